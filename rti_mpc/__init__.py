@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Real-time nonlinear model predictive control: numbers in, numbers out.
+
+Data flows one way: model, integrator, ocp, transcription, codegen, qp, solver,
+rti, controller, wire. Names are imported on first use, so that a process which
+only speaks the wire contract loads neither CasADi nor OSQP.
+
+References, cited by key throughout:
+
+* [Rosales] A. Rosales Acosta, "Dynamic nonlinear model based predictive control for mobile robots".
+* [DeLaCruz2006] C. De La Cruz, R. Carelli, "Dynamic modeling and centralized formation control of mobile robots", IECON 2006.
+* [Diehl2005] M. Diehl, H. G. Bock, J. P. Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback control",
+  SIAM J. Control Optim. 43(5), 2005.
+* [Gros2020] S. Gros, M. Zanon, R. Quirynen, A. Bemporad, M. Diehl, "From linear to nonlinear MPC: bridging the gap via the real-time iteration",
+  Int. J. Control 93(1), 2020.
+* [Verschueren2022] R. Verschueren et al., "acados - a modular open-source framework for fast embedded optimal control", Math. Prog. Comp. 14, 2022.
+* [Stellato2020] B. Stellato et al., "OSQP: an operator splitting solver for quadratic programs", Math. Prog. Comp. 12, 2020.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rti_mpc.controller import Controller as Controller
+    from rti_mpc.model import Model as Model
+    from rti_mpc.model import Signal as Signal
+    from rti_mpc.model import find_model as find_model
+    from rti_mpc.ocp import Ocp as Ocp
+    from rti_mpc.rti import Rti as Rti
+
+HOME = {
+    "Controller": "rti_mpc.controller",
+    "Model": "rti_mpc.model",
+    "Ocp": "rti_mpc.ocp",
+    "Rti": "rti_mpc.rti",
+    "Signal": "rti_mpc.model",
+    "find_model": "rti_mpc.model",
+}
+
+__version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name from its module on first use (PEP 562)."""
+    if name not in HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(HOME[name]), name)

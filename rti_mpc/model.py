@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+A robot as CasADi expressions: :math:`\dot x = f(x, u, p)`, :math:`y = h(x, p)`, with names and units.
+
+The names are those of acados (`f_expl_expr`), so that a model written for it
+can be brought along.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+
+from rti_mpc.errors import OcpError
+
+
+@dataclass(frozen=True)
+class Signal:
+    """
+    One component of a state, input, output or parameter vector.
+
+    Attributes:
+        name: Unique within its vector; what configuration and viewers call it.
+        unit: SI unit, ``"1"`` if none.
+        angle: Whether it wraps at :math:`\\pm\\pi` on the wire.
+    """
+
+    name: str
+    unit: str
+    angle: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """
+    A continuous-time model.
+
+    Attributes:
+        name: Name, as in the configuration.
+        x: State symbol, shape ``(nx, 1)``.
+        u: Input symbol, shape ``(nu, 1)``.
+        p: Parameter symbol, shape ``(np, 1)``.
+        f_expl_expr: Right-hand side f(x, u, p), shape ``(nx, 1)``.
+        y_expr: Output h(x, p), shape ``(ny, 1)``.
+        states: Names and units of `x`.
+        inputs: Names and units of `u`.
+        outputs: Names and units of `y_expr`.
+        parameters: Names and units of `p`.
+        p_nominal: Values of `p` unless a reference carries others.
+        u_rest: Input at which the robot stands still; zeros by default.
+
+    Raises:
+        OcpError: A dimension, a name or a free symbol does not fit.
+    """
+
+    name: str
+    x: ca.SX
+    u: ca.SX
+    f_expl_expr: ca.SX
+    y_expr: ca.SX
+    states: tuple[Signal, ...]
+    inputs: tuple[Signal, ...]
+    outputs: tuple[Signal, ...]
+    p: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
+    parameters: tuple[Signal, ...] = ()
+    p_nominal: tuple[float, ...] = ()
+    u_rest: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check that names, dimensions and symbols fit together."""
+        if not self.u_rest:
+            object.__setattr__(self, "u_rest", (0.0,) * len(self.inputs))
+        for label, expr, length in (
+            ("states", self.x, len(self.states)),
+            ("f_expl_expr", self.f_expl_expr, len(self.states)),
+            ("inputs", self.u, len(self.inputs)),
+            ("outputs", self.y_expr, len(self.outputs)),
+            ("parameters", self.p, len(self.parameters)),
+            ("p_nominal", self.p, len(self.p_nominal)),
+            ("u_rest", self.u, len(self.u_rest)),
+        ):
+            if expr.numel() != length or (length and expr.shape != (length, 1)):
+                raise OcpError(f"model {self.name}: {label} must have {expr.numel()} entries, in a column, got {length} for shape {expr.shape}")
+        for signals in (self.states, self.inputs, self.outputs, self.parameters):
+            names = [signal.name for signal in signals]
+            if len(set(names)) < len(names):
+                raise OcpError(f"model {self.name}: names must be unique within a vector, got {names}")
+        for label, expr, known in (
+            ("f_expl_expr", self.f_expl_expr, (self.x, self.u, self.p)),
+            ("y_expr", self.y_expr, (self.x, self.p)),
+        ):
+            free = [str(s) for s in ca.symvar(expr) if not any(ca.depends_on(k, s) for k in known)]
+            if free:
+                raise OcpError(f"model {self.name}: {label} must depend only on x, {'u, ' if label[0] == 'f' else ''}p, also has {', '.join(free)}")
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def ny(self) -> int:
+        """Number of outputs."""
+        return len(self.outputs)
+
+    @property
+    def np_(self) -> int:
+        """Number of parameters."""
+        return len(self.parameters)
+
+    def with_parameters(self, **values: float) -> Model:
+        """
+        Return this model with other nominal parameters.
+
+        Raises:
+            OcpError: A name is not a parameter of this model.
+        """
+        names = [signal.name for signal in self.parameters]
+        for name in values:
+            if name not in names:
+                raise OcpError(f"model {self.name} has parameters {', '.join(names) or 'none'}, got {name}")
+        return replace(self, p_nominal=tuple(values.get(n, v) for n, v in zip(names, self.p_nominal, strict=True)))
+
+
+SHIPPED = {"pioneer_3dx": "rti_mpc.pioneer_3dx:pioneer_3dx"}
+
+
+def find_model(name: str) -> Model:
+    """
+    Find a model by the name of a shipped one, or by ``package.module:function``.
+
+    Raises:
+        OcpError: There is no such model, or the function does not return one.
+    """
+    path = SHIPPED.get(name, name)
+    module_name, colon, function_name = path.partition(":")
+    try:
+        if not colon:
+            raise ImportError("it is neither")
+        build: Callable[[], Model] = getattr(importlib.import_module(module_name), function_name)
+    except (ImportError, AttributeError) as error:
+        raise OcpError(f"a model must be one of {', '.join(SHIPPED)} or an importable package.module:function, got {name!r} ({error})") from error
+    model = build()
+    if not isinstance(model, Model):
+        raise OcpError(f"{name} must return a rti_mpc.model.Model, got {type(model).__name__}")
+    return model
