@@ -1,0 +1,360 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The bus: bytes in and out over Zenoh, with every trap of it closed off.
+
+* Whatever is received waits in a ring of fixed size that drops the oldest: an
+  unread subscriber stops nobody, and no Python runs in a thread of Zenoh.
+* Whatever is sent is dropped rather than waited for where a link is congested.
+* A session hears nothing of what it publishes itself.
+* `Bus.close` is bounded, unblocks every `recv`, and the interpreter then exits.
+
+Peers find each other by gossip. Each listens on a free loopback port; one, the
+robot, listens on the rendezvous endpoint as well; the others connect to it, again
+and again until it is there, learn of one another and link directly. So processes
+start and restart in any order, and those already linked stay so without the
+robot. Multicast is off. Across hosts, name the endpoint to listen on; across a
+security boundary, use ``mode="client"`` and a router: a peer never forwards, and
+never passes a router's access control.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic
+
+import zenoh
+from zenoh import ext
+
+from rti_mpc.errors import ConfigError
+from rti_mpc.wire.cdr import M, encode, encoding
+from rti_mpc.wire.keys import Keys
+
+RENDEZVOUS = "tcp/127.0.0.1:7447"
+CLOSE_TIMEOUT_S = 0.5
+RETRY_S = 0.1  # between two looks for somebody who is not there yet
+
+# Ours, unless the user's own Zenoh configuration says otherwise.
+DEFAULTS: dict[str, Any] = {
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
+    "scouting/gossip/enabled": True,
+    "transport/link/tx/lease": 2000,  # a hung process is noticed after 1.5 s, not 7.5 s
+    "transport/link/rx/max_message_size": 1 << 26,  # bytes: what a peer can make us hold
+    "transport/shared_memory/enabled": False,  # gains nothing at these sizes
+    "queries_default_timeout": 1000,  # ms: a hung publisher delays a late joiner no longer
+}
+
+
+@dataclass(frozen=True, slots=True)
+class BusSettings:
+    """
+    How a process joins the bus. What a Zenoh configuration file sets, it sets; the other attributes fill in the rest.
+
+    Attributes:
+        mode: peer, client or router.
+        listen: Endpoints to listen on, besides the free loopback port of a peer.
+        connect: Endpoints to connect to; those in `listen` are left out.
+        config: Configuration file of Zenoh, JSON5.
+        multicast: Whether to look for others by multicast.
+        cfg: Further settings of Zenoh, each ``KEY:VALUE``, applied last.
+    """
+
+    mode: str = "peer"
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = (RENDEZVOUS,)
+    config: Path | None = None
+    multicast: bool = False
+    cfg: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """
+    A payload as it came, not yet looked at.
+
+    Attributes:
+        payload: Its bytes.
+        encoding: What the sender says they are.
+        key: Where it was published.
+    """
+
+    payload: bytes
+    encoding: str
+    key: str
+
+
+def zenoh_config(settings: BusSettings) -> zenoh.Config:
+    """
+    Zenoh configuration of a process.
+
+    Raises:
+        ConfigError: If Zenoh refuses a value, or cannot read the file.
+    """
+    loopback = ("tcp/127.0.0.1:0",) if settings.mode == "peer" else ()
+    values = {
+        "mode": settings.mode,
+        "listen/endpoints": [*settings.listen, *loopback],
+        "connect/endpoints": [endpoint for endpoint in settings.connect if endpoint not in settings.listen],
+        "scouting/multicast/enabled": settings.multicast,
+        "connect/timeout_ms": 500 if settings.mode == "client" else -1,
+        **DEFAULTS,
+    }
+    untouched = zenoh.Config()
+    name = str(settings.config)
+    try:
+        config = zenoh.Config() if settings.config is None else zenoh.Config.from_file(settings.config)
+        for name, value in values.items():
+            if config.get_json(name) == untouched.get_json(name):
+                config.insert_json5(name, json.dumps(value))
+        for name, _, text in (setting.partition(":") for setting in settings.cfg):
+            config.insert_json5(name, text)
+    except zenoh.ZError as error:
+        raise ConfigError(f"bus: {name} must be what Zenoh takes, got: {_brief(error)}") from None
+    return config
+
+
+def _brief(error: Exception) -> str:
+    return " ".join(str(error).split(" at /")[0].split())
+
+
+def _open(settings: BusSettings) -> zenoh.Session:
+    """Open a session; a client waits for its router."""
+    while True:
+        try:
+            return zenoh.open(zenoh_config(settings))
+        except zenoh.ZError as error:
+            if "Unable to connect" not in str(error):
+                raise ConfigError(f"bus: endpoints must be free and valid, got: {_brief(error)}") from None
+            time.sleep(RETRY_S)
+
+
+class Publisher(Generic[M]):
+    """Sends messages of one class on one key. `put` never blocks, and after `Bus.close` does nothing."""
+
+    def __init__(self, publisher: zenoh.Publisher | ext.AdvancedPublisher) -> None:
+        self._publisher = publisher
+
+    def put(self, message: M) -> None:
+        """Send a message to whoever listens now, and to late joiners if the publisher is cached."""
+        self.put_bytes(encode(message))
+
+    def put_bytes(self, payload: bytes) -> None:
+        """Send bytes as they are."""
+        try:
+            self._publisher.put(payload)
+        except zenoh.ZError as error:
+            if "closed" not in str(error):
+                raise
+
+
+class Subscriber:
+    """Receives from one key expression into a ring: the newest samples, oldest first. After `Bus.close`, nothing."""
+
+    def __init__(self, subscriber: zenoh.Subscriber[Any] | ext.AdvancedSubscriber[Any], own: str) -> None:
+        self._subscriber = subscriber
+        self._handler = subscriber.handler
+        self._own = own  # a cache answers its own session, too
+
+    def recv(self) -> Received | None:
+        """Next sample, waiting for it; None once the bus is closed."""
+        try:
+            while (received := self._received(self._handler.recv())) is None:
+                pass
+        except zenoh.ZError:
+            return None
+        return received
+
+    def try_recv(self) -> Received | None:
+        """Next sample, None if there is none now."""
+        try:
+            while (sample := self._handler.try_recv()) is not None:
+                if (received := self._received(sample)) is not None:
+                    return received
+        except zenoh.ZError:
+            return None
+        return None
+
+    def drain(self) -> list[Received]:
+        """All samples there are now, oldest first."""
+        return list(iter(self.try_recv, None))
+
+    def _received(self, sample: zenoh.Sample) -> Received | None:
+        if self._own and (info := sample.source_info) is not None and str(info.source_id.zid) == self._own:
+            return None
+        return Received(sample.payload.to_bytes(), str(sample.encoding), str(sample.key_expr))
+
+
+class Bus:
+    """
+    One process on the bus of one robot.
+
+    Attributes:
+        keys: Where the streams are.
+        closed: Whether `close` was called.
+    """
+
+    def __init__(self, settings: BusSettings, keys: Keys) -> None:
+        self.keys = keys
+        self.closed = False
+        self._session = _open(settings)
+        self._declared: list[Any] = []  # a token or queryable lives as long as its object
+        self._json: dict[str, Publisher[Any]] = {}
+
+    def __enter__(self) -> Bus:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the bus within half a second, even where Zenoh takes longer; every `recv` returns None."""
+        if self.closed:
+            return
+        self.closed = True
+        closing = threading.Thread(target=self._session.close, daemon=True)
+        closing.start()
+        closing.join(CLOSE_TIMEOUT_S)
+
+    def publisher(self, key: str, cls: type[M], *, realtime: bool = False, cached: bool = False) -> Publisher[M]:
+        """
+        Publisher of one class of message.
+
+        Args:
+            key: Where to publish.
+            cls: Class of the messages.
+            realtime: Whether it goes before everything else, unbatched.
+            cached: Whether late joiners get the last message.
+        """
+        priority = zenoh.Priority.REAL_TIME if realtime else zenoh.Priority.DATA if cached else zenoh.Priority.DATA_LOW
+        return Publisher(self._publisher(key, encoding(cls), priority, express=realtime, cached=cached))
+
+    def subscriber(self, key: str, *, capacity: int = 1, cached: bool = False) -> Subscriber:
+        """
+        Subscriber to a key expression.
+
+        Args:
+            key: What to listen to; may hold wildcards.
+            capacity: Samples kept, the oldest dropped first.
+            cached: Whether to ask publishers for their last message, those which come later included.
+        """
+        ring: Any = zenoh.handlers.RingChannel(capacity)
+        origin = zenoh.Locality.REMOTE
+        if not cached:
+            return Subscriber(self._session.declare_subscriber(key, ring, allowed_origin=origin), own="")
+        history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+        subscriber = ext.declare_advanced_subscriber(self._session, key, ring, allowed_origin=origin, history=history)
+        return Subscriber(subscriber, own=str(self._session.info.zid()))
+
+    def publish_json(self, key: str, value: dict[str, Any]) -> None:
+        """Publish a JSON object that late joiners get, too."""
+        if key not in self._json:
+            self._json[key] = Publisher(self._publisher(key, "application/json", zenoh.Priority.DATA, express=False, cached=True))
+        self._json[key].put_bytes(json.dumps(value).encode())
+
+    def _publisher(self, key: str, encoding: str, priority: zenoh.Priority, *, express: bool, cached: bool) -> Any:
+        qos: Any = {
+            "encoding": encoding,
+            "priority": priority,
+            "express": express,
+            "congestion_control": zenoh.CongestionControl.DROP,
+            "allowed_destination": zenoh.Locality.REMOTE,
+        }
+        if cached:
+            sequence = ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
+            publisher: Any = ext.declare_advanced_publisher(
+                self._session, key, cache=ext.CacheConfig(1), sample_miss_detection=sequence, publisher_detection=True, **qos
+            )
+        else:
+            publisher = self._session.declare_publisher(key, **qos)
+        self._declared.append(publisher)
+        return publisher
+
+    def serve(self, key: str, handler: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+        """
+        Answer requests on a key, in a thread of its own.
+
+        What the handler raises, and requests that are not a JSON object, are
+        answered ``{"ok": false, "error": ...}``.
+        """
+        ring: Any = zenoh.handlers.RingChannel(16)
+        queryable = self._session.declare_queryable(key, ring)
+        self._declared.append(queryable)
+        self._follow(queryable.handler, lambda query: _answer(key, query, handler))
+
+    def request(self, key: str, value: dict[str, Any], timeout_s: float) -> dict[str, Any]:
+        """
+        Answer of whoever serves a key; where several do, a refusal before a consent.
+
+        Raises:
+            TimeoutError: If nobody answers in time.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        while (left_s := deadline_s - time.monotonic()) > 0.0:
+            replies = self._session.get(
+                key,
+                timeout=left_s,
+                payload=json.dumps(value).encode(),
+                encoding="application/json",
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+            )
+            answers = [_json_object(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
+            if answers:
+                return min(answers, key=lambda answer: answer.get("ok") is True)
+            time.sleep(min(RETRY_S, left_s))  # nobody serves it yet
+        raise TimeoutError(f"{key} must be served, got no answer within {timeout_s} s")
+
+    def alive(self, role: str) -> zenoh.LivelinessToken:
+        """Show presence in a role until the token is undeclared, the bus closed or the process gone."""
+        token = self._session.liveliness().declare_token(self.keys.alive(role))
+        self._declared.append(token)
+        return token
+
+    def is_alive(self, role: str, timeout_s: float = 1.0) -> bool:
+        """Whether anybody shows presence in a role, ourselves included."""
+        replies = self._session.liveliness().get(self.keys.alive(role), timeout=timeout_s)
+        return any(reply.ok is not None for reply in replies)
+
+    def watch_alive(self, callback: Callable[[str, bool], None]) -> None:
+        """Call back, in a thread of its own, with a role and whether it is present, for those present now and at every change."""
+        ring: Any = zenoh.handlers.RingChannel(256)
+        subscriber = self._session.liveliness().declare_subscriber(self.keys.lives, ring, history=True)
+        self._declared.append(subscriber)
+        self._follow(subscriber.handler, lambda sample: callback(str(sample.key_expr).rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT))
+
+    def _follow(self, handler: Any, act: Callable[[Any], None]) -> None:
+        def follow() -> None:
+            while True:
+                try:
+                    item = handler.recv()
+                except zenoh.ZError:  # the bus is closed
+                    return
+                act(item)
+
+        threading.Thread(target=follow, daemon=True).start()
+
+
+def _json_object(payload: bytes) -> dict[str, Any]:
+    try:
+        value = json.loads(payload)
+    except (ValueError, RecursionError):
+        value = None
+    return value if isinstance(value, dict) else {"ok": False, "error": "message must be a JSON object"}
+
+
+def _answer(key: str, query: zenoh.Query, handler: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+    with query:
+        request = _json_object(query.payload.to_bytes() if query.payload is not None else b"")
+        try:
+            answer = request if request.get("ok") is False else handler(request)
+            payload = json.dumps(answer)
+        except Exception as error:  # a handler's fault is the requester's to hear, not ours to die of
+            payload = json.dumps({"ok": False, "error": str(error)})
+        try:
+            query.reply(key, payload.encode(), encoding="application/json")
+        except zenoh.ZError:
+            return  # the requester, or the bus, is gone
