@@ -228,8 +228,8 @@ def _decode_command(payload: bytes) -> Command:
     flat, end = _vector(payload, COMMAND.size + 4, "u")
     _finish(payload, end)
     u = _finite(_filled(_rows(flat, nu, "u"), "u"), "u")
-    values += _member(MODES, mode, "mode"), _member(STATUSES, status, "status"), _positive(period_ns, "period_ns")
-    return Command(*values, u=u)
+    values += _member(MODES, mode, "mode"), _member(STATUSES, status, "status"), _positive(period_ns, "period_ns"), u
+    return Command(*values)
 
 
 def _encode_telemetry(message: Telemetry) -> bytes:
@@ -279,7 +279,8 @@ def _decode_telemetry(payload: bytes) -> Telemetry:
     if x0.size not in (0, nx):
         raise Refused("length", f"x0 must hold {nx} numbers, got {x0.size}")
     values[5:7] = _member(MODES, values[5], "mode"), _member(STATUSES, values[6], "status")
-    return Telemetry(*values, x0=x0, x=_rows(x, nx, "x"), u=_rows(u, nu, "u"), y_ref=_rows(y_ref, ny, "y_ref"))
+    values += x0, _rows(x, nx, "x"), _rows(u, nu, "u"), _rows(y_ref, ny, "y_ref")
+    return Telemetry(*values)
 
 
 def _pack_string(offset: int, text: str) -> bytes:

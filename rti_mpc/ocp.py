@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+The optimal control problem of one sample, frozen and validated.
+
+Over stages of `dt` seconds, with :math:`y_i = h(x_i, p_i)`, the previous input
+:math:`u_{-1}`, and inputs held after the control horizon,
+
+.. math::
+
+    \min \; & \sum_{i=1}^{N} \delta_i \|y_i - y_{ref,i}\|_Q^2
+            + \sum_{i=1}^{N_u} \lambda_i \|u_{i-1} - u_{i-2}\|_R^2
+            + \sum_{i=1}^{N} \left( z^T s_i + \tfrac12 s_i^T Z s_i \right) \\
+    \text{s.t.} \; & x_{k+1} = \phi(x_k, u_k, p_k), \quad x_0 \text{ given}, \\
+    & lbu \le u_k \le ubu, \quad lbdu \le u_k - u_{k-1} \le ubdu, \\
+    & lbx - s_i \le x_i \le ubx + s_i, \quad s_i \ge 0 .
+
+This is the cost (4) of [Rosales]_ in full. State bounds are softened by an
+exact penalty, so that no measurement makes the problem infeasible.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rti_mpc.array import Array
+from rti_mpc.errors import OcpError
+from rti_mpc.integrator import integrator
+from rti_mpc.model import Model
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Ocp:
+    r"""
+    An optimal control problem. Everything is checked, and every array owned and read-only.
+
+    Attributes:
+        model: Dynamics and outputs.
+        N: Horizon, in stages.
+        N_u: Control horizon, ``1 <= N_u <= N``; `N` by default.
+        dt: Duration of a stage, s.
+        method: Integrator of a stage, ``"rk4"`` or ``"euler"``.
+        Q: Output weight, shape ``(ny, ny)``, given so or by its diagonal; cost / unit of the outputs squared.
+        R: Increment weight, shape ``(nu, nu)``, given so or by its diagonal; cost / unit of the inputs squared.
+        delta: Penalty sequence on outputs, shape ``(N,)``, given so or as a constant.
+        lambda_: Penalty sequence on increments, shape ``(N_u,)``, given so or as a constant.
+        lbu: Lower bound on inputs, shape ``(nu,)``; none by default, as for the following.
+        ubu: Upper bound on inputs, shape ``(nu,)``.
+        lbdu: Lower bound on the increment of inputs from stage to stage, shape ``(nu,)``.
+        ubdu: Upper bound on the increment of inputs, shape ``(nu,)``.
+        lbx: Softened lower bound on states at nodes 1 to N, shape ``(nx,)``.
+        ubx: Softened upper bound on states, shape ``(nx,)``.
+        z: L1 weight of the slacks, shape ``(nx,)``, given so or as a constant; cost / unit of the state.
+        Z: L2 weight of the slacks, shape ``(nx,)``, given so or as a constant; cost / unit of the state squared.
+
+    Raises:
+        OcpError: An argument does not fit; the message names it, and what it must be.
+    """
+
+    model: Model
+    N: int
+    N_u: int
+    dt: float
+    method: str
+    Q: Array
+    R: Array
+    delta: Array
+    lambda_: Array
+    lbu: Array
+    ubu: Array
+    lbdu: Array
+    ubdu: Array
+    lbx: Array
+    ubx: Array
+    z: Array
+    Z: Array
+
+    def __init__(
+        self,
+        model: Model,
+        *,
+        N: int,
+        dt: float,
+        Q: ArrayLike,
+        R: ArrayLike,
+        N_u: int | None = None,
+        method: str = "rk4",
+        delta: ArrayLike = 1.0,
+        lambda_: ArrayLike = 1.0,
+        lbu: ArrayLike = -np.inf,
+        ubu: ArrayLike = np.inf,
+        lbdu: ArrayLike = -np.inf,
+        ubdu: ArrayLike = np.inf,
+        lbx: ArrayLike = -np.inf,
+        ubx: ArrayLike = np.inf,
+        z: ArrayLike = 1e3,
+        Z: ArrayLike = 1e3,
+    ) -> None:
+        if N_u is None:
+            N_u = N
+        if not 1 <= N_u <= N:
+            raise OcpError(f"N_u and N must satisfy 1 <= N_u <= N, got N_u = {N_u}, N = {N}")
+        if not (np.isfinite(dt) and dt > 0):
+            raise OcpError(f"dt must be a positive number of seconds, got {dt}")
+        integrator(model, method)  # raises for an unknown method
+        nx, nu, ny = model.nx, model.nu, model.ny
+        fields: dict[str, Any] = {
+            "model": model,
+            "N": N,
+            "N_u": N_u,
+            "dt": float(dt),
+            "method": method,
+            "Q": weight_matrix("Q", Q, ny),
+            "R": weight_matrix("R", R, nu),
+            "delta": weights("delta", delta, N),
+            "lambda_": weights("lambda_", lambda_, N_u),
+            "lbu": bound("lbu", lbu, nu),
+            "ubu": bound("ubu", ubu, nu),
+            "lbdu": bound("lbdu", lbdu, nu),
+            "ubdu": bound("ubdu", ubdu, nu),
+            "lbx": bound("lbx", lbx, nx),
+            "ubx": bound("ubx", ubx, nx),
+            "z": weights("z", z, nx),
+            "Z": weights("Z", Z, nx),
+        }
+        for lower, upper in (("lbu", "ubu"), ("lbx", "ubx")):
+            if not np.all(fields[lower] < fields[upper]):
+                raise OcpError(f"{lower} must lie below {upper}, got {fields[lower]} and {fields[upper]}")
+        if np.any(fields["lbdu"] > 0) or np.any(fields["ubdu"] < 0):
+            raise OcpError(f"lbdu <= 0 <= ubdu must hold, or no input could be kept, got {fields['lbdu']} and {fields['ubdu']}")
+        for name, value in fields.items():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    @property
+    def soft(self) -> tuple[int, ...]:
+        """Indices of the states with a bound, each with one slack a node."""
+        return tuple(int(j) for j in np.flatnonzero(np.isfinite(self.lbx) | np.isfinite(self.ubx)))
+
+    def phi(self) -> ca.Function:
+        """One stage of the dynamics, ``phi(x, u, p) -> x_next``."""
+        model = self.model
+        x_next = integrator(model, self.method)(model.x, model.u, model.p, self.dt)
+        return ca.Function("phi", [model.x, model.u, model.p], [x_next], ["x", "u", "p"], ["x_next"])
+
+
+def weights(name: str, value: ArrayLike, length: int) -> Array:
+    """Return finite weights >= 0 of shape ``(length,)`` from these or a constant."""
+    array = vector(name, value, length)
+    if not np.all(np.isfinite(array)) or np.any(array < 0):
+        raise OcpError(f"{name} must be finite and not negative, got {value}")
+    return array
+
+
+def weight_matrix(name: str, value: ArrayLike, size: int) -> Array:
+    """Return a finite symmetric positive semidefinite matrix from itself or its diagonal."""
+    array = np.array(value, dtype=np.float64)
+    if array.shape == (size,):
+        array = np.diag(array)
+    if array.shape != (size, size):
+        raise OcpError(f"{name} must have shape ({size}, {size}) or be its diagonal ({size},), got shape {array.shape}")
+    if not np.all(np.isfinite(array)) or not np.array_equal(array, array.T) or np.linalg.eigvalsh(array).min(initial=0.0) < -1e-12 * np.abs(array).max():
+        raise OcpError(f"{name} must be finite, symmetric and positive semidefinite, got {array.tolist()}")
+    return array
+
+
+def bound(name: str, value: ArrayLike, length: int) -> Array:
+    """Return bounds of shape ``(length,)`` from these or a constant; infinite where there is none."""
+    array = vector(name, value, length)
+    if np.any(np.isnan(array)):
+        raise OcpError(f"{name} must not be NaN, got {value}")
+    return array
+
+
+def vector(name: str, value: ArrayLike, length: int) -> Array:
+    """Return an owned array of shape ``(length,)`` from one or from a constant."""
+    array = np.array(value, dtype=np.float64)
+    if array.shape not in ((), (length,)):
+        raise OcpError(f"{name} must be a number or have shape ({length},), got shape {array.shape}")
+    return np.array(np.broadcast_to(array, (length,)))
