@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The clock keeps an absolute grid."""
+
+from __future__ import annotations
+
+import time
+from threading import Event
+
+import numpy as np
+import pytest
+
+from rti_mpc.errors import ConfigError
+from sim.clock import Clock
+
+
+@pytest.mark.parametrize("speed", [1.0, 4.0])
+def test_waits_end_on_an_absolute_grid(speed: float) -> None:
+    """Each is at most a little late, whatever was done in between, and never early; nothing adds up."""
+    clock = Clock(speed)
+    late_ms = []
+    for k in range(1, 41):
+        clock.wait(k * round(10_000_000 * speed), Event())
+        late_ms.append(1e-6 * (clock.now_ns() / speed - k * 10_000_000))
+        time.sleep(0.002)
+    assert min(late_ms) >= 0.0
+    assert np.median(late_ms) < 1.0
+
+
+def test_a_stopped_wait_ends_soon() -> None:
+    stop = Event()
+    stop.set()
+    clock = Clock()
+    clock.wait(10_000_000_000, stop)
+    assert clock.now_ns() < 1_000_000_000
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), float("inf")])
+def test_speed_must_be_positive(speed: float) -> None:
+    with pytest.raises(ConfigError, match="speed"):
+        Clock(speed)
