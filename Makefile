@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+# Every target sets itself up: `make demo` or `make test` in a fresh clone is enough. Arguments: make demo ARGS="--scenario circle".
+
+BIN := .venv/bin
+READY := .venv/ready
+UV := $(shell command -v uv)
+
+# The first Python of 3.11 to 3.14 that starts: for these every pinned package has a wheel.
+FITS := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
+PYTHON = $(shell for python in python3 python3.13 python3.12 python3.11 python3.14; do $$python -c '$(FITS)' 2>/dev/null && echo $$python && break; done)
+
+.PHONY: demo test test-slow bench lint format types lock clean
+
+demo: $(READY)
+	$(BIN)/rti-mpc demo $(ARGS)
+
+test: $(READY)
+	$(BIN)/pytest $(ARGS)
+
+test-slow: $(READY)
+	$(BIN)/pytest -m slow $(ARGS)
+
+bench: $(READY)
+	$(BIN)/pytest -m benchmark -s $(ARGS)
+
+lint: $(READY)
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+
+format: $(READY)
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+types: $(READY)
+	$(BIN)/mypy
+
+lock:
+	$(if $(UV),,$(error make lock needs uv: pip install uv))
+	uv pip compile --quiet --no-config --upgrade --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate \
+		--custom-compile-command "make lock" --extra view --extra figure --group dev --output-file constraints.txt pyproject.toml
+
+clean:
+	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache dist
+
+ifdef UV
+$(READY): constraints.txt
+	@echo "setting up .venv with uv"
+	@rm -rf .venv && uv venv --quiet --python '$(or $(PYTHON),>=3.11,<3.15)' .venv
+	@uv pip install --quiet --python $(BIN)/python --require-hashes --requirement constraints.txt
+	@uv pip install --quiet --python $(BIN)/python --no-build-isolation --no-deps --editable .
+	@touch $@
+else
+$(READY): constraints.txt
+	@test -n "$(PYTHON)" || { echo "make needs Python 3.11 to 3.14: apt-get install python3 python3-venv" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "make needs venv: apt-get install $$(basename $(PYTHON))-venv" >&2; exit 1; }
+	@echo "setting up .venv with pip and $$($(PYTHON) --version), about a minute"
+	@rm -rf .venv && $(PYTHON) -m venv .venv
+	@$(BIN)/pip install --quiet --disable-pip-version-check --no-compile --require-hashes --requirement constraints.txt
+	@$(BIN)/pip install --quiet --disable-pip-version-check --no-build-isolation --no-deps --editable .
+	@touch $@
+endif
