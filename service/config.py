@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The configuration of one robot: a TOML file, read once into a frozen tree.
+
+Everything is checked here, so that nothing behind this door checks again: the
+tree by itself (`service.schema`), then its names against the model, then the
+whole by building the `Ocp`. Each refusal is one line (`service.refusal`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import Field, ValidationError
+
+from rti_mpc.errors import ConfigError, OcpError
+from service.refusal import explain, unknown_name
+from service.schema import BusSection, ModelSection, OcpSection, Section, SimSection, SolverSection, TimingSection
+
+if TYPE_CHECKING:
+    from rti_mpc.model import Model, Signal
+    from rti_mpc.ocp import Ocp
+    from rti_mpc.solver import SolverSettings
+    from rti_mpc.wire.bus import BusSettings
+    from rti_mpc.wire.keys import Keys
+
+
+class Config(Section):
+    """Everything physical about one robot."""
+
+    robot: str = Field(pattern=r"^[A-Za-z0-9_.-]+$", description="the robot's name in keys: letters, digits, _ . -")
+    prefix: str = Field(default="rti_mpc", pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$", description="what all keys begin with")
+    model: ModelSection = Field(description="which robot")
+    ocp: OcpSection = Field(description="the optimal control problem")
+    solver: SolverSection = Field(default=SolverSection(), description="the QP solver's settings")
+    timing: TimingSection = Field(default=TimingSection(), description="delays and timeouts")
+    bus: BusSection = Field(default=BusSection(), description="the Zenoh session")
+    sim: SimSection = Field(default=SimSection(), description="the simulated robot")
+
+    @property
+    def N_u(self) -> int:
+        """Control horizon, in stages."""
+        return self.ocp.N_u or self.ocp.N
+
+    @property
+    def stale_s(self) -> float:
+        """Age from which a state is not used, s of the robot."""
+        return self.timing.stale_s or min(max(2.5 * self.ocp.dt_s, 0.05), 0.25)
+
+    @property
+    def config_hash(self) -> int:
+        """64 bits of everything that decides a command: not of the bus, not of the simulation."""
+        content = self.model_dump(mode="json", exclude={"bus", "sim"})
+        return int.from_bytes(hashlib.sha256(json.dumps(content, sort_keys=True).encode()).digest()[:8], "little")
+
+    def build_model(self) -> Model:
+        """Return the controller's model."""
+        from rti_mpc.model import find_model
+
+        return find_model(self.model.name).with_parameters(**self.model.parameters)
+
+    def build_ocp(self) -> Ocp:
+        """Return the optimal control problem."""
+        from rti_mpc.ocp import Ocp
+
+        model, weights, limits = self.build_model(), self.ocp.weights, self.ocp.bounds
+        lbu, ubu = bounds(limits.inputs, model.inputs)
+        lbdu, ubdu = bounds(limits.increments, model.inputs)
+        lbx, ubx = bounds(limits.states, model.states)
+        return Ocp(
+            model,
+            N=self.ocp.N,
+            N_u=self.N_u,
+            dt=self.ocp.dt_s,
+            method=self.ocp.integrator,
+            Q=[weights.Q[output.name] for output in model.outputs],
+            R=[weights.R[input.name] for input in model.inputs],
+            delta=spread(weights.delta, self.ocp.N),
+            lambda_=spread(weights.lambda_, self.N_u),
+            lbu=lbu,
+            ubu=ubu,
+            lbdu=lbdu,
+            ubdu=ubdu,
+            lbx=lbx,
+            ubx=ubx,
+            **({} if limits.soft_weight is None else {"z": limits.soft_weight}),
+        )
+
+    def robot_settings(self) -> dict[str, Any]:
+        """Return what `sim.settings.RobotSettings` is made from; the slew limits are those of the increments."""
+        model, sim = self.build_model().with_parameters(**self.sim.parameters), self.sim
+        increments = zip(*bounds(self.ocp.bounds.increments, model.inputs), strict=True)
+        return {
+            "state_period_s": self.ocp.dt_s,
+            **sim.model_dump(exclude_none=True, exclude={"parameters"}),
+            "model": model,
+            "x0": [sim.x0.get(state.name, 0.0) for state in model.states],
+            "noise_std": [sim.noise_std.get(state.name, 0.0) for state in model.states],
+            "slew": [min(-lower, upper) / self.ocp.dt_s for lower, upper in increments],
+        }
+
+    def solver_settings(self) -> SolverSettings:
+        """Return the settings of the QP solver."""
+        from rti_mpc.solver import SolverSettings
+
+        return SolverSettings(**self.solver.model_dump(exclude_none=True))
+
+    def keys(self) -> Keys:
+        """Return the keys of this robot."""
+        from rti_mpc.wire.keys import Keys
+
+        return Keys(self.prefix, self.robot)
+
+    def bus_settings(self) -> BusSettings:
+        """Return the settings of this robot's Zenoh sessions."""
+        from rti_mpc.wire.bus import BusSettings
+
+        return BusSettings(**self.bus.model_dump(exclude_none=True))
+
+
+def spread(values: tuple[float, ...], length: int) -> tuple[float, ...]:
+    """Return a sequence, or the constant that a single value stands for."""
+    return values if len(values) == length else values * length
+
+
+def bounds(table: Mapping[str, tuple[float, float]], signals: tuple[Signal, ...]) -> tuple[list[float], list[float]]:
+    """Return lower and upper bounds in the order of the signals."""
+    pairs = [table.get(signal.name, (-math.inf, math.inf)) for signal in signals]
+    return [lower for lower, _ in pairs], [upper for _, upper in pairs]
+
+
+def load(path: Path) -> Config:
+    """
+    Read, check and freeze a robot's configuration.
+
+    Raises:
+        ConfigError: One line: the file, the key, what must hold, what was got.
+    """
+    try:
+        config = Config.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        if config.bus.config is not None:
+            config = config.model_copy(update={"bus": config.bus.model_copy(update={"config": path.parent / config.bus.config})})
+        check(config)
+    except OSError as error:
+        raise ConfigError(f"{path}: must be a readable file, got {error.strerror}") from error
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {explain(error, Config)}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: must be TOML, got {error}") from error
+    except (ConfigError, OcpError) as error:
+        raise ConfigError(f"{path}: {error}") from error
+    return config
+
+
+def check(config: Config) -> None:
+    """
+    Check what only the whole, the model or the file system knows.
+
+    Raises:
+        ConfigError: A key does not fit the others or the model.
+        OcpError: The problem is ill-posed in some other way.
+    """
+    from rti_mpc.model import find_model
+
+    ocp, sim = config.ocp, config.sim
+    if config.N_u > ocp.N:
+        raise ConfigError(f"ocp.N_u must be at most ocp.N = {ocp.N}, got {ocp.N_u}")
+    for key, values, length in (("delta", ocp.weights.delta, ocp.N), ("lambda", ocp.weights.lambda_, config.N_u)):
+        if len(values) not in (1, length):
+            raise ConfigError(f"ocp.weights.{key} must be a number or a list of {length}, one a stage, got {list(values)}")
+    if config.bus.config is not None and not config.bus.config.is_file():
+        raise ConfigError(f"bus.config must be a file, got {config.bus.config}")
+    try:
+        model = find_model(config.model.name)
+    except OcpError as error:
+        raise ConfigError(f"model.name: {error}") from error
+    tables: tuple[tuple[str, Mapping[str, object], str, tuple[Signal, ...]], ...] = (
+        ("model.parameters", config.model.parameters, "parameter", model.parameters),
+        ("ocp.weights.Q", ocp.weights.Q, "output", model.outputs),
+        ("ocp.weights.R", ocp.weights.R, "input", model.inputs),
+        ("ocp.bounds.inputs", ocp.bounds.inputs, "input", model.inputs),
+        ("ocp.bounds.increments", ocp.bounds.increments, "input", model.inputs),
+        ("ocp.bounds.states", ocp.bounds.states, "state", model.states),
+        ("sim.x0", sim.x0, "state", model.states),
+        ("sim.noise_std", sim.noise_std, "state", model.states),
+        ("sim.parameters", sim.parameters, "parameter", model.parameters),
+    )
+    for key, table, kind, signals in tables:
+        if wrong := unknown_name(key, table, kind, signals, complete=key.startswith("ocp.weights")):
+            raise ConfigError(wrong)
+    config.build_ocp()

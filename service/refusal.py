@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Why a configuration is refused, in one line: the key, what must hold, what was got, and what was probably meant."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from typing import TYPE_CHECKING
+
+from pydantic import BaseModel, ValidationError
+
+if TYPE_CHECKING:
+    from rti_mpc.model import Signal
+
+# Pydantic's words, in those of a TOML file.
+WORDS = (
+    (r"^Value error, ", ""),
+    (r"^(Input|String) should ", "must "),
+    (r"be a valid dictionary.*", "be a table"),
+    (r"be a valid tuple", "be a list"),
+    (r"be a valid string", "be text"),
+    (r"be a valid integer", "be a whole number"),
+    (r"be a valid number", "be a number"),
+    (r"greater than or equal to", "at least"),
+    (r"less than or equal to", "at most"),
+)
+
+
+def explain(error: ValidationError, tree: type[BaseModel]) -> str:
+    """Word one complaint; an unknown key comes first, for it is often why another is missing."""
+    complaint = min(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden")
+    loc, got, keys = complaint["loc"], complaint["input"], dict(entries(tree))
+    key, described = dotted(loc), describe(loc, keys)
+    if complaint["type"] == "extra_forbidden":
+        return f"{key} is unknown, {meant(key, keys)}, got {got!r}"
+    if complaint["type"] == "missing":
+        return f"{key} is missing: {described}"
+    must = complaint["msg"]
+    for pattern, words in WORDS:
+        must = re.sub(pattern, words, must)
+    return f"{key} ({described}) {must}, got {got!r}"
+
+
+def unknown_name(key: str, table: Mapping[str, object], kind: str, signals: Sequence[Signal], *, complete: bool) -> str | None:
+    """
+    Say what is wrong with the names of a table, if anything.
+
+    Args:
+        key: The table's key.
+        table: Values by name.
+        kind: What the names stand for, such as ``"state"``.
+        signals: What the model has.
+        complete: Whether the table must name each of them.
+    """
+    units = {signal.name: f"{signal.name} [{signal.unit}]" for signal in signals}
+    for name, got in table.items():
+        if name not in units:
+            near = [units[n] for n in get_close_matches(name, units, 1)]
+            return f"{key}.{name} is no {kind} of the model, " + (f"perhaps {near[0]} is meant" if near else known(units.values())) + f", got {got!r}"
+    missing = [unit for name, unit in units.items() if complete and name not in table]
+    return f"{key} must name every {kind} of the model, {missing[0]} is missing, got {dict(table)!r}" if missing else None
+
+
+def entries(tree: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield every key of a tree with its description, depth first."""
+    for name, field in tree.model_fields.items():
+        key = prefix + (field.alias or name)
+        yield key, field.description or ""
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from entries(field.annotation, key + ".")
+
+
+def dotted(loc: Sequence[int | str]) -> str:
+    """Write a location as the file's reader would: ``bus.listen[0]``."""
+    return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in loc).removeprefix(".")
+
+
+def describe(loc: Sequence[int | str], tree: dict[str, str]) -> str:
+    """Return the description of the innermost key that has one."""
+    return next((tree[key] for n in range(len(loc), 0, -1) if (key := dotted(loc[:n])) in tree), "")
+
+
+def meant(key: str, tree: dict[str, str]) -> str:
+    """Return the nearest key beside this one, or the same elsewhere, or all that are beside it."""
+    section, _, name = key.rpartition(".")
+    beside = {other.rpartition(".")[2]: other for other in tree if other.rpartition(".")[0] == section}
+    near = [beside[n] for n in get_close_matches(name, beside, 1)] + [other for other in tree if other.rpartition(".")[2] == name]
+    return f"perhaps {near[0]} is meant ({tree[near[0]]})" if near else known(beside)
+
+
+def known(names: Iterable[str]) -> str:
+    """List what there is."""
+    return f"known: {', '.join(names) or 'none'}"

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The tables of a robot's TOML file, each a frozen model whose fields say what they are and in which unit.
+
+What a table leaves out here as None, the library decides: a default stands in
+one place only.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, AllowInfNan, BaseModel, BeforeValidator, ConfigDict, Field
+
+
+def interval(value: object) -> object:
+    """Accept ``[lower, upper]`` only; infinite where there is no bound."""
+    if not (isinstance(value, list | tuple) and len(value) == 2 and all(type(v) in (int, float) for v in value) and value[0] < value[1]):
+        raise ValueError("must be [lower, upper], two numbers with lower < upper")
+    return tuple(value)
+
+
+def around_zero(value: tuple[float, float]) -> tuple[float, float]:
+    """Accept an interval that lets an input be kept."""
+    if not value[0] <= 0.0 <= value[1]:
+        raise ValueError("must hold lower <= 0 <= upper, or no input could be kept")
+    return value
+
+
+def sequence(value: object) -> object:
+    """Accept a constant for a sequence of length one."""
+    return tuple(value) if isinstance(value, list | tuple) else (value,)
+
+
+Bound = Annotated[float, AllowInfNan(True)]
+Interval = Annotated[tuple[Bound, Bound], BeforeValidator(interval)]
+Increment = Annotated[Interval, AfterValidator(around_zero)]
+Weight = Annotated[float, Field(ge=0)]
+Weights = Annotated[tuple[Weight, ...], BeforeValidator(sequence)]
+Duration = Annotated[float, Field(ge=0, le=10)]
+Period = Annotated[float, Field(ge=1e-4, le=10)]
+Endpoint = Annotated[str, Field(pattern=r"^[a-z0-9_-]+/\S+$")]
+Endpoints = Annotated[tuple[Endpoint, ...], Field(strict=False)]
+
+
+class Section(BaseModel):
+    """A table of the file: frozen, nothing unknown, numbers finite, no text taken for a number."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class ModelSection(Section):
+    """Which robot."""
+
+    name: str = Field(description="a shipped model, or package.module:function of your own")
+    parameters: dict[str, float] = Field(default={}, description="parameters that differ from the model's by name, each in its own unit")
+
+
+class WeightSection(Section):
+    """The cost (4) of [Rosales]_."""
+
+    Q: dict[str, Weight] = Field(description="weight of each output by name, in cost / unit of the output squared")
+    R: dict[str, Weight] = Field(description="weight of each input's increment by name, in cost / unit of the input squared")
+    delta: Weights = Field(description="factor of Q, without unit: a constant, or one for each of the N stages")
+    lambda_: Weights = Field(alias="lambda", description="factor of R, without unit: a constant, or one for each of the N_u stages")
+
+
+class BoundSection(Section):
+    """What inputs and states may be; a name left out has no bound."""
+
+    inputs: dict[str, Interval] = Field(default={}, description="bounds of inputs by name, in the input's unit")
+    increments: dict[str, Increment] = Field(default={}, description="bounds of an input's change from sample to sample by name, in its unit")
+    states: dict[str, Interval] = Field(default={}, description="softened bounds of states by name, in the state's unit")
+    soft_weight: Weight | None = Field(default=None, description="L1 weight of a state outside its bounds, in cost / unit of the state")
+
+
+class OcpSection(Section):
+    """The optimal control problem of one sample."""
+
+    N: int = Field(ge=1, le=1000, description="horizon, in stages")
+    N_u: int | None = Field(default=None, ge=1, description="control horizon, in stages; N if left out")
+    dt_s: Period = Field(description="duration of a stage and period of the controller, in seconds")
+    integrator: Literal["rk4", "euler"] = Field(description="integrator of a stage")
+    weights: WeightSection = Field(description="the cost")
+    bounds: BoundSection = Field(default=BoundSection(), description="bounds of inputs, increments and states")
+
+
+class SolverSection(Section):
+    """OSQP's settings; what is left out is as `SolverSettings` has it."""
+
+    eps: float | None = Field(default=None, ge=1e-12, le=1e-1, description="absolute and relative tolerance on the residuals, without unit")
+    max_iter: int | None = Field(default=None, ge=1, le=1_000_000, description="iterations at most; the iterate is then taken as it is")
+    rho: float | None = Field(default=None, ge=1e-6, le=1e6, description="step size of ADMM, without unit")
+    check_termination: int | None = Field(default=None, ge=1, le=1000, description="iterations between two looks at the residuals")
+
+
+class TimingSection(Section):
+    """Delays and timeouts, in the robot's time."""
+
+    delay_s: Duration = Field(default=0.0, description="delay from a state to the act of its command, in seconds")
+    stale_s: Period | None = Field(
+        default=None, description="age from which a state is not used, in seconds; max(2.5 dt_s, 0.05) up to 0.25 if left out"
+    )
+    valid_s: float = Field(default=0.25, gt=0, le=0.3, description="how long after a state its command may act, in seconds")
+
+
+class BusSection(Section):
+    """The Zenoh session of each process; what is left out is as `BusSettings` has it, and the command line overrides it."""
+
+    mode: Literal["peer", "client"] | None = Field(default=None, description="peer, or client of a router")
+    listen: Endpoints | None = Field(default=None, description="endpoints to listen on, such as tcp/127.0.0.1:7447")
+    connect: Endpoints | None = Field(default=None, description="endpoints to connect to, such as tcp/127.0.0.1:7447")
+    config: Annotated[Path, Field(strict=False)] | None = Field(default=None, description="Zenoh's own JSON5 file, beside this one")
+
+
+class SimSection(Section):
+    """The simulated robot, which may differ from the controller's model; what is left out is as `RobotSettings` has it."""
+
+    x0: dict[str, float] = Field(default={}, description="initial state by name, in the state's unit; zero if left out")
+    parameters: dict[str, float] = Field(default={}, description="parameters of the plant that differ from [model]'s by name, each in its own unit")
+    state_period_s: Period | None = Field(default=None, description="period of the states, in seconds of the robot; dt_s if left out")
+    substeps: int | None = Field(default=None, ge=1, le=1000, description="RK4 steps in each period of the states")
+    noise_std: dict[str, Weight] = Field(default={}, description="standard deviation of measured states by name, in the state's unit")
+    sensor_delay_s: Duration | None = Field(default=None, description="from measuring a state to sending it, in seconds of the robot")
+    dropout: float | None = Field(default=None, ge=0, lt=1, description="share of states lost on the way, without unit")
+    actuator_delay_s: Duration | None = Field(default=None, description="from a command being due to the input moving, in seconds of the robot")
+    actuator_lag_s: Duration | None = Field(default=None, description="time constant of the inputs, in seconds of the robot")
+    seed: int | None = Field(default=None, ge=0, description="seed of noise and dropout")

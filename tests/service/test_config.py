@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rti_mpc.errors import ConfigError
+from service.config import Config, load
+from sim.settings import RobotSettings
+
+ROOT = Path(__file__).parents[2]
+SHIPPED = ROOT / "deploy" / "pioneer_3dx.toml"
+MINIMAL = """
+robot = "r"
+model = { name = "pioneer_3dx" }
+ocp.N = 3
+ocp.dt_s = 0.1
+ocp.integrator = "euler"
+ocp.weights = { Q = { x = 1, y = 2, psi = 0 }, R = { u_c = 1, omega_c = 3 }, delta = [1, 2, 3], lambda = 0.5 }
+"""
+
+# What a user may write into the shipped file, and what the one line must tell them.
+WRONG = [
+    ("dt_s = 0.1", "dt_ms = 100", ["ocp.dt_ms", "dt_s", "in seconds", "100"]),
+    ("dt_s = 0.1", "dt_s = 100.0", ["ocp.dt_s", "in seconds", "at most 10", "100.0"]),
+    ("dt_s = 0.1", 'dt_s = "0.1"', ["ocp.dt_s", "must be a number", "'0.1'"]),
+    ("dt_s = 0.1", "dt_s = nan", ["ocp.dt_s", "finite", "nan"]),
+    ("dt_s = 0.1", "", ["ocp.dt_s", "missing", "in seconds"]),
+    ("N = 7", "N = 7.5", ["ocp.N", "whole number", "7.5"]),
+    ("N = 7", "N = true", ["ocp.N", "whole number", "True"]),
+    ("N = 7", "N = 7\nN_u = 8", ["ocp.N_u", "at most ocp.N = 7", "8"]),
+    ("N = 7", "N = 7\nstale_s = 0.1", ["ocp.stale_s", "timing.stale_s"]),
+    ("N = 7", "N = 7\nhorizon = 7", ["ocp.horizon", "N, N_u, dt_s"]),
+    ('integrator = "rk4"', 'integrator = "rk5"', ["ocp.integrator", "'rk4' or 'euler'", "'rk5'"]),
+    ("psi = 0.05", "psi = -0.05", ["ocp.weights.Q.psi", "at least 0", "-0.05"]),
+    ("psi = 0.05", "phi = 0.05", ["ocp.weights.Q.phi", "no output", "psi [rad]"]),
+    (", psi = 0.05", "", ["ocp.weights.Q", "psi [rad]", "missing"]),
+    ("delta = 28.0", "delta = [28.0, 28.0]", ["ocp.weights.delta", "7", "[28.0, 28.0]"]),
+    ("delta = 28.0", "delta = [28.0, -1.0]", ["ocp.weights.delta[1]", "at least 0", "-1.0"]),
+    ("lambda = 0.8", "lamda = 0.8", ["ocp.weights.lamda", "ocp.weights.lambda", "0.8"]),
+    ("u_c = [-0.5, 0.5]", "u_c = 0.5", ["ocp.bounds.inputs.u_c", "[lower, upper]", "0.5"]),
+    ("u_c = [-0.5, 0.5]", "u_c = [0.5, -0.5]", ["ocp.bounds.inputs.u_c", "lower < upper", "[0.5, -0.5]"]),
+    ("u_c = [-0.5, 0.5]", "u_c = [nan, 0.5]", ["ocp.bounds.inputs.u_c", "nan"]),
+    ("u_c = [-0.25, 0.25]", "u_c = [0.1, 0.25]", ["ocp.bounds.increments.u_c", "lower <= 0 <= upper", "0.1"]),
+    ('name = "pioneer_3dx"', 'name = "pioneer_4dx"', ["model.name", "pioneer_4dx", "pioneer_3dx"]),
+    ('robot = "pioneer"', 'robot = "two words"', ["robot", "letters, digits", "'two words'"]),
+    ('robot = "pioneer"', "robot = 3", ["robot", "must be text", "3"]),
+    ("[ocp]", "[bus]\nconnect = ['127.0.0.1:7447']\n[ocp]", ["bus.connect[0]", "tcp/127.0.0.1:7447", "'127.0.0.1:7447'"]),
+    ("[ocp]", "[bus]\nconfig = 'none.json5'\n[ocp]", ["bus.config", "file", "none.json5"]),
+    ("[ocp]", "[sim]\nx0 = { z = 1.0 }\n[ocp]", ["sim.x0.z", "no state", "x [m]"]),
+    ("[ocp]", "[sim]\nparameters = { theta_7 = 1.0 }\n[ocp]", ["sim.parameters.theta_7", "no parameter", "theta_6"]),
+    ("[model]", "[modle]", ["modle", "model"]),
+    ("[model]", "[model", ["TOML", "line"]),
+]
+
+
+@pytest.mark.parametrize(("right", "wrong", "told"), WRONG, ids=[wrong.replace("\n", " ") or f"no {right}" for right, wrong, _ in WRONG])
+def test_wrong_value_is_refused_in_one_line_that_says_what_would_be_right(right: str, wrong: str, told: list[str], tmp_path: Path) -> None:
+    text = SHIPPED.read_text()
+    assert right in text
+    path = tmp_path / "robot.toml"
+    path.write_text(text.replace(right, wrong, 1))
+    with pytest.raises(ConfigError) as refusal:
+        load(path)
+    line = str(refusal.value)
+    assert "\n" not in line
+    assert line.startswith(f"{path}: ")
+    for words in told:
+        assert words in line, line
+
+
+def test_file_that_is_not_there_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=re.escape(str(tmp_path / "none.toml"))):
+        load(tmp_path / "none.toml")
+
+
+def test_configuration_becomes_the_ocp_it_describes(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL)
+    ocp = load(path).build_ocp()
+    assert (ocp.N, ocp.N_u, ocp.dt, ocp.method) == (3, 3, 0.1, "euler")
+    np.testing.assert_array_equal(np.diag(ocp.Q), [1, 2, 0])
+    np.testing.assert_array_equal(np.diag(ocp.R), [1, 3])
+    np.testing.assert_array_equal(ocp.delta, [1, 2, 3])
+    np.testing.assert_array_equal(ocp.lambda_, [0.5, 0.5, 0.5])
+    assert np.all(np.isinf(ocp.ubu)), "a bound left out is no bound"
+
+
+def test_bounds_go_to_the_signals_they_name_whatever_their_order() -> None:
+    ocp = load(SHIPPED).build_ocp()
+    np.testing.assert_array_equal(ocp.ubu, [0.5, 0.745])
+    np.testing.assert_array_equal(ocp.lbdu, [-0.25, -0.40])
+    np.testing.assert_array_equal(ocp.ubx, [math.inf, math.inf, math.inf, 0.5, 0.745])
+
+
+def test_parameters_by_name_reach_the_model(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL.replace('"pioneer_3dx"', '"pioneer_3dx", parameters = { a = 0.1 }'))
+    assert load(path).build_model().p_nominal[-1] == 0.1
+
+
+def test_zenoh_file_is_found_beside_the_configuration(tmp_path: Path) -> None:
+    (tmp_path / "zenoh.json5").write_text("{}")
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + '[bus]\nconfig = "zenoh.json5"\n')
+    assert load(path).bus_settings().config == tmp_path / "zenoh.json5"
+
+
+def test_staleness_follows_the_period_within_limits(tmp_path: Path) -> None:
+    stale_s = []
+    for dt_s in (0.01, 0.04, 0.2):
+        path = tmp_path / "robot.toml"
+        path.write_text(MINIMAL.replace("dt_s = 0.1", f"dt_s = {dt_s}"))
+        stale_s.append(load(path).stale_s)
+    assert stale_s == [0.05, 0.1, 0.25]
+
+
+def test_hash_follows_what_decides_a_command_and_nothing_else(tmp_path: Path) -> None:
+    def config_hash(text: str) -> int:
+        path = tmp_path / "robot.toml"
+        path.write_text(text)
+        return load(path).config_hash
+
+    reference = config_hash(MINIMAL)
+    assert 0 <= reference < 2**64
+    assert config_hash("# a comment\n" + MINIMAL.replace("x = 1, y = 2", "y = 2.0, x = 1.0")) == reference
+    assert config_hash(MINIMAL + "[sim]\nseed = 2\n[bus]\nlisten = ['tcp/127.0.0.1:7448']\n") == reference
+    assert config_hash(MINIMAL.replace("lambda = 0.5", "lambda = 0.6")) != reference
+
+
+def test_every_field_says_what_it_is() -> None:
+    def fields(schema: dict[str, object]) -> list[str]:
+        found = []
+        for section in (schema, *schema["$defs"].values()):  # type: ignore[attr-defined]
+            found += [name for name, field in section["properties"].items() if "description" not in field]
+        return found
+
+    assert fields(Config.model_json_schema()) == []
+
+
+def test_plant_takes_its_own_parameters_the_rest_from_the_controller(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(
+        MINIMAL + "[sim]\nx0 = { psi = 1.5 }\nparameters = { theta_1 = 0.3 }\nseed = 4\n[ocp.bounds]\nincrements = { u_c = [-0.1, 0.2] }\n"
+    )
+    settings = RobotSettings(**load(path).robot_settings())
+    assert settings.model.p_nominal[0] == 0.3
+    assert settings.seed == 4
+    assert settings.state_period_s == 0.1
+    np.testing.assert_array_equal(settings.x0, [0, 0, 1.5, 0, 0])
+    np.testing.assert_allclose(settings.slew, [1.0, math.inf], rtol=1e-15)
