@@ -85,7 +85,7 @@ class Actuator:
 
     def accept(self, command: Command, arrival_ns: int) -> str:
         """
-        Take a command, or refuse it.
+        Take a command, or refuse it. It can act from its arrival on, plus the delay of the actuators.
 
         A command of another source is taken if its epoch is higher, or if
         nothing acts any more.
@@ -95,6 +95,7 @@ class Actuator:
         """
         rows = command.u.shape[0] if command.u.ndim == 2 else 0
         end_ns = min(command.valid_until_ns, command.stamp_ns + rows * command.period_ns)
+        arrival_ns += self._delay_ns
         same_source = command.epoch == self._epoch
         if self._off:
             reason = "switched_off"
@@ -131,10 +132,10 @@ class Actuator:
         Yields:
             Until when, in ns, and the input held until then, shape ``(nu,)``: valid until the next one.
         """
-        t, end = from_ns - self._delay_ns, to_ns - self._delay_ns
-        while t < end:
-            t = min(self._step(t), end)
-            yield t + self._delay_ns, self.u
+        t = from_ns
+        while t < to_ns:
+            t = min(self._step(t), to_ns)
+            yield t, self.u
 
     def switch_off(self) -> None:
         """Drop every plan and take no other: the inputs ramp to rest."""

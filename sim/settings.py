@@ -26,7 +26,7 @@ class RobotSettings:
         noise_std: Standard deviation of the measured states, shape ``(nx,)``; zero by default.
         sensor_delay_s: Time from measuring a state to sending it; its stamp is that of the measurement.
         dropout: Share of states that are lost on the way.
-        actuator_delay_s: Time from a command's row being due to the input moving.
+        actuator_delay_s: Time from the arrival of a command to the instant from which it can act.
         actuator_lag_s: Time constant of the inputs, first order; 0: none.
         seed: Seed of noise and dropout.
 

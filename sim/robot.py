@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The simulated robot as a process: the lockstep robot with a clock, on the bus.
+
+It measures and sends states on an absolute grid of wall time over speed, and
+advances over exactly the intervals in which each received row acted. Times that
+were missed are skipped. When it is stopped its inputs ramp to rest, and the last
+state it sends is the one in which it stands.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+import numpy as np
+
+import rti_mpc
+from rti_mpc.errors import MessageError
+from rti_mpc.message import Command, Severity, State
+from rti_mpc.model import Model
+from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
+from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.keys import Keys
+from sim.actuator import Counters
+from sim.announcer import Announcer
+from sim.clock import Clock
+from sim.interrupt import stop_on_signals
+from sim.lockstep import Lockstep
+from sim.log import Log
+from sim.settings import RobotSettings
+
+ROLE = "robot"
+STANDING = 1e-6  # change of the state in a period, in any unit, below which the robot stands
+COAST_NS = 10_000_000_000  # robot time after which it is taken to stand anyway
+
+
+@dataclass(frozen=True)
+class RobotSummary:
+    """
+    What a robot did in its life.
+
+    Attributes:
+        states: States sent.
+        skipped: States not measured because their time was missed.
+        malformed: Payloads on the command key that are no command.
+        counters: What became of commands.
+    """
+
+    states: int
+    skipped: int
+    malformed: int
+    counters: Counters
+
+
+def main(
+    settings: RobotSettings,
+    bus_settings: BusSettings,
+    keys: Keys,
+    *,
+    speed: float = 1.0,
+    log: Path | None = None,
+    duration_s: float | None = None,
+    info: dict[str, Any] | None = None,
+    stop: Event | None = None,
+) -> RobotSummary:
+    """
+    Play the robot until it is stopped.
+
+    Args:
+        settings: Plant, actuators and sensors.
+        bus_settings: How to join the bus; the robot listens on the rendezvous endpoint.
+        keys: Where its streams are.
+        speed: Seconds of robot time per second.
+        log: CSV file to write, see `sim.log`.
+        duration_s: Robot time after which it stops by itself.
+        info: Further entries of its description.
+        stop: Stops the robot when set; SIGINT and SIGTERM if there is none.
+
+    Raises:
+        ConfigError: A setting is out of range, an endpoint is taken.
+    """
+    stop = stop or stop_on_signals()
+    with Bus(bus_settings, keys) as bus:
+        robot = Robot(settings, bus, speed, log)
+        life = {"role": ROLE, "epoch": robot.body.epoch, "speed": speed, "state_period_s": settings.state_period_s}
+        bus.publish_json(keys.info(ROLE), {**describe(settings.model), **(info or {}), **life})
+        bus.alive(ROLE)
+        gc.collect()
+        gc.freeze()
+        robot.run(stop, None if duration_s is None else round(1e9 * duration_s))
+        return robot.finish()
+
+
+def describe(model: Model) -> dict[str, Any]:
+    """Describe a model for ``info``."""
+    vectors = {"states": model.states, "inputs": model.inputs, "outputs": model.outputs}
+    return {
+        "version": rti_mpc.__version__,
+        "model": model.name,
+        **{name: [{"name": s.name, "unit": s.unit, "angle": s.angle} for s in signals] for name, signals in vectors.items()},
+        "parameters": {s.name: value for s, value in zip(model.parameters, model.p_nominal, strict=True)},
+    }
+
+
+class Robot:
+    """
+    One life of the robot on the bus.
+
+    Attributes:
+        body: The robot itself.
+        clock: Its clock.
+    """
+
+    def __init__(self, settings: RobotSettings, bus: Bus, speed: float, log: Path | None) -> None:
+        # Milliseconds: a robot restarted within a second is another one.
+        self.body = Lockstep(settings, epoch=time.time_ns() // 1_000_000)
+        self._log = Log(log, settings.model)
+        self._states = bus.publisher(bus.keys.state, State, realtime=True)
+        self._announcer = Announcer(bus, ROLE, self.body.epoch)
+        self._inbox: deque[tuple[Command, int]] = deque(maxlen=64)  # with the monotonic time of arrival
+        self._sent = 0
+        self._skipped = 0
+        self._malformed = 0
+        Thread(target=self._receive, args=(bus.subscriber(bus.keys.command, capacity=8),), daemon=True).start()
+        self.clock = Clock(speed)
+
+    def run(self, stop: Event, until_ns: int | None = None) -> None:
+        """Live until stopped."""
+        body = self.body
+        while not stop.is_set() and (until_ns is None or body.now_ns < until_ns):
+            due_ns = body.due_ns
+            self.clock.wait(due_ns, stop)
+            missed = max(0, self.clock.now_ns() - due_ns) // body.period_ns
+            self._skipped += missed
+            self._live(due_ns + missed * body.period_ns)
+
+    def finish(self) -> RobotSummary:
+        """Ramp to rest, coast until the robot stands, send that state, and sum up."""
+        body = self.body
+        body.actuator.switch_off()
+        deadline_ns, x = body.now_ns + COAST_NS, np.full_like(body.x, np.inf)
+        last = None
+        while body.now_ns < deadline_ns and not (body.actuator.at_rest and np.abs(body.x - x).max() < STANDING):
+            x[:] = body.x
+            self._advance(body.due_ns)
+            last = body.sensor.take(body.now_ns) or last
+        if last is not None:
+            self._send(last)
+        self._announcer.say(Severity.INFO, "robot_stopped", "the robot was stopped and stands", body.now_ns)
+        self._log.close()
+        return RobotSummary(self._sent, self._skipped, self._malformed, body.counters)
+
+    def _receive(self, subscriber: Subscriber) -> None:
+        """Note every command with the time of its arrival; a thread of its own."""
+        for received in iter(subscriber.recv, None):
+            now_ns = time.monotonic_ns()
+            try:
+                self._inbox.append((decode(Command, received.payload), now_ns))
+            except MessageError:
+                self._malformed += 1
+
+    def _live(self, to_ns: int) -> None:
+        """Advance to a time with the commands that arrived by then, measure, send."""
+        while self._inbox and self.clock.at_ns(self._inbox[0][1]) <= to_ns:
+            self._take(*self._inbox.popleft())
+        starved = self.body.counters.starved
+        self._advance(to_ns)
+        if self.body.counters.starved > starved:
+            self._announcer.say(Severity.ERROR, "command_ran_out", "no valid command is left: the robot brakes to rest on its own", to_ns)
+        while (state := self.body.sensor.take(to_ns)) is not None:
+            self._send(state)
+        self._log.write(time.monotonic_ns())
+
+    def _take(self, command: Command, monotonic_ns: int) -> None:
+        """Hand a command to the actuators."""
+        arrival_ns = self.clock.at_ns(monotonic_ns)
+        reason = self.body.accept(command, arrival_ns)
+        if reason:
+            text = f"command {command.seq} of epoch {command.epoch} was refused: {reason.replace('_', ' ')}"
+            self._announcer.say(Severity.WARNING, f"command_{reason}", text, arrival_ns)
+        else:
+            self._log.answered(command.state_seq, command.seq, monotonic_ns)
+
+    def _advance(self, to_ns: int) -> None:
+        """Advance, and measure if it is time to."""
+        body = self.body
+        body.advance(to_ns)
+        if (seq := body.measure()) is not None:
+            self._log.measured(seq, body.now_ns, body.x, body.u, body.counters, time.monotonic_ns())
+
+    def _send(self, state: State) -> None:
+        """Send a state."""
+        self._log.sent(state.seq, time.monotonic_ns())
+        self._states.put(state)
+        self._sent += 1

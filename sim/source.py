@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A reference source as a process: one trajectory, anchored to the robot's clock.
+
+It waits for a state, publishes the whole reference from that state's stamp on,
+and again for every robot that starts anew. Whoever joins late gets the last
+one, for as long as the source lives.
+"""
+
+from __future__ import annotations
+
+import time
+from threading import Event, Thread
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.errors import MessageError
+from rti_mpc.message import Reference, Severity, State
+from rti_mpc.trajectory import Heading, Trajectory, rows
+from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.keys import Keys
+from sim.announcer import Announcer
+from sim.interrupt import stop_on_signals
+
+ROLE = "reference"
+
+
+def main(
+    trajectory: Trajectory,
+    bus_settings: BusSettings,
+    keys: Keys,
+    *,
+    heading: Heading = "consistent",
+    a: float = 0.2,
+    psi0: float | None = None,
+    period_s: float = 0.05,
+    stop: Event | None = None,
+) -> int:
+    """
+    Publish a reference until stopped.
+
+    Args:
+        trajectory: What to follow, see `rti_mpc.trajectory.find_trajectory`.
+        bus_settings: How to join the bus.
+        keys: Where its streams are.
+        heading: ``"tangent"``, ``"consistent"``, or ``"none"`` for a controller without weight on it.
+        a: Distance of the reference point ahead of the axle, in m.
+        psi0: Initial consistent heading of an open path, in rad.
+        period_s: Time between rows; the receiver interpolates, on the eight within 0.02 mm.
+        stop: Stops the source when set; SIGINT and SIGTERM if there is none.
+
+    Returns:
+        How many robots the reference was anchored to.
+
+    Raises:
+        ConfigError: The heading or a number is out of range.
+        OcpError: No consistent heading repeats on this closed path.
+    """
+    y = rows(trajectory, period_s, heading, a, psi0)
+    stop = stop or stop_on_signals()
+    with Bus(bus_settings, keys) as bus:
+        source = Source(bus, trajectory, y, round(1e9 * period_s))
+        bus.alive(ROLE)
+        Thread(target=source.follow, daemon=True).start()
+        while not stop.is_set():
+            time.sleep(0.05)
+    return source.anchored
+
+
+class Source:
+    """
+    Anchors rows to every new life of the robot.
+
+    Attributes:
+        anchored: How many robots the reference was anchored to.
+    """
+
+    def __init__(self, bus: Bus, trajectory: Trajectory, y: Array, period_ns: int) -> None:
+        self.anchored = 0
+        self._trajectory = trajectory
+        self._y = y
+        self._period_ns = period_ns
+        self._epoch = time.time_ns() // 1_000_000_000
+        self._publisher = bus.publisher(bus.keys.reference, Reference, cached=True)
+        self._announcer = Announcer(bus, ROLE, self._epoch)
+        self._states = bus.subscriber(bus.keys.state)
+        self._robot_epoch = -1
+
+    def follow(self) -> None:
+        """Publish whenever a robot starts, until the bus is closed."""
+        for received in iter(self._states.recv, None):
+            try:
+                state = decode(State, received.payload)
+            except MessageError:
+                continue
+            if state.epoch > self._robot_epoch:
+                self._robot_epoch = state.epoch
+                self._anchor(state.stamp_ns)
+
+    def _anchor(self, stamp_ns: int) -> None:
+        """Publish the reference from a time on."""
+        self.anchored += 1
+        p = np.empty((len(self._y), 0))
+        self._publisher.put(Reference(self._epoch, self.anchored, stamp_ns, self._period_ns, self._trajectory.end, self._y, p))
+        text = f"{self._trajectory.name} for {self._trajectory.duration_s:.1f} s from {1e-9 * stamp_ns:.3f} s of the robot on"
+        self._announcer.say(Severity.INFO, "reference_published", text, stamp_ns)

@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot and the reference source as real processes over loopback."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rti_mpc.message import Command, End, Event, Reference, State
+from rti_mpc.status import Mode, QpStatus
+from rti_mpc.trajectory import eight, rows
+from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
+from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.keys import Keys
+
+ROOT = Path(__file__).parents[2]
+MS = 1_000_000
+KEYS = Keys("test", "sim")
+PATIENCE_S = 15.0  # to start a process and hear of it
+
+ROBOT = """
+import sys
+from pathlib import Path
+import numpy as np
+from rti_mpc.pioneer_3dx import pioneer_3dx
+from rti_mpc.wire.bus import BusSettings
+from rti_mpc.wire.keys import Keys
+from sim import robot
+from sim.settings import RobotSettings
+
+_, endpoint, speed, period_s, log = sys.argv
+settings = RobotSettings(pioneer_3dx(), np.array([0.5, 0.0, 0.0, 0.0, 0.0]), slew=np.array([1.0, 2.0]), state_period_s=float(period_s))
+robot.main(settings, BusSettings(listen=(endpoint,), connect=()), Keys("test", "sim"), speed=float(speed), log=Path(log))
+"""
+
+SOURCE = """
+import sys
+from rti_mpc.trajectory import eight
+from rti_mpc.wire.bus import BusSettings
+from rti_mpc.wire.keys import Keys
+from sim import source
+
+source.main(eight(), BusSettings(connect=(sys.argv[1],)), Keys("test", "sim"), period_s=0.1)
+"""
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@contextmanager
+def running(script: str, *arguments: object) -> Iterator[subprocess.Popen[bytes]]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen([sys.executable, "-c", script, *map(str, arguments)], env=environment)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+@contextmanager
+def peer(endpoint: str) -> Iterator[Bus]:
+    """Join the bus for a bounded time: every receive ends then."""
+    with Bus(BusSettings(connect=(endpoint,)), KEYS) as bus:
+        timer = threading.Timer(PATIENCE_S, bus.close)
+        timer.start()
+        yield bus
+        timer.cancel()
+
+
+def next_state(states: Subscriber) -> State:
+    received = states.recv()
+    assert received is not None, "no state came in time"
+    return decode(State, received.payload)
+
+
+def interrupted(process: subprocess.Popen[bytes]) -> float:
+    """Press Ctrl-C and tell how long the process took to end, in s."""
+    start = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=5.0) == 0
+    return time.monotonic() - start
+
+
+def command(state: State, seq: int, u: list[float], epoch: int = 5) -> Command:
+    stamp_ns = state.stamp_ns
+    rows_ = np.tile(u, (5, 1))
+    return Command(epoch, seq, stamp_ns, state.epoch, state.seq, stamp_ns, stamp_ns + 250 * MS, 0, Mode.TRACKING, QpStatus.SOLVED, 100 * MS, rows_)
+
+
+@pytest.mark.parametrize(("speed", "period_s"), [(1.0, 0.02), (4.0, 0.1)])
+def test_robot_publishes_at_the_rate_asked_for_and_stands_still_without_commands(
+    endpoint: str, tmp_path: Path, speed: float, period_s: float
+) -> None:
+    with running(ROBOT, endpoint, speed, period_s, tmp_path / "log.csv") as process, peer(endpoint) as bus:
+        states = bus.subscriber(KEYS.state, capacity=256)
+        first, start = next_state(states), time.monotonic()
+        heard = [next_state(states) for _ in range(40)]
+        wall_s = time.monotonic() - start
+        assert [state.stamp_ns - first.stamp_ns for state in heard] == [k * round(1e9 * period_s) for k in range(1, 41)]
+        assert [state.seq for state in heard] == list(range(first.seq + 1, first.seq + 41))
+        assert wall_s * speed == pytest.approx(40 * period_s, rel=0.1)
+        assert all(state.x.tolist() == [0.5, 0.0, 0.0, 0.0, 0.0] for state in heard)
+        assert interrupted(process) < 1.0
+
+
+def test_commanded_robot_moves_stops_on_silence_and_ends_on_ctrl_c_standing(endpoint: str, tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    with running(ROBOT, endpoint, 1.0, 0.05, log) as process, peer(endpoint) as bus:
+        states = bus.subscriber(KEYS.state)
+        events = bus.subscriber(KEYS.events, capacity=16, cached=True)
+        commands = bus.publisher(KEYS.command, Command, realtime=True)
+        for seq in range(1, 21):
+            state = next_state(states)
+            commands.put(command(state, seq, [0.4, 0.2]))
+        assert state.x[3] > 0.3
+        while np.abs(state.x[3:]).max() > 1e-3:  # nobody commands any more
+            state = next_state(states)
+        for seq in range(21, 31):
+            state = next_state(states)
+            commands.put(command(state, seq, [0.4, 0.2]))
+        commands.put(replace(command(state, 31, [0.5, 0.0]), state_epoch=1))
+        next_state(states)
+        codes = set()
+        while codes != {"command_ran_out", "command_foreign_epoch"}:
+            received = events.recv()
+            assert received is not None, f"only {codes}"
+            codes.add(decode(Event, received.payload).code)
+        assert interrupted(process) < 1.0
+    with log.open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    latencies = [float(line["latency_us"]) for line in lines if line["latency_us"]]
+    assert len(latencies) >= 25
+    assert 50.0 < np.median(latencies) < 20_000.0
+    u = np.array([float(line["u_c"]) for line in lines])
+    assert u.max() == 0.4
+    assert -np.diff(u).min() <= 1.0 * 0.05 + 0.01 + 1e-9  # the ramp: 1 per s over 0.05 s, in steps of 10 ms
+    assert (u[-1], lines[-1]["refused"], lines[-1]["starved"]) == (0.0, "1", lines[-1]["starved"])
+    assert abs(float(lines[-1]["u"])) < 1e-5
+
+
+def test_robot_survives_what_is_no_command(endpoint: str, tmp_path: Path) -> None:
+    with running(ROBOT, endpoint, 1.0, 0.02, tmp_path / "log.csv") as process, peer(endpoint) as bus:
+        states = bus.subscriber(KEYS.state)
+        commands = bus.publisher(KEYS.command, Command, realtime=True)
+        next_state(states)
+        for payload in (b"", b"\x00\x00\x00\x00", b"\x00\x01\x00\x00" + b"\xff" * 200):
+            commands.put_bytes(payload)
+            next_state(states)
+        seq = next_state(states).seq
+        assert next_state(states).seq > seq
+        assert process.poll() is None
+
+
+def test_source_anchors_its_reference_to_every_new_robot_and_keeps_it_for_late_joiners(endpoint: str, tmp_path: Path) -> None:
+    with running(SOURCE, endpoint) as source, peer(endpoint) as bus:
+        references = bus.subscriber(KEYS.reference, capacity=4, cached=True)
+        heard = []
+        for life in range(2):
+            with running(ROBOT, endpoint, 1.0, 0.02, tmp_path / f"{life}.csv"):
+                received = references.recv()
+                assert received is not None, "no reference came in time"
+                heard.append(decode(Reference, received.payload))
+        assert heard[1].seq > heard[0].seq
+        assert [reference.stamp_ns % (20 * MS) for reference in heard] == [0, 0]
+        assert (heard[0].period_ns, heard[0].end, heard[0].p.shape[1]) == (100 * MS, End.STOP, 0)
+        np.testing.assert_array_equal(heard[1].y, rows(eight(), 0.1, "consistent"))
+        assert interrupted(source) < 1.0
