@@ -20,6 +20,7 @@ never passes a router's access control.
 from __future__ import annotations
 
 import json
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -38,6 +39,10 @@ RENDEZVOUS = "tcp/127.0.0.1:7447"
 CLOSE_TIMEOUT_S = 0.5
 RETRY_S = 0.1  # between two looks for somebody who is not there yet
 
+# Closing the link of a hung peer occupies a thread of Zenoh for its linger time, 10 s. By default there is one to send and
+# two to receive: a hung viewer would then cut the controller from the robot.
+THREADS = "(rx: (worker_threads: 4), tx: (worker_threads: 4))"
+
 # Ours, unless the user's own Zenoh configuration says otherwise.
 DEFAULTS: dict[str, Any] = {
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
@@ -45,6 +50,7 @@ DEFAULTS: dict[str, Any] = {
     "transport/link/tx/lease": 2000,  # a hung process is noticed after 1.5 s, not 7.5 s
     "transport/link/rx/max_message_size": 1 << 26,  # bytes: what a peer can make us hold
     "transport/shared_memory/enabled": False,  # gains nothing at these sizes
+    "transport/link/tx/queue/congestion_control/block/wait_before_close": 500_000,  # us: what a query waits for a hung peer
     "queries_default_timeout": 1000,  # ms: a hung publisher delays a late joiner no longer
 }
 
@@ -123,6 +129,7 @@ def _brief(error: Exception) -> str:
 
 def _open(settings: BusSettings) -> zenoh.Session:
     """Open a session; a client waits for its router."""
+    os.environ.setdefault("ZENOH_RUNTIME", THREADS)
     while True:
         try:
             return zenoh.open(zenoh_config(settings))

@@ -15,6 +15,7 @@ allocated from a declared length before as many bytes are there.
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import isfinite
 from struct import Struct
 from typing import Any, TypeVar
 
@@ -134,8 +135,9 @@ def _rows(flat: Array, width: int, name: str) -> Array:
 
 
 def _finite(array: Array, name: str) -> Array:
-    if not np.isfinite(array).all():
-        raise Refused("not_finite", f"{name} must be finite, got {array[~np.isfinite(array)][0]} among {array.size} numbers")
+    flat = array.reshape(-1)
+    if not isfinite(flat.dot(flat)) and not np.isfinite(flat).all():  # the square may overflow where the numbers do not
+        raise Refused("not_finite", f"{name} must be finite, got {flat[~np.isfinite(flat)][0]} among {flat.size} numbers")
     return array
 
 

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The door of a receiver: whatever a peer sends becomes a message or a count, never an exception."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Generic, Protocol
+
+from rti_mpc.message import Severity
+from rti_mpc.wire.cdr import VERSION, M, Refused, decode, encoding
+from rti_mpc.wire.source import Source, Verdict
+
+QUOTE = 120  # characters of a peer's own words in a notice
+
+
+class Payload(Protocol):
+    """What the bus hands over, `rti_mpc.wire.bus.Received`."""
+
+    @property
+    def payload(self) -> bytes:
+        """Bytes as they came."""
+
+    @property
+    def encoding(self) -> str:
+        """What the sender says they are."""
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """
+    What an event is to say; whoever publishes it adds who, when and its number.
+
+    Attributes:
+        severity: How bad it is.
+        code: ``message_refused``, ``source_refused`` or ``source_changed``.
+        text: One sentence for people.
+    """
+
+    severity: Severity
+    code: str
+    text: str
+
+
+class Intake(Generic[M]):
+    """
+    Takes the messages of one class from one source.
+
+    Attributes:
+        source: The source it is locked to, with its counts of lost and dropped messages.
+        refused: Malformed payloads by reason, one of `rti_mpc.wire.cdr.REASONS`.
+    """
+
+    def __init__(self, cls: type[M], stale_s: float, widths: Mapping[str, int] | None = None, quiet_s: float = 1.0) -> None:
+        """
+        Open the door.
+
+        Args:
+            cls: Class of the messages.
+            stale_s: Silence of the source after which another may take over.
+            widths: Numbers a row must have, by array, such as ``{"x": 5}``; stage parameters may be left out.
+            quiet_s: Shortest time between two notices of one code.
+        """
+        self.source = Source(round(1e9 * stale_s))
+        self.refused: Counter[str] = Counter()
+        self._cls = cls
+        self._encoding = encoding(cls)
+        self._widths = tuple((widths or {}).items())
+        self._quiet_ns = round(1e9 * quiet_s)
+        self._pending: dict[str, Notice] = {}
+        self._said_ns: dict[str, int] = {}
+
+    def accept(self, received: Payload, now_ns: int) -> M | None:
+        """
+        Message in a payload; None if it is malformed, repeated or not from our source.
+
+        Args:
+            received: Payload and encoding as they came.
+            now_ns: Receiver's monotonic clock.
+        """
+        try:
+            if received.encoding != self._encoding:
+                raise self._encoding_error(received.encoding)
+            message = decode(self._cls, received.payload)
+            for name, width in self._widths:
+                self._check_width(message, name, width)
+        except Refused as error:
+            self.refused[error.reason] += 1
+            self._note(Severity.WARNING, "message_refused", f"{error}; {self.refused.total()} refused so far")
+            return None
+        before = self.source.epoch
+        verdict = self.source.accept(message.epoch, message.seq, now_ns)
+        if verdict is Verdict.NEXT:
+            return message
+        if verdict is Verdict.NEW:
+            if before is not None:
+                self._note(Severity.INFO, "source_changed", f"epoch {message.epoch} took over from {before}")
+            return message
+        text = f"epoch {message.epoch}, seq {message.seq} is {verdict.value}: ours is epoch {self.source.epoch}, seq {self.source.seq}"
+        self._note(Severity.WARNING, "source_refused", f"{text}; {self.source.dropped} dropped so far")
+        return None
+
+    def notices(self, now_ns: int) -> list[Notice]:
+        """Take what there is to publish now: per code the latest, and not again before `quiet_s` has passed."""
+        if not self._pending:
+            return []
+        due = [code for code in self._pending if now_ns - self._said_ns.get(code, now_ns - self._quiet_ns) >= self._quiet_ns]
+        self._said_ns.update(dict.fromkeys(due, now_ns))
+        return [self._pending.pop(code) for code in due]
+
+    def _note(self, severity: Severity, code: str, text: str) -> None:
+        self._pending[code] = Notice(severity, code, f"{self._cls.__name__.lower()}: {text}")
+
+    def _check_width(self, message: M, name: str, width: int) -> None:
+        got = getattr(message, name).shape[-1]
+        if got != width and not (name == "p" and got == 0):
+            raise Refused("length", f"{name} must hold {width} numbers a row, got {got}")
+
+    def _encoding_error(self, got: str) -> Refused:
+        kind, _, schema = got.partition(";")
+        expected_kind, _, expected_schema = self._encoding.partition(";")
+        name, _, version = schema.partition("@")
+        reason = "encoding"
+        if kind == expected_kind:
+            reason = "version" if name == expected_schema.partition("@")[0] and version != str(VERSION) else "schema"
+        return Refused(reason, f"encoding must be {self._encoding}, got {got[:QUOTE]!r}")

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+One source a key.
+
+Several processes may publish on one key: a robot that was started twice, a
+planner forgotten in another terminal. A receiver locks to one epoch and takes
+nothing else, unless the epoch is higher (a restart) or its own has gone stale.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+
+class Verdict(Enum):
+    """What a message is to a receiver."""
+
+    NEW = "new"  # accepted, the first of a source: whatever is remembered of another no longer holds
+    NEXT = "next"  # accepted
+    REPEATED = "repeated"  # refused: this sequence number, or a later one, was accepted before
+    FOREIGN = "foreign"  # refused: somebody else's, while our source is alive
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the message may be used."""
+        return self in (Verdict.NEW, Verdict.NEXT)
+
+
+class Source:
+    """
+    The source a receiver is locked to.
+
+    Attributes:
+        stale_ns: Silence after which another epoch may take over, even a lower one.
+        epoch: Epoch of the source, None before the first message.
+        seq: Sequence number of its last accepted message.
+        lost: Messages missing between accepted ones.
+        dropped: Messages refused.
+    """
+
+    def __init__(self, stale_ns: int) -> None:
+        self.stale_ns = stale_ns
+        self.epoch: int | None = None
+        self.seq = 0
+        self.lost = 0
+        self.dropped = 0
+        self._heard_ns = 0
+
+    def accept(self, epoch: int, seq: int, now_ns: int) -> Verdict:
+        """
+        Judge a message by its first two fields.
+
+        Args:
+            epoch: Epoch of the message.
+            seq: Its sequence number.
+            now_ns: Receiver's monotonic clock.
+        """
+        verdict = self._judge(epoch, seq, now_ns)
+        if not verdict.accepted:
+            self.dropped += 1
+            return verdict
+        if verdict is Verdict.NEXT:
+            self.lost += seq - self.seq - 1
+        self.epoch, self.seq, self._heard_ns = epoch, seq, now_ns
+        return verdict
+
+    def _judge(self, epoch: int, seq: int, now_ns: int) -> Verdict:
+        if epoch == self.epoch:
+            return Verdict.NEXT if seq > self.seq else Verdict.REPEATED
+        if self.epoch is None or epoch > self.epoch or now_ns - self._heard_ns > self.stale_ns:
+            return Verdict.NEW
+        return Verdict.FOREIGN
