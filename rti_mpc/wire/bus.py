@@ -8,9 +8,9 @@ The bus: bytes in and out over Zenoh, with every trap of it closed off.
 * A session hears nothing of what it publishes itself.
 * `Bus.close` is bounded, unblocks every `recv`, and the interpreter then exits.
 
-Peers find each other by gossip. Each listens on a free loopback port; one, the
-robot, listens on the rendezvous endpoint as well; the others connect to it, again
-and again until it is there, learn of one another and link directly. So processes
+Peers find each other by gossip. One, the robot, listens on the rendezvous
+endpoint, the others on a free loopback port; those connect to the robot, again and
+again until it is there, learn of one another and link directly. So processes
 start and restart in any order, and those already linked stay so without the
 robot. Multicast is off. Across hosts, name the endpoint to listen on; across a
 security boundary, use ``mode="client"`` and a router: a peer never forwards, and
@@ -37,6 +37,7 @@ from rti_mpc.wire.keys import Keys
 
 RENDEZVOUS = "tcp/127.0.0.1:7447"
 CLOSE_TIMEOUT_S = 0.5
+CLIENT_TIMEOUT_MS = 500  # one attempt to reach a router
 RETRY_S = 0.1  # between two looks for somebody who is not there yet
 
 # Closing the link of a hung peer occupies a thread of Zenoh for its linger time, 10 s. By default there is one to send and
@@ -58,12 +59,12 @@ DEFAULTS: dict[str, Any] = {
 @dataclass(frozen=True, slots=True)
 class BusSettings:
     """
-    How a process joins the bus. What a Zenoh configuration file sets, it sets; the other attributes fill in the rest.
+    How a process joins the bus. A Zenoh configuration file yields to attributes that differ from their defaults.
 
     Attributes:
         mode: peer, client or router.
-        listen: Endpoints to listen on, besides the free loopback port of a peer.
-        connect: Endpoints to connect to; those in `listen` are left out.
+        listen: Endpoints to listen on; none: a free loopback port, for a router the rendezvous.
+        connect: Endpoints to connect to; those in `listen` are left out, for a router the rendezvous, too.
         config: Configuration file of Zenoh, JSON5.
         multicast: Whether to look for others by multicast.
         cfg: Further settings of Zenoh, each ``KEY:VALUE``, applied last.
@@ -100,27 +101,34 @@ def zenoh_config(settings: BusSettings) -> zenoh.Config:
     Raises:
         ConfigError: If Zenoh refuses a value, or cannot read the file.
     """
-    loopback = ("tcp/127.0.0.1:0",) if settings.mode == "peer" else ()
-    values = {
-        "mode": settings.mode,
-        "listen/endpoints": [*settings.listen, *loopback],
-        "connect/endpoints": [endpoint for endpoint in settings.connect if endpoint not in settings.listen],
-        "scouting/multicast/enabled": settings.multicast,
-        "connect/timeout_ms": 500 if settings.mode == "client" else -1,
-        **DEFAULTS,
-    }
-    untouched = zenoh.Config()
     name = str(settings.config)
     try:
         config = zenoh.Config() if settings.config is None else zenoh.Config.from_file(settings.config)
-        for name, value in values.items():
-            if config.get_json(name) == untouched.get_json(name):
+        untouched = zenoh.Config()
+        mode = settings.mode if settings.mode != BusSettings().mode else json.loads(config.get_json("mode")) or settings.mode
+        usual = _by_name(BusSettings(), mode)
+        for name, value in _by_name(settings, mode).items():
+            if value != usual[name] or config.get_json(name) == untouched.get_json(name):
                 config.insert_json5(name, json.dumps(value))
+        name = "mode"
+        config.insert_json5(name, json.dumps(mode))
         for name, _, text in (setting.partition(":") for setting in settings.cfg):
             config.insert_json5(name, text)
     except zenoh.ZError as error:
         raise ConfigError(f"bus: {name} must be what Zenoh takes, got: {_brief(error)}") from None
     return config
+
+
+def _by_name(settings: BusSettings, mode: str) -> dict[str, Any]:
+    """Settings by their names in Zenoh. Nobody connects to himself, and a router to nobody unless told."""
+    others = () if mode == "router" and settings.connect == (RENDEZVOUS,) else settings.connect
+    return {
+        "listen/endpoints": settings.listen or {"client": [], "peer": ["tcp/127.0.0.1:0"], "router": [RENDEZVOUS]}.get(mode, []),
+        "connect/endpoints": [endpoint for endpoint in others if endpoint not in settings.listen],
+        "connect/timeout_ms": CLIENT_TIMEOUT_MS if mode == "client" else -1,
+        "scouting/multicast/enabled": settings.multicast,
+        **DEFAULTS,
+    }
 
 
 def _brief(error: Exception) -> str:

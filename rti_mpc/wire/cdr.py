@@ -27,7 +27,7 @@ from rti_mpc.message import Command, End, Event, Reference, Severity, State, Tel
 from rti_mpc.status import Mode, QpStatus
 
 Message = State | Reference | Command | Telemetry | Event
-M = TypeVar("M", State, Reference, Command, Telemetry, Event)
+M = TypeVar("M", bound=Message)
 
 PACKAGE = "rti_mpc_msgs/msg"
 VERSION = 1  # major: a receiver refuses any other
@@ -48,12 +48,12 @@ STATUSES = {int(status): status for status in QpStatus}
 SEVERITIES = {int(severity): severity for severity in Severity}
 
 
-def schema(cls: type[Message]) -> str:
+def schema(cls: type[Any]) -> str:
     """Schema of a message class, such as ``rti_mpc_msgs/msg/State@1``."""
     return f"{PACKAGE}/{cls.__name__}@{VERSION}"
 
 
-def encoding(cls: type[Message]) -> str:
+def encoding(cls: type[Any]) -> str:
     """Encoding that travels with every payload, such as ``application/cdr;rti_mpc_msgs/msg/State@1``."""
     return f"application/cdr;{schema(cls)}"
 
@@ -325,14 +325,14 @@ def _decode_event(payload: bytes) -> Event:
     return Event(epoch, seq, stamp_ns, source, severity, code, text)
 
 
-ENCODERS: dict[type[Message], Callable[[Any], bytes]] = {
+ENCODERS: dict[type[Any], Callable[[Any], bytes]] = {
     State: _encode_state,
     Reference: _encode_reference,
     Command: _encode_command,
     Telemetry: _encode_telemetry,
     Event: _encode_event,
 }
-DECODERS: dict[type[Message], Callable[[bytes], Any]] = {
+DECODERS: dict[type[Any], Callable[[bytes], Any]] = {
     State: _decode_state,
     Reference: _decode_reference,
     Command: _decode_command,

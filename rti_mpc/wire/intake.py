@@ -97,8 +97,9 @@ class Intake(Generic[M]):
             if before is not None:
                 self._note(Severity.INFO, "source_changed", f"epoch {message.epoch} took over from {before}")
             return message
-        text = f"epoch {message.epoch}, seq {message.seq} is {verdict.value}: ours is epoch {self.source.epoch}, seq {self.source.seq}"
-        self._note(Severity.WARNING, "source_refused", f"{text}; {self.source.dropped} dropped so far")
+        if verdict is not Verdict.REPEATED:
+            text = f"epoch {message.epoch}, seq {message.seq} is {verdict.value}: ours is epoch {self.source.epoch}, seq {self.source.seq}"
+            self._note(Severity.WARNING, "source_refused", f"{text}; {self.source.dropped} dropped so far")
         return None
 
     def notices(self, now_ns: int) -> list[Notice]:

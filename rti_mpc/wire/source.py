@@ -17,7 +17,8 @@ class Verdict(Enum):
 
     NEW = "new"  # accepted, the first of a source: whatever is remembered of another no longer holds
     NEXT = "next"  # accepted
-    REPEATED = "repeated"  # refused: this sequence number, or a later one, was accepted before
+    REPEATED = "repeated"  # refused: the last accepted message once more, as caches send it
+    OLD = "old"  # refused: a later sequence number was accepted before
     FOREIGN = "foreign"  # refused: somebody else's, while our source is alive
 
     @property
@@ -66,7 +67,7 @@ class Source:
 
     def _judge(self, epoch: int, seq: int, now_ns: int) -> Verdict:
         if epoch == self.epoch:
-            return Verdict.NEXT if seq > self.seq else Verdict.REPEATED
+            return Verdict.NEXT if seq > self.seq else Verdict.REPEATED if seq == self.seq else Verdict.OLD
         if self.epoch is None or epoch > self.epoch or now_ns - self._heard_ns > self.stale_ns:
             return Verdict.NEW
         return Verdict.FOREIGN
