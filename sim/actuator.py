@@ -18,8 +18,10 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.message import Command
+from rti_mpc.wire.source import Source
 
 BRAKE_STEP_NS = 10_000_000  # the ramp to rest is a staircase of such steps
+STALE_NS = 250_000_000  # silence after which another controller may take over, even one of a lower epoch
 WAITING = 64  # commands ahead of their time kept at most
 
 
@@ -32,7 +34,7 @@ class Counters:
         lost: Missing sequence numbers.
         late: Arrived when their first row was already over; the remaining rows act.
         expired: Arrived when nothing of them could act any more.
-        refused: From another epoch or source, repeated, or not a plan of finite inputs.
+        refused: Malformed, repeated, from another source, for another life of the robot, or not a plan of finite inputs.
         starved: How often a plan ran out in motion and the robot braked on its own.
     """
 
@@ -74,8 +76,7 @@ class Actuator:
         self._robot_epoch = epoch
         self._delay_ns = delay_ns
         self._plans: deque[Plan] = deque()  # the one that acts, then those that wait, by start
-        self._epoch = -1
-        self._seq = -1
+        self._source = Source(STALE_NS)
         self._off = False
 
     @property
@@ -87,40 +88,32 @@ class Actuator:
         """
         Take a command, or refuse it. It can act from its arrival on, plus the delay of the actuators.
 
-        A command of another source is taken if its epoch is higher, or if
-        nothing acts any more.
-
         Returns:
             The reason for refusing it, empty if it was taken.
         """
         rows = command.u.shape[0] if command.u.ndim == 2 else 0
         end_ns = min(command.valid_until_ns, command.stamp_ns + rows * command.period_ns)
         arrival_ns += self._delay_ns
-        same_source = command.epoch == self._epoch
+        verdict = self._source.accept(command.epoch, command.seq, arrival_ns)
+        self.counters.lost = self._source.lost
         if self._off:
             reason = "switched_off"
+        elif not verdict.accepted:
+            reason = verdict.value
         elif command.state_epoch != self._robot_epoch:
             reason = "foreign_epoch"
         elif not rows or command.u.shape[1] != len(self.u) or command.period_ns <= 0:
             reason = "wrong_shape"
         elif not np.isfinite(command.u).all():
             reason = "not_finite"
-        elif same_source and command.seq <= self._seq:
-            reason = "repeated"
-        elif command.epoch < self._epoch and not self._nothing_left(arrival_ns):
-            reason = "second_source"
         elif end_ns <= max(arrival_ns, command.stamp_ns):
             reason = "expired"
         else:
             reason = ""
-        if same_source:
-            self.counters.lost += max(0, command.seq - self._seq - 1)
-            self._seq = max(self._seq, command.seq)
         if reason:
             self.counters.expired += reason == "expired"
             self.counters.refused += reason != "expired"
             return reason
-        self._epoch, self._seq = command.epoch, command.seq
         self.counters.late += arrival_ns >= command.stamp_ns + command.period_ns
         self._line_up(Plan(max(command.stamp_ns, arrival_ns), end_ns, command.stamp_ns, command.period_ns, command.u.copy()))
         return ""
@@ -173,7 +166,3 @@ class Actuator:
             np.copyto(self.u, np.where(np.abs(way) <= self._brake_step, self._rest, self.u + np.clip(way, -self._brake_step, self._brake_step)))
             self._brake_ns = t + BRAKE_STEP_NS
         return min(change_ns, self._brake_ns)
-
-    def _nothing_left(self, now_ns: int) -> bool:
-        """Whether no plan acts at a time or later."""
-        return all(plan.end_ns <= now_ns for plan in self._plans)

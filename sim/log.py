@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from rti_mpc.array import Array
+from rti_mpc.errors import ConfigError
 from rti_mpc.model import Model
 from sim.actuator import Counters
 
@@ -37,10 +38,18 @@ class Line:
 
 
 class Log:
-    """Writes the record; to nowhere if it has no path."""
+    """
+    Writes the record; to nowhere if it has no path.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
 
     def __init__(self, path: Path | None, model: Model) -> None:
-        self._file = open(path or os.devnull, "w", newline="", buffering=1, encoding="utf-8")
+        try:
+            self._file = open(path or os.devnull, "w", newline="", buffering=1, encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"log must be a file that can be written, got {path}: {error.strerror}") from error
         self._writer = csv.writer(self._file)
         names = [signal.name for signal in (*model.states, *model.inputs)]
         self._writer.writerow(["stamp_ns", "seq", *names, "command_seq", "latency_us", *(field.name for field in fields(Counters))])

@@ -21,13 +21,12 @@ from typing import Any
 import numpy as np
 
 import rti_mpc
-from rti_mpc.errors import MessageError
 from rti_mpc.message import Command, Severity, State
 from rti_mpc.model import Model
-from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
-from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.bus import Bus, BusSettings, Received, Subscriber
+from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
-from sim.actuator import Counters
+from sim.actuator import STALE_NS, Counters
 from sim.announcer import Announcer
 from sim.clock import Clock
 from sim.interrupt import stop_on_signals
@@ -48,13 +47,11 @@ class RobotSummary:
     Attributes:
         states: States sent.
         skipped: States not measured because their time was missed.
-        malformed: Payloads on the command key that are no command.
         counters: What became of commands.
     """
 
     states: int
     skipped: int
-    malformed: int
     counters: Counters
 
 
@@ -123,10 +120,10 @@ class Robot:
         self._log = Log(log, settings.model)
         self._states = bus.publisher(bus.keys.state, State, realtime=True)
         self._announcer = Announcer(bus, ROLE, self.body.epoch)
-        self._inbox: deque[tuple[Command, int]] = deque(maxlen=64)  # with the monotonic time of arrival
+        self._inbox: deque[tuple[Received, int]] = deque(maxlen=64)  # with the monotonic time of arrival
+        self._intake = Intake(Command, 1e-9 * STALE_NS / speed, {"u": settings.model.nu})
         self._sent = 0
         self._skipped = 0
-        self._malformed = 0
         Thread(target=self._receive, args=(bus.subscriber(bus.keys.command, capacity=8),), daemon=True).start()
         self.clock = Clock(speed)
 
@@ -154,21 +151,19 @@ class Robot:
             self._send(last)
         self._announcer.say(Severity.INFO, "robot_stopped", "the robot was stopped and stands", body.now_ns)
         self._log.close()
-        return RobotSummary(self._sent, self._skipped, self._malformed, body.counters)
+        return RobotSummary(self._sent, self._skipped, body.counters)
 
     def _receive(self, subscriber: Subscriber) -> None:
         """Note every command with the time of its arrival; a thread of its own."""
         for received in iter(subscriber.recv, None):
-            now_ns = time.monotonic_ns()
-            try:
-                self._inbox.append((decode(Command, received.payload), now_ns))
-            except MessageError:
-                self._malformed += 1
+            self._inbox.append((received, time.monotonic_ns()))
 
     def _live(self, to_ns: int) -> None:
         """Advance to a time with the commands that arrived by then, measure, send."""
         while self._inbox and self.clock.at_ns(self._inbox[0][1]) <= to_ns:
             self._take(*self._inbox.popleft())
+        for notice in self._intake.notices(time.monotonic_ns()):
+            self._announcer.say(notice.severity, notice.code, notice.text, to_ns)
         starved = self.body.counters.starved
         self._advance(to_ns)
         if self.body.counters.starved > starved:
@@ -177,8 +172,12 @@ class Robot:
             self._send(state)
         self._log.write(time.monotonic_ns())
 
-    def _take(self, command: Command, monotonic_ns: int) -> None:
+    def _take(self, received: Received, monotonic_ns: int) -> None:
         """Hand a command to the actuators."""
+        command = self._intake.accept(received, monotonic_ns)
+        if command is None:
+            self.body.counters.refused += 1
+            return
         arrival_ns = self.clock.at_ns(monotonic_ns)
         reason = self.body.accept(command, arrival_ns)
         if reason:

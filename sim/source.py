@@ -15,16 +15,16 @@ from threading import Event, Thread
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.errors import MessageError
 from rti_mpc.message import Reference, Severity, State
 from rti_mpc.trajectory import Heading, Trajectory, rows
 from rti_mpc.wire.bus import Bus, BusSettings
-from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
 from sim.announcer import Announcer
 from sim.interrupt import stop_on_signals
 
 ROLE = "reference"
+STALE_S = 1.0  # silence of the robot after which the reference is anchored to another one, even of a lower epoch
 
 
 def main(
@@ -86,18 +86,19 @@ class Source:
         self._publisher = bus.publisher(bus.keys.reference, Reference, cached=True)
         self._announcer = Announcer(bus, ROLE, self._epoch)
         self._states = bus.subscriber(bus.keys.state)
+        self._intake = Intake(State, STALE_S)
         self._robot_epoch = -1
 
     def follow(self) -> None:
         """Publish whenever a robot starts, until the bus is closed."""
         for received in iter(self._states.recv, None):
-            try:
-                state = decode(State, received.payload)
-            except MessageError:
-                continue
-            if state.epoch > self._robot_epoch:
+            now_ns = time.monotonic_ns()
+            state = self._intake.accept(received, now_ns)
+            if state is not None and state.epoch != self._robot_epoch:
                 self._robot_epoch = state.epoch
                 self._anchor(state.stamp_ns)
+            for notice in self._intake.notices(now_ns):
+                self._announcer.say(notice.severity, notice.code, notice.text, 0 if state is None else state.stamp_ns)
 
     def _anchor(self, stamp_ns: int) -> None:
         """Publish the reference from a time on."""

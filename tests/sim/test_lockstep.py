@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -86,6 +87,22 @@ def test_same_seed_gives_the_same_run() -> None:
         return trace
 
     assert run() == run()
+
+
+def test_robot_does_not_grow_the_heap() -> None:
+    robot = Lockstep(SETTINGS)
+
+    def live(first: int, last: int) -> int:
+        for seq in range(first, last):
+            robot.tick()
+            robot.accept(command(robot, seq, [0.4, 0.1], stamp_ns=robot.now_ns + 30 * MS))
+        return tracemalloc.get_traced_memory()[0]
+
+    tracemalloc.start()
+    before = live(1, 100)
+    after = live(100, 400)
+    tracemalloc.stop()
+    assert after - before < 4096
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,9 @@ import csv
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from rti_mpc.errors import ConfigError
 from rti_mpc.pioneer_3dx import pioneer_3dx
 from sim.actuator import Counters
 from sim.log import PATIENCE_NS, Log
@@ -54,3 +56,8 @@ def test_record_without_a_path_goes_nowhere() -> None:
     log = Log(None, pioneer_3dx())
     log.measured(1, 0, X, U, Counters(), 0)
     log.close()
+
+
+def test_record_that_cannot_be_written_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="log must be a file that can be written, got .*nowhere"):
+        Log(tmp_path / "nowhere" / "robot.csv", pioneer_3dx())

@@ -156,17 +156,26 @@ def test_commanded_robot_moves_stops_on_silence_and_ends_on_ctrl_c_standing(endp
     assert abs(float(lines[-1]["u"])) < 1e-5
 
 
-def test_robot_survives_what_is_no_command(endpoint: str, tmp_path: Path) -> None:
-    with running(ROBOT, endpoint, 1.0, 0.02, tmp_path / "log.csv") as process, peer(endpoint) as bus:
+def test_what_is_no_command_is_counted_and_published_and_stops_nothing(endpoint: str, tmp_path: Path) -> None:
+    log = tmp_path / "log.csv"
+    with running(ROBOT, endpoint, 1.0, 0.02, log) as process, peer(endpoint) as bus:
         states = bus.subscriber(KEYS.state)
+        events = bus.subscriber(KEYS.events, capacity=16, cached=True)
         commands = bus.publisher(KEYS.command, Command, realtime=True)
-        next_state(states)
+        state = next_state(states)
         for payload in (b"", b"\x00\x00\x00\x00", b"\x00\x01\x00\x00" + b"\xff" * 200):
             commands.put_bytes(payload)
-            next_state(states)
+        commands.put(replace(command(state, 1, [0.1, 0.1]), u=np.full((5, 2), np.nan)))
+        commands.put(replace(command(state, 2, [0.1, 0.1]), u=np.zeros((5, 3))))
+        received = events.recv()
+        assert received is not None, "no event came in time"
+        assert decode(Event, received.payload).code == "message_refused"
         seq = next_state(states).seq
         assert next_state(states).seq > seq
-        assert process.poll() is None
+        interrupted(process)
+    with log.open(newline="") as file:
+        last = list(csv.DictReader(file))[-1]
+    assert (last["refused"], last["u_c"], last["x"]) == ("5", "0.0", "0.5")
 
 
 def test_source_anchors_its_reference_to_every_new_robot_and_keeps_it_for_late_joiners(endpoint: str, tmp_path: Path) -> None:
