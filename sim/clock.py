@@ -43,3 +43,9 @@ class Clock:
             if left_ns <= 0:
                 return
             time.sleep(min(SLICE_S, 1e-9 * max(0, left_ns - LAST_NS)))
+
+    def set_back(self, robot_ns: int) -> int:
+        """Make it a past robot time now; return by how much wall time, in ns."""
+        late_ns = time.monotonic_ns() - self._start_ns - math.ceil(robot_ns / self.speed)
+        self._start_ns += late_ns
+        return late_ns

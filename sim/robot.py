@@ -3,9 +3,10 @@
 The simulated robot as a process: the lockstep robot with a clock, on the bus.
 
 It measures and sends states on an absolute grid of wall time over speed, and
-advances over exactly the intervals in which each received row acted. Times that
-were missed are skipped. When it is stopped its inputs ramp to rest, and the last
-state it sends is the one in which it stands.
+advances over exactly the intervals in which each received row acted. Where this
+process itself is held up for a whole period, the robot's clock waits with it: a
+busy machine is no fault of the robot. When it is stopped its inputs ramp to
+rest, and the last state it sends is the one in which it stands.
 """
 
 from __future__ import annotations
@@ -46,12 +47,12 @@ class RobotSummary:
 
     Attributes:
         states: States sent.
-        skipped: States not measured because their time was missed.
+        held_up_s: Wall time for which the robot's clock waited for this process.
         counters: What became of commands.
     """
 
     states: int
-    skipped: int
+    held_up_s: float
     counters: Counters
 
 
@@ -123,7 +124,7 @@ class Robot:
         self._inbox: deque[tuple[Received, int]] = deque(maxlen=64)  # with the monotonic time of arrival
         self._intake = Intake(Command, 1e-9 * STALE_NS / speed, {"u": settings.model.nu})
         self._sent = 0
-        self._skipped = 0
+        self._held_up_ns = 0
         Thread(target=self._receive, args=(bus.subscriber(bus.keys.command, capacity=8),), daemon=True).start()
         self.clock = Clock(speed)
 
@@ -133,9 +134,9 @@ class Robot:
         while not stop.is_set() and (until_ns is None or body.now_ns < until_ns):
             due_ns = body.due_ns
             self.clock.wait(due_ns, stop)
-            missed = max(0, self.clock.now_ns() - due_ns) // body.period_ns
-            self._skipped += missed
-            self._live(due_ns + missed * body.period_ns)
+            if self.clock.now_ns() - due_ns >= body.period_ns:
+                self._hold(due_ns)
+            self._live(due_ns)
 
     def finish(self) -> RobotSummary:
         """Ramp to rest, coast until the robot stands, send that state, and sum up."""
@@ -151,12 +152,19 @@ class Robot:
             self._send(last)
         self._announcer.say(Severity.INFO, "robot_stopped", "the robot was stopped and stands", body.now_ns)
         self._log.close()
-        return RobotSummary(self._sent, self._skipped, body.counters)
+        return RobotSummary(self._sent, 1e-9 * self._held_up_ns, body.counters)
 
     def _receive(self, subscriber: Subscriber) -> None:
         """Note every command with the time of its arrival; a thread of its own."""
         for received in iter(subscriber.recv, None):
             self._inbox.append((received, time.monotonic_ns()))
+
+    def _hold(self, due_ns: int) -> None:
+        """Set the clock back to a time that this process missed."""
+        late_ns = self.clock.set_back(due_ns)
+        self._held_up_ns += late_ns
+        text = f"the simulation was held up for {1e-6 * late_ns:.1f} ms, {1e-6 * self._held_up_ns:.1f} ms in all: the robot's clock waited"
+        self._announcer.say(Severity.WARNING, "simulation_held_up", text, due_ns)
 
     def _live(self, to_ns: int) -> None:
         """Advance to a time with the commands that arrived by then, measure, send."""
@@ -178,7 +186,7 @@ class Robot:
         if command is None:
             self.body.counters.refused += 1
             return
-        arrival_ns = self.clock.at_ns(monotonic_ns)
+        arrival_ns = max(self.body.now_ns, self.clock.at_ns(monotonic_ns))
         reason = self.body.accept(command, arrival_ns)
         if reason:
             text = f"command {command.seq} of epoch {command.epoch} was refused: {reason.replace('_', ' ')}"

@@ -34,6 +34,14 @@ def test_a_stopped_wait_ends_soon() -> None:
     assert clock.now_ns() < 1_000_000_000
 
 
+def test_clock_set_back_goes_on_from_there_at_its_speed() -> None:
+    clock = Clock(4.0)
+    clock.wait(100_000_000, Event())
+    assert clock.set_back(80_000_000) >= 5_000_000
+    clock.wait(120_000_000, Event())
+    assert 120_000_000 <= clock.now_ns() < 160_000_000
+
+
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), float("inf")])
 def test_speed_must_be_positive(speed: float) -> None:
     with pytest.raises(ConfigError, match="speed"):

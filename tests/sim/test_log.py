@@ -59,5 +59,5 @@ def test_record_without_a_path_goes_nowhere() -> None:
 
 
 def test_record_that_cannot_be_written_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="log must be a file that can be written, got .*nowhere"):
+    with pytest.raises(ConfigError, match=r"log must be a file that can be written, got .*nowhere"):
         Log(tmp_path / "nowhere" / "robot.csv", pioneer_3dx())

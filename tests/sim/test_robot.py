@@ -178,6 +178,21 @@ def test_what_is_no_command_is_counted_and_published_and_stops_nothing(endpoint:
     assert (last["refused"], last["u_c"], last["x"]) == ("5", "0.0", "0.5")
 
 
+def test_clock_of_a_robot_whose_process_is_held_up_waits_with_it(endpoint: str, tmp_path: Path) -> None:
+    with running(ROBOT, endpoint, 1.0, 0.02, tmp_path / "log.csv") as process, peer(endpoint) as bus:
+        states = bus.subscriber(KEYS.state, capacity=256)
+        events = bus.subscriber(KEYS.events, capacity=16, cached=True)
+        first = next_state(states)
+        process.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, process.pid, os.WSTOPPED)
+        time.sleep(0.2)
+        process.send_signal(signal.SIGCONT)
+        received = events.recv()
+        assert received is not None, "no event came in time"
+        assert decode(Event, received.payload).code == "simulation_held_up"
+        assert [next_state(states).stamp_ns - first.stamp_ns for _ in range(20)] == [20 * MS * k for k in range(1, 21)]
+
+
 def test_source_anchors_its_reference_to_every_new_robot_and_keeps_it_for_late_joiners(endpoint: str, tmp_path: Path) -> None:
     with running(SOURCE, endpoint) as source, peer(endpoint) as bus:
         references = bus.subscriber(KEYS.reference, capacity=4, cached=True)
