@@ -13,7 +13,7 @@ import hashlib
 import json
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,6 +105,24 @@ class Config(Section):
             "slew": [min(-lower, upper) / self.ocp.dt_s for lower, upper in increments],
         }
 
+    def with_initial_state(self, assignments: Sequence[str]) -> Config:
+        """
+        Return this configuration with other initial states of the simulated robot.
+
+        Args:
+            assignments: Each ``name=value``, in the state's unit.
+
+        Raises:
+            ConfigError: An assignment is none, or the model has no such state.
+        """
+        try:
+            given = {name: float(value) for name, _, value in (assignment.partition("=") for assignment in assignments)}
+        except ValueError as error:
+            raise ConfigError(f"--x0 must be NAME=VALUE, got {' '.join(assignments)}") from error
+        if wrong := unknown_name("sim.x0", given, "state", self.build_model().states, complete=False):
+            raise ConfigError(wrong)
+        return self.model_copy(update={"sim": self.sim.model_copy(update={"x0": {**self.sim.x0, **given}})})
+
     def solver_settings(self) -> SolverSettings:
         """Return the settings of the QP solver."""
         from rti_mpc.solver import SolverSettings
@@ -118,10 +136,10 @@ class Config(Section):
         return Keys(self.prefix, self.robot)
 
     def bus_settings(self) -> BusSettings:
-        """Return the settings of this robot's Zenoh sessions."""
+        """Return how a process other than the robot joins the bus: it connects, and listens on a free port."""
         from rti_mpc.wire.bus import BusSettings
 
-        return BusSettings(**self.bus.model_dump(exclude_none=True))
+        return BusSettings(**self.bus.model_dump(exclude_none=True, exclude={"listen"}))
 
 
 def spread(values: tuple[float, ...], length: int) -> tuple[float, ...]:

@@ -109,8 +109,8 @@ class BusSection(Section):
     """The Zenoh session of each process; what is left out is as `BusSettings` has it, and the command line overrides it."""
 
     mode: Literal["peer", "client"] | None = Field(default=None, description="peer, or client of a router")
-    listen: Endpoints | None = Field(default=None, description="endpoints to listen on, such as tcp/127.0.0.1:7447")
-    connect: Endpoints | None = Field(default=None, description="endpoints to connect to, such as tcp/127.0.0.1:7447")
+    listen: Endpoints | None = Field(default=None, description="endpoints the robot listens on, such as tcp/127.0.0.1:7447; connect's if left out")
+    connect: Endpoints | None = Field(default=None, description="endpoints the others connect to, such as tcp/127.0.0.1:7447")
     config: Annotated[Path, Field(strict=False)] | None = Field(default=None, description="Zenoh's own JSON5 file, beside this one")
 
 

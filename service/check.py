@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A dry run of one configuration: does it load, how long does a sample take here, is its QP solver right?
+
+The plan's own prediction, disturbed, is the next state: 200 samples of closed
+loop around a wave in every output, seeded. Every tenth QP is solved by another
+solver too.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import qpsolvers
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from rti_mpc.array import Array
+from rti_mpc.rti import Rti
+from rti_mpc.status import QpStatus
+from service.config import Config, load
+
+SAMPLES = 200
+OPINIONS = 20  # samples whose QP the second solver is asked about
+SECOND = "daqp"
+TOLERANCE = 5e-3  # what two answers to one QP may differ by, in the unit of each variable; OSQP stops at a residual, not at a distance
+
+WAVE_S = 40.0  # period of the reference, s
+NOISE = 0.01  # standard deviation of the disturbance, in the unit of each state
+
+
+@dataclass(frozen=True)
+class Report:
+    """
+    Outcome of a dry run.
+
+    Attributes:
+        prepare_us: Time of each preparation, shape ``(SAMPLES,)``.
+        feedback_us: Time of each feedback, shape ``(SAMPLES,)``.
+        statuses: How often each status came out.
+        opinions: How many solved QPs the second solver was asked about.
+        difference: Largest difference of their solutions, in the unit of each variable.
+    """
+
+    prepare_us: Array
+    feedback_us: Array
+    statuses: Counter[QpStatus]
+    opinions: int
+    difference: float
+
+    @property
+    def agree(self) -> bool:
+        """Whether the second solver was asked and confirms the first."""
+        return self.opinions > 0 and self.difference <= TOLERANCE
+
+
+def main(path: Path) -> int:
+    """Check a configuration, print what was found, and return the exit status: 0 if every sample was usable and both solvers agree."""
+    config = load(path)
+    console = Console()
+    report = check(config, track(range(SAMPLES), "solving", console=console, transient=True))
+    table = Table("phase, us", "p50", "p99", "max")
+    for phase, times in (("preparation", report.prepare_us), ("feedback", report.feedback_us)):
+        table.add_row(phase, *(f"{np.percentile(times, share):.0f}" for share in (50, 99, 100)))
+    console.print(
+        f"{path}: N = {config.ocp.N}, N_u = {config.N_u}, dt = {config.ocp.dt_s} s, configuration {config.config_hash:016x}", soft_wrap=True
+    )
+    console.print(table)
+    console.print(f"{SAMPLES} samples: " + ", ".join(f"{count} {status.name}" for status, count in sorted(report.statuses.items())))
+    verdict = "agree" if report.agree else "DISAGREE"
+    console.print(
+        f"osqp and {SECOND} {verdict}: on {report.opinions} QPs their solutions differ by at most {report.difference:.1e}, {TOLERANCE:.0e} allowed"
+    )
+    return 0 if report.agree and all(status.usable for status in report.statuses) else 1
+
+
+def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> Report:
+    """Solve one QP for each of the samples."""
+    ocp = config.build_ocp()
+    model, N = ocp.model, ocp.N
+    rti = Rti(ocp, config.solver_settings())
+    rng = np.random.default_rng(1)
+    x = np.array(config.robot_settings()["x0"])
+    phases = rng.uniform(-np.pi, np.pi, model.ny)
+    start = np.array([x[[state.name for state in model.states].index(y.name)] if y in model.states else 0.0 for y in model.outputs])
+    prepare_us, feedback_us = np.zeros(SAMPLES), np.zeros(SAMPLES)
+    statuses: Counter[QpStatus] = Counter()
+    differences: list[float] = []
+    rti.reset(x, np.array(model.u_rest))
+    for k in samples:
+        t = ocp.dt * np.arange(k + 1, k + 1 + N)[:, None]
+        y_ref = start + np.sin(2 * np.pi / WAVE_S * t + phases) - np.sin(phases)
+        began_ns = time.perf_counter_ns()
+        rti.prepare(y_ref)
+        prepared_ns = time.perf_counter_ns()
+        status = rti.feedback(x)
+        feedback_us[k] = 1e-3 * (time.perf_counter_ns() - prepared_ns)
+        prepare_us[k] = 1e-3 * (prepared_ns - began_ns)
+        statuses[status] += 1
+        if k % (SAMPLES // OPINIONS) == 0 and status is QpStatus.SOLVED:
+            solution = qpsolvers.solve_problem(rti.qp.to_problem(), SECOND)
+            other = solution.x if solution.found else None
+            differences.append(np.inf if other is None else float(np.max(np.abs(rti.solver.z - other))))
+        x = rti.x[1] + NOISE * rng.standard_normal(model.nx)
+    return Report(prepare_us, feedback_us, statuses, len(differences), max(differences, default=np.inf))

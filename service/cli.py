@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The command line: options in, one call out. Everything physical is in the configuration.
+
+Each command imports what it runs when it runs: `rti-mpc --help` loads no solver,
+no bus and no viewer, and this file alone knows both `service` and `sim`.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from rti_mpc.errors import RtiMpcError
+from service import log
+from service.config import Config, load
+
+if TYPE_CHECKING:
+    from rti_mpc.wire.bus import BusSettings
+
+HERE = Path(__file__).parent
+SHIPPED = (HERE / "deploy" if (HERE / "deploy").is_dir() else HERE.parent / "deploy") / "pioneer_3dx.toml"  # in the wheel, in a clone
+
+app = typer.Typer(
+    help="Real-time nonlinear model predictive control as a service, over Zenoh.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="The robot's TOML file.", show_default="the shipped pioneer_3dx.toml")]
+
+
+def options(
+    mode: Annotated[Literal["peer", "client"] | None, typer.Option("--mode", "-m", help="Mode of the Zenoh session.")] = None,
+    connect: Annotated[list[str] | None, typer.Option("--connect", "-e", metavar="ENDPOINT", help="Endpoint to connect to; repeatable.")] = None,
+    listen: Annotated[list[str] | None, typer.Option("--listen", "-l", metavar="ENDPOINT", help="Endpoint to listen on; repeatable.")] = None,
+    zenoh: Annotated[Path | None, typer.Option("--config", "-c", metavar="FILE", help="Zenoh's own configuration, JSON5.")] = None,
+    cfg: Annotated[list[str] | None, typer.Option("--cfg", metavar="KEY:VALUE", help="One setting of Zenoh, applied last; repeatable.")] = None,
+    multicast: Annotated[bool | None, typer.Option("--multicast-scouting/--no-multicast-scouting", help="Look for others by multicast; off.")] = None,
+) -> dict[str, Any]:
+    """Collect Zenoh's options, named as in Zenoh's own programs."""
+    given = {"mode": mode, "connect": connect, "listen": listen, "config": zenoh, "cfg": cfg, "multicast": multicast}
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in given.items() if value is not None}
+
+
+def process(command: Callable[..., int | None]) -> Callable[..., None]:
+    """
+    Register a process of a robot: a command with CONFIG and Zenoh's options besides its own.
+
+    Args:
+        command: Takes the configuration, how to join the bus, and its own options; returns an exit status, None for 0.
+    """
+    shared = inspect.signature(options, eval_str=True).parameters
+    own = list(inspect.signature(command, eval_str=True, locals={"BusSettings": Any}).parameters.values())[2:]
+
+    @wraps(command)
+    def run(config: Path = SHIPPED, **given: Any) -> None:
+        loaded = load(config)
+        overrides = options(**{name: given.pop(name) for name in shared})
+        raise typer.Exit(command(loaded, replace(loaded.bus_settings(), **overrides), **given) or 0)
+
+    path = inspect.Parameter("config", inspect.Parameter.POSITIONAL_OR_KEYWORD, default=SHIPPED, annotation=ConfigPath)
+    run.__signature__ = inspect.Signature([path, *own, *shared.values()])  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in (path, *own, *shared.values())}
+    del run.__wrapped__  # or its signature would be read instead
+    return app.command()(run)
+
+
+Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", min=0.1, help="How long to wait for the controller's answer.")]
+
+
+@process
+def sim(
+    config: Config,
+    bus: BusSettings,
+    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Seconds of the robot per second.")] = 1.0,
+    x0: Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE", help="Initial state, before the configuration's; repeatable.")] = None,
+    duration: Annotated[float | None, typer.Option(metavar="SECONDS", min=0.0, help="Stop after this long, in the robot's time.")] = None,
+    log: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Write every state, input and answer time.")] = None,
+) -> None:
+    """Play the robot: a plant of its own model, that stops without valid commands."""
+    from sim.robot import main
+    from sim.settings import RobotSettings
+
+    listen = bus.listen or config.bus.listen or (bus.connect if bus.mode == "peer" and bus.config is None else ())
+    settings = RobotSettings(**config.with_initial_state(x0 or []).robot_settings())
+    main(settings, replace(bus, listen=listen), config.keys(), speed=speed, log=log, duration_s=duration)
+
+
+@process
+def reference(
+    config: Config,
+    bus: BusSettings,
+    scenario: Annotated[str, typer.Option(metavar="circle|eight|positioning|FILE.csv", help="What to follow; a file holds waypoints.")] = "eight",
+    heading: Annotated[
+        Literal["tangent", "consistent", "none"], typer.Option(help="Of the path; what the point ahead of the axle can follow; 0.")
+    ] = "consistent",
+    duration: Annotated[
+        float | None, typer.Option(metavar="SECONDS", min=0.1, help="How long, in the robot's time; the scenario's own if not given.")
+    ] = None,
+    waypoint_speed: Annotated[float, typer.Option(metavar="M/S", min=0.001, help="Speed along waypoints.")] = 0.25,
+) -> None:
+    """Publish a reference from the robot's present state on, and again when the robot restarts."""
+    from rti_mpc.trajectory import find_trajectory
+    from sim.source import main
+
+    trajectory = find_trajectory(scenario, waypoint_speed)
+    if duration is not None:
+        trajectory = trajectory.lasting(duration)
+    model = config.build_model()
+    parameters = {parameter.name: value for parameter, value in zip(model.parameters, model.p_nominal, strict=True)}
+    main(trajectory, bus, config.keys(), heading=heading, a=parameters.get("a", 0.0))
+
+
+@process
+def view(
+    config: Config,
+    bus: BusSettings,
+    rerun_spawn: Annotated[bool, typer.Option("--rerun-spawn", help="Start a Rerun viewer on this machine.")] = False,
+    rerun_connect: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Draw in a Rerun viewer that is there, or will be.")] = None,
+    rerun_save: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Record to a file.")] = None,
+    rerun_memory_limit: Annotated[str, typer.Option(metavar="SIZE", help="Memory a spawned viewer may fill before it forgets.")] = "25%",
+) -> int:
+    """Draw the robot live in Rerun, or record it."""
+    from service.view import main
+
+    return main(
+        bus,
+        config.keys(),
+        rerun_spawn=rerun_spawn,
+        rerun_connect=rerun_connect,
+        rerun_save=rerun_save,
+        rerun_memory_limit=rerun_memory_limit,
+    )
+
+
+@process
+def router(config: Config, bus: BusSettings) -> None:
+    """Run a Zenoh router, for clients on several hosts or behind access control."""
+    from service.router import main
+
+    main(bus, config.keys())
+
+
+@process
+def stop(config: Config, bus: BusSettings, timeout: Timeout = 2.0) -> int:
+    """Bring the robot to a standstill; only `enable` releases it."""
+    from service.request import main
+
+    return main(bus, config.keys(), "stop", timeout)
+
+
+@process
+def enable(config: Config, bus: BusSettings, timeout: Timeout = 2.0) -> int:
+    """Release a robot that was stopped."""
+    from service.request import main
+
+    return main(bus, config.keys(), "enable", timeout)
+
+
+@app.command()
+def check(config: ConfigPath = SHIPPED) -> None:
+    """Load a configuration, solve 200 times, print both phases and the verdict of a second solver."""
+    from service.check import main
+
+    raise typer.Exit(main(config))
+
+
+def main() -> None:
+    """Run the command line; what it refuses is one line, with exit status 2."""
+    log.start()
+    try:
+        app()
+    except RtiMpcError as error:
+        print(f"rti-mpc: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer.main
+from typer.testing import CliRunner
+
+from service.cli import SHIPPED, app
+
+ROOT = Path(__file__).parents[2]
+ZENOH = ("--mode", "--connect", "--listen", "--config", "--cfg", "--no-multicast-scouting")
+COMMANDS = sorted(typer.main.get_group(app).commands)
+
+
+def rti_mpc(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line as a process, as a shell would."""
+    environment = {**os.environ, "COLUMNS": "200"}
+    command = [sys.executable, "-c", "from service.cli import main; main()", *arguments]
+    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_every_command_explains_every_option(command: str) -> None:
+    parameters = typer.main.get_group(app).commands[command].params
+    for parameter in parameters:
+        assert getattr(parameter, "help", None), f"{command} {parameter.name}"
+    assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
+
+
+@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"check", "demo"}))
+def test_every_process_takes_the_options_of_zenoh_programs(command: str) -> None:
+    parameters = typer.main.get_group(app).commands[command].params
+    options = {option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)}
+    assert set(ZENOH) | {"-m", "-e", "-l", "-c"} <= options
+
+
+@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"demo"}))
+def test_bad_configuration_is_one_line_and_exit_status_2(command: str, tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(SHIPPED.read_text().replace("dt_s", "dt_ms"))
+    done = rti_mpc(command, str(path))
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith(f"rti-mpc: {path}: ocp.dt_ms is unknown, perhaps ocp.dt_s is meant")
+
+
+def test_bad_option_is_exit_status_2() -> None:
+    assert rti_mpc("sim", "--speed", "-1").returncode == 2
+    done = rti_mpc("sim", "--x0", "phi=1")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "sim.x0.phi is no state of the model, perhaps psi [rad] is meant" in done.stderr
+
+
+@pytest.mark.parametrize("command", ["stop", "enable"])
+def test_operator_is_told_in_one_line_when_nobody_answers(command: str) -> None:
+    done = rti_mpc(command, "--timeout", "0.3", "-e", "tcp/127.0.0.1:1")
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert done.stderr == "rti-mpc: pioneer has no controller that answers within 0.3 s: nothing was changed\n"
+
+
+def test_check_of_the_shipped_configuration_prints_both_phases_and_the_verdict() -> None:
+    done = rti_mpc("check")
+    assert done.returncode == 0, done.stderr
+    for words in ("preparation", "feedback", "200 samples: ", "osqp and daqp agree"):
+        assert words in done.stdout
