@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The layers of the system, held by what each file imports."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("rti_mpc", "service", "sim")
+
+# What no file of a layer imports; the command line alone may start a simulation, lazily.
+FORBIDDEN = {
+    "rti_mpc": {"service", "sim", "asyncio", "logging", "pydantic", "typer", "rich"},
+    "service": {"sim"},
+    "sim": {"service", "osqp", "pydantic", "typer"},
+}
+EXCEPT = {"service/cli.py"}
+
+# Who alone imports a package, wherever in the file.
+ALONE = {
+    "osqp": {"rti_mpc/solver.py"},
+    "zenoh": {"rti_mpc/wire/bus.py"},
+    "rerun": {"service/blueprint.py", "service/outlet.py", "service/recording.py", "service/view.py"},
+    "qpsolvers": {"rti_mpc/qp.py", "service/check.py"},
+    "casadi": {
+        *(f"rti_mpc/{name}.py" for name in ("model", "pioneer_3dx", "integrator", "ocp", "transcription", "codegen", "track")),
+        "sim/plant.py",
+    },
+}
+
+# Inside the library, a file imports only from groups before its own.
+FLOW: tuple[set[str], ...] = (
+    {"errors", "array", "status", "robot_clock"},
+    {"message", "polyline"},
+    {"heading", "sent"},
+    {"trajectory"},
+    {"model"},
+    {"pioneer_3dx", "integrator", "track"},
+    {"ocp"},
+    {"transcription"},
+    {"codegen"},
+    {"qp"},
+    {"solver"},
+    {"rti"},
+    {"controller"},
+)
+BEFORE_WIRE = {"errors", "array", "status", "message"}
+
+
+def imported(path: Path) -> set[str]:
+    """Full names of all modules a file imports, in functions too."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path} imports relatively"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def roots(path: Path) -> set[str]:
+    return {name.partition(".")[0] for name in imported(path)}
+
+
+def files(package: str) -> list[Path]:
+    return sorted((ROOT / package).rglob("*.py"))
+
+
+def inside(path: Path) -> set[str]:
+    """Modules of the library that a file of the library imports, by their first name."""
+    return {name.split(".")[1] for name in imported(path) if name.startswith("rti_mpc.")}
+
+
+@pytest.mark.parametrize("layer", FORBIDDEN)
+def test_layer_does_not_import_upwards(layer: str) -> None:
+    assert files(layer)
+    for path in files(layer):
+        if path.relative_to(ROOT).as_posix() not in EXCEPT:
+            assert not roots(path) & FORBIDDEN[layer], path
+
+
+@pytest.mark.parametrize("package", ALONE)
+def test_foreign_package_is_behind_its_own_files(package: str) -> None:
+    importers = {path.relative_to(ROOT).as_posix() for layer in PACKAGES for path in files(layer) if package in roots(path)}
+    assert importers <= ALONE[package]
+
+
+def test_data_flows_one_way_through_the_library() -> None:
+    before: set[str] = set()
+    for group in FLOW:
+        for name in group:
+            assert inside(ROOT / "rti_mpc" / f"{name}.py") <= before, name
+        before |= group
+    assert {path.stem for path in (ROOT / "rti_mpc").glob("*.py")} == before | {"__init__"}, "every file has its place"
+
+
+def test_wire_depends_on_messages_only() -> None:
+    for path in files("rti_mpc/wire"):
+        assert inside(path) <= BEFORE_WIRE | {"wire"}, path
+
+
+@pytest.mark.parametrize(
+    ("module", "absent"),
+    [
+        ("rti_mpc.wire.bus", {"casadi", "osqp", "scipy", "pydantic", "rerun"}),
+        ("rti_mpc.trajectory", {"casadi", "osqp", "scipy", "zenoh"}),
+        ("rti_mpc.rti", {"zenoh", "rerun", "qpsolvers", "pydantic"}),
+        ("service.config", {"casadi", "osqp", "scipy", "zenoh", "rerun"}),
+        ("service.cli", {"casadi", "osqp", "scipy", "zenoh", "rerun", "sim"}),
+    ],
+)
+def test_import_loads_only_what_it_needs(module: str, absent: set[str]) -> None:
+    code = f"import sys, {module}; print(*{{name.partition('.')[0] for name in sys.modules}})"
+    loaded = set(subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split())
+    assert module.partition(".")[0] in loaded
+    assert not loaded & absent
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_file_names_its_licence_first(package: str) -> None:
+    for path in files(package):
+        assert path.read_text().startswith("# SPDX-License-Identifier: Apache-2.0\n"), path
