@@ -44,6 +44,7 @@ class Rti:
 
     def __init__(self, ocp: Ocp, settings: SolverSettings | None = None, *, compile: bool = True) -> None:
         model, N, N_u = ocp.model, ocp.N, ocp.N_u
+        transcription = simultaneous(ocp)
         self.ocp = ocp
         self.x: Array = np.zeros((N + 1, model.nx))
         self.u: Array = np.zeros((N_u, model.nu))
@@ -54,14 +55,13 @@ class Rti:
         self._weights = tuple(np.array(getattr(ocp, name)) for name in WEIGHTS)
         self._cost_at_guess: Array = np.zeros(1)
         self._checksum: Array = np.zeros(1)
-        self._x_next: Array = np.zeros(model.nx)
-        self._x_tail: Array = np.zeros(model.nx)
-        self._u_tail: Array = np.zeros(model.nu)
-        self._p_tail: Array = np.zeros(model.np_)
+        self._tail = (np.zeros(model.nx), np.zeros(model.nu), np.zeros(model.np_), np.zeros(model.nx))  # x, u, p of the last stage, and phi there
+        self._z: Array = np.zeros(transcription.A.shape[1])
+        self._plan = (np.zeros_like(self.x), np.zeros_like(self.u))
 
-        transcription = simultaneous(ocp)
-        self._places = transcription
         self._hessian_varies = transcription.hessian_varies
+        self._initial = transcription.initial
+        self._slacks = transcription.s
         make = compiled if compile else lambda function: function
         self.qp = qp = Qp(transcription)
         self._linearize = bind(
@@ -71,7 +71,8 @@ class Rti:
         )
         hessian = make(transcription.hessian) if transcription.hessian_varies else transcription.hessian
         self._write_hessian = bind(hessian, (self.x, self.p, *self._weights), (qp.P.data,))
-        self._step = bind(make(ocp.phi()), (self._x_tail, self._u_tail, self._p_tail), (self._x_next,))
+        self._take_step = bind(make(transcription.step), (self.x, self.u, self.u_prev, self._z, *self._weights), self._plan)
+        self._integrate_tail = bind(make(ocp.phi()), self._tail[:3], self._tail[3:])
         self._write_hessian()
         self._linearize()
         if not isfinite(self._checksum[0]):
@@ -85,45 +86,47 @@ class Rti:
         self.x[:] = x0
         self.solver.rebuild()
 
-    def prepare(self, y_ref: Array, p: Array | None = None, *, shift: bool = True) -> None:
+    def prepare(self, y_ref: Array, p: Array | None = None, *, shift: bool = True, u_prev: Array | None = None) -> None:
         """
         Shift the guess by one stage, linearize there and load the QP.
 
         Args:
             y_ref: Reference at nodes 1 to N, shape ``(N, ny)``.
             p: Stage parameters at nodes 0 to N, shape ``(N + 1, np)``; those of the last sample if none are given.
-            shift: Whether time goes on: the plan's first input becomes the previous one. Without, the same sample is iterated on.
+            shift: Whether time goes on. Without, the same sample is iterated on.
+            u_prev: Input that acts before the plan, shape ``(nu,)``, where it is not the first input of the last plan.
 
         Raises:
             ShapeError: A shape does not fit.
         """
         if y_ref.shape != self.y_ref.shape:
             raise ShapeError("y_ref", self.y_ref.shape, y_ref)
-        self.y_ref[:] = y_ref
         if p is not None:
             if p.shape != self.p.shape:
                 raise ShapeError("p", self.p.shape, p)
             self.p[:] = p
+        self.y_ref[:] = y_ref
         if shift:
-            self._shift()
+            self.shift()
+        if u_prev is not None:
+            self.u_prev[:] = u_prev
         self._linearize()
-        if isfinite(self._checksum[0]):
+        if isfinite(self._checksum[0]):  # or OSQP would not recover from it
             if self._hessian_varies:
                 self._write_hessian()
                 self.solver.load_hessian()
             self.solver.load()
 
-    def _shift(self) -> None:
-        """Move the guess on by one stage; the last one is repeated, with the state the model predicts."""
+    def shift(self) -> None:
+        """Move the guess on by one stage: its first input becomes the previous one, its last is repeated, with the state the model predicts."""
         x, u = self.x, self.u
+        x_tail, u_tail, p_tail, x_next = self._tail
         self.u_prev[:] = u[0]
         x[:-1] = x[1:]
         u[:-1] = u[1:]
-        self._x_tail[:] = x[-1]
-        self._u_tail[:] = u[-1]
-        self._p_tail[:] = self.p[-1]
-        self._step()
-        x[-1] = self._x_next
+        x_tail[:], u_tail[:], p_tail[:] = x[-1], u[-1], self.p[-1]
+        self._integrate_tail()
+        x[-1] = x_next
 
     def feedback(self, x0: Array) -> QpStatus:
         """
@@ -133,22 +136,29 @@ class Rti:
         solve starts cold: a failure never seeds what follows.
 
         Args:
-            x0: State at node 0, shape ``(nx,)``, finite; angles continue those of the last sample.
+            x0: State at node 0, shape ``(nx,)``; angles continue those of the last sample.
         """
-        qp, at = self.qp, self._places
         deviation = x0 - self.x[0]
         if not isfinite(deviation.sum() + self._checksum[0]):
             self.status = QpStatus.FAILED
             return self.status
-        qp.l[at.initial] = deviation
-        qp.u[at.initial] = deviation
+        self.qp.l[self._initial] = deviation
+        self.qp.u[self._initial] = deviation
         self.status = self.solver.solve()
         if self.status.usable:
-            z = self.solver.z
-            self.x += z[at.dx].reshape(self.x.shape)
-            self.u += z[at.du].reshape(self.u.shape)
-            # OSQP's iterate meets the bounds to its tolerance, an actuator wants them exactly.
-            np.clip(self.u, self.ocp.lbu, self.ocp.ubu, out=self.u)
+            self._z[:] = self.solver.z
+            self._take_step()
+            self.x[:], self.u[:] = self._plan
         else:
             self.solver.rebuild()
         return self.status
+
+    @property
+    def cost(self) -> float:
+        """The cost of the plan, as the QP sees it: quadratic around the last guess."""
+        return float(self._cost_at_guess[0]) + 2.0 * self.solver.objective
+
+    @property
+    def violation(self) -> float:
+        """Largest slack of the plan, in the unit of its state."""
+        return float(self._z[self._slacks].max(initial=0.0))

@@ -53,9 +53,8 @@ class Transcription:
             at the guess, and a number that is finite if and only if all the others are.
         hessian: ``(x, p, *WEIGHTS) -> P_data``.
         hessian_varies: Whether `hessian` depends on more than the weights.
+        step: ``(x, u, u_prev, z, *WEIGHTS) -> (x+, u+)``, the full step.
         initial: Rows of the initial state.
-        dx: Entries of the state deviations in z.
-        du: Entries of the input deviations in z.
         s: Entries of the slacks in z.
     """
 
@@ -64,9 +63,8 @@ class Transcription:
     data: ca.Function
     hessian: ca.Function
     hessian_varies: bool
+    step: ca.Function
     initial: slice
-    dx: slice
-    du: slice
     s: slice
 
 
@@ -252,11 +250,34 @@ def simultaneous(ocp: Ocp) -> Transcription:
         ),
         hessian=ca.Function("hessian", [x, p, *w.values()], [ca.densify(P_data)]),
         hessian_varies=hessian_varies,
+        step=full_step(ocp, n, to_dx, to_du),
         initial=slice(0, nx),
-        dx=slice(to_dx, to_du),
-        du=slice(to_du, to_s),
         s=slice(to_s, n),
     )
+
+
+def full_step(ocp: Ocp, n: int, to_dx: int, to_du: int) -> ca.Function:
+    """
+    Build ``(x, u, u_prev, z, *WEIGHTS) -> (x + dx, u + du)``.
+
+    A solver's iterate meets the bounds to its tolerance; a robot wants them
+    exactly. So the inputs are clipped on the way, increments first: from an
+    input inside its bounds, that leaves both satisfied.
+    """
+    x = ca.SX.sym("x", ocp.model.nx, ocp.N + 1)
+    u = ca.SX.sym("u", ocp.model.nu, ocp.N_u)
+    u_prev = ca.SX.sym("u_prev", ocp.model.nu)
+    z = ca.SX.sym("z", n)
+    w = {name: ca.SX.sym(name, *np.shape(getattr(ocp, name))) for name in WEIGHTS}
+    dx = ca.reshape(z[to_dx : to_dx + x.numel()], x.shape)
+    du = ca.reshape(z[to_du : to_du + u.numel()], u.shape)
+    rows = []
+    last = u_prev
+    for k in range(ocp.N_u):
+        last = ca.fmax(ca.fmin(u[:, k] + du[:, k], last + w["ubdu"]), last + w["lbdu"])
+        last = ca.fmax(ca.fmin(last, w["ubu"]), w["lbu"])
+        rows.append(last)
+    return ca.Function("step", [x, u, u_prev, z, *w.values()], [x + dx, ca.horzcat(*rows)])
 
 
 def finite(*bounds: np.ndarray[Any, Any]) -> list[int]:

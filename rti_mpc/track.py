@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A reference, laid on the controller's stages.
+
+Angles are unwrapped along time, as a whole put nearest to where the robot is,
+and only then interpolated: a reference that crosses pi changes nothing. Past its
+last row a reference is held, never extrapolated; before its first, likewise.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.message import End, Reference
+from rti_mpc.model import Model
+
+TWO_PI = 2.0 * np.pi
+
+
+class Track:
+    """
+    The reference being followed.
+
+    Attributes:
+        y_ref: Reference at nodes 1 to N of the last `look_up`, shape ``(N, ny)``.
+        p: Stage parameters at nodes 0 to N of the last `look_up`, shape ``(N + 1, np)``.
+    """
+
+    def __init__(self, model: Model, N: int, dt_ns: int) -> None:
+        self.y_ref: Array = np.zeros((N, model.ny))
+        self.p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
+        self._nominal = self.p.copy()
+        self._angles = [j for j, signal in enumerate(model.outputs) if signal.angle]
+        self._output = ca.Function("h", [model.x, model.p], [model.y_expr])
+        self._nodes_ns = np.arange(N + 1) * dt_ns
+        self._reference: Reference | None = None
+        self._rows: Array = np.zeros((1, model.ny + model.np_))
+
+    def load(self, reference: Reference, x: Array, stamp_ns: int) -> None:
+        """
+        Follow a reference from now on.
+
+        Args:
+            reference: Checked: of the model's `ny`, and of its `np` or none.
+            x: State, shape ``(nx,)``, whose outputs the angles are put nearest to.
+            stamp_ns: Time of that state.
+        """
+        self._reference = reference
+        y = np.array(reference.y)
+        now = min(max(0, round((stamp_ns - reference.stamp_ns) / reference.period_ns)), len(y) - 1)
+        outputs = np.array(self._output(x, self._nominal[0])).ravel()
+        for j in self._angles:
+            y[:, j] = np.unwrap(y[:, j])
+            y[:, j] += TWO_PI * np.round((outputs[j] - y[now, j]) / TWO_PI)
+        p = reference.p if reference.p.shape[1] else np.broadcast_to(self._nominal[0], (len(y), self._nominal.shape[1]))
+        self._rows = np.hstack([y, p])
+
+    def clear(self) -> None:
+        """Follow nothing."""
+        self._reference = None
+
+    @property
+    def loaded(self) -> bool:
+        """Whether there is a reference to follow."""
+        return self._reference is not None
+
+    def ended(self, t_ns: int) -> End | None:
+        """Return what to do after the end, if the reference is over by then."""
+        reference = self._reference
+        if reference is None or t_ns <= reference.stamp_ns + (len(reference.y) - 1) * reference.period_ns:
+            return None
+        return reference.end
+
+    def look_up(self, t_ns: int) -> None:
+        """Write the reference from `t_ns` on, node 0 included for `p`, into `y_ref` and `p`."""
+        assert self._reference is not None
+        rows = self._rows
+        at = np.clip((self._nodes_ns + (t_ns - self._reference.stamp_ns)) / self._reference.period_ns, 0, len(rows) - 1)
+        below = np.minimum(at.astype(np.intp), max(len(rows) - 2, 0))
+        fraction = (at - below)[:, np.newaxis]
+        values = rows[below] + fraction * (rows[np.minimum(below + 1, len(rows) - 1)] - rows[below])
+        self.y_ref[:] = values[1:, : self.y_ref.shape[1]]
+        self.p[:] = values[:, self.y_ref.shape[1] :]
