@@ -64,7 +64,7 @@ def main(path: Path) -> int:
     """Check a configuration, print what was found, and return the exit status: 0 if every sample was usable and both solvers agree."""
     config = load(path)
     console = Console()
-    report = check(config, track(range(SAMPLES), "solving", console=console, transient=True))
+    report = check(config, track(range(SAMPLES), "solving", console=console, transient=True, disable=not console.is_terminal))
     table = Table("phase, us", "p50", "p99", "max")
     for phase, times in (("preparation", report.prepare_us), ("feedback", report.feedback_us)):
         table.add_row(phase, *(f"{np.percentile(times, share):.0f}" for share in (50, 99, 100)))
@@ -74,9 +74,8 @@ def main(path: Path) -> int:
     console.print(table)
     console.print(f"{SAMPLES} samples: " + ", ".join(f"{count} {status.name}" for status, count in sorted(report.statuses.items())))
     verdict = "agree" if report.agree else "DISAGREE"
-    console.print(
-        f"osqp and {SECOND} {verdict}: on {report.opinions} QPs their solutions differ by at most {report.difference:.1e}, {TOLERANCE:.0e} allowed"
-    )
+    difference = f"their solutions differ by at most {report.difference:.1e}, {TOLERANCE} allowed"
+    console.print(f"osqp and {SECOND} {verdict}: on {report.opinions} QPs {difference}", soft_wrap=True)
     return 0 if report.agree and all(status.usable for status in report.statuses) else 1
 
 

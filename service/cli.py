@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 HERE = Path(__file__).parent
 SHIPPED = (HERE / "deploy" if (HERE / "deploy").is_dir() else HERE.parent / "deploy") / "pioneer_3dx.toml"  # in the wheel, in a clone
+EXTRAS = {"rerun": "view", "rerun_cli": "view", "matplotlib": "figure"}  # what a robot's own installation leaves out
 
 app = typer.Typer(
     help="Real-time nonlinear model predictive control as a service, over Zenoh.",
@@ -181,5 +182,10 @@ def main() -> None:
     try:
         app()
     except RtiMpcError as error:
-        print(f"rti-mpc: {error}", file=sys.stderr)
-        sys.exit(2)
+        refusal = str(error)
+    except ModuleNotFoundError as error:
+        if error.name not in EXTRAS:
+            raise
+        refusal = f"{error.name} must be installed for this command: pip install 'rti-mpc[{EXTRAS[error.name]}]'"
+    print(f"rti-mpc: {refusal}", file=sys.stderr)
+    sys.exit(2)

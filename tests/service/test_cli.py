@@ -17,11 +17,10 @@ ZENOH = ("--mode", "--connect", "--listen", "--config", "--cfg", "--no-multicast
 COMMANDS = sorted(typer.main.get_group(app).commands)
 
 
-def rti_mpc(*arguments: str) -> subprocess.CompletedProcess[str]:
+def rti_mpc(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run the command line as a process, as a shell would."""
-    environment = {**os.environ, "COLUMNS": "200"}
     command = [sys.executable, "-c", "from service.cli import main; main()", *arguments]
-    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60)
+    return subprocess.run(command, cwd=ROOT, env={**os.environ, "COLUMNS": "200", **environment}, capture_output=True, text=True, timeout=60)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -70,3 +69,10 @@ def test_check_of_the_shipped_configuration_prints_both_phases_and_the_verdict()
     assert done.returncode == 0, done.stderr
     for words in ("preparation", "feedback", "200 samples: ", "osqp and daqp agree"):
         assert words in done.stdout
+
+
+def test_missing_viewer_is_one_line_that_says_what_to_install(tmp_path: Path) -> None:
+    (tmp_path / "rerun.py").write_text("raise ModuleNotFoundError(name='rerun')")
+    done = rti_mpc("view", PYTHONPATH=str(tmp_path))
+    assert done.returncode == 2
+    assert done.stderr == "rti-mpc: rerun must be installed for this command: pip install 'rti-mpc[view]'\n"
