@@ -153,6 +153,14 @@ class Publisher(Generic[M]):
     def __init__(self, publisher: zenoh.Publisher | ext.AdvancedPublisher) -> None:
         self._publisher = publisher
 
+    @property
+    def heard(self) -> bool:
+        """Whether anybody listens now; of a cached publisher always true, since its last message waits for them."""
+        if not isinstance(self._publisher, zenoh.Publisher):
+            return True
+        status: Any = self._publisher.matching_status  # an object, always true, whatever its type hint says
+        return bool(status.matching)
+
     def put(self, message: M) -> None:
         """Send a message to whoever listens now, and to late joiners if the publisher is cached."""
         self.put_bytes(encode(message))
@@ -329,10 +337,17 @@ class Bus:
         self._declared.append(token)
         return token
 
-    def is_alive(self, role: str, timeout_s: float = 1.0) -> bool:
-        """Whether anybody shows presence in a role, ourselves included."""
-        replies = self._session.liveliness().get(self.keys.alive(role), timeout=timeout_s)
-        return any(reply.ok is not None for reply in replies)
+    def is_alive(self, role: str, timeout_s: float = 0.5) -> bool:
+        """Whether anybody shows presence in a role, ourselves included; just started, it may take a moment to meet the others."""
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            left_s = deadline_s - time.monotonic()
+            replies = self._session.liveliness().get(self.keys.alive(role), timeout=max(left_s, 0.01))
+            if any(reply.ok is not None for reply in replies):
+                return True
+            if left_s <= 0.0:
+                return False
+            time.sleep(min(RETRY_S, left_s))
 
     def watch_alive(self, callback: Callable[[str, bool], None]) -> None:
         """Call back, in a thread of its own, with a role and whether it is present, for those present now and at every change."""

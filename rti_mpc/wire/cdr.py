@@ -15,7 +15,6 @@ allocated from a declared length before as many bytes are there.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import isfinite
 from struct import Struct
 from typing import Any, TypeVar
 
@@ -135,9 +134,9 @@ def _rows(flat: Array, width: int, name: str) -> Array:
 
 
 def _finite(array: Array, name: str) -> Array:
-    flat = array.reshape(-1)
-    if not isfinite(flat.dot(flat)) and not np.isfinite(flat).all():  # the square may overflow where the numbers do not
-        raise Refused("not_finite", f"{name} must be finite, got {flat[~np.isfinite(flat)][0]} among {flat.size} numbers")
+    finite = np.isfinite(array)
+    if not finite.all():
+        raise Refused("not_finite", f"{name} must be finite, got {array[~finite][0]} among {array.size} numbers")
     return array
 
 

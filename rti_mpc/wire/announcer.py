@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Events of a process of this package, each kind at most once a second."""
+
+from __future__ import annotations
+
+import time
+
+from rti_mpc.message import Event, Severity
+from rti_mpc.wire.bus import Bus
+
+PERIOD_NS = 1_000_000_000  # monotonic, between two events of one code
+
+
+class Announcer:
+    """Publishes events of one role."""
+
+    def __init__(self, bus: Bus, role: str, epoch: int) -> None:
+        self._publisher = bus.publisher(bus.keys.event(role), Event, cached=True)
+        self._role = role
+        self._epoch = epoch
+        self._seq = 0
+        self._last_ns: dict[str, int] = {}  # by code
+
+    def say(self, severity: Severity, code: str, text: str, stamp_ns: int) -> None:
+        """Publish an event, unless one of its code just was."""
+        now_ns = time.monotonic_ns()
+        if now_ns - self._last_ns.get(code, -PERIOD_NS) >= PERIOD_NS:
+            self._last_ns[code] = now_ns
+            self._seq += 1
+            self._publisher.put(Event(self._epoch, self._seq, stamp_ns, self._role, severity, code, text))

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The other process of the bus tests: ``python peer.py WHAT ENDPOINT [listen]``; runs until it is killed or its work is done."""
+
+from __future__ import annotations
+
+import sys
+import threading
+
+import numpy as np
+
+from rti_mpc.message import Command, End, Event, Reference, Severity, State
+from rti_mpc.status import Mode, QpStatus
+from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.keys import Keys
+
+KEYS = Keys(robot="test")
+FAST = ("transport/link/tx/lease:600",)  # ms: hangs are noticed soon
+
+
+def echo(bus: Bus) -> None:
+    """Answer every state with a command of its number; thousand telemetry events a second with ten states in ten milliseconds."""
+    states = bus.subscriber(KEYS.state)
+    commands = bus.publisher(KEYS.command, Command, realtime=True)
+    telemetry = bus.publisher(KEYS.telemetry, Event)
+    bus.alive("controller")
+    while (received := states.recv()) is not None:
+        state = decode(State, received.payload)
+        commands.put(Command(1, state.seq, 0, 1, state.seq, 0, 1, 0, Mode.TRACKING, QpStatus.SOLVED, 1, np.ones((7, 2))))
+        for seq in range(10):
+            telemetry.put(Event(1, seq, 0, "controller", Severity.INFO, "load", 6000 * "x"))
+
+
+def watch(bus: Bus) -> None:
+    """Read telemetry, like a viewer."""
+    telemetry = bus.subscriber(KEYS.telemetry)
+    bus.alive("viewer")
+    while telemetry.recv() is not None:
+        pass
+
+
+def plan(bus: Bus) -> None:
+    """Publish one reference and stay."""
+    reference = Reference(1, 1, 0, 10**8, End.HOLD, np.arange(6.0).reshape(2, 3), np.zeros((2, 0)))
+    bus.publisher(KEYS.reference, Reference, cached=True).put(reference)
+    threading.Event().wait()
+
+
+def farewell(bus: Bus) -> None:
+    """Send a last message and leave."""
+    bus.publisher(KEYS.state, State, realtime=True).put(State(1, 1, 0, np.zeros(5)))
+    bus.close()
+
+
+def careless(bus: Bus) -> None:
+    """Leave with everything open and threads waiting."""
+    threading.Thread(target=bus.subscriber(KEYS.state).recv, daemon=True).start()
+    bus.subscriber(KEYS.events, cached=True)
+    bus.publisher(KEYS.event("x"), Event, cached=True)
+    bus.serve(KEYS.request, lambda request: request)
+    bus.watch_alive(lambda role, present: None)
+
+
+if __name__ == "__main__":
+    what, endpoint, *listen = sys.argv[1:]
+    settings = BusSettings(listen=(endpoint,) if listen else (), connect=(endpoint,), cfg=FAST)
+    globals()[what](Bus(settings, KEYS))

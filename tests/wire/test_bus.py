@@ -1,0 +1,380 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import pytest
+import zenoh
+
+from rti_mpc.message import Command, End, Event, Reference, Severity, State
+from rti_mpc.wire.bus import Bus, BusSettings, Received, Subscriber
+from rti_mpc.wire.cdr import decode, encoding
+from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.keys import Keys
+
+ROOT = Path(__file__).parents[2]
+KEYS = Keys(robot="test")
+FAST = ("transport/link/tx/lease:600",)  # ms, as in peer.py
+STATE = State(1, 1, 0, np.arange(5.0))
+EVENT = Event(1, 1, 0, "robot", Severity.INFO, "code", "text")
+REFERENCE = Reference(1, 1, 0, 10**8, End.HOLD, np.arange(6.0).reshape(2, 3), np.zeros((2, 0)))
+TIMEOUT_S = 10.0
+T = TypeVar("T")
+
+
+def eventually(look: Callable[[], T | None], timeout_s: float = TIMEOUT_S) -> T:
+    """First value that is neither None nor False."""
+    deadline_s = time.monotonic() + timeout_s
+    while time.monotonic() < deadline_s:
+        if (value := look()) is not None and value is not False:
+            return value
+        time.sleep(0.002)
+    raise AssertionError(f"nothing happened within {timeout_s} s")
+
+
+def received(subscriber: Subscriber) -> Received:
+    return eventually(subscriber.try_recv)
+
+
+def stranger(endpoint: str) -> zenoh.Session:
+    """Session of a program that is not ours."""
+    config = zenoh.Config()
+    for name, value in {"mode": '"client"', "connect/endpoints": f'["{endpoint}"]', "scouting/multicast/enabled": "false"}.items():
+        config.insert_json5(name, value)
+    return zenoh.open(config)
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def join(endpoint: str) -> Iterator[Callable[..., Bus]]:
+    """Joins the bus, as the robot that listens or as anybody else."""
+    with ExitStack() as stack:
+
+        def join(*, robot: bool = False, **settings: Any) -> Bus:
+            settings = {"listen": (endpoint,) if robot else (), "connect": (endpoint,), "cfg": FAST, **settings}
+            return stack.enter_context(Bus(BusSettings(**settings), KEYS))
+
+        yield join
+
+
+@pytest.fixture
+def start(endpoint: str) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+    """Starts another process, see `peer.py`."""
+    with ExitStack() as stack:
+
+        def start(what: str, *args: str) -> subprocess.Popen[bytes]:
+            command = [sys.executable, str(Path(__file__).with_name("peer.py")), what, endpoint, *args]
+            process = stack.enter_context(subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(ROOT)}))
+            stack.callback(process.kill)
+            return process
+
+        yield start
+
+
+def echoed(bus: Bus, seq: int) -> bool:
+    """Whether a state is answered by the command of its number."""
+    states, commands = bus.publisher(KEYS.state, State, realtime=True), bus.subscriber(KEYS.command)
+
+    def answered() -> bool:
+        states.put(State(1, seq, 0, np.ones(5)))
+        answer = commands.try_recv()
+        return answer is not None and decode(Command, answer.payload).state_seq == seq
+
+    return eventually(answered)
+
+
+def test_processes_exchange_messages_when_the_robot_starts_first(join: Any, start: Any) -> None:
+    robot = join(robot=True)
+    start("echo")
+    assert echoed(robot, 7)
+
+
+def test_processes_exchange_messages_when_the_robot_starts_last_and_restarts(join: Any, start: Any) -> None:
+    start("echo")
+    time.sleep(0.5)  # long enough to have tried in vain
+    with join(robot=True) as robot:
+        assert echoed(robot, 1)
+    with join(robot=True) as robot:
+        assert echoed(robot, 2)
+
+
+def test_those_who_met_through_the_robot_stay_linked_without_it(join: Any) -> None:
+    controller, viewer = join(), join()
+    commands, seen = controller.publisher(KEYS.command, Event), viewer.subscriber(KEYS.command)
+
+    def passes() -> bool:
+        commands.put(EVENT)
+        return seen.try_recv() is not None
+
+    assert not passes()
+    with join(robot=True):
+        assert eventually(passes)
+    seen.drain()
+    assert eventually(passes)
+    controller.close()
+    with join(robot=True):
+        commands = join().publisher(KEYS.command, Event)
+        assert eventually(passes)
+
+
+def test_a_cached_reference_reaches_a_late_joiner_in_another_process(join: Any, start: Any) -> None:
+    start("plan")
+    robot = join(robot=True)
+    assert decode(Reference, received(robot.subscriber(KEYS.reference, cached=True)).payload).y[1, 2] == 5.0
+    late = join()
+    sample = received(late.subscriber(KEYS.reference, cached=True))
+    assert np.array_equal(decode(Reference, sample.payload).y, REFERENCE.y)
+    assert sample.encoding == encoding(Reference)
+
+
+def test_a_cached_message_put_before_anybody_was_there_arrives_once(join: Any) -> None:
+    planner, controller = join(), join()
+    references = controller.subscriber(KEYS.reference, capacity=8, cached=True)
+    planner.publisher(KEYS.reference, Reference, cached=True).put(REFERENCE)
+    join(robot=True)
+    received(references)
+    late = join().subscriber(KEYS.reference, capacity=8, cached=True)
+    received(late)
+    assert references.drain() == late.drain() == []
+
+
+def test_late_joiners_get_the_last_event_and_info_of_every_role(join: Any) -> None:
+    robot, other = join(robot=True), join()
+    for role, bus in {"robot": robot, "reference": other}.items():
+        events = bus.publisher(KEYS.event(role), Event, cached=True)
+        events.put(EVENT)
+        events.put(Event(1, 2, 0, role, Severity.INFO, "last", ""))
+        bus.publish_json(KEYS.info(role), {"role": role})
+        bus.publish_json(KEYS.info(role), {"role": role, "dt_s": 0.1})
+    late = join()
+    events, infos = late.subscriber(KEYS.events, capacity=8, cached=True), late.subscriber(KEYS.infos, capacity=8, cached=True)
+    got = [received(events), received(events)]
+    assert {decode(Event, sample.payload).source for sample in got} == {"robot", "reference"}
+    assert {decode(Event, sample.payload).code for sample in got} == {"last"}
+    assert {received(infos).payload, received(infos).payload} == {b'{"role": "%s", "dt_s": 0.1}' % role for role in (b"robot", b"reference")}
+
+
+def test_own_messages_do_not_come_back(join: Any) -> None:
+    robot, other = join(robot=True), join()
+    own = [robot.subscriber(KEYS.state), robot.subscriber(KEYS.events, cached=True)]
+    seen = other.subscriber(KEYS.events, cached=True)
+    robot.publisher(KEYS.state, State, realtime=True).put(STATE)
+    robot.publisher(KEYS.event("robot"), Event, cached=True).put(EVENT)
+    own.append(robot.subscriber(KEYS.events, cached=True))
+    received(seen)
+    assert [subscriber.try_recv() for subscriber in own] == [None, None, None]
+
+
+def test_a_ring_keeps_the_newest(join: Any) -> None:
+    robot, other = join(robot=True), join()
+    one, three, end = robot.subscriber(KEYS.state), robot.subscriber(KEYS.state, capacity=3), robot.subscriber(KEYS.command)
+    states = other.publisher(KEYS.state, State, realtime=True)
+    ends = other.publisher(KEYS.command, Event, realtime=True)
+    eventually(lambda: states.heard and ends.heard)
+    for seq in range(10):
+        states.put(State(1, seq, 0, np.zeros(1)))
+    ends.put(EVENT)
+    received(end)
+    assert [decode(State, sample.payload).seq for sample in one.drain()] == [9]
+    assert [decode(State, sample.payload).seq for sample in three.drain()] == [7, 8, 9]
+
+
+def test_an_unread_subscriber_stops_nobody_and_put_never_waits(join: Any) -> None:
+    robot, other = join(robot=True), join()
+    unread, commands = robot.subscriber(KEYS.telemetry), robot.subscriber(KEYS.command)
+    flood, marks = other.publisher(KEYS.telemetry, Event), other.publisher(KEYS.command, Event, realtime=True)
+    eventually(lambda: flood.heard and marks.heard)
+    load = Event(1, 1, 0, "controller", Severity.INFO, "load", 2000 * "x")
+    worst_s = 0.0
+    for _ in range(3000):
+        before_s = time.monotonic()
+        flood.put(load)
+        worst_s = max(worst_s, time.monotonic() - before_s)
+    marks.put(EVENT)
+    received(commands)
+    received(unread)
+    assert worst_s < 1.0
+
+
+def test_a_hung_viewer_does_not_cut_the_robot_from_the_controller(join: Any, start: Any) -> None:
+    robot = join(robot=True)
+    changes: list[tuple[str, bool]] = []
+    robot.watch_alive(lambda role, present: changes.append((role, present)))
+    viewers = [start("watch") for _ in range(2)]
+    eventually(lambda: changes.count(("viewer", True)) >= 1)
+    start("echo")
+    assert echoed(robot, 1)
+    for viewer in viewers:
+        viewer.send_signal(signal.SIGSTOP)
+    states, commands = robot.publisher(KEYS.state, State, realtime=True), robot.subscriber(KEYS.command)
+    until_s, heard_s, gap_s = time.monotonic() + 3.0, time.monotonic(), 0.0  # five leases
+    while time.monotonic() < until_s:
+        states.put(STATE)
+        time.sleep(0.01)  # the pace of the robot
+        now_s = time.monotonic()
+        gap_s = max(gap_s, now_s - heard_s)
+        heard_s = now_s if commands.try_recv() is not None else heard_s
+    assert ("viewer", False) in changes
+    assert ("controller", False) not in changes
+    assert gap_s < 0.6
+
+
+def test_close_unblocks_whoever_waits(join: Any) -> None:
+    bus = join(robot=True)
+    subscribers = [bus.subscriber(KEYS.state), bus.subscriber(KEYS.events, cached=True)]
+    results: list[Received | None] = []
+    threads = [threading.Thread(target=lambda s=subscriber: results.append(s.recv())) for subscriber in subscribers]
+    for thread in threads:
+        thread.start()
+    bus.close()
+    for thread in threads:
+        thread.join(TIMEOUT_S)
+    assert results == [None, None]
+    assert subscribers[0].try_recv() is None
+    assert subscribers[0].recv() is None
+
+
+def test_close_is_bounded_while_a_peer_hangs(join: Any, start: Any) -> None:
+    bus = join(robot=True)
+    viewer = start("watch")
+    eventually(lambda: bus.is_alive("viewer"))
+    viewer.send_signal(signal.SIGSTOP)
+    flood = bus.publisher(KEYS.telemetry, Event)
+    for _ in range(2000):
+        flood.put(Event(1, 1, 0, "controller", Severity.INFO, "load", 6000 * "x"))
+    before_s = time.monotonic()
+    bus.close()
+    assert time.monotonic() - before_s < 1.0
+
+
+def test_after_close_put_does_nothing(join: Any) -> None:
+    bus = join(robot=True)
+    publishers = [bus.publisher(KEYS.state, State, realtime=True), bus.publisher(KEYS.reference, Reference, cached=True)]
+    bus.close()
+    bus.close()
+    publishers[0].put(STATE)
+    publishers[1].put(REFERENCE)
+
+
+def test_the_last_message_before_close_arrives(join: Any, start: Any) -> None:
+    states = join(robot=True).subscriber(KEYS.state)
+    assert start("farewell").wait(TIMEOUT_S) == 0
+    assert decode(State, received(states).payload).seq == 1
+
+
+def test_a_process_that_forgets_to_close_exits(start: Any) -> None:
+    assert start("careless").wait(TIMEOUT_S) == 0
+
+
+def test_large_references_pass(join: Any) -> None:
+    robot, other = join(robot=True), join()
+    references = robot.subscriber(KEYS.reference, cached=True)
+    large = Reference(1, 1, 0, 10**7, End.STOP, np.random.default_rng(1).normal(size=(100_000, 3)), np.zeros((100_000, 0)))
+    other.publisher(KEYS.reference, Reference, cached=True).put(large)
+    assert np.array_equal(decode(Reference, received(references).payload).y, large.y)
+
+
+def test_whatever_peers_send_is_counted_and_the_next_message_passes(join: Any, endpoint: str) -> None:
+    robot = join(robot=True)
+    states, intake = robot.subscriber(KEYS.state, capacity=16), Intake(State, stale_s=1.0, widths={"x": 5})
+    with stranger(endpoint) as session, session.declare_publisher(KEYS.state) as publisher:
+        eventually(lambda: publisher.matching_status.matching)
+        publisher.put(b"\x01\x02\x03")
+        publisher.put(b"\x01\x02\x03", encoding=encoding(State))
+        publisher.put(b"", encoding=encoding(State), attachment=b"\x00")
+        publisher.put(b"\x00\x00\x00\x00", encoding=encoding(State))
+        publisher.put(np.random.default_rng(5).bytes(10**6), encoding=encoding(State).replace("@1", "@2"))
+        publisher.delete()
+        samples = [received(states) for _ in range(6)]
+        assert [intake.accept(sample, n) for n, sample in enumerate(samples)] == [None] * 6
+    assert intake.refused == {"encoding": 2, "truncated": 1, "empty": 1, "big_endian": 1, "version": 1}
+    ours = join().publisher(KEYS.state, State, realtime=True)
+    eventually(lambda: ours.heard)
+    ours.put(STATE)
+    assert intake.accept(received(states), 7) is not None
+
+
+def test_a_second_publisher_on_a_key_takes_nothing_over(join: Any) -> None:
+    robot, first, second = join(robot=True), join(), join()
+    states, intake = robot.subscriber(KEYS.state, capacity=64), Intake(State, stale_s=10.0)
+    ours, theirs = first.publisher(KEYS.state, State, realtime=True), second.publisher(KEYS.state, State, realtime=True)
+    eventually(lambda: ours.heard and theirs.heard)
+    ours.put(State(9, 0, 0, np.zeros(5)))
+    assert intake.accept(received(states), 0) is not None
+    for seq in range(1, 11):
+        ours.put(State(9, seq, 0, np.zeros(5)))
+        theirs.put(State(8, 100 + seq, 0, np.ones(5)))
+    samples = [received(states) for _ in range(20)]
+    accepted = [message for sample in samples if (message := intake.accept(sample, 1)) is not None]
+    assert [(message.epoch, message.seq) for message in accepted] == [(9, seq) for seq in range(1, 11)]
+    assert [notice.code for notice in intake.notices(1)] == ["source_refused"]
+
+
+def test_requests_are_answered_and_faults_of_handlers_reported(join: Any) -> None:
+    robot, operator = join(robot=True), join()
+
+    def handle(request: dict[str, Any]) -> dict[str, Any]:
+        return {"ok": True, "did": request["do"]} if request["do"] != "burn" else {"ok": True, "fire": object()}
+
+    robot.serve(KEYS.request, handle)
+    assert operator.request(KEYS.request, {"do": "stop"}, TIMEOUT_S) == {"ok": True, "did": "stop"}
+    assert operator.request(KEYS.request, {}, TIMEOUT_S) == {"ok": False, "error": "'do'"}
+    assert operator.request(KEYS.request, {"do": "burn"}, TIMEOUT_S)["ok"] is False
+    assert operator.request(KEYS.request, {"do": "stop"}, TIMEOUT_S)["ok"] is True
+
+
+@pytest.mark.parametrize("payload", [b"", b"{", b"[]", b"1", b"\xff", 100_000 * b"["])
+def test_requests_that_are_not_json_objects_are_answered(join: Any, endpoint: str, payload: bytes) -> None:
+    robot = join(robot=True)
+    robot.serve(KEYS.request, lambda request: {"ok": True})
+    with stranger(endpoint) as session:
+        (reply,) = session.get(KEYS.request, payload=payload, timeout=TIMEOUT_S)
+        assert reply.ok.payload.to_string() == '{"ok": false, "error": "message must be a JSON object"}'
+
+
+def test_of_several_answers_a_refusal_counts(join: Any) -> None:
+    robot, other, operator = join(robot=True), join(), join()
+    robot.serve(KEYS.request, lambda request: {"ok": True})
+    other.serve(KEYS.request, lambda request: {"ok": False, "error": "no"})
+    eventually(lambda: operator.request(KEYS.request, {}, TIMEOUT_S) == {"ok": False, "error": "no"})
+
+
+def test_a_request_waits_for_its_server_and_gives_up_in_time(join: Any) -> None:
+    robot, operator = join(robot=True), join()
+    before_s = time.monotonic()
+    with pytest.raises(TimeoutError, match="test/request must be served"):
+        operator.request(KEYS.request, {}, 0.3)
+    assert time.monotonic() - before_s < 1.0
+    threading.Timer(0.2, robot.serve, (KEYS.request, lambda request: {"ok": True})).start()
+    assert operator.request(KEYS.request, {}, TIMEOUT_S) == {"ok": True}
+
+
+def test_presence_is_seen_and_a_killed_process_is_missed(join: Any, start: Any) -> None:
+    robot = join(robot=True)
+    changes: list[tuple[str, bool]] = []
+    robot.watch_alive(lambda role, present: changes.append((role, present)))
+    assert not robot.is_alive("controller")
+    controller = start("echo")
+    eventually(lambda: ("controller", True) in changes)
+    assert robot.is_alive("controller")
+    assert join().is_alive("controller")
+    controller.kill()
+    eventually(lambda: ("controller", False) in changes)
+    assert not robot.is_alive("controller")

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import struct
+import subprocess
+import sys
+import tracemalloc
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from rti_mpc.errors import MessageError
+from rti_mpc.message import STAMP_ON_ARRIVAL, Command, End, Event, Reference, Severity, State, Telemetry
+from rti_mpc.status import Mode, QpStatus
+from rti_mpc.wire.cdr import PACKAGE, REASONS, Message, Refused, decode, encode, encoding, schema
+
+ROOT = Path(__file__).parents[2]
+RNG = np.random.default_rng(1)
+HUGE = 2**64 - 1
+
+STATE = State(HUGE, 7, -5, RNG.normal(size=5))
+REFERENCE = Reference(1, 2, STAMP_ON_ARRIVAL, 10**8, End.STOP, RNG.normal(size=(4, 3)), RNG.normal(size=(4, 2)))
+COMMAND = Command(1, 2, 3, HUGE, 5, -6, 2**63 - 1, HUGE, Mode.TRACKING, QpStatus.MAX_ITER, 10**8, RNG.normal(size=(7, 2)))
+NUMBERS = {"res_prim": 1e-3, "res_dual": np.nan, "cost": np.inf, "violation": 0.0}
+TIMES = {"prepare_us": 1.5, "feedback_us": 2.5, "latency_us": 3.5, "state_age_s": 0.1, "slack_s": -0.5}
+COUNTS = {"skipped": 8, "fallbacks": 9, "parameter_version": 10}
+ARRAYS = {"x0": RNG.normal(size=5), "x": RNG.normal(size=(8, 5)), "u": RNG.normal(size=(7, 2)), "y_ref": RNG.normal(size=(7, 3))}
+TELEMETRY = Telemetry(1, 2, 3, 4, 5, Mode.FALLBACK, QpStatus.INFEASIBLE, 6, **NUMBERS, **TIMES, **COUNTS, **ARRAYS)
+EVENT = Event(1, 2, 3, "robot", Severity.ERROR, "command_expired", "Räder stehen")
+
+MESSAGES: list[Message] = [
+    STATE,
+    replace(STATE, x=np.zeros(1)),
+    REFERENCE,
+    replace(REFERENCE, p=np.zeros((4, 0))),
+    replace(REFERENCE, y=np.zeros((1, 1)), p=np.zeros((1, 1)), end=End.HOLD),
+    COMMAND,
+    replace(COMMAND, u=np.zeros((1, 1)), mode=Mode.STOPPED, status=QpStatus.NONE),
+    TELEMETRY,
+    replace(TELEMETRY, x0=np.zeros(0), x=np.zeros((0, 5)), u=np.zeros((0, 2)), y_ref=np.zeros((0, 3))),
+    replace(TELEMETRY, y_ref=np.zeros((0, 3))),
+    EVENT,
+    *(replace(EVENT, source="r" * n, code="c" * k, text="") for n in range(4) for k in range(4)),
+]
+
+store = get_typestore(Stores.EMPTY)
+for path in sorted((ROOT / "deploy" / "msg").glob("*.msg")):
+    store.register(get_types_from_msg(path.read_text(), f"{PACKAGE}/{path.stem}"))
+
+
+def same(a: Any, b: Any) -> bool:
+    """Equal values; of arrays the elements, as rows or flat."""
+    return a == b if isinstance(a, str) else np.array_equal(np.ravel(a), np.ravel(b), equal_nan=True)
+
+
+@pytest.mark.parametrize("message", MESSAGES)
+def test_rosbags_decodes_our_bytes_to_equal_values(message: Message) -> None:
+    decoded = store.deserialize_cdr(encode(message), schema(type(message)).partition("@")[0])
+    for field in fields(message):
+        assert same(getattr(decoded, field.name), getattr(message, field.name)), field.name
+
+
+@pytest.mark.parametrize("message", MESSAGES)
+def test_we_decode_what_rosbags_serialises(message: Message) -> None:
+    name = schema(type(message)).partition("@")[0]
+    ours = encode(message)
+    theirs = bytes(store.serialize_cdr(store.deserialize_cdr(ours, name), name))
+    assert theirs == ours
+    decoded = decode(type(message), theirs)
+    for field in fields(message):
+        assert same(getattr(decoded, field.name), getattr(message, field.name)), field.name
+
+
+def test_row_widths_on_the_wire_are_those_of_the_arrays() -> None:
+    decoded = store.deserialize_cdr(encode(TELEMETRY), f"{PACKAGE}/Telemetry")
+    assert (decoded.nx, decoded.nu, decoded.ny) == (5, 2, 3)
+    assert store.deserialize_cdr(encode(REFERENCE), f"{PACKAGE}/Reference").np == 2
+    assert store.deserialize_cdr(encode(COMMAND), f"{PACKAGE}/Command").nu == 2
+
+
+def test_msg_files_list_the_enumerations_we_use() -> None:
+    for cls, enums in {Reference: (End,), Command: (Mode, QpStatus), Event: (Severity,)}.items():
+        text = (ROOT / "deploy" / "msg" / f"{cls.__name__}.msg").read_text()
+        for member in (member for enum in enums for member in enum):
+            assert f"uint8 {member.name}={int(member)}\n" in text
+
+
+@pytest.mark.parametrize("message", MESSAGES)
+def test_decoded_messages_have_the_shapes_and_own_their_arrays(message: Message) -> None:
+    decoded = decode(type(message), encode(message))
+    for field in fields(message):
+        before, after = getattr(message, field.name), getattr(decoded, field.name)
+        assert type(after) is type(before)
+        if isinstance(before, np.ndarray):
+            assert after.shape == before.shape
+            assert after.dtype == np.float64
+            assert after.flags.c_contiguous
+            assert after.flags.writeable
+            assert after.flags.aligned
+
+
+def test_strided_arrays_are_encoded_by_value() -> None:
+    u = np.arange(24.0).reshape(6, 4)
+    strided = replace(COMMAND, u=u[::2, ::2])
+    assert np.array_equal(decode(Command, encode(strided)).u, u[::2, ::2])
+
+
+def test_encoding_names_the_schema_and_its_major_version() -> None:
+    assert encoding(State) == "application/cdr;rti_mpc_msgs/msg/State@1"
+
+
+def words(message: Message, at: int, *values: int) -> bytes:
+    """Payload with 32-bit words overwritten, `at` counted from the end of the header."""
+    payload = bytearray(encode(message))
+    struct.pack_into(f"<{len(values)}I", payload, 4 + at, *values)
+    return bytes(payload)
+
+
+def byte(message: Message, at: int, value: int) -> bytes:
+    payload = bytearray(encode(message))
+    payload[4 + at] = value
+    return bytes(payload)
+
+
+ONE_STATE = encode(STATE)
+MALFORMED = [
+    (State, b"", "empty"),
+    (State, ONE_STATE[:3], "truncated"),
+    (State, ONE_STATE[:4], "truncated"),
+    (State, ONE_STATE[:27], "truncated"),
+    (State, ONE_STATE[:28], "truncated"),
+    (State, ONE_STATE[:-1], "truncated"),
+    (State, ONE_STATE + b"\x00", "oversized"),
+    (State, b"\x00\x00" + ONE_STATE[2:], "big_endian"),
+    (State, b"\x00\x03" + ONE_STATE[2:], "header"),
+    (State, b"\x00\x07" + ONE_STATE[2:], "header"),
+    (State, words(STATE, 24, 2**32 - 1), "truncated"),
+    (State, words(STATE, 24, 6), "truncated"),
+    (State, words(STATE, 24, 4), "oversized"),
+    (State, encode(replace(STATE, x=np.zeros(0))), "length"),
+    (State, encode(replace(STATE, x=np.array([1.0, np.nan]))), "not_finite"),
+    (State, encode(replace(STATE, x=np.array([np.inf, -np.inf]))), "not_finite"),
+    (Reference, encode(replace(REFERENCE, y=np.full((4, 3), np.nan))), "not_finite"),
+    (Reference, encode(replace(REFERENCE, p=np.full((4, 2), -np.inf))), "not_finite"),
+    (Reference, encode(replace(REFERENCE, y=np.zeros((0, 3)), p=np.zeros((0, 0)))), "length"),
+    (Reference, encode(replace(REFERENCE, p=np.zeros((3, 2)))), "length"),
+    (Reference, encode(replace(REFERENCE, period_ns=0)), "value"),
+    (Reference, encode(replace(REFERENCE, period_ns=-1)), "value"),
+    (Reference, words(REFERENCE, 36, 5), "length"),
+    (Reference, words(REFERENCE, 36, 0), "length"),
+    (Reference, words(REFERENCE, 36, 2**32 - 1), "length"),
+    (Reference, words(REFERENCE, 40, 2**32 - 1), "truncated"),
+    (Reference, words(REFERENCE, 48 + 96, 2**32 - 1), "length"),
+    (Reference, byte(REFERENCE, 32, 2), "value"),
+    (Command, encode(replace(COMMAND, u=np.array([[np.nan]]))), "not_finite"),
+    (Command, encode(replace(COMMAND, u=np.zeros((0, 2)))), "length"),
+    (Command, encode(replace(COMMAND, period_ns=0)), "value"),
+    (Command, byte(COMMAND, 64, 7), "value"),
+    (Command, byte(COMMAND, 65, 255), "value"),
+    (Command, words(COMMAND, 80, 3), "length"),
+    (Telemetry, byte(TELEMETRY, 40, 99), "value"),
+    (Telemetry, words(TELEMETRY, 140, 4), "length"),
+    (Telemetry, encode(TELEMETRY)[:-8], "truncated"),
+    (Event, words(EVENT, 24, 2**32 - 1), "truncated"),
+    (Event, words(EVENT, 24, 0), "text"),
+    (Event, words(EVENT, 24, 5), "text"),
+    (Event, byte(EVENT, 28, 0xFF), "text"),
+    (Event, byte(EVENT, 34, 3), "value"),
+    (Event, encode(EVENT) + b"\x00", "oversized"),
+    (Event, encode(STATE), "text"),
+]
+
+
+@pytest.mark.parametrize(("cls", "payload", "reason"), MALFORMED)
+def test_malformed_bytes_are_refused_with_their_reason(cls: type[Message], payload: bytes, reason: str) -> None:
+    with pytest.raises(Refused) as refusal:
+        decode(cls, payload)
+    assert refusal.value.reason == reason
+    assert reason in REASONS
+    assert isinstance(refusal.value, MessageError)
+    assert len(str(refusal.value)) < 200
+
+
+@pytest.mark.parametrize("message", [STATE, REFERENCE, COMMAND, TELEMETRY, EVENT])
+def test_every_truncation_is_refused(message: Message) -> None:
+    payload = encode(message)
+    for size in range(len(payload)):
+        with pytest.raises(Refused):
+            decode(type(message), payload[:size])
+
+
+@pytest.mark.parametrize("message", [STATE, REFERENCE, COMMAND, TELEMETRY, EVENT])
+def test_mutated_bytes_give_a_message_or_a_refusal(message: Message) -> None:
+    rng = np.random.default_rng(2)
+    payload = np.frombuffer(encode(message), np.uint8)
+    refused = 0
+    for _ in range(3000):
+        mutant = payload[: rng.integers(len(payload) + 1)].copy() if rng.random() < 0.2 else payload.copy()
+        at = rng.integers(0, max(1, min(len(mutant), 160)), size=rng.integers(1, 6))
+        mutant[at[at < len(mutant)]] = rng.choice([0, 1, 127, 128, 255, rng.integers(256)])
+        try:
+            decode(type(message), mutant.tobytes())
+        except Refused:
+            refused += 1
+    assert 0 < refused < 3000
+
+
+@pytest.mark.parametrize("cls", [State, Reference, Command, Telemetry, Event])
+def test_random_bytes_behind_our_header_are_refused(cls: type[Message]) -> None:
+    rng = np.random.default_rng(3)
+    for size in rng.integers(0, 400, size=500):
+        with pytest.raises(Refused):
+            decode(cls, b"\x00\x01\x00\x00" + rng.bytes(size))
+
+
+def test_declared_lengths_allocate_nothing() -> None:
+    payload = words(STATE, 24, 2**32 - 1)
+    tracemalloc.start()
+    with pytest.raises(Refused):
+        decode(State, payload)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 100_000
+
+
+def test_the_largest_numbers_are_accepted() -> None:
+    assert decode(State, encode(replace(STATE, x=np.array([1e308, -1e308])))).x[0] == 1e308
+
+
+@pytest.mark.parametrize("module", ["rti_mpc.wire", "rti_mpc.wire.cdr", "rti_mpc.wire.intake", "rti_mpc.wire.bus"])
+def test_the_wire_loads_neither_casadi_nor_osqp(module: str) -> None:
+    check = f"import sys, {module}; assert not {{'casadi', 'osqp', 'qpsolvers', 'scipy'}} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", check], cwd=ROOT, check=True, timeout=20)

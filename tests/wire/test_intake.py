@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rti_mpc.message import Command, End, Reference, Severity, State
+from rti_mpc.status import Mode, QpStatus
+from rti_mpc.wire.bus import Received
+from rti_mpc.wire.cdr import Message, encode, encoding
+from rti_mpc.wire.intake import Intake
+
+STATE = State(5, 1, 0, np.arange(5.0))
+REFERENCE = Reference(5, 1, 0, 10**8, End.HOLD, np.zeros((4, 3)), np.zeros((4, 0)))
+COMMAND = Command(5, 1, 0, 1, 1, 0, 10**9, 0, Mode.TRACKING, QpStatus.SOLVED, 10**8, np.zeros((7, 2)))
+SECOND_NS = 10**9
+
+
+def received(message: Message) -> Received:
+    return Received(encode(message), encoding(type(message)), "key")
+
+
+def test_a_message_from_our_source_passes() -> None:
+    intake = Intake(State, stale_s=1.0, widths={"x": 5})
+    message = intake.accept(received(STATE), 0)
+    assert message is not None
+    assert np.array_equal(message.x, STATE.x)
+    assert intake.notices(0) == []
+
+
+@pytest.mark.parametrize(
+    ("other", "reason"),
+    [
+        ("", "encoding"),
+        ("zenoh/bytes", "encoding"),
+        ("application/json;rti_mpc_msgs/msg/State@1", "encoding"),
+        ("application/cdr", "schema"),
+        ("application/cdr;rti_mpc_msgs/msg/Command@1", "schema"),
+        ("application/cdr;rti_mpc_msgs/msg/State@2", "version"),
+        ("application/cdr;rti_mpc_msgs/msg/State", "version"),
+        ("x" * 10**6, "encoding"),
+    ],
+)
+def test_other_encodings_schemas_and_versions_are_refused(other: str, reason: str) -> None:
+    intake = Intake(State, stale_s=1.0)
+    assert intake.accept(replace(received(STATE), encoding=other), 0) is None
+    assert intake.refused == {reason: 1}
+    (notice,) = intake.notices(0)
+    assert notice.code == "message_refused"
+    assert len(notice.text) < 400
+
+
+@pytest.mark.parametrize(
+    ("message", "widths"),
+    [
+        (STATE, {"x": 4}),
+        (REFERENCE, {"y": 2}),
+        (replace(REFERENCE, p=np.zeros((4, 3))), {"y": 3, "p": 4}),
+        (COMMAND, {"u": 3}),
+    ],
+)
+def test_rows_of_another_width_are_refused(message: Message, widths: dict[str, int]) -> None:
+    intake = Intake(type(message), stale_s=1.0, widths=widths)
+    assert intake.accept(received(message), 0) is None
+    assert intake.refused == {"length": 1}
+    assert intake.source.epoch is None
+
+
+def test_stage_parameters_may_be_left_out() -> None:
+    assert Intake(Reference, stale_s=1.0, widths={"y": 3, "p": 4}).accept(received(REFERENCE), 0) is not None
+
+
+def test_a_second_publisher_takes_nothing_over() -> None:
+    intake = Intake(State, stale_s=1.0)
+    for seq in range(10):
+        assert intake.accept(received(replace(STATE, seq=2 * seq)), seq) is not None
+        assert intake.accept(received(replace(STATE, epoch=4, seq=2 * seq + 1)), seq) is None
+    assert intake.source.epoch == 5
+    assert intake.source.dropped == 10
+    (notice,) = intake.notices(10)
+    assert (notice.severity, notice.code) == (Severity.WARNING, "source_refused")
+    assert "epoch 4" in notice.text
+
+
+def test_a_restarted_publisher_takes_over_and_is_announced() -> None:
+    intake = Intake(State, stale_s=1.0)
+    intake.accept(received(STATE), 0)
+    assert intake.notices(0) == []
+    assert intake.accept(received(replace(STATE, epoch=6, seq=0)), 1) is not None
+    assert [notice.code for notice in intake.notices(1)] == ["source_changed"]
+
+
+def test_what_a_cache_repeats_is_dropped_in_silence() -> None:
+    intake = Intake(Reference, stale_s=1.0)
+    assert intake.accept(received(REFERENCE), 0) is not None
+    assert intake.accept(received(REFERENCE), 1) is None
+    assert intake.source.dropped == 1
+    assert intake.notices(1) == []
+
+
+def test_notices_are_rate_limited_by_code_and_count_what_was_not_said() -> None:
+    intake = Intake(State, stale_s=1.0, quiet_s=1.0)
+    said = []
+    for millisecond in range(3000):
+        now_ns = millisecond * 10**6
+        assert intake.accept(Received(b"", encoding(State), "key"), now_ns) is None
+        said += intake.notices(now_ns)
+    assert len(said) == 3
+    assert said[-1].text.endswith("2001 refused so far")
+    intake.accept(received(STATE), 0)
+    intake.accept(received(replace(STATE, epoch=1)), 0)
+    assert [notice.code for notice in intake.notices(3 * SECOND_NS)] == ["message_refused", "source_refused"]
+
+
+def test_nothing_a_peer_sends_raises() -> None:
+    rng = np.random.default_rng(4)
+    intakes = [Intake(State, 1.0, {"x": 5}), Intake(Reference, 1.0, {"y": 3}), Intake(Command, 1.0, {"u": 2})]
+    seeds = [np.frombuffer(encode(message), np.uint8) for message in (STATE, REFERENCE, COMMAND)]
+    for n in range(6000):
+        intake, seed = intakes[n % 3], seeds[rng.integers(3)]
+        payload = seed[: rng.integers(len(seed) + 1)].copy() if rng.random() < 0.3 else seed.copy()
+        payload = np.append(payload, rng.integers(0, 256, size=rng.integers(20), dtype=np.uint8)) if rng.random() < 0.2 else payload
+        spots = rng.integers(0, max(1, len(payload)), size=rng.integers(8))
+        payload[spots[spots < len(payload)]] = rng.integers(256, dtype=np.uint8)
+        intake.accept(Received(payload.tobytes(), encoding((State, Reference, Command)[n % 3]), "key"), n)
+        intake.notices(n)
+    for intake in intakes:
+        assert {"truncated", "oversized", "header"} <= set(intake.refused)

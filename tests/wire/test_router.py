@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rti_mpc.message import State
+from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.keys import Keys
+
+ROOT = Path(__file__).parents[2]
+KEYS = Keys(robot="test")
+TIMEOUT_S = 10.0
+ROUTER = """
+from rti_mpc.wire.bus import BusSettings
+from rti_mpc.wire.keys import Keys
+from service.router import main
+main(BusSettings(listen=({!r},)), Keys(robot="test"))
+"""
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def router(endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
+    command = [sys.executable, "-c", ROUTER.format(endpoint)]
+    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(ROOT)}) as process:
+        yield process
+        process.kill()
+
+
+def test_clients_wait_for_the_router_and_reach_each_other_through_it(router: subprocess.Popen[bytes], endpoint: str) -> None:
+    settings = BusSettings(mode="client", connect=(endpoint,))
+    with Bus(settings, KEYS) as robot, Bus(settings, KEYS) as controller:  # the router is still starting
+        states, seen = robot.publisher(KEYS.state, State, realtime=True), controller.subscriber(KEYS.state)
+        waiting = threading.Thread(target=seen.recv)
+        waiting.start()
+        deadline_s = time.monotonic() + TIMEOUT_S
+        while waiting.is_alive() and time.monotonic() < deadline_s:
+            states.put(State(1, 1, 0, np.zeros(5)))
+            waiting.join(0.01)
+        assert not waiting.is_alive()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_router_ends_cleanly_within_a_second(router: subprocess.Popen[bytes], endpoint: str, number: int) -> None:
+    with Bus(BusSettings(mode="client", connect=(endpoint,)), KEYS) as client:
+        assert client.is_alive("router", TIMEOUT_S)
+        before_s = time.monotonic()
+        router.send_signal(number)
+        assert router.wait(TIMEOUT_S) == 0
+        assert time.monotonic() - before_s < 1.0

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import pytest
+
+from rti_mpc.wire.source import Source, Verdict
+
+STALE_NS = 100
+
+
+@pytest.fixture
+def source() -> Source:
+    """Locked to epoch 5, sequence 10, at time 0."""
+    source = Source(STALE_NS)
+    assert source.accept(5, 10, 0) is Verdict.NEW
+    return source
+
+
+def test_the_next_message_is_accepted_and_gaps_are_counted(source: Source) -> None:
+    assert source.accept(5, 11, 1) is Verdict.NEXT
+    assert source.accept(5, 14, 2) is Verdict.NEXT
+    assert source.lost == 2
+
+
+def test_repeated_and_old_messages_are_dropped_however_late(source: Source) -> None:
+    assert source.accept(5, 10, 1) is Verdict.REPEATED
+    assert source.accept(5, 9, 10 * STALE_NS) is Verdict.OLD
+    assert source.dropped == 2
+    assert source.seq == 10
+
+
+def test_a_higher_epoch_takes_over_at_once(source: Source) -> None:
+    assert source.accept(6, 0, 1) is Verdict.NEW
+    assert (source.epoch, source.seq, source.lost) == (6, 0, 0)
+
+
+def test_a_lower_epoch_takes_over_only_from_a_stale_source(source: Source) -> None:
+    assert source.accept(4, 99, STALE_NS) is Verdict.FOREIGN
+    assert source.accept(4, 100, STALE_NS + 1) is Verdict.NEW
+    assert source.dropped == 1
+
+
+def test_foreign_messages_do_not_keep_a_source_alive_nor_disturb_it(source: Source) -> None:
+    assert source.accept(4, 1, 60) is Verdict.FOREIGN
+    assert source.accept(5, 11, 61) is Verdict.NEXT
+    assert source.accept(4, 2, 61 + STALE_NS) is Verdict.FOREIGN
+    assert source.accept(4, 3, 62 + STALE_NS) is Verdict.NEW

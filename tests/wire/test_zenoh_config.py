@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rti_mpc.errors import ConfigError
+from rti_mpc.wire.bus import RENDEZVOUS, Bus, BusSettings, zenoh_config
+from rti_mpc.wire.keys import Keys
+
+SHIPPED = Path(__file__).parents[2] / "deploy" / "zenoh"
+ROBOT = "tcp/127.0.0.1:17447"
+
+
+def value(settings: BusSettings, name: str) -> Any:
+    return json.loads(zenoh_config(settings).get_json(name))
+
+
+@pytest.mark.parametrize("settings", [BusSettings(), *(BusSettings(config=SHIPPED / f"{mode}.json5") for mode in ("peer", "client", "router"))])
+def test_multicast_is_off_and_hangs_are_noticed_soon(settings: BusSettings) -> None:
+    assert value(settings, "scouting/multicast/enabled") is False
+    assert value(settings, "transport/link/tx/lease") == 2000
+    assert value(settings, "transport/link/rx/max_message_size") == 1 << 26
+
+
+@pytest.mark.parametrize("mode", ["peer", "client", "router"])
+def test_shipped_configurations_say_what_the_settings_would(mode: str) -> None:
+    for name in ("mode", "listen/endpoints", "connect/endpoints", "connect/timeout_ms"):
+        if (mode, name) != ("router", "connect/timeout_ms"):
+            assert value(BusSettings(config=SHIPPED / f"{mode}.json5"), name) == value(BusSettings(mode=mode), name)
+
+
+def test_a_peer_listens_on_loopback_and_connects_to_the_rendezvous() -> None:
+    assert value(BusSettings(), "listen/endpoints") == ["tcp/127.0.0.1:0"]
+    assert value(BusSettings(), "connect/endpoints") == [RENDEZVOUS]
+
+
+def test_nobody_connects_to_himself() -> None:
+    assert value(BusSettings(listen=(RENDEZVOUS,)), "connect/endpoints") == []
+    assert value(BusSettings(mode="router"), "connect/endpoints") == []
+    assert value(BusSettings(mode="router", listen=("tcp/0.0.0.0:7447",)), "connect/endpoints") == []
+
+
+def test_given_settings_win_over_the_file_and_the_file_over_defaults(tmp_path: Path) -> None:
+    path = tmp_path / "zenoh.json5"
+    path.write_text('{mode: "client", connect: {endpoints: ["tcp/10.0.0.1:7447"]}, transport: {link: {tx: {lease: 700}}}}')
+    assert value(BusSettings(config=path), "mode") == "client"
+    assert value(BusSettings(config=path), "connect/endpoints") == ["tcp/10.0.0.1:7447"]
+    assert value(BusSettings(config=path), "transport/link/tx/lease") == 700
+    assert value(BusSettings(config=path, connect=(ROBOT,)), "connect/endpoints") == [ROBOT]
+    assert value(BusSettings(config=path, mode="router"), "mode") == "router"
+    assert value(BusSettings(config=path, cfg=("transport/link/tx/lease:900",)), "transport/link/tx/lease") == 900
+
+
+@pytest.mark.parametrize(
+    ("settings", "word"),
+    [
+        (BusSettings(mode="peeer"), "mode"),
+        (BusSettings(connect=("nonsense",)), "connect/endpoints"),
+        (BusSettings(cfg=("no/such/key:1",)), "no/such/key"),
+        (BusSettings(cfg=("transport/link/tx/lease:soon",)), "transport/link/tx/lease"),
+        (BusSettings(config=Path("missing.json5")), "missing.json5"),
+    ],
+)
+def test_what_zenoh_refuses_is_named(settings: BusSettings, word: str) -> None:
+    with pytest.raises(ConfigError, match=word):
+        zenoh_config(settings)
+
+
+@pytest.mark.parametrize("listen", ["tcp/127.0.0.1:99999", "carrier/pigeon", "tcp/192.0.2.1:7447"])
+def test_endpoints_that_cannot_be_listened_on_are_refused(listen: str) -> None:
+    with pytest.raises(ConfigError, match="endpoints"):
+        Bus(BusSettings(listen=(listen,), connect=()), Keys())
+
+
+def test_an_endpoint_already_taken_is_refused() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(ConfigError, match="in use"):
+            Bus(BusSettings(listen=(f"tcp/127.0.0.1:{taken.getsockname()[1]}",), connect=()), Keys())
