@@ -90,11 +90,9 @@ def bind(function: ca.Function, arguments: Sequence[Array], results: Sequence[Ar
         for i, array in enumerate(arrays):
             if array.dtype != np.float64 or not array.flags.c_contiguous or array.size != sparsity(i).nnz():
                 raise ShapeError(f"{function.name()}: {name(i)}", sparsity(i).shape[::-1], array)
-            attach(i, memoryview(array))
+            attach(i, array.data)
 
-    keep = (buffer, *arguments, *results)
-
-    def call(evaluate: Callable[[], None] = evaluate, _keep: tuple[object, ...] = keep) -> None:
+    def call(_keep: tuple[object, ...] = (buffer, *arguments, *results)) -> None:
         evaluate()
 
     return call

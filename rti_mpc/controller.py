@@ -113,9 +113,7 @@ class Controller:
         self._input: Array = np.zeros(model.nu)
         self._x0: Array = np.zeros(model.nx)
         phi = integrator(model, "rk4")
-        self._integrate = bind(
-            compiled(phi) if compile else phi, (self._start, self._input, np.array(model.p_nominal), self._span), (self._x0,)
-        )
+        self._integrate = bind(compiled(phi) if compile else phi, (self._start, self._input, np.array(model.p_nominal), self._span), (self._x0,))
 
     # What comes in.
 
@@ -325,10 +323,9 @@ class Controller:
         """Whether the last command is rest from its first row on, or there never was one."""
         return self._command is None or np.array_equal(self._command.u[0], self._u_rest)
 
-    @property
-    def slack_ns(self) -> int:
-        """Robot time at which the state of the next sample is expected, minus the last stamp."""
-        return self._act_ns - self._delay_ns - self._clock.stamp_ns
+    def slack_s(self, local_ns: int) -> float:
+        """Return robot time, s, from a local monotonic time to the state of the next sample."""
+        return 1e-9 * (self._act_ns - self._delay_ns - self._clock.now_ns(local_ns))
 
     def robot_now_ns(self, local_ns: int) -> int:
         """Return robot time at a local monotonic time."""

@@ -121,7 +121,7 @@ class Telemetry:
         feedback_us: Time of the feedback phase.
         latency_us: From the state's arrival to the command's hand-over to the bus.
         state_age_s: How much older than the command's stamp the state was, robot time.
-        slack_s: Time left to the next sample when the command left, robot time; negative: missed.
+        slack_s: Time left to the next state when its sample was prepared, robot time; negative: the sample overran its period.
         skipped: Samples skipped since start.
         fallbacks: Samples commanded without a usable QP since start.
         parameter_version: Version of the controller's parameters.

@@ -19,13 +19,13 @@ from rti_mpc.errors import OcpError
 
 @dataclass(frozen=True)
 class Signal:
-    """
+    r"""
     One component of a state, input, output or parameter vector.
 
     Attributes:
         name: Unique within its vector; what configuration and viewers call it.
         unit: SI unit, ``"1"`` if none.
-        angle: Whether it wraps at :math:`\\pm\\pi` on the wire.
+        angle: Whether it wraps at :math:`\pm\pi` on the wire.
     """
 
     name: str

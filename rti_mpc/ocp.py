@@ -153,7 +153,7 @@ def weights(name: str, value: ArrayLike, length: int) -> Array:
     """Return finite weights >= 0 of shape ``(length,)`` from these or a constant."""
     array = vector(name, value, length)
     if not np.all(np.isfinite(array)) or np.any(array < 0):
-        raise OcpError(f"{name} must be finite and not negative, got {value}")
+        raise OcpError(f"{name} must be finite and not negative, got {array.tolist()}")
     return array
 
 
@@ -164,7 +164,11 @@ def weight_matrix(name: str, value: ArrayLike, size: int) -> Array:
         array = np.diag(array)
     if array.shape != (size, size):
         raise OcpError(f"{name} must have shape ({size}, {size}) or be its diagonal ({size},), got shape {array.shape}")
-    if not np.all(np.isfinite(array)) or not np.array_equal(array, array.T) or np.linalg.eigvalsh(array).min(initial=0.0) < -1e-12 * np.abs(array).max():
+    if (
+        not np.all(np.isfinite(array))
+        or not np.array_equal(array, array.T)
+        or np.linalg.eigvalsh(array).min(initial=0.0) < -1e-12 * np.abs(array).max()
+    ):
         raise OcpError(f"{name} must be finite, symmetric and positive semidefinite, got {array.tolist()}")
     return array
 
@@ -173,7 +177,7 @@ def bound(name: str, value: ArrayLike, length: int) -> Array:
     """Return bounds of shape ``(length,)`` from these or a constant; infinite where there is none."""
     array = vector(name, value, length)
     if np.any(np.isnan(array)):
-        raise OcpError(f"{name} must not be NaN, got {value}")
+        raise OcpError(f"{name} must not be NaN, got {array.tolist()}")
     return array
 
 

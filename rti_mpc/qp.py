@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""
-The data of one QP, :math:`\min \tfrac12 z^T P z + q^T z` subject to :math:`l \le A z \le u`, in arrays that never move.
-"""
+r"""The data of one QP, :math:`\min \tfrac12 z^T P z + q^T z` subject to :math:`l \le A z \le u`, in arrays that never move."""
 
 from __future__ import annotations
 

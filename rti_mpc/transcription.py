@@ -112,7 +112,6 @@ def pattern(weight: np.ndarray[Any, Any]) -> ca.DM:
     return ca.DM(sp.csc_matrix(((weight != 0) | np.eye(len(weight), dtype=bool)).astype(float)))
 
 
-
 class Blocks:
     """
     A sparse matrix under assembly, its nonzeros gathered from a pool of values: 1, -1, then whatever is appended.

@@ -24,13 +24,13 @@ import numpy as np
 import rti_mpc
 from rti_mpc.message import Command, Severity, State
 from rti_mpc.model import Model
+from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import Bus, BusSettings, Received, Subscriber
 from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from sim.actuator import STALE_NS, Counters
-from sim.announcer import Announcer
 from sim.clock import Clock
-from sim.interrupt import stop_on_signals
 from sim.lockstep import Lockstep
 from sim.log import Log
 from sim.settings import RobotSettings

@@ -17,11 +17,11 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.message import Reference, Severity, State
 from rti_mpc.trajectory import Heading, Trajectory, rows
+from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
-from sim.announcer import Announcer
-from sim.interrupt import stop_on_signals
 
 ROLE = "reference"
 STALE_S = 1.0  # silence of the robot after which the reference is anchored to another one, even of a lower epoch
