@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What lies in deploy/ is used as it lies there."""
+
+from __future__ import annotations
+
+import configparser
+import re
+import shutil
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+import typer.main
+
+from rti_mpc.wire.bus import BusSettings, zenoh_config
+from service.cli import app
+from service.config import load
+
+ROOT = Path(__file__).parents[1]
+DEPLOY = ROOT / "deploy"
+UNIT = DEPLOY / "systemd" / "rti-mpc@.service"
+RUNBOOK = (DEPLOY / "runbook.md").read_text()
+SHELL = [line for block in re.findall(r"```sh\n(.*?)```", RUNBOOK, re.DOTALL) for line in block.splitlines()]
+
+
+@pytest.mark.parametrize("path", sorted(DEPLOY.glob("*.toml")), ids=lambda path: path.name)
+def test_configuration_builds_its_problem(path: Path) -> None:
+    config = load(path)
+    assert config.build_ocp().N == config.ocp.N
+    assert config.keys().command.endswith(f"{config.robot}/command")
+
+
+@pytest.mark.parametrize("path", sorted(DEPLOY.rglob("*.json5")), ids=lambda path: path.name)
+def test_zenoh_takes_its_configuration_without_multicast(path: Path) -> None:
+    config = zenoh_config(BusSettings(config=path))
+    assert config.get_json("mode") == f'"{path.stem}"'
+    assert config.get_json("scouting/multicast/enabled") == "false"
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed: the unit was NOT verified")
+def test_systemd_finds_nothing_to_complain_about_in_the_unit(tmp_path: Path) -> None:
+    instance = tmp_path / "rti-mpc@pioneer_3dx.service"
+    instance.write_text(UNIT.read_text().replace("/opt/rti-mpc/bin/rti-mpc", "/bin/true"))  # verify wants the program to be there
+    done = subprocess.run(["systemd-analyze", "verify", "--man=no", instance], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_unit_runs_a_command_that_exists_and_never_gives_up() -> None:
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.optionxform = str  # type: ignore[assignment, method-assign]
+    unit.read_string(UNIT.read_text())
+    program, command, config = unit["Service"]["ExecStart"].split()
+    assert Path(program).name == "rti-mpc"
+    assert command in typer.main.get_group(app).commands
+    assert config == "/etc/rti-mpc/%i.toml"
+    assert (unit["Service"]["Restart"], unit["Unit"]["StartLimitIntervalSec"]) == ("always", "0")
+    assert unit["Service"]["RestartPreventExitStatus"] == "2"
+
+
+@pytest.mark.parametrize("line", [line for line in SHELL if re.match(r"(\S*/)?rti-mpc ", line)])
+def test_command_in_the_runbook_exists_with_its_options(line: str) -> None:
+    _, name, *words = line.split()
+    command = typer.main.get_group(app).commands[name]
+    command.make_parser(command.make_context(name, [], resilient_parsing=True)).parse_args(words)
+
+
+def test_files_in_the_runbook_exist() -> None:
+    named = {word for line in SHELL for word in line.split() if word.startswith("deploy/")} | set(
+        re.findall(r"^\| `([^`]+)` \|", RUNBOOK, re.MULTILINE)
+    )
+    assert len(named) > 4
+    for name in named:
+        assert list(ROOT.glob(name) if name.startswith("deploy/") else DEPLOY.glob(name)), name
+
+
+def test_versions_are_pinned_with_hashes_and_without_an_index() -> None:
+    text = (ROOT / "constraints.txt").read_text()
+    pinned = {line.split("==")[0] for line in text.splitlines() if "==" in line}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    wanted = [*project["build-system"]["requires"], *project["project"]["dependencies"]]
+    wanted += [entry for group in project["dependency-groups"].values() for entry in group if isinstance(entry, str)]
+    wanted += [entry for extra in project["project"]["optional-dependencies"].values() for entry in extra]
+    assert {re.split(r"[\[<>=]", entry)[0] for entry in wanted} <= pinned
+    assert "://" not in text
+    for requirement in re.split(r"\n(?=\S)", text):
+        assert requirement.startswith("#") or "--hash=sha256:" in requirement, requirement
