@@ -80,6 +80,14 @@ Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", min=0.1,
 
 
 @process
+def run(config: Config, bus: BusSettings) -> int:
+    """Control the robot: wait for its states and a reference, answer each with a command."""
+    from service.daemon import main
+
+    return main(config, bus)
+
+
+@process
 def sim(
     config: Config,
     bus: BusSettings,
