@@ -61,8 +61,7 @@ def test_unit_runs_a_command_that_exists_and_never_gives_up() -> None:
 @pytest.mark.parametrize("line", [line for line in SHELL if re.match(r"(\S*/)?rti-mpc ", line)])
 def test_command_in_the_runbook_exists_with_its_options(line: str) -> None:
     _, name, *words = line.split()
-    command = typer.main.get_group(app).commands[name]
-    command.make_parser(command.make_context(name, [], resilient_parsing=True)).parse_args(words)
+    typer.main.get_group(app).commands[name].make_context(name, words)  # parses all, runs nothing
 
 
 def test_files_in_the_runbook_exist() -> None:
