@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All streams of one robot, drained together and placed on its timeline."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from rti_mpc.errors import MessageError
+from rti_mpc.message import STAMP_ON_ARRIVAL, Command, Event, Reference, State, Telemetry
+from rti_mpc.wire.bus import Bus, Received, Subscriber
+from rti_mpc.wire.intake import Intake
+from service.info import Info
+from service.recording import Entry
+from service.timeline import Timeline
+
+CAPACITY = 2048  # messages a stream may be ahead of us: 2 s at 1 kHz
+STALE_S = 2.0
+DOORS = 64  # keys listened to: a peer may invent roles, and must not fill our memory
+
+Door = Intake[Any]
+
+
+class Listener:
+    """
+    Subscriptions to everything a viewer draws.
+
+    What waits to be drained waits in rings that drop the oldest; the holes this
+    leaves in the sequence numbers are counted. Nothing a peer sends raises.
+
+    Attributes:
+        received: Messages accepted.
+    """
+
+    def __init__(self, bus: Bus, capacity: int = CAPACITY) -> None:
+        keys = bus.keys
+        self.received = 0
+        self._bad_infos = 0
+        self._timeline = Timeline()
+        self._doors: dict[str, Door] = {}
+        self._infos = bus.subscriber(keys.infos, capacity=DOORS, cached=True)
+        self._streams: tuple[tuple[type[Any], Subscriber], ...] = (
+            (State, bus.subscriber(keys.state, capacity=capacity)),
+            (Reference, bus.subscriber(keys.reference, capacity=16, cached=True)),
+            (Reference, bus.subscriber(keys.anchored, capacity=16, cached=True)),
+            (Command, bus.subscriber(keys.command, capacity=capacity)),
+            (Telemetry, bus.subscriber(keys.telemetry, capacity=capacity)),
+            (Event, bus.subscriber(keys.events, capacity=capacity, cached=True)),
+        )
+
+    @property
+    def lost(self) -> int:
+        """Messages that never came, or that our rings dropped."""
+        return sum(door.source.lost for door in self._doors.values())
+
+    @property
+    def refused(self) -> int:
+        """Payloads that were no message of ours."""
+        return self._bad_infos + sum(door.refused.total() for door in self._doors.values())
+
+    def drain(self) -> list[Entry]:
+        """Everything received since the last call, states first, for they move the timeline."""
+        now_ns = time.monotonic_ns()
+        entries = [*self._descriptions(), *self._messages(now_ns)]
+        self.received += len(entries)
+        return [*entries, *self._notices(now_ns)]
+
+    def _descriptions(self) -> Iterator[Entry]:
+        for received in self._infos.drain():
+            try:
+                yield Entry(self._timeline.now_ns, Info.from_json(json.loads(received.payload)))
+            except (MessageError, ValueError, RecursionError):
+                self._bad_infos += 1
+
+    def _messages(self, now_ns: int) -> Iterator[Entry]:
+        for cls, subscriber in self._streams:
+            for received in subscriber.drain():
+                door = self._door(cls, received)
+                message = None if door is None else door.accept(received, now_ns)
+                if message is None:
+                    continue
+                if isinstance(message, State):
+                    yield Entry(self._timeline.place_state(message.epoch, message.stamp_ns), message)
+                elif message.stamp_ns != STAMP_ON_ARRIVAL:  # such a reference follows with its real stamp
+                    yield Entry(self._timeline.place(message.stamp_ns), message)
+
+    def _door(self, cls: type[Any], received: Received) -> Door | None:
+        if received.key not in self._doors and len(self._doors) < DOORS:
+            self._doors[received.key] = Intake(cls, STALE_S)
+        return self._doors.get(received.key)
+
+    def _notices(self, now_ns: int) -> Iterator[Entry]:
+        """Show what the doors have to say as events of our own."""
+        time_ns = self._timeline.now_ns
+        for door in self._doors.values():
+            for notice in door.notices(now_ns):
+                yield Entry(time_ns, Event(0, 0, time_ns, "viewer", notice.severity, notice.code, notice.text))

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The robot's clock as one axis, through all lives of the robot."""
+
+from __future__ import annotations
+
+GAP_NS = 1_000_000_000  # between two lives of a robot whose clock began again
+AHEAD_NS = 1_000_000_000  # commands act a little after the newest state; nothing is drawn later than this
+
+
+class Timeline:
+    """
+    Places stamps on one axis, in ns.
+
+    The axis is the robot's clock itself. Where a restarted robot's clock begins
+    again, its new life is appended, so that nothing is drawn over the old one.
+    """
+
+    def __init__(self) -> None:
+        self._epoch: int | None = None
+        self._first_ns = 0
+        self._latest_ns = 0
+        self._offset_ns = 0
+
+    @property
+    def now_ns(self) -> int:
+        """Where the newest state lies."""
+        return self._offset_ns + self._latest_ns
+
+    def place_state(self, epoch: int, stamp_ns: int) -> int:
+        """Return where a state lies, and let the axis advance to it."""
+        if epoch != self._epoch:
+            if self._epoch is not None and stamp_ns < self._latest_ns:
+                self._offset_ns += self._latest_ns + GAP_NS - stamp_ns
+            self._epoch, self._first_ns, self._latest_ns = epoch, stamp_ns, stamp_ns
+        self._latest_ns = max(self._latest_ns, stamp_ns)
+        return self._offset_ns + stamp_ns
+
+    def place(self, stamp_ns: int) -> int:
+        """Return where anything else lies: within the robot's present life, for a late message of a former one cannot be told."""
+        if self._epoch is None:
+            return max(stamp_ns, 0)
+        return self._offset_ns + min(max(stamp_ns, self._first_ns), self._latest_ns + AHEAD_NS)

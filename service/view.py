@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The live viewer: a process of its own that listens to one robot and draws it in Rerun."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from threading import Event
+from urllib.parse import urlsplit
+
+from rti_mpc.errors import ConfigError
+from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.keys import Keys
+from service.listener import Listener
+from service.outlet import Outlet, file_outlet, viewer_outlet
+
+ADDRESS = "127.0.0.1:9876"
+PERIOD_S = 0.05
+
+log = logging.getLogger(__name__)
+
+
+def main(
+    bus_settings: BusSettings,
+    keys: Keys,
+    *,
+    rerun_spawn: bool = False,
+    rerun_connect: str | None = None,
+    rerun_save: Path | None = None,
+    rerun_memory_limit: str = "25%",
+    stop: Event | None = None,
+) -> int:
+    """
+    Draw a robot until stopped; in a viewer of its own if nothing else is asked for.
+
+    Args:
+        bus_settings: How to join the bus.
+        keys: Where the robot's streams are.
+        rerun_spawn: Whether to start a viewer on this machine, listening on loopback; it stays open afterwards.
+        rerun_connect: Where a viewer listens, or will: ``HOST:PORT``, or a URL of Rerun's.
+        rerun_save: File to record to, overwritten.
+        rerun_memory_limit: Memory a spawned viewer may fill before it forgets the oldest.
+        stop: Stops the viewer process when set; SIGINT and SIGTERM if there is none.
+
+    Returns:
+        Exit status: 1 if something received is not in the recording.
+
+    Raises:
+        ConfigError: An address or a file is not one.
+    """
+    rerun_spawn |= rerun_connect is None and rerun_save is None
+    url = viewer_url(rerun_connect or ADDRESS)
+    stop = stop or _stop_on_signals()
+    with Bus(bus_settings, keys) as bus:
+        listener = Listener(bus)
+        outlets = [file_outlet(rerun_save, keys.robot)] if rerun_save is not None else []
+        if rerun_spawn:
+            spawn_viewer(url, rerun_memory_limit)
+        if rerun_spawn or rerun_connect is not None:
+            outlets.append(viewer_outlet(url, keys.robot))
+        bus.alive("viewer")
+        log.info("listening to %s", keys.stream("*"))
+        pump(listener, outlets, stop)
+    log.info("%d messages, %d lost, %d refused", listener.received, listener.lost, listener.refused)
+    complete = [outlet.close() for outlet in outlets]
+    return 0 if rerun_save is None or complete[0] else 1
+
+
+def pump(listener: Listener, outlets: list[Outlet], stop: Event) -> None:
+    """Pass on what is heard until told to stop, and then what is still there."""
+    stopped = False
+    while not stopped:
+        stopped = stop.wait(PERIOD_S)
+        entries = listener.drain()
+        for outlet in outlets:
+            outlet.offer(entries)
+
+
+def _stop_on_signals() -> Event:
+    stop = Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+def viewer_url(address: str) -> str:
+    """
+    Return Rerun's URL of an address, ``HOST:PORT`` or such a URL already.
+
+    Raises:
+        ConfigError: It is neither.
+    """
+    url = address if "://" in address else f"rerun+http://{address}/proxy"
+    try:
+        parts = urlsplit(url)
+        valid = parts.scheme.startswith("rerun") and bool(parts.hostname) and bool(parts.port)
+    except ValueError:
+        valid = False
+    if not valid:
+        raise ConfigError(f"rerun-connect must be HOST:PORT or rerun+http://HOST:PORT/proxy, got {address!r}")
+    return url
+
+
+def spawn_viewer(url: str, memory_limit: str) -> None:
+    """
+    Start a viewer on loopback that outlives us.
+
+    Rerun's own `spawn` listens on all interfaces.
+
+    Raises:
+        ConfigError: The URL is not one of this machine.
+    """
+    address = urlsplit(url)
+    if address.hostname not in ("127.0.0.1", "localhost"):
+        raise ConfigError(f"rerun-spawn must be on 127.0.0.1, got {url!r}")
+    options = ["--bind", "127.0.0.1", "--port", str(address.port), "--memory-limit", memory_limit, "--expect-data-soon"]
+    subprocess.Popen([sys.executable, "-m", "rerun_cli", *options], start_new_session=True, stdin=subprocess.DEVNULL)

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from queue import Queue
+from threading import Thread
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rerun")
+from rerun.chunk import RrdReader
+
+from rti_mpc.errors import ConfigError
+from rti_mpc.message import State
+from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.keys import Keys
+from service.listener import Listener
+from service.view import spawn_viewer, viewer_url
+
+ROOT = Path(__file__).parents[2]
+PATIENCE_S = 30.0
+
+# A robot and its controller in one: epoch in x, sequence number in y; a line for each tenth sample once a viewer is there.
+PUBLISHER = """
+import itertools, sys, time
+import numpy as np
+from rti_mpc.message import Command, End, Event, Reference, Severity, State, Telemetry
+from rti_mpc.status import Mode, QpStatus
+from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.keys import Keys
+
+port, epoch = sys.argv[1], int(sys.argv[2])
+keys = Keys(robot="r")
+label = lambda name: {"name": name, "unit": "m", "angle": False}
+info = {"role": "controller", "states": [label("x"), label("y")], "inputs": [label("f")], "outputs": [label("x"), label("y")], "dt_s": 0.01}
+with Bus(BusSettings(listen=(f"tcp/127.0.0.1:{port}",), connect=(f"tcp/127.0.0.1:{port}",)), keys) as bus:
+    bus.publish_json(keys.info("controller"), info)
+    reference = bus.publisher(keys.reference, Reference, cached=True)
+    reference.put(Reference(epoch, 1, 0, 10**7, End.HOLD, np.zeros((2, 2)), np.zeros((2, 0))))
+    state, command = bus.publisher(keys.state, State, realtime=True), bus.publisher(keys.command, Command, realtime=True)
+    telemetry, event = bus.publisher(keys.telemetry, Telemetry), bus.publisher(keys.event("robot"), Event, cached=True)
+    while not bus.is_alive("viewer"):
+        pass
+    event.put(Event(epoch, 1, 0, "robot", Severity.INFO, "started", f"epoch {epoch}"))
+    for k in itertools.count(1):
+        stamp, x = k * 10**7, np.array([float(epoch), float(k)])
+        state.put(State(epoch, k, stamp, x))
+        command.put(Command(epoch, k, stamp, epoch, k, stamp, stamp + 10**8, 1, Mode.TRACKING, QpStatus.SOLVED, 10**7, np.ones((2, 1))))
+        numbers = (5, 0.0, 0.0, 1.0, 0.0, 10.0, 20.0, 30.0, 0.0, 0.0, 0, 0, 1)
+        arrays = (x, np.zeros((3, 2)), np.ones((2, 1)), np.zeros((2, 2)))
+        telemetry.put(Telemetry(epoch, k, stamp, k, stamp, Mode.TRACKING, QpStatus.SOLVED, *numbers, *arrays))
+        if k % 10 == 0:
+            print(k, flush=True)
+        time.sleep(0.005)
+"""
+VIEWER = """
+import logging, sys
+from pathlib import Path
+from rti_mpc.wire.bus import BusSettings
+from rti_mpc.wire.keys import Keys
+from service.view import main
+
+logging.basicConfig(level=logging.INFO)
+sys.exit(main(BusSettings(connect=(f"tcp/127.0.0.1:{sys.argv[1]}",)), Keys(robot="r"), rerun_save=Path(sys.argv[2])))
+"""
+
+
+@pytest.fixture
+def port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Child:
+    """A process whose lines are read with a timeout, killed at the end."""
+
+    def __init__(self, source: str, *arguments: object) -> None:
+        command = [sys.executable, "-c", source, *map(str, arguments)]
+        self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        self.lines: Queue[str] = Queue()
+        self._reader = Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self.lines.put(line)
+
+    def wait_for(self, text: str) -> str:
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            line = self.lines.get(timeout=max(0.0, deadline - time.monotonic()))
+            if text in line:
+                return line
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self._reader.join()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+@pytest.fixture
+def children() -> Iterator[list[Child]]:
+    children: list[Child] = []
+    yield children
+    for child in children:
+        child.kill()
+
+
+def rows(path: Path, entity: str) -> list[tuple[int, float]]:
+    """What a finished recording holds of a scalar: robot time in ns, value."""
+    pairs = []
+    for chunk in RrdReader(path).store().stream().to_chunks():
+        if chunk.entity_path == f"/{entity}" and not chunk.is_static:
+            batch = chunk.to_record_batch()
+            times = batch.column("robot_time").to_numpy(zero_copy_only=False).astype(np.int64)
+            pairs += zip(times.tolist(), [v[0] for v in batch.column("Scalars:scalars").to_pylist()], strict=True)
+    return pairs
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_viewer_leaves_everything_received_in_the_recording(
+    children: list[Child], port: int, tmp_path: Path, number: signal.Signals
+) -> None:
+    children += [Child(PUBLISHER, port, 1), Child(VIEWER, port, tmp_path / "run.rrd")]
+    publisher, viewer = children
+    publisher.wait_for("100\n")
+    viewer.process.send_signal(number)
+    before = time.monotonic()
+    assert viewer.process.wait(PATIENCE_S) == 0
+    assert time.monotonic() - before < 2.0  # a second, on a machine that is busy
+    received, lost, refused = map(int, re.findall(r"\d+", viewer.wait_for(" messages, ").rpartition("INFO")[2]))
+    samples = {entity: len(rows(tmp_path / "run.rrd", entity)) for entity in ("state/y", "command/f", "telemetry/cost")}
+    assert min(samples.values()) >= 80
+    assert received == sum(samples.values()) + len(["info", "reference", "event"])
+    assert (lost, refused) == (0, 0)
+    numbers = [value for _, value in rows(tmp_path / "run.rrd", "state/y")]
+    assert numbers == list(np.arange(numbers[0], numbers[-1] + 1))
+    assert all(
+        value == pytest.approx(1e3 * np.hypot(1.0, k)) for (_, value), k in zip(rows(tmp_path / "run.rrd", "error/position"), numbers, strict=True)
+    )
+
+
+def test_a_robot_killed_and_started_again_goes_on_in_the_recording(children: list[Child], port: int, tmp_path: Path) -> None:
+    children += [Child(VIEWER, port, tmp_path / "run.rrd"), Child(PUBLISHER, port, 1)]
+    viewer, publisher = children
+    publisher.wait_for("30\n")
+    publisher.kill()
+    children[1] = Child(PUBLISHER, port, 2)
+    children[1].wait_for("30\n")
+    viewer.process.terminate()
+    assert viewer.process.wait(PATIENCE_S) == 0
+    lives = Counter(epoch for _, epoch in rows(tmp_path / "run.rrd", "state/x"))
+    assert min(lives[1.0], lives[2.0]) >= 20
+    times = [time_ns for time_ns, _ in rows(tmp_path / "run.rrd", "state/x")]
+    assert times == sorted(times)  # the second life behind the first, though its clock began again
+
+
+def test_a_listener_that_falls_behind_keeps_the_newest_and_counts_the_rest(port: int) -> None:
+    keys = Keys(robot="r")
+    endpoint = f"tcp/127.0.0.1:{port}"
+    with Bus(BusSettings(listen=(endpoint,)), keys) as robot, Bus(BusSettings(connect=(endpoint,)), keys) as bus:
+        listener = Listener(bus, capacity=10)
+        publisher = robot.publisher(keys.state, State)
+        seen = 0
+        deadline = time.monotonic() + PATIENCE_S
+        while not (entries := listener.drain()):
+            assert time.monotonic() < deadline
+            seen += 1
+            publisher.put(State(1, seen, seen, np.zeros(1)))
+        last = seen + 50
+        for k in range(seen + 1, last + 1):
+            publisher.put(State(1, k, k, np.zeros(1)))
+        marker = robot.publisher(keys.telemetry, State)  # a refused payload on the same link, behind the states
+        marker.put(State(1, 1, 1, np.zeros(1)))
+        bytes_behind = bus.subscriber(keys.telemetry, capacity=1)
+        while bytes_behind.try_recv() is None:
+            assert time.monotonic() < deadline
+            marker.put(State(1, 1, 1, np.zeros(1)))
+        entries = [entry for entry in listener.drain() if isinstance(entry.message, State)]
+        assert [entry.message.seq for entry in entries if isinstance(entry.message, State)] == list(range(last - 9, last + 1))
+        assert listener.lost >= 40 - 10
+        assert listener.refused > 0
+
+
+@pytest.mark.parametrize("address", ["nowhere", "host:port", "http://127.0.0.1:9876", ":9876"])
+def test_an_address_that_is_none_is_refused(address: str) -> None:
+    with pytest.raises(ConfigError, match="HOST:PORT"):
+        viewer_url(address)
+
+
+def test_an_address_becomes_a_url_of_reruns() -> None:
+    assert viewer_url("127.0.0.1:9000") == "rerun+http://127.0.0.1:9000/proxy"
+    assert viewer_url("rerun+https://host:9000/proxy") == "rerun+https://host:9000/proxy"
+
+
+def test_a_viewer_is_spawned_on_loopback_only() -> None:
+    with pytest.raises(ConfigError, match="rerun-spawn must be on 127"):
+        spawn_viewer("rerun+http://192.0.2.1:9876/proxy", "25%")
