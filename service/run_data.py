@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One run of a robot along a reference, as arrays: what figures are drawn from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rti_mpc.array import Array
+from service.info import Info
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """
+    A run, one row a state of the robot and one row a sample of the controller.
+
+    Attributes:
+        info: The controller's: names, units, limits, period.
+        scenario: Name of the reference.
+        stamp_ns: Stamps of the states, robot time, shape ``(M,)``.
+        x: True states, shape ``(M, nx)``.
+        u_applied: Inputs acting at the stamps, shape ``(M, nu)``.
+        reference: Position the reference asks for at the stamps, in m, shape ``(M, 2)``.
+        sample_stamp_ns: Stamps of the samples' telemetry, shape ``(K,)``.
+        prepare_us: Preparation phases, shape ``(K,)``.
+        feedback_us: Feedback phases, shape ``(K,)``.
+        latency_us: State in to command out, shape ``(K,)``.
+        speed: Robot seconds in a second.
+        transient_s: How long the robot may take to get to the reference.
+    """
+
+    info: Info
+    scenario: str
+    stamp_ns: NDArray[np.int64]
+    x: Array
+    u_applied: Array
+    reference: Array
+    sample_stamp_ns: NDArray[np.int64]
+    prepare_us: Array
+    feedback_us: Array
+    latency_us: Array
+    speed: float = 1.0
+    transient_s: float = 20.0
+
+    @property
+    def time_s(self) -> Array:
+        """Times of the states since the first, shape ``(M,)``."""
+        return np.asarray(1e-9 * (self.stamp_ns - self.stamp_ns[0]))
+
+    @property
+    def sample_time_s(self) -> Array:
+        """Times of the samples since the first state, shape ``(K,)``."""
+        return np.asarray(1e-9 * (self.sample_stamp_ns - self.stamp_ns[0]))
+
+    @property
+    def position(self) -> Array:
+        """True positions in m, shape ``(M, 2)``."""
+        assert self.info.position is not None
+        return self.x[:, self.info.position]
+
+    @property
+    def error_mm(self) -> Array:
+        """Distance of the true position from the reference at the same stamp, shape ``(M,)``."""
+        dx, dy = (self.position - self.reference).T
+        return np.asarray(1e3 * np.hypot(dx, dy))
+
+    @property
+    def settled(self) -> NDArray[np.bool_]:
+        """Which states come after the transient, shape ``(M,)``."""
+        return np.asarray(self.time_s >= self.transient_s)
+
+    @property
+    def period_us(self) -> float:
+        """Wall time there is for a sample."""
+        return 1e6 * self.info.dt_s / self.speed

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from rti_mpc.errors import MessageError
+from service.info import Info
+
+PIONEER: dict[str, Any] = {
+    "role": "controller",
+    "model": "pioneer_3dx",
+    "states": [{"name": n, "unit": u, "angle": n == "psi"} for n, u in [("x", "m"), ("y", "m"), ("psi", "rad"), ("u", "m/s"), ("omega", "rad/s")]],
+    "inputs": [{"name": "u_c", "unit": "m/s", "angle": False}, {"name": "omega_c", "unit": "rad/s", "angle": False}],
+    "outputs": [{"name": "psi", "unit": "rad", "angle": True}, {"name": "z", "unit": "1", "angle": False}],
+    "dt_s": 0.1,
+    "lbu": [-0.2, None],
+    "ubu": [0.5, None],
+    "lbx": [None] * 5,
+    "ubx": [None, None, None, 0.5, None],
+}
+
+
+def test_null_bounds_are_the_infinity_of_their_side() -> None:
+    info = Info.from_json(PIONEER)
+    assert info.lbu == (-0.2, -math.inf)
+    assert info.ubu == (0.5, math.inf)
+    assert info.ubx[3:] == (0.5, math.inf)
+
+
+def test_bounds_that_are_not_said_are_infinite() -> None:
+    info = Info.from_json({name: value for name, value in PIONEER.items() if name not in ("lbu", "ubu", "dt_s")})
+    assert info.lbu == (-math.inf, -math.inf)
+    assert math.isnan(info.dt_s)
+
+
+def test_position_heading_and_tracked_states_are_found_by_name_and_mark() -> None:
+    info = Info.from_json(PIONEER)
+    assert info.position == (0, 1)
+    assert info.heading == 2
+    assert info.tracked == [(0, 2)]
+
+
+@pytest.mark.parametrize(
+    ("states", "inputs", "expected"),
+    [
+        ([("u", "m/s"), ("omega", "rad/s")], [("u_c", "m/s"), ("omega_c", "rad/s")], [0, 1]),
+        ([("vx", "m/s"), ("vy", "m/s")], [("vy_c", "m/s")], [1]),
+        ([("vx", "m/s"), ("vy", "m/s")], [("speed", "m/s")], [None]),
+        ([("q", "1")], [("duty", "1")], [None]),
+        ([("x", "m")], [("force", "N")], [None]),
+    ],
+)
+def test_a_command_is_shown_beside_the_one_state_it_is_about(states: Any, inputs: Any, expected: list[int | None]) -> None:
+    vectors = {name: [{"name": n, "unit": u, "angle": False} for n, u in pairs] for name, pairs in (("states", states), ("inputs", inputs))}
+    info = Info.from_json({"role": "controller", **vectors})
+    assert [info.measured(i) for i in range(len(inputs))] == expected
+
+
+def test_infos_that_label_alike_are_equal() -> None:
+    assert Info.from_json(PIONEER) == Info.from_json({**PIONEER, "epoch": 7, "version": "2"})
+    assert Info.from_json(PIONEER) != Info.from_json({**PIONEER, "ubu": [0.4, None]})
+
+
+def test_a_robot_never_described_has_numbered_components() -> None:
+    info = Info.unnamed(2, 1, 1)
+    assert [str(label) for label in (*info.states, *info.inputs)] == ["state_0", "state_1", "input_0"]
+    assert info.position is None
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {},
+        [],
+        None,
+        {"role": "controller", "states": 3},
+        {"role": "controller", "states": [{"name": "x"}]},
+        {**PIONEER, "lbu": [1.0]},
+        {**PIONEER, "lbu": ["low", None]},
+        {**PIONEER, "dt_s": "soon"},
+    ],
+)
+def test_a_description_that_is_none_is_refused(wrong: Any) -> None:
+    with pytest.raises(MessageError, match="info must be"):
+        Info.from_json(wrong)
