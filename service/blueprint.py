@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the viewer shows where."""
+"""What the viewer shows where, and what each entity looks like."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from rti_mpc.array import Array
+from rti_mpc.status import Mode, QpStatus
 from service.info import Info
+from service.outline import outline
 
 TIMELINE = "robot_time"
 TRAIL_S = 90.0
@@ -33,6 +37,12 @@ COLORS = {
     "good": (72, 160, 96),
     "warning": (222, 160, 40),
     "bad": (214, 70, 70),
+}
+PHASES = ("prepare", "feedback", "latency")
+LANES = {"mode": Mode, "status": QpStatus}
+LANE_COLORS = {
+    "mode": ("idle", "idle", "good", "good", "warning", "warning", "bad"),
+    "status": ("good", "warning", "warning", "warning", "bad", "bad", "idle"),
 }
 
 
@@ -141,7 +151,7 @@ def _times(info: Info) -> rrb.Container:
     period_ms = 1e3 * info.dt_s
     axis = rrb.ScalarAxis(range=(-0.1 * period_ms, 1.2 * period_ms)) if period_ms > 0 else None
     return rrb.Horizontal(
-        _series("Phase times [us]", [f"telemetry/{name}_us" for name in ("prepare", "feedback", "latency")]),
+        _series("Phase times [us]", [f"telemetry/{name}_us" for name in PHASES]),
         _series(f"Left of the {period_ms:g} ms period [ms]" if axis else "Left of the period [ms]", ["slack/**"], axis),
     )
 
@@ -150,3 +160,70 @@ def _events() -> rrb.TextLogView:
     kinds = rrb.encodings.TextLogColumnKind
     columns = [rrb.encodings.TextLogColumn(kind, visible=kind is not kinds.EntityPath) for kind in kinds]
     return rrb.TextLogView(origin="/event", name="Events", columns=rrb.TextLogColumns(text_log_columns=columns))
+
+
+class Strip(NamedTuple):
+    """How a polyline in the plane looks; heights, in m, say what lies on top of what."""
+
+    color: str
+    width: float
+    z: float
+
+
+STRIPS = {
+    "world/reference": Strip("reference", 5.0, 0.0),
+    "world/trail": Strip("measured", 2.0, 0.004),
+    "world/horizon": Strip("command", 4.0, 0.02),
+}
+ROBOT_Z = 0.008  # [m], between trail and horizon
+
+
+def looks(info: Info) -> dict[str, rr.AsComponents]:
+    """Return what does not change about a recording, by entity."""
+    return _series_looks(info) | _lane_looks() | ({} if info.position is None else _world_looks(info))
+
+
+def lifted(xy: Array, z: float) -> Array:
+    """Return points in the plane, shape ``(..., 2)``, at a height, shape ``(..., 3)``."""
+    return np.concatenate([xy, np.full((*xy.shape[:-1], 1), z)], axis=-1)
+
+
+def _series_looks(info: Info) -> dict[str, rr.AsComponents]:
+    looks: dict[str, rr.AsComponents] = {f"state/{label.name}": _line(str(label), "measured") for label in info.states}
+    for label in info.inputs:
+        looks[f"command/{label.name}"] = _line("command", "command", interpolation=rr.components.InterpolationMode.StepAfter)
+        looks |= {f"command/{label.name}/{side}": _line(side, "limit", 1.0) for side in ("min", "max")}
+    looks |= {f"error/{info.outputs[i].name}": _line(str(info.outputs[i]), "error") for i, _ in info.tracked}
+    looks |= {f"telemetry/{phase}_us": _line(phase, phase) for phase in PHASES}
+    looks |= {"error/position": _line("position [mm]", "error"), "slack": _line("left", "feedback"), "slack/period": _line("period", "limit", 1.0)}
+    return looks
+
+
+def _lane_looks() -> dict[str, rr.AsComponents]:
+    looks: dict[str, rr.AsComponents] = {}
+    for lane, values in LANES.items():
+        names, colors = [value.name for value in values], [COLORS[color] for color in LANE_COLORS[lane]]
+        looks[f"lane/{lane}"] = rr.StateConfiguration(values=names, labels=names, colors=colors)
+    return looks
+
+
+def _world_looks(info: Info) -> dict[str, rr.AsComponents]:
+    looks: dict[str, rr.AsComponents] = {"world": rr.ViewCoordinates.RIGHT_HAND_Z_UP}
+    for path, strip in STRIPS.items():
+        looks[path] = rr.LineStrips3D.from_fields(colors=COLORS[strip.color], radii=rr.Radius.ui_points(strip.width / 2))
+    for k, polygon in enumerate(outline(info.model) if info.heading is not None else []):
+        edge = lifted(np.vstack([polygon, polygon[:1]]), ROBOT_Z + 0.002)
+        looks[f"world/robot/part_{k}"] = _filled(polygon, ROBOT_Z - 0.001 * (k > 0), COLORS["wheel" if k else "body"])
+        looks[f"world/robot/part_{k}/edge"] = rr.LineStrips3D([edge], colors=COLORS["edge"], radii=rr.Radius.ui_points(0.75))
+    looks["world/robot/point"] = rr.Points3D([[0.0, 0.0, 0.02]], colors=COLORS["measured"], radii=rr.Radius.ui_points(3.0))
+    return looks
+
+
+def _line(name: str, color: str, width: float = 1.5, interpolation: rr.components.InterpolationMode | None = None) -> rr.SeriesLines:
+    return rr.SeriesLines(names=name, colors=COLORS[color], widths=width, interpolation_mode=interpolation)
+
+
+def _filled(polygon: Array, z: float, color: tuple[int, int, int]) -> rr.Mesh3D:
+    """Return a polygon that its first corner sees whole as a fan of triangles."""
+    fan = [(0, k, k + 1) for k in range(1, len(polygon) - 1)]
+    return rr.Mesh3D(vertex_positions=lifted(polygon, z), triangle_indices=fan, vertex_colors=[color] * len(polygon))

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import logging
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +12,7 @@ from urllib.parse import urlsplit
 
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from service.listener import Listener
 from service.outlet import Outlet, file_outlet, viewer_outlet
@@ -53,7 +53,7 @@ def main(
     """
     rerun_spawn |= rerun_connect is None and rerun_save is None
     url = viewer_url(rerun_connect or ADDRESS)
-    stop = stop or _stop_on_signals()
+    stop = stop or stop_on_signals()
     with Bus(bus_settings, keys) as bus:
         listener = Listener(bus)
         outlets = [file_outlet(rerun_save, keys.robot)] if rerun_save is not None else []
@@ -77,13 +77,6 @@ def pump(listener: Listener, outlets: list[Outlet], stop: Event) -> None:
         entries = listener.drain()
         for outlet in outlets:
             outlet.offer(entries)
-
-
-def _stop_on_signals() -> Event:
-    stop = Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    return stop
 
 
 def viewer_url(address: str) -> str:
