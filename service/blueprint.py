@@ -92,7 +92,7 @@ def blueprint(info: Info, frame: Frame | None = None) -> rrb.Blueprint:
         rrb.Vertical(
             rrb.Horizontal(left, rrb.Vertical(*series), column_shares=[1, 1]),
             rrb.Horizontal(lanes, _events(), column_shares=[1, 1]),
-            row_shares=[5, 1],
+            row_shares=[9, 2],
         ),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),

@@ -15,9 +15,10 @@ from matplotlib.figure import Figure
 from service.outline import outline, placed
 from service.run_data import Run
 
-INK, GRID, SHADE = "#2b303b", "#dfe3ea", "#eef1f6"
+INK, GRID, SHADE = "#2b303b", "#dfe3ea", "#e6eaf2"
 REFERENCE, MEASURED, COMMAND, LIMIT, ERROR = "#9aa3b2", "#2f6fd0", "#e08a1e", "#c8404a", "#b8377e"
 PHASES = {"prepare": "#4c9f6b", "feedback": "#e08a1e", "latency": "#7a5cc9"}
+FLOOR_MM = 1e-4  # drawn for anything closer: a logarithm has no zero
 LOOK: Any = {
     "font.size": 9.5,
     "font.family": "DejaVu Sans",
@@ -88,7 +89,7 @@ def _path(axes: Axes, run: Run) -> None:
 def _error(axes: Axes, run: Run) -> None:
     """Draw the error on a logarithmic scale, which shows transient and steady tracking alike."""
     axes.axvspan(0.0, min(run.transient_s, run.time_s[-1]), color=SHADE, label="transient")
-    axes.semilogy(run.time_s, np.maximum(run.error_mm, 1e-6), color=ERROR, linewidth=1.2)
+    axes.semilogy(run.time_s, np.maximum(run.error_mm, FLOOR_MM), color=ERROR, linewidth=1.2)
     settled = run.error_mm[run.settled]
     if settled.size:
         label = f"after the transient: max {settled.max():.3g} mm, rms {np.sqrt((settled**2).mean()):.3g} mm"
