@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The second opinion on a whole OCP: its nonlinear program, written down again by the book and solved by IPOPT."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import casadi as ca
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.ocp import Ocp
+
+# Bounds are not relaxed and the tolerances are tight: at a weakly active bound an interior point method stays sqrt(mu) away, and IPOPT's own
+# error would be what a test of 1e-5 sees.
+IPOPT = {
+    "print_time": False,
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "ipopt.tol": 1e-12,
+    "ipopt.compl_inf_tol": 1e-13,
+    "ipopt.bound_relax_factor": 0.0,
+    "ipopt.max_iter": 500,
+}
+
+
+def nlp(ocp: Ocp) -> Callable[[Array, Array, Array, Array, Array], tuple[Array, Array, float]]:
+    """
+    Build the nonlinear program of `rti_mpc.ocp`, by multiple shooting.
+
+    Returns:
+        ``solve(x0, u_prev, y_ref, x, u) -> (x, u, cost)`` from the guess ``x, u``; it fails where IPOPT does not converge.
+    """
+    model, N, N_u = ocp.model, ocp.N, ocp.N_u
+    nx, nu = model.nx, model.nu
+    p = ca.DM(model.p_nominal)
+    phi = ocp.phi()
+    h = ca.Function("h", [model.x, model.p], [model.y_expr])
+    x = ca.SX.sym("x", nx, N + 1)
+    u = ca.SX.sym("u", nu, N_u)
+    s = ca.SX.sym("s", nx, N)
+    x0 = ca.SX.sym("x0", nx)
+    u_prev = ca.SX.sym("u_prev", nu)
+    y_ref = ca.SX.sym("y_ref", model.ny, N)
+
+    rows: list[tuple[Array, ca.SX, Array]] = [(np.zeros(nx), x[:, 0] - x0, np.zeros(nx))]
+    cost = ca.SX(0)
+    for k in range(N):
+        e = h(x[:, k + 1], p) - y_ref[:, k]
+        cost += ocp.delta[k] * ca.bilin(ca.DM(ocp.Q), e, e)
+        cost += ca.dot(ca.DM(ocp.z), s[:, k]) + 0.5 * ca.dot(ca.DM(ocp.Z), s[:, k] ** 2)
+        rows.append((np.zeros(nx), phi(x[:, k], u[:, min(k, N_u - 1)], p) - x[:, k + 1], np.zeros(nx)))
+        rows.append((np.full(nx, -np.inf), x[:, k + 1] - s[:, k], ocp.ubx))
+        rows.append((ocp.lbx, x[:, k + 1] + s[:, k], np.full(nx, np.inf)))
+    last = u_prev
+    for k in range(N_u):
+        du = u[:, k] - last
+        cost += ocp.lambda_[k] * ca.bilin(ca.DM(ocp.R), du, du)
+        rows.append((ocp.lbdu, du, ocp.ubdu))
+        last = u[:, k]
+
+    lbg, g, ubg = zip(*rows, strict=True)
+    program = {"x": ca.veccat(x, u, s), "f": cost, "g": ca.vertcat(*g), "p": ca.veccat(x0, u_prev, y_ref)}
+    solver = ca.nlpsol("nlp", "ipopt", program, IPOPT)
+    free = np.full(nx * (N + 1), np.inf)
+    bounds = {
+        "lbg": np.concatenate(lbg),
+        "ubg": np.concatenate(ubg),
+        "lbx": np.concatenate([-free, np.tile(ocp.lbu, N_u), np.zeros(nx * N)]),
+        "ubx": np.concatenate([free, np.tile(ocp.ubu, N_u), np.full(nx * N, np.inf)]),
+    }
+
+    def solve(x0: Array, u_prev: Array, y_ref: Array, x: Array, u: Array) -> tuple[Array, Array, float]:
+        guess = np.concatenate([x.ravel(), u.ravel(), np.zeros(nx * N)])
+        answer = solver(x0=guess, p=np.concatenate([x0, u_prev, y_ref.ravel()]), **bounds)
+        assert solver.stats()["success"], solver.stats()["return_status"]
+        z = np.array(answer["x"]).ravel()
+        return z[: x.size].reshape(x.shape), z[x.size : x.size + u.size].reshape(u.shape), float(answer["f"])
+
+    return solve

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Optimal control problems that tests share, small ones first."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.model import Model, Signal
+from rti_mpc.ocp import Ocp
+from rti_mpc.pioneer_3dx import pioneer_3dx
+
+INF = np.inf
+
+
+def double_integrator(**changes: Any) -> Ocp:
+    """A mass on a line, 2 states, 1 input, linear: position and speed follow a reference."""
+    x = ca.SX.sym("x", 2)
+    u = ca.SX.sym("u")
+    model = Model(
+        name="double_integrator",
+        x=x,
+        u=u,
+        f_expl_expr=ca.vertcat(x[1], u),
+        y_expr=x,
+        states=(Signal("r", "m"), Signal("v", "m/s")),
+        inputs=(Signal("a", "m/s^2"),),
+        outputs=(Signal("r", "m"), Signal("v", "m/s")),
+    )
+    return Ocp(model, **({"N": 10, "dt": 0.1, "Q": [1.0, 0.1], "R": [0.05]} | changes))
+
+
+def beacon(**changes: Any) -> Ocp:
+    """A unicycle that sees the range and the bearing of a beacon, 3 states, 2 inputs: outputs not linear, a parameter in them, no bounds."""
+    x = ca.SX.sym("x", 3)
+    u = ca.SX.sym("u", 2)
+    p = ca.SX.sym("p", 2)
+    dx, dy = p[0] - x[0], p[1] - x[1]
+    model = Model(
+        name="beacon",
+        x=x,
+        u=u,
+        p=p,
+        f_expl_expr=ca.vertcat(u[0] * ca.cos(x[2]), u[0] * ca.sin(x[2]), u[1]),
+        y_expr=ca.vertcat(ca.sqrt(dx**2 + dy**2), ca.atan2(dy, dx) - x[2]),
+        states=(Signal("x", "m"), Signal("y", "m"), Signal("psi", "rad", angle=True)),
+        inputs=(Signal("v", "m/s"), Signal("omega", "rad/s")),
+        outputs=(Signal("range", "m"), Signal("bearing", "rad", angle=True)),
+        parameters=(Signal("x_b", "m"), Signal("y_b", "m")),
+        p_nominal=(5.0, 3.0),
+    )
+    return Ocp(model, **({"N": 6, "dt": 0.1, "Q": [[2.0, 0.3], [0.3, 1.0]], "R": [[1.0, 0.2], [0.2, 0.5]]} | changes))
+
+
+PAPER: dict[str, Any] = {
+    "N": 7,
+    "dt": 0.1,
+    "Q": [1.0, 1.0, 0.05],
+    "R": [1.0, 1.0],
+    "delta": 28.0,
+    "lambda_": 0.8,
+    "lbu": [-0.5, -0.745],
+    "ubu": [0.5, 0.745],
+    "lbx": [-INF, -INF, -INF, -0.5, -0.745],
+    "ubx": [INF, INF, INF, 0.5, 0.745],
+}
+SLEW: dict[str, Any] = {"lbdu": [-0.25, -0.4], "ubdu": [0.25, 0.4]}
+
+
+def pioneer(**changes: Any) -> Ocp:
+    """The paper's robot with the shipped configuration's bounds, 5 states, 2 inputs: everything at once."""
+    return Ocp(pioneer_3dx(), **(PAPER | SLEW | changes))
+
+
+def arc(t: Array, psi0: float = 0.0) -> Array:
+    """Rows ``x, y, psi`` of the paper's eight and its tangent at times t, shape ``(N, 3)``; psi nearest to `psi0` at the start."""
+    psi = np.unwrap(np.arctan2(np.cos(t / 5) / 5, np.cos(t / 10) / 10))
+    return np.column_stack([np.sin(t / 10), np.sin(t / 5), psi + 2 * np.pi * np.round((psi0 - psi[0]) / (2 * np.pi))])
