@@ -21,7 +21,7 @@ from rti_mpc.ocp import Ocp
 from rti_mpc.qp import Qp
 from rti_mpc.solver import Solver, SolverSettings
 from rti_mpc.status import QpStatus
-from rti_mpc.transcription import WEIGHTS, simultaneous
+from rti_mpc.transcription import INFINITY, WEIGHTS, simultaneous
 
 
 class Rti:
@@ -52,7 +52,7 @@ class Rti:
         self.y_ref: Array = np.zeros((N, model.ny))
         self.p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
         self.status = QpStatus.NONE
-        self._weights = tuple(np.array(getattr(ocp, name)) for name in WEIGHTS)
+        self._weights = tuple(np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS)  # OSQP has its own infinity
         self._cost_at_guess: Array = np.zeros(1)
         self._checksum: Array = np.zeros(1)
         self._tail = (np.zeros(model.nx), np.zeros(model.nu), np.zeros(model.np_), np.zeros(model.nx))  # x, u, p of the last stage, and phi there
