@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiled functions: the same numbers as the interpreted ones, cached, and never in the way."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from rti_mpc import codegen
+from rti_mpc.array import Array
+from rti_mpc.codegen import bind, cache_dir, compiled
+from rti_mpc.errors import ShapeError
+
+needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler on this machine")
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path / "rti_mpc"
+
+
+def product() -> ca.Function:
+    """``(2, 3)`` times ``(3,)``, and the sine of it."""
+    A, b = ca.SX.sym("A", 2, 3), ca.SX.sym("b", 3)
+    return ca.Function("product", [A, b], [A @ b, ca.sin(A @ b)], ["A", "b"], ["c", "s"])
+
+
+def arrays() -> tuple[Array, Array, Array, Array]:
+    rng = np.random.default_rng(1)
+    return rng.normal(size=(3, 2)), rng.normal(size=3), np.zeros(2), np.zeros(2)
+
+
+@needs_compiler
+def test_compiled_function_is_machine_code_and_gives_the_same_numbers(cache: Path) -> None:
+    assert cache_dir() == cache
+    fast = compiled(product())
+    assert fast.class_name() == "External"
+    A, b, c, s = arrays()
+    bind(fast, (A, b), (c, s))()
+    np.testing.assert_allclose(c, A.T @ b, rtol=1e-15)
+    np.testing.assert_allclose(s, np.sin(A.T @ b), rtol=1e-15)
+
+
+@needs_compiler
+def test_second_build_comes_from_the_cache(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled(product())
+    (library,) = cache.iterdir()
+    assert library.suffix == ".so"
+    monkeypatch.setattr(codegen, "build", lambda *_: pytest.fail("built twice"))
+    assert compiled(product()).class_name() == "External"
+
+
+@needs_compiler
+def test_another_function_of_the_same_name_is_built_anew(cache: Path) -> None:
+    x = ca.SX.sym("x")
+    one, two = (compiled(ca.Function("g", [x], [k * x])) for k in (1, 2))
+    assert (float(one(3)), float(two(3))) == (3.0, 6.0)
+    assert len(list(cache.iterdir())) == 2
+
+
+def test_machine_without_a_compiler_interprets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "which", lambda _: None)
+    function = product()
+    assert compiled(function) is function
+
+
+@pytest.mark.parametrize("script", ["#!/bin/sh\nexit 1\n", "#!/bin/sh\nwhile [ $# -gt 0 ]; do [ $1 = -o ] && echo junk > $2; shift; done\n"])
+def test_compiler_that_fails_or_lies_is_no_error(cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:
+    broken = tmp_path / "cc"
+    broken.write_text(script)
+    broken.chmod(0o755)
+    monkeypatch.setattr(shutil, "which", lambda _: str(broken))
+    function = product()
+    assert compiled(function) is function
+
+
+def test_cache_that_cannot_be_written_is_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    function = product()
+    assert compiled(function) is function or shutil.which("cc") is None
+
+
+@pytest.mark.parametrize("make", [compiled, lambda function: function], ids=["compiled", "interpreted"])
+def test_bound_function_follows_its_arrays_and_writes_in_place(make: Any) -> None:
+    A, b, c, s = arrays()
+    call = bind(make(product()), (A, b), (c, s))
+    for _ in range(3):
+        A += 1.0
+        b *= -0.5
+        call()
+        np.testing.assert_allclose(c, A.T @ b, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda A, b, c, s: (A[:2], b, c, s), r"product: A must be a C-contiguous float64 array of shape \(3, 2\), got float64 of shape \(2, 2\)"),
+        (lambda A, b, c, s: (np.asfortranarray(A), b, c, s), "product: A must be a C-contiguous"),
+        (lambda A, b, c, s: (A, np.zeros(6)[::2], c, s), "product: b must be a C-contiguous"),
+        (lambda A, b, c, s: (A, b.astype(np.float32), c, s), "got float32"),
+        (lambda A, b, c, s: (A, b, np.zeros(3), s), "product: c must be"),
+        (lambda A, b, c, s: (A, b, c, np.zeros(2, dtype=np.int64)), "product: s must be .* got int64"),
+    ],
+)
+def test_array_that_casadi_would_misread_is_refused_by_name(change: Any, message: str) -> None:
+    A, b, c, s = change(*arrays())
+    with pytest.raises(ShapeError, match=message):
+        bind(product(), (A, b), (c, s))
+
+
+def test_arrays_stay_alive_as_long_as_the_call() -> None:
+    def make() -> tuple[Any, Array]:
+        A, b, c, s = arrays()
+        return bind(product(), (A, b), (c, s)), c
+
+    call, c = make()
+    garbage = [np.full(6, 1e9) for _ in range(1000)]
+    call()
+    A, b, *_ = arrays()
+    np.testing.assert_allclose(c, A.T @ b, rtol=1e-14)
+    assert garbage[0][0] == 1e9

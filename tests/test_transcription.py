@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The QP of one sample: every number of it against finite differences of the OCP, every pattern against what is ever nonzero."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from rti_mpc.array import Array
+from rti_mpc.ocp import Ocp
+from rti_mpc.qp import Qp
+from rti_mpc.rti import Rti
+from rti_mpc.transcription import INFINITY
+from tests.problems import INF, beacon, double_integrator, pioneer
+
+PROBLEMS: dict[str, Callable[[], Ocp]] = {
+    "pioneer_euler": lambda: pioneer(method="euler", delta=[1, 2, 3, 4, 5, 6, 28]),
+    "pioneer_rk4": lambda: pioneer(lambda_=[0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2]),
+    "pioneer_with_held_inputs": lambda: pioneer(N=9, N_u=4, Q=[[1.0, 0.2, 0.0], [0.2, 1.0, 0.1], [0.0, 0.1, 0.05]], R=[[1.0, 0.3], [0.3, 2.0]]),
+    "pioneer_bounded_on_one_side": lambda: pioneer(ubu=[0.5, INF], lbu=-INF, lbdu=[-0.1, -INF], ubx=[2.0, INF, INF, 0.4, INF], z=7.0, Z=3.0),
+    "beacon_euler": lambda: beacon(method="euler", delta=[1, 2, 3, 4, 5, 6]),
+    "beacon_rk4": lambda: beacon(N_u=1),
+    "double_integrator": lambda: double_integrator(lbx=[-INF, -0.5]),
+}
+
+
+def at_random(ocp: Ocp, seed: int, *, compile: bool = True) -> Rti:
+    """Prepare at a guess, reference and parameters that are nowhere special."""
+    rng = np.random.default_rng(seed)
+    rti = simultaneous(ocp, compile=compile)
+    rti.x[:] = rng.normal(size=rti.x.shape)
+    rti.u[:] = rng.normal(size=rti.u.shape)
+    p = np.array(ocp.model.p_nominal) * rng.uniform(0.8, 1.2, size=rti.p.shape)
+    rti.prepare(rng.normal(size=rti.y_ref.shape), p, shift=False, u_prev=rng.normal(size=ocp.model.nu))
+    return rti
+
+
+def simultaneous(ocp: Ocp, **options: Any) -> Rti:
+    return Rti(ocp, **options)
+
+
+class ByHand:
+    """The OCP as functions of all variables, ``v = (x, u, s)``, as its documentation writes it: nothing of it is differentiated."""
+
+    def __init__(self, rti: Rti) -> None:
+        self.ocp = ocp = rti.ocp
+        self._rti = rti
+        model = ocp.model
+        self._phi = ocp.phi()
+        self._h = ca.Function("h", [model.x, model.p], [model.y_expr])
+        self.guess = np.concatenate([rti.x.ravel(), rti.u.ravel(), np.zeros(ocp.N * len(ocp.soft))])
+
+    def _split(self, v: Array) -> tuple[Array, Array, Array]:
+        x, u = self._rti.x, self._rti.u
+        return v[: x.size].reshape(x.shape), v[x.size : x.size + u.size].reshape(u.shape), v[x.size + u.size :].reshape(self.ocp.N, -1)
+
+    def residuals(self, v: Array) -> Array:
+        """What the Gauss-Newton cost is the squared norm of, slacks apart."""
+        ocp, rti = self.ocp, self._rti
+        x, u, _ = self._split(v)
+        root_Q, root_R = (np.linalg.cholesky(W).T for W in (ocp.Q, ocp.R))
+        e = [np.array(self._h(x[i], rti.p[i])).ravel() - rti.y_ref[i - 1] for i in range(1, ocp.N + 1)]
+        du = np.diff(np.vstack([rti.u_prev, u]), axis=0)
+        outputs = [np.sqrt(d) * root_Q @ e_i for d, e_i in zip(ocp.delta, e, strict=True)]
+        return np.concatenate([*outputs, (np.sqrt(ocp.lambda_)[:, None] * (du @ root_R.T)).ravel()])
+
+    def rows(self, v: Array) -> Array:
+        """Left-hand sides of all constraints, in the order the transcription documents."""
+        ocp, rti = self.ocp, self._rti
+        x, u, s = self._split(v)
+        soft = list(ocp.soft)
+        held = np.minimum(np.arange(ocp.N), ocp.N_u - 1)
+        phi = [np.array(self._phi(x[k], u[held[k]], rti.p[k])).ravel() for k in range(ocp.N)]
+        du = np.diff(np.vstack([rti.u_prev, u]), axis=0)
+        wide = np.zeros((ocp.N, ocp.model.nx))
+        wide[:, soft] = s
+        return np.concatenate(
+            [
+                x[0],
+                (np.array(phi) - x[1:]).ravel(),
+                u[:, present(ocp.lbu, ocp.ubu)].ravel(),
+                du[:, present(ocp.lbdu, ocp.ubdu)].ravel(),
+                (x[1:] - wide)[:, present(ocp.ubx)].ravel(),
+                (x[1:] + wide)[:, present(ocp.lbx)].ravel(),
+                s.ravel(),
+            ]
+        )
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Bounds of `rows`, the initial state's left at the guess."""
+        ocp, x = self.ocp, self._rti.x
+        N, N_u, slacks = ocp.N, ocp.N_u, ocp.N * len(ocp.soft)
+        upper, lower = present(ocp.ubx), present(ocp.lbx)
+        inputs, increments = present(ocp.lbu, ocp.ubu), present(ocp.lbdu, ocp.ubdu)
+        lb = [x[0], np.zeros(x[1:].size), np.tile(ocp.lbu[inputs], N_u), np.tile(ocp.lbdu[increments], N_u)]
+        ub = [x[0], np.zeros(x[1:].size), np.tile(ocp.ubu[inputs], N_u), np.tile(ocp.ubdu[increments], N_u)]
+        lb += [np.full(N * upper.sum(), -INF), np.tile(ocp.lbx[lower], N), np.zeros(slacks)]
+        ub += [np.tile(ocp.ubx[upper], N), np.full(N * lower.sum(), INF), np.full(slacks, INF)]
+        return np.concatenate(lb), np.concatenate(ub)
+
+
+def present(*bounds: Array) -> np.ndarray[Any, Any]:
+    return np.any(np.isfinite(bounds), axis=0)
+
+
+def jacobian(function: Callable[[Array], Array], v: Array, h: float = 1e-6) -> Array:
+    """Central differences."""
+    return np.stack([(function(v + h * e) - function(v - h * e)) / (2 * h) for e in np.eye(len(v))], axis=1)
+
+
+def hessian(qp: Qp) -> Array:
+    upper = qp.P.toarray()
+    return upper + np.triu(upper, k=1).T
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_constraint_matrix_is_the_jacobian_of_the_constraints(name: str) -> None:
+    """With it every A_k and B_k, and where each of them lies."""
+    rti = at_random(PROBLEMS[name](), seed=1)
+    problem = ByHand(rti)
+    difference = jacobian(problem.rows, problem.guess)
+    np.testing.assert_allclose(rti.qp.A.toarray(), difference, atol=2e-8)  # h^2 and rounding over h
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_bounds_of_the_qp_are_what_the_guess_leaves_of_the_bounds(name: str) -> None:
+    """In deviations: lb - g <= A z <= ub - g. With it the defects b_k."""
+    rti = at_random(PROBLEMS[name](), seed=2)
+    problem = ByHand(rti)
+    lb, ub = problem.bounds()
+    g = problem.rows(problem.guess)
+    nx = rti.ocp.model.nx  # the rows of the initial state are the feedback's
+    np.testing.assert_allclose(rti.qp.l[nx:], np.where(np.isfinite(lb), lb - g, -INFINITY)[nx:], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(rti.qp.u[nx:], np.where(np.isfinite(ub), ub - g, INFINITY)[nx:], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_gradient_is_half_that_of_the_cost(name: str) -> None:
+    rti = at_random(PROBLEMS[name](), seed=3)
+    ocp, problem = rti.ocp, ByHand(rti)
+    difference = jacobian(lambda v: np.atleast_1d(0.5 * (problem.residuals(v) ** 2).sum()), problem.guess)[0]
+    slacks = ocp.N * len(ocp.soft)
+    difference[len(difference) - slacks :] = 0.5 * np.tile(ocp.z[list(ocp.soft)], ocp.N)
+    np.testing.assert_allclose(rti.qp.q, difference, rtol=1e-7, atol=1e-6)  # costs of 1e3 over h
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_hessian_is_the_gauss_newton_approximation(name: str) -> None:
+    """Outputs that are not linear included: their Hessian follows the guess."""
+    for seed in (4, 5):
+        rti = at_random(PROBLEMS[name](), seed=seed)
+        ocp, problem = rti.ocp, ByHand(rti)
+        J = jacobian(problem.residuals, problem.guess)
+        expected = J.T @ J
+        slacks = len(problem.guess) - ocp.N * len(ocp.soft)
+        expected[slacks:, slacks:] = np.diag(0.5 * np.tile(ocp.Z[list(ocp.soft)], ocp.N))
+        np.testing.assert_allclose(hessian(rti.qp), expected, rtol=1e-7, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_cost_at_the_guess_is_that_of_the_ocp(name: str) -> None:
+    """A solution that changes nothing costs what the guess costs."""
+    rti = at_random(PROBLEMS[name](), seed=6)
+    problem = ByHand(rti)
+    assert rti._cost_at_guess[0] == pytest.approx((problem.residuals(problem.guess) ** 2).sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_no_entry_is_stored_that_is_never_nonzero(name: str) -> None:
+    """Dense blocks would be right, and slow."""
+    A, P = (sum(abs(getattr(at_random(PROBLEMS[name](), seed=seed).qp, matrix).data) for seed in range(10, 14)) for matrix in "AP")
+    assert np.all(A > 0)
+    assert np.all(P > 0)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_compiled_and_interpreted_functions_fill_the_same_qp(name: str) -> None:
+    ocp = PROBLEMS[name]()
+    compiled, interpreted = (at_random(ocp, seed=7, compile=compile).qp for compile in (True, False))
+    for ours, theirs in ((getattr(compiled, a), getattr(interpreted, a)) for a in ("q", "l", "u")):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(compiled.A.data, interpreted.A.data, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(compiled.P.data, interpreted.P.data, rtol=1e-12, atol=1e-12)
+
+
+def test_defects_vanish_on_a_trajectory_of_the_model() -> None:
+    rti = simultaneous(pioneer())
+    rng = np.random.default_rng(8)
+    rti.u[:] = rng.uniform(-0.4, 0.4, rti.u.shape)
+    phi = rti.ocp.phi()
+    for k in range(rti.ocp.N):
+        rti.x[k + 1] = np.array(phi(rti.x[k], rti.u[k], rti.p[k])).ravel()
+    rti.prepare(rti.y_ref.copy(), shift=False)
+    dynamics = slice(5, 5 + 5 * rti.ocp.N)
+    np.testing.assert_allclose(rti.qp.l[dynamics], 0.0, atol=1e-15)
+
+
+def test_pattern_is_the_same_whatever_the_data() -> None:
+    first, second = (at_random(pioneer(), seed=seed).qp for seed in (20, 21))
+    np.testing.assert_array_equal(first.A.indices, second.A.indices)
+    np.testing.assert_array_equal(first.A.indptr, second.A.indptr)
+    assert first.A.shape == second.A.shape
