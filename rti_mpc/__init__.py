@@ -15,6 +15,9 @@ References, cited by key throughout:
 * [Gros2020] S. Gros, M. Zanon, R. Quirynen, A. Bemporad, M. Diehl, "From linear to nonlinear MPC: bridging the gap via the real-time iteration",
   Int. J. Control 93(1), 2020.
 * [Verschueren2022] R. Verschueren et al., "acados - a modular open-source framework for fast embedded optimal control", Math. Prog. Comp. 14, 2022.
+* [Andersson2013] J. Andersson, "A general-purpose software framework for dynamic optimization", PhD thesis, KU Leuven, 2013.
+* [Ghadimi2015] E. Ghadimi, A. Teixeira, I. Shames, M. Johansson, "Optimal parameter selection for the alternating direction method of
+  multipliers (ADMM): quadratic problems", IEEE Trans. Autom. Control 60(3), 2015.
 * [Stellato2020] B. Stellato et al., "OSQP: an operator splitting solver for quadratic programs", Math. Prog. Comp. 12, 2020.
 """
 

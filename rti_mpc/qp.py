@@ -1,23 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""The data of one QP, :math:`\min \tfrac12 z^T P z + q^T z` subject to :math:`l \le A z \le u`, in arrays that never move."""
+r"""
+One QP, :math:`\min \tfrac12 z^T P z + q^T z` subject to :math:`l \le A z \le u`, in arrays that never move.
+
+Compiled code fills them, the solver reads them, and nothing else is in between.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
 from rti_mpc.array import Array
-from rti_mpc.transcription import INFINITY, Transcription
+from rti_mpc.codegen import bind
+from rti_mpc.transcription import INFINITY, SLACK_UNIT, Transcription
 
 if TYPE_CHECKING:
     import qpsolvers
 
 
+@dataclass(frozen=True, eq=False)
+class Guess:
+    """
+    Where the QPs of an OCP are made, and what comes out: arrays that all of them share.
+
+    Attributes:
+        sample: x, u, u_prev, y_ref, p, and the weights, in the order of `Linearization.arguments`.
+        x0: State embedded at node 0, shape ``(nx,)``.
+        plan: States and inputs after the full step, shapes as the guess, and by how much the states exceed their bounds, shape ``(1,)``.
+    """
+
+    sample: tuple[Array, ...]
+    x0: Array
+    plan: tuple[Array, Array, Array]
+
+
 class Qp:
     """
-    A QP of fixed pattern. Compiled code writes into these arrays, the solver reads them.
+    A QP of fixed pattern.
 
     Attributes:
         P: Upper triangle of the Hessian, shape ``(n, n)``.
@@ -25,15 +49,59 @@ class Qp:
         A: Constraint matrix, shape ``(m, n)``.
         l: Lower bounds, shape ``(m,)``; minus `INFINITY` where there is none.
         u: Upper bounds, shape ``(m,)``; `INFINITY` where there is none.
+        z: Where the solver puts its solution, shape ``(n,)``.
+        cost: The cost (4) at the guess, shape ``(1,)``.
+        checksum: Finite if and only if all of this is, shape ``(1,)``.
+        varies_P: Whether the Hessian changes from sample to sample.
+        varies_A: Whether the constraint matrix does.
+        fill: Writes all but `z` from the guess: slow, uncompiled, after a change of weights.
+        linearize: Writes of that what changes from sample to sample.
+        embed: Writes the initial state into it.
+        step: Makes the plan of `z`.
     """
 
-    def __init__(self, transcription: Transcription) -> None:
+    fill: Callable[[], None]
+    linearize: Callable[[], None]
+    embed: Callable[[], None]
+    step: Callable[[], None]
+
+    def __init__(self, transcription: Transcription, guess: Guess, make: Callable[[ca.Function], ca.Function]) -> None:
         m, n = transcription.A.shape
         self.P: sp.csc_matrix[Any] = sp.csc_matrix(transcription.P, copy=True)
         self.q: Array = np.zeros(n)
         self.A: sp.csc_matrix[Any] = sp.csc_matrix(transcription.A, copy=True)
         self.l: Array = np.zeros(m)
         self.u: Array = np.zeros(m)
+        self.z: Array = np.zeros(n)
+        self.cost: Array = np.zeros(1)
+        self.checksum: Array = np.zeros(1)
+        memory: Array = np.zeros(transcription.everything.numel_out(5))
+        self._slacks = transcription.slacks
+        self._eliminable = transcription.eliminable
+        self.varies_P, self.varies_A = 1 in transcription.varying, 2 in transcription.varying
+
+        outputs = (self.q, self.P.data, self.A.data, self.l, self.u, memory, self.cost, self.checksum)
+        self.fill = bind(transcription.everything, guess.sample, outputs)
+        self.linearize = bind(make(transcription.data), guess.sample, [outputs[i] for i in transcription.varying])
+        x, u, u_prev, *_ = guess.sample
+        weights = guess.sample[5:]
+        targets = [getattr(self, name)[place] for name, place in transcription.embedded]
+        self.embed = bind(make(transcription.embed), (guess.x0, x, memory), targets)
+        self.step = bind(make(transcription.step), (x, u, u_prev, self.z, guess.x0, memory, *weights), guess.plan)
+
+    @property
+    def slacks(self) -> Array:
+        """Slacks of the softened bounds in the solution, in the units of their states."""
+        return SLACK_UNIT * self.z[self._slacks]
+
+    def reduced_hessian(self) -> Array:
+        """Return the Hessian in the inputs alone, the states eliminated by the dynamics; of a QP without slacks."""
+        k = self._eliminable
+        P = (self.P + sp.triu(self.P, k=1).T).toarray()
+        A = self.A.toarray()
+        response = -np.linalg.solve(A[:k, :k], A[:k, k:])
+        beside = response.T @ P[:k, k:]
+        return np.asarray(response.T @ P[:k, :k] @ response + beside + beside.T + P[k:, k:])
 
     def to_problem(self) -> qpsolvers.Problem:
         """
@@ -56,3 +124,14 @@ class Qp:
             sp.csc_matrix(A[equal]),
             self.u[equal],
         )
+
+
+def step_size(qp: Qp) -> float:
+    r"""
+    Return the step size at which ADMM converges fastest on a QP, :math:`\sqrt{\lambda_{min} \lambda_{max}}` of its reduced Hessian.
+
+    That is the optimum for a problem of inequalities alone [Ghadimi2015]_; for others `docs/engine.md` shows that it holds as well.
+    """
+    eigenvalues = np.linalg.eigvalsh(qp.reduced_hessian())
+    curved = eigenvalues[eigenvalues > 1e-9 * eigenvalues[-1]]
+    return float(np.sqrt(curved[0] * curved[-1])) if len(curved) else 1.0

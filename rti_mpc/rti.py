@@ -6,6 +6,10 @@ Preparation needs no state: it shifts the guess, linearizes there and loads the
 QP, factorization included. Feedback embeds the initial state, solves and takes
 the full step. Only feedback is on the path from sensor to actuator
 [Diehl2005]_ [Gros2020]_.
+
+Bounds on states rarely act. So the QP without them is solved first; a plan that
+keeps them all the same is the solution of the whole QP too. If it does not, the
+whole QP is solved, and is the one prepared until its plan has left the bounds.
 """
 
 from __future__ import annotations
@@ -17,11 +21,18 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled
 from rti_mpc.errors import OcpError, ShapeError
+from rti_mpc.linearization import WEIGHTS
 from rti_mpc.ocp import Ocp
-from rti_mpc.qp import Qp
+from rti_mpc.qp import Guess, Qp, step_size
+from rti_mpc.sequential import sequential
+from rti_mpc.simultaneous import simultaneous
 from rti_mpc.solver import Solver, SolverSettings
 from rti_mpc.status import QpStatus
-from rti_mpc.transcription import INFINITY, WEIGHTS, simultaneous
+from rti_mpc.transcription import INFINITY
+
+FORMULATIONS = {"simultaneous": simultaneous, "sequential": sequential}
+SEQUENTIAL_UP_TO = 10  # control horizon up to which the sequential formulation is the faster one, see docs/engine.md
+TOUCHING = 1e-3  # distance from its bound, in units of the state, at which a plan counts as having left it
 
 
 class Rti:
@@ -33,58 +44,72 @@ class Rti:
 
     Attributes:
         ocp: The problem.
-        qp: The QP of the current sample.
+        formulation: ``"simultaneous"`` or ``"sequential"``.
         x: State guess, and the plan after feedback, shape ``(N + 1, nx)``.
         u: Input guess, and the plan after feedback, shape ``(N_u, nu)``. Row 0 is the command.
         u_prev: Input before the plan, shape ``(nu,)``: what increments are counted from.
         y_ref: Reference rows of the current sample, shape ``(N, ny)``.
         p: Stage parameters of the current sample, shape ``(N + 1, np)``.
+        solvers: The workspaces, each with its QP: without the bounds on states and, if there are any, with them.
+        solver: The one of the current sample.
         status: Outcome of the last feedback.
+
+    Raises:
+        OcpError: The formulation is unknown, or the model not finite where the robot rests.
     """
 
-    def __init__(self, ocp: Ocp, settings: SolverSettings | None = None, *, compile: bool = True) -> None:
+    def __init__(self, ocp: Ocp, settings: SolverSettings | None = None, *, formulation: str = "auto", compile: bool = True) -> None:
         model, N, N_u = ocp.model, ocp.N, ocp.N_u
-        transcription = simultaneous(ocp)
+        if formulation == "auto":
+            formulation = "sequential" if N_u <= SEQUENTIAL_UP_TO else "simultaneous"
+        if formulation not in FORMULATIONS:
+            raise OcpError(f"formulation must be auto, {' or '.join(FORMULATIONS)}, got {formulation!r}")
         self.ocp = ocp
+        self.formulation = formulation
         self.x: Array = np.zeros((N + 1, model.nx))
         self.u: Array = np.zeros((N_u, model.nu))
         self.u_prev: Array = np.array(model.u_rest)
         self.y_ref: Array = np.zeros((N, model.ny))
         self.p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
         self.status = QpStatus.NONE
-        self._weights = tuple(np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS)  # OSQP has its own infinity
-        self._cost_at_guess: Array = np.zeros(1)
-        self._checksum: Array = np.zeros(1)
+        self._x0: Array = np.zeros(model.nx)
+        self._plan = (np.zeros_like(self.x), np.zeros_like(self.u), np.zeros(1))
         self._tail = (np.zeros(model.nx), np.zeros(model.nu), np.zeros(model.np_), np.zeros(model.nx))  # x, u, p of the last stage, and phi there
-        self._z: Array = np.zeros(transcription.A.shape[1])
-        self._plan = (np.zeros_like(self.x), np.zeros_like(self.u))
+        # OSQP has its own infinity, and reads no other.
+        weights = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS}
+        guess = Guess((self.x, self.u, self.u_prev, self.y_ref, self.p, *weights.values()), self._x0, self._plan)
 
-        self._hessian_varies = transcription.hessian_varies
-        self._initial = transcription.initial
-        self._slacks = transcription.s
         make = compiled if compile else lambda function: function
-        self.qp = qp = Qp(transcription)
-        self._linearize = bind(
-            make(transcription.data),
-            (self.x, self.u, self.u_prev, self.y_ref, self.p, *self._weights),
-            (qp.q, qp.A.data, qp.l, qp.u, self._cost_at_guess, self._checksum),
-        )
-        hessian = make(transcription.hessian) if transcription.hessian_varies else transcription.hessian
-        self._write_hessian = bind(hessian, (self.x, self.p, *self._weights), (qp.P.data,))
-        self._take_step = bind(make(transcription.step), (self.x, self.u, self.u_prev, self._z, *self._weights), self._plan)
         self._integrate_tail = bind(make(ocp.phi()), self._tail[:3], self._tail[3:])
-        self._write_hessian()
-        self._linearize()
-        if not isfinite(self._checksum[0]):
-            raise OcpError(f"model {model.name} must be finite and differentiable at the zero state and rest input")
-        self.solver = Solver(qp, settings or SolverSettings())
+        transcribe = FORMULATIONS[formulation]
+        qps = [Qp(transcribe(ocp, state_bounds=bounds), guess, make) for bounds in (False, True)[: 2 if ocp.soft else 1]]
+        self._roll_out()
+        qps[0].fill()
+        if not isfinite(qps[0].checksum[0]):
+            raise OcpError(f"model {model.name} must be finite and differentiable around the zero state")
+        # The cost normalised, so that one step size of ADMM, and one tolerance, fit every problem.
+        self._cost_scale = 1.0 / step_size(qps[0])
+        for name in ("delta", "lambda_", "z", "Z"):
+            weights[name] *= self._cost_scale
+        for qp in qps:
+            qp.fill()
+        self.solvers = [Solver(qp, settings or SolverSettings()) for qp in qps]
+        self.reset(np.zeros(model.nx), np.array(model.u_rest))
+
+    @property
+    def qp(self) -> Qp:
+        """The QP of the current sample."""
+        return self.solver.qp
 
     def reset(self, x0: Array, u_prev: Array) -> None:
         """Start cold: the guess stays at one state and one input, and no earlier solution seeds the next."""
         self.u_prev[:] = u_prev
         self.u[:] = np.clip(u_prev, self.ocp.lbu, self.ocp.ubu)
         self.x[:] = x0
-        self.solver.rebuild()
+        self._touching = False
+        self.solver = self.solvers[0]
+        for solver in self.solvers:
+            solver.cold = True
 
     def prepare(self, y_ref: Array, p: Array | None = None, *, shift: bool = True, u_prev: Array | None = None) -> None:
         """
@@ -110,12 +135,17 @@ class Rti:
             self.shift()
         if u_prev is not None:
             self.u_prev[:] = u_prev
-        self._linearize()
-        if isfinite(self._checksum[0]):  # or OSQP would not recover from it
-            if self._hessian_varies:
-                self._write_hessian()
-                self.solver.load_hessian()
-            self.solver.load()
+        self.solver = self.solvers[self._touching]
+        self.solver.load()
+
+    def _roll_out(self) -> None:
+        """Make a guess in motion, half way to the upper bounds of the inputs, where the problem shows its scale."""
+        ubu = self.ocp.ubu
+        self.u[:] = np.where(np.isfinite(ubu), 0.5 * (np.clip(ubu, -INFINITY, INFINITY) + self.u_prev), self.u_prev)
+        self.x[:] = 0.0
+        for _ in range(self.ocp.N):
+            self.shift()
+        self.u_prev[:] = self.u[0]
 
     def shift(self) -> None:
         """Move the guess on by one stage: its first input becomes the previous one, its last is repeated, with the state the model predicts."""
@@ -138,27 +168,28 @@ class Rti:
         Args:
             x0: State at node 0, shape ``(nx,)``; angles continue those of the last sample.
         """
-        deviation = x0 - self.x[0]
-        if not isfinite(deviation.sum() + self._checksum[0]):
+        self._x0[:] = x0
+        if not isfinite(self._x0.sum()):
             self.status = QpStatus.FAILED
             return self.status
-        self.qp.l[self._initial] = deviation
-        self.qp.u[self._initial] = deviation
+        x_plan, u_plan, violation = self._plan
         self.status = self.solver.solve()
+        if self.status.usable and self.solver is self.solvers[0] and violation[0] > 0.0:
+            self.solver = self.solvers[1]
+            self.solver.load()
+            self.status = self.solver.solve()
         if self.status.usable:
-            self._z[:] = self.solver.z
-            self._take_step()
-            self.x[:], self.u[:] = self._plan
-        else:
-            self.solver.rebuild()
+            self.x[:] = x_plan
+            self.u[:] = u_plan
+            self._touching = self.solver is not self.solvers[0] and bool(violation[0] > -TOUCHING)
         return self.status
 
     @property
     def cost(self) -> float:
         """The cost of the plan, as the QP sees it: quadratic around the last guess."""
-        return float(self._cost_at_guess[0]) + 2.0 * self.solver.objective
+        return (float(self.qp.cost[0]) + 2.0 * self.solver.objective) / self._cost_scale
 
     @property
     def violation(self) -> float:
-        """Largest slack of the plan, in the unit of its state."""
-        return float(self._z[self._slacks].max(initial=0.0))
+        """By how much the plan's states exceed their bounds at most, in the unit of the state; 0 if they do not."""
+        return max(0.0, float(self._plan[2][0]))

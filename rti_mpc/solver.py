@@ -13,11 +13,11 @@ builds namespaces at every call, which costs more than the solve.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 import osqp
 
-from rti_mpc.array import Array
 from rti_mpc.qp import Qp
 from rti_mpc.status import QpStatus
 
@@ -37,25 +37,23 @@ STATUS = {
 @dataclass(frozen=True)
 class SolverSettings:
     """
-    Settings of OSQP, as its documentation names them.
+    Settings of OSQP, as its documentation names them, for a problem whose cost is normalised.
 
     Attributes:
         eps: Absolute and relative tolerance on the residuals.
-        max_iter: Iterations at most.
-        rho: Step size of ADMM.
+        max_iter: Iterations at most; the iterate is then taken as it is.
+        rho: Step size of ADMM, relative to the one that `rti_mpc.qp.step_size` holds best.
         check_termination: Iterations between two looks at the residuals.
         scaling: Sweeps of Ruiz scaling; none by default: they break the symmetry of the problem, and cost a sample more than they save.
         alpha: Over-relaxation, between 0 and 2.
-        sigma: Regularisation of the linear system.
     """
 
     eps: float = 1e-6
-    max_iter: int = 4000
+    max_iter: int = 400
     rho: float = 1.0
     check_termination: int = 5
     scaling: int = 0
     alpha: float = 1.6
-    sigma: float = 1e-6
 
 
 class Solver:
@@ -63,63 +61,71 @@ class Solver:
     An OSQP workspace for one `Qp`.
 
     Attributes:
-        z: Last usable solution, shape ``(n,)``.
+        qp: The problem.
+        cold: Whether the next `load` forgets the last solution.
     """
 
     def __init__(self, qp: Qp, settings: SolverSettings) -> None:
-        self._qp = qp
-        self._settings = settings
+        self.qp = qp
+        self.cold = False
+        self._finite = True
         self._zero = (np.zeros_like(qp.q), np.zeros_like(qp.l))
-        self.z: Array = np.zeros_like(qp.q)
-        self.rebuild()
-
-    def rebuild(self) -> None:
-        """Set the workspace up anew from the current data, about 2 ms: the way out when it may be poisoned."""
-        s = self._settings
         public = osqp.OSQP(algebra="builtin")
         public.setup(
-            self._qp.P,
-            self._qp.q,
-            self._qp.A.copy(),  # OSQP keeps what it is given, and writes into it
-            self._qp.l,
-            self._qp.u,
+            qp.P,
+            qp.q,
+            qp.A.copy(),  # OSQP keeps what it is given, and writes into it
+            qp.l,
+            qp.u,
             verbose=False,
-            eps_abs=s.eps,
-            eps_rel=s.eps,
-            max_iter=s.max_iter,
-            rho=s.rho,
+            eps_abs=settings.eps,
+            eps_rel=settings.eps,
+            max_iter=settings.max_iter,
+            rho=settings.rho,
             adaptive_rho=0,
-            check_termination=s.check_termination,
-            scaling=s.scaling,
-            alpha=s.alpha,
-            sigma=s.sigma,
+            check_termination=settings.check_termination,
+            scaling=settings.scaling,
+            alpha=settings.alpha,
             warm_starting=True,
             polishing=False,
         )
         self._osqp = public._solver
         self._info = self._osqp.info
         self._solution = self._osqp.solution
-
-    def cold_start(self) -> None:
-        """Forget the last solution."""
-        self._osqp.warm_start(*self._zero)
+        self._matrices = {
+            "P_x": qp.P.data if qp.varies_P else None,
+            "P_i": None,
+            "A_x": qp.A.data if qp.varies_A else None,
+            "A_i": None,
+        }
+        refused = self._osqp.update_data_mat(P_x=qp.P.data, P_i=None, A_x=qp.A.data, A_i=None)
+        assert not refused, "OSQP must have kept the patterns it was given"
 
     def load(self) -> None:
-        """Take over a new constraint matrix, factorization included."""
-        self._osqp.update_data_mat(P_x=None, P_i=None, A_x=self._qp.A.data, A_i=None)
-
-    def load_hessian(self) -> None:
-        """Take over a new Hessian, factorization included."""
-        self._osqp.update_data_mat(P_x=self._qp.P.data, P_i=None, A_x=None, A_i=None)
+        """Linearize at the guess, and take over the new matrices, factorization included; off the path from state to command."""
+        self.qp.linearize()
+        self._finite = isfinite(self.qp.checksum[0])
+        if self._finite:  # or OSQP would never recover
+            self._osqp.update_data_mat(**self._matrices)
+            if self.cold:
+                self._osqp.warm_start(*self._zero)
+                self.cold = False
 
     def solve(self) -> QpStatus:
-        """Take over the new vectors and solve, starting from the last solution."""
-        qp = self._qp
-        self._osqp.update_data_vec(q=qp.q, l=qp.l, u=qp.u)
-        self._osqp.solve()
+        """Embed the initial state, solve from the last solution, and make the plan."""
+        if not self._finite:
+            self.cold = True
+            return QpStatus.FAILED
+        qp, workspace = self.qp, self._osqp
+        qp.embed()
+        workspace.update_data_vec(q=qp.q, l=qp.l, u=qp.u)
+        workspace.solve()
         status = STATUS.get(self._info.status_val, QpStatus.FAILED)
         if status.usable:
-            self.z = self._solution.x
+            qp.z[:] = self._solution.x
+            qp.step()
+        else:
+            self.cold = True  # a failed solve never seeds the next
         return status
 
     @property

@@ -105,6 +105,6 @@ def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> Report:
         if k % (SAMPLES // OPINIONS) == 0 and status is QpStatus.SOLVED:
             solution = qpsolvers.solve_problem(rti.qp.to_problem(), SECOND)
             other = solution.x if solution.found else None
-            differences.append(np.inf if other is None else float(np.max(np.abs(rti.solver.z - other))))
+            differences.append(np.inf if other is None else float(np.max(np.abs(rti.qp.z - other))))
         x = rti.x[1] + NOISE * rng.standard_normal(model.nx)
     return Report(prepare_us, feedback_us, statuses, len(differences), max(differences, default=np.inf))

@@ -28,7 +28,8 @@ ALONE = {
     "rerun": {"service/blueprint.py", "service/outlet.py", "service/recording.py", "service/view.py"},
     "qpsolvers": {"rti_mpc/qp.py", "service/check.py"},
     "casadi": {
-        *(f"rti_mpc/{name}.py" for name in ("model", "pioneer_3dx", "integrator", "ocp", "transcription", "codegen", "track")),
+        *(f"rti_mpc/{name}.py" for name in ("simultaneous", "sequential")),
+        *(f"rti_mpc/{name}.py" for name in ("model", "pioneer_3dx", "integrator", "ocp", "linearization", "transcription", "codegen", "qp", "track")),
         "sim/plant.py",
     },
 }
@@ -42,7 +43,9 @@ FLOW: tuple[set[str], ...] = (
     {"model"},
     {"pioneer_3dx", "integrator", "track"},
     {"ocp"},
+    {"linearization"},
     {"transcription"},
+    {"simultaneous", "sequential"},
     {"codegen"},
     {"qp"},
     {"solver"},

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+The linear-quadratic approximation of the OCP at a guess, stage by stage: what both formulations are made of.
+
+At a guess :math:`(x, u)`, in the deviations
+:math:`\Delta x_k = x_k^+ - x_k`, :math:`\Delta u_k = u_k^+ - u_k`, the
+dynamics and outputs of `rti_mpc.ocp` become
+
+.. math::
+
+    \Delta x_0 &= \bar x_0 - x_0 \\
+    \Delta x_{k+1} &= A_k \Delta x_k + B_k \Delta u_k + b_k, \qquad b_k = \phi(x_k, u_k, p_k) - x_{k+1} \\
+    y_i &\approx h(x_i, p_i) + C_i \Delta x_i
+
+and the cost its Gauss-Newton approximation. It is halved, to read
+:math:`\tfrac12 z^T P z + q^T z` as a QP solver wants it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import scipy.sparse as sp
+
+from rti_mpc.ocp import Ocp
+
+# What may change between samples without a new structure: attributes of the Ocp, read by the compiled functions in this order.
+WEIGHTS = ("Q", "R", "delta", "lambda_", "lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx", "z", "Z")
+
+
+class Linearization:
+    """
+    Expressions of one sample. Columns are stages or nodes.
+
+    Attributes:
+        x: State guess, shape ``(nx, N + 1)``.
+        u: Input guess, shape ``(nu, N_u)``.
+        u_prev: Input before the plan, shape ``(nu, 1)``.
+        y_ref: Reference, shape ``(ny, N)``.
+        p: Stage parameters, shape ``(np, N + 1)``.
+        w: The weights and bounds, by the names in `WEIGHTS`.
+        A: Sensitivities to the state, nonzeros of `A_k` column by column, shape ``(nnz, N)``.
+        B: Sensitivities to the input, nonzeros of `B_k`, shape ``(nnz, N)``.
+        A_k: Pattern of one A, shape ``(nx, nx)``.
+        B_k: Pattern of one B, shape ``(nx, nu)``.
+        b: Defects, shape ``(nx, N)``.
+        gradient: Gradient of half the output cost in the states at nodes 1 to N, shape ``(nx, N)``.
+        hessian: Its Gauss-Newton Hessian, upper triangle, nonzeros of `H_i`, shape ``(nnz, N)``.
+        H_i: Pattern of one upper triangle, shape ``(nx, nx)``.
+        increments: ``u_k - u_{k-1}``, shape ``(nu, N_u)``.
+        force: ``lambda_k R (u_k - u_{k-1})``, shape ``(nu, N_u)``.
+        R: The increment weight, sparse.
+        cost: The cost (4) at the guess.
+        checksum: Finite if and only if everything above is.
+    """
+
+    def __init__(self, ocp: Ocp) -> None:
+        model, N, N_u = ocp.model, ocp.N, ocp.N_u
+        nx, nu = model.nx, model.nu
+        self.x = ca.MX.sym("x", nx, N + 1)
+        self.u = ca.MX.sym("u", nu, N_u)
+        self.u_prev = ca.MX.sym("u_prev", nu)
+        self.y_ref = ca.MX.sym("y_ref", model.ny, N)
+        self.p = ca.MX.sym("p", model.np_, N + 1)
+        self.w = {name: ca.MX.sym(name, *np.shape(getattr(ocp, name))) for name in WEIGHTS}
+
+        stage, self.A_k, self.B_k = linearize(ocp)
+        held = ca.horzcat(self.u, ca.repmat(self.u[:, -1], 1, N - N_u))
+        stages = stage.map(N)(self.x[:, :-1], held, self.p[:, :-1])
+        to_B = nx + self.A_k.nnz()
+        self.A, self.B = stages[nx:to_B, :], stages[to_B:, :]
+        self.b = stages[:nx, :] - self.x[:, 1:]
+
+        node, self.H_i = gauss_newton(ocp)
+        nodes = node.map(N)(self.x[:, 1:], self.p[:, 1:], self.y_ref, self.w["delta"].T, ca.repmat(self.w["Q"], 1, N))
+        self.gradient, self.hessian = nodes[:nx, :], nodes[nx + 1 :, :]
+        self.increments = self.u - ca.horzcat(self.u_prev, self.u[:, :-1])
+        self.R = self.w["R"] * pattern(ocp.R)
+        self.force = (self.R @ self.increments) * ca.repmat(self.w["lambda_"].T, nu, 1)
+        self.cost = ca.sum2(nodes[nx, :]) + ca.dot(self.increments, self.force)
+        self.checksum = ca.sum1(ca.vec(stages)) + ca.sum1(ca.vec(nodes)) + self.cost + ca.sum1(ca.vec(self.b))
+
+    @property
+    def arguments(self) -> list[ca.MX]:
+        """What the data of a sample depends on, in the order of all compiled functions."""
+        return [*self.sample, *self.w.values()]
+
+    @property
+    def sample(self) -> list[ca.MX]:
+        """What changes from sample to sample: all but the weights."""
+        return [self.x, self.u, self.u_prev, self.y_ref, self.p]
+
+    def increment_gradient(self) -> ca.MX:
+        """Return the gradient of half the increment cost in the inputs, shape ``(nu, N_u)``."""
+        return self.force - ca.horzcat(self.force[:, 1:], ca.MX.zeros(self.u_prev.numel()))
+
+    def increment_hessian(self, k: int) -> tuple[ca.MX, ca.MX | None]:
+        """Return the blocks ``(k, k)`` and ``(k, k + 1)`` of the Hessian of half the increment cost; None after the last stage."""
+        last = k == self.u.shape[1] - 1
+        following = 0 if last else self.w["lambda_"][k + 1]
+        return self.R * (self.w["lambda_"][k] + following), None if last else -self.R * following
+
+
+def linearize(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
+    """
+    Linearize the dynamics over one stage.
+
+    Returns:
+        ``stage(x, u, p) -> [phi; nonzeros of A; nonzeros of B]``, with the patterns of A, shape ``(nx, nx)``, and of B, shape ``(nx, nu)``.
+    """
+    model = ocp.model
+    x_next = ocp.phi()(model.x, model.u, model.p)
+    A = ca.jacobian(x_next, model.x)
+    B = ca.jacobian(x_next, model.u)
+    out = ca.cse(ca.densify(ca.vertcat(x_next, A.nz[:], B.nz[:])))
+    return ca.Function("stage", [model.x, model.u, model.p], [out]), A.sparsity(), B.sparsity()
+
+
+def gauss_newton(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity]:
+    r"""
+    Build the terms of :math:`\tfrac12 \delta \|h(x, p) - y_{ref}\|_Q^2` at one node.
+
+    Returns:
+        ``node(x, p, y_ref, delta, Q) -> [gradient in x; twice the term itself; nonzeros of triu(delta C' Q C)]``, and the pattern of the last.
+    """
+    model = ocp.model
+    y_ref = ca.SX.sym("y_ref", model.ny)
+    delta = ca.SX.sym("delta")
+    Q = ca.SX.sym("Q", model.ny, model.ny)
+    W = delta * Q * pattern(ocp.Q)
+    C = ca.jacobian(model.y_expr, model.x)
+    e = model.y_expr - y_ref
+    H = ca.triu(C.T @ W @ C)
+    out = ca.cse(ca.densify(ca.vertcat(C.T @ (W @ e), e.T @ (W @ e), H.nz[:])))
+    return ca.Function("node", [model.x, model.p, y_ref, delta, Q], [out]), H.sparsity()
+
+
+def pattern(weight: np.ndarray[Any, Any]) -> ca.DM:
+    """Return ones where a weight matrix may become nonzero: its diagonal, and what is nonzero now."""
+    return ca.DM(sp.csc_matrix(((weight != 0) | np.eye(len(weight), dtype=bool)).astype(float)))

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+The simultaneous formulation: states and inputs are variables, the QP is sparse.
+
+Its variables are :math:`z = (\Delta x_0, \dots, \Delta x_N, \Delta u_0, \dots,
+\Delta u_{N_u - 1}, s_1, \dots, s_N)`, its rows
+
+1. the initial state, the only ones the feedback phase touches,
+2. the dynamics,
+3. the bounds on inputs, and on increments,
+4. the softened bounds on states from above and from below, and :math:`s \ge 0`.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import scipy.sparse as sp
+
+from rti_mpc.linearization import Linearization
+from rti_mpc.ocp import Ocp
+from rti_mpc.transcription import (
+    SLACK_UNIT,
+    Blocks,
+    Rows,
+    Transcription,
+    clipped,
+    data_functions,
+    each,
+    finite,
+    input_rows,
+    violation,
+    weight_symbols,
+)
+
+
+def simultaneous(ocp: Ocp, *, state_bounds: bool = True) -> Transcription:
+    """
+    Transcribe an OCP with states and inputs as variables.
+
+    Args:
+        ocp: The problem.
+        state_bounds: Whether the bounds on states, and their slacks, are there.
+    """
+    lin = Linearization(ocp)
+    N, N_u, nx, nu, w = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu, lin.w
+    soft = list(ocp.soft) if state_bounds else []
+    nodes = lin.x[:, 1:]  # the cost and the state bounds begin at node 1
+    to_du, to_s = (N + 1) * nx, (N + 1) * nx + N_u * nu
+    n = to_s + N * len(soft)
+
+    A, rows = Blocks(), Rows()
+    zero = ca.MX.zeros(nx)
+    A.place(rows.add(zero, zero, zero), 0, sp.eye_array(nx))
+
+    # Dynamics: A_k dx_k + B_k du_k - dx_{k+1} = -b_k.
+    row = rows.add(ca.MX.zeros(lin.b.shape), lin.b, ca.MX.zeros(lin.b.shape))
+    A.place_values(ca.vec(lin.A), [(row + k * nx, k * nx, lin.A_k) for k in range(N)])
+    A.place_values(ca.vec(lin.B), [(row + k * nx, to_du + min(k, N_u - 1) * nu, lin.B_k) for k in range(N)])
+    A.place(row, nx, -sp.eye_array(N * nx))
+
+    input_rows(ocp, lin, rows, A, to_du)
+
+    # Softened bounds on states: x - s <= ubx, x + s >= lbx, s >= 0.
+    for bound, sign in (("ubx", -1), ("lbx", 1)):
+        at = [j for j in finite(getattr(ocp, bound)) if j in soft]
+        if at:
+            limit = each(w[bound][at], N)
+            row = rows.add(None if sign < 0 else limit, nodes[at, :], limit if sign < 0 else None)
+            A.place(row, nx, sp.kron(sp.eye_array(N), np.eye(nx)[at]))
+            A.place(row, to_s, sign * SLACK_UNIT * sp.kron(sp.eye_array(N), np.eye(nx)[np.ix_(at, soft)]))
+    if soft:
+        slack = ca.MX.zeros(len(soft), N)
+        A.place(rows.add(slack, slack, None), to_s, sp.eye_array(N * len(soft)))
+
+    P = Blocks()
+    P.place_values(ca.vec(lin.hessian), [(nx + i * nx, nx + i * nx, lin.H_i) for i in range(N)])
+    for k in range(N_u):
+        at_k = to_du + k * nu
+        diagonal, beside = lin.increment_hessian(k)
+        P.place_values(ca.triu(diagonal).nz[:], [(at_k, at_k, ca.triu(diagonal).sparsity())])
+        if beside is not None:
+            P.place_values(beside.nz[:], [(at_k, at_k + nu, beside.sparsity())])
+    if soft:
+        P.place_values(ca.repmat(SLACK_UNIT**2 / 2 * w["Z"][soft], N), [(to_s, to_s, ca.Sparsity.diag(N * len(soft)))])
+    q = ca.vertcat(zero, ca.vec(lin.gradient), ca.vec(lin.increment_gradient()), ca.repmat(SLACK_UNIT / 2 * w["z"][soft], N))
+
+    A_pattern, A_data = A.finish(rows.count, n)
+    P_pattern, P_data = P.finish(n, n)
+    outputs = [q, P_data, A_data, ca.vertcat(*rows.lower), ca.vertcat(*rows.upper), ca.MX.zeros(0), lin.cost, lin.checksum]
+    everything, varying, data = data_functions(lin, outputs)
+    return Transcription(
+        P=P_pattern,
+        A=A_pattern,
+        everything=everything,
+        varying=varying,
+        data=data,
+        embed=embed(ocp),
+        embedded=(("l", slice(0, nx)), ("u", slice(0, nx))),
+        step=full_step(ocp, n),
+        slacks=slice(to_s, n),
+        eliminable=to_du,
+    )
+
+
+def embed(ocp: Ocp) -> ca.Function:
+    """Write the initial state into the bounds of its rows."""
+    x0 = ca.SX.sym("x0", ocp.model.nx)
+    x = ca.SX.sym("x", ocp.model.nx, ocp.N + 1)
+    deviation = x0 - x[:, 0]
+    return ca.Function("embed", [x0, x, ca.SX(0, 1)], [deviation, deviation])
+
+
+def full_step(ocp: Ocp, n: int) -> ca.Function:
+    """Read states and inputs off the solution."""
+    x = ca.SX.sym("x", ocp.model.nx, ocp.N + 1)
+    u = ca.SX.sym("u", ocp.model.nu, ocp.N_u)
+    u_prev = ca.SX.sym("u_prev", ocp.model.nu)
+    z = ca.SX.sym("z", n)
+    x0 = ca.SX.sym("x0", ocp.model.nx)
+    w = weight_symbols(ocp)
+    to_du, to_s = x.numel(), x.numel() + u.numel()
+    x_plan = x + ca.reshape(z[:to_du], x.shape)
+    u_plan = clipped(ocp, u + ca.reshape(z[to_du:to_s], u.shape), u_prev, w)
+    return ca.Function("step", [x, u, u_prev, z, x0, ca.SX(0, 1), *w.values()], [x_plan, u_plan, violation(ocp, x_plan, w)])
