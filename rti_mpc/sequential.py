@@ -42,49 +42,49 @@ class Condensing:
     """
     Expressions of the condensed problem.
 
-    The responses to inputs, initial state and defects are columns of one matrix, so that two loops over the stages make everything.
-
     Attributes:
-        G: Responses at nodes 1 to N, each of shape ``(nx, nu * N_u + nx + 1)``: to the inputs, to the initial state, to the defects.
-        H: Rows of the Hessian, one block of shape ``(nu, nu * N_u)`` for each input; right up to its diagonal block.
-        M: Gradient in the inputs: coefficients of the initial state and, in the last column, the rest; shape ``(nu * N_u, nx + 1)``.
+        G: Response of the states at nodes 1 to N to the inputs that have acted by then, each of shape ``(nx, nu * min(i, N_u))``.
+        Phi: Response to the initial state, each of shape ``(nx, nx)``.
+        c: Response to the defects, each of shape ``(nx, 1)``.
+        H: Rows of the Hessian up to the diagonal block, one of shape ``(nu, nu * (k + 1))`` for each input.
+        M: Coefficients of the initial state in the gradient, shape ``(nu * N_u, nx)``.
+        m: The rest of the gradient, shape ``(nu * N_u, 1)``.
     """
 
     def __init__(self, ocp: Ocp, lin: Linearization) -> None:
         N, N_u, nx, nu = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu
-        inputs, width = nu * N_u, nu * N_u + nx + 1
-        a, b, h = (ca.SX.sym(name, pattern.nnz()) for name, pattern in (("a", lin.A_k), ("b", lin.B_k), ("h", lin.H_i)))
-        A, B, H = ca.SX(lin.A_k, a), ca.SX(lin.B_k, b), ca.triu2symm(ca.SX(lin.H_i, h))
-        acting = ca.SX.sym("acting", N_u)  # 1 for the input that acts at the stage
-        last = ca.SX.sym("last", nx)
-        X, W = ca.SX.sym("X", nx, width), ca.SX.sym("W", nx, width)
-        beside = ca.horzcat(ca.SX(nx, width - 1), last)
+        A, B, H = (
+            [ca.MX(sparsity, nonzeros[:, k]) for k in range(N)]
+            for sparsity, nonzeros in ((lin.A_k, lin.A), (lin.B_k, lin.B), (lin.H_i, lin.hessian))
+        )
+        self.G: list[ca.MX] = []
+        self.Phi: list[ca.MX] = []
+        self.c: list[ca.MX] = []
+        G, Phi, c = ca.MX(nx, 0), ca.MX.eye(nx), ca.MX.zeros(nx)
+        for k in range(N):
+            G, Phi, c = A[k] @ G, A[k] @ Phi, A[k] @ c + lin.b[:, k]
+            G = ca.horzcat(G, ca.densify(B[k])) if k < N_u else ca.horzcat(G[:, :-nu], G[:, -nu:] + B[k])
+            Phi = ca.densify(Phi)
+            self.G.append(G)
+            self.Phi.append(Phi)
+            self.c.append(c)
 
-        response = ca.horzcat(ca.kron(acting.T, B), ca.SX(nx, nx), last)
-        forward = ca.Function("forward", [X, a, b, acting, last], [ca.densify(A @ X + response)])
-        sum_W = ca.densify(H @ X + A.T @ W + beside)
-        backward = ca.Function("backward", [W, a, b, h, X, last], [sum_W, ca.densify(B.T @ sum_W)])
-
-        start = ca.DM.zeros(nx, width)
-        start[:, inputs:-1] = ca.DM.eye(nx)
-        schedule = ca.DM(np.eye(N_u)[:, np.minimum(np.arange(N), N_u - 1)])
-        responses = forward.mapaccum("forwards", N)(start, lin.A, lin.B, schedule, lin.b)
-        self.G = ca.horzsplit(responses, width)
-
-        # Backwards, from node N: W_i = H_i G_i + A_i' W_{i+1}, and rows B_{i-1}' W_i.
-        back = list(range(N))[::-1]
-        A_after = ca.horzcat(lin.A[:, 1:], ca.MX.zeros(lin.A_k.nnz()))
-        columns = [width * i + j for i in back for j in range(width)]
-        sums = backward.mapaccum("backwards", N)(
-            ca.DM.zeros(nx, width), A_after[:, back], lin.B[:, back], lin.hessian[:, back], responses[:, columns], lin.gradient[:, back]
-        )[1]
-        rows = ca.horzsplit(sums, width)[::-1]
-        held = rows[N_u - 1]
-        for row in rows[N_u:]:
-            held = held + row
-        rows = [*rows[: N_u - 1], held]
-        self.H = [row[:, :inputs] for row in rows]
-        self.M = ca.vertcat(*(row[:, inputs:] for row in rows))
+        # Backwards: W_i = H_i G_i + A_i' W_{i+1}, of which the inputs before node i alone are wanted; rows B_{i-1}' W_i.
+        self.H: list[ca.MX] = [ca.MX.zeros(nu, nu * (k + 1)) for k in range(N_u)]
+        M = [ca.MX.zeros(nu, nx) for _ in range(N_u)]
+        m = [ca.MX.zeros(nu) for _ in range(N_u)]
+        for k in reversed(range(N)):
+            at = min(k, N_u - 1)
+            W_G, W_Phi, W_c = H[k] @ self.G[k], H[k] @ self.Phi[k], H[k] @ self.c[k] + lin.gradient[:, k]
+            if k < N - 1:
+                A_T = A[k + 1].T
+                W_G, W_Phi, W_c = W_G + A_T @ V_G[:, : nu * (at + 1)], W_Phi + A_T @ V_Phi, W_c + A_T @ V_c  # noqa: F821
+            V_G, V_Phi, V_c = ca.densify(W_G), ca.densify(W_Phi), ca.densify(W_c)  # noqa: F841
+            B_T = B[k].T
+            self.H[at] += B_T @ V_G
+            M[at] += B_T @ V_Phi
+            m[at] += B_T @ V_c
+        self.M, self.m = ca.vertcat(*M), ca.vertcat(*m)
 
 
 def sequential(ocp: Ocp, *, state_bounds: bool = True) -> Transcription:
@@ -111,10 +111,10 @@ def sequential(ocp: Ocp, *, state_bounds: bool = True) -> Transcription:
     for bound, sign in (("ubx", -1), ("lbx", 1)):
         at = [j for j in finite(getattr(ocp, bound)) if j in soft]
         for i in range(N) if at else ():
-            value = lin.x[at, i + 1] + condensed.G[i][at, -1]
+            value = lin.x[at, i + 1] + condensed.c[i][at]
             limit = w[bound][at]
             row = rows.add(None if sign < 0 else limit, value, limit if sign < 0 else None)
-            G = condensed.G[i][at, : nu * min(i + 1, N_u)]
+            G = condensed.G[i][at, :]
             A.place_values(ca.vec(G), [(row, 0, ca.Sparsity.dense(*G.shape))])
             A.place(row, to_s + i * len(soft), sign * SLACK_UNIT * sp.csc_array(np.eye(nx)[np.ix_(at, soft)]))
             limits += [(bound, i, j) for j in at]
@@ -127,7 +127,7 @@ def sequential(ocp: Ocp, *, state_bounds: bool = True) -> Transcription:
 
     P = Blocks()
     for k in range(N_u):
-        column = condensed.H[k][:, : nu * (k + 1)].T
+        column = condensed.H[k].T
         diagonal, _ = lin.increment_hessian(k)
         beside = lin.increment_hessian(k - 1)[1] if k else None
         addition = [ca.MX.zeros(nu * max(0, k - 1), nu), *([ca.densify(beside)] if beside is not None else []), ca.densify(diagonal)]
@@ -136,12 +136,12 @@ def sequential(ocp: Ocp, *, state_bounds: bool = True) -> Transcription:
         P.place_values(ca.vec(column)[np.flatnonzero(upper.T.ravel()).tolist()], [(0, k * nu, ca.DM(sp.csc_matrix(upper)).sparsity())])
     if soft:
         P.place_values(ca.repmat(SLACK_UNIT**2 / 2 * w["Z"][soft], N), [(to_s, to_s, ca.Sparsity.diag(N * len(soft)))])
-    q_inputs = condensed.M[:, nx] + ca.vec(lin.increment_gradient())
-    q = ca.vertcat(q_inputs, ca.repmat(SLACK_UNIT / 2 * w["z"][soft], N))
+    q_inputs = condensed.m + ca.vec(lin.increment_gradient())
+    q = ca.vertcat(q_inputs, ca.repmat(SLACK_UNIT / 2 * w["z"][soft, 0], N))
 
     lower, upper_bounds = ca.vertcat(*rows.lower), ca.vertcat(*rows.upper)
-    Phi = ca.vertcat(*(condensed.G[i][j, to_s : to_s + nx] for _, i, j in limits)) if limits else ca.MX(0, nx)
-    memory = ca.veccat(lin.A, lin.B, lin.b, q_inputs, condensed.M[:, :nx], Phi, lower[first_soft:end_soft], upper_bounds[first_soft:end_soft])
+    Phi = ca.vertcat(*(condensed.Phi[i][j, :] for _, i, j in limits)) if limits else ca.MX(0, nx)
+    memory = ca.veccat(lin.A, lin.B, lin.b, q_inputs, condensed.M, Phi, lower[first_soft:end_soft], upper_bounds[first_soft:end_soft])
     A_pattern, A_data = A.finish(rows.count, n)
     P_pattern, P_data = P.finish(n, n)
     checksum = lin.checksum + ca.sum1(memory) + ca.sum1(P_data)

@@ -74,7 +74,9 @@ def simultaneous(ocp: Ocp, *, state_bounds: bool = True) -> Transcription:
         A.place(rows.add(slack, slack, None), to_s, sp.eye_array(N * len(soft)))
 
     P = Blocks()
-    P.place_values(ca.vec(lin.hessian), [(nx + i * nx, nx + i * nx, lin.H_i) for i in range(N)])
+    H_upper = ca.triu(lin.H_i)
+    in_upper = [i for i, (row, col) in enumerate(zip(*lin.H_i.get_triplet(), strict=True)) if row <= col]
+    P.place_values(ca.vec(lin.hessian[in_upper, :]), [(nx + i * nx, nx + i * nx, H_upper) for i in range(N)])
     for k in range(N_u):
         at_k = to_du + k * nu
         diagonal, beside = lin.increment_hessian(k)
@@ -83,7 +85,7 @@ def simultaneous(ocp: Ocp, *, state_bounds: bool = True) -> Transcription:
             P.place_values(beside.nz[:], [(at_k, at_k + nu, beside.sparsity())])
     if soft:
         P.place_values(ca.repmat(SLACK_UNIT**2 / 2 * w["Z"][soft], N), [(to_s, to_s, ca.Sparsity.diag(N * len(soft)))])
-    q = ca.vertcat(zero, ca.vec(lin.gradient), ca.vec(lin.increment_gradient()), ca.repmat(SLACK_UNIT / 2 * w["z"][soft], N))
+    q = ca.vertcat(zero, ca.vec(lin.gradient), ca.vec(lin.increment_gradient()), ca.repmat(SLACK_UNIT / 2 * w["z"][soft, 0], N))
 
     A_pattern, A_data = A.finish(rows.count, n)
     P_pattern, P_data = P.finish(n, n)
