@@ -131,6 +131,7 @@ class Robot:
     def run(self, stop: Event, until_ns: int | None = None) -> None:
         """Live until stopped."""
         body = self.body
+        self.clock.set_back(body.now_ns)  # what came before was birth
         while not stop.is_set() and (until_ns is None or body.now_ns < until_ns):
             due_ns = body.due_ns
             self.clock.wait(due_ns, stop)

@@ -146,12 +146,15 @@ def _open(settings: BusSettings) -> zenoh.Session:
                 raise ConfigError(f"bus: endpoints must be free and valid, got: {_brief(error)}") from None
             time.sleep(RETRY_S)
 
+give_way: Callable[[], None] = getattr(os, "sched_yield", lambda: None)  # not on every system
+
 
 class Publisher(Generic[M]):
     """Sends messages of one class on one key. `put` never blocks, and after `Bus.close` does nothing."""
 
-    def __init__(self, publisher: zenoh.Publisher | ext.AdvancedPublisher) -> None:
+    def __init__(self, publisher: zenoh.Publisher | ext.AdvancedPublisher, *, realtime: bool = False) -> None:
         self._publisher = publisher
+        self._realtime = realtime
 
     @property
     def heard(self) -> bool:
@@ -172,6 +175,8 @@ class Publisher(Generic[M]):
         except zenoh.ZError as error:
             if "closed" not in str(error):
                 raise
+        if self._realtime:
+            give_way()  # to the thread that sends it: whoever puts goes on computing, and cores may be few
 
 
 class Subscriber:
@@ -253,7 +258,7 @@ class Bus:
             cached: Whether late joiners get the last message.
         """
         priority = zenoh.Priority.REAL_TIME if realtime else zenoh.Priority.DATA if cached else zenoh.Priority.DATA_LOW
-        return Publisher(self._publisher(key, encoding(cls), priority, express=realtime, cached=cached))
+        return Publisher(self._publisher(key, encoding(cls), priority, express=realtime, cached=cached), realtime=realtime)
 
     def subscriber(self, key: str, *, capacity: int = 1, cached: bool = False) -> Subscriber:
         """
