@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import signal
-from threading import Event
+from threading import Event, Thread
 from types import FrameType
 
 
@@ -13,7 +13,7 @@ def stop_on_signals() -> Event:
     stop = Event()
 
     def handle(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
+        Thread(target=stop.set, daemon=True).start()  # not here: the main thread may hold the event's lock, inside `stop.wait`
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, handle)

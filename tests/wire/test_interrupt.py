@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from threading import Timer
+
+ROOT = Path(__file__).parents[2]
+LOOP = """
+import time
+from rti_mpc.wire.interrupt import stop_on_signals
+
+stop = stop_on_signals()
+print("ready", flush=True)
+deadline_s = time.monotonic() + 2.0
+while time.monotonic() < deadline_s:
+    stop.clear()
+    stop.wait(1e-5)
+stop.clear()
+print("survived", flush=True)
+stop.wait()
+"""
+
+
+def test_ctrl_c_never_hangs_a_process_that_waits_for_it() -> None:
+    """The handler runs in the main thread, which may be inside the very wait that it ends."""
+    with subprocess.Popen([sys.executable, "-c", LOOP], cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        patience = Timer(10.0, process.kill)
+        patience.start()
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ready\n"
+            for _ in range(2000):
+                process.send_signal(signal.SIGINT)
+                time.sleep(5e-4)  # the pace of the storm: nobody is waited for
+            assert process.stdout.readline() == "survived\n"
+            process.send_signal(signal.SIGINT)
+            assert process.wait(5.0) == 0
+        finally:
+            patience.cancel()
+            process.kill()
