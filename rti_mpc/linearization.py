@@ -47,8 +47,8 @@ class Linearization:
         B_k: Pattern of one B, shape ``(nx, nu)``.
         b: Defects, shape ``(nx, N)``.
         gradient: Gradient of half the output cost in the states at nodes 1 to N, shape ``(nx, N)``.
-        hessian: Its Gauss-Newton Hessian, upper triangle, nonzeros of `H_i`, shape ``(nnz, N)``.
-        H_i: Pattern of one upper triangle, shape ``(nx, nx)``.
+        hessian: Its Gauss-Newton Hessian, nonzeros of `H_i`, shape ``(nnz, N)``.
+        H_i: Pattern of one Hessian, symmetric, shape ``(nx, nx)``.
         increments: ``u_k - u_{k-1}``, shape ``(nu, N_u)``.
         force: ``lambda_k R (u_k - u_{k-1})``, shape ``(nu, N_u)``.
         R: The increment weight, sparse.
@@ -123,7 +123,7 @@ def gauss_newton(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity]:
     Build the terms of :math:`\tfrac12 \delta \|h(x, p) - y_{ref}\|_Q^2` at one node.
 
     Returns:
-        ``node(x, p, y_ref, delta, Q) -> [gradient in x; twice the term itself; nonzeros of triu(delta C' Q C)]``, and the pattern of the last.
+        ``node(x, p, y_ref, delta, Q) -> [gradient in x; twice the term itself; nonzeros of delta C' Q C]``, and the pattern of the last.
     """
     model = ocp.model
     y_ref = ca.SX.sym("y_ref", model.ny)
@@ -132,7 +132,7 @@ def gauss_newton(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity]:
     W = delta * Q * pattern(ocp.Q)
     C = ca.jacobian(model.y_expr, model.x)
     e = model.y_expr - y_ref
-    H = ca.triu(C.T @ W @ C)
+    H = C.T @ W @ C
     out = ca.cse(ca.densify(ca.vertcat(C.T @ (W @ e), e.T @ (W @ e), H.nz[:])))
     return ca.Function("node", [model.x, model.p, y_ref, delta, Q], [out]), H.sparsity()
 

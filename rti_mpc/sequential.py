@@ -53,38 +53,57 @@ class Condensing:
 
     def __init__(self, ocp: Ocp, lin: Linearization) -> None:
         N, N_u, nx, nu = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu
-        A, B, H = (
-            [ca.MX(sparsity, nonzeros[:, k]) for k in range(N)]
-            for sparsity, nonzeros in ((lin.A_k, lin.A), (lin.B_k, lin.B), (lin.H_i, lin.hessian))
-        )
         self.G: list[ca.MX] = []
         self.Phi: list[ca.MX] = []
         self.c: list[ca.MX] = []
-        G, Phi, c = ca.MX(nx, 0), ca.MX.eye(nx), ca.MX.zeros(nx)
+        apply_A, apply_H_A, apply_B, dense_B = kernels(lin, nu)
+        on_state = kernels(lin, nx)
+        on_defect = kernels(lin, 1)
+
+        G, Phi, c = ca.MX(nx, 0), ca.MX(ca.DM.eye(nx)), ca.MX.zeros(nx)
         for k in range(N):
-            G, Phi, c = A[k] @ G, A[k] @ Phi, A[k] @ c + lin.b[:, k]
-            G = ca.horzcat(G, ca.densify(B[k])) if k < N_u else ca.horzcat(G[:, :-nu], G[:, -nu:] + B[k])
-            Phi = ca.densify(Phi)
+            G = over(apply_A, min(k, N_u), [0])(lin.A[:, k], G) if k else G
+            B_k = dense_B(lin.B[:, k])
+            G = ca.horzcat(G, B_k) if k < N_u else ca.horzcat(G[:, :-nu], G[:, -nu:] + B_k)
+            Phi = on_state[0](lin.A[:, k], Phi)
+            c = on_defect[0](lin.A[:, k], c) + lin.b[:, k]
             self.G.append(G)
             self.Phi.append(Phi)
             self.c.append(c)
 
-        # Backwards: W_i = H_i G_i + A_i' W_{i+1}, of which the inputs before node i alone are wanted; rows B_{i-1}' W_i.
+        # Backwards: W_i = H_i X_i + A_i' W_{i+1} for each response X, of G the blocks before node i alone; rows B_{i-1}' W_i.
         self.H: list[ca.MX] = [ca.MX.zeros(nu, nu * (k + 1)) for k in range(N_u)]
         M = [ca.MX.zeros(nu, nx) for _ in range(N_u)]
         m = [ca.MX.zeros(nu) for _ in range(N_u)]
+        W_G, W_Phi, W_c = ca.MX.zeros(nx, nu * N_u), ca.MX.zeros(nx, nx), ca.MX.zeros(nx)
         for k in reversed(range(N)):
-            at = min(k, N_u - 1)
-            W_G, W_Phi, W_c = H[k] @ self.G[k], H[k] @ self.Phi[k], H[k] @ self.c[k] + lin.gradient[:, k]
-            if k < N - 1:
-                A_T = A[k + 1].T
-                W_G, W_Phi, W_c = W_G + A_T @ V_G[:, : nu * (at + 1)], W_Phi + A_T @ V_Phi, W_c + A_T @ V_c  # noqa: F821
-            V_G, V_Phi, V_c = ca.densify(W_G), ca.densify(W_Phi), ca.densify(W_c)  # noqa: F841
-            B_T = B[k].T
-            self.H[at] += B_T @ V_G
-            M[at] += B_T @ V_Phi
-            m[at] += B_T @ V_c
+            blocks = min(k + 1, N_u)
+            A_after = lin.A[:, k + 1] if k < N - 1 else ca.MX.zeros(lin.A_k.nnz())
+            W_G = over(apply_H_A, blocks, [0, 1])(lin.hessian[:, k], A_after, self.G[k], W_G[:, : nu * blocks])
+            W_Phi = on_state[1](lin.hessian[:, k], A_after, self.Phi[k], W_Phi)
+            W_c = on_defect[1](lin.hessian[:, k], A_after, self.c[k], W_c) + lin.gradient[:, k]
+            self.H[blocks - 1] += over(apply_B, blocks, [0])(lin.B[:, k], W_G)
+            M[blocks - 1] += on_state[2](lin.B[:, k], W_Phi)
+            m[blocks - 1] += on_defect[2](lin.B[:, k], W_c)
         self.M, self.m = ca.vertcat(*M), ca.vertcat(*m)
+
+
+def kernels(lin: Linearization, width: int) -> tuple[ca.Function, ca.Function, ca.Function, ca.Function]:
+    """Return ``A X``, ``H X + A' W`` and ``B' W`` for `width` columns, and B; from nonzeros, with every structural zero left out."""
+    a, b, h = (ca.SX.sym(name, pattern.nnz()) for name, pattern in (("a", lin.A_k), ("b", lin.B_k), ("h", lin.H_i)))
+    A, B, H = ca.SX(lin.A_k, a), ca.SX(lin.B_k, b), ca.SX(lin.H_i, h)
+    X, W = (ca.SX.sym(name, A.shape[0], width) for name in ("X", "W"))
+    return (
+        ca.Function(f"apply_A_{width}", [a, X], [ca.densify(A @ X)]),
+        ca.Function(f"apply_H_A_{width}", [h, a, X, W], [ca.densify(H @ X + A.T @ W)]),
+        ca.Function(f"apply_B_{width}", [b, W], [ca.densify(B.T @ W)]),
+        ca.Function("dense_B", [b], [ca.densify(B)]),
+    )
+
+
+def over(function: ca.Function, blocks: int, shared: list[int]) -> ca.Function:
+    """Return a function of so many blocks side by side; the arguments in `shared` are the same for all."""
+    return function if blocks == 1 else function.map(f"{function.name()}_{blocks}", "serial", blocks, shared, [], {})
 
 
 def sequential(ocp: Ocp, *, state_bounds: bool = True) -> Transcription:

@@ -146,6 +146,7 @@ def _open(settings: BusSettings) -> zenoh.Session:
                 raise ConfigError(f"bus: endpoints must be free and valid, got: {_brief(error)}") from None
             time.sleep(RETRY_S)
 
+
 give_way: Callable[[], None] = getattr(os, "sched_yield", lambda: None)  # not on every system
 
 
