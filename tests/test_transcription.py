@@ -14,7 +14,7 @@ from rti_mpc.array import Array
 from rti_mpc.ocp import Ocp
 from rti_mpc.qp import Qp
 from rti_mpc.rti import Rti
-from rti_mpc.transcription import INFINITY
+from rti_mpc.transcription import INFINITY, SLACK_UNIT
 from tests.problems import INF, beacon, double_integrator, pioneer
 
 PROBLEMS: dict[str, Callable[[], Ocp]] = {
@@ -28,23 +28,26 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
 }
 
 
-def at_random(ocp: Ocp, seed: int, *, compile: bool = True) -> Rti:
-    """Prepare at a guess, reference and parameters that are nowhere special."""
+def at_random(ocp: Ocp, seed: int, *, formulation: str = "simultaneous", compile: bool = False) -> Rti:
+    """Linearize everything, state bounds included, at a guess, reference and parameters that are nowhere special."""
     rng = np.random.default_rng(seed)
-    rti = simultaneous(ocp, compile=compile)
+    rti = Rti(ocp, formulation=formulation, compile=compile)
     rti.x[:] = rng.normal(size=rti.x.shape)
     rti.u[:] = rng.normal(size=rti.u.shape)
     p = np.array(ocp.model.p_nominal) * rng.uniform(0.8, 1.2, size=rti.p.shape)
     rti.prepare(rng.normal(size=rti.y_ref.shape), p, shift=False, u_prev=rng.normal(size=ocp.model.nu))
+    for solver in rti.solvers:
+        solver.load()
     return rti
 
 
-def simultaneous(ocp: Ocp, **options: Any) -> Rti:
-    return Rti(ocp, **options)
+def whole(rti: Rti) -> Qp:
+    """The QP with every bound."""
+    return rti.solvers[-1].qp
 
 
 class ByHand:
-    """The OCP as functions of all variables, ``v = (x, u, s)``, as its documentation writes it: nothing of it is differentiated."""
+    """The OCP as functions of all variables, ``v = (x, u, s / SLACK_UNIT)``, as its documentation writes it: nothing of it is differentiated."""
 
     def __init__(self, rti: Rti) -> None:
         self.ocp = ocp = rti.ocp
@@ -59,14 +62,14 @@ class ByHand:
         return v[: x.size].reshape(x.shape), v[x.size : x.size + u.size].reshape(u.shape), v[x.size + u.size :].reshape(self.ocp.N, -1)
 
     def residuals(self, v: Array) -> Array:
-        """What the Gauss-Newton cost is the squared norm of, slacks apart."""
+        """What the normalised Gauss-Newton cost is the squared norm of, slacks apart."""
         ocp, rti = self.ocp, self._rti
         x, u, _ = self._split(v)
         root_Q, root_R = (np.linalg.cholesky(W).T for W in (ocp.Q, ocp.R))
         e = [np.array(self._h(x[i], rti.p[i])).ravel() - rti.y_ref[i - 1] for i in range(1, ocp.N + 1)]
         du = np.diff(np.vstack([rti.u_prev, u]), axis=0)
         outputs = [np.sqrt(d) * root_Q @ e_i for d, e_i in zip(ocp.delta, e, strict=True)]
-        return np.concatenate([*outputs, (np.sqrt(ocp.lambda_)[:, None] * (du @ root_R.T)).ravel()])
+        return np.sqrt(rti._cost_scale) * np.concatenate([*outputs, (np.sqrt(ocp.lambda_)[:, None] * (du @ root_R.T)).ravel()])
 
     def rows(self, v: Array) -> Array:
         """Left-hand sides of all constraints, in the order the transcription documents."""
@@ -77,7 +80,7 @@ class ByHand:
         phi = [np.array(self._phi(x[k], u[held[k]], rti.p[k])).ravel() for k in range(ocp.N)]
         du = np.diff(np.vstack([rti.u_prev, u]), axis=0)
         wide = np.zeros((ocp.N, ocp.model.nx))
-        wide[:, soft] = s
+        wide[:, soft] = SLACK_UNIT * s
         return np.concatenate(
             [
                 x[0],
@@ -123,7 +126,7 @@ def test_constraint_matrix_is_the_jacobian_of_the_constraints(name: str) -> None
     rti = at_random(PROBLEMS[name](), seed=1)
     problem = ByHand(rti)
     difference = jacobian(problem.rows, problem.guess)
-    np.testing.assert_allclose(rti.qp.A.toarray(), difference, atol=2e-8)  # h^2 and rounding over h
+    np.testing.assert_allclose(whole(rti).A.toarray(), difference, atol=2e-8)  # h^2 and rounding over h
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -134,8 +137,8 @@ def test_bounds_of_the_qp_are_what_the_guess_leaves_of_the_bounds(name: str) -> 
     lb, ub = problem.bounds()
     g = problem.rows(problem.guess)
     nx = rti.ocp.model.nx  # the rows of the initial state are the feedback's
-    np.testing.assert_allclose(rti.qp.l[nx:], np.where(np.isfinite(lb), lb - g, -INFINITY)[nx:], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(rti.qp.u[nx:], np.where(np.isfinite(ub), ub - g, INFINITY)[nx:], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(whole(rti).l[nx:], np.where(np.isfinite(lb), lb - g, -INFINITY)[nx:], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(whole(rti).u[nx:], np.where(np.isfinite(ub), ub - g, INFINITY)[nx:], rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -144,8 +147,8 @@ def test_gradient_is_half_that_of_the_cost(name: str) -> None:
     ocp, problem = rti.ocp, ByHand(rti)
     difference = jacobian(lambda v: np.atleast_1d(0.5 * (problem.residuals(v) ** 2).sum()), problem.guess)[0]
     slacks = ocp.N * len(ocp.soft)
-    difference[len(difference) - slacks :] = 0.5 * np.tile(ocp.z[list(ocp.soft)], ocp.N)
-    np.testing.assert_allclose(rti.qp.q, difference, rtol=1e-7, atol=1e-6)  # costs of 1e3 over h
+    difference[len(difference) - slacks :] = 0.5 * rti._cost_scale * SLACK_UNIT * np.tile(ocp.z[list(ocp.soft)], ocp.N)
+    np.testing.assert_allclose(whole(rti).q, difference, rtol=1e-7, atol=1e-6)  # costs of 1e3 over h
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -157,8 +160,8 @@ def test_hessian_is_the_gauss_newton_approximation(name: str) -> None:
         J = jacobian(problem.residuals, problem.guess)
         expected = J.T @ J
         slacks = len(problem.guess) - ocp.N * len(ocp.soft)
-        expected[slacks:, slacks:] = np.diag(0.5 * np.tile(ocp.Z[list(ocp.soft)], ocp.N))
-        np.testing.assert_allclose(hessian(rti.qp), expected, rtol=1e-7, atol=1e-6)
+        expected[slacks:, slacks:] = np.diag(0.5 * rti._cost_scale * SLACK_UNIT**2 * np.tile(ocp.Z[list(ocp.soft)], ocp.N))
+        np.testing.assert_allclose(hessian(whole(rti)), expected, rtol=1e-7, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -166,29 +169,64 @@ def test_cost_at_the_guess_is_that_of_the_ocp(name: str) -> None:
     """A solution that changes nothing costs what the guess costs."""
     rti = at_random(PROBLEMS[name](), seed=6)
     problem = ByHand(rti)
-    assert rti._cost_at_guess[0] == pytest.approx((problem.residuals(problem.guess) ** 2).sum(), rel=1e-12)
+    assert rti.qp.cost[0] == pytest.approx((problem.residuals(problem.guess) ** 2).sum(), rel=1e-12)
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_no_entry_is_stored_that_is_never_nonzero(name: str) -> None:
     """Dense blocks would be right, and slow."""
-    A, P = (sum(abs(getattr(at_random(PROBLEMS[name](), seed=seed).qp, matrix).data) for seed in range(10, 14)) for matrix in "AP")
-    assert np.all(A > 0)
-    assert np.all(P > 0)
+    samples = [whole(at_random(PROBLEMS[name](), seed=seed)) for seed in range(10, 13)]
+    for matrix in "PA":
+        assert np.all(sum(abs(getattr(qp, matrix).data) for qp in samples) > 0)
+
+
+@pytest.mark.parametrize("name", ["pioneer_rk4", "beacon_rk4"])
+@pytest.mark.parametrize("formulation", ["simultaneous", "sequential"])
+def test_compiled_and_interpreted_functions_fill_the_same_qp(name: str, formulation: str) -> None:
+    ocp = PROBLEMS[name]()
+    compiled, interpreted = (whole(at_random(ocp, seed=7, formulation=formulation, compile=compile)) for compile in (True, False))
+    for attribute in "qluPA":
+        ours, theirs = (getattr(qp, attribute) if attribute in "qlu" else getattr(qp, attribute).data for qp in (compiled, interpreted))
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_compiled_and_interpreted_functions_fill_the_same_qp(name: str) -> None:
+def test_sequential_qp_is_the_simultaneous_one_with_the_states_eliminated(name: str) -> None:
+    """Number by number: Hessian, gradient, rows and bounds, the initial state embedded in both."""
     ocp = PROBLEMS[name]()
-    compiled, interpreted = (at_random(ocp, seed=7, compile=compile).qp for compile in (True, False))
-    for ours, theirs in ((getattr(compiled, a), getattr(interpreted, a)) for a in ("q", "l", "u")):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(compiled.A.data, interpreted.A.data, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(compiled.P.data, interpreted.P.data, rtol=1e-12, atol=1e-12)
+    sparse, dense = (at_random(ocp, seed=9, formulation=formulation) for formulation in ("simultaneous", "sequential"))
+    x0 = np.random.default_rng(9).normal(size=ocp.model.nx)
+    for rti in (sparse, dense):
+        rti._x0[:] = x0
+        whole(rti).embed()
+    full, reduced = whole(sparse), whole(dense)
+    scale = dense._cost_scale / sparse._cost_scale
+    k = sparse.x.size
+    A, P = full.A.toarray(), hessian(full)
+    offset = np.linalg.solve(A[:k, :k], full.l[:k])  # states where the inputs do not change
+    response = np.vstack([-np.linalg.solve(A[:k, :k], A[:k, k:]), np.eye(len(full.q) - k)])
+    at = np.concatenate([offset, np.zeros(len(full.q) - k)])
+    np.testing.assert_allclose(hessian(reduced), scale * response.T @ P @ response, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(reduced.q, scale * response.T @ (P @ at + full.q), rtol=1e-9, atol=1e-9)
+
+    def rows(matrix: Array, lower: Array, upper: Array) -> Array:
+        """Rows and bounds, in an order that depends on nothing but them."""
+        table = np.column_stack([matrix, lower, upper]).round(9) + 0.0
+        return table[np.lexsort(table.T)]
+
+    finite = np.where(np.abs(full.l[k:]) < INFINITY, A[k:] @ at, 0.0), np.where(np.abs(full.u[k:]) < INFINITY, A[k:] @ at, 0.0)
+    expected = rows(A[k:] @ response, full.l[k:] - finite[0], full.u[k:] - finite[1])
+    if len(expected):
+        np.testing.assert_allclose(rows(reduced.A.toarray(), reduced.l, reduced.u), expected, atol=1e-8)
+
+
+def test_sequential_qp_without_bounds_has_the_row_that_osqp_wants() -> None:
+    qp = whole(at_random(beacon(), seed=1, formulation="sequential"))
+    assert (qp.A.shape[0], qp.l[0], qp.u[0]) == (1, -INFINITY, INFINITY)
 
 
 def test_defects_vanish_on_a_trajectory_of_the_model() -> None:
-    rti = simultaneous(pioneer())
+    rti = Rti(pioneer(), formulation="simultaneous")
     rng = np.random.default_rng(8)
     rti.u[:] = rng.uniform(-0.4, 0.4, rti.u.shape)
     phi = rti.ocp.phi()
@@ -200,7 +238,7 @@ def test_defects_vanish_on_a_trajectory_of_the_model() -> None:
 
 
 def test_pattern_is_the_same_whatever_the_data() -> None:
-    first, second = (at_random(pioneer(), seed=seed).qp for seed in (20, 21))
+    first, second = (whole(at_random(pioneer(), seed=seed)) for seed in (20, 21))
     np.testing.assert_array_equal(first.A.indices, second.A.indices)
     np.testing.assert_array_equal(first.A.indptr, second.A.indptr)
     assert first.A.shape == second.A.shape
