@@ -16,6 +16,7 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
@@ -81,7 +82,7 @@ def bind(function: ca.Function, arguments: Sequence[Array], results: Sequence[Ar
     Raises:
         ShapeError: An array is not C-contiguous float64 of the right size.
     """
-    buffer, evaluate = function.buffer()
+    buffer, evaluate = cast(tuple[Any, Callable[[], None]], function.buffer())
     for arrays, count, name, sparsity, attach in (
         (arguments, function.n_in(), function.name_in, function.sparsity_in, buffer.set_arg),
         (results, function.n_out(), function.name_out, function.sparsity_out, buffer.set_res),

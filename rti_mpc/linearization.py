@@ -94,7 +94,7 @@ class Linearization:
 
     def increment_gradient(self) -> ca.MX:
         """Return the gradient of half the increment cost in the inputs, shape ``(nu, N_u)``."""
-        return self.force - ca.horzcat(self.force[:, 1:], ca.MX.zeros(self.u_prev.numel()))
+        return ca.MX(self.force - ca.horzcat(self.force[:, 1:], ca.MX.zeros(self.u_prev.numel())))
 
     def increment_hessian(self, k: int) -> tuple[ca.MX, ca.MX | None]:
         """Return the blocks ``(k, k)`` and ``(k, k + 1)`` of the Hessian of half the increment cost; None after the last stage."""

@@ -48,9 +48,9 @@ class SolverSettings:
         alpha: Over-relaxation, between 0 and 2.
     """
 
-    eps: float = 1e-6
-    max_iter: int = 400
-    rho: float = 1.0
+    eps: float = 1e-5
+    max_iter: int = 100
+    rho: float = 0.7
     check_termination: int = 5
     scaling: int = 0
     alpha: float = 1.6
