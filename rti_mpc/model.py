@@ -148,7 +148,10 @@ def find_model(name: str) -> Model:
         build: Callable[[], Model] = getattr(importlib.import_module(module_name), function_name)
     except (ImportError, AttributeError) as error:
         raise OcpError(f"a model must be one of {', '.join(SHIPPED)} or an importable package.module:function, got {name!r} ({error})") from error
-    model = build()
+    try:
+        model = build()
+    except Exception as error:  # whatever a user's function raises, named as theirs
+        raise OcpError(f"{name} must return a model, it raised {type(error).__name__}: {error}") from error
     if not isinstance(model, Model):
         raise OcpError(f"{name} must return a rti_mpc.model.Model, got {type(model).__name__}")
     return model

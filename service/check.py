@@ -22,7 +22,6 @@ from rich.progress import track
 from rich.table import Table
 
 from rti_mpc.array import Array
-from rti_mpc.rti import Rti
 from rti_mpc.status import QpStatus
 from service.config import Config, load
 
@@ -81,9 +80,9 @@ def main(path: Path) -> int:
 
 def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> Report:
     """Solve one QP for each of the samples."""
-    ocp = config.build_ocp()
+    rti = config.build_rti()
+    ocp = rti.ocp
     model, N = ocp.model, ocp.N
-    rti = Rti(ocp, config.solver_settings())
     rng = np.random.default_rng(1)
     x = np.array(config.robot_settings()["x0"])
     phases = rng.uniform(-np.pi, np.pi, model.ny)

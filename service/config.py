@@ -26,6 +26,7 @@ from service.schema import BusSection, ModelSection, OcpSection, Section, SimSec
 if TYPE_CHECKING:
     from rti_mpc.model import Model, Signal
     from rti_mpc.ocp import Ocp
+    from rti_mpc.rti import Rti
     from rti_mpc.solver import SolverSettings
     from rti_mpc.wire.bus import BusSettings
     from rti_mpc.wire.keys import Keys
@@ -91,6 +92,12 @@ class Config(Section):
             ubx=ubx,
             **({} if limits.soft_weight is None else {"z": limits.soft_weight}),
         )
+
+    def build_rti(self) -> Rti:
+        """Return the real-time iteration, compiled."""
+        from rti_mpc.rti import Rti
+
+        return Rti(self.build_ocp(), self.solver_settings(), formulation=self.ocp.formulation)
 
     def robot_settings(self) -> dict[str, Any]:
         """Return what `sim.settings.RobotSettings` is made from; the slew limits are those of the increments."""

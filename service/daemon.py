@@ -59,11 +59,11 @@ def main(config: Config, bus_settings: BusSettings, *, stop: Event | None = None
         Exit status: 0 when stopped, 1 when another controller is there or an unforeseen error ended this one.
     """
     stop = stop or stop_on_signals()
-    ocp = config.build_ocp()
-    rti = Rti(ocp, config.solver_settings())
+    rti = config.build_rti()
+    ocp = rti.ocp
     warm_up(rti)
     timing = Timing(config.timing.delay_s, config.stale_s, config.timing.valid_s)
-    with Bus(bus_settings, config.keys()) as bus:
+    with Bus(bus_settings, config.keys(), stop=stop) as bus:
         heard = heard_epoch(bus, stop)
         if bus.is_alive(ROLE, HEARING_S):
             print(f"rti-mpc: {config.robot} already has a controller: stop it first, or give this robot another name", file=sys.stderr)
@@ -71,7 +71,10 @@ def main(config: Config, bus_settings: BusSettings, *, stop: Event | None = None
         epoch = max(time.time_ns() // 1_000_000_000, heard + 1)
         controller = Controller(rti, timing, epoch=epoch, config_hash=config.config_hash)
         daemon = Daemon(controller, bus, epoch, ocp, config.stale_s)
-        bus.publish_json(bus.keys.info(ROLE), {**describe(ocp), "config_hash": config.config_hash, "epoch": epoch, "stale_s": config.stale_s})
+        bus.publish_json(
+            bus.keys.info(ROLE),
+            {**describe(ocp), "formulation": rti.formulation, "config_hash": config.config_hash, "epoch": epoch, "stale_s": config.stale_s},
+        )
         bus.serve(bus.keys.request, daemon.answer)
         bus.alive(ROLE)
         log.info("epoch %d controls %s every %g s", epoch, config.robot, ocp.dt)

@@ -23,7 +23,7 @@ def main(bus_settings: BusSettings, keys: Keys, request: str, timeout_s: float) 
     Returns:
         Exit status: 0 if it was granted, 1 if it was refused or nobody answered.
     """
-    with Bus(bus_settings, keys) as bus:
+    with Bus(bus_settings, keys, timeout_s=timeout_s) as bus:
         try:
             answer = bus.request(keys.request, {"request": request}, timeout_s)
         except TimeoutError:

@@ -82,6 +82,7 @@ class OcpSection(Section):
     N_u: int | None = Field(default=None, ge=1, description="control horizon, in stages; N if left out")
     dt_s: Period = Field(description="duration of a stage and period of the controller, in seconds")
     integrator: Literal["rk4", "euler"] = Field(description="integrator of a stage")
+    formulation: Literal["auto", "simultaneous", "sequential"] = Field(default="auto", description="of the QP; auto takes the faster one")
     weights: WeightSection = Field(description="the cost")
     bounds: BoundSection = Field(default=BoundSection(), description="bounds of inputs, increments and states")
 

@@ -84,7 +84,7 @@ def main(
         ConfigError: A setting is out of range, an endpoint is taken.
     """
     stop = stop or stop_on_signals()
-    with Bus(bus_settings, keys) as bus:
+    with Bus(bus_settings, keys, stop=stop) as bus:
         robot = Robot(settings, bus, speed, log)
         life = {"role": ROLE, "epoch": robot.body.epoch, "speed": speed, "state_period_s": settings.state_period_s}
         bus.publish_json(keys.info(ROLE), {**describe(settings.model), **(info or {}), **life})

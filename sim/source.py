@@ -10,7 +10,7 @@ one, for as long as the source lives.
 from __future__ import annotations
 
 import time
-from threading import Event, Thread
+from threading import Event
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 
 ROLE = "reference"
+LOOK_S = 0.02  # between two looks at the robot: waking for every state would take a core from those who control
 STALE_S = 1.0  # silence of the robot after which the reference is anchored to another one, even of a lower epoch
 
 
@@ -60,12 +61,11 @@ def main(
     """
     y = rows(trajectory, period_s, heading, a, psi0)
     stop = stop or stop_on_signals()
-    with Bus(bus_settings, keys) as bus:
+    with Bus(bus_settings, keys, stop=stop) as bus:
         source = Source(bus, trajectory, y, round(1e9 * period_s))
         bus.alive(ROLE)
-        Thread(target=source.follow, daemon=True).start()
-        while not stop.is_set():
-            time.sleep(0.05)
+        while not stop.wait(LOOK_S):
+            source.look()
     return source.anchored
 
 
@@ -89,16 +89,18 @@ class Source:
         self._intake = Intake(State, STALE_S)
         self._robot_epoch = -1
 
-    def follow(self) -> None:
-        """Publish whenever a robot starts, until the bus is closed."""
-        for received in iter(self._states.recv, None):
-            now_ns = time.monotonic_ns()
-            state = self._intake.accept(received, now_ns)
-            if state is not None and state.epoch != self._robot_epoch:
-                self._robot_epoch = state.epoch
-                self._anchor(state.stamp_ns)
-            for notice in self._intake.notices(now_ns):
-                self._announcer.say(notice.severity, notice.code, notice.text, 0 if state is None else state.stamp_ns)
+    def look(self) -> None:
+        """Publish if a robot has started since the last look."""
+        received = self._states.try_recv()
+        if received is None:
+            return
+        now_ns = time.monotonic_ns()
+        state = self._intake.accept(received, now_ns)
+        if state is not None and state.epoch != self._robot_epoch:
+            self._robot_epoch = state.epoch
+            self._anchor(state.stamp_ns)
+        for notice in self._intake.notices(now_ns):
+            self._announcer.say(notice.severity, notice.code, notice.text, 0 if state is None else state.stamp_ns)
 
     def _anchor(self, stamp_ns: int) -> None:
         """Publish the reference from a time on."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events of a process of this package, each kind at most once a second."""
+"""Events of a process of this package: mode changes each, faults at most once a second a kind."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class Announcer:
         self._last_ns: dict[str, int] = {}  # by code
 
     def say(self, severity: Severity, code: str, text: str, stamp_ns: int) -> None:
-        """Publish an event, unless one of its code just was."""
+        """Publish an event; a fault not, if one of its code just was."""
         now_ns = time.monotonic_ns()
-        if now_ns - self._last_ns.get(code, -PERIOD_NS) >= PERIOD_NS:
+        if severity is Severity.INFO or now_ns - self._last_ns.get(code, -PERIOD_NS) >= PERIOD_NS:
             self._last_ns[code] = now_ns
             self._seq += 1
             self._publisher.put(Event(self._epoch, self._seq, stamp_ns, self._role, severity, code, text))

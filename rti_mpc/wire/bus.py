@@ -20,6 +20,7 @@ never passes a router's access control.
 from __future__ import annotations
 
 import json
+import math
 import os
 import threading
 import time
@@ -135,8 +136,9 @@ def _brief(error: Exception) -> str:
     return " ".join(str(error).split(" at /")[0].split())
 
 
-def _open(settings: BusSettings) -> zenoh.Session:
-    """Open a session; a client waits for its router."""
+def _open(settings: BusSettings, timeout_s: float, stop: threading.Event | None) -> zenoh.Session:
+    """Open a session; a client waits for its router, unless it is stopped."""
+    deadline_s = time.monotonic() + timeout_s
     os.environ.setdefault("ZENOH_RUNTIME", THREADS)
     while True:
         try:
@@ -144,6 +146,8 @@ def _open(settings: BusSettings) -> zenoh.Session:
         except zenoh.ZError as error:
             if "Unable to connect" not in str(error):
                 raise ConfigError(f"bus: endpoints must be free and valid, got: {_brief(error)}") from None
+            if time.monotonic() > deadline_s or (stop is not None and stop.is_set()):
+                raise ConfigError(f"bus: a router must be reachable at {', '.join(settings.connect)}, none has answered") from None
             time.sleep(RETRY_S)
 
 
@@ -226,10 +230,22 @@ class Bus:
         closed: Whether `close` was called.
     """
 
-    def __init__(self, settings: BusSettings, keys: Keys) -> None:
+    def __init__(self, settings: BusSettings, keys: Keys, *, timeout_s: float = math.inf, stop: threading.Event | None = None) -> None:
+        """
+        Join the bus.
+
+        Args:
+            settings: How.
+            keys: Of which robot.
+            timeout_s: How long a client waits for its router.
+            stop: Ends that wait when set.
+
+        Raises:
+            ConfigError: Zenoh refuses a setting, an endpoint is taken, or no router was there in time.
+        """
         self.keys = keys
         self.closed = False
-        self._session = _open(settings)
+        self._session = _open(settings, timeout_s, stop)
         self._declared: list[Any] = []  # a token or queryable lives as long as its object
         self._json: dict[str, Publisher[Any]] = {}
 
