@@ -177,6 +177,27 @@ def enable(config: Config, bus: BusSettings, timeout: Timeout = 2.0) -> int:
 
 
 @app.command()
+def demo(
+    config: ConfigPath = SHIPPED,
+    scenario: Annotated[str, typer.Option(metavar="circle|eight|positioning|FILE.csv", help="What to follow; a file holds waypoints.")] = "eight",
+    heading: Annotated[
+        Literal["tangent", "consistent", "none"] | None,
+        typer.Option(help="Of the path; what the point ahead of the axle can follow; without weight on it.", show_default="the scenario's best"),
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Seconds of the robot per second.")] = 4.0,
+    duration: Annotated[
+        float | None, typer.Option(metavar="SECONDS", min=1.0, help="How long, in the robot's time.", show_default="the scenario's own")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder to leave everything in.", show_default="runs/SCENARIO-TIME")] = None,
+    viewer: Annotated[bool, typer.Option("--viewer", help="Watch live in Rerun.")] = False,
+) -> None:
+    """Run the whole system on this machine, and sum up how well the robot was driven."""
+    from service.demo import main
+
+    raise typer.Exit(main(load(config), scenario, heading=heading, speed=speed, duration_s=duration, folder=out, viewer=viewer))
+
+
+@app.command()
 def check(config: ConfigPath = SHIPPED) -> None:
     """Load a configuration, solve 200 times, print both phases and the verdict of a second solver."""
     from service.check import main
@@ -197,3 +218,7 @@ def main() -> None:
         refusal = f"{error.name} must be installed for this command: pip install 'rti-mpc[{EXTRAS[error.name]}]'"
     print(f"rti-mpc: {refusal}", file=sys.stderr)
     sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Processes of ours, each in a group of its own, what they say in files, and none left behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from types import TracebackType
+
+ROOT = Path(__file__).parents[1]  # where `service` is imported from, in a clone or installed
+PATIENCE_S = 3.0
+
+
+class Children:
+    """
+    Starts processes and ends them by their ids, all of them at the end.
+
+    Ctrl-C reaches us alone, and so does a closed terminal: we end the others, in
+    the order that is right.
+
+    Attributes:
+        folder: Where their output goes, a file each.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> Children:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        for name in list(self._running):
+            self.end(name, 0.0 if kind else PATIENCE_S)
+
+    def start(self, name: str, module: str, *arguments: object, nice: int = 0) -> None:
+        """
+        Start a module of ours as a process.
+
+        Args:
+            name: For its output and for `end`.
+            module: As after ``python -m``.
+            arguments: Of its command line.
+            nice: By how much others go before it.
+        """
+        command = [sys.executable, "-P", "-m", module, *map(str, arguments)]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
+        with self.log(name).open("wb") as log:
+            child = subprocess.Popen(
+                command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, process_group=0
+            )  # no session of its own: Linux weighs sessions against each other first, and niceness only within one
+        os.setpriority(os.PRIO_PROCESS, child.pid, os.getpriority(os.PRIO_PROCESS, 0) + nice)
+        self._running[name] = child
+
+    def log(self, name: str) -> Path:
+        """Return the file that holds what a process said."""
+        return self.folder / f"{name}.log"
+
+    def ended(self) -> str | None:
+        """Return the name of a process that has ended by itself, if there is one."""
+        return next((name for name, child in self._running.items() if child.poll() is not None), None)
+
+    def end(self, name: str, patience_s: float = PATIENCE_S) -> int:
+        """Ask a process to end as Ctrl-C does, insist after a while, and return its exit status."""
+        child = self._running.pop(name)
+        if child.poll() is None:
+            child.send_signal(signal.SIGINT)
+        try:
+            return child.wait(patience_s)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            return child.wait()

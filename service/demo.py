@@ -1,0 +1,303 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The whole system on this machine: robot, controller, reference and recorder, each its own process, judged at the end.
+
+The demo is one more peer. It listens on a free loopback port where all the
+others meet, so that several demos run side by side; it starts the robot when all
+who are to follow it are there, listens, and stops everybody when the robot has
+been driven for long enough. Robot and controller go before everything else.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from importlib.util import find_spec
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from rti_mpc.message import Command, State
+from rti_mpc.status import Mode, QpStatus
+from rti_mpc.trajectory import Heading, Trajectory, find_trajectory
+from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.cdr import encode
+from rti_mpc.wire.interrupt import stop_on_signals
+from service import machine, robot_log, toml
+from service.board import Board, print_summary
+from service.children import Children
+from service.config import Config
+from service.echo import ROLE as ECHO
+from service.echo import Echo
+from service.summary import Outcome, summarize
+from service.witness import Witness
+
+HEADINGS: dict[str, Heading] = {"circle": "none", "positioning": "none"}  # what ends nearest; "consistent" for all others
+PATIENCE_S = 60.0  # for everybody to be there: the first controller on a machine compiles
+SILENCE_S = 5.0  # of the controller, after which the robot will not be driven any further
+PATIENCE_END_S = 3.0
+LOOK_S = 0.1
+SHOW_S = 0.25
+MARGIN_S = 5.0  # of reference past the horizon of the last sample: near its last row a controller slows down
+POLITE = 10  # niceness of those who only watch
+RECORDER_S = 8.0  # to write what it has
+CLI = "service.cli"
+ENDING = ("controller", "robot", "reference", "echo", *(("recorder",) if find_spec("rerun") else ()))
+
+
+class Failed(Exception):
+    """The run cannot go on; says why."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """
+    What is to be run.
+
+    Attributes:
+        config: The robot, as its processes load it.
+        scenario: As on the command line.
+        heading: What the reference says of it.
+        trajectory: What to follow.
+        duration_s: For how long, robot time.
+        speed: Robot seconds in a second.
+        folder: Where everything goes.
+        viewer: Whether to watch live.
+    """
+
+    config: Config
+    scenario: str
+    heading: Heading
+    trajectory: Trajectory
+    duration_s: float
+    speed: float
+    folder: Path
+    viewer: bool
+
+    @property
+    def reference_s(self) -> float:
+        """How long the reference lasts."""
+        return self.duration_s + self.config.ocp.N * self.config.ocp.dt_s + MARGIN_S
+
+
+def plan(
+    config: Config, scenario: str, *, heading: Heading | None, speed: float, duration_s: float | None, folder: Path | None, viewer: bool
+) -> Plan:
+    """
+    Fill in what the scenario decides.
+
+    Raises:
+        ConfigError: There is no such scenario, or the model has no pose to start it from.
+    """
+    trajectory = find_trajectory(scenario)
+    heading = heading or HEADINGS.get(scenario, "consistent")
+    return Plan(
+        config=configured(config, trajectory, heading),
+        scenario=scenario,
+        heading=heading,
+        trajectory=trajectory,
+        duration_s=duration_s or trajectory.duration_s,
+        speed=speed,
+        folder=folder or Path("runs") / f"{trajectory.name}-{datetime.now():%Y%m%d-%H%M%S}",
+        viewer=viewer,
+    )
+
+
+def configured(config: Config, trajectory: Trajectory, heading: Heading) -> Config:
+    """Return the configuration of a run: on loopback, from the scenario's pose, without weight on a heading that is none."""
+    config = config.with_initial_state([f"{name}={value!r}" for name, value in zip(("x", "y", "psi"), trajectory.pose0, strict=True)])
+    content = config.model_dump(by_alias=True, exclude_unset=True, exclude={"bus"})
+    if heading == "none":
+        content["ocp"]["weights"]["Q"] |= {output.name: 0.0 for output in config.build_model().outputs if output.angle}
+    return Config.model_validate(content)
+
+
+def main(config: Config, scenario: str, **options: Any) -> int:
+    """
+    Run a demo, leave its folder, print its sum.
+
+    Returns:
+        Exit status: 0 if the robot was driven to the end.
+
+    Raises:
+        ConfigError: The scenario is none, or does not fit the robot.
+    """
+    console = Console()
+    run = plan(config, scenario, **options)
+    run.folder.mkdir(parents=True, exist_ok=True)
+    (run.folder / "config.toml").write_text(toml.write(run.config), encoding="utf-8")
+    stop = stop_on_signals()
+    signal.signal(signal.SIGHUP, lambda *_: stop.set())
+    try:
+        outcome = drive(run, console, stop)
+    except Failed as error:
+        console.print(f"rti-mpc: {error}", soft_wrap=True, markup=False)
+        return 1
+    return conclude(run, outcome, console)
+
+
+def drive(run: Plan, console: Console, stop: Event) -> Outcome:
+    """
+    Start everybody, listen until the end, stop everybody.
+
+    Raises:
+        Failed: Somebody has ended, or nobody came.
+    """
+    ocp = run.config.build_ocp()
+    endpoint = free_endpoint()
+    title = f"{run.trajectory.name}, heading {run.heading}, {run.speed:g} times real speed"
+    logs = run.folder / "logs"
+    logs.mkdir(exist_ok=True)
+    keys = run.config.keys()
+    with (
+        Bus(BusSettings(listen=(endpoint,), connect=()), keys) as bus,
+        Children(logs) as children,
+        Board(console, title, ocp.model.inputs, run.duration_s) as board,
+    ):
+        witness = Witness(bus)
+        command = Command(0, 0, 0, 0, 0, 0, 0, 0, Mode.TRACKING, QpStatus.SOLVED, 0, np.zeros((ocp.N, ocp.model.nu)))
+        start(run, children, endpoint, len(encode(command)))
+        company = {"controller", "reference", ECHO, *(["viewer"] if recorded() else [])}
+        board.wait(f"starting {', '.join(sorted(company))}")
+        wait(lambda: witness.listen().met(company), children, stop, PATIENCE_S, "all processes")
+        echo = Echo(bus, State(0, 0, 0, np.zeros(ocp.model.nx)), 0.5 * ocp.dt / run.speed)
+        meeting = ("-l", "tcp/127.0.0.1:0", "-e", endpoint)
+        children.start("robot", CLI, "sim", run.folder / "config.toml", *meeting, "--speed", run.speed, "--log", run.folder / "robot.csv")
+        board.wait("starting the robot")
+        follow(run, witness, board, children, stop)
+        board.wait("stopping all processes")
+        for name in ENDING:
+            if children.end(name, RECORDER_S if name == "recorder" else PATIENCE_END_S):
+                board.console.print(f"{name} did not end well, see {children.log(name)}", soft_wrap=True, markup=False)
+        witness.listen()
+    if witness.info is None or witness.reference is None:
+        raise Failed("stopped before the robot had a reference")
+    return Outcome(
+        trajectory=run.trajectory,
+        anchor_ns=witness.reference.stamp_ns,
+        duration_s=run.duration_s,
+        speed=run.speed,
+        ocp=ocp,
+        info=witness.info,
+        log=robot_log.read(run.folder / "robot.csv", witness.info),
+        telemetry=witness.telemetry,
+        unheard=witness.lost,
+        events=witness.events,
+        echo_us=echo.round_trip_us,
+    )
+
+
+def start(run: Plan, children: Children, endpoint: str, size: int) -> None:
+    """Start everybody but the robot."""
+    keys, config = run.config.keys(), run.folder / "config.toml"
+    scenario = ("--scenario", run.scenario, "--heading", run.heading, "--duration", run.reference_s)
+    children.start("controller", CLI, "run", config, "-e", endpoint)
+    children.start("reference", CLI, "reference", config, "-e", endpoint, *scenario, nice=POLITE)
+    children.start("echo", "service.echo", endpoint, keys.prefix, keys.robot, size)
+    if recorded():
+        live = ("--rerun-spawn",) if run.viewer else ()
+        children.start("recorder", CLI, "view", config, "-e", endpoint, "--rerun-save", run.folder / "run.rrd", *live, nice=POLITE)
+
+
+def follow(run: Plan, witness: Witness, board: Board, children: Children, stop: Event) -> None:
+    """
+    Listen until the robot was driven for long enough, the controller fell silent, or we are stopped.
+
+    Raises:
+        Failed: A process has ended by itself, or nothing was ever driven.
+    """
+    wait(lambda: witness.listen().begun, children, stop, PATIENCE_S, "the first sample")
+    heard, heard_s, shown_s = 0, time.monotonic(), 0.0
+    while not stop.is_set() and witness.reference is not None:
+        now_s, last = time.monotonic(), witness.telemetry[-1]
+        time_s = 1e-9 * (last.state_stamp_ns - witness.reference.stamp_ns)
+        if len(witness.telemetry) > heard:
+            heard, heard_s = len(witness.telemetry), now_s
+        if time_s >= run.duration_s or now_s - heard_s > SILENCE_S:
+            return
+        if now_s - shown_s > SHOW_S:
+            shown_s = now_s
+            at_s = np.array(1e-9 * (last.stamp_ns - witness.reference.stamp_ns))
+            error_mm = 1e3 * float(np.hypot(*(last.x0[:2] - run.trajectory.position(at_s))))
+            board.show(time_s, error_mm, witness.telemetry, witness.events)
+        check(children)
+        stop.wait(LOOK_S)
+        witness.listen()
+
+
+def wait(condition: Callable[[], object], children: Children, stop: Event, patience_s: float, what: str) -> None:
+    """
+    Wait for a condition, or until stopped.
+
+    Raises:
+        Failed: It did not come true in time, or a process has ended by itself.
+    """
+    deadline_s = time.monotonic() + patience_s
+    while not condition() and not stop.is_set():
+        check(children)
+        if time.monotonic() > deadline_s:
+            raise Failed(f"waited {patience_s:g} s for {what} in vain, see {children.folder}")
+        stop.wait(0.5 * LOOK_S)
+
+
+def check(children: Children) -> None:
+    """
+    Look after everybody.
+
+    Raises:
+        Failed: A process has ended by itself.
+    """
+    if name := children.ended():
+        said = children.log(name).read_text(encoding="utf-8", errors="replace").splitlines()
+        raise Failed(f"the {name} has ended by itself, see {children.log(name)}" + (f": {said[-1]}" if said else ""))
+
+
+def conclude(run: Plan, outcome: Outcome, console: Console) -> int:
+    """Write and print the sum of a run, draw it, and tell how to look at it; return the exit status."""
+    summary = {**summarize(outcome), "heading": run.heading, "machine": machine.describe()}
+    (run.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    if not summary["samples"]:
+        console.print(f"rti-mpc: nothing was driven, see {run.folder / 'logs'}", soft_wrap=True, markup=False)
+        return 1
+    console.print(
+        f"{run.trajectory.name}, heading {run.heading}, {run.duration_s:.0f} s of the robot at {run.speed:g} times real speed", highlight=False
+    )
+    print_summary(console, summary)
+    if find_spec("matplotlib") is not None:
+        from service.figure import figure
+
+        figure(outcome.run(), run.folder / "run.png")
+        console.print(f"figure     {run.folder / 'run.png'}", soft_wrap=True, markup=False)
+    if recorded():
+        rerun = Path(sys.executable).with_name("rerun")
+        console.print(f"recording  {shown(rerun) if rerun.exists() else 'rerun'} {run.folder / 'run.rrd'}", soft_wrap=True, markup=False)
+    console.print(f"all of it  {run.folder}", soft_wrap=True, markup=False)
+    if not summary["driven"]:
+        console.print("rti-mpc: the robot was not driven to the end", markup=False)
+    return 0 if summary["driven"] else 1
+
+
+def recorded() -> bool:
+    """Whether Rerun is there to record with."""
+    return find_spec("rerun") is not None
+
+
+def shown(path: Path) -> Path:
+    """Return a path as it would be typed here."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+def free_endpoint() -> str:
+    """Return a loopback endpoint that is free now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

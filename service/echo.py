@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The floor under every latency: a bare echo over the same bus, in a process of its own.
+
+A message of a state's size goes out, one of a command's size comes back, and
+nothing is computed between. `python -m service.echo ENDPOINT PREFIX ROBOT BYTES`
+answers; `Echo` asks, half a period after each sample, so that the two do
+not get into each other's way.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from threading import Thread
+
+from rti_mpc.message import Command, State
+from rti_mpc.wire.bus import Bus, BusSettings, Publisher, Subscriber
+from rti_mpc.wire.cdr import encode
+from rti_mpc.wire.interrupt import stop_on_signals
+from rti_mpc.wire.keys import Keys
+
+ROLE = "echo"
+PING, PONG = "echo/ping", "echo/pong"
+
+
+class Echo:
+    """
+    Pings, at the pace of telemetry.
+
+    Attributes:
+        round_trip_us: Every answer's time so far.
+    """
+
+    def __init__(self, bus: Bus, state: State, pause_s: float) -> None:
+        """
+        Begin.
+
+        Args:
+            bus: Where telemetry and the answering process are.
+            state: What is sent.
+            pause_s: From hearing of a sample to the next ping.
+        """
+        self.round_trip_us: list[float] = []
+        self._payload = encode(state)
+        self._pause_s = pause_s
+        self._samples = bus.subscriber(bus.keys.telemetry)
+        self._pings = bus.publisher(bus.keys.stream(PING), State, realtime=True)
+        self._pongs = bus.subscriber(bus.keys.stream(PONG))
+        Thread(target=self._run, daemon=True).start()
+
+    def _run(self) -> None:
+        """Ping until the bus is closed."""
+        for _ in iter(self._samples.recv, None):
+            time.sleep(self._pause_s)
+            self._pongs.drain()
+            sent_ns = time.monotonic_ns()
+            self._pings.put_bytes(self._payload)
+            if self._pongs.recv() is None:
+                return
+            self.round_trip_us.append(1e-3 * (time.monotonic_ns() - sent_ns))
+
+
+def main(settings: BusSettings, keys: Keys, size: int) -> None:
+    """Answer every ping with so many bytes, until stopped."""
+    stop = stop_on_signals()
+    with Bus(settings, keys) as bus:
+        pings, pongs = bus.subscriber(keys.stream(PING)), bus.publisher(keys.stream(PONG), Command, realtime=True)
+        bus.alive(ROLE)
+        Thread(target=_answer, args=(pings, pongs, bytes(size)), daemon=True).start()
+        stop.wait()
+
+
+def _answer(pings: Subscriber, pongs: Publisher[Command], payload: bytes) -> None:
+    """Receive, send, and nothing else."""
+    while pings.recv() is not None:
+        pongs.put_bytes(payload)
+
+
+if __name__ == "__main__":
+    _, endpoint, prefix, robot, size = sys.argv
+    main(BusSettings(connect=(endpoint,)), Keys(prefix, robot), int(size))

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The machine a figure was measured on: a time without it says nothing."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+CPUINFO = Path("/proc/cpuinfo")
+GOVERNOR = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+PACKAGES = ("casadi", "eclipse-zenoh", "numpy", "osqp")
+
+
+def describe() -> dict[str, Any]:
+    """Describe this machine and what runs on it, in JSON."""
+    return {
+        "processor": processor(),
+        "cores": os.cpu_count(),
+        "governor": GOVERNOR.read_text().strip() if GOVERNOR.is_file() else "unknown",
+        "load": round(os.getloadavg()[0], 2),
+        "system": f"{platform.system()} {platform.release()}",
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in PACKAGES},
+    }
+
+
+def processor() -> str:
+    """Return the name of the processor, as far as the system tells."""
+    if CPUINFO.is_file():
+        for line in CPUINFO.read_text(encoding="utf-8", errors="replace").splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() == "model name":
+                return value.strip()
+    return platform.processor() or platform.machine()

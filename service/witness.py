@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Somebody who listens to a run and remembers it: what was said about every sample, and what went wrong."""
+
+from __future__ import annotations
+
+import json
+import time
+
+from rti_mpc.message import Event, Reference, Telemetry
+from rti_mpc.wire.bus import Bus
+from rti_mpc.wire.intake import Intake
+from service.info import Info
+
+CAPACITY = 4096  # samples between two looks: seconds, at any rate
+STALE_S = 60.0  # one life of each process is a run
+
+
+class Witness:
+    """
+    Collects telemetry, events and the reference.
+
+    Attributes:
+        telemetry: One a sample.
+        events: In the order they came.
+        reference: The last one, with its real stamp.
+        info: The controller's description of itself.
+        lives: Roles that are present now.
+    """
+
+    def __init__(self, bus: Bus) -> None:
+        self.telemetry: list[Telemetry] = []
+        self.events: list[Event] = []
+        self.reference: Reference | None = None
+        self.info: Info | None = None
+        self.lives: set[str] = set()
+        self._samples, self._samples_in = bus.subscriber(bus.keys.telemetry, capacity=CAPACITY), Intake(Telemetry, STALE_S)
+        self._references, self._references_in = bus.subscriber(bus.keys.reference, cached=True), Intake(Reference, STALE_S)
+        self._events, self._events_in = bus.subscriber(bus.keys.events, capacity=CAPACITY, cached=True), dict[str, Intake[Event]]()
+        self._infos = bus.subscriber(bus.keys.info("controller"), cached=True)
+        bus.watch_alive(self._notice)
+
+    @property
+    def lost(self) -> int:
+        """Samples nobody told us about."""
+        return self._samples_in.source.lost
+
+    @property
+    def begun(self) -> bool:
+        """Whether the robot is being driven."""
+        return bool(self.telemetry) and self.reference is not None
+
+    def met(self, roles: set[str]) -> bool:
+        """Whether these are present, and the controller has told who it is."""
+        return roles <= self.lives and self.info is not None
+
+    def listen(self) -> Witness:
+        """Take in what has come since the last call."""
+        now_ns = time.monotonic_ns()
+        for received in self._samples.drain():
+            if (sample := self._samples_in.accept(received, now_ns)) is not None:
+                self.telemetry.append(sample)
+        for received in self._references.drain():
+            self.reference = self._references_in.accept(received, now_ns) or self.reference
+        for received in self._infos.drain():
+            self.info = Info.from_json(json.loads(received.payload))
+        for received in self._events.drain():
+            door = self._events_in.setdefault(received.key, Intake(Event, STALE_S))
+            if (event := door.accept(received, now_ns)) is not None:
+                self.events.append(event)
+        return self
+
+    def _notice(self, role: str, present: bool) -> None:
+        """Note who comes and goes; called in a thread of the bus."""
+        (self.lives.add if present else self.lives.discard)(role)
