@@ -105,6 +105,7 @@ class Controller:
         self._failed = 0  # samples in a row without a usable QP
         self._stopped = ""  # why an operator's stop is latched
         self._command: Command | None = None
+        self._planned = (rti.x.copy(), rti.y_ref.copy())  # states and reference of that command, for telemetry
         self._valid_until_ns = 0
 
         # One integration step over any duration, for the prediction from a state's stamp to the act of its command.
@@ -300,6 +301,7 @@ class Controller:
             u=u,
         )
         self._sent.append(self._command)
+        self._planned = (self._rti.x.copy(), self._rti.y_ref.copy())
         return self._command
 
     def _ramp(self, u: Array) -> Array:
@@ -357,9 +359,9 @@ class Controller:
             fallbacks=self.fallbacks,
             parameter_version=0,
             x0=self._x0.copy(),
-            x=self._rti.x.copy(),
+            x=self._planned[0],
             u=command.u,
-            y_ref=self._rti.y_ref.copy(),
+            y_ref=self._planned[1],
         )
 
     # Small parts.

@@ -140,3 +140,21 @@ def gauss_newton(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity]:
 def pattern(weight: np.ndarray[Any, Any]) -> ca.DM:
     """Return ones where a weight matrix may become nonzero: its diagonal, and what is nonzero now."""
     return ca.DM(sp.csc_matrix(((weight != 0) | np.eye(len(weight), dtype=bool)).astype(float)))
+
+
+def plan_cost(ocp: Ocp) -> ca.Function:
+    """Build ``(x, u, u_prev, y_ref, p, *WEIGHTS) -> cost``: the cost (4) of a plan and its penalties, nothing of it linearized."""
+    model, N, N_u = ocp.model, ocp.N, ocp.N_u
+    x, u, u_prev = ca.SX.sym("x", model.nx, N + 1), ca.SX.sym("u", model.nu, N_u), ca.SX.sym("u_prev", model.nu)
+    y_ref, p = ca.SX.sym("y_ref", model.ny, N), ca.SX.sym("p", model.np_, N + 1)
+    w = {name: ca.SX.sym(name, *np.shape(getattr(ocp, name))) for name in WEIGHTS}
+    h = ca.Function("h", [model.x, model.p], [model.y_expr])
+    cost = ca.SX(0)
+    for i in range(1, N + 1):
+        e = h(x[:, i], p[:, i]) - y_ref[:, i - 1]
+        s = ca.fmax(0, ca.fmax(x[:, i] - w["ubx"], w["lbx"] - x[:, i]))
+        cost += w["delta"][i - 1] * ca.bilin(w["Q"] * pattern(ocp.Q), e, e) + ca.dot(w["z"], s) + ca.dot(w["Z"], s**2) / 2
+    for k in range(N_u):
+        increment = u[:, k] - (u[:, k - 1] if k else u_prev)
+        cost += w["lambda_"][k] * ca.bilin(w["R"] * pattern(ocp.R), increment, increment)
+    return ca.Function("cost", [x, u, u_prev, y_ref, p, *w.values()], [cost])

@@ -21,7 +21,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled
 from rti_mpc.errors import OcpError, ShapeError
-from rti_mpc.linearization import WEIGHTS
+from rti_mpc.linearization import WEIGHTS, plan_cost
 from rti_mpc.ocp import Ocp
 from rti_mpc.qp import Guess, Qp, step_size
 from rti_mpc.sequential import sequential
@@ -81,6 +81,8 @@ class Rti:
 
         make = compiled if compile else lambda function: function
         self._integrate_tail = bind(make(ocp.phi()), self._tail[:3], self._tail[3:])
+        self._cost: Array = np.zeros(1)
+        self._evaluate = bind(make(plan_cost(ocp)), (*self._plan[:2], *guess.sample[2:]), (self._cost,))
         transcribe = FORMULATIONS[formulation]
         qps = [Qp(transcribe(ocp, state_bounds=bounds), guess, make) for bounds in (False, True)[: 2 if ocp.soft else 1]]
         self._roll_out()
@@ -179,6 +181,11 @@ class Rti:
             self.solver.load()
             self.status = self.solver.solve()
         if self.status.usable:
+            self._evaluate()
+            if not isfinite(self._cost[0]):  # numbers of such a size that they overflowed inside the solver
+                self.solver.cold = True
+                self.status = QpStatus.FAILED
+                return self.status
             self.x[:] = x_plan
             self.u[:] = u_plan
             self._touching = self.solver is not self.solvers[0] and bool(violation[0] > -TOUCHING)
@@ -186,8 +193,8 @@ class Rti:
 
     @property
     def cost(self) -> float:
-        """The cost of the plan, as the QP sees it: quadratic around the last guess."""
-        return (float(self.qp.cost[0]) + 2.0 * self.solver.objective) / self._cost_scale
+        """The cost (4) of the last plan, with the penalties for what it exceeds."""
+        return float(self._cost[0]) / self._cost_scale
 
     @property
     def violation(self) -> float:

@@ -165,14 +165,6 @@ def test_hessian_is_the_gauss_newton_approximation(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_cost_at_the_guess_is_that_of_the_ocp(name: str) -> None:
-    """A solution that changes nothing costs what the guess costs."""
-    rti = at_random(PROBLEMS[name](), seed=6)
-    problem = ByHand(rti)
-    assert rti.qp.cost[0] == pytest.approx((problem.residuals(problem.guess) ** 2).sum(), rel=1e-12)
-
-
-@pytest.mark.parametrize("name", PROBLEMS)
 def test_no_entry_is_stored_that_is_never_nonzero(name: str) -> None:
     """Dense blocks would be right, and slow."""
     samples = [whole(at_random(PROBLEMS[name](), seed=seed)) for seed in range(10, 13)]
