@@ -327,11 +327,14 @@ def test_references_of_other_types_and_layouts_are_read_right(kind: Any) -> None
 
 def fails_and_recovers(rti: Rti, bad: Any, good: Any) -> None:
     """A failed sample leaves the plan, and after good data two samples are as if nothing had happened."""
-    rest = rti.u_prev.copy()
+    u_prev = rti.u_prev.copy()
+    good(rti)
+    x0 = rti.x[0].copy()
+    rti.reset(x0, u_prev)
     for _ in range(3):
         good(rti)
     without = rti.u.copy()
-    rti.reset(rti.x[0].copy(), rest)
+    rti.reset(x0, u_prev)
     good(rti)
     before = unmoving(rti)
     status = bad(rti)
@@ -366,7 +369,6 @@ def test_state_that_is_not_finite_or_beyond_all_reason_fails_and_is_forgotten(fo
                 rti.prepare(y_ref, shift=False)
                 return rti.feedback(broken)
 
-            rti.reset(x0, np.zeros(2))
             fails_and_recovers(rti, bad, held(x0, y_ref))
 
 
