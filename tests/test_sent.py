@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the robot does with the commands already sent, against the robot itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rti_mpc.array import Array
+from rti_mpc.message import Command
+from rti_mpc.sent import Sent
+from rti_mpc.status import Mode, QpStatus
+from sim.actuator import Actuator
+
+MS = 1_000_000
+DT = 100 * MS
+SLEW = np.array([0.2, 0.3])  # per dt
+
+
+def command(seq: int, stamp_ms: int, rows: Array, valid_ms: int = 250) -> Command:
+    stamp_ns = stamp_ms * MS
+    return Command(1, seq, stamp_ns, 1, seq, stamp_ns, stamp_ns + valid_ms * MS, 0, Mode.TRACKING, QpStatus.SOLVED, DT, rows)
+
+
+def sent(*commands: Command, slew: Array = SLEW) -> Sent:
+    memory = Sent(np.zeros(2), -slew, slew, DT, commands=3)
+    for one in commands:
+        memory.append(one)
+    return memory
+
+
+def plan(value: float, rows: int = 5) -> Array:
+    return np.array([[value + 0.01 * i, -value - 0.01 * i] for i in range(rows)])
+
+
+def test_nothing_sent_is_rest() -> None:
+    u, change_ns = sent().at(7 * MS)
+    np.testing.assert_array_equal(u, [0.0, 0.0])
+    assert change_ns > 10**18
+
+
+@pytest.mark.parametrize(("at_ms", "row", "change_ms"), [(0, 0, 100), (99, 0, 100), (100, 1, 200), (199, 1, 200), (249, 2, 250)])
+def test_rows_act_one_after_the_other_until_the_command_expires(at_ms: int, row: int, change_ms: int) -> None:
+    u, change_ns = sent(command(1, 0, plan(0.3))).at(at_ms * MS)
+    np.testing.assert_array_equal(u, plan(0.3)[row])
+    assert change_ns == change_ms * MS
+
+
+def test_newest_command_whose_time_has_come_acts() -> None:
+    memory = sent(command(1, 0, plan(0.1)), command(2, 100, plan(0.2)), command(3, 200, plan(0.3)))
+    for at_ms, value, change_ms in ((50, 0.1, 100), (150, 0.2, 200), (200, 0.3, 300)):
+        u, change_ns = memory.at(at_ms * MS)
+        np.testing.assert_array_equal(u, plan(value)[0])
+        assert change_ns == change_ms * MS
+
+
+def test_time_before_all_that_is_remembered_was_rest() -> None:
+    u, change_ns = sent(command(1, 100, plan(0.1))).at(99 * MS)
+    np.testing.assert_array_equal(u, [0.0, 0.0])
+    assert change_ns == 100 * MS
+
+
+def test_expired_command_ramps_to_rest_inside_the_slew_limits() -> None:
+    memory = sent(command(1, 0, np.tile([0.5, -0.7], (5, 1)), valid_ms=200))
+    speeds = np.array([memory.at((200 + 50 * i) * MS)[0] for i in range(10)])
+    np.testing.assert_allclose(speeds[0], [0.5, -0.7])
+    np.testing.assert_allclose(speeds[2], [0.3, -0.4])
+    np.testing.assert_allclose(speeds[-1], [0.0, 0.0], atol=1e-15)
+    assert np.all(np.abs(np.diff(speeds, axis=0)) <= SLEW / 2 + 1e-12)
+
+
+def test_robot_without_slew_limits_stops_at_once() -> None:
+    memory = sent(command(1, 0, plan(0.5), valid_ms=200), slew=np.full(2, np.inf))
+    np.testing.assert_array_equal(memory.at(200 * MS)[0], plan(0.5)[2])
+    np.testing.assert_array_equal(memory.at(201 * MS)[0], [0.0, 0.0])
+
+
+def test_cleared_memory_is_rest() -> None:
+    memory = sent(command(1, 0, plan(0.5)))
+    memory.clear()
+    np.testing.assert_array_equal(memory.at(50 * MS)[0], [0.0, 0.0])
+
+
+def test_it_tells_what_the_actuator_really_plays() -> None:
+    """Random plans, some late in coming, some skipped: the controller predicts over what acts."""
+    rng = np.random.default_rng(3)
+    actuator = Actuator(np.zeros(2), SLEW / 0.1, epoch=1)
+    memory = sent()
+    now_ns = 0
+    for seq in range(1, 60):
+        if rng.random() < 0.8:
+            one = command(seq, now_ns // MS + int(rng.integers(0, 2)) * 30, rng.uniform(-0.5, 0.5, (5, 2)))
+            memory.append(one)
+            assert actuator.accept(one, now_ns) == ""
+        to_ns = now_ns + DT
+        for until_ns, u in actuator.play(now_ns, to_ns):
+            if not actuator.braking:
+                expected, change_ns = memory.at(now_ns)
+                np.testing.assert_array_equal(u, expected)
+                assert until_ns == min(change_ns, to_ns)
+            else:  # the robot brakes in steps of 10 ms, the memory in a line
+                np.testing.assert_allclose(u, memory.at(now_ns)[0], atol=0.1 * SLEW.max() + 1e-12)
+            now_ns = until_ns
