@@ -19,6 +19,7 @@ from rti_mpc.model import Signal
 RECENT = 200  # samples the medians are of
 EVENTS = 3  # shown
 LINES = 10  # of progress, without a terminal
+MISSING = "none"
 
 
 class Board:
@@ -89,11 +90,11 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
     """Print the sum of a run."""
     table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
     rows = [
-        (f"error after {summary['transient_s']:g} s", f"max {summary['max_error_mm']:.3f} mm, rms {summary['rms_error_mm']:.3f} mm"),
-        ("at the end", f"{summary['final_error_mm']:.4f} mm from the reference, at {summary['final_speed_mm_s']:.2g} mm/s"),
+        (f"error after {summary['transient_s']:g} s", "max {} mm, rms {} mm".format(*said(summary, "max_error_mm", "rms_error_mm"))),
+        ("error of the last lap", "max {} mm".format(*said(summary, "last_lap_max_error_mm"))),
+        ("at the end", "{} mm from the reference, at {} mm/s".format(*said(summary, "final_error_mm", "final_speed_mm_s"))),
     ]
-    if summary["last_lap_max_error_mm"] is not None:
-        rows.insert(1, ("error of the last lap", f"max {summary['last_lap_max_error_mm']:.3f} mm"))
+    rows = [row for row in rows if MISSING not in row[1]]
     rows += [
         ("samples in period", f"{summary['in_period_share']:.2%} of {summary['samples']}, {summary['skipped']} skipped"),
         ("inputs in bounds", "always" if inputs_in_bounds(summary) else "NOT ALWAYS"),
@@ -114,6 +115,11 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
         )
     for fault in summary["events"]:
         console.print("{severity} of the {source} at {at_s:.1f} s: {text}".format(**fault), soft_wrap=True, markup=False)
+
+
+def said(summary: Mapping[str, Any], *names: str) -> list[str]:
+    """Return numbers in words, `MISSING` for what the run was too short for."""
+    return [MISSING if summary[name] is None else f"{summary[name]:.3g}" for name in names]
 
 
 def inputs_in_bounds(summary: Mapping[str, Any]) -> bool:

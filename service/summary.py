@@ -146,18 +146,17 @@ def summarize(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def errors(run: Run, lap_s: float | None) -> dict[str, Any]:
-    """Sum up the distance from the reference, and the speed in the end."""
+def errors(run: Run, lap_s: float | None) -> dict[str, float | None]:
+    """Sum up the distance from the reference, and the speed in the end; null where the run did not get so far."""
     settled = run.error_mm[run.settled]
-    step_mm = 1e3 * float(np.hypot(*(run.position[-1] - run.position[-2]))) if len(run.position) > 1 else np.nan
-    whole = lap_s is not None and run.time_s[-1] - lap_s >= run.transient_s
-    last_lap = run.error_mm[run.time_s >= run.time_s[-1] - lap_s] if whole else None
+    last_lap = run.error_mm[run.time_s >= run.time_s[-1] - lap_s] if lap_s and run.time_s[-1] - lap_s >= run.transient_s else settled[:0]
+    steps_mm, steps_s = 1e3 * np.hypot(*np.diff(run.position, axis=0).T), np.diff(run.time_s)
     return {
-        "max_error_mm": float(settled.max()),
-        "rms_error_mm": float(np.sqrt((settled**2).mean())),
-        "last_lap_max_error_mm": None if last_lap is None else float(last_lap.max()),
+        "max_error_mm": float(settled.max()) if settled.size else None,
+        "rms_error_mm": float(np.sqrt((settled**2).mean())) if settled.size else None,
+        "last_lap_max_error_mm": float(last_lap.max()) if last_lap.size else None,
         "final_error_mm": float(run.error_mm[-1]),
-        "final_speed_mm_s": step_mm / float(run.time_s[-1] - run.time_s[-2]) if len(run.position) > 1 else None,
+        "final_speed_mm_s": float(steps_mm[-1] / steps_s[-1]) if steps_s.size else None,
     }
 
 

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot, its controller and a reference as the processes a user runs, and what tests need to watch them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TypeVar
+
+from rti_mpc.message import Command, Event, State, Telemetry
+from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
+from rti_mpc.wire.cdr import M, decode
+from service.cli import SHIPPED
+from service.config import load
+
+ROOT = Path(__file__).parents[2]
+CONFIG = load(SHIPPED)
+KEYS = CONFIG.keys()
+PATIENCE_S = 20.0  # to start processes and hear of them; the first controller on a machine compiles
+SPEED = 4.0
+ARGUMENTS: dict[str, tuple[object, ...]] = {
+    "robot": ("sim", "--speed", SPEED, "--x0", "x=0.5"),
+    "controller": ("run",),
+    "reference": ("reference", "--scenario", "eight", "--duration", 600),
+}
+T = TypeVar("T")
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def command_line(*arguments: object) -> list[str]:
+    return [sys.executable, "-c", "from service.cli import main; main()", *map(str, arguments)]
+
+
+def rti_mpc(*arguments: object, timeout_s: float = 30.0) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end."""
+    return subprocess.run(command_line(*arguments), cwd=ROOT, env=environment(), capture_output=True, text=True, timeout=timeout_s)
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT)}
+
+
+class System:
+    """The processes of one robot, and a peer that listens to them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.endpoint = free_endpoint()
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
+        self.lives: set[str] = set()
+        self._stack = ExitStack()
+        self.bus = self._stack.enter_context(Bus(BusSettings(connect=(self.endpoint,)), KEYS))
+        self.bus.watch_alive(lambda role, present: (self.lives.add if present else self.lives.discard)(role))
+
+    def __enter__(self) -> System:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for name in list(self.running):
+            self.kill(name)
+        self._stack.close()
+
+    def start(self, *roles: str) -> None:
+        for role in roles:
+            command, *options = ARGUMENTS[role]
+            options += ["--log", self.folder / "robot.csv"] if role == "robot" else []
+            with (self.folder / f"{role}.log").open("ab") as log:
+                arguments = command_line(command, SHIPPED, "-e", self.endpoint, *options)
+                self.running[role] = subprocess.Popen(arguments, cwd=ROOT, env=environment(), stdout=log, stderr=subprocess.STDOUT)
+
+    def kill(self, role: str) -> None:
+        """End a process without notice, as a crash does."""
+        process = self.running.pop(role)
+        process.kill()
+        process.wait()
+
+    def interrupt(self, role: str) -> tuple[int, float]:
+        """Press Ctrl-C; return the exit status, and how long it took in s."""
+        process = self.running.pop(role)
+        start_s = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        try:
+            return process.wait(10.0), time.monotonic() - start_s
+        finally:
+            process.kill()
+
+    def opened(self, role: str) -> None:
+        """Wait until a process has joined the bus, whomever it may meet there."""
+        until(lambda: listening(self.running[role].pid), f"{role} listens")
+
+    def said(self, role: str) -> str:
+        return (self.folder / f"{role}.log").read_text()
+
+    def tracking(self, epoch: int = 0) -> Command:
+        """Wait for a command that follows the reference, for a robot of this epoch or a later one."""
+        commands = self.bus.subscriber(KEYS.command)
+        return heard(commands, Command, lambda command: command.mode.name == "TRACKING" and command.state_epoch >= epoch)
+
+    def sample(self) -> Telemetry:
+        return heard(self.bus.subscriber(KEYS.telemetry), Telemetry, lambda _: True)
+
+    def event(self, code: str, source: str, act: Callable[[], object] = lambda: None) -> Event:
+        """Wait for an event that comes after we act, again and again."""
+        events = self.bus.subscriber(KEYS.event(source), capacity=64)
+
+        def look() -> Event | None:
+            act()
+            return next((event for event in (decode(Event, r.payload) for r in events.drain()) if event.code == code), None)
+
+        return until(look, f"{source} says {code}", pause_s=0.05)
+
+    def state(self, condition: Callable[[State], bool]) -> State:
+        return heard(self.bus.subscriber(KEYS.state), State, condition)
+
+
+def heard(subscriber: Subscriber, cls: type[M], condition: Callable[[M], bool]) -> M:
+    """Wait for a message."""
+
+    def look() -> M | None:
+        for received in subscriber.drain():
+            message = decode(cls, received.payload)
+            if condition(message):
+                return message
+        return None
+
+    return until(look, f"a {cls.__name__} as wanted")
+
+
+def until(look: Callable[[], T | None], what: str, pause_s: float = 0.002, patience_s: float = PATIENCE_S) -> T:
+    """Return the first value that is neither None nor False."""
+    deadline_s = time.monotonic() + patience_s
+    while time.monotonic() < deadline_s:
+        if (value := look()) is not None and value is not False:
+            return value
+        time.sleep(pause_s)
+    raise AssertionError(f"waited {patience_s} s in vain: {what}")
+
+
+def listening(pid: int) -> bool:
+    """Whether a process listens on a TCP port."""
+    sockets = {os.readlink(path) for path in Path(f"/proc/{pid}/fd").iterdir() if path.is_symlink()}
+    lines = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+    return any(line[3] == "0A" and f"socket:[{line[9]}]" in sockets for line in lines)

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo from end to end, as short as it makes sense, and what it leaves behind."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.cli import SHIPPED
+from service.config import load
+from tests.processes.system import ROOT, command_line, environment, rti_mpc, until
+
+pytest.importorskip("rerun")
+pytest.importorskip("matplotlib")
+from rerun.chunk import RrdReader
+
+QUANTILES = ("prepare_us", "feedback_us", "latency_us", "echo_us")
+ASKED_FOR = {
+    *("scenario", "samples", "max_error_mm", "rms_error_mm", "final_error_mm", "final_speed_mm_s"),
+    *("in_period_share", "fallbacks", "late", "lost"),
+    *QUANTILES,
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a demo: twenty-four seconds of the circle."""
+    folder = tmp_path_factory.mktemp("demo") / "out"
+    done = rti_mpc("demo", "--scenario", "circle", "--duration", 24, "--speed", 6, "--out", folder, timeout_s=90.0)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (folder / "stdout").write_text(done.stdout)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def summary(folder: Path) -> Any:
+    return json.loads((folder / "summary.json").read_text())
+
+
+def test_summary_holds_what_it_promises(summary: Any) -> None:
+    assert summary.keys() >= ASKED_FOR
+    assert (summary["scenario"], summary["heading"], summary["driven"]) == ("circle", "none", True)
+    assert 235 <= summary["samples"] <= 241
+    assert summary["states"] == 241
+    for name in QUANTILES:
+        assert 0.0 < summary[name]["p50"] <= summary[name]["p99"] <= summary[name]["max"], name
+    assert summary["latency_us"]["p50"] > summary["feedback_us"]["p50"]
+    assert summary["machine"]["cores"] == os.cpu_count()
+
+
+def test_robot_is_driven_onto_its_path_inside_its_bounds(summary: Any) -> None:
+    """Twelve seconds after its start half a metre away; two laps are measured by the demo itself, on a machine that does nothing else."""
+    assert summary["transient_s"] == 12.0
+    assert summary["rms_error_mm"] < 5.0
+    assert summary["fallbacks"] == 0
+    assert summary["commanded_inputs_in_bounds"]
+    assert summary["commanded_increments_in_bounds"]
+    assert summary["applied_inputs_in_bounds"]
+
+
+def test_configuration_used_is_one_that_loads_and_says_what_the_scenario_decided(folder: Path) -> None:
+    config, shipped = load(folder / "config.toml"), load(SHIPPED)
+    assert config.ocp.weights.Q == {**shipped.ocp.weights.Q, "psi": 0.0}
+    assert config.sim.x0 == {"x": 0.5, "y": 0.0, "psi": 0.0}
+    assert config.ocp.bounds == shipped.ocp.bounds
+    assert rti_mpc("check", folder / "config.toml").returncode == 0
+
+
+def test_folder_holds_record_figure_and_recording(folder: Path) -> None:
+    with (folder / "robot.csv").open(newline="") as file:
+        assert len(list(csv.DictReader(file))) >= 241
+    assert (folder / "run.png").read_bytes().startswith(b"\x89PNG")
+    entities = {chunk.entity_path for chunk in RrdReader(folder / "run.rrd").stream().to_chunks()}
+    assert {"/world/robot", "/world/reference", "/command/u_c"} <= entities
+    assert {path.stem for path in (folder / "logs").iterdir()} == {"controller", "robot", "reference", "recorder", "echo"}
+    assert "Traceback" not in "".join(path.read_text() for path in (folder / "logs").iterdir())
+
+
+def test_output_says_how_to_look_at_it(folder: Path) -> None:
+    printed = (folder / "stdout").read_text()
+    for words in ("of 24 s", "bare echo", "heading none", str(folder / "run.png"), f"rerun {folder / 'run.rrd'}"):
+        assert words in printed, words
+
+
+def test_waypoints_of_a_file_are_driven_too(tmp_path: Path) -> None:
+    (tmp_path / "square.csv").write_text("x,y\n0,0\n1,0\n1,1\n0,1\n0,0\n")
+    done = rti_mpc("demo", "--scenario", tmp_path / "square.csv", "--duration", 6, "--speed", 6, "--out", tmp_path / "out", timeout_s=60.0)
+    assert done.returncode == 0, done.stdout + done.stderr
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["scenario"], summary["heading"]) == ("square", "consistent")
+
+
+def test_ctrl_c_leaves_no_process_behind_and_does_not_count_as_driven(tmp_path: Path) -> None:
+    log = (tmp_path / "demo.log").open("wb")
+    command = command_line("demo", "--out", tmp_path / "out")
+    with log, subprocess.Popen(command, cwd=ROOT, env=environment(), stdout=log, stderr=subprocess.STDOUT) as demo:
+        try:
+            until(lambda: "mode tracking" in (tmp_path / "demo.log").read_text(), "the robot is driven")
+            children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
+            assert len(children) == 5
+            demo.send_signal(signal.SIGINT)
+            assert demo.wait(20.0) == 1
+        finally:
+            demo.kill()
+    assert not [pid for pid in children if Path(f"/proc/{pid}").exists()]
+    assert "not driven to the end" in (tmp_path / "demo.log").read_text()
+
+
+@pytest.mark.parametrize(("option", "value"), [("--scenario", "spiral"), ("--speed", "0"), ("--duration", "-1"), ("--heading", "left")])
+def test_what_cannot_be_run_is_refused_before_anything_starts(tmp_path: Path, option: str, value: str) -> None:
+    done = rti_mpc("demo", option, value, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Real processes, real Zenoh: what holds when they start, stop and die."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rti_mpc.message import Command, Reference, State, Telemetry
+from rti_mpc.status import Mode
+from rti_mpc.wire.cdr import decode
+from service.cli import SHIPPED
+from tests.processes.system import CONFIG, KEYS, SPEED, System, heard, rti_mpc, until
+
+STANDING = 1e-3  # m/s, rad/s
+
+
+@pytest.fixture
+def system(tmp_path: Path) -> Iterator[System]:
+    with System(tmp_path) as system:
+        yield system
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
+    """A robot that is being driven, and that every test leaves so."""
+    with System(tmp_path_factory.mktemp("driven")) as system:
+        system.start("robot", "controller", "reference")
+        system.tracking()
+        yield system
+
+
+def rests(state: State) -> bool:
+    return bool(np.abs(state.x[3:]).max() < STANDING)
+
+
+def moves(state: State) -> bool:
+    return bool(np.abs(state.x[3]) > 0.03)
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        ("reference", "controller", "robot"),
+        pytest.param(("robot", "reference", "controller"), marks=pytest.mark.slow),
+        pytest.param(("controller", "robot", "reference"), marks=pytest.mark.slow),
+    ],
+    ids="-".join,
+)
+def test_processes_start_in_any_order(system: System, order: tuple[str, ...]) -> None:
+    for role in order:
+        system.start(role)
+        system.opened(role)
+    system.tracking()
+    system.state(moves)
+
+
+def test_ctrl_c_ends_each_process_within_a_second_and_the_last_command_is_a_standstill(system: System) -> None:
+    commands = system.bus.subscriber(KEYS.command, capacity=4096)
+    system.start("robot", "controller", "reference")
+    system.tracking()
+    system.state(moves)
+    status, took_s = system.interrupt("reference")
+    assert (status, took_s < 1.0) == (0, True), took_s
+    system.tracking()  # the reference was published whole, and outlives its source
+    status, took_s = system.interrupt("controller")
+    assert (status, took_s < 1.0) == (0, True), took_s
+    until(lambda: "controller" not in system.lives, "the controller is gone")
+    last = decode(Command, commands.drain()[-1].payload)
+    assert (last.mode, np.abs(last.u).max()) == (Mode.STOPPED, 0.0)
+    system.state(rests)
+    status, took_s = system.interrupt("robot")
+    assert (status, took_s < 1.0) == (0, True), took_s
+    assert "Traceback" not in system.said("controller") + system.said("robot") + system.said("reference")
+
+
+def test_controller_recovers_when_the_robot_is_killed_and_restarted(system: System) -> None:
+    system.start("controller", "reference", "robot")
+    first = system.tracking()
+    system.state(moves)
+    system.kill("robot")
+    system.start("robot")
+    again = system.tracking(first.state_epoch + 1)
+    assert again.epoch == first.epoch
+    assert again.seq > first.seq
+    state = system.state(moves)
+    assert state.epoch == again.state_epoch
+
+
+def test_robot_brakes_and_stands_when_the_controller_is_killed_and_another_one_takes_over(system: System) -> None:
+    """Its last command ends 250 ms after its state; then the robot brakes inside its slew limits, and coasts."""
+    system.start("robot", "controller", "reference")
+    first = system.tracking()
+    driving = system.state(lambda state: state.x[3] > 0.1)
+    system.kill("controller")
+    standing = system.state(rests)
+    slew_s = driving.x[3] / (0.25 / CONFIG.ocp.dt_s)
+    coast_s = 0.25 * np.log(0.5 / STANDING)  # the plant's time constant is below 0.25 s
+    assert 1e-9 * (standing.stamp_ns - driving.stamp_ns) < 0.25 + slew_s + coast_s + 2 * CONFIG.ocp.dt_s + 0.05 * SPEED
+    system.start("controller")
+    again = system.tracking(first.state_epoch)
+    until(lambda: system.tracking().epoch > first.epoch, "another epoch")
+    assert again.state_epoch == first.state_epoch
+    system.state(moves)
+
+
+def test_stop_is_latched_until_enable(driven: System) -> None:
+    driven.state(moves)
+    assert rti_mpc("stop", SHIPPED, "-e", driven.endpoint).returncode == 0
+    stopped = heard(driven.bus.subscriber(KEYS.command), Command, lambda command: command.mode is Mode.STOPPED and not command.u.any())
+    stood = driven.state(rests)
+    driven.interrupt("reference")
+    driven.start("reference")  # a new reference releases nothing
+    heard(driven.bus.subscriber(KEYS.reference, cached=True), Reference, lambda reference: True)
+    later = heard(driven.bus.subscriber(KEYS.command), Command, lambda command: command.seq > stopped.seq + 40)
+    assert later.mode is Mode.STOPPED
+    assert driven.state(lambda state: state.seq > stood.seq + 40).x[:2] == pytest.approx(stood.x[:2], abs=1e-3)
+    assert rti_mpc("enable", SHIPPED, "-e", driven.endpoint).returncode == 0
+    assert driven.tracking().seq > later.seq
+    driven.state(moves)
+
+
+def test_second_controller_refuses_to_start_beside_a_live_one(driven: System) -> None:
+    before = driven.tracking()
+    done = rti_mpc("run", SHIPPED, "-e", driven.endpoint)
+    assert done.returncode == 1
+    assert "pioneer already has a controller" in done.stderr
+    assert driven.tracking().epoch == before.epoch
+
+
+def test_malformed_payloads_are_counted_and_published_while_control_goes_on(driven: System) -> None:
+    states, references = driven.bus.publisher(KEYS.state, State), driven.bus.publisher(KEYS.reference, Reference)
+    heard(driven.bus.subscriber(KEYS.command), Command, lambda _: True)
+    garbage = (b"", b"\x00\x00\x00\x00", b"\x00\x01\x00\x00" + bytes(24), b"\x00\x01\x00\x00" + b"\xff" * 4000)
+    before = driven.sample()
+
+    def send() -> None:
+        for payload in garbage:
+            states.put_bytes(payload)
+            references.put_bytes(payload)
+
+    event = driven.event("message_refused", "controller", send)
+    assert "refused so far" in event.text
+    after = heard(driven.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.seq > before.seq + 20)
+    assert after.mode is Mode.TRACKING
+    assert after.fallbacks == before.fallbacks
+
+
+def test_second_publisher_takes_nothing_over(driven: System) -> None:
+    """Neither a state of an older life of the robot, nor a command of an older controller."""
+    states, commands = driven.bus.publisher(KEYS.state, State), driven.bus.publisher(KEYS.command, Command)
+    true, command = driven.state(lambda _: True), driven.tracking()
+    seqs = iter(range(10**6, 10**9))
+
+    def lie() -> None:
+        seq = next(seqs)
+        states.put(State(true.epoch - 1, seq, true.stamp_ns + 10**12, np.full(5, 9.0)))
+        commands.put(replace(command, epoch=command.epoch - 1, seq=seq, valid_until_ns=2**62, u=np.full((20, 2), 0.5)))
+
+    before = driven.sample()
+    assert str(true.epoch) in driven.event("source_refused", "controller", lie).text
+    assert str(command.epoch) in driven.event("source_refused", "robot", lie).text
+    after = heard(driven.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.seq > before.seq + 20)
+    assert after.mode is Mode.TRACKING
+    assert np.abs(after.x0).max() < 8.0
+    assert driven.tracking().epoch == command.epoch
+
+
+def test_inputs_stayed_inside_their_bounds_through_all_of_it(driven: System) -> None:
+    driven.tracking()
+    with (driven.folder / "robot.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    u = np.array([[float(row["u_c"]), float(row["omega_c"])] for row in rows])
+    assert np.all(np.abs(u) <= [0.5, 0.745])
