@@ -94,7 +94,7 @@ class Controller:
         self.skipped = 0
         self.fallbacks = 0
         self._track = Track(model, ocp.N, self._dt_ns)
-        self._arriving: Reference | None = None  # waits for a state to start at
+        self._arriving: Reference | None = None  # waits for a state, to start at or to put its angles next to
         self._clock = RobotClock()
         self._sent = Sent(self._u_rest, ocp.lbdu, ocp.ubdu, self._dt_ns, commands=2 + -(-self._delay_ns // self._dt_ns))
         self._state: State | None = None
@@ -170,12 +170,11 @@ class Controller:
                 f"got {rows} rows of {ny} and {reference.p.shape[1]}, {reference.period_ns} ns",
             )
             return None
-        on_arrival = reference.stamp_ns == STAMP_ON_ARRIVAL
-        if on_arrival and self._state is None:
+        if self._state is None:
             self._arriving = reference
             return None
         anchored = self._anchor(reference)
-        return anchored if on_arrival else None
+        return anchored if reference.stamp_ns == STAMP_ON_ARRIVAL else None
 
     def stop(self, reason: str) -> None:
         """Ramp to rest and stay there until `enable`."""

@@ -27,7 +27,7 @@ import scipy.sparse as sp
 from rti_mpc.ocp import Ocp
 
 # What may change between samples without a new structure: attributes of the Ocp, read by the compiled functions in this order.
-WEIGHTS = ("Q", "R", "delta", "lambda_", "lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx", "z", "Z")
+WEIGHTS = ("Q", "R", "delta", "lambda_", "lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx", "z", "Z", "Q_e", "lh", "uh", "zh", "Zh")
 
 
 class Linearization:
@@ -49,6 +49,12 @@ class Linearization:
         gradient: Gradient of half the output cost in the states at nodes 1 to N, shape ``(nx, N)``.
         hessian: Its Gauss-Newton Hessian, nonzeros of `H_i`, shape ``(nnz, N)``.
         H_i: Pattern of one Hessian, symmetric, shape ``(nx, nx)``.
+        g: What has softened bounds, at nodes 1 to N: states, then general constraints; shape ``(ng, N)``.
+        g_x: Its sensitivities to the state of the node, nonzeros of `G_x`, shape ``(nnz, N)``.
+        g_u: Its sensitivities to the input that led there, nonzeros of `G_u`, shape ``(nnz, N)``.
+        G_x: Pattern of one, shape ``(ng, nx)``.
+        G_u: Pattern of one, shape ``(ng, nu)``.
+        lg: Lower bounds on g, shape ``(ng, 1)``; `ug`, upper bounds; `zg` and `Zg`, weights of the slacks.
         increments: ``u_k - u_{k-1}``, shape ``(nu, N_u)``.
         force: ``lambda_k R (u_k - u_{k-1})``, shape ``(nu, N_u)``.
         R: The increment weight, sparse.
@@ -74,13 +80,25 @@ class Linearization:
         self.b = stages[:nx, :] - self.x[:, 1:]
 
         node, self.H_i = gauss_newton(ocp)
-        nodes = node.map(N)(self.x[:, 1:], self.p[:, 1:], self.y_ref, self.w["delta"].T, ca.repmat(self.w["Q"], 1, N))
+        W = ca.kron(self.w["delta"].T, self.w["Q"])
+        W = ca.horzcat(W[:, : -model.ny], W[:, -model.ny :] + self.w["Q_e"])
+        nodes = node.map(N)(self.x[:, 1:], self.p[:, 1:], self.y_ref, W)
         self.gradient, self.hessian = nodes[:nx, :], nodes[nx + 1 :, :]
+
+        soft, w = list(ocp.soft), self.w
+        constraint, self.G_x, self.G_u = constraints(ocp)
+        bounded = constraint.map(N)(self.x[:, 1:], held, self.p[:, 1:])
+        to_x, to_u = len(ocp.lg), len(ocp.lg) + self.G_x.nnz()
+        self.g, self.g_x, self.g_u = bounded[:to_x, :], bounded[to_x:to_u, :], bounded[to_u:, :]
+        self.lg, self.ug = ca.vertcat(w["lbx"][soft, 0], w["lh"]), ca.vertcat(w["ubx"][soft, 0], w["uh"])
+        self.zg, self.Zg = ca.vertcat(w["z"][soft, 0], w["zh"]), ca.vertcat(w["Z"][soft, 0], w["Zh"])
+
         self.increments = self.u - ca.horzcat(self.u_prev, self.u[:, :-1])
         self.R = self.w["R"] * pattern(ocp.R)
         self.force = (self.R @ self.increments) * ca.repmat(self.w["lambda_"].T, nu, 1)
         self.cost = ca.sum2(nodes[nx, :]) + ca.dot(self.increments, self.force)
         self.checksum = ca.sum1(ca.vec(stages)) + ca.sum1(ca.vec(nodes)) + self.cost + ca.sum1(ca.vec(self.b))
+        self.checksum += ca.sum1(ca.vec(bounded))
 
     @property
     def arguments(self) -> list[ca.MX]:
@@ -120,21 +138,39 @@ def linearize(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
 
 def gauss_newton(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity]:
     r"""
-    Build the terms of :math:`\tfrac12 \delta \|h(x, p) - y_{ref}\|_Q^2` at one node.
+    Build the terms of :math:`\tfrac12 \|h(x, p) - y_{ref}\|_W^2` at one node.
 
     Returns:
-        ``node(x, p, y_ref, delta, Q) -> [gradient in x; twice the term itself; nonzeros of delta C' Q C]``, and the pattern of the last.
+        ``node(x, p, y_ref, W) -> [gradient in x; twice the term itself; nonzeros of C' W C]``, and the pattern of the last.
     """
     model = ocp.model
     y_ref = ca.SX.sym("y_ref", model.ny)
-    delta = ca.SX.sym("delta")
-    Q = ca.SX.sym("Q", model.ny, model.ny)
-    W = delta * Q * pattern(ocp.Q)
+    weight = ca.SX.sym("W", model.ny, model.ny)
+    W = weight * output_pattern(ocp)
     C = ca.jacobian(model.y_expr, model.x)
     e = model.y_expr - y_ref
     H = C.T @ W @ C
     out = ca.cse(ca.densify(ca.vertcat(C.T @ (W @ e), e.T @ (W @ e), H.nz[:])))
-    return ca.Function("node", [model.x, model.p, y_ref, delta, Q], [out]), H.sparsity()
+    return ca.Function("node", [model.x, model.p, y_ref, weight], [out]), H.sparsity()
+
+
+def constraints(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
+    """
+    Linearize what has softened bounds: the bounded states, then the general constraints.
+
+    Returns:
+        ``constraint(x, u, p) -> [g; nonzeros of G_x; nonzeros of G_u]``, with their patterns.
+    """
+    model = ocp.model
+    g = ca.vertcat(model.x[list(ocp.soft), 0], ocp.h_expr)
+    G_x, G_u = ca.jacobian(g, model.x), ca.jacobian(g, model.u)
+    out = ca.cse(ca.densify(ca.vertcat(g, G_x.nz[:], G_u.nz[:])))
+    return ca.Function("constraint", [model.x, model.u, model.p], [out]), G_x.sparsity(), G_u.sparsity()
+
+
+def output_pattern(ocp: Ocp) -> ca.DM:
+    """Return ones where the weight on outputs may become nonzero."""
+    return pattern((ocp.Q != 0) | (ocp.Q_e != 0))
 
 
 def pattern(weight: np.ndarray[Any, Any]) -> ca.DM:
@@ -149,11 +185,15 @@ def plan_cost(ocp: Ocp) -> ca.Function:
     y_ref, p = ca.SX.sym("y_ref", model.ny, N), ca.SX.sym("p", model.np_, N + 1)
     w = {name: ca.SX.sym(name, *np.shape(getattr(ocp, name))) for name in WEIGHTS}
     h = ca.Function("h", [model.x, model.p], [model.y_expr])
+    g = ca.Function("g", [model.x, model.u, model.p], [ca.vertcat(model.x[list(ocp.soft), 0], ocp.h_expr)])
+    lg, ug, zg, Zg = (ca.vertcat(w[state][list(ocp.soft), 0], w[other]) for state, other in (("lbx", "lh"), ("ubx", "uh"), ("z", "zh"), ("Z", "Zh")))
     cost = ca.SX(0)
     for i in range(1, N + 1):
         e = h(x[:, i], p[:, i]) - y_ref[:, i - 1]
-        s = ca.fmax(0, ca.fmax(x[:, i] - w["ubx"], w["lbx"] - x[:, i]))
-        cost += w["delta"][i - 1] * ca.bilin(w["Q"] * pattern(ocp.Q), e, e) + ca.dot(w["z"], s) + ca.dot(w["Z"], s**2) / 2
+        value = g(x[:, i], u[:, min(i, N_u) - 1], p[:, i])
+        s = ca.fmax(0, ca.fmax(value - ug, lg - value))
+        weight = w["delta"][i - 1] * w["Q"] + (w["Q_e"] if i == N else 0)
+        cost += ca.bilin(weight * output_pattern(ocp), e, e) + ca.dot(zg, s) + ca.dot(Zg, s**2) / 2
     for k in range(N_u):
         increment = u[:, k] - (u[:, k - 1] if k else u_prev)
         cost += w["lambda_"][k] * ca.bilin(w["R"] * pattern(ocp.R), increment, increment)

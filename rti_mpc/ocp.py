@@ -9,13 +9,16 @@ Over stages of `dt` seconds, with :math:`y_i = h(x_i, p_i)`, the previous input
 
     \min \; & \sum_{i=1}^{N} \delta_i \|y_i - y_{ref,i}\|_Q^2
             + \sum_{i=1}^{N_u} \lambda_i \|u_{i-1} - u_{i-2}\|_R^2
+            + \|y_N - y_{ref,N}\|_{Q_e}^2
             + \sum_{i=1}^{N} \left( z^T s_i + \tfrac12 s_i^T Z s_i \right) \\
     \text{s.t.} \; & x_{k+1} = \phi(x_k, u_k, p_k), \quad x_0 \text{ given}, \\
     & lbu \le u_k \le ubu, \quad lbdu \le u_k - u_{k-1} \le ubdu, \\
-    & lbx - s_i \le x_i \le ubx + s_i, \quad s_i \ge 0 .
+    & lbx - s_i \le x_i \le ubx + s_i, \quad
+      lh - s_i \le h(x_i, u_{i-1}, p_i) \le uh + s_i, \quad s_i \ge 0 .
 
-This is the cost (4) of [Rosales]_ in full. State bounds are softened by an
-exact penalty, so that no measurement makes the problem infeasible.
+This is the cost (4) of [Rosales]_ in full, with a terminal weight beside it.
+Bounds on states and general constraints, each with its own slacks, are softened
+by an exact penalty, so that no measurement makes the problem infeasible.
 """
 
 from __future__ import annotations
@@ -56,6 +59,12 @@ class Ocp:
         ubx: Softened upper bound on states, shape ``(nx,)``.
         z: L1 weight of the slacks, shape ``(nx,)``, given so or as a constant; cost / unit of the state.
         Z: L2 weight of the slacks, shape ``(nx,)``, given so or as a constant; cost / unit of the state squared.
+        Q_e: Terminal weight beside ``delta_N Q``, shape ``(ny, ny)``, given so or by its diagonal; none by default.
+        h_expr: General constraints h(x, u, p) in the model's symbols, shape ``(nh, 1)``; none by default.
+        lh: Softened lower bound on them, shape ``(nh,)``.
+        uh: Softened upper bound on them, shape ``(nh,)``.
+        zh: L1 weight of their slacks, shape ``(nh,)``, given so or as a constant.
+        Zh: L2 weight of their slacks, shape ``(nh,)``, given so or as a constant.
 
     Raises:
         OcpError: An argument does not fit; the message names it, and what it must be.
@@ -78,6 +87,12 @@ class Ocp:
     ubx: Array
     z: Array
     Z: Array
+    Q_e: Array
+    h_expr: ca.SX
+    lh: Array
+    uh: Array
+    zh: Array
+    Zh: Array
 
     def __init__(
         self,
@@ -99,6 +114,12 @@ class Ocp:
         ubx: ArrayLike = np.inf,
         z: ArrayLike = 1e3,
         Z: ArrayLike = 1e3,
+        Q_e: ArrayLike | None = None,
+        h_expr: ca.SX | None = None,
+        lh: ArrayLike = -np.inf,
+        uh: ArrayLike = np.inf,
+        zh: ArrayLike = 1e3,
+        Zh: ArrayLike = 1e3,
     ) -> None:
         if N_u is None:
             N_u = N
@@ -108,6 +129,11 @@ class Ocp:
             raise OcpError(f"dt must be a positive number of seconds, got {dt}")
         integrator(model, method)  # raises for an unknown method
         nx, nu, ny = model.nx, model.nu, model.ny
+        h_expr = ca.SX(0, 1) if h_expr is None else h_expr
+        nh = h_expr.numel()
+        free = [s for s in ca.symvar(h_expr) if not ca.depends_on(ca.vertcat(model.x, model.u, model.p), s)]
+        if free or (nh and h_expr.shape != (nh, 1)):
+            raise OcpError(f"h_expr must be a column of the model's x, u, p, got shape {h_expr.shape} and {free or 'nothing'} besides")
         fields: dict[str, Any] = {
             "model": model,
             "N": N,
@@ -126,8 +152,14 @@ class Ocp:
             "ubx": bound("ubx", ubx, nx),
             "z": weights("z", z, nx),
             "Z": weights("Z", Z, nx),
+            "Q_e": weight_matrix("Q_e", np.zeros(ny) if Q_e is None else Q_e, ny),
+            "h_expr": h_expr,
+            "lh": bound("lh", lh, nh),
+            "uh": bound("uh", uh, nh),
+            "zh": weights("zh", zh, nh),
+            "Zh": weights("Zh", Zh, nh),
         }
-        for lower, upper in (("lbu", "ubu"), ("lbx", "ubx")):
+        for lower, upper in (("lbu", "ubu"), ("lbx", "ubx"), ("lh", "uh")):
             if not np.all(fields[lower] < fields[upper]):
                 raise OcpError(f"{lower} must lie below {upper}, got {fields[lower]} and {fields[upper]}")
         if np.any(fields["lbdu"] > 0) or np.any(fields["ubdu"] < 0):
@@ -141,6 +173,16 @@ class Ocp:
     def soft(self) -> tuple[int, ...]:
         """Indices of the states with a bound, each with one slack a node."""
         return tuple(int(j) for j in np.flatnonzero(np.isfinite(self.lbx) | np.isfinite(self.ubx)))
+
+    @property
+    def lg(self) -> Array:
+        """Lower bounds of everything softened: of the states in `soft`, then of `h_expr`."""
+        return np.concatenate([self.lbx[list(self.soft)], self.lh])
+
+    @property
+    def ug(self) -> Array:
+        """Upper bounds of everything softened."""
+        return np.concatenate([self.ubx[list(self.soft)], self.uh])
 
     def phi(self) -> ca.Function:
         """One stage of the dynamics, ``phi(x, u, p) -> x_next``."""

@@ -84,14 +84,14 @@ class Rti:
         self._cost: Array = np.zeros(1)
         self._evaluate = bind(make(plan_cost(ocp)), (*self._plan[:2], *guess.sample[2:]), (self._cost,))
         transcribe = FORMULATIONS[formulation]
-        qps = [Qp(transcribe(ocp, state_bounds=bounds), guess, make) for bounds in (False, True)[: 2 if ocp.soft else 1]]
+        qps = [Qp(transcribe(ocp, softened=softened), guess, make) for softened in (False, True)[: 2 if len(ocp.lg) else 1]]
         self._roll_out()
         qps[0].fill()
         if not isfinite(qps[0].checksum[0]):
             raise OcpError(f"model {model.name} must be finite and differentiable around the zero state")
         # The cost normalised, so that one step size of ADMM, and one tolerance, fit every problem.
         self._cost_scale = 1.0 / step_size(qps[0])
-        for name in ("delta", "lambda_", "z", "Z"):
+        for name in ("delta", "lambda_", "z", "Z", "Q_e", "zh", "Zh"):
             weights[name] *= self._cost_scale
         for qp in qps:
             qp.fill()

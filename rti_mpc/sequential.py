@@ -27,13 +27,14 @@ from rti_mpc.ocp import Ocp
 from rti_mpc.transcription import (
     SLACK_UNIT,
     Blocks,
+    Remembered,
     Rows,
     Transcription,
     clipped,
     data_functions,
     finite,
+    head,
     input_rows,
-    violation,
     weight_symbols,
 )
 
@@ -106,41 +107,42 @@ def over(function: ca.Function, blocks: int, shared: list[int]) -> ca.Function:
     return function if blocks == 1 else function.map(f"{function.name()}_{blocks}", "serial", blocks, shared, [], {})
 
 
-def sequential(ocp: Ocp, *, state_bounds: bool = True) -> Transcription:
+def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
     """
     Transcribe an OCP with the inputs alone as variables.
 
     Args:
         ocp: The problem.
-        state_bounds: Whether the bounds on states, and their slacks, are there.
+        softened: Whether the softened bounds, on states and general constraints, and their slacks are there.
     """
     lin = Linearization(ocp)
     condensed = Condensing(ocp, lin)
-    N, N_u, nx, nu, w = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu, lin.w
-    soft = list(ocp.soft) if state_bounds else []
+    N, N_u, nu = ocp.N, ocp.N_u, ocp.model.nu
+    ng = len(ocp.lg) if softened else 0
     to_s = N_u * nu
-    n = to_s + N * len(soft)
+    n = to_s + N * ng
 
     A, rows = Blocks(), Rows()
     input_rows(ocp, lin, rows, A, 0)
     first_soft = rows.count
 
-    # Softened bounds on states: G du - s <= ubx - x - c, G du + s >= lbx - x - c, s >= 0; feedback subtracts Phi dx_0.
-    limits: list[tuple[str, int, int]] = []  # bound, node, state
-    for bound, sign in (("ubx", -1), ("lbx", 1)):
-        at = [j for j in finite(getattr(ocp, bound)) if j in soft]
+    # Softened bounds on g: the same with g_x G_i for the response to the inputs; feedback subtracts the one to the initial state.
+    responses: list[ca.MX] = []
+    for bounds, limit, sign in ((ocp.ug, lin.ug, -1), (ocp.lg, lin.lg, 1)):
+        at = finite(bounds) if ng else []
         for i in range(N) if at else ():
-            value = lin.x[at, i + 1] + condensed.c[i][at]
-            limit = w[bound][at]
-            row = rows.add(None if sign < 0 else limit, value, limit if sign < 0 else None)
-            G = condensed.G[i][at, :]
-            A.place_values(ca.vec(G), [(row, 0, ca.Sparsity.dense(*G.shape))])
-            A.place(row, to_s + i * len(soft), sign * SLACK_UNIT * sp.csc_array(np.eye(nx)[np.ix_(at, soft)]))
-            limits += [(bound, i, j) for j in at]
+            G_x, G_u = (ca.densify(ca.MX(sparsity, e[:, i])[at, :]) for sparsity, e in ((lin.G_x, lin.g_x), (lin.G_u, lin.g_u)))
+            value = lin.g[at, i] + G_x @ condensed.c[i]
+            row = rows.add(None if sign < 0 else limit[at], value, limit[at] if sign < 0 else None)
+            response = G_x @ condensed.G[i]
+            response = ca.horzcat(response[:, :-nu], response[:, -nu:] + G_u)
+            A.place_values(ca.vec(response), [(row, 0, ca.Sparsity.dense(*response.shape))])
+            A.place(row, to_s + i * ng, sign * SLACK_UNIT * sp.csc_array(np.eye(ng)[at]))
+            responses.append(G_x @ condensed.Phi[i])
     end_soft = rows.count
-    if soft:
-        slack = ca.MX.zeros(len(soft), N)
-        A.place(rows.add(slack, slack, None), to_s, sp.eye_array(N * len(soft)))
+    if ng:
+        slack = ca.MX.zeros(ng, N)
+        A.place(rows.add(slack, slack, None), to_s, sp.eye_array(N * ng))
     if not rows.count:
         A.place(rows.add(None, ca.MX.zeros(1), None), 0, sp.csc_array(np.eye(1)))  # OSQP wants a row
 
@@ -153,27 +155,27 @@ def sequential(ocp: Ocp, *, state_bounds: bool = True) -> Transcription:
         column = column + ca.vertcat(*addition)
         upper = np.vstack([np.ones((k * nu, nu)), np.triu(np.ones((nu, nu)))])
         P.place_values(ca.vec(column)[np.flatnonzero(upper.T.ravel()).tolist()], [(0, k * nu, ca.DM(sp.csc_matrix(upper)).sparsity())])
-    if soft:
-        P.place_values(ca.repmat(SLACK_UNIT**2 / 2 * w["Z"][soft], N), [(to_s, to_s, ca.Sparsity.diag(N * len(soft)))])
+    if ng:
+        P.place_values(ca.repmat(SLACK_UNIT**2 / 2 * lin.Zg, N), [(to_s, to_s, ca.Sparsity.diag(N * ng))])
     q_inputs = condensed.m + ca.vec(lin.increment_gradient())
-    q = ca.vertcat(q_inputs, ca.repmat(SLACK_UNIT / 2 * w["z"][soft, 0], N))
+    q = ca.vertcat(q_inputs, *([ca.repmat(SLACK_UNIT / 2 * lin.zg, N)] if ng else []))
 
     lower, upper_bounds = ca.vertcat(*rows.lower), ca.vertcat(*rows.upper)
-    Phi = ca.vertcat(*(condensed.Phi[i][j, :] for _, i, j in limits)) if limits else ca.MX(0, nx)
-    memory = ca.veccat(lin.A, lin.B, lin.b, q_inputs, condensed.M, Phi, lower[first_soft:end_soft], upper_bounds[first_soft:end_soft])
+    Phi = ca.vertcat(*responses)
+    known = [*head(lin), lin.A, lin.B, lin.b]
+    memory = ca.veccat(*known, q_inputs, condensed.M, Phi, lower[first_soft:end_soft], upper_bounds[first_soft:end_soft])
     A_pattern, A_data = A.finish(rows.count, n)
     P_pattern, P_data = P.finish(n, n)
     checksum = lin.checksum + ca.sum1(memory) + ca.sum1(P_data)
     everything, varying, data = data_functions(lin, [q, P_data, A_data, lower, upper_bounds, memory, lin.cost, checksum])
-    after_stages = lin.A.numel() + lin.B.numel() + lin.b.numel()
     return Transcription(
         P=P_pattern,
         A=A_pattern,
         everything=everything,
         varying=varying,
         data=data,
-        embed=embed(ocp, memory.numel(), after_stages, end_soft - first_soft),
-        embedded=(("q", slice(0, to_s)), *((name, slice(first_soft, end_soft)) for name in ("l", "u") if soft)),
+        embed=embed(ocp, memory.numel(), sum(e.numel() for e in known), end_soft - first_soft),
+        embedded=(("q", slice(0, to_s)), *((name, slice(first_soft, end_soft)) for name in ("l", "u") if ng)),
         step=full_step(ocp, lin, n, memory.numel()),
         slacks=slice(to_s, n),
         eliminable=0,
@@ -204,14 +206,14 @@ def full_step(ocp: Ocp, lin: Linearization, n: int, remembered: int) -> ca.Funct
     u_prev = ca.SX.sym("u_prev", ocp.model.nu)
     z = ca.SX.sym("z", n)
     x0 = ca.SX.sym("x0", nx)
-    memory = ca.SX.sym("memory", remembered)
+    known = Remembered(ocp, lin, remembered)
     w = weight_symbols(ocp)
     at = np.cumsum([0, lin.A.numel(), lin.B.numel(), lin.b.numel()]).tolist()
-    A, B, b = (ca.reshape(memory[at[i] : at[i + 1]], -1, N) for i in range(3))
+    A, B, b = (ca.reshape(known.rest[at[i] : at[i + 1]], -1, N) for i in range(3))
     du = ca.reshape(z[: u.numel()], u.shape)
     dx = [x0 - x[:, 0]]
     for k in range(N):
         dx.append(ca.SX(lin.A_k, A[:, k]) @ dx[k] + ca.SX(lin.B_k, B[:, k]) @ du[:, min(k, N_u - 1)] + b[:, k])
-    x_plan = x + ca.horzcat(*dx)
-    u_plan = clipped(ocp, u + du, u_prev, w)
-    return ca.Function("step", [x, u, u_prev, z, x0, memory, *w.values()], [ca.densify(x_plan), u_plan, violation(ocp, x_plan, w)])
+    deviation = ca.densify(ca.horzcat(*dx))
+    plan = [x + deviation, clipped(ocp, u + du, u_prev, w), known.violation(deviation, du, w)]
+    return ca.Function("step", [x, u, u_prev, z, x0, known.memory, *w.values()], plan)

@@ -8,7 +8,7 @@ Its variables are :math:`z = (\Delta x_0, \dots, \Delta x_N, \Delta u_0, \dots,
 1. the initial state, the only ones the feedback phase touches,
 2. the dynamics,
 3. the bounds on inputs, and on increments,
-4. the softened bounds on states from above and from below, and :math:`s \ge 0`.
+4. the softened bounds, from above and from below, and :math:`s \ge 0`.
 """
 
 from __future__ import annotations
@@ -22,32 +22,33 @@ from rti_mpc.ocp import Ocp
 from rti_mpc.transcription import (
     SLACK_UNIT,
     Blocks,
+    Remembered,
     Rows,
     Transcription,
     clipped,
     data_functions,
     each,
     finite,
+    head,
     input_rows,
-    violation,
+    picked,
     weight_symbols,
 )
 
 
-def simultaneous(ocp: Ocp, *, state_bounds: bool = True) -> Transcription:
+def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
     """
     Transcribe an OCP with states and inputs as variables.
 
     Args:
         ocp: The problem.
-        state_bounds: Whether the bounds on states, and their slacks, are there.
+        softened: Whether the softened bounds, on states and general constraints, and their slacks are there.
     """
     lin = Linearization(ocp)
-    N, N_u, nx, nu, w = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu, lin.w
-    soft = list(ocp.soft) if state_bounds else []
-    nodes = lin.x[:, 1:]  # the cost and the state bounds begin at node 1
+    N, N_u, nx, nu = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu
+    ng = len(ocp.lg) if softened else 0
     to_du, to_s = (N + 1) * nx, (N + 1) * nx + N_u * nu
-    n = to_s + N * len(soft)
+    n = to_s + N * ng
 
     A, rows = Blocks(), Rows()
     zero = ca.MX.zeros(nx)
@@ -61,17 +62,21 @@ def simultaneous(ocp: Ocp, *, state_bounds: bool = True) -> Transcription:
 
     input_rows(ocp, lin, rows, A, to_du)
 
-    # Softened bounds on states: x - s <= ubx, x + s >= lbx, s >= 0.
-    for bound, sign in (("ubx", -1), ("lbx", 1)):
-        at = [j for j in finite(getattr(ocp, bound)) if j in soft]
+    # Softened bounds: g - s <= ug, g + s >= lg, s >= 0.
+    for bounds, limit, sign in ((ocp.ug, lin.ug, -1), (ocp.lg, lin.lg, 1)):
+        at = finite(bounds) if ng else []
         if at:
-            limit = each(w[bound][at], N)
-            row = rows.add(None if sign < 0 else limit, nodes[at, :], limit if sign < 0 else None)
-            A.place(row, nx, sp.kron(sp.eye_array(N), np.eye(nx)[at]))
-            A.place(row, to_s, sign * SLACK_UNIT * sp.kron(sp.eye_array(N), np.eye(nx)[np.ix_(at, soft)]))
-    if soft:
-        slack = ca.MX.zeros(len(soft), N)
-        A.place(rows.add(slack, slack, None), to_s, sp.eye_array(N * len(soft)))
+            side = each(limit[at], N)
+            row = rows.add(None if sign < 0 else side, lin.g[at, :], side if sign < 0 else None)
+            places = [(row + i * len(at), nx + i * nx, to_du + min(i, N_u - 1) * nu) for i in range(N)]  # row, column of dx, column of du
+            for column, nonzeros, sparsity in ((1, lin.g_x, lin.G_x), (2, lin.g_u, lin.G_u)):
+                chosen, block = picked(sparsity, at)
+                if chosen:
+                    A.place_values(ca.vec(nonzeros[chosen, :]), [(place[0], place[column], block) for place in places])
+            A.place(row, to_s, sign * SLACK_UNIT * sp.kron(sp.eye_array(N), np.eye(ng)[at]))
+    if ng:
+        slack = ca.MX.zeros(ng, N)
+        A.place(rows.add(slack, slack, None), to_s, sp.eye_array(N * ng))
 
     P = Blocks()
     H_upper = ca.triu(lin.H_i)
@@ -83,13 +88,14 @@ def simultaneous(ocp: Ocp, *, state_bounds: bool = True) -> Transcription:
         P.place_values(ca.triu(diagonal).nz[:], [(at_k, at_k, ca.triu(diagonal).sparsity())])
         if beside is not None:
             P.place_values(beside.nz[:], [(at_k, at_k + nu, beside.sparsity())])
-    if soft:
-        P.place_values(ca.repmat(SLACK_UNIT**2 / 2 * w["Z"][soft], N), [(to_s, to_s, ca.Sparsity.diag(N * len(soft)))])
-    q = ca.vertcat(zero, ca.vec(lin.gradient), ca.vec(lin.increment_gradient()), ca.repmat(SLACK_UNIT / 2 * w["z"][soft, 0], N))
+    if ng:
+        P.place_values(ca.repmat(SLACK_UNIT**2 / 2 * lin.Zg, N), [(to_s, to_s, ca.Sparsity.diag(N * ng))])
+    q = ca.vertcat(zero, ca.vec(lin.gradient), ca.vec(lin.increment_gradient()), *([ca.repmat(SLACK_UNIT / 2 * lin.zg, N)] if ng else []))
 
     A_pattern, A_data = A.finish(rows.count, n)
     P_pattern, P_data = P.finish(n, n)
-    outputs = [q, P_data, A_data, ca.vertcat(*rows.lower), ca.vertcat(*rows.upper), ca.MX.zeros(0), lin.cost, lin.checksum]
+    memory = ca.veccat(*head(lin))
+    outputs = [q, P_data, A_data, ca.vertcat(*rows.lower), ca.vertcat(*rows.upper), memory, lin.cost, lin.checksum]
     everything, varying, data = data_functions(lin, outputs)
     return Transcription(
         P=P_pattern,
@@ -97,31 +103,32 @@ def simultaneous(ocp: Ocp, *, state_bounds: bool = True) -> Transcription:
         everything=everything,
         varying=varying,
         data=data,
-        embed=embed(ocp),
+        embed=embed(ocp, memory.numel()),
         embedded=(("l", slice(0, nx)), ("u", slice(0, nx))),
-        step=full_step(ocp, n),
+        step=full_step(ocp, lin, n, memory.numel()),
         slacks=slice(to_s, n),
         eliminable=to_du,
     )
 
 
-def embed(ocp: Ocp) -> ca.Function:
+def embed(ocp: Ocp, remembered: int) -> ca.Function:
     """Write the initial state into the bounds of its rows."""
     x0 = ca.SX.sym("x0", ocp.model.nx)
     x = ca.SX.sym("x", ocp.model.nx, ocp.N + 1)
     deviation = x0 - x[:, 0]
-    return ca.Function("embed", [x0, x, ca.SX(0, 1)], [deviation, deviation])
+    return ca.Function("embed", [x0, x, ca.SX.sym("memory", remembered)], [deviation, deviation])
 
 
-def full_step(ocp: Ocp, n: int) -> ca.Function:
+def full_step(ocp: Ocp, lin: Linearization, n: int, remembered: int) -> ca.Function:
     """Read states and inputs off the solution."""
     x = ca.SX.sym("x", ocp.model.nx, ocp.N + 1)
     u = ca.SX.sym("u", ocp.model.nu, ocp.N_u)
     u_prev = ca.SX.sym("u_prev", ocp.model.nu)
     z = ca.SX.sym("z", n)
     x0 = ca.SX.sym("x0", ocp.model.nx)
+    known = Remembered(ocp, lin, remembered)
     w = weight_symbols(ocp)
     to_du, to_s = x.numel(), x.numel() + u.numel()
-    x_plan = x + ca.reshape(z[:to_du], x.shape)
-    u_plan = clipped(ocp, u + ca.reshape(z[to_du:to_s], u.shape), u_prev, w)
-    return ca.Function("step", [x, u, u_prev, z, x0, ca.SX(0, 1), *w.values()], [x_plan, u_plan, violation(ocp, x_plan, w)])
+    dx, du = ca.reshape(z[:to_du], x.shape), ca.reshape(z[to_du:to_s], u.shape)
+    plan = [x + dx, clipped(ocp, u + du, u_prev, w), known.violation(dx, du, w)]
+    return ca.Function("step", [x, u, u_prev, z, x0, known.memory, *w.values()], plan)

@@ -9,6 +9,7 @@ Beside the QP itself there are two small functions of the feedback phase:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -36,7 +37,7 @@ class Transcription:
         data: As `everything`, but returns only what varies.
         embed: ``(x0, x, memory) -> `` what of the QP depends on the initial state.
         embedded: Where that goes: attribute of the QP, and place in it.
-        step: ``(x, u, u_prev, z, x0, memory, *WEIGHTS) -> (x+, u+, violation)``: the full step, and by how much its states exceed their bounds.
+        step: ``(x, u, u_prev, z, x0, memory, *WEIGHTS) -> (x+, u+, violation)``: the full step, and by how much it exceeds softened bounds.
         slacks: Entries of the slacks in z.
         eliminable: States in z, which as many first rows determine.
     """
@@ -135,15 +136,46 @@ def clipped(ocp: Ocp, u: ca.SX, u_prev: ca.SX, w: dict[str, ca.SX]) -> ca.SX:
     return ca.horzcat(*columns)
 
 
-def violation(ocp: Ocp, x: ca.SX, w: dict[str, ca.SX]) -> ca.SX:
-    """Return by how much the states at nodes 1 to N exceed their bounds at most; negative if all are inside."""
-    worst = ca.SX(-INFINITY)
-    for j in ocp.soft:
-        if np.isfinite(ocp.ubx[j]):
-            worst = ca.fmax(worst, ca.mmax(x[j, 1:]) - w["ubx"][j])
-        if np.isfinite(ocp.lbx[j]):
-            worst = ca.fmax(worst, w["lbx"][j] - ca.mmin(x[j, 1:]))
-    return worst
+class Remembered:
+    """
+    What the full step wants to know of the linearization of the softened constraints: the head of `memory`, as symbols.
+
+    Attributes:
+        memory: All of it, shape ``(remembered, 1)``.
+        rest: What comes behind.
+    """
+
+    def __init__(self, ocp: Ocp, lin: Linearization, remembered: int) -> None:
+        self._ocp, self._lin = ocp, lin
+        self.memory = ca.SX.sym("memory", remembered)
+        ends = np.cumsum([0, *(e.numel() for e in head(lin))]).tolist()
+        self._parts = [ca.reshape(self.memory[a:b], -1, ocp.N) for a, b in pairwise(ends)]
+        self.rest = self.memory[ends[-1] :]
+
+    def violation(self, dx: ca.SX, du: ca.SX, w: dict[str, ca.SX]) -> ca.SX:
+        """Return by how much a plan exceeds the linearized constraints at most, negative if it keeps them all; `dx` from node 0 on."""
+        ocp, lin = self._ocp, self._lin
+        g, g_x, g_u = self._parts
+        soft = list(ocp.soft)
+        lg, ug = ca.vertcat(w["lbx"][soft, 0], w["lh"]), ca.vertcat(w["ubx"][soft, 0], w["uh"])
+        worst = ca.SX(-INFINITY)
+        for i in range(ocp.N) if len(ocp.lg) else ():
+            value = g[:, i] + ca.SX(lin.G_x, g_x[:, i]) @ dx[:, i + 1] + ca.SX(lin.G_u, g_u[:, i]) @ du[:, min(i, ocp.N_u - 1)]
+            for bounds, excess in ((ocp.ug, value - ug), (ocp.lg, lg - value)):
+                for j in finite(bounds):
+                    worst = ca.fmax(worst, excess[j])
+        return worst
+
+
+def head(lin: Linearization) -> list[ca.MX]:
+    """Return the head of `memory`, see `Remembered`."""
+    return [lin.g, lin.g_x, lin.g_u]
+
+
+def picked(sparsity: ca.Sparsity, rows: list[int]) -> tuple[list[int], ca.Sparsity]:
+    """Return which nonzeros of a pattern lie in some rows, and the pattern of these rows alone."""
+    at = [(i, rows.index(row), col) for i, (row, col) in enumerate(zip(*sparsity.get_triplet(), strict=True)) if row in rows]
+    return [i for i, _, _ in at], ca.Sparsity.triplet(len(rows), sparsity.size2(), [row for _, row, _ in at], [col for _, _, col in at])
 
 
 def weight_symbols(ocp: Ocp) -> dict[str, ca.SX]:
