@@ -278,6 +278,7 @@ class Controller:
         for _ in range(ITERATIONS_COLD):
             self._load(shift=False)
             status = self._rti.feedback(self._x0)
+        self._loaded = status.usable  # a guess that was never a plan is none to fall back to
         return status
 
     # What goes out.
