@@ -52,6 +52,7 @@ class Qp:
         z: Where the solver puts its solution, shape ``(n,)``.
         cost: The cost (4) at the guess, shape ``(1,)``.
         checksum: Finite if and only if all of this is, shape ``(1,)``.
+        watched: For each softened row, the last ones, those by which it is known to act, see `Transcription`; shape ``(rows, 4)``.
         varies_P: Whether the Hessian changes from sample to sample.
         varies_A: Whether the constraint matrix does.
         fill: Writes all but `z` from the guess: slow, uncompiled, after a change of weights.
@@ -78,6 +79,7 @@ class Qp:
         memory: Array = np.zeros(transcription.everything.numel_out(5))
         self._slacks = transcription.slacks
         self._eliminable = transcription.eliminable
+        self.watched = transcription.watched
         self.varies_P, self.varies_A = 1 in transcription.varying, 2 in transcription.varying
 
         outputs = (self.q, self.P.data, self.A.data, self.l, self.u, memory, self.cost, self.checksum)

@@ -126,6 +126,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
     input_rows(ocp, lin, rows, A, 0)
     first_soft = rows.count
 
+    sides: list[tuple[int, list[int]]] = []
     # Softened bounds on g: the same with g_x G_i for the response to the inputs; feedback subtracts the one to the initial state.
     responses: list[ca.MX] = []
     for bounds, limit, sign in ((ocp.ug, lin.ug, -1), (ocp.lg, lin.lg, 1)):
@@ -139,10 +140,15 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
             A.place_values(ca.vec(response), [(row, 0, ca.Sparsity.dense(*response.shape))])
             A.place(row, to_s + i * ng, sign * SLACK_UNIT * sp.csc_array(np.eye(ng)[at]))
             responses.append(G_x @ condensed.Phi[i])
+        if at:
+            rows.chain(rows.count - N * len(at), len(at))
+            sides.append((rows.count - N * len(at), at))
     end_soft = rows.count
     if ng:
         slack = ca.MX.zeros(ng, N)
-        A.place(rows.add(slack, slack, None), to_s, sp.eye_array(N * ng))
+        row = rows.add(slack, slack, None)
+        rows.follow(row, ng, sides)
+        A.place(row, to_s, sp.eye_array(N * ng))
     if not rows.count:
         A.place(rows.add(None, ca.MX.zeros(1), None), 0, sp.csc_array(np.eye(1)))  # OSQP wants a row
 
@@ -179,6 +185,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
         step=full_step(ocp, lin, n, memory.numel()),
         slacks=slice(to_s, n),
         eliminable=0,
+        watched=rows.watched_from(first_soft),
     )
 
 

@@ -62,6 +62,8 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
 
     input_rows(ocp, lin, rows, A, to_du)
 
+    first_soft = rows.count
+    sides: list[tuple[int, list[int]]] = []
     # Softened bounds: g - s <= ug, g + s >= lg, s >= 0.
     for bounds, limit, sign in ((ocp.ug, lin.ug, -1), (ocp.lg, lin.lg, 1)):
         at = finite(bounds) if ng else []
@@ -74,9 +76,13 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
                 if chosen:
                     A.place_values(ca.vec(nonzeros[chosen, :]), [(place[0], place[column], block) for place in places])
             A.place(row, to_s, sign * SLACK_UNIT * sp.kron(sp.eye_array(N), np.eye(ng)[at]))
+            rows.chain(row, len(at))
+            sides.append((row, at))
     if ng:
         slack = ca.MX.zeros(ng, N)
-        A.place(rows.add(slack, slack, None), to_s, sp.eye_array(N * ng))
+        row = rows.add(slack, slack, None)
+        rows.follow(row, ng, sides)
+        A.place(row, to_s, sp.eye_array(N * ng))
 
     P = Blocks()
     H_upper = ca.triu(lin.H_i)
@@ -108,6 +114,7 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
         step=full_step(ocp, lin, n, memory.numel()),
         slacks=slice(to_s, n),
         eliminable=to_du,
+        watched=rows.watched_from(first_soft),
     )
 
 

@@ -33,6 +33,9 @@ STATUS = {
     8: QpStatus.TIME_LIMIT,
 }
 
+ACTING = 1e-6  # multiplier from which a bound acts: the others are zero exactly
+ACTING_SCALE = 30.0  # of such a row: its step size is that of an equation, about 1000 times the others'
+
 
 @dataclass(frozen=True)
 class SolverSettings:
@@ -92,24 +95,50 @@ class Solver:
         self._osqp = public._solver
         self._info = self._osqp.info
         self._solution = self._osqp.solution
-        self._matrices = {
-            "P_x": qp.P.data if qp.varies_P else None,
-            "P_i": None,
-            "A_x": qp.A.data if qp.varies_A else None,
-            "A_i": None,
-        }
         refused = self._osqp.update_data_mat(P_x=qp.P.data, P_i=None, A_x=qp.A.data, A_i=None)
         assert not refused, "OSQP must have kept the patterns it was given"
+        self._P_x = qp.P.data if qp.varies_P else None
+        # The softened rows, the last of all, are weighed by whether they act; OSQP sees what comes of that.
+        self._soft = slice(len(qp.l) - len(qp.watched), None)
+        self._active = np.zeros(len(qp.watched), dtype=bool)
+        self._scale = np.ones_like(qp.l)
+        weighed = len(qp.watched) > 0
+        self._A_x, self._l, self._u = (array.copy() if weighed else array for array in (qp.A.data, qp.l, qp.u))
 
     def load(self) -> None:
         """Linearize at the guess, and take over the new matrices, factorization included; off the path from state to command."""
-        self.qp.linearize()
-        self._finite = isfinite(self.qp.checksum[0])
-        if self._finite:  # or OSQP would never recover
-            self._osqp.update_data_mat(**self._matrices)
-            if self.cold:
-                self._osqp.warm_start(*self._zero)
-                self.cold = False
+        qp = self.qp
+        qp.linearize()
+        self._finite = isfinite(qp.checksum[0])
+        if not self._finite:  # or OSQP would never recover
+            return
+        changed = qp.varies_A or qp.varies_P
+        if self._A_x is not qp.A.data:
+            changed |= self._weigh()
+            np.multiply(qp.A.data, self._scale[qp.A.indices], out=self._A_x)
+        if changed:
+            self._osqp.update_data_mat(P_x=self._P_x, P_i=None, A_x=self._A_x, A_i=None)
+        if self.cold:
+            self._osqp.warm_start(*self._zero)
+            self.cold = False
+
+    def _weigh(self) -> bool:
+        """
+        Give softened rows that act the step size of equations, and tell whether anything changed.
+
+        One step size does not fit both: where such a bound acts, its multiplier
+        must travel far; where it does not, it must not hold the solution back.
+        Which act is seen from the last multipliers, a stage earlier.
+        """
+        y = self._solution.y * self._scale
+        acts = np.abs(y[self._soft]) > ACTING
+        active = np.zeros_like(acts) if self.cold else acts[self.qp.watched].any(axis=1)
+        if np.array_equal(active, self._active):
+            return False
+        self._active = active
+        self._scale[self._soft] = np.where(active, ACTING_SCALE, 1.0)
+        self._osqp.warm_start(self._solution.x, y / self._scale)
+        return True
 
     def solve(self) -> QpStatus:
         """Embed the initial state, solve from the last solution, and make the plan."""
@@ -118,7 +147,10 @@ class Solver:
             return QpStatus.FAILED
         qp, workspace = self.qp, self._osqp
         qp.embed()
-        workspace.update_data_vec(q=qp.q, l=qp.l, u=qp.u)
+        if self._l is not qp.l:
+            np.multiply(qp.l, self._scale, out=self._l)
+            np.multiply(qp.u, self._scale, out=self._u)
+        workspace.update_data_vec(q=qp.q, l=self._l, u=self._u)
         workspace.solve()
         status = STATUS.get(self._info.status_val, QpStatus.FAILED)
         if status.usable:

@@ -40,6 +40,8 @@ class Transcription:
         step: ``(x, u, u_prev, z, x0, memory, *WEIGHTS) -> (x+, u+, violation)``: the full step, and by how much it exceeds softened bounds.
         slacks: Entries of the slacks in z.
         eliminable: States in z, which as many first rows determine.
+        watched: For each softened row, the last rows of all, those by which it is known a stage earlier to act: itself and its like one stage
+            later; for the sign of a slack, those of the bounds that it softens. Counted from the first of them; shape ``(rows, 4)``.
     """
 
     P: sp.csc_array[Any]
@@ -52,6 +54,7 @@ class Transcription:
     step: ca.Function
     slacks: slice
     eliminable: int
+    watched: np.ndarray[Any, Any]
 
 
 class Blocks:
@@ -99,6 +102,7 @@ class Rows:
         self.lower: list[ca.MX] = []
         self.upper: list[ca.MX] = []
         self.count = 0
+        self.watched: list[list[int]] = []
 
     def add(self, lb: ca.MX | None, value: ca.MX, ub: ca.MX | None) -> int:
         """Append rows whose left-hand side is `value` at the guess; None: no bound. Return the first of them."""
@@ -107,7 +111,24 @@ class Rows:
         self.lower.append(-absent if lb is None else ca.vec(lb - value))
         self.upper.append(absent if ub is None else ca.vec(ub - value))
         self.count += value.numel()
+        self.watched += [[row] * 4 for row in range(first, self.count)]
         return first
+
+    def chain(self, first: int, width: int) -> None:
+        """Let each row from `first` on watch its like one stage, that is `width` rows, later."""
+        for row in range(first, self.count - width):
+            self.watched[row][1] = row + width
+
+    def watched_from(self, first: int) -> np.ndarray[Any, Any]:
+        """Return what the rows from `first` on watch, counted from there."""
+        return np.array(self.watched[first : self.count], dtype=np.intp).reshape(-1, 4) - first
+
+    def follow(self, first: int, ng: int, sides: list[tuple[int, list[int]]]) -> None:
+        """Let the signs of slacks, ng a node from `first` on, watch the bounds they soften, each ``(first row, which of the ng)``."""
+        for row in range(first, self.count):
+            i, j = divmod(row - first, ng)
+            watched = [start + i * len(at) + at.index(j) for start, at in sides if j in at]
+            self.watched[row] = [seen for bound in watched for seen in self.watched[bound][:2]] * (2 if len(watched) == 1 else 1)
 
 
 def input_rows(ocp: Ocp, lin: Linearization, rows: Rows, A: Blocks, to_du: int) -> None:
