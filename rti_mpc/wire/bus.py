@@ -187,10 +187,12 @@ class Publisher(Generic[M]):
 class Subscriber:
     """Receives from one key expression into a ring: the newest samples, oldest first. After `Bus.close`, nothing."""
 
-    def __init__(self, subscriber: zenoh.Subscriber[Any] | ext.AdvancedSubscriber[Any], own: str) -> None:
+    def __init__(self, subscriber: zenoh.Subscriber[Any] | ext.AdvancedSubscriber[Any], key: str, own: str) -> None:
         self._subscriber = subscriber
         self._handler = subscriber.handler
+        self._key = "" if "*" in key else key
         self._own = own  # a cache answers its own session, too
+        self._encoding: tuple[zenoh.Encoding | None, str] = None, ""  # the last one, and its text: to compare costs a fifth of making it
 
     def recv(self) -> Received | None:
         """Next sample, waiting for it; None once the bus is closed."""
@@ -218,7 +220,9 @@ class Subscriber:
     def _received(self, sample: zenoh.Sample) -> Received | None:
         if self._own and (info := sample.source_info) is not None and str(info.source_id.zid) == self._own:
             return None
-        return Received(sample.payload.to_bytes(), str(sample.encoding), str(sample.key_expr))
+        if sample.encoding != self._encoding[0]:
+            self._encoding = sample.encoding, str(sample.encoding)
+        return Received(sample.payload.to_bytes(), self._encoding[1], self._key or str(sample.key_expr))
 
 
 class Bus:
@@ -289,10 +293,10 @@ class Bus:
         ring: Any = zenoh.handlers.RingChannel(capacity)
         origin = zenoh.Locality.REMOTE
         if not cached:
-            return Subscriber(self._session.declare_subscriber(key, ring, allowed_origin=origin), own="")
+            return Subscriber(self._session.declare_subscriber(key, ring, allowed_origin=origin), key, own="")
         history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
         subscriber = ext.declare_advanced_subscriber(self._session, key, ring, allowed_origin=origin, history=history)
-        return Subscriber(subscriber, own=str(self._session.info.zid()))
+        return Subscriber(subscriber, key, own=str(self._session.info.zid()))
 
     def publish_json(self, key: str, value: dict[str, Any]) -> None:
         """Publish a JSON object that late joiners get, too."""
