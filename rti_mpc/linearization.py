@@ -180,21 +180,7 @@ def pattern(weight: np.ndarray[Any, Any]) -> ca.DM:
 
 def plan_cost(ocp: Ocp) -> ca.Function:
     """Build ``(x, u, u_prev, y_ref, p, *WEIGHTS) -> cost``: the cost (4) of a plan and its penalties, nothing of it linearized."""
-    model, N, N_u = ocp.model, ocp.N, ocp.N_u
-    x, u, u_prev = ca.SX.sym("x", model.nx, N + 1), ca.SX.sym("u", model.nu, N_u), ca.SX.sym("u_prev", model.nu)
-    y_ref, p = ca.SX.sym("y_ref", model.ny, N), ca.SX.sym("p", model.np_, N + 1)
-    w = {name: ca.SX.sym(name, *np.shape(getattr(ocp, name))) for name in WEIGHTS}
-    h = ca.Function("h", [model.x, model.p], [model.y_expr])
-    g = ca.Function("g", [model.x, model.u, model.p], [ca.vertcat(model.x[list(ocp.soft), 0], ocp.h_expr)])
-    lg, ug, zg, Zg = (ca.vertcat(w[state][list(ocp.soft), 0], w[other]) for state, other in (("lbx", "lh"), ("ubx", "uh"), ("z", "zh"), ("Z", "Zh")))
-    cost = ca.SX(0)
-    for i in range(1, N + 1):
-        e = h(x[:, i], p[:, i]) - y_ref[:, i - 1]
-        value = g(x[:, i], u[:, min(i, N_u) - 1], p[:, i])
-        s = ca.fmax(0, ca.fmax(value - ug, lg - value))
-        weight = w["delta"][i - 1] * w["Q"] + (w["Q_e"] if i == N else 0)
-        cost += ca.bilin(weight * output_pattern(ocp), e, e) + ca.dot(zg, s) + ca.dot(Zg, s**2) / 2
-    for k in range(N_u):
-        increment = u[:, k] - (u[:, k - 1] if k else u_prev)
-        cost += w["lambda_"][k] * ca.bilin(w["R"] * pattern(ocp.R), increment, increment)
-    return ca.Function("cost", [x, u, u_prev, y_ref, p, *w.values()], [cost])
+    lin = Linearization(ocp)
+    lg, ug, zg, Zg = (ca.repmat(e, 1, ocp.N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg))
+    s = ca.fmax(0, ca.fmax(lin.g - ug, lg - lin.g))
+    return ca.Function("cost", lin.arguments, [lin.cost + ca.dot(zg, s) + ca.dot(Zg, s**2) / 2])

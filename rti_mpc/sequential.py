@@ -18,6 +18,8 @@ backward recursion makes both with :math:`O(N^2)` operations: "condensing",
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import casadi as ca
 import numpy as np
 import scipy.sparse as sp
@@ -35,7 +37,6 @@ from rti_mpc.transcription import (
     finite,
     head,
     input_rows,
-    weight_symbols,
 )
 
 
@@ -208,19 +209,22 @@ def embed(ocp: Ocp, remembered: int, start: int, soft_rows: int) -> ca.Function:
 def full_step(ocp: Ocp, lin: Linearization, n: int, remembered: int) -> ca.Function:
     """Read the inputs off the solution, and let the linearized dynamics make the states."""
     N, N_u, nx = ocp.N, ocp.N_u, ocp.model.nx
-    x = ca.SX.sym("x", nx, N + 1)
-    u = ca.SX.sym("u", ocp.model.nu, N_u)
-    u_prev = ca.SX.sym("u_prev", ocp.model.nu)
-    z = ca.SX.sym("z", n)
-    x0 = ca.SX.sym("x0", nx)
+    z = ca.MX.sym("z", n)
+    x0 = ca.MX.sym("x0", nx)
     known = Remembered(ocp, lin, remembered)
-    w = weight_symbols(ocp)
-    at = np.cumsum([0, lin.A.numel(), lin.B.numel(), lin.b.numel()]).tolist()
-    A, B, b = (ca.reshape(known.rest[at[i] : at[i + 1]], -1, N) for i in range(3))
+    x, u, u_prev, w = lin.x, lin.u, lin.u_prev, lin.w
+    shapes = [e.shape for e in (lin.A, lin.B, lin.b)]
+    ends = np.cumsum([0, *(rows * columns for rows, columns in shapes)]).tolist()
+    A, B, b = (ca.reshape(known.rest[start:end], *shape) for (start, end), shape in zip(pairwise(ends), shapes, strict=True))
     du = ca.reshape(z[: u.numel()], u.shape)
-    dx = [x0 - x[:, 0]]
-    for k in range(N):
-        dx.append(ca.SX(lin.A_k, A[:, k]) @ dx[k] + ca.SX(lin.B_k, B[:, k]) @ du[:, min(k, N_u - 1)] + b[:, k])
-    deviation = ca.densify(ca.horzcat(*dx))
-    plan = [x + deviation, clipped(ocp, u + du, u_prev, w), known.violation(deviation, du, w)]
+
+    dx_k, du_k = ca.SX.sym("dx", nx), ca.SX.sym("du", u.shape[0])
+    A_k, B_k, b_k = (ca.SX.sym(name, shape[0]) for name, shape in zip("ABb", shapes, strict=True))
+    ahead = ca.SX(lin.A_k, A_k) @ dx_k + ca.SX(lin.B_k, B_k) @ du_k + b_k
+    advance = ca.Function("advance", [dx_k, A_k, B_k, du_k, b_k], [ca.densify(ahead)])
+    if N > 1:
+        advance = advance.mapaccum("advances", N)
+    deviation = x0 - x[:, 0]
+    dx = ca.horzcat(deviation, advance(deviation, A, B, ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u)), b))
+    plan = [x + dx, clipped(u + du, u_prev, w), known.violation(dx, du, w)]
     return ca.Function("step", [x, u, u_prev, z, x0, known.memory, *w.values()], plan)

@@ -32,7 +32,6 @@ from rti_mpc.transcription import (
     head,
     input_rows,
     picked,
-    weight_symbols,
 )
 
 
@@ -128,14 +127,11 @@ def embed(ocp: Ocp, remembered: int) -> ca.Function:
 
 def full_step(ocp: Ocp, lin: Linearization, n: int, remembered: int) -> ca.Function:
     """Read states and inputs off the solution."""
-    x = ca.SX.sym("x", ocp.model.nx, ocp.N + 1)
-    u = ca.SX.sym("u", ocp.model.nu, ocp.N_u)
-    u_prev = ca.SX.sym("u_prev", ocp.model.nu)
-    z = ca.SX.sym("z", n)
-    x0 = ca.SX.sym("x0", ocp.model.nx)
+    z = ca.MX.sym("z", n)
+    x0 = ca.MX.sym("x0", ocp.model.nx)
     known = Remembered(ocp, lin, remembered)
-    w = weight_symbols(ocp)
+    x, u, u_prev, w = lin.x, lin.u, lin.u_prev, lin.w
     to_du, to_s = x.numel(), x.numel() + u.numel()
     dx, du = ca.reshape(z[:to_du], x.shape), ca.reshape(z[to_du:to_s], u.shape)
-    plan = [x + dx, clipped(ocp, u + du, u_prev, w), known.violation(dx, du, w)]
+    plan = [x + dx, clipped(u + du, u_prev, w), known.violation(dx, du, w)]
     return ca.Function("step", [x, u, u_prev, z, x0, known.memory, *w.values()], plan)

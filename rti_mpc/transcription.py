@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
-from rti_mpc.linearization import WEIGHTS, Linearization
+from rti_mpc.linearization import Linearization
 from rti_mpc.ocp import Ocp
 
 INFINITY = 1e30  # OSQP's: a bound this far away is absent
@@ -142,19 +142,20 @@ def input_rows(ocp: Ocp, lin: Linearization, rows: Rows, A: Blocks, to_du: int) 
             A.place(row, to_du, sp.kron(over, np.eye(nu)[at]))
 
 
-def clipped(ocp: Ocp, u: ca.SX, u_prev: ca.SX, w: dict[str, ca.SX]) -> ca.SX:
+def clipped(u: ca.MX, u_prev: ca.MX, w: dict[str, ca.MX]) -> ca.MX:
     """
     Return inputs that meet their bounds exactly, as an actuator wants them: a solver's iterate does so to its tolerance.
 
     Increments first: from an input inside its bounds, that leaves both satisfied.
     """
-    columns = []
-    last = u_prev
-    for k in range(ocp.N_u):
-        last = ca.fmax(ca.fmin(u[:, k], last + w["ubdu"]), last + w["lbdu"])
-        last = ca.fmax(ca.fmin(last, w["ubu"]), w["lbu"])
-        columns.append(last)
-    return ca.horzcat(*columns)
+    nu, N_u = u.shape
+    last, wanted, lbdu, ubdu, lbu, ubu = (ca.SX.sym(name, nu) for name in ("last", "wanted", "lbdu", "ubdu", "lbu", "ubu"))
+    met = ca.fmax(ca.fmin(wanted, last + ubdu), last + lbdu)
+    met = ca.fmax(ca.fmin(met, ubu), lbu)
+    clip = ca.Function("clip", [last, wanted, lbdu, ubdu, lbu, ubu], [met])
+    if N_u > 1:
+        clip = clip.mapaccum("clips", N_u)
+    return ca.MX(clip(u_prev, u, *(each(w[name], N_u) for name in ("lbdu", "ubdu", "lbu", "ubu"))))
 
 
 class Remembered:
@@ -168,24 +169,32 @@ class Remembered:
 
     def __init__(self, ocp: Ocp, lin: Linearization, remembered: int) -> None:
         self._ocp, self._lin = ocp, lin
-        self.memory = ca.SX.sym("memory", remembered)
-        ends = np.cumsum([0, *(e.numel() for e in head(lin))]).tolist()
-        self._parts = [ca.reshape(self.memory[a:b], -1, ocp.N) for a, b in pairwise(ends)]
+        self.memory = ca.MX.sym("memory", remembered)
+        shapes = [e.shape for e in head(lin)]
+        ends = np.cumsum([0, *(rows * columns for rows, columns in shapes)]).tolist()
+        self._parts = [ca.reshape(self.memory[a:b], *shape) for (a, b), shape in zip(pairwise(ends), shapes, strict=True)]
         self.rest = self.memory[ends[-1] :]
 
-    def violation(self, dx: ca.SX, du: ca.SX, w: dict[str, ca.SX]) -> ca.SX:
+    def violation(self, dx: ca.MX, du: ca.MX, w: dict[str, ca.MX]) -> ca.MX:
         """Return by how much a plan exceeds the linearized constraints at most, negative if it keeps them all; `dx` from node 0 on."""
         ocp, lin = self._ocp, self._lin
-        g, g_x, g_u = self._parts
-        soft = list(ocp.soft)
-        lg, ug = ca.vertcat(w["lbx"][soft, 0], w["lh"]), ca.vertcat(w["ubx"][soft, 0], w["uh"])
-        worst = ca.SX(-INFINITY)
-        for i in range(ocp.N) if len(ocp.lg) else ():
-            value = g[:, i] + ca.SX(lin.G_x, g_x[:, i]) @ dx[:, i + 1] + ca.SX(lin.G_u, g_u[:, i]) @ du[:, min(i, ocp.N_u - 1)]
-            for bounds, excess in ((ocp.ug, value - ug), (ocp.lg, lg - value)):
-                for j in finite(bounds):
-                    worst = ca.fmax(worst, excess[j])
-        return worst
+        ng, N = len(ocp.lg), ocp.N
+        if not ng:
+            return ca.MX(-INFINITY)
+        g, g_x, g_u, lg, ug = (ca.SX.sym(n, e.shape[0]) for n, e in zip(("g", "g_x", "g_u", "lg", "ug"), (*head(lin), lin.lg, lin.ug), strict=True))
+        dx_i, du_i = ca.SX.sym("dx", dx.shape[0]), ca.SX.sym("du", du.shape[0])
+        value = g + ca.SX(lin.G_x, g_x) @ dx_i + ca.SX(lin.G_u, g_u) @ du_i
+        excess = [*((value - ug)[j] for j in finite(ocp.ug)), *((lg - value)[j] for j in finite(ocp.lg))]
+        worst = ca.Function("worst", [g, g_x, g_u, dx_i, du_i, lg, ug], [ca.mmax(ca.vertcat(*excess))]).map(N)
+        limits = softened_bounds(ocp, w)
+        held = ca.horzcat(du, ca.repmat(du[:, -1], 1, N - ocp.N_u))
+        return ca.MX(ca.mmax(worst(*self._parts, dx[:, 1:], held, *(each(limit, N) for limit in limits))))
+
+
+def softened_bounds(ocp: Ocp, w: dict[str, Any]) -> tuple[Any, Any]:
+    """Return lower and upper bounds of everything softened, as expressions."""
+    soft = list(ocp.soft)
+    return ca.vertcat(w["lbx"][soft, 0], w["lh"]), ca.vertcat(w["ubx"][soft, 0], w["uh"])
 
 
 def head(lin: Linearization) -> list[ca.MX]:
@@ -197,11 +206,6 @@ def picked(sparsity: ca.Sparsity, rows: list[int]) -> tuple[list[int], ca.Sparsi
     """Return which nonzeros of a pattern lie in some rows, and the pattern of these rows alone."""
     at = [(i, rows.index(row), col) for i, (row, col) in enumerate(zip(*sparsity.get_triplet(), strict=True)) if row in rows]
     return [i for i, _, _ in at], ca.Sparsity.triplet(len(rows), sparsity.size2(), [row for _, row, _ in at], [col for _, _, col in at])
-
-
-def weight_symbols(ocp: Ocp) -> dict[str, ca.SX]:
-    """Return symbols for the weights and bounds, in the order of `WEIGHTS`."""
-    return {name: ca.SX.sym(name, *np.shape(getattr(ocp, name))) for name in WEIGHTS}
 
 
 def finite(*bounds: np.ndarray[Any, Any]) -> list[int]:
