@@ -386,9 +386,11 @@ def test_reference_that_is_not_finite_fails_and_is_forgotten() -> None:
 
 
 def test_model_that_returns_nan_fails_and_is_forgotten() -> None:
-    """The square root of what a parameter may make negative."""
+    """The square root of what a parameter may make negative: in the matrices too."""
     x, u, p = ca.SX.sym("x"), ca.SX.sym("u"), ca.SX.sym("p")
-    model = Model("root", x, u, u - ca.sqrt(p), x, (Signal("x", "m"),), (Signal("u", "m/s"),), (Signal("x", "m"),), p, (Signal("p", "1"),), (0.25,))
+    model = Model(
+        "root", x, u, u - x * ca.sqrt(p), x, (Signal("x", "m"),), (Signal("u", "m/s"),), (Signal("x", "m"),), p, (Signal("p", "1"),), (0.25,)
+    )
     ocp = Ocp(model, N=5, dt=0.1, Q=[1.0], R=[0.1], lbu=-1.0, ubu=1.0)
     x0, y_ref, good_p = np.zeros(1), np.ones((5, 1)), np.full((6, 1), 0.25)
 
@@ -422,6 +424,24 @@ def test_infeasible_qp_leaves_the_plan_and_the_next_solve_is_right(formulation: 
         return rti.feedback(x0)
 
     fails_and_recovers(Rti(ocp, TIGHT, formulation=formulation), bad, held(x0, y_ref))
+
+
+def test_failed_solve_never_seeds_the_next() -> None:
+    """What follows is bit for bit what follows a cold start."""
+    ocp = pioneer()
+    ((x0, y_ref, _),) = near_the_eight(ocp, seed=16, count=1)
+    failed, cold = Rti(ocp), Rti(ocp)
+    good = held(x0, y_ref)
+    for rti in (failed, cold):
+        good(rti)
+        rti.prepare(y_ref, shift=False)
+    contradict(failed)
+    assert failed.feedback(x0) is QpStatus.INFEASIBLE
+    cold.solver.cold = True
+    for rti in (failed, cold):
+        good(rti)
+    np.testing.assert_array_equal(failed.u, cold.u)
+    assert failed.solver.iterations == cold.solver.iterations
 
 
 def contradict(rti: Rti) -> None:
