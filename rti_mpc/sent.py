@@ -26,8 +26,9 @@ class Sent:
         self._commands: deque[Command] = deque(maxlen=commands)
 
     def append(self, command: Command) -> None:
-        """Remember a command."""
-        self._commands.append(command)
+        """Remember a command, unless it has expired before its time, as the last of several fallbacks may: the robot refuses it."""
+        if command.stamp_ns < command.valid_until_ns:
+            self._commands.append(command)
 
     def clear(self) -> None:
         """Forget everything: the robot was restarted, and stands."""

@@ -75,6 +75,15 @@ def test_robot_without_slew_limits_stops_at_once() -> None:
     np.testing.assert_array_equal(memory.at(201 * MS)[0], [0.0, 0.0])
 
 
+def test_command_that_has_expired_before_its_time_is_none() -> None:
+    """The robot refuses the last of several fallbacks, and brakes on from the one before."""
+    memory = sent(
+        command(1, 0, np.tile([0.5, -0.7], (5, 1)), valid_ms=150), command(2, 200, plan(0.1), valid_ms=-50), command(3, 300, plan(0.2), valid_ms=0)
+    )
+    np.testing.assert_allclose(memory.at(200 * MS)[0], [0.4, -0.55])
+    np.testing.assert_allclose(memory.at(350 * MS)[0], [0.1, -0.1])
+
+
 def test_cleared_memory_is_rest() -> None:
     memory = sent(command(1, 0, plan(0.5)))
     memory.clear()
@@ -89,9 +98,9 @@ def test_it_tells_what_the_actuator_really_plays() -> None:
     now_ns = 0
     for seq in range(1, 60):
         if rng.random() < 0.8:
-            one = command(seq, now_ns // MS + int(rng.integers(0, 2)) * 30, rng.uniform(-0.5, 0.5, (5, 2)))
+            one = command(seq, now_ns // MS + int(rng.integers(0, 2)) * 30, rng.uniform(-0.5, 0.5, (5, 2)), valid_ms=int(rng.choice([-50, 150, 250])))
             memory.append(one)
-            assert actuator.accept(one, now_ns) == ""
+            assert actuator.accept(one, now_ns) == ("" if one.valid_until_ns > one.stamp_ns else "expired")
         to_ns = now_ns + DT
         for until_ns, u in actuator.play(now_ns, to_ns):
             if not actuator.braking:
