@@ -117,7 +117,7 @@ class Solver:
             changed |= self._weigh()
             np.multiply(qp.A.data, self._scale[qp.A.indices], out=self._A_x)
         if changed:
-            self._osqp.update_data_mat(P_x=self._P_x, P_i=None, A_x=self._A_x, A_i=None)
+            self._finite = not self._osqp.update_data_mat(P_x=self._P_x, P_i=None, A_x=self._A_x, A_i=None)  # refused: numbers out of all proportion
         if self.cold:
             self._osqp.warm_start(*self._zero)
             self.cold = False
@@ -150,7 +150,9 @@ class Solver:
         if self._l is not qp.l:
             np.multiply(qp.l, self._scale, out=self._l)
             np.multiply(qp.u, self._scale, out=self._u)
-        workspace.update_data_vec(q=qp.q, l=self._l, u=self._u)
+        if workspace.update_data_vec(q=qp.q, l=self._l, u=self._u):  # refused: what it holds is another problem
+            self.cold = True
+            return QpStatus.FAILED
         workspace.solve()
         status = STATUS.get(self._info.status_val, QpStatus.FAILED)
         if status.usable:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -616,8 +617,11 @@ def test_commands_are_exactly_inside_bounds_and_increments_whatever_the_solver_d
     plans = np.array([command.u for command in run.commands])
     assert np.all(plans >= ocp.lbu)
     assert np.all(plans <= ocp.ubu)
-    assert_inside_slew(run, excess=1e-14)  # of rounding
     assert plans.max() == 0.745
+    assert_inside_slew(Run(commands=run.commands), excess=1e-14)  # of rounding
+    for last, command in itertools.pairwise(run.commands):
+        if last.mode is command.mode is Mode.TRACKING:
+            assert np.all(np.abs(command.u[0] - last.u[0]) <= STEP)
 
 
 def test_same_states_give_the_same_commands_bit_for_bit(rti: Rti) -> None:

@@ -122,6 +122,18 @@ def test_infeasible_problem_is_told_by_its_status_and_its_iterate_not_taken() ->
     np.testing.assert_array_equal(one.u, plan[1])
 
 
+def test_data_that_osqp_refuses_is_a_failure_not_a_solve_of_what_it_held_before() -> None:
+    """It returns a code then, raises nothing, and solves the old problem when asked to."""
+    one = rti()
+    solve(one, 1)
+    one.prepare(np.zeros((10, 2)), shift=False)
+    row = np.flatnonzero(one.qp.l < one.qp.u)[0]
+    one.qp.l[row] = one.qp.u[row] + 1.0
+    assert one.feedback(np.zeros(2)) is QpStatus.FAILED
+    one.prepare(np.zeros((10, 2)), shift=False)
+    assert one.feedback(np.zeros(2)) is QpStatus.SOLVED
+
+
 def test_iteration_limit_is_a_usable_status() -> None:
     one = rti(SolverSettings(eps=1e-12, max_iter=5))
     assert solve(one, 1) is QpStatus.MAX_ITER
