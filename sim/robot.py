@@ -134,6 +134,8 @@ class Robot:
         self.clock.set_back(body.now_ns)  # what came before was birth
         while not stop.is_set() and (until_ns is None or body.now_ns < until_ns):
             due_ns = body.due_ns
+            self.clock.wait(due_ns - body.period_ns // 2, stop)  # after a state the cores are for those who answer it
+            self._log.write(time.monotonic_ns())
             self.clock.wait(due_ns, stop)
             if self.clock.now_ns() - due_ns >= body.period_ns:
                 self._hold(due_ns)
@@ -179,7 +181,6 @@ class Robot:
             self._announcer.say(Severity.ERROR, "command_ran_out", "no valid command is left: the robot brakes to rest on its own", to_ns)
         while (state := self.body.sensor.take(to_ns)) is not None:
             self._send(state)
-        self._log.write(time.monotonic_ns())
 
     def _take(self, received: Received, monotonic_ns: int) -> None:
         """Hand a command to the actuators."""
