@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -48,16 +49,20 @@ def sample(ocp: Ocp, rng: np.random.Generator) -> tuple[Array, Array, Array]:
 SETTINGS = {"double_integrator": SolverSettings(eps=1e-9, max_iter=200_000, scaling=10)}
 
 
+@functools.cache
+def built(name: str, formulation: str) -> Rti:
+    return Rti(PROBLEMS[name](), SETTINGS.get(name, TIGHT), formulation=formulation, compile=False)
+
+
 @pytest.mark.parametrize("name", PROBLEMS)
 @pytest.mark.parametrize("solver", OTHERS)
 @pytest.mark.parametrize("formulation", ["simultaneous", "sequential"])
 def test_qp_agrees_with_other_solvers_to_1e_6(name: str, solver: str, formulation: str) -> None:
     options, atol = OTHERS[solver]
-    ocp = PROBLEMS[name]()
-    rti = Rti(ocp, SETTINGS.get(name, TIGHT), formulation=formulation, compile=False)
+    rti = built(name, formulation)
     rng = np.random.default_rng(1)
     for _ in range(4):
-        x0, y_ref, u_prev = sample(ocp, rng)
+        x0, y_ref, u_prev = sample(rti.ocp, rng)
         rti.reset(x0, u_prev)
         for _ in range(3):
             rti.prepare(y_ref, shift=False)
