@@ -75,6 +75,21 @@ def pioneer(**changes: Any) -> Ocp:
     return Ocp(pioneer_3dx(), **(PAPER | SLEW | changes))
 
 
+def fenced(**changes: Any) -> Ocp:
+    """The paper's robot beside a disc, its power limited by an input at once, and a terminal weight: general constraints in x, u and p."""
+    model = pioneer_3dx()
+    x, y = model.x[0], model.x[1]
+    constraints = {
+        "h_expr": ca.vertcat((x - 1) ** 2 + (y - model.p[6]) ** 2, model.x[3] * model.u[0]),
+        "lh": [0.2, -INF],
+        "uh": [INF, 0.1],
+        "zh": [5.0, 7.0],
+        "Zh": [2.0, 3.0],
+    }
+    weights = {"Q": [[1.0, 0.1, 0.0], [0.1, 1.0, 0.0], [0.0, 0.0, 0.05]], "Q_e": [[9.0, 1.0, 0.0], [1.0, 8.0, 0.0], [0.0, 0.0, 0.5]]}
+    return Ocp(model, **(PAPER | SLEW | constraints | weights | changes))
+
+
 def arc(t: Array, psi0: float = 0.0) -> Array:
     """Rows ``x, y, psi`` of the paper's eight and its tangent at times t, shape ``(N, 3)``; psi nearest to `psi0` at the start."""
     psi = np.unwrap(np.arctan2(np.cos(t / 5) / 5, np.cos(t / 10) / 10))

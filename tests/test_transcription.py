@@ -16,13 +16,15 @@ from rti_mpc.ocp import Ocp
 from rti_mpc.qp import Qp
 from rti_mpc.rti import Rti
 from rti_mpc.transcription import INFINITY, SLACK_UNIT
-from tests.problems import INF, beacon, double_integrator, pioneer
+from tests.problems import INF, beacon, double_integrator, fenced, pioneer
 
 PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "pioneer_euler": lambda: pioneer(method="euler", delta=[1, 2, 3, 4, 5, 6, 28]),
     "pioneer_rk4": lambda: pioneer(lambda_=[0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2]),
     "pioneer_with_held_inputs": lambda: pioneer(N=9, N_u=4, Q=[[1.0, 0.2, 0.0], [0.2, 1.0, 0.1], [0.0, 0.1, 0.05]], R=[[1.0, 0.3], [0.3, 2.0]]),
     "pioneer_bounded_on_one_side": lambda: pioneer(ubu=[0.5, INF], lbu=-INF, lbdu=[-0.1, -INF], ubx=[2.0, INF, INF, 0.4, INF], z=7.0, Z=3.0),
+    "fenced": fenced,
+    "fenced_with_held_inputs": lambda: fenced(N=6, N_u=3, ubx=INF, lbx=-INF),
     "beacon_euler": lambda: beacon(method="euler", delta=[1, 2, 3, 4, 5, 6]),
     "beacon_rk4": lambda: beacon(N_u=1),
     "double_integrator": lambda: double_integrator(lbx=[-INF, -0.5]),
@@ -61,7 +63,8 @@ class ByHand:
         model = ocp.model
         self._phi = ocp.phi()
         self._h = ca.Function("h", [model.x, model.p], [model.y_expr])
-        self.guess = np.concatenate([rti.x.ravel(), rti.u.ravel(), np.zeros(ocp.N * len(ocp.soft))])
+        self._g = ca.Function("g", [model.x, model.u, model.p], [ca.vertcat(model.x[list(ocp.soft), 0], ocp.h_expr)])
+        self.guess = np.concatenate([rti.x.ravel(), rti.u.ravel(), np.zeros(ocp.N * len(ocp.lg))])
 
     def _split(self, v: Array) -> tuple[Array, Array, Array]:
         x, u = self._rti.x, self._rti.u
@@ -75,26 +78,26 @@ class ByHand:
         e = [np.array(self._h(x[i], rti.p[i])).ravel() - rti.y_ref[i - 1] for i in range(1, ocp.N + 1)]
         du = np.diff(np.vstack([rti.u_prev, u]), axis=0)
         outputs = [np.sqrt(d) * root_Q @ e_i for d, e_i in zip(ocp.delta, e, strict=True)]
+        if ocp.Q_e.any():
+            outputs.append(np.linalg.cholesky(ocp.Q_e).T @ e[-1])
         return np.sqrt(rti._cost_scale) * np.concatenate([*outputs, (np.sqrt(ocp.lambda_)[:, None] * (du @ root_R.T)).ravel()])
 
     def rows(self, v: Array) -> Array:
         """Left-hand sides of all constraints, in the order the transcription documents."""
         ocp, rti = self.ocp, self._rti
         x, u, s = self._split(v)
-        soft = list(ocp.soft)
         held = np.minimum(np.arange(ocp.N), ocp.N_u - 1)
         phi = [np.array(self._phi(x[k], u[held[k]], rti.p[k])).ravel() for k in range(ocp.N)]
         du = np.diff(np.vstack([rti.u_prev, u]), axis=0)
-        wide = np.zeros((ocp.N, ocp.model.nx))
-        wide[:, soft] = SLACK_UNIT * s
+        g = np.array([np.array(self._g(x[i], u[held[i - 1]], rti.p[i])).ravel() for i in range(1, ocp.N + 1)])
         return np.concatenate(
             [
                 x[0],
                 (np.array(phi) - x[1:]).ravel(),
                 u[:, present(ocp.lbu, ocp.ubu)].ravel(),
                 du[:, present(ocp.lbdu, ocp.ubdu)].ravel(),
-                (x[1:] - wide)[:, present(ocp.ubx)].ravel(),
-                (x[1:] + wide)[:, present(ocp.lbx)].ravel(),
+                (g - SLACK_UNIT * s)[:, present(ocp.ug)].ravel(),
+                (g + SLACK_UNIT * s)[:, present(ocp.lg)].ravel(),
                 s.ravel(),
             ]
         )
@@ -102,13 +105,13 @@ class ByHand:
     def bounds(self) -> tuple[Array, Array]:
         """Bounds of `rows`, the initial state's left at the guess."""
         ocp, x = self.ocp, self._rti.x
-        N, N_u, slacks = ocp.N, ocp.N_u, ocp.N * len(ocp.soft)
-        upper, lower = present(ocp.ubx), present(ocp.lbx)
+        N, N_u, slacks = ocp.N, ocp.N_u, ocp.N * len(ocp.lg)
+        upper, lower = present(ocp.ug), present(ocp.lg)
         inputs, increments = present(ocp.lbu, ocp.ubu), present(ocp.lbdu, ocp.ubdu)
         lb = [x[0], np.zeros(x[1:].size), np.tile(ocp.lbu[inputs], N_u), np.tile(ocp.lbdu[increments], N_u)]
         ub = [x[0], np.zeros(x[1:].size), np.tile(ocp.ubu[inputs], N_u), np.tile(ocp.ubdu[increments], N_u)]
-        lb += [np.full(N * upper.sum(), -INF), np.tile(ocp.lbx[lower], N), np.zeros(slacks)]
-        ub += [np.tile(ocp.ubx[upper], N), np.full(N * lower.sum(), INF), np.full(slacks, INF)]
+        lb += [np.full(N * upper.sum(), -INF), np.tile(ocp.lg[lower], N), np.zeros(slacks)]
+        ub += [np.tile(ocp.ug[upper], N), np.full(N * lower.sum(), INF), np.full(slacks, INF)]
         return np.concatenate(lb), np.concatenate(ub)
 
 
@@ -152,8 +155,8 @@ def test_gradient_is_half_that_of_the_cost(name: str) -> None:
     rti = at_random(name, seed=3)
     ocp, problem = rti.ocp, ByHand(rti)
     difference = jacobian(lambda v: np.atleast_1d(0.5 * (problem.residuals(v) ** 2).sum()), problem.guess)[0]
-    slacks = ocp.N * len(ocp.soft)
-    difference[len(difference) - slacks :] = 0.5 * rti._cost_scale * SLACK_UNIT * np.tile(ocp.z[list(ocp.soft)], ocp.N)
+    slacks = ocp.N * len(ocp.lg)
+    difference[len(difference) - slacks :] = 0.5 * rti._cost_scale * SLACK_UNIT * np.tile([*ocp.z[list(ocp.soft)], *ocp.zh], ocp.N)
     np.testing.assert_allclose(whole(rti).q, difference, rtol=1e-7, atol=1e-6)  # costs of 1e3 over h
 
 
@@ -165,8 +168,8 @@ def test_hessian_is_the_gauss_newton_approximation(name: str) -> None:
         ocp, problem = rti.ocp, ByHand(rti)
         J = jacobian(problem.residuals, problem.guess)
         expected = J.T @ J
-        slacks = len(problem.guess) - ocp.N * len(ocp.soft)
-        expected[slacks:, slacks:] = np.diag(0.5 * rti._cost_scale * SLACK_UNIT**2 * np.tile(ocp.Z[list(ocp.soft)], ocp.N))
+        slacks = len(problem.guess) - ocp.N * len(ocp.lg)
+        expected[slacks:, slacks:] = np.diag(0.5 * rti._cost_scale * SLACK_UNIT**2 * np.tile([*ocp.Z[list(ocp.soft)], *ocp.Zh], ocp.N))
         np.testing.assert_allclose(hessian(whole(rti)), expected, rtol=1e-7, atol=1e-6)
 
 
