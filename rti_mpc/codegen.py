@@ -33,27 +33,32 @@ def cache_dir() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rti_mpc"
 
 
-def compiled(function: ca.Function) -> ca.Function:
+def compiled(*functions: ca.Function) -> list[ca.Function]:
     """
-    Return the function as machine code, or itself where there is no compiler.
+    Return functions as machine code, or themselves where there is no compiler.
 
-    A build that fails for whatever reason, a full disk or a broken compiler,
-    is not an error: the virtual machine takes over.
+    They are compiled together, which takes half as long as one by one. A build
+    that fails for whatever reason, a full disk or a broken compiler, is not an
+    error: the virtual machine takes over.
+
+    Args:
+        functions: Of different names.
     """
     compiler = shutil.which("cc")
     if compiler is None:
-        return function
-    generator = ca.CodeGenerator(function.name(), {"with_header": False})
-    generator.add(function)
+        return list(functions)
+    generator = ca.CodeGenerator("functions", {"with_header": False})
+    for function in functions:
+        generator.add(function)
     source = generator.dump()
     key = hashlib.sha256("\0".join((source, compiler, *FLAGS, os.uname().machine)).encode()).hexdigest()[:32]
-    library = cache_dir() / f"{function.name()}-{key}.so"
+    library = cache_dir() / f"{functions[0].name()}-{key}.so"
     try:
         if not library.exists():
             build(compiler, source, library)
-        return ca.external(function.name(), str(library))
+        return [ca.external(function.name(), str(library)) for function in functions]
     except (OSError, subprocess.CalledProcessError, RuntimeError):
-        return function
+        return list(functions)
 
 
 def build(compiler: str, source: str, library: Path) -> None:

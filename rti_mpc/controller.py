@@ -114,7 +114,7 @@ class Controller:
         self._input: Array = np.zeros(model.nu)
         self._x0: Array = np.zeros(model.nx)
         phi = integrator(model, "rk4")
-        self._integrate = bind(compiled(phi) if compile else phi, (self._start, self._input, np.array(model.p_nominal), self._span), (self._x0,))
+        self._integrate = bind(compiled(phi)[0] if compile else phi, (self._start, self._input, np.array(model.p_nominal), self._span), (self._x0,))
 
     # What comes in.
 

@@ -79,12 +79,14 @@ class Rti:
         weights = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS}
         guess = Guess((self.x, self.u, self.u_prev, self.y_ref, self.p, *weights.values()), self._x0, self._plan)
 
-        make = compiled if compile else lambda function: function
-        self._integrate_tail = bind(make(ocp.phi()), self._tail[:3], self._tail[3:])
-        self._cost: Array = np.zeros(1)
-        self._evaluate = bind(make(plan_cost(ocp)), (*self._plan[:2], *guess.sample[2:]), (self._cost,))
         transcribe = FORMULATIONS[formulation]
-        qps = [Qp(transcribe(ocp, softened=softened), guess, make) for softened in (False, True)[: 2 if len(ocp.lg) else 1]]
+        transcriptions = [transcribe(ocp, softened=softened) for softened in (False, True)[: 2 if len(ocp.lg) else 1]]
+        functions = [ocp.phi(), plan_cost(ocp), *(f for t in transcriptions for f in (t.data, t.embed, t.step))]
+        made = dict(zip((f.name() for f in functions), compiled(*functions) if compile else functions, strict=True))
+        self._integrate_tail = bind(made["phi"], self._tail[:3], self._tail[3:])
+        self._cost: Array = np.zeros(1)
+        self._evaluate = bind(made["cost"], (*self._plan[:2], *guess.sample[2:]), (self._cost,))
+        qps = [Qp(t, guess, lambda function: made[function.name()]) for t in transcriptions]
         self._roll_out()
         qps[0].fill()
         if not isfinite(qps[0].checksum[0]):

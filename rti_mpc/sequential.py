@@ -27,6 +27,7 @@ import scipy.sparse as sp
 from rti_mpc.linearization import Linearization
 from rti_mpc.ocp import Ocp
 from rti_mpc.transcription import (
+    KINDS,
     SLACK_UNIT,
     Blocks,
     Remembered,
@@ -120,6 +121,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
     condensed = Condensing(ocp, lin)
     N, N_u, nu = ocp.N, ocp.N_u, ocp.model.nu
     ng = len(ocp.lg) if softened else 0
+    kind = KINDS[softened]
     to_s = N_u * nu
     n = to_s + N * ng
 
@@ -174,23 +176,23 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
     A_pattern, A_data = A.finish(rows.count, n)
     P_pattern, P_data = P.finish(n, n)
     checksum = lin.checksum + ca.sum1(memory) + ca.sum1(P_data)
-    everything, varying, data = data_functions(lin, [q, P_data, A_data, lower, upper_bounds, memory, lin.cost, checksum])
+    everything, varying, data = data_functions(lin, [q, P_data, A_data, lower, upper_bounds, memory, lin.cost, checksum], kind)
     return Transcription(
         P=P_pattern,
         A=A_pattern,
         everything=everything,
         varying=varying,
         data=data,
-        embed=embed(ocp, memory.numel(), sum(e.numel() for e in known), end_soft - first_soft),
+        embed=embed(ocp, kind, memory.numel(), sum(e.numel() for e in known), end_soft - first_soft),
         embedded=(("q", slice(0, to_s)), *((name, slice(first_soft, end_soft)) for name in ("l", "u") if ng)),
-        step=full_step(ocp, lin, n, memory.numel()),
+        step=full_step(ocp, kind, lin, n, memory.numel()),
         slacks=slice(to_s, n),
         eliminable=0,
         watched=rows.watched_from(first_soft),
     )
 
 
-def embed(ocp: Ocp, remembered: int, start: int, soft_rows: int) -> ca.Function:
+def embed(ocp: Ocp, kind: str, remembered: int, start: int, soft_rows: int) -> ca.Function:
     """Add the response to the initial state: to the gradient, and to the softened bounds."""
     nx, inputs = ocp.model.nx, ocp.N_u * ocp.model.nu
     x0 = ca.MX.sym("x0", nx)
@@ -203,10 +205,10 @@ def embed(ocp: Ocp, remembered: int, start: int, soft_rows: int) -> ca.Function:
     if soft_rows:
         response = ca.reshape(Phi, soft_rows, nx) @ deviation
         outputs += [lower - response, upper - response]
-    return ca.Function("embed", [x0, x, memory], outputs)
+    return ca.Function(f"embed_{kind}", [x0, x, memory], outputs)
 
 
-def full_step(ocp: Ocp, lin: Linearization, n: int, remembered: int) -> ca.Function:
+def full_step(ocp: Ocp, kind: str, lin: Linearization, n: int, remembered: int) -> ca.Function:
     """Read the inputs off the solution, and let the linearized dynamics make the states."""
     N, N_u, nx = ocp.N, ocp.N_u, ocp.model.nx
     z = ca.MX.sym("z", n)
@@ -227,4 +229,4 @@ def full_step(ocp: Ocp, lin: Linearization, n: int, remembered: int) -> ca.Funct
     deviation = x0 - x[:, 0]
     dx = ca.horzcat(deviation, advance(deviation, A, B, ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u)), b))
     plan = [x + dx, clipped(u + du, u_prev, w), known.violation(dx, du, w)]
-    return ca.Function("step", [x, u, u_prev, z, x0, known.memory, *w.values()], plan)
+    return ca.Function(f"step_{kind}", [x, u, u_prev, z, x0, known.memory, *w.values()], plan)

@@ -20,6 +20,7 @@ import scipy.sparse as sp
 from rti_mpc.linearization import Linearization
 from rti_mpc.ocp import Ocp
 from rti_mpc.transcription import (
+    KINDS,
     SLACK_UNIT,
     Blocks,
     Remembered,
@@ -46,6 +47,7 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
     lin = Linearization(ocp)
     N, N_u, nx, nu = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu
     ng = len(ocp.lg) if softened else 0
+    kind = KINDS[softened]
     to_du, to_s = (N + 1) * nx, (N + 1) * nx + N_u * nu
     n = to_s + N * ng
 
@@ -101,31 +103,31 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
     P_pattern, P_data = P.finish(n, n)
     memory = ca.veccat(*head(lin))
     outputs = [q, P_data, A_data, ca.vertcat(*rows.lower), ca.vertcat(*rows.upper), memory, lin.cost, lin.checksum]
-    everything, varying, data = data_functions(lin, outputs)
+    everything, varying, data = data_functions(lin, outputs, kind)
     return Transcription(
         P=P_pattern,
         A=A_pattern,
         everything=everything,
         varying=varying,
         data=data,
-        embed=embed(ocp, memory.numel()),
+        embed=embed(ocp, kind, memory.numel()),
         embedded=(("l", slice(0, nx)), ("u", slice(0, nx))),
-        step=full_step(ocp, lin, n, memory.numel()),
+        step=full_step(ocp, kind, lin, n, memory.numel()),
         slacks=slice(to_s, n),
         eliminable=to_du,
         watched=rows.watched_from(first_soft),
     )
 
 
-def embed(ocp: Ocp, remembered: int) -> ca.Function:
+def embed(ocp: Ocp, kind: str, remembered: int) -> ca.Function:
     """Write the initial state into the bounds of its rows."""
     x0 = ca.SX.sym("x0", ocp.model.nx)
     x = ca.SX.sym("x", ocp.model.nx, ocp.N + 1)
     deviation = x0 - x[:, 0]
-    return ca.Function("embed", [x0, x, ca.SX.sym("memory", remembered)], [deviation, deviation])
+    return ca.Function(f"embed_{kind}", [x0, x, ca.SX.sym("memory", remembered)], [deviation, deviation])
 
 
-def full_step(ocp: Ocp, lin: Linearization, n: int, remembered: int) -> ca.Function:
+def full_step(ocp: Ocp, kind: str, lin: Linearization, n: int, remembered: int) -> ca.Function:
     """Read states and inputs off the solution."""
     z = ca.MX.sym("z", n)
     x0 = ca.MX.sym("x0", ocp.model.nx)
@@ -134,4 +136,4 @@ def full_step(ocp: Ocp, lin: Linearization, n: int, remembered: int) -> ca.Funct
     to_du, to_s = x.numel(), x.numel() + u.numel()
     dx, du = ca.reshape(z[:to_du], x.shape), ca.reshape(z[to_du:to_s], u.shape)
     plan = [x + dx, clipped(u + du, u_prev, w), known.violation(dx, du, w)]
-    return ca.Function("step", [x, u, u_prev, z, x0, known.memory, *w.values()], plan)
+    return ca.Function(f"step_{kind}", [x, u, u_prev, z, x0, known.memory, *w.values()], plan)

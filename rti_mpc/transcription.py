@@ -19,6 +19,7 @@ import scipy.sparse as sp
 from rti_mpc.linearization import Linearization
 from rti_mpc.ocp import Ocp
 
+KINDS = {False: "relaxed", True: "whole"}  # by whether the softened bounds are there: functions compiled together differ in name
 INFINITY = 1e30  # OSQP's: a bound this far away is absent
 SLACK_UNIT = 0.1  # a slack variable counts tenths of its state's unit: the stiff penalty is then no stiffer than the rest, see docs/engine.md
 
@@ -218,12 +219,12 @@ def each(column: ca.MX, times: int) -> ca.MX:
     return ca.repmat(column, 1, times)
 
 
-def data_functions(lin: Linearization, outputs: list[ca.MX]) -> tuple[ca.Function, tuple[int, ...], ca.Function]:
+def data_functions(lin: Linearization, outputs: list[ca.MX], kind: str) -> tuple[ca.Function, tuple[int, ...], ca.Function]:
     """Return the function of all outputs, which of them vary with the sample, and the function of these."""
     outputs = [ca.densify(output) for output in outputs]
     varying = tuple(i for i, output in enumerate(outputs) if output.numel() and ca.depends_on(output, ca.veccat(*lin.sample)))
     return (
         ca.Function("everything", lin.arguments, outputs),
         varying,
-        ca.Function("data", lin.arguments, [outputs[i] for i in varying]),
+        ca.Function(f"data_{kind}", lin.arguments, [outputs[i] for i in varying]),
     )
