@@ -198,6 +198,20 @@ def demo(
 
 
 @app.command()
+def bench(
+    horizon: Annotated[list[int] | None, typer.Option("--horizon", "-n", min=2, help="Stages; repeatable.", show_default="7, 20, 50, 100")] = None,
+    interpreted: Annotated[bool, typer.Option("--interpreted", help="Also without a compiler.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="A first look: eight seconds of driving.")] = False,
+    costs: Annotated[bool, typer.Option("--costs", help="Also closed-loop costs against exact QPs and converged NMPC.")] = False,
+    path: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the rows as JSON.")] = None,
+) -> None:
+    """Measure what a sample costs, by horizon and formulation, beside IPOPT on the same states."""
+    from service.bench import HORIZONS, main
+
+    raise typer.Exit(main(tuple(horizon or HORIZONS), interpreted=interpreted, quick=quick, costs=costs, path=path))
+
+
+@app.command()
 def check(config: ConfigPath = SHIPPED) -> None:
     """Load a configuration, solve 200 times, print both phases and the verdict of a second solver."""
     from service.check import main

@@ -74,6 +74,7 @@ class Config(Section):
         lbu, ubu = bounds(limits.inputs, model.inputs)
         lbdu, ubdu = bounds(limits.increments, model.inputs)
         lbx, ubx = bounds(limits.states, model.states)
+        soft: dict[str, Any] = {} if limits.soft_weight is None else {"z": limits.soft_weight}
         return Ocp(
             model,
             N=self.ocp.N,
@@ -90,7 +91,7 @@ class Config(Section):
             ubdu=ubdu,
             lbx=lbx,
             ubx=ubx,
-            **({} if limits.soft_weight is None else {"z": limits.soft_weight}),
+            **soft,
         )
 
     def build_rti(self) -> Rti:

@@ -31,6 +31,7 @@ ALONE = {
         *(f"rti_mpc/{name}.py" for name in ("simultaneous", "sequential", "terminal", "obstacle")),
         *(f"rti_mpc/{name}.py" for name in ("model", "pioneer_3dx", "integrator", "ocp", "linearization", "transcription", "codegen", "qp", "track")),
         "sim/plant.py",
+        "service/yardstick.py",
     },
 }
 

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`rti-mpc bench` in its short form: that it runs, and that a step is far cheaper than converged IPOPT, by a wide margin."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from service.bench import main
+
+KEYS = {"N", "formulation", "solver", "compiled", "step_us", "prepare_us", "feedback_us", "ipopt_us", "speedup"}
+
+
+@pytest.mark.benchmark
+def test_bench_prints_and_writes_a_row_for_each_contender_and_each_is_faster_than_ipopt(tmp_path: Path) -> None:
+    path = tmp_path / "bench.json"
+    assert main((7, 20), interpreted=True, quick=True, costs=True, path=path) == 0
+    result = json.loads(path.read_text())
+    assert {(row["N"], row["formulation"], row["compiled"]) for row in result} == {
+        (N, formulation, compiled) for N in (7, 20) for formulation in ("simultaneous", "sequential") for compiled in (True, False)
+    }
+    for row in result:
+        assert row.keys() >= KEYS
+        assert all(row[key].keys() >= {"p50", "p99"} for key in KEYS if key.endswith("_us"))
+        assert row["speedup"] > 2.0  # 4 to 20 in these transients, whatever the machine's mood
+        assert abs(row["over_exact"]) < 0.02  # of seconds that are all transient
