@@ -51,7 +51,8 @@ MARGIN_S = 5.0  # of reference past the horizon of the last sample: near its las
 POLITE = 10  # niceness of those who only watch
 RECORDER_S = 8.0  # to write what it has
 CLI = "service.cli"
-ENDING = ("controller", "robot", "reference", "echo", *(("recorder",) if find_spec("rerun") else ()))
+# The recorder first: a reference that goes on without a robot is nothing to look at.
+ENDING = (*(("recorder",) if find_spec("rerun") else ()), "controller", "robot", "reference", "echo")
 
 
 class Failed(Exception):
