@@ -18,13 +18,14 @@ from rti_mpc.array import Array
 from rti_mpc.message import Reference, Severity, State
 from rti_mpc.trajectory import Heading, Trajectory, rows
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 
 ROLE = "reference"
 LOOK_S = 0.02  # between two looks at the robot: waking for every state would take a core from those who control
+LOOK_AGAIN_NS = 500_000_000  # after which it is looked whether the robot was restarted
 STALE_S = 1.0  # silence of the robot after which the reference is anchored to another one, even of a lower epoch
 
 
@@ -85,16 +86,29 @@ class Source:
         self._epoch = time.time_ns() // 1_000_000_000
         self._publisher = bus.publisher(bus.keys.reference, Reference, cached=True)
         self._announcer = Announcer(bus, ROLE, self._epoch)
-        self._states = bus.subscriber(bus.keys.state)
+        self._bus = bus
+        self._states: Subscriber | None = None
+        self._look_again_ns = 0
         self._intake = Intake(State, STALE_S)
         self._robot_epoch = -1
 
     def look(self) -> None:
-        """Publish if a robot has started since the last look."""
+        """
+        Publish if a robot has started since the last look.
+
+        One state now and then tells. A subscription in between would wake this
+        process at every state, while robot and controller want the processor.
+        """
+        now_ns = time.monotonic_ns()
+        if self._states is None:
+            if now_ns < self._look_again_ns:
+                return
+            self._states = self._bus.subscriber(self._bus.keys.state)
         received = self._states.try_recv()
         if received is None:
             return
-        now_ns = time.monotonic_ns()
+        self._states = None
+        self._look_again_ns = now_ns + LOOK_AGAIN_NS
         state = self._intake.accept(received, now_ns)
         if state is not None and state.epoch != self._robot_epoch:
             self._robot_epoch = state.epoch
