@@ -258,7 +258,10 @@ class Controller:
         status = self._feedback_cold() if not self._loaded else self._rti.feedback(self._x0)
         if status.usable:
             self._failed = 0
-            self._enter(Mode.TRACKING if ending is None else Mode.HOLDING, "the reference has ended" if ending else "following the reference")
+            if ending is None:
+                self._enter(Mode.TRACKING, "following the reference")
+            else:
+                self._enter(Mode.HOLDING, "the reference has ended")
             self._valid_until_ns = min(self._act_ns + self._rti.ocp.N * self._dt_ns, state.stamp_ns + self._delay_ns + self._valid_ns)
             return self._issue(state, self._act_ns, status, self._rti.u[self._held])
         self._failed += 1

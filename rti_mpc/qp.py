@@ -17,7 +17,7 @@ import scipy.sparse as sp
 
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind
-from rti_mpc.transcription import INFINITY, SLACK_UNIT, Transcription
+from rti_mpc.transcription import INFINITY, Transcription
 
 if TYPE_CHECKING:
     import qpsolvers
@@ -77,7 +77,6 @@ class Qp:
         self.cost: Array = np.zeros(1)
         self.checksum: Array = np.zeros(1)
         memory: Array = np.zeros(transcription.everything.numel_out(5))
-        self._slacks = transcription.slacks
         self._eliminable = transcription.eliminable
         self.watched = transcription.watched
         self.varies_P, self.varies_A = 1 in transcription.varying, 2 in transcription.varying
@@ -90,11 +89,6 @@ class Qp:
         targets = [getattr(self, name)[place] for name, place in transcription.embedded]
         self.embed = bind(make(transcription.embed), (guess.x0, x, memory), targets)
         self.step = bind(make(transcription.step), (x, u, u_prev, self.z, guess.x0, memory, *weights), guess.plan)
-
-    @property
-    def slacks(self) -> Array:
-        """Slacks of the softened bounds in the solution, in the units of their states."""
-        return SLACK_UNIT * self.z[self._slacks]
 
     def reduced_hessian(self) -> Array:
         """Return the Hessian in the inputs alone, the states eliminated by the dynamics; of a QP without slacks."""

@@ -186,7 +186,6 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
         embed=embed(ocp, kind, memory.numel(), sum(e.numel() for e in known), end_soft - first_soft),
         embedded=(("q", slice(0, to_s)), *((name, slice(first_soft, end_soft)) for name in ("l", "u") if ng)),
         step=full_step(ocp, kind, lin, n, memory.numel()),
-        slacks=slice(to_s, n),
         eliminable=0,
         watched=rows.watched_from(first_soft),
     )

@@ -113,7 +113,6 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
         embed=embed(ocp, kind, memory.numel()),
         embedded=(("l", slice(0, nx)), ("u", slice(0, nx))),
         step=full_step(ocp, kind, lin, n, memory.numel()),
-        slacks=slice(to_s, n),
         eliminable=to_du,
         watched=rows.watched_from(first_soft),
     )

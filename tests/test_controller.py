@@ -375,6 +375,7 @@ def test_reference_that_ends_with_hold_is_held(controller: Controller) -> None:
     run = drive(controller, body, 25.0)
     assert modes(run)[:10] == [Mode.TRACKING] * 10
     assert modes(run)[-1] is Mode.HOLDING
+    assert controller.notices[-1].text == "tracking to holding: the reference has ended"
     assert np.abs(run.x[-1][3:]).max() < 1e-3
 
 
