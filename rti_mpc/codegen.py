@@ -98,7 +98,5 @@ def bind(function: ca.Function, arguments: Sequence[Array], results: Sequence[Ar
                 raise ShapeError(f"{function.name()}: {name(i)}", sparsity(i).shape[::-1], array)
             attach(i, array.data)
 
-    def call(_keep: tuple[object, ...] = (buffer, *arguments, *results)) -> None:
-        evaluate()
-
-    return call
+    evaluate.memory = (buffer, *arguments, *results)  # type: ignore[attr-defined] # lives as long as the call
+    return evaluate

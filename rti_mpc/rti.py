@@ -2,28 +2,32 @@
 """
 The real-time iteration: one Newton-type step of the OCP a sample, in two phases.
 
-Preparation needs no state: it shifts the guess, linearizes there and loads the
-QP, factorization included. Feedback embeds the initial state, solves and takes
+Preparation needs no state: it shifts the guess, linearizes there and prepares the
+solver, factorization included. Feedback embeds the initial state, solves and takes
 the full step. Only feedback is on the path from sensor to actuator
 [Diehl2005]_ [Gros2020]_.
 
-Bounds on states rarely act. So the QP without them is solved first; a plan that
-keeps them all the same is the solution of the whole QP too. If it does not, the
-whole QP is solved, and is the one prepared until its plan has left the bounds.
+Nearly always the QP is solved by `ActiveSet`; a QP solver is there for when that
+finds no way. Softened bounds rarely act: the QP without them is solved first; a
+plan that keeps them all the same is the solution of the whole QP too. If it does
+not, the whole QP is solved, and is the one prepared until its plan has left them.
 """
 
 from __future__ import annotations
 
 from math import isfinite
+from typing import Any
 
 import numpy as np
 
+from rti_mpc.active_set import ActiveSet
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled
 from rti_mpc.errors import OcpError, ShapeError
 from rti_mpc.linearization import WEIGHTS, plan_cost
 from rti_mpc.ocp import Ocp
 from rti_mpc.qp import Guess, Qp, step_size
+from rti_mpc.riccati import riccati
 from rti_mpc.sequential import sequential
 from rti_mpc.simultaneous import simultaneous
 from rti_mpc.solver import Solver, SolverSettings
@@ -31,6 +35,7 @@ from rti_mpc.status import QpStatus
 from rti_mpc.transcription import INFINITY
 
 FORMULATIONS = {"simultaneous": simultaneous, "sequential": sequential}
+SOLVERS = ("riccati", "osqp")
 SEQUENTIAL_UP_TO = 10  # control horizon up to which the sequential formulation is the faster one, see docs/engine.md
 TOUCHING = 1e-3  # distance from its bound, in units of the state, at which a plan counts as having left it
 
@@ -39,8 +44,8 @@ class Rti:
     """
     Real-time iteration on a fixed OCP.
 
-    Between samples it remembers the guess, the previous input, and OSQP's last
-    solution; nothing else.
+    Between samples it remembers the guess, the previous input, and what its
+    solvers start from; nothing else.
 
     Attributes:
         ocp: The problem.
@@ -50,43 +55,72 @@ class Rti:
         u_prev: Input before the plan, shape ``(nu,)``: what increments are counted from.
         y_ref: Reference rows of the current sample, shape ``(N, ny)``.
         p: Stage parameters of the current sample, shape ``(N + 1, np)``.
-        solvers: The workspaces, each with its QP: without the bounds on states and, if there are any, with them.
-        solver: The one of the current sample.
+        active_set: What is tried first; None if the solver is another.
+        solvers: The workspaces, each with its QP: without softened bounds and, if there are any, with them.
+        solver: What solved the current sample, or is about to.
         status: Outcome of the last feedback.
 
     Raises:
-        OcpError: The formulation is unknown, or the model not finite where the robot rests.
+        OcpError: The formulation or the solver is unknown, or the model not finite where the robot rests.
     """
 
-    def __init__(self, ocp: Ocp, settings: SolverSettings | None = None, *, formulation: str = "auto", compile: bool = True) -> None:
+    solver: ActiveSet | Solver
+
+    def __init__(
+        self,
+        ocp: Ocp,
+        settings: SolverSettings | None = None,
+        *,
+        formulation: str = "auto",
+        solver: str = "riccati",
+        compile: bool = True,
+    ) -> None:
         model, N, N_u = ocp.model, ocp.N, ocp.N_u
         if formulation == "auto":
             formulation = "sequential" if N_u <= SEQUENTIAL_UP_TO else "simultaneous"
         if formulation not in FORMULATIONS:
             raise OcpError(f"formulation must be auto, {' or '.join(FORMULATIONS)}, got {formulation!r}")
+        if solver not in SOLVERS:
+            raise OcpError(f"solver must be {' or '.join(SOLVERS)}, got {solver!r}")
         self.ocp = ocp
         self.formulation = formulation
-        self.x: Array = np.zeros((N + 1, model.nx))
-        self.u: Array = np.zeros((N_u, model.nu))
-        self.u_prev: Array = np.array(model.u_rest)
+        # One row more each, so that a shift is one move: the state after the last, the input before the first.
+        states, inputs = np.zeros((N + 2, model.nx)), np.zeros((N_u + 1, model.nu))
+        # Memory is moved through views of bytes laid out before: numpy decides anew each time how to copy, which takes longer than to do it.
+        self._moves = tuple((a.reshape(-1)[: -a.shape[1]].data, a.reshape(-1)[a.shape[1] :].data) for a in (states, inputs))
+        self.x: Array = states[:-1]
+        self.u: Array = inputs[1:]
+        self.u_prev: Array = inputs[0]
+        self.u_prev[:] = model.u_rest
         self.y_ref: Array = np.zeros((N, model.ny))
         self.p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
         self.status = QpStatus.NONE
         self._x0: Array = np.zeros(model.nx)
         self._plan = (np.zeros_like(self.x), np.zeros_like(self.u), np.zeros(1))
-        self._tail = (np.zeros(model.nx), np.zeros(model.nu), np.zeros(model.np_), np.zeros(model.nx))  # x, u, p of the last stage, and phi there
+        self._taken = tuple((guess.reshape(-1).data, plan.reshape(-1).data) for guess, plan in zip((self.x, self.u), self._plan[:2], strict=True))
         # OSQP has its own infinity, and reads no other.
         weights = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS}
         guess = Guess((self.x, self.u, self.u_prev, self.y_ref, self.p, *weights.values()), self._x0, self._plan)
 
         transcribe = FORMULATIONS[formulation]
         transcriptions = [transcribe(ocp, softened=softened) for softened in (False, True)[: 2 if len(ocp.lg) else 1]]
-        functions = [ocp.phi(), plan_cost(ocp), *(f for t in transcriptions for f in (t.data, t.embed, t.step))]
+        recursion = riccati(ocp) if solver == "riccati" else None
+        functions = [ocp.phi(), plan_cost(ocp)]
+        if recursion is not None:  # a QP solver is then so rarely asked that its QP is left to the virtual machine: it would double the build
+            functions += [recursion.linearize, recursion.gains, recursion.roll_out]
+        else:
+            functions += [f for t in transcriptions for f in (t.data, t.embed, t.step)]
         made = dict(zip((f.name() for f in functions), compiled(*functions) if compile else functions, strict=True))
-        self._integrate_tail = bind(made["phi"], self._tail[:3], self._tail[3:])
+
+        def make(function: Any) -> Any:
+            return made.get(function.name(), function)
+
+        self._integrate_tail = bind(made["phi"], (self.x[-1], self.u[-1], self.p[-1]), (states[-1],))
         self._cost: Array = np.zeros(1)
+        self._valued = True
         self._evaluate = bind(made["cost"], (*self._plan[:2], *guess.sample[2:]), (self._cost,))
-        qps = [Qp(t, guess, lambda function: made[function.name()]) for t in transcriptions]
+        qps = [Qp(t, guess, make) for t in transcriptions]
+        self.active_set = ActiveSet(recursion, guess, make) if recursion is not None else None
         self._roll_out()
         qps[0].fill()
         if not isfinite(qps[0].checksum[0]):
@@ -102,18 +136,20 @@ class Rti:
 
     @property
     def qp(self) -> Qp:
-        """The QP of the current sample."""
-        return self.solver.qp
+        """The QP of the current sample; filled if its solver is a QP solver."""
+        return self.solver.qp if isinstance(self.solver, Solver) else self._backup.qp
 
     def reset(self, x0: Array, u_prev: Array) -> None:
         """Start cold: the guess stays at one state and one input, and no earlier solution seeds the next."""
         self.u_prev[:] = u_prev
         self.u[:] = np.clip(u_prev, self.ocp.lbu, self.ocp.ubu)
         self.x[:] = x0
-        self._touching = False
-        self.solver = self.solvers[0]
-        for solver in self.solvers:
-            solver.cold = True
+        self._backup = self.solvers[0]
+        self._loaded = False
+        self.solver = self.active_set or self._backup
+        for solver in (self.active_set, *self.solvers):
+            if solver is not None:
+                solver.cold = True
 
     def prepare(self, y_ref: Array, p: Array | None = None, *, shift: bool = True, u_prev: Array | None = None) -> None:
         """
@@ -130,17 +166,21 @@ class Rti:
         """
         if y_ref.shape != self.y_ref.shape:
             raise ShapeError("y_ref", self.y_ref.shape, y_ref)
+        if p is not None and p.shape != self.p.shape:
+            raise ShapeError("p", self.p.shape, p)
+        self._value()
         if p is not None:
-            if p.shape != self.p.shape:
-                raise ShapeError("p", self.p.shape, p)
             self.p[:] = p
         self.y_ref[:] = y_ref
         if shift:
             self.shift()
         if u_prev is not None:
             self.u_prev[:] = u_prev
-        self.solver = self.solvers[self._touching]
-        self.solver.load()
+        if self.active_set is not None:
+            self.active_set.load()
+        if self.solver is not self.active_set:  # so that a sample like the last is prepared in full
+            self._backup.load()
+        self._loaded = self.solver is not self.active_set
 
     def _roll_out(self) -> None:
         """Make a guess in motion, half way to the upper bounds of the inputs, where the problem shows its scale."""
@@ -153,14 +193,12 @@ class Rti:
 
     def shift(self) -> None:
         """Move the guess on by one stage: its first input becomes the previous one, its last is repeated, with the state the model predicts."""
-        x, u = self.x, self.u
-        x_tail, u_tail, p_tail, x_next = self._tail
-        self.u_prev[:] = u[0]
-        x[:-1] = x[1:]
-        u[:-1] = u[1:]
-        x_tail[:], u_tail[:], p_tail[:] = x[-1], u[-1], self.p[-1]
+        self._value()
         self._integrate_tail()
-        x[-1] = x_next
+        for now, later in self._moves:
+            now[:] = later
+        if self.active_set is not None:
+            self.active_set.shift()
 
     def feedback(self, x0: Array) -> QpStatus:
         """
@@ -173,30 +211,50 @@ class Rti:
             x0: State at node 0, shape ``(nx,)``; angles continue those of the last sample.
         """
         self._x0[:] = x0
+        if self.active_set is not None and (status := self.active_set.solve()).usable:
+            self.solver = self.active_set
+        else:
+            status = self._solve()
+        if status.usable:
+            for guess, plan in self._taken:
+                guess[:] = plan
+            self._valued = False
+        self.status = status
+        return status
+
+    def _solve(self) -> QpStatus:
+        """Solve with the QP solver."""
+        self.solver = self._backup
         if not isfinite(self._x0.sum()):
-            self.status = QpStatus.FAILED
-            return self.status
-        x_plan, u_plan, violation = self._plan
-        self.status = self.solver.solve()
-        if self.status.usable and self.solver is self.solvers[0] and violation[0] > 0.0:
-            self.solver = self.solvers[1]
-            self.solver.load()
-            self.status = self.solver.solve()
-        if self.status.usable:
+            return QpStatus.FAILED
+        violation = self._plan[2]
+        if not self._loaded:
+            self._backup.load()
+        status = self._backup.solve()
+        if status.usable and self._backup is not self.solvers[-1] and violation[0] > 0.0:
+            self._backup = self.solver = self.solvers[-1]
+            self._backup.load()
+            status = self._backup.solve()
+        if status.usable:
             self._evaluate()
             if not isfinite(self._cost[0]):  # numbers of such a size that they overflowed inside the solver
                 self.solver.cold = True
-                self.status = QpStatus.FAILED
-                return self.status
-            self.x[:] = x_plan
-            self.u[:] = u_plan
-            self._touching = self.solver is not self.solvers[0] and bool(violation[0] > -TOUCHING)
-        return self.status
+                return QpStatus.FAILED
+            if violation[0] < -TOUCHING:
+                self._backup = self.solvers[0]
+        return status
 
     @property
     def cost(self) -> float:
         """The cost (4) of the last plan, with the penalties for what it exceeds."""
+        self._value()
         return float(self._cost[0]) / self._cost_scale
+
+    def _value(self) -> None:
+        """Evaluate the cost of the last plan, off the path to the command, while what it depends on is still there."""
+        if not self._valued:
+            self._evaluate()
+            self._valued = True
 
     @property
     def violation(self) -> float:

@@ -29,7 +29,22 @@ ALONE = {
     "qpsolvers": {"rti_mpc/qp.py", "service/check.py"},
     "casadi": {
         *(f"rti_mpc/{name}.py" for name in ("simultaneous", "sequential", "terminal", "obstacle")),
-        *(f"rti_mpc/{name}.py" for name in ("model", "pioneer_3dx", "integrator", "ocp", "linearization", "transcription", "codegen", "qp", "track")),
+        *(
+            f"rti_mpc/{name}.py"
+            for name in (
+                "model",
+                "pioneer_3dx",
+                "integrator",
+                "ocp",
+                "linearization",
+                "transcription",
+                "riccati",
+                "codegen",
+                "qp",
+                "active_set",
+                "track",
+            )
+        ),
         "sim/plant.py",
         "service/yardstick.py",
     },
@@ -46,10 +61,10 @@ FLOW: tuple[set[str], ...] = (
     {"ocp"},
     {"linearization", "terminal"},
     {"transcription"},
-    {"simultaneous", "sequential"},
+    {"simultaneous", "sequential", "riccati"},
     {"codegen"},
     {"qp"},
-    {"solver"},
+    {"solver", "active_set"},
     {"rti"},
     {"controller"},
 )

@@ -51,7 +51,7 @@ SETTINGS = {"double_integrator": SolverSettings(eps=1e-9, max_iter=200_000, scal
 
 @functools.cache
 def built(name: str, formulation: str) -> Rti:
-    return Rti(PROBLEMS[name](), SETTINGS.get(name, TIGHT), formulation=formulation, compile=False)
+    return Rti(PROBLEMS[name](), SETTINGS.get(name, TIGHT), formulation=formulation, solver="osqp", compile=False)
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -79,7 +79,7 @@ def test_qp_agrees_with_other_solvers_to_1e_6(name: str, solver: str, formulatio
 
 def test_problem_for_others_splits_rows_by_which_bounds_are_there() -> None:
     ocp = double_integrator(N=2, lbu=-1.0, ubx=[0.5, INF])
-    qp = Rti(ocp, formulation="simultaneous", compile=False).solvers[1].qp
+    qp = Rti(ocp, formulation="simultaneous", solver="osqp", compile=False).solvers[1].qp
     problem = qp.to_problem()
     equal = qp.l == qp.u
     assert problem.A.shape == (equal.sum(), len(qp.q)) == (6, len(qp.q))  # initial state and two stages
@@ -92,7 +92,7 @@ def test_problem_for_others_splits_rows_by_which_bounds_are_there() -> None:
 
 
 def test_problem_for_others_is_a_copy() -> None:
-    qp = Rti(double_integrator(lbu=-1.0), compile=False).qp
+    qp = Rti(double_integrator(lbu=-1.0), solver="osqp", compile=False).qp
     problem = qp.to_problem()
     problem.q[:] = 7.0
     problem.P.data[:] = 7.0

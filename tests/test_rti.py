@@ -423,14 +423,14 @@ def test_infeasible_qp_leaves_the_plan_and_the_next_solve_is_right(formulation: 
         contradict(rti)
         return rti.feedback(x0)
 
-    fails_and_recovers(Rti(ocp, TIGHT, formulation=formulation), bad, held(x0, y_ref))
+    fails_and_recovers(Rti(ocp, TIGHT, formulation=formulation, solver="osqp"), bad, held(x0, y_ref))
 
 
 def test_failed_solve_never_seeds_the_next() -> None:
     """What follows is bit for bit what follows a cold start."""
     ocp = pioneer()
     ((x0, y_ref, _),) = near_the_eight(ocp, seed=16, count=1)
-    failed, cold = Rti(ocp), Rti(ocp)
+    failed, cold = Rti(ocp, solver="osqp"), Rti(ocp, solver="osqp")
     good = held(x0, y_ref)
     for rti in (failed, cold):
         good(rti)
@@ -455,7 +455,7 @@ def contradict(rti: Rti) -> None:
 
 def test_feedback_touches_only_the_initial_state_rows() -> None:
     ocp = pioneer()
-    rti = Rti(ocp, formulation="simultaneous")
+    rti = Rti(ocp, formulation="simultaneous", solver="osqp")
     ((x0, y_ref, _),) = near_the_eight(ocp, seed=17, count=1)
     x0[3:] = 0.1, 0.2
     rti.reset(x0 - 0.01, np.zeros(2))

@@ -17,7 +17,7 @@ TIGHT = SolverSettings(eps=1e-9, max_iter=100_000)
 
 
 def rti(settings: SolverSettings = TIGHT, formulation: str = "simultaneous") -> Rti:
-    return Rti(double_integrator(lbu=-1.0, ubu=1.0), settings, formulation=formulation, compile=False)
+    return Rti(double_integrator(lbu=-1.0, ubu=1.0), settings, formulation=formulation, solver="osqp", compile=False)
 
 
 def solve(one: Rti, seed: int) -> QpStatus:
@@ -45,10 +45,10 @@ def test_inner_object_of_osqp_offers_what_is_driven() -> None:
 @pytest.mark.parametrize("build", [double_integrator, beacon])
 def test_updated_workspace_solves_the_new_problem(build: type, formulation: str) -> None:
     """Vectors, constraint matrix and, where outputs are not linear, the Hessian: as a workspace set up anew does."""
-    used = Rti(build(), TIGHT, formulation=formulation, compile=False)
+    used = Rti(build(), TIGHT, formulation=formulation, solver="osqp", compile=False)
     for seed in (1, 2, 3):
         assert solve(used, seed) is QpStatus.SOLVED
-        new = Rti(build(), TIGHT, formulation=formulation, compile=False)
+        new = Rti(build(), TIGHT, formulation=formulation, solver="osqp", compile=False)
         assert solve(new, seed) is QpStatus.SOLVED
         np.testing.assert_allclose(used.u, new.u, atol=1e-6)
 

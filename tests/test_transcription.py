@@ -33,7 +33,7 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
 
 @functools.cache
 def built(name: str, formulation: str, compile: bool) -> Rti:
-    return Rti(PROBLEMS[name](), formulation=formulation, compile=compile)
+    return Rti(PROBLEMS[name](), formulation=formulation, solver="osqp", compile=compile)
 
 
 def at_random(name: str, seed: int, *, formulation: str = "simultaneous", compile: bool = False) -> Rti:
@@ -225,7 +225,7 @@ def test_sequential_qp_without_bounds_has_the_row_that_osqp_wants() -> None:
 
 
 def test_defects_vanish_on_a_trajectory_of_the_model() -> None:
-    rti = Rti(pioneer(), formulation="simultaneous", compile=False)
+    rti = Rti(pioneer(), formulation="simultaneous", solver="osqp", compile=False)
     rng = np.random.default_rng(8)
     rti.u[:] = rng.uniform(-0.4, 0.4, rti.u.shape)
     phi = rti.ocp.phi()
