@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What a sample costs, by horizon and formulation, and of what parts: beside IPOPT, interleaved on the same states.
+What a sample costs, by horizon, solver and formulation, and of what parts: beside IPOPT, interleaved on the same states.
 
 The problem is the paper's (Euler, bounds on inputs and on speeds), in closed
 loop with its robot on the eight and on positioning; every sample counts. The
 states are those of one driver; before each, all others are at random in turn,
-so that every one of them finds the caches as a service does.
+so that every one of them finds the caches as a service does. A quarter of the
+samples, at random, is timed in parts instead of whole.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import gc
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,21 +33,24 @@ from rti_mpc.solver import SolverSettings
 from rti_mpc.status import QpStatus
 from rti_mpc.trajectory import eight, positioning, rows
 from service import machine
+from service.parts import PARTS, Parts
 from service.yardstick import Ipopt
 
 HORIZONS = (7, 20, 50, 100)
+ENTRIES = (("riccati", "simultaneous"), ("osqp", "simultaneous"), ("osqp", "sequential"))
 DT = 0.1
 EXACT = SolverSettings(eps=1e-9, max_iter=20_000)
 
 
 @dataclass
 class Times:
-    """What one contender took, us a sample, and how often it stopped at its iteration limit."""
+    """What one contender took, us a sample, as a whole or in parts, and how often it stopped at its iteration limit."""
 
     prepare: list[float] = field(default_factory=list)
     feedback: list[float] = field(default_factory=list)
     iterations: list[int] = field(default_factory=list)
     capped: int = 0
+    parts: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in PARTS})
 
     @property
     def step(self) -> Array:
@@ -116,6 +120,7 @@ def race(N: int, contenders: dict[str, Rti], ipopt: Ipopt, quick: bool, tick: An
     plant, p = integrator(model, "rk4", 20), np.array(model.p_nominal)
     rng = np.random.default_rng(1)
     times = {name: Times() for name in contenders}
+    parts = {name: Parts(rti) for name, rti in contenders.items()}
     ipopt_us: list[float] = []
     x, u = np.zeros(model.nx), np.zeros(model.nu)
     driver = next(iter(contenders.values()))
@@ -135,13 +140,17 @@ def race(N: int, contenders: dict[str, Rti], ipopt: Ipopt, quick: bool, tick: An
                     ipopt_us.append(1e-3 * (time.perf_counter_ns() - began_ns))
                     continue
                 rti, row = contenders[name], times[name]
-                began_ns = time.perf_counter_ns()
-                rti.prepare(y_ref, shift=k > 0, u_prev=u)
-                prepared_ns = time.perf_counter_ns()
-                status = rti.feedback(x)
-                done_ns = time.perf_counter_ns()
-                row.prepare.append(1e-3 * (prepared_ns - began_ns))
-                row.feedback.append(1e-3 * (done_ns - prepared_ns))
+                with parts[name].maybe(rng.random() < 0.25) as parts_us:
+                    began_ns = time.perf_counter_ns()
+                    rti.prepare(y_ref, shift=k > 0, u_prev=u)
+                    prepared_ns = time.perf_counter_ns()
+                    status = rti.feedback(x)
+                    done_ns = time.perf_counter_ns()
+                for part, part_us in parts_us.items():
+                    row.parts[part].append(part_us)
+                if not parts_us:
+                    row.prepare.append(1e-3 * (prepared_ns - began_ns))
+                    row.feedback.append(1e-3 * (done_ns - prepared_ns))
                 row.iterations.append(rti.solver.iterations)
                 row.capped += status is QpStatus.MAX_ITER
             u = driver.u[0].copy()
@@ -157,12 +166,12 @@ def spread(values: Any) -> dict[str, float]:
     return {name: round(float(np.percentile(values, share)), 1) for name, share in (("p50", 50), ("p99", 99), ("max", 100))}
 
 
-def measure(N: int, *, formulations: tuple[str, ...], compiled: tuple[bool, ...], quick: bool, tick: Any) -> list[dict[str, Any]]:
-    """Race at one horizon; return a row for each contender."""
+def measure(N: int, *, entries: Sequence[tuple[str, str]], compiled: tuple[bool, ...], quick: bool, tick: Any) -> list[dict[str, Any]]:
+    """Race at one horizon, an entry being solver and formulation; return a row for each contender."""
     ocp = paper_ocp(N)
     contenders = {
-        f"{formulation} {'compiled' if compile else 'interpreted'}": Rti(ocp, formulation=formulation, compile=compile)
-        for formulation in formulations
+        f"{solver} {formulation} {'compiled' if compile else 'interpreted'}": Rti(ocp, formulation=formulation, solver=solver, compile=compile)
+        for solver, formulation in entries
         for compile in compiled
     }
     ipopt = Ipopt(ocp)
@@ -172,11 +181,12 @@ def measure(N: int, *, formulations: tuple[str, ...], compiled: tuple[bool, ...]
     for name, row in times.items():
         rti = contenders[name]
         step, feedback = spread(row.step), spread(row.feedback)
+        native_us = float(np.median(np.sum(list(row.parts.values()), axis=0)))
         result.append(
             {
                 "N": N,
                 "formulation": rti.formulation,
-                "solver": "osqp",
+                "solver": name.split()[0],
                 "compiled": name.endswith(" compiled"),
                 "step_us": step,
                 "prepare_us": spread(row.prepare),
@@ -186,6 +196,8 @@ def measure(N: int, *, formulations: tuple[str, ...], compiled: tuple[bool, ...]
                 "feedback_speedup": round(against["p50"] / feedback["p50"], 1),
                 "iterations": {"p50": int(np.median(row.iterations)), "p99": int(np.percentile(row.iterations, 99))},
                 "capped_share": round(row.capped / len(row.iterations), 4),
+                "parts_us": {part: round(float(np.median(us)), 1) for part, us in row.parts.items()},
+                "python_us": round(step["p50"] - native_us, 1),
                 "samples": len(row.iterations),
             }
         )
@@ -195,7 +207,7 @@ def measure(N: int, *, formulations: tuple[str, ...], compiled: tuple[bool, ...]
 def main(
     horizons: tuple[int, ...] = HORIZONS,
     *,
-    formulations: tuple[str, ...] = ("simultaneous", "sequential"),
+    entries: tuple[tuple[str, str], ...] = ENTRIES,
     interpreted: bool,
     quick: bool,
     costs: bool,
@@ -206,7 +218,7 @@ def main(
 
     Args:
         horizons: Stages.
-        formulations: Of the QP; the sequential one is left out beyond 20 stages, where it takes long to compile.
+        entries: Solver and formulation; the sequential one is left out beyond 20 stages, where it takes long to compile.
         interpreted: Whether to measure CasADi's virtual machine, too.
         quick: Eight seconds of driving in all, for a first look.
         costs: Whether to compare closed-loop costs, with exact QPs and with converged NMPC, too.
@@ -218,15 +230,15 @@ def main(
     with Progress(console=console, transient=True) as progress:
         for N in horizons:
             task = progress.add_task(f"N = {N}", total=sum(1 for _ in samples(N, quick)))
-            chosen = tuple(f for f in formulations if f != "sequential" or N <= 20)
+            chosen = [entry for entry in entries if entry[1] != "sequential" or N <= 20]
             found = measure(
-                N, formulations=chosen, compiled=(True, False) if interpreted else (True,), quick=quick, tick=lambda t=task: progress.advance(t)
+                N, entries=chosen, compiled=(True, False) if interpreted else (True,), quick=quick, tick=lambda t=task: progress.advance(t)
             )
             if costs:
-                exact = closed_loop_cost(N, quick, Rti(paper_ocp(N), EXACT, formulation="simultaneous"))
+                exact = closed_loop_cost(N, quick, Rti(paper_ocp(N), EXACT, formulation="simultaneous", solver="osqp"))
                 converged = closed_loop_cost(N, quick, Ipopt(paper_ocp(N)))
                 for row in found:
-                    cost = closed_loop_cost(N, quick, Rti(paper_ocp(N), formulation=row["formulation"]))
+                    cost = closed_loop_cost(N, quick, Rti(paper_ocp(N), formulation=row["formulation"], solver=row["solver"]))
                     row |= {"cost": round(cost, 3), "over_exact": round(cost / exact - 1, 6), "over_converged": round(cost / converged - 1, 6)}
             result += found
     show(console, result, costs=costs)
@@ -240,6 +252,7 @@ def show(console: Console, result: list[dict[str, Any]], *, costs: bool) -> None
     table = Table(title="us a sample: median / p99")
     for name in (
         "N",
+        "solver",
         "formulation",
         "step",
         "preparation",
@@ -256,6 +269,7 @@ def show(console: Console, result: list[dict[str, Any]], *, costs: bool) -> None
         pairs = ["{p50:.0f} / {p99:.0f}".format(**row[key]) for key in ("step_us", "prepare_us", "feedback_us", "ipopt_us")]
         table.add_row(
             str(row["N"]),
+            row["solver"],
             row["formulation"] + ("" if row["compiled"] else ", interpreted"),
             *pairs,
             f"{row['speedup']:.1f} x",
@@ -265,7 +279,16 @@ def show(console: Console, result: list[dict[str, Any]], *, costs: bool) -> None
             *([f"{row['over_exact']:+.3%} exact, {row['over_converged']:+.3%} converged"] if costs else []),
         )
     console.print(table)
-    sparse = [row for row in result if row["formulation"] == "simultaneous" and row["compiled"] and row["N"] >= 20]
-    if len(sparse) > 1:
-        slope = np.polyfit(np.log([row["N"] for row in sparse]), np.log([row["step_us"]["p50"] for row in sparse]), 1)[0]
-        console.print(f"simultaneous from N = 20 on: the step grows as N^{slope:.2f}")
+    made = Table(title="of what parts, medians, us")
+    for name in ("N", "solver", "formulation", *PARTS, "Python around"):
+        made.add_column(name, justify="right")
+    for row in result:
+        head = str(row["N"]), row["solver"], row["formulation"] + ("" if row["compiled"] else ", interpreted")
+        share = row["python_us"] / row["step_us"]["p50"]
+        made.add_row(*head, *(f"{row['parts_us'][part]:.0f}" for part in PARTS), f"{row['python_us']:.0f}, {share:.0%}")
+    console.print(made)
+    for solver in dict.fromkeys(row["solver"] for row in result):
+        sparse = [row for row in result if (row["solver"], row["formulation"]) == (solver, "simultaneous") and row["compiled"] and row["N"] >= 20]
+        if len(sparse) > 1:
+            slope = np.polyfit(np.log([row["N"] for row in sparse]), np.log([row["step_us"]["p50"] for row in sparse]), 1)[0]
+            console.print(f"{solver}, simultaneous, from N = 20 on: the step grows as N^{slope:.2f}")

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a step is made of: the native calls in it, timed where they are made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from time import perf_counter_ns
+from typing import Any
+
+from rti_mpc.rti import Rti
+
+PARTS = ("evaluation", "matrix update", "vector update", "iterations")
+
+
+class Parts:
+    """
+    Stands between a controller and its native calls, when asked to.
+
+    Attributes:
+        timed: Whether it does now.
+    """
+
+    def __init__(self, rti: Rti) -> None:
+        self.timed = False
+        self._times: dict[str, int] = {}
+        self._swaps: list[tuple[Any, str, Any, Any]] = []  # object, attribute, as it is, timed
+        self._watch(rti, "evaluation", "_integrate_tail", "_evaluate")
+        if (active_set := getattr(rti, "active_set", None)) is not None:
+            self._watch(active_set, "evaluation", "_linearize")
+            self._watch(active_set, "matrix update", "_gain")
+            self._watch(active_set, "iterations", "_roll_out")
+        for solver in rti.solvers:
+            self._watch(solver.qp, "evaluation", "linearize", "embed", "step")
+            workspace = solver._osqp
+            calls = {"update_data_mat": "matrix update", "update_data_vec": "vector update", "solve": "iterations"}
+            proxy = Workspace(workspace, {name: self._timing(part, getattr(workspace, name)) for name, part in calls.items()})
+            self._swaps.append((solver, "_osqp", workspace, proxy))
+
+    def _watch(self, owner: Any, part: str, *names: str) -> None:
+        """Time some calls of an object as one part."""
+        self._swaps += [(owner, name, getattr(owner, name), self._timing(part, getattr(owner, name))) for name in names]
+
+    def _timing(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the call with its time added to a part."""
+
+        def timing(*args: Any, **kwargs: Any) -> Any:
+            began = perf_counter_ns()
+            result = call(*args, **kwargs)
+            self._times[part] += perf_counter_ns() - began
+            return result
+
+        return timing
+
+    @contextmanager
+    def maybe(self, timed: bool) -> Iterator[dict[str, float]]:
+        """Time the parts of what happens inside, or not; filled at its end, in us."""
+        times_us: dict[str, float] = {}
+        self.timed = timed
+        if timed:
+            self._times = dict.fromkeys(PARTS, 0)
+            self._swap(3)
+        yield times_us
+        if timed:
+            self._swap(2)
+            times_us.update((part, 1e-3 * time) for part, time in self._times.items())
+
+    def _swap(self, which: int) -> None:
+        """Put the calls as they are, or timed, in place."""
+        for swap in self._swaps:
+            setattr(swap[0], swap[1], swap[which])
+
+
+class Workspace:
+    """OSQP's workspace with some calls replaced; it takes no attributes itself."""
+
+    def __init__(self, workspace: Any, calls: dict[str, Callable[..., Any]]) -> None:
+        self._workspace = workspace
+        self.__dict__.update(calls)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._workspace, name)
