@@ -24,7 +24,7 @@ EXCEPT = {"service/cli.py"}
 # Who alone imports a package, wherever in the file.
 ALONE = {
     "osqp": {"rti_mpc/solver.py"},
-    "zenoh": {"rti_mpc/wire/bus.py"},
+    "zenoh": {"rti_mpc/wire/bus.py", "rti_mpc/wire/session.py"},
     "rerun": {"service/blueprint.py", "service/outlet.py", "service/recording.py", "service/view.py"},
     "qpsolvers": {"rti_mpc/qp.py", "service/check.py"},
     "casadi": {

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import typer.main
 
-from rti_mpc.wire.bus import BusSettings, zenoh_config
+from rti_mpc.wire.session import BusSettings, zenoh_config
 from service.cli import app
 from service.config import load
 

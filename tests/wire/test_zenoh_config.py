@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from rti_mpc.errors import ConfigError
-from rti_mpc.wire.bus import RENDEZVOUS, Bus, BusSettings, zenoh_config
+from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.session import RENDEZVOUS, BusSettings, zenoh_config
 
 SHIPPED = Path(__file__).parents[2] / "deploy" / "zenoh"
 ROBOT = "tcp/127.0.0.1:17447"

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+How a process joins the bus: settings, and the Zenoh session made of them.
+
+Peers find each other by gossip. One, the robot, listens on the rendezvous
+endpoint, the others on a free loopback port; those connect to the robot, again and
+again until it is there, learn of one another and link directly. So processes
+start and restart in any order, and those already linked stay so without the
+robot. Multicast is off. Across hosts, name the endpoint to listen on; across a
+security boundary, use ``mode="client"`` and a router: a peer never forwards, and
+never passes a router's access control.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from rti_mpc.errors import ConfigError
+
+RENDEZVOUS = "tcp/127.0.0.1:7447"
+CLIENT_TIMEOUT_MS = 500  # one attempt to reach a router
+RETRY_S = 0.1  # between two looks for somebody who is not there yet
+
+# Closing the link of a hung peer occupies a thread of Zenoh for its linger time, 10 s. By default there is one to send and
+# two to receive: a hung viewer would then cut the controller from the robot.
+THREADS = "(rx: (worker_threads: 4), tx: (worker_threads: 4))"
+
+# Ours, unless the user's own Zenoh configuration says otherwise.
+DEFAULTS: dict[str, Any] = {
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
+    "scouting/gossip/enabled": True,
+    "transport/link/tx/lease": 2000,  # a hung process is noticed after 1.5 s, not 7.5 s
+    "transport/link/rx/max_message_size": 1 << 26,  # bytes: what a peer can make us hold
+    "transport/shared_memory/enabled": False,  # gains nothing at these sizes
+    "transport/link/tx/queue/congestion_control/block/wait_before_close": 500_000,  # us: what a query waits for a hung peer
+    "queries_default_timeout": 1000,  # ms: a hung publisher delays a late joiner no longer
+}
+
+
+@dataclass(frozen=True, slots=True)
+class BusSettings:
+    """
+    How a process joins the bus. A Zenoh configuration file yields to attributes that differ from their defaults.
+
+    Attributes:
+        mode: peer, client or router.
+        listen: Endpoints to listen on; none: a free loopback port, for a router the rendezvous.
+        connect: Endpoints to connect to; those in `listen` are left out, for a router the rendezvous, too.
+        config: Configuration file of Zenoh, JSON5.
+        multicast: Whether to look for others by multicast.
+        cfg: Further settings of Zenoh, each ``KEY:VALUE``, applied last.
+    """
+
+    mode: str = "peer"
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = (RENDEZVOUS,)
+    config: Path | None = None
+    multicast: bool = False
+    cfg: tuple[str, ...] = ()
+
+
+def zenoh_config(settings: BusSettings) -> zenoh.Config:
+    """
+    Zenoh configuration of a process.
+
+    Raises:
+        ConfigError: If Zenoh refuses a value, or cannot read the file.
+    """
+    name = str(settings.config)
+    try:
+        config = zenoh.Config() if settings.config is None else zenoh.Config.from_file(settings.config)
+        untouched = zenoh.Config()
+        mode = settings.mode if settings.mode != BusSettings().mode else json.loads(config.get_json("mode")) or settings.mode
+        usual = _by_name(BusSettings(), mode)
+        for name, value in _by_name(settings, mode).items():
+            if value != usual[name] or config.get_json(name) == untouched.get_json(name):
+                config.insert_json5(name, json.dumps(value))
+        name = "mode"
+        config.insert_json5(name, json.dumps(mode))
+        for name, _, text in (setting.partition(":") for setting in settings.cfg):
+            config.insert_json5(name, text)
+    except zenoh.ZError as error:
+        raise ConfigError(f"bus: {name} must be what Zenoh takes, got: {_brief(error)}") from None
+    return config
+
+
+def _by_name(settings: BusSettings, mode: str) -> dict[str, Any]:
+    """Settings by their names in Zenoh. Nobody connects to himself, and a router to nobody unless told."""
+    others = () if mode == "router" and settings.connect == (RENDEZVOUS,) else settings.connect
+    return {
+        "listen/endpoints": settings.listen or {"client": [], "peer": ["tcp/127.0.0.1:0"], "router": [RENDEZVOUS]}.get(mode, []),
+        "connect/endpoints": [endpoint for endpoint in others if endpoint not in settings.listen],
+        "connect/timeout_ms": CLIENT_TIMEOUT_MS if mode == "client" else -1,
+        "scouting/multicast/enabled": settings.multicast,
+        **DEFAULTS,
+    }
+
+
+def _brief(error: Exception) -> str:
+    return " ".join(str(error).split(" at /")[0].split())
+
+
+def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event | None) -> zenoh.Session:
+    """Open a session; a client waits for its router, unless it is stopped."""
+    deadline_s = time.monotonic() + timeout_s
+    os.environ.setdefault("ZENOH_RUNTIME", THREADS)
+    while True:
+        try:
+            return zenoh.open(zenoh_config(settings))
+        except zenoh.ZError as error:
+            if "Unable to connect" not in str(error):
+                raise ConfigError(f"bus: endpoints must be free and valid, got: {_brief(error)}") from None
+            if time.monotonic() > deadline_s or (stop is not None and stop.is_set()):
+                raise ConfigError(f"bus: a router must be reachable at {', '.join(settings.connect)}, none has answered") from None
+            time.sleep(RETRY_S)
