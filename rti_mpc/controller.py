@@ -17,15 +17,14 @@ at most `FALLBACKS` samples; then a ramp to rest, from past commands alone.
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.codegen import bind, compiled
-from rti_mpc.integrator import integrator
 from rti_mpc.message import STAMP_ON_ARRIVAL, Command, End, Reference, Severity, State, Telemetry
+from rti_mpc.mode import ModeMachine
+from rti_mpc.prediction import Prediction
 from rti_mpc.robot_clock import RobotClock
 from rti_mpc.rti import Rti
 from rti_mpc.sent import Sent
@@ -52,15 +51,6 @@ class Timing:
     valid_s: float = 0.25
 
 
-@dataclass(frozen=True, slots=True)
-class Notice:
-    """A mode change or a fault, to be published as an event."""
-
-    severity: Severity
-    code: str
-    text: str
-
-
 class Controller:
     """
     The controller of one robot.
@@ -69,7 +59,6 @@ class Controller:
     and calls `prepare` after each command, off the path from state to command.
 
     Attributes:
-        mode: What the controller is doing.
         notices: Mode changes and faults since the caller last emptied it.
         skipped: Samples skipped since start.
         fallbacks: Samples commanded without a usable QP since start.
@@ -89,8 +78,8 @@ class Controller:
         self._u_rest: Array = np.array(model.u_rest)
         self._held = np.minimum(np.arange(ocp.N), ocp.N_u - 1)  # plan row of each stage
 
-        self.mode = Mode.IDLE
-        self.notices: deque[Notice] = deque(maxlen=64)
+        self._modes = ModeMachine()
+        self.notices = self._modes.notices
         self.skipped = 0
         self.fallbacks = 0
         self._track = Track(model, ocp.N, self._dt_ns)
@@ -105,16 +94,17 @@ class Controller:
         self._failed = 0  # samples in a row without a usable QP
         self._stopped = ""  # why an operator's stop is latched
         self._command: Command | None = None
-        self._planned = (rti.x.copy(), rti.y_ref.copy())  # states and reference of that command, for telemetry
+        self._planned = (rti.x.copy(), rti.y_ref.copy())  # states and reference of a command, for telemetry
+        self._planned_seq = 0  # of that command
         self._valid_until_ns = 0
 
-        # One integration step over any duration, for the prediction from a state's stamp to the act of its command.
-        self._span: Array = np.zeros(1)
-        self._start: Array = np.zeros(model.nx)
-        self._input: Array = np.zeros(model.nu)
-        self._x0: Array = np.zeros(model.nx)
-        phi = integrator(model, "rk4")
-        self._integrate = bind(compiled(phi)[0] if compile else phi, (self._start, self._input, np.array(model.p_nominal), self._span), (self._x0,))
+        self._prediction = Prediction(model, self._sent, compile=compile)
+        self._x0 = self._prediction.x
+
+    @property
+    def mode(self) -> Mode:
+        """What the controller is doing."""
+        return self._modes.mode
 
     # What comes in.
 
@@ -139,7 +129,7 @@ class Controller:
         self._unwrap(state)
         self._state = state
         if self.mode is Mode.IDLE:
-            self._enter(Mode.WAITING, "first state")
+            self._modes.enter(Mode.WAITING, "first state")
         if self._arriving is not None:
             self._anchor(self._arriving)
         if not (self._track.loaded or self._stopped):
@@ -163,7 +153,7 @@ class Controller:
         model = self._rti.ocp.model
         rows, ny = reference.y.shape
         if rows < 1 or ny != model.ny or reference.p.shape[1] not in (0, model.np_) or reference.period_ns <= 0:
-            self._notice(
+            self._modes.say(
                 Severity.WARNING,
                 "reference_refused",
                 f"a reference must have rows of {model.ny} outputs and of 0 or {model.np_} parameters, and a positive period, "
@@ -180,16 +170,16 @@ class Controller:
         """Ramp to rest and stay there until `enable`."""
         if not self._stopped:
             self._stopped = reason
-            self._notice(Severity.INFO, "stop", f"stop: {reason}")
+            self._modes.say(Severity.INFO, "stop", f"stop: {reason}")
 
     def enable(self) -> None:
         """Release a `stop`: start cold, from the input that acts."""
         if self._stopped:
             self._stopped = ""
-            self._warm = False
-            self._notice(Severity.INFO, "enable", "released by an operator")
-            if self._state is not None:
-                self._enter(Mode.WAITING, "enabled")
+            self._modes.say(Severity.INFO, "enable", "released by an operator")
+            if self.mode is Mode.STOPPED:
+                self._warm = False
+                self._modes.enter(Mode.WAITING, "enabled")
 
     def tick(self, local_ns: int) -> Command | None:
         """
@@ -205,13 +195,14 @@ class Controller:
         if age_ns <= self._stale_ns:
             return None
         self._warm = False
-        self._enter(Mode.STOPPED if self._stopped else Mode.BRAKING, f"no state for {1e-9 * age_ns:.3f} s", Severity.ERROR, "state_stale")
+        self._modes.enter(Mode.STOPPED if self._stopped else Mode.BRAKING, f"no state for {1e-9 * age_ns:.3f} s", Severity.ERROR, "state_stale")
         return self._issue(self._state, now_ns, QpStatus.NONE, self._ramp(self._sent.at(now_ns)[0]))
 
     # The two phases.
 
     def prepare(self) -> None:
         """Prepare the next sample: fix `t_k`, look the reference up, shift, linearize and load the QP."""
+        self._keep()
         if not self._warm or self._state is None:
             return
         offset_ns = self._state.stamp_ns + self._delay_ns - self._act_ns
@@ -221,6 +212,12 @@ class Controller:
         self._loaded = False
         if self.mode in (Mode.TRACKING, Mode.HOLDING, Mode.FALLBACK):
             self._load(shift=True)
+
+    def _keep(self) -> None:
+        """Keep the plan of the last command for telemetry, before the next one overwrites it."""
+        if self._planned_seq != self._seq:
+            self._planned = (self._rti.x.copy(), self._rti.y_ref.copy())
+            self._planned_seq = self._seq
 
     def _load(self, *, shift: bool) -> None:
         """Load the QP of `t_k`."""
@@ -251,26 +248,26 @@ class Controller:
         if self._stopped or ending is End.STOP:
             mode, reason = (Mode.STOPPED, self._stopped) if self._stopped else (Mode.BRAKING, "the reference ended with STOP")
             self._loaded = False
-            self._enter(mode, reason)
+            self._modes.enter(mode, reason)
             self._valid_until_ns = state.stamp_ns + self._delay_ns + self._valid_ns
             return self._issue(state, self._act_ns, QpStatus.NONE, self._ramp(self._sent.at(self._act_ns - 1)[0]))
-        self._predict(state)
+        self._prediction.predict(self._x, state.stamp_ns, self._act_ns)
         status = self._feedback_cold() if not self._loaded else self._rti.feedback(self._x0)
         if status.usable:
             self._failed = 0
             if ending is None:
-                self._enter(Mode.TRACKING, "following the reference")
+                self._modes.enter(Mode.TRACKING, "following the reference")
             else:
-                self._enter(Mode.HOLDING, "the reference has ended")
+                self._modes.enter(Mode.HOLDING, "the reference has ended")
             self._valid_until_ns = min(self._act_ns + self._rti.ocp.N * self._dt_ns, state.stamp_ns + self._delay_ns + self._valid_ns)
             return self._issue(state, self._act_ns, status, self._rti.u[self._held])
         self._failed += 1
         self.fallbacks += 1
         if self._failed <= FALLBACKS and self._loaded:
-            self._enter(Mode.FALLBACK, f"the QP is {status.name.lower()}: playing the previous plan", Severity.WARNING, "qp_failed")
+            self._modes.enter(Mode.FALLBACK, f"the QP is {status.name.lower()}: playing the previous plan", Severity.WARNING, "qp_failed")
             return self._issue(state, self._act_ns, status, self._rti.u[self._held])
         self._loaded = False
-        self._enter(Mode.BRAKING, f"the QP is {status.name.lower()} and no plan is left", Severity.ERROR, "no_plan")
+        self._modes.enter(Mode.BRAKING, f"the QP is {status.name.lower()} and no plan is left", Severity.ERROR, "no_plan")
         self._valid_until_ns = state.stamp_ns + self._delay_ns + self._valid_ns
         return self._issue(state, self._act_ns, status, self._ramp(self._sent.at(self._act_ns - 1)[0]))
 
@@ -304,7 +301,6 @@ class Controller:
             u=u,
         )
         self._sent.append(self._command)
-        self._planned = (self._rti.x.copy(), self._rti.y_ref.copy())
         return self._command
 
     def _ramp(self, u: Array) -> Array:
@@ -340,6 +336,7 @@ class Controller:
         """Describe the last sample; the times are the caller's, who has a clock."""
         command, solver = self._command, self._rti.solver
         assert command is not None
+        self._keep()
         return Telemetry(
             epoch=command.epoch,
             seq=command.seq,
@@ -388,38 +385,11 @@ class Controller:
             for j in self._angles:
                 self._x[j] += TWO_PI * round((last[j] - self._x[j]) / TWO_PI)
 
-    def _predict(self, state: State) -> None:
-        """Integrate the state from its stamp to `t_k` with the inputs already sent; a little backward, if it came late."""
-        self._x0[:] = self._x
-        t_ns = state.stamp_ns
-        while t_ns != self._act_ns:
-            if t_ns < self._act_ns:
-                u, change_ns = self._sent.at(t_ns)
-                until_ns = min(change_ns, self._act_ns)
-            else:
-                u, _ = self._sent.at(self._act_ns)
-                until_ns = self._act_ns
-            self._start[:] = self._x0
-            self._input[:] = u
-            self._span[0] = 1e-9 * (until_ns - t_ns)
-            self._integrate()
-            t_ns = until_ns
-
     def _restart(self, code: str, text: str) -> None:
         """Forget the robot's last life."""
-        self._notice(Severity.WARNING, code, text)
+        self._modes.enter(Mode.IDLE, text, Severity.WARNING, code)
         self._state = None
         self._clock.reset()
         self._sent.clear()
         self._track.clear()
         self._warm = self._loaded = False
-        self.mode = Mode.IDLE
-
-    def _enter(self, mode: Mode, reason: str, severity: Severity = Severity.INFO, code: str = "mode") -> None:
-        """Change the mode, and say why."""
-        if mode is not self.mode:
-            self._notice(severity, code, f"{self.mode.name.lower()} to {mode.name.lower()}: {reason}")
-            self.mode = mode
-
-    def _notice(self, severity: Severity, code: str, text: str) -> None:
-        self.notices.append(Notice(severity, code, text))

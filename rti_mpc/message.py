@@ -175,3 +175,18 @@ class Event:
     severity: Severity
     code: str
     text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """
+    What an event is to say; whoever publishes it adds who, when and its number.
+
+    Attributes:
+        code: Stable word for machines, such as ``state_stale``.
+        text: One sentence for people.
+    """
+
+    severity: Severity
+    code: str
+    text: str

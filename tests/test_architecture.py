@@ -54,7 +54,7 @@ ALONE = {
 FLOW: tuple[set[str], ...] = (
     {"errors", "array", "status", "robot_clock"},
     {"message", "polyline"},
-    {"heading", "sent"},
+    {"heading", "sent", "mode"},
     {"trajectory"},
     {"model"},
     {"pioneer_3dx", "integrator", "track", "obstacle"},
@@ -63,7 +63,7 @@ FLOW: tuple[set[str], ...] = (
     {"transcription"},
     {"simultaneous", "sequential", "riccati"},
     {"codegen"},
-    {"qp"},
+    {"qp", "prediction"},
     {"solver", "active_set"},
     {"rti"},
     {"controller"},

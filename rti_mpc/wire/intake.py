@@ -5,10 +5,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Generic, Protocol
 
-from rti_mpc.message import Severity
+from rti_mpc.message import Notice, Severity
 from rti_mpc.wire.cdr import VERSION, M, Refused, decode, encoding
 from rti_mpc.wire.source import Source, Verdict
 
@@ -25,22 +24,6 @@ class Payload(Protocol):
     @property
     def encoding(self) -> str:
         """What the sender says they are."""
-
-
-@dataclass(frozen=True, slots=True)
-class Notice:
-    """
-    What an event is to say; whoever publishes it adds who, when and its number.
-
-    Attributes:
-        severity: How bad it is.
-        code: ``message_refused``, ``source_refused`` or ``source_changed``.
-        text: One sentence for people.
-    """
-
-    severity: Severity
-    code: str
-    text: str
 
 
 class Intake(Generic[M]):

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the robot will be when the next command acts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.codegen import bind, compiled
+from rti_mpc.integrator import integrator
+from rti_mpc.model import Model
+from rti_mpc.sent import Sent
+
+
+class Prediction:
+    """
+    Integrates a state over the inputs already sent: its whole vector, speeds as well as pose.
+
+    Attributes:
+        x: The state predicted last, shape ``(nx,)``. Overwritten by the next one.
+    """
+
+    def __init__(self, model: Model, sent: Sent, *, compile: bool = True) -> None:
+        self.x: Array = np.zeros(model.nx)
+        self._sent = sent
+        self._span: Array = np.zeros(1)  # s
+        self._start: Array = np.zeros(model.nx)
+        self._input: Array = np.zeros(model.nu)
+        phi = integrator(model, "rk4")
+        self._integrate = bind(compiled(phi)[0] if compile else phi, (self._start, self._input, np.array(model.p_nominal), self._span), (self.x,))
+
+    def predict(self, x: Array, from_ns: int, to_ns: int) -> Array:
+        """
+        Integrate from one time to another, one RK4 step over each input; a little backward, if need be.
+
+        Args:
+            x: State at `from_ns`, shape ``(nx,)``.
+            from_ns: Robot time.
+            to_ns: Robot time.
+        """
+        self.x[:] = x
+        t_ns = from_ns
+        while t_ns != to_ns:
+            if t_ns < to_ns:
+                u, change_ns = self._sent.at(t_ns)
+                until_ns = min(change_ns, to_ns)
+            else:
+                u, _ = self._sent.at(to_ns)
+                until_ns = to_ns
+            self._start[:] = self.x
+            self._input[:] = u
+            self._span[0] = 1e-9 * (until_ns - t_ns)
+            self._integrate()
+            t_ns = until_ns
+        return self.x
