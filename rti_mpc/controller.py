@@ -24,6 +24,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.message import STAMP_ON_ARRIVAL, Command, End, Reference, Severity, State, Telemetry
 from rti_mpc.mode import ModeMachine
+from rti_mpc.observer import Observer
 from rti_mpc.prediction import Prediction
 from rti_mpc.robot_clock import RobotClock
 from rti_mpc.rti import Rti
@@ -60,11 +61,14 @@ class Controller:
 
     Attributes:
         notices: Mode changes and faults since the caller last emptied it.
+        np_: Parameters a row of a reference may carry: the model's, without the disturbances an observer estimates.
         skipped: Samples skipped since start.
         fallbacks: Samples commanded without a usable QP since start.
     """
 
-    def __init__(self, rti: Rti, timing: Timing, *, epoch: int = 1, config_hash: int = 0, compile: bool = True) -> None:
+    def __init__(
+        self, rti: Rti, timing: Timing, *, epoch: int = 1, config_hash: int = 0, observer: Observer | None = None, compile: bool = True
+    ) -> None:
         ocp, model = rti.ocp, rti.ocp.model
         self._rti = rti
         self._epoch = epoch
@@ -78,6 +82,8 @@ class Controller:
         self._u_rest: Array = np.array(model.u_rest)
         self._held = np.minimum(np.arange(ocp.N), ocp.N_u - 1)  # plan row of each stage
 
+        self._observer = observer
+        self.np_ = model.np_ - (0 if observer is None else len(observer.d))
         self._modes = ModeMachine()
         self.notices = self._modes.notices
         self.skipped = 0
@@ -127,6 +133,7 @@ class Controller:
             self._restart("clock_jumped", f"the robot's clock went back {1e-9 * (self._state.stamp_ns - state.stamp_ns):.3f} s: starting anew")
         self._clock.observe(state.seq, state.stamp_ns, arrival_ns)
         self._unwrap(state)
+        self._observe(state)
         self._state = state
         if self.mode is Mode.IDLE:
             self._modes.enter(Mode.WAITING, "first state")
@@ -152,11 +159,11 @@ class Controller:
         """
         model = self._rti.ocp.model
         rows, ny = reference.y.shape
-        if rows < 1 or ny != model.ny or reference.p.shape[1] not in (0, model.np_) or reference.period_ns <= 0:
+        if rows < 1 or ny != model.ny or reference.p.shape[1] not in (0, self.np_) or reference.period_ns <= 0:
             self._modes.say(
                 Severity.WARNING,
                 "reference_refused",
-                f"a reference must have rows of {model.ny} outputs and of 0 or {model.np_} parameters, and a positive period, "
+                f"a reference must have rows of {model.ny} outputs and of 0 or {self.np_} parameters, and a positive period, "
                 f"got {rows} rows of {ny} and {reference.p.shape[1]}, {reference.period_ns} ns",
             )
             return None
@@ -222,6 +229,7 @@ class Controller:
     def _load(self, *, shift: bool) -> None:
         """Load the QP of `t_k`."""
         self._track.look_up(self._act_ns)
+        self._track.p[:, self.np_ :] = self._prediction.p[self.np_ :]
         self._rti.prepare(self._track.y_ref, self._track.p, shift=shift, u_prev=self._sent.at(self._act_ns - 1)[0])
         self._loaded = True
 
@@ -362,6 +370,7 @@ class Controller:
             x=self._planned[0],
             u=command.u,
             y_ref=self._planned[1],
+            d=self._prediction.p[self.np_ :].copy(),
         )
 
     # Small parts.
@@ -384,6 +393,21 @@ class Controller:
         if self._state is not None:
             for j in self._angles:
                 self._x[j] += TWO_PI * round((last[j] - self._x[j]) / TWO_PI)
+
+    def _observe(self, state: State) -> None:
+        """Replace the state by its estimate, and let predictions know of the disturbances."""
+        observer = self._observer
+        if observer is None:
+            return
+        if self._state is None or state.stamp_ns - self._state.stamp_ns > self._stale_ns:
+            observer.reset(self._x)
+        else:
+            observer.frozen = self.mode not in (Mode.TRACKING, Mode.HOLDING)  # which inputs act is then known less well
+            for u, span_s in self._sent.spans(self._state.stamp_ns, state.stamp_ns):
+                observer.predict(u, span_s)
+            observer.correct(self._x)
+        self._x[:] = observer.x
+        self._prediction.p[self.np_ :] = observer.d
 
     def _restart(self, code: str, text: str) -> None:
         """Forget the robot's last life."""

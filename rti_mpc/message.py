@@ -10,8 +10,10 @@ are the business of `rti_mpc.wire.cdr`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
+
+import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.status import Mode, QpStatus
@@ -129,6 +131,7 @@ class Telemetry:
         x: Predicted states, shape ``(N + 1, nx)``.
         u: Planned inputs, shape ``(N, nu)``; row 0 is what was commanded.
         y_ref: Reference rows used, shape ``(N, ny)``.
+        d: Estimated disturbances, shape ``(nd,)``, those of ``info``; none without an observer.
     """
 
     epoch: int
@@ -155,6 +158,7 @@ class Telemetry:
     x: Array
     u: Array
     y_ref: Array
+    d: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(slots=True)

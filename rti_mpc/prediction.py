@@ -18,16 +18,18 @@ class Prediction:
 
     Attributes:
         x: The state predicted last, shape ``(nx,)``. Overwritten by the next one.
+        p: Parameters it predicts with, shape ``(np,)``; the model's nominal ones unless set.
     """
 
     def __init__(self, model: Model, sent: Sent, *, compile: bool = True) -> None:
         self.x: Array = np.zeros(model.nx)
+        self.p: Array = np.array(model.p_nominal)
         self._sent = sent
         self._span: Array = np.zeros(1)  # s
         self._start: Array = np.zeros(model.nx)
         self._input: Array = np.zeros(model.nu)
         phi = integrator(model, "rk4")
-        self._integrate = bind(compiled(phi)[0] if compile else phi, (self._start, self._input, np.array(model.p_nominal), self._span), (self.x,))
+        self._integrate = bind(compiled(phi)[0] if compile else phi, (self._start, self._input, self.p, self._span), (self.x,))
 
     def predict(self, x: Array, from_ns: int, to_ns: int) -> Array:
         """
@@ -39,17 +41,9 @@ class Prediction:
             to_ns: Robot time.
         """
         self.x[:] = x
-        t_ns = from_ns
-        while t_ns != to_ns:
-            if t_ns < to_ns:
-                u, change_ns = self._sent.at(t_ns)
-                until_ns = min(change_ns, to_ns)
-            else:
-                u, _ = self._sent.at(to_ns)
-                until_ns = to_ns
+        for u, span_s in self._sent.spans(from_ns, to_ns):
             self._start[:] = self.x
             self._input[:] = u
-            self._span[0] = 1e-9 * (until_ns - t_ns)
+            self._span[0] = span_s
             self._integrate()
-            t_ns = until_ns
         return self.x

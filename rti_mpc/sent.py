@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -33,6 +34,16 @@ class Sent:
     def clear(self) -> None:
         """Forget everything: the robot was restarted, and stands."""
         self._commands.clear()
+
+    def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Array, float]]:
+        """Yield the inputs that act between two times, shape ``(nu,)``, each with for how long, s; backward, the one that acts at the end."""
+        if to_ns < from_ns:
+            yield self.at(to_ns)[0], 1e-9 * (to_ns - from_ns)
+        while from_ns < to_ns:
+            u, change_ns = self.at(from_ns)
+            until_ns = min(change_ns, to_ns)
+            yield u, 1e-9 * (until_ns - from_ns)
+            from_ns = until_ns
 
     def at(self, t_ns: int) -> tuple[Array, int]:
         """Return the input that acts at a time, shape ``(nu,)``, and when it next changes."""

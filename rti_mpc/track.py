@@ -43,7 +43,7 @@ class Track:
         Follow a reference from now on.
 
         Args:
-            reference: Checked: of the model's `ny`, and of its `np` or none.
+            reference: Checked: of the model's `ny`, and of the first of its `np` or none; the others are nominal.
             x: State, shape ``(nx,)``, whose outputs the angles are put nearest to.
             stamp_ns: Time of that state.
         """
@@ -54,8 +54,8 @@ class Track:
         for j in self._angles:
             y[:, j] = np.unwrap(y[:, j])
             y[:, j] += TWO_PI * np.round((outputs[j] - y[now, j]) / TWO_PI)
-        p = reference.p if reference.p.shape[1] else np.broadcast_to(self._nominal[0], (len(y), self._nominal.shape[1]))
-        self._rows = np.hstack([y, p])
+        given = reference.p.shape[1]
+        self._rows = np.hstack([y, reference.p, np.broadcast_to(self._nominal[0, given:], (len(y), self._nominal.shape[1] - given))])
 
     def clear(self) -> None:
         """Follow nothing."""

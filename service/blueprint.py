@@ -86,7 +86,8 @@ def blueprint(info: Info, frame: Frame | None = None) -> rrb.Blueprint:
         _times(info),
     ]
     states = _series("States", ["state/**"])
-    left: rrb.Container = rrb.Vertical(states) if info.position is None else rrb.Tabs(_world(frame or Frame()), states)
+    estimated = [_series("Disturbances", ["disturbance/**"])] if info.disturbances else []
+    left: rrb.Container = rrb.Vertical(states, *estimated) if info.position is None else rrb.Tabs(_world(frame or Frame()), states, *estimated)
     lanes = rrb.StateTimelineView(origin="/lane", name="Mode and QP status", time_view=_time_axis())
     return rrb.Blueprint(
         rrb.Vertical(
@@ -190,6 +191,7 @@ def lifted(xy: Array, z: float) -> Array:
 
 def _series_looks(info: Info) -> dict[str, rr.AsComponents]:
     looks: dict[str, rr.AsComponents] = {f"state/{label.name}": _line(str(label), "measured") for label in info.states}
+    looks |= {f"disturbance/{label.name}": _line(str(label), "error") for label in info.disturbances}
     for label in info.inputs:
         looks[f"command/{label.name}"] = _line("command", "command", interpolation=rr.components.InterpolationMode.StepAfter)
         looks |= {f"command/{label.name}/{side}": _line(side, "limit", 1.0) for side in ("min", "max")}

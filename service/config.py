@@ -21,10 +21,11 @@ from pydantic import Field, ValidationError
 
 from rti_mpc.errors import ConfigError, OcpError
 from service.refusal import explain, unknown_name
-from service.schema import BusSection, ModelSection, OcpSection, Section, SimSection, SolverSection, TimingSection
+from service.schema import BusSection, ModelSection, ObserverSection, OcpSection, Section, SimSection, SolverSection, TimingSection
 
 if TYPE_CHECKING:
     from rti_mpc.model import Model, Signal
+    from rti_mpc.observer import Observer
     from rti_mpc.ocp import Ocp
     from rti_mpc.rti import Rti
     from rti_mpc.solver import SolverSettings
@@ -41,6 +42,7 @@ class Config(Section):
     ocp: OcpSection = Field(description="the optimal control problem")
     solver: SolverSection = Field(default=SolverSection(), description="the QP solver's settings")
     timing: TimingSection = Field(default=TimingSection(), description="delays and timeouts")
+    observer: ObserverSection = Field(default=ObserverSection(), description="estimator of disturbances and of unmeasured states; none if left out")
     bus: BusSection = Field(default=BusSection(), description="the Zenoh session")
     sim: SimSection = Field(default=SimSection(), description="the simulated robot")
 
@@ -68,9 +70,11 @@ class Config(Section):
 
     def build_ocp(self) -> Ocp:
         """Return the optimal control problem."""
+        from rti_mpc.disturbance import with_disturbances
         from rti_mpc.ocp import Ocp
 
-        model, weights, limits = self.build_model(), self.ocp.weights, self.ocp.bounds
+        model = with_disturbances(self.build_model(), self.observer.disturbances)
+        weights, limits = self.ocp.weights, self.ocp.bounds
         lbu, ubu = bounds(limits.inputs, model.inputs)
         lbdu, ubdu = bounds(limits.increments, model.inputs)
         lbx, ubx = bounds(limits.states, model.states)
@@ -99,6 +103,16 @@ class Config(Section):
         from rti_mpc.rti import Rti
 
         return Rti(self.build_ocp(), self.solver_settings(), formulation=self.ocp.formulation)
+
+    def build_observer(self) -> Observer | None:
+        """Return the observer, compiled, if there is anything to estimate."""
+        from rti_mpc.observer import Disturbance, Observer, ObserverSettings
+
+        if not (self.observer.disturbances or self.observer.measured):
+            return None
+        disturbances = {name: Disturbance(of.drift, of.limit) for name, of in self.observer.disturbances.items()}
+        settings = ObserverSettings(disturbances, self.observer.measured, self.observer.noise, self.observer.process)
+        return Observer(self.build_model(), settings)
 
     def robot_settings(self) -> dict[str, Any]:
         """Return what `sim.settings.RobotSettings` is made from; the slew limits are those of the increments."""
@@ -194,7 +208,7 @@ def check(config: Config) -> None:
     """
     from rti_mpc.model import find_model
 
-    ocp, sim = config.ocp, config.sim
+    ocp, sim, observer = config.ocp, config.sim, config.observer
     if config.N_u > ocp.N:
         raise ConfigError(f"ocp.N_u must be at most ocp.N = {ocp.N}, got {ocp.N_u}")
     for key, values, length in (("delta", ocp.weights.delta, ocp.N), ("lambda", ocp.weights.lambda_, config.N_u)):
@@ -213,6 +227,10 @@ def check(config: Config) -> None:
         ("ocp.bounds.inputs", ocp.bounds.inputs, "input", model.inputs),
         ("ocp.bounds.increments", ocp.bounds.increments, "input", model.inputs),
         ("ocp.bounds.states", ocp.bounds.states, "state", model.states),
+        ("observer.disturbances", observer.disturbances, "input or state", (*model.inputs, *model.states)),
+        ("observer.measured", dict.fromkeys(observer.measured), "state", model.states),
+        ("observer.noise", observer.noise, "state", model.states),
+        ("observer.process", observer.process, "state", model.states),
         ("sim.x0", sim.x0, "state", model.states),
         ("sim.noise_std", sim.noise_std, "state", model.states),
         ("sim.parameters", sim.parameters, "parameter", model.parameters),

@@ -62,6 +62,7 @@ def main(config: Config, bus_settings: BusSettings, *, stop: Event | None = None
     rti = config.build_rti()
     ocp = rti.ocp
     warm_up(rti)
+    observer = config.build_observer()
     timing = Timing(config.timing.delay_s, config.stale_s, config.timing.valid_s)
     with Bus(bus_settings, config.keys(), stop=stop) as bus:
         heard = heard_epoch(bus, stop)
@@ -69,11 +70,17 @@ def main(config: Config, bus_settings: BusSettings, *, stop: Event | None = None
             print(f"rti-mpc: {config.robot} already has a controller: stop it first, or give this robot another name", file=sys.stderr)
             return 1
         epoch = max(time.time_ns() // 1_000_000_000, heard + 1)
-        controller = Controller(rti, timing, epoch=epoch, config_hash=config.config_hash)
+        controller = Controller(rti, timing, epoch=epoch, config_hash=config.config_hash, observer=observer)
         daemon = Daemon(controller, bus, epoch, ocp, config.stale_s)
         bus.publish_json(
             bus.keys.info(ROLE),
-            {**describe(ocp), "formulation": rti.formulation, "config_hash": config.config_hash, "epoch": epoch, "stale_s": config.stale_s},
+            {
+                **describe(ocp, controller.np_),
+                "formulation": rti.formulation,
+                "config_hash": config.config_hash,
+                "epoch": epoch,
+                "stale_s": config.stale_s,
+            },
         )
         bus.serve(bus.keys.request, daemon.answer)
         bus.alive(ROLE)
@@ -104,9 +111,10 @@ def heard_epoch(bus: Bus, stop: Event) -> int:
     return highest
 
 
-def describe(ocp: Ocp) -> dict[str, Any]:
-    """Describe a controller for ``info``: names, units, limits; null where there is none."""
-    vectors = {"states": ocp.model.states, "inputs": ocp.model.inputs, "outputs": ocp.model.outputs}
+def describe(ocp: Ocp, np_: int) -> dict[str, Any]:
+    """Describe a controller for ``info``: names, units, limits; null where there is none. Parameters from `np_` on are disturbances."""
+    model = ocp.model
+    vectors = {"states": model.states, "inputs": model.inputs, "outputs": model.outputs, "disturbances": model.parameters[np_:]}
     limits = ("lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx")
     return {
         "role": ROLE,
@@ -135,7 +143,7 @@ class Daemon:
         self._telemetry = bus.publisher(keys.telemetry, Telemetry)
         self._anchored = bus.publisher(keys.anchored, Reference, cached=True)
         self._states_in = Intake(State, stale_s, {"x": model.nx})
-        self._references_in = Intake(Reference, PLANNER_STALE_S, {"y": model.ny, "p": model.np_})
+        self._references_in = Intake(Reference, PLANNER_STALE_S, {"y": model.ny, "p": controller.np_})
         self._references: deque[Reference] = deque(maxlen=1)
         self._prepare_us = 0.0
         self._ticked_ns = 0

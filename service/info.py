@@ -43,6 +43,7 @@ class Info:
         states: Labels of ``x``; empty where the publisher does not know the model.
         inputs: Labels of ``u``.
         outputs: Labels of ``y``.
+        disturbances: Labels of what an observer estimates besides.
         dt_s: Sample period; NaN if not said.
         lbu: Lower bounds of the inputs, infinite where there is none.
         ubu: Upper bounds of the inputs.
@@ -56,6 +57,7 @@ class Info:
     states: tuple[Label, ...] = ()
     inputs: tuple[Label, ...] = ()
     outputs: tuple[Label, ...] = ()
+    disturbances: tuple[Label, ...] = ()
     dt_s: float = math.nan
     lbu: tuple[float, ...] = ()
     ubu: tuple[float, ...] = ()
@@ -87,7 +89,7 @@ class Info:
     @classmethod
     def unnamed(cls, nx: int, nu: int, ny: int) -> Info:
         """Number the components of a robot whose description was never heard."""
-        vectors: dict[str, Any] = {name: tuple(Label(f"{name[:-1]}_{i}") for i in range(n)) for name, n in zip(VECTORS, (nx, nu, ny), strict=True)}
+        vectors: dict[str, Any] = {name: tuple(Label(f"{name[:-1]}_{i}") for i in range(n)) for name, n in zip(VECTORS, (nx, nu, ny, 0), strict=True)}
         bounds: dict[str, Any] = {name: _bounds(None, sign, len(vectors[vector])) for name, (vector, sign) in BOUNDS.items()}
         return cls(role="unknown", **vectors, **bounds)
 
@@ -117,7 +119,7 @@ class Info:
         return found[0] if len(found) == 1 else None
 
 
-VECTORS = ("states", "inputs", "outputs")
+VECTORS = ("states", "inputs", "outputs", "disturbances")
 BOUNDS = {"lbu": ("inputs", -1), "ubu": ("inputs", 1), "lbx": ("states", -1), "ubx": ("states", 1)}
 
 

@@ -179,6 +179,8 @@ class Recording:
         assert self.info is not None
         for name in SCALARS:
             self._scalars(f"telemetry/{name}", times, np.array([getattr(sample, name) for sample in samples], float))
+        for i, label in enumerate(self.info.disturbances):
+            self._scalars(f"disturbance/{label.name}", times, np.array([sample.d[i] if i < len(sample.d) else np.nan for sample in samples]))
         self._scalars("slack", times, np.array([1e3 * sample.slack_s for sample in samples]))
         self._scalars("slack/period", times, np.full(len(times), 1e3 * self.info.dt_s))
         for lane in LANES:

@@ -37,6 +37,7 @@ Bound = Annotated[float, AllowInfNan(True)]
 Interval = Annotated[tuple[Bound, Bound], BeforeValidator(interval)]
 Increment = Annotated[Interval, AfterValidator(around_zero)]
 Weight = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
 Weights = Annotated[tuple[Weight, ...], BeforeValidator(sequence)]
 Duration = Annotated[float, Field(ge=0, le=10)]
 Period = Annotated[float, Field(ge=1e-4, le=10)]
@@ -104,6 +105,24 @@ class TimingSection(Section):
         default=None, description="age from which a state is not used, in seconds; max(2.5 dt_s, 0.05) up to 0.25 if left out"
     )
     valid_s: float = Field(default=0.25, gt=0, le=0.3, description="how long after a state its command may act, in seconds")
+
+
+class DisturbanceSection(Section):
+    """What is known of one disturbance."""
+
+    drift: Positive = Field(description="random walk, in the input's unit, or the state's / s, each / sqrt(s): larger follows faster, and noisier")
+    limit: Positive = Field(description="largest magnitude of the estimate, in the input's unit, or the state's / s")
+
+
+class ObserverSection(Section):
+    """An estimator of disturbances and of unmeasured states; what is left out is as `ObserverSettings` has it."""
+
+    disturbances: dict[str, DisturbanceSection] = Field(
+        default={}, description="by the name of an input, or of a state whose derivative is disturbed"
+    )
+    measured: Annotated[tuple[str, ...], Field(strict=False)] = Field(default=(), description="states that are measured; all if left out")
+    noise: dict[str, Positive] = Field(default={}, description="standard deviation of measured states by name, in the state's unit")
+    process: dict[str, Weight] = Field(default={}, description="random walk of states beside the model by name, in the state's unit / sqrt(s)")
 
 
 class BusSection(Section):

@@ -28,7 +28,7 @@ ALONE = {
     "rerun": {"service/blueprint.py", "service/outlet.py", "service/recording.py", "service/view.py"},
     "qpsolvers": {"rti_mpc/qp.py", "service/check.py"},
     "casadi": {
-        *(f"rti_mpc/{name}.py" for name in ("simultaneous", "sequential", "terminal", "obstacle")),
+        *(f"rti_mpc/{name}.py" for name in ("simultaneous", "sequential", "terminal", "obstacle", "disturbance", "observer")),
         *(
             f"rti_mpc/{name}.py"
             for name in (
@@ -57,13 +57,13 @@ FLOW: tuple[set[str], ...] = (
     {"heading", "sent", "mode"},
     {"trajectory"},
     {"model"},
-    {"pioneer_3dx", "integrator", "track", "obstacle"},
+    {"pioneer_3dx", "integrator", "track", "obstacle", "disturbance"},
     {"ocp"},
     {"linearization", "terminal"},
     {"transcription"},
     {"simultaneous", "sequential", "riccati"},
     {"codegen"},
-    {"qp", "prediction"},
+    {"qp", "prediction", "observer"},
     {"solver", "active_set"},
     {"rti"},
     {"controller"},

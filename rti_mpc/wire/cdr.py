@@ -264,7 +264,7 @@ def _encode_telemetry(message: Telemetry) -> bytes:
         )
     ]
     offset = TELEMETRY.size - START
-    for array in (m.x0, m.x, m.u, m.y_ref):
+    for array in (m.x0, m.x, m.u, m.y_ref, m.d):
         parts.append(_pack_vector(offset, array))
         offset += len(parts[-1])
     return b"".join(parts)
@@ -276,11 +276,12 @@ def _decode_telemetry(payload: bytes) -> Telemetry:
     x, end = _vector(payload, end, "x")
     u, end = _vector(payload, end, "u")
     y_ref, end = _vector(payload, end, "y_ref")
+    d, end = _vector(payload, end, "d")
     _finish(payload, end)
     if x0.size not in (0, nx):
         raise Refused("length", f"x0 must hold {nx} numbers, got {x0.size}")
     values[5:7] = _member(MODES, values[5], "mode"), _member(STATUSES, values[6], "status")
-    values += x0, _rows(x, nx, "x"), _rows(u, nu, "u"), _rows(y_ref, ny, "y_ref")
+    values += x0, _rows(x, nx, "x"), _rows(u, nu, "u"), _rows(y_ref, ny, "y_ref"), d
     return Telemetry(*values)
 
 

@@ -53,6 +53,10 @@ WRONG = [
     ("[ocp]", "[bus]\nconfig = 'none.json5'\n[ocp]", ["bus.config", "file", "none.json5"]),
     ("[ocp]", "[sim]\nx0 = { z = 1.0 }\n[ocp]", ["sim.x0.z", "no state", "x [m]"]),
     ("[ocp]", "[sim]\nparameters = { theta_7 = 1.0 }\n[ocp]", ["sim.parameters.theta_7", "no parameter", "theta_6"]),
+    ("[ocp]", "[observer.disturbances]\nv = { drift = 0.1, limit = 0.2 }\n[ocp]", ["observer.disturbances.v", "no input or state", "u_c [m/s]"]),
+    ("[ocp]", "[observer.disturbances]\nu_c = { drift = 0.0, limit = 0.2 }\n[ocp]", ["observer.disturbances.u_c.drift", "greater than 0", "0.0"]),
+    ("[ocp]", "[observer.disturbances]\nu_c = { drift = 0.1 }\n[ocp]", ["observer.disturbances.u_c.limit", "missing"]),
+    ("[ocp]", "[observer]\nmeasured = ['x', 'z']\n[ocp]", ["observer.measured.z", "no state", "x [m]"]),
     ("[model]", "[modle]", ["modle", "model"]),
     ("[model]", "[model", ["TOML", "line"]),
 ]
