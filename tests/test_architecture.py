@@ -54,8 +54,8 @@ ALONE = {
 FLOW: tuple[set[str], ...] = (
     {"errors", "array", "status", "robot_clock"},
     {"message", "polyline"},
-    {"heading", "sent", "mode"},
-    {"trajectory"},
+    {"heading", "sent", "mode", "schedule"},
+    {"trajectory", "guard"},
     {"model"},
     {"pioneer_3dx", "integrator", "track", "obstacle", "disturbance"},
     {"ocp"},

@@ -10,8 +10,9 @@ import pytest
 
 from rti_mpc.array import Array
 from rti_mpc.message import Command
+from rti_mpc.schedule import STEP_NS
 from rti_mpc.status import Mode, QpStatus
-from sim.actuator import BRAKE_STEP_NS, Actuator
+from sim.actuator import Actuator
 
 MS = 1_000_000
 SLEW = np.array([1.0, 2.0])
@@ -106,7 +107,7 @@ def test_flood_of_early_commands_is_bounded() -> None:
     robot = actuator()
     for seq in range(1000):
         robot.accept(command(seq=seq, stamp_ms=1000 * seq), 0)
-    assert len(robot._plans) <= 65
+    assert len(robot._schedule) <= 64
 
 
 def test_nothing_acts_once_a_plan_expires_and_the_ramp_ends_exactly_at_rest() -> None:
@@ -230,4 +231,4 @@ def test_switched_off_robot_ramps_to_rest_and_takes_no_command() -> None:
 
 
 def test_brake_steps_are_short_against_any_sample() -> None:
-    assert BRAKE_STEP_NS <= 10 * MS
+    assert STEP_NS <= 10 * MS

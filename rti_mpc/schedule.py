@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Which input acts when: the command contract as a function of time.
+
+Row ``i`` of the newest plan whose time has come acts from ``stamp_ns + i * period_ns``,
+never before it arrived; a plan ahead of its time waits while the previous one plays on.
+Nothing acts from the plan's end on: then the inputs ramp to rest inside the slew limits,
+and stay there. Whoever knows the plans knows what acts: the robot plays them, the guard
+tells from them what the robot does.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.message import Command
+
+STEP_NS = 10_000_000  # the ramp to rest is a staircase of such steps
+NEVER_NS = 2**63
+EVER_NS = -(2**62)
+WAITING = 64  # plans ahead of their time kept at most
+ROUNDING = 1e-9  # of a way to rest that is a whole number of steps
+
+
+def unfit(command: Command, nu: int, robot_epoch: int) -> str:
+    """Return why a command can be no plan for this life of a robot with `nu` inputs; empty if it can."""
+    if command.state_epoch != robot_epoch:
+        return "foreign_epoch"
+    if command.u.ndim != 2 or not len(command.u) or command.u.shape[1] != nu or command.period_ns <= 0:
+        return "wrong_shape"
+    return "" if np.isfinite(command.u).all() else "not_finite"
+
+
+def end_ns(command: Command) -> int:
+    """Return when the last row of a command ends, or its validity if that is earlier."""
+    return min(command.valid_until_ns, command.stamp_ns + len(command.u) * command.period_ns)
+
+
+@dataclass(slots=True)
+class Plan:
+    """
+    What acts from `start_ns` until `end_ns`.
+
+    Attributes:
+        stamp_ns: When row 0 would act.
+        period_ns: Time between rows.
+        u: Rows, shape ``(n, nu)``.
+        before: Input that acted before it, shape ``(nu,)``.
+    """
+
+    start_ns: int
+    end_ns: int
+    stamp_ns: int
+    period_ns: int
+    u: Array
+    before: Array
+
+    def row(self, t_ns: int) -> int:
+        """Return the row of a time."""
+        return max(0, min((t_ns - self.stamp_ns) // self.period_ns, len(self.u) - 1))
+
+
+class Schedule:
+    """
+    The plans of one robot.
+
+    The ramp to rest goes at the rate of the slew limits, less what a last row has
+    just used up of them: over any duration the change stays inside.
+    """
+
+    def __init__(self, u_rest: Array, slew: Array) -> None:
+        """
+        Begin at rest.
+
+        Args:
+            u_rest: Input at rest, shape ``(nu,)``.
+            slew: Largest rate of each input, shape ``(nu,)``, in the input's unit per s; infinite where there is no limit.
+        """
+        self.u_rest: Array = np.array(u_rest, dtype=np.float64)
+        self._slew = 1e-9 * np.asarray(slew, dtype=np.float64)  # per ns
+        self._plans: deque[Plan] = deque()  # by start; those of the past as far as `forget` has left them
+        self.brake(self.u_rest, EVER_NS)
+
+    def __len__(self) -> int:
+        """Return how many plans are kept."""
+        return len(self._plans)
+
+    def brake(self, u: Array, t_ns: int) -> None:
+        """Drop every plan: the inputs ramp to rest from `u`, shape ``(nu,)``, beginning at a time."""
+        self._plans.clear()
+        self._plans.append(Plan(t_ns, t_ns, t_ns, 1, np.array(u, dtype=np.float64)[None], np.array(u, dtype=np.float64)))
+
+    def add(self, command: Command, start_ns: int, end_ns: int) -> None:
+        """Put a command in line, from `start_ns` until `end_ns`; those that would start after it never act."""
+        plans, before = self._plans, self.at(start_ns - 1)[0].copy()
+        while plans and plans[-1].start_ns >= start_ns:
+            plans.pop()
+        plans.append(Plan(start_ns, end_ns, command.stamp_ns, command.period_ns, command.u.copy(), before))
+        if len(plans) > WAITING:
+            del plans[1]
+
+    def forget(self, t_ns: int) -> None:
+        """Drop what is over before a time."""
+        while len(self._plans) > 1 and self._plans[1].start_ns <= t_ns:
+            self._plans.popleft()
+
+    def at(self, t_ns: int) -> tuple[Array, int, bool]:
+        """Return the input that acts at a time, shape ``(nu,)``, until when it does, and whether no plan acts."""
+        change_ns = NEVER_NS
+        for plan in reversed(self._plans):
+            if plan.start_ns <= t_ns:
+                break
+            change_ns = plan.start_ns
+        else:
+            return plan.before, change_ns, True  # a time that is forgotten
+        if t_ns < plan.end_ns:
+            row = plan.row(t_ns)
+            row_end_ns = plan.stamp_ns + (row + 1) * plan.period_ns if row < len(plan.u) - 1 else plan.end_ns
+            return plan.u[row], min(change_ns, row_end_ns, plan.end_ns), False
+        u, step_ns = self._ramp(plan, t_ns)
+        return u, min(change_ns, step_ns), True
+
+    def _ramp(self, plan: Plan, t_ns: int) -> tuple[Array, int]:
+        """Return the input at a time after the end of a plan, and when the ramp steps next."""
+        row = plan.row(plan.end_ns - 1)
+        row_ns = plan.stamp_ns + row * plan.period_ns
+        last = plan.u[row]
+        jump = last - (plan.u[row - 1] if row and row_ns > plan.start_ns else plan.before)
+        way = self.u_rest - last
+        # A last row that has gone this way itself goes on counting until its jump is paid for, which it is after its period.
+        paid_ns = np.where(jump * way > 0.0, np.minimum(np.abs(jump) / self._slew, plan.period_ns), 0.0)
+        begin_ns = np.where(paid_ns > 0.0, np.maximum(0.0, max(plan.start_ns, row_ns) + STEP_NS - plan.end_ns + paid_ns), 0.0)  # after the end
+        after_ns = t_ns - plan.end_ns
+        steps = np.floor((after_ns - begin_ns) / STEP_NS) + 1.0
+        with np.errstate(invalid="ignore"):  # no slew limit, no step: 0 * inf is no way at all
+            reach = np.where(steps > 0.0, steps * (STEP_NS * self._slew), 0.0)
+        rests = np.abs(way) <= reach * (1.0 + ROUNDING)
+        if rests.all():
+            return self.u_rest, NEVER_NS
+        next_ns = begin_ns + STEP_NS * np.maximum(steps, 0.0)
+        return np.where(rests, self.u_rest, last + np.clip(way, -reach, reach)), plan.end_ns + int(np.ceil(next_ns[~rests].min()))
