@@ -91,7 +91,7 @@ class Controller:
         self._track = Track(model, ocp.N, self._dt_ns)
         self._arriving: Reference | None = None  # waits for a state, to start at or to put its angles next to
         self._clock = RobotClock()
-        self._sent = Sent(self._u_rest, ocp.lbdu, ocp.ubdu, self._dt_ns, commands=2 + -(-self._delay_ns // self._dt_ns))
+        self._sent = Sent(self._u_rest, ocp.lbdu, ocp.ubdu, self._dt_ns)
         self._state: State | None = None
         self._x: Array = np.zeros(model.nx)  # the last state, angles unwrapped
         self._act_ns = 0  # t_k

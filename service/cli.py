@@ -12,7 +12,7 @@ import inspect
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -53,19 +53,20 @@ def options(
     return {name: tuple(value) if isinstance(value, list) else value for name, value in given.items() if value is not None}
 
 
-def process(command: Callable[..., int | None]) -> Callable[..., None]:
+def process(command: Callable[..., int | None], *, with_model: bool = True) -> Callable[..., None]:
     """
     Register a process of a robot: a command with CONFIG and Zenoh's options besides its own.
 
     Args:
         command: Takes the configuration, how to join the bus, and its own options; returns an exit status, None for 0.
+        with_model: Whether the configuration is checked against the model.
     """
     shared = inspect.signature(options, eval_str=True).parameters
     own = list(inspect.signature(command, eval_str=True, locals={"BusSettings": Any}).parameters.values())[2:]
 
     @wraps(command)
     def run(config: Path = SHIPPED, **given: Any) -> None:
-        loaded = load(config)
+        loaded = load(config, with_model=with_model)
         overrides = options(**{name: given.pop(name) for name in shared})
         raise typer.Exit(command(loaded, replace(loaded.bus_settings(), **overrides), **given) or 0)
 
@@ -87,6 +88,14 @@ def run(config: Config, bus: BusSettings) -> int:
     return main(config, bus)
 
 
+@partial(process, with_model=False)
+def guard(config: Config, bus: BusSettings) -> int:
+    """Stand between controller and robot: pass on what is fresh and inside the limits, brake when nothing is."""
+    from service.guard import main
+
+    return main(config, bus)
+
+
 @process
 def sim(
     config: Config,
@@ -102,7 +111,7 @@ def sim(
 
     listen = bus.listen or config.bus.listen or (bus.connect if bus.mode == "peer" and bus.config is None else ())
     settings = RobotSettings(**config.with_initial_state(x0 or []).robot_settings())
-    main(settings, replace(bus, listen=listen), config.keys(), speed=speed, log=log, duration_s=duration)
+    main(settings, replace(bus, listen=listen), config.keys(), speed=speed, log=log, duration_s=duration, guarded=config.guard.enabled)
 
 
 @process

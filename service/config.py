@@ -13,7 +13,7 @@ import hashlib
 import json
 import math
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,9 +21,10 @@ from pydantic import Field, ValidationError
 
 from rti_mpc.errors import ConfigError, OcpError
 from service.refusal import explain, unknown_name
-from service.schema import BusSection, ModelSection, ObserverSection, OcpSection, Section, SimSection, SolverSection, TimingSection
+from service.schema import BusSection, GuardSection, ModelSection, ObserverSection, OcpSection, Section, SimSection, SolverSection, TimingSection
 
 if TYPE_CHECKING:
+    from rti_mpc.guard import Limits
     from rti_mpc.model import Model, Signal
     from rti_mpc.observer import Observer
     from rti_mpc.ocp import Ocp
@@ -43,6 +44,7 @@ class Config(Section):
     solver: SolverSection = Field(default=SolverSection(), description="the QP solver's settings")
     timing: TimingSection = Field(default=TimingSection(), description="delays and timeouts")
     observer: ObserverSection = Field(default=ObserverSection(), description="estimator of disturbances and of unmeasured states; none if left out")
+    guard: GuardSection = Field(default=GuardSection(), description="the guard between controller and robot")
     bus: BusSection = Field(default=BusSection(), description="the Zenoh session")
     sim: SimSection = Field(default=SimSection(), description="the simulated robot")
 
@@ -58,8 +60,8 @@ class Config(Section):
 
     @property
     def config_hash(self) -> int:
-        """64 bits of everything that decides a command: not of the bus, not of the simulation."""
-        content = self.model_dump(mode="json", exclude={"bus", "sim"})
+        """64 bits of everything that decides a command: not of the bus, the guard or the simulation."""
+        content = self.model_dump(mode="json", exclude={"bus", "guard", "sim"})
         return int.from_bytes(hashlib.sha256(json.dumps(content, sort_keys=True).encode()).digest()[:8], "little")
 
     def build_model(self) -> Model:
@@ -75,9 +77,9 @@ class Config(Section):
 
         model = with_disturbances(self.build_model(), self.observer.disturbances)
         weights, limits = self.ocp.weights, self.ocp.bounds
-        lbu, ubu = bounds(limits.inputs, model.inputs)
-        lbdu, ubdu = bounds(limits.increments, model.inputs)
-        lbx, ubx = bounds(limits.states, model.states)
+        lbu, ubu = bounds(limits.inputs, names(model.inputs))
+        lbdu, ubdu = bounds(limits.increments, names(model.inputs))
+        lbx, ubx = bounds(limits.states, names(model.states))
         soft: dict[str, Any] = {} if limits.soft_weight is None else {"z": limits.soft_weight}
         return Ocp(
             model,
@@ -117,7 +119,7 @@ class Config(Section):
     def robot_settings(self) -> dict[str, Any]:
         """Return what `sim.settings.RobotSettings` is made from; the slew limits are those of the increments."""
         model, sim = self.build_model().with_parameters(**self.sim.parameters), self.sim
-        increments = zip(*bounds(self.ocp.bounds.increments, model.inputs), strict=True)
+        increments = zip(*bounds(self.ocp.bounds.increments, names(model.inputs)), strict=True)
         return {
             "state_period_s": self.ocp.dt_s,
             **sim.model_dump(exclude_none=True, exclude={"parameters"}),
@@ -126,6 +128,26 @@ class Config(Section):
             "noise_std": [sim.noise_std.get(state.name, 0.0) for state in model.states],
             "slew": [min(-lower, upper) / self.ocp.dt_s for lower, upper in increments],
         }
+
+    def guard_limits(self) -> Limits:
+        """Return what the guard lets pass; its configuration is enough, no model is loaded."""
+        import numpy as np
+
+        from rti_mpc.guard import Limits
+
+        inputs = tuple(self.ocp.bounds.inputs)
+        lbu, ubu = bounds(self.ocp.bounds.inputs, inputs)
+        lbdu, ubdu = bounds(self.ocp.bounds.increments, inputs)
+        return Limits(
+            u_rest=np.array([self.guard.u_rest.get(name, 0.0) for name in inputs]),
+            lbu=np.array(lbu),
+            ubu=np.array(ubu),
+            lbdu=np.array(lbdu),
+            ubdu=np.array(ubdu),
+            dt_s=self.ocp.dt_s,
+            delay_s=self.timing.delay_s,
+            stale_s=self.stale_s,
+        )
 
     def with_initial_state(self, assignments: Sequence[str]) -> Config:
         """
@@ -169,15 +191,24 @@ def spread(values: tuple[float, ...], length: int) -> tuple[float, ...]:
     return values if len(values) == length else values * length
 
 
-def bounds(table: Mapping[str, tuple[float, float]], signals: tuple[Signal, ...]) -> tuple[list[float], list[float]]:
-    """Return lower and upper bounds in the order of the signals."""
-    pairs = [table.get(signal.name, (-math.inf, math.inf)) for signal in signals]
+def bounds(table: Mapping[str, tuple[float, float]], names: Iterable[str]) -> tuple[list[float], list[float]]:
+    """Return lower and upper bounds in the order of the names."""
+    pairs = [table.get(name, (-math.inf, math.inf)) for name in names]
     return [lower for lower, _ in pairs], [upper for _, upper in pairs]
 
 
-def load(path: Path) -> Config:
+def names(signals: Iterable[Signal]) -> list[str]:
+    """Return the names of signals."""
+    return [signal.name for signal in signals]
+
+
+def load(path: Path, *, with_model: bool = True) -> Config:
     """
     Read, check and freeze a robot's configuration.
+
+    Args:
+        path: TOML file.
+        with_model: Whether to check it against the model, too, which loads CasADi.
 
     Raises:
         ConfigError: One line: the file, the key, what must hold, what was got.
@@ -186,7 +217,9 @@ def load(path: Path) -> Config:
         config = Config.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
         if config.bus.config is not None:
             config = config.model_copy(update={"bus": config.bus.model_copy(update={"config": path.parent / config.bus.config})})
-        check(config)
+        check_tree(config)
+        if with_model:
+            check_model(config)
     except OSError as error:
         raise ConfigError(f"{path}: must be a readable file, got {error.strerror}") from error
     except ValidationError as error:
@@ -198,17 +231,14 @@ def load(path: Path) -> Config:
     return config
 
 
-def check(config: Config) -> None:
+def check_tree(config: Config) -> None:
     """
-    Check what only the whole, the model or the file system knows.
+    Check what only the whole or the file system knows.
 
     Raises:
-        ConfigError: A key does not fit the others or the model.
-        OcpError: The problem is ill-posed in some other way.
+        ConfigError: A key does not fit the others.
     """
-    from rti_mpc.model import find_model
-
-    ocp, sim, observer = config.ocp, config.sim, config.observer
+    ocp = config.ocp
     if config.N_u > ocp.N:
         raise ConfigError(f"ocp.N_u must be at most ocp.N = {ocp.N}, got {ocp.N_u}")
     for key, values, length in (("delta", ocp.weights.delta, ocp.N), ("lambda", ocp.weights.lambda_, config.N_u)):
@@ -216,6 +246,26 @@ def check(config: Config) -> None:
             raise ConfigError(f"ocp.weights.{key} must be a number or a list of {length}, one a stage, got {list(values)}")
     if config.bus.config is not None and not config.bus.config.is_file():
         raise ConfigError(f"bus.config must be a file, got {config.bus.config}")
+    if config.guard.enabled:
+        for name in ocp.weights.R:
+            if name not in ocp.bounds.inputs:
+                raise ConfigError(f"ocp.bounds.inputs must bound every input where a guard is enabled, {name} is missing")
+        for name, (lower, upper) in ocp.bounds.increments.items():
+            if not lower < 0.0 < upper:
+                raise ConfigError(f"ocp.bounds.increments.{name} must hold lower < 0 < upper where a guard is enabled, or it could not brake")
+
+
+def check_model(config: Config) -> None:
+    """
+    Check what only the model knows.
+
+    Raises:
+        ConfigError: A key does not fit the model.
+        OcpError: The problem is ill-posed in some other way.
+    """
+    from rti_mpc.model import find_model
+
+    ocp, sim, observer = config.ocp, config.sim, config.observer
     try:
         model = find_model(config.model.name)
     except OcpError as error:
@@ -231,6 +281,7 @@ def check(config: Config) -> None:
         ("observer.measured", dict.fromkeys(observer.measured), "state", model.states),
         ("observer.noise", observer.noise, "state", model.states),
         ("observer.process", observer.process, "state", model.states),
+        ("guard.u_rest", config.guard.u_rest, "input", model.inputs),
         ("sim.x0", sim.x0, "state", model.states),
         ("sim.noise_std", sim.noise_std, "state", model.states),
         ("sim.parameters", sim.parameters, "parameter", model.parameters),
@@ -238,4 +289,10 @@ def check(config: Config) -> None:
     for key, table, kind, signals in tables:
         if wrong := unknown_name(key, table, kind, signals, complete=key.startswith("ocp.weights")):
             raise ConfigError(wrong)
+    if config.guard.enabled:
+        inputs = names(model.inputs)
+        if list(ocp.bounds.inputs) != inputs:
+            raise ConfigError(f"ocp.bounds.inputs must be in the model's order {inputs} where a guard is enabled, got {list(ocp.bounds.inputs)}")
+        if tuple(config.guard.u_rest.get(name, 0.0) for name in inputs) != model.u_rest:
+            raise ConfigError(f"guard.u_rest must be the model's {dict(zip(inputs, model.u_rest, strict=True))}, got {config.guard.u_rest}")
     config.build_ocp()

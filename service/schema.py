@@ -125,6 +125,19 @@ class ObserverSection(Section):
     process: dict[str, Weight] = Field(default={}, description="random walk of states beside the model by name, in the state's unit / sqrt(s)")
 
 
+class GuardSection(Section):
+    """
+    The guard, a process of its own between controller and robot.
+
+    It loads no model: bounds and slew limits are those of ``ocp.bounds``, whose
+    ``inputs`` must then name every input, in the model's order.
+    """
+
+    enabled: bool = Field(default=False, description="whether the robot takes what the guard passes on, not what the controller commands")
+    tick_s: float = Field(default=0.01, ge=1e-3, le=0.01, description="between two looks at the clock, in seconds of the wall")
+    u_rest: dict[str, float] = Field(default={}, description="inputs at which the robot stands by name, in the input's unit; zero if left out")
+
+
 class BusSection(Section):
     """The Zenoh session of each process; what is left out is as `BusSettings` has it, and the command line overrides it."""
 

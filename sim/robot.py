@@ -64,6 +64,7 @@ def main(
     speed: float = 1.0,
     log: Path | None = None,
     duration_s: float | None = None,
+    guarded: bool = False,
     info: dict[str, Any] | None = None,
     stop: Event | None = None,
 ) -> RobotSummary:
@@ -77,6 +78,7 @@ def main(
         speed: Seconds of robot time per second.
         log: CSV file to write, see `sim.log`.
         duration_s: Robot time after which it stops by itself.
+        guarded: Whether it takes `actuation`, a guard's, and no `command`.
         info: Further entries of its description.
         stop: Stops the robot when set; SIGINT and SIGTERM if there is none.
 
@@ -85,7 +87,7 @@ def main(
     """
     stop = stop or stop_on_signals()
     with Bus(bus_settings, keys, stop=stop) as bus:
-        robot = Robot(settings, bus, speed, log)
+        robot = Robot(settings, bus, keys.actuation if guarded else keys.command, speed, log)
         life = {"role": ROLE, "epoch": robot.body.epoch, "speed": speed, "state_period_s": settings.state_period_s}
         bus.publish_json(keys.info(ROLE), {**describe(settings.model), **(info or {}), **life})
         bus.alive(ROLE)
@@ -115,7 +117,7 @@ class Robot:
         clock: Its clock.
     """
 
-    def __init__(self, settings: RobotSettings, bus: Bus, speed: float, log: Path | None) -> None:
+    def __init__(self, settings: RobotSettings, bus: Bus, key: str, speed: float, log: Path | None) -> None:
         # Milliseconds: a robot restarted within a second is another one.
         self.body = Lockstep(settings, epoch=time.time_ns() // 1_000_000)
         self._log = Log(log, settings.model)
@@ -125,7 +127,7 @@ class Robot:
         self._intake = Intake(Command, 1e-9 * STALE_NS / speed, {"u": settings.model.nu})
         self._sent = 0
         self._held_up_ns = 0
-        Thread(target=self._receive, args=(bus.subscriber(bus.keys.command, capacity=8),), daemon=True).start()
+        Thread(target=self._receive, args=(bus.subscriber(key, capacity=8),), daemon=True).start()
         self.clock = Clock(speed)
 
     def run(self, stop: Event, until_ns: int | None = None) -> None:

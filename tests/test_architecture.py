@@ -54,8 +54,8 @@ ALONE = {
 FLOW: tuple[set[str], ...] = (
     {"errors", "array", "status", "robot_clock"},
     {"message", "polyline"},
-    {"heading", "sent", "mode", "schedule"},
-    {"trajectory", "guard"},
+    {"heading", "mode", "schedule"},
+    {"trajectory", "guard", "sent"},
     {"model"},
     {"pioneer_3dx", "integrator", "track", "obstacle", "disturbance"},
     {"ocp"},

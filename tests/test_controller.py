@@ -145,12 +145,12 @@ def test_telemetry_describes_the_sample_of_its_command(on_the_circle: tuple[Cont
     np.testing.assert_allclose(after.x[0], after.x0, atol=1e-5)
     t = 1e-9 * command.stamp_ns + 0.1 * np.arange(1, 13)
     np.testing.assert_allclose(after.y_ref[:, :2], circle().position(t), atol=1e-4)  # rows of 20 ms, interpolated
-    assert after.cost == pytest.approx(cost(after.x, after.u, after.y_ref, controller), rel=1e-9)
+    assert after.cost == pytest.approx(cost(after.x, after.u, after.y_ref, controller._sent.at(after.stamp_ns - 1)[0]), rel=1e-9)
 
 
-def cost(x: Array, u: Array, y_ref: Array, controller: Controller) -> float:
+def cost(x: Array, u: Array, y_ref: Array, u_prev: Array) -> float:
     e = x[1:, :3] - y_ref
-    du = np.diff(np.vstack([controller._sent._commands[-2].u[0], u]), axis=0)
+    du = np.diff(np.vstack([u_prev, u]), axis=0)
     return float(28 * (e**2 @ [1, 1, 0]).sum() + 0.8 * (du**2).sum())
 
 

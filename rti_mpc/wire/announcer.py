@@ -21,10 +21,12 @@ class Announcer:
         self._seq = 0
         self._last_ns: dict[str, int] = {}  # by code
 
-    def say(self, severity: Severity, code: str, text: str, stamp_ns: int) -> None:
-        """Publish an event; a fault not, if one of its code just was."""
+    def say(self, severity: Severity, code: str, text: str, stamp_ns: int) -> bool:
+        """Publish an event; a fault not, if one of its code just was. Return whether it was published."""
         now_ns = time.monotonic_ns()
         if severity is Severity.INFO or now_ns - self._last_ns.get(code, -PERIOD_NS) >= PERIOD_NS:
             self._last_ns[code] = now_ns
             self._seq += 1
             self._publisher.put(Event(self._epoch, self._seq, stamp_ns, self._role, severity, code, text))
+            return True
+        return False

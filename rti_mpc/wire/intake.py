@@ -54,14 +54,8 @@ class Intake(Generic[M]):
         self._pending: dict[str, Notice] = {}
         self._said_ns: dict[str, int] = {}
 
-    def accept(self, received: Payload, now_ns: int) -> M | None:
-        """
-        Message in a payload; None if it is malformed, repeated or not from our source.
-
-        Args:
-            received: Payload and encoding as they came.
-            now_ns: Receiver's monotonic clock.
-        """
+    def read(self, received: Payload) -> M | None:
+        """Message in a payload, whoever sent it; None if it is malformed."""
         try:
             if received.encoding != self._encoding:
                 raise self._encoding_error(received.encoding)
@@ -71,6 +65,19 @@ class Intake(Generic[M]):
         except Refused as error:
             self.refused[error.reason] += 1
             self._note(Severity.WARNING, "message_refused", f"{error}; {self.refused.total()} refused so far")
+            return None
+        return message
+
+    def accept(self, received: Payload, now_ns: int) -> M | None:
+        """
+        Message in a payload; None if it is malformed, repeated or not from our source.
+
+        Args:
+            received: Payload and encoding as they came.
+            now_ns: Receiver's monotonic clock.
+        """
+        message = self.read(received)
+        if message is None:
             return None
         before = self.source.epoch
         verdict = self.source.accept(message.epoch, message.seq, now_ns)

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The guard as a process: no model, no solver, nothing of CasADi, OSQP or SciPy.
+
+One thread waits for commands and passes them on, one waits for states, the main
+one ticks. Each holds a lock for microseconds. What the guard decides is
+`rti_mpc.guard`'s.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import sys
+import time
+from collections.abc import Callable
+from threading import Event, Lock, Thread
+
+import rti_mpc
+from rti_mpc.errors import ConfigError, MessageError
+from rti_mpc.guard import Guard
+from rti_mpc.message import Command, Severity, State
+from rti_mpc.wire.announcer import Announcer
+from rti_mpc.wire.bus import Bus, Received, Subscriber
+from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.interrupt import stop_on_signals
+from rti_mpc.wire.session import BusSettings
+from service.config import Config
+
+ROLE = "guard"
+HEARING_S = 0.5  # for which a starting guard listens for another
+RAMP_S = 3.0  # of a guard that is being stopped, to bring the robot to rest, at most
+WAITING = 8  # commands or states that wait at most, while this process is held up
+
+log = logging.getLogger(ROLE)
+
+
+def main(config: Config, bus_settings: BusSettings, *, stop: Event | None = None) -> int:
+    """
+    Guard one robot until stopped.
+
+    Args:
+        config: The robot, of whose model no more is known than its inputs' bounds.
+        bus_settings: How to join the bus.
+        stop: Stops the guard when set; SIGINT and SIGTERM if there is none.
+
+    Returns:
+        Exit status: 0 when stopped, 1 when another guard is there or an unforeseen error ended this one.
+
+    Raises:
+        ConfigError: The configuration has no guard, or an endpoint cannot be had.
+    """
+    if not config.guard.enabled:
+        raise ConfigError("guard.enabled must be true for the robot to take what a guard passes on, got false")
+    stop = stop or stop_on_signals()
+    with Bus(bus_settings, config.keys(), stop=stop) as bus:
+        heard = bus.subscriber(bus.keys.actuation)
+        if bus.is_alive(ROLE, HEARING_S):
+            print(f"rti-mpc: {config.robot} already has a guard: stop it first, or give this robot another name", file=sys.stderr)
+            return 1
+        epoch = max(time.time_ns() // 1_000_000_000, epoch_of(heard.try_recv()) + 1)
+        process = Process(config, bus, epoch)
+        bus.publish_json(bus.keys.info(ROLE), {**describe(config), "epoch": epoch})
+        bus.alive(ROLE)
+        log.info("epoch %d guards %s", epoch, config.robot)
+        return process.run(stop)
+
+
+def epoch_of(received: Received | None) -> int:
+    """Return the epoch of a command as it came, 0 if there is none."""
+    try:
+        return 0 if received is None else decode(Command, received.payload).epoch
+    except MessageError:
+        return 0
+
+
+def describe(config: Config) -> dict[str, object]:
+    """Describe a guard for ``info``: what it lets pass, per input; null where there is no limit."""
+    limits, bounds = config.guard_limits(), config.ocp.bounds
+    return {
+        "role": ROLE,
+        "version": rti_mpc.__version__,
+        "inputs": [{"name": name, "unit": "1", "angle": False} for name in bounds.inputs],
+        **{
+            name: [value if abs(value) < float("inf") else None for value in getattr(limits, name).tolist()]
+            for name in ("u_rest", "lbu", "ubu", "lbdu", "ubdu")
+        },
+        "dt_s": limits.dt_s,
+        "tick_s": config.guard.tick_s,
+        "config_hash": config.config_hash,
+    }
+
+
+class Process:
+    """One life of the guard on the bus."""
+
+    def __init__(self, config: Config, bus: Bus, epoch: int) -> None:
+        limits, keys = config.guard_limits(), bus.keys
+        self._guard = Guard(limits, epoch=epoch, config_hash=config.config_hash)
+        self._tick_s = config.guard.tick_s
+        self._lock = Lock()
+        self._crashed = Event()
+        self._announcer = Announcer(bus, ROLE, epoch)
+        self._actuation = bus.publisher(keys.actuation, Command, realtime=True)
+        self._states = Intake(State, config.stale_s)
+        self._commands = Intake(Command, config.stale_s, {"u": len(limits.u_rest)})
+        self._threads = [
+            Thread(target=self._follow, args=(act, bus.subscriber(key, capacity=WAITING)), name=act.__name__, daemon=True)
+            for act, key in ((self._state, keys.state), (self._command, keys.command))
+        ]
+
+    def run(self, stop: Event) -> int:
+        """Guard until stopped; then tell the robot to ramp to rest, and to stand."""
+        gc.collect()
+        gc.freeze()
+        for thread in self._threads:
+            thread.start()
+        while not stop.wait(self._tick_s) and not self._crashed.is_set():
+            self._tick()
+        with self._lock:
+            self._guard.stop(time.monotonic_ns())
+        deadline_s = time.monotonic() + RAMP_S
+        while not self._guard.at_rest and time.monotonic() < deadline_s:
+            self._tick()
+            time.sleep(self._tick_s)
+        self._tick()
+        log.info("stopped")
+        return int(self._crashed.is_set())
+
+    def _state(self, received: Received) -> None:
+        """Take a state in."""
+        with self._lock:
+            local_ns = time.monotonic_ns()
+            if (state := self._states.accept(received, local_ns)) is not None:
+                self._guard.receive_state(state, local_ns)
+
+    def _command(self, received: Received) -> None:
+        """Pass a command on at once, if it is in order."""
+        command = self._commands.read(received)
+        if command is None:
+            return
+        with self._lock:
+            passed = self._guard.receive_command(command, time.monotonic_ns())
+            if passed is not None:
+                self._actuation.put(passed)
+
+    def _tick(self) -> None:
+        """Look after the time, and say what there is to say."""
+        with self._lock:
+            local_ns = time.monotonic_ns()
+            told = self._guard.tick(local_ns)
+            if told is not None:
+                self._actuation.put(told)
+        stamp_ns = self._guard.robot_now_ns(local_ns)
+        while self._guard.notices:
+            notice = self._guard.notices.popleft()
+            if self._announcer.say(notice.severity, notice.code, notice.text, stamp_ns):
+                log.log(LEVELS[notice.severity], "%s", notice.text)
+        for intake in (self._states, self._commands):
+            for refusal in intake.notices(local_ns):
+                log.warning("%s", refusal.text)
+                self._announcer.say(refusal.severity, refusal.code, refusal.text, stamp_ns)
+
+    def _follow(self, act: Callable[[Received], None], subscriber: Subscriber) -> None:
+        """Run a loop; what nobody foresaw ends in a ramp to rest and a non-zero exit, for the supervisor to restart."""
+        try:
+            for received in iter(subscriber.recv, None):
+                act(received)
+        except Exception:
+            log.exception("stopping after an unforeseen error")
+            self._crashed.set()
+
+
+LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
