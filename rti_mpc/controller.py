@@ -100,7 +100,7 @@ class Controller:
         self._failed = 0  # samples in a row without a usable QP
         self._stopped = ""  # why an operator's stop is latched
         self._command: Command | None = None
-        self._planned = (rti.x.copy(), rti.y_ref.copy())  # states and reference of a command, for telemetry
+        self._planned = (rti.x.copy(), rti.y_ref.copy(), 0.0)  # states, reference and cost of a command, for telemetry
         self._planned_seq = 0  # of that command
         self._valid_until_ns = 0
 
@@ -223,7 +223,7 @@ class Controller:
     def _keep(self) -> None:
         """Keep the plan of the last command for telemetry, before the next one overwrites it."""
         if self._planned_seq != self._seq:
-            self._planned = (self._rti.x.copy(), self._rti.y_ref.copy())
+            self._planned = (self._rti.x.copy(), self._rti.y_ref.copy(), self._rti.cost)
             self._planned_seq = self._seq
 
     def _load(self, *, shift: bool) -> None:
@@ -356,7 +356,7 @@ class Controller:
             iterations=solver.iterations,
             res_prim=solver.res_prim,
             res_dual=solver.res_dual,
-            cost=self._rti.cost,
+            cost=self._planned[2],
             violation=self._rti.violation,
             prepare_us=prepare_us,
             feedback_us=feedback_us,

@@ -178,6 +178,21 @@ def pattern(weight: np.ndarray[Any, Any]) -> ca.DM:
     return ca.DM(sp.csc_matrix(((weight != 0) | np.eye(len(weight), dtype=bool)).astype(float)))
 
 
+def shift(ocp: Ocp) -> ca.Function:
+    """Build ``(x, u, p) -> (x+, u+)``: a plan moved on by one stage, its last input repeated, with the state the model predicts."""
+    lin = Linearization(ocp)
+    x_next = ocp.phi()(lin.x[:, -1], lin.u[:, -1], lin.p[:, -1])
+    shifted = [ca.horzcat(lin.x[:, 1:], x_next), ca.horzcat(lin.u[:, 1:], lin.u[:, -1])]
+    return ca.Function("shift", [lin.x, lin.u, lin.p], shifted)
+
+
+def change(ocp: Ocp, u: Any, before: Any) -> Any:
+    """Return the size of a step as an expression: what an input changes by at most, relative to half its range, or to its unit if that has no end."""
+    half = 0.5 * (ocp.ubu - ocp.lbu)
+    scale = ca.repmat(ca.DM(np.where(np.isfinite(half), half, 1.0)), 1, u.shape[1])
+    return ca.mmax(ca.fabs(u - before) / scale)
+
+
 def plan_cost(ocp: Ocp) -> ca.Function:
     """Build ``(x, u, u_prev, y_ref, p, *WEIGHTS) -> cost``: the cost (4) of a plan and its penalties, nothing of it linearized."""
     lin = Linearization(ocp)

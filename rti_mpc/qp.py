@@ -31,12 +31,13 @@ class Guess:
     Attributes:
         sample: x, u, u_prev, y_ref, p, and the weights, in the order of `Linearization.arguments`.
         x0: State embedded at node 0, shape ``(nx,)``.
-        plan: States and inputs after the full step, shapes as the guess, and by how much the states exceed their bounds, shape ``(1,)``.
+        plan: States and inputs after the full step, shapes as the guess; by how much the states exceed their bounds, and the size of the step, see
+            `rti_mpc.linearization.change`, each of shape ``(1,)``.
     """
 
     sample: tuple[Array, ...]
     x0: Array
-    plan: tuple[Array, Array, Array]
+    plan: tuple[Array, Array, Array, Array]
 
 
 class Qp:

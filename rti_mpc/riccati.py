@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from rti_mpc.linearization import Linearization
+from rti_mpc.linearization import Linearization, change, shift
 from rti_mpc.ocp import Ocp
 from rti_mpc.transcription import INFINITY
 
@@ -43,16 +43,16 @@ class Recursion:
 
     Attributes:
         linearize: ``(x, u, u_prev, y_ref, p, *WEIGHTS) -> stages``.
+        advance: ``(x, u, u_prev, y_ref, p, *WEIGHTS, places) -> (x+, u+, places+, stages)``: the same of a plan moved on by one stage.
         gains: ``(stages, u, *WEIGHTS, places, stiff) -> gains``; `stiff` is the weight of the penalty that holds what is at its bound.
-        roll_out: ``(x, u, u_prev, x0, stages, gains, *WEIGHTS, places, stiff) -> (x+, u+, violation, verdict, places+)``: the full step, by how much
-            it exceeds softened bounds, how many places change, and a number that is finite if and only if data, gains and plan are.
-        shapes: Of the three kinds of places, as arrays of rows.
+        roll_out: ``(x, u, u_prev, x0, stages, gains, *WEIGHTS, places, stiff) -> (x+, u+, violation, change, changes, places+)``: the full step, by
+            how much it exceeds softened bounds, its size, and how many places change: -1 if data, gains or plan are not finite.
     """
 
     linearize: ca.Function
+    advance: ca.Function
     gains: ca.Function
     roll_out: ca.Function
-    shapes: tuple[tuple[int, int], ...]
 
 
 def riccati(ocp: Ocp) -> Recursion:
@@ -66,6 +66,9 @@ def riccati(ocp: Ocp) -> Recursion:
     kinds = (lin.u, lin.u, lin.g)
     flat = ca.MX.sym("places", sum(kind.numel() for kind in kinds))
     places = divided(flat, kinds)
+    x, u = shift(ocp)(lin.x, lin.u, lin.p)
+    moved = ca.veccat(*(ca.horzcat(kind[:, 1:], kind[:, -1]) for kind in places))
+    advance = ca.Function("advance", [*lin.arguments, flat], [x, u, moved, linearize(x, u, *lin.arguments[2:])])
     stiff = ca.MX.sym("stiff")
     weights = list(lin.w.values())
     gains = ca.Function("gains", [stages, lin.u, *weights, flat, stiff], [backward(ocp, lin, forms, places, stiff)])
@@ -73,7 +76,7 @@ def riccati(ocp: Ocp) -> Recursion:
     found = ca.MX.sym("gains", *gains.size_out(0))
     rolled = forward(ocp, lin, forms, x0, found, places, stiff)
     roll_out = ca.Function("roll_out", [lin.x, lin.u, lin.u_prev, x0, stages, found, *weights, flat, stiff], rolled)
-    return Recursion(linearize, gains, roll_out, tuple(kind.shape[::-1] for kind in kinds))
+    return Recursion(linearize, advance, gains, roll_out)
 
 
 def divided(flat: ca.MX, like: list[ca.MX] | tuple[ca.MX, ...]) -> list[ca.MX]:
@@ -226,7 +229,8 @@ def forward(ocp: Ocp, lin: Linearization, forms: list[ca.MX], x0: ca.MX, gains: 
         found[2].append(acts)
     x_plan, u_plan = ca.horzcat(*states), ca.horzcat(*inputs)
     finite = forms[-1] + ca.sum1(ca.vec(u_plan)) + ca.sumsqr(x_plan) ** 2  # overflows for what is no state
-    return [x_plan, u_plan, verdict[1], ca.vertcat(verdict[0], finite), ca.veccat(*(ca.horzcat(*kind) for kind in found))]
+    changes = ca.if_else(ca.fabs(finite) < np.inf, verdict[0], -1)
+    return [x_plan, u_plan, verdict[1], change(ocp, u_plan, lin.u), changes, ca.veccat(*(ca.horzcat(*kind) for kind in found))]
 
 
 def forward_stage(ocp: Ocp, lin: Linearization, free: bool) -> ca.Function:
@@ -238,7 +242,7 @@ def forward_stage(ocp: Ocp, lin: Linearization, free: bool) -> ca.Function:
     increment, u, before, place, pace, lbu, ubu, lbdu, ubdu = (
         ca.SX.sym(name, nu) for name in ("increment", "u", "before", "place", "pace", "lbu", "ubu", "lbdu", "ubdu")
     )
-    changes, worst = verdict[0], verdict[1]
+    changes, worst = ca.vertsplit(verdict)
 
     K = ca.reshape(gain, nu, n + 1)
     du = -(K[:, :n] @ s + K[:, n]) if free else s[nx:]

@@ -5,7 +5,9 @@ The real-time iteration: one Newton-type step of the OCP a sample, in two phases
 Preparation needs no state: it shifts the guess, linearizes there and prepares the
 solver, factorization included. Feedback embeds the initial state, solves and takes
 the full step. Only feedback is on the path from sensor to actuator
-[Diehl2005]_ [Gros2020]_.
+[Diehl2005]_ [Gros2020]_. Where that step is large, one linearization was not
+enough: feedback then iterates, a few times at most. One iteration at most is the
+plain scheme; many, and a small tolerance, are sequential quadratic programming.
 
 Nearly always the QP is solved by `ActiveSet`; a QP solver is there for when that
 finds no way. Softened bounds rarely act: the QP without them is solved first; a
@@ -24,7 +26,7 @@ from rti_mpc.active_set import ActiveSet
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled
 from rti_mpc.errors import OcpError, ShapeError
-from rti_mpc.linearization import WEIGHTS, plan_cost
+from rti_mpc.linearization import WEIGHTS, plan_cost, shift
 from rti_mpc.ocp import Ocp
 from rti_mpc.qp import Guess, Qp, step_size
 from rti_mpc.riccati import riccati
@@ -37,6 +39,9 @@ from rti_mpc.transcription import INFINITY
 FORMULATIONS = {"simultaneous": simultaneous, "sequential": sequential}
 SOLVERS = ("riccati", "osqp")
 SEQUENTIAL_UP_TO = 10  # control horizon up to which the sequential formulation is the faster one, see docs/engine.md
+SOLVED = QpStatus.SOLVED  # an enumeration looks its members up slowly
+ITERATIONS = 3  # a sample, at most, and
+TOLERANCE = 0.015  # the step from which there is another: what converged NMPC costs in closed loop, within 0.5 %, see docs/engine.md
 TOUCHING = 1e-3  # distance from its bound, in units of the state, at which a plan counts as having left it
 
 
@@ -50,18 +55,22 @@ class Rti:
     Attributes:
         ocp: The problem.
         formulation: ``"simultaneous"`` or ``"sequential"``.
-        x: State guess, and the plan after feedback, shape ``(N + 1, nx)``.
-        u: Input guess, and the plan after feedback, shape ``(N_u, nu)``. Row 0 is the command.
+        iterations: QPs a sample, at most: 1 is the plain real-time iteration, many with a small tolerance converged SQP.
+        tolerance: Change of the inputs by one iteration, relative to half their range, from which on another follows.
+        taken: Iterations of the last feedback.
+        x: States of the plan, shape ``(N + 1, nx)``: of the last feedback, and the next guess.
+        u: Inputs of the plan, shape ``(N_u, nu)``. Row 0 is the command.
         u_prev: Input before the plan, shape ``(nu,)``: what increments are counted from.
         y_ref: Reference rows of the current sample, shape ``(N, ny)``.
         p: Stage parameters of the current sample, shape ``(N + 1, np)``.
+        guess: Where the current sample is linearized, and what the solvers read and write.
         active_set: What is tried first; None if the solver is another.
         solvers: The workspaces, each with its QP: without softened bounds and, if there are any, with them.
         solver: What solved the current sample, or is about to.
         status: Outcome of the last feedback.
 
     Raises:
-        OcpError: The formulation or the solver is unknown, or the model not finite where the robot rests.
+        OcpError: The formulation or the solver is unknown, a number of iterations or a tolerance makes no sense, or the model not finite where the robot rests.
     """
 
     solver: ActiveSet | Solver
@@ -73,6 +82,8 @@ class Rti:
         *,
         formulation: str = "auto",
         solver: str = "riccati",
+        iterations: int = ITERATIONS,
+        tolerance: float = TOLERANCE,
         compile: bool = True,
     ) -> None:
         model, N, N_u = ocp.model, ocp.N, ocp.N_u
@@ -82,32 +93,38 @@ class Rti:
             raise OcpError(f"formulation must be auto, {' or '.join(FORMULATIONS)}, got {formulation!r}")
         if solver not in SOLVERS:
             raise OcpError(f"solver must be {' or '.join(SOLVERS)}, got {solver!r}")
+        if not (iterations >= 1 and tolerance >= 0.0):
+            raise OcpError(f"iterations must be at least 1 and tolerance not negative, got {iterations} and {tolerance}")
         self.ocp = ocp
         self.formulation = formulation
-        # One row more each, so that a shift is one move: the state after the last, the input before the first.
-        states, inputs = np.zeros((N + 2, model.nx)), np.zeros((N_u + 1, model.nu))
-        # Memory is moved through views of bytes laid out before: numpy decides anew each time how to copy, which takes longer than to do it.
-        self._moves = tuple((a.reshape(-1)[: -a.shape[1]].data, a.reshape(-1)[a.shape[1] :].data) for a in (states, inputs))
-        self.x: Array = states[:-1]
-        self.u: Array = inputs[1:]
-        self.u_prev: Array = inputs[0]
-        self.u_prev[:] = model.u_rest
+        self.iterations, self.tolerance, self.taken = iterations, tolerance, 0
+        # A step leads from a guess to a plan; the next guess is that plan, moved on by a stage. No memory is both.
+        self.x: Array = np.zeros((N + 1, model.nx))
+        self.u: Array = np.zeros((N_u, model.nu))
+        x, u = np.zeros_like(self.x), np.zeros_like(self.u)
+        # Moved through views of bytes laid out before: numpy decides anew each time how to copy, which takes longer than to do it.
+        self._pairs = tuple((guess.reshape(-1).data, plan.reshape(-1).data) for guess, plan in ((x, self.x), (u, self.u)))
+        self.u_prev: Array = np.array(model.u_rest, dtype=np.float64)
         self.y_ref: Array = np.zeros((N, model.ny))
         self.p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
         self.status = QpStatus.NONE
+        self._rows = self.y_ref.shape
+        self._pending = False  # whether a sample was prepared and has had no feedback
         self._x0: Array = np.zeros(model.nx)
-        self._plan = (np.zeros_like(self.x), np.zeros_like(self.u), np.zeros(1))
-        self._taken = tuple((guess.reshape(-1).data, plan.reshape(-1).data) for guess, plan in zip((self.x, self.u), self._plan[:2], strict=True))
+        self._violation: Array = np.zeros(1)
+        change: Array = np.zeros(1)
+        self._change = change.data
         # OSQP has its own infinity, and reads no other.
         weights = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS}
-        guess = Guess((self.x, self.u, self.u_prev, self.y_ref, self.p, *weights.values()), self._x0, self._plan)
+        guess = Guess((x, u, self.u_prev, self.y_ref, self.p, *weights.values()), self._x0, (self.x, self.u, self._violation, change))
 
+        self.guess = guess
         transcribe = FORMULATIONS[formulation]
         transcriptions = [transcribe(ocp, softened=softened) for softened in (False, True)[: 2 if len(ocp.lg) else 1]]
         recursion = riccati(ocp) if solver == "riccati" else None
-        functions = [ocp.phi(), plan_cost(ocp)]
+        functions = [shift(ocp), plan_cost(ocp)]
         if recursion is not None:  # a QP solver is then so rarely asked that its QP is left to the virtual machine: it would double the build
-            functions += [recursion.linearize, recursion.gains, recursion.roll_out]
+            functions += [recursion.linearize, recursion.advance, recursion.gains, recursion.roll_out]
         else:
             functions += [f for t in transcriptions for f in (t.data, t.embed, t.step)]
         made = dict(zip((f.name() for f in functions), compiled(*functions) if compile else functions, strict=True))
@@ -115,10 +132,9 @@ class Rti:
         def make(function: Any) -> Any:
             return made.get(function.name(), function)
 
-        self._integrate_tail = bind(made["phi"], (self.x[-1], self.u[-1], self.p[-1]), (states[-1],))
+        self._shift = bind(made["shift"], (self.x, self.u, self.p), (x, u))
         self._cost: Array = np.zeros(1)
-        self._valued = True
-        self._evaluate = bind(made["cost"], (*self._plan[:2], *guess.sample[2:]), (self._cost,))
+        self._evaluate = bind(made["cost"], (self.x, self.u, *guess.sample[2:]), (self._cost,))
         qps = [Qp(t, guess, make) for t in transcriptions]
         self.active_set = ActiveSet(recursion, guess, make) if recursion is not None else None
         self._roll_out()
@@ -144,12 +160,15 @@ class Rti:
         self.u_prev[:] = u_prev
         self.u[:] = np.clip(u_prev, self.ocp.lbu, self.ocp.ubu)
         self.x[:] = x0
+        self._pending = False
         self._backup = self.solvers[0]
         self._loaded = False
-        self.solver = self.active_set or self._backup
-        for solver in (self.active_set, *self.solvers):
-            if solver is not None:
-                solver.cold = True
+        self.solver = self._backup
+        for solver in self.solvers:
+            solver.cold = True
+        if self.active_set is not None:
+            self.solver = self.active_set
+            self.active_set.forget()
 
     def prepare(self, y_ref: Array, p: Array | None = None, *, shift: bool = True, u_prev: Array | None = None) -> None:
         """
@@ -164,23 +183,53 @@ class Rti:
         Raises:
             ShapeError: A shape does not fit.
         """
-        if y_ref.shape != self.y_ref.shape:
-            raise ShapeError("y_ref", self.y_ref.shape, y_ref)
-        if p is not None and p.shape != self.p.shape:
-            raise ShapeError("p", self.p.shape, p)
-        self._value()
+        if y_ref.shape != self._rows:
+            raise ShapeError("y_ref", self._rows, y_ref)
         if p is not None:
-            self.p[:] = p
-        self.y_ref[:] = y_ref
-        if shift:
-            self.shift()
+            if p.shape != self.p.shape:
+                raise ShapeError("p", self.p.shape, p)
+            self.p[...] = p
+        if self._pending:
+            self._keep()
+        self.y_ref[...] = y_ref
         if u_prev is not None:
-            self.u_prev[:] = u_prev
+            self.u_prev[...] = u_prev
+        elif shift:
+            self.u_prev[...] = self.u[0]
+        self._pending = True
+        self._loaded = False
+        if not shift:
+            self._relinearize()
+            return
         if self.active_set is not None:
-            self.active_set.load()
+            self.active_set.advance()
+            self.active_set.gain()
+        else:
+            self._shift()
         if self.solver is not self.active_set:  # so that a sample like the last is prepared in full
-            self._backup.load()
-        self._loaded = self.solver is not self.active_set
+            self._load()
+
+    def _relinearize(self) -> None:
+        """Linearize at the plan itself, and prepare the solver."""
+        for guess, plan in self._pairs:
+            guess[:] = plan
+        if self.active_set is not None:
+            self.active_set.linearize()
+            self.active_set.gain()
+        if self.solver is not self.active_set:
+            self._load()
+
+    def _load(self) -> None:
+        """Prepare the QP solver at the guess."""
+        self._backup.load()
+        self._loaded = True
+
+    def _keep(self) -> None:
+        """Let the guess be the plan: for want of a better one."""
+        for guess, plan in self._pairs:
+            plan[:] = guess
+        if self.active_set is not None:
+            self.active_set.keep()
 
     def _roll_out(self) -> None:
         """Make a guess in motion, half way to the upper bounds of the inputs, where the problem shows its scale."""
@@ -192,44 +241,62 @@ class Rti:
         self.u_prev[:] = self.u[0]
 
     def shift(self) -> None:
-        """Move the guess on by one stage: its first input becomes the previous one, its last is repeated, with the state the model predicts."""
-        self._value()
-        self._integrate_tail()
-        for now, later in self._moves:
-            now[:] = later
-        if self.active_set is not None:
-            self.active_set.shift()
+        """Move the plan on by one stage: its first input becomes the previous one, its last is repeated, with the state the model predicts."""
+        if self._pending:
+            self._keep()
+        self.u_prev[...] = self.u[0]
+        if self.active_set is None:
+            self._shift()
+        else:
+            self.active_set.advance()
+        self._keep()
 
     def feedback(self, x0: Array) -> QpStatus:
         """
-        Embed the initial state, solve the QP and take the full step.
+        Embed the initial state, solve the QP and take the full step; iterate while that was large.
 
-        A status that is not `usable` leaves the guess as it was, and the next
+        A status that is not `usable` leaves the guess for a plan, and the next
         solve starts cold: a failure never seeds what follows.
 
         Args:
             x0: State at node 0, shape ``(nx,)``; angles continue those of the last sample.
         """
-        self._x0[:] = x0
-        if self.active_set is not None and (status := self.active_set.solve()).usable:
-            self.solver = self.active_set
-        else:
-            status = self._solve()
-        if status.usable:
-            for guess, plan in self._taken:
-                guess[:] = plan
-            self._valued = False
-        self.status = status
-        return status
+        self._x0[...] = x0
+        self._pending = False
+        self.status = self._solve()
+        self.taken = 1
+        if self._change[0] > self.tolerance:
+            self._iterate()
+        return self.status
 
     def _solve(self) -> QpStatus:
+        """Solve the QP, whoever can, and make the plan; without one, the guess stays."""
+        active_set = self.active_set
+        if active_set is not None and active_set.solve():
+            self.solver = active_set
+            return SOLVED
+        status = self._solve_qp()
+        if not status.usable:
+            self._keep()
+        return status
+
+    def _iterate(self) -> None:
+        """Iterate at the plan while the step is large; an iteration that fails leaves the plan of the one before."""
+        while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
+            self._relinearize()
+            if not (status := self._solve()).usable:
+                break
+            self.status = status
+            self.taken += 1
+
+    def _solve_qp(self) -> QpStatus:
         """Solve with the QP solver."""
         self.solver = self._backup
         if not isfinite(self._x0.sum()):
             return QpStatus.FAILED
-        violation = self._plan[2]
+        violation = self._violation
         if not self._loaded:
-            self._backup.load()
+            self._load()
         status = self._backup.solve()
         if status.usable and self._backup is not self.solvers[-1] and violation[0] > 0.0:
             self._backup = self.solver = self.solvers[-1]
@@ -246,17 +313,11 @@ class Rti:
 
     @property
     def cost(self) -> float:
-        """The cost (4) of the last plan, with the penalties for what it exceeds."""
-        self._value()
+        """The cost (4) of the plan, with the penalties for what it exceeds; ask before the next `prepare`, which overwrites what it depends on."""
+        self._evaluate()
         return float(self._cost[0]) / self._cost_scale
-
-    def _value(self) -> None:
-        """Evaluate the cost of the last plan, off the path to the command, while what it depends on is still there."""
-        if not self._valued:
-            self._evaluate()
-            self._valued = True
 
     @property
     def violation(self) -> float:
         """By how much the plan's states exceed their bounds at most, in the unit of the state; 0 if they do not."""
-        return max(0.0, float(self._plan[2][0]))
+        return max(0.0, float(self._violation[0]))

@@ -24,7 +24,7 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
-from rti_mpc.linearization import Linearization
+from rti_mpc.linearization import Linearization, change
 from rti_mpc.ocp import Ocp
 from rti_mpc.transcription import (
     KINDS,
@@ -227,5 +227,6 @@ def full_step(ocp: Ocp, kind: str, lin: Linearization, n: int, remembered: int) 
         advance = advance.mapaccum("advances", N)
     deviation = x0 - x[:, 0]
     dx = ca.horzcat(deviation, advance(deviation, A, B, ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u)), b))
-    plan = [x + dx, clipped(u + du, u_prev, w), known.violation(dx, du, w)]
+    u_plan = clipped(u + du, u_prev, w)
+    plan = [x + dx, u_plan, known.violation(dx, du, w), change(ocp, u_plan, u)]
     return ca.Function(f"step_{kind}", [x, u, u_prev, z, x0, known.memory, *w.values()], plan)

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
-from rti_mpc.linearization import Linearization
+from rti_mpc.linearization import Linearization, change
 from rti_mpc.ocp import Ocp
 from rti_mpc.transcription import (
     KINDS,
@@ -134,5 +134,6 @@ def full_step(ocp: Ocp, kind: str, lin: Linearization, n: int, remembered: int) 
     x, u, u_prev, w = lin.x, lin.u, lin.u_prev, lin.w
     to_du, to_s = x.numel(), x.numel() + u.numel()
     dx, du = ca.reshape(z[:to_du], x.shape), ca.reshape(z[to_du:to_s], u.shape)
-    plan = [x + dx, clipped(u + du, u_prev, w), known.violation(dx, du, w)]
+    u_plan = clipped(u + du, u_prev, w)
+    plan = [x + dx, u_plan, known.violation(dx, du, w), change(ocp, u_plan, u)]
     return ca.Function(f"step_{kind}", [x, u, u_prev, z, x0, known.memory, *w.values()], plan)

@@ -38,7 +38,8 @@ class Transcription:
         data: As `everything`, but returns only what varies.
         embed: ``(x0, x, memory) -> `` what of the QP depends on the initial state.
         embedded: Where that goes: attribute of the QP, and place in it.
-        step: ``(x, u, u_prev, z, x0, memory, *WEIGHTS) -> (x+, u+, violation)``: the full step, and by how much it exceeds softened bounds.
+        step: ``(x, u, u_prev, z, x0, memory, *WEIGHTS) -> (x+, u+, violation, change)``: the full step, by how much it exceeds softened bounds,
+            and its size.
         eliminable: States in z, which as many first rows determine.
         watched: For each softened row, the last rows of all, those by which it is known a stage earlier to act: itself and its like one stage
             later; for the sign of a slack, those of the bounds that it softens. Counted from the first of them; shape ``(rows, 4)``.

@@ -8,9 +8,10 @@ from contextlib import contextmanager
 from time import perf_counter_ns
 from typing import Any
 
+from rti_mpc.array import Array
 from rti_mpc.rti import Rti
 
-PARTS = ("evaluation", "matrix update", "vector update", "iterations")
+PARTS = ("copies in", "evaluation", "matrix update", "vector update", "iterations")
 
 
 class Parts:
@@ -25,10 +26,13 @@ class Parts:
         self.timed = False
         self._times: dict[str, int] = {}
         self._swaps: list[tuple[Any, str, Any, Any]] = []  # object, attribute, as it is, timed
-        self._watch(rti, "evaluation", "_integrate_tail", "_evaluate")
+        for name in ("y_ref", "p", "u_prev", "_x0"):
+            array = getattr(rti, name)
+            self._swaps.append((rti, name, array, Memory(array, self._timing("copies in", array.__setitem__))))
+        self._watch(rti, "evaluation", "_shift", "_evaluate")
         if (active_set := getattr(rti, "active_set", None)) is not None:
-            self._watch(active_set, "evaluation", "_linearize")
-            self._watch(active_set, "matrix update", "_gain")
+            self._watch(active_set, "evaluation", "linearize", "advance")
+            self._watch(active_set, "matrix update", "gain")
             self._watch(active_set, "iterations", "_roll_out")
         for solver in rti.solvers:
             self._watch(solver.qp, "evaluation", "linearize", "embed", "step")
@@ -69,6 +73,20 @@ class Parts:
         """Put the calls as they are, or timed, in place."""
         for swap in self._swaps:
             setattr(swap[0], swap[1], swap[which])
+
+
+class Memory:
+    """An array of the controller's own, timed when something is copied into it."""
+
+    def __init__(self, array: Array, write: Callable[[Any, Any], None]) -> None:
+        self._array = array
+        self._write = write
+
+    def __setitem__(self, where: Any, values: Any) -> None:
+        self._write(where, values)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._array, name)
 
 
 class Workspace:

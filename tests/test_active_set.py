@@ -46,7 +46,7 @@ def samples(ocp: Ocp, count: int) -> list[tuple[Array, Array, Array]]:
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_plan_is_that_of_the_qp_solved_to_1e_9(name: str) -> None:
     ocp = PROBLEMS[name]()
-    rti, exact = Rti(ocp, compile=False), Rti(ocp, TIGHT, solver="osqp", compile=False)
+    rti, exact = Rti(ocp, iterations=1, compile=False), Rti(ocp, TIGHT, solver="osqp", iterations=1, compile=False)
     assert isinstance(rti.active_set, ActiveSet)
     found = 0
     for x0, y_ref, u_prev in samples(ocp, 40):
@@ -69,7 +69,7 @@ def test_plan_is_that_of_the_qp_solved_to_1e_9(name: str) -> None:
 def test_bounds_that_act_are_remembered() -> None:
     """The next sample, a stage later, needs fewer roll-outs than a cold start."""
     ocp = double_integrator(N=20, lbu=-0.5, ubu=0.5)
-    used, new = Rti(ocp, compile=False), Rti(ocp, compile=False)
+    used, new = Rti(ocp, iterations=1, compile=False), Rti(ocp, iterations=1, compile=False)
     y_ref, x0 = np.tile([3.0, 0.0], (20, 1)), np.zeros(2)
     used.reset(x0, np.zeros(1))
     for _ in range(3):
@@ -87,7 +87,7 @@ def test_bounds_that_act_are_remembered() -> None:
 
 def test_without_bounds_one_roll_out_is_exact() -> None:
     ocp = double_integrator()
-    rti, exact = Rti(ocp, compile=False), Rti(ocp, TIGHT, solver="osqp", compile=False)
+    rti, exact = Rti(ocp, iterations=1, compile=False), Rti(ocp, TIGHT, solver="osqp", iterations=1, compile=False)
     for x0, y_ref, u_prev in samples(ocp, 10):
         for one in (rti, exact):
             one.reset(x0, u_prev)

@@ -258,7 +258,7 @@ def test_missed_samples_shift_the_plan_by_the_stages_elapsed(
     x = plan.x[missed + 1]  # where the plan would have the robot now, had it been played to the end
     command = controller.receive_state(dataclasses.replace(state, x=x), body.now_ns)
     assert command is not None
-    assert len(shifts) == missed
+    assert len(shifts) == missed - 1  # and one more by the preparation
     assert controller.skipped == missed
     assert command.stamp_ns == state.stamp_ns
     np.testing.assert_array_equal(rti.u_prev, controller._sent.at(command.stamp_ns - 1)[0])  # not the plan's: the robot has braked
@@ -443,21 +443,25 @@ def test_angles_that_wrap_change_nothing() -> None:
 def failing(rti: Rti, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Let the next QPs fail."""
     left = 0
-    feedback = rti.feedback
+    assert rti.active_set is not None
+    solve, solve_qp = rti.active_set.solve, rti._solve_qp
 
-    def broken(x0: Array) -> QpStatus:
+    def gives_up() -> bool:
+        return left == 0 and solve()
+
+    def fails() -> QpStatus:
         nonlocal left
-        if left > 0:
-            left -= 1
-            rti.status = QpStatus.INFEASIBLE
-            return rti.status
-        return feedback(x0)
+        if left == 0:
+            return solve_qp()
+        left -= 1
+        return QpStatus.INFEASIBLE
 
     def fail(times: int) -> None:
         nonlocal left
         left = times
 
-    monkeypatch.setattr(rti, "feedback", broken)
+    monkeypatch.setattr(rti.active_set, "solve", gives_up)
+    monkeypatch.setattr(rti, "_solve_qp", fails)
     return fail
 
 

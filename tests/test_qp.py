@@ -51,7 +51,7 @@ SETTINGS = {"double_integrator": SolverSettings(eps=1e-9, max_iter=200_000, scal
 
 @functools.cache
 def built(name: str, formulation: str) -> Rti:
-    return Rti(PROBLEMS[name](), SETTINGS.get(name, TIGHT), formulation=formulation, solver="osqp", compile=False)
+    return Rti(PROBLEMS[name](), SETTINGS.get(name, TIGHT), formulation=formulation, solver="osqp", iterations=1, compile=False)
 
 
 @pytest.mark.parametrize("name", PROBLEMS)

@@ -455,7 +455,7 @@ def contradict(rti: Rti) -> None:
 
 def test_feedback_touches_only_the_initial_state_rows() -> None:
     ocp = pioneer()
-    rti = Rti(ocp, formulation="simultaneous", solver="osqp")
+    rti = Rti(ocp, formulation="simultaneous", solver="osqp", iterations=1)
     ((x0, y_ref, _),) = near_the_eight(ocp, seed=17, count=1)
     x0[3:] = 0.1, 0.2
     rti.reset(x0 - 0.01, np.zeros(2))

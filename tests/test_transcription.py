@@ -40,6 +40,7 @@ def at_random(name: str, seed: int, *, formulation: str = "simultaneous", compil
     """Linearize everything, state bounds included, at a guess, reference and parameters that are nowhere special."""
     rng = np.random.default_rng(seed)
     rti = built(name, formulation, compile)
+    rti.reset(np.zeros(rti.ocp.model.nx), np.array(rti.ocp.model.u_rest))
     rti.x[:] = rng.normal(size=rti.x.shape)
     rti.u[:] = rng.normal(size=rti.u.shape)
     p = np.array(rti.ocp.model.p_nominal) * rng.uniform(0.8, 1.2, size=rti.p.shape)
