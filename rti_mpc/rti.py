@@ -70,7 +70,8 @@ class Rti:
         status: Outcome of the last feedback.
 
     Raises:
-        OcpError: The formulation or the solver is unknown, a number of iterations or a tolerance makes no sense, or the model not finite where the robot rests.
+        OcpError: The formulation or the solver is unknown, a number of iterations or a tolerance makes no sense, or the model is not finite where
+            the robot rests.
     """
 
     solver: ActiveSet | Solver
