@@ -36,7 +36,7 @@ from service import machine
 from service.parts import PARTS, Parts
 from service.yardstick import Ipopt
 
-HORIZONS = (7, 20, 50, 100)
+HORIZONS = (7, 20, 50, 100, 200)
 ENTRIES = (("riccati", "simultaneous"), ("osqp", "simultaneous"), ("osqp", "sequential"))
 DT = 0.1
 EXACT = SolverSettings(eps=1e-9, max_iter=20_000)
@@ -49,6 +49,7 @@ class Times:
     prepare: list[float] = field(default_factory=list)
     feedback: list[float] = field(default_factory=list)
     iterations: list[int] = field(default_factory=list)
+    taken: list[int] = field(default_factory=list)
     capped: int = 0
     parts: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in PARTS})
 
@@ -152,6 +153,7 @@ def race(N: int, contenders: dict[str, Rti], ipopt: Ipopt, quick: bool, tick: An
                     row.prepare.append(1e-3 * (prepared_ns - began_ns))
                     row.feedback.append(1e-3 * (done_ns - prepared_ns))
                 row.iterations.append(rti.solver.iterations)
+                row.taken.append(rti.taken)
                 row.capped += status is QpStatus.MAX_ITER
             u = driver.u[0].copy()
             x = np.array(plant(x, u, p, DT)).ravel()
@@ -194,6 +196,7 @@ def measure(N: int, *, entries: Sequence[tuple[str, str]], compiled: tuple[bool,
                 "ipopt_us": against,
                 "speedup": round(against["p50"] / step["p50"], 1),
                 "feedback_speedup": round(against["p50"] / feedback["p50"], 1),
+                "qps": {"p50": int(np.median(row.taken)), "p99": int(np.percentile(row.taken, 99)), "mean": round(float(np.mean(row.taken)), 2)},
                 "iterations": {"p50": int(np.median(row.iterations)), "p99": int(np.percentile(row.iterations, 99))},
                 "capped_share": round(row.capped / len(row.iterations), 4),
                 "parts_us": {part: round(float(np.median(us)), 1) for part, us in row.parts.items()},
@@ -260,6 +263,7 @@ def show(console: Console, result: list[dict[str, Any]], *, costs: bool) -> None
         "IPOPT",
         "faster",
         "feedback",
+        "QPs",
         "iterations",
         "capped",
         *(["cost"] if costs else []),
@@ -274,6 +278,7 @@ def show(console: Console, result: list[dict[str, Any]], *, costs: bool) -> None
             *pairs,
             f"{row['speedup']:.1f} x",
             f"{row['feedback_speedup']:.1f} x",
+            "{p50} / {p99}".format(**row["qps"]),
             "{p50} / {p99}".format(**row["iterations"]),
             f"{row['capped_share']:.1%}",
             *([f"{row['over_exact']:+.3%} exact, {row['over_converged']:+.3%} converged"] if costs else []),

@@ -208,7 +208,9 @@ def demo(
 
 @app.command()
 def bench(
-    horizon: Annotated[list[int] | None, typer.Option("--horizon", "-n", min=2, help="Stages; repeatable.", show_default="7, 20, 50, 100")] = None,
+    horizon: Annotated[
+        list[int] | None, typer.Option("--horizon", "-n", min=2, help="Stages; repeatable.", show_default="7, 20, 50, 100, 200")
+    ] = None,
     interpreted: Annotated[bool, typer.Option("--interpreted", help="Also without a compiler.")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="A first look: eight seconds of driving.")] = False,
     costs: Annotated[bool, typer.Option("--costs", help="Also closed-loop costs against exact QPs and converged NMPC.")] = False,

@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from rti_mpc.wire.keys import Keys
 
 
+ITERATIONS = {"iterations", "tolerance"}  # what of the solver's section is not OSQP's
+
+
 class Config(Section):
     """Everything physical about one robot."""
 
@@ -104,7 +107,7 @@ class Config(Section):
         """Return the real-time iteration, compiled."""
         from rti_mpc.rti import Rti
 
-        return Rti(self.build_ocp(), self.solver_settings(), formulation=self.ocp.formulation)
+        return Rti(self.build_ocp(), self.solver_settings(), formulation=self.ocp.formulation, **self.iterations())
 
     def build_observer(self) -> Observer | None:
         """Return the observer, compiled, if there is anything to estimate."""
@@ -171,7 +174,11 @@ class Config(Section):
         """Return the settings of the QP solver."""
         from rti_mpc.solver import SolverSettings
 
-        return SolverSettings(**self.solver.model_dump(exclude_none=True))
+        return SolverSettings(**self.solver.model_dump(exclude_none=True, exclude=ITERATIONS))
+
+    def iterations(self) -> dict[str, Any]:
+        """Return the limits of the iterations a sample, as `Rti` names them, that are given."""
+        return self.solver.model_dump(exclude_none=True, include=ITERATIONS)
 
     def keys(self) -> Keys:
         """Return the keys of this robot."""

@@ -89,12 +89,14 @@ class OcpSection(Section):
 
 
 class SolverSection(Section):
-    """OSQP's settings; what is left out is as `SolverSettings` has it."""
+    """Iterations a sample, and OSQP's settings; what is left out is as `Rti` and `SolverSettings` have it."""
 
     eps: float | None = Field(default=None, ge=1e-12, le=1e-1, description="absolute and relative tolerance on the residuals, without unit")
     max_iter: int | None = Field(default=None, ge=1, le=1_000_000, description="iterations at most; the iterate is then taken as it is")
     rho: float | None = Field(default=None, ge=1e-6, le=1e6, description="step size of ADMM, without unit")
     check_termination: int | None = Field(default=None, ge=1, le=1000, description="iterations between two looks at the residuals")
+    iterations: int | None = Field(default=None, ge=1, le=100, description="QPs a sample at most: 1 is the plain real-time iteration, many are SQP")
+    tolerance: float | None = Field(default=None, ge=0, le=2, description="step from which another follows, in shares of half an input's range")
 
 
 class TimingSection(Section):

@@ -7,6 +7,7 @@ import resource
 import tracemalloc
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -15,6 +16,7 @@ import pytest
 
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError, ShapeError
+from rti_mpc.integrator import integrator
 from rti_mpc.model import Model, Signal
 from rti_mpc.ocp import Ocp
 from rti_mpc.rti import FORMULATIONS, Rti
@@ -150,6 +152,80 @@ def test_formulation_is_chosen_by_the_control_horizon_and_an_unknown_one_refused
     assert Rti(double_integrator(N=50), compile=False).formulation == "simultaneous"
     with pytest.raises(OcpError, match="formulation must be auto, simultaneous or sequential, got 'dense'"):
         Rti(double_integrator(), formulation="dense", compile=False)
+
+
+# How often it iterates.
+
+
+def test_many_iterations_a_sample_are_converged_nmpc() -> None:
+    """In closed loop with a robot that is not the model: IPOPT, converged at each sample, drives the same way."""
+    ocp = pioneer(N=10, method="euler")
+    rti = Rti(ocp, iterations=300, tolerance=1e-9, compile=False)
+    solve, plant, p = nlp(ocp), integrator(ocp.model, "rk4", 20), np.array(ocp.model.p_nominal)
+    start = arc(np.array([7.0]))[0]
+    driven = {}
+    for name in ("rti", "ipopt"):
+        x0, u_prev = np.array([start[0] - 0.1, start[1] + 0.05, start[2] + 0.3, 0.0, 0.0]), np.zeros(2)
+        rti.reset(x0, u_prev)
+        x, u = rti.x.copy(), rti.u.copy()
+        states = []
+        for k in range(30):
+            y_ref = arc(7.0 + 0.1 * np.arange(k + 1, k + 11), psi0=start[2])
+            if name == "rti":
+                rti.prepare(y_ref, shift=k > 0, u_prev=u_prev)
+                assert rti.feedback(x0) is QpStatus.SOLVED
+                u_prev = rti.u[0].copy()
+            else:
+                x, u, _ = solve(x0, u_prev, y_ref, x, u)
+                u_prev = u[0].copy()
+            x0 = np.array(plant(x0, u_prev, p, 0.1)).ravel()
+            states.append(x0)
+        driven[name] = np.array(states)
+    np.testing.assert_allclose(driven["rti"], driven["ipopt"], rtol=0, atol=1e-6)
+
+
+def test_sample_is_iterated_on_only_while_the_step_is_large() -> None:
+    ocp = pioneer()
+    rti, plain = Rti(ocp, iterations=4, tolerance=1e-6), Rti(ocp, iterations=1)
+    ((x0, y_ref, u_prev),) = near_the_eight(ocp, seed=24, count=1)
+    for one in (rti, plain):
+        one.reset(x0, u_prev)
+        one.prepare(y_ref, shift=False)
+        one.feedback(x0)
+    assert rti.taken == 4
+    assert plain.taken == 1
+    for _ in range(3):
+        plain.prepare(y_ref, shift=False)
+        plain.feedback(x0)
+    np.testing.assert_array_equal(rti.u, plain.u)  # bit for bit what four samples without a shift are
+    rti.tolerance = 0.01
+    for _ in range(10):
+        rti.prepare(y_ref, shift=False)
+        rti.feedback(x0)
+    assert rti.taken == 1
+
+
+def test_iteration_that_fails_leaves_the_plan_of_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    ocp = pioneer()
+    rti, plain = Rti(ocp), Rti(ocp, iterations=1)
+    ((x0, y_ref, u_prev),) = near_the_eight(ocp, seed=24, count=1)
+    assert rti.active_set is not None
+    solve, solved = rti.active_set.solve, iter((True, False))
+    monkeypatch.setattr(rti.active_set, "solve", lambda: next(solved) and solve())
+    monkeypatch.setattr(rti, "_solve_qp", lambda: QpStatus.FAILED)
+    for one in (rti, plain):
+        one.reset(x0, u_prev)
+        one.prepare(y_ref, shift=False)
+        assert one.feedback(x0) is QpStatus.SOLVED
+    assert rti.taken == 1
+    for array, same in zip(unmoving(rti), unmoving(plain), strict=True):
+        np.testing.assert_array_equal(array, same)
+
+
+@pytest.mark.parametrize("limits", [{"iterations": 0}, {"tolerance": -1.0}, {"tolerance": np.nan}])
+def test_limits_of_iterations_that_make_no_sense_are_refused(limits: dict[str, Any]) -> None:
+    with pytest.raises(OcpError, match="iterations must be at least 1 and tolerance not negative, got"):
+        Rti(double_integrator(), compile=False, **limits)
 
 
 # What it preserves.
@@ -502,21 +578,33 @@ def test_prepare_and_feedback_do_not_grow_the_heap() -> None:
     assert after - before < 1024
 
 
-@pytest.mark.slow
-def test_memory_stays_flat_over_200_000_samples() -> None:
-    """What tracemalloc does not see: OSQP's own memory, failures and cold starts included."""
+@pytest.mark.parametrize(
+    ("solver", "samples"),
+    [
+        ("riccati", 20_000),
+        ("osqp", 4_000),
+        pytest.param("riccati", 1_000_000, marks=pytest.mark.slow),
+        pytest.param("osqp", 200_000, marks=pytest.mark.slow),
+    ],
+)
+def test_resident_memory_stays_flat(solver: str, samples: int) -> None:
+    """What tracemalloc does not see: compiled code's and OSQP's own memory, failures and cold starts included."""
     ocp = pioneer()
-    rti = Rti(ocp, SolverSettings(eps=1e-3, max_iter=50))
-    samples = list(near_the_eight(ocp, seed=20, count=50))
+    rti = Rti(ocp, SolverSettings(eps=1e-3, max_iter=50), solver=solver)
+    known = list(near_the_eight(ocp, seed=20, count=50))
     bad = np.full(5, np.nan)
     before = 0
-    for i in range(200_000):
-        x0, y_ref, u_prev = samples[i // 20 % 50]
+    for i in range(samples):
+        x0, y_ref, u_prev = known[i // 20 % 50]
         if i % 20 == 0:
             rti.reset(x0, u_prev)
-        rti.prepare(y_ref)
+        rti.prepare(y_ref, u_prev=u_prev)
         rti.feedback(bad if i % 100 == 7 else x0)
-        if i == 20_000:
-            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    assert after - before < 1024  # KiB
+        if i == 2_000:
+            before = resident()
+    assert resident() - before < 1 << 20
+
+
+def resident() -> int:
+    """Resident memory of this process, bytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()

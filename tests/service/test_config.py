@@ -25,6 +25,7 @@ ocp.weights = { Q = { x = 1, y = 2, psi = 0 }, R = { u_c = 1, omega_c = 3 }, del
 
 # What a user may write into the shipped file, and what the one line must tell them.
 WRONG = [
+    ("[ocp]", "[solver]\niterations = 0\n[ocp]", ["solver.iterations", "at least 1", "0"]),
     ("dt_s = 0.1", "dt_ms = 100", ["ocp.dt_ms", "dt_s", "in seconds", "100"]),
     ("dt_s = 0.1", "dt_s = 100.0", ["ocp.dt_s", "in seconds", "at most 10", "100.0"]),
     ("dt_s = 0.1", 'dt_s = "0.1"', ["ocp.dt_s", "must be a number", "'0.1'"]),
@@ -157,3 +158,11 @@ def test_plant_takes_its_own_parameters_the_rest_from_the_controller(tmp_path: P
     assert settings.state_period_s == 0.1
     np.testing.assert_array_equal(settings.x0, [0, 0, 1.5, 0, 0])
     np.testing.assert_allclose(settings.slew, [1.0, math.inf], rtol=1e-15)
+
+
+def test_limits_of_iterations_reach_the_controller(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + "[solver]\niterations = 7\ntolerance = 1e-3\neps = 1e-4\n")
+    rti = load(path).build_rti()
+    assert (rti.iterations, rti.tolerance) == (7, 1e-3)
+    assert load(path).solver_settings().eps == 1e-4
