@@ -198,10 +198,10 @@ class Rti:
         elif shift:
             self.u_prev[...] = self.u[0]
         self._pending = True
-        self._loaded = False
         if not shift:
             self._relinearize()
             return
+        self._loaded = False
         if self.active_set is not None:
             self.active_set.advance()
             self.active_set.gain()
@@ -214,6 +214,7 @@ class Rti:
         """Linearize at the plan itself, and prepare the solver."""
         for guess, plan in self._pairs:
             guess[:] = plan
+        self._loaded = False
         if self.active_set is not None:
             self.active_set.linearize()
             self.active_set.gain()
@@ -282,8 +283,8 @@ class Rti:
         return status
 
     def _iterate(self) -> None:
-        """Iterate at the plan while the step is large; an iteration that fails leaves the plan of the one before."""
-        while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
+        """Iterate at the plan while QPs are solved and steps are large; an iteration that fails leaves the plan of the one before."""
+        while self.status is SOLVED and self.taken < self.iterations and self._change[0] > self.tolerance:
             self._relinearize()
             if not (status := self._solve()).usable:
                 break

@@ -222,6 +222,22 @@ def test_iteration_that_fails_leaves_the_plan_of_the_one_before(monkeypatch: pyt
         np.testing.assert_array_equal(array, same)
 
 
+@pytest.mark.parametrize("finds_a_way", [(False, True, False, True), (True, False, True, False)])
+def test_iterations_are_the_same_whichever_solver_makes_them(finds_a_way: tuple[bool, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    ocp = pioneer(N=15)
+    rti, recursion = (Rti(ocp, TIGHT, iterations=4, tolerance=0.0, compile=False) for _ in range(2))
+    ((x0, y_ref, u_prev),) = near_the_eight(ocp, seed=25, count=1)
+    assert rti.active_set is not None
+    solve, ways = rti.active_set.solve, iter(finds_a_way)
+    monkeypatch.setattr(rti.active_set, "solve", lambda: next(ways) and solve())
+    for one in (rti, recursion):
+        one.reset(x0, u_prev)
+        one.prepare(y_ref, shift=False)
+        assert one.feedback(x0) is QpStatus.SOLVED
+        assert one.taken == 4
+    np.testing.assert_allclose(rti.u, recursion.u, rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("limits", [{"iterations": 0}, {"tolerance": -1.0}, {"tolerance": np.nan}])
 def test_limits_of_iterations_that_make_no_sense_are_refused(limits: dict[str, Any]) -> None:
     with pytest.raises(OcpError, match="iterations must be at least 1 and tolerance not negative, got"):
