@@ -271,10 +271,11 @@ class Guard:
         limits, share = self._limits, self._share(command)
         u = np.clip(command.u, limits.lbu, limits.ubu)
         first = max(0, (start_ns - command.stamp_ns) // command.period_ns)
-        now = self._schedule.at(command.stamp_ns + first * command.period_ns - 1)[0]
-        before = self._schedule.at(start_ns - round(WINDOW * self._dt_ns))[0]
-        lower = np.minimum(np.maximum(now, before) + limits.lbdu, now)
-        upper = np.maximum(np.minimum(now, before) + limits.ubdu, now)
+        now = self._schedule.at(start_ns - 1)[0]
+        row_ns = command.stamp_ns + first * command.period_ns  # before that, what the controller thinks it changes from
+        acted = np.array([now, self._schedule.at(row_ns - 1)[0], self._schedule.at(start_ns - round(WINDOW * self._dt_ns))[0]])
+        lower = np.minimum(acted.max(axis=0) + limits.lbdu, now)
+        upper = np.maximum(acted.min(axis=0) + limits.ubdu, now)
         limited = False
         for row in u[first:]:
             if (row >= lower - ROUNDING).all() and (row <= upper + ROUNDING).all():
