@@ -33,7 +33,7 @@ HELD_UP_NS = 250_000_000  # local time without a tick after which this process w
 LEAD_NS = 30_000_000  # local time by which the robot is told of the ramp before it is due
 TOLD = 10  # steps of the ramp in a command of our own
 ROUNDING = 1e-6  # of an input, in its unit: above any rounding, single precision included, and below what an actuator resolves
-WINDOW = 0.75  # of dt: two rows this far apart are two samples, however the bus jitters
+WINDOW = (0.25, 0.5, 0.75, 0.95)  # of dt: when what acted before counts against the slew limits; the milliseconds of a command's way lie between
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,14 +266,17 @@ class Guard:
         Return the rows of a command, from that on which acts first no faster than the slew limits from what acts before.
 
         A controller that has heard nothing of a gap goes on where it believes the
-        robot to be; the robot has braked meanwhile.
+        robot to be; the robot has braked meanwhile. The next row of the plan before,
+        played for the milliseconds that a command takes on the way, does not count:
+        limits around both it and the row before would not let a plan turn round.
         """
-        limits, share = self._limits, self._share(command)
+        limits, scale = self._limits, self._share(command)
         u = np.clip(command.u, limits.lbu, limits.ubu)
         first = max(0, (start_ns - command.stamp_ns) // command.period_ns)
-        now = self._schedule.at(start_ns - 1)[0]
-        row_ns = command.stamp_ns + first * command.period_ns  # before that, what the controller thinks it changes from
-        acted = np.array([now, self._schedule.at(row_ns - 1)[0], self._schedule.at(start_ns - round(WINDOW * self._dt_ns))[0]])
+        now, _, braking = self._schedule.at(start_ns - 1)
+        if not braking:
+            now = self._schedule.at(command.stamp_ns + first * command.period_ns - 1)[0]
+        acted = np.array([now, *(self._schedule.at(start_ns - round(share * self._dt_ns))[0] for share in WINDOW)])
         lower = np.minimum(acted.max(axis=0) + limits.lbdu, now)
         upper = np.maximum(acted.min(axis=0) + limits.ubdu, now)
         limited = False
@@ -282,7 +285,7 @@ class Guard:
                 break
             limited = True
             np.clip(row, lower, upper, out=row)
-            lower, upper = row + share * limits.lbdu, row + share * limits.ubdu
+            lower, upper = row + scale * limits.lbdu, row + scale * limits.ubdu
         if limited:
             text = f"command {command.seq} of epoch {command.epoch} begins too far from what acts: approached inside the slew limits"
             self._say(Severity.WARNING, "slew_limited", text)

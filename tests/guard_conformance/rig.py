@@ -27,6 +27,7 @@ from sim.actuator import Actuator
 
 ROOT = Path(__file__).parents[2]
 MS = 1_000_000
+BIRTH_NS = 60_000 * MS
 PERIOD_NS = 100 * MS  # of states and commands
 POLL_S = 1e-3
 PATIENCE_S = 20.0  # to start a guard and hear of it
@@ -88,13 +89,12 @@ class Rig:
         return time.monotonic_ns() - self._zero_ns
 
     def new_robot(self) -> None:
-        """Begin another life of the robot, at its time 0."""
+        """Begin another life of the robot, at its time `BIRTH_NS`."""
         self.epoch += 1
         self.leader += 10
-        self._zero_ns = time.monotonic_ns()
-        self._played_ns = 0
-        self._due_ns = 0
-        self.state = State(self.epoch, 0, 0, np.zeros(5))
+        self._zero_ns = time.monotonic_ns() - BIRTH_NS
+        self._played_ns = self._due_ns = BIRTH_NS
+        self.state = State(self.epoch, 0, BIRTH_NS, np.zeros(5))
         self.actuator = Actuator(np.zeros(2), self._slew, self.epoch)
         self.heard: list[tuple[int, Command]] = []
         self.times: list[int] = []
@@ -114,7 +114,7 @@ class Rig:
         """Let the robot's clock jump; its actuators brake from what acts."""
         u = self.actuator.u.copy()
         self._zero_ns -= ms * MS
-        self._played_ns, self._due_ns = self.now_ns, self.now_ns // PERIOD_NS * PERIOD_NS
+        self._played_ns = self._due_ns = self.now_ns
         self.actuator = Actuator(np.zeros(2), self._slew, self.epoch)
         self.actuator._schedule = Schedule(np.zeros(2), self._slew)
         self.actuator._schedule.brake(u, self._played_ns)
@@ -124,8 +124,8 @@ class Rig:
         until_ns = self.now_ns + ms * MS
         while self.now_ns < until_ns:
             if self.now_ns >= self._due_ns:
-                self.state = State(self.epoch, self.state.seq + 1, self._due_ns, np.zeros(5))
-                self._due_ns = max(self._due_ns, (self.now_ns - 1) // PERIOD_NS * PERIOD_NS) + PERIOD_NS
+                self.state = State(self.epoch, self.state.seq + 1, self.now_ns, np.zeros(5))
+                self._due_ns = max(self._due_ns + PERIOD_NS, self.now_ns)
                 if not self.deaf:
                     self._states.put(self.state)
                 if (command := pilot(self.state)) is not None:
