@@ -403,7 +403,7 @@ def test_starting_guard_waits_until_what_another_one_told_the_robot_has_run_out(
     while not scene.send(np.zeros(2)):
         codes += scene.said()
         scene.wait(100)
-    assert set(codes) == {"command_no_state", "command_starting"}
+    assert set(codes) == {"command_no_state", "guard_starting"}
     assert scene.actuator.at_rest
     assert scene.said() == ["guard_passing"]
 
