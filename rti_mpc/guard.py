@@ -26,14 +26,14 @@ from rti_mpc.schedule import EVER_NS, STEP_NS, Schedule, end_ns, unfit
 from rti_mpc.status import Mode, QpStatus
 
 VALID_NS = 300_000_000  # after its state, and the delay, in which a command may act at most, whatever it says itself
-EARLY_NS = 50_000_000  # by which a state that a command answers may be ahead of our idea of the robot's clock
-LATE_NS = 50_000_000  # by which a state is late if it has waited on the way, and says nothing of the time now
+EARLY_NS = 50_000_000  # local time by which a state that a command answers may be ahead of our idea of the robot's clock
+LATE_NS = 50_000_000  # local time by which a state is late if it has waited on the way, and says nothing of the time now
 JUMP_NS = 250_000_000  # by which a clock has jumped
 HELD_UP_NS = 250_000_000  # local time without a tick after which this process was held up
 LEAD_NS = 30_000_000  # local time by which the robot is told of the ramp before it is due
 TOLD = 10  # steps of the ramp in a command of our own
 ROUNDING = 1e-6  # of an input, in its unit: above any rounding, single precision included, and below what an actuator resolves
-WINDOW = 0.75  # of dt: two rows this far apart are two samples, however the bus jitters
+WINDOW = (0.25, 0.5, 0.75, 0.95)  # of dt: when what acted before counts against the slew limits; the milliseconds of a command's way lie between
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,10 +108,11 @@ class Guard:
         self._told_ns = EVER_NS  # until when the robot knows what to do
         self._engaged = False  # whether this robot was ever told anything
         self._stopped = False
+        self._waiting = False  # whether it was said that commands wait for `_open_ns`
 
     def robot_now_ns(self, local_ns: int) -> int:
-        """Return robot time at a local monotonic time."""
-        return self._clock.now_ns(local_ns)
+        """Return robot time at a local monotonic time, 0 before the first state."""
+        return 0 if self._state is None else self._clock.now_ns(local_ns)
 
     @property
     def at_rest(self) -> bool:
@@ -132,9 +133,10 @@ class Guard:
             self._jump(state, local_ns, "back")
         else:
             ahead_ns = state.stamp_ns - self._clock.now_ns(local_ns)
+            late = ahead_ns < -LATE_NS * self._clock.rate
             paced = 2 * (local_ns - heard_local_ns) * self._clock.rate >= state.stamp_ns - heard_ns
-            believed = ahead_ns >= -LATE_NS or (self._late and paced)  # late twice, and at the robot's own pace: its clock has waited
-            self._heard, self._late = (state.stamp_ns, local_ns), ahead_ns < -LATE_NS
+            believed = not late or (self._late and paced)  # late twice, and at the robot's own pace: its clock has waited
+            self._heard, self._late = (state.stamp_ns, local_ns), late
             if not believed:
                 return
             if ahead_ns > max(JUMP_NS, 2.5 * self._clock.period_ns):
@@ -157,7 +159,10 @@ class Guard:
         if not reason:
             self._follow(command)
             if now_ns < self._open_ns:
-                reason = "starting: what an earlier guard may have told the robot has not run out yet"
+                if not self._waiting:
+                    self._say(Severity.INFO, "guard_starting", "commands wait until what an earlier guard may have told the robot has run out")
+                self._waiting = True
+                return None
         if reason:
             code, _, why = reason.partition(": ")
             text = f"command {command.seq} of epoch {command.epoch} was refused: {why or code.replace('_', ' ')}"
@@ -241,7 +246,7 @@ class Guard:
         if now_ns - self._clock.stamp_ns > max(self._stale_ns, 2.5 * self._clock.period_ns):
             return f"blind: no state for {1e-9 * (now_ns - self._clock.stamp_ns):.3f} s"
         age_ns = now_ns - command.state_stamp_ns
-        if age_ns > self._delay_ns + self._stale_ns or age_ns < -EARLY_NS:
+        if age_ns > self._delay_ns + self._stale_ns or age_ns < -EARLY_NS * self._clock.rate:
             return f"{'stale' if age_ns > 0 else 'early'}: it answers a state of {1e-9 * age_ns:.3f} s ago"
         if until_ns <= max(command.stamp_ns, now_ns):
             return "expired"
@@ -266,22 +271,26 @@ class Guard:
         Return the rows of a command, from that on which acts first no faster than the slew limits from what acts before.
 
         A controller that has heard nothing of a gap goes on where it believes the
-        robot to be; the robot has braked meanwhile.
+        robot to be; the robot has braked meanwhile. The next row of the plan before,
+        played for the milliseconds that a command takes on the way, does not count:
+        limits around both it and the row before would not let a plan turn round.
         """
-        limits, share = self._limits, self._share(command)
+        limits, scale = self._limits, self._share(command)
         u = np.clip(command.u, limits.lbu, limits.ubu)
         first = max(0, (start_ns - command.stamp_ns) // command.period_ns)
-        now = self._schedule.at(command.stamp_ns + first * command.period_ns - 1)[0]
-        before = self._schedule.at(start_ns - round(WINDOW * self._dt_ns))[0]
-        lower = np.minimum(np.maximum(now, before) + limits.lbdu, now)
-        upper = np.maximum(np.minimum(now, before) + limits.ubdu, now)
+        now, _, braking = self._schedule.at(start_ns - 1)
+        if not braking:
+            now = self._schedule.at(command.stamp_ns + first * command.period_ns - 1)[0]
+        acted = np.array([now, *(self._schedule.at(start_ns - round(share * self._dt_ns))[0] for share in WINDOW)])
+        lower = np.minimum(acted.max(axis=0) + limits.lbdu, now)
+        upper = np.maximum(acted.min(axis=0) + limits.ubdu, now)
         limited = False
         for row in u[first:]:
             if (row >= lower - ROUNDING).all() and (row <= upper + ROUNDING).all():
                 break
             limited = True
             np.clip(row, lower, upper, out=row)
-            lower, upper = row + share * limits.lbdu, row + share * limits.ubdu
+            lower, upper = row + scale * limits.lbdu, row + scale * limits.ubdu
         if limited:
             text = f"command {command.seq} of epoch {command.epoch} begins too far from what acts: approached inside the slew limits"
             self._say(Severity.WARNING, "slew_limited", text)

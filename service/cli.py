@@ -199,11 +199,12 @@ def demo(
     ] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder to leave everything in.", show_default="runs/SCENARIO-TIME")] = None,
     viewer: Annotated[bool, typer.Option("--viewer", help="Watch live in Rerun.")] = False,
+    guard: Annotated[bool, typer.Option("--guard", help="With a guard between controller and robot.")] = False,
 ) -> None:
     """Run the whole system on this machine, and sum up how well the robot was driven."""
     from service.demo import main
 
-    raise typer.Exit(main(load(config), scenario, heading=heading, speed=speed, duration_s=duration, folder=out, viewer=viewer))
+    raise typer.Exit(main(load(config), scenario, heading=heading, speed=speed, duration_s=duration, folder=out, viewer=viewer, guard=guard))
 
 
 @app.command()

@@ -52,7 +52,7 @@ POLITE = 10  # niceness of those who only watch
 RECORDER_S = 8.0  # to write what it has
 CLI = "service.cli"
 # The recorder first: a reference that goes on without a robot is nothing to look at.
-ENDING = (*(("recorder",) if find_spec("rerun") else ()), "controller", "robot", "reference", "echo")
+ENDING = (*(("recorder",) if find_spec("rerun") else ()), "controller", "guard", "robot", "reference", "echo")
 
 
 class Failed(Exception):
@@ -91,7 +91,7 @@ class Plan:
 
 
 def plan(
-    config: Config, scenario: str, *, heading: Heading | None, speed: float, duration_s: float | None, folder: Path | None, viewer: bool
+    config: Config, scenario: str, *, heading: Heading | None, speed: float, duration_s: float | None, folder: Path | None, viewer: bool, guard: bool
 ) -> Plan:
     """
     Fill in what the scenario decides.
@@ -102,7 +102,7 @@ def plan(
     trajectory = find_trajectory(scenario)
     heading = heading or HEADINGS.get(scenario, "consistent")
     return Plan(
-        config=configured(config, trajectory, heading),
+        config=configured(config, trajectory, heading, guard),
         scenario=scenario,
         heading=heading,
         trajectory=trajectory,
@@ -113,12 +113,14 @@ def plan(
     )
 
 
-def configured(config: Config, trajectory: Trajectory, heading: Heading) -> Config:
-    """Return the configuration of a run: on loopback, from the scenario's pose, without weight on a heading that is none."""
+def configured(config: Config, trajectory: Trajectory, heading: Heading, guard: bool) -> Config:
+    """Return the configuration of a run: on loopback, from the scenario's pose, guarded if asked for, without weight on a heading that is none."""
     config = config.with_initial_state([f"{name}={value!r}" for name, value in zip(("x", "y", "psi"), trajectory.pose0, strict=True)])
     content = config.model_dump(by_alias=True, exclude_unset=True, exclude={"bus"})
     if heading == "none":
         content["ocp"]["weights"]["Q"] |= {output.name: 0.0 for output in config.build_model().outputs if output.angle}
+    if guard:
+        content["guard"] = {**content.get("guard", {}), "enabled": True}
     return Config.model_validate(content)
 
 
@@ -167,7 +169,7 @@ def drive(run: Plan, console: Console, stop: Event) -> Outcome:
         witness = Witness(bus)
         command = Command(0, 0, 0, 0, 0, 0, 0, 0, Mode.TRACKING, QpStatus.SOLVED, 0, np.zeros((ocp.N, ocp.model.nu)))
         start(run, children, endpoint, len(encode(command)))
-        company = {"controller", "reference", ECHO, *(["viewer"] if recorded() else [])}
+        company = {"controller", "reference", ECHO, *(["viewer"] if recorded() else []), *guards(run)}
         board.wait(f"starting {', '.join(sorted(company))}")
         wait(lambda: witness.listen().met(company), children, stop, PATIENCE_S, "all processes")
         echo = Echo(bus, State(0, 0, 0, np.zeros(ocp.model.nx)), 0.5 * ocp.dt / run.speed)
@@ -176,7 +178,7 @@ def drive(run: Plan, console: Console, stop: Event) -> Outcome:
         board.wait("starting the robot")
         follow(run, witness, board, children, stop)
         board.wait("stopping all processes")
-        for name in ENDING:
+        for name in (name for name in ENDING if name != "guard" or guards(run)):
             if children.end(name, RECORDER_S if name == "recorder" else PATIENCE_END_S):
                 board.console.print(f"{name} did not end well, see {children.log(name)}", soft_wrap=True, markup=False)
         witness.listen()
@@ -202,6 +204,8 @@ def start(run: Plan, children: Children, endpoint: str, size: int) -> None:
     keys, config = run.config.keys(), run.folder / "config.toml"
     scenario = ("--scenario", run.scenario, "--heading", run.heading, "--duration", run.reference_s)
     children.start("controller", CLI, "run", config, "-e", endpoint)
+    for name in guards(run):
+        children.start(name, CLI, "guard", config, "-e", endpoint)
     children.start("reference", CLI, "reference", config, "-e", endpoint, *scenario, nice=POLITE)
     children.start("echo", "service.echo", endpoint, keys.prefix, keys.robot, size)
     if recorded():
@@ -285,6 +289,11 @@ def conclude(run: Plan, outcome: Outcome, console: Console) -> int:
     if not summary["driven"]:
         console.print("rti-mpc: the robot was not driven to the end", markup=False)
     return 0 if summary["driven"] else 1
+
+
+def guards(run: Plan) -> tuple[str, ...]:
+    """Return the guard's role, if there is one."""
+    return ("guard",) if run.config.guard.enabled else ()
 
 
 def recorded() -> bool:

@@ -131,6 +131,7 @@ def test_wire_depends_on_messages_only() -> None:
         ("rti_mpc.trajectory", {"casadi", "osqp", "scipy", "zenoh"}),
         ("rti_mpc.rti", {"zenoh", "rerun", "qpsolvers", "pydantic"}),
         ("service.config", {"casadi", "osqp", "scipy", "zenoh", "rerun"}),
+        ("service.guard", {"casadi", "osqp", "scipy", "rerun", "qpsolvers"}),
         ("service.cli", {"casadi", "osqp", "scipy", "zenoh", "rerun", "sim"}),
     ],
 )

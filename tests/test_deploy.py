@@ -19,7 +19,7 @@ from service.config import load
 
 ROOT = Path(__file__).parents[1]
 DEPLOY = ROOT / "deploy"
-UNIT = DEPLOY / "systemd" / "rti-mpc@.service"
+UNITS = {"run": DEPLOY / "systemd" / "rti-mpc@.service", "guard": DEPLOY / "systemd" / "rti-mpc-guard@.service"}
 RUNBOOK = (DEPLOY / "runbook.md").read_text()
 SHELL = [line for block in re.findall(r"```sh\n(.*?)```", RUNBOOK, re.DOTALL) for line in block.splitlines()]
 
@@ -39,20 +39,22 @@ def test_zenoh_takes_its_configuration_without_multicast(path: Path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed: the unit was NOT verified")
-def test_systemd_finds_nothing_to_complain_about_in_the_unit(tmp_path: Path) -> None:
-    instance = tmp_path / "rti-mpc@pioneer_3dx.service"
-    instance.write_text(UNIT.read_text().replace("/opt/rti-mpc/bin/rti-mpc", "/bin/true"))  # verify wants the program to be there
+@pytest.mark.parametrize("unit", UNITS.values(), ids=UNITS.keys())
+def test_systemd_finds_nothing_to_complain_about_in_the_unit(tmp_path: Path, unit: Path) -> None:
+    instance = tmp_path / unit.name.replace("@", "@pioneer_3dx")
+    instance.write_text(unit.read_text().replace("/opt/rti-mpc/bin/rti-mpc", "/bin/true"))  # verify wants the program to be there
     done = subprocess.run(["systemd-analyze", "verify", "--man=no", instance], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_unit_runs_a_command_that_exists_and_never_gives_up() -> None:
+@pytest.mark.parametrize("expected", UNITS)
+def test_unit_runs_a_command_that_exists_and_never_gives_up(expected: str) -> None:
     unit = configparser.ConfigParser(strict=False, interpolation=None)
     unit.optionxform = str  # type: ignore[assignment, method-assign]
-    unit.read_string(UNIT.read_text())
+    unit.read_string(UNITS[expected].read_text())
     program, command, config = unit["Service"]["ExecStart"].split()
     assert Path(program).name == "rti-mpc"
-    assert command in typer.main.get_group(app).commands
+    assert (command, command in typer.main.get_group(app).commands) == (expected, True)
     assert config == "/etc/rti-mpc/%i.toml"
     assert (unit["Service"]["Restart"], unit["Unit"]["StartLimitIntervalSec"]) == ("always", "0")
     assert unit["Service"]["RestartPreventExitStatus"] == "2"
@@ -62,6 +64,13 @@ def test_unit_runs_a_command_that_exists_and_never_gives_up() -> None:
 def test_command_in_the_runbook_exists_with_its_options(line: str) -> None:
     _, name, *words = line.split()
     typer.main.get_group(app).commands[name].make_context(name, words)  # parses all, runs nothing
+
+
+def test_checks_that_the_contract_of_a_guard_names_exist() -> None:
+    suite = (ROOT / "tests" / "guard_conformance" / "test_guard.py").read_text()
+    named = re.findall(r"`(test_\w+?)_?(?:\.\.\.)?`", (DEPLOY / "guard.md").read_text())
+    assert len(named) > 12
+    assert set(re.findall(r"def (test_\w+)", suite)) == {check for check in re.findall(r"def (test_\w+)", suite) if check.startswith(tuple(named))}
 
 
 def test_files_in_the_runbook_exist() -> None:

@@ -28,7 +28,7 @@ SCENARIOS: dict[str, tuple[Trajectory, Heading, float]] = {
 
 def controller_for(trajectory: Trajectory, heading: Heading) -> tuple[Controller, Ocp]:
     """The controller that `rti-mpc demo` runs."""
-    config = configured(CONFIG, trajectory, heading)
+    config = configured(CONFIG, trajectory, heading, guard=False)
     rti = config.build_rti()
     return Controller(rti, Timing(config.timing.delay_s, config.stale_s, config.timing.valid_s)), rti.ocp
 

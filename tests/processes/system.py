@@ -29,6 +29,7 @@ ARGUMENTS: dict[str, tuple[object, ...]] = {
     "robot": ("sim", "--speed", SPEED, "--x0", "x=0.5"),
     "controller": ("run",),
     "reference": ("reference", "--scenario", "eight", "--duration", 600),
+    "guard": ("guard",),
 }
 T = TypeVar("T")
 
@@ -55,8 +56,10 @@ def environment() -> dict[str, str]:
 class System:
     """The processes of one robot, and a peer that listens to them."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, config: Path = SHIPPED, **arguments: tuple[object, ...]) -> None:
         self.folder = folder
+        self.config = config
+        self.arguments = ARGUMENTS | arguments
         self.endpoint = free_endpoint()
         self.running: dict[str, subprocess.Popen[bytes]] = {}
         self.lives: set[str] = set()
@@ -74,10 +77,10 @@ class System:
 
     def start(self, *roles: str) -> None:
         for role in roles:
-            command, *options = ARGUMENTS[role]
+            command, *options = self.arguments[role]
             options += ["--log", self.folder / "robot.csv"] if role == "robot" else []
             with (self.folder / f"{role}.log").open("ab") as log:
-                arguments = command_line(command, SHIPPED, "-e", self.endpoint, *options)
+                arguments = command_line(command, self.config, "-e", self.endpoint, *options)
                 self.running[role] = subprocess.Popen(arguments, cwd=ROOT, env=environment(), stdout=log, stderr=subprocess.STDOUT)
 
     def kill(self, role: str) -> None:

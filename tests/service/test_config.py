@@ -58,6 +58,9 @@ WRONG = [
     ("[ocp]", "[observer.disturbances]\nu_c = { drift = 0.0, limit = 0.2 }\n[ocp]", ["observer.disturbances.u_c.drift", "greater than 0", "0.0"]),
     ("[ocp]", "[observer.disturbances]\nu_c = { drift = 0.1 }\n[ocp]", ["observer.disturbances.u_c.limit", "missing"]),
     ("[ocp]", "[observer]\nmeasured = ['x', 'z']\n[ocp]", ["observer.measured.z", "no state", "x [m]"]),
+    ("[ocp]", "[guard]\ntick_s = 0.1\n[ocp]", ["guard.tick_s", "at most 0.01", "0.1"]),
+    ("[ocp]", "[guard]\nu_rest = { v = 1.0 }\n[ocp]", ["guard.u_rest.v", "no input", "u_c [m/s]"]),
+    ("[ocp]", "[guard]\nenabled = true\nu_rest = { u_c = 1.0 }\n[ocp]", ["guard.u_rest", "must be the model's", "'u_c': 0.0"]),
     ("[model]", "[modle]", ["modle", "model"]),
     ("[model]", "[model", ["TOML", "line"]),
 ]
@@ -166,3 +169,40 @@ def test_limits_of_iterations_reach_the_controller(tmp_path: Path) -> None:
     rti = load(path).build_rti()
     assert (rti.iterations, rti.tolerance) == (7, 1e-3)
     assert load(path).solver_settings().eps == 1e-4
+
+
+GUARDED = SHIPPED.read_text() + "\n[guard]\nenabled = true\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "instead", "words"),
+    [
+        (", omega_c = [-0.745, 0.745] }", " }", ["ocp.bounds.inputs", "bound every input", "omega_c"]),
+        (
+            "inputs = { u_c = [-0.5, 0.5], omega_c = [-0.745, 0.745] }",
+            "inputs = { omega_c = [-1, 1], u_c = [-1, 1] }",
+            ["the model's order ['u_c', 'omega_c']"],
+        ),
+        ("u_c = [-0.25, 0.25]", "u_c = [0.0, 0.25]", ["ocp.bounds.increments.u_c", "lower < 0 < upper", "could not brake"]),
+    ],
+)
+def test_guard_must_know_every_limit_in_the_order_of_the_wire(tmp_path: Path, text: str, instead: str, words: list[str]) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(GUARDED.replace(text, instead))
+    with pytest.raises(ConfigError) as refusal:
+        load(path)
+    assert all(word in str(refusal.value) for word in words), refusal.value
+    path.write_text(SHIPPED.read_text().replace(text, instead))
+    load(path)  # nobody else minds
+
+
+def test_limits_of_the_guard_are_those_of_the_problem(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(GUARDED)
+    config = load(path, with_model=False)
+    limits, ocp = config.guard_limits(), config.build_ocp()
+    for name in ("lbu", "ubu", "lbdu", "ubdu"):
+        np.testing.assert_array_equal(getattr(limits, name), getattr(ocp, name))
+    np.testing.assert_allclose(limits.slew, [2.5, 4.0])
+    assert limits.settling_s == pytest.approx(0.3 + 0.2)
+    assert config.config_hash == load(SHIPPED).config_hash

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot and a controller in front of and behind a guard, in one thread, in real time; all they have in common with it is the bus."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.message import Command, State
+from rti_mpc.schedule import Schedule
+from rti_mpc.status import Mode, QpStatus
+from rti_mpc.wire.bus import Bus
+from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.session import BusSettings
+from service.cli import SHIPPED
+from service.config import load
+from sim.actuator import Actuator
+
+ROOT = Path(__file__).parents[2]
+MS = 1_000_000
+BIRTH_NS = 60_000 * MS
+PERIOD_NS = 100 * MS  # of states and commands
+POLL_S = 1e-3
+PATIENCE_S = 20.0  # to start a guard and hear of it
+
+Pilot = Callable[[State], Command | None]
+
+
+class Rig:
+    """
+    Drives one guard.
+
+    Attributes:
+        config: Configuration file given to the guard.
+        lbu, ubu, step: Bounds of the inputs, and how far they may move in a period, from it.
+        heard: What the guard published, with the robot's time of its arrival, in this life of the robot.
+        times, inputs: When which input began to act at the actuators, in ns and its unit.
+        epoch: Of the robot.
+        leader: Epoch of the controller.
+    """
+
+    def __init__(self, guard: list[str], folder: Path) -> None:
+        self.config = folder / "robot.toml"
+        self.config.write_text(SHIPPED.read_text() + "\n[guard]\nenabled = true\n")
+        loaded = load(self.config)
+        limits = loaded.guard_limits()
+        self.lbu, self.ubu, self.step = limits.lbu, limits.ubu, np.minimum(-limits.lbdu, limits.ubdu)
+        self._slew, self._guard, self._folder = limits.slew, guard, folder
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self._endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self.bus = Bus(BusSettings(listen=(self._endpoint,), connect=()), loaded.keys())
+        keys = self.bus.keys
+        self._states = self.bus.publisher(keys.state, State, realtime=True)
+        self._commands = self.bus.publisher(keys.command, Command, realtime=True)
+        self._actuation = self.bus.subscriber(keys.actuation, capacity=4096)
+        self.epoch, self.leader, self.seq = 1000, 100, 0
+        self.deaf = False  # whether the robot's states reach nobody
+        self.new_robot()
+        self.start()
+
+    def start(self) -> None:
+        """Start a guard."""
+        with (self._folder / "guard.log").open("ab") as log:
+            command = [*self._guard, str(self.config), "-e", self._endpoint]
+            environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+            self.process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    def close(self) -> None:
+        self.kill()
+        self.bus.close()
+
+    @property
+    def now_ns(self) -> int:
+        """The robot's clock."""
+        return time.monotonic_ns() - self._zero_ns
+
+    def new_robot(self) -> None:
+        """Begin another life of the robot, at its time `BIRTH_NS`."""
+        self.epoch += 1
+        self.leader += 10
+        self._zero_ns = time.monotonic_ns() - BIRTH_NS
+        self._played_ns = self._due_ns = BIRTH_NS
+        self.state = State(self.epoch, 0, BIRTH_NS, np.zeros(5))
+        self.actuator = Actuator(np.zeros(2), self._slew, self.epoch)
+        self.heard: list[tuple[int, Command]] = []
+        self.times: list[int] = []
+        self.inputs: list[Array] = []
+
+    def ready(self) -> None:
+        """Begin a life of the robot, and wait until the guard lets its commands pass."""
+        self.new_robot()
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not any(told.state_epoch == self.epoch for _, told in self.heard):
+            assert self.process.poll() is None, (self._folder / "guard.log").read_text()
+            assert time.monotonic() < deadline_s, "a guard must let healthy commands pass"
+            self.run(100, lambda state: self.command(np.zeros(2)))
+        self.run(300, lambda state: self.command(np.zeros(2)))
+
+    def jump(self, ms: int) -> None:
+        """Let the robot's clock jump; its actuators brake from what acts."""
+        u = self.actuator.u.copy()
+        self._zero_ns -= ms * MS
+        self._played_ns = self._due_ns = self.now_ns
+        self.actuator = Actuator(np.zeros(2), self._slew, self.epoch)
+        self.actuator._schedule = Schedule(np.zeros(2), self._slew)
+        self.actuator._schedule.brake(u, self._played_ns)
+
+    def run(self, ms: int, pilot: Pilot = lambda _: None) -> None:
+        """Let the robot live for a while; a pilot answers each state, or not."""
+        until_ns = self.now_ns + ms * MS
+        while self.now_ns < until_ns:
+            if self.now_ns >= self._due_ns:
+                self.state = State(self.epoch, self.state.seq + 1, self.now_ns, np.zeros(5))
+                self._due_ns = max(self._due_ns + PERIOD_NS, self.now_ns)
+                if not self.deaf:
+                    self._states.put(self.state)
+                if (command := pilot(self.state)) is not None:
+                    self.send(command)
+            self.listen()
+            time.sleep(POLL_S)
+
+    def listen(self) -> None:
+        """Take what the guard has published, and play up to now."""
+        for received in self._actuation.drain():
+            now_ns = self.now_ns
+            self._play(now_ns)
+            told = decode(Command, received.payload)
+            self.heard.append((now_ns, told))
+            self.actuator.accept(told, now_ns)
+        self._play(self.now_ns)
+
+    def _play(self, to_ns: int) -> None:
+        for until_ns, u in self.actuator.play(self._played_ns, to_ns):
+            self.times.append(self._played_ns)
+            self.inputs.append(u.copy())
+            self._played_ns = until_ns
+
+    def command(self, u: Any, **change: Any) -> Command:
+        """A command that answers the last state: an input held over twenty rows, or those rows."""
+        self.seq += 1
+        stamp_ns = self.state.stamp_ns
+        rows = np.tile(u, (20, 1)) if np.ndim(u) == 1 else np.array(u)
+        healthy = Command(
+            epoch=self.leader,
+            seq=self.seq,
+            stamp_ns=stamp_ns,
+            state_epoch=self.epoch,
+            state_seq=self.state.seq,
+            state_stamp_ns=stamp_ns,
+            valid_until_ns=stamp_ns + 250 * MS,
+            config_hash=0,
+            mode=Mode.TRACKING,
+            status=QpStatus.SOLVED,
+            period_ns=PERIOD_NS,
+            u=rows,
+        )
+        return replace(healthy, **change)
+
+    def send(self, command: Command) -> None:
+        self._commands.put(command)
+
+    def towards(self, u: Array) -> Pilot:
+        """A healthy controller: it approaches an input inside the slew limits."""
+        target = np.array(u)
+
+        def pilot(state: State) -> Command:
+            rows = [self.actuator.u + np.clip(target - self.actuator.u, -self.step, self.step)]
+            while len(rows) < 20:
+                rows.append(rows[-1] + np.clip(target - rows[-1], -self.step, self.step))
+            return self.command(rows)
+
+        return pilot
+
+    def drive(self, ms: int = 600) -> Array:
+        """Bring the robot to full inputs."""
+        self.run(ms, self.towards(self.ubu))
+        np.testing.assert_allclose(self.actuator.u, self.ubu)
+        return self.ubu
+
+    def passed(self, command: Command) -> bool:
+        """Whether a command was passed on, in whatever form: what the guard says itself comes in pieces of its own, braking."""
+        return any(
+            told.state_seq == command.state_seq and told.mode is command.mode and told.config_hash == command.config_hash for _, told in self.heard
+        )
+
+    def acting(self, from_ns: int) -> tuple[Array, Array]:
+        """Times in ms after an instant, and the inputs that began to act then."""
+        times = (np.array(self.times) - from_ns) / MS
+        after = times >= 0.0
+        return times[after], np.array(self.inputs)[after]

@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a guard promises, over nothing but the bus; `deploy/guard.md` is the contract in words.
+
+``pytest tests/guard_conformance --guard "my_guard --verbose"`` runs ``my_guard --verbose CONFIG.toml -e ENDPOINT``; ours without the option.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rti_mpc.message import Command
+from rti_mpc.wire.cdr import encode
+from tests.guard_conformance.rig import MS, Rig
+
+OURS = f"{shlex.quote(sys.executable)} -c 'from service.cli import main; main()' guard"
+
+
+@pytest.fixture(scope="module")
+def running(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    rig = Rig(shlex.split(request.config.getoption("--guard") or OURS), tmp_path_factory.mktemp("guard"))
+    yield rig
+    rig.close()
+
+
+@pytest.fixture
+def rig(running: Rig) -> Iterator[Rig]:
+    """A guard that lets the commands of a robot just started pass; whatever follows, inputs stay inside bounds and slew limits."""
+    running.ready()
+    yield running
+    inputs = np.array(running.inputs)
+    assert (inputs >= running.lbu).all() and (inputs <= running.ubu).all()
+    assert (np.abs(np.diff(inputs, axis=0)) <= running.step + 1e-5).all()  # rounding that a guard may forgive
+
+
+def test_healthy_command_passes_at_once_and_whole(rig: Rig) -> None:
+    sent = []
+    rows = np.array([[0.1 + 0.01 * k, 0.2] for k in range(20)])
+
+    def pilot(_: object) -> Command:
+        sent.append(rig.command(rows, config_hash=77))
+        return sent[-1]
+
+    rig.run(1000, pilot)
+    passed = {told.state_seq: (at_ns, told) for at_ns, told in rig.heard if told.config_hash == 77}
+    assert len(passed) >= len(sent) - 2, "on a busy machine one may be late"
+    for command in sent:
+        if command.state_seq in passed:
+            _, told = passed[command.state_seq]
+            np.testing.assert_array_equal(told.u, command.u)
+            assert replace(told, u=command.u, epoch=command.epoch, seq=command.seq) == command
+    assert np.median([at_ns - told.stamp_ns for at_ns, told in passed.values()]) < 50 * MS, "long before the next sample"
+
+
+def test_actuation_is_numbered_upwards_in_epochs_no_lower_than_any_controllers(rig: Rig) -> None:
+    rig.drive()
+    rig.run(700)
+    rig.leader += 1
+    rig.run(300, rig.towards(np.zeros(2)))
+    numbers = [(told.epoch, told.seq) for _, told in rig.heard]
+    assert numbers == sorted(set(numbers))
+    assert all(told.state_epoch == rig.epoch for _, told in rig.heard)
+    assert numbers[-1][0] >= rig.leader or rig.heard[-1][1].epoch >= rig.leader
+
+
+WRONG: dict[str, Callable[[Rig, Command], dict[str, Any]]] = {
+    "of a robot's earlier life": lambda rig, command: {"state_epoch": rig.epoch - 1},
+    "of rows that are too wide": lambda rig, command: {"u": np.zeros((20, 3))},
+    "that answers a state of half a second ago": lambda rig, command: {"state_stamp_ns": command.state_stamp_ns - 500 * MS},
+    "that answers a state of the future": lambda rig, command: {
+        name: getattr(command, name) + 400 * MS for name in ("state_stamp_ns", "stamp_ns", "valid_until_ns")
+    },
+    "that has expired": lambda rig, command: {"valid_until_ns": command.stamp_ns - 1},
+    "whose number has passed": lambda rig, command: {"seq": 0},
+    "of a lower epoch": lambda rig, command: {"epoch": rig.leader - 1},
+    "beyond the bounds at once": lambda rig, command: {"u": np.tile(1.2 * rig.ubu, (20, 1))},
+    "beyond the bounds later": lambda rig, command: {"u": np.vstack([np.tile(rig.ubu, (10, 1)), 1.01 * rig.ubu])},
+    "beyond the slew limits from row to row": lambda rig, command: {"u": np.vstack([rig.ubu, rig.ubu - 1.2 * rig.step])},
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_command_is_refused_as_a_whole(rig: Rig, what: str) -> None:
+    rig.drive()
+    healthy = rig.command(rig.ubu, config_hash=77)
+    wrong = replace(healthy, **WRONG[what](rig, healthy))
+    rig.send(wrong)
+    rig.run(50)
+    assert not any(told.config_hash == 77 for _, told in rig.heard)
+    np.testing.assert_allclose(rig.actuator.u, rig.ubu)
+    rig.drive(300)  # and the next healthy one passes
+
+
+def test_what_is_no_message_is_refused(rig: Rig) -> None:
+    rig.drive()
+    healthy = encode(rig.command(rig.ubu))
+    nan = encode(rig.command(np.full(2, np.nan)))
+    for payload in (b"", healthy[:40], healthy[:-1], b"\x00\x00" + healthy[2:], nan, healthy + b"\x00", b"\x00\x01\x00\x00" + b"\xff" * 400):
+        rig._commands.put_bytes(payload)
+    rig.run(50)
+    rig.drive(300)
+
+
+def test_plan_plays_on_while_a_message_is_late(rig: Rig) -> None:
+    rig.drive()
+    rows = np.array([rig.ubu * (1 - 0.1 * k) for k in range(5)])
+    rig.run(100, lambda _: rig.command(rows))
+    stamp_ns = rig.state.stamp_ns
+    rig.run(120)
+    times, inputs = rig.acting(stamp_ns)
+    np.testing.assert_allclose(inputs[(times >= 105) & (times < 195)], np.tile(rows[1], (((times >= 105) & (times < 195)).sum(), 1)))
+
+
+def test_silence_is_answered_in_time_inside_the_slew_limits_and_for_good(rig: Rig) -> None:
+    """The fault comes right after a command; braking begins within 300 ms, and the command is zero within 500 ms."""
+    rig.drive()
+    fault_ns = rig.state.stamp_ns
+    rig.run(1500)
+    times, inputs = rig.acting(fault_ns)
+    assert times[(inputs < rig.ubu - 1e-9).all(axis=1)][0] <= 300.0
+    zero_ms = times[~inputs.any(axis=1)][0]
+    assert zero_ms <= 500.0
+    assert not inputs[times >= zero_ms].any()
+    smooth = np.array([np.interp(np.arange(0.0, 600.0, 10.0), times, column) for column in inputs.T]).T
+    assert (np.abs(smooth[10:] - smooth[:-10]) <= 1.12 * rig.step).all(), "over any 100 ms, a step of the ramp aside"
+
+
+def test_standing_is_told_with_a_short_validity(rig: Rig) -> None:
+    rig.drive()
+    rig.run(1500)
+    at_ns, told = rig.heard[-1]
+    assert rig.now_ns - at_ns < 500 * MS
+    assert not told.u.any()
+    assert told.valid_until_ns - at_ns <= 300 * MS
+
+
+def test_nothing_acts_longer_than_promised_whatever_a_command_says(rig: Rig) -> None:
+    rig.run(400, lambda _: rig.command(0.5 * rig.step, valid_until_ns=2**62))
+    assert all(told.valid_until_ns <= told.state_stamp_ns + 300 * MS for _, told in rig.heard if told.u.any())
+    rig.run(600)
+    assert not rig.actuator.u.any()
+
+
+def test_gap_is_left_without_a_jump(rig: Rig) -> None:
+    """A controller that knows of none goes on at full inputs; the fixture watches the slew limits."""
+    rig.drive()
+    rig.run(800)
+    assert not rig.actuator.u.any()
+    rig.run(800, lambda _: rig.command(rig.ubu))
+    np.testing.assert_allclose(rig.actuator.u, rig.ubu)
+
+
+def test_higher_epoch_takes_over_and_the_old_leader_is_fenced_for_good(rig: Rig) -> None:
+    rig.drive()
+    old = rig.leader
+    rig.leader += 5
+    rig.run(300, rig.towards(0.5 * rig.ubu))
+    np.testing.assert_allclose(rig.actuator.u, 0.5 * rig.ubu)
+    rig.leader, rig.seq = old, rig.seq + 1000
+    rig.run(1500, lambda _: rig.command(rig.ubu, config_hash=77))  # while the new one is silent
+    assert not any(told.config_hash == 77 for _, told in rig.heard)
+    assert not rig.actuator.u.any()
+
+
+def test_stale_commands_of_a_controller_that_was_stopped_do_not_pass(rig: Rig) -> None:
+    rig.drive()
+    waiting: list[Command] = []
+
+    def collect(_: object) -> None:
+        waiting.append(rig.command(rig.ubu, config_hash=77))
+
+    rig.run(1500, collect)
+    for command in waiting:
+        rig.send(command)
+    rig.run(60)
+    answered = {told.state_stamp_ns for _, told in rig.heard if told.config_hash == 77}
+    assert all(rig.now_ns - stamp_ns < 400 * MS for stamp_ns in answered)
+
+
+def test_guard_that_was_stopped_passes_nothing_stale_and_goes_on(rig: Rig) -> None:
+    rig.drive()
+    os.kill(rig.process.pid, signal.SIGSTOP)
+    before = len(rig.heard)
+    try:
+        rig.run(1500, rig.towards(rig.ubu))
+        assert not rig.actuator.u.any(), "the robot's own watchdog"
+    finally:
+        os.kill(rig.process.pid, signal.SIGCONT)
+    rig.run(300)
+    assert all(at_ns - told.state_stamp_ns < 300 * MS for at_ns, told in rig.heard[before:] if told.u.any())
+    rig.run(600, rig.towards(rig.ubu))
+    rig.drive()
+
+
+def test_another_life_of_the_robot_forgets_leader_and_plan(rig: Rig) -> None:
+    rig.drive()
+    rig.new_robot()
+    rig.leader -= 50
+    rig.run(400, rig.towards(0.2 * rig.ubu))
+    np.testing.assert_allclose(rig.actuator.u, 0.2 * rig.ubu)
+
+
+@pytest.mark.parametrize("ms", [-3000, 3000])
+def test_clock_that_jumps_lets_nothing_old_pass(rig: Rig, ms: int) -> None:
+    rig.drive()
+    old = rig.command(rig.ubu, config_hash=77)
+    rig.jump(ms)
+    rig.run(150)
+    rig.send(old)
+    rig.run(400)
+    assert not any(told.config_hash == 77 for _, told in rig.heard)
+    assert not rig.actuator.u.any()
+    rig.drive(800)
+
+
+def test_guard_without_states_lets_nothing_pass(rig: Rig) -> None:
+    rig.drive()
+    rig.deaf = True
+    try:
+        rig.run(400, rig.towards(rig.ubu))
+        before = len(rig.heard)
+        rig.run(400, lambda _: rig.command(rig.ubu, config_hash=77))
+        assert not any(told.config_hash == 77 for _, told in rig.heard[before:])
+    finally:
+        rig.deaf = False
+
+
+def test_killed_guard_leaves_the_plan_with_the_robot_and_another_one_goes_on_in_a_higher_epoch(rig: Rig) -> None:
+    rig.drive()
+    fault_ns, epoch = rig.state.stamp_ns, rig.heard[-1][1].epoch
+    rig.kill()
+    rig.start()
+    rig.run(600)
+    times, inputs = rig.acting(fault_ns)
+    assert (inputs[times < 240.0] == rig.ubu).all()
+    assert times[~inputs.any(axis=1)][0] <= 500.0
+    for _ in range(100):
+        rig.run(100, rig.towards(rig.ubu))
+        if rig.actuator.u.any():
+            break
+    rig.drive()
+    assert rig.heard[-1][1].epoch > epoch
+
+
+def test_interrupted_guard_tells_the_robot_to_ramp_to_rest_and_to_stand(rig: Rig) -> None:
+    rig.drive()
+    rig.process.send_signal(signal.SIGINT)
+    rig.run(700, rig.towards(rig.ubu))
+    assert not rig.heard[-1][1].u[-1].any()
+    assert not rig.actuator.u.any()
+    assert rig.actuator.counters.starved == 0
+    assert rig.process.wait(5.0) == 0
+    rig.start()

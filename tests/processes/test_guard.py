@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The guard among real processes: real signals, measured in the robot's own record, by its own clock, at speed 1.
+
+Braking begins within 300 ms of a fault, the command is zero within 500 ms, the
+robot stands within 2.5 s, and it stays so.
+"""
+
+from __future__ import annotations
+
+import csv
+import signal
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rti_mpc.array import Array
+from rti_mpc.message import Command
+from rti_mpc.wire.cdr import decode
+from service.cli import SHIPPED
+from tests.processes.system import CONFIG, KEYS, System, rti_mpc, until
+
+SPEED_M_S = 0.5
+STANDING = 1e-3  # m/s, rad/s
+SLEW = np.array([0.25, 0.40])  # of the shipped configuration, over 0.1 s
+MS = 1_000_000
+PERIOD_NS = 10 * MS  # of the states: the resolution of the record
+
+
+@pytest.fixture(scope="module")
+def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
+    """A robot on a long straight line at its full speed, and its guard; every test leaves it so."""
+    folder = tmp_path_factory.mktemp("guarded")
+    (folder / "line.csv").write_text("x,y\n0,0\n200,0\n")
+    (folder / "robot.toml").write_text(f"{SHIPPED.read_text()}\n[guard]\nenabled = true\n[sim]\nstate_period_s = {1e-9 * PERIOD_NS}\n")
+    line = ("reference", "--scenario", folder / "line.csv", "--waypoint-speed", SPEED_M_S)
+    with System(folder, folder / "robot.toml", robot=("sim",), reference=line) as system:
+        system.start("robot", "guard", "controller", "reference")
+        yield system
+
+
+@pytest.fixture
+def driven(system: System) -> System:
+    """The system, when the robot is at its full speed."""
+    system.tracking()
+    system.state(lambda state: bool(state.x[3] > 0.95 * SPEED_M_S))
+    return system
+
+
+@dataclass
+class Record:
+    """What the robot did after an instant: times in ms, inputs and speeds."""
+
+    times: Array
+    inputs: Array
+    speeds: Array
+
+    @property
+    def braking_ms(self) -> float:
+        """When the first input had left what acted at the instant, towards rest."""
+        return float(self.times[self.inputs[:, 0] < self.inputs[0, 0] - 1e-3][0])
+
+    @property
+    def zero_ms(self) -> float:
+        return float(self.times[~self.inputs.any(axis=1)][0])
+
+    @property
+    def standing_ms(self) -> float:
+        """From when on it stood, to the end."""
+        return float(self.times[(np.abs(self.speeds) >= STANDING).any(axis=1)][-1]) + 1e-6 * PERIOD_NS
+
+
+def recorded(system: System, fault_ns: int, to_ms: int) -> Record:
+    """Wait until the record reaches a time after a fault, and read it from the fault on."""
+
+    def read() -> list[list[float]] | None:
+        with (system.folder / "robot.csv").open(newline="") as file:
+            rows = [row for row in csv.DictReader(file) if row["starved"] and int(row["stamp_ns"]) >= fault_ns]
+        names = ("stamp_ns", "u_c", "omega_c", "u", "omega")
+        return [[float(row[name]) for name in names] for row in rows] if rows and int(rows[-1]["stamp_ns"]) >= fault_ns + to_ms * MS else None
+
+    rows = np.array(until(read, "the record is written", pause_s=0.1))
+    rows = rows[rows[:, 0] <= fault_ns + to_ms * MS]
+    return Record((rows[:, 0] - fault_ns) / MS, rows[:, 1:3], rows[:, 3:])
+
+
+def fault(system: System, number: signal.Signals, *roles: str) -> int:
+    """Send a signal; return the robot's time at it."""
+    now_ns = system.state(lambda _: True).stamp_ns
+    for role in roles:
+        system.running[role].send_signal(number)
+    return now_ns
+
+
+def stopped_in_time(record: Record) -> None:
+    assert record.braking_ms <= 300.0
+    assert record.zero_ms <= 500.0
+    assert record.standing_ms <= 2500.0
+    assert not record.inputs[record.times >= record.zero_ms].any()
+    within_slew(record)
+
+
+def within_slew(record: Record) -> None:
+    """Over any 100 ms; a command that is late leaves the plan before it on for some milliseconds more, which a median of 50 ms does not see."""
+    inputs = np.median(np.lib.stride_tricks.sliding_window_view(record.inputs, 5, axis=0), axis=-1)
+    changes = np.abs(inputs[10:] - inputs[:-10])
+    assert (changes <= SLEW + 1e-6).all(), changes.max(axis=0)
+
+
+@pytest.mark.parametrize("killed", [("controller",), ("guard",), ("controller", "guard")], ids="+".join)
+def test_robot_stops_in_time_when_somebody_is_killed_and_is_driven_again_after_a_restart(driven: System, killed: tuple[str, ...]) -> None:
+    """Without a guard by the robot's own watchdog, which still has the plan."""
+    fault_ns = fault(driven, signal.SIGKILL, *killed)
+    for role in killed:
+        driven.kill(role)
+    record = recorded(driven, fault_ns, 2700)
+    print(f"\n{'+'.join(killed)} killed: braking {record.braking_ms:.0f}, zero {record.zero_ms:.0f}, standing {record.standing_ms:.0f} ms")
+    stopped_in_time(record)
+    restart_ns = driven.state(lambda _: True).stamp_ns
+    driven.start(*killed)
+    driven.state(lambda state: state.x[3] > 0.9 * SPEED_M_S)
+    within_slew(recorded(driven, restart_ns, 1500))
+
+
+@pytest.mark.parametrize("role", ["controller", "guard"])
+def test_nothing_stale_acts_when_somebody_was_stopped_and_goes_on(driven: System, role: str) -> None:
+    """``kill -STOP; sleep 1.5; kill -CONT``"""
+    actuation = driven.bus.subscriber(KEYS.actuation, capacity=4096)
+    fault_ns = fault(driven, signal.SIGSTOP, role)
+    try:
+        driven.state(lambda state: state.stamp_ns >= fault_ns + 1500 * MS)
+    finally:
+        resumed_ns = fault(driven, signal.SIGCONT, role)
+    driven.state(lambda state: state.x[3] > 0.9 * SPEED_M_S)
+    record = recorded(driven, fault_ns, (resumed_ns - fault_ns) // MS + 1500)
+    print(f"\n{role} stopped: braking {record.braking_ms:.0f}, zero {record.zero_ms:.0f} ms")
+    assert record.braking_ms <= 300.0
+    assert record.zero_ms <= 500.0
+    resumed_ms = (resumed_ns - fault_ns) / MS
+    assert not record.inputs[(record.times >= record.zero_ms) & (record.times < resumed_ms)].any()
+    within_slew(record)
+    told = [decode(Command, received.payload) for received in actuation.drain()]
+    stale = [c for c in told if c.u.any() and fault_ns + 100 * MS < c.state_stamp_ns < resumed_ns - 300 * MS and c.mode.name != "BRAKING"]
+    assert not stale
+
+
+def test_guard_says_why_it_intervened(driven: System) -> None:
+    events = driven.bus.subscriber(KEYS.event("guard"), capacity=64)
+    driven.running["controller"].send_signal(signal.SIGSTOP)
+    try:
+        until(lambda: any(b"guard_braking" in received.payload for received in events.drain()), "the guard says that it brakes")
+    finally:
+        driven.running["controller"].send_signal(signal.SIGCONT)
+    until(lambda: any(b"guard_passing" in received.payload for received in events.drain()), "the guard says that commands pass again")
+
+
+def test_guard_process_loads_no_solver_and_no_model(driven: System) -> None:
+    maps = Path(f"/proc/{driven.running['guard'].pid}/maps").read_text()
+    assert "numpy" in maps
+    for package in ("casadi", "osqp", "scipy"):
+        assert f"/{package}/" not in maps, package
+
+
+def test_second_guard_refuses_to_start_beside_a_live_one(driven: System) -> None:
+    done = rti_mpc("guard", driven.config, "-e", driven.endpoint)
+    assert (done.returncode, "pioneer already has a guard" in done.stderr) == (1, True), done.stderr
+
+
+def test_configuration_without_a_guard_is_one_line_and_exit_status_2() -> None:
+    done = rti_mpc("guard", SHIPPED)
+    assert (done.returncode, done.stderr) == (2, "rti-mpc: guard.enabled must be true for the robot to take what a guard passes on, got false\n")
+
+
+def test_ctrl_c_ends_the_guard_with_a_ramp_to_rest(driven: System) -> None:
+    """The last test: the robot stays where it is."""
+    actuation = driven.bus.subscriber(KEYS.actuation, capacity=4096)
+    stopped_ns = driven.state(lambda _: True).stamp_ns
+    status, took_s = driven.interrupt("guard")
+    assert (status, took_s < 1.0) == (0, True), took_s
+    until(lambda: "guard" not in driven.lives, "the guard is gone")
+    last = decode(Command, actuation.drain()[-1].payload)
+    assert not last.u[-1].any()
+    stopped_in_time(recorded(driven, stopped_ns, 2700))
+    assert "Traceback" not in driven.said("guard")
+    assert CONFIG.guard.enabled is False, "the quickstart needs none"
