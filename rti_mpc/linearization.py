@@ -180,10 +180,10 @@ def pattern(weight: np.ndarray[Any, Any]) -> ca.DM:
 
 def shift(ocp: Ocp) -> ca.Function:
     """Build ``(x, u, p) -> (x+, u+)``: a plan moved on by one stage, its last input repeated, with the state the model predicts."""
-    lin = Linearization(ocp)
-    x_next = ocp.phi()(lin.x[:, -1], lin.u[:, -1], lin.p[:, -1])
-    shifted = [ca.horzcat(lin.x[:, 1:], x_next), ca.horzcat(lin.u[:, 1:], lin.u[:, -1])]
-    return ca.Function("shift", [lin.x, lin.u, lin.p], shifted)
+    model, nodes = ocp.model, ocp.N + 1
+    x, u, p = ca.MX.sym("x", model.nx, nodes), ca.MX.sym("u", model.nu, ocp.N_u), ca.MX.sym("p", model.np_, nodes)
+    x_next = ocp.phi()(x[:, -1], u[:, -1], p[:, -1])
+    return ca.Function("shift", [x, u, p], [ca.horzcat(x[:, 1:], x_next), ca.horzcat(u[:, 1:], u[:, -1])])
 
 
 def change(ocp: Ocp, u: Any, before: Any) -> Any:
