@@ -283,8 +283,8 @@ class Rti:
         return status
 
     def _iterate(self) -> None:
-        """Iterate at the plan while QPs are solved and steps are large; an iteration that fails leaves the plan of the one before."""
-        while self.status is SOLVED and self.taken < self.iterations and self._change[0] > self.tolerance:
+        """Iterate at the plan while the step is large; an iteration that fails leaves the plan of the one before."""
+        while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
             self._relinearize()
             if not (status := self._solve()).usable:
                 break
