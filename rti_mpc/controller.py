@@ -3,53 +3,42 @@
 State and reference in, command out: the real-time iteration on the robot's time grid.
 
 No clock inside: every time is a stamp of the robot, or local monotonic time
-handed in. Samples lie on a grid that follows the robot. Preparation fixes the
-time :math:`t_k` at which the next command acts, looks the reference up from
-there on, shifts and linearizes. Feedback starts with the first state stamped
-:math:`t_k - d - h` or later, `d` being the delay from state to actuation and
-`h` half the period of the states; it integrates that state to :math:`t_k` with
-the inputs already sent, embeds it and solves. Reference, plan and command all
-start at :math:`t_k`.
+handed in. Samples lie on a grid that follows the robot (`rti_mpc.grid`).
+Preparation fixes the time :math:`t_k` at which the next command acts, looks the
+reference up from there on, shifts and linearizes. Feedback starts with the
+state that is due; it integrates that state to :math:`t_k` with the inputs already
+sent, embeds it and solves. Reference, plan and command all start at :math:`t_k`.
 
-A plan that cannot be made is replaced, rung by rung: the shifted previous plan,
-at most `FALLBACKS` samples; then a ramp to rest, from past commands alone.
+A plan that cannot be made, or comes too late, is replaced rung by rung
+(`rti_mpc.ladder`). Whatever goes out has passed the `rti_mpc.envelope.Envelope`.
+What follows a gap starts cold, and acts late enough to be there in time.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.delay import DelayEstimator
+from rti_mpc.envelope import Envelope
+from rti_mpc.grid import Grid
+from rti_mpc.grid import Timing as Timing
+from rti_mpc.ladder import Ladder
 from rti_mpc.message import STAMP_ON_ARRIVAL, Command, End, Reference, Severity, State, Telemetry
 from rti_mpc.mode import ModeMachine
 from rti_mpc.observer import Observer
 from rti_mpc.prediction import Prediction
-from rti_mpc.robot_clock import RobotClock
+from rti_mpc.record import Record
 from rti_mpc.rti import Rti
 from rti_mpc.sent import Sent
+from rti_mpc.state_stream import Arrival, StateStream
 from rti_mpc.status import Mode, QpStatus
-from rti_mpc.track import TWO_PI, Track
+from rti_mpc.track import Track
 
-FALLBACKS = 3  # samples in a row that the shifted previous plan may serve
+BUDGET = 0.75  # of a period, after the time at which a command acts, in which it may leave; the rest is for messages on their way
 ITERATIONS_COLD = 3  # iterations of a first sample, whose guess is one state and one input
-
-
-@dataclass(frozen=True)
-class Timing:
-    """
-    Delays and timeouts, in the robot's time.
-
-    Attributes:
-        delay_s: From a state to the act of its command, s.
-        stale_s: Age from which a state is not used, s.
-        valid_s: How long after its state, and the delay, a command may act, s.
-    """
-
-    delay_s: float = 0.0
-    stale_s: float = 0.25
-    valid_s: float = 0.25
 
 
 class Controller:
@@ -57,13 +46,15 @@ class Controller:
     The controller of one robot.
 
     The caller hands in each message as it comes, publishes what is returned,
-    and calls `prepare` after each command, off the path from state to command.
+    and calls `prepare` after each sample, off the path from state to command.
 
     Attributes:
         notices: Mode changes and faults since the caller last emptied it.
-        np_: Parameters a row of a reference may carry: the model's, without the disturbances an observer estimates.
         skipped: Samples skipped since start.
-        fallbacks: Samples commanded without a usable QP since start.
+        ladder: Samples without a plan of their own, by what replaced it.
+        np_: Parameters a row of a reference may carry: the model's, without the disturbances an observer estimates.
+        envelope: What inputs may be.
+        grid: When commands act.
     """
 
     def __init__(
@@ -74,38 +65,33 @@ class Controller:
         self._epoch = epoch
         self._config_hash = config_hash
         self._seq = 0
-        self._dt_ns = round(1e9 * ocp.dt)
-        self._delay_ns = round(1e9 * timing.delay_s)
         self._stale_ns = round(1e9 * timing.stale_s)
         self._valid_ns = round(1e9 * timing.valid_s)
-        self._angles = [j for j, signal in enumerate(model.states) if signal.angle]
         self._u_rest: Array = np.array(model.u_rest)
-        self._held = np.minimum(np.arange(ocp.N), ocp.N_u - 1)  # plan row of each stage
 
-        self._observer = observer
-        self.np_ = model.np_ - (0 if observer is None else len(observer.d))
         self._modes = ModeMachine()
         self.notices = self._modes.notices
         self.skipped = 0
-        self.fallbacks = 0
-        self._track = Track(model, ocp.N, self._dt_ns)
+        self.ladder = Ladder()
+        self.envelope = Envelope(ocp, compile=compile)
+        self.grid = Grid(ocp.dt, timing)
+        self._states = StateStream(model, self._stale_ns, self.grid.dt_ns, observer)
+        self.np_ = model.np_ - len(self._states.d)
+        self._track = Track(model, ocp.N, self.grid.dt_ns)
         self._arriving: Reference | None = None  # waits for a state, to start at or to put its angles next to
-        self._clock = RobotClock()
-        self._sent = Sent(self._u_rest, ocp.lbdu, ocp.ubdu, self._dt_ns)
-        self._state: State | None = None
-        self._x: Array = np.zeros(model.nx)  # the last state, angles unwrapped
-        self._act_ns = 0  # t_k
-        self._warm = False  # whether the guess is one to shift and act on
-        self._loaded = False  # whether the QP of t_k is prepared
-        self._failed = 0  # samples in a row without a usable QP
-        self._stopped = ""  # why an operator's stop is latched
-        self._command: Command | None = None
-        self._planned = (rti.x.copy(), rti.y_ref.copy(), 0.0)  # states, reference and cost of a command, for telemetry
-        self._planned_seq = 0  # of that command
-        self._valid_until_ns = 0
-
+        self._sent = Sent(self._u_rest, ocp.lbdu, ocp.ubdu, self.grid.dt_ns)
         self._prediction = Prediction(model, self._sent, compile=compile)
         self._x0 = self._prediction.x
+        self._loaded = False  # whether the QP of t_k is prepared
+        self._reach: tuple[Array, Array] = (np.zeros((2, model.nu)), np.zeros((2, model.nu)))  # what the first rows at t_k may be
+        self._left_ns = 0  # when the last command left, if that is known
+        self._overran = False  # whether the last sample was over its budget
+        self._stopped = ""  # why an operator's stop is latched
+        self._command: Command | None = None
+        self._plan: Command | None = None  # the last one with a plan of its own
+        self._before: tuple[Command | None, Command | None] = (None, None)  # those two before the last command
+        self._record = Record(rti)
+        self._delay = DelayEstimator(model, self.grid.dt_ns, self.grid.most_ns, compile=compile) if timing.delay_s is None else None
 
     @property
     def mode(self) -> Mode:
@@ -125,29 +111,24 @@ class Controller:
         Returns:
             The command to publish at once, or None: then the state is only kept as the freshest.
         """
-        if self._state is not None and state.epoch != self._state.epoch:
-            self._restart("robot_restarted", "the robot was restarted: starting anew")
-        if self._state is not None and state.stamp_ns <= self._state.stamp_ns:
-            if self._state.stamp_ns - state.stamp_ns <= self._stale_ns:
+        arrival = self._states.receive(state, arrival_ns)
+        if arrival is not Arrival.FRESH:
+            if (notice := self._states.notice) is not None:
+                self.notices.append(notice)
+            if arrival in (Arrival.REPEATED, Arrival.REFUSED, Arrival.OLD):
                 return None
-            self._restart("clock_jumped", f"the robot's clock went back {1e-9 * (self._state.stamp_ns - state.stamp_ns):.3f} s: starting anew")
-        self._clock.observe(state.seq, state.stamp_ns, arrival_ns)
-        self._unwrap(state)
-        self._observe(state)
-        self._state = state
+            self._forget(arrival, state.stamp_ns)
+        self._states.estimate(self._sent, known=self.mode in (Mode.TRACKING, Mode.HOLDING))
+        self._prediction.p[self.np_ :] = self._states.d
         if self.mode is Mode.IDLE:
             self._modes.enter(Mode.WAITING, "first state")
         if self._arriving is not None:
             self._anchor(self._arriving)
-        if not (self._track.loaded or self._stopped):
+        grid, period_ns = self.grid, self._states.clock.period_ns
+        if not (self._track.loaded or self._stopped) or grid.early(state.stamp_ns, period_ns):
             return None
-        early_ns = self._act_ns - self._delay_ns - state.stamp_ns
-        if self._warm and early_ns > self._clock.period_ns / 2:
-            return None
-        if not self._warm or -early_ns > self._dt_ns / 2:
-            self._rejoin(state.stamp_ns)
-            if self._act_ns - self._delay_ns - state.stamp_ns > self._clock.period_ns / 2:
-                return None
+        if (behind := grid.behind(state.stamp_ns)) or not grid.running:
+            self._rejoin(state.stamp_ns, behind)
         return self._act(state)
 
     def receive_reference(self, reference: Reference) -> Reference | None:
@@ -157,17 +138,10 @@ class Controller:
         Returns:
             The reference with its real stamp, to be published, if it was to start on arrival and a state is there to start at.
         """
-        model = self._rti.ocp.model
-        rows, ny = reference.y.shape
-        if rows < 1 or ny != model.ny or reference.p.shape[1] not in (0, self.np_) or reference.period_ns <= 0:
-            self._modes.say(
-                Severity.WARNING,
-                "reference_refused",
-                f"a reference must have rows of {model.ny} outputs and of 0 or {self.np_} parameters, and a positive period, "
-                f"got {rows} rows of {ny} and {reference.p.shape[1]}, {reference.period_ns} ns",
-            )
+        if misfit := self._track.misfit(reference, self.np_):
+            self._modes.say(Severity.WARNING, "reference_refused", misfit)
             return None
-        if self._state is None:
+        if self._states.last is None:
             self._arriving = reference
             return None
         anchored = self._anchor(reference)
@@ -185,7 +159,7 @@ class Controller:
             self._stopped = ""
             self._modes.say(Severity.INFO, "enable", "released by an operator")
             if self.mode is Mode.STOPPED:
-                self._warm = False
+                self.grid.running = False
                 self._modes.enter(Mode.WAITING, "enabled")
 
     def tick(self, local_ns: int) -> Command | None:
@@ -195,105 +169,179 @@ class Controller:
         Args:
             local_ns: Local monotonic time.
         """
-        if self._state is None or self.mode in (Mode.IDLE, Mode.WAITING) or not self._warm:
+        state = self._states.last
+        if state is None or not self.grid.running:
             return None
-        now_ns = self._clock.now_ns(local_ns)
-        age_ns = now_ns - self._state.stamp_ns
+        now_ns = self._states.clock.now_ns(local_ns)
+        age_ns = now_ns - state.stamp_ns
         if age_ns <= self._stale_ns:
             return None
-        self._warm = False
-        self._modes.enter(Mode.STOPPED if self._stopped else Mode.BRAKING, f"no state for {1e-9 * age_ns:.3f} s", Severity.ERROR, "state_stale")
-        return self._issue(self._state, now_ns, QpStatus.NONE, self._ramp(self._sent.at(now_ns)[0]))
+        self.grid.running = False
+        mode = Mode.STOPPED if self._stopped else Mode.BRAKING
+        self._modes.enter(mode, f"no state for {1e-9 * age_ns:.3f} s", Severity.ERROR, "state_stale")
+        return self._brake(state, now_ns + self.grid.delay_ns, QpStatus.NONE)
+
+    def in_time(self, command: Command, local_ns: int) -> Command | None:
+        """
+        Hold a sample to its budget: its command must be there before its first row is over.
+
+        Args:
+            command: What `receive_state` has just returned.
+            local_ns: Local monotonic time.
+
+        Returns:
+            What to publish: the command; or nothing if it is too late, so that the
+            previous plan plays on in the robot's hands; or a ramp when it does not.
+        """
+        elapsed_ns = round((local_ns - self._states.clock.arrival_ns) * self._states.clock.rate)
+        now_ns = command.state_stamp_ns + self._states.clock.late_ns + elapsed_ns
+        if now_ns < command.stamp_ns + BUDGET * self.grid.dt_ns:
+            if self._overran:
+                self._overran = False
+                self._modes.enter(command.mode, "samples are in time again")
+            self._left_ns = now_ns
+            return command
+        self._overran = True
+        self._sent.withdraw(command)
+        self._seq -= 1
+        self._command, self._plan = self._before
+        failure = f"a sample took {1e-9 * elapsed_ns:.3f} s"
+        if self._plays_on(now_ns, counted=command.mode is Mode.FALLBACK):
+            self._modes.enter(Mode.FALLBACK, f"{failure}: the previous plan plays on", Severity.WARNING, "over_budget")
+            return None
+        if not self._stopped:
+            self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "over_budget")
+        assert self._states.last is not None
+        return self._brake(self._states.last, now_ns + self.grid.delay_ns, command.status)
 
     # The two phases.
 
     def prepare(self) -> None:
         """Prepare the next sample: fix `t_k`, look the reference up, shift, linearize and load the QP."""
-        self._keep()
-        if not self._warm or self._state is None:
+        self._record.keep(self._seq)
+        if self._command is not None and self._left_ns > self._command.stamp_ns:
+            self._sent.withdraw(self._command)
+            self._sent.append(self._command, self._left_ns)
+        state = self._states.last
+        if not self.grid.running or state is None:
             return
-        offset_ns = self._state.stamp_ns + self._delay_ns - self._act_ns
-        self._act_ns += self._dt_ns
-        if abs(offset_ns) <= self._clock.period_ns / 2:
-            self._act_ns += offset_ns  # the grid follows the robot's; what is late beyond jitter does not move it
+        if self._delay is not None:
+            self._measure_delay(self._delay, state.stamp_ns)
+        self.grid.advance(state.stamp_ns, self._states.clock.period_ns)
         self._loaded = False
-        if self.mode in (Mode.TRACKING, Mode.HOLDING, Mode.FALLBACK):
-            self._load(shift=True)
+        if self.mode in (Mode.TRACKING, Mode.HOLDING):
+            self.ladder.failed = 0
+        elif self.mode is not Mode.FALLBACK or not np.isfinite(self._rti.x).all():
+            return  # the next sample starts cold
+        self._load(shift=True)
 
-    def _keep(self) -> None:
-        """Keep the plan of the last command for telemetry, before the next one overwrites it."""
-        if self._planned_seq != self._seq:
-            self._planned = (self._rti.x.copy(), self._rti.y_ref.copy(), self._rti.cost)
-            self._planned_seq = self._seq
+    def _measure_delay(self, estimator: DelayEstimator, stamp_ns: int) -> None:
+        """Learn from the state of the last sample, and let the grid follow."""
+        estimator.observe(self._states.x, stamp_ns)
+        if self._command is not None:
+            estimator.sent(self._command)
+        self._sent.delay_ns = estimator.delay_ns
+        self.grid.adapt(estimator.delay_ns)
 
     def _load(self, *, shift: bool) -> None:
         """Load the QP of `t_k`."""
-        self._track.look_up(self._act_ns)
-        self._track.p[:, self.np_ :] = self._prediction.p[self.np_ :]
-        self._rti.prepare(self._track.y_ref, self._track.p, shift=shift, u_prev=self._sent.at(self._act_ns - 1)[0])
+        act_ns = self.grid.act_ns
+        self._track.look_up(act_ns)
+        self._track.p[:, self.np_ :] = self._states.d
+        self._reach = self._sent.reach(act_ns)
+        self._rti.prepare(self._track.y_ref, self._track.p, shift=shift, u_prev=self._sent.at(act_ns - 1)[0])
         self._loaded = True
 
-    def _rejoin(self, stamp_ns: int) -> None:
-        """Bring plan and grid to a state that the grid has not expected: the first one, or one that comes late."""
-        behind = round((stamp_ns + self._delay_ns - self._act_ns) / self._dt_ns) if self._warm else 0
-        if 0 < behind < self._rti.ocp.N:
-            self.skipped += behind
-            self._act_ns += behind * self._dt_ns
+    def _rejoin(self, stamp_ns: int, behind: int) -> None:
+        """Bring plan and grid to a state that the grid has not expected: one that comes late, or the first after a gap."""
+        self.skipped += behind
+        if behind and self._command is not None and stamp_ns + self.grid.delay_ns < self._command.valid_until_ns:  # what was sent still acts
+            self.grid.catch_up(behind, stamp_ns)
             if self._loaded:
                 for _ in range(behind - 1):
                     self._rti.shift()
                 self._load(shift=True)
             return
-        self.skipped += behind
-        self._act_ns = stamp_ns + self._delay_ns
-        self._warm = True
-        self._failed = 0
+        if behind:
+            self._modes.say(Severity.WARNING, "gap", f"no sample for {behind} periods: starting cold")
+        self.grid.start(stamp_ns)
         self._loaded = False
+        self._plan = None
+        self.ladder.failed = 0
 
     def _act(self, state: State) -> Command:
         """Feedback: from a due state to the command that acts at `t_k`."""
-        ending = self._track.ended(self._act_ns)
+        act_ns = self.grid.act_ns
+        ending = self._track.ended(act_ns)
         if self._stopped or ending is End.STOP:
             mode, reason = (Mode.STOPPED, self._stopped) if self._stopped else (Mode.BRAKING, "the reference ended with STOP")
-            self._loaded = False
             self._modes.enter(mode, reason)
-            self._valid_until_ns = state.stamp_ns + self._delay_ns + self._valid_ns
-            return self._issue(state, self._act_ns, QpStatus.NONE, self._ramp(self._sent.at(self._act_ns - 1)[0]))
-        self._prediction.predict(self._x, state.stamp_ns, self._act_ns)
-        status = self._feedback_cold() if not self._loaded else self._rti.feedback(self._x0)
-        if status.usable:
-            self._failed = 0
-            if ending is None:
-                self._modes.enter(Mode.TRACKING, "following the reference")
-            else:
-                self._modes.enter(Mode.HOLDING, "the reference has ended")
-            self._valid_until_ns = min(self._act_ns + self._rti.ocp.N * self._dt_ns, state.stamp_ns + self._delay_ns + self._valid_ns)
-            return self._issue(state, self._act_ns, status, self._rti.u[self._held])
-        self._failed += 1
-        self.fallbacks += 1
-        if self._failed <= FALLBACKS and self._loaded:
-            self._modes.enter(Mode.FALLBACK, f"the QP is {status.name.lower()}: playing the previous plan", Severity.WARNING, "qp_failed")
-            return self._issue(state, self._act_ns, status, self._rti.u[self._held])
-        self._loaded = False
-        self._modes.enter(Mode.BRAKING, f"the QP is {status.name.lower()} and no plan is left", Severity.ERROR, "no_plan")
-        self._valid_until_ns = state.stamp_ns + self._delay_ns + self._valid_ns
-        return self._issue(state, self._act_ns, status, self._ramp(self._sent.at(self._act_ns - 1)[0]))
+            return self._brake(state, act_ns, QpStatus.NONE, wanted=True)
+        self._prediction.predict(self._states.x, state.stamp_ns, act_ns)
+        status = self._rti.feedback(self._x0) if self._loaded else self._feedback_cold()
+        if not (status.usable and np.isfinite(self._rti.u).all()):
+            return self._fall_back(state, status)
+        self.ladder.softened += self._rti.solver is not (self._rti.active_set or self._rti.solvers[0])
+        mode, reason = (Mode.TRACKING, "following the reference") if ending is None else (Mode.HOLDING, "the reference has ended")
+        if not self._overran:
+            self._modes.enter(mode, reason)
+        valid_until_ns = min(act_ns + self._rti.ocp.N * self.grid.dt_ns, state.stamp_ns + self.grid.delay_ns + self._valid_ns)
+        self._plan = self._issue(state, act_ns, valid_until_ns, mode, status, self.envelope.fit(self._rti.u, self._reach))
+        return self._plan
 
     def _feedback_cold(self) -> QpStatus:
         """Solve a first sample: the guess stays where the robot is, and is iterated on."""
-        self._rti.reset(self._x0, self._sent.at(self._act_ns - 1)[0])
+        self._rti.reset(self._x0, self._sent.at(self.grid.act_ns - 1)[0])
         status = QpStatus.FAILED
         for _ in range(ITERATIONS_COLD):
             self._load(shift=False)
             status = self._rti.feedback(self._x0)
-        self._loaded = status.usable  # a guess that was never a plan is none to fall back to
         return status
+
+    # What replaces a plan.
+
+    def _plays_on(self, now_ns: int, *, counted: bool = False) -> bool:
+        """Whether the previous plan may serve a sample that has none of its own."""
+        left = self._plan is not None and now_ns < self._plan.valid_until_ns
+        return left if counted else self.ladder.fall(plan_left=left)
+
+    def _fall_back(self, state: State, status: QpStatus) -> Command:
+        """Replace a plan that could not be made."""
+        act_ns, plan, failure = self.grid.act_ns, self._plan, f"the QP is {status.name.lower()}"
+        if self._plays_on(act_ns) and plan is not None:
+            self._modes.enter(Mode.FALLBACK, f"{failure}: playing the previous plan", Severity.WARNING, "qp_failed")
+            rows = self.envelope.refit(plan.u, round((act_ns - plan.stamp_ns) / plan.period_ns), self._reach)
+            return self._issue(state, act_ns, plan.valid_until_ns, Mode.FALLBACK, status, rows)
+        self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "no_plan")
+        return self._brake(state, act_ns, status)
+
+    def _brake(self, state: State, act_ns: int, status: QpStatus, *, wanted: bool = False) -> Command:
+        """
+        Issue the brake law, because a stop is `wanted` or for want of a plan.
+
+        It is valid from its own time on, not from its state's: made of past commands
+        and never further from rest than they, it is as right without a state.
+        """
+        rows = self.envelope.ramp(self._sent.reach(act_ns))
+        if not wanted:
+            self.ladder.brake(at_rest=bool((rows[0] == self._u_rest).all()))
+        self._plan = None
+        self._loaded = False
+        return self._issue(state, act_ns, act_ns + self._valid_ns, self.mode, status, rows)
+
+    def standstill(self, local_ns: int) -> Command | None:
+        """Return the last command of a life: to rest as fast as the slew limits allow; None if nothing was ever commanded."""
+        state = self._states.last
+        if self._command is None or state is None:
+            return None
+        return self._brake(state, self.robot_now_ns(local_ns) + self.grid.delay_ns, QpStatus.NONE, wanted=True)
 
     # What goes out.
 
-    def _issue(self, state: State, act_ns: int, status: QpStatus, u: Array) -> Command:
+    def _issue(self, state: State, act_ns: int, valid_until_ns: int, mode: Mode, status: QpStatus, u: Array) -> Command:
         """Make a command of a plan, shape ``(N, nu)``."""
         self._seq += 1
+        self._before = (self._command, self._plan)
         self._command = Command(
             epoch=self._epoch,
             seq=self._seq,
@@ -301,31 +349,15 @@ class Controller:
             state_epoch=state.epoch,
             state_seq=state.seq,
             state_stamp_ns=state.stamp_ns,
-            valid_until_ns=self._valid_until_ns,
+            valid_until_ns=valid_until_ns,
             config_hash=self._config_hash,
-            mode=self.mode,
+            mode=mode,
             status=status,
-            period_ns=self._dt_ns,
+            period_ns=self.grid.dt_ns,
             u=u,
         )
         self._sent.append(self._command)
         return self._command
-
-    def _ramp(self, u: Array) -> Array:
-        """Return a plan from an input to rest inside the slew limits, shape ``(N, nu)``; from past commands, never from a measured speed."""
-        ocp = self._rti.ocp
-        plan = np.empty((ocp.N, len(u)))
-        for k in range(ocp.N):
-            u = u + np.clip(self._u_rest - u, ocp.lbdu, ocp.ubdu)
-            plan[k] = u
-        return plan
-
-    def standstill(self) -> Command | None:
-        """Return the last command of a life: rest, whatever came before; None if nothing was ever commanded."""
-        if self._command is None or self._state is None:
-            return None
-        self._valid_until_ns = self._state.stamp_ns + self._delay_ns + self._valid_ns
-        return self._issue(self._state, self._act_ns, QpStatus.NONE, np.tile(self._u_rest, (self._rti.ocp.N, 1)))
 
     @property
     def at_rest(self) -> bool:
@@ -334,86 +366,44 @@ class Controller:
 
     def slack_s(self, local_ns: int) -> float:
         """Return robot time, s, from a local monotonic time to the state of the next sample."""
-        return 1e-9 * (self._act_ns - self._delay_ns - self._clock.now_ns(local_ns))
+        return 1e-9 * (self.grid.act_ns - self.grid.delay_ns - self._states.clock.now_ns(local_ns))
 
     def robot_now_ns(self, local_ns: int) -> int:
         """Return robot time at a local monotonic time."""
-        return self._clock.now_ns(local_ns)
+        return self._states.clock.now_ns(local_ns)
 
     def telemetry(self, *, prepare_us: float, feedback_us: float, latency_us: float, slack_s: float) -> Telemetry:
         """Describe the last sample; the times are the caller's, who has a clock."""
-        command, solver = self._command, self._rti.solver
-        assert command is not None
-        self._keep()
-        return Telemetry(
-            epoch=command.epoch,
-            seq=command.seq,
-            stamp_ns=command.stamp_ns,
-            state_seq=command.state_seq,
-            state_stamp_ns=command.state_stamp_ns,
-            mode=command.mode,
-            status=command.status,
-            iterations=solver.iterations,
-            res_prim=solver.res_prim,
-            res_dual=solver.res_dual,
-            cost=self._planned[2],
-            violation=self._rti.violation,
-            prepare_us=prepare_us,
-            feedback_us=feedback_us,
-            latency_us=latency_us,
-            state_age_s=1e-9 * (command.stamp_ns - command.state_stamp_ns),
-            slack_s=slack_s,
-            skipped=self.skipped,
-            fallbacks=self.fallbacks,
-            parameter_version=0,
-            x0=self._x0.copy(),
-            x=self._planned[0],
-            u=command.u,
-            y_ref=self._planned[1],
-            d=self._prediction.p[self.np_ :].copy(),
+        assert self._command is not None
+        times = prepare_us, feedback_us, latency_us, slack_s
+        return self._record.telemetry(
+            self._command, self._x0, self._states.d, times, delay_s=1e-9 * self.grid.delay_ns, skipped=self.skipped, ladder=self.ladder
         )
 
     # Small parts.
 
     def _anchor(self, reference: Reference) -> Reference:
         """Follow a checked reference, from the last state on if it is to start on arrival."""
+        state = self._states.last
+        assert state is not None
         self._arriving = None
-        stamp_ns = reference.stamp_ns if self._state is None else self._state.stamp_ns
         if reference.stamp_ns == STAMP_ON_ARRIVAL:
-            reference = replace(reference, stamp_ns=stamp_ns)
-        self._track.load(reference, self._x, stamp_ns)
-        if self._loaded and self._warm:
+            reference = replace(reference, stamp_ns=state.stamp_ns)
+        self._track.load(reference, self._states.x, state.stamp_ns)
+        if self._loaded and self.grid.running:
             self._load(shift=False)
         return reference
 
-    def _unwrap(self, state: State) -> None:
-        """Take over a state, its angles nearest to those of the last one."""
-        last = self._x.copy()
-        self._x[:] = state.x
-        if self._state is not None:
-            for j in self._angles:
-                self._x[j] += TWO_PI * round((last[j] - self._x[j]) / TWO_PI)
-
-    def _observe(self, state: State) -> None:
-        """Replace the state by its estimate, and let predictions know of the disturbances."""
-        observer = self._observer
-        if observer is None:
-            return
-        if self._state is None or state.stamp_ns - self._state.stamp_ns > self._stale_ns:
-            observer.reset(self._x)
+    def _forget(self, arrival: Arrival, stamp_ns: int) -> None:
+        """Keep nothing of the robot's last life, or of the time before its clock jumped but that it brakes since then."""
+        if arrival is Arrival.NEW_LIFE:
+            self._sent.clear()
         else:
-            observer.frozen = self.mode not in (Mode.TRACKING, Mode.HOLDING)  # which inputs act is then known less well
-            for u, span_s in self._sent.spans(self._state.stamp_ns, state.stamp_ns):
-                observer.predict(u, span_s)
-            observer.correct(self._x)
-        self._x[:] = observer.x
-        self._prediction.p[self.np_ :] = observer.d
-
-    def _restart(self, code: str, text: str) -> None:
-        """Forget the robot's last life."""
-        self._modes.enter(Mode.IDLE, text, Severity.WARNING, code)
-        self._state = None
-        self._clock.reset()
-        self._sent.clear()
-        self._track.clear()
-        self._warm = self._loaded = False
+            self._sent.brake(self._states.before_ns, stamp_ns)
+        if arrival is not Arrival.JUMPED_AHEAD:
+            self._modes.enter(Mode.IDLE, "another life of the robot, or of its clock")
+            self._track.clear()
+        if self._delay is not None:
+            self._delay.clear()
+        self._plan = None
+        self._overran = self._loaded = self.grid.running = False

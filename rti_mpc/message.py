@@ -125,13 +125,18 @@ class Telemetry:
         state_age_s: How much older than the command's stamp the state was, robot time.
         slack_s: Time left to the next state when its sample was prepared, robot time; negative: the sample overran its period.
         skipped: Samples skipped since start.
-        fallbacks: Samples commanded without a usable QP since start.
+        fallbacks: Samples without a plan of their own since start.
         parameter_version: Version of the controller's parameters.
         x0: State embedded at stage 0, shape ``(nx,)``.
         x: Predicted states, shape ``(N + 1, nx)``.
         u: Planned inputs, shape ``(N, nu)``; row 0 is what was commanded.
         y_ref: Reference rows used, shape ``(N, ny)``.
         d: Estimated disturbances, shape ``(nd,)``, those of ``info``; none without an observer.
+        delay_s: From a state to the act of its command, as configured or measured, robot time.
+        softened: Samples since start whose plan another solver had to find than the first.
+        shifted: Samples since start, of the fallbacks, on which the previous plan played on.
+        braked: Samples since start, of the fallbacks, that were answered by the ramp to rest.
+        rested: Samples since start, of the fallbacks, that were answered by a standstill.
     """
 
     epoch: int
@@ -159,6 +164,11 @@ class Telemetry:
     u: Array
     y_ref: Array
     d: Array = field(default_factory=lambda: np.zeros(0))
+    delay_s: float = 0.0
+    softened: int = 0
+    shifted: int = 0
+    braked: int = 0
+    rested: int = 0
 
 
 @dataclass(slots=True)

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 WINDOW_NS = 1_000_000_000  # local time over which the rate is measured
+EACH_STATE = 1.05  # factor by which one state may change the rate
+LEAP_NS = 250_000_000  # robot time by which a clock that has jumped is ahead
 
 
 class RobotClock:
@@ -14,13 +16,22 @@ class RobotClock:
     unchanged: timeouts are local time since arrival, times `rate`.
 
     Attributes:
-        stamp_ns: Last stamp, robot time.
+        stamp_ns: Stamp of the last state that was fresh, robot time.
         arrival_ns: When it arrived, local monotonic time.
         rate: Robot seconds per local second; assumed low until measured, or a slow simulation would be taken for a dead robot.
+        late_ns: By how much the last state came later than those before it had, robot time.
+        leapt: Whether the last stamp was far ahead of its time: the robot's clock has jumped.
         period_ns: Time between states, robot time, smoothed; 0 until two have come.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, late_ns: int = 250_000_000) -> None:
+        """
+        Begin with nothing known.
+
+        Args:
+            late_ns: Robot time by which a state may be late and still be fresh.
+        """
+        self._most_ns = late_ns
         self.reset()
 
     def reset(self) -> None:
@@ -31,21 +42,49 @@ class RobotClock:
         self.period_ns = 0.0
         self._seq = 0
         self._anchor: tuple[int, int] | None = None
+        self._old: tuple[int, int] | None = None  # stamp and arrival of the last state, if that was not fresh
+        self._measured = False  # whether the rate is
+        self.late_ns = 0
+        self.leapt = False
 
-    def observe(self, seq: int, stamp_ns: int, arrival_ns: int) -> None:
-        """Take note of a state's stamp and arrival."""
-        if self._anchor is None:
+    def observe(self, seq: int, stamp_ns: int, arrival_ns: int) -> bool:
+        """
+        Take note of a state's stamp and arrival, and tell whether it is fresh.
+
+        One that comes much later than the others did has waited on its way, in
+        the queues of a process that was stopped for instance: more like it
+        follow at once. If the next one takes its time, it is the robot's clock
+        that has waited, as a simulation's may, and goes on from here.
+        """
+        late = self._anchor is not None
+        ahead_ns = stamp_ns - self.now_ns(arrival_ns)
+        leaps = self._measured and ahead_ns > max(self._most_ns, LEAP_NS) and not self.leapt
+        if self._anchor is None or leaps:
+            self._anchor = (stamp_ns, arrival_ns)
+        elif -ahead_ns > self._most_ns:
+            old, self._old = self._old, (stamp_ns, arrival_ns)
+            if old is None or 2 * self.rate * (arrival_ns - old[1]) < stamp_ns - old[0]:
+                return False
+            late = False
+            self.rate = self._rate(stamp_ns - old[0], arrival_ns - old[1])
             self._anchor = (stamp_ns, arrival_ns)
         elif stamp_ns > self.stamp_ns:
             period_ns = (stamp_ns - self.stamp_ns) / max(1, seq - self._seq)
-            self.period_ns += (period_ns - self.period_ns) * (0.1 if self.period_ns else 1.0)
+            self.period_ns += (min(period_ns, 2.0 * self.period_ns) - self.period_ns) * 0.1 if self.period_ns else period_ns
             elapsed_ns = arrival_ns - self._anchor[1]
             if elapsed_ns >= WINDOW_NS // 4:
-                rate = (stamp_ns - self._anchor[0]) / elapsed_ns
-                self.rate = min(max(rate, 1e-3), 1e3)
+                rate = self._rate(stamp_ns - self._anchor[0], elapsed_ns)  # little by little: it may be this state that is late
+                self.rate = min(max(rate, self.rate / EACH_STATE), self.rate * EACH_STATE) if self._measured else rate
+                self._measured = True
             if elapsed_ns >= WINDOW_NS:
                 self._anchor = (stamp_ns, arrival_ns)
+        self._old, self.leapt = None, leaps
+        self.late_ns = max(0, -ahead_ns) if late else 0
         self._seq, self.stamp_ns, self.arrival_ns = seq, stamp_ns, arrival_ns
+        return True
+
+    def _rate(self, robot_ns: int, local_ns: int) -> float:
+        return min(max(robot_ns / local_ns, 1e-3), 1e3)
 
     def now_ns(self, local_ns: int) -> int:
         """Return robot time at a local time."""

@@ -103,6 +103,11 @@ class Schedule:
         if len(plans) > WAITING:
             del plans[1]
 
+    def withdraw(self, command: Command) -> None:
+        """Take the last plan back, if it is this command's: it will not act."""
+        if len(self._plans) > 1 and self._plans[-1].stamp_ns == command.stamp_ns:
+            self._plans.pop()
+
     def forget(self, t_ns: int) -> None:
         """Drop what is over before a time."""
         while len(self._plans) > 1 and self._plans[1].start_ns <= t_ns:

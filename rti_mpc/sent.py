@@ -13,15 +13,32 @@ from rti_mpc.schedule import EVER_NS, Schedule, end_ns
 
 
 class Sent:
-    """The last commands, as the robot plays them if none is late."""
+    """
+    The last commands, as the robot plays them if none is later than expected.
+
+    Attributes:
+        delay_ns: How long after the state that it answers a command can act, though its time have come before.
+    """
 
     def __init__(self, u_rest: Array, lbdu: Array, ubdu: Array, dt_ns: int) -> None:
+        self.delay_ns = 0
+        self._slew = (lbdu, ubdu)  # per dt
+        self._dt_ns = dt_ns
         self._schedule = Schedule(u_rest, 1e9 * np.minimum(-lbdu, ubdu) / dt_ns)
 
-    def append(self, command: Command) -> None:
-        """Remember a command, unless it has expired before its time, as the last of several fallbacks may: the robot refuses it."""
-        if command.stamp_ns < end_ns(command):
-            self._schedule.add(command, command.stamp_ns, end_ns(command))
+    def append(self, command: Command, left_ns: int = EVER_NS) -> None:
+        """Remember a command, and when it left; unless it has expired before its time, and the robot refuses it."""
+        start_ns = max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, left_ns)
+        if start_ns < end_ns(command):
+            self._schedule.add(command, start_ns, end_ns(command))
+
+    def withdraw(self, command: Command) -> None:
+        """Forget the last command: it was not sent after all."""
+        self._schedule.withdraw(command)
+
+    def brake(self, before_ns: int, now_ns: int) -> None:
+        """Assume that the robot, whose clock has jumped from one time to another, brakes from what acted."""
+        self._schedule.brake(self.at(before_ns)[0], now_ns)
 
     def clear(self) -> None:
         """Forget everything: the robot was restarted, and stands."""
@@ -41,3 +58,28 @@ class Sent:
         """Return the input that acts at a time, shape ``(nu,)``, and when it next changes."""
         u, change_ns, _ = self._schedule.at(t_ns)
         return u, change_ns
+
+    def reach(self, t_ns: int) -> tuple[Array, Array]:
+        """
+        Return what the first two rows of a plan may be at least and at most, each of shape ``(2, nu)``.
+
+        Row 0 takes over at a time, or late by up to a period. It is to be within
+        the slew limits of every input that acts in the period before, and of those
+        that act until it arrives; so is row 1 of the latter. Then the inputs change
+        by no more than the limits within any period, whenever the plan arrives.
+        Where the robot brakes on its own, that leaves it the speed it has.
+        """
+        acting = self.at(t_ns)[0]
+        second = self._near(acting + self._slew[0], acting + self._slew[1], t_ns, t_ns + self._dt_ns - 1)
+        first = self._near(*second, t_ns - self._dt_ns + 1, t_ns)
+        return np.array([first[0], second[0]]), np.array([first[1], second[1]])
+
+    def _near(self, lowest: Array, highest: Array, at_ns: int, last_ns: int) -> tuple[Array, Array]:
+        """Narrow an interval to what is within the slew limits of all inputs from one time to another; if nothing is, to what comes nearest."""
+        lbdu, ubdu = self._slew
+        while at_ns <= last_ns:
+            u, change_ns = self.at(at_ns)
+            narrowed = np.minimum(np.maximum(lowest, u + lbdu), highest)
+            lowest, highest = narrowed, np.maximum(np.minimum(highest, u + ubdu), narrowed)
+            at_ns = change_ns if at_ns == last_ns else min(change_ns, last_ns)
+        return lowest, highest

@@ -38,6 +38,22 @@ class Track:
         self._reference: Reference | None = None
         self._rows: Array = np.zeros((1, model.ny + model.np_))
 
+    def misfit(self, reference: Reference, right_np: int) -> str:
+        """
+        Return what is wrong with a reference and what would be right, empty if it can be followed.
+
+        Args:
+            reference: As it came.
+            right_np: Parameters that a row may have.
+        """
+        (rows, ny), np_, right_ny = reference.y.shape, reference.p.shape[1], self.y_ref.shape[1]
+        if rows >= 1 and ny == right_ny and np_ in (0, right_np) and reference.period_ns > 0:
+            return ""
+        return (
+            f"a reference must have rows of {right_ny} outputs and of 0 or {right_np} parameters, and a positive period, "
+            f"got {rows} rows of {ny} and {np_}, {reference.period_ns} ns"
+        )
+
     def load(self, reference: Reference, x: Array, stamp_ns: int) -> None:
         """
         Follow a reference from now on.

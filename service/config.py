@@ -21,7 +21,18 @@ from pydantic import Field, ValidationError
 
 from rti_mpc.errors import ConfigError, OcpError
 from service.refusal import explain, unknown_name
-from service.schema import BusSection, GuardSection, ModelSection, ObserverSection, OcpSection, Section, SimSection, SolverSection, TimingSection
+from service.schema import (
+    BusSection,
+    DebugSection,
+    GuardSection,
+    ModelSection,
+    ObserverSection,
+    OcpSection,
+    Section,
+    SimSection,
+    SolverSection,
+    TimingSection,
+)
 
 if TYPE_CHECKING:
     from rti_mpc.guard import Limits
@@ -35,6 +46,7 @@ if TYPE_CHECKING:
 
 
 ITERATIONS = {"iterations", "tolerance"}  # what of the solver's section is not OSQP's
+RAMP_LEAD_S = 0.025  # from a state going stale to the end of its plan: in it the ramp is made, and reaches the robot
 
 
 class Config(Section):
@@ -48,6 +60,7 @@ class Config(Section):
     timing: TimingSection = Field(default=TimingSection(), description="delays and timeouts")
     observer: ObserverSection = Field(default=ObserverSection(), description="estimator of disturbances and of unmeasured states; none if left out")
     guard: GuardSection = Field(default=GuardSection(), description="the guard between controller and robot")
+    debug: DebugSection = Field(default=DebugSection(), description="failures on request")
     bus: BusSection = Field(default=BusSection(), description="the Zenoh session")
     sim: SimSection = Field(default=SimSection(), description="the simulated robot")
 
@@ -58,13 +71,18 @@ class Config(Section):
 
     @property
     def stale_s(self) -> float:
-        """Age from which a state is not used, s of the robot."""
-        return self.timing.stale_s or min(max(2.5 * self.ocp.dt_s, 0.05), 0.25)
+        """Age from which a state is not used, s of the robot; early enough that the ramp is there before the last plan ends."""
+        return self.timing.stale_s or min(max(2.5 * self.ocp.dt_s, 0.05), max(self.timing.valid_s - RAMP_LEAD_S, self.ocp.dt_s))
+
+    @property
+    def delay_s(self) -> float | None:
+        """Delay from a state to the act of its command, s of the robot; None: measured."""
+        return None if self.timing.delay_s == "measured" else self.timing.delay_s
 
     @property
     def config_hash(self) -> int:
-        """64 bits of everything that decides a command: not of the bus, the guard or the simulation."""
-        content = self.model_dump(mode="json", exclude={"bus", "guard", "sim"})
+        """64 bits of everything that decides a command: not of the bus, the guard, the simulation or failures on request."""
+        content = self.model_dump(mode="json", exclude={"bus", "debug", "guard", "sim"})
         return int.from_bytes(hashlib.sha256(json.dumps(content, sort_keys=True).encode()).digest()[:8], "little")
 
     def build_model(self) -> Model:
@@ -106,8 +124,10 @@ class Config(Section):
     def build_rti(self) -> Rti:
         """Return the real-time iteration, compiled."""
         from rti_mpc.rti import Rti
+        from service.injection import FaultyRti
 
-        return Rti(self.build_ocp(), self.solver_settings(), formulation=self.ocp.formulation, **self.iterations())
+        cls = FaultyRti if self.debug.inject else Rti
+        return cls(self.build_ocp(), self.solver_settings(), formulation=self.ocp.formulation, **self.iterations())
 
     def build_observer(self) -> Observer | None:
         """Return the observer, compiled, if there is anything to estimate."""
@@ -136,6 +156,7 @@ class Config(Section):
         """Return what the guard lets pass; its configuration is enough, no model is loaded."""
         import numpy as np
 
+        from rti_mpc.grid import MOST
         from rti_mpc.guard import Limits
 
         inputs = tuple(self.ocp.bounds.inputs)
@@ -148,8 +169,8 @@ class Config(Section):
             lbdu=np.array(lbdu),
             ubdu=np.array(ubdu),
             dt_s=self.ocp.dt_s,
-            delay_s=self.timing.delay_s,
-            stale_s=self.stale_s,
+            delay_s=MOST * self.ocp.dt_s if self.delay_s is None else self.delay_s,
+            stale_s=self.timing.valid_s,  # of commands, too: a ramp answers a state that is stale
         )
 
     def with_initial_state(self, assignments: Sequence[str]) -> Config:

@@ -34,6 +34,7 @@ from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.interrupt import stop_on_signals
+from service import injection
 from service.config import Config
 
 ROLE = "controller"
@@ -63,7 +64,7 @@ def main(config: Config, bus_settings: BusSettings, *, stop: Event | None = None
     ocp = rti.ocp
     warm_up(rti)
     observer = config.build_observer()
-    timing = Timing(config.timing.delay_s, config.stale_s, config.timing.valid_s)
+    timing = Timing(config.delay_s, config.stale_s, config.timing.valid_s)
     with Bus(bus_settings, config.keys(), stop=stop) as bus:
         heard = heard_epoch(bus, stop)
         if bus.is_alive(ROLE, HEARING_S):
@@ -71,7 +72,7 @@ def main(config: Config, bus_settings: BusSettings, *, stop: Event | None = None
             return 1
         epoch = max(time.time_ns() // 1_000_000_000, heard + 1)
         controller = Controller(rti, timing, epoch=epoch, config_hash=config.config_hash, observer=observer)
-        daemon = Daemon(controller, bus, epoch, ocp, config.stale_s)
+        daemon = Daemon(controller, bus, epoch, rti, config.stale_s)
         bus.publish_json(
             bus.keys.info(ROLE),
             {
@@ -132,8 +133,9 @@ def describe(ocp: Ocp, np_: int) -> dict[str, Any]:
 class Daemon:
     """One life of the controller on the bus."""
 
-    def __init__(self, controller: Controller, bus: Bus, epoch: int, ocp: Ocp, stale_s: float) -> None:
-        keys, model = bus.keys, ocp.model
+    def __init__(self, controller: Controller, bus: Bus, epoch: int, rti: Rti, stale_s: float) -> None:
+        keys, model = bus.keys, rti.ocp.model
+        self._rti = rti
         self._controller = controller
         self._lock = Lock()
         self._ending = False
@@ -168,8 +170,8 @@ class Daemon:
             time.sleep(TICK_S)
         with self._lock:
             self._ending = True
-            # Whatever happened above, the last thing the robot hears is to stand still.
-            if (command := self._controller.standstill()) is not None:
+            # Whatever happened above, the last thing the robot hears is to come to rest, and stay there.
+            if (command := self._controller.standstill(time.monotonic_ns())) is not None:
                 self._commands.put(command)
         self._announce()
         log.info("stopped")
@@ -183,8 +185,10 @@ class Daemon:
                 self._controller.stop("asked for by an operator")
             elif what == "enable":
                 self._controller.enable()
+            elif what == "inject":
+                return injection.answer(self._rti, request)
             else:
-                return {"ok": False, "error": f"request must be stop or enable, got {what!r}"}
+                return {"ok": False, "error": f"request must be stop, enable or inject, got {what!r}"}
         return {"ok": True, "request": what}
 
     def _control(self, subscriber: Subscriber) -> None:
@@ -201,7 +205,9 @@ class Daemon:
                     command = controller.receive_state(state, arrival_ns)
                     acted_ns = time.monotonic_ns()
                     if command is not None:
-                        self._commands.put(command)
+                        command = controller.in_time(command, acted_ns)
+                        if command is not None:
+                            self._commands.put(command)
                         sent_ns = time.monotonic_ns()
                         controller.prepare()
                         prepared_ns = time.monotonic_ns()

@@ -27,7 +27,7 @@ HELD = 10_000  # entries kept until an info tells their names
 SCALARS = (
     *("prepare_us", "feedback_us", "latency_us"),
     *("iterations", "res_prim", "res_dual", "cost", "violation"),
-    *("state_age_s", "slack_s", "skipped", "fallbacks", "parameter_version"),
+    *("state_age_s", "slack_s", "delay_s", "skipped", "fallbacks", "softened", "parameter_version"),
 )
 LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 ROWS = 5000  # of a reference, drawn

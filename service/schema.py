@@ -102,9 +102,9 @@ class SolverSection(Section):
 class TimingSection(Section):
     """Delays and timeouts, in the robot's time."""
 
-    delay_s: Duration = Field(default=0.0, description="delay from a state to the act of its command, in seconds")
+    delay_s: Duration | Literal["measured"] = Field(default=0.0, description="delay from a state to the act of its command, in seconds, or measured")
     stale_s: Period | None = Field(
-        default=None, description="age from which a state is not used, in seconds; max(2.5 dt_s, 0.05) up to 0.25 if left out"
+        default=None, description="age from which a state is not used, in seconds; max(2.5 dt_s, 0.05) up to valid_s - 0.025 if left out"
     )
     valid_s: float = Field(default=0.25, gt=0, le=0.3, description="how long after a state its command may act, in seconds")
 
@@ -138,6 +138,12 @@ class GuardSection(Section):
     enabled: bool = Field(default=False, description="whether the robot takes what the guard passes on, not what the controller commands")
     tick_s: float = Field(default=0.01, ge=1e-3, le=0.01, description="between two looks at the clock, in seconds of the wall")
     u_rest: dict[str, float] = Field(default={}, description="inputs at which the robot stands by name, in the input's unit; zero if left out")
+
+
+class DebugSection(Section):
+    """What is never wanted on a robot at work."""
+
+    inject: bool = Field(default=False, description="whether requests may let samples fail, to see what the controller then does")
 
 
 class BusSection(Section):

@@ -43,6 +43,7 @@ ALONE = {
                 "qp",
                 "active_set",
                 "track",
+                "envelope",
             )
         ),
         "sim/plant.py",
@@ -52,7 +53,7 @@ ALONE = {
 
 # Inside the library, a file imports only from groups before its own.
 FLOW: tuple[set[str], ...] = (
-    {"errors", "array", "status", "robot_clock"},
+    {"errors", "array", "status", "robot_clock", "ladder", "grid"},
     {"message", "polyline"},
     {"heading", "mode", "schedule"},
     {"trajectory", "guard", "sent"},
@@ -63,9 +64,10 @@ FLOW: tuple[set[str], ...] = (
     {"transcription"},
     {"simultaneous", "sequential", "riccati"},
     {"codegen"},
-    {"qp", "prediction", "observer"},
-    {"solver", "active_set"},
+    {"qp", "prediction", "observer", "envelope", "delay"},
+    {"solver", "active_set", "state_stream"},
     {"rti"},
+    {"record"},
     {"controller"},
 )
 BEFORE_WIRE = {"errors", "array", "status", "message"}

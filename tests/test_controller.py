@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.controller import FALLBACKS, Controller, Timing
+from rti_mpc.controller import Controller, Timing
+from rti_mpc.ladder import FALLBACKS
 from rti_mpc.message import STAMP_ON_ARRIVAL, End, Reference, State
 from rti_mpc.rti import Rti
 from rti_mpc.solver import SolverSettings
@@ -66,7 +67,7 @@ def test_nothing_is_commanded_before_state_and_reference(controller: Controller)
     body = robot(circle())
     assert controller.mode is Mode.IDLE
     assert controller.tick(10**12) is None
-    assert controller.standstill() is None
+    assert controller.standstill(0) is None
     assert controller.receive_state(body.tick(), 0) is None
     assert controller.mode is Mode.WAITING
     assert controller.receive_state(body.tick(), DT) is None
@@ -205,7 +206,7 @@ def test_plan_starts_where_the_robot_is_when_it_acts(rti: Rti, delay_s: float, l
     issue = controller._issue
 
     def noted(*args: Any) -> Any:
-        predicted[controller._act_ns] = controller._x0.copy()
+        predicted[controller.grid.act_ns] = controller._x0.copy()
         return issue(*args)
 
     controller._issue = noted  # type: ignore[method-assign]
@@ -242,11 +243,12 @@ def test_reference_and_prediction_begin_where_the_command_acts(rti: Rti) -> None
     assert command.valid_until_ns == command.state_stamp_ns + 420 * MS
 
 
-@pytest.mark.parametrize("missed", [1, 2, 5, 11])
-def test_missed_samples_shift_the_plan_by_the_stages_elapsed(
-    on_the_circle: tuple[Controller, Lockstep], rti: Rti, monkeypatch: pytest.MonkeyPatch, missed: int
-) -> None:
-    controller, body = on_the_circle
+@pytest.mark.parametrize("missed", [1, 2])
+def test_missed_samples_shift_the_plan_by_the_stages_elapsed(rti: Rti, monkeypatch: pytest.MonkeyPatch, missed: int) -> None:
+    """As long as the plan sent last still acts."""
+    controller, body = Controller(rti, Timing(valid_s=0.35), compile=False), robot(circle())
+    controller.receive_reference(reference(circle()))
+    drive(controller, body, 15.0)
     plan = controller.telemetry(prepare_us=0, feedback_us=0, latency_us=0, slack_s=0)
     shifts: list[int] = []
     shift = rti.shift
@@ -261,9 +263,26 @@ def test_missed_samples_shift_the_plan_by_the_stages_elapsed(
     assert len(shifts) == missed - 1  # and one more by the preparation
     assert controller.skipped == missed
     assert command.stamp_ns == state.stamp_ns
-    np.testing.assert_array_equal(rti.u_prev, controller._sent.at(command.stamp_ns - 1)[0])  # not the plan's: the robot has braked
-    if missed == 1:  # later, plans have expired, and the robot has braked
-        np.testing.assert_allclose(command.u[:-3], plan.u[2:-1], atol=5e-3)  # the horizon has moved on
+    np.testing.assert_array_equal(rti.u_prev, plan.u[missed])
+    np.testing.assert_allclose(command.u[:8], plan.u[1 + missed : 9 + missed], atol=1e-2)  # the horizon has moved on
+
+
+@pytest.mark.parametrize("missed", [2, 5, 11, 50])
+def test_gap_in_which_the_plan_has_run_out_is_followed_by_a_cold_start(
+    on_the_circle: tuple[Controller, Lockstep], rti: Rti, monkeypatch: pytest.MonkeyPatch, missed: int
+) -> None:
+    controller, body = on_the_circle
+    monkeypatch.setattr(rti, "shift", lambda: pytest.fail("a plan that has run out was gone on with"))
+    for _ in range(missed):
+        body.tick()
+    state = body.tick()
+    command = controller.receive_state(state, body.now_ns)
+    assert command is not None
+    assert controller.notices[-1].code == "gap"
+    assert f"no sample for {missed} periods" in controller.notices[-1].text
+    assert controller.skipped == missed
+    assert command.stamp_ns == state.stamp_ns
+    assert np.all(np.abs(command.u[0] - body.actuator.u) <= STEP)
 
 
 @pytest.mark.parametrize("outage_s", [0.5, 1.1, 1.5, 4.0])
@@ -285,7 +304,7 @@ def test_states_that_go_back_a_little_are_not_used(on_the_circle: tuple[Controll
     state = body.tick()
     assert controller.receive_state(state, body.now_ns) is not None
     controller.prepare()
-    for back_ms in (0, 100, 240):
+    for back_ms in (0, 100, 220):
         assert controller.receive_state(dataclasses.replace(state, seq=state.seq + 1, stamp_ns=state.stamp_ns - back_ms * MS), body.now_ns) is None
     assert controller.mode is Mode.TRACKING
 
@@ -470,18 +489,34 @@ def test_failed_qps_play_the_shifted_plan_and_then_brake(on_the_circle: tuple[Co
     good = drive(controller, body, 15.1).commands[-1]
     failing(100)
     run = drive(controller, body, 16.0)
-    assert modes(run) == [Mode.FALLBACK] * FALLBACKS + [Mode.BRAKING] * (9 - FALLBACKS)
-    assert FALLBACKS == 3
-    for i, command in enumerate(run.commands[:FALLBACKS]):
+    assert modes(run) == [Mode.FALLBACK] * 2 + [Mode.BRAKING] * 7  # the third would act when the plan has expired
+    for i, command in enumerate(run.commands[:2]):
         np.testing.assert_array_equal(command.u[0], good.u[i + 1])
         np.testing.assert_array_equal(command.u[-1], good.u[-1])
         assert command.valid_until_ns == good.valid_until_ns  # never renewed
         assert command.status is QpStatus.INFEASIBLE
     assert [n.code for n in controller.notices if n.code != "mode"] == ["qp_failed", "no_plan"]
-    assert controller.fallbacks == 9
-    ramp = run.commands[FALLBACKS]
+    assert controller.ladder.fallbacks == 9
+    ramp = run.commands[2]
     assert_inside_slew(run, excess=0.1)  # the robot brakes in steps of 10 ms
     np.testing.assert_array_equal(ramp.u[-1], 0.0)
+
+
+def test_shifted_plan_serves_three_samples_at_most(failing: Callable[[int], None], rti: Rti) -> None:
+    """However long it might still act."""
+    controller = Controller(rti, Timing(valid_s=1.0), compile=False)
+    controller.receive_reference(reference(circle()))
+    body = robot(circle())
+    drive(controller, body, 5.0)
+    failing(100)
+    run = drive(controller, body, 6.6)
+    assert FALLBACKS == 3
+    assert modes(run) == [Mode.FALLBACK] * 3 + [Mode.BRAKING] * 13
+    assert_inside_slew(run)
+    ladder = controller.ladder
+    assert (ladder.shifted, ladder.braked + ladder.rested, ladder.fallbacks) == (3, 13, 16)
+    assert ladder.rested == sum(not command.u.any() for command in run.commands)
+    np.testing.assert_array_equal(run.commands[-1].u, 0.0)
 
 
 def test_robot_and_controller_agree_on_what_acts_after_the_last_valid_plan(
@@ -514,11 +549,11 @@ def test_failures_are_counted_anew_after_a_success(on_the_circle: tuple[Controll
     controller, body = on_the_circle
     until_s = 15.0
     for _ in range(4):
-        failing(FALLBACKS)
-        until_s += 0.1 * (FALLBACKS + 1)
+        failing(2)
+        until_s += 0.3
         run = drive(controller, body, until_s)
-        assert modes(run) == [Mode.FALLBACK] * FALLBACKS + [Mode.TRACKING]
-    assert controller.fallbacks == 4 * FALLBACKS
+        assert modes(run) == [Mode.FALLBACK] * 2 + [Mode.TRACKING]
+    assert controller.ladder.fallbacks == 8
 
 
 def test_first_qp_that_fails_leaves_the_robot_at_rest(controller: Controller, failing: Callable[[int], None]) -> None:
@@ -542,7 +577,8 @@ def test_stale_state_is_answered_by_one_ramp(controller: Controller, rti: Rti) -
     assert controller.tick(body.now_ns + 130 * MS) is None
     assert controller.tick(body.now_ns + 900 * MS) is None
     assert (command.mode, command.status) == (Mode.BRAKING, QpStatus.NONE)
-    assert command.valid_until_ns == last.valid_until_ns
+    assert command.valid_until_ns == command.stamp_ns + 250 * MS  # a ramp is as right without a state
+    assert command.stamp_ns < last.valid_until_ns  # so that it takes over from a plan that still acts
     assert command.stamp_ns == pytest.approx(body.now_ns + 125 * MS, abs=MS)
     assert np.all(np.abs(command.u[0] - last.u[1]) <= STEP)
     assert_inside_slew(Run(commands=[command]))
@@ -602,7 +638,7 @@ def test_stop_outlasts_a_restart_of_the_robot(on_the_circle: tuple[Controller, L
 def test_last_command_of_a_life_is_a_standstill(on_the_circle: tuple[Controller, Lockstep]) -> None:
     controller, body = on_the_circle
     body.tick()
-    command = controller.standstill()
+    command = controller.standstill(body.now_ns)
     assert command is not None
     np.testing.assert_array_equal(command.u, 0.0)
     assert command.seq == controller._seq

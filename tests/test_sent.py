@@ -90,6 +90,44 @@ def test_cleared_memory_is_rest() -> None:
     np.testing.assert_array_equal(memory.at(50 * MS)[0], [0.0, 0.0])
 
 
+def test_reach_keeps_to_all_inputs_of_the_period_before_and_after() -> None:
+    """Row 0 acts before, row 1 until the next command arrives: that is to be near to both."""
+    lowest, highest = sent(command(1, 0, np.array([[0.3, 0.0], [0.4, -0.2], [0.9, 0.9]]))).reach(DT)
+    np.testing.assert_allclose(lowest, [[0.4 - 0.2, 0.0 - 0.3], [0.4 - 0.2, -0.2 - 0.3]])
+    np.testing.assert_allclose(highest, [[0.3 + 0.2, -0.2 + 0.3], [0.4 + 0.2, -0.2 + 0.3]])
+
+
+def test_robot_that_brakes_on_its_own_is_taken_over_at_the_speed_it_has() -> None:
+    """Whenever in the period the command arrives, the robot has not to take back more than its braking."""
+    memory = sent(command(1, 0, np.tile([0.8, -1.2], (5, 1)), valid_ms=100))
+    lowest, highest = memory.reach(2 * DT)
+    step = SLEW / 10  # of the robot's braking
+    assert np.all(np.abs([lowest[0], highest[0]] - memory.at(2 * DT)[0]) <= 1.01 * step)
+
+
+def test_nothing_sent_lets_an_input_leave_rest_within_the_slew_limits() -> None:
+    lowest, highest = sent().reach(0)
+    np.testing.assert_array_equal([lowest, highest], [[-SLEW, -SLEW], [SLEW, SLEW]])
+
+
+def test_command_that_was_not_sent_after_all_is_forgotten() -> None:
+    first, second = command(1, 0, plan(0.1)), command(2, 100, plan(0.2))
+    memory = sent(first, second)
+    memory.withdraw(first)  # not the last one
+    memory.withdraw(second)
+    np.testing.assert_array_equal(memory.at(150 * MS)[0], plan(0.1)[1])
+
+
+@pytest.mark.parametrize(("delay_ms", "value"), [(0, 0.2), (40, 0.2), (60, 0.11)])
+def test_command_acts_not_before_it_can_have_arrived(delay_ms: int, value: float) -> None:
+    memory = sent()
+    memory.delay_ns = delay_ms * MS
+    memory.append(command(1, 0, plan(0.1)))
+    memory.append(command(2, 100, plan(0.2)))
+    assert memory.at(150 * MS)[0][0] == pytest.approx(value)
+    assert memory.at(160 * MS)[0][0] == pytest.approx(0.2)
+
+
 def test_it_tells_what_the_actuator_really_plays() -> None:
     """Random plans, some late in coming, some skipped: the controller predicts over what acts."""
     rng = np.random.default_rng(3)

@@ -36,7 +36,7 @@ START = len(HEADER)  # alignment counts from here
 STATE = Struct("<4sQQq")
 REFERENCE = Struct("<4sQQqqB3x")
 COMMAND = Struct("<4sQQqQQqqQBB6xq")
-TELEMETRY = Struct("<4sQQqQqBB2xI9dQQ4I")
+TELEMETRY = Struct("<4sQQqQqBB2xI10d6Q4I")
 EVENT = Struct("<4sQQq")
 WORD = Struct("<I")
 WORD_PADDED = Struct("<I4x")
@@ -255,8 +255,13 @@ def _encode_telemetry(message: Telemetry) -> bytes:
             m.latency_us,
             m.state_age_s,
             m.slack_s,
+            m.delay_s,
             m.skipped,
             m.fallbacks,
+            m.softened,
+            m.shifted,
+            m.braked,
+            m.rested,
             m.parameter_version,
             m.x.shape[1],
             m.u.shape[1],
@@ -281,7 +286,9 @@ def _decode_telemetry(payload: bytes) -> Telemetry:
     if x0.size not in (0, nx):
         raise Refused("length", f"x0 must hold {nx} numbers, got {x0.size}")
     values[5:7] = _member(MODES, values[5], "mode"), _member(STATUSES, values[6], "status")
-    values += x0, _rows(x, nx, "x"), _rows(u, nu, "u"), _rows(y_ref, ny, "y_ref"), d
+    *values, delay_s, skipped, fallbacks, softened, shifted, braked, rested, version = values
+    values += skipped, fallbacks, version, x0, _rows(x, nx, "x"), _rows(u, nu, "u"), _rows(y_ref, ny, "y_ref"), d
+    values += delay_s, softened, shifted, braked, rested
     return Telemetry(*values)
 
 

@@ -39,7 +39,7 @@ def drive_shipped(name: str, **changes: Any) -> tuple[Run, Trajectory, Ocp]:
     body = robot(trajectory, **changes)
     controller.receive_reference(reference(trajectory.lasting(140.0), heading))  # it goes on, or the robot would slow down for its end
     run = drive(controller, body, duration_s)
-    assert controller.fallbacks == controller.skipped == 0
+    assert controller.ladder.fallbacks == controller.skipped == 0
     assert not run.refused
     return run, trajectory, ocp
 
@@ -97,5 +97,5 @@ def test_robot_that_is_not_the_model_is_followed_all_the_same(disturbance: dict[
     controller.receive_reference(reference(trajectory.lasting(140.0), heading))  # it goes on, or the robot would slow down for its end
     run = drive(controller, body, 60.0)
     assert run.error_mm(trajectory)[np.array(run.t_s) > 20.0].max() < limit_mm
-    assert controller.fallbacks == 0
+    assert controller.ladder.fallbacks == 0
     assert all(np.all((c.u >= ocp.lbu) & (c.u <= ocp.ubu)) for c in run.commands)

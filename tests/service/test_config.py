@@ -124,7 +124,7 @@ def test_staleness_follows_the_period_within_limits(tmp_path: Path) -> None:
         path = tmp_path / "robot.toml"
         path.write_text(MINIMAL.replace("dt_s = 0.1", f"dt_s = {dt_s}"))
         stale_s.append(load(path).stale_s)
-    assert stale_s == [0.05, 0.1, 0.25]
+    assert stale_s == [0.05, 0.1, 0.225]
 
 
 def test_hash_follows_what_decides_a_command_and_nothing_else(tmp_path: Path) -> None:

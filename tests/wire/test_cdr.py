@@ -26,8 +26,8 @@ STATE = State(HUGE, 7, -5, RNG.normal(size=5))
 REFERENCE = Reference(1, 2, STAMP_ON_ARRIVAL, 10**8, End.STOP, RNG.normal(size=(4, 3)), RNG.normal(size=(4, 2)))
 COMMAND = Command(1, 2, 3, HUGE, 5, -6, 2**63 - 1, HUGE, Mode.TRACKING, QpStatus.MAX_ITER, 10**8, RNG.normal(size=(7, 2)))
 NUMBERS = {"res_prim": 1e-3, "res_dual": np.nan, "cost": np.inf, "violation": 0.0}
-TIMES = {"prepare_us": 1.5, "feedback_us": 2.5, "latency_us": 3.5, "state_age_s": 0.1, "slack_s": -0.5}
-COUNTS = {"skipped": 8, "fallbacks": 9, "parameter_version": 10}
+TIMES = {"prepare_us": 1.5, "feedback_us": 2.5, "latency_us": 3.5, "state_age_s": 0.1, "slack_s": -0.5, "delay_s": 0.05}
+COUNTS = {"skipped": 8, "fallbacks": 9, "softened": 11, "shifted": 2, "braked": 3, "rested": 4, "parameter_version": 10}
 ARRAYS = {"x0": RNG.normal(size=5), "x": RNG.normal(size=(8, 5)), "u": RNG.normal(size=(7, 2)), "y_ref": RNG.normal(size=(7, 3))}
 TELEMETRY = Telemetry(1, 2, 3, 4, 5, Mode.FALLBACK, QpStatus.INFEASIBLE, 6, **NUMBERS, **TIMES, **COUNTS, **ARRAYS)
 EVENT = Event(1, 2, 3, "robot", Severity.ERROR, "command_expired", "Räder stehen")
@@ -163,7 +163,7 @@ MALFORMED = [
     (Command, byte(COMMAND, 65, 255), "value"),
     (Command, words(COMMAND, 80, 3), "length"),
     (Telemetry, byte(TELEMETRY, 40, 99), "value"),
-    (Telemetry, words(TELEMETRY, 140, 4), "length"),
+    (Telemetry, words(TELEMETRY, 180, 4), "length"),
     (Telemetry, encode(TELEMETRY)[:-8], "truncated"),
     (Event, words(EVENT, 24, 2**32 - 1), "truncated"),
     (Event, words(EVENT, 24, 0), "text"),

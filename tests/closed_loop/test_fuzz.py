@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Samples of everything that may happen, by the thousand and by the million."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.closed_loop.fuzz import Fuzz
+
+SHORT = 10_000
+MILLION = 1_000_000
+
+
+def resident_bytes() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+
+def run(fuzz: Fuzz, samples: int) -> None:
+    while fuzz.samples < samples:
+        fuzz.step()
+
+
+@pytest.mark.parametrize("measured", [False, True], ids=["no delay", "measured delay"])
+def test_no_fuzzed_sample_leaves_the_limits_or_raises(measured: bool) -> None:
+    fuzz = Fuzz(seed=1, measured=measured)
+    run(fuzz, SHORT)
+    happened = set(fuzz.seen)
+    assert {"TRACKING", "HOLDING", "FALLBACK", "BRAKING", "STOPPED", "over budget", "reference", "jump", "refused at the door"} <= happened
+    assert {"qp", "nan_model", "solver", "state_stale", "state_old", "state_refused", "robot_restarted", "clock_jumped", "gap"} <= happened
+
+
+@pytest.mark.slow
+def test_no_sample_of_a_million_leaves_the_limits_or_raises() -> None:
+    start_s = time.monotonic()
+    fuzz = Fuzz(seed=2)
+    run(fuzz, MILLION // 5)
+    before = resident_bytes()
+    run(fuzz, MILLION)
+    grown = resident_bytes() - before
+    print(f"\n{fuzz.samples} samples in {time.monotonic() - start_s:.0f} s, memory grown by {grown / 2**20:.2f} MiB: {dict(fuzz.seen)}")
+    assert grown < 2**22  # bytes; of 800,000 samples

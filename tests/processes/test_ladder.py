@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Real processes: a controller whose samples fail on request, and one that is stopped for a while."""
+
+from __future__ import annotations
+
+import csv
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rti_mpc.message import Command, Event, Telemetry
+from rti_mpc.status import Mode
+from rti_mpc.wire.bus import Subscriber
+from rti_mpc.wire.cdr import decode
+from service.cli import SHIPPED
+from tests.processes.system import CONFIG, KEYS, System, heard
+
+SLEW = np.array([0.25, 0.4]) / CONFIG.ocp.dt_s  # per s
+STOPPED_S = 1.5
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
+    """A robot that is being driven by a controller that fails on request."""
+    folder = tmp_path_factory.mktemp("driven")
+    config = folder / "robot.toml"
+    config.write_text(SHIPPED.read_text() + "\n[debug]\ninject = true\n")
+    with System(folder, config) as system:
+        system.start("robot", "controller", "reference")
+        system.tracking()
+        yield system
+
+
+def inject(system: System, failure: str, samples: int) -> None:
+    answer = system.bus.request(KEYS.request, {"request": "inject", "failure": failure, "samples": samples}, 5.0)
+    assert answer == {"ok": True, "request": "inject", "failure": failure, "samples": samples}
+
+
+def codes(events: Subscriber) -> list[str]:
+    return [decode(Event, received.payload).code for received in events.drain()]
+
+
+def recovered(system: System, samples: int = 10) -> Telemetry:
+    """Telemetry of a controller that has been following the reference for some samples."""
+    stream = system.bus.subscriber(KEYS.telemetry)
+    start = heard(stream, Telemetry, lambda sample: sample.mode is Mode.TRACKING)
+    return heard(stream, Telemetry, lambda sample: sample.seq > start.seq + samples and sample.mode is Mode.TRACKING)
+
+
+def test_other_solver_takes_over_without_anybody_noticing(driven: System) -> None:
+    before = recovered(driven)
+    inject(driven, "solver", 10)
+    heard(driven.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.softened > before.softened)
+    after = recovered(driven)
+    assert 0 < after.softened - before.softened <= 10  # fewer if samples were skipped on a busy machine
+    assert after.fallbacks == before.fallbacks
+
+
+@pytest.mark.parametrize(("failure", "samples"), [("qp", 8), ("nan_model", 8)])
+def test_failures_lead_down_the_ladder_and_up_again(driven: System, failure: str, samples: int) -> None:
+    before = recovered(driven, 50)  # a second: no more often is one kind of fault published
+    events = driven.bus.subscriber(KEYS.event("controller"), capacity=64)
+    commands = driven.bus.subscriber(KEYS.command, capacity=4096)
+    inject(driven, failure, samples)
+    heard(driven.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.fallbacks >= before.fallbacks + samples)
+    after = recovered(driven)
+    modes = [decode(Command, received.payload).mode for received in commands.drain()]
+    first = modes.index(Mode.FALLBACK)
+    assert set(modes[first : modes.index(Mode.BRAKING)]) == {Mode.FALLBACK}
+    assert modes.count(Mode.FALLBACK) == after.shifted - before.shifted <= 3
+    assert after.braked + after.rested - before.braked - before.rested == modes.count(Mode.BRAKING)
+    assert samples <= after.fallbacks - before.fallbacks <= samples + 2  # a NaN is forgotten within two samples
+    assert {"qp_failed", "no_plan"} <= set(codes(events))
+
+
+def test_samples_over_budget_are_not_sent_and_leave_the_loop_in_phase(driven: System) -> None:
+    before = recovered(driven, 50)  # a second: no more often is one kind of fault published
+    events = driven.bus.subscriber(KEYS.event("controller"), capacity=64)
+    commands = driven.bus.subscriber(KEYS.command, capacity=4096)
+    inject(driven, "over_budget", 4)
+    heard(driven.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.fallbacks >= before.fallbacks + 4)
+    recovered(driven)
+    assert "over_budget" in codes(events)
+    sent = [decode(Command, received.payload) for received in commands.drain()]
+    assert np.all(np.diff([command.seq for command in sent]) == 1)
+    dt_ns = round(1e9 * CONFIG.ocp.dt_s)
+    tracked = np.array([command.stamp_ns for command in sent if command.mode is Mode.TRACKING])
+    assert np.diff(tracked).min() >= 0.9 * dt_ns  # no burst
+    offset = (tracked - tracked[0]) % dt_ns
+    assert np.minimum(offset, dt_ns - offset).max() < 0.1 * dt_ns  # in phase
+
+
+def test_controller_that_was_stopped_acts_on_nothing_that_has_waited(driven: System) -> None:
+    """SIGSTOP, 1.5 s, SIGCONT: it notices the gap, starts cold, and re-enters softly."""
+    before = recovered(driven, 50)  # a second: no more often is one kind of fault published
+    events = driven.bus.subscriber(KEYS.event("controller"), capacity=64)
+    commands = driven.bus.subscriber(KEYS.command, capacity=4096)
+    process = driven.running["controller"]
+    last = driven.tracking()
+    process.send_signal(signal.SIGSTOP)
+    try:
+        time.sleep(STOPPED_S)  # the fault itself
+        stood = driven.state(lambda state: bool(np.abs(state.x[3:]).max() < 1e-2))
+    finally:
+        process.send_signal(signal.SIGCONT)
+    after = recovered(driven)
+    sent = [decode(Command, received.payload) for received in commands.drain()]
+    later = [command for command in sent if command.seq > last.seq + 1]
+    assert later[0].stamp_ns > stood.stamp_ns  # one may have been on its way when it was stopped
+    assert after.mode is Mode.TRACKING
+    assert after.fallbacks - before.fallbacks <= 3  # the sample it was stopped in, and what a busy machine makes of the first ones
+    assert {"state_old", "state_stale", "gap"} & set(codes(events))
+
+
+def test_inputs_stayed_inside_bounds_and_slew_limits_through_all_of_it(driven: System) -> None:
+    recovered(driven)
+    with (driven.folder / "robot.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    t = np.array([float(row["stamp_ns"]) for row in rows])
+    u = np.array([[float(row["u_c"]), float(row["omega_c"])] for row in rows])
+    assert np.all(np.abs(u) <= [0.5, 0.745])
+    late = np.array([int(row["late"]) for row in rows])  # more than a period, on a busy machine: that is the guard's to answer
+    in_time = late[3:] == late[:-3]
+    beyond = np.abs(np.diff(u, axis=0)) - SLEW * np.diff(t)[:, None] / 1e9
+    assert np.count_nonzero(in_time) > 0.5 * len(in_time)
+    assert beyond[2:][in_time].max() <= 1e-9, rows[2 + int(beyond[2:].max(axis=1).argmax())]
+
+
+@pytest.mark.parametrize("request_", [{"request": "inject", "failure": "flood"}, {"request": "inject", "failure": "qp", "samples": 0}])
+def test_failure_that_cannot_be_injected_is_refused_with_what_can(driven: System, request_: dict[str, object]) -> None:
+    answer = driven.bus.request(KEYS.request, request_, 5.0)
+    assert answer["ok"] is False
+    assert "must be" in answer["error"]
+
+
+def test_nothing_fails_on_request_unless_the_configuration_says_so(tmp_path: Path) -> None:
+    with System(tmp_path) as system:
+        system.start("robot", "controller")
+        answer = system.bus.request(KEYS.request, {"request": "inject", "failure": "qp", "samples": 3}, 20.0)
+    assert answer == {"ok": False, "error": "inject must be enabled in the configuration, with debug.inject = true, got false"}
