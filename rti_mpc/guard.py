@@ -288,9 +288,10 @@ class Guard:
         for row in u[first:]:
             if (row >= lower - ROUNDING).all() and (row <= upper + ROUNDING).all():
                 break
-            limited = True
             np.clip(row, lower, upper, out=row)
-            lower, upper = row + scale * limits.lbdu, row + scale * limits.ubdu
+            if limited:  # not from the first to the second: should this one come late, the robot begins there
+                lower, upper = row + scale * limits.lbdu, row + scale * limits.ubdu
+            limited = True
         if limited:
             text = f"command {command.seq} of epoch {command.epoch} begins too far from what acts: approached inside the slew limits"
             self._say(Severity.WARNING, "slew_limited", text)
