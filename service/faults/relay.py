@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A robot's sensors gone wrong: its states pass through a process that changes them on request.
+
+The robot lives under one prefix, everybody else under another; commands pass
+unchanged. `python -m service.faults.relay ENDPOINT PREFIX_OF_ROBOT PREFIX ROBOT`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from threading import Thread
+from typing import Any
+
+import numpy as np
+
+from rti_mpc.errors import MessageError
+from rti_mpc.message import Command, State
+from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
+from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.interrupt import stop_on_signals
+from rti_mpc.wire.keys import Keys
+
+ROLE = "relay"
+LATE_NS = 400_000_000
+JUMP_NS = 5_000_000_000
+
+Change = Callable[[State, "deque[State]"], Iterable[State]]
+
+
+def frozen(state: State, held: deque[State]) -> Iterable[State]:
+    """The last state again and again, with new sequence numbers."""
+    held.append(state)
+    return [replace(held[0], seq=state.seq)]
+
+
+def late(state: State, held: deque[State]) -> Iterable[State]:
+    """Every state so much later."""
+    held.append(state)
+    while state.stamp_ns - held[0].stamp_ns >= LATE_NS:
+        yield held.popleft()
+
+
+def reordered(state: State, held: deque[State]) -> Iterable[State]:
+    """Every two states in the wrong order."""
+    held.append(state)
+    return [held.pop(), held.pop()] if len(held) == 2 else []
+
+
+# What becomes of a state, by name.
+CHANGES: dict[str, Change] = {
+    "none": lambda state, _: [state],
+    "frozen": frozen,
+    "late": late,
+    "duplicated": lambda state, _: [state, state, state],
+    "reordered": reordered,
+    "nan": lambda state, _: [replace(state, x=np.where(np.arange(len(state.x)), state.x, np.nan))],
+    "short": lambda state, _: [replace(state, x=state.x[:-1])],
+    "ahead": lambda state, _: [replace(state, stamp_ns=state.stamp_ns + JUMP_NS)],
+    "behind": lambda state, _: [replace(state, stamp_ns=state.stamp_ns - JUMP_NS)],
+}
+
+
+class Relay:
+    """Passes states on, and commands back."""
+
+    def __init__(self, bus: Bus, robot: Keys) -> None:
+        keys = bus.keys
+        self._fault: tuple[str, int, deque[State]] = ("none", 0, deque())  # what, for how many states, those it holds back
+        self._states = bus.publisher(keys.state, State, realtime=True)
+        self._follow(bus.subscriber(robot.state, capacity=64), self._change)
+        for there, here in ((robot.command, keys.command), (robot.actuation, keys.actuation)):
+            self._follow(bus.subscriber(here, capacity=64), bus.publisher(there, Command, realtime=True).put_bytes)
+
+    def answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Change the states from now on: ``{"fault": NAME, "states": HOW_MANY}``, all of them without a number."""
+        name = request["fault"]
+        if name not in CHANGES:
+            return {"ok": False, "error": f"fault must be one of {', '.join(CHANGES)}, got {name!r}"}
+        self._fault = (name, request.get("states", 2**62), deque())
+        return {"ok": True}
+
+    def _change(self, payload: bytes) -> None:
+        """Pass a state on, or what becomes of it."""
+        try:
+            state = decode(State, payload)
+        except MessageError:
+            return
+        name, states, held = self._fault
+        for changed in CHANGES[name](state, held):
+            self._states.put(changed)
+        if name != "none" and self._fault[2] is held:
+            self._fault = (name, states - 1, held) if states > 1 else ("none", 0, deque())
+
+    def _follow(self, subscriber: Subscriber, act: Callable[[bytes], None]) -> None:
+        def follow() -> None:
+            for received in iter(subscriber.recv, None):
+                act(received.payload)
+
+        Thread(target=follow, daemon=True).start()
+
+
+def main(settings: BusSettings, robot: Keys, keys: Keys) -> None:
+    """Relay until stopped."""
+    stop = stop_on_signals()
+    with Bus(settings, keys, stop=stop) as bus:
+        relay = Relay(bus, robot)
+        bus.serve(keys.stream(ROLE), relay.answer)
+        bus.alive(ROLE)
+        stop.wait()
+
+
+if __name__ == "__main__":
+    _, endpoint, prefix_of_robot, prefix, name = sys.argv
+    main(BusSettings(connect=(endpoint,)), Keys(prefix_of_robot, name), Keys(prefix, name))

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Injects faults into real processes, one after another, and holds what the robot did against what is promised.
+
+Systems start as `demo` starts them, at real speed. Faults of one wiring follow one
+another in one system, each once the robot is driven again; a system that breaks a
+promise ends with it.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+
+from rti_mpc.errors import ConfigError
+from rti_mpc.trajectory import find_trajectory
+from rti_mpc.wire.interrupt import stop_on_signals
+from service.config import Config, bounds
+from service.demo import Failed, configured
+from service.faults.measure import Incident, Limits, Measured, measure
+from service.faults.relay import ROLE as RELAY
+from service.faults.report import Report, Row, report_console
+from service.faults.system import HEADING, SCENARIO, System, Wiring
+from service.faults.table import FAULTS, Fault
+
+STATE_PERIOD_S = 0.01  # of the robot, and so of its record: what times are known to
+COMPANY = {
+    Wiring.PEERS: ("controller", "reference", "robot"),
+    Wiring.ROUTER: ("router", "controller", "reference", "robot"),
+    Wiring.RELAY: (RELAY, "controller", "reference", "robot"),
+}
+SETTLED_M = 0.001
+RECOVERY_S = 20.0
+FLUSH_S = 5.0  # for the robot to write what it knows; a line waits a second for an answer
+
+
+def main(config: Config, only: Sequence[str], path: Path | None) -> int:
+    """
+    Inject faults, print the matrix, and write it to a file if asked to.
+
+    Args:
+        config: The robot.
+        only: Names of faults; none: all.
+        path: JSON file to write.
+
+    Returns:
+        Exit status: 0 if every promise was kept.
+
+    Raises:
+        ConfigError: A name is none, or the model has no pose to start from.
+    """
+    faults = chosen(only)
+    config = prepared(config)
+    stop = stop_on_signals()
+    folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
+    with Report(console := report_console(), len(faults)) as report:
+        inject(config, faults, folder, report, stop)
+    report.conclude()
+    if report.kept:
+        shutil.rmtree(folder)
+    else:
+        console.print(f"what the processes said and the robot recorded: {folder}", soft_wrap=True, markup=False)
+    if path is not None:
+        path.write_text(json.dumps([row.to_json() for row in report.rows], indent=1) + "\n", encoding="utf-8")
+    return 0 if report.kept and not stop.is_set() else 1
+
+
+def chosen(only: Sequence[str]) -> list[Fault]:
+    """
+    Return faults by their names, in the order of the table.
+
+    Raises:
+        ConfigError: There is no fault of a name.
+    """
+    names = [fault.name for fault in FAULTS]
+    if unknown := [name for name in only if name not in names]:
+        raise ConfigError(f"--only must be one of {', '.join(names)}, got {unknown[0]!r}")
+    return [fault for fault in FAULTS if (fault.name in only or not only) and (find_spec("rerun") or not fault.viewer)]
+
+
+def prepared(config: Config) -> Config:
+    """Return the configuration of a run: from the scenario's pose, with states that come fast enough to measure by."""
+    config = configured(config, find_trajectory(SCENARIO), HEADING)
+    content = config.model_dump(by_alias=True, exclude_unset=True)
+    content["sim"] = {**content.get("sim", {}), "state_period_s": STATE_PERIOD_S}
+    return Config.model_validate(content)
+
+
+def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Report, stop: Event) -> None:
+    """Inject faults until there are none left, or we are stopped."""
+    limits = Limits(
+        step=np.minimum(*(np.abs(side) for side in bounds(config.ocp.bounds.increments, config.build_model().inputs))),
+        rest=np.array(config.build_model().u_rest),
+        dt_s=config.ocp.dt_s,
+    )
+    system: System | None = None
+    with ExitStack() as stack:
+        for number, fault in enumerate(faults):
+            if stop.is_set():
+                return
+            try:
+                if system is None or system.wiring is not fault.wiring:
+                    stack.close()
+                    report.say(fault, f"starting {fault.wiring.value}")
+                    system = stack.enter_context(System(config, fault.wiring, folder / f"{number}", stop))
+                make_ready(system, fault, report)
+                row = Row(fault, measured := suffer(system, fault, limits, report), fault.promise.broken(measured))
+            except Failed as error:
+                row = Row(fault, None, [str(error)])
+            if stop.is_set():
+                return
+            report.add(row)
+            if row.broken:
+                stack.close()
+                system = None
+
+
+def make_ready(system: System, fault: Fault, report: Report) -> None:
+    """
+    Wait until the robot is driven, as well as the fault wants it.
+
+    Raises:
+        Failed: It is not.
+    """
+    report.say(fault, "waiting for the robot to be driven")
+    system.ensure(*COMPANY[fault.wiring], *(("viewer",) if fault.viewer else ()))
+    error_m = SETTLED_M if "missed" in fault.promise.at_most else np.inf
+    system.wait(lambda: system.driven(error_m), "the robot to be driven")
+
+
+def suffer(system: System, fault: Fault, limits: Limits, report: Report) -> Measured:
+    """
+    Break, wait, mend, wait, and measure.
+
+    Raises:
+        Failed: Nothing can be measured.
+    """
+    report.say(fault, fault.text)
+    before_ns = system.now_ns()
+    injected_ns = fault.inject(system)
+    fault_ns = before_ns if injected_ns is None else injected_ns
+    system.pause(fault.hold_s)
+    mend_ns, robots = max(system.now_ns(), fault_ns + round(2e9 * STATE_PERIOD_S)), system.robots
+    reference = system.reference_at
+    report.say(fault, "waiting for the robot to recover")
+    fault.mend(system)
+    if system.robots != robots:  # another life: nothing of the last one counts
+        system.wait(lambda: system.observer.epoch, "the robot's first state")
+        fault_ns = mend_ns = 0
+    recovered(system)
+    end_ns = system.now_ns()
+    system.wait(lambda: system.logged_ns() >= end_ns, "the robot's record", FLUSH_S)
+    log = system.log()
+    measured = measure(log, reference(log.stamp_ns), Incident(fault_ns, mend_ns, end_ns), limits)
+    return replace(measured, brake_s=None, zero_s=None, still_s=None) if system.robots != robots else measured
+
+
+def recovered(system: System) -> None:
+    """Wait until the robot is driven; if it is not, the measurement says so."""
+    try:
+        system.wait(system.driven, "the robot to be driven", RECOVERY_S)
+    except Failed:
+        return
