@@ -77,7 +77,7 @@ class Measured:
         distance_m: Way from the fault to the standstill, or until mended.
         stale: Instants at which an input acted, once at rest, that answers no state fresh when mended.
         step_share: Largest step of an input, as a share of what it may change in a period; while braking, in any period.
-        recovery_s: From mended to the first input that moves a robot that had stopped.
+        recovery_s: From mended to a robot that moves again, or, where it never stopped, to the first answer to one of its states.
         missed: Samples of the controller that the robot had no command for, until mended.
         error_m: Largest distance from the reference until mended.
         final_error_m: Distance from the reference when mended.
@@ -115,9 +115,10 @@ def measure(log: RobotLog, reference: Array, incident: Incident, limits: Limits)
     error = np.hypot(*(log.x[:, :2] - reference).T)[broken]
 
     zero = settled(~moving, broken)
-    brake = None if zero is None else braking(log, limits, int(np.argmax(broken)), zero)
-    still = settled(np.asarray(speed < STANDING_M_S), broken)
-    driven = np.flatnonzero(moving & seen & (t > incident.mend_ns))
+    brake = None if zero is None or zero == np.argmax(broken) else braking(log, limits, int(np.argmax(broken)), zero)
+    still = settled(np.array(speed < STANDING_M_S), broken)
+    stopped = zero is not None or still is not None
+    driven = np.flatnonzero((speed > STANDING_M_S if stopped else np.isfinite(log.latency_us)) & seen & (t > incident.mend_ns))
 
     def after(instant_ns: int, row: int | None) -> float | None:
         return None if row is None else 1e-9 * float(t[row] - instant_ns)
@@ -130,7 +131,7 @@ def measure(log: RobotLog, reference: Array, incident: Incident, limits: Limits)
         distance_m=float(way[broken & (still is None or t <= t[still])].sum()),
         stale=0 if zero is None else int((moving & (t > t[zero]) & (t < fresh_ns(log, incident))).sum()),
         step_share=max(step_share(log.u[seen], limits), 0.0 if zero is None or brake is None else ramp_share(log, limits, brake, zero)),
-        recovery_s=after(incident.mend_ns, int(driven[0])) if zero is not None and driven.size else None,
+        recovery_s=after(incident.mend_ns, int(driven[0])) if driven.size else None,
         missed=missed(log, incident, limits.dt_s),
         error_m=float(error.max()),
         final_error_m=float(error[-1]),

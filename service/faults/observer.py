@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What time it is for the robot, and how it moves, from its states."""
+"""What time it is for the robot, how it moves, and what its controller has answered."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.errors import MessageError
-from rti_mpc.message import State
+from rti_mpc.message import Command, State
 from rti_mpc.wire.bus import Bus, Subscriber
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
@@ -21,21 +21,25 @@ LOOK_BACK_NS = 200_000_000  # over which speed is measured
 
 class Observer:
     """
-    Follows the states of a robot at speed 1.
+    Follows the states of a robot at speed 1, and the commands for them.
 
     Attributes:
         epoch: Of the robot's present life, 0 before the first state.
+        answered: Sequence numbers of states of that life that a controller has answered.
     """
 
     def __init__(self, bus: Bus, robot: Keys) -> None:
         self.epoch = 0
+        self.answered: set[int] = set()
         self._states: deque[tuple[int, int, Array]] = deque(maxlen=4096)  # stamp, local monotonic arrival, position
-        Thread(target=self._receive, args=(bus.subscriber(robot.state, capacity=64),), daemon=True).start()
+        for act, key in ((self._receive, robot.state), (self._listen, bus.keys.command)):
+            Thread(target=act, args=(bus.subscriber(key, capacity=64),), daemon=True).start()
 
     def forget(self) -> None:
         """Wait for another life of the robot."""
         self.epoch = 0
         self._states.clear()
+        self.answered.clear()
 
     @property
     def stamp_ns(self) -> int:
@@ -68,7 +72,15 @@ class Observer:
                 state = decode(State, received.payload)
             except MessageError:
                 continue
-            if state.epoch > self.epoch:
-                self._states.clear()
-                self.epoch = state.epoch
+            self.epoch = state.epoch
             self._states.append((state.stamp_ns, arrival_ns, state.x[:2]))
+
+    def _listen(self, subscriber: Subscriber) -> None:
+        """Note which states were answered; a thread of its own."""
+        for received in iter(subscriber.recv, None):
+            try:
+                command = decode(Command, received.payload)
+            except MessageError:
+                continue
+            if command.state_epoch == self.epoch:
+                self.answered.add(command.state_seq)

@@ -41,7 +41,7 @@ class Row:
         """What the robot did, in words."""
         if (measured := self.measured) is None:
             return "unknown"
-        if measured.zero_s is None:
+        if measured.zero_s is None and measured.still_s is None:
             return "drove on"
         words = [
             word
@@ -65,6 +65,7 @@ class Row:
 
     def cells(self) -> tuple[str, ...]:
         """Return the cells of the table."""
+        promised = self.fault.promise.at_most
         measured, verdict = self.measured, "yes" if not self.broken else "NO"
         if measured is None:
             return (self.fault.name, self.did, *[NONE] * (len(COLUMNS) - 3), verdict)
@@ -77,8 +78,8 @@ class Row:
             shown(measured.still_s, 1.0, 2),
             f"{measured.distance_m:.3f}",
             f"{100 * measured.step_share:.0f}",
-            f"{1e3 * measured.error_m:.1f}" if measured.zero_s is None else NONE,
-            shown(measured.recovery_s, 1.0, 2),
+            shown(next((getattr(measured, name) for name in ("error_m", "final_error_m") if name in promised), None), 1e3, 1),
+            shown(measured.recovery_s if "recovery_s" in promised else None, 1.0, 2),
             verdict,
         )
 

@@ -14,7 +14,6 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Event
@@ -156,17 +155,18 @@ def suffer(system: System, fault: Fault, limits: Limits, report: Report) -> Meas
     if system.robots != robots:  # another life: nothing of the last one counts
         system.wait(lambda: system.observer.epoch, "the robot's first state")
         fault_ns = mend_ns = 0
-    recovered(system)
+    recovered(system, mend_ns)
     end_ns = system.now_ns()
     system.wait(lambda: system.logged_ns() >= end_ns, "the robot's record", FLUSH_S)
+    if system.stopped:
+        raise Failed("stopped")
     log = system.log()
-    measured = measure(log, reference(log.stamp_ns), Incident(fault_ns, mend_ns, end_ns), limits)
-    return replace(measured, brake_s=None, zero_s=None, still_s=None) if system.robots != robots else measured
+    return measure(log, reference(log.stamp_ns), Incident(fault_ns, mend_ns, end_ns), limits)
 
 
-def recovered(system: System) -> None:
-    """Wait until the robot is driven; if it is not, the measurement says so."""
+def recovered(system: System, mend_ns: int) -> None:
+    """Wait until the robot is driven by answers to its present states; if it is not, the measurement says so."""
     try:
-        system.wait(system.driven, "the robot to be driven", RECOVERY_S)
+        system.wait(lambda: system.driven() and system.witness.telemetry[-1].state_stamp_ns > mend_ns, "the robot to be driven", RECOVERY_S)
     except Failed:
         return

@@ -34,7 +34,7 @@ from service.witness import Witness
 
 SCENARIO = "eight"
 HEADING: Heading = "consistent"
-REFERENCE_S = 900
+REFERENCE_S = 600
 PATIENCE_S = 30.0  # for processes to start and the robot to be driven; the first controller on a machine compiles
 DRIVEN_M_S = 0.1
 REQUEST_S = 2.0
@@ -170,8 +170,9 @@ class System:
         return self._folder / f"robot-{self.robots}.csv"
 
     def log(self) -> RobotLog:
-        """Return the record of the robot's present life, as far as it is written."""
-        return robot_log.read(self.log_path, self._info)
+        """Return the record of the robot's present life, as far as it is written; a guard's own commands are no answers."""
+        log = robot_log.read(self.log_path, self._info)
+        return replace(log, latency_us=np.where(np.isin(log.seq, list(self.observer.answered)), log.latency_us, np.nan))
 
     def logged_ns(self) -> int:
         """Return the stamp of the last whole line of that record, -1 if there is none."""
@@ -206,6 +207,11 @@ class System:
         """
         wait(condition, self.children, self._stop, patience_s, what)
 
+    @property
+    def stopped(self) -> bool:
+        """Whether we are to stop."""
+        return self._stop.is_set()
+
     def pause(self, duration_s: float) -> None:
         """Wait for so long, or until stopped."""
         self._stop.wait(duration_s)
@@ -213,13 +219,14 @@ class System:
     def ensure(self, *roles: str) -> None:
         """Start those that are not there, and wait until all are present."""
         self.start(*(role for role in roles if self.children.pid(role) is None))
-        self.wait(lambda: self.witness.listen().met(set(roles)), f"{', '.join(roles)} to be there")
+        others = set(roles) - {"robot"}  # whose presence a relay does not pass on, and whom states tell of
+        self.wait(lambda: self.witness.listen().met(others), f"{', '.join(roles)} to be there")
 
     # What is said.
 
     def refer(self, reference: Reference) -> None:
         """Publish a reference, as another planner that takes over."""
-        reference = replace(reference, epoch=time.time_ns() // 1_000_000_000, seq=1)
+        reference = replace(reference, epoch=max(time.time_ns() // 1_000_000_000, self.reference.epoch + 1), seq=1)
         self._references.put(reference)
         self.witness.reference = reference
 

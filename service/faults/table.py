@@ -20,14 +20,14 @@ from service.faults.system import System, Wiring
 
 Act = Callable[[System], int | None]
 
-HOLD_S = 4.0
+HOLD_S = 3.5
 PAUSE_S = 1.5
 MALFORMED = 10_000
 GARBAGE = (b"", b"\x00\x00\x00\x00", b"\x00\x01\x00\x00" + bytes(24), b"\x00\x01\x00\x00" + b"\xff" * 400)  # none is a message
 SLICE_S, SHARE = 0.1, 0.05  # of time a slow process gets
 REFERENCE_ENDS_S = 1.0
 STALE_NS = 10**12
-JUMP_S = 5.0
+JUMP_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ FAULTS = (
     Fault("disk_full", "viewer and controller cannot write", PEERS, KEEPS_ON, fill_disk, free_disk, viewer=True),
     Fault("malformed_flood", f"{MALFORMED} malformed messages at once", PEERS, KEEPS_ON, flood, nothing),
     Fault("reference_killed", "SIGKILL of the reference's source", PEERS, KEEPS_ON, kill("reference"), nothing),
-    Fault("reference_jumps", f"the reference is {JUMP_S:g} s further on", PEERS, REJOINS, reference_jumps, restart("reference"), 10.0),
+    Fault("reference_jumps", f"the reference is {JUMP_S:g} s further on", PEERS, REJOINS, reference_jumps, restart("reference"), 8.0),
     Fault("controller_killed", "SIGKILL of the controller", PEERS, STOPS, kill("controller"), start("controller")),
     Fault("controller_hung", "SIGSTOP of the controller", PEERS, STOPS, suspend("controller"), resume("controller")),
     Fault("controller_paused", f"SIGSTOP of the controller for {PAUSE_S:g} s", PEERS, PAUSES, suspend("controller"), resume("controller"), PAUSE_S),
