@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rti_mpc.array import Array
+from rti_mpc.guard import Limits
 from service.robot_log import RobotLog
 
 STANDING_M_S = 1e-3
@@ -30,22 +31,6 @@ LATE_S = 0.02  # by which a ramp may be behind one that began in time: two steps
 FRESH_S = 0.25  # age up to which a state may be answered
 
 Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Limits:
-    """
-    What inputs may do.
-
-    Attributes:
-        step: Largest change of each input in a period, shape ``(nu,)``.
-        rest: Inputs at rest, shape ``(nu,)``.
-        dt_s: Period of the controller.
-    """
-
-    step: Array
-    rest: Array
-    dt_s: float
 
 
 @dataclass(frozen=True)
@@ -109,14 +94,14 @@ def measure(log: RobotLog, reference: Array, incident: Incident, limits: Limits)
     t = log.stamp_ns
     broken = (t >= incident.fault_ns) & (t <= incident.mend_ns)
     seen = (t >= incident.fault_ns) & (t <= incident.end_ns)
-    moving = (np.abs(log.u - limits.rest) > AT_REST).any(axis=1)
+    moving: Mask = np.abs(log.u - limits.u_rest).max(axis=1) > AT_REST
     way = np.hypot(*np.diff(log.x[:, :2], axis=0, prepend=log.x[:1, :2]).T)
     speed: Array = way / (1e-9 * np.diff(t, prepend=t[0] - 1))
     error = np.hypot(*(log.x[:, :2] - reference).T)[broken]
 
     zero = settled(~moving, broken)
     brake = None if zero is None or zero == np.argmax(broken) else braking(log, limits, int(np.argmax(broken)), zero)
-    still = settled(np.array(speed < STANDING_M_S), broken)
+    still = settled(speed < STANDING_M_S, broken)
     stopped = zero is not None or still is not None
     driven = np.flatnonzero((speed > STANDING_M_S if stopped else np.isfinite(log.latency_us)) & seen & (t > incident.mend_ns))
 
@@ -138,6 +123,11 @@ def measure(log: RobotLog, reference: Array, incident: Incident, limits: Limits)
     )
 
 
+def step(limits: Limits) -> Array:
+    """Return the largest change of each input in a period, shape ``(nu,)``."""
+    return limits.slew * limits.dt_s
+
+
 def settled(condition: Mask, window: Mask) -> int | None:
     """Return the row from which a condition holds up to the end of a window; None if it does not hold there."""
     rows = np.flatnonzero(window)
@@ -150,7 +140,7 @@ def settled(condition: Mask, window: Mask) -> int | None:
 def braking(log: RobotLog, limits: Limits, first: int, zero: int) -> int:
     """Return the row at which the ramp to rest, which ends at row `zero`, has begun; see above."""
     t_s = 1e-9 * (log.stamp_ns - log.stamp_ns[zero])
-    left_s = (np.abs(log.u - limits.rest) / limits.step).max(axis=1) * limits.dt_s
+    left_s = (np.abs(log.u - limits.u_rest) / step(limits)).max(axis=1) * limits.dt_s
     for row in range(max(first, 1), zero):
         if t_s[row - 1] + left_s[row - 1] >= -LATE_S and not np.array_equal(log.u[row], log.u[row - 1]):
             return row
@@ -167,7 +157,7 @@ def fresh_ns(log: RobotLog, incident: Incident) -> int:
 
 def step_share(u: Array, limits: Limits) -> float:
     """Return the largest change from row to row, as a share of what it may be."""
-    return float((np.abs(np.diff(u, axis=0)) / limits.step).max()) if len(u) > 1 else 0.0
+    return float((np.abs(np.diff(u, axis=0)) / step(limits)).max()) if len(u) > 1 else 0.0
 
 
 def ramp_share(log: RobotLog, limits: Limits, brake: int, zero: int) -> float:
@@ -175,7 +165,7 @@ def ramp_share(log: RobotLog, limits: Limits, brake: int, zero: int) -> float:
     t, share = log.stamp_ns[: zero + 1], 0.0
     for row in range(max(brake - 1, 0), zero):
         last = int(np.searchsorted(t, t[row] + 1e9 * limits.dt_s, side="right")) - 1
-        share = max(share, float((np.abs(log.u[last] - log.u[row]) / limits.step).max()))
+        share = max(share, float((np.abs(log.u[last] - log.u[row]) / step(limits)).max()))
     return share
 
 

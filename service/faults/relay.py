@@ -19,10 +19,11 @@ import numpy as np
 
 from rti_mpc.errors import MessageError
 from rti_mpc.message import Command, State
-from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
+from rti_mpc.wire.bus import Bus, Subscriber
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.session import BusSettings
 
 ROLE = "relay"
 LATE_NS = 400_000_000

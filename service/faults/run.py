@@ -21,11 +21,12 @@ from threading import Event
 import numpy as np
 
 from rti_mpc.errors import ConfigError
+from rti_mpc.guard import Limits
 from rti_mpc.trajectory import find_trajectory
 from rti_mpc.wire.interrupt import stop_on_signals
-from service.config import Config, bounds
+from service.config import Config
 from service.demo import Failed, configured
-from service.faults.measure import Incident, Limits, Measured, measure
+from service.faults.measure import Incident, Measured, measure
 from service.faults.relay import ROLE as RELAY
 from service.faults.report import Report, Row, report_console
 from service.faults.system import HEADING, SCENARIO, System, Wiring
@@ -33,9 +34,9 @@ from service.faults.table import FAULTS, Fault
 
 STATE_PERIOD_S = 0.01  # of the robot, and so of its record: what times are known to
 COMPANY = {
-    Wiring.PEERS: ("controller", "reference", "robot"),
-    Wiring.ROUTER: ("router", "controller", "reference", "robot"),
-    Wiring.RELAY: (RELAY, "controller", "reference", "robot"),
+    Wiring.PEERS: ("controller", "guard", "reference", "robot"),
+    Wiring.ROUTER: ("router", "controller", "guard", "reference", "robot"),
+    Wiring.RELAY: (RELAY, "controller", "guard", "reference", "robot"),
 }
 SETTLED_M = 0.001
 RECOVERY_S = 20.0
@@ -87,20 +88,17 @@ def chosen(only: Sequence[str]) -> list[Fault]:
 
 
 def prepared(config: Config) -> Config:
-    """Return the configuration of a run: from the scenario's pose, with states that come fast enough to measure by."""
+    """Return the configuration of a run: from the scenario's pose, guarded, with states that come fast enough to measure by."""
     config = configured(config, find_trajectory(SCENARIO), HEADING)
     content = config.model_dump(by_alias=True, exclude_unset=True)
+    content["guard"] = {**content.get("guard", {}), "enabled": True}
     content["sim"] = {**content.get("sim", {}), "state_period_s": STATE_PERIOD_S}
     return Config.model_validate(content)
 
 
 def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Report, stop: Event) -> None:
     """Inject faults until there are none left, or we are stopped."""
-    limits = Limits(
-        step=np.minimum(*(np.abs(side) for side in bounds(config.ocp.bounds.increments, config.build_model().inputs))),
-        rest=np.array(config.build_model().u_rest),
-        dt_s=config.ocp.dt_s,
-    )
+    limits = config.guard_limits()
     system: System | None = None
     with ExitStack() as stack:
         for number, fault in enumerate(faults):

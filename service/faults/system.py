@@ -19,8 +19,9 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.message import Reference
 from rti_mpc.trajectory import Heading, find_trajectory
-from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.session import BusSettings
 from service import robot_log, toml
 from service.children import Children
 from service.config import Config
