@@ -62,7 +62,7 @@ class Measured:
         distance_m: Way from the fault to the standstill, or until mended.
         stale: Instants at which an input acted, once at rest, that answers no state fresh when mended.
         step_share: Largest step of an input, as a share of what it may change in a period; while braking, in any period.
-        recovery_s: From mended to a robot that moves again, or, where it never stopped, to the first answer to one of its states.
+        recovery_s: From mended to the first input other than rest, or motion, whichever had ended; else to the first state that is answered.
         missed: Samples of the controller that the robot had no command for, until mended.
         error_m: Largest distance from the reference until mended.
         final_error_m: Distance from the reference when mended.
@@ -102,8 +102,8 @@ def measure(log: RobotLog, reference: Array, incident: Incident, limits: Limits)
     zero = settled(~moving, broken)
     brake = None if zero is None or zero == np.argmax(broken) else braking(log, limits, int(np.argmax(broken)), zero)
     still = settled(speed < STANDING_M_S, broken)
-    stopped = zero is not None or still is not None
-    driven = np.flatnonzero((speed > STANDING_M_S if stopped else np.isfinite(log.latency_us)) & seen & (t > incident.mend_ns))
+    again = moving if zero is not None else speed > STANDING_M_S if still is not None else np.isfinite(log.latency_us)
+    driven = np.flatnonzero(again & seen & (t > incident.mend_ns))
 
     def after(instant_ns: int, row: int | None) -> float | None:
         return None if row is None else 1e-9 * float(t[row] - instant_ns)
@@ -174,5 +174,6 @@ def missed(log: RobotLog, incident: Incident, dt_s: float) -> int:
     period_ns = 1e9 * dt_s
     near = (log.stamp_ns >= incident.fault_ns - 2 * period_ns) & (log.stamp_ns <= incident.mend_ns)
     stamps = log.stamp_ns[near & np.isfinite(log.latency_us)]
-    ends = np.append(stamps, [incident.mend_ns - period_ns] * bool(stamps.size))  # the last sample need not be over
-    return int(np.maximum(np.round(np.diff(ends) / period_ns) - 1, 0).sum())
+    silent_ns = incident.mend_ns - (stamps[-1] if stamps.size else incident.fault_ns)  # the last sample need not be over
+    gaps = np.append(np.round(np.diff(stamps) / period_ns), silent_ns // period_ns)
+    return int(np.maximum(gaps - 1, 0).sum())

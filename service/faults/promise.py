@@ -27,6 +27,11 @@ class Promise:
     text: str
     at_most: Mapping[str, float]
 
+    @property
+    def on_path(self) -> bool:
+        """Whether it is about the distance from the reference."""
+        return not {"error_m", "final_error_m"}.isdisjoint(self.at_most)
+
     def broken(self, measured: Measured) -> list[str]:
         """Return what is not within the promise."""
         values = {name: getattr(measured, name) for name in self.at_most}
@@ -42,5 +47,5 @@ PAUSES = Promise("brakes to zero, and drives again when mended", {**EVERYWHERE, 
 KEEPS_ON = Promise("keeps on", {**EVERYWHERE, "missed": 0.0, "error_m": 0.005})
 RECOVERS = Promise("is driven again when mended", {**EVERYWHERE, **AGAIN})
 REJOINS = Promise("moves over to the new reference", {**EVERYWHERE, "missed": 0.0, "final_error_m": 0.01})
-COMES_TO_REST = Promise("comes to rest, and drives again when mended", {**EVERYWHERE, "still_s": 5.0, **AGAIN})
+HOLDS = Promise("stands where the reference ends, and drives again when mended", {**EVERYWHERE, "still_s": 5.0, "final_error_m": 0.01, **AGAIN})
 WAITS = Promise("does not move before there is a reference", {**EVERYWHERE, "distance_m": 1e-6, **AGAIN})

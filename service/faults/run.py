@@ -29,7 +29,7 @@ from service.demo import Failed, configured
 from service.faults.measure import Incident, Measured, measure
 from service.faults.relay import ROLE as RELAY
 from service.faults.report import Report, Row, report_console
-from service.faults.system import HEADING, SCENARIO, System, Wiring
+from service.faults.system import HEADING, SCENARIO, System, Wiring, positions
 from service.faults.table import FAULTS, Fault
 
 STATE_PERIOD_S = 0.01  # of the robot, and so of its record: what times are known to
@@ -130,7 +130,7 @@ def make_ready(system: System, fault: Fault, report: Report) -> None:
     """
     report.say(fault, "waiting for the robot to be driven")
     system.ensure(*COMPANY[fault.wiring], *(("viewer",) if fault.viewer else ()))
-    error_m = SETTLED_M if "missed" in fault.promise.at_most else np.inf
+    error_m = SETTLED_M if fault.promise.on_path else np.inf
     system.wait(lambda: system.driven(error_m), "the robot to be driven")
 
 
@@ -147,7 +147,7 @@ def suffer(system: System, fault: Fault, limits: Limits, report: Report) -> Meas
     fault_ns = before_ns if injected_ns is None else injected_ns
     system.pause(fault.hold_s)
     mend_ns, robots = max(system.now_ns(), fault_ns + round(2e9 * STATE_PERIOD_S)), system.robots
-    reference = system.reference_at
+    reference = system.witness.reference
     report.say(fault, "waiting for the robot to recover")
     fault.mend(system)
     if system.robots != robots:  # another life: nothing of the last one counts
@@ -159,7 +159,7 @@ def suffer(system: System, fault: Fault, limits: Limits, report: Report) -> Meas
     if system.stopped:
         raise Failed("stopped")
     log = system.log()
-    return measure(log, reference(log.stamp_ns), Incident(fault_ns, mend_ns, end_ns), limits)
+    return measure(log, positions(reference, log.stamp_ns), Incident(fault_ns, mend_ns, end_ns), limits)
 
 
 def recovered(system: System, mend_ns: int) -> None:

@@ -15,10 +15,11 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rti_mpc.array import Array
 from rti_mpc.message import Reference
-from rti_mpc.trajectory import Heading, find_trajectory
+from rti_mpc.trajectory import Heading
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.session import BusSettings
@@ -35,7 +36,7 @@ from service.witness import Witness
 
 SCENARIO = "eight"
 HEADING: Heading = "consistent"
-REFERENCE_S = 600
+REFERENCE_S = 300
 PATIENCE_S = 30.0  # for processes to start and the robot to be driven; the first controller on a machine compiles
 DRIVEN_M_S = 0.1
 REQUEST_S = 2.0
@@ -71,7 +72,6 @@ class System:
         self.robots = 0
         self.wiring, self._folder, self._stop = wiring, folder, stop
         self._robot_keys = Keys(f"{self.keys.prefix}/behind", self.keys.robot) if wiring is Wiring.RELAY else self.keys
-        self._trajectory = find_trajectory(SCENARIO)
         model = config.build_model()
         states, inputs = (tuple(Label(signal.name) for signal in signals) for signals in (model.states, model.inputs))
         self._info = Info("robot", states=states, inputs=inputs)
@@ -185,14 +185,9 @@ class System:
         alive = self.children.pid("robot") is not None and "robot" not in self._suspended
         return self.observer.now_ns() if alive else self.observer.stamp_ns
 
-    def reference_at(self, stamp_ns: object) -> Array:
-        """Return where the robot is to be at stamps, shape ``(..., 2)``."""
-        anchor_ns = 0 if self.witness.reference is None else self.witness.reference.stamp_ns
-        return self._trajectory.position(1e-9 * (np.asarray(stamp_ns, dtype=np.float64) - anchor_ns))
-
     def error_m(self) -> float:
         """Return the distance from the reference now."""
-        return float(np.hypot(*(self.observer.position - self.reference_at(self.observer.stamp_ns))))
+        return float(np.hypot(*(self.observer.position - positions(self.witness.reference, np.array(self.observer.stamp_ns)))))
 
     def driven(self, error_m: float = np.inf) -> bool:
         """Whether the robot is driven, and as near to its reference as told."""
@@ -250,3 +245,11 @@ class System:
             answer = {"error": f"no answer within {REQUEST_S:g} s"}
         if answer.get("ok") is not True:
             raise Failed(f"{key} was asked for {request}: {answer.get('error')}")
+
+
+def positions(reference: Reference | None, stamp_ns: NDArray[np.int64]) -> Array:
+    """Return where a reference wants the robot at stamps, shape ``(..., 2)``, m; NaN if there is none."""
+    if reference is None:
+        return np.full((*stamp_ns.shape, 2), np.nan)
+    rows = (stamp_ns - reference.stamp_ns) / reference.period_ns
+    return np.stack([np.interp(rows, np.arange(len(reference.y)), reference.y[:, j]) for j in (0, 1)], axis=-1)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from rti_mpc.message import Command, End, Reference, State
-from service.faults.promise import COMES_TO_REST, KEEPS_ON, PAUSES, RECOVERS, REJOINS, STOPS, WAITS, Promise
+from service.faults.promise import HOLDS, KEEPS_ON, PAUSES, RECOVERS, REJOINS, STOPS, WAITS, Promise
 from service.faults.relay import ROLE as RELAY
 from service.faults.system import System, Wiring
 
@@ -131,28 +131,35 @@ def clock_right(system: System) -> None:
     system.restart("reference")
 
 
+def part(system: System, from_s: float, duration_s: float) -> Reference:
+    """Return rows of the followed reference, from some time after now on, stamped as they are: few enough for one packet."""
+    followed, period_ns = system.reference, system.reference.period_ns
+    first = (system.now_ns() + round(1e9 * from_s) - followed.stamp_ns) // period_ns
+    rows = slice(first, first + round(1e9 * duration_s) // period_ns)
+    return replace(followed, stamp_ns=followed.stamp_ns + first * period_ns, y=followed.y[rows], p=followed.p[rows])
+
+
 def reference_ends(end: End) -> Act:
     """Let the reference end in a moment; the fault is its last row."""
 
     def act(system: System) -> int:
-        followed = system.reference
-        rows = (system.now_ns() - followed.stamp_ns) // followed.period_ns + round(1e9 * REFERENCE_ENDS_S) // followed.period_ns + 1
-        system.refer(replace(followed, end=end, y=followed.y[:rows], p=followed.p[:rows]))
-        return followed.stamp_ns + (rows - 1) * followed.period_ns
+        short = replace(part(system, 0.0, REFERENCE_ENDS_S), end=end)
+        system.refer(short)
+        return short.stamp_ns + (len(short.y) - 1) * short.period_ns
 
     return act
 
 
 def reference_in_the_past(system: System) -> None:
     """Publish a reference that ended long ago."""
-    followed = system.reference
-    system.refer(replace(followed, end=End.STOP, stamp_ns=followed.stamp_ns - STALE_NS))
+    short = part(system, 0.0, REFERENCE_ENDS_S)
+    system.refer(replace(short, end=End.STOP, stamp_ns=short.stamp_ns - STALE_NS))
 
 
 def reference_jumps(system: System) -> None:
     """Follow the same path some seconds further on."""
-    followed = system.reference
-    system.refer(replace(followed, stamp_ns=followed.stamp_ns - round(1e9 * JUMP_S)))
+    later = part(system, JUMP_S, 10 * JUMP_S)
+    system.refer(replace(later, stamp_ns=later.stamp_ns - round(1e9 * JUMP_S)))
 
 
 def no_reference(system: System) -> int:
@@ -172,13 +179,13 @@ FAULTS = (
     Fault("malformed_flood", f"{MALFORMED} malformed messages at once", PEERS, KEEPS_ON, flood, nothing),
     Fault("reference_killed", "SIGKILL of the reference's source", PEERS, KEEPS_ON, kill("reference"), nothing),
     Fault("reference_jumps", f"the reference is {JUMP_S:g} s further on", PEERS, REJOINS, reference_jumps, restart("reference"), 8.0),
+    Fault("reference_ends_hold", "the reference ends, to be held", PEERS, HOLDS, reference_ends(End.HOLD), restart("reference"), 6.0),
     Fault("controller_killed", "SIGKILL of the controller", PEERS, STOPS, kill("controller"), start("controller")),
     Fault("controller_hung", "SIGSTOP of the controller", PEERS, STOPS, suspend("controller"), resume("controller")),
     Fault("controller_paused", f"SIGSTOP of the controller for {PAUSE_S:g} s", PEERS, PAUSES, suspend("controller"), resume("controller"), PAUSE_S),
     Fault("guard_killed", "SIGKILL of the guard", PEERS, STOPS, kill("guard"), start("guard")),
     Fault("guard_hung", "SIGSTOP of the guard", PEERS, STOPS, suspend("guard"), resume("guard")),
     Fault("guard_and_controller_killed", "SIGKILL of both", PEERS, STOPS, kill("guard", "controller"), start("guard", "controller")),
-    Fault("reference_ends_hold", "the reference ends, to be held", PEERS, COMES_TO_REST, reference_ends(End.HOLD), restart("reference"), 7.0),
     Fault("reference_ends_stop", "the reference ends with a stop", PEERS, STOPS, reference_ends(End.STOP), restart("reference"), 5.0),
     Fault("reference_stale", "a reference that ended long ago", PEERS, STOPS, reference_in_the_past, restart("reference")),
     Fault("reference_missing", "all start, but no reference", PEERS, WAITS, no_reference, start("reference")),
