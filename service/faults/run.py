@@ -36,10 +36,12 @@ STATE_PERIOD_S = 0.01  # of the robot, and so of its record: what times are know
 COMPANY = {
     Wiring.PEERS: ("controller", "guard", "reference", "robot"),
     Wiring.ROUTER: ("router", "controller", "guard", "reference", "robot"),
-    Wiring.RELAY: (RELAY, "controller", "guard", "reference", "robot"),
+    Wiring.LINK: (RELAY, "controller", "guard", "reference", "robot"),
+    Wiring.SENSOR: (RELAY, "controller", "guard", "reference", "robot"),
 }
 SETTLED_M = 0.001
 RECOVERY_S = 20.0
+LEFT_S = 40.0  # of reference, that a fault may take
 FLUSH_S = 5.0  # for the robot to write what it knows; a line waits a second for an answer
 
 
@@ -130,6 +132,9 @@ def make_ready(system: System, fault: Fault, report: Report) -> None:
     """
     report.say(fault, "waiting for the robot to be driven")
     system.ensure(*COMPANY[fault.wiring], *(("viewer",) if fault.viewer else ()))
+    if system.witness.begun and system.reference_left_s() < LEFT_S:
+        system.restart("reference")
+        system.wait(lambda: system.witness.listen() and system.reference_left_s() > LEFT_S, "another reference")
     error_m = SETTLED_M if fault.promise.on_path else np.inf
     system.wait(lambda: system.driven(error_m), "the robot to be driven")
 

@@ -36,7 +36,7 @@ from service.witness import Witness
 
 SCENARIO = "eight"
 HEADING: Heading = "consistent"
-REFERENCE_S = 300
+REFERENCE_S = 120  # 58 kB: one packet, which a busy host does not drop half of
 PATIENCE_S = 30.0  # for processes to start and the robot to be driven; the first controller on a machine compiles
 DRIVEN_M_S = 0.1
 REQUEST_S = 2.0
@@ -48,7 +48,11 @@ class Wiring(Enum):
 
     PEERS = "peers"  # each directly with each
     ROUTER = "router"  # clients of a router, the controller through a link that can be cut
-    RELAY = "relay"  # peers, the robot's states through a process that can change them
+    LINK = "link"  # peers, what the controller hears of the robot through a process that can change it
+    SENSOR = "sensor"  # the same for everybody, the guard, too
+
+
+RELAYED = (Wiring.LINK, Wiring.SENSOR)
 
 
 class System:
@@ -71,7 +75,7 @@ class System:
         self.keys = config.keys()
         self.robots = 0
         self.wiring, self._folder, self._stop = wiring, folder, stop
-        self._robot_keys = Keys(f"{self.keys.prefix}/behind", self.keys.robot) if wiring is Wiring.RELAY else self.keys
+        self._robot_keys = Keys(f"{self.keys.prefix}/behind", self.keys.robot) if wiring in RELAYED else self.keys
         model = config.build_model()
         states, inputs = (tuple(Label(signal.name) for signal in signals) for signals in (model.states, model.inputs))
         self._info = Info("robot", states=states, inputs=inputs)
@@ -146,9 +150,13 @@ class System:
                 _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
                 resource.prlimit(pid, resource.RLIMIT_FSIZE, (hard if size is None else size, hard))
 
+    def _keys_of(self, role: str) -> Keys:
+        """Return where the streams of a process are: before or behind the relay, if there is one."""
+        return self._robot_keys if role == "robot" or (role == "guard" and self.wiring is Wiring.LINK) else self.keys
+
     def _command(self, role: str) -> tuple[object, ...]:
         """Return module and arguments of a process."""
-        here = self._folder / ("robot.toml" if role == "robot" else "config.toml")
+        here = self._folder / ("config.toml" if self._keys_of(role) is self.keys else "robot.toml")
         through = self.link.endpoint if self.wiring is Wiring.ROUTER and role == "controller" else self._endpoint
         meeting: tuple[object, ...] = (here, *(("-m", "client") if self.wiring is Wiring.ROUTER else ()), "-e", through)
         scenario = ("--scenario", SCENARIO, "--heading", HEADING, "--duration", REFERENCE_S)
@@ -189,6 +197,11 @@ class System:
         """Return the distance from the reference now."""
         return float(np.hypot(*(self.observer.position - positions(self.witness.reference, np.array(self.observer.stamp_ns)))))
 
+    def reference_left_s(self) -> float:
+        """Return how long the reference still lasts."""
+        reference = self.reference
+        return 1e-9 * (reference.stamp_ns + (len(reference.y) - 1) * reference.period_ns - self.now_ns())
+
     def driven(self, error_m: float = np.inf) -> bool:
         """Whether the robot is driven, and as near to its reference as told."""
         self.witness.listen()
@@ -215,8 +228,8 @@ class System:
     def ensure(self, *roles: str) -> None:
         """Start those that are not there, and wait until all are present."""
         self.start(*(role for role in roles if self.children.pid(role) is None))
-        others = set(roles) - {"robot"}  # whose presence a relay does not pass on, and whom states tell of
-        self.wait(lambda: self.witness.listen().met(others), f"{', '.join(roles)} to be there")
+        others = [role for role in roles if self._keys_of(role) is self.keys]  # a relay passes no presence on, and the robot's states tell
+        self.wait(lambda: self.witness.listen().met(set(others)), f"{', '.join(others)} to be there")
 
     # What is said.
 

@@ -125,12 +125,6 @@ def free_disk(system: System) -> None:
     system.limit_files(None, "viewer", "controller")
 
 
-def clock_right(system: System) -> None:
-    """Set the clock right, and anchor the reference to it."""
-    states("none")(system)
-    system.restart("reference")
-
-
 def part(system: System, from_s: float, duration_s: float) -> Reference:
     """Return rows of the followed reference, from some time after now on, stamped as they are: few enough for one packet."""
     followed, period_ns = system.reference, system.reference.period_ns
@@ -170,7 +164,7 @@ def no_reference(system: System) -> int:
     return 0
 
 
-PEERS, ROUTER, RELAYED = Wiring.PEERS, Wiring.ROUTER, Wiring.RELAY
+PEERS, ROUTER, LINK, SENSOR = Wiring
 FAULTS = (
     Fault("viewer_killed", "SIGKILL of the viewer", PEERS, KEEPS_ON, kill("viewer"), nothing, viewer=True),
     Fault("viewer_hung", "SIGSTOP of the viewer", PEERS, KEEPS_ON, suspend("viewer"), resume("viewer"), viewer=True),
@@ -193,13 +187,13 @@ FAULTS = (
     Fault("robot_killed", "SIGKILL of the simulator", PEERS, RECOVERS, kill("robot"), start("robot")),
     Fault("link_cut", "the controller's link is cut", ROUTER, STOPS, lambda system: system.link.cut(), lambda system: system.link.restore()),
     Fault("router_killed", "SIGKILL of the router", ROUTER, STOPS, kill("router"), start("router")),
-    Fault("state_duplicated", "every state comes three times", RELAYED, KEEPS_ON, states("duplicated"), states("none")),
-    Fault("state_reordered", "every two states in the wrong order", RELAYED, KEEPS_ON, states("reordered"), states("none")),
-    Fault("state_nan_once", "one state with a NaN", RELAYED, KEEPS_ON, states("nan", 1), nothing),
-    Fault("state_nan", "every state with a NaN", RELAYED, STOPS, states("nan"), states("none")),
-    Fault("state_wrong_length", "every state one number short", RELAYED, STOPS, states("short"), states("none")),
-    Fault("state_frozen", "the same state again and again", RELAYED, STOPS, states("frozen"), states("none")),
-    Fault("state_late", "every state 0.4 s late", RELAYED, STOPS, states("late"), states("none")),
-    Fault("clock_ahead", "stamps 5 s ahead of the robot's clock", RELAYED, STOPS, states("ahead"), clock_right),
-    Fault("clock_behind", "stamps 5 s behind the robot's clock", RELAYED, STOPS, states("behind"), clock_right),
+    Fault("state_duplicated", "every state comes three times", LINK, KEEPS_ON, states("duplicated"), states("none")),
+    Fault("state_reordered", "every two states in the wrong order", LINK, KEEPS_ON, states("reordered"), states("none")),
+    Fault("state_late", "every state 0.4 s late", LINK, STOPS, states("late"), states("none")),
+    Fault("state_nan_once", "one state with a NaN", SENSOR, KEEPS_ON, states("nan", 1), nothing),
+    Fault("state_nan", "every state with a NaN", SENSOR, STOPS, states("nan"), states("none")),
+    Fault("state_wrong_length", "every state one number short", SENSOR, STOPS, states("short"), states("none")),
+    Fault("state_frozen", "the same state again and again", SENSOR, STOPS, states("frozen"), states("none")),
+    Fault("clock_back", "the robot's clock jumps back by 5 s", SENSOR, STOPS, states("behind"), restart("reference")),
+    Fault("clock_ahead", "the robot's clock jumps ahead by 5 s", SENSOR, RECOVERS, states("ahead"), nothing),
 )

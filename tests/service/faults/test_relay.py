@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rti_mpc.message import State
-from service.faults.relay import CHANGES, JUMP_NS
+from service.faults.relay import CHANGES
 
 PERIOD_NS = 10_000_000
 SENT = [State(7, seq, seq * PERIOD_NS, np.array([0.1 * seq, 1.0, 2.0])) for seq in range(1, 81)]
@@ -40,10 +40,8 @@ def test_late_states_are_late_by_more_than_a_command_is_valid() -> None:
 
 
 def test_a_change_of_content_leaves_the_rest_as_it_is() -> None:
-    for change, wrong in (("nan", 3), ("short", 3), ("ahead", 2), ("behind", 2)):
-        (state,), sent = CHANGES[change](SENT[0], deque()), SENT[0]
-        assert all(a == b for i, (a, b) in enumerate(zip(astuple(state)[:3], astuple(sent)[:3], strict=True)) if i != wrong), change
+    for change in ("nan", "short"):
+        assert [astuple(state)[:3] for state in relayed(change)] == [astuple(state)[:3] for state in SENT], change
     assert np.isnan(relayed("nan")[0].x).tolist() == [True, False, False]
     assert len(relayed("short")[0].x) == 2
-    assert (relayed("ahead")[0].stamp_ns, relayed("behind")[0].stamp_ns) == (PERIOD_NS + JUMP_NS, PERIOD_NS - JUMP_NS)
     assert np.isfinite(SENT[0].x).all()
