@@ -42,6 +42,7 @@ COMPANY = {
 SETTLED_M = 0.001
 RECOVERY_S = 20.0
 LEFT_S = 40.0  # of reference, that a fault may take
+A_MOMENT_S = 0.3  # more, to see what comes of it
 FLUSH_S = 5.0  # for the robot to write what it knows; a line waits a second for an answer
 
 
@@ -159,6 +160,7 @@ def suffer(system: System, fault: Fault, limits: Limits, report: Report) -> Meas
         system.wait(lambda: system.observer.epoch, "the robot's first state")
         fault_ns = mend_ns = 0
     recovered(system, mend_ns)
+    system.pause(A_MOMENT_S)
     end_ns = system.now_ns()
     system.wait(lambda: system.logged_ns() >= end_ns, "the robot's record", FLUSH_S)
     if system.stopped:
