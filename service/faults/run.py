@@ -95,6 +95,7 @@ def prepared(config: Config) -> Config:
     config = configured(config, find_trajectory(SCENARIO), HEADING)
     content = config.model_dump(by_alias=True, exclude_unset=True)
     content["guard"] = {**content.get("guard", {}), "enabled": True}
+    content["debug"] = {"inject": True}
     content["sim"] = {**content.get("sim", {}), "state_period_s": STATE_PERIOD_S}
     return Config.model_validate(content)
 

@@ -27,6 +27,7 @@ GARBAGE = (b"", b"\x00\x00\x00\x00", b"\x00\x01\x00\x00" + bytes(24), b"\x00\x01
 SLICE_S, SHARE = 0.1, 0.05  # of time a slow process gets
 REFERENCE_ENDS_S = 1.0
 STALE_NS = 10**12
+UNTIL_MENDED = 10_000  # samples
 JUMP_S = 2.0
 
 
@@ -101,6 +102,11 @@ def solver(failure: str, samples: int) -> Act:
     return lambda system: system.ask(system.keys.request, request="inject", failure=failure, samples=samples)
 
 
+def solver_works(system: System) -> None:
+    """Let the solver find something again, after one more sample."""
+    solver("solver", 1)(system)
+
+
 def flood(system: System) -> None:
     """Publish what is no message on every key that somebody acts on, as fast as it goes."""
     keys = system.keys
@@ -171,6 +177,8 @@ FAULTS = (
     Fault("viewer_slow", "the viewer gets 5 % of its time", PEERS, KEEPS_ON, slow_viewer, nothing, 0.0, viewer=True),
     Fault("disk_full", "viewer and controller cannot write", PEERS, KEEPS_ON, fill_disk, free_disk, viewer=True),
     Fault("malformed_flood", f"{MALFORMED} malformed messages at once", PEERS, KEEPS_ON, flood, nothing),
+    Fault("solver_fails", "the first solver finds nothing", PEERS, KEEPS_ON, solver("solver", UNTIL_MENDED), solver_works),
+    Fault("qp_fails_twice", "no solver finds anything, twice", PEERS, KEEPS_ON, solver("qp", 2), nothing),
     Fault("reference_killed", "SIGKILL of the reference's source", PEERS, KEEPS_ON, kill("reference"), nothing),
     Fault("reference_jumps", f"the reference is {JUMP_S:g} s further on", PEERS, REJOINS, reference_jumps, restart("reference"), 8.0),
     Fault("reference_ends_hold", "the reference ends, to be held", PEERS, HOLDS, reference_ends(End.HOLD), restart("reference"), 6.0),
@@ -180,6 +188,9 @@ FAULTS = (
     Fault("guard_killed", "SIGKILL of the guard", PEERS, STOPS, kill("guard"), start("guard")),
     Fault("guard_hung", "SIGSTOP of the guard", PEERS, STOPS, suspend("guard"), resume("guard")),
     Fault("guard_and_controller_killed", "SIGKILL of both", PEERS, STOPS, kill("guard", "controller"), start("guard", "controller")),
+    Fault("qp_fails", "no solver finds anything", PEERS, STOPS, solver("qp", UNTIL_MENDED), solver_works),
+    Fault("nan_model", "the model gives NaN", PEERS, STOPS, solver("nan_model", UNTIL_MENDED), solver_works),
+    Fault("over_budget", "a sample takes 1.5 periods", PEERS, STOPS, solver("over_budget", UNTIL_MENDED), solver_works),
     Fault("reference_ends_stop", "the reference ends with a stop", PEERS, STOPS, reference_ends(End.STOP), restart("reference"), 5.0),
     Fault("reference_stale", "a reference that ended long ago", PEERS, STOPS, reference_in_the_past, restart("reference")),
     Fault("reference_missing", "all start, but no reference", PEERS, WAITS, no_reference, start("reference")),
