@@ -148,11 +148,10 @@ def braking(log: RobotLog, limits: Limits, first: int, zero: int) -> int:
 
 
 def fresh_ns(log: RobotLog, incident: Incident) -> int:
-    """Return when the first command arrived that answers a state fresh when mended; the end if there was none."""
-    answered = (log.stamp_ns >= incident.mend_ns - round(1e9 * FRESH_S)) & np.isfinite(log.latency_us)
-    arrivals = (log.stamp_ns + 1e3 * log.latency_us)[answered]
-    arrivals = arrivals[arrivals >= incident.mend_ns]
-    return int(arrivals.min()) if arrivals.size else incident.end_ns
+    """Return the first stamp, of states fresh when mended, that was answered after that; the end if none was."""
+    arrival_ns = log.stamp_ns + 1e3 * log.latency_us
+    answered = log.stamp_ns[(log.stamp_ns >= incident.mend_ns - round(1e9 * FRESH_S)) & (arrival_ns >= incident.mend_ns)]
+    return int(answered[0]) if answered.size else incident.end_ns
 
 
 def step_share(u: Array, limits: Limits) -> float:

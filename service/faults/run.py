@@ -173,6 +173,6 @@ def suffer(system: System, fault: Fault, limits: Limits, report: Report) -> Meas
 def recovered(system: System, mend_ns: int) -> None:
     """Wait until the robot is driven by answers to its present states; if it is not, the measurement says so."""
     try:
-        system.wait(lambda: system.driven() and system.witness.telemetry[-1].state_stamp_ns > mend_ns, "the robot to be driven", RECOVERY_S)
+        system.wait(lambda: system.driven() and system.last_sample_ns() > mend_ns, "the robot to be driven", RECOVERY_S)
     except Failed:
         return

@@ -37,7 +37,7 @@ from service.witness import Witness
 SCENARIO = "eight"
 HEADING: Heading = "consistent"
 REFERENCE_S = 120  # 58 kB: one packet, which a busy host does not drop half of
-PATIENCE_S = 30.0  # for processes to start and the robot to be driven; the first controller on a machine compiles
+PATIENCE_S = 60.0  # for processes to start and the robot to be driven; the first controller on a machine compiles
 DRIVEN_M_S = 0.1
 REQUEST_S = 2.0
 CLI = "service.cli"
@@ -62,6 +62,7 @@ class System:
     Attributes:
         wiring: How they are linked.
         keys: Where everybody's streams are.
+        period_ns: Of the controller.
         children: The processes.
         bus: Ours, a peer among them.
         witness: Hears the controller.
@@ -73,6 +74,7 @@ class System:
     def __init__(self, config: Config, wiring: Wiring, folder: Path, stop: Event) -> None:
         folder.mkdir(parents=True)
         self.keys = config.keys()
+        self.period_ns = round(1e9 * config.ocp.dt_s)
         self.robots = 0
         self.wiring, self._folder, self._stop = wiring, folder, stop
         self._robot_keys = Keys(f"{self.keys.prefix}/behind", self.keys.robot) if wiring in RELAYED else self.keys
@@ -118,7 +120,7 @@ class System:
                 self.robots += 1
                 self.observer.forget()
             module, *arguments = self._command(role)
-            self.children.start(role, str(module), *arguments, nice=POLITE if role in ("reference", "viewer") else 0)
+            self.children.start(role, str(module), *arguments, nice=POLITE if role == "viewer" else 0)
 
     def kill(self, *roles: str) -> None:
         """SIGKILL."""
@@ -192,6 +194,10 @@ class System:
         """Robot time; a robot that is suspended or dead has none but that of its last state."""
         alive = self.children.pid("robot") is not None and "robot" not in self._suspended
         return self.observer.now_ns() if alive else self.observer.stamp_ns
+
+    def last_sample_ns(self) -> int:
+        """Return the stamp of the last state that the controller has answered, as far as it has told us."""
+        return self.witness.listen().telemetry[-1].state_stamp_ns
 
     def error_m(self) -> float:
         """Return the distance from the reference now."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from rti_mpc.message import Command, End, Reference, State
-from service.faults.promise import HOLDS, KEEPS_ON, PAUSES, RECOVERS, REJOINS, STOPS, WAITS, Promise
+from service.faults.promise import HOLDS, KEEPS_ON, PAUSES, PLAYS_ON, RECOVERS, REJOINS, STOPS, WAITS, Promise
 from service.faults.relay import ROLE as RELAY
 from service.faults.system import System, Wiring
 
@@ -98,13 +98,20 @@ def states(change: str, count: int | None = None) -> Act:
 
 
 def solver(failure: str, samples: int) -> Act:
-    """Let the solver fail so many times in a row."""
-    return lambda system: system.ask(system.keys.request, request="inject", failure=failure, samples=samples)
+    """Let the solver fail so many times in a row; the fault is when the second sample from now is due, for one is prepared already."""
+
+    def act(system: System) -> int:
+        asked_ns = system.now_ns()
+        system.ask(system.keys.request, request="inject", failure=failure, samples=samples)
+        system.wait(lambda: system.last_sample_ns() > asked_ns, "the next sample")
+        return system.last_sample_ns() + system.period_ns
+
+    return act
 
 
 def solver_works(system: System) -> None:
     """Let the solver find something again, after one more sample."""
-    solver("solver", 1)(system)
+    system.ask(system.keys.request, request="inject", failure="solver", samples=1)
 
 
 def flood(system: System) -> None:
@@ -190,7 +197,7 @@ FAULTS = (
     Fault("guard_and_controller_killed", "SIGKILL of both", PEERS, STOPS, kill("guard", "controller"), start("guard", "controller")),
     Fault("qp_fails", "no solver finds anything", PEERS, STOPS, solver("qp", UNTIL_MENDED), solver_works),
     Fault("nan_model", "the model gives NaN", PEERS, STOPS, solver("nan_model", UNTIL_MENDED), solver_works),
-    Fault("over_budget", "a sample takes 1.5 periods", PEERS, STOPS, solver("over_budget", UNTIL_MENDED), solver_works),
+    Fault("over_budget", "a sample takes 1.5 periods", PEERS, PLAYS_ON, solver("over_budget", UNTIL_MENDED), solver_works),
     Fault("reference_ends_stop", "the reference ends with a stop", PEERS, STOPS, reference_ends(End.STOP), restart("reference"), 5.0),
     Fault("reference_stale", "a reference that ended long ago", PEERS, STOPS, reference_in_the_past, restart("reference")),
     Fault("reference_missing", "all start, but no reference", PEERS, WAITS, no_reference, start("reference")),
