@@ -47,7 +47,7 @@ PLAYS_ON = Promise(
     "plays the plan on for three samples, stops, and drives again when mended", {**EVERYWHERE, "brake_s": 0.6, "zero_s": 0.8, "still_s": 2.8, **AGAIN}
 )
 PAUSES = Promise("brakes to zero, and drives again when mended", {**EVERYWHERE, **BRAKES, **AGAIN})
-KEEPS_ON = Promise("keeps on", {**EVERYWHERE, "missed": 0.0, "error_m": 0.005})
+KEEPS_ON = Promise("keeps on", {**EVERYWHERE, "missed": 0.0, "error_m": 0.01})
 RECOVERS = Promise("is driven again when mended", {**EVERYWHERE, **AGAIN})
 REJOINS = Promise("moves over to the new reference", {**EVERYWHERE, "missed": 0.0, "final_error_m": 0.01})
 HOLDS = Promise("stands where the reference ends, and drives again when mended", {**EVERYWHERE, "still_s": 5.0, "final_error_m": 0.01, **AGAIN})
