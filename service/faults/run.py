@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -24,7 +25,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.guard import Limits
 from rti_mpc.trajectory import find_trajectory
 from rti_mpc.wire.interrupt import stop_on_signals
-from service.config import Config
+from service.config import Config, check
 from service.demo import Failed, configured
 from service.faults.measure import Incident, Measured, measure
 from service.faults.relay import ROLE as RELAY
@@ -59,11 +60,14 @@ def main(config: Config, only: Sequence[str], path: Path | None) -> int:
         Exit status: 0 if every promise was kept.
 
     Raises:
-        ConfigError: A name is none, or the model has no pose to start from.
+        ConfigError: A name is none, the robot cannot be guarded or has no pose to start from, or the file cannot be written.
     """
     faults = chosen(only)
     config = prepared(config)
+    if path is not None:
+        claim(path)
     stop = stop_on_signals()
+    signal.signal(signal.SIGHUP, lambda *_: stop.set())
     folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
     with Report(console := report_console(), len(faults)) as report:
         inject(config, faults, folder, report, stop)
@@ -90,14 +94,29 @@ def chosen(only: Sequence[str]) -> list[Fault]:
     return [fault for fault in FAULTS if (fault.name in only or not only) and (find_spec("rerun") or not fault.viewer)]
 
 
+def claim(path: Path) -> None:
+    """
+    Make sure that a file can be written, before minutes are spent on what it is to hold.
+
+    Raises:
+        ConfigError: It cannot.
+    """
+    try:
+        path.touch()
+    except OSError as error:
+        raise ConfigError(f"--json must be a file that can be written, got {path}: {error.strerror}") from error
+
+
 def prepared(config: Config) -> Config:
     """Return the configuration of a run: from the scenario's pose, guarded, with states that come fast enough to measure by."""
     config = configured(config, find_trajectory(SCENARIO), HEADING)
     content = config.model_dump(by_alias=True, exclude_unset=True)
     content["guard"] = {**content.get("guard", {}), "enabled": True}
     content["debug"] = {"inject": True}
-    content["sim"] = {**content.get("sim", {}), "state_period_s": STATE_PERIOD_S}
-    return Config.model_validate(content)
+    content["sim"] = {**content.get("sim", {}), "state_period_s": min(STATE_PERIOD_S, config.ocp.dt_s)}
+    config = Config.model_validate(content)
+    check(config)
+    return config
 
 
 def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Report, stop: Event) -> None:

@@ -25,7 +25,7 @@ def matrix(path: Path, *names: str, timeout_s: float = 120.0) -> dict[str, dict[
 
 @pytest.mark.parametrize(
     "names",
-    [("controller_killed", "guard_and_controller_killed"), ("link_cut",), ("state_nan",)],
+    [("controller_killed", "guard_and_controller_killed"), ("link_cut",), pytest.param(("state_nan",), marks=pytest.mark.slow)],
     ids="-".join,
 )
 def test_robot_stops_in_time_and_drives_again(tmp_path: Path, names: tuple[str, ...]) -> None:
@@ -45,6 +45,12 @@ def test_unknown_fault_is_one_line_that_names_all_there_are() -> None:
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert done.stderr.endswith("got 'controller_kiled'\n")
     assert all(fault.name in done.stderr for fault in FAULTS)
+
+
+def test_matrix_that_cannot_be_written_is_refused_before_anything_is_broken(tmp_path: Path) -> None:
+    done = rti_mpc("faults", "--json", tmp_path / "nowhere" / "faults.json")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("rti-mpc: --json must be a file that can be written")
 
 
 @pytest.mark.slow
