@@ -216,7 +216,7 @@ def faults(
     """Break every part of a running system in turn, and print what the robot did: the fault matrix."""
     from service.faults.run import main
 
-    raise typer.Exit(main(load(config), tuple(only or ()), path))
+    raise typer.Exit(main(config, tuple(only or ()), path))
 
 
 @app.command()

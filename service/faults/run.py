@@ -25,7 +25,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.guard import Limits
 from rti_mpc.trajectory import find_trajectory
 from rti_mpc.wire.interrupt import stop_on_signals
-from service.config import Config, check
+from service.config import Config, check_model, check_tree, load
 from service.demo import Failed, configured
 from service.faults.measure import Incident, Measured, measure
 from service.faults.relay import ROLE as RELAY
@@ -47,12 +47,12 @@ A_MOMENT_S = 0.3  # more, to see what comes of it
 FLUSH_S = 5.0  # for the robot to write what it knows; a line waits a second for an answer
 
 
-def main(config: Config, only: Sequence[str], path: Path | None) -> int:
+def main(config_path: Path, only: Sequence[str], path: Path | None) -> int:
     """
     Inject faults, print the matrix, and write it to a file if asked to.
 
     Args:
-        config: The robot.
+        config_path: The robot's TOML file.
         only: Names of faults; none: all.
         path: JSON file to write.
 
@@ -63,9 +63,9 @@ def main(config: Config, only: Sequence[str], path: Path | None) -> int:
         ConfigError: A name is none, the robot cannot be guarded or has no pose to start from, or the file cannot be written.
     """
     faults = chosen(only)
-    config = prepared(config)
     if path is not None:
         claim(path)
+    config = prepared(load(config_path))
     stop = stop_on_signals()
     signal.signal(signal.SIGHUP, lambda *_: stop.set())
     folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
@@ -109,13 +109,13 @@ def claim(path: Path) -> None:
 
 def prepared(config: Config) -> Config:
     """Return the configuration of a run: from the scenario's pose, guarded, with states that come fast enough to measure by."""
-    config = configured(config, find_trajectory(SCENARIO), HEADING)
+    config = configured(config, find_trajectory(SCENARIO), HEADING, guard=True)
     content = config.model_dump(by_alias=True, exclude_unset=True)
-    content["guard"] = {**content.get("guard", {}), "enabled": True}
     content["debug"] = {"inject": True}
     content["sim"] = {**content.get("sim", {}), "state_period_s": min(STATE_PERIOD_S, config.ocp.dt_s)}
     config = Config.model_validate(content)
-    check(config)
+    check_tree(config)
+    check_model(config)
     return config
 
 
