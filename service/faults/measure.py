@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from rti_mpc.array import Array
 from rti_mpc.guard import Limits
+from rti_mpc.message import Reference
 from service.robot_log import RobotLog
 
 STANDING_M_S = 1e-3
@@ -121,6 +122,14 @@ def measure(log: RobotLog, reference: Array, incident: Incident, limits: Limits)
         error_m=float(error.max()),
         final_error_m=float(error[-1]),
     )
+
+
+def positions(reference: Reference | None, stamp_ns: NDArray[np.int64]) -> Array:
+    """Return where a reference wants the robot at stamps, shape ``(..., 2)``, m: at its ends beyond them; NaN without one."""
+    if reference is None:
+        return np.full((*stamp_ns.shape, 2), np.nan)
+    rows = (stamp_ns - reference.stamp_ns) / reference.period_ns
+    return np.stack([np.interp(rows, np.arange(len(reference.y)), reference.y[:, j]) for j in (0, 1)], axis=-1)
 
 
 def step(limits: Limits) -> Array:

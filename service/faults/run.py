@@ -27,10 +27,10 @@ from rti_mpc.trajectory import find_trajectory
 from rti_mpc.wire.interrupt import stop_on_signals
 from service.config import Config, check_model, check_tree, load
 from service.demo import Failed, configured
-from service.faults.measure import Incident, Measured, measure
+from service.faults.measure import Incident, Measured, measure, positions
 from service.faults.relay import ROLE as RELAY
 from service.faults.report import Report, Row, report_console
-from service.faults.system import HEADING, SCENARIO, System, Wiring, positions
+from service.faults.system import HEADING, SCENARIO, System, Wiring
 from service.faults.table import FAULTS, Fault
 
 STATE_PERIOD_S = 0.01  # of the robot, and so of its record: what times are known to
@@ -87,11 +87,17 @@ def chosen(only: Sequence[str]) -> list[Fault]:
 
     Raises:
         ConfigError: There is no fault of a name.
+        ModuleNotFoundError: It wants a viewer, and there is none; of all faults, those are left out.
     """
     names = [fault.name for fault in FAULTS]
     if unknown := [name for name in only if name not in names]:
         raise ConfigError(f"--only must be one of {', '.join(names)}, got {unknown[0]!r}")
-    return [fault for fault in FAULTS if (fault.name in only or not only) and (find_spec("rerun") or not fault.viewer)]
+    faults = [fault for fault in FAULTS if fault.name in only or not only]
+    if find_spec("rerun") is not None:
+        return faults
+    if only and any(fault.viewer for fault in faults):
+        raise ModuleNotFoundError(name="rerun")
+    return [fault for fault in faults if not fault.viewer]
 
 
 def claim(path: Path) -> None:
@@ -134,7 +140,7 @@ def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Report
                     system = stack.enter_context(System(config, fault.wiring, folder / f"{number}", stop))
                 make_ready(system, fault, report)
                 row = Row(fault, measured := suffer(system, fault, limits, report), fault.promise.broken(measured))
-            except Failed as error:
+            except (Failed, ConfigError) as error:
                 row = Row(fault, None, [str(error)])
             if stop.is_set():
                 return

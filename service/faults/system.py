@@ -15,9 +15,7 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rti_mpc.array import Array
 from rti_mpc.message import Reference
 from rti_mpc.trajectory import Heading
 from rti_mpc.wire.bus import Bus
@@ -27,6 +25,7 @@ from service import robot_log, toml
 from service.children import Children
 from service.config import Config
 from service.demo import POLITE, Failed, free_endpoint, wait
+from service.faults.measure import positions
 from service.faults.observer import Observer
 from service.faults.proxy import Proxy
 from service.faults.relay import ROLE as RELAY
@@ -264,11 +263,3 @@ class System:
             answer = {"error": f"no answer within {REQUEST_S:g} s"}
         if answer.get("ok") is not True:
             raise Failed(f"{key} was asked for {request}: {answer.get('error')}")
-
-
-def positions(reference: Reference | None, stamp_ns: NDArray[np.int64]) -> Array:
-    """Return where a reference wants the robot at stamps, shape ``(..., 2)``, m; NaN if there is none."""
-    if reference is None:
-        return np.full((*stamp_ns.shape, 2), np.nan)
-    rows = (stamp_ns - reference.stamp_ns) / reference.period_ns
-    return np.stack([np.interp(rows, np.arange(len(reference.y)), reference.y[:, j]) for j in (0, 1)], axis=-1)

@@ -63,3 +63,5 @@ def test_faults_are_chosen_by_name_in_the_order_of_the_table() -> None:
 def test_faults_of_a_viewer_are_left_out_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "find_spec", lambda name: None)
     assert [fault.name for fault in run.chosen(())] == [fault.name for fault in FAULTS if not fault.viewer]
+    with pytest.raises(ModuleNotFoundError):
+        run.chosen(("viewer_killed", "link_cut"))
