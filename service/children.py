@@ -28,6 +28,7 @@ class Children:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._logged: set[str] = set()  # those that were started before, whose output goes on
 
     def __enter__(self) -> Children:
         return self
@@ -48,12 +49,13 @@ class Children:
         """
         command = [sys.executable, "-P", "-m", module, *map(str, arguments)]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
-        with self.log(name).open("wb") as log:
+        with self.log(name).open("ab" if name in self._logged else "wb") as log:
             child = subprocess.Popen(
                 command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, process_group=0
             )  # no session of its own: Linux weighs sessions against each other first, and niceness only within one
         os.setpriority(os.PRIO_PROCESS, child.pid, os.getpriority(os.PRIO_PROCESS, 0) + nice)
         self._running[name] = child
+        self._logged.add(name)
 
     def log(self, name: str) -> Path:
         """Return the file that holds what a process said."""
@@ -62,6 +64,20 @@ class Children:
     def ended(self) -> str | None:
         """Return the name of a process that has ended by itself, if there is one."""
         return next((name for name, child in self._running.items() if child.poll() is not None), None)
+
+    def signal(self, name: str, number: int) -> None:
+        """Send a signal to a process."""
+        self._running[name].send_signal(number)
+
+    def kill(self, name: str) -> None:
+        """End a process without notice, as a crash does."""
+        child = self._running.pop(name)
+        child.kill()
+        child.wait()
+
+    def pid(self, name: str) -> int | None:
+        """Return the id of a process that was started and not ended by us; None if there is none."""
+        return self._running[name].pid if name in self._running else None
 
     def end(self, name: str, patience_s: float = PATIENCE_S) -> int:
         """Ask a process to end as Ctrl-C does, insist after a while, and return its exit status."""

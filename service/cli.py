@@ -208,6 +208,18 @@ def demo(
 
 
 @app.command()
+def faults(
+    config: ConfigPath = SHIPPED,
+    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="One fault of the matrix; repeatable.", show_default="all")] = None,
+    path: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the matrix as JSON.")] = None,
+) -> None:
+    """Break every part of a running system in turn, and print what the robot did: the fault matrix."""
+    from service.faults.run import main
+
+    raise typer.Exit(main(config, tuple(only or ()), path))
+
+
+@app.command()
 def bench(
     horizon: Annotated[
         list[int] | None, typer.Option("--horizon", "-n", min=2, help="Stages; repeatable.", show_default="7, 20, 50, 100, 200")

@@ -29,6 +29,7 @@ from rti_mpc.wire.session import BusSettings as BusSettings
 from rti_mpc.wire.session import open_session
 
 CLOSE_TIMEOUT_S = 0.5
+HEARTBEAT_S = 1.0  # of a cached publisher, which tells the number of its last message
 RETRY_S = 0.1  # between two looks for somebody who is not there yet
 
 
@@ -192,7 +193,8 @@ class Bus:
         if not cached:
             return Subscriber(self._session.declare_subscriber(key, ring, allowed_origin=origin), key, own="")
         history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
-        subscriber = ext.declare_advanced_subscriber(self._session, key, ring, allowed_origin=origin, history=history)
+        recovery = ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
+        subscriber = ext.declare_advanced_subscriber(self._session, key, ring, allowed_origin=origin, history=history, recovery=recovery)
         return Subscriber(subscriber, key, own=str(self._session.info.zid()))
 
     def publish_json(self, key: str, value: dict[str, Any]) -> None:
@@ -210,7 +212,9 @@ class Bus:
             "allowed_destination": zenoh.Locality.REMOTE,
         }
         if cached:
-            sequence = ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
+            sequence = ext.MissDetectionConfig(
+                heartbeat=HEARTBEAT_S, sporadic_heartbeat=None
+            )  # or a last message that was dropped would not be missed
             publisher: Any = ext.declare_advanced_publisher(
                 self._session, key, cache=ext.CacheConfig(1), sample_miss_detection=sequence, publisher_detection=True, **qos
             )

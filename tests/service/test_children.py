@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -45,6 +46,20 @@ def test_child_has_a_group_of_its_own_is_polite_and_ends_as_ctrl_c_asks(tmp_path
         assert children.ended() is None
         assert children.end("polite") == 7
         assert gone(pid)
+
+
+def test_child_is_suspended_and_killed_by_its_name_and_what_the_next_one_says_comes_after(tmp_path: Path, module: str) -> None:
+    with Children(tmp_path) as children:
+        children.start("victim", module)
+        pid, *_ = ready(children, "victim")
+        children.signal("victim", signal.SIGSTOP)
+        until(lambda: Path(f"/proc/{pid}/stat").read_text().split()[2] == "T", "the child stands still")
+        assert children.pid("victim") == pid
+        children.kill("victim")
+        assert gone(pid)
+        assert (children.pid("victim"), children.ended()) == (None, None)
+        children.start("victim", module)
+        until(lambda: children.log("victim").read_text().count("ready") == 2, "another one")
 
 
 def test_child_that_is_deaf_is_killed(tmp_path: Path, module: str) -> None:

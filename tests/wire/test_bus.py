@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -142,6 +143,17 @@ def test_a_cached_reference_reaches_a_late_joiner_in_another_process(join: Any, 
     sample = received(late.subscriber(KEYS.reference, cached=True))
     assert np.array_equal(decode(Reference, sample.payload).y, REFERENCE.y)
     assert sample.encoding == encoding(Reference)
+
+
+def test_a_cached_message_that_the_link_has_dropped_arrives_all_the_same(join: Any) -> None:
+    """As large ones are on a busy host: DROP waits for nobody."""
+    dropping = f"downsampling:[{{messages:['put'],flows:['egress'],rules:[{{key_expr:'{KEYS.reference}',freq:0.001}}]}}]"
+    robot, planner = join(robot=True), join(cfg=(*FAST, dropping))
+    references = robot.subscriber(KEYS.reference, capacity=8, cached=True)
+    publisher = planner.publisher(KEYS.reference, Reference, cached=True)
+    for seq in (1, 2, 3):  # all but the first that passes come too soon for the link
+        publisher.put(replace(REFERENCE, seq=seq))
+        assert eventually(lambda seq=seq: [decode(Reference, r.payload).seq for r in references.drain()] == [seq])
 
 
 def test_a_cached_message_put_before_anybody_was_there_arrives_once(join: Any) -> None:

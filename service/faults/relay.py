@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A link or a sensor gone wrong: the robot's states pass through a process that changes them on request.
+
+The robot lives under one prefix, whoever hears the changed states under another.
+What is commanded passes back as it is, but for a clock that has jumped: its stamps
+are told in the time of the clock that they are for. `python -m service.faults.relay ENDPOINT PREFIX_OF_ROBOT PREFIX ROBOT`.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import partial
+from threading import Thread
+from typing import Any
+
+import numpy as np
+
+from rti_mpc.errors import MessageError
+from rti_mpc.message import Command, State
+from rti_mpc.wire.bus import Bus, Publisher, Subscriber
+from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.interrupt import stop_on_signals
+from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.session import BusSettings
+
+ROLE = "relay"
+LATE_NS = 400_000_000
+JUMP_NS = 5_000_000_000
+
+Change = Callable[[State, "deque[State]"], Iterable[State]]
+STAMPS = ("stamp_ns", "state_stamp_ns", "valid_until_ns")  # of a command
+
+
+def frozen(state: State, held: deque[State]) -> Iterable[State]:
+    """The last state again and again, with new sequence numbers."""
+    held.append(state)
+    return [replace(held[0], seq=state.seq)]
+
+
+def late(state: State, held: deque[State]) -> Iterable[State]:
+    """Every state so much later."""
+    held.append(state)
+    while state.stamp_ns - held[0].stamp_ns >= LATE_NS:
+        yield held.popleft()
+
+
+def reordered(state: State, held: deque[State]) -> Iterable[State]:
+    """Every two states in the wrong order."""
+    held.append(state)
+    return [held.pop(), held.pop()] if len(held) == 2 else []
+
+
+# What becomes of a state, by name.
+CHANGES: dict[str, Change] = {
+    "none": lambda state, _: [state],
+    "frozen": frozen,
+    "late": late,
+    "duplicated": lambda state, _: [state, state, state],
+    "reordered": reordered,
+    "nan": lambda state, _: [replace(state, x=np.where(np.arange(len(state.x)), state.x, np.nan))],
+    "short": lambda state, _: [replace(state, x=state.x[:-1])],
+}
+JUMPS = {"ahead": JUMP_NS, "behind": -JUMP_NS}  # of the robot's clock
+
+
+class Relay:
+    """Passes states on, and commands back."""
+
+    def __init__(self, bus: Bus, robot: Keys) -> None:
+        keys = bus.keys
+        self._offset_ns = 0
+        self._fault: tuple[str, int, deque[State]] = ("none", 0, deque())  # what, for how many states, those it holds back
+        self._states = bus.publisher(keys.state, State, realtime=True)
+        self._follow(bus.subscriber(robot.state, capacity=64), self._change)
+        for there, here in ((robot.command, keys.command), (robot.actuation, keys.actuation)):
+            self._follow(bus.subscriber(here, capacity=64), partial(self._pass, bus.publisher(there, Command, realtime=True)))
+
+    def answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Change the states from now on: ``{"fault": NAME, "states": HOW_MANY}``, all of them without a number."""
+        name = request["fault"]
+        if name in JUMPS:
+            self._offset_ns += JUMPS[name]
+            return {"ok": True}
+        if name not in CHANGES:
+            return {"ok": False, "error": f"fault must be one of {', '.join([*CHANGES, *JUMPS])}, got {name!r}"}
+        self._fault = (name, request.get("states", 2**62), deque())
+        return {"ok": True}
+
+    def _change(self, payload: bytes) -> None:
+        """Pass a state on, or what becomes of it."""
+        try:
+            state = decode(State, payload)
+        except MessageError:
+            return
+        name, states, held = self._fault
+        for changed in CHANGES[name](state, held):
+            self._states.put(replace(changed, stamp_ns=changed.stamp_ns + self._offset_ns))
+        if name != "none" and self._fault[2] is held:
+            self._fault = (name, states - 1, held) if states > 1 else ("none", 0, deque())
+
+    def _pass(self, publisher: Publisher[Command], payload: bytes) -> None:
+        """Pass a command back."""
+        try:
+            command = decode(Command, payload)
+        except MessageError:
+            return
+        publisher.put(replace(command, **{name: getattr(command, name) - self._offset_ns for name in STAMPS}))
+
+    def _follow(self, subscriber: Subscriber, act: Callable[[bytes], None]) -> None:
+        def follow() -> None:
+            for received in iter(subscriber.recv, None):
+                act(received.payload)
+
+        Thread(target=follow, daemon=True).start()
+
+
+def main(settings: BusSettings, robot: Keys, keys: Keys) -> None:
+    """Relay until stopped."""
+    stop = stop_on_signals()
+    with Bus(settings, keys, stop=stop) as bus:
+        relay = Relay(bus, robot)
+        bus.serve(keys.stream(ROLE), relay.answer)
+        bus.alive(ROLE)
+        stop.wait()
+
+
+if __name__ == "__main__":
+    _, endpoint, prefix_of_robot, prefix, name = sys.argv
+    main(BusSettings(connect=(endpoint,)), Keys(prefix_of_robot, name), Keys(prefix, name))

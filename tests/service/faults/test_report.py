@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from rti_mpc.errors import ConfigError
+from service.faults import run
+from service.faults.measure import Measured
+from service.faults.report import WIDTH, Report, Row
+from service.faults.table import FAULTS
+
+BY_NAME = {fault.name: fault for fault in FAULTS}
+STOPPED = Measured(0.2, 0.21, 0.4, 1.8, 0.25, 0, 1.0, 2.5, 30, 0.5, 0.5)
+DRIVING = replace(STOPPED, brake_s=None, zero_s=None, still_s=None, missed=0, error_m=0.002, recovery_s=0.01)
+
+
+def row(name: str, measured: Measured | None) -> Row:
+    fault = BY_NAME[name]
+    return Row(fault, measured, ["it was not there"] if measured is None else fault.promise.broken(measured))
+
+
+def test_row_says_what_the_robot_did() -> None:
+    assert row("controller_killed", STOPPED).did == "braked, stood, drove again"
+    assert row("controller_paused", replace(STOPPED, still_s=None)).did == "braked, drove again"
+    assert row("robot_killed", replace(STOPPED, brake_s=None)).did == "stood, drove again"
+    assert row("viewer_killed", DRIVING).did == "drove on"
+    assert row("viewer_killed", None).did == "unknown"
+
+
+def test_row_holds_every_number_in_json_and_those_that_were_promised_in_the_table() -> None:
+    stopped, driving = row("controller_killed", STOPPED), row("viewer_killed", DRIVING)
+    document = json.loads(json.dumps(stopped.to_json()))
+    assert (document["name"], document["kept"], document["brake_s"], document["error_m"]) == ("controller_killed", True, 0.21, 0.5)
+    assert stopped.cells()[2:] == ("0.20", "210", "400", "1.80", "0.250", "100", "-", "2.50", "yes")
+    assert driving.cells()[2:] == ("0.20", "-", "-", "-", "0.250", "100", "2.0", "-", "yes")
+    assert row("viewer_killed", None).cells()[-1] == "NO"
+
+
+def test_matrix_is_printed_with_what_was_not_kept() -> None:
+    console = Console(file=io.StringIO(), width=WIDTH)
+    with Report(console, 2) as report:
+        report.add(row("controller_killed", replace(STOPPED, brake_s=0.31)))
+        report.add(row("viewer_killed", DRIVING))
+    report.conclude()
+    printed = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "controller_killed: stops, and drives again when mended: brake_s must be at most 0.3, got 0.31\n" in printed
+    assert "1 of 2 within their promise" in printed
+    assert not report.kept
+
+
+def test_faults_are_chosen_by_name_in_the_order_of_the_table() -> None:
+    assert [fault.name for fault in run.chosen(("link_cut", "controller_killed"))] == ["controller_killed", "link_cut"]
+    assert len({fault.name for fault in FAULTS}) == len(FAULTS)
+    with pytest.raises(ConfigError, match=r"--only must be one of .*viewer_killed.*, got 'link_cutt'"):
+        run.chosen(("link_cut", "link_cutt"))
+
+
+def test_faults_of_a_viewer_are_left_out_where_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "find_spec", lambda name: None)
+    assert [fault.name for fault in run.chosen(())] == [fault.name for fault in FAULTS if not fault.viewer]
+    with pytest.raises(ModuleNotFoundError):
+        run.chosen(("viewer_killed", "link_cut"))
