@@ -19,7 +19,8 @@ class Children:
     Starts processes and ends them by their ids, all of them at the end.
 
     Ctrl-C reaches us alone, and so does a closed terminal: we end the others, in
-    the order that is right.
+    the order that is right. Where we cannot, killed ourselves, the kernel presses
+    Ctrl-C for each of them (`service.leash`).
 
     Attributes:
         folder: Where their output goes, a file each.
@@ -39,7 +40,7 @@ class Children:
 
     def start(self, name: str, module: str, *arguments: object, nice: int = 0) -> None:
         """
-        Start a module of ours as a process.
+        Start a module of ours as a process. It lives no longer than the thread that calls this: call it in the main thread.
 
         Args:
             name: For its output and for `end`.
@@ -47,7 +48,7 @@ class Children:
             arguments: Of its command line.
             nice: By how much others go before it.
         """
-        command = [sys.executable, "-P", "-m", module, *map(str, arguments)]
+        command = [sys.executable, "-P", "-m", "service.leash", str(os.getpid()), module, *map(str, arguments)]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
         with self.log(name).open("ab" if name in self._logged else "wb") as log:
             child = subprocess.Popen(

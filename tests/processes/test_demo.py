@@ -97,7 +97,8 @@ def test_waypoints_of_a_file_are_driven_too(tmp_path: Path) -> None:
     assert (summary["scenario"], summary["heading"]) == ("square", "consistent")
 
 
-def test_ctrl_c_leaves_no_process_behind_and_does_not_count_as_driven(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("number", "status", "last_words"), [(signal.SIGINT, 1, "not driven to the end"), (signal.SIGKILL, -9, "")])
+def test_demo_that_is_ended_leaves_no_process_behind(tmp_path: Path, number: signal.Signals, status: int, last_words: str) -> None:
     log = (tmp_path / "demo.log").open("wb")
     command = command_line("demo", "--out", tmp_path / "out")
     with log, subprocess.Popen(command, cwd=ROOT, env=environment(), stdout=log, stderr=subprocess.STDOUT) as demo:
@@ -105,12 +106,12 @@ def test_ctrl_c_leaves_no_process_behind_and_does_not_count_as_driven(tmp_path: 
             until(lambda: "mode tracking" in (tmp_path / "demo.log").read_text(), "the robot is driven")
             children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
             assert len(children) == 5
-            demo.send_signal(signal.SIGINT)
-            assert demo.wait(20.0) == 1
+            demo.send_signal(number)
+            assert demo.wait(20.0) == status
         finally:
             demo.kill()
-    assert not [pid for pid in children if Path(f"/proc/{pid}").exists()]
-    assert "not driven to the end" in (tmp_path / "demo.log").read_text()
+    until(lambda: not [pid for pid in children if Path(f"/proc/{pid}").exists()], "all are gone")
+    assert last_words in (tmp_path / "demo.log").read_text()
 
 
 @pytest.mark.parametrize(("option", "value"), [("--scenario", "spiral"), ("--speed", "0"), ("--duration", "-1"), ("--heading", "left")])

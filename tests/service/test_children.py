@@ -3,6 +3,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +13,16 @@ import pytest
 from service.children import Children
 from tests.processes.system import until
 
+ROOT = Path(__file__).parents[2]
+PARENT = """
+import sys, threading
+from pathlib import Path
+from service.children import Children
+with Children(Path(sys.argv[1])) as children:
+    for name in ("one", "two"):
+        children.start(name, sys.argv[2])
+    threading.Event().wait(60)
+"""
 SLEEPER = """
 import os, signal, sys, threading
 print(os.getpid(), os.getpgid(0), os.getpriority(os.PRIO_PROCESS, 0), flush=True)
@@ -75,6 +87,15 @@ def test_child_that_ended_by_itself_is_named(tmp_path: Path) -> None:
         children.start("missing", "no_such_module")
         until(lambda: children.ended() == "missing", "it ends")
         assert "no_such_module" in children.log("missing").read_text()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel's signal on a parent's death is Linux's")
+def test_children_end_as_ctrl_c_asks_when_their_parent_is_killed(tmp_path: Path, module: str) -> None:
+    with subprocess.Popen([sys.executable, "-c", PARENT, tmp_path, module], cwd=ROOT) as parent:
+        until(lambda: (tmp_path / "two.log").exists(), "both are started")
+        pids = [ready(Children(tmp_path), name)[0] for name in ("one", "two")]
+        parent.kill()
+    until(lambda: all(gone(pid) for pid in pids), "both are gone")
 
 
 @pytest.mark.parametrize("fail", [lambda: None, lambda: 1 / 0])
