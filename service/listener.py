@@ -11,7 +11,7 @@ from typing import Any
 from rti_mpc.errors import MessageError
 from rti_mpc.message import STAMP_ON_ARRIVAL, Command, Event, Reference, State, Telemetry
 from rti_mpc.wire.bus import Bus, Received, Subscriber
-from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.intake import Intake, Notice
 from service.info import Info
 from service.recording import Entry
 from service.timeline import Timeline
@@ -60,6 +60,15 @@ class Listener:
         """Payloads that were no message of ours."""
         return self._bad_infos + sum(door.refused.total() for door in self._doors.values())
 
+    @property
+    def now_ns(self) -> int:
+        """Where the newest state lies on the robot's timeline."""
+        return self._timeline.now_ns
+
+    def own(self, notice: Notice) -> Entry:
+        """Return an event of our own, as of now."""
+        return Entry(self.now_ns, Event(0, 0, self.now_ns, "viewer", notice.severity, notice.code, notice.text))
+
     def drain(self) -> list[Entry]:
         """Everything received since the last call, states first, for they move the timeline."""
         now_ns = time.monotonic_ns()
@@ -93,7 +102,6 @@ class Listener:
 
     def _notices(self, now_ns: int) -> Iterator[Entry]:
         """Show what the doors have to say as events of our own."""
-        time_ns = self._timeline.now_ns
         for door in self._doors.values():
             for notice in door.notices(now_ns):
-                yield Entry(time_ns, Event(0, 0, time_ns, "viewer", notice.severity, notice.code, notice.text))
+                yield self.own(notice)

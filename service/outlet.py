@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import socket
 import threading
 import uuid
@@ -15,7 +16,8 @@ from urllib.parse import urlsplit
 import rerun as rr
 
 from rti_mpc.errors import ConfigError
-from rti_mpc.message import Reference
+from rti_mpc.message import Reference, Severity
+from rti_mpc.wire.intake import Notice
 from service.info import Info
 from service.recording import Entry, Recording
 
@@ -47,6 +49,7 @@ class Outlet:
         name: For the log.
         dropped: Entries the queue had no room for.
         failures: Streams given up.
+        notices: What went wrong since the owner last emptied it.
     """
 
     def __init__(
@@ -58,14 +61,17 @@ class Outlet:
         flush_s: float = VIEWER_FLUSH_S,
         close_s: float = VIEWER_CLOSE_S,
         capacity: int = CAPACITY,
+        epitaph: Callable[[], str] = lambda: "given up, what it had not taken is lost",
     ) -> None:
         self.name = name
         self.dropped = 0
         self.failures = 0
+        self.notices: deque[Notice] = deque(maxlen=16)
         self._open_stream = open_stream
         self._period_s = period_s
         self._flush_s = flush_s
         self._close_s = close_s
+        self._epitaph = epitaph  # of a stream that failed
         self._queue: deque[Entry] = deque(maxlen=capacity)
         self._context: dict[str, Entry] = {}
         self._missed = 0
@@ -94,7 +100,7 @@ class Outlet:
     def close(self) -> bool:
         """Write what is queued and end the stream, within a bounded time; return whether nothing was lost on the way."""
         self._closing.set()
-        self._thread.join(self._close_s)
+        self._thread.join(min(self._close_s, VIEWER_CLOSE_S) if self.failures else self._close_s)
         return not (self._thread.is_alive() or self._queue or self.dropped or self.failures)
 
     def _run(self) -> None:
@@ -118,7 +124,7 @@ class Outlet:
             return
         except RuntimeError as error:
             self.failures += 1
-            log.error("%s: given up, what it had not taken is lost: %s", self.name, error)
+            self._note("outlet_failed", f"{self._epitaph()}: {error}")
             self._give_up()
 
     def _take(self, new: bool) -> list[Entry]:
@@ -130,8 +136,11 @@ class Outlet:
             queued = {id(entry) for entry in entries}
             context = [entry for entry in self._context.values() if id(entry) not in queued] if new or missed else []
         if missed:
-            log.error("%s: too slow, %d entries dropped", self.name, missed)
+            self._note("outlet_slow", f"too slow, {missed} entries dropped")
         return context + entries
+
+    def _note(self, code: str, text: str) -> None:
+        self.notices.append(Notice(Severity.ERROR, code, f"{self.name}: {text}"))
 
     def _give_up(self) -> None:
         """Leave a stream; waits for as long as its receiver hangs, in which there is nobody to connect to anyway."""
@@ -161,7 +170,10 @@ def file_outlet(path: Path, name: str) -> Outlet:
             return stream
         raise Unavailable
 
-    return Outlet(str(path), open_stream, period_s=FILE_PERIOD_S, flush_s=FILE_FLUSH_S, close_s=FILE_CLOSE_S)
+    def epitaph() -> str:
+        return f"the recording ends here, with {1e-6 * shutil.disk_usage(path.parent).free:.1f} MB free on its disk"
+
+    return Outlet(str(path), open_stream, period_s=FILE_PERIOD_S, flush_s=FILE_FLUSH_S, close_s=FILE_CLOSE_S, epitaph=epitaph)
 
 
 def viewer_outlet(url: str, name: str) -> Outlet:

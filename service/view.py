@@ -6,17 +6,22 @@ from __future__ import annotations
 import logging
 import subprocess
 import sys
+import time
+from collections.abc import Sequence
 from pathlib import Path
 from threading import Event
 from urllib.parse import urlsplit
 
 from rti_mpc.errors import ConfigError
+from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.intake import Notice
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from service.listener import Listener
 from service.outlet import Outlet, file_outlet, viewer_outlet
 
+ROLE = "viewer"
 ADDRESS = "127.0.0.1:9876"
 PERIOD_S = 0.05
 
@@ -61,22 +66,34 @@ def main(
             spawn_viewer(url, rerun_memory_limit)
         if rerun_spawn or rerun_connect is not None:
             outlets.append(viewer_outlet(url, keys.robot))
-        bus.alive("viewer")
+        bus.alive(ROLE)
         log.info("listening to %s", keys.stream("*"))
-        pump(listener, outlets, stop)
+        pump(listener, outlets, Announcer(bus, ROLE, time.time_ns() // 1_000_000_000), stop)
     log.info("%d messages, %d lost, %d refused", listener.received, listener.lost, listener.refused)
     complete = [outlet.close() for outlet in outlets]
+    notices(outlets)
     return 0 if rerun_save is None or complete[0] else 1
 
 
-def pump(listener: Listener, outlets: list[Outlet], stop: Event) -> None:
-    """Pass on what is heard until told to stop, and then what is still there."""
+def pump(listener: Listener, outlets: Sequence[Outlet], announcer: Announcer, stop: Event) -> None:
+    """Pass on what is heard until told to stop, and then what is still there; say where an outlet failed, to the bus and to the others."""
     stopped = False
     while not stopped:
         stopped = stop.wait(PERIOD_S)
         entries = listener.drain()
+        for notice in notices(outlets):
+            announcer.say(notice.severity, notice.code, notice.text, listener.now_ns)
+            entries.append(listener.own(notice))
         for outlet in outlets:
             outlet.offer(entries)
+
+
+def notices(outlets: Sequence[Outlet]) -> list[Notice]:
+    """Take and log what outlets have to say."""
+    taken = [outlet.notices.popleft() for outlet in outlets for _ in range(len(outlet.notices))]
+    for notice in taken:
+        log.error("%s", notice.text)
+    return taken
 
 
 def viewer_url(address: str) -> str:

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import re
+import resource
 import signal
 import socket
 import subprocess
@@ -20,11 +21,14 @@ pytest.importorskip("rerun")
 from rerun.chunk import RrdReader
 
 from rti_mpc.errors import ConfigError
-from rti_mpc.message import State
+from rti_mpc.message import Event, Severity, State
 from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
 from service.listener import Listener
 from service.view import spawn_viewer, viewer_url
+from tests.processes.system import until
+from tests.service.test_view_outlet import Viewer as Screen
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 30.0
@@ -70,7 +74,8 @@ from rti_mpc.wire.keys import Keys
 from service.view import main
 
 logging.basicConfig(level=logging.INFO)
-sys.exit(main(BusSettings(connect=(f"tcp/127.0.0.1:{sys.argv[1]}",)), Keys(robot="r"), rerun_save=Path(sys.argv[2])))
+bus, live = BusSettings(connect=(f"tcp/127.0.0.1:{sys.argv[1]}",)), sys.argv[3] if len(sys.argv) > 3 else None
+sys.exit(main(bus, Keys(robot="r"), rerun_save=Path(sys.argv[2]), rerun_connect=live))
 """
 
 
@@ -166,6 +171,33 @@ def test_a_robot_killed_and_started_again_goes_on_in_the_recording(children: lis
     assert min(lives[1.0], lives[2.0]) >= 20
     times = [time_ns for time_ns, _ in rows(tmp_path / "run.rrd", "state/x")]
     assert times == sorted(times)  # the second life behind the first, though its clock began again
+
+
+@pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="filling the disk of one process needs prlimit")
+def test_a_disk_that_fills_up_ends_the_recording_but_neither_the_viewer_nor_what_it_shows(children: list[Child], port: int, tmp_path: Path) -> None:
+    screen = Screen(tmp_path)
+    screen.start()
+    children += [Child(PUBLISHER, port, 1), Child(VIEWER, port, tmp_path / "run.rrd", screen.url)]
+    publisher, viewer = children
+    try:
+        with Bus(BusSettings(connect=(f"tcp/127.0.0.1:{port}",)), Keys(robot="r")) as bus:
+            events = bus.subscriber(bus.keys.event("viewer"), capacity=8, cached=True)
+            viewer.wait_for(f"{screen.url}: open")
+            until(lambda: (tmp_path / "run.rrd").stat().st_size > 0, "it records")
+            resource.prlimit(viewer.process.pid, resource.RLIMIT_FSIZE, (1, 1))  # to the writer of a file as good as a full disk
+            event = decode(Event, until(lambda: next(iter(events.drain()), None), "an event").payload)
+            assert (event.source, event.severity, event.code) == ("viewer", Severity.ERROR, "outlet_failed")
+            assert re.match(rf"{tmp_path}/run.rrd: the recording ends here, with [0-9.]+ MB free on its disk: ", event.text)
+            assert event.text in viewer.wait_for("the recording ends here")
+            shown = screen.shown
+            until(lambda: screen.shown > shown, "the screen goes on")
+            viewer.process.send_signal(signal.SIGINT)
+            before = time.monotonic()
+            assert viewer.process.wait(PATIENCE_S) == 1
+            assert time.monotonic() - before < 3.0
+    finally:
+        screen.kill()
+    assert re.search(r" messages, 0 lost, 0 refused", viewer.wait_for(" messages, "))
 
 
 def test_a_listener_that_falls_behind_keeps_the_newest_and_counts_the_rest(port: int) -> None:
