@@ -38,7 +38,7 @@ class Children:
         for name in list(self._running):
             self.end(name, 0.0 if kind else PATIENCE_S)
 
-    def start(self, name: str, module: str, *arguments: object, nice: int = 0) -> None:
+    def start(self, name: str, module: str, *arguments: object, nice: int = 0) -> int:
         """
         Start a module of ours as a process. It lives no longer than the thread that calls this: call it in the main thread.
 
@@ -47,6 +47,9 @@ class Children:
             module: As after ``python -m``.
             arguments: Of its command line.
             nice: By how much others go before it.
+
+        Returns:
+            Its process id.
         """
         command = [sys.executable, "-P", "-m", "service.leash", str(os.getpid()), module, *map(str, arguments)]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
@@ -57,6 +60,7 @@ class Children:
         os.setpriority(os.PRIO_PROCESS, child.pid, os.getpriority(os.PRIO_PROCESS, 0) + nice)
         self._running[name] = child
         self._logged.add(name)
+        return child.pid
 
     def log(self, name: str) -> Path:
         """Return the file that holds what a process said."""

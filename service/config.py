@@ -28,6 +28,7 @@ from service.schema import (
     ModelSection,
     ObserverSection,
     OcpSection,
+    RealtimeSection,
     Section,
     SimSection,
     SolverSection,
@@ -62,6 +63,7 @@ class Config(Section):
     guard: GuardSection = Field(default=GuardSection(), description="the guard between controller and robot")
     debug: DebugSection = Field(default=DebugSection(), description="failures on request")
     bus: BusSection = Field(default=BusSection(), description="the Zenoh session")
+    realtime: RealtimeSection = Field(default=RealtimeSection(), description="what the controller asks of the operating system")
     sim: SimSection = Field(default=SimSection(), description="the simulated robot")
 
     @property
@@ -81,8 +83,8 @@ class Config(Section):
 
     @property
     def config_hash(self) -> int:
-        """64 bits of everything that decides a command: not of the bus, the guard, the simulation or failures on request."""
-        content = self.model_dump(mode="json", exclude={"bus", "debug", "guard", "sim"})
+        """64 bits of everything that decides a command: not of the bus, the guard, the scheduler, the simulation or failures on request."""
+        content = self.model_dump(mode="json", exclude={"bus", "debug", "guard", "realtime", "sim"})
         return int.from_bytes(hashlib.sha256(json.dumps(content, sort_keys=True).encode()).digest()[:8], "little")
 
     def build_model(self) -> Model:

@@ -34,7 +34,7 @@ from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.interrupt import stop_on_signals
-from service import injection
+from service import injection, realtime
 from service.config import Config
 
 ROLE = "controller"
@@ -65,6 +65,7 @@ def main(config: Config, bus_settings: BusSettings, *, stop: Event | None = None
     warm_up(rti)
     observer = config.build_observer()
     timing = Timing(config.delay_s, config.stale_s, config.timing.valid_s)
+    outcomes = realtime.attempt(**config.realtime.model_dump())  # before any thread is started, for all of them
     with Bus(bus_settings, config.keys(), stop=stop) as bus:
         heard = heard_epoch(bus, stop)
         if bus.is_alive(ROLE, HEARING_S):
@@ -81,11 +82,15 @@ def main(config: Config, bus_settings: BusSettings, *, stop: Event | None = None
                 "config_hash": config.config_hash,
                 "epoch": epoch,
                 "stale_s": config.stale_s,
+                "realtime": {outcome.what: outcome.text for outcome in outcomes},
             },
         )
         bus.serve(bus.keys.request, daemon.answer)
         bus.alive(ROLE)
         log.info("epoch %d controls %s every %g s", epoch, config.robot, ocp.dt)
+        if outcomes:
+            level = logging.INFO if all(outcome.granted for outcome in outcomes) else logging.WARNING
+            log.log(level, "real time: %s", "; ".join(map(str, outcomes)))
         return daemon.run(stop)
 
 

@@ -155,6 +155,18 @@ class BusSection(Section):
     config: Annotated[Path, Field(strict=False)] | None = Field(default=None, description="Zenoh's own JSON5 file, beside this one")
 
 
+class RealtimeSection(Section):
+    """What the controller asks of the operating system; each is attempted, reported, and not required."""
+
+    priority: int | None = Field(
+        default=None, ge=1, le=99, description="of the controller among SCHED_FIFO's, 1 to 99; the usual scheduler if left out"
+    )
+    cores: tuple[Annotated[int, Field(ge=0)], ...] = Field(
+        default=(), strict=False, description="to run the controller on, by number; any if left out"
+    )
+    lock_memory: bool = Field(default=False, description="whether the controller's memory may not be swapped out")
+
+
 class SimSection(Section):
     """The simulated robot, which may differ from the controller's model; what is left out is as `RobotSettings` has it."""
 

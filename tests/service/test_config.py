@@ -136,7 +136,7 @@ def test_hash_follows_what_decides_a_command_and_nothing_else(tmp_path: Path) ->
     reference = config_hash(MINIMAL)
     assert 0 <= reference < 2**64
     assert config_hash("# a comment\n" + MINIMAL.replace("x = 1, y = 2", "y = 2.0, x = 1.0")) == reference
-    assert config_hash(MINIMAL + "[sim]\nseed = 2\n[bus]\nlisten = ['tcp/127.0.0.1:7448']\n") == reference
+    assert config_hash(MINIMAL + "[sim]\nseed = 2\n[bus]\nlisten = ['tcp/127.0.0.1:7448']\n[realtime]\npriority = 1\n") == reference
     assert config_hash(MINIMAL.replace("lambda = 0.5", "lambda = 0.6")) != reference
 
 

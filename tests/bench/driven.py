@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The shipped robot, sampled faster, driven along the eight in real time by the processes a user runs; and what is heard of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from rti_mpc.message import Telemetry
+from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
+from rti_mpc.wire.cdr import decode
+from service import robot_log
+from service.children import Children
+from service.cli import SHIPPED
+from service.config import load
+from service.demo import free_endpoint
+from service.info import Info, Label
+from service.robot_log import RobotLog
+from tests.processes.system import until
+
+INFO = Info("controller", states=tuple(map(Label, ("x", "y", "psi", "u", "omega"))), inputs=tuple(map(Label, ("u_c", "omega_c"))))
+
+
+@dataclass
+class Driven:
+    """A robot being driven."""
+
+    folder: Path
+    endpoint: str
+    bus: Bus
+    children: Children
+    lives: set[str]
+    subscriber: Subscriber
+    telemetry: list[Telemetry] = field(default_factory=list)
+
+    @property
+    def toml(self) -> Path:
+        return self.folder / "robot.toml"
+
+    def listen(self) -> int:
+        """Take in what was sampled since the last call; return how much there is by now."""
+        self.telemetry += [decode(Telemetry, received.payload) for received in self.subscriber.drain()]
+        return len(self.telemetry)
+
+    def samples(self, number: int) -> list[Telemetry]:
+        """Wait for so many samples from now on."""
+        first = self.listen()
+        period_s = 1e-9 * (self.telemetry[-1].state_stamp_ns - self.telemetry[-2].state_stamp_ns)
+        until(lambda: self.listen() >= first + number, f"{number} samples", pause_s=0.2, patience_s=2 * number * period_s + 10.0)
+        return self.telemetry[first : first + number]
+
+    def log(self) -> RobotLog:
+        """What the robot wrote; only after it has ended."""
+        return robot_log.read(self.folder / "robot.csv", INFO)
+
+
+def sampled(folder: Path, dt_s: float) -> Path:
+    """Write the shipped robot's configuration with another period."""
+    path = folder / "robot.toml"
+    path.write_text(SHIPPED.read_text().replace("dt_s = 0.1 ", f"dt_s = {dt_s} ") + "[sim]\nx0 = { x = 0.5 }\n")
+    assert load(path).ocp.dt_s == dt_s
+    return path
+
+
+@contextmanager
+def driven(folder: Path, dt_s: float, duration_s: float) -> Iterator[Driven]:
+    """Drive until left, at most for so long."""
+    endpoint, toml = free_endpoint(), sampled(folder, dt_s)
+    keys = load(toml).keys()
+    with Bus(BusSettings(listen=(endpoint,), connect=()), keys) as bus, Children(folder) as children:
+        lives: set[str] = set()
+        bus.watch_alive(lambda role, present: (lives.add if present else lives.discard)(role))
+        children.start("controller", "service.cli", "run", toml, "-e", endpoint)
+        children.start("reference", "service.cli", "reference", toml, "-e", endpoint, "--duration", duration_s)
+        until(lambda: {"controller", "reference"} <= lives, "controller and reference", patience_s=60.0)
+        robot = Driven(folder, endpoint, bus, children, lives, bus.subscriber(keys.telemetry, capacity=8192))
+        children.start("robot", "service.cli", "sim", toml, "-l", "tcp/127.0.0.1:0", "-e", endpoint, "--log", folder / "robot.csv")
+        until(lambda: robot.listen() > 1, "the first samples", patience_s=30.0)
+        yield robot
+
+
+def quantiles(values: np.ndarray) -> str:
+    return "p50 {:6.0f}  p99 {:6.0f}  max {:6.0f} us".format(*np.nanpercentile(values, [50, 99, 100]))

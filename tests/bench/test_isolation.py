@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Whoever only watches delays no sample: a viewer that hangs, one that stops, one whose disk is full.
+
+Real processes, 100 samples a second in real time, in rounds of blocks in random
+order. Each trouble begins with its block and is compared with a block of the
+same round in which nobody watches; so is a second such block: what two equal
+blocks differ by is the machine, and no trouble may be told from that.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rti_mpc.message import Telemetry
+from service import machine
+from tests.bench.driven import Driven, driven, quantiles
+from tests.processes.system import until
+
+pytest.importorskip("rerun")
+pytestmark = [
+    pytest.mark.benchmark,
+    pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="filling the disk of one process needs prlimit"),
+]
+
+DT_S = 0.01
+SHORT = "CI" in os.environ
+ROUNDS = 2 if SHORT else 12
+BLOCK = 400  # samples: Zenoh closes the link of a hung peer in the second second, in the block
+COLD = 300  # first samples, left out: the robot drives to its path
+TROUBLES: dict[str, Callable[[int], None]] = {
+    "hung": lambda pid: os.kill(pid, signal.SIGSTOP),
+    "stopped": lambda pid: os.kill(pid, signal.SIGINT),
+    "full disk": lambda pid: resource.prlimit(pid, resource.RLIMIT_FSIZE, (1, 1)) and None,
+}
+BLOCKS = ("alone", "alone again", *TROUBLES)
+
+
+def block(robot: Driven, name: str) -> list[Telemetry]:
+    """Samples from the beginning of a trouble on, or of a time without a viewer."""
+    if name not in TROUBLES:
+        return robot.samples(BLOCK)
+    recording = robot.folder / "run.rrd"
+    recording.unlink(missing_ok=True)
+    pid = robot.children.start("viewer", "service.cli", "view", robot.toml, "-e", robot.endpoint, "--rerun-save", recording, nice=10)
+    until(lambda: "viewer" in robot.lives and recording.exists() and recording.stat().st_size, "the viewer records", patience_s=30.0)
+    robot.listen()
+    TROUBLES[name](pid)
+    samples = robot.samples(BLOCK)
+    if name == "hung":
+        os.kill(pid, signal.SIGCONT)
+    robot.children.end("viewer")
+    until(lambda: "viewer" not in robot.lives, "the viewer is gone")
+    return samples
+
+
+def test_no_trouble_of_a_viewer_can_be_told_from_the_noise_of_the_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(1)
+    blocks: dict[str, list[list[Telemetry]]] = {name: [] for name in BLOCKS}
+    with driven(tmp_path, DT_S, duration_s=3600.0) as robot:
+        robot.samples(COLD)
+        for _ in range(ROUNDS):
+            for name in rng.permutation(BLOCKS).tolist():
+                blocks[name].append(block(robot, name))
+        for name in ("controller", "robot", "reference"):
+            assert robot.children.end(name) == 0
+        log = robot.log()
+    answered_us = dict(zip(log.seq.tolist(), log.latency_us.tolist(), strict=True))
+    inside = {name: np.array([[sample.latency_us for sample in one] for one in blocks[name]]) for name in BLOCKS}
+    outside = {name: np.array([[answered_us[sample.state_seq] for sample in one] for one in blocks[name]]) for name in BLOCKS}
+    with capsys.disabled():
+        print(f"\n{machine.describe()}\n{ROUNDS} rounds of {len(BLOCKS)} blocks of {BLOCK} samples")
+        for what, times in {"state in to command out": inside, "state sent to command received, at the robot": outside}.items():
+            ratio, spread = compared(times)
+            print(f"{what}; two equal blocks differ in p99 by {spread:.1%}")
+            for name in BLOCKS:
+                print(f"  {name:12} {quantiles(times[name])}, p99 {ratio[name]:.3f} of alone in the same round")
+    for name in BLOCKS:
+        samples = [sample for one in blocks[name] for sample in one]
+        assert all(one[-1].skipped == one[0].skipped for one in blocks[name]), name
+        assert np.isfinite(outside[name]).mean() > 0.999, name
+        assert len(samples) == ROUNDS * BLOCK
+    if SHORT:
+        return  # of two rounds there is no spread to compare with
+    ratio, spread = compared(inside)
+    for name in TROUBLES:
+        assert ratio[name] <= 1.0 + max(0.05, spread), name
+
+
+def compared(times: dict[str, np.ndarray]) -> tuple[dict[str, float], float]:
+    """Median over the rounds of p99 against that of the block alone; and by how much a round's two such blocks differ, root mean square."""
+    p99 = {name: np.nanpercentile(blocks, 99, axis=1) for name, blocks in times.items()}
+    ratio = {name: float(np.median(values / p99["alone"])) for name, values in p99.items()}
+    return ratio, float(np.sqrt(np.mean(np.log(p99["alone again"] / p99["alone"]) ** 2)))
