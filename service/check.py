@@ -11,17 +11,19 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import qpsolvers
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
 from rti_mpc.array import Array
+from rti_mpc.ocp import Ocp
 from rti_mpc.rti import Rti
 from rti_mpc.status import QpStatus
 from service.config import Config, load
@@ -87,15 +89,13 @@ def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> Report:
     twin = Rti(ocp, config.solver_settings(), formulation="sequential", solver="osqp", compile=False)
     rng = np.random.default_rng(1)
     x = np.array(config.robot_settings()["x0"])
-    phases = rng.uniform(-np.pi, np.pi, model.ny)
-    start = np.array([x[[state.name for state in model.states].index(y.name)] if y in model.states else 0.0 for y in model.outputs])
+    reference = wave(ocp, x, rng)
     prepare_us, feedback_us = np.zeros(SAMPLES), np.zeros(SAMPLES)
     statuses: Counter[QpStatus] = Counter()
     differences: list[float] = []
     rti.reset(x, np.array(model.u_rest))
     for k in samples:
-        t = ocp.dt * np.arange(k + 1, k + 1 + N)[:, None]
-        y_ref = start + np.sin(2 * np.pi / WAVE_S * t + phases) - np.sin(phases)
+        y_ref = reference(k + 1 + np.arange(N))
         began_ns = time.perf_counter_ns()
         rti.prepare(y_ref)
         prepare_us[k] = 1e-3 * (time.perf_counter_ns() - began_ns)
@@ -112,6 +112,14 @@ def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> Report:
             differences.append(np.inf if other is None else float(np.max(np.abs(rti.u - other))))
         x = rti.x[1] + NOISE * rng.standard_normal(model.nx)
     return Report(prepare_us, feedback_us, statuses, len(differences), max(differences, default=np.inf))
+
+
+def wave(ocp: Ocp, x: Array, rng: np.random.Generator) -> Callable[[NDArray[np.int64]], Array]:
+    """Return a reference that leaves a state, shape ``(nx,)``, in a wave of every output: stages, shape ``(M,)``, to rows, ``(M, ny)``."""
+    model = ocp.model
+    phases = rng.uniform(-np.pi, np.pi, model.ny)
+    start = np.array([x[[state.name for state in model.states].index(y.name)] if y in model.states else 0.0 for y in model.outputs])
+    return lambda k: np.asarray(start + np.sin(2 * np.pi / WAVE_S * ocp.dt * k[:, None] + phases) - np.sin(phases))
 
 
 def opinion(twin: Rti, y_ref: Array, x0: Array) -> Array | None:

@@ -243,6 +243,17 @@ def check(config: ConfigPath = SHIPPED) -> None:
     raise typer.Exit(main(config))
 
 
+@app.command()
+def doctor(
+    config: ConfigPath = SHIPPED,
+    path: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what was found as JSON.")] = None,
+) -> None:
+    """Examine this host: scheduler, clock, timers, bus, compiler, and which period the loop can keep here."""
+    from service.doctor import main
+
+    raise typer.Exit(main(config, path))
+
+
 def main() -> None:
     """Run the command line; what it refuses is one line, with exit status 2."""
     log.start()

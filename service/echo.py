@@ -24,13 +24,40 @@ ROLE = "echo"
 PING, PONG = "echo/ping", "echo/pong"
 
 
-class Echo:
+class Pinger:
     """
-    Pings, at the pace of telemetry.
+    Asks.
 
     Attributes:
         round_trip_us: Every answer's time so far.
     """
+
+    def __init__(self, bus: Bus, state: State) -> None:
+        """
+        Begin.
+
+        Args:
+            bus: Where the answering process is.
+            state: What is sent.
+        """
+        self.round_trip_us: list[float] = []
+        self._payload = encode(state)
+        self._pings = bus.publisher(bus.keys.stream(PING), State, realtime=True)
+        self._pongs = bus.subscriber(bus.keys.stream(PONG))
+
+    def ping(self) -> bool:
+        """Ask once; return whether there was an answer before the bus was closed."""
+        self._pongs.drain()
+        sent_ns = time.monotonic_ns()
+        self._pings.put_bytes(self._payload)
+        if self._pongs.recv() is None:
+            return False
+        self.round_trip_us.append(1e-3 * (time.monotonic_ns() - sent_ns))
+        return True
+
+
+class Echo(Pinger):
+    """Pings, at the pace of telemetry."""
 
     def __init__(self, bus: Bus, state: State, pause_s: float) -> None:
         """
@@ -41,24 +68,17 @@ class Echo:
             state: What is sent.
             pause_s: From hearing of a sample to the next ping.
         """
-        self.round_trip_us: list[float] = []
-        self._payload = encode(state)
+        super().__init__(bus, state)
         self._pause_s = pause_s
         self._samples = bus.subscriber(bus.keys.telemetry)
-        self._pings = bus.publisher(bus.keys.stream(PING), State, realtime=True)
-        self._pongs = bus.subscriber(bus.keys.stream(PONG))
         Thread(target=self._run, daemon=True).start()
 
     def _run(self) -> None:
         """Ping until the bus is closed."""
         for _ in iter(self._samples.recv, None):
             time.sleep(self._pause_s)
-            self._pongs.drain()
-            sent_ns = time.monotonic_ns()
-            self._pings.put_bytes(self._payload)
-            if self._pongs.recv() is None:
+            if not self.ping():
                 return
-            self.round_trip_us.append(1e-3 * (time.monotonic_ns() - sent_ns))
 
 
 def main(settings: BusSettings, keys: Keys, size: int) -> None:

@@ -31,7 +31,7 @@ def test_help_of_every_command_explains_every_option(command: str) -> None:
     assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
 
 
-@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "check", "demo", "faults"}))
+@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "check", "demo", "doctor", "faults"}))
 def test_every_process_takes_the_options_of_zenoh_programs(command: str) -> None:
     parameters = typer.main.get_group(app).commands[command].params
     options = {option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)}
