@@ -9,7 +9,7 @@ UV := $(shell command -v uv)
 FITS := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 PYTHON = $(shell for python in python3 python3.13 python3.12 python3.11 python3.14; do $$python -c '$(FITS)' 2>/dev/null && echo $$python && break; done)
 
-.PHONY: demo test test-slow bench lint format types lock clean
+.PHONY: demo test test-slow soak bench lint format types lock clean
 
 demo: $(READY)
 	$(BIN)/rti-mpc demo $(ARGS)
@@ -19,6 +19,9 @@ test: $(READY)
 
 test-slow: $(READY)
 	$(BIN)/pytest -m slow $(ARGS)
+
+soak: $(READY)
+	$(BIN)/pytest -m slow -s tests/processes/test_soak.py --soak-s 1800 $(ARGS)
 
 bench: $(READY)
 	$(BIN)/pytest -m benchmark -s $(ARGS)

@@ -7,26 +7,25 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rti_mpc.array import Array
 
-
-def lateness_us(period_s: float, go_on: Callable[[], object]) -> Array:
+def bare_timer(period_s: float, go_on: Callable[[], object]) -> NDArray[np.int64]:
     """
-    Sleep to the ticks of an absolute grid, and note how late each wake-up is.
+    Sleep to the ticks of an absolute grid, and note when each was due and how late the wake-up is.
 
     Args:
-        period_s: Between two ticks, s; those that were missed are left out of the grid.
+        period_s: Between two ticks, s; those that were slept through are left out.
         go_on: Asked at each tick.
 
     Returns:
-        Lateness of each wake-up, us, shape ``(n,)``.
+        Due times by the monotonic clock, and lateness, ns, shape ``(n, 2)``.
     """
-    period_ns, late_us = round(1e9 * period_s), []
+    period_ns, ticks = round(1e9 * period_s), []
     due_ns = time.monotonic_ns()
     while go_on():
         due_ns += period_ns
         due_ns += max(0, time.monotonic_ns() - due_ns) // period_ns * period_ns
         time.sleep(max(0.0, 1e-9 * (due_ns - time.monotonic_ns())))
-        late_us.append(1e-3 * (time.monotonic_ns() - due_ns))
-    return np.array(late_us)
+        ticks.append((due_ns, time.monotonic_ns() - due_ns))
+    return np.array(ticks, np.int64).reshape(-1, 2)

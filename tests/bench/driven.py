@@ -35,6 +35,7 @@ class Driven:
     children: Children
     lives: set[str]
     subscriber: Subscriber
+    pids: dict[str, int]
     telemetry: list[Telemetry] = field(default_factory=list)
 
     @property
@@ -58,27 +59,30 @@ class Driven:
         return robot_log.read(self.folder / "robot.csv", INFO)
 
 
-def sampled(folder: Path, dt_s: float) -> Path:
-    """Write the shipped robot's configuration with another period."""
+def sampled(folder: Path, dt_s: float, realtime: str = "") -> Path:
+    """Write the shipped robot's configuration with another period, and what its controller asks of the system."""
     path = folder / "robot.toml"
-    path.write_text(SHIPPED.read_text().replace("dt_s = 0.1 ", f"dt_s = {dt_s} ") + "[sim]\nx0 = { x = 0.5 }\n")
+    path.write_text(SHIPPED.read_text().replace("dt_s = 0.1 ", f"dt_s = {dt_s} ") + f"[sim]\nx0 = {{ x = 0.5 }}\n[realtime]\n{realtime}\n")
     assert load(path).ocp.dt_s == dt_s
     return path
 
 
 @contextmanager
-def driven(folder: Path, dt_s: float, duration_s: float) -> Iterator[Driven]:
+def driven(folder: Path, dt_s: float, duration_s: float, realtime: str = "") -> Iterator[Driven]:
     """Drive until left, at most for so long."""
-    endpoint, toml = free_endpoint(), sampled(folder, dt_s)
+    endpoint, toml = free_endpoint(), sampled(folder, dt_s, realtime)
     keys = load(toml).keys()
     with Bus(BusSettings(listen=(endpoint,), connect=()), keys) as bus, Children(folder) as children:
         lives: set[str] = set()
         bus.watch_alive(lambda role, present: (lives.add if present else lives.discard)(role))
-        children.start("controller", "service.cli", "run", toml, "-e", endpoint)
-        children.start("reference", "service.cli", "reference", toml, "-e", endpoint, "--duration", duration_s)
-        until(lambda: {"controller", "reference"} <= lives, "controller and reference", patience_s=60.0)
-        robot = Driven(folder, endpoint, bus, children, lives, bus.subscriber(keys.telemetry, capacity=8192))
-        children.start("robot", "service.cli", "sim", toml, "-l", "tcp/127.0.0.1:0", "-e", endpoint, "--log", folder / "robot.csv")
+        meeting = ("-l", "tcp/127.0.0.1:0", "-e", endpoint)
+        pids = {
+            "controller": children.start("controller", "service.cli", "run", toml, "-e", endpoint),
+            "reference": children.start("reference", "service.cli", "reference", toml, "-e", endpoint, "--duration", duration_s),
+        }
+        until(lambda: pids.keys() <= lives, "controller and reference", patience_s=60.0)
+        robot = Driven(folder, endpoint, bus, children, lives, bus.subscriber(keys.telemetry, capacity=8192), pids)
+        pids["robot"] = children.start("robot", "service.cli", "sim", toml, *meeting, "--log", folder / "robot.csv")
         until(lambda: robot.listen() > 1, "the first samples", patience_s=30.0)
         yield robot
 

@@ -28,10 +28,9 @@ from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import decode, encode
 from service import machine, robot_log
 from service.children import Children
-from service.cli import SHIPPED
 from service.config import Config, load
 from service.demo import free_endpoint
-from service.info import Info, Label
+from tests.bench.driven import INFO, quantiles, sampled
 from tests.processes.system import until
 
 pytestmark = pytest.mark.benchmark
@@ -59,11 +58,7 @@ while True:
 @pytest.fixture
 def config(tmp_path: Path) -> Config:
     """The shipped robot, ten times as often."""
-    path = tmp_path / "robot.toml"
-    path.write_text(SHIPPED.read_text().replace("dt_s = 0.1 ", f"dt_s = {DT_S} ") + "[sim]\nx0 = { x = 0.5 }\n")
-    config = load(path)
-    assert config.ocp.dt_s == DT_S
-    return config
+    return load(sampled(tmp_path, DT_S))
 
 
 @contextmanager
@@ -125,8 +120,7 @@ def test_command_takes_at_most_one_and_a_half_echoes_and_the_feedback(config: Co
         until(enough, f"{SAMPLES} samples", pause_s=0.2, patience_s=2 * SAMPLES * DT_S + 20.0)
         for name in ("controller", "robot", "reference"):
             children.end(name)
-    info = Info("controller", states=tuple(map(Label, ("x", "y", "psi", "u", "omega"))), inputs=tuple(map(Label, ("u_c", "omega_c"))))
-    log = robot_log.read(tmp_path / "robot.csv", info)
+    log = robot_log.read(tmp_path / "robot.csv", INFO)
     latency_us = dict(zip(log.seq.tolist(), log.latency_us.tolist(), strict=True))
     rows = [(latency_us[sample.state_seq], sample.feedback_us, sample.prepare_us) for sample in telemetry[COLD:SAMPLES]]
     latency, feedback, prepare = np.array(rows).T
@@ -135,7 +129,7 @@ def test_command_takes_at_most_one_and_a_half_echoes_and_the_feedback(config: Co
     with capsys.disabled():
         print(f"\n{machine.describe()}")
         for name, values in {"state to command": latency, "bare echo": echo, "feedback": feedback, "preparation": prepare}.items():
-            print(f"{name:16} p50 {np.median(values):6.0f}  p99 {np.percentile(values, 99):6.0f}  max {values.max():6.0f} us, {len(values)} samples")
+            print(f"{name:16} {quantiles(values)}, {len(values)} samples")
         print(f"p50 of state to command is {np.median(latency) / allowed_us:.2f} of 1.5 echoes and the feedback, {allowed_us:.0f} us")
     assert len(latency) > 0.98 * (SAMPLES - COLD)
     assert np.median(latency) <= allowed_us

@@ -5,11 +5,12 @@ import json
 from itertools import count
 from typing import Any
 
+import numpy as np
 import pytest
 
 from service.cli import SHIPPED
 from service.doctor import MARGIN, promise, rows
-from service.jitter import lateness_us
+from service.jitter import bare_timer
 from tests.processes.system import rti_mpc
 
 PARTS = ("prepare_us", "feedback_us", "timer_us", "round_trip_us")
@@ -52,8 +53,9 @@ def test_nothing_is_promised_where_a_part_could_not_be_measured() -> None:
     assert (loop["shortest_period_us"], loop["fits"]) == (None, False)
 
 
-def test_a_bare_timer_never_wakes_early() -> None:
+def test_a_bare_timer_stays_on_its_grid_and_never_wakes_early() -> None:
     ticks = count()
-    late_us = lateness_us(0.001, lambda: next(ticks) < 50)
-    assert len(late_us) == 50
-    assert late_us.min() >= 0.0
+    due_ns, late_ns = bare_timer(0.001, lambda: next(ticks) < 50).T
+    assert len(due_ns) == 50
+    assert not np.any(np.diff(due_ns) % 1_000_000)
+    assert late_ns.min() >= 0

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What `[realtime]` is worth here: from a state in to its command out, on a machine at rest and beside processes that never rest.
+
+Real processes, 100 samples a second. In every round each setting has a controller
+of its own, the settings in random order. Nothing is demanded but that what was
+asked for was granted: what it is worth is the machine's business.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service import machine, realtime
+from tests.bench.driven import driven, quantiles
+
+pytestmark = pytest.mark.benchmark
+
+DT_S = 0.01
+SHORT = "CI" in os.environ
+ROUNDS = 1 if SHORT else 4
+COLD, BLOCK = 100, 300  # samples
+LAST = realtime.available()[-1]
+SETTINGS = {
+    "off": "",
+    "priority": "priority = 20",
+    "cores": f"cores = [{LAST}]",
+    "all": f"priority = 20\ncores = [{LAST}]\nlock_memory = true",
+}
+GREEDY = "while True: pass"
+
+
+@contextmanager
+def company(number: int) -> Iterator[None]:
+    """Processes that want a core each, always."""
+    greedy = [subprocess.Popen([sys.executable, "-c", GREEDY]) for _ in range(number)]
+    try:
+        yield
+    finally:
+        for process in greedy:
+            process.kill()
+            process.wait()
+
+
+def test_what_real_time_is_worth_here(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(1)
+    times: dict[tuple[str, int], list[np.ndarray]] = {(name, number): [] for number in (0, len(realtime.available())) for name in SETTINGS}
+    for k in range(ROUNDS):
+        for name, number in rng.permutation(np.array(list(times), dtype=object)).tolist():
+            folder = tmp_path / f"{k}-{name}-{number}"
+            folder.mkdir()
+            with driven(folder, DT_S, 60.0, realtime=SETTINGS[name]) as robot:
+                if "refused" in (folder / "controller.log").read_text():
+                    pytest.skip(f"{name} is not granted here: NOT measured")
+                with company(number):
+                    robot.samples(COLD)
+                    times[name, number].append(np.array([sample.latency_us for sample in robot.samples(BLOCK)]))
+    with capsys.disabled():
+        print(f"\n{machine.describe()}\nstate in to command out, {ROUNDS} rounds of {BLOCK} samples")
+        for (name, number), blocks in times.items():
+            print(f"  {name:9} beside {number} that never rest  {quantiles(np.concatenate(blocks))}")
