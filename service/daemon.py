@@ -65,6 +65,7 @@ def main(config: Config, bus_settings: BusSettings, *, stop: Event | None = None
     warm_up(rti)
     observer = config.build_observer()
     timing = Timing(config.delay_s, config.stale_s, config.timing.valid_s)
+    Controller(rti, timing)  # compiles what is left to: a compiler must not be started in real time
     outcomes = realtime.attempt(**config.realtime.model_dump())  # before any thread is started, for all of them
     with Bus(bus_settings, config.keys(), stop=stop) as bus:
         heard = heard_epoch(bus, stop)

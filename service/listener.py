@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from typing import Any
 
 from rti_mpc.errors import MessageError
-from rti_mpc.message import STAMP_ON_ARRIVAL, Command, Event, Reference, State, Telemetry
+from rti_mpc.message import STAMP_ON_ARRIVAL, Command, Event, Notice, Reference, State, Telemetry
 from rti_mpc.wire.bus import Bus, Received, Subscriber
-from rti_mpc.wire.intake import Intake, Notice
+from rti_mpc.wire.intake import Intake
 from service.info import Info
 from service.recording import Entry
 from service.timeline import Timeline

@@ -16,8 +16,7 @@ from urllib.parse import urlsplit
 import rerun as rr
 
 from rti_mpc.errors import ConfigError
-from rti_mpc.message import Reference, Severity
-from rti_mpc.wire.intake import Notice
+from rti_mpc.message import Notice, Reference, Severity
 from service.info import Info
 from service.recording import Entry, Recording
 

@@ -13,9 +13,9 @@ from threading import Event
 from urllib.parse import urlsplit
 
 from rti_mpc.errors import ConfigError
+from rti_mpc.message import Notice
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import Bus, BusSettings
-from rti_mpc.wire.intake import Notice
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from service.listener import Listener
