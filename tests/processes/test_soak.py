@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from rti_mpc.message import Command, Telemetry
 from rti_mpc.wire.cdr import decode
@@ -37,7 +38,7 @@ AFTERMATH_NS = 50_000_000  # in which they may be: all that was held up is then 
 COLD = 400  # first samples, left out: everybody starts
 LOOK_S = 1.0
 WARM_UP_S = 60.0  # of allocators and ring buffers; a quarter of a shorter run
-LONG_S = 300.0  # from which on a slope per hour can be told from one page more or less
+LONG_S = 900.0  # from which on a slope per hour can be told from a high-water mark that a stall has left
 MIB = 2**20
 
 TIMER = """
@@ -102,8 +103,8 @@ def anonymous_bytes(pid: int) -> int:
 
 
 def growth(times_s: np.ndarray, mib: np.ndarray) -> float:
-    """Fitted, in MiB per hour."""
-    return 3600.0 * float(np.polyfit(times_s - times_s[0], mib, 1)[0])
+    """Fitted (Theil 1950, Sen 1968: the median of all slopes, which a single step does not move), in MiB per hour."""
+    return 3600.0 * float(scipy.stats.theilslopes(mib, times_s).slope)
 
 
 @dataclass
