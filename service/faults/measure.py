@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from rti_mpc.array import Array
 from rti_mpc.guard import Limits
 from rti_mpc.message import Reference
+from rti_mpc.schedule import STEP_NS
 from service.robot_log import RobotLog
 
 STANDING_M_S = 1e-3
@@ -169,10 +170,14 @@ def step_share(u: Array, limits: Limits) -> float:
 
 
 def ramp_share(log: RobotLog, limits: Limits, brake: int, zero: int) -> float:
-    """Return the largest change in any period of a ramp to rest, as a share of what it may be."""
+    """
+    Return the largest change in any period of a ramp to rest, as a share of what it may be.
+
+    One step less than a period, for a ramp that is told over a bus begins with the step that was due meanwhile.
+    """
     t, share = log.stamp_ns[: zero + 1], 0.0
     for row in range(max(brake - 1, 0), zero):
-        last = int(np.searchsorted(t, t[row] + 1e9 * limits.dt_s, side="right")) - 1
+        last = int(np.searchsorted(t, t[row] + 1e9 * limits.dt_s - STEP_NS, side="right")) - 1
         share = max(share, float((np.abs(log.u[last] - log.u[row]) / step(limits)).max()))
     return share
 

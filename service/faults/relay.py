@@ -73,6 +73,7 @@ class Relay:
     def __init__(self, bus: Bus, robot: Keys) -> None:
         keys = bus.keys
         self._offset_ns = 0
+        self._stamp_ns = 0  # of the last state, as the robot sent it
         self._fault: tuple[str, int, deque[State]] = ("none", 0, deque())  # what, for how many states, those it holds back
         self._states = bus.publisher(keys.state, State, realtime=True)
         self._follow(bus.subscriber(robot.state, capacity=64), self._change)
@@ -80,15 +81,15 @@ class Relay:
             self._follow(bus.subscriber(here, capacity=64), partial(self._pass, bus.publisher(there, Command, realtime=True)))
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Change the states from now on: ``{"fault": NAME, "states": HOW_MANY}``, all of them without a number."""
+        """Change the states from now on: ``{"fault": NAME, "states": HOW_MANY}``, all of them without a number; answer since when, robot time."""
         name = request["fault"]
         if name in JUMPS:
             self._offset_ns += JUMPS[name]
-            return {"ok": True}
+            return {"ok": True, "stamp_ns": self._stamp_ns}
         if name not in CHANGES:
             return {"ok": False, "error": f"fault must be one of {', '.join([*CHANGES, *JUMPS])}, got {name!r}"}
         self._fault = (name, request.get("states", 2**62), deque())
-        return {"ok": True}
+        return {"ok": True, "stamp_ns": self._stamp_ns}
 
     def _change(self, payload: bytes) -> None:
         """Pass a state on, or what becomes of it."""
@@ -97,6 +98,7 @@ class Relay:
         except MessageError:
             return
         name, states, held = self._fault
+        self._stamp_ns = state.stamp_ns
         for changed in CHANGES[name](state, held):
             self._states.put(replace(changed, stamp_ns=changed.stamp_ns + self._offset_ns))
         if name != "none" and self._fault[2] is held:

@@ -250,9 +250,9 @@ class System:
         assert self.witness.reference is not None
         return self.witness.reference
 
-    def ask(self, key: str, **request: Any) -> None:
+    def ask(self, key: str, **request: Any) -> dict[str, Any]:
         """
-        Ask a process for something that it grants.
+        Ask a process for something that it grants, and return its answer.
 
         Raises:
             Failed: It refuses, or does not answer.
@@ -263,3 +263,4 @@ class System:
             answer = {"error": f"no answer within {REQUEST_S:g} s"}
         if answer.get("ok") is not True:
             raise Failed(f"{key} was asked for {request}: {answer.get('error')}")
+        return answer

@@ -92,9 +92,9 @@ def slow_viewer(system: System) -> None:
 
 
 def states(change: str, count: int | None = None) -> Act:
-    """Change so many states, or all from now on."""
+    """Change so many states, or all from now on; the fault is after the last one that passed as it was."""
     request = {"fault": change} | ({} if count is None else {"states": count})
-    return lambda system: system.ask(system.keys.stream(RELAY), **request)
+    return lambda system: int(system.ask(system.keys.stream(RELAY), **request)["stamp_ns"])
 
 
 def solver(failure: str, samples: int) -> Act:

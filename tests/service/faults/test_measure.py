@@ -58,7 +58,7 @@ def test_ramp_to_rest_is_timed_from_its_first_step_to_its_last_and_the_robot_to_
     assert found.still_s == pytest.approx(0.41 + LAG_S * np.log(0.4 * 0.75 / 1e-3), abs=0.05)  # a quarter is lost in the ramp
     assert found.distance_m == pytest.approx(0.4 * (0.25 + 0.08 + LAG_S), abs=5e-3)
     assert found.recovery_s == pytest.approx(0.5, abs=2 * ROW_S)
-    assert found.step_share == pytest.approx(1.0, abs=1e-6)
+    assert found.step_share == pytest.approx(0.9, abs=1e-6)  # nine steps of ten
     assert found.stale == 0
     assert not STOPS.broken(found)
 
@@ -80,7 +80,7 @@ def test_stepwise_ramp_begins_with_its_first_step() -> None:
 
 
 def test_ramp_that_is_too_steep_shows() -> None:
-    assert measured(record(lambda t: stopping(t, slew=1.2 * SLEW))).step_share == pytest.approx(1.2, abs=1e-6)
+    assert measured(record(lambda t: stopping(t, slew=1.2 * SLEW))).step_share == pytest.approx(0.9 * 1.2, abs=1e-6)
     found = measured(record(lambda t: np.where(t < FAULT_S + 0.2, 0.4, 0.0)))
     assert found.step_share == pytest.approx(0.4 / 0.25)
     assert "step_share must be at most 1, got 1.6" in STOPS.broken(found)
