@@ -356,7 +356,7 @@ class Controller:
             period_ns=self.grid.dt_ns,
             u=u,
         )
-        self._sent.append(self._command)
+        self._sent.append(self._command, self._left_ns + 1)
         return self._command
 
     @property
