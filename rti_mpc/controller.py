@@ -195,11 +195,11 @@ class Controller:
         """
         elapsed_ns = round((local_ns - self._states.clock.arrival_ns) * self._states.clock.rate)
         now_ns = command.state_stamp_ns + self._states.clock.late_ns + elapsed_ns
+        self._left_ns = max(self._left_ns + 1, now_ns)  # commands leave one after the other, whatever our idea of the robot's clock
         if now_ns < command.stamp_ns + BUDGET * self.grid.dt_ns:
             if self._overran:
                 self._overran = False
                 self._modes.enter(command.mode, "samples are in time again")
-            self._left_ns = now_ns
             return command
         self._overran = True
         self._sent.withdraw(command)
@@ -356,7 +356,7 @@ class Controller:
             period_ns=self.grid.dt_ns,
             u=u,
         )
-        self._sent.append(self._command)
+        self._sent.append(self._command, self._left_ns + 1)
         return self._command
 
     @property
@@ -406,4 +406,5 @@ class Controller:
         if self._delay is not None:
             self._delay.clear()
         self._plan = None
+        self._left_ns = 0
         self._overran = self._loaded = self.grid.running = False
