@@ -127,7 +127,8 @@ class Config(Section):
         from service.injection import FaultyRti
 
         cls = FaultyRti if self.debug.inject else Rti
-        return cls(self.build_ocp(), self.solver_settings(), formulation=self.ocp.formulation, **self.iterations())
+        settings = self.solver_settings()
+        return cls(self.build_ocp(), settings, formulation=self.ocp.formulation, solver=self.solver.name, **self.iterations())
 
     def build_observer(self) -> Observer | None:
         """Return the observer, compiled, if there is anything to estimate."""
@@ -191,11 +192,12 @@ class Config(Section):
             raise ConfigError(wrong)
         return self.model_copy(update={"sim": self.sim.model_copy(update={"x0": {**self.sim.x0, **given}})})
 
-    def solver_settings(self) -> SolverSettings:
-        """Return the settings of the QP solver."""
+    def solver_settings(self) -> SolverSettings | None:
+        """Return the settings of OSQP, None if none are given."""
         from rti_mpc.solver import SolverSettings
 
-        return SolverSettings(**self.solver.model_dump(exclude_none=True, exclude=ITERATIONS))
+        given = self.solver.model_dump(exclude_none=True, exclude=ITERATIONS | {"name"})
+        return SolverSettings(**given) if given else None
 
     def iterations(self) -> dict[str, Any]:
         """Return the limits of the iterations a sample, as `Rti` names them, that are given."""
@@ -323,4 +325,26 @@ def check_model(config: Config) -> None:
             raise ConfigError(f"ocp.bounds.inputs must be in the model's order {inputs} where a guard is enabled, got {list(ocp.bounds.inputs)}")
         if tuple(config.guard.u_rest.get(name, 0.0) for name in inputs) != model.u_rest:
             raise ConfigError(f"guard.u_rest must be the model's {dict(zip(inputs, model.u_rest, strict=True))}, got {config.guard.u_rest}")
+    check_solver(config)
     config.build_ocp()
+
+
+def check_solver(config: Config) -> None:
+    """
+    Check that the QP solver is there, and the settings are its own.
+
+    Raises:
+        ConfigError: They are not.
+    """
+    from rti_mpc.foreign_solver import check_name
+    from rti_mpc.rti import SOLVERS
+
+    if config.solver.name in SOLVERS:
+        return
+    try:
+        check_name(config.solver.name)
+    except OcpError as error:
+        raise ConfigError(f"solver.name: {error}") from error
+    if foreign := config.solver.model_dump(exclude_none=True, exclude=ITERATIONS | {"name"}):
+        key, got = next(iter(foreign.items()))
+        raise ConfigError(f"solver.{key} is a setting of osqp, it must be left out for solver.name = {config.solver.name!r}, got {got}")

@@ -89,8 +89,9 @@ class OcpSection(Section):
 
 
 class SolverSection(Section):
-    """Iterations a sample, and OSQP's settings; what is left out is as `Rti` and `SolverSettings` have it."""
+    """The QP solver, iterations a sample, and OSQP's settings; what is left out is as `Rti` and `SolverSettings` have it."""
 
+    name: str = Field(default="riccati", description="riccati, with osqp behind it; osqp; or another one's name in qpsolvers, such as daqp")
     eps: float | None = Field(default=None, ge=1e-12, le=1e-1, description="absolute and relative tolerance on the residuals, without unit")
     max_iter: int | None = Field(default=None, ge=1, le=1_000_000, description="iterations at most; the iterate is then taken as it is")
     rho: float | None = Field(default=None, ge=1e-6, le=1e6, description="step size of ADMM, without unit")

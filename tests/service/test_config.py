@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from rti_mpc.errors import ConfigError
+from rti_mpc.foreign_solver import ForeignSolver
+from rti_mpc.solver import Solver
 from service.config import Config, load
 from sim.settings import RobotSettings
 
@@ -61,6 +63,8 @@ WRONG = [
     ("[ocp]", "[guard]\ntick_s = 0.1\n[ocp]", ["guard.tick_s", "at most 0.01", "0.1"]),
     ("[ocp]", "[guard]\nu_rest = { v = 1.0 }\n[ocp]", ["guard.u_rest.v", "no input", "u_c [m/s]"]),
     ("[ocp]", "[guard]\nenabled = true\nu_rest = { u_c = 1.0 }\n[ocp]", ["guard.u_rest", "must be the model's", "'u_c': 0.0"]),
+    ("[ocp]", "[solver]\nname = 'dapq'\n[ocp]", ["solver.name", "'dapq'", "riccati, osqp", "daqp", "pip install 'qpsolvers[NAME]'"]),
+    ("[ocp]", "[solver]\nname = 'daqp'\nrho = 2.0\n[ocp]", ["solver.rho", "osqp", "'daqp'", "2.0"]),
     ("[model]", "[modle]", ["modle", "model"]),
     ("[model]", "[model", ["TOML", "line"]),
 ]
@@ -96,6 +100,15 @@ def test_configuration_becomes_the_ocp_it_describes(tmp_path: Path) -> None:
     np.testing.assert_array_equal(ocp.delta, [1, 2, 3])
     np.testing.assert_array_equal(ocp.lambda_, [0.5, 0.5, 0.5])
     assert np.all(np.isinf(ocp.ubu)), "a bound left out is no bound"
+
+
+@pytest.mark.parametrize("name", ["riccati", "osqp", "daqp"])
+def test_solver_is_chosen_by_one_word(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + f'[solver]\nname = "{name}"\n')
+    rti = load(path).build_rti()
+    assert (rti.active_set is None) is (name != "riccati")
+    assert isinstance(rti.solvers[0], Solver if name != "daqp" else ForeignSolver)
 
 
 def test_bounds_go_to_the_signals_they_name_whatever_their_order() -> None:
