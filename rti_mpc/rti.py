@@ -338,3 +338,8 @@ class Rti:
     def violation(self) -> float:
         """By how much the plan's states exceed their bounds at most, in the unit of the state; 0 if they do not."""
         return max(0.0, float(self._violation[0]))
+
+    @property
+    def touches(self) -> bool:
+        """Whether the last plan is at a softened bound, or beyond it."""
+        return bool(self._violation[0] > -TOUCHING)

@@ -136,7 +136,7 @@ def reference(
         trajectory = trajectory.lasting(duration)
     model = config.build_model()
     parameters = {parameter.name: value for parameter, value in zip(model.parameters, model.p_nominal, strict=True)}
-    main(trajectory, bus, config.keys(), heading=heading, a=parameters.get("a", 0.0))
+    main(trajectory, bus, config.keys(), heading=heading, a=parameters.get("a", 0.0), parameters=config.stage_parameters)
 
 
 @process

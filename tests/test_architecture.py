@@ -28,7 +28,7 @@ ALONE = {
     "rerun": {"service/blueprint.py", "service/outlet.py", "service/recording.py", "service/view.py"},
     "qpsolvers": {"rti_mpc/qp.py", "rti_mpc/foreign_solver.py", "service/check.py"},
     "casadi": {
-        *(f"rti_mpc/{name}.py" for name in ("simultaneous", "sequential", "terminal", "obstacle", "disturbance", "observer")),
+        *(f"rti_mpc/{name}.py" for name in ("simultaneous", "sequential", "terminal", "obstacle", "blockage", "disturbance", "observer")),
         *(
             f"rti_mpc/{name}.py"
             for name in (
@@ -67,7 +67,7 @@ FLOW: tuple[set[str], ...] = (
     {"qp", "prediction", "observer", "envelope", "delay"},
     {"solver", "active_set", "foreign_solver", "state_stream"},
     {"rti"},
-    {"record"},
+    {"record", "blockage"},
     {"controller"},
 )
 BEFORE_WIRE = {"errors", "array", "status", "message"}
