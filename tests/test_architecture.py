@@ -26,7 +26,7 @@ ALONE = {
     "osqp": {"rti_mpc/solver.py"},
     "zenoh": {"rti_mpc/wire/bus.py", "rti_mpc/wire/session.py"},
     "rerun": {"service/blueprint.py", "service/outlet.py", "service/recording.py", "service/view.py"},
-    "qpsolvers": {"rti_mpc/qp.py", "rti_mpc/foreign_solver.py", "service/check.py"},
+    "qpsolvers": {"rti_mpc/qp.py", "rti_mpc/foreign_solver.py"},
     "casadi": {
         *(f"rti_mpc/{name}.py" for name in ("simultaneous", "sequential", "terminal", "obstacle", "blockage", "disturbance", "observer")),
         *(
