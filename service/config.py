@@ -30,7 +30,6 @@ from service.schema import (
     ModelSection,
     ObserverSection,
     OcpSection,
-    RegulatorSection,
     Section,
     SimSection,
     SolverSection,
@@ -100,7 +99,6 @@ class Config(Section):
         from rti_mpc.disturbance import with_disturbances
         from rti_mpc.obstacle import with_obstacles
         from rti_mpc.ocp import Ocp
-        from rti_mpc.terminal import lqr_weight
 
         own = self.build_model()
         discs = [(*obstacle.centre_m, obstacle.radius_m + obstacle.margin_m) for obstacle in self.ocp.obstacles]
@@ -139,6 +137,8 @@ class Config(Section):
         if terminal.Q is not None:
             return problem(Q_e=[terminal.Q[output.name] for output in model.outputs])
         if terminal.lqr is not None:
+            from rti_mpc.terminal import lqr_weight
+
             x = [terminal.lqr.states.get(state.name, 0.0) for state in model.states]
             u = [terminal.lqr.inputs.get(input.name, rest) for input, rest in zip(model.inputs, model.u_rest, strict=True)]
             return problem(Q_e=lqr_weight(problem(), np.array(x), np.array(u)))
@@ -290,6 +290,8 @@ def load(path: Path, *, with_model: bool = True) -> Config:
             config = config.model_copy(update={"bus": config.bus.model_copy(update={"config": path.parent / config.bus.config})})
         check_tree(config)
         if with_model:
+            from service.fit import check_model
+
             check_model(config)
     except OSError as error:
         raise ConfigError(f"{path}: must be a readable file, got {error.strerror}") from error
@@ -326,78 +328,3 @@ def check_tree(config: Config) -> None:
         for name, (lower, upper) in ocp.bounds.increments.items():
             if not lower < 0.0 < upper:
                 raise ConfigError(f"ocp.bounds.increments.{name} must hold lower < 0 < upper where a guard is enabled, or it could not brake")
-
-
-def check_model(config: Config) -> None:
-    """
-    Check what only the model knows.
-
-    Raises:
-        ConfigError: A key does not fit the model.
-        OcpError: The problem is ill-posed in some other way.
-    """
-    from rti_mpc.model import find_model
-    from rti_mpc.obstacle import with_obstacles
-
-    ocp, sim, observer, terminal = config.ocp, config.sim, config.observer, config.ocp.terminal
-    regulator = terminal.lqr or RegulatorSection()
-    try:
-        model = find_model(config.model.name)
-    except OcpError as error:
-        raise ConfigError(f"model.name: {error}") from error
-    tables: tuple[tuple[str, Mapping[str, object], str, tuple[Signal, ...]], ...] = (
-        ("model.parameters", config.model.parameters, "parameter", model.parameters),
-        ("ocp.weights.Q", ocp.weights.Q, "output", model.outputs),
-        ("ocp.weights.R", ocp.weights.R, "input", model.inputs),
-        ("ocp.bounds.inputs", ocp.bounds.inputs, "input", model.inputs),
-        ("ocp.bounds.increments", ocp.bounds.increments, "input", model.inputs),
-        ("ocp.bounds.states", ocp.bounds.states, "state", model.states),
-        ("ocp.bounds.constraints", ocp.bounds.constraints, "constraint", model.constraints),
-        *((("ocp.terminal.Q", terminal.Q, "output", model.outputs),) if terminal.Q is not None else ()),
-        ("ocp.terminal.lqr.states", regulator.states, "state", model.states),
-        ("ocp.terminal.lqr.inputs", regulator.inputs, "input", model.inputs),
-        ("observer.disturbances", observer.disturbances, "input or state", (*model.inputs, *model.states)),
-        ("observer.measured", dict.fromkeys(observer.measured), "state", model.states),
-        ("observer.noise", observer.noise, "state", model.states),
-        ("observer.process", observer.process, "state", model.states),
-        ("guard.u_rest", config.guard.u_rest, "input", model.inputs),
-        ("sim.x0", sim.x0, "state", model.states),
-        ("sim.noise_std", sim.noise_std, "state", model.states),
-        ("sim.parameters", sim.parameters, "parameter", model.parameters),
-    )
-    for key, table, kind, signals in tables:
-        if wrong := unknown_name(key, table, kind, signals, complete=key.startswith("ocp.weights") or key == "ocp.terminal.Q"):
-            raise ConfigError(wrong)
-    if config.guard.enabled:
-        inputs = names(model.inputs)
-        if list(ocp.bounds.inputs) != inputs:
-            raise ConfigError(f"ocp.bounds.inputs must be in the model's order {inputs} where a guard is enabled, got {list(ocp.bounds.inputs)}")
-        if tuple(config.guard.u_rest.get(name, 0.0) for name in inputs) != model.u_rest:
-            raise ConfigError(f"guard.u_rest must be the model's {dict(zip(inputs, model.u_rest, strict=True))}, got {config.guard.u_rest}")
-    check_solver(config)
-    try:
-        with_obstacles(model, [(0.0, 0.0, 1.0) for _ in ocp.obstacles])
-    except OcpError as error:
-        raise ConfigError(f"ocp.obstacles: {error}") from error
-    config.build_ocp()
-
-
-def check_solver(config: Config) -> None:
-    """
-    Check that the QP solver is there, and the settings are its own.
-
-    Raises:
-        ConfigError: They are not.
-    """
-    from rti_mpc.foreign_solver import check_name
-    from rti_mpc.rti import SOLVERS
-
-    if config.solver.name in SOLVERS:
-        return
-    try:
-        check_name(config.solver.name)
-    except OcpError as error:
-        raise ConfigError(f"solver.name: {error}") from error
-    if foreign := config.solver.model_dump(exclude_none=True, exclude=ITERATIONS | {"name"}):
-        key, got = next(iter(foreign.items()))
-        raise ConfigError(f"solver.{key} is a setting of osqp, it must be left out for solver.name = {config.solver.name!r}, got {got}")
