@@ -23,7 +23,6 @@ from rich.progress import track
 from rich.table import Table
 
 from rti_mpc.array import Array
-from rti_mpc.ocp import Ocp
 from rti_mpc.rti import FORMULATIONS, SOLVERS, Rti
 from rti_mpc.solver import SolverSettings
 from rti_mpc.status import QpStatus
@@ -95,8 +94,7 @@ def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> Report:
     model, N = ocp.model, ocp.N
     first, second = config.solver.name, SECOND if config.solver.name != SECOND else "osqp"
     other = next(name for name in FORMULATIONS if name != rti.formulation)
-    tight = twin(ocp, first, rti.formulation)
-    judge = twin(ocp, second, other)
+    tight, judge = (twin(rti, solver, formulation) for solver, formulation in ((first, rti.formulation), (second, other)))
     rng = np.random.default_rng(1)
     x = np.array(config.robot_settings()["x0"])
     phases = rng.uniform(-np.pi, np.pi, model.ny)
@@ -113,7 +111,7 @@ def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> Report:
         rti.prepare(y_ref)
         prepare_us[k] = 1e-3 * (time.perf_counter_ns() - began_ns)
         asked = k % (SAMPLES // OPINIONS) == 0
-        guess = rti.x.copy(), rti.u.copy(), rti.u_prev.copy()
+        guess = *(array.copy() for array in rti.guess.sample[:2]), rti.u_prev.copy()
         prepared_ns = time.perf_counter_ns()
         status = rti.feedback(x)
         feedback_us[k] = 1e-3 * (time.perf_counter_ns() - prepared_ns)
@@ -128,12 +126,13 @@ def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> Report:
     return Report(prepare_us, feedback_us, statuses, second, len(differences), *most)
 
 
-def twin(ocp: Ocp, solver: str, formulation: str) -> Rti:
-    """Return an iteration that solves its QPs tightly; the solvers of qpsolvers do so in any case."""
-    return Rti(ocp, TIGHT if solver in SOLVERS else None, formulation=formulation, solver=solver, compile=False)
+def twin(rti: Rti, solver: str, formulation: str) -> Rti:
+    """Return a controller's like whose solver is tight; those of qpsolvers are in any case."""
+    settings = TIGHT if solver in SOLVERS else None
+    return Rti(rti.ocp, settings, formulation=formulation, solver=solver, iterations=rti.iterations, tolerance=rti.tolerance, compile=False)
 
 
-def answer(one: Rti, guess: tuple[Array, Array, Array], y_ref: Array, x0: Array) -> Array | None:
+def answer(one: Rti, guess: tuple[Array, ...], y_ref: Array, x0: Array) -> Array | None:
     """Return the inputs that an iteration makes of a sample, from a guess of x, u and u_prev; shape ``(N_u, nu)``, None if it makes none."""
     one.x[:], one.u[:], one.u_prev[:] = guess
     one.prepare(y_ref, shift=False)

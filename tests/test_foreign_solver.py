@@ -20,7 +20,7 @@ NAMES = ("clarabel", "daqp", "piqp")
 
 
 def rti(name: str = "daqp", formulation: str = "simultaneous", **changes: Any) -> Rti:
-    return Rti(double_integrator(lbu=-1.0, ubu=1.0, **changes), formulation=formulation, solver=name, compile=False)
+    return Rti(double_integrator(lbu=-1.0, ubu=1.0, **changes), formulation=formulation, solver=name, iterations=1, compile=False)
 
 
 def solve(one: Rti, seed: int) -> QpStatus:
@@ -38,7 +38,7 @@ def solve(one: Rti, seed: int) -> QpStatus:
 @pytest.mark.parametrize("build", [beacon, fenced])
 def test_matrices_updated_in_place_are_those_of_the_problem_written_anew(build: Any, name: str, formulation: str) -> None:
     """Hessian and constraints change from sample to sample; dense for a solver of dense problems alone."""
-    one = Rti(build(), formulation=formulation, solver=name, compile=False)
+    one = Rti(build(), formulation=formulation, solver=name, iterations=1, compile=False)
     for seed in (1, 2):
         assert solve(one, seed) is QpStatus.SOLVED
         ours, anew = one.solver._problem, one.qp.to_problem()
