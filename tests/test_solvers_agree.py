@@ -17,7 +17,7 @@ from rti_mpc.status import QpStatus
 
 TIGHT = SolverSettings(eps=1e-9, max_iter=500_000, scaling=10)  # bounds that are far exceeded are slow without Ruiz scaling
 SOLVERS: dict[str, SolverSettings | None] = {"osqp": TIGHT, "daqp": None, "clarabel": None}  # the others are as exact by themselves
-STRUCTURES, SAMPLES = 10, 20
+STRUCTURES, SAMPLES = 8, 25
 
 
 def random_ocp(rng: np.random.Generator) -> Ocp:
