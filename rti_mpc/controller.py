@@ -21,6 +21,7 @@ from dataclasses import replace
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.blockage import Blockage
 from rti_mpc.delay import DelayEstimator
 from rti_mpc.envelope import Envelope
 from rti_mpc.grid import Grid
@@ -91,6 +92,7 @@ class Controller:
         self._plan: Command | None = None  # the last one with a plan of its own
         self._before: tuple[Command | None, Command | None] = (None, None)  # those two before the last command
         self._record = Record(rti)
+        self._blockage = Blockage(rti)
         self._delay = DelayEstimator(model, self.grid.dt_ns, self.grid.most_ns, compile=compile) if timing.delay_s is None else None
 
     @property
@@ -219,6 +221,7 @@ class Controller:
     def prepare(self) -> None:
         """Prepare the next sample: fix `t_k`, look the reference up, shift, linearize and load the QP."""
         self._record.keep(self._seq)
+        self._look_ahead()
         if self._command is not None and self._left_ns > self._command.stamp_ns:
             self._sent.withdraw(self._command)
             self._sent.append(self._command, self._left_ns)
@@ -242,6 +245,15 @@ class Controller:
             estimator.sent(self._command)
         self._sent.delay_ns = estimator.delay_ns
         self.grid.adapt(estimator.delay_ns)
+
+    def _look_ahead(self) -> None:
+        """Say that the way is blocked, or free again."""
+        if self.mode not in (Mode.TRACKING, Mode.HOLDING) or not self._blockage.look():
+            return
+        if self._blockage.blocked:
+            self._modes.say(Severity.WARNING, "blocked", "the way is blocked: the plan stands still at a softened bound, short of the reference")
+        else:
+            self._modes.say(Severity.INFO, "free", "the way is free again")
 
     def _load(self, *, shift: bool) -> None:
         """Load the QP of `t_k`."""
@@ -403,6 +415,7 @@ class Controller:
         if arrival is not Arrival.JUMPED_AHEAD:
             self._modes.enter(Mode.IDLE, "another life of the robot, or of its clock")
             self._track.clear()
+            self._blockage.clear()
         if self._delay is not None:
             self._delay.clear()
         self._plan = None

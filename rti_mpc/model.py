@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-A robot as CasADi expressions: :math:`\dot x = f(x, u, p)`, :math:`y = h(x, p)`, with names and units.
+A robot as CasADi expressions: :math:`\dot x = f(x, u, p)`, outputs, and what else is to be kept inside bounds, with names and units.
 
 The names are those of acados (`f_expl_expr`), so that a model written for it
 can be brought along.
@@ -49,6 +49,8 @@ class Model:
         inputs: Names and units of `u`.
         outputs: Names and units of `y_expr`.
         parameters: Names and units of `p`.
+        h_expr: What else than inputs and states may be bounded, h(x, u, p), shape ``(nh, 1)``; nothing by default.
+        constraints: Names and units of `h_expr`.
         p_nominal: Values of `p` unless a reference carries others.
         u_rest: Input at which the robot stands still; zeros by default.
 
@@ -67,6 +69,8 @@ class Model:
     p: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
     parameters: tuple[Signal, ...] = ()
     p_nominal: tuple[float, ...] = ()
+    h_expr: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
+    constraints: tuple[Signal, ...] = ()
     u_rest: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -79,22 +83,24 @@ class Model:
             ("inputs", self.u, len(self.inputs)),
             ("outputs", self.y_expr, len(self.outputs)),
             ("parameters", self.p, len(self.parameters)),
+            ("constraints", self.h_expr, len(self.constraints)),
             ("p_nominal", self.p, len(self.p_nominal)),
             ("u_rest", self.u, len(self.u_rest)),
         ):
             if expr.numel() != length or (length and expr.shape != (length, 1)):
                 raise OcpError(f"model {self.name}: {label} must have {expr.numel()} entries, in a column, got {length} for shape {expr.shape}")
-        for signals in (self.states, self.inputs, self.outputs, self.parameters):
+        for signals in (self.states, self.inputs, self.outputs, self.parameters, self.constraints):
             names = [signal.name for signal in signals]
             if len(set(names)) < len(names):
                 raise OcpError(f"model {self.name}: names must be unique within a vector, got {names}")
         for label, expr, known in (
             ("f_expl_expr", self.f_expl_expr, (self.x, self.u, self.p)),
             ("y_expr", self.y_expr, (self.x, self.p)),
+            ("h_expr", self.h_expr, (self.x, self.u, self.p)),
         ):
             free = [str(s) for s in ca.symvar(expr) if not any(ca.depends_on(k, s) for k in known)]
             if free:
-                raise OcpError(f"model {self.name}: {label} must depend only on x, {'u, ' if label[0] == 'f' else ''}p, also has {', '.join(free)}")
+                raise OcpError(f"model {self.name}: {label} must depend only on x, {'' if label[0] == 'y' else 'u, '}p, also has {', '.join(free)}")
 
     @property
     def nx(self) -> int:

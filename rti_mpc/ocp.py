@@ -60,7 +60,7 @@ class Ocp:
         z: L1 weight of the slacks, shape ``(nx,)``, given so or as a constant; cost / unit of the state.
         Z: L2 weight of the slacks, shape ``(nx,)``, given so or as a constant; cost / unit of the state squared.
         Q_e: Terminal weight beside ``delta_N Q``, shape ``(ny, ny)``, given so or by its diagonal; none by default.
-        h_expr: General constraints h(x, u, p) in the model's symbols, shape ``(nh, 1)``; none by default.
+        h_expr: General constraints h(x, u, p) in the model's symbols, shape ``(nh, 1)``; the model's by default.
         lh: Softened lower bound on them, shape ``(nh,)``.
         uh: Softened upper bound on them, shape ``(nh,)``.
         zh: L1 weight of their slacks, shape ``(nh,)``, given so or as a constant.
@@ -129,7 +129,7 @@ class Ocp:
             raise OcpError(f"dt must be a positive number of seconds, got {dt}")
         integrator(model, method)  # raises for an unknown method
         nx, nu, ny = model.nx, model.nu, model.ny
-        h_expr = ca.SX(0, 1) if h_expr is None else h_expr
+        h_expr = model.h_expr if h_expr is None else h_expr
         nh = h_expr.numel()
         free = [s for s in ca.symvar(h_expr) if not ca.depends_on(ca.vertcat(model.x, model.u, model.p), s)]
         if free or (nh and h_expr.shape != (nh, 1)):

@@ -100,6 +100,11 @@ class Qp:
         beside = response.T @ P[:k, k:]
         return np.asarray(response.T @ P[:k, :k] @ response + beside + beside.T + P[k:, k:])
 
+    def sides(self) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+        """Return which rows are equations, and which of the others have an upper and a lower bound, each of shape ``(m,)``."""
+        equal = self.l == self.u
+        return equal, ~equal & (self.u < INFINITY), ~equal & (self.l > -INFINITY)
+
     def to_problem(self) -> qpsolvers.Problem:
         """
         Return a copy in the form of qpsolvers, for a second opinion or a dump.
@@ -108,9 +113,7 @@ class Qp:
         """
         import qpsolvers  # the second opinion is never on the hot path, nor in memory until asked for
 
-        equal = self.l == self.u
-        above = ~equal & (self.u < INFINITY)
-        below = ~equal & (self.l > -INFINITY)
+        equal, above, below = self.sides()
         A = sp.csr_matrix(self.A)
         P = self.P + sp.triu(self.P, k=1).T
         return qpsolvers.Problem(

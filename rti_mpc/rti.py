@@ -17,6 +17,7 @@ not, the whole QP is solved, and is the one prepared until its plan has left the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import isfinite
 from typing import Any
 
@@ -26,6 +27,7 @@ from rti_mpc.active_set import ActiveSet
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled
 from rti_mpc.errors import OcpError, ShapeError
+from rti_mpc.foreign_solver import ForeignSolver, check_name
 from rti_mpc.linearization import WEIGHTS, plan_cost, shift
 from rti_mpc.ocp import Ocp
 from rti_mpc.qp import Guess, Qp, step_size
@@ -37,7 +39,7 @@ from rti_mpc.status import QpStatus
 from rti_mpc.transcription import INFINITY
 
 FORMULATIONS = {"simultaneous": simultaneous, "sequential": sequential}
-SOLVERS = ("riccati", "osqp")
+SOLVERS = ("riccati", "osqp")  # the built-in ones; any other is one of qpsolvers
 SEQUENTIAL_UP_TO = 10  # control horizon up to which the sequential formulation is the faster one, see docs/engine.md
 SOLVED = QpStatus.SOLVED  # an enumeration looks its members up slowly
 ITERATIONS = 3  # a sample, at most, and
@@ -65,16 +67,24 @@ class Rti:
         p: Stage parameters of the current sample, shape ``(N + 1, np)``.
         guess: Where the current sample is linearized, and what the solvers read and write.
         active_set: What is tried first; None if the solver is another.
-        solvers: The workspaces, each with its QP: without softened bounds and, if there are any, with them.
+        solvers: The QP solvers, each with its QP: without softened bounds and, if there are any, with them.
         solver: What solved the current sample, or is about to.
         status: Outcome of the last feedback.
 
+    Args:
+        ocp: The problem.
+        settings: OSQP's, as a solver or as what is there for when `riccati` finds no way.
+        formulation: ``"simultaneous"``, ``"sequential"``, or ``"auto"`` for the faster one.
+        solver: ``"riccati"``, ``"osqp"``, or another one's name in qpsolvers.
+        compile: Whether to compile the model.
+
     Raises:
-        OcpError: The formulation or the solver is unknown, a number of iterations or a tolerance makes no sense, or the model is not finite where
-            the robot rests.
+        OcpError: The formulation or the solver is unknown, the settings are not the solver's, a number of iterations or a tolerance makes no sense,
+            or the model is not finite where the robot rests.
     """
 
-    solver: ActiveSet | Solver
+    solver: ActiveSet | Solver | ForeignSolver
+    solvers: Sequence[Solver | ForeignSolver]
 
     def __init__(
         self,
@@ -93,7 +103,9 @@ class Rti:
         if formulation not in FORMULATIONS:
             raise OcpError(f"formulation must be auto, {' or '.join(FORMULATIONS)}, got {formulation!r}")
         if solver not in SOLVERS:
-            raise OcpError(f"solver must be {' or '.join(SOLVERS)}, got {solver!r}")
+            check_name(solver)
+            if settings is not None:
+                raise OcpError(f"settings are OSQP's, they must be left out for another solver, got {settings} for {solver!r}")
         if not (iterations >= 1 and tolerance >= 0.0):
             raise OcpError(f"iterations must be at least 1 and tolerance not negative, got {iterations} and {tolerance}")
         self.ocp = ocp
@@ -148,13 +160,16 @@ class Rti:
             weights[name] *= self._cost_scale
         for qp in qps:
             qp.fill()
-        self.solvers = [Solver(qp, settings or SolverSettings()) for qp in qps]
+        if solver in SOLVERS:
+            self.solvers = [Solver(qp, settings or SolverSettings()) for qp in qps]
+        else:
+            self.solvers = [ForeignSolver(qp, solver) for qp in qps]
         self.reset(np.zeros(model.nx), np.array(model.u_rest))
 
     @property
     def qp(self) -> Qp:
         """The QP of the current sample; filled if its solver is a QP solver."""
-        return self.solver.qp if isinstance(self.solver, Solver) else self._backup.qp
+        return self._backup.qp if isinstance(self.solver, ActiveSet) else self.solver.qp
 
     def reset(self, x0: Array, u_prev: Array) -> None:
         """Start cold: the guess stays at one state and one input, and no earlier solution seeds the next."""
@@ -323,3 +338,8 @@ class Rti:
     def violation(self) -> float:
         """By how much the plan's states exceed their bounds at most, in the unit of the state; 0 if they do not."""
         return max(0.0, float(self._violation[0]))
+
+    @property
+    def touches(self) -> bool:
+        """Whether the last plan is at a softened bound, or beyond it."""
+        return bool(self._violation[0] > -TOUCHING)

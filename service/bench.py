@@ -25,6 +25,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from rti_mpc.array import Array
+from rti_mpc.foreign_solver import check_name
 from rti_mpc.integrator import integrator
 from rti_mpc.ocp import Ocp
 from rti_mpc.pioneer_3dx import pioneer_3dx
@@ -38,6 +39,7 @@ from service.yardstick import Ipopt
 
 HORIZONS = (7, 20, 50, 100, 200)
 ENTRIES = (("riccati", "simultaneous"), ("osqp", "simultaneous"), ("osqp", "sequential"))
+FORMULATIONS = ("simultaneous", "sequential")  # of a solver asked for by name
 DT = 0.1
 EXACT = SolverSettings(eps=1e-9, max_iter=20_000)
 
@@ -211,6 +213,7 @@ def main(
     horizons: tuple[int, ...] = HORIZONS,
     *,
     entries: tuple[tuple[str, str], ...] = ENTRIES,
+    solvers: tuple[str, ...] = (),
     interpreted: bool,
     quick: bool,
     costs: bool,
@@ -222,11 +225,15 @@ def main(
     Args:
         horizons: Stages.
         entries: Solver and formulation; the sequential one is left out beyond 20 stages, where it takes long to compile.
+        solvers: Others to compare them with, by their names in qpsolvers, in both formulations.
         interpreted: Whether to measure CasADi's virtual machine, too.
         quick: Eight seconds of driving in all, for a first look.
         costs: Whether to compare closed-loop costs, with exact QPs and with converged NMPC, too.
         path: JSON file to write.
     """
+    for solver in solvers:
+        check_name(solver)
+    entries += tuple((solver, formulation) for solver in solvers for formulation in FORMULATIONS)
     console = Console()
     console.print(", ".join(f"{name} {value}" for name, value in machine.describe().items()), soft_wrap=True)
     result: list[dict[str, Any]] = []

@@ -31,6 +31,7 @@ COLORS = {
     "feedback": (255, 176, 59),
     "latency": (170, 140, 245),
     "body": (70, 78, 96),
+    "obstacle": (74, 40, 44),
     "wheel": (112, 120, 138),
     "edge": (200, 206, 218),
     "idle": (110, 116, 128),
@@ -176,6 +177,8 @@ STRIPS = {
     "world/trail": Strip("measured", 2.0, 0.004),
     "world/horizon": Strip("command", 4.0, 0.02),
 }
+OBSTACLE_Z = -0.004  # [m], below everything
+CIRCLE: Array = np.column_stack([np.cos(angles := np.linspace(0, 2 * np.pi, 48, endpoint=False)), np.sin(angles)])
 ROBOT_Z = 0.008  # [m], between trail and horizon
 
 
@@ -217,6 +220,11 @@ def _world_looks(info: Info) -> dict[str, rr.AsComponents]:
         edge = lifted(np.vstack([polygon, polygon[:1]]), ROBOT_Z + 0.002)
         looks[f"world/robot/part_{k}"] = _filled(polygon, ROBOT_Z - 0.001 * (k > 0), COLORS["wheel" if k else "body"])
         looks[f"world/robot/part_{k}/edge"] = rr.LineStrips3D([edge], colors=COLORS["edge"], radii=rr.Radius.ui_points(0.75))
+    for i in range(len(info.obstacles)):  # of radius 1 m: where each is, and its radius, come with the samples
+        looks[f"world/obstacle_{i}/disc"] = _filled(CIRCLE, OBSTACLE_Z, COLORS["obstacle"])
+        looks[f"world/obstacle_{i}/edge"] = rr.LineStrips3D(
+            [lifted(np.vstack([CIRCLE, CIRCLE[:1]]), OBSTACLE_Z)], colors=COLORS["limit"], radii=rr.Radius.ui_points(0.75)
+        )
     looks["world/robot/point"] = rr.Points3D([[0.0, 0.0, 0.02]], colors=COLORS["measured"], radii=rr.Radius.ui_points(3.0))
     return looks
 

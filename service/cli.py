@@ -136,7 +136,7 @@ def reference(
         trajectory = trajectory.lasting(duration)
     model = config.build_model()
     parameters = {parameter.name: value for parameter, value in zip(model.parameters, model.p_nominal, strict=True)}
-    main(trajectory, bus, config.keys(), heading=heading, a=parameters.get("a", 0.0))
+    main(trajectory, bus, config.keys(), heading=heading, a=parameters.get("a", 0.0), parameters=config.stage_parameters)
 
 
 @process
@@ -224,6 +224,7 @@ def bench(
     horizon: Annotated[
         list[int] | None, typer.Option("--horizon", "-n", min=2, help="Stages; repeatable.", show_default="7, 20, 50, 100, 200")
     ] = None,
+    solver: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Another QP solver of qpsolvers, such as daqp; repeatable.")] = None,
     interpreted: Annotated[bool, typer.Option("--interpreted", help="Also without a compiler.")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="A first look: eight seconds of driving.")] = False,
     costs: Annotated[bool, typer.Option("--costs", help="Also closed-loop costs against exact QPs and converged NMPC.")] = False,
@@ -232,7 +233,7 @@ def bench(
     """Measure what a sample costs, by horizon and formulation, beside IPOPT on the same states."""
     from service.bench import HORIZONS, main
 
-    raise typer.Exit(main(tuple(horizon or HORIZONS), interpreted=interpreted, quick=quick, costs=costs, path=path))
+    raise typer.Exit(main(tuple(horizon or HORIZONS), solvers=tuple(solver or ()), interpreted=interpreted, quick=quick, costs=costs, path=path))
 
 
 @app.command()

@@ -14,9 +14,11 @@ import json
 import math
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from pydantic import Field, ValidationError
 
 from rti_mpc.errors import ConfigError, OcpError
@@ -36,6 +38,7 @@ from service.schema import (
 )
 
 if TYPE_CHECKING:
+    from rti_mpc.array import Array
     from rti_mpc.guard import Limits
     from rti_mpc.model import Model, Signal
     from rti_mpc.observer import Observer
@@ -94,17 +97,24 @@ class Config(Section):
         return find_model(self.model.name).with_parameters(**self.model.parameters)
 
     def build_ocp(self) -> Ocp:
-        """Return the optimal control problem."""
+        """Return the optimal control problem; its model has the obstacles and, last, the disturbances among its parameters."""
         from rti_mpc.disturbance import with_disturbances
+        from rti_mpc.obstacle import with_obstacles
         from rti_mpc.ocp import Ocp
 
-        model = with_disturbances(self.build_model(), self.observer.disturbances)
-        weights, limits = self.ocp.weights, self.ocp.bounds
+        own = self.build_model()
+        discs = [(*obstacle.centre_m, obstacle.radius_m + obstacle.margin_m) for obstacle in self.ocp.obstacles]
+        model = with_disturbances(with_obstacles(own, discs), self.observer.disturbances)
+        weights, limits, terminal = self.ocp.weights, self.ocp.bounds, self.ocp.terminal
         lbu, ubu = bounds(limits.inputs, names(model.inputs))
         lbdu, ubdu = bounds(limits.increments, names(model.inputs))
         lbx, ubx = bounds(limits.states, names(model.states))
-        soft: dict[str, Any] = {} if limits.soft_weight is None else {"z": limits.soft_weight}
-        return Ocp(
+        outside = {signal.name: (0.0, math.inf) for signal in model.constraints[len(own.constraints) :]}
+        bounded = [i for i, signal in enumerate(model.constraints) if signal.name in (limits.constraints | outside)]
+        lh, uh = bounds(limits.constraints | outside, names(model.constraints[i] for i in bounded))
+        soft = {name: weight for name, weight in (("z", limits.soft_weight), ("Z", limits.soft_weight_L2)) if weight is not None}
+        problem = partial(
+            Ocp,
             model,
             N=self.ocp.N,
             N_u=self.N_u,
@@ -120,8 +130,39 @@ class Config(Section):
             ubdu=ubdu,
             lbx=lbx,
             ubx=ubx,
+            h_expr=model.h_expr[bounded, 0],
+            lh=lh,
+            uh=uh,
             **soft,
+            **{f"{name}h": weight for name, weight in soft.items()},
         )
+        if terminal.Q is not None:
+            return problem(Q_e=[terminal.Q[output.name] for output in model.outputs])
+        if terminal.lqr is not None:
+            from rti_mpc.terminal import lqr_weight
+
+            x = [terminal.lqr.states.get(state.name, 0.0) for state in model.states]
+            u = [terminal.lqr.inputs.get(input.name, rest) for input, rest in zip(model.inputs, model.u_rest, strict=True)]
+            return problem(Q_e=lqr_weight(problem(), np.array(x), np.array(u)))
+        return problem()
+
+    def stage_parameters(self, t_s: Array) -> Array:
+        """
+        Return what a reference carries of moving obstacles.
+
+        Args:
+            t_s: Times of its rows from its start on, shape ``(M,)``, in s.
+
+        Returns:
+            Rows, shape ``(M, np)``: the model's own parameters, then x, y and radius of each obstacle; ``(M, 0)``, all nominal, if none moves.
+        """
+        if not any(any(obstacle.velocity_m_s) for obstacle in self.ocp.obstacles):
+            return np.empty((len(t_s), 0))
+        columns = [np.full(len(t_s), value) for value in self.build_model().p_nominal]
+        for obstacle in self.ocp.obstacles:
+            columns += [centre + speed * t_s for centre, speed in zip(obstacle.centre_m, obstacle.velocity_m_s, strict=True)]
+            columns.append(np.full(len(t_s), obstacle.radius_m + obstacle.margin_m))
+        return np.column_stack(columns)
 
     def build_rti(self) -> Rti:
         """Return the real-time iteration, compiled."""
@@ -129,7 +170,8 @@ class Config(Section):
         from service.injection import FaultyRti
 
         cls = FaultyRti if self.debug.inject else Rti
-        return cls(self.build_ocp(), self.solver_settings(), formulation=self.ocp.formulation, **self.iterations())
+        settings = self.solver_settings()
+        return cls(self.build_ocp(), settings, formulation=self.ocp.formulation, solver=self.solver.name, **self.iterations())
 
     def build_observer(self) -> Observer | None:
         """Return the observer, compiled, if there is anything to estimate."""
@@ -193,11 +235,12 @@ class Config(Section):
             raise ConfigError(wrong)
         return self.model_copy(update={"sim": self.sim.model_copy(update={"x0": {**self.sim.x0, **given}})})
 
-    def solver_settings(self) -> SolverSettings:
-        """Return the settings of the QP solver."""
+    def solver_settings(self) -> SolverSettings | None:
+        """Return the settings of OSQP, None if none are given."""
         from rti_mpc.solver import SolverSettings
 
-        return SolverSettings(**self.solver.model_dump(exclude_none=True, exclude=ITERATIONS))
+        given = self.solver.model_dump(exclude_none=True, exclude=ITERATIONS | {"name"})
+        return SolverSettings(**given) if given else None
 
     def iterations(self) -> dict[str, Any]:
         """Return the limits of the iterations a sample, as `Rti` names them, that are given."""
@@ -249,6 +292,8 @@ def load(path: Path, *, with_model: bool = True) -> Config:
             config = config.model_copy(update={"bus": config.bus.model_copy(update={"config": path.parent / config.bus.config})})
         check_tree(config)
         if with_model:
+            from service.fit import check_model
+
             check_model(config)
     except OSError as error:
         raise ConfigError(f"{path}: must be a readable file, got {error.strerror}") from error
@@ -268,7 +313,9 @@ def check_tree(config: Config) -> None:
     Raises:
         ConfigError: A key does not fit the others.
     """
-    ocp = config.ocp
+    ocp, terminal = config.ocp, config.ocp.terminal
+    if terminal.Q is not None and terminal.lqr is not None:
+        raise ConfigError("ocp.terminal must have Q or lqr, not both")
     if config.N_u > ocp.N:
         raise ConfigError(f"ocp.N_u must be at most ocp.N = {ocp.N}, got {ocp.N_u}")
     for key, values, length in (("delta", ocp.weights.delta, ocp.N), ("lambda", ocp.weights.lambda_, config.N_u)):
@@ -283,46 +330,3 @@ def check_tree(config: Config) -> None:
         for name, (lower, upper) in ocp.bounds.increments.items():
             if not lower < 0.0 < upper:
                 raise ConfigError(f"ocp.bounds.increments.{name} must hold lower < 0 < upper where a guard is enabled, or it could not brake")
-
-
-def check_model(config: Config) -> None:
-    """
-    Check what only the model knows.
-
-    Raises:
-        ConfigError: A key does not fit the model.
-        OcpError: The problem is ill-posed in some other way.
-    """
-    from rti_mpc.model import find_model
-
-    ocp, sim, observer = config.ocp, config.sim, config.observer
-    try:
-        model = find_model(config.model.name)
-    except OcpError as error:
-        raise ConfigError(f"model.name: {error}") from error
-    tables: tuple[tuple[str, Mapping[str, object], str, tuple[Signal, ...]], ...] = (
-        ("model.parameters", config.model.parameters, "parameter", model.parameters),
-        ("ocp.weights.Q", ocp.weights.Q, "output", model.outputs),
-        ("ocp.weights.R", ocp.weights.R, "input", model.inputs),
-        ("ocp.bounds.inputs", ocp.bounds.inputs, "input", model.inputs),
-        ("ocp.bounds.increments", ocp.bounds.increments, "input", model.inputs),
-        ("ocp.bounds.states", ocp.bounds.states, "state", model.states),
-        ("observer.disturbances", observer.disturbances, "input or state", (*model.inputs, *model.states)),
-        ("observer.measured", dict.fromkeys(observer.measured), "state", model.states),
-        ("observer.noise", observer.noise, "state", model.states),
-        ("observer.process", observer.process, "state", model.states),
-        ("guard.u_rest", config.guard.u_rest, "input", model.inputs),
-        ("sim.x0", sim.x0, "state", model.states),
-        ("sim.noise_std", sim.noise_std, "state", model.states),
-        ("sim.parameters", sim.parameters, "parameter", model.parameters),
-    )
-    for key, table, kind, signals in tables:
-        if wrong := unknown_name(key, table, kind, signals, complete=key.startswith("ocp.weights")):
-            raise ConfigError(wrong)
-    if config.guard.enabled:
-        inputs = names(model.inputs)
-        if list(ocp.bounds.inputs) != inputs:
-            raise ConfigError(f"ocp.bounds.inputs must be in the model's order {inputs} where a guard is enabled, got {list(ocp.bounds.inputs)}")
-        if tuple(config.guard.u_rest.get(name, 0.0) for name in inputs) != model.u_rest:
-            raise ConfigError(f"guard.u_rest must be the model's {dict(zip(inputs, model.u_rest, strict=True))}, got {config.guard.u_rest}")
-    config.build_ocp()

@@ -27,6 +27,7 @@ from rti_mpc.array import Array
 from rti_mpc.controller import Controller, Timing
 from rti_mpc.errors import MessageError
 from rti_mpc.message import Command, Reference, Severity, State, Telemetry
+from rti_mpc.obstacle import discs_of
 from rti_mpc.ocp import Ocp
 from rti_mpc.rti import Rti
 from rti_mpc.wire.announcer import Announcer
@@ -121,7 +122,8 @@ def heard_epoch(bus: Bus, stop: Event) -> int:
 def describe(ocp: Ocp, np_: int) -> dict[str, Any]:
     """Describe a controller for ``info``: names, units, limits; null where there is none. Parameters from `np_` on are disturbances."""
     model = ocp.model
-    vectors = {"states": model.states, "inputs": model.inputs, "outputs": model.outputs, "disturbances": model.parameters[np_:]}
+    vectors = {"states": model.states, "inputs": model.inputs, "outputs": model.outputs}
+    vectors |= {"parameters": model.parameters[:np_], "disturbances": model.parameters[np_:]}
     limits = ("lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx")
     return {
         "role": ROLE,
@@ -129,6 +131,8 @@ def describe(ocp: Ocp, np_: int) -> dict[str, Any]:
         "model": ocp.model.name,
         **{name: [{"name": s.name, "unit": s.unit, "angle": s.angle} for s in signals] for name, signals in vectors.items()},
         **{name: [value if isfinite(value) else None for value in getattr(ocp, name).tolist()] for name in limits},
+        "p_nominal": list(model.p_nominal[:np_]),
+        "obstacles": [{"at": at, "x": x, "y": y, "r": r} for at, x, y, r in discs_of(model)],
         "N": ocp.N,
         "N_u": ocp.N_u,
         "dt_s": ocp.dt,

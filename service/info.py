@@ -32,6 +32,23 @@ class Label:
 
 
 @dataclass(frozen=True)
+class Obstacle:
+    """
+    A disc that the robot keeps out of.
+
+    Attributes:
+        at: Column of a reference's `p` that is its x; y and r follow.
+        x: Where it is, in m, unless a reference says where else; y likewise.
+        r: Its radius, in m.
+    """
+
+    at: int
+    x: float
+    y: float
+    r: float
+
+
+@dataclass(frozen=True)
 class Info:
     """
     Description of a process on the bus; a controller's names every vector. Equal if it labels alike.
@@ -44,6 +61,7 @@ class Info:
         inputs: Labels of ``u``.
         outputs: Labels of ``y``.
         disturbances: Labels of what an observer estimates besides.
+        obstacles: What it keeps out of.
         dt_s: Sample period; NaN if not said.
         lbu: Lower bounds of the inputs, infinite where there is none.
         ubu: Upper bounds of the inputs.
@@ -58,6 +76,7 @@ class Info:
     inputs: tuple[Label, ...] = ()
     outputs: tuple[Label, ...] = ()
     disturbances: tuple[Label, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
     dt_s: float = math.nan
     lbu: tuple[float, ...] = ()
     ubu: tuple[float, ...] = ()
@@ -79,6 +98,7 @@ class Info:
                 role=str(document["role"]),
                 document=json.dumps(document, indent=2),
                 model=str(document.get("model", "")),
+                obstacles=tuple(Obstacle(int(o["at"]), *(float(o[part]) for part in "xyr")) for o in document.get("obstacles", ())),
                 dt_s=float(document.get("dt_s", math.nan)),
                 **vectors,
                 **bounds,

@@ -9,6 +9,7 @@ from time import perf_counter_ns
 from typing import Any
 
 from rti_mpc.array import Array
+from rti_mpc.foreign_solver import ForeignSolver
 from rti_mpc.rti import Rti
 
 PARTS = ("copies in", "evaluation", "matrix update", "vector update", "iterations")
@@ -36,6 +37,9 @@ class Parts:
             self._watch(active_set, "iterations", "_roll_out")
         for solver in rti.solvers:
             self._watch(solver.qp, "evaluation", "linearize", "embed", "step")
+            if isinstance(solver, ForeignSolver):
+                self._watch(solver, "iterations", "_solve")
+                continue
             workspace = solver._osqp
             calls = {"update_data_mat": "matrix update", "update_data_vec": "vector update", "solve": "iterations"}
             proxy = Workspace(workspace, {name: self._timing(part, getattr(workspace, name)) for name, part in calls.items()})

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rti_mpc.array import Array
 from rti_mpc.message import Command, Event, Reference, Severity, State, Telemetry
 from service.blueprint import LANES, STRIPS, TIMELINE, Frame, blueprint, lifted, looks
-from service.info import Info, Label
+from service.info import Info, Label, Obstacle
 from service.tracking_error import tracking_error
 
 Message = Info | Reference | State | Command | Telemetry | Event
@@ -186,7 +186,16 @@ class Recording:
         for lane in LANES:
             self._lane(lane, times, [int(getattr(sample, lane)) for sample in samples])
         if self.info.position is not None:
+            self._obstacles(times, np.array([sample.stamp_ns for sample in samples], np.int64))
             self._strips("world/horizon", times, [sample.x[:, self.info.position] for sample in samples])
+
+    def _obstacles(self, times: Times, stamps: NDArray[np.int64]) -> None:
+        """Write where obstacles are: where the reference says, or where they are by themselves."""
+        assert self.info is not None
+        for i, obstacle in enumerate(self.info.obstacles):
+            x, y, r = located(obstacle, self._reference, stamps)
+            scale = np.column_stack([r, r, np.ones_like(r)])
+            self._columns(f"world/obstacle_{i}", times, rr.Transform3D.columns(translation=np.column_stack([x, y, 0 * x]), scale=scale))
 
     def _lane(self, lane: str, times: Times, values: Sequence[int]) -> None:
         before = [self._lanes.get(lane), *values[:-1]]
@@ -201,6 +210,16 @@ class Recording:
             text = [f"{source}: {events[k].text} ({events[k].code})" for k in mine]
             columns = rr.TextLog.columns(text=text, level=[LEVELS[events[k].severity] for k in mine])
             self._columns(f"event/{rr.escape_entity_path_part(source)}", times[mine], columns)
+
+
+def located(obstacle: Obstacle, reference: Reference | None, stamps: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+    """Return x, y and radius of an obstacle at stamps, each of shape ``(n,)``, in m; held before and after the reference, as a controller does."""
+    if reference is None or reference.p.shape[1] < obstacle.at + 3:
+        x, y, r = (np.full(len(stamps), value) for value in (obstacle.x, obstacle.y, obstacle.r))
+    else:
+        row = (stamps - reference.stamp_ns) / reference.period_ns
+        x, y, r = (np.interp(row, np.arange(len(reference.p)), reference.p[:, obstacle.at + part]) for part in range(3))
+    return x, y, r
 
 
 def _positions(outputs: Sequence[Label]) -> tuple[int, int] | None:

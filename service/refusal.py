@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -31,15 +31,15 @@ def explain(error: ValidationError, tree: type[BaseModel]) -> str:
     """Word one complaint; an unknown key comes first, for it is often why another is missing."""
     complaint = min(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden")
     loc, got, keys = complaint["loc"], complaint["input"], dict(entries(tree))
-    key, described = dotted(loc), describe(loc, keys)
+    key, what = dotted(loc), describe(loc, keys)
     if complaint["type"] == "extra_forbidden":
-        return f"{key} is unknown, {meant(key, keys)}, got {got!r}"
+        return f"{key} is unknown, {meant(described(loc), keys)}, got {got!r}"
     if complaint["type"] == "missing":
-        return f"{key} is missing: {described}"
+        return f"{key} is missing: {what}"
     must = complaint["msg"]
     for pattern, words in WORDS:
         must = re.sub(pattern, words, must)
-    return f"{key} ({described}) {must}, got {got!r}"
+    return f"{key} ({what}) {must}, got {got!r}"
 
 
 def unknown_name(key: str, table: Mapping[str, object], kind: str, signals: Sequence[Signal], *, complete: bool) -> str | None:
@@ -67,8 +67,9 @@ def entries(tree: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str]
     for name, field in tree.model_fields.items():
         key = prefix + (field.alias or name)
         yield key, field.description or ""
-        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-            yield from entries(field.annotation, key + ".")
+        for inside in (field.annotation, *get_args(field.annotation)):  # a table, one that may be left out, or a list of tables
+            if isinstance(inside, type) and issubclass(inside, BaseModel):
+                yield from entries(inside, key + ".")
 
 
 def dotted(loc: Sequence[int | str]) -> str:
@@ -76,16 +77,21 @@ def dotted(loc: Sequence[int | str]) -> str:
     return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in loc).removeprefix(".")
 
 
+def described(loc: Sequence[int | str]) -> str:
+    """Write a location as the tree does, whichever table of a list it is in."""
+    return ".".join(step for step in loc if isinstance(step, str))
+
+
 def describe(loc: Sequence[int | str], tree: dict[str, str]) -> str:
     """Return the description of the innermost key that has one."""
-    return next((tree[key] for n in range(len(loc), 0, -1) if (key := dotted(loc[:n])) in tree), "")
+    return next((tree[key] for n in range(len(loc), 0, -1) if (key := described(loc[:n])) in tree), "")
 
 
 def meant(key: str, tree: dict[str, str]) -> str:
-    """Return the nearest key beside this one, or the same elsewhere, or all that are beside it."""
+    """Return the same key elsewhere, or the nearest beside this one, or all that are beside it."""
     section, _, name = key.rpartition(".")
     beside = {other.rpartition(".")[2]: other for other in tree if other.rpartition(".")[0] == section}
-    near = [beside[n] for n in get_close_matches(name, beside, 1)] + [other for other in tree if other.rpartition(".")[2] == name]
+    near = [other for other in tree if other.rpartition(".")[2] == name] + [beside[n] for n in get_close_matches(name, beside, 1)]
     return f"perhaps {near[0]} is meant ({tree[near[0]]})" if near else known(beside)
 
 

@@ -28,6 +28,13 @@ def around_zero(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
+def pair(value: object) -> object:
+    """Accept ``[x, y]`` only."""
+    if not (isinstance(value, list | tuple) and len(value) == 2 and all(type(v) in (int, float) for v in value)):
+        raise ValueError("must be [x, y], two numbers")
+    return tuple(value)
+
+
 def sequence(value: object) -> object:
     """Accept a constant for a sequence of length one."""
     return tuple(value) if isinstance(value, list | tuple) else (value,)
@@ -39,6 +46,7 @@ Increment = Annotated[Interval, AfterValidator(around_zero)]
 Weight = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
 Weights = Annotated[tuple[Weight, ...], BeforeValidator(sequence)]
+Pair = Annotated[tuple[float, float], BeforeValidator(pair)]
 Duration = Annotated[float, Field(ge=0, le=10)]
 Period = Annotated[float, Field(ge=1e-4, le=10)]
 Endpoint = Annotated[str, Field(pattern=r"^[a-z0-9_-]+/\S+$")]
@@ -68,12 +76,39 @@ class WeightSection(Section):
 
 
 class BoundSection(Section):
-    """What inputs and states may be; a name left out has no bound."""
+    """What inputs, states and constraints may be; a name left out has no bound."""
 
     inputs: dict[str, Interval] = Field(default={}, description="bounds of inputs by name, in the input's unit")
     increments: dict[str, Increment] = Field(default={}, description="bounds of an input's change from sample to sample by name, in its unit")
     states: dict[str, Interval] = Field(default={}, description="softened bounds of states by name, in the state's unit")
-    soft_weight: Weight | None = Field(default=None, description="L1 weight of a state outside its bounds, in cost / unit of the state")
+    constraints: dict[str, Interval] = Field(default={}, description="softened bounds of the model's constraints by name, in the constraint's unit")
+    soft_weight: Weight | None = Field(
+        default=None, description="L1 weight of a state or constraint outside its bounds, and of an obstacle entered, in cost / its unit"
+    )
+    soft_weight_L2: Weight | None = Field(default=None, description="L2 weight of the same, in cost / its unit squared")
+
+
+class RegulatorSection(Section):
+    """Where the linear-quadratic regulator is linearized; what is left out is zero, or an input's rest."""
+
+    states: dict[str, float] = Field(default={}, description="states by name, in the state's unit; a wheeled robot must be in motion")
+    inputs: dict[str, float] = Field(default={}, description="inputs by name, in the input's unit")
+
+
+class TerminalSection(Section):
+    """A weight on the last outputs of the horizon beside their Q: given, or from a regulator."""
+
+    Q: dict[str, Weight] | None = Field(default=None, description="weight of each output by name, in cost / unit of the output squared")
+    lqr: RegulatorSection | None = Field(default=None, description="instead: what the model's regulator would pay from there on for ever")
+
+
+class ObstacleSection(Section):
+    """A disc that the robot's position keeps out of, at the price of `soft_weight`."""
+
+    centre_m: Pair = Field(description="its centre [x, y], in m")
+    radius_m: Positive = Field(description="its radius, in m")
+    margin_m: Weight = Field(default=0.0, description="kept from it, in m: the robot's own radius, and what it cuts short between two samples")
+    velocity_m_s: Pair = Field(default=(0.0, 0.0), description="[x, y] in m/s, at which `rti-mpc reference` moves it from the reference's start on")
 
 
 class OcpSection(Section):
@@ -85,12 +120,15 @@ class OcpSection(Section):
     integrator: Literal["rk4", "euler"] = Field(description="integrator of a stage")
     formulation: Literal["auto", "simultaneous", "sequential"] = Field(default="auto", description="of the QP; auto takes the faster one")
     weights: WeightSection = Field(description="the cost")
-    bounds: BoundSection = Field(default=BoundSection(), description="bounds of inputs, increments and states")
+    bounds: BoundSection = Field(default=BoundSection(), description="bounds of inputs, increments, states and constraints")
+    terminal: TerminalSection = Field(default=TerminalSection(), description="weight on the end of the horizon; none if left out")
+    obstacles: Annotated[tuple[ObstacleSection, ...], Field(strict=False)] = Field(default=(), description="discs to keep out of; none if left out")
 
 
 class SolverSection(Section):
-    """Iterations a sample, and OSQP's settings; what is left out is as `Rti` and `SolverSettings` have it."""
+    """The QP solver, iterations a sample, and OSQP's settings; what is left out is as `Rti` and `SolverSettings` have it."""
 
+    name: str = Field(default="riccati", description="riccati, with osqp behind it; osqp; or another one's name in qpsolvers, such as daqp")
     eps: float | None = Field(default=None, ge=1e-12, le=1e-1, description="absolute and relative tolerance on the residuals, without unit")
     max_iter: int | None = Field(default=None, ge=1, le=1_000_000, description="iterations at most; the iterate is then taken as it is")
     rho: float | None = Field(default=None, ge=1e-6, le=1e6, description="step size of ADMM, without unit")

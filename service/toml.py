@@ -20,7 +20,7 @@ def _table(path: str, values: Mapping[str, Any]) -> list[str]:
     """Return the lines of a table: its own keys, then the tables below it."""
     below = {name: value for name, value in values.items() if isinstance(value, dict)}
     own = [f"{_key(name)} = {_value(value)}" for name, value in values.items() if name not in below]
-    lines = ["", f"[{path}]", *own] if path and own else own
+    lines = ["", f"[{path}]", *own] if path and (own or not below) else own
     for name, value in below.items():
         lines += _table(f"{path}.{_key(name)}" if path else _key(name), value)
     return lines
@@ -33,6 +33,8 @@ def _key(name: str) -> str:
 
 def _value(value: Any) -> str:
     """Return a value; JSON's text is TOML's but for infinities and what JSON lacks."""
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{_key(name)} = {_value(inner)}' for name, inner in value.items())} }}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_value, value))}]"
     if isinstance(value, float) and not math.isfinite(value):

@@ -10,6 +10,7 @@ one, for as long as the source lives.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from threading import Event
 
 import numpy as np
@@ -38,6 +39,7 @@ def main(
     a: float = 0.2,
     psi0: float | None = None,
     period_s: float = 0.05,
+    parameters: Callable[[Array], Array] | None = None,
     stop: Event | None = None,
 ) -> int:
     """
@@ -51,6 +53,7 @@ def main(
         a: Distance of the reference point ahead of the axle, in m.
         psi0: Initial consistent heading of an open path, in rad.
         period_s: Time between rows; the receiver interpolates, on the eight within 0.02 mm.
+        parameters: Stage parameters at times since the start, in s: of shape ``(M,)`` to ``(M, np)``; the model's nominal ones if left out.
         stop: Stops the source when set; SIGINT and SIGTERM if there is none.
 
     Returns:
@@ -61,9 +64,10 @@ def main(
         OcpError: No consistent heading repeats on this closed path.
     """
     y = rows(trajectory, period_s, heading, a, psi0)
+    p: Array = np.empty((len(y), 0)) if parameters is None else parameters(period_s * np.arange(len(y), dtype=np.float64))
     stop = stop or stop_on_signals()
     with Bus(bus_settings, keys, stop=stop) as bus:
-        source = Source(bus, trajectory, y, round(1e9 * period_s))
+        source = Source(bus, trajectory, y, p, round(1e9 * period_s))
         bus.alive(ROLE)
         while not stop.wait(LOOK_S):
             source.look()
@@ -78,10 +82,10 @@ class Source:
         anchored: How many robots the reference was anchored to.
     """
 
-    def __init__(self, bus: Bus, trajectory: Trajectory, y: Array, period_ns: int) -> None:
+    def __init__(self, bus: Bus, trajectory: Trajectory, y: Array, p: Array, period_ns: int) -> None:
         self.anchored = 0
         self._trajectory = trajectory
-        self._y = y
+        self._y, self._p = y, p
         self._period_ns = period_ns
         self._epoch = time.time_ns() // 1_000_000_000
         self._publisher = bus.publisher(bus.keys.reference, Reference, cached=True)
@@ -119,7 +123,6 @@ class Source:
     def _anchor(self, stamp_ns: int) -> None:
         """Publish the reference from a time on."""
         self.anchored += 1
-        p = np.empty((len(self._y), 0))
-        self._publisher.put(Reference(self._epoch, self.anchored, stamp_ns, self._period_ns, self._trajectory.end, self._y, p))
+        self._publisher.put(Reference(self._epoch, self.anchored, stamp_ns, self._period_ns, self._trajectory.end, self._y, self._p))
         text = f"{self._trajectory.name} for {self._trajectory.duration_s:.1f} s from {1e-9 * stamp_ns:.3f} s of the robot on"
         self._announcer.say(Severity.INFO, "reference_published", text, stamp_ns)

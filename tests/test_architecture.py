@@ -26,9 +26,9 @@ ALONE = {
     "osqp": {"rti_mpc/solver.py"},
     "zenoh": {"rti_mpc/wire/bus.py", "rti_mpc/wire/session.py"},
     "rerun": {"service/blueprint.py", "service/outlet.py", "service/recording.py", "service/view.py"},
-    "qpsolvers": {"rti_mpc/qp.py", "service/check.py"},
+    "qpsolvers": {"rti_mpc/qp.py", "rti_mpc/foreign_solver.py"},
     "casadi": {
-        *(f"rti_mpc/{name}.py" for name in ("simultaneous", "sequential", "terminal", "obstacle", "disturbance", "observer")),
+        *(f"rti_mpc/{name}.py" for name in ("simultaneous", "sequential", "terminal", "obstacle", "blockage", "disturbance", "observer")),
         *(
             f"rti_mpc/{name}.py"
             for name in (
@@ -65,9 +65,9 @@ FLOW: tuple[set[str], ...] = (
     {"simultaneous", "sequential", "riccati"},
     {"codegen"},
     {"qp", "prediction", "observer", "envelope", "delay"},
-    {"solver", "active_set", "state_stream"},
+    {"solver", "active_set", "foreign_solver", "state_stream"},
     {"rti"},
-    {"record"},
+    {"record", "blockage"},
     {"controller"},
 )
 BEFORE_WIRE = {"errors", "array", "status", "message"}

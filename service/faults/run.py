@@ -25,13 +25,14 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.guard import Limits
 from rti_mpc.trajectory import find_trajectory
 from rti_mpc.wire.interrupt import stop_on_signals
-from service.config import Config, check_model, check_tree, load
+from service.config import Config, check_tree, load
 from service.demo import Failed, configured
 from service.faults.measure import Incident, Measured, measure, positions
 from service.faults.relay import ROLE as RELAY
 from service.faults.report import Report, Row, report_console
 from service.faults.system import HEADING, SCENARIO, System, Wiring
 from service.faults.table import FAULTS, Fault
+from service.fit import check_model
 
 STATE_PERIOD_S = 0.01  # of the robot, and so of its record: what times are known to
 COMPANY = {

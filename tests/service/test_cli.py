@@ -67,7 +67,7 @@ def test_operator_is_told_in_one_line_when_nobody_answers(command: str) -> None:
 def test_check_of_the_shipped_configuration_prints_both_phases_and_the_verdict() -> None:
     done = rti_mpc("check")
     assert done.returncode == 0, done.stderr
-    for words in ("preparation", "feedback", "200 samples: ", "the controller and daqp agree"):
+    for words in ("preparation", "feedback", "200 samples: ", "riccati and daqp agree", "own plans are within"):
         assert words in done.stdout
 
 

@@ -3,12 +3,19 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 
 from rti_mpc.errors import ConfigError
+from rti_mpc.foreign_solver import ForeignSolver
+from rti_mpc.model import Model, Signal
+from rti_mpc.pioneer_3dx import pioneer_3dx
+from rti_mpc.solver import Solver
+from rti_mpc.terminal import lqr_weight
 from service.config import Config, load
 from sim.settings import RobotSettings
 
@@ -22,6 +29,8 @@ ocp.dt_s = 0.1
 ocp.integrator = "euler"
 ocp.weights = { Q = { x = 1, y = 2, psi = 0 }, R = { u_c = 1, omega_c = 3 }, delta = [1, 2, 3], lambda = 0.5 }
 """
+
+DISC = "[[ocp.obstacles]]\ncentre_m = [1.0, 0.5]\n"
 
 # What a user may write into the shipped file, and what the one line must tell them.
 WRONG = [
@@ -61,6 +70,21 @@ WRONG = [
     ("[ocp]", "[guard]\ntick_s = 0.1\n[ocp]", ["guard.tick_s", "at most 0.01", "0.1"]),
     ("[ocp]", "[guard]\nu_rest = { v = 1.0 }\n[ocp]", ["guard.u_rest.v", "no input", "u_c [m/s]"]),
     ("[ocp]", "[guard]\nenabled = true\nu_rest = { u_c = 1.0 }\n[ocp]", ["guard.u_rest", "must be the model's", "'u_c': 0.0"]),
+    ("[ocp]", "[solver]\nname = 'dapq'\n[ocp]", ["solver.name", "'dapq'", "riccati, osqp", "daqp", "pip install 'qpsolvers[NAME]'"]),
+    ("[ocp]", "[solver]\nname = 'daqp'\nrho = 2.0\n[ocp]", ["solver.rho", "osqp", "'daqp'", "2.0"]),
+    ("soft_weight = 1e3", "soft_weight = -1.0", ["ocp.bounds.soft_weight", "L1", "at least 0", "-1.0"]),
+    ("soft_weight = 1e3", "soft_weight_l2 = 1.0", ["ocp.bounds.soft_weight_l2", "soft_weight_L2"]),
+    ("soft_weight = 1e3", "constraints = { power = [0, 1] }", ["ocp.bounds.constraints.power", "no constraint", "none"]),
+    ("[ocp.bounds]", "[ocp.terminal]\nQ = { x = 1.0, y = 1.0 }\n[ocp.bounds]", ["ocp.terminal.Q", "psi [rad]", "missing"]),
+    ("[ocp.bounds]", "[ocp.terminal]\nQ = { x = 1.0, y = -1.0 }\n[ocp.bounds]", ["ocp.terminal.Q.y", "at least 0", "-1.0"]),
+    ("[ocp.bounds]", "[ocp.terminal]\nlqr.states = { v = 0.2 }\n[ocp.bounds]", ["ocp.terminal.lqr.states.v", "no state", "u [m/s]"]),
+    ("[ocp.bounds]", "[ocp.terminal]\nlqr = {}\n[ocp.bounds]", ["stabilizable", "terminal weight"]),
+    ("[ocp.bounds]", "[ocp.terminal]\nlqr = {}\nQ = { x = 1, y = 1, psi = 0 }\n[ocp.bounds]", ["ocp.terminal", "Q or lqr, not both"]),
+    ("[model]", DISC + "radius_m = -0.3\n[model]", ["ocp.obstacles[0].radius_m", "in m", "greater than 0", "-0.3"]),
+    ("[model]", DISC + "[model]", ["ocp.obstacles[0].radius_m", "missing", "in m"]),
+    ("[model]", DISC + "radius = 0.3\n[model]", ["ocp.obstacles[0].radius", "ocp.obstacles.radius_m", "in m"]),
+    ("[model]", DISC + "radius_m = 0.3\nvelocity_m_s = 0.1\n[model]", ["ocp.obstacles[0].velocity_m_s", "[x, y]", "m/s", "0.1"]),
+    ("[model]", DISC + "radius_m = 0.3\nmargin_m = -0.1\n[model]", ["ocp.obstacles[0].margin_m", "in m", "at least 0", "-0.1"]),
     ("[model]", "[modle]", ["modle", "model"]),
     ("[model]", "[model", ["TOML", "line"]),
 ]
@@ -96,6 +120,61 @@ def test_configuration_becomes_the_ocp_it_describes(tmp_path: Path) -> None:
     np.testing.assert_array_equal(ocp.delta, [1, 2, 3])
     np.testing.assert_array_equal(ocp.lambda_, [0.5, 0.5, 0.5])
     assert np.all(np.isinf(ocp.ubu)), "a bound left out is no bound"
+
+
+def test_softened_bounds_constraints_and_obstacles_become_those_of_the_ocp(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    bounds = "[ocp.bounds]\nstates = { u = [-1, 1] }\nconstraints = { power = [-inf, 0.1] }\nsoft_weight = 5.0\nsoft_weight_L2 = 6.0\n"
+    path.write_text(MINIMAL.replace("pioneer_3dx", "tests.service.test_config:limited") + bounds + DISC + "radius_m = 0.3\nmargin_m = 0.2\n")
+    ocp = load(path).build_ocp()
+    assert ocp.h_expr.numel() == 2, "the constraint that is bounded, and the disc"
+    h = ca.Function("h", [ocp.model.x, ocp.model.u, ocp.model.p], [ocp.h_expr])
+    value = np.array(h([1.0, 0.0, 0.0, 0.4, 0.0], [0.5, 0.0], ocp.model.p_nominal)).ravel()
+    np.testing.assert_allclose(value, [0.2, 0.0], rtol=0, atol=1e-8)  # 0.4 * 0.5; half a metre from the centre is where the disc begins
+    np.testing.assert_array_equal(ocp.lh, [-math.inf, 0.0])
+    np.testing.assert_array_equal(ocp.uh, [0.1, math.inf])
+    for l1, l2 in ((ocp.z, ocp.Z), (ocp.zh, ocp.Zh)):
+        assert set(l1) == {5.0}
+        assert set(l2) == {6.0}
+
+
+def limited() -> Model:
+    """The paper's robot, which says how much power it takes."""
+    model = pioneer_3dx()
+    power, other = model.x[3] * model.u[0], model.x[4]
+    return replace(model, h_expr=ca.vertcat(other, power), constraints=(Signal("other", "rad/s"), Signal("power", "m^2/s^2")))
+
+
+def test_terminal_weight_is_the_one_given_or_the_regulators(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + "[ocp.terminal]\nQ = { psi = 3.0, x = 1.0, y = 2.0 }\n")
+    np.testing.assert_array_equal(np.diag(load(path).build_ocp().Q_e), [1, 2, 3])
+    path.write_text(MINIMAL)
+    assert not load(path).build_ocp().Q_e.any()
+    path.write_text(MINIMAL + "[ocp.terminal.lqr]\nstates = { u = 0.25 }\ninputs = { u_c = 0.25 }\n")
+    ocp = load(path).build_ocp()
+    np.testing.assert_array_equal(ocp.Q_e, lqr_weight(ocp, np.array([0, 0, 0, 0.25, 0]), np.array([0.25, 0])))
+
+
+def test_moving_obstacles_are_parameters_that_a_reference_carries_row_by_row(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    discs = DISC + "radius_m = 0.3\n" + DISC + "radius_m = 0.2\nmargin_m = 0.1\n"
+    path.write_text(MINIMAL + discs)
+    assert load(path).stage_parameters(np.array([0.0, 2.0])).shape == (2, 0), "none moves: all nominal"
+    path.write_text(MINIMAL + discs + "velocity_m_s = [0.0, -0.1]\n")
+    config = load(path)
+    rows, nominal = config.stage_parameters(np.array([0.0, 2.0])), config.build_ocp().model.p_nominal
+    np.testing.assert_allclose(rows[0], nominal, rtol=1e-15)
+    np.testing.assert_allclose(rows[1], [*nominal[:-2], 0.3, 0.3], rtol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["riccati", "osqp", "daqp"])
+def test_solver_is_chosen_by_one_word(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + f'[solver]\nname = "{name}"\n')
+    rti = load(path).build_rti()
+    assert (rti.active_set is None) is (name != "riccati")
+    assert isinstance(rti.solvers[0], Solver if name != "daqp" else ForeignSolver)
 
 
 def test_bounds_go_to_the_signals_they_name_whatever_their_order() -> None:

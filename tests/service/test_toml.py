@@ -19,8 +19,21 @@ listen = ['tcp/[::1]:7448']
 theta_1 = 0.25
 """
 
+TABLES = """
+[ocp.terminal.lqr]
+states = { u = 0.25 }
+inputs = { u_c = 0.25 }
+[[ocp.obstacles]]
+centre_m = [1, -2.5]
+radius_m = 0.3
+[[ocp.obstacles]]
+centre_m = [-1.0, 0.0]
+radius_m = 0.2
+velocity_m_s = [0.0, 0.1]
+"""
 
-@pytest.mark.parametrize("text", [SHIPPED.read_text(), MINIMAL, MINIMAL + ODD])
+
+@pytest.mark.parametrize("text", [SHIPPED.read_text(), MINIMAL, MINIMAL + ODD, MINIMAL + TABLES])
 def test_configuration_written_is_the_one_that_was_read(tmp_path: Path, text: str) -> None:
     path, again = tmp_path / "robot.toml", tmp_path / "again.toml"
     path.write_text(text)

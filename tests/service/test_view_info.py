@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from rti_mpc.errors import MessageError
-from service.info import Info
+from service.config import load
+from service.daemon import describe
+from service.info import Info, Obstacle
+from tests.service.test_config import DISC, MINIMAL
 
 PIONEER: dict[str, Any] = {
     "role": "controller",
@@ -86,3 +91,15 @@ def test_a_robot_never_described_has_numbered_components() -> None:
 def test_a_description_that_is_none_is_refused(wrong: Any) -> None:
     with pytest.raises(MessageError, match="info must be"):
         Info.from_json(wrong)
+
+
+def test_a_controller_lists_what_a_planner_sends_and_where_obstacles_are_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + DISC + "radius_m = 0.3\nmargin_m = 0.1\n" + "[observer.disturbances]\nu_c = { drift = 0.1, limit = 0.2 }\n")
+    model = (ocp := load(path).build_ocp()).model
+    document = json.loads(json.dumps(describe(ocp, model.np_ - 1)))
+    assert [parameter["name"] for parameter in document["parameters"][-4:]] == ["a", "disc_0_x", "disc_0_y", "disc_0_r"]
+    assert document["p_nominal"] == list(model.p_nominal[:-1])
+    info = Info.from_json(document)
+    assert info.obstacles == (Obstacle(7, 1.0, 0.5, 0.4),)
+    assert [label.name for label in info.disturbances] == ["d_u_c"]

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +123,18 @@ def test_commands_lie_between_the_limits_there_are(writer: Writer) -> None:
     assert [v for _, v in rows["command/u_c/max"]] == [[0.5], [0.5]]
     assert [v for _, v in rows["command/omega_c/min"]] == [[-1.2], [-1.2]]
     assert "command/omega_c/max" not in rows
+
+
+def test_obstacles_are_where_the_reference_says_and_by_themselves_without(writer: Writer) -> None:
+    discs = [{"at": 7, "x": 1.0, "y": 2.0, "r": 0.3}, {"at": 10, "x": 3.0, "y": 4.0, "r": 0.2}]
+    writer.send(described("controller", STATES, INPUTS, STATES[:3], obstacles=discs), telemetry(0))
+    moves = reference([[0.0, 0.0, 0.0]] * 2, stamp_ns=SECOND)
+    moves.p = np.array([[0.0] * 7 + [1.0, 2.0, 0.3] + [3.0, 4.0, 0.2], [0.0] * 7 + [1.0, 2.0, 0.3] + [3.0, 2.0, 0.2]])
+    writer.send(moves)
+    writer.recording.send([Entry(t, replace(telemetry(1), stamp_ns=t)) for t in (SECOND, SECOND * 3 // 2, 9 * SECOND)])
+    rows = writer.read()
+    assert [place for _, place in rows["world/obstacle_0"]] == [[[1.0, 2.0, 0.0]]] * 4
+    assert [place for _, place in rows["world/obstacle_1"]] == [[[3.0, y, 0.0]] for y in (4.0, 4.0, 3.0, 2.0)]
 
 
 def test_every_scalar_of_the_telemetry_is_recorded(writer: Writer) -> None:

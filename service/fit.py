@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a configuration fits its model, and its solver is there: what a process that builds no problem need not know."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from rti_mpc.errors import ConfigError, OcpError
+from rti_mpc.model import find_model
+from rti_mpc.obstacle import with_obstacles
+from service.config import ITERATIONS, Config, names
+from service.refusal import unknown_name
+from service.schema import RegulatorSection
+
+if TYPE_CHECKING:
+    from rti_mpc.model import Signal
+
+
+def check_model(config: Config) -> None:
+    """
+    Check what only the model knows.
+
+    Raises:
+        ConfigError: A key does not fit the model.
+        OcpError: The problem is ill-posed in some other way.
+    """
+    ocp, sim, observer, terminal = config.ocp, config.sim, config.observer, config.ocp.terminal
+    regulator = terminal.lqr or RegulatorSection()
+    try:
+        model = find_model(config.model.name)
+    except OcpError as error:
+        raise ConfigError(f"model.name: {error}") from error
+    tables: tuple[tuple[str, Mapping[str, object], str, tuple[Signal, ...]], ...] = (
+        ("model.parameters", config.model.parameters, "parameter", model.parameters),
+        ("ocp.weights.Q", ocp.weights.Q, "output", model.outputs),
+        ("ocp.weights.R", ocp.weights.R, "input", model.inputs),
+        ("ocp.bounds.inputs", ocp.bounds.inputs, "input", model.inputs),
+        ("ocp.bounds.increments", ocp.bounds.increments, "input", model.inputs),
+        ("ocp.bounds.states", ocp.bounds.states, "state", model.states),
+        ("ocp.bounds.constraints", ocp.bounds.constraints, "constraint", model.constraints),
+        *((("ocp.terminal.Q", terminal.Q, "output", model.outputs),) if terminal.Q is not None else ()),
+        ("ocp.terminal.lqr.states", regulator.states, "state", model.states),
+        ("ocp.terminal.lqr.inputs", regulator.inputs, "input", model.inputs),
+        ("observer.disturbances", observer.disturbances, "input or state", (*model.inputs, *model.states)),
+        ("observer.measured", dict.fromkeys(observer.measured), "state", model.states),
+        ("observer.noise", observer.noise, "state", model.states),
+        ("observer.process", observer.process, "state", model.states),
+        ("guard.u_rest", config.guard.u_rest, "input", model.inputs),
+        ("sim.x0", sim.x0, "state", model.states),
+        ("sim.noise_std", sim.noise_std, "state", model.states),
+        ("sim.parameters", sim.parameters, "parameter", model.parameters),
+    )
+    for key, table, kind, signals in tables:
+        if wrong := unknown_name(key, table, kind, signals, complete=key.startswith("ocp.weights") or key == "ocp.terminal.Q"):
+            raise ConfigError(wrong)
+    if config.guard.enabled:
+        inputs = names(model.inputs)
+        if list(ocp.bounds.inputs) != inputs:
+            raise ConfigError(f"ocp.bounds.inputs must be in the model's order {inputs} where a guard is enabled, got {list(ocp.bounds.inputs)}")
+        if tuple(config.guard.u_rest.get(name, 0.0) for name in inputs) != model.u_rest:
+            raise ConfigError(f"guard.u_rest must be the model's {dict(zip(inputs, model.u_rest, strict=True))}, got {config.guard.u_rest}")
+    check_solver(config)
+    try:
+        with_obstacles(model, [(0.0, 0.0, 1.0) for _ in ocp.obstacles])
+    except OcpError as error:
+        raise ConfigError(f"ocp.obstacles: {error}") from error
+    config.build_ocp()
+
+
+def check_solver(config: Config) -> None:
+    """
+    Check that the QP solver is there, and the settings are its own.
+
+    Raises:
+        ConfigError: They are not.
+    """
+    if "name" not in config.solver.model_fields_set:
+        return
+    from rti_mpc.foreign_solver import check_name  # a robot or a viewer has no use for solvers
+    from rti_mpc.rti import SOLVERS
+
+    if config.solver.name in SOLVERS:
+        return
+    try:
+        check_name(config.solver.name)
+    except OcpError as error:
+        raise ConfigError(f"solver.name: {error}") from error
+    if foreign := config.solver.model_dump(exclude_none=True, exclude=ITERATIONS | {"name"}):
+        key, got = next(iter(foreign.items()))
+        raise ConfigError(f"solver.{key} is a setting of osqp, it must be left out for solver.name = {config.solver.name!r}, got {got}")

@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The default tolerance of OSQP, judged by what it costs a robot and not by residuals."""
+
+from __future__ import annotations
+
+import pytest
+
+from rti_mpc.rti import FORMULATIONS, Rti
+from rti_mpc.solver import SolverSettings
+from service.bench import closed_loop_cost, paper_ocp
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_default_tolerance_of_osqp_costs_the_robot_no_more_than_one_ten_times_tighter(formulation: str) -> None:
+    """Eight and positioning, every sample of both; both stop at the default limit of iterations."""
+    default, tighter = (
+        closed_loop_cost(7, False, Rti(paper_ocp(7), settings, formulation=formulation, solver="osqp"))
+        for settings in (SolverSettings(), SolverSettings(eps=SolverSettings().eps / 10))
+    )
+    assert default <= tighter * (1 + 1e-4)
