@@ -111,7 +111,7 @@ def test_configured_discs_are_passed_and_nobody_is_told_that_the_way_is_blocked(
         assert np.hypot(x[:, 0] - px, x[:, 1] - py - v * t).min() > r - 1e-3
     np.testing.assert_allclose(x[-1, :2], [4.0, 0.0], rtol=0, atol=2e-3)
     assert not [notice.code for notice in controller.notices if notice.code in ("blocked", "free")]
-    assert controller.fallbacks == 0
+    assert controller.ladder.fallbacks == 0
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 2e-3])
