@@ -237,6 +237,19 @@ def bench(
 
 
 @app.command()
+def paper(
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for paper.md and its folder of figures and run.json.", show_default="runs/paper-TIME")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="A first look: seven seconds of every experiment, few of each sweep.")] = False,
+) -> None:
+    """Do the paper's study again, and beyond: its algorithms beside this one's, what it leaves open, what each setting gains."""
+    from service.paper.study import main
+
+    raise typer.Exit(main(out, quick=quick))
+
+
+@app.command()
 def check(config: ConfigPath = SHIPPED) -> None:
     """Load a configuration, solve 200 times, print both phases and the verdict of a second solver."""
     from service.check import main

@@ -48,6 +48,7 @@ ALONE = {
         ),
         "sim/plant.py",
         "service/yardstick.py",
+        "service/paper/slsqp.py",
     },
 }
 

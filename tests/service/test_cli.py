@@ -31,14 +31,14 @@ def test_help_of_every_command_explains_every_option(command: str) -> None:
     assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
 
 
-@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "check", "demo", "doctor", "faults"}))
+@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "check", "demo", "doctor", "faults", "paper"}))
 def test_every_process_takes_the_options_of_zenoh_programs(command: str) -> None:
     parameters = typer.main.get_group(app).commands[command].params
     options = {option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)}
     assert set(ZENOH) | {"-m", "-e", "-l", "-c"} <= options
 
 
-@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "demo"}))
+@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "demo", "paper"}))
 def test_bad_configuration_is_one_line_and_exit_status_2(command: str, tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(SHIPPED.read_text().replace("dt_s", "dt_ms"))

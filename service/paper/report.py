@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report of a run: report.md beside this file, filled with numbers of its JSON and with nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+TEMPLATE = Path(__file__).with_name("report.md")
+Row = dict[str, Any]
+
+# What the paper prints of its own runs: largest error in mm, and the share of solves inside the sampling time.
+PRINTED: dict[str, dict[str, Row]] = {
+    "eight": {"sequential": {"max_mm": 3, "inside_period": 0.97}, "simultaneous": {"max_mm": 3, "inside_period": 0.72}},
+    "positioning": {"sequential": {"inside_period": 0.93}, "simultaneous": {"inside_period": 0.81}},
+}
+CONTENDERS = {
+    "slsqp_sequential": "the paper's sequential, SLSQP, finite differences",
+    "slsqp_simultaneous": "the paper's simultaneous, SLSQP, analytic gradients",
+    "ipopt": "converged NMPC, IPOPT",
+    "osqp_sequential": "real-time iteration, sequential, OSQP",
+    "osqp_simultaneous": "real-time iteration, simultaneous, OSQP",
+    "rti_sequential": "real-time iteration, sequential, default solver",
+    "rti_simultaneous": "real-time iteration, simultaneous, default solver",
+    "best": "real-time iteration, best settings",
+}
+MISMATCH = {"theta_1": "inertia (theta_1, theta_2)", "theta_4": "friction (theta_4, theta_6)", "a": "offset a"}
+WEIGHTS = {"consistent": "the paper's", "none": "best"}
+Column = tuple[str, Callable[[Row], str]]
+
+
+def report(run: Row) -> str:
+    """Return the report of a run, Markdown."""
+    tables = {name: make(run) for name, make in TABLES.items()}
+    return TEMPLATE.read_text(encoding="utf-8").format(run=run, tables=tables, took_min=run["took_s"] / 60.0)
+
+
+def table(rows: Iterable[Row], columns: Sequence[Column]) -> str:
+    """Return rows as a Markdown table."""
+    lines = [[title for title, _ in columns], ["---"] * len(columns), *([cell(row) for _, cell in columns] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def number(key: str, digits: int = 3) -> Callable[[Row], str]:
+    """Return a cell of significant digits."""
+    return lambda row: f"{row[key]:.{digits}g}"
+
+
+def share(key: str) -> Callable[[Row], str]:
+    """Return a cell of percent."""
+    return lambda row: percent(row[key])
+
+
+def percent(value: float) -> str:
+    """Return a share; 100 % is said only of all."""
+    return f"{100.0 * value:.4g} %" if value < 1.0 else "100 %"
+
+
+def spread(key: str, unit_us: float) -> Callable[[Row], str]:
+    """Return a cell of median, p99 and maximum."""
+    return lambda row: " / ".join(f"{row[key][name] / unit_us:.3g}" for name in ("p50", "p99", "max"))
+
+
+WALL_US: Column = ("time of a solve, us, p50 / p99 / max", spread("wall_us", 1.0))
+MAX: Column = ("largest error, mm", number("max_mm"))
+
+
+def headline(scenario: str) -> Callable[[Row], str]:
+    """Return the maker of the table beside the paper's own figures."""
+
+    def make(run: Row) -> str:
+        columns: Sequence[Column] = (
+            ("", lambda row: row["name"]),
+            MAX,
+            ("between samples, mm", number("between_mm")),
+            ("error at the end, mm", number("end_mm")),
+            ("speed at the end, mm/s", number("end_speed_mm_s", 2)),
+            ("cost", lambda row: "-" if row["name"] == CONTENDERS["best"] else f"{row['cost']:.5g}"),
+            ("wall time of a solve, ms, p50 / p99 / max", spread("wall_us", 1e3)),
+            ("CPU time, ms, p50 / p99 / max", spread("cpu_us", 1e3)),
+            ("inside T0", share("inside_period")),
+            ("inside 1 % of T0, wall", share("inside_percent_wall")),
+            ("inside 1 % of T0, CPU", share("inside_percent_cpu")),
+        )
+        printed = []
+        for formulation, row in PRINTED[scenario].items():
+            cells = ["-"] * len(columns)
+            cells[0], cells[8] = f"*printed in the paper, {formulation}*", percent(row["inside_period"])
+            cells[1] = str(row.get("max_mm", "-"))
+            printed.append(f"| {' | '.join(cells)} |")
+        ours = table(({"name": title} | run["race"][scenario][name] for name, title in CONTENDERS.items()), columns).split("\n")
+        return "\n".join([*ours[:2], *printed, *ours[2:]])
+
+    return make
+
+
+def headings(run: Row) -> str:
+    """Return the readings of the first experiment."""
+    columns: Sequence[Column] = (
+        ("curve", lambda row: row["trajectory"]),
+        ("heading", lambda row: row["heading"]),
+        ("a, m", number("a_m")),
+        ("robot", lambda row: row["plant"]),
+        MAX,
+        ("squared, m²", number("max_squared_m2", 2)),
+        ("error at the end, mm", number("end_mm")),
+    )
+    return table(run["readings"]["headings"], columns)
+
+
+def converged(run: Row) -> str:
+    """Return the readings judged by converged NMPC."""
+    columns: Sequence[Column] = (
+        ("curve", lambda row: row["trajectory"]),
+        ("heading", lambda row: row["heading"]),
+        ("robot", lambda row: row["plant"]),
+        ("largest error, converged NMPC, mm", number("max_mm")),
+        ("squared, m²", number("max_squared_m2", 2)),
+    )
+    return table(run["readings"]["converged"], columns)
+
+
+def speeds(run: Row) -> str:
+    """Return the speeds of the references."""
+    rows = ({"name": name} | row for name, row in run["readings"]["speeds"].items())
+    return table(rows, (("reference", lambda row: row["name"]), *((f"{key}, m/s", number(key)) for key in ("min", "mean", "max"))))
+
+
+def at_printed_speed(run: Row) -> str:
+    """Return the errors at the speed that is printed."""
+    rows = run["readings"]["at_printed_speed"]
+    columns: Sequence[Column] = (
+        ("curve", lambda row: row["trajectory"]),
+        ("mean speed, m/s", number("mean_speed_m_s")),
+        ("weights", lambda row: WEIGHTS[row["heading"]]),
+        ("integrator", lambda row: row["method"]),
+        MAX,
+    )
+    return table(rows, columns)
+
+
+def goals(run: Row) -> str:
+    """Return both ends the second reference may have."""
+    rows = ({"name": name} | row for name, row in run["readings"]["goals"].items())
+    columns: Sequence[Column] = (
+        ("end", lambda row: {"continuous": "(-r √2, -r √2/2)", "jumping": "(-r √2, -r √2)"}[row["name"]]),
+        ("leap of the reference, mm", number("jump_mm")),
+        ("error at the end, mm", number("end_mm")),
+    )
+    return table(rows, columns)
+
+
+def increments(run: Row) -> str:
+    """Return the sweep of the weight on increments."""
+    columns: Sequence[Column] = (
+        ("λ", number("lambda")),
+        ("heading", lambda row: row["heading"]),
+        ("noise", lambda row: "yes" if row["noise"] else "no"),
+        MAX,
+        ("rms of increments", number("increment_rms")),
+        WALL_US,
+    )
+    return table(run["sweeps"]["lambda"], columns)
+
+
+def horizons(name: str) -> Callable[[Row], str]:
+    """Return the maker of the table of a sweep of a horizon."""
+
+    def make(run: Row) -> str:
+        columns: Sequence[Column] = (
+            ("N", number("N")),
+            ("N_u", number("N_u")),
+            ("weights", lambda row: WEIGHTS[row["heading"]]),
+            ("integrator", lambda row: row["method"]),
+            MAX,
+            WALL_US,
+        )
+        return table(run["sweeps"][name], columns)
+
+    return make
+
+
+def periods(run: Row) -> str:
+    """Return the sweep of the sampling time."""
+    columns: Sequence[Column] = (
+        ("T0, ms", lambda row: f"{1e3 * row['T0_s']:.3g}"),
+        MAX,
+        ("between samples, mm", number("between_mm")),
+        WALL_US,
+        ("CPU time, us, p50 / p99 / max", spread("cpu_us", 1.0)),
+        ("inside T0", share("inside_period")),
+    )
+    return table(run["sweeps"]["T0"], columns)
+
+
+def mismatch(run: Row) -> str:
+    """Return the sweep of the robot's parameters."""
+    columns: Sequence[Column] = (
+        ("the robot's", lambda row: MISMATCH[next(iter(row["mismatch"]))]),
+        ("times the model's", lambda row: f"{next(iter(row['mismatch'].values())):.3g}"),
+        ("weights", lambda row: WEIGHTS[row["heading"]]),
+        MAX,
+    )
+    return table(run["sweeps"]["mismatch"], columns)
+
+
+TABLES: dict[str, Callable[[Row], str]] = {
+    "eight": headline("eight"),
+    "positioning": headline("positioning"),
+    "headings": headings,
+    "converged": converged,
+    "speeds": speeds,
+    "at_printed_speed": at_printed_speed,
+    "goals": goals,
+    "increments": increments,
+    "N": horizons("N"),
+    "N_u": horizons("N_u"),
+    "periods": periods,
+    "mismatch": mismatch,
+}
