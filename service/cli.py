@@ -241,7 +241,7 @@ def paper(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for paper.md and its folder of figures and run.json.", show_default="runs/paper-TIME")
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="A first look: seven seconds of every experiment, few of each sweep.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="A first look: three seconds of every experiment, few of each sweep.")] = False,
 ) -> None:
     """Do the paper's study again, and beyond: its algorithms beside this one's, what it leaves open, what each setting gains."""
     from service.paper.study import main

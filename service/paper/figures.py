@@ -79,7 +79,7 @@ def paths(figure: Figure, loops: Loops) -> None:
             axes.plot(*loops[name].x[:, :2].T, STYLE[name], color=COLOR[name], linewidth=WIDTH[name], label=NAME[name])
         axes.plot(*experiment.x0[:2], "o", color=LIMIT, markerfacecolor="white", markersize=7, zorder=5, label="start")
         axes.set(xlabel="x [m]", ylabel="y [m]")
-        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_aspect("equal", adjustable="box")
     near = np.vstack([loops[name].x[:61, :2] for name in SHOWN])
     start.set(xlim=(near[:, 0].min() - 0.08, near[:, 0].max() + 0.08), ylim=(near[:, 1].min() - 0.08, near[:, 1].max() + 0.08))
     start.set_title("the first 6 s")

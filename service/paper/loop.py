@@ -17,7 +17,7 @@ from service.paper.experiment import DELTA, Experiment, Q, R
 
 LOOKS = 20  # at the robot in a sample of 0.1 s, and RK4 steps of it
 NOISE = np.array([1e-3, 1e-3, 2e-3, 5e-3, 5e-3])  # standard deviation of what is measured: m, m, rad, m/s, rad/s
-WARM_UP = 20  # solves before the first that counts
+WARM_UP = 5  # solves before the first that counts
 
 
 class Loop:

@@ -21,7 +21,7 @@ from service.paper.experiment import BEST, Experiment
 from service.paper.loop import Loop
 
 DURATION_S = 82.8  # a lap after the transient
-QUICK_S, QUICK_TRANSIENT_S = 7.0, 5.0  # of a first look
+QUICK_S, QUICK_TRANSIENT_S = 3.0, 2.0  # of a first look
 
 # On the eight the heading is the one of the reading that gives the paper's 3 mm (`service.paper.readings`).
 EIGHT = Experiment(eight().lasting(DURATION_S), heading="consistent")

@@ -95,6 +95,25 @@ def headline(scenario: str) -> Callable[[Row], str]:
     return make
 
 
+def short(run: Row) -> str:
+    """Return the figures of both experiments in one small table, Markdown."""
+    eight, positioning = run["race"]["eight"], run["race"]["positioning"]
+    chosen = ("slsqp_sequential", "slsqp_simultaneous", "ipopt", "rti_simultaneous", "best")
+    rows = [{"name": CONTENDERS[name], "eight": eight[name], "positioning": positioning[name]} for name in chosen]
+    columns: Sequence[Column] = (
+        ("", lambda row: row["name"]),
+        ("eight, largest error, mm", lambda row: f"{row['eight']['max_mm']:.3g}"),
+        ("positioning, error at the end, mm", lambda row: f"{row['positioning']['end_mm']:.2g}"),
+        ("time of a solve, ms, p50 / p99", lambda row: f"{1e-3 * row['eight']['wall_us']['p50']:.2g} / {1e-3 * row['eight']['wall_us']['p99']:.2g}"),
+        ("inside T0", lambda row: f"{percent(row['eight']['inside_period'])}, {percent(row['positioning']['inside_period'])}"),
+        (
+            "CPU time inside 1 % of T0",
+            lambda row: f"{percent(row['eight']['inside_percent_cpu'])}, {percent(row['positioning']['inside_percent_cpu'])}",
+        ),
+    )
+    return table(rows, columns)
+
+
 def headings(run: Row) -> str:
     """Return the readings of the first experiment."""
     columns: Sequence[Column] = (

@@ -21,11 +21,11 @@ from service.paper.experiment import BEST, Experiment
 from service.paper.figures import draw
 from service.paper.loop import Loop
 from service.paper.race import SCENARIOS, grid, race, shortened
-from service.paper.report import report
+from service.paper.report import report, short
 from service.paper.sweeps import SWEEPS
 
 OWN, CONVERGED = "rti_simultaneous", "ipopt"
-QUICK_STRIDE = 7  # of a sweep, in a first look
+QUICK_STRIDE = 15  # of a sweep, in a first look
 DIGITS = 5  # of every number written
 
 
@@ -133,6 +133,7 @@ def main(out: Path | None = None, *, quick: bool = False) -> int:
     (folder / "run.json").write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
     draw(study.races, run, folder)
     (out / "paper.md").write_text(report(run), encoding="utf-8")
+    print(short(run))  # as it is, to be copied
     console.print(f"{out / 'paper.md'}, {folder}: {run['solves']['own']} solves, {run['took_s']:.0f} s", soft_wrap=True)
     return 0
 

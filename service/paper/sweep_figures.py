@@ -14,7 +14,7 @@ from service.paper.sweeps import MISMATCHES
 
 BLUE, ORANGE, GREEN, PURPLE, YELLOW, BLACK = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#000000"
 Row = dict[str, Any]
-LABEL = {"consistent": "the paper's weights", "none": "best settings"}
+LABEL = {"consistent": "the paper's weights", "none": "best weights"}
 
 
 def curve(axes: Axes, rows: Iterable[Row], x: Callable[[Row], float], y: Callable[[Row], float], **look: Any) -> None:
@@ -77,7 +77,7 @@ def horizons(figure: Figure, run: Row) -> None:
         curve(middle, chosen, lambda row: row["N_u"], lambda row: row["max_mm"], color=color, marker="o", markersize=4.0, label=LABEL[heading])
     left.set(title="horizon", xscale="log", yscale="log", xlabel="N", ylabel="largest error after 20 s [mm]")
     middle.set(title="control horizon, N = 20", xscale="log", yscale="log", xlabel="$N_u$", ylabel="largest error after 20 s [mm]")
-    right.set(title="cost", xscale="log", yscale="log", xlabel="N", ylabel="median time of a solve [us]")
+    right.set(title="time of a solve", xscale="log", yscale="log", xlabel="N", ylabel="median time of a solve [us]")
     for axes in (left, middle, right):
         below(axes, 1)
 
