@@ -17,7 +17,7 @@ not, the whole QP is solved, and is the one prepared until its plan has left the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import isfinite
 from typing import Any
 
@@ -44,6 +44,7 @@ SEQUENTIAL_UP_TO = 10  # control horizon up to which the sequential formulation 
 SOLVED = QpStatus.SOLVED  # an enumeration looks its members up slowly
 ITERATIONS = 3  # a sample, at most, and
 TOLERANCE = 0.015  # the step from which there is another: what converged NMPC costs in closed loop, within 0.5 %, see docs/engine.md
+COSTS = ("delta", "lambda_", "z", "Z", "Q_e", "zh", "Zh")  # weights that carry the scale of the cost
 TOUCHING = 1e-3  # distance from its bound, in units of the state, at which a plan counts as having left it
 
 
@@ -156,8 +157,9 @@ class Rti:
             raise OcpError(f"model {model.name} must be finite and differentiable around the zero state")
         # The cost normalised, so that one step size of ADMM, and one tolerance, fit every problem.
         self._cost_scale = 1.0 / step_size(qps[0])
-        for name in ("delta", "lambda_", "z", "Z", "Q_e", "zh", "Zh"):
+        for name in COSTS:
             weights[name] *= self._cost_scale
+        self._weights = weights
         for qp in qps:
             qp.fill()
         if solver in SOLVERS:
@@ -185,6 +187,20 @@ class Rti:
         if self.active_set is not None:
             self.solver = self.active_set
             self.active_set.forget()
+
+    def retune(self, values: Mapping[str, Array]) -> None:
+        """
+        Take other weights and bounds from the next `prepare` on; `ocp` keeps those it was built with.
+
+        Args:
+            values: By the names in `WEIGHTS`, shapes as in `Ocp`. Finite where the problem's are: which bounds there are is compiled in.
+        """
+        for name, value in values.items():
+            self._weights[name][:] = np.clip(value, -INFINITY, INFINITY)
+            if name in COSTS:
+                self._weights[name] *= self._cost_scale
+        for solver in self.solvers:
+            solver.refill()
 
     def prepare(self, y_ref: Array, p: Array | None = None, *, shift: bool = True, u_prev: Array | None = None) -> None:
         """

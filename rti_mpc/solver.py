@@ -112,7 +112,7 @@ class Solver:
         self._finite = isfinite(qp.checksum[0])
         if not self._finite:  # or OSQP would never recover
             return
-        changed = qp.varies_A or qp.varies_P
+        changed = qp.varies_A or self._P_x is not None
         if self._A_x is not qp.A.data:
             changed |= self._weigh()
             np.multiply(qp.A.data, self._scale[qp.A.indices], out=self._A_x)
@@ -121,6 +121,11 @@ class Solver:
         if self.cold:
             self._osqp.warm_start(*self._zero)
             self.cold = False
+
+    def refill(self) -> None:
+        """Take over, with the next `load`, what no sample changes, too: after a change of weights."""
+        self.qp.fill()
+        self._P_x = self.qp.P.data
 
     def _weigh(self) -> bool:
         """

@@ -68,6 +68,7 @@ FLOW: tuple[set[str], ...] = (
     {"qp", "prediction", "observer", "envelope", "delay"},
     {"solver", "active_set", "foreign_solver", "state_stream"},
     {"rti"},
+    {"tuning"},
     {"record", "blockage"},
     {"controller"},
 )
