@@ -30,6 +30,7 @@ from rti_mpc.ladder import Ladder
 from rti_mpc.message import STAMP_ON_ARRIVAL, Command, End, Reference, Severity, State, Telemetry
 from rti_mpc.mode import ModeMachine
 from rti_mpc.observer import Observer
+from rti_mpc.ocp import Ocp
 from rti_mpc.prediction import Prediction
 from rti_mpc.record import Record
 from rti_mpc.rti import Rti
@@ -37,6 +38,7 @@ from rti_mpc.sent import Sent
 from rti_mpc.state_stream import Arrival, StateStream
 from rti_mpc.status import Mode, QpStatus
 from rti_mpc.track import Track
+from rti_mpc.tuning import Tuning
 
 BUDGET = 0.75  # of a period, after the time at which a command acts, in which it may leave; the rest is for messages on their way
 ITERATIONS_COLD = 3  # iterations of a first sample, whose guess is one state and one input
@@ -51,6 +53,7 @@ class Controller:
 
     Attributes:
         notices: Mode changes and faults since the caller last emptied it.
+        shadowing: Whether another controller's commands act, those handed to `overhear`, and not what is made here.
         skipped: Samples skipped since start.
         ladder: Samples without a plan of their own, by what replaced it.
         np_: Parameters a row of a reference may carry: the model's, without the disturbances an observer estimates.
@@ -70,11 +73,13 @@ class Controller:
         self._valid_ns = round(1e9 * timing.valid_s)
         self._u_rest: Array = np.array(model.u_rest)
 
+        self.shadowing = False
         self._modes = ModeMachine()
         self.notices = self._modes.notices
         self.skipped = 0
         self.ladder = Ladder()
         self.envelope = Envelope(ocp, compile=compile)
+        self._tuning = Tuning(rti, self.envelope.limits)
         self.grid = Grid(ocp.dt, timing)
         self._states = StateStream(model, self._stale_ns, self.grid.dt_ns, observer)
         self.np_ = model.np_ - len(self._states.d)
@@ -91,7 +96,7 @@ class Controller:
         self._command: Command | None = None
         self._plan: Command | None = None  # the last one with a plan of its own
         self._before: tuple[Command | None, Command | None] = (None, None)  # those two before the last command
-        self._record = Record(rti)
+        self._record = Record(rti, self._tuning)
         self._blockage = Blockage(rti)
         self._delay = DelayEstimator(model, self.grid.dt_ns, self.grid.most_ns, compile=compile) if timing.delay_s is None else None
 
@@ -164,6 +169,31 @@ class Controller:
                 self.grid.running = False
                 self._modes.enter(Mode.WAITING, "enabled")
 
+    def retune(self, ocp: Ocp, version: int) -> int:
+        """
+        Plan with other weights and bounds, from the next sample on that is not prepared yet; a stop keeps the slew limits it was built with.
+
+        Returns:
+            Sequence number of its command.
+
+        Raises:
+            OcpError: The problem differs in more than these.
+        """
+        self._tuning.change(ocp, version)
+        return self._seq + 1 + self._loaded
+
+    def overhear(self, command: Command) -> None:
+        """Take note of a command of the controller that this one shadows."""
+        self._sent.append(command)
+        if self._delay is not None:
+            self._delay.sent(command)
+
+    def lead(self, epoch: int) -> None:
+        """Let what is made here act from the next command on; it goes on from what has acted so far."""
+        self._epoch, self.shadowing = epoch, False
+        if self._loaded:
+            self._load(shift=False)
+
     def tick(self, local_ns: int) -> Command | None:
         """
         Notice silence: return a ramp to rest, once, when the last state has become stale.
@@ -204,7 +234,8 @@ class Controller:
                 self._modes.enter(command.mode, "samples are in time again")
             return command
         self._overran = True
-        self._sent.withdraw(command)
+        if not self.shadowing:
+            self._sent.withdraw(command)
         self._seq -= 1
         self._command, self._plan = self._before
         failure = f"a sample took {1e-9 * elapsed_ns:.3f} s"
@@ -236,12 +267,13 @@ class Controller:
             self.ladder.failed = 0
         elif self.mode is not Mode.FALLBACK or not np.isfinite(self._rti.x).all():
             return  # the next sample starts cold
+        self._tuning.begin()
         self._load(shift=True)
 
     def _measure_delay(self, estimator: DelayEstimator, stamp_ns: int) -> None:
         """Learn from the state of the last sample, and let the grid follow."""
         estimator.observe(self._states.x, stamp_ns)
-        if self._command is not None:
+        if self._command is not None and not self.shadowing:
             estimator.sent(self._command)
         self._sent.delay_ns = estimator.delay_ns
         self.grid.adapt(estimator.delay_ns)
@@ -261,7 +293,9 @@ class Controller:
         self._track.look_up(act_ns)
         self._track.p[:, self.np_ :] = self._states.d
         self._reach = self._sent.reach(act_ns)
-        self._rti.prepare(self._track.y_ref, self._track.p, shift=shift, u_prev=self._sent.at(act_ns - 1)[0])
+        u_prev = self._sent.at(act_ns - 1)[0]
+        self._tuning.follow(u_prev)
+        self._rti.prepare(self._track.y_ref, self._track.p, shift=shift, u_prev=u_prev)
         self._loaded = True
 
     def _rejoin(self, stamp_ns: int, behind: int) -> None:
@@ -304,6 +338,7 @@ class Controller:
     def _feedback_cold(self) -> QpStatus:
         """Solve a first sample: the guess stays where the robot is, and is iterated on."""
         self._rti.reset(self._x0, self._sent.at(self.grid.act_ns - 1)[0])
+        self._tuning.begin()
         status = QpStatus.FAILED
         for _ in range(ITERATIONS_COLD):
             self._load(shift=False)
@@ -368,7 +403,8 @@ class Controller:
             period_ns=self.grid.dt_ns,
             u=u,
         )
-        self._sent.append(self._command, self._left_ns + 1)
+        if not self.shadowing:
+            self._sent.append(self._command, self._left_ns + 1)
         return self._command
 
     @property

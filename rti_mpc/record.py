@@ -7,21 +7,24 @@ from rti_mpc.array import Array
 from rti_mpc.ladder import Ladder
 from rti_mpc.message import Command, Telemetry
 from rti_mpc.rti import Rti
+from rti_mpc.tuning import Tuning
 
 
 class Record:
     """The plan behind the last command, kept before preparation overwrites it."""
 
-    def __init__(self, rti: Rti) -> None:
+    def __init__(self, rti: Rti, tuning: Tuning) -> None:
         self._rti = rti
+        self._tuning = tuning
         self._seq = 0  # of the command whose plan is kept
         self._plan = (rti.x.copy(), rti.y_ref.copy(), 0.0)  # states, reference, cost
+        self._version = 0  # of the parameters
 
     def keep(self, seq: int) -> None:
         """Keep the plan of a command, by its number, if it is not kept already."""
         if self._seq != seq:
             self._plan = (self._rti.x.copy(), self._rti.y_ref.copy(), self._rti.cost)
-            self._seq = seq
+            self._seq, self._version = seq, self._tuning.version
 
     def telemetry(
         self, command: Command, x0: Array, d: Array, times: tuple[float, float, float, float], *, delay_s: float, skipped: int, ladder: Ladder
@@ -61,7 +64,7 @@ class Record:
             slack_s=slack_s,
             skipped=skipped,
             fallbacks=ladder.fallbacks,
-            parameter_version=0,
+            parameter_version=self._version,
             x0=x0.copy(),
             x=self._plan[0],
             u=command.u,

@@ -2,13 +2,15 @@
 """
 Other weights and bounds for a controller that runs, without a bump.
 
-Weights change from one sample to the next: what the QP may do with an input
-is bounded all the same. A bound that an input is beyond is approached as fast
-as the slew limits allow: until then it stays just so far out that some plan
-keeps it. The first increment keeps the old slew limits and the new ones.
+Weights change from one sample to the next: what a plan may do with an input is
+bounded all the same. A bound that the input is beyond is approached as fast as
+the slew limits allow: until then it stays just so far out that a plan can keep
+it. The first increment keeps the old slew limits and the new ones.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -31,16 +33,27 @@ class Tuning:
         version: Of the weights and bounds that act; 0 for those it was built with.
     """
 
-    def __init__(self, rti: Rti) -> None:
+    def __init__(self, rti: Rti, limits: Mapping[str, Array] | None = None) -> None:
+        """
+        Begin with what an `Rti` was built with.
+
+        Args:
+            rti: It.
+            limits: Where else the bounds that act are to be written, by name: ``lbu`` and ``ubu``, each of shape ``(nu,)``.
+        """
         self.version = 0
         self._rti = rti
+        self._limits = {} if limits is None else {name: limits[name] for name in ("lbu", "ubu")}
+        self._changed = False
         self._wanted = rti.ocp
         self._wanted_version = 0
-        self._bounds = {name: getattr(rti.ocp, name) for name in BOUNDS}  # that act
+        self._slew = rti.ocp.lbdu, rti.ocp.ubdu  # of this sample
+        self._acting = {name: getattr(rti.ocp, name) for name in BOUNDS}
+        self._written = 0  # version of the weights that act
 
     def change(self, ocp: Ocp, version: int) -> None:
         """
-        Tune to the weights and bounds of an OCP, from the next `follow` on.
+        Tune to the weights and bounds of an OCP, from the next `begin` on.
 
         Raises:
             OcpError: Something else of it differs, such as which bounds there are.
@@ -53,26 +66,30 @@ class Tuning:
             if not np.array_equal(np.isfinite(getattr(ocp, name)), np.isfinite(getattr(built, name))):
                 raise OcpError(f"{name} must be finite where it was built so, and only there, got {getattr(ocp, name)}: it is compiled in")
         self._wanted, self._wanted_version = ocp, version
+        self._changed = True
+
+    def begin(self) -> None:
+        """Begin the preparation of another sample."""
+        lbdu, ubdu = self._wanted.lbdu, self._wanted.ubdu
+        if self.version != self._wanted_version:
+            self.version = self._wanted_version
+            lbdu, ubdu = np.maximum(lbdu, self._acting["lbdu"]), np.minimum(ubdu, self._acting["ubdu"])
+        self._slew = lbdu, ubdu
 
     def follow(self, u_prev: Array) -> None:
         """
-        Take the next step there; before a preparation.
+        Go there, as far as the input allows; before each preparation.
 
         Args:
-            u_prev: Input before the plan that is to be prepared, shape ``(nu,)``.
+            u_prev: Input before the plan, shape ``(nu,)``.
         """
-        if not self._wanted_version:
+        if not self._changed:
             return
-        u, wanted, acting = self._rti.u, self._wanted, self._bounds
-        fresh = self.version != self._wanted_version
-        lbdu, ubdu = wanted.lbdu, wanted.ubdu
-        if fresh:
-            lbdu, ubdu = np.maximum(lbdu, acting["lbdu"]), np.minimum(ubdu, acting["ubdu"])
-        # What the last plan holds is counted too: after samples that are missed, any of its rows may be the previous input.
-        lbu = np.minimum(wanted.lbu, np.minimum(u_prev, u.min(axis=0)) + ubdu)
-        ubu = np.maximum(wanted.ubu, np.maximum(u_prev, u.max(axis=0)) + lbdu)
-        bounds = dict(zip(BOUNDS, (lbu, ubu, lbdu, ubdu), strict=True))
-        if fresh or any(not np.array_equal(bounds[name], acting[name]) for name in BOUNDS):
+        wanted, (lbdu, ubdu) = self._wanted, self._slew
+        bounds = dict(zip(BOUNDS, (np.minimum(wanted.lbu, u_prev + ubdu), np.maximum(wanted.ubu, u_prev + lbdu), lbdu, ubdu), strict=True))
+        fresh = self.version != self._written
+        if fresh or any(not np.array_equal(bounds[name], self._acting[name]) for name in BOUNDS):
             self._rti.retune({**{name: getattr(wanted, name) for name in WEIGHTS if fresh}, **bounds})
-            np.clip(u, lbu, ubu, out=u)  # a fallback plays these rows
-        self._bounds, self.version = bounds, self._wanted_version
+            for name, limit in self._limits.items():
+                limit[:] = bounds[name]
+        self._acting, self._written = bounds, self.version
