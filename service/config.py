@@ -30,6 +30,7 @@ from service.schema import (
     ModelSection,
     ObserverSection,
     OcpSection,
+    ParamsSection,
     RealtimeSection,
     Section,
     SimSection,
@@ -65,6 +66,7 @@ class Config(Section):
     observer: ObserverSection = Field(default=ObserverSection(), description="estimator of disturbances and of unmeasured states; none if left out")
     guard: GuardSection = Field(default=GuardSection(), description="the guard between controller and robot")
     debug: DebugSection = Field(default=DebugSection(), description="failures on request")
+    params: ParamsSection = Field(default=ParamsSection(), description="what may change while the controller runs")
     bus: BusSection = Field(default=BusSection(), description="the Zenoh session")
     realtime: RealtimeSection = Field(default=RealtimeSection(), description="what the controller asks of the operating system")
     sim: SimSection = Field(default=SimSection(), description="the simulated robot")

@@ -184,6 +184,12 @@ class DebugSection(Section):
     inject: bool = Field(default=False, description="whether requests may let samples fail, to see what the controller then does")
 
 
+class ParamsSection(Section):
+    """What `rti-mpc params` may do."""
+
+    live: bool = Field(default=False, description="whether requests may change weights, and tighten bounds, while the controller runs")
+
+
 class BusSection(Section):
     """The Zenoh session of each process; what is left out is as `BusSettings` has it, and the command line overrides it."""
 

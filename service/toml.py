@@ -19,7 +19,7 @@ def write(config: Config) -> str:
 def _table(path: str, values: Mapping[str, Any]) -> list[str]:
     """Return the lines of a table: its own keys, then the tables below it."""
     below = {name: value for name, value in values.items() if isinstance(value, dict)}
-    own = [f"{_key(name)} = {_value(value)}" for name, value in values.items() if name not in below]
+    own = [f"{_key(name)} = {text(value)}" for name, value in values.items() if name not in below]
     lines = ["", f"[{path}]", *own] if path and (own or not below) else own
     for name, value in below.items():
         lines += _table(f"{path}.{_key(name)}" if path else _key(name), value)
@@ -31,12 +31,12 @@ def _key(name: str) -> str:
     return name if name.isascii() and name.replace("_", "").replace("-", "").isalnum() else json.dumps(name)
 
 
-def _value(value: Any) -> str:
+def text(value: Any) -> str:
     """Return a value; JSON's text is TOML's but for infinities and what JSON lacks."""
     if isinstance(value, dict):
-        return f"{{ {', '.join(f'{_key(name)} = {_value(inner)}' for name, inner in value.items())} }}"
+        return f"{{ {', '.join(f'{_key(name)} = {text(inner)}' for name, inner in value.items())} }}"
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_value, value))}]"
+        return f"[{', '.join(map(text, value))}]"
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     return json.dumps(value if isinstance(value, bool | int | float) else str(value))
