@@ -253,7 +253,7 @@ class Controller:
         """Prepare the next sample: fix `t_k`, look the reference up, shift, linearize and load the QP."""
         self._record.keep(self._seq)
         self._look_ahead()
-        if self._command is not None and self._left_ns > self._command.stamp_ns:
+        if self._command is not None and not self.shadowing and self._left_ns > self._command.stamp_ns:
             self._sent.withdraw(self._command)
             self._sent.append(self._command, self._left_ns)
         state = self._states.last

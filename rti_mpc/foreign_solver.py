@@ -83,6 +83,10 @@ class ForeignSolver:
             for update in self._updates:
                 update()
 
+    def refill(self) -> None:
+        """Take over, with the next `load`, what no sample changes, too: after a change of weights."""
+        self.qp.fill()
+
     def solve(self) -> QpStatus:
         """Embed the initial state, solve, and make the plan."""
         if not self._finite:

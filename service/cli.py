@@ -58,7 +58,8 @@ def process(command: Callable[..., int | None], *, with_model: bool = True) -> C
     Register a process of a robot: a command with CONFIG and Zenoh's options besides its own.
 
     Args:
-        command: Takes the configuration, how to join the bus, and its own options; returns an exit status, None for 0.
+        command: Takes the configuration, how to join the bus, and its own options; returns an exit status, None for 0. CONFIG is the
+            first TOML file among its `words`, if it takes any.
         with_model: Whether the configuration is checked against the model.
     """
     shared = inspect.signature(options, eval_str=True).parameters
@@ -66,6 +67,10 @@ def process(command: Callable[..., int | None], *, with_model: bool = True) -> C
 
     @wraps(command)
     def run(config: Path = SHIPPED, **given: Any) -> None:
+        if "words" in given:
+            words = [str(config), *(given["words"] or [])]
+            file = next((word for word in words if word.endswith(".toml")), "")
+            config, given["words"] = Path(file or SHIPPED), [word for word in words if word != file]
         loaded = load(config, with_model=with_model)
         overrides = options(**{name: given.pop(name) for name in shared})
         raise typer.Exit(command(loaded, replace(loaded.bus_settings(), **overrides), **given) or 0)
@@ -81,11 +86,15 @@ Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", min=0.1,
 
 
 @process
-def run(config: Config, bus: BusSettings) -> int:
+def run(
+    config: Config,
+    bus: BusSettings,
+    standby: Annotated[bool, typer.Option("--standby", help="Stand by while another controller leads, and take over when it falls silent.")] = False,
+) -> int:
     """Control the robot: wait for its states and a reference, answer each with a command."""
     from service.daemon import main
 
-    return main(config, bus)
+    return main(config, bus, standby=standby)
 
 
 @partial(process, with_model=False)
@@ -183,6 +192,19 @@ def enable(config: Config, bus: BusSettings, timeout: Timeout = 2.0) -> int:
     from service.request import main
 
     return main(bus, config.keys(), "enable", timeout)
+
+
+@partial(process, with_model=False)
+def params(
+    config: Config,
+    bus: BusSettings,
+    words: Annotated[list[str] | None, typer.Argument(metavar="get [KEY]... | set KEY=VALUE...", help="Keys and values as in the file.")] = None,
+    timeout: Timeout = 2.0,
+) -> int:
+    """Print parameters of a controller that runs, or change them, all or none, between two samples."""
+    from service.request import params
+
+    return params(bus, config.keys(), words or ["get"], timeout)
 
 
 @app.command()

@@ -15,11 +15,12 @@ from service.schema import RegulatorSection
 
 if TYPE_CHECKING:
     from rti_mpc.model import Signal
+    from rti_mpc.ocp import Ocp
 
 
-def check_model(config: Config) -> None:
+def check_model(config: Config) -> Ocp:
     """
-    Check what only the model knows.
+    Check what only the model knows, and return the problem.
 
     Raises:
         ConfigError: A key does not fit the model.
@@ -65,7 +66,7 @@ def check_model(config: Config) -> None:
         with_obstacles(model, [(0.0, 0.0, 1.0) for _ in ocp.obstacles])
     except OcpError as error:
         raise ConfigError(f"ocp.obstacles: {error}") from error
-    config.build_ocp()
+    return config.build_ocp()
 
 
 def check_solver(config: Config) -> None:

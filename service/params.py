@@ -23,7 +23,8 @@ from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.ocp import Ocp
 from rti_mpc.rti import Rti
 from rti_mpc.tuning import Tuning
-from service.config import Config, check_model, check_tree
+from service.config import Config, check_tree
+from service.fit import check_model
 from service.refusal import entries, explain
 
 WEIGHTS = ("ocp.weights.Q", "ocp.weights.R", "ocp.weights.delta", "ocp.weights.lambda", "ocp.bounds.soft_weight")

@@ -60,6 +60,16 @@ def test_unit_runs_a_command_that_exists_and_never_gives_up(expected: str) -> No
     assert unit["Service"]["RestartPreventExitStatus"] == "2"
 
 
+def test_drop_in_changes_the_unit_s_command_to_one_that_exists() -> None:
+    first, second = [
+        line.partition("=")[2] for line in (DEPLOY / "systemd" / "standby.conf").read_text().splitlines() if line.startswith("ExecStart=")
+    ]
+    program, name, *words = second.split()
+    assert (first, program) == ("", "/opt/rti-mpc/bin/rti-mpc"), "a second command would be refused by systemd, so the first is taken back"
+    context = typer.main.get_group(app).commands[name].make_context(name, words)
+    assert context.params["standby"] is True
+
+
 @pytest.mark.parametrize("line", [line for line in SHELL if re.match(r"(\S*/)?rti-mpc ", line)])
 def test_command_in_the_runbook_exists_with_its_options(line: str) -> None:
     _, name, *words = line.split()

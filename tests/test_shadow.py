@@ -40,12 +40,12 @@ def controller(role: str, delay_s: float = 0.0) -> Controller:
     return one
 
 
-def take_over(samples: int, dies_at: int, delay_s: float = 0.0, hears: bool = True) -> tuple[Array, list[Command]]:
+def take_over(samples: int, dies_at: int, delay_s: float = 0.0, *, hears: bool = True, late: bool = False) -> tuple[Array, list[Command]]:
     """
     Inputs that acted, one row a state, and the commands of who took over.
 
-    The shadow hears each command of the leader after it has prepared its own next sample, as it does over a bus, and
-    leads from the second state on that the leader does not answer.
+    The shadow hears each command of the leader after it has prepared its own next sample, as it does over a bus, the
+    last one perhaps only after one more, and leads from the second state on that the leader does not answer.
     """
     leader, shadow = controller("leader", delay_s), controller("shadow", delay_s)
     shadow.shadowing = True
@@ -63,8 +63,11 @@ def take_over(samples: int, dies_at: int, delay_s: float = 0.0, hears: bool = Tr
         if command is not None:
             leader.prepare()
             assert not body.accept(command, body.now_ns)
-            if hears:
+            if hears and not (late and k == dies_at - 1):
                 shadow.overhear(command)
+            last = command
+        elif k == dies_at and late:
+            shadow.overhear(last)
         elif k > dies_at:
             assert not body.accept(own, body.now_ns)
             taken.append(own)
@@ -87,7 +90,7 @@ def test_take_over_in_a_transient_keeps_the_slew_limits() -> None:
     applied, _ = take_over(10, 10**6)
     assert np.any(np.abs(np.diff(applied, axis=0)) > STEP - ROUNDING)
     for dies_at in (1, 2, 4, 6):
-        applied, _ = take_over(10, dies_at)
+        applied, _ = take_over(10, dies_at, late=dies_at > 2)
         assert np.all(np.abs(np.diff(applied, axis=0)) <= STEP + ROUNDING), dies_at
 
 

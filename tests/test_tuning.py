@@ -53,7 +53,7 @@ def plan(rti: Rti, samples: int = 12) -> tuple[Array, Array, float]:
 @pytest.mark.parametrize("solver", ["riccati", "osqp"])
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_retuned_iteration_plans_like_one_built_so(formulation: str, solver: str) -> None:
-    """Nearly: the cost keeps the scale it was built with, and with it how stiffly bounds hold, and where OSQP stops."""
+    """Nearly: it keeps the scales it was built with, and with them how stiffly bounds hold, when it iterates once more, and where OSQP stops."""
     how: dict[str, Any] = {"formulation": formulation, "solver": solver, "compile": False}
     wanted = pioneer(**OTHER)
     retuned = Rti(pioneer(), TIGHT, **how)
@@ -61,7 +61,7 @@ def test_retuned_iteration_plans_like_one_built_so(formulation: str, solver: str
     retuned.retune(values(wanted))
     x, u, cost = plan(Rti(wanted, TIGHT, **how))
     assert np.abs(before[1] - u).max() > 0.1
-    tolerance = 1e-6 if solver == "riccati" else 1e-4
+    tolerance = 1e-5 if solver == "riccati" else 1e-4
     for ours, built in zip(plan(retuned), (x, u, cost), strict=True):
         np.testing.assert_allclose(ours, built, rtol=tolerance, atol=tolerance)
     retuned.retune(values(retuned.ocp))

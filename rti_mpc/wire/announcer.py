@@ -12,11 +12,16 @@ PERIOD_NS = 1_000_000_000  # monotonic, between two events of one code
 
 
 class Announcer:
-    """Publishes events of one role."""
+    """
+    Publishes events of one role.
+
+    Attributes:
+        role: Which one.
+    """
 
     def __init__(self, bus: Bus, role: str, epoch: int) -> None:
         self._publisher = bus.publisher(bus.keys.event(role), Event, cached=True)
-        self._role = role
+        self.role = role
         self._epoch = epoch
         self._seq = 0
         self._last_ns: dict[str, int] = {}  # by code
@@ -27,6 +32,6 @@ class Announcer:
         if severity is Severity.INFO or now_ns - self._last_ns.get(code, -PERIOD_NS) >= PERIOD_NS:
             self._last_ns[code] = now_ns
             self._seq += 1
-            self._publisher.put(Event(self._epoch, self._seq, stamp_ns, self._role, severity, code, text))
+            self._publisher.put(Event(self._epoch, self._seq, stamp_ns, self.role, severity, code, text))
             return True
         return False

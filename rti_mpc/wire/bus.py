@@ -81,6 +81,11 @@ class Publisher(Generic[M]):
         if self._realtime:
             give_way()  # to the thread that sends it: whoever puts goes on computing, and cores may be few
 
+    def undeclare(self) -> None:
+        """Leave the key."""
+        publisher: Any = self._publisher
+        publisher.undeclare()
+
 
 class Subscriber:
     """Receives from one key expression into a ring: the newest samples, oldest first. After `Bus.close`, nothing."""
@@ -203,6 +208,11 @@ class Bus:
             self._json[key] = Publisher(self._publisher(key, "application/json", zenoh.Priority.DATA, express=False, cached=True))
         self._json[key].put_bytes(json.dumps(value).encode())
 
+    def withdraw_json(self, key: str) -> None:
+        """Publish on a key no more, and let late joiners find nothing there."""
+        if (publisher := self._json.pop(key, None)) is not None:
+            publisher.undeclare()
+
     def _publisher(self, key: str, encoding: str, priority: zenoh.Priority, *, express: bool, cached: bool) -> Any:
         qos: Any = {
             "encoding": encoding,
@@ -223,12 +233,12 @@ class Bus:
         self._declared.append(publisher)
         return publisher
 
-    def serve(self, key: str, handler: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+    def serve(self, key: str, handler: Callable[[dict[str, Any]], dict[str, Any] | None]) -> None:
         """
         Answer requests on a key, in a thread of its own.
 
         What the handler raises, and requests that are not a JSON object, are
-        answered ``{"ok": false, "error": ...}``.
+        answered ``{"ok": false, "error": ...}``; None is no answer: another gives it.
         """
         ring: Any = zenoh.handlers.RingChannel(16)
         queryable = self._session.declare_queryable(key, ring)
@@ -303,11 +313,13 @@ def _json_object(payload: bytes) -> dict[str, Any]:
     return value if isinstance(value, dict) else {"ok": False, "error": "message must be a JSON object"}
 
 
-def _answer(key: str, query: zenoh.Query, handler: Callable[[dict[str, Any]], dict[str, Any]]) -> None:
+def _answer(key: str, query: zenoh.Query, handler: Callable[[dict[str, Any]], dict[str, Any] | None]) -> None:
     with query:
         request = _json_object(query.payload.to_bytes() if query.payload is not None else b"")
         try:
             answer = request if request.get("ok") is False else handler(request)
+            if answer is None:
+                return
             payload = json.dumps(answer)
         except Exception as error:  # a handler's fault is the requester's to hear, not ours to die of
             payload = json.dumps({"ok": False, "error": str(error)})

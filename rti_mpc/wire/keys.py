@@ -64,6 +64,11 @@ class Keys:
         return self.stream("telemetry")
 
     @property
+    def shadow_telemetry(self) -> str:
+        """`Telemetry`, by a controller that stands by."""
+        return self.stream("telemetry/standby")
+
+    @property
     def events(self) -> str:
         """All events, for subscribers."""
         return self.event("*")

@@ -183,6 +183,17 @@ def test_late_joiners_get_the_last_event_and_info_of_every_role(join: Any) -> No
     assert {received(infos).payload, received(infos).payload} == {b'{"role": "%s", "dt_s": 0.1}' % role for role in (b"robot", b"reference")}
 
 
+def test_late_joiners_do_not_get_what_was_withdrawn(join: Any) -> None:
+    robot = join(robot=True)
+    for role in ("controller", "standby"):
+        robot.publish_json(KEYS.info(role), {"role": role})
+    robot.withdraw_json(KEYS.info("controller"))
+    infos = join().subscriber(KEYS.infos, capacity=8, cached=True)
+    assert received(infos).payload == b'{"role": "standby"}'
+    robot.publish_json(KEYS.info("standby"), {"role": "last"})
+    assert received(infos).payload == b'{"role": "last"}'
+
+
 def test_own_messages_do_not_come_back(join: Any) -> None:
     robot, other = join(robot=True), join()
     own = [robot.subscriber(KEYS.state), robot.subscriber(KEYS.events, cached=True)]
@@ -366,6 +377,13 @@ def test_of_several_answers_a_refusal_counts(join: Any) -> None:
     robot.serve(KEYS.request, lambda request: {"ok": True})
     other.serve(KEYS.request, lambda request: {"ok": False, "error": "no"})
     eventually(lambda: operator.request(KEYS.request, {}, TIMEOUT_S) == {"ok": False, "error": "no"})
+
+
+def test_who_has_no_answer_leaves_it_to_others(join: Any) -> None:
+    robot, other = join(robot=True), join()
+    robot.serve(KEYS.request, lambda request: None)
+    other.serve(KEYS.request, lambda request: {"ok": True, "by": "other"})
+    assert join().request(KEYS.request, {"request": "params"}, TIMEOUT_S) == {"ok": True, "by": "other"}
 
 
 def test_a_request_waits_for_its_server_and_gives_up_in_time(join: Any) -> None:

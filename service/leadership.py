@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Who leads: of the controllers of one robot, the one of the highest epoch.
+
+There is no arbiter. Receivers take commands of the highest epoch they have
+heard and no others, and so does each controller: one that hears a higher epoch
+than its own stands by. It then plans like the leader, unheard, until the leader
+leaves states unanswered for `SILENCE_PERIODS`; then it leads, with a higher
+epoch. Of several that stand by the one of the lowest number is first, the
+others wait a period longer each. A leader that has itself left states unanswered
+for so long, or is shown one so late that another may lead by now, says nothing
+until it has listened.
+
+The low bits of an epoch are the number of its owner, drawn at its start:
+whatever two controllers have heard, they never arrive at the same one.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from threading import Event
+from typing import Any
+
+from rti_mpc.controller import Controller
+from rti_mpc.errors import MessageError
+from rti_mpc.message import Command, Notice, Severity, State
+from rti_mpc.status import Mode
+from rti_mpc.wire.bus import Bus, Received
+from rti_mpc.wire.cdr import decode
+
+LEADER, STANDBY = "controller", "standby"  # roles
+HEARING_S = 0.5  # for which a starting controller listens for others
+NUMBER_BITS = 20
+SILENCE_PERIODS = 1.5  # of the leader, by the states it did not answer, after which another leads
+SILENCE_S = 0.03  # at least, robot time
+ASLEEP_S = 0.03  # without a look at the clock, at least: less is a busy machine
+DOUBT_S = 0.03  # for which a leader in doubt listens, local time
+UNREADY = (Mode.IDLE, Mode.WAITING)  # with nothing to command
+
+
+@dataclass(frozen=True)
+class Others:
+    """
+    What a starting controller hears of others.
+
+    Attributes:
+        epoch: Highest epoch of a controller or a guard, 0 if there is none.
+        config_hash: Of the controller that leads, None if there is none.
+    """
+
+    epoch: int
+    config_hash: int | None
+
+
+def hear_others(bus: Bus, stop: Event) -> Others:
+    """Listen for `HEARING_S`."""
+    commands = [bus.subscriber(key) for key in (bus.keys.command, bus.keys.actuation)]
+    infos = bus.subscriber(bus.keys.info(LEADER), capacity=8, cached=True)
+    stop.wait(HEARING_S)
+    heard = [command for subscriber in commands if (command := decoded(subscriber.try_recv())) is not None]
+    leaders = [(info["epoch"], info["config_hash"]) for info in map(leader_info, infos.drain()) if info is not None]
+    epoch = max([command.epoch for command in heard] + [epoch for epoch, _ in leaders], default=0)
+    return Others(epoch, max(leaders)[1] if leaders else None)
+
+
+def decoded(received: Received | None) -> Command | None:
+    """Return the command in a payload, if it is one."""
+    try:
+        return None if received is None else decode(Command, received.payload)
+    except MessageError:
+        return None
+
+
+def leader_info(received: Received) -> dict[str, Any] | None:
+    """Return a leader's description of itself, if it is one."""
+    try:
+        info = json.loads(received.payload)
+        return info if isinstance(info["epoch"], int) and isinstance(info["config_hash"], int) else None
+    except (ValueError, RecursionError, KeyError, TypeError):
+        return None
+
+
+def epoch_above(epoch: int, number: int) -> int:
+    """Return the lowest epoch above another whose low bits are a number."""
+    return epoch + 1 + (number - epoch - 1) % (1 << NUMBER_BITS)
+
+
+class Leadership:
+    """
+    Whether one controller leads or stands by.
+
+    Attributes:
+        leading: Whether it leads.
+        epoch: Of its commands; those of the robot's first leader are the Unix seconds at its start, times ``2 ** NUMBER_BITS``, or above.
+        misfit: Why it can neither lead nor stand by: the leader has another configuration. Empty while it can.
+    """
+
+    def __init__(self, bus: Bus, controller: Controller, others: Others, *, config_hash: int, dt_s: float, standby: bool) -> None:
+        self.number = secrets.randbits(NUMBER_BITS)
+        self.epoch = epoch_above(max(others.epoch, time.time_ns() // 1_000_000_000 << NUMBER_BITS), self.number)
+        self.leading = False
+        self.misfit = ""
+        self._bus = bus
+        self._controller = controller
+        self._config_hash = config_hash
+        self._dt_ns = round(1e9 * dt_s)
+        self._silence_ns = round(1e9 * max(SILENCE_PERIODS * dt_s, SILENCE_S))
+        self._late_ns = -((self._dt_ns - self._silence_ns) // self._dt_ns) * self._dt_ns  # age of a state not answered at which another leads
+        self._highest = 0  # epoch heard of a controller; a guard counts its own
+        self._robot_epoch = 0
+        self._seen_ns = 0  # stamp of the last state
+        self._quiet_ns = 0  # stamp of the last state that the leader, we or another, is known to have answered, or from which on we listen
+        self._doubt_ns: int | None = None  # local time from which on this leader is in doubt
+        self._replaced = 0  # epoch of the leader before
+        self._took_over: Notice | None = None  # until the first command
+        self._looked_ns = time.monotonic_ns()
+        self._infos = bus.subscriber(bus.keys.info(LEADER), capacity=8, cached=True)
+        self._info: dict[str, Any] | None = None  # of the highest epoch, until it is read
+        self._commands = bus.subscriber(bus.keys.command, capacity=8)
+        self._tokens: dict[str, Any] = {}
+        self._company: set[int] = set()  # numbers of those who stand by
+        self._accompanied = False  # whether there ever was one
+        if not standby:
+            self._lead()
+        bus.watch_alive(self._meet)
+        controller.shadowing = standby
+
+    @property
+    def role(self) -> str:
+        """Role it plays."""
+        return LEADER if self.leading else STANDBY
+
+    @property
+    def relieved(self) -> bool:
+        """Whether another one takes over when this one ends."""
+        return not self.leading or bool(self._company)
+
+    def hear(self, state: State, local_ns: int) -> None:
+        """
+        Decide who answers a state; before the controller does.
+
+        Args:
+            state: The state.
+            local_ns: Local monotonic time.
+        """
+        self.listen(local_ns)
+        missed = state.stamp_ns - self._seen_ns >= self._silence_ns
+        self._seen_ns = state.stamp_ns
+        if state.epoch != self._robot_epoch or self._controller.mode in UNREADY or (missed and not self.leading):
+            self._robot_epoch, self._quiet_ns = state.epoch, state.stamp_ns
+        self._quiet_ns = min(self._quiet_ns, state.stamp_ns)  # the robot's clock may be set back
+        silent_ns = state.stamp_ns - self._quiet_ns
+        if not self.leading:
+            rank = sum(number < self.number for number in self._company)
+            if silent_ns >= self._silence_ns + rank * self._dt_ns and not self.misfit:
+                self._replaced = self._highest
+                self._lead()
+                text = f"leads from now on, with epoch {self.epoch}: nobody has answered a state for {1e-9 * silent_ns:.3f} s"
+                self._took_over = Notice(Severity.WARNING, "took_over", text)
+        elif self._doubt_ns is None:
+            if silent_ns >= self._silence_ns or self._controller.robot_now_ns(local_ns) - state.stamp_ns >= self._late_ns:
+                self._doubt(local_ns)
+        elif local_ns - self._doubt_ns >= 1e9 * DOUBT_S:
+            self._doubt_ns = None
+            self._controller.lead(self.epoch)
+
+    def sends(self, command: Command) -> bool:
+        """Whether a command is ours to send; it then counts as sent. The first one is not if the one that was replaced has answered after all."""
+        if not self.leading or self._doubt_ns is not None:
+            return False
+        if self._took_over is not None:
+            notice, self._took_over = self._took_over, None
+            late = [heard for heard in self._heard() if heard.epoch >= self._replaced]
+            if late:
+                self._highest = self._replaced
+                self._stand_by()
+                for command in late:
+                    self._follow(command)
+                return False
+            self._controller.notices.append(notice)
+        self._quiet_ns = command.state_stamp_ns
+        return True
+
+    def listen(self, local_ns: int) -> None:
+        """
+        Take in what others command, and stand by if one of them leads.
+
+        Args:
+            local_ns: Local monotonic time.
+        """
+        slept_ns, before_ns, self._looked_ns = local_ns - self._looked_ns, self._looked_ns, local_ns
+        if slept_ns > 1e9 * ASLEEP_S and self._controller.robot_now_ns(local_ns) - self._controller.robot_now_ns(before_ns) > self._silence_ns:
+            self._doubt(local_ns)
+        for command in self._heard():
+            if command.epoch >= self._highest:
+                self._follow(command)
+
+    def leader(self) -> Mapping[str, Any] | None:
+        """Return what the leader has last said of itself, once; None while this one leads."""
+        for info in map(leader_info, self._infos.drain()):
+            if info is not None and (self._info is None or info["epoch"] >= self._info["epoch"]):
+                self._info = info
+        if self.leading or self._info is None or self._info["epoch"] < self._highest:
+            return None
+        info, self._info = self._info, None
+        self._fit(info["config_hash"])
+        return info
+
+    def declare(self) -> bool:
+        """Show on the bus which role is played, if that has changed, and tell whether it has; off the path from state to command."""
+        roles = (LEADER,) if self.leading else (STANDBY, f"{STANDBY}.{self.number}")
+        if tuple(self._tokens) == roles:
+            return False
+        before, self._tokens = self._tokens, {role: self._bus.alive(role) for role in roles}
+        for token in before.values():
+            token.undeclare()
+        return True
+
+    def _lead(self) -> None:
+        self.epoch = self._highest = epoch_above(max(self.epoch - 1, self._highest), self.number)
+        self.leading = True
+        self._controller.lead(self.epoch)
+
+    def _heard(self) -> Iterator[Command]:
+        """Yield what others have commanded since the last call."""
+        while (received := self._commands.try_recv()) is not None:
+            if (command := decoded(received)) is not None:
+                yield command
+
+    def _stand_by(self) -> None:
+        self.leading = False
+        self._controller.shadowing = True
+        self._quiet_ns, self._doubt_ns = self._seen_ns, None
+
+    def _doubt(self, local_ns: int) -> None:
+        """Say nothing for a while, if there is somebody who may lead by now."""
+        if self.leading and self._accompanied:
+            self._doubt_ns = local_ns
+            self._controller.shadowing = True
+
+    def _follow(self, command: Command) -> None:
+        """Let somebody else's command act: its epoch is the highest."""
+        self._highest = command.epoch
+        self._fit(command.config_hash)
+        if self.leading:
+            self._stand_by()
+            text = f"stands by: epoch {command.epoch} leads, ours was {self.epoch}"
+            self._controller.notices.append(Notice(Severity.WARNING, "stepped_down", text))
+        self._controller.overhear(command)
+        if command.state_epoch == self._robot_epoch:
+            self._quiet_ns = max(self._quiet_ns, command.state_stamp_ns)
+
+    def _fit(self, config_hash: int) -> None:
+        if config_hash != self._config_hash:
+            self.misfit = differ(config_hash, self._config_hash)
+
+    def _meet(self, role: str, present: bool) -> None:
+        """Count who stands by; in a thread of the bus."""
+        kind, _, number = role.partition(".")
+        if kind == STANDBY and number.isdigit() and int(number) != self.number:
+            self._company = self._company | {int(number)} if present else self._company - {int(number)}
+            self._accompanied = True
+
+
+def differ(leader: int, ours: int) -> str:
+    """Say that configurations differ."""
+    return f"a standby needs the leader's configuration: its hash is {leader:016x}, ours {ours:016x}"

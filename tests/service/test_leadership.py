@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who leads, decided state by state: without processes, on a bus of lists."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from rti_mpc.message import Command, Notice, State
+from rti_mpc.status import Mode, QpStatus
+from rti_mpc.wire.bus import Received
+from rti_mpc.wire.cdr import encode
+from rti_mpc.wire.keys import Keys
+from service.leadership import NUMBER_BITS, Leadership, Others, epoch_above
+
+DT_S = 0.1
+DT_NS = 100_000_000
+HASH = 7
+
+
+@dataclass
+class Wire:
+    """What all hear of each other."""
+
+    buses: list[WireBus] = field(default_factory=list)
+
+    def put(self, sender: WireBus, payload: bytes) -> None:
+        for bus in self.buses:
+            if bus is not sender:
+                bus.commands.append(Received(payload, "", ""))
+
+    def show(self, role: str, present: bool) -> None:
+        for bus in self.buses:
+            bus.watch(role, present)
+
+
+class WireBus:
+    """As much of a bus as a `Leadership` uses."""
+
+    def __init__(self, wire: Wire) -> None:
+        self.keys = Keys()
+        self.commands: deque[Received] = deque()
+        self.watch: Callable[[str, bool], None] = lambda role, present: None
+        self._wire = wire
+        wire.buses.append(self)
+
+    def subscriber(self, key: str, **_: object) -> Any:
+        inbox = self.commands if key == self.keys.command else deque()
+
+        class Subscriber:
+            def try_recv(self) -> Received | None:
+                return inbox.popleft() if inbox else None
+
+            def drain(self) -> list[Received]:
+                return []
+
+        return Subscriber()
+
+    def watch_alive(self, callback: Callable[[str, bool], None]) -> None:
+        self.watch = callback
+
+    def alive(self, role: str) -> Any:
+        self._wire.show(role, True)
+
+        class Token:
+            def undeclare(token) -> None:
+                self._wire.show(role, False)
+
+        return Token()
+
+
+@dataclass
+class Puppet:
+    """As much of a controller as a `Leadership` uses."""
+
+    mode: Mode = Mode.TRACKING
+    shadowing: bool = False
+    epoch: int = 0
+    heard: list[Command] = field(default_factory=list)
+    notices: deque[Notice] = field(default_factory=deque)
+
+    def overhear(self, command: Command) -> None:
+        self.heard.append(command)
+
+    def lead(self, epoch: int) -> None:
+        self.epoch, self.shadowing = epoch, False
+
+    def robot_now_ns(self, local_ns: int) -> int:
+        return local_ns
+
+
+class One:
+    """One controller of several on a wire."""
+
+    def __init__(self, wire: Wire, *, standby: bool, number: int | None = None) -> None:
+        self.bus, self.puppet, self.wire = WireBus(wire), Puppet(), wire
+        self.leadership = Leadership(cast(Any, self.bus), cast(Any, self.puppet), Others(0, None), config_hash=HASH, dt_s=DT_S, standby=standby)
+        if number is not None:
+            self.leadership.number = number
+        self.leadership.declare()
+        self._seq = 0
+
+    def see(self, k: float, late_ns: int = 0) -> bool:
+        """Be shown the state of a sample; return whether it was answered."""
+        stamp_ns = round(k * DT_NS)
+        state = State(1, round(10 * k), stamp_ns, np.zeros(1))
+        self.leadership.hear(state, stamp_ns + late_ns)
+        command = self.made(k)
+        sends = self.leadership.sends(command)
+        if sends:
+            self.wire.put(self.bus, encode(command))
+        return sends
+
+    def made(self, k: float) -> Command:
+        """A command that answers the state of a sample."""
+        self._seq += 1
+        stamp_ns = round(k * DT_NS)
+        head = (self.puppet.epoch, self._seq, stamp_ns, 1, round(10 * k), stamp_ns, stamp_ns + DT_NS, HASH)
+        return Command(*head, Mode.TRACKING, QpStatus.SOLVED, DT_NS, np.zeros((1, 1)))
+
+
+@pytest.fixture
+def pair() -> tuple[One, One]:
+    """A leader and one that stands by, who have seen some states."""
+    wire = Wire()
+    pair = One(wire, standby=False), One(wire, standby=True)
+    for k in range(1, 5):
+        assert [one.see(k) for one in pair] == [True, False]
+    return pair
+
+
+def codes(one: One) -> list[str]:
+    return [notice.code for notice in one.puppet.notices]
+
+
+def test_standby_hears_the_leader_and_leads_from_the_second_state_without_an_answer(pair: tuple[One, One]) -> None:
+    leader, standby = pair
+    assert standby.puppet.shadowing
+    assert [standby.see(k) for k in (5, 6, 7)] == [False, True, True]
+    assert [command.state_stamp_ns for command in standby.puppet.heard] == [k * DT_NS for k in range(1, 5)]
+    assert standby.leadership.epoch > leader.leadership.epoch
+    assert codes(standby) == ["took_over"]
+    assert not standby.puppet.shadowing
+
+
+def test_states_between_samples_are_no_silence(pair: tuple[One, One]) -> None:
+    """A robot that sends states five times a period: the leader answers each fifth, and has one period to do so."""
+    _, standby = pair
+    assert [standby.see(4 + k / 5) for k in range(1, 9)] == [False] * 7 + [True]
+
+
+def test_leader_that_has_slept_says_nothing_until_it_has_listened(pair: tuple[One, One]) -> None:
+    leader, standby = pair
+    assert [standby.see(k) for k in (5, 6, 7)] == [False, True, True]
+    leader.bus.commands.clear()  # not here yet
+    assert not leader.see(8)
+    standby.see(8)
+    assert not leader.see(9)
+    assert leader.leadership.role == "standby"
+    assert codes(leader) == ["stepped_down"]
+    assert str(standby.leadership.epoch) in leader.puppet.notices[0].text
+
+
+def test_leader_that_nobody_has_replaced_goes_on_after_listening(pair: tuple[One, One]) -> None:
+    """No state reached anybody for a while: neither knows more than the other, and who led leads."""
+    leader, standby = pair
+    epoch = leader.leadership.epoch
+    assert [(leader.see(k), standby.see(k)) for k in (8, 9, 10)] == [(False, False), (True, False), (True, False)]
+    assert leader.leadership.epoch == leader.puppet.epoch == epoch
+    assert codes(leader) == codes(standby) == []
+
+
+def test_late_look_at_the_clock_counts_as_sleep(pair: tuple[One, One]) -> None:
+    """A process that was stopped may be shown a state of before: it is fresh by its stamp only."""
+    leader, _ = pair
+    assert not leader.see(5, late_ns=10 * DT_NS)
+    assert not leader.see(6, late_ns=9 * DT_NS + 10_000_000), "a queue of old states is no time to listen"
+    assert leader.see(7, late_ns=8 * DT_NS + 50_000_000)
+
+
+def test_state_shown_a_period_late_is_not_answered() -> None:
+    """The next one is out, and whoever stands by may have answered that."""
+    for late_ns, answered in ((DT_NS - 1, True), (DT_NS, False)):
+        leader, standby = One(wire := Wire(), standby=False), One(wire, standby=True)
+        assert leader.see(1)
+        for local_ns in range(DT_NS, 2 * DT_NS + late_ns, 10_000_000):
+            leader.leadership.listen(local_ns)  # awake all the time
+        assert leader.see(2, late_ns) == answered
+        assert not standby.leadership.leading
+
+
+def test_leader_that_answers_while_it_is_being_replaced_stays_the_leader(pair: tuple[One, One]) -> None:
+    leader, standby = pair
+    hear = standby.leadership.hear
+
+    def hear_and_compute(state: State, local_ns: int) -> None:
+        hear(state, local_ns)
+        if state.stamp_ns == 6 * DT_NS:
+            leader.wire.put(leader.bus, encode(leader.made(5)))  # comes at last
+
+    standby.leadership.hear = hear_and_compute  # type: ignore[method-assign]
+    assert [standby.see(k) for k in (5, 6, 7, 8)] == [False, False, False, True]
+    assert codes(standby) == ["took_over"]
+
+
+def test_leader_that_missed_states_says_nothing_until_it_has_listened(pair: tuple[One, One]) -> None:
+    """It was awake, and is shown the next state in time: those before were lost on the way, to it alone perhaps."""
+    leader, _ = pair
+    for local_ns in range(4 * DT_NS, 7 * DT_NS, 10_000_000):
+        leader.leadership.listen(local_ns)
+    assert not leader.see(7)
+    assert leader.see(8)
+
+
+def test_leader_that_has_just_woken_sends_no_ramp_of_its_own(pair: tuple[One, One]) -> None:
+    leader, _ = pair
+    leader.leadership.listen(30 * DT_NS)
+    assert not leader.leadership.sends(leader.made(4))
+
+
+def test_standby_that_has_slept_itself_listens_first(pair: tuple[One, One]) -> None:
+    leader, standby = pair
+    for k in range(5, 20):
+        assert leader.see(k)
+    standby.bus.commands.clear()
+    assert not standby.see(20)
+    leader.see(20)
+    assert not standby.see(21)
+
+
+def test_leader_alone_answers_whatever_it_missed() -> None:
+    leader = One(Wire(), standby=False)
+    assert [leader.see(k) for k in (1, 2, 9, 10)] == [True] * 4
+
+
+def test_of_two_that_stand_by_the_lower_number_leads_and_the_other_a_period_later_if_it_must() -> None:
+    for dead in (False, True):
+        wire = Wire()
+        leader, high, low = One(wire, standby=False), One(wire, standby=True), One(wire, standby=True)
+        for one, number in ((high, 9), (low, 5)):
+            one.leadership.number = number
+            one.leadership._tokens = {}
+            one.leadership._company = set()
+        for one in (high, low):
+            one.leadership.declare()
+        for k in range(1, 5):
+            assert [one.see(k) for one in (leader, high, low)] == [True, False, False]
+        answers = [(high.see(k), not dead and low.see(k)) for k in range(5, 9)]
+        assert answers == ([(False, False), (False, False), (True, False), (True, False)] if dead else [(False, False)] + [(False, True)] * 3)
+
+
+def test_higher_epoch_ends_a_leadership_at_once(pair: tuple[One, One]) -> None:
+    leader, standby = pair
+    standby.leadership._lead()
+    standby.leadership.declare()
+    assert standby.see(5)
+    assert not leader.see(5)
+    assert [leader.see(k) for k in (6, 7)] == [False, True], "and begins another when that falls silent"
+    assert leader.leadership.epoch > standby.leadership.epoch
+
+
+def test_robot_that_restarts_or_sets_its_clock_back_is_not_a_silent_leader(pair: tuple[One, One]) -> None:
+    _, standby = pair
+    for epoch, stamp_ns in ((2, 90 * DT_NS), (2, 91 * DT_NS), (2, 3 * DT_NS), (2, 4 * DT_NS)):
+        standby.leadership.hear(State(epoch, 1, stamp_ns, np.zeros(1)), stamp_ns)
+        assert not standby.leadership.leading
+    standby.leadership.hear(State(2, 1, 5 * DT_NS, np.zeros(1)), 5 * DT_NS)
+    assert standby.leadership.leading, "silence is counted from there"
+
+
+def test_controller_with_nothing_to_command_takes_over_nothing(pair: tuple[One, One]) -> None:
+    _, standby = pair
+    standby.puppet.mode = Mode.WAITING
+    assert [standby.see(k) for k in range(5, 12)] == [False] * 7
+    standby.puppet.mode = Mode.TRACKING
+    assert [standby.see(k) for k in (12, 13)] == [False, True]
+
+
+def test_leader_of_another_configuration_is_not_followed(pair: tuple[One, One]) -> None:
+    leader, standby = pair
+    standby.leadership._config_hash = 8
+    leader.see(5)
+    standby.see(5)
+    assert f"{HASH:016x}" in standby.leadership.misfit
+    assert [standby.see(k) for k in range(6, 10)] == [False] * 4
+
+
+def test_epochs_of_two_numbers_never_meet() -> None:
+    rng = np.random.default_rng(1)
+    for heard, other, number in rng.integers(0, [2**52, 2**52, 2**NUMBER_BITS], size=(500, 3)).tolist():
+        epoch = epoch_above(heard, number)
+        assert heard < epoch <= heard + 2**NUMBER_BITS
+        assert epoch % 2**NUMBER_BITS == number
+        assert epoch != epoch_above(other, (number + 1) % 2**NUMBER_BITS)
+
+
+def test_never_two_answer_a_state_and_nearly_every_state_is_answered_though_controllers_sleep() -> None:
+    """Three that hear each other; each falls asleep now and then, for up to 20 states."""
+    rng = np.random.default_rng(2)
+    answered = []
+    for _ in range(20):
+        wire = Wire()
+        ones = [One(wire, standby=k > 0) for k in range(3)]
+        asleep = np.zeros(3, dtype=int)
+        for k in range(1, 200):
+            falling = (rng.random(3) < 0.02) & (asleep == 0)
+            asleep = np.where(falling, rng.integers(1, 20, 3), np.maximum(asleep - 1, 0))
+            answered.append(sum(one.see(k) for one, rest in zip(ones, asleep, strict=True) if rest == 0))
+    assert max(answered) == 1
+    assert np.mean(answered) > 0.9
