@@ -90,7 +90,6 @@ class Controller:
         self._x0 = self._prediction.x
         self._loaded = False  # whether the QP of t_k is prepared
         self._reach: tuple[Array, Array] = (np.zeros((2, model.nu)), np.zeros((2, model.nu)))  # what the first rows at t_k may be
-        self._left_ns = 0  # when the last command left, if that is known
         self._overran = False  # whether the last sample was over its budget
         self._stopped = ""  # why an operator's stop is latched
         self._command: Command | None = None
@@ -217,21 +216,17 @@ class Controller:
         """
         Hold a sample to its budget: its command must be there before its first row is over.
 
-        Args:
-            command: What `receive_state` has just returned.
-            local_ns: Local monotonic time.
-
         Returns:
-            What to publish: the command; or nothing if it is too late, so that the
-            previous plan plays on in the robot's hands; or a ramp when it does not.
+            What to publish: the command; nothing if it is too late and the previous plan plays on in the robot's hands; or a ramp.
         """
         elapsed_ns = round((local_ns - self._states.clock.arrival_ns) * self._states.clock.rate)
         now_ns = command.state_stamp_ns + self._states.clock.late_ns + elapsed_ns
-        self._left_ns = max(self._left_ns + 1, now_ns)  # commands leave one after the other, whatever our idea of the robot's clock
         if now_ns < command.stamp_ns + BUDGET * self.grid.dt_ns:
             if self._overran:
                 self._overran = False
                 self._modes.enter(command.mode, "samples are in time again")
+            if not self.shadowing:
+                self._sent.leave(command, now_ns)
             return command
         self._overran = True
         if not self.shadowing:
@@ -245,6 +240,8 @@ class Controller:
         if not self._stopped:
             self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "over_budget")
         assert self._states.last is not None
+        if not self.shadowing:
+            self._sent.leave(command, now_ns)
         return self._brake(self._states.last, now_ns + self.grid.delay_ns, command.status)
 
     # The two phases.
@@ -253,9 +250,7 @@ class Controller:
         """Prepare the next sample: fix `t_k`, look the reference up, shift, linearize and load the QP."""
         self._record.keep(self._seq)
         self._look_ahead()
-        if self._command is not None and not self.shadowing and self._left_ns > self._command.stamp_ns:
-            self._sent.withdraw(self._command)
-            self._sent.append(self._command, self._left_ns)
+        self._sent.settle()
         state = self._states.last
         if not self.grid.running or state is None:
             return
@@ -404,7 +399,7 @@ class Controller:
             u=u,
         )
         if not self.shadowing:
-            self._sent.append(self._command, self._left_ns + 1)
+            self._sent.append(self._command)
         return self._command
 
     @property
@@ -455,5 +450,4 @@ class Controller:
         if self._delay is not None:
             self._delay.clear()
         self._plan = None
-        self._left_ns = 0
         self._overran = self._loaded = self.grid.running = False

@@ -34,6 +34,7 @@ EACH = 4  # candidates a period
 FORGETTING = 0.98  # in a step that says something: the last fifty count
 TELLING = 0.1  # in normalised squared errors, by which the candidates must differ for a step to say something
 BELIEVED = 20.0  # in normalised squared errors, by which another candidate must be better: noise alone is 4.5 sigma away from it
+WILD = 1e6  # error of a state, in its unit, from which on it says nothing
 FINEST = 1e-4  # error of a state, in its unit, below which none is told from another
 
 
@@ -82,7 +83,8 @@ class DelayEstimator:
         last, self._last = self._last, (x.copy(), stamp_ns)
         if last is None or not 0 < stamp_ns - last[1] <= 2 * self._dt_ns:
             return
-        squared = self._errors(*last, x, stamp_ns) ** 2
+        errors = self._errors(*last, x, stamp_ns)
+        squared = np.where(np.abs(errors) < WILD, errors, np.nan) ** 2
         played = np.flatnonzero(np.isfinite(squared.sum(axis=1)))
         if not len(played):
             return

@@ -325,7 +325,7 @@ class Rti:
     def _solve_qp(self) -> QpStatus:
         """Solve with the QP solver."""
         self.solver = self._backup
-        if not isfinite(self._x0.sum()):
+        if not np.isfinite(self._x0).all():
             return QpStatus.FAILED
         violation = self._violation
         if not self._loaded:

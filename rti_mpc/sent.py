@@ -22,15 +22,29 @@ class Sent:
 
     def __init__(self, u_rest: Array, lbdu: Array, ubdu: Array, dt_ns: int) -> None:
         self.delay_ns = 0
+        self._left_ns = EVER_NS  # when the last command left at the earliest
+        self._late: Command | None = None  # the last one, if it left after its time
         self._slew = (lbdu, ubdu)  # per dt
         self._dt_ns = dt_ns
         self._schedule = Schedule(u_rest, 1e9 * np.minimum(-lbdu, ubdu) / dt_ns)
 
-    def append(self, command: Command, left_ns: int = EVER_NS) -> None:
-        """Remember a command, and when it left; unless it has expired before its time, and the robot refuses it."""
-        start_ns = max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, left_ns)
+    def append(self, command: Command) -> None:
+        """Remember a command, unless it has expired before its time: the robot refuses it."""
+        self._late = None
+        self._left_ns += 1  # commands leave one after the other, whatever our idea of the robot's clock
+        start_ns = max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, self._left_ns)
         if start_ns < end_ns(command):
             self._schedule.add(command, start_ns, end_ns(command))
+
+    def leave(self, command: Command, now_ns: int) -> None:
+        """Take note of when the last command leaves: what was sent before acts at least until then."""
+        self._left_ns, self._late = max(self._left_ns, now_ns), command if now_ns > command.stamp_ns else None
+
+    def settle(self) -> None:
+        """Remember what `leave` has noted."""
+        if (late := self._late) is not None:
+            self.withdraw(late)
+            self.append(late)
 
     def withdraw(self, command: Command) -> None:
         """Forget the last command: it was not sent after all."""
@@ -38,10 +52,12 @@ class Sent:
 
     def brake(self, before_ns: int, now_ns: int) -> None:
         """Assume that the robot, whose clock has jumped from one time to another, brakes from what acted."""
+        self._left_ns = EVER_NS
         self._schedule.brake(self.at(before_ns)[0], now_ns)
 
     def clear(self) -> None:
         """Forget everything: the robot was restarted, and stands."""
+        self._left_ns = EVER_NS
         self._schedule.brake(self._schedule.u_rest, EVER_NS)
 
     def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Array, float]]:

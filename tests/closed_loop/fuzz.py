@@ -68,13 +68,15 @@ class Fuzz:
     def _begin(self, now_ns: int) -> None:
         """Begin a life of the robot."""
         self._now_ns = now_ns
-        self._offset_ns += 10**10
+        self._offset_ns += 10**15
         self._origin_ns = now_ns
         self._actuator = Actuator(np.zeros(2), STEP / 0.1, self._epoch)
         self._played: deque[tuple[int, float, float, bool]] = deque()  # until when, what, and whether the robot braked on its own
         self._queue.clear()
         self._waiting: Payload | None = None  # the newest state that the controller has not had time for
         self._busy_ns = now_ns  # until when it has none
+        self._settled_ns = 0  # until when after a jump nobody but the robot, and a guard beside it, knows what acts
+        self._ordered_ns = 0  # until when no state overtakes another
 
     def local_ns(self, t_ns: int) -> int:
         """Local time at a robot time."""
@@ -103,7 +105,8 @@ class Fuzz:
                 while played and played[0][0] <= self._now_ns - WINDOW_NS:
                     played.popleft()
                 # Braking is the robot's own: in steps, and from a row that may just have begun to act.
-                for end_ns, u_before, omega_before, braked in list(played)[-1:] if self._actuator.braking else played:
+                known = played if not self._actuator.braking and self._now_ns > self._settled_ns else list(played)[-1:]
+                for end_ns, u_before, omega_before, braked in known if self._now_ns > self._settled_ns else ():
                     most = 1.1 + ROUNDING if braked else 1.0 + ROUNDING
                     assert abs(u_c - u_before) <= 0.25 * most, (self.samples, self._now_ns, end_ns, u_c, u_before)
                     assert abs(omega_c - omega_before) <= 0.4 * most, (self.samples, self._now_ns, end_ns, omega_c, omega_before)
@@ -194,7 +197,7 @@ class Fuzz:
             x = rng.standard_normal(5) * 10.0 ** rng.integers(-3, 12)
         elif kind < 0.02:
             x[2] += 2 * np.pi * rng.integers(-5, 6)
-        if rng.random() < 0.01:
+        if rng.random() < 0.01 and stamp_ns > self._ordered_ns:
             stamp_ns -= int(rng.integers(0, 200)) * MS  # one that was sent before
         return State(self._epoch, self._seq, stamp_ns, x)
 
@@ -259,7 +262,7 @@ class Fuzz:
         """Stop the controller for a while: then it sees some of the states that have waited, all at once."""
         first_ns, last_ns = self._now_ns + DT, self._now_ns + duration_ns
         self._play(last_ns)
-        self._busy_ns = last_ns
+        self._busy_ns, self._ordered_ns = last_ns, last_ns + 10 * DT
         self._waiting = None
         kept = sorted(self.rng.choice(np.arange(first_ns, last_ns, DT), size=2))
         for stamp_ns in kept:
@@ -274,8 +277,9 @@ class Fuzz:
 
     def _jump(self, by_ns: int) -> None:
         """Let the robot's clock jump: what it was told of the future no longer holds, and it brakes."""
-        u = self._actuator.u.copy()
+        u, local_ns = self._actuator.u.copy(), self.local_ns(self._now_ns)
         self._begin(max(0, self._now_ns + by_ns))
-        self._offset_ns -= 10**10
+        self._offset_ns = local_ns
+        self._settled_ns = self._now_ns + 10 * DT
         self._actuator._schedule.brake(u, self._now_ns)
         self.seen["jump"] += 1

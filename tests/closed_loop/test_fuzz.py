@@ -10,7 +10,7 @@ import pytest
 
 from tests.closed_loop.fuzz import Fuzz
 
-SHORT = 10_000
+SHORT = 5_000
 MILLION = 1_000_000
 
 
