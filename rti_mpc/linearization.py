@@ -14,6 +14,11 @@ dynamics and outputs of `rti_mpc.ocp` become
 
 and the cost its Gauss-Newton approximation. It is halved, to read
 :math:`\tfrac12 z^T P z + q^T z` as a QP solver wants it.
+
+Far from the reference the curvature that Gauss-Newton leaves out, residual times
+second derivative, is the larger part, and full steps go to and fro. So steps are
+damped in proportion to the cost at the guess (Levenberg-Marquardt
+[FanYuan2005]_): where the reference is met, not at all; the optimum stays.
 """
 
 from __future__ import annotations
@@ -28,6 +33,8 @@ from rti_mpc.ocp import Ocp
 
 # What may change between samples without a new structure: attributes of the Ocp, read by the compiled functions in this order.
 WEIGHTS = ("Q", "R", "delta", "lambda_", "lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx", "z", "Z", "Q_e", "lh", "uh", "zh", "Zh")
+
+DAMPING = 0.005  # see docs/engine.md
 
 
 class Linearization:
@@ -57,6 +64,7 @@ class Linearization:
         lg: Lower bounds on g, shape ``(ng, 1)``; `ug`, upper bounds; `zg` and `Zg`, weights of the slacks.
         increments: ``u_k - u_{k-1}``, shape ``(nu, N_u)``.
         force: ``lambda_k R (u_k - u_{k-1})``, shape ``(nu, N_u)``.
+        damping: Weight of half the square of a step in each input, shape ``(nu, 1)``.
         R: The increment weight, sparse.
         cost: The cost (4) at the guess.
         checksum: Finite if and only if everything above is.
@@ -97,6 +105,7 @@ class Linearization:
         self.R = self.w["R"] * pattern(ocp.R)
         self.force = (self.R @ self.increments) * ca.repmat(self.w["lambda_"].T, nu, 1)
         self.cost = ca.sum2(nodes[nx, :]) + ca.dot(self.increments, self.force)
+        self.damping = DAMPING * self.cost / ca.DM(half_range(ocp) ** 2)
         self.checksum = ca.sum1(ca.vec(stages)) + ca.sum1(ca.vec(nodes)) + self.cost + ca.sum1(ca.vec(self.b))
         self.checksum += ca.sum1(ca.vec(bounded))
 
@@ -115,10 +124,10 @@ class Linearization:
         return ca.MX(self.force - ca.horzcat(self.force[:, 1:], ca.MX.zeros(self.u_prev.numel())))
 
     def increment_hessian(self, k: int) -> tuple[ca.MX, ca.MX | None]:
-        """Return the blocks ``(k, k)`` and ``(k, k + 1)`` of the Hessian of half the increment cost; None after the last stage."""
+        """Return the blocks ``(k, k)`` and ``(k, k + 1)`` of the Hessian of half the increment cost and the damping; None after the last stage."""
         last = k == self.u.shape[1] - 1
         following = 0 if last else self.w["lambda_"][k + 1]
-        return self.R * (self.w["lambda_"][k] + following), None if last else -self.R * following
+        return self.R * (self.w["lambda_"][k] + following) + ca.diag(self.damping), None if last else -self.R * following
 
 
 def linearize(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
@@ -188,9 +197,13 @@ def shift(ocp: Ocp) -> ca.Function:
 
 def change(ocp: Ocp, u: Any, before: Any) -> Any:
     """Return the size of a step as an expression: what an input changes by at most, relative to half its range, or to its unit if that has no end."""
+    return ca.mmax(ca.fabs(u - before) / ca.repmat(ca.DM(half_range(ocp)), 1, u.shape[1]))
+
+
+def half_range(ocp: Ocp) -> np.ndarray[Any, Any]:
+    """Return half the range of each input, or its unit if that has no end."""
     half = 0.5 * (ocp.ubu - ocp.lbu)
-    scale = ca.repmat(ca.DM(np.where(np.isfinite(half), half, 1.0)), 1, u.shape[1])
-    return ca.mmax(ca.fabs(u - before) / scale)
+    return np.where(np.isfinite(half), half, 1.0)
 
 
 def plan_cost(ocp: Ocp) -> ca.Function:

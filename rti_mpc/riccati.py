@@ -58,7 +58,7 @@ class Recursion:
 def riccati(ocp: Ocp) -> Recursion:
     """Build the recursion of an OCP."""
     lin = Linearization(ocp)
-    forms = [lin.A, lin.B, lin.b, lin.hessian, lin.gradient, lin.force, lin.increments, lin.g, lin.g_x, lin.g_u, lin.checksum]
+    forms = [lin.A, lin.B, lin.b, lin.hessian, lin.gradient, lin.force, lin.increments, lin.g, lin.g_x, lin.g_u, lin.damping, lin.checksum]
     linearize = ca.Function("linearize", lin.arguments, [ca.veccat(*forms)])
 
     stages = ca.MX.sym("stages", linearize.numel_out(0))
@@ -124,14 +124,14 @@ def backward(ocp: Ocp, lin: Linearization, forms: list[ca.MX], places: list[ca.M
     soft = soft_stages(lin, forms, places[2], stiff)
     u, at, at_increment = (ca.horzsplit(e) for e in (lin.u, *places[:2]))
     lambda_ = ca.vertsplit(w["lambda_"])
-    R = lin.R.nz[:]
+    R, damping = lin.R.nz[:], forms[10]
     P, p = ca.MX.zeros(n * (n + 1) // 2), ca.MX.zeros(n)
     gains = []
     for k in reversed(range(N)):
         stage = A[k], B[k], b[k], *soft[k], H[k], h[k], P, p
         if k < N_u:
             bounds = w["lbu"], w["ubu"], w["lbdu"], w["ubdu"]
-            P, p, gain = free(*stage, R, lambda_[k], force[k], increment[k], u[k], at[k], at_increment[k], *bounds)
+            P, p, gain = free(*stage, R, damping, lambda_[k], force[k], increment[k], u[k], at[k], at_increment[k], *bounds)
             gains.append(gain)
         else:
             P, p = held(*stage)
@@ -164,6 +164,7 @@ def backward_stage(ocp: Ocp, lin: Linearization, free: bool) -> ca.Function:
         return ca.Function("held", inputs, ca.cse([ca.densify(Qss)[upper].nz[:], ca.densify(qs)]))
 
     R_nz, lambda_ = ca.SX.sym("R", lin.R.sparsity().nnz()), ca.SX.sym("lambda")
+    damping = ca.SX.sym("damping", nu)
     force_guess, increment, u, place, at, lbu, ubu, lbdu, ubdu = (
         ca.SX.sym(name, nu) for name in ("force", "increment", "u", "place", "at", "lbu", "ubu", "lbdu", "ubdu")
     )
@@ -171,14 +172,14 @@ def backward_stage(ocp: Ocp, lin: Linearization, free: bool) -> ca.Function:
     weight, pull = hold(of.stiff, at, increment, lbdu, ubdu)
     R, force = R + ca.diag(weight), force_guess + pull
     weight, pull = hold(of.stiff, place, u, lbu, ubu)
-    Quu, qu = Quu + R + ca.diag(weight), qu + force + pull
+    Quu, qu = Quu + R + ca.diag(weight + damping), qu + force + pull
     Qus = ca.horzcat(Qux, -R)
     gain = cholesky_solve(Quu, ca.horzcat(Qus, qu))
     # The cost with du = -K s - kappa in it.
     P_before = ca.diagcat(Qxx, R) - Qus.T @ gain[:, :n]
     p_before = ca.vertcat(qx, -force) - Qus.T @ gain[:, n]
     out = [ca.densify(P_before)[upper].nz[:], ca.densify(p_before), ca.densify(ca.vec(gain))]
-    return ca.Function("free", [*inputs, R_nz, lambda_, force_guess, increment, u, place, at, lbu, ubu, lbdu, ubdu], ca.cse(out))
+    return ca.Function("free", [*inputs, R_nz, damping, lambda_, force_guess, increment, u, place, at, lbu, ubu, lbdu, ubdu], ca.cse(out))
 
 
 def hold(stiff: ca.SX, place: ca.SX, value: ca.SX, lower: ca.SX, upper: ca.SX) -> tuple[ca.SX, ca.SX]:

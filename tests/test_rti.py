@@ -624,3 +624,20 @@ def test_resident_memory_stays_flat(solver: str, samples: int) -> None:
 def resident() -> int:
     """Resident memory of this process, bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+
+
+@pytest.mark.parametrize("iterations", [1, 3])
+@pytest.mark.parametrize("beside_m", [0.02, 1.0])
+def test_metres_behind_its_reference_a_robot_does_not_swing(iterations: int, beside_m: float) -> None:
+    """Undamped, full steps turn it at the slew limit, to and fro, at nine samples of ten; converged NMPC hardly turns it."""
+    ocp = pioneer(N=20, method="rk4")
+    rti = Rti(ocp, iterations=iterations, compile=False)
+    plant, x, turns = ocp.phi(), np.array([-4.0, beside_m, 0.0, 0.0, 0.0]), []
+    rti.reset(x, np.zeros(2))
+    for k in range(50):
+        t = 0.1 * np.arange(k + 1, k + 21)
+        rti.prepare(np.column_stack([0.5 * t, 0 * t, 0 * t]), shift=k > 0)
+        assert rti.feedback(x).usable
+        turns.append(rti.u[0, 1])
+        x = np.array(plant(x, rti.u[0], ocp.model.p_nominal)).ravel()
+    assert np.abs(np.diff(turns[10:])).max() < 0.05  # of a slew limit of 0.4
