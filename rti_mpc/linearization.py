@@ -34,7 +34,7 @@ from rti_mpc.ocp import Ocp
 # What may change between samples without a new structure: attributes of the Ocp, read by the compiled functions in this order.
 WEIGHTS = ("Q", "R", "delta", "lambda_", "lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx", "z", "Z", "Q_e", "lh", "uh", "zh", "Zh")
 
-DAMPING = 0.005  # see docs/engine.md
+DAMPING = 0.005  # of the cost, for a step of half an input's range; see docs/engine.md
 
 
 class Linearization:
@@ -64,7 +64,7 @@ class Linearization:
         lg: Lower bounds on g, shape ``(ng, 1)``; `ug`, upper bounds; `zg` and `Zg`, weights of the slacks.
         increments: ``u_k - u_{k-1}``, shape ``(nu, N_u)``.
         force: ``lambda_k R (u_k - u_{k-1})``, shape ``(nu, N_u)``.
-        damping: Weight of half the square of a step in each input, shape ``(nu, 1)``.
+        damping: Weight of half the square of a step in each input, shape ``(nu, 1)``; zero for a linear model.
         R: The increment weight, sparse.
         cost: The cost (4) at the guess.
         checksum: Finite if and only if everything above is.
@@ -105,7 +105,7 @@ class Linearization:
         self.R = self.w["R"] * pattern(ocp.R)
         self.force = (self.R @ self.increments) * ca.repmat(self.w["lambda_"].T, nu, 1)
         self.cost = ca.sum2(nodes[nx, :]) + ca.dot(self.increments, self.force)
-        self.damping = DAMPING * self.cost / ca.DM(half_range(ocp) ** 2)
+        self.damping = damping(ocp) * self.cost
         self.checksum = ca.sum1(ca.vec(stages)) + ca.sum1(ca.vec(nodes)) + self.cost + ca.sum1(ca.vec(self.b))
         self.checksum += ca.sum1(ca.vec(bounded))
 
@@ -198,6 +198,15 @@ def shift(ocp: Ocp) -> ca.Function:
 def change(ocp: Ocp, u: Any, before: Any) -> Any:
     """Return the size of a step as an expression: what an input changes by at most, relative to half its range, or to its unit if that has no end."""
     return ca.mmax(ca.fabs(u - before) / ca.repmat(ca.DM(half_range(ocp)), 1, u.shape[1]))
+
+
+def damping(ocp: Ocp) -> ca.DM:
+    """Return the damping of steps in each input relative to the cost, shape ``(nu, 1)``: none for a linear model, whose full step is exact."""
+    model = ocp.model
+    variables = ca.vertcat(model.x, model.u)
+    first = ca.jacobian(ca.vertcat(model.f_expl_expr, model.y_expr), variables)
+    linear = ca.jacobian(ca.vec(first), variables).nnz() == 0
+    return ca.DM.zeros(model.nu) if linear else ca.DM(DAMPING / half_range(ocp) ** 2)
 
 
 def half_range(ocp: Ocp) -> np.ndarray[Any, Any]:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
+from rti_mpc.linearization import damping
 from rti_mpc.ocp import Ocp
 from rti_mpc.qp import Qp
 from rti_mpc.rti import Rti
@@ -162,14 +163,17 @@ def test_gradient_is_half_that_of_the_cost(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_hessian_is_the_gauss_newton_approximation(name: str) -> None:
-    """Outputs that are not linear included: their Hessian follows the guess."""
+def test_hessian_is_the_gauss_newton_approximation_and_the_damping(name: str) -> None:
+    """Outputs that are not linear included: their Hessian follows the guess. Steps in inputs are damped in proportion to the cost."""
     for seed in (4, 5):
         rti = at_random(name, seed=seed)
         ocp, problem = rti.ocp, ByHand(rti)
         J = jacobian(problem.residuals, problem.guess)
         expected = J.T @ J
         slacks = len(problem.guess) - ocp.N * len(ocp.lg)
+        steps = range(slacks - rti.u.size, slacks)
+        residuals = problem.residuals(problem.guess)
+        expected[steps, steps] += np.tile(np.array(damping(ocp)).ravel(), ocp.N_u) * (residuals @ residuals)
         expected[slacks:, slacks:] = np.diag(0.5 * rti._cost_scale * SLACK_UNIT**2 * np.tile([*ocp.Z[list(ocp.soft)], *ocp.Zh], ocp.N))
         np.testing.assert_allclose(hessian(whole(rti)), expected, rtol=1e-7, atol=1e-6)
 
