@@ -101,9 +101,9 @@ def solver(failure: str, samples: int) -> Act:
     """Let the solver fail so many times in a row; the fault is when the second sample from now is due, for one is prepared already."""
 
     def act(system: System) -> int:
-        asked_ns = system.now_ns()
         system.ask(system.keys.request, request="inject", failure=failure, samples=samples)
-        system.wait(lambda: system.last_sample_ns() > asked_ns, "the next sample")
+        granted_ns = system.now_ns()
+        system.wait(lambda: system.last_sample_ns() > granted_ns, "the next sample")
         return system.last_sample_ns() + system.period_ns
 
     return act
