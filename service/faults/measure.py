@@ -30,6 +30,7 @@ from service.robot_log import RobotLog
 STANDING_M_S = 1e-3
 AT_REST = 1e-9  # of an input, in its unit
 LATE_S = 0.02  # by which a ramp may be behind one that began in time: two steps of ten milliseconds
+JUMP = 0.5  # share of a period's change with which a ramp begins that may be a whole period behind: it then waits until that is paid for
 FRESH_S = 0.25  # age up to which a state may be answered
 
 Mask = NDArray[np.bool_]
@@ -151,8 +152,10 @@ def braking(log: RobotLog, limits: Limits, first: int, zero: int) -> int:
     """Return the row at which the ramp to rest, which ends at row `zero`, has begun; see above."""
     t_s = 1e-9 * (log.stamp_ns - log.stamp_ns[zero])
     left_s = (np.abs(log.u - limits.u_rest) / step(limits)).max(axis=1) * limits.dt_s
+    way = np.abs(log.u - limits.u_rest)
     for row in range(max(first, 1), zero):
-        if t_s[row - 1] + left_s[row - 1] >= -LATE_S and not np.array_equal(log.u[row], log.u[row - 1]):
+        late_s, share = -t_s[row - 1] - left_s[row - 1], float(((way[row - 1] - way[row]) / step(limits)).max())
+        if not np.array_equal(log.u[row], log.u[row - 1]) and (late_s <= LATE_S or (late_s <= limits.dt_s and share >= JUMP)):
             return row
     return zero
 
