@@ -39,6 +39,7 @@ from service.params import Params
 from service.references import References
 
 TICK_S = 0.01  # between two looks for silence
+PLANNERS = 16  # whose references may wait for one who has just started, all at once
 RAMP_S = 0.6  # of a controller that is being stopped, to bring the robot to rest
 WARM_UP = 20  # solves before the first command: the first real sample is not the first call
 
@@ -140,7 +141,12 @@ class Daemon:
         self._prepare_us = 0.0
         self._ticked_ns = 0
         self._threads = [
-            Thread(target=self._guarded, args=(act, bus.subscriber(key, cached=cached)), name=act.__name__, daemon=True)
+            Thread(
+                target=self._guarded,
+                args=(act, bus.subscriber(key, capacity=PLANNERS if cached else 1, cached=cached)),
+                name=act.__name__,
+                daemon=True,
+            )
             for act, key, cached in (
                 (self._control, keys.state, False),
                 (self._references.from_planner, keys.reference, True),

@@ -12,6 +12,7 @@ from rti_mpc.wire.intake import Intake
 from service.info import Info
 
 CAPACITY = 4096  # samples between two looks: seconds, at any rate
+PLANNERS = 16  # references between two looks
 STALE_S = 60.0  # one life of each process is a run
 
 
@@ -34,7 +35,7 @@ class Witness:
         self.info: Info | None = None
         self.lives: set[str] = set()
         self._samples, self._samples_in = bus.subscriber(bus.keys.telemetry, capacity=CAPACITY), Intake(Telemetry, STALE_S)
-        self._references, self._references_in = bus.subscriber(bus.keys.reference, cached=True), Intake(Reference, STALE_S)
+        self._references, self._references_in = bus.subscriber(bus.keys.reference, capacity=PLANNERS, cached=True), Intake(Reference, STALE_S)
         self._events, self._events_in = bus.subscriber(bus.keys.events, capacity=CAPACITY, cached=True), dict[str, Intake[Event]]()
         self._infos = bus.subscriber(bus.keys.info("controller"), cached=True)
         bus.watch_alive(self._notice)

@@ -10,8 +10,8 @@ ends at
 
     t_z = t_0 + \max_i |u_i(t_0)| / \dot u_{max, i} ,
 
-so braking begins with the first input from which rest is just reached when it is
-reached: slowing down along a path comes before that.
+so braking begins with the first step towards rest from which rest is reached about
+when the slew limits allow: slowing down along a path comes before that.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ from service.robot_log import RobotLog
 STANDING_M_S = 1e-3
 AT_REST = 1e-9  # of an input, in its unit
 LATE_S = 0.02  # by which a ramp may be behind one that began in time: two steps of ten milliseconds
+SLOWER = 1.5  # times as long as the slew limits need may a ramp take that is put together of several
+RAMP_STEP = 0.09  # share of a period's change with which a ramp begins at least: a step of ten milliseconds
 FRESH_S = 0.25  # age up to which a state may be answered
 
 Mask = NDArray[np.bool_]
@@ -151,8 +153,10 @@ def braking(log: RobotLog, limits: Limits, first: int, zero: int) -> int:
     """Return the row at which the ramp to rest, which ends at row `zero`, has begun; see above."""
     t_s = 1e-9 * (log.stamp_ns - log.stamp_ns[zero])
     left_s = (np.abs(log.u - limits.u_rest) / step(limits)).max(axis=1) * limits.dt_s
+    way = np.abs(log.u - limits.u_rest)
     for row in range(max(first, 1), zero):
-        if t_s[row - 1] + left_s[row - 1] >= -LATE_S and not np.array_equal(log.u[row], log.u[row - 1]):
+        share = float(((way[row - 1] - way[row]) / step(limits)).max())
+        if share >= RAMP_STEP and -t_s[row - 1] <= SLOWER * left_s[row - 1] + LATE_S:
             return row
     return zero
 

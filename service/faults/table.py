@@ -101,9 +101,9 @@ def solver(failure: str, samples: int) -> Act:
     """Let the solver fail so many times in a row; the fault is when the second sample from now is due, for one is prepared already."""
 
     def act(system: System) -> int:
-        asked_ns = system.now_ns()
         system.ask(system.keys.request, request="inject", failure=failure, samples=samples)
-        system.wait(lambda: system.last_sample_ns() > asked_ns, "the next sample")
+        granted_ns = system.now_ns()
+        system.wait(lambda: system.last_sample_ns() > granted_ns, "the next sample")
         return system.last_sample_ns() + system.period_ns
 
     return act
@@ -195,8 +195,8 @@ FAULTS = (
     Fault("guard_killed", "SIGKILL of the guard", PEERS, STOPS, kill("guard"), start("guard")),
     Fault("guard_hung", "SIGSTOP of the guard", PEERS, STOPS, suspend("guard"), resume("guard")),
     Fault("guard_and_controller_killed", "SIGKILL of both", PEERS, STOPS, kill("guard", "controller"), start("guard", "controller")),
-    Fault("qp_fails", "no solver finds anything", PEERS, STOPS, solver("qp", UNTIL_MENDED), solver_works),
-    Fault("nan_model", "the model gives NaN", PEERS, STOPS, solver("nan_model", UNTIL_MENDED), solver_works),
+    Fault("qp_fails", "no solver finds anything", PEERS, PLAYS_ON, solver("qp", UNTIL_MENDED), solver_works),
+    Fault("nan_model", "the model gives NaN", PEERS, PLAYS_ON, solver("nan_model", UNTIL_MENDED), solver_works),
     Fault("over_budget", "a sample takes 1.5 periods", PEERS, PLAYS_ON, solver("over_budget", UNTIL_MENDED), solver_works),
     Fault("reference_ends_stop", "the reference ends with a stop", PEERS, STOPS, reference_ends(End.STOP), restart("reference"), 5.0),
     Fault("reference_stale", "a reference that ended long ago", PEERS, STOPS, reference_in_the_past, restart("reference")),

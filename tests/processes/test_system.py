@@ -5,15 +5,18 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rti_mpc.message import Command, Reference, State, Telemetry
+from rti_mpc.message import Command, End, Reference, State, Telemetry
 from rti_mpc.status import Mode
+from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.session import BusSettings
 from service.cli import SHIPPED
 from tests.processes.system import CONFIG, KEYS, SPEED, System, heard, rti_mpc, until
 
@@ -107,6 +110,19 @@ def test_robot_brakes_and_stands_when_the_controller_is_killed_and_another_one_t
     until(lambda: system.tracking().epoch > first.epoch, "another epoch")
     assert again.state_epoch == first.state_epoch
     system.state(moves)
+
+
+def test_of_several_planners_a_controller_that_starts_after_them_follows_the_latest(system: System) -> None:
+    """All their references come at once, in any order."""
+    keys, latest = system.bus.keys, 5
+    with ExitStack() as stack:
+        for epoch in (latest, *range(1, latest)):
+            planner = stack.enter_context(Bus(BusSettings(connect=(system.endpoint,)), keys))
+            there = Reference(epoch, 1, 0, 10**9, End.HOLD, np.full((600, 3), 0.1 * epoch), np.zeros((600, 0)))
+            planner.publisher(keys.reference, Reference, cached=True).put(there)
+        system.start("robot", "controller")
+        samples = heard(system.bus.subscriber(keys.telemetry), Telemetry, lambda sample: sample.seq >= 5)
+    assert samples.y_ref[:, :2] == pytest.approx(0.1 * latest)
 
 
 def test_stop_is_latched_until_enable(driven: System) -> None:

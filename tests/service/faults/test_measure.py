@@ -79,6 +79,15 @@ def test_stepwise_ramp_begins_with_its_first_step() -> None:
     assert found.step_share == pytest.approx(1.0)
 
 
+def test_ramp_that_waits_after_its_first_step_begins_with_that_step() -> None:
+    def waiting(t: Array) -> Array:
+        ramp = np.clip(0.25 - SLEW * (t - FAULT_S - 0.35), 0.0, 0.25)
+        return np.where(t < FAULT_S + 0.2 - 1e-9, 0.5, ramp)
+
+    found = measured(record(waiting))
+    assert (found.brake_s, found.zero_s) == (pytest.approx(0.2, abs=1e-9), pytest.approx(0.45, abs=1e-9))
+
+
 def test_ramp_that_is_too_steep_shows() -> None:
     assert measured(record(lambda t: stopping(t, slew=1.2 * SLEW))).step_share == pytest.approx(0.9 * 1.2, abs=1e-6)
     found = measured(record(lambda t: np.where(t < FAULT_S + 0.2, 0.4, 0.0)))
