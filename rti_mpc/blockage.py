@@ -63,7 +63,7 @@ def progress(rti: Rti) -> ca.Function:
     """Build ``(x, y_ref, p) -> [|y_N - y_0|^2, |y_ref,N - y_N|^2]``, both weighted by Q."""
     model, N, Q = rti.ocp.model, rti.ocp.N, ca.DM(rti.ocp.Q)
     x, y_ref, p = ca.MX.sym("x", model.nx, N + 1), ca.MX.sym("y_ref", model.ny, N), ca.MX.sym("p", model.np_, N + 1)
-    output = ca.Function("output", [model.x, model.p], [model.y_expr])
+    output = model.h()
     start, end = output(x[:, 0], p[:, -1]), output(x[:, -1], p[:, -1])  # outputs of one moment: a beacon that moves is no progress
     moved, left = end - start, y_ref[:, -1] - end
     return ca.Function("progress", [x, y_ref, p], [ca.vertcat(ca.bilin(Q, moved, moved), ca.bilin(Q, left, left))])

@@ -139,6 +139,8 @@ class Guard:
             self._heard, self._late = (state.stamp_ns, local_ns), late
             if not believed:
                 return
+            if self._late:
+                self._restart_clock()
             if ahead_ns > max(JUMP_NS, 2.5 * self._clock.period_ns):
                 self._jump(state, local_ns, "ahead")
         self._heard = state.stamp_ns, local_ns

@@ -122,6 +122,10 @@ class Model:
         """Number of parameters."""
         return len(self.parameters)
 
+    def h(self) -> ca.Function:
+        """Return the outputs at a node, ``h(x, p) -> y``."""
+        return ca.Function("h", [self.x, self.p], [self.y_expr])
+
     def with_parameters(self, **values: float) -> Model:
         """
         Return this model with other nominal parameters.

@@ -30,7 +30,7 @@ from rti_mpc.ocp import Ocp
 from rti_mpc.transcription import INFINITY
 
 TOLERANCE = 1e-9  # by which a bound may be crossed before it acts: rounding must not decide
-SLACKENED = 1e-5  # pull, the wrong way, at which that penalty is let go
+SLACKENED = 1e-6  # pull, the wrong way, at which that penalty is let go
 
 
 @dataclass(frozen=True, eq=False)

@@ -159,6 +159,7 @@ class Rti:
         self._cost_scale = 1.0 / step_size(qps[0])
         for name in COSTS:
             weights[name] *= self._cost_scale
+        self.y_ref[:] = 0.0
         self._weights = weights
         for qp in qps:
             qp.fill()
@@ -265,13 +266,14 @@ class Rti:
             self.active_set.keep()
 
     def _roll_out(self) -> None:
-        """Make a guess in motion, half way to the upper bounds of the inputs, where the problem shows its scale."""
+        """Make a guess in motion, half way to the upper bounds of the inputs, on its reference: there the problem shows its scale, undamped."""
         ubu = self.ocp.ubu
         self.u[:] = np.where(np.isfinite(ubu), 0.5 * (np.clip(ubu, -INFINITY, INFINITY) + self.u_prev), self.u_prev)
         self.x[:] = 0.0
         for _ in range(self.ocp.N):
             self.shift()
         self.u_prev[:] = self.u[0]
+        self.y_ref[:] = np.array(self.ocp.model.h().map(self.ocp.N)(self.x[1:].T, self.p[1:].T)).T
 
     def shift(self) -> None:
         """Move the plan on by one stage: its first input becomes the previous one, its last is repeated, with the state the model predicts."""

@@ -24,6 +24,7 @@ class Sent:
         self.delay_ns = 0
         self._left_ns = EVER_NS  # when the last command left at the earliest
         self._late: Command | None = None  # the last one, if it left after its time
+        self._alone: tuple[int, Array] = (EVER_NS, u_rest)  # when the robot last stopped braking on its own, and from which input
         self._slew = (lbdu, ubdu)  # per dt
         self._dt_ns = dt_ns
         self._schedule = Schedule(u_rest, 1e9 * np.minimum(-lbdu, ubdu) / dt_ns)
@@ -34,6 +35,9 @@ class Sent:
         self._left_ns += 1  # commands leave one after the other, whatever our idea of the robot's clock
         start_ns = max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, self._left_ns)
         if start_ns < end_ns(command):
+            before, _, braking = self._schedule.at(start_ns - 1)
+            if braking:
+                self._alone = start_ns, before.copy()
             self._schedule.add(command, start_ns, end_ns(command))
 
     def leave(self, command: Command, now_ns: int) -> None:
@@ -83,19 +87,27 @@ class Sent:
         the slew limits of every input that acts in the period before, and of those
         that act until it arrives; so is row 1 of the latter. Then the inputs change
         by no more than the limits within any period, whenever the plan arrives.
-        Where the robot brakes on its own, that leaves it the speed it has.
+        Where the robot brakes on its own, that leaves it the speed it has; a plan
+        that has ended this may be late, too, and the robot have braked on.
         """
         acting = self.at(t_ns)[0]
         second = self._near(acting + self._slew[0], acting + self._slew[1], t_ns, t_ns + self._dt_ns - 1)
+        ended_ns, u = self._alone
+        if abs(t_ns - ended_ns) < self._dt_ns:
+            way, share = self._schedule.u_rest - u, (t_ns + self._dt_ns - ended_ns) / self._dt_ns
+            second = self._within(*second, u + np.clip(way, share * self._slew[0], share * self._slew[1]))
         first = self._near(*second, t_ns - self._dt_ns + 1, t_ns)
         return np.array([first[0], second[0]]), np.array([first[1], second[1]])
 
     def _near(self, lowest: Array, highest: Array, at_ns: int, last_ns: int) -> tuple[Array, Array]:
         """Narrow an interval to what is within the slew limits of all inputs from one time to another; if nothing is, to what comes nearest."""
-        lbdu, ubdu = self._slew
         while at_ns <= last_ns:
             u, change_ns = self.at(at_ns)
-            narrowed = np.minimum(np.maximum(lowest, u + lbdu), highest)
-            lowest, highest = narrowed, np.maximum(np.minimum(highest, u + ubdu), narrowed)
+            lowest, highest = self._within(lowest, highest, u)
             at_ns = change_ns if at_ns == last_ns else min(change_ns, last_ns)
         return lowest, highest
+
+    def _within(self, lowest: Array, highest: Array, u: Array) -> tuple[Array, Array]:
+        """Narrow an interval to what is within the slew limits of an input."""
+        narrowed = np.minimum(np.maximum(lowest, u + self._slew[0]), highest)
+        return narrowed, np.maximum(np.minimum(highest, u + self._slew[1]), narrowed)

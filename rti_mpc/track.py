@@ -9,7 +9,6 @@ last row a reference is held, never extrapolated; before its first, likewise.
 
 from __future__ import annotations
 
-import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
@@ -33,7 +32,7 @@ class Track:
         self.p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
         self._nominal = self.p.copy()
         self._angles = [j for j, signal in enumerate(model.outputs) if signal.angle]
-        self._output = ca.Function("h", [model.x, model.p], [model.y_expr])
+        self._output = model.h()
         self._nodes_ns = np.arange(N + 1) * dt_ns
         self._reference: Reference | None = None
         self._rows: Array = np.zeros((1, model.ny + model.np_))

@@ -138,7 +138,7 @@ def round_trip_us(config: Config) -> Array:
 
 
 def phases_us(config: Config) -> tuple[Array, Array]:
-    """Control a robot that does what the plan says, as the daemon does; return the times of preparation and of feedback."""
+    """Control a robot that does what the plan says, as the daemon does, each state in its time; return the times of preparation and of feedback."""
     rti, x = config.build_rti(), np.array(config.robot_settings()["x0"])
     warm_up(rti)
     dt_ns = round(1e9 * config.ocp.dt_s)
@@ -151,7 +151,7 @@ def phases_us(config: Config) -> tuple[Array, Array]:
     gc.disable()
     for k in paced(SAMPLES):
         arrival_ns = time.monotonic_ns()
-        command = controller.receive_state(State(1, k + 1, k * dt_ns, x), arrival_ns)
+        command = controller.receive_state(State(1, k + 1, k * dt_ns, x), k * dt_ns)
         assert command is not None
         encode(command)
         commanded_ns = time.monotonic_ns()

@@ -43,7 +43,7 @@ def sequence(value: object) -> object:
 Bound = Annotated[float, AllowInfNan(True)]
 Interval = Annotated[tuple[Bound, Bound], BeforeValidator(interval)]
 Increment = Annotated[Interval, AfterValidator(around_zero)]
-Weight = Annotated[float, Field(ge=0)]
+Weight = Annotated[float, Field(ge=0, le=1e15)]  # beyond it, numbers are no numbers any more
 Positive = Annotated[float, Field(gt=0)]
 Weights = Annotated[tuple[Weight, ...], BeforeValidator(sequence)]
 Pair = Annotated[tuple[float, float], BeforeValidator(pair)]

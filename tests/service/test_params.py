@@ -10,6 +10,8 @@ import pytest
 
 from rti_mpc.controller import Controller, Timing
 from rti_mpc.errors import ConfigError
+from rti_mpc.rti import Rti
+from rti_mpc.status import QpStatus
 from rti_mpc.trajectory import circle
 from service.cli import SHIPPED
 from service.config import Config, load
@@ -82,7 +84,7 @@ REFUSED: list[tuple[dict[str, Any], list[str]]] = [
     ({"ocp.bounds.increments.u_c": [0.1, 0.2]}, ["ocp.bounds.increments.u_c", "lower <= 0 <= upper"]),
     ({"ocp.bounds.states.x": [-1.0, 1.0]}, ["ocp.bounds.states.x", "not in the controller's file", "which bounds there are is fixed"]),
     ({"ocp.bounds.states.u": [-float("inf"), 0.5]}, ["ocp.bounds.states.u", "inside the file's [-0.5, 0.5]"]),
-    ({"ocp.weights.Q.x": 1e200, "ocp.weights.delta": 1e200}, ["present sample", "failed"]),
+    ({"ocp.weights.Q.x": 1e200}, ["ocp.weights.Q.x", "at most 1000000000000000", "1e+200"]),
     ({}, ["params", '"set"']),
 ]
 
@@ -99,6 +101,16 @@ def test_change_that_does_not_fit_is_refused_in_one_line_and_nothing_of_it_is_ta
         assert word in str(refusal.value)
     assert (params.version, params.changes, params.answer({"get": True})["values"]) == (0, {}, values(config))
     assert controller.telemetry(prepare_us=0, feedback_us=0, latency_us=0, slack_s=0).parameter_version == 0
+
+
+def test_change_without_a_solution_on_the_present_sample_is_refused(
+    running: tuple[Controller, Params, Config], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, params, config = running
+    monkeypatch.setattr(Rti, "feedback", lambda *_: QpStatus.FAILED)
+    with pytest.raises(ConfigError, match="present sample must have a solution with the new values, its QP is failed"):
+        params.answer({"set": {"ocp.weights.R.u_c": 2.0}})
+    assert (params.version, params.answer({"get": True})["values"]) == (0, values(config))
 
 
 def test_nothing_changes_unless_the_file_allows_it(tmp_path: Any) -> None:

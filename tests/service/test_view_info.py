@@ -97,7 +97,7 @@ def test_a_controller_lists_what_a_planner_sends_and_where_obstacles_are_in_it(t
     path = tmp_path / "robot.toml"
     path.write_text(MINIMAL + DISC + "radius_m = 0.3\nmargin_m = 0.1\n" + "[observer.disturbances]\nu_c = { drift = 0.1, limit = 0.2 }\n")
     model = (ocp := load(path).build_ocp()).model
-    document = json.loads(json.dumps(describe(ocp, model.np_ - 1)))
+    document = json.loads(json.dumps({"role": "controller", **describe(ocp, model.np_ - 1)}))
     assert [parameter["name"] for parameter in document["parameters"][-4:]] == ["a", "disc_0_x", "disc_0_y", "disc_0_r"]
     assert document["p_nominal"] == list(model.p_nominal[:-1])
     info = Info.from_json(document)
