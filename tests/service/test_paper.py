@@ -147,6 +147,7 @@ def test_the_committed_run_shows_what_is_promised() -> None:
     assert RUN["solves"]["unusable"] == 0
     for race in races.values():
         assert all(race[name]["inside_percent_cpu"] == 1.0 for name in OWN)
+        assert all(race[name]["inside_percent_wall"] >= 0.995 for name in OWN)
 
 
 @pytest.mark.slow
