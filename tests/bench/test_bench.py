@@ -33,8 +33,8 @@ def test_bench_prints_and_writes_a_row_for_each_contender_and_each_is_faster_tha
 @pytest.mark.benchmark
 @pytest.mark.parametrize(("N", "faster", "feedback_faster"), [(7, 40, 90), (20, 30, 60), (50, 17, 35), (100, 17, 35)])
 def test_step_is_as_much_faster_than_ipopt_as_promised(N: int, faster: float, feedback_faster: float) -> None:
-    """Measured on a quiet machine they are one and a half to four times these; both sides of a ratio are interleaved, so that load spares it."""
-    (row,) = measure(N, entries=[("riccati", "simultaneous")], compiled=(True,), quick=True, tick=lambda: None)
+    """Over all samples. On a quiet machine they are 1.5 to 7 times these; both sides of a ratio are interleaved, so that load spares it."""
+    (row,) = measure(N, entries=[("riccati", "simultaneous")], compiled=(True,), quick=False, tick=lambda: None)
     assert row["speedup"] > faster
     assert row["feedback_speedup"] > feedback_faster
 
