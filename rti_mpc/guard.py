@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.epoch import epoch_above
 from rti_mpc.message import Command, Notice, Severity, State
 from rti_mpc.robot_clock import RobotClock
 from rti_mpc.schedule import EVER_NS, STEP_NS, Schedule, end_ns, unfit
@@ -266,7 +267,7 @@ class Guard:
             self._say(Severity.WARNING, "source_changed", f"epoch {command.epoch} took over from {self._leader[0]}")
         self._leader = command.epoch, command.seq
         if command.epoch > self.epoch:
-            self.epoch = command.epoch
+            self.epoch = epoch_above(command.epoch, self.epoch)  # with our own number: never that of another guard, whose numbering is not ours
 
     def _approach(self, command: Command, start_ns: int) -> Array:
         """

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import gc
 import logging
+import secrets
 import sys
 import time
 from collections.abc import Callable
 from threading import Event, Lock, Thread
 
 import rti_mpc
+from rti_mpc.epoch import NUMBER_BITS, epoch_above
 from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.guard import Guard
 from rti_mpc.message import Command, Severity, State
@@ -59,7 +61,8 @@ def main(config: Config, bus_settings: BusSettings, *, stop: Event | None = None
         if bus.is_alive(ROLE, HEARING_S):
             print(f"rti-mpc: {config.robot} already has a guard: stop it first, or give this robot another name", file=sys.stderr)
             return 1
-        epoch = max(time.time_ns() // 1_000_000_000, epoch_of(heard.try_recv()) + 1)
+        known = max(time.time_ns() // 1_000_000_000 << NUMBER_BITS, epoch_of(heard.try_recv()))
+        epoch = epoch_above(known, secrets.randbits(NUMBER_BITS))
         process = Process(config, bus, epoch)
         bus.publish_json(bus.keys.info(ROLE), {**describe(config), "epoch": epoch})
         bus.alive(ROLE)

@@ -26,6 +26,7 @@ from threading import Event
 from typing import Any
 
 from rti_mpc.controller import Controller
+from rti_mpc.epoch import NUMBER_BITS, epoch_above
 from rti_mpc.errors import MessageError
 from rti_mpc.message import Command, Notice, Severity, State
 from rti_mpc.status import Mode
@@ -34,7 +35,6 @@ from rti_mpc.wire.cdr import decode
 
 LEADER, STANDBY = "controller", "standby"  # roles
 HEARING_S = 0.5  # for which a starting controller listens for others
-NUMBER_BITS = 20
 SILENCE_PERIODS = 1.5  # of the leader, by the states it did not answer, after which another leads
 SILENCE_S = 0.03  # at least, robot time
 ASLEEP_S = 0.03  # without a look at the clock, at least: less is a busy machine
@@ -82,11 +82,6 @@ def leader_info(received: Received) -> dict[str, Any] | None:
         return info if isinstance(info["epoch"], int) and isinstance(info["config_hash"], int) else None
     except (ValueError, RecursionError, KeyError, TypeError):
         return None
-
-
-def epoch_above(epoch: int, number: int) -> int:
-    """Return the lowest epoch above another whose low bits are a number."""
-    return epoch + 1 + (number - epoch - 1) % (1 << NUMBER_BITS)
 
 
 class Leadership:

@@ -54,7 +54,7 @@ ALONE = {
 
 # Inside the library, a file imports only from groups before its own.
 FLOW: tuple[set[str], ...] = (
-    {"errors", "array", "status", "robot_clock", "ladder", "grid"},
+    {"errors", "array", "status", "robot_clock", "ladder", "grid", "epoch"},
     {"message", "polyline"},
     {"heading", "mode", "schedule"},
     {"trajectory", "guard", "sent"},

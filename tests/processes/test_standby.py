@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rti_mpc.epoch import NUMBER_BITS
 from rti_mpc.message import Command, State, Telemetry
 from rti_mpc.status import Mode
 from rti_mpc.wire.cdr import decode
 from service.cli import SHIPPED
-from service.leadership import NUMBER_BITS
 from tests.processes.system import KEYS, System, heard, rti_mpc, until
 
 ARGUMENTS: dict[str, tuple[object, ...]] = {
