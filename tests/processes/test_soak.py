@@ -129,11 +129,13 @@ class Soak:
         answered = set(seq[np.isfinite(latency_us)].tolist())
         refused = set(seq.tolist()) & {state_seq for state_seq, _ in self.commands} - answered
         skipped = self.last.skipped - self.first.skipped
+        withheld = self.last.fallbacks - self.first.fallbacks  # over their budget: no QP fails here
         return {
             "answered": len(answered),
             "not accepted": len(refused),
             "skipped": skipped,
-            "rest": len(seq) - len(answered) - len(refused) - skipped,
+            "over budget": withheld,
+            "rest": len(seq) - len(answered) - len(refused) - skipped - withheld,
         }
 
     def missed_ns(self) -> np.ndarray:
