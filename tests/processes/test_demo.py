@@ -33,7 +33,7 @@ ASKED_FOR = {
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a demo: twenty-four seconds of the circle."""
     folder = tmp_path_factory.mktemp("demo") / "out"
-    done = rti_mpc("demo", "--scenario", "circle", "--duration", 24, "--speed", 6, "--out", folder, timeout_s=90.0)
+    done = rti_mpc("demo", "--scenario", "circle", "--duration", 24, "--speed", 3, "--out", folder, timeout_s=90.0)
     assert done.returncode == 0, done.stdout + done.stderr
     (folder / "stdout").write_text(done.stdout)
     return folder
