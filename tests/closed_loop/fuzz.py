@@ -106,9 +106,7 @@ class Fuzz:
                     played.popleft()
                 # Braking is the robot's own: in steps, and from a row that may just have begun to act.
                 known = played if not self._actuator.braking and self._now_ns > self._settled_ns else list(played)[-1:]
-                braked = False
-                for end_ns, u_before, omega_before, alone in reversed(known) if self._now_ns > self._settled_ns else ():
-                    braked |= alone  # somewhere in between
+                for end_ns, u_before, omega_before, braked in known if self._now_ns > self._settled_ns else ():
                     most = 1.1 + ROUNDING if braked else 1.0 + ROUNDING
                     assert abs(u_c - u_before) <= 0.25 * most, (self.samples, self._now_ns, end_ns, u_c, u_before)
                     assert abs(omega_c - omega_before) <= 0.4 * most, (self.samples, self._now_ns, end_ns, omega_c, omega_before)
