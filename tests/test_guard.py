@@ -147,6 +147,16 @@ def test_what_it_publishes_is_numbered_without_a_gap_in_an_epoch_no_lower_than_a
     assert [told.seq for told in scene.published] == list(range(1, len(epochs) + 1))
 
 
+def test_restarted_guard_publishes_in_an_epoch_of_its_own_though_controllers_have_higher_ones(scene: Scene) -> None:
+    """In that of the guard before it, numbered from 1, the robot would refuse it as old, and then take it in one step."""
+    scene.drive(1000)
+    first, refused = scene.published[-1].epoch, scene.refused
+    scene.guard = Guard(LIMITS, epoch=11)
+    scene.ready().drive(1000)
+    assert scene.leader < first < scene.published[-1].epoch
+    assert scene.refused == refused
+
+
 def test_robot_plays_the_plan_while_a_message_is_late(scene: Scene) -> None:
     scene.drive(500)
     rows = np.array([[0.5 - 0.1 * k, 0.3] for k in range(5)])
