@@ -59,7 +59,7 @@ class ForeignSolver:
         self.cold = False
         self.iterations = 0
         self.res_prim = self.res_dual = 0.0
-        self._finite = True
+        self._sound = True
         dense = name not in qpsolvers.sparse_solvers
         self._equal, self._above, self._below = qp.sides()
         self._problem: Any = qp.to_problem()
@@ -78,8 +78,8 @@ class ForeignSolver:
     def load(self) -> None:
         """Linearize at the guess, and take over the new matrices; off the path from state to command."""
         self.qp.linearize()
-        self._finite = isfinite(self.qp.checksum[0])
-        if self._finite:
+        self._sound = self.qp.sound
+        if self._sound:
             for update in self._updates:
                 update()
 
@@ -89,7 +89,7 @@ class ForeignSolver:
 
     def solve(self) -> QpStatus:
         """Embed the initial state, solve, and make the plan."""
-        if not self._finite:
+        if not self._sound:
             return QpStatus.FAILED
         qp, problem = self.qp, self._problem
         qp.embed()

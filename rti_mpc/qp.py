@@ -52,7 +52,7 @@ class Qp:
         u: Upper bounds, shape ``(m,)``; `INFINITY` where there is none.
         z: Where the solver puts its solution, shape ``(n,)``.
         cost: The cost (4) at the guess, shape ``(1,)``.
-        checksum: Finite if and only if all of this is, shape ``(1,)``.
+        checksum: Sum of all of this, finite if and only if it is, shape ``(1,)``.
         watched: For each softened row, the last ones, those by which it is known to act, see `Transcription`; shape ``(rows, 4)``.
         varies_P: Whether the Hessian changes from sample to sample.
         varies_A: Whether the constraint matrix does.
@@ -90,6 +90,11 @@ class Qp:
         targets = [getattr(self, name)[place] for name, place in transcription.embedded]
         self.embed = bind(make(transcription.embed), (guess.x0, x, memory), targets)
         self.step = bind(make(transcription.step), (x, u, u_prev, self.z, guess.x0, memory, *weights), guess.plan)
+
+    @property
+    def sound(self) -> bool:
+        """Whether all of it is finite, and of a size that a factorization survives: OSQP prints, in the middle of a sample, what it refuses."""
+        return bool(abs(self.checksum[0]) < INFINITY)
 
     def reduced_hessian(self) -> Array:
         """Return the Hessian in the inputs alone, the states eliminated by the dynamics; of a QP without slacks."""

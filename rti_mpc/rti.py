@@ -153,7 +153,7 @@ class Rti:
         self.active_set = ActiveSet(recursion, guess, make) if recursion is not None else None
         self._roll_out()
         qps[0].fill()
-        if not isfinite(qps[0].checksum[0]):
+        if not qps[0].sound:
             raise OcpError(f"model {model.name} must be finite and differentiable around the zero state")
         # The cost normalised, so that one step size of ADMM, and one tolerance, fit every problem.
         self._cost_scale = 1.0 / step_size(qps[0])

@@ -13,7 +13,6 @@ builds namespaces at every call, which costs more than the solve.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite
 
 import numpy as np
 import osqp
@@ -71,7 +70,7 @@ class Solver:
     def __init__(self, qp: Qp, settings: SolverSettings) -> None:
         self.qp = qp
         self.cold = False
-        self._finite = True
+        self._sound = True
         self._zero = (np.zeros_like(qp.q), np.zeros_like(qp.l))
         public = osqp.OSQP(algebra="builtin")
         public.setup(
@@ -109,15 +108,15 @@ class Solver:
         """Linearize at the guess, and take over the new matrices, factorization included; off the path from state to command."""
         qp = self.qp
         qp.linearize()
-        self._finite = isfinite(qp.checksum[0])
-        if not self._finite:  # or OSQP would never recover
+        self._sound = qp.sound
+        if not self._sound:  # or OSQP would never recover
             return
         changed = qp.varies_A or self._P_x is not None
         if self._A_x is not qp.A.data:
             changed |= self._weigh()
             np.multiply(qp.A.data, self._scale[qp.A.indices], out=self._A_x)
         if changed:
-            self._finite = not self._osqp.update_data_mat(P_x=self._P_x, P_i=None, A_x=self._A_x, A_i=None)  # refused: numbers out of all proportion
+            self._sound = not self._osqp.update_data_mat(P_x=self._P_x, P_i=None, A_x=self._A_x, A_i=None)  # refused: no factorization
         if self.cold:
             self._osqp.warm_start(*self._zero)
             self.cold = False
@@ -147,7 +146,7 @@ class Solver:
 
     def solve(self) -> QpStatus:
         """Embed the initial state, solve from the last solution, and make the plan."""
-        if not self._finite:
+        if not self._sound:
             self.cold = True
             return QpStatus.FAILED
         qp, workspace = self.qp, self._osqp

@@ -465,6 +465,24 @@ def test_state_that_is_not_finite_or_beyond_all_reason_fails_and_is_forgotten(fo
             fails_and_recovers(rti, bad, held(x0, y_ref))
 
 
+def test_parameters_out_of_all_proportion_fail_without_a_word_on_stdout(capfd: pytest.CaptureFixture[str]) -> None:
+    """OSQP prints what it cannot factorize, and a pipe that nobody reads would hold the sample up."""
+    ocp = pioneer()
+    ((x0, y_ref, _),) = near_the_eight(ocp, seed=21, count=1)
+    huge = np.tile(1e200 * np.array(ocp.model.p_nominal), (ocp.N + 1, 1))
+
+    def bad(rti: Rti) -> QpStatus:
+        rti.prepare(y_ref, huge, shift=False)
+        return rti.feedback(x0)
+
+    def good(rti: Rti) -> QpStatus:
+        rti.prepare(y_ref, 1e-200 * huge, shift=False)
+        return rti.feedback(x0)
+
+    fails_and_recovers(Rti(ocp, TIGHT, solver="osqp", formulation="simultaneous"), bad, good)
+    assert not "".join(capfd.readouterr())
+
+
 def test_reference_that_is_not_finite_fails_and_is_forgotten() -> None:
     ocp = pioneer()
     ((x0, y_ref, _),) = near_the_eight(ocp, seed=15, count=1)
