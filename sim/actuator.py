@@ -29,7 +29,7 @@ class Counters:
         lost: Missing sequence numbers.
         late: Arrived when their first row was already over; the remaining rows act.
         expired: Arrived when nothing of them could act any more.
-        refused: Malformed, repeated, from another source, for another life of the robot, or not a plan of finite inputs.
+        refused: Malformed, repeated, from another source, for another life of the robot or a state that is still to come, or not a plan of finite inputs.
         starved: How often a plan ran out in motion and the robot braked on its own.
     """
 
@@ -73,6 +73,7 @@ class Actuator:
         Returns:
             The reason for refusing it, empty if it was taken.
         """
+        early = command.state_stamp_ns > arrival_ns
         arrival_ns += self._delay_ns
         verdict = self._source.accept(command.epoch, command.seq, arrival_ns)
         self.counters.lost = self._source.lost
@@ -81,7 +82,7 @@ class Actuator:
         elif not verdict.accepted:
             reason = verdict.value
         else:
-            reason = unfit(command, len(self.u), self._robot_epoch)
+            reason = unfit(command, len(self.u), self._robot_epoch) or ("early" if early else "")
         start_ns = max(command.stamp_ns, arrival_ns)
         if not reason and end_ns(command) <= start_ns:
             reason = "expired"

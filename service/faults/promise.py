@@ -43,10 +43,6 @@ class Promise:
 
 
 STOPS = Promise("stops, and drives again when mended", {**EVERYWHERE, **BRAKES, "still_s": 2.5, **AGAIN})
-PLAYS_ON = Promise(
-    "plays the plan on for three samples at most, stops, and drives again when mended",
-    {**EVERYWHERE, "brake_s": 0.6, "zero_s": 0.8, "still_s": 2.8, **AGAIN},
-)
 PAUSES = Promise("brakes to zero, and drives again when mended", {**EVERYWHERE, **BRAKES, **AGAIN})
 KEEPS_ON = Promise("keeps on", {**EVERYWHERE, "missed": 0.0, "error_m": 0.01})
 RECOVERS = Promise("is driven again when mended", {**EVERYWHERE, **AGAIN})

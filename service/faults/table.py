@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from rti_mpc.message import Command, End, Reference, State
-from service.faults.promise import HOLDS, KEEPS_ON, PAUSES, PLAYS_ON, RECOVERS, REJOINS, STOPS, WAITS, Promise
+from service.faults.promise import HOLDS, KEEPS_ON, PAUSES, RECOVERS, REJOINS, STOPS, WAITS, Promise
 from service.faults.relay import ROLE as RELAY
 from service.faults.system import System, Wiring
 
@@ -195,9 +195,9 @@ FAULTS = (
     Fault("guard_killed", "SIGKILL of the guard", PEERS, STOPS, kill("guard"), start("guard")),
     Fault("guard_hung", "SIGSTOP of the guard", PEERS, STOPS, suspend("guard"), resume("guard")),
     Fault("guard_and_controller_killed", "SIGKILL of both", PEERS, STOPS, kill("guard", "controller"), start("guard", "controller")),
-    Fault("qp_fails", "no solver finds anything", PEERS, PLAYS_ON, solver("qp", UNTIL_MENDED), solver_works),
-    Fault("nan_model", "the model gives NaN", PEERS, PLAYS_ON, solver("nan_model", UNTIL_MENDED), solver_works),
-    Fault("over_budget", "a sample takes 1.5 periods", PEERS, PLAYS_ON, solver("over_budget", UNTIL_MENDED), solver_works),
+    Fault("qp_fails", "no solver finds anything", PEERS, STOPS, solver("qp", UNTIL_MENDED), solver_works),
+    Fault("nan_model", "the model gives NaN", PEERS, STOPS, solver("nan_model", UNTIL_MENDED), solver_works),
+    Fault("over_budget", "a sample takes 1.5 periods", PEERS, STOPS, solver("over_budget", UNTIL_MENDED), solver_works),
     Fault("reference_ends_stop", "the reference ends with a stop", PEERS, STOPS, reference_ends(End.STOP), restart("reference"), 5.0),
     Fault("reference_stale", "a reference that ended long ago", PEERS, STOPS, reference_in_the_past, restart("reference")),
     Fault("reference_missing", "all start, but no reference", PEERS, WAITS, no_reference, start("reference")),
