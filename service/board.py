@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console, Group
-from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
 from rti_mpc.message import Event, Severity, Telemetry
 from rti_mpc.model import Signal
+from service.redrawn import Redrawn
 
 RECENT = 200  # samples the medians are of
 EVENTS = 3  # shown
@@ -22,42 +22,27 @@ LINES = 10  # of progress, without a terminal
 MISSING = "none"
 
 
-class Board:
-    """
-    Shows the progress of a run.
-
-    Attributes:
-        console: Where to.
-    """
+class Board(Redrawn):
+    """Shows the progress of a run."""
 
     def __init__(self, console: Console, title: str, inputs: Sequence[Signal], duration_s: float) -> None:
-        self.console = console
+        super().__init__(console)
         self._title = title
         self._inputs = inputs
         self._duration_s = duration_s
         self._said = 0
-        self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
-
-    def __enter__(self) -> Board:
-        if self._live is not None:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._live is not None:
-            self._live.stop()
 
     def wait(self, text: str) -> None:
         """Tell what is waited for."""
-        if self._live is not None:
-            self._live.update(Text(f"{self._title}: {text}"), refresh=True)
+        if self.live:
+            self.draw(Text(f"{self._title}: {text}"))
         else:
             self.console.print(text)
 
     def show(self, time_s: float, error_mm: float, telemetry: Sequence[Telemetry], events: Sequence[Event]) -> None:
         """Show where the robot is and how the controller fares; at least one sample is there."""
         rows = self._rows(error_mm, telemetry)
-        if self._live is not None:
+        if self.live:
             table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
             for row in rows.items():
                 table.add_row(*row)
@@ -65,7 +50,7 @@ class Board:
             news = [Text(event.text, "red" if event.severity is Severity.ERROR else "yellow") for event in events if event.severity]
             head = Table.grid(padding=(0, 2))
             head.add_row(self._title, bar, f"{max(time_s, 0.0):.0f} of {self._duration_s:.0f} s")
-            self._live.update(Group(head, table, *news[-EVENTS:]), refresh=True)
+            self.draw(Group(head, table, *news[-EVENTS:]))
         elif time_s >= self._said * self._duration_s / LINES:
             self._said = int(time_s * LINES / self._duration_s) + 1
             self.console.print(

@@ -29,7 +29,7 @@ class Counters:
         lost: Missing sequence numbers.
         late: Arrived when their first row was already over; the remaining rows act.
         expired: Arrived when nothing of them could act any more.
-        refused: Malformed, repeated, from another source, for another life of the robot or a state that is still to come, or not a plan of finite inputs.
+        refused: Malformed, repeated, from another source, for another life of the robot or a state still to come, or no finite plan.
         starved: How often a plan ran out in motion and the robot braked on its own.
     """
 

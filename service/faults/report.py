@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from rich.console import Console, Group
-from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
@@ -15,6 +14,7 @@ from rich.text import Text
 from service import machine
 from service.faults.measure import Measured
 from service.faults.table import Fault
+from service.redrawn import Redrawn
 
 COLUMNS = ("fault", "the robot", "speed\nm/s", "braking\nms", "zero\nms", "standstill\ns", "way\nm", "step\n%", "error\nmm", "recovery\ns", "kept")
 NONE = "-"
@@ -95,7 +95,7 @@ def report_console() -> Console:
     return console if console.is_terminal else Console(width=WIDTH)
 
 
-class Report:
+class Report(Redrawn):
     """
     Shows the matrix while it grows.
 
@@ -104,19 +104,9 @@ class Report:
     """
 
     def __init__(self, console: Console, count: int) -> None:
+        super().__init__(console)
         self.rows: list[Row] = []
-        self._console = console
         self._count = count
-        self._live = Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else None
-
-    def __enter__(self) -> Report:
-        if self._live is not None:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._live is not None:
-            self._live.stop()
 
     @property
     def kept(self) -> bool:
@@ -125,27 +115,27 @@ class Report:
 
     def say(self, fault: Fault, text: str) -> None:
         """Tell what is going on."""
-        if self._live is not None:
+        if self.live:
             head = Table.grid(padding=(0, 2))
             head.add_row(f"{len(self.rows)} of {self._count}", ProgressBar(total=self._count, completed=len(self.rows), width=32), fault.name, text)
-            self._live.update(Group(self._table(), head) if self.rows else head, refresh=True)
+            self.draw(Group(self._table(), head) if self.rows else head)
 
     def add(self, row: Row) -> None:
         """Add a row; without a terminal, as a line."""
         self.rows.append(row)
-        if self._live is None:
+        if not self.live:
             said = "kept" if not row.broken else "; ".join(row.broken)
-            self._console.print(f"{len(self.rows)} of {self._count}: {row.fault.name}, the robot {row.did}: {said}", soft_wrap=True, markup=False)
+            self.console.print(f"{len(self.rows)} of {self._count}: {row.fault.name}, the robot {row.did}: {said}", soft_wrap=True, markup=False)
 
     def conclude(self) -> None:
         """Print the whole, and what was not kept."""
-        self._console.print(self._table())
+        self.console.print(self._table())
         for row in self.rows:
             if row.broken:
-                self._console.print(f"{row.fault.name}: {row.fault.promise.text}: {'; '.join(row.broken)}", soft_wrap=True, markup=False)
+                self.console.print(f"{row.fault.name}: {row.fault.promise.text}: {'; '.join(row.broken)}", soft_wrap=True, markup=False)
         kept = sum(not row.broken for row in self.rows)
         about = machine.describe()
-        self._console.print(
+        self.console.print(
             f"{kept} of {len(self.rows)} within their promise; robot time at speed 1, {about['processor']}, {about['cores']} cores", soft_wrap=True
         )
 

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a terminal shows and redraws in place, while something goes on."""
+
+from __future__ import annotations
+
+from typing import Self
+
+from rich.console import Console, RenderableType
+from rich.live import Live
+
+
+class Redrawn:
+    """
+    A part of the terminal, gone when left.
+
+    Attributes:
+        console: Where it is.
+        live: Whether it is: where there is no terminal, nothing is drawn.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.live = console.is_terminal
+        self._area = Live(console=console, auto_refresh=False, transient=True)
+
+    def __enter__(self) -> Self:
+        if self.live:
+            self._area.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._area.stop()
+
+    def draw(self, what: RenderableType) -> None:
+        """Draw it anew."""
+        self._area.update(what, refresh=True)
