@@ -219,8 +219,7 @@ class Controller:
         Returns:
             What to publish: the command; nothing if it is too late and the previous plan plays on in the robot's hands; or a ramp.
         """
-        elapsed_ns = round((local_ns - self._states.clock.arrival_ns) * self._states.clock.rate)
-        now_ns = command.state_stamp_ns + self._states.clock.late_ns + elapsed_ns
+        now_ns = self._states.clock.latest_ns(local_ns)
         if now_ns < command.stamp_ns + BUDGET * self.grid.dt_ns:
             if self._overran:
                 self._overran = False
@@ -233,7 +232,7 @@ class Controller:
             self._sent.withdraw(command)
         self._seq -= 1
         self._command, self._plan = self._before
-        failure = f"a sample took {1e-9 * elapsed_ns:.3f} s"
+        failure = f"a sample was {1e-9 * (now_ns - command.stamp_ns):.3f} s late"
         if self._plays_on(now_ns, counted=command.mode is Mode.FALLBACK):
             self._modes.enter(Mode.FALLBACK, f"{failure}: the previous plan plays on", Severity.WARNING, "over_budget")
             return None

@@ -6,6 +6,7 @@ from __future__ import annotations
 WINDOW_NS = 1_000_000_000  # local time over which the rate is measured
 EACH_STATE = 1.05  # factor by which one state may change the rate
 LEAP_NS = 250_000_000  # robot time by which a clock that has jumped is ahead
+FASTEST = 10.0  # rate of a robot whose second state is still to come, at most
 
 
 class RobotClock:
@@ -19,6 +20,7 @@ class RobotClock:
         stamp_ns: Stamp of the last state that was fresh, robot time.
         arrival_ns: When it arrived, local monotonic time.
         rate: Robot seconds per local second; assumed low until measured, or a slow simulation would be taken for a dead robot.
+        rate_most: What it is at most: until measured, as fast as states have come so far.
         late_ns: By how much the last state came later than those before it had, robot time.
         leapt: Whether the last stamp was far ahead of its time: the robot's clock has jumped.
         period_ns: Time between states, robot time, smoothed; 0 until two have come.
@@ -39,6 +41,7 @@ class RobotClock:
         self.stamp_ns = 0
         self.arrival_ns = 0
         self.rate = 0.1
+        self.rate_most = FASTEST
         self.period_ns = 0.0
         self._seq = 0
         self._anchor: tuple[int, int] | None = None
@@ -46,6 +49,12 @@ class RobotClock:
         self._measured = False  # whether the rate is
         self.late_ns = 0
         self.leapt = False
+
+    def jump(self) -> None:
+        """Forget stamps and arrivals, but not how fast the clock runs: it has jumped."""
+        known = self.rate, self.rate_most, self._measured
+        self.reset()
+        self.rate, self.rate_most, self._measured = known
 
     def observe(self, seq: int, stamp_ns: int, arrival_ns: int) -> bool:
         """
@@ -72,12 +81,16 @@ class RobotClock:
             period_ns = (stamp_ns - self.stamp_ns) / max(1, seq - self._seq)
             self.period_ns += (min(period_ns, 2.0 * self.period_ns) - self.period_ns) * 0.1 if self.period_ns else period_ns
             elapsed_ns = arrival_ns - self._anchor[1]
+            if not self._measured:
+                self.rate_most = self._rate(stamp_ns - self._anchor[0], max(1, elapsed_ns))
             if elapsed_ns >= WINDOW_NS // 4:
                 rate = self._rate(stamp_ns - self._anchor[0], elapsed_ns)  # little by little: it may be this state that is late
                 self.rate = min(max(rate, self.rate / EACH_STATE), self.rate * EACH_STATE) if self._measured else rate
                 self._measured = True
             if elapsed_ns >= WINDOW_NS:
                 self._anchor = (stamp_ns, arrival_ns)
+        if self._measured:
+            self.rate_most = self.rate
         self._old, self.leapt = None, leaps
         self.late_ns = max(0, -ahead_ns) if late else 0
         self._seq, self.stamp_ns, self.arrival_ns = seq, stamp_ns, arrival_ns
@@ -85,6 +98,10 @@ class RobotClock:
 
     def _rate(self, robot_ns: int, local_ns: int) -> float:
         return min(max(robot_ns / local_ns, 1e-3), 1e3)
+
+    def latest_ns(self, local_ns: int) -> int:
+        """Return what robot time is at a local time at most, for a state that came as late as the last one did."""
+        return self.stamp_ns + self.late_ns + round((local_ns - self.arrival_ns) * self.rate_most)
 
     def now_ns(self, local_ns: int) -> int:
         """Return robot time at a local time."""

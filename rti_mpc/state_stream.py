@@ -114,7 +114,7 @@ class StateStream:
             judged = Arrival.JUMPED_BACK, "clock_jumped", f"the robot's clock went back {1e-9 * back_ns:.3f} s: starting anew"
         if judged[0] is not Arrival.FRESH:
             self.last = None
-            self.clock.reset()
+            self.clock.jump() if judged[0] is Arrival.JUMPED_BACK else self.clock.reset()
         if not self.clock.observe(state.seq, state.stamp_ns, arrival_ns):
             return Arrival.OLD, "state_old", "states have waited on their way: they are not acted on"
         if self.clock.leapt:

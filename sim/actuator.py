@@ -17,6 +17,7 @@ from rti_mpc.message import Command
 from rti_mpc.schedule import Schedule, end_ns, unfit
 from rti_mpc.wire.source import Source
 
+EARLY_NS = 250_000_000  # by which a state that is answered may be ahead of the robot's clock: a guard knows that clock no better
 STALE_NS = 250_000_000  # silence after which another controller may take over, even one of a lower epoch
 
 
@@ -73,7 +74,7 @@ class Actuator:
         Returns:
             The reason for refusing it, empty if it was taken.
         """
-        early = command.state_stamp_ns > arrival_ns
+        early = command.state_stamp_ns > arrival_ns + EARLY_NS
         arrival_ns += self._delay_ns
         verdict = self._source.accept(command.epoch, command.seq, arrival_ns)
         self.counters.lost = self._source.lost

@@ -110,7 +110,7 @@ def test_sample_over_its_budget_is_not_sent_and_the_previous_plan_plays_on(drivi
     assert sample(controller, body, took_ms=105) is None
     assert controller.mode is Mode.FALLBACK
     assert codes(controller) == ["over_budget"]
-    assert "took 0.105 s" in controller.notices[-1].text
+    assert "0.105 s late" in controller.notices[-1].text
     assert (controller.ladder.shifted, controller.ladder.failed) == (1, 1)
     after = sample(controller, body)
     assert after is not None
@@ -148,6 +148,22 @@ def test_delay_that_is_known_is_part_of_the_budget(rti: FaultyRti) -> None:
     drive(controller, body, 2.0)
     assert sample(controller, body, took_ms=120) is not None
     assert sample(controller, body, took_ms=130) is None
+
+
+def test_sample_right_after_a_restart_is_held_to_its_budget_though_the_speed_of_the_simulation_is_not_known_yet(rti: FaultyRti) -> None:
+    """At four times real speed 25 ms are a period; a rate assumed low would take them for 2.5."""
+    speed, controller, body = 4, Controller(rti, Timing(), compile=False), robot(circle())
+    controller.receive_reference(reference(circle()))
+    for _ in range(2):
+        arrival_ns = (state := body.tick()).stamp_ns // speed
+        command = controller.receive_state(state, arrival_ns)
+        assert command is not None
+        assert controller.in_time(command, arrival_ns + 1 * MS) is command
+        controller.prepare()
+    arrival_ns = (state := body.tick()).stamp_ns // speed
+    command = controller.receive_state(state, arrival_ns)
+    assert command is not None
+    assert controller.in_time(command, arrival_ns + 25 * MS) is None
 
 
 # Gaps.

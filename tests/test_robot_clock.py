@@ -39,6 +39,24 @@ def test_rate_is_assumed_low_until_it_is_known() -> None:
     assert clock.now_ns(clock.arrival_ns + 1000 * MS) - clock.stamp_ns == 100 * MS
 
 
+def test_rate_is_at_most_as_fast_as_states_have_come_until_it_is_known() -> None:
+    """Or a sample of a fast simulation would be sent long after its time."""
+    clock = ticking(4.0, count=1)
+    assert clock.latest_ns(clock.arrival_ns + 10 * MS) - clock.stamp_ns == 100 * MS  # after one state it may be that of any
+    clock = ticking(4.0, count=2)
+    assert (clock.rate, clock.rate_most) == (0.1, 4.0)
+    assert ticking(4.0, count=30).rate_most == pytest.approx(4.0)
+
+
+def test_clock_that_has_jumped_runs_as_fast_as_before() -> None:
+    clock = ticking(4.0)
+    rate = clock.rate
+    clock.jump()
+    clock.observe(31, 1000 * MS, clock.arrival_ns + 10**9)
+    assert (clock.rate, clock.rate_most) == (rate, rate)
+    assert clock.now_ns(clock.arrival_ns) == 1000 * MS
+
+
 def test_time_of_a_robot_that_has_fallen_silent_goes_on() -> None:
     clock = ticking(2.0)
     assert clock.now_ns(clock.arrival_ns + 500 * MS) - clock.stamp_ns == pytest.approx(1000 * MS, rel=1e-3)

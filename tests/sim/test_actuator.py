@@ -172,7 +172,7 @@ def test_rest_need_not_be_zero() -> None:
         ("repeated", {"seq": 1}),
         ("old", {"seq": 0}),
         ("foreign", {"epoch": 99}),
-        ("early", {"state_stamp_ns": 10 * MS + 1}),
+        ("early", {"state_stamp_ns": 260 * MS + 1}),
     ],
 )
 def test_refused_commands_are_counted_and_the_plan_plays_on(reason: str, change) -> None:
