@@ -135,7 +135,7 @@ class Controller:
             return None
         if (behind := grid.behind(state.stamp_ns)) or not grid.running:
             self._rejoin(state.stamp_ns, behind)
-        return self._act(state)
+        return self._act(state) if grid.running else None
 
     def receive_reference(self, reference: Reference) -> Reference | None:
         """
@@ -304,10 +304,14 @@ class Controller:
             return
         if behind:
             self._modes.say(Severity.WARNING, "gap", f"no sample for {behind} periods: starting cold")
-        self.grid.start(stamp_ns)
         self._loaded = False
         self._plan = None
         self.ladder.failed = 0
+        clock = self._states.clock
+        if clock.late_ns + clock.doubt_ns < BUDGET * self.grid.dt_ns:
+            self.grid.start(stamp_ns)
+        else:  # it may have waited on its way for too long to be answered: the next one will tell
+            self.grid.running = False
 
     def _act(self, state: State) -> Command:
         """Feedback: from a due state to the command that acts at `t_k`."""

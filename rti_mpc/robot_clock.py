@@ -6,6 +6,7 @@ from __future__ import annotations
 WINDOW_NS = 1_000_000_000  # local time over which the rate is measured
 EACH_STATE = 1.05  # factor by which one state may change the rate
 LEAP_NS = 250_000_000  # robot time by which a clock that has jumped is ahead
+DRIFT = 0.1  # share by which the rate may be wrong, where states come late now and then
 FASTEST = 10.0  # rate of a robot whose second state is still to come, at most
 
 
@@ -22,6 +23,7 @@ class RobotClock:
         rate: Robot seconds per local second; assumed low until measured, or a slow simulation would be taken for a dead robot.
         rate_most: What it is at most: until measured, as fast as states have come so far.
         late_ns: By how much the last state came later than those before it had, robot time.
+        doubt_ns: By how much that may be wrong: a clock that was not heard for a while has gone on faster or slower than thought.
         leapt: Whether the last stamp was far ahead of its time: the robot's clock has jumped.
         period_ns: Time between states, robot time, smoothed; 0 until two have come.
     """
@@ -47,7 +49,7 @@ class RobotClock:
         self._anchor: tuple[int, int] | None = None
         self._old: tuple[int, int] | None = None  # stamp and arrival of the last state, if that was not fresh
         self._measured = False  # whether the rate is
-        self.late_ns = 0
+        self.late_ns = self.doubt_ns = 0
         self.leapt = False
 
     def jump(self) -> None:
@@ -93,6 +95,7 @@ class RobotClock:
             self.rate_most = self.rate
         self._old, self.leapt = None, leaps
         self.late_ns = max(0, -ahead_ns) if late else 0
+        self.doubt_ns = round(DRIFT * self.rate * (arrival_ns - self.arrival_ns)) if late else 0
         self._seq, self.stamp_ns, self.arrival_ns = seq, stamp_ns, arrival_ns
         return True
 

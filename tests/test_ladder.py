@@ -170,16 +170,17 @@ def test_sample_right_after_a_restart_is_held_to_its_budget_though_the_speed_of_
 
 
 def test_states_that_have_waited_while_the_controller_was_stopped_are_not_acted_on(driving: tuple[Controller, Lockstep]) -> None:
-    """As after SIGSTOP and SIGCONT: they come all at once, the newest is fresh."""
+    """As after SIGSTOP and SIGCONT: they come all at once; that the newest is fresh is known when the next one comes."""
     controller, body = driving
     waiting = [body.tick() for _ in range(15)]
     for state in waiting[:-3]:  # fresh enough are the last three
         assert controller.receive_state(state, body.now_ns) is None
     assert codes(controller) == ["state_old"]
-    command = controller.receive_state(waiting[-1], body.now_ns)
+    assert controller.receive_state(waiting[-1], body.now_ns) is None
+    assert codes(controller)[-1] == "gap"
+    command = controller.receive_state(body.tick(), body.now_ns)
     assert command is not None
     assert command.stamp_ns == body.now_ns
-    assert codes(controller)[-1] == "gap"
     assert np.all(np.abs(command.u[0] - body.actuator.u) <= STEP)
 
 
