@@ -84,7 +84,7 @@ class Controller:
         self._states = StateStream(model, self._stale_ns, self.grid.dt_ns, observer)
         self.np_ = model.np_ - len(self._states.d)
         self._track = Track(model, ocp.N, self.grid.dt_ns)
-        self._arriving: Reference | None = None  # waits for a state, to start at or to put its angles next to
+        self._arriving: tuple[Reference, Array] | None = None  # waits for a state, to start at or to put its angles next to
         self._sent = Sent(self._u_rest, ocp.lbdu, ocp.ubdu, self.grid.dt_ns)
         self._prediction = Prediction(model, self._sent, compile=compile)
         self._x0 = self._prediction.x
@@ -129,7 +129,7 @@ class Controller:
         if self.mode is Mode.IDLE:
             self._modes.enter(Mode.WAITING, "first state")
         if self._arriving is not None:
-            self._anchor(self._arriving)
+            self._anchor(*self._arriving)
         grid, period_ns = self.grid, self._states.clock.period_ns
         if not (self._track.loaded or self._stopped) or grid.early(state.stamp_ns, period_ns):
             return None
@@ -137,9 +137,17 @@ class Controller:
             self._rejoin(state.stamp_ns, behind)
         return self._act(state) if grid.running else None
 
-    def receive_reference(self, reference: Reference) -> Reference | None:
+    def lay_out(self, reference: Reference) -> Array | None:
+        """Do of `receive_reference` what may be done in any thread, and takes longer the more rows there are; None if it will be refused."""
+        return None if self._track.misfit(reference, self.np_) else self._track.lay_out(reference)
+
+    def receive_reference(self, reference: Reference, rows: Array | None = None) -> Reference | None:
         """
         Follow a reference from the next sample on.
+
+        Args:
+            reference: It.
+            rows: What `lay_out` has made of it; done here if None.
 
         Returns:
             The reference with its real stamp, to be published, if it was to start on arrival and a state is there to start at.
@@ -147,10 +155,11 @@ class Controller:
         if misfit := self._track.misfit(reference, self.np_):
             self._modes.say(Severity.WARNING, "reference_refused", misfit)
             return None
+        laid = reference, self._track.lay_out(reference) if rows is None else rows
         if self._states.last is None:
-            self._arriving = reference
+            self._arriving = laid
             return None
-        anchored = self._anchor(reference)
+        anchored = self._anchor(*laid)
         return anchored if reference.stamp_ns == STAMP_ON_ARRIVAL else None
 
     def stop(self, reason: str) -> None:
@@ -428,14 +437,14 @@ class Controller:
 
     # Small parts.
 
-    def _anchor(self, reference: Reference) -> Reference:
+    def _anchor(self, reference: Reference, rows: Array) -> Reference:
         """Follow a checked reference, from the last state on if it is to start on arrival."""
         state = self._states.last
         assert state is not None
         self._arriving = None
         if reference.stamp_ns == STAMP_ON_ARRIVAL:
             reference = replace(reference, stamp_ns=state.stamp_ns)
-        self._track.load(reference, self._states.x, state.stamp_ns)
+        self._track.load(reference, rows, self._states.x, state.stamp_ns)
         if self._loaded and self.grid.running:
             self._load(shift=False)
         return reference

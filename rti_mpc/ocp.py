@@ -23,6 +23,8 @@ by an exact penalty, so that no measurement makes the problem infeasible.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,6 +36,8 @@ from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
 from rti_mpc.integrator import integrator
 from rti_mpc.model import Model
+
+SOFT_WEIGHT = 1e3  # L1 and L2, of slacks that are given none
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -112,14 +116,14 @@ class Ocp:
         ubdu: ArrayLike = np.inf,
         lbx: ArrayLike = -np.inf,
         ubx: ArrayLike = np.inf,
-        z: ArrayLike = 1e3,
-        Z: ArrayLike = 1e3,
+        z: ArrayLike = SOFT_WEIGHT,
+        Z: ArrayLike = SOFT_WEIGHT,
         Q_e: ArrayLike | None = None,
         h_expr: ca.SX | None = None,
         lh: ArrayLike = -np.inf,
         uh: ArrayLike = np.inf,
-        zh: ArrayLike = 1e3,
-        Zh: ArrayLike = 1e3,
+        zh: ArrayLike = SOFT_WEIGHT,
+        Zh: ArrayLike = SOFT_WEIGHT,
     ) -> None:
         if N_u is None:
             N_u = N
@@ -128,46 +132,42 @@ class Ocp:
         if not (np.isfinite(dt) and dt > 0):
             raise OcpError(f"dt must be a positive number of seconds, got {dt}")
         integrator(model, method)  # raises for an unknown method
-        nx, nu, ny = model.nx, model.nu, model.ny
         h_expr = model.h_expr if h_expr is None else h_expr
         nh = h_expr.numel()
         free = [s for s in ca.symvar(h_expr) if not ca.depends_on(ca.vertcat(model.x, model.u, model.p), s)]
         if free or (nh and h_expr.shape != (nh, 1)):
             raise OcpError(f"h_expr must be a column of the model's x, u, p, got shape {h_expr.shape} and {free or 'nothing'} besides")
-        fields: dict[str, Any] = {
-            "model": model,
-            "N": N,
-            "N_u": N_u,
-            "dt": float(dt),
-            "method": method,
-            "Q": weight_matrix("Q", Q, ny),
-            "R": weight_matrix("R", R, nu),
-            "delta": weights("delta", delta, N),
-            "lambda_": weights("lambda_", lambda_, N_u),
-            "lbu": bound("lbu", lbu, nu),
-            "ubu": bound("ubu", ubu, nu),
-            "lbdu": bound("lbdu", lbdu, nu),
-            "ubdu": bound("ubdu", ubdu, nu),
-            "lbx": bound("lbx", lbx, nx),
-            "ubx": bound("ubx", ubx, nx),
-            "z": weights("z", z, nx),
-            "Z": weights("Z", Z, nx),
-            "Q_e": weight_matrix("Q_e", np.zeros(ny) if Q_e is None else Q_e, ny),
-            "h_expr": h_expr,
-            "lh": bound("lh", lh, nh),
-            "uh": bound("uh", uh, nh),
-            "zh": weights("zh", zh, nh),
-            "Zh": weights("Zh", Zh, nh),
-        }
-        for lower, upper in (("lbu", "ubu"), ("lbx", "ubx"), ("lh", "uh")):
-            if not np.all(fields[lower] < fields[upper]):
-                raise OcpError(f"{lower} must lie below {upper}, got {fields[lower]} and {fields[upper]}")
-        if np.any(fields["lbdu"] > 0) or np.any(fields["ubdu"] < 0):
-            raise OcpError(f"lbdu <= 0 <= ubdu must hold, or no input could be kept, got {fields['lbdu']} and {fields['ubdu']}")
+        fields: dict[str, Any] = {"model": model, "N": N, "N_u": N_u, "dt": float(dt), "method": method, "h_expr": h_expr}
         for name, value in fields.items():
-            if isinstance(value, np.ndarray):
-                value.setflags(write=False)
             object.__setattr__(self, name, value)
+        values = {"Q": Q, "R": R, "delta": delta, "lambda_": lambda_, "lbu": lbu, "ubu": ubu, "lbdu": lbdu, "ubdu": ubdu, "lbx": lbx, "ubx": ubx}
+        values |= {"z": z, "Z": Z, "Q_e": np.zeros(model.ny) if Q_e is None else Q_e, "lh": lh, "uh": uh, "zh": zh, "Zh": Zh}
+        self._take(values)
+
+    def retuned(self, **values: ArrayLike) -> Ocp:
+        """
+        Return this problem with other weights and bounds, by their names; no expression is built.
+
+        Raises:
+            OcpError: As at construction.
+        """
+        other = copy(self)
+        other._take(values)
+        return other
+
+    def _take(self, values: Mapping[str, ArrayLike]) -> None:
+        """Check and own weights and bounds; for what has no reader yet."""
+        sizes = {"nx": self.model.nx, "nu": self.model.nu, "ny": self.model.ny, "nh": self.h_expr.numel(), "N": self.N, "N_u": self.N_u}
+        for name, value in values.items():
+            check, size = VALUES[name]
+            array = check(name, value, sizes[size])
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        for lower, upper in (("lbu", "ubu"), ("lbx", "ubx"), ("lh", "uh")):
+            if not np.all(getattr(self, lower) < getattr(self, upper)):
+                raise OcpError(f"{lower} must lie below {upper}, got {getattr(self, lower)} and {getattr(self, upper)}")
+        if np.any(self.lbdu > 0) or np.any(self.ubdu < 0):
+            raise OcpError(f"lbdu <= 0 <= ubdu must hold, or no input could be kept, got {self.lbdu} and {self.ubdu}")
 
     @property
     def soft(self) -> tuple[int, ...]:
@@ -229,3 +229,25 @@ def vector(name: str, value: ArrayLike, length: int) -> Array:
     if array.shape not in ((), (length,)):
         raise OcpError(f"{name} must be a number or have shape ({length},), got shape {array.shape}")
     return np.array(np.broadcast_to(array, (length,)))
+
+
+# What checks and owns each weight and bound, and its size.
+VALUES: dict[str, tuple[Callable[[str, ArrayLike, int], Array], str]] = {
+    "Q": (weight_matrix, "ny"),
+    "R": (weight_matrix, "nu"),
+    "delta": (weights, "N"),
+    "lambda_": (weights, "N_u"),
+    "lbu": (bound, "nu"),
+    "ubu": (bound, "nu"),
+    "lbdu": (bound, "nu"),
+    "ubdu": (bound, "nu"),
+    "lbx": (bound, "nx"),
+    "ubx": (bound, "nx"),
+    "z": (weights, "nx"),
+    "Z": (weights, "nx"),
+    "Q_e": (weight_matrix, "ny"),
+    "lh": (bound, "nh"),
+    "uh": (bound, "nh"),
+    "zh": (weights, "nh"),
+    "Zh": (weights, "nh"),
+}

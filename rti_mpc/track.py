@@ -5,6 +5,9 @@ A reference, laid on the controller's stages.
 Angles are unwrapped along time, as a whole put nearest to where the robot is,
 and only then interpolated: a reference that crosses pi changes nothing. Past its
 last row a reference is held, never extrapolated; before its first, likewise.
+
+What takes longer the more rows there are is done by `Track.lay_out`, which any
+thread may call; to follow the result takes the same time for all.
 """
 
 from __future__ import annotations
@@ -35,7 +38,8 @@ class Track:
         self._output = model.h()
         self._nodes_ns = np.arange(N + 1) * dt_ns
         self._reference: Reference | None = None
-        self._rows: Array = np.zeros((1, model.ny + model.np_))
+        self._rows: Array = np.zeros((1, model.ny))
+        self._turns: Array = np.zeros(model.ny)  # whole ones, from the angles as they came to those nearest to the robot's
 
     def misfit(self, reference: Reference, right_np: int) -> str:
         """
@@ -53,24 +57,33 @@ class Track:
             f"got {rows} rows of {ny} and {np_}, {reference.period_ns} ns"
         )
 
-    def load(self, reference: Reference, x: Array, stamp_ns: int) -> None:
+    def lay_out(self, reference: Reference) -> Array:
+        """
+        Return the rows of a reference as `load` wants them: outputs, angles unwrapped along time, and the parameters given. Changes nothing here.
+
+        Args:
+            reference: Checked: of the model's `ny`, and of the first of its `np` or none; the others are nominal.
+        """
+        rows = np.hstack([reference.y, reference.p])
+        for j in self._angles:
+            rows[:, j] = np.unwrap(rows[:, j])
+        return rows
+
+    def load(self, reference: Reference, rows: Array, x: Array, stamp_ns: int) -> None:
         """
         Follow a reference from now on.
 
         Args:
-            reference: Checked: of the model's `ny`, and of the first of its `np` or none; the others are nominal.
+            reference: It.
+            rows: What `lay_out` makes of it.
             x: State, shape ``(nx,)``, whose outputs the angles are put nearest to.
             stamp_ns: Time of that state.
         """
-        self._reference = reference
-        y = np.array(reference.y)
-        now = min(max(0, round((stamp_ns - reference.stamp_ns) / reference.period_ns)), len(y) - 1)
+        self._reference, self._rows = reference, rows
+        now = min(max(0, round((stamp_ns - reference.stamp_ns) / reference.period_ns)), len(rows) - 1)
         outputs = np.array(self._output(x, self._nominal[0])).ravel()
         for j in self._angles:
-            y[:, j] = np.unwrap(y[:, j])
-            y[:, j] += TWO_PI * np.round((outputs[j] - y[now, j]) / TWO_PI)
-        given = reference.p.shape[1]
-        self._rows = np.hstack([y, reference.p, np.broadcast_to(self._nominal[0, given:], (len(y), self._nominal.shape[1] - given))])
+            self._turns[j] = TWO_PI * np.round((outputs[j] - rows[now, j]) / TWO_PI)
 
     def clear(self) -> None:
         """Follow nothing."""
@@ -96,5 +109,7 @@ class Track:
         below = np.minimum(at.astype(np.intp), max(len(rows) - 2, 0))
         fraction = (at - below)[:, np.newaxis]
         values = rows[below] + fraction * (rows[np.minimum(below + 1, len(rows) - 1)] - rows[below])
-        self.y_ref[:] = values[1:, : self.y_ref.shape[1]]
-        self.p[:] = values[:, self.y_ref.shape[1] :]
+        ny, given = self.y_ref.shape[1], rows.shape[1]
+        np.add(values[1:, :ny], self._turns, out=self.y_ref)
+        self.p[:, : given - ny] = values[:, ny:]
+        self.p[:, given - ny :] = self._nominal[:, given - ny :]

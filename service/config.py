@@ -14,7 +14,6 @@ import json
 import math
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -107,46 +106,64 @@ class Config(Section):
         own = self.build_model()
         discs = [(*obstacle.centre_m, obstacle.radius_m + obstacle.margin_m) for obstacle in self.ocp.obstacles]
         model = with_disturbances(with_obstacles(own, discs), self.observer.disturbances)
-        weights, limits, terminal = self.ocp.weights, self.ocp.bounds, self.ocp.terminal
-        lbu, ubu = bounds(limits.inputs, names(model.inputs))
-        lbdu, ubdu = bounds(limits.increments, names(model.inputs))
-        lbx, ubx = bounds(limits.states, names(model.states))
+        limits, terminal = self.ocp.bounds, self.ocp.terminal
         outside = {signal.name: (0.0, math.inf) for signal in model.constraints[len(own.constraints) :]}
         bounded = [i for i, signal in enumerate(model.constraints) if signal.name in (limits.constraints | outside)]
         lh, uh = bounds(limits.constraints | outside, names(model.constraints[i] for i in bounded))
-        soft = {name: weight for name, weight in (("z", limits.soft_weight), ("Z", limits.soft_weight_L2)) if weight is not None}
-        problem = partial(
-            Ocp,
+        problem = Ocp(
             model,
             N=self.ocp.N,
             N_u=self.N_u,
             dt=self.ocp.dt_s,
             method=self.ocp.integrator,
-            Q=[weights.Q[output.name] for output in model.outputs],
-            R=[weights.R[input.name] for input in model.inputs],
-            delta=spread(weights.delta, self.ocp.N),
-            lambda_=spread(weights.lambda_, self.N_u),
-            lbu=lbu,
-            ubu=ubu,
-            lbdu=lbdu,
-            ubdu=ubdu,
-            lbx=lbx,
-            ubx=ubx,
+            Q_e=None if terminal.Q is None else [terminal.Q[output.name] for output in model.outputs],
             h_expr=model.h_expr[bounded, 0],
             lh=lh,
             uh=uh,
-            **soft,
-            **{f"{name}h": weight for name, weight in soft.items()},
+            **self.weights_and_bounds(model),
         )
-        if terminal.Q is not None:
-            return problem(Q_e=[terminal.Q[output.name] for output in model.outputs])
-        if terminal.lqr is not None:
-            from rti_mpc.terminal import lqr_weight
+        return problem if terminal.lqr is None else problem.retuned(Q_e=self.lqr_weight(problem))
 
-            x = [terminal.lqr.states.get(state.name, 0.0) for state in model.states]
-            u = [terminal.lqr.inputs.get(input.name, rest) for input, rest in zip(model.inputs, model.u_rest, strict=True)]
-            return problem(Q_e=lqr_weight(problem(), np.array(x), np.array(u)))
-        return problem()
+    def retuned(self, problem: Ocp) -> Ocp:
+        """Return a problem that was built of another configuration with the weights and bounds of this one; all else is kept, not built again."""
+        other = problem.retuned(**self.weights_and_bounds(problem.model))
+        return other if self.ocp.terminal.lqr is None else other.retuned(Q_e=self.lqr_weight(other))
+
+    def weights_and_bounds(self, model: Model) -> dict[str, Any]:
+        """Return those of the problem that may change while it is solved, as `Ocp` names them."""
+        from rti_mpc.ocp import SOFT_WEIGHT
+
+        weights, limits = self.ocp.weights, self.ocp.bounds
+        z, Z = (SOFT_WEIGHT if weight is None else weight for weight in (limits.soft_weight, limits.soft_weight_L2))
+        lbu, ubu = bounds(limits.inputs, names(model.inputs))
+        lbdu, ubdu = bounds(limits.increments, names(model.inputs))
+        lbx, ubx = bounds(limits.states, names(model.states))
+        return {
+            "Q": [weights.Q[output.name] for output in model.outputs],
+            "R": [weights.R[input.name] for input in model.inputs],
+            "delta": spread(weights.delta, self.ocp.N),
+            "lambda_": spread(weights.lambda_, self.N_u),
+            "lbu": lbu,
+            "ubu": ubu,
+            "lbdu": lbdu,
+            "ubdu": ubdu,
+            "lbx": lbx,
+            "ubx": ubx,
+            "z": z,
+            "Z": Z,
+            "zh": z,
+            "Zh": Z,
+        }
+
+    def lqr_weight(self, problem: Ocp) -> Array:
+        """Return the terminal weight that the problem's own weights lead to, in the motion that `ocp.terminal.lqr` says."""
+        from rti_mpc.terminal import lqr_weight
+
+        model, motion = problem.model, self.ocp.terminal.lqr
+        assert motion is not None
+        x = [motion.states.get(state.name, 0.0) for state in model.states]
+        u = [motion.inputs.get(input.name, rest) for input, rest in zip(model.inputs, model.u_rest, strict=True)]
+        return lqr_weight(problem, np.array(x), np.array(u))
 
     def stage_parameters(self, t_s: Array) -> Array:
         """

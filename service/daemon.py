@@ -7,6 +7,12 @@ between a state and its command but `Controller.receive_state` and one `put`. Th
 others only hand things over: references through an inbox that is emptied in the
 slack, requests and the watch for silence through a lock that is held for
 microseconds.
+
+All of them share the interpreter's lock with the thread that controls, so none may
+compute for long: references are laid out where they are received, of a change of
+parameters nothing is built, and it is tried when a sample has just ended. A switch
+interval below the interpreter's 5 ms does not help, as measured: a sample then
+loses the lock as often as it takes it, and preparations take twice as long.
 """
 
 from __future__ import annotations
@@ -16,7 +22,7 @@ import logging
 import sys
 import time
 from collections.abc import Sequence
-from threading import Event, Lock, Thread
+from threading import Condition, Event, Lock, Thread
 from typing import Any
 
 import numpy as np
@@ -67,7 +73,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
     warm_up(rti)
     timing = Timing(config.delay_s, config.stale_s, config.timing.valid_s)
     controller = Controller(rti, timing, config_hash=config.config_hash, observer=config.build_observer())
-    lock = Lock()
+    lock = Condition()
     params = Params(config, controller, rti, lock)
     outcomes = realtime.attempt(**config.realtime.model_dump())  # when all is compiled, and before any thread is started, for all of them
     with Bus(bus_settings, config.keys(), stop=stop) as bus:
@@ -116,7 +122,7 @@ class Daemon:
         bus: Bus,
         leadership: Leadership,
         params: Params,
-        lock: Lock,
+        lock: Condition,
         rti: Rti,
         outcomes: Sequence[realtime.Outcome],
     ) -> None:
@@ -137,7 +143,7 @@ class Daemon:
         self._commands = bus.publisher(keys.command, Command, realtime=True)
         self._telemetries = {role: bus.publisher(key, Telemetry) for role, key in ((LEADER, keys.telemetry), (STANDBY, keys.shadow_telemetry))}
         self._states_in = Intake(State, config.stale_s, {"x": model.nx})
-        self._references = References(bus, model.ny, controller.np_)
+        self._references = References(bus, controller, model.ny)
         self._prepare_us = 0.0
         self._ticked_ns = 0
         self._threads = [
@@ -200,7 +206,8 @@ class Daemon:
                         sent_ns = time.monotonic_ns()
                         controller.prepare()
                         prepared_ns = time.monotonic_ns()
-                    self._references.hand_over(controller, self._leadership.leading)
+                        self._lock.notify_all()
+                    self._references.hand_over(self._leadership.leading)
             if command is not None:
                 self._telemetries[self._leadership.role].put(
                     controller.telemetry(

@@ -14,7 +14,7 @@ from service.refusal import unknown_name
 from service.schema import RegulatorSection
 
 if TYPE_CHECKING:
-    from rti_mpc.model import Signal
+    from rti_mpc.model import Model, Signal
     from rti_mpc.ocp import Ocp
 
 
@@ -26,12 +26,34 @@ def check_model(config: Config) -> Ocp:
         ConfigError: A key does not fit the model.
         OcpError: The problem is ill-posed in some other way.
     """
-    ocp, sim, observer, terminal = config.ocp, config.sim, config.observer, config.ocp.terminal
-    regulator = terminal.lqr or RegulatorSection()
     try:
         model = find_model(config.model.name)
     except OcpError as error:
         raise ConfigError(f"model.name: {error}") from error
+    check_names(config, model)
+    if config.guard.enabled:
+        inputs, given = names(model.inputs), list(config.ocp.bounds.inputs)
+        if given != inputs:
+            raise ConfigError(f"ocp.bounds.inputs must be in the model's order {inputs} where a guard is enabled, got {given}")
+        if tuple(config.guard.u_rest.get(name, 0.0) for name in inputs) != model.u_rest:
+            raise ConfigError(f"guard.u_rest must be the model's {dict(zip(inputs, model.u_rest, strict=True))}, got {config.guard.u_rest}")
+    check_solver(config)
+    try:
+        with_obstacles(model, [(0.0, 0.0, 1.0) for _ in config.ocp.obstacles])
+    except OcpError as error:
+        raise ConfigError(f"ocp.obstacles: {error}") from error
+    return config.build_ocp()
+
+
+def check_names(config: Config, model: Model) -> None:
+    """
+    Check that names are those of the model.
+
+    Raises:
+        ConfigError: One is not, or one is missing.
+    """
+    ocp, sim, observer, terminal = config.ocp, config.sim, config.observer, config.ocp.terminal
+    regulator = terminal.lqr or RegulatorSection()
     tables: tuple[tuple[str, Mapping[str, object], str, tuple[Signal, ...]], ...] = (
         ("model.parameters", config.model.parameters, "parameter", model.parameters),
         ("ocp.weights.Q", ocp.weights.Q, "output", model.outputs),
@@ -55,18 +77,6 @@ def check_model(config: Config) -> Ocp:
     for key, table, kind, signals in tables:
         if wrong := unknown_name(key, table, kind, signals, complete=key.startswith("ocp.weights") or key == "ocp.terminal.Q"):
             raise ConfigError(wrong)
-    if config.guard.enabled:
-        inputs = names(model.inputs)
-        if list(ocp.bounds.inputs) != inputs:
-            raise ConfigError(f"ocp.bounds.inputs must be in the model's order {inputs} where a guard is enabled, got {list(ocp.bounds.inputs)}")
-        if tuple(config.guard.u_rest.get(name, 0.0) for name in inputs) != model.u_rest:
-            raise ConfigError(f"guard.u_rest must be the model's {dict(zip(inputs, model.u_rest, strict=True))}, got {config.guard.u_rest}")
-    check_solver(config)
-    try:
-        with_obstacles(model, [(0.0, 0.0, 1.0) for _ in ocp.obstacles])
-    except OcpError as error:
-        raise ConfigError(f"ocp.obstacles: {error}") from error
-    return config.build_ocp()
 
 
 def check_solver(config: Config) -> None:

@@ -10,7 +10,7 @@ by take over what they have not heard themselves.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from threading import Lock
+from threading import Condition
 from typing import Any
 
 from rti_mpc.controller import Controller
@@ -31,7 +31,9 @@ class Orders:
         stopped: Why it is stopped; empty while it is not.
     """
 
-    def __init__(self, controller: Controller, rti: Rti, params: Params, lock: Lock, leading: Callable[[], bool], tell: Callable[[], None]) -> None:
+    def __init__(
+        self, controller: Controller, rti: Rti, params: Params, lock: Condition, leading: Callable[[], bool], tell: Callable[[], None]
+    ) -> None:
         self.stopped = ""
         self._rti = rti
         self._controller = controller

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from threading import Lock
+from threading import Condition
 from typing import Any
 
 from pydantic import ValidationError
@@ -24,11 +24,12 @@ from rti_mpc.ocp import Ocp
 from rti_mpc.rti import Rti
 from rti_mpc.tuning import Tuning
 from service.config import Config, check_tree
-from service.fit import check_model
+from service.fit import check_names
 from service.refusal import entries, explain
 
 WEIGHTS = ("ocp.weights.Q", "ocp.weights.R", "ocp.weights.delta", "ocp.weights.lambda", "ocp.bounds.soft_weight")
 BOUNDS = ("ocp.bounds.inputs", "ocp.bounds.increments", "ocp.bounds.states")
+PATIENCE = 2  # periods, for a sample
 SAMPLE = ("x", "u", "u_prev", "y_ref", "p")  # of an `Rti`
 
 
@@ -42,7 +43,7 @@ class Params:
         changes: What differs from the file, by key.
     """
 
-    def __init__(self, config: Config, controller: Controller, rti: Rti, lock: Lock) -> None:
+    def __init__(self, config: Config, controller: Controller, rti: Rti, lock: Condition) -> None:
         self.ocp: Ocp = rti.ocp
         self.version = 0
         self.changes: dict[str, Any] = {}
@@ -50,7 +51,7 @@ class Params:
         self._values = values(config)
         self._controller = controller
         self._rti = rti
-        self._lock = lock  # held between samples
+        self._lock = lock  # held while a sample is made; notified when one has been
         self._trial = config.build_rti() if config.params.live else None
 
     def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
@@ -67,7 +68,7 @@ class Params:
             raise ConfigError(f'params must be asked for with "get": true or "set": {{key: value}}, got {dict(request)!r}')
         if self._trial is None:
             raise ConfigError("params.live must be true in the controller's file for a change while it runs, got false")
-        config, ocp = changed(self._file, {**self.changes, **given})
+        config, ocp = changed(self._file, self.ocp, {**self.changes, **given})
         self._try(self._trial, ocp)
         seq = self._take(config, ocp, self.version + 1, {**self.changes, **given})
         return {"version": self.version, "from_seq": seq}
@@ -80,7 +81,7 @@ class Params:
             ConfigError: It does not fit.
         """
         if version != self.version:
-            self._take(*changed(self._file, changes), version, dict(changes))
+            self._take(*changed(self._file, self.ocp, changes), version, dict(changes))
 
     def _take(self, config: Config, ocp: Ocp, version: int, changes: dict[str, Any]) -> int:
         with self._lock:
@@ -91,6 +92,7 @@ class Params:
     def _try(self, trial: Rti, ocp: Ocp) -> None:
         """Solve the QP that is prepared now with other weights and bounds, on a copy."""
         with self._lock:
+            self._lock.wait(PATIENCE * self.ocp.dt)  # for a sample to end: what follows then falls into the slack before the next
             sample = {name: getattr(self._rti, name).copy() for name in SAMPLE}
         trial.reset(sample["x"][0], sample["u_prev"])
         for name, value in sample.items():
@@ -123,24 +125,27 @@ def branch(document: Mapping[str, Any], key: str) -> Any:
     return document
 
 
-def changed(file: Config, changes: Mapping[str, Any]) -> tuple[Config, Ocp]:
+def changed(file: Config, ocp: Ocp, changes: Mapping[str, Any]) -> tuple[Config, Ocp]:
     """
-    Return a configuration with other values, and its problem.
+    Return a configuration with other values, and its problem, made of one that was built of the file.
+
+    No expression is built, which would take ten times as long: whatever is done
+    here, the interpreter's lock is shared with the thread that controls.
 
     Raises:
         ConfigError: A key may not change, a value does not fit.
     """
     document = file.model_dump(by_alias=True)
-    known = dict(entries(Config))
     for key, value in changes.items():
         table, _, name = key.rpartition(".")
         if key not in WEIGHTS and table not in (*WEIGHTS[:2], *BOUNDS):
-            raise ConfigError(f"{key} {refused(key, known)}, got {value!r}")
+            raise ConfigError(f"{key} {refused(key)}, got {value!r}")
         branch(document, table)[name] = value
     try:
         config = Config.model_validate(document)
         check_tree(config)
-        ocp = check_model(config)
+        check_names(config, ocp.model)
+        ocp = config.retuned(ocp)
     except ValidationError as error:
         raise ConfigError(explain(error, Config)) from error
     except OcpError as error:
@@ -150,8 +155,9 @@ def changed(file: Config, changes: Mapping[str, Any]) -> tuple[Config, Ocp]:
     return config, ocp
 
 
-def refused(key: str, known: Mapping[str, str]) -> str:
+def refused(key: str) -> str:
     """Say why a key is none that may change."""
+    known = dict(entries(Config))
     table = key.rpartition(".")[0]
     named = known.get(table, "") if not any(other.startswith(f"{table}.") for other in known) else ""  # a table of names
     what = known.get(key, named)

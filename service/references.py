@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 from collections import deque
 
+from rti_mpc.array import Array
 from rti_mpc.controller import Controller
 from rti_mpc.message import STAMP_ON_ARRIVAL, Reference
 from rti_mpc.wire.bus import Bus, Subscriber
@@ -24,17 +25,20 @@ class References:
     """
     Takes them in, in threads of the caller, and hands them over when asked to.
 
+    Those threads lay them out, too, so that to hand one over takes the thread that controls equally long, however many rows it has.
+
     Attributes:
         planners: Door of what planners send.
         leaders: Door of what a leader has given a stamp.
     """
 
-    def __init__(self, bus: Bus, ny: int, np_: int) -> None:
-        widths = {"y": ny, "p": np_}
+    def __init__(self, bus: Bus, controller: Controller, ny: int) -> None:
+        widths = {"y": ny, "p": controller.np_}
         self.planners, self.leaders = Intake(Reference, STALE_S, widths), Intake(Reference, STALE_S, widths)
-        self._inbox: deque[Reference] = deque(maxlen=1)
+        self._controller = controller
+        self._inbox: deque[tuple[Reference, Array | None]] = deque(maxlen=1)
         self._publisher = bus.publisher(bus.keys.anchored, Reference, cached=True)
-        self._waiting: Reference | None = None  # for its stamp
+        self._waiting: tuple[Reference, Array | None] | None = None  # for its stamp
         self._anchored: Reference | None = None
         self._leading = False
 
@@ -42,7 +46,7 @@ class References:
         """Take in what planners send."""
         for received in iter(subscriber.recv, None):
             if (reference := self.planners.accept(received, time.monotonic_ns())) is not None:
-                self._inbox.append(reference)
+                self._inbox.append((reference, self._controller.lay_out(reference)))
 
     def from_leader(self, subscriber: Subscriber) -> None:
         """Take in what a leader has given a stamp, unless a planner has sent something later."""
@@ -50,10 +54,10 @@ class References:
             reference = self.leaders.accept(received, time.monotonic_ns())
             planner = self.planners.source
             if reference is not None and not self._leading and (reference.epoch, reference.seq) >= (planner.epoch or 0, planner.seq):
-                self._inbox.append(reference)
+                self._inbox.append((reference, self._controller.lay_out(reference)))
 
-    def hand_over(self, controller: Controller, leading: bool) -> None:
-        """Let a controller follow what has come, and publish what it has given a stamp."""
+    def hand_over(self, leading: bool) -> None:
+        """Let the controller follow what has come, and publish what it has given a stamp."""
         if leading and not self._leading:
             if self._waiting is not None:
                 self._inbox.append(self._waiting)
@@ -61,11 +65,11 @@ class References:
                 self._publisher.put(self._anchored)  # who published it first may be gone
         self._leading = leading
         while self._inbox:
-            reference = self._inbox.pop()
+            reference, rows = self._inbox.pop()
             arriving = reference.stamp_ns == STAMP_ON_ARRIVAL
-            self._waiting = reference if arriving and not leading else None
+            self._waiting = (reference, rows) if arriving and not leading else None
             if self._waiting is None:
-                anchored = controller.receive_reference(reference)
+                anchored = self._controller.receive_reference(reference, rows)
                 if anchored is not None:
                     self._publisher.put(anchored)
                 self._anchored = anchored if arriving else reference

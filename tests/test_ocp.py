@@ -72,3 +72,15 @@ def test_papers_problem_is_accepted_without_increment_bounds() -> None:
     ocp = pioneer(lbdu=-INF, ubdu=INF, method="euler")
     assert (ocp.N, ocp.N_u, ocp.dt) == (PAPER["N"], PAPER["N"], 0.1)
     assert ocp.soft == (3, 4)
+
+
+def test_retuned_problem_is_checked_alike_and_leaves_the_first_as_it_was() -> None:
+    ocp = pioneer()
+    Q, other = ocp.Q, ocp.retuned(Q=[1.0, 2.0, 3.0], ubu=[0.4, 0.7])
+    assert (other.Q.diagonal().tolist(), other.ubu.tolist()) == ([1.0, 2.0, 3.0], [0.4, 0.7])
+    assert ocp.Q is Q
+    assert not other.Q.flags.writeable
+    with pytest.raises(OcpError, match="Q must be finite, symmetric and positive semidefinite"):
+        ocp.retuned(Q=[1.0, 2.0, -3.0])
+    with pytest.raises(OcpError, match="lbu must lie below ubu"):
+        ocp.retuned(ubu=[-0.6, 0.7])

@@ -30,9 +30,13 @@ def turning(rows: int, wrapped: bool) -> Array:
     return y
 
 
+def follow(track: Track, message: Reference, x: Array, stamp_ns: int) -> None:
+    track.load(message, track.lay_out(message), x, stamp_ns)
+
+
 def looked_up(y: Array, t_ms: float, x: Array = X, **options: int) -> Array:
     track = Track(pioneer_3dx(), N, 100 * MS)
-    track.load(reference(y, **options), x, 0)
+    follow(track, reference(y, **options), x, 0)
     track.look_up(round(t_ms * MS))
     return track.y_ref.copy()
 
@@ -41,7 +45,7 @@ def test_nothing_is_followed_before_a_reference_and_after_it_is_cleared() -> Non
     track = Track(pioneer_3dx(), N, 100 * MS)
     assert not track.loaded
     assert track.ended(0) is None
-    track.load(reference(turning(3, wrapped=False)), X, 0)
+    follow(track, reference(turning(3, wrapped=False)), X, 0)
     assert track.loaded
     track.clear()
     assert not track.loaded
@@ -86,7 +90,7 @@ def test_heading_is_put_nearest_where_the_robot_is_now_not_at_the_start() -> Non
     """A reference received again half way round must not send the robot back a turn."""
     y = np.column_stack([np.zeros((201, 2)), np.linspace(0.0, 4 * np.pi, 201)])
     track = Track(pioneer_3dx(), N, 100 * MS)
-    track.load(reference(y, period_ms=100), np.array([0, 0, 3 * np.pi, 0, 0]), 15_000 * MS)
+    follow(track, reference(y, period_ms=100), np.array([0, 0, 3 * np.pi, 0, 0]), 15_000 * MS)
     track.look_up(15_000 * MS)
     assert track.y_ref[0, 2] == pytest.approx(3 * np.pi + 0.02 * np.pi)
 
@@ -96,7 +100,7 @@ def test_angles_of_outputs_are_compared_to_outputs() -> None:
     model = beacon().model
     track = Track(model, N, 100 * MS)
     x = np.array([0.0, 0.0, -7.0])  # sees the beacon at atan2(3, 5) + 7
-    track.load(reference(np.tile([5.0, 1.0], (10, 1))), x, 0)
+    follow(track, reference(np.tile([5.0, 1.0], (10, 1))), x, 0)
     track.look_up(0)
     assert abs(track.y_ref[0, 1] - (np.arctan2(3, 5) + 7.0)) <= np.pi
     np.testing.assert_allclose(np.remainder(track.y_ref[:, 1], 2 * np.pi), 1.0)
@@ -104,7 +108,7 @@ def test_angles_of_outputs_are_compared_to_outputs() -> None:
 
 def test_reference_ends_with_its_last_row_and_says_what_then() -> None:
     track = Track(pioneer_3dx(), N, 100 * MS)
-    track.load(reference(turning(11, wrapped=False), stamp_ms=1000, end=End.STOP), X, 0)
+    follow(track, reference(turning(11, wrapped=False), stamp_ms=1000, end=End.STOP), X, 0)
     assert track.ended(1200 * MS) is None
     assert track.ended(1200 * MS + 1) is End.STOP
 
@@ -114,10 +118,10 @@ def test_parameters_are_looked_up_for_all_nodes_and_nominal_where_there_are_none
     track = Track(model, N, 100 * MS)
     y = np.zeros((20, 2))
     p = np.column_stack([np.arange(20.0), np.full(20, 3.0)])
-    track.load(reference(y, p, period_ms=100), np.zeros(3), 0)
+    follow(track, reference(y, p, period_ms=100), np.zeros(3), 0)
     track.look_up(250 * MS)
     np.testing.assert_allclose(track.p[:, 0], 2.5 + np.arange(6))
-    track.load(reference(y), np.zeros(3), 0)
+    follow(track, reference(y), np.zeros(3), 0)
     track.look_up(250 * MS)
     np.testing.assert_allclose(track.p, np.tile(model.p_nominal, (6, 1)))
 
@@ -131,7 +135,7 @@ def test_message_is_not_changed_and_may_change_later() -> None:
     before = y.copy()
     message = reference(y)
     track = Track(pioneer_3dx(), N, 100 * MS)
-    track.load(message, X, 0)
+    follow(track, message, X, 0)
     np.testing.assert_array_equal(message.y, before)
     track.look_up(0)
     first = track.y_ref.copy()

@@ -30,6 +30,7 @@ from rti_mpc.wire.session import open_session
 
 CLOSE_TIMEOUT_S = 0.5
 HEARTBEAT_S = 1.0  # of a cached publisher, which tells the number of its last message
+MOST_BYTES = 32_768  # of a request: to parse JSON holds the interpreter's lock, for 30 ms a megabyte
 RETRY_S = 0.1  # between two looks for somebody who is not there yet
 
 
@@ -237,8 +238,9 @@ class Bus:
         """
         Answer requests on a key, in a thread of its own.
 
-        What the handler raises, and requests that are not a JSON object, are
-        answered ``{"ok": false, "error": ...}``; None is no answer: another gives it.
+        What the handler raises, and requests that are not a JSON object or longer
+        than `MOST_BYTES`, are answered ``{"ok": false, "error": ...}``; None is no
+        answer: another gives it.
         """
         ring: Any = zenoh.handlers.RingChannel(16)
         queryable = self._session.declare_queryable(key, ring)
@@ -315,15 +317,19 @@ def _json_object(payload: bytes) -> dict[str, Any]:
 
 def _answer(key: str, query: zenoh.Query, handler: Callable[[dict[str, Any]], dict[str, Any] | None]) -> None:
     with query:
-        request = _json_object(query.payload.to_bytes() if query.payload is not None else b"")
+        payload = query.payload
+        if payload is not None and len(payload) > MOST_BYTES:
+            request: dict[str, Any] = {"ok": False, "error": f"request must have at most {MOST_BYTES} bytes, got {len(payload)}"}
+        else:
+            request = _json_object(payload.to_bytes() if payload is not None else b"")
         try:
             answer = request if request.get("ok") is False else handler(request)
             if answer is None:
                 return
-            payload = json.dumps(answer)
+            text = json.dumps(answer)
         except Exception as error:  # a handler's fault is the requester's to hear, not ours to die of
-            payload = json.dumps({"ok": False, "error": str(error)})
+            text = json.dumps({"ok": False, "error": str(error)})
         try:
-            query.reply(key, payload.encode(), encoding="application/json")
+            query.reply(key, text.encode(), encoding="application/json")
         except zenoh.ZError:
             return  # the requester, or the bus, is gone

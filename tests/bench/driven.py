@@ -62,7 +62,10 @@ class Driven:
 def sampled(folder: Path, dt_s: float, realtime: str = "") -> Path:
     """Write the shipped robot's configuration with another period, and what its controller asks of the system."""
     path = folder / "robot.toml"
-    path.write_text(SHIPPED.read_text().replace("dt_s = 0.1 ", f"dt_s = {dt_s} ") + f"[sim]\nx0 = {{ x = 0.5 }}\n[realtime]\n{realtime}\n")
+    path.write_text(
+        SHIPPED.read_text().replace("dt_s = 0.1 ", f"dt_s = {dt_s} ").replace("live = false ", "live = true ")
+        + f"[sim]\nx0 = {{ x = 0.5 }}\n[realtime]\n{realtime}\n"
+    )
     assert load(path).ocp.dt_s == dt_s
     return path
 

@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
-from threading import Lock
+from threading import Condition
 from typing import Any
 
+import casadi as ca
+import numpy as np
 import pytest
 
 from rti_mpc.controller import Controller, Timing
 from rti_mpc.errors import ConfigError
+from rti_mpc.ocp import VALUES
 from rti_mpc.rti import Rti
 from rti_mpc.status import QpStatus
 from rti_mpc.trajectory import circle
@@ -35,7 +38,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> tuple[Controller, Param
     config = configuration(tmp_path_factory.mktemp("params"))
     rti = config.build_rti()
     controller = Controller(rti, Timing())
-    params = Params(config, controller, rti, Lock())
+    params = Params(config, controller, rti, Condition())
     controller.receive_reference(reference(circle()))
     drive(controller, robot(circle()), 1.0)
     return controller, params, config
@@ -56,7 +59,7 @@ def test_change_is_told_with_its_version_and_its_first_command_and_acts_from_the
     config = configuration(tmp_path)
     rti = config.build_rti()
     controller, body = Controller(rti, Timing()), robot(circle())
-    params = Params(config, controller, rti, Lock())
+    params = Params(config, controller, rti, Condition())
     controller.receive_reference(reference(circle()))
     last = drive(controller, body, 1.0).commands[-1]
     answer = params.answer({"set": {"ocp.bounds.inputs.u_c": [-0.05, 0.05], "ocp.weights.Q.psi": 0.0}})
@@ -116,7 +119,7 @@ def test_change_without_a_solution_on_the_present_sample_is_refused(
 def test_nothing_changes_unless_the_file_allows_it(tmp_path: Any) -> None:
     config = configuration(tmp_path, live=False)
     rti = config.build_rti()
-    params = Params(config, Controller(rti, Timing()), rti, Lock())
+    params = Params(config, Controller(rti, Timing()), rti, Condition())
     assert params.answer({"get": True})["live"] is False
     with pytest.raises(ConfigError, match=r"params\.live must be true"):
         params.answer({"set": {"ocp.weights.Q.psi": 0.0}})
@@ -124,7 +127,7 @@ def test_nothing_changes_unless_the_file_allows_it(tmp_path: Any) -> None:
 
 def test_one_that_stands_by_has_what_the_leader_has(running: tuple[Controller, Params, Config]) -> None:
     controller, _, config = running
-    params = Params(config, controller, config.build_rti(), Lock())
+    params = Params(config, controller, config.build_rti(), Condition())
     params.adopt(4, {"ocp.weights.Q.psi": 0.7})
     assert (params.version, params.ocp.Q[2, 2]) == (4, 0.7)
     params.adopt(0, {})  # a leader that was started anew
@@ -136,5 +139,58 @@ def test_a_bound_on_one_side_stays_on_that_side(tmp_path: Any) -> None:
     path.write_text(MINIMAL + "ocp.bounds.inputs = { u_c = [-inf, 0.5] }\nparams.live = true\n")
     config = load(path)
     with pytest.raises(ConfigError, match="be finite where it is"):
-        changed(config, {"ocp.bounds.inputs.u_c": [-1.0, 0.5]})
-    assert changed(config, {"ocp.bounds.inputs.u_c": [-float("inf"), 0.4]})[1].ubu[0] == 0.4
+        changed(config, config.build_ocp(), {"ocp.bounds.inputs.u_c": [-1.0, 0.5]})
+    assert changed(config, config.build_ocp(), {"ocp.bounds.inputs.u_c": [-float("inf"), 0.4]})[1].ubu[0] == 0.4
+
+
+FILES = {
+    "plain": "",
+    "soft": "ocp.bounds = { states = { u = [-0.5, 0.5] }, soft_weight = 7.0 }\n",
+    "regulator": "[ocp.terminal.lqr]\nstates = { u = 0.25 }\ninputs = { u_c = 0.25 }\n",
+    "obstacle": "[[ocp.obstacles]]\ncentre_m = [1.0, 0.5]\nradius_m = 0.3\n",
+    "disturbance": "[observer.disturbances]\nu_c = { drift = 0.1, limit = 0.3 }\n",
+}
+CHANGES: dict[str, Any] = {"ocp.weights.Q.psi": 0.3, "ocp.weights.R.u_c": 2.0, "ocp.weights.lambda": 0.9, "ocp.bounds.soft_weight": None}
+
+
+@pytest.mark.parametrize("file", FILES.values(), ids=FILES)
+def test_problem_after_changes_is_the_one_its_file_would_have_built(tmp_path: Any, file: str) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + file)
+    config = load(path)
+    built = config.build_ocp()
+    _, before = changed(config, built, {"ocp.bounds.soft_weight": 9.0, "ocp.weights.Q.x": 5.0})
+    now, ocp = changed(config, before, CHANGES)
+    wanted = now.build_ocp()
+    for name in VALUES:
+        np.testing.assert_array_equal(getattr(ocp, name), getattr(wanted, name), err_msg=name)
+    assert ocp.model is built.model
+    assert ocp.h_expr is built.h_expr
+
+
+def test_change_builds_no_expression(running: tuple[Controller, Params, Config], monkeypatch: pytest.MonkeyPatch) -> None:
+    """That would take ten times as long, while the thread that controls wants the interpreter, too."""
+    _, params, config = running
+
+    def refuse(*_: Any) -> None:
+        raise AssertionError("an expression is built")
+
+    monkeypatch.setattr(ca, "Function", refuse)
+    monkeypatch.setattr(ca.SX, "sym", refuse)
+    assert changed(config, params.ocp, {"ocp.weights.Q.psi": 0.3})[1].Q[2, 2] == 0.3
+
+
+def test_change_is_tried_when_a_sample_has_just_ended(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[str] = []
+
+    class Samples(Condition):
+        def wait(self, timeout: float | None = None) -> bool:
+            seen.append(f"waits {timeout:g} s")
+            return True
+
+    config = configuration(tmp_path)
+    rti = config.build_rti()
+    params = Params(config, Controller(rti, Timing()), rti, Samples())
+    monkeypatch.setattr(Rti, "feedback", lambda *_: seen.append("tries") or QpStatus.SOLVED)
+    params.answer({"set": {"ocp.weights.R.u_c": 2.0}})
+    assert seen == ["waits 0.2 s", "tries"]

@@ -363,13 +363,22 @@ def test_requests_are_answered_and_faults_of_handlers_reported(join: Any) -> Non
     assert operator.request(KEYS.request, {"do": "stop"}, TIMEOUT_S)["ok"] is True
 
 
-@pytest.mark.parametrize("payload", [b"", b"{", b"[]", b"1", b"\xff", 100_000 * b"["])
+@pytest.mark.parametrize("payload", [b"", b"{", b"[]", b"1", b"\xff", 30_000 * b"["])
 def test_requests_that_are_not_json_objects_are_answered(join: Any, endpoint: str, payload: bytes) -> None:
     robot = join(robot=True)
     robot.serve(KEYS.request, lambda request: {"ok": True})
     with stranger(endpoint) as session:
         (reply,) = session.get(KEYS.request, payload=payload, timeout=TIMEOUT_S)
         assert reply.ok.payload.to_string() == '{"ok": false, "error": "message must be a JSON object"}'
+
+
+def test_request_that_would_take_long_to_parse_is_refused_unread(join: Any, endpoint: str) -> None:
+    robot = join(robot=True)
+    robot.serve(KEYS.request, lambda request: {"ok": True})
+    with stranger(endpoint) as session:
+        for size, answer in ((32_768, '{"ok": true}'), (32_769, '{"ok": false, "error": "request must have at most 32768 bytes, got 32769"}')):
+            (reply,) = session.get(KEYS.request, payload=b"{}".ljust(size), timeout=TIMEOUT_S)
+            assert reply.ok.payload.to_string() == answer
 
 
 def test_of_several_answers_a_refusal_counts(join: Any) -> None:
