@@ -9,7 +9,9 @@ leaves states unanswered for `SILENCE_PERIODS`; then it leads, with a higher
 epoch. Of several that stand by the one of the lowest number is first, the
 others wait a period longer each. A leader that has itself left states unanswered
 for so long, or is shown one so late that another may lead by now, says nothing
-until it has listened.
+until it has listened. One that stands by and has missed states, or is shown one
+so late, knows nothing of the leader's silence: the host may have held both up.
+It counts anew, from when a leader would have listened.
 
 The low bits of an epoch are the number of its owner, drawn at its start:
 whatever two controllers have heard, they never arrive at the same one.
@@ -143,11 +145,14 @@ class Leadership:
             local_ns: Local monotonic time.
         """
         self.listen(local_ns)
-        missed = state.stamp_ns - self._seen_ns >= self._silence_ns
+        elapsed_ns = state.stamp_ns - self._seen_ns
+        late_ns = self._controller.robot_now_ns(local_ns) - state.stamp_ns
         self._seen_ns = state.stamp_ns
-        if state.epoch != self._robot_epoch or self._controller.mode in UNREADY or (missed and not self.leading):
+        if state.epoch != self._robot_epoch or self._controller.mode in UNREADY or elapsed_ns < 0:  # the clock of the robot may be set back
             self._robot_epoch, self._quiet_ns = state.epoch, state.stamp_ns
-        self._quiet_ns = min(self._quiet_ns, state.stamp_ns)  # the robot's clock may be set back
+        elif not self.leading and (elapsed_ns >= self._silence_ns or late_ns >= self._late_ns):
+            # Held up, as the leader may be, which listens first; a clock of the robot that has waited looks late by more than any state.
+            self._quiet_ns = state.stamp_ns + max(0, min(late_ns, self._late_ns)) + round(1e9 * DOUBT_S)
         silent_ns = state.stamp_ns - self._quiet_ns
         if not self.leading:
             rank = sum(number < self.number for number in self._company)
@@ -157,7 +162,7 @@ class Leadership:
                 text = f"leads from now on, with epoch {self.epoch}: nobody has answered a state for {1e-9 * silent_ns:.3f} s"
                 self._took_over = Notice(Severity.WARNING, "took_over", text)
         elif self._doubt_ns is None:
-            if silent_ns >= self._silence_ns or self._controller.robot_now_ns(local_ns) - state.stamp_ns >= self._late_ns:
+            if silent_ns >= self._silence_ns or late_ns >= self._late_ns:
                 self._doubt(local_ns)
         elif local_ns - self._doubt_ns >= 1e9 * DOUBT_S:
             self._doubt_ns = None

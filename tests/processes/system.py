@@ -89,6 +89,13 @@ class System:
         process.kill()
         process.wait()
 
+    def fault(self, number: signal.Signals, *roles: str) -> int:
+        """Send a signal; return the robot's time at it, at real speed within a few ms."""
+        now_ns = self.state(lambda _: True).stamp_ns
+        for role in roles:
+            self.running[role].send_signal(number)
+        return now_ns
+
     def interrupt(self, role: str) -> tuple[int, float]:
         """Press Ctrl-C; return the exit status, and how long it took in s."""
         process = self.running.pop(role)

@@ -8,33 +8,26 @@ robot stands within 2.5 s, and it stays so.
 
 from __future__ import annotations
 
-import csv
 import signal
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from rti_mpc.array import Array
 from rti_mpc.message import Command
 from rti_mpc.wire.cdr import decode
 from service.cli import SHIPPED
+from tests.processes.record import GUARDED, MS, Record, recorded, within_slew
 from tests.processes.system import CONFIG, KEYS, System, rti_mpc, until
 
 SPEED_M_S = 0.5
-STANDING = 1e-3  # m/s, rad/s
-SLEW = np.array([0.25, 0.40])  # of the shipped configuration, over 0.1 s
-MS = 1_000_000
-PERIOD_NS = 10 * MS  # of the states: the resolution of the record
 
 
 @pytest.fixture(scope="module")
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
     """A robot on a long straight line at its full speed, and its guard."""
     folder = tmp_path_factory.mktemp("guarded")
-    (folder / "robot.toml").write_text(f"{SHIPPED.read_text()}\n[guard]\nenabled = true\n[sim]\nstate_period_s = {1e-9 * PERIOD_NS}\n")
+    (folder / "robot.toml").write_text(SHIPPED.read_text() + GUARDED)
     line = ("reference", "--scenario", folder / "line.csv", "--waypoint-speed", SPEED_M_S)
     with System(folder, folder / "robot.toml", robot=("sim",), reference=line) as system:
         system.start("robot", "guard", "controller")
@@ -54,51 +47,6 @@ def driven(system: System) -> System:
     return system
 
 
-@dataclass
-class Record:
-    """What the robot did after an instant: times in ms, inputs and speeds."""
-
-    times: Array
-    inputs: Array
-    speeds: Array
-
-    @property
-    def braking_ms(self) -> float:
-        """When the first input had left what acted at the instant, towards rest."""
-        return float(self.times[self.inputs[:, 0] < self.inputs[0, 0] - 1e-3][0])
-
-    @property
-    def zero_ms(self) -> float:
-        return float(self.times[~self.inputs.any(axis=1)][0])
-
-    @property
-    def standing_ms(self) -> float:
-        """From when on it stood, to the end."""
-        return float(self.times[(np.abs(self.speeds) >= STANDING).any(axis=1)][-1]) + 1e-6 * PERIOD_NS
-
-
-def recorded(system: System, fault_ns: int, to_ms: int) -> Record:
-    """Wait until the record reaches a time after a fault, and read it from the fault on."""
-
-    def read() -> list[list[float]] | None:
-        with (system.folder / "robot.csv").open(newline="") as file:
-            rows = [row for row in csv.DictReader(file) if row["starved"] and int(row["stamp_ns"]) >= fault_ns]
-        names = ("stamp_ns", "u_c", "omega_c", "u", "omega")
-        return [[float(row[name]) for name in names] for row in rows] if rows and int(rows[-1]["stamp_ns"]) >= fault_ns + to_ms * MS else None
-
-    rows = np.array(until(read, "the record is written", pause_s=0.1))
-    rows = rows[rows[:, 0] <= fault_ns + to_ms * MS]
-    return Record((rows[:, 0] - fault_ns) / MS, rows[:, 1:3], rows[:, 3:])
-
-
-def fault(system: System, number: signal.Signals, *roles: str) -> int:
-    """Send a signal; return the robot's time at it."""
-    now_ns = system.state(lambda _: True).stamp_ns
-    for role in roles:
-        system.running[role].send_signal(number)
-    return now_ns
-
-
 def stopped_in_time(record: Record) -> None:
     assert record.braking_ms <= 300.0
     assert record.zero_ms <= 500.0
@@ -107,17 +55,10 @@ def stopped_in_time(record: Record) -> None:
     within_slew(record)
 
 
-def within_slew(record: Record) -> None:
-    """Over any 100 ms; a command that is late leaves the plan before it on for some milliseconds more, which a median of 50 ms does not see."""
-    inputs = np.median(np.lib.stride_tricks.sliding_window_view(record.inputs, 5, axis=0), axis=-1)
-    changes = np.abs(inputs[10:] - inputs[:-10])
-    assert (changes <= SLEW + 1e-6).all(), changes.max(axis=0)
-
-
 @pytest.mark.parametrize("killed", [("controller",), ("guard",), ("controller", "guard")], ids="+".join)
 def test_robot_stops_in_time_when_somebody_is_killed_and_is_driven_again_after_a_restart(driven: System, killed: tuple[str, ...]) -> None:
     """Without a guard by the robot's own watchdog, which still has the plan."""
-    fault_ns = fault(driven, signal.SIGKILL, *killed)
+    fault_ns = driven.fault(signal.SIGKILL, *killed)
     for role in killed:
         driven.kill(role)
     record = recorded(driven, fault_ns, 2700)
@@ -131,11 +72,11 @@ def test_robot_stops_in_time_when_somebody_is_killed_and_is_driven_again_after_a
 def test_nothing_stale_acts_when_somebody_was_stopped_and_goes_on(driven: System, role: str) -> None:
     """``kill -STOP; sleep 1.5; kill -CONT``"""
     actuation = driven.bus.subscriber(KEYS.actuation, capacity=4096)
-    fault_ns = fault(driven, signal.SIGSTOP, role)
+    fault_ns = driven.fault(signal.SIGSTOP, role)
     try:
         driven.state(lambda state: state.stamp_ns >= fault_ns + 1500 * MS)
     finally:
-        resumed_ns = fault(driven, signal.SIGCONT, role)
+        resumed_ns = driven.fault(signal.SIGCONT, role)
     driven.state(lambda state: bool(state.x[3] > 0.9 * SPEED_M_S))
     record = recorded(driven, fault_ns, (resumed_ns - fault_ns) // MS + 500)
     print(f"\n{role} stopped: braking {record.braking_ms:.0f}, zero {record.zero_ms:.0f} ms")

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import signal
 from collections.abc import Iterator
@@ -12,115 +11,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rti_mpc.epoch import NUMBER_BITS
-from rti_mpc.message import Command, State, Telemetry
+from rti_mpc.message import Telemetry
 from rti_mpc.status import Mode
 from rti_mpc.wire.cdr import decode
-from service.cli import SHIPPED
-from tests.processes.system import KEYS, System, heard, rti_mpc, until
-
-ARGUMENTS: dict[str, tuple[object, ...]] = {
-    "robot": ("sim", "--x0", "x=0.5"),  # at real speed: the promises are in the robot's time
-    "leader": ("run",),
-    "standby": ("run", "--standby"),
-    "third": ("run", "--standby"),
-    "reference": ("reference", "--scenario", "eight", "--duration", 600),
-}
-SPEED_LIMIT, TURN_LIMIT = 2.5, 4.0  # m/s^2, rad/s^2
-
-
-def configuration(folder: Path, dt_s: float, live: bool = False) -> Path:
-    """The shipped robot at another period, its slew limits per second the same."""
-    text = SHIPPED.read_text()
-    for old, new in (
-        ("dt_s = 0.1 ", f"dt_s = {dt_s} "),
-        ("[-0.25, 0.25]", f"[{-SPEED_LIMIT * dt_s}, {SPEED_LIMIT * dt_s}]"),
-        ("live = false", f"live = {str(live).lower()}"),
-        ("[-0.40, 0.40]", f"[{-TURN_LIMIT * dt_s}, {TURN_LIMIT * dt_s}]"),
-    ):
-        assert old in text
-        text = text.replace(old, new)
-    path = folder / "robot.toml"
-    path.write_text(text)
-    return path
-
-
-class Watched(System):
-    """A system of which every command on the bus is kept."""
-
-    def __init__(self, folder: Path, dt_s: float, live: bool = False) -> None:
-        super().__init__(folder, configuration(folder, dt_s, live), **ARGUMENTS)
-        self.dt_s = dt_s
-        self.commands: list[Command] = []
-        self._commands = self.bus.subscriber(KEYS.command, capacity=8192)
-
-    def listen(self) -> list[Command]:
-        self.commands += [decode(Command, received.payload) for received in self._commands.drain()]
-        return self.commands
-
-    def led_by_another(self, epoch: int) -> Command:
-        """Wait for a command of a higher epoch."""
-        return until(lambda: next((command for command in self.listen() if command.epoch > epoch), None), "another epoch")
-
-    def answers(self, first: Command, count: int) -> None:
-        """Wait until a leader has sent so many commands more."""
-        until(lambda: any(command.epoch == first.epoch and command.seq >= first.seq + count for command in self.listen()), "more commands")
-
-    def next_state_ns(self) -> int:
-        """Wait for a state; return its stamp, the robot's time now but for its way here: at real speed at most a few ms."""
-        return heard(self.bus.subscriber(KEYS.state), State, lambda _: True).stamp_ns
-
-    def samples_of_two_epochs(self) -> list[int]:
-        """States that more than one leader has answered."""
-        self.listen()
-        answers = {(command.state_seq, command.epoch) for command in self.commands}
-        return sorted(seq for seq in {seq for seq, _ in answers} if sum(seq == other for other, _ in answers) > 1)
-
-    def log(self) -> list[dict[str, str]]:
-        with (self.folder / "robot.csv").open(newline="") as file:
-            return [row for row in csv.DictReader(file) if None not in row.values()]
-
-    def answered_ns(self, command: Command) -> int:
-        """When the robot took a command, by its own log."""
-
-        def look() -> int | None:
-            rows = (row for row in self.log() if int(row["seq"]) == command.state_seq and row["command_seq"] == str(command.seq))
-            return next((int(row["stamp_ns"]) + round(1e3 * float(row["latency_us"])) for row in rows), None)
-
-        return until(look, "the robot's log tells of the command", pause_s=0.05)
+from tests.processes.system import KEYS, heard, rti_mpc, until
+from tests.processes.watched import Watched, configuration, within_limits
 
 
 @pytest.fixture(params=[0.1, 0.02], ids=["10Hz", "50Hz"])
 def redundant(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Watched]:
     """A robot that is being driven by a leader, beside whom another stands by."""
     with Watched(tmp_path, request.param) as system:
-        system.start("robot", "leader")
-        until(lambda: "controller" in system.lives, "a leader")
-        system.start("standby", "reference")
-        until(lambda: "standby" in system.lives, "a standby")
-        shadow = system.bus.subscriber(KEYS.shadow_telemetry)
-        heard(shadow, Telemetry, lambda sample: sample.mode is Mode.TRACKING)
-        system.state(lambda state: abs(state.x[3]) > 0.05)
+        system.drive()
         yield system
-
-
-def within_limits(system: Watched) -> None:
-    """What acted never ran out, and never jumped."""
-    rows = system.log()
-    u = np.array([[float(row["u_c"]), float(row["omega_c"])] for row in rows])
-    assert np.all(np.abs(np.diff(u, axis=0)) <= np.array([SPEED_LIMIT, TURN_LIMIT]) * system.dt_s + 1e-9)  # rounding
-    assert int(rows[-1]["starved"]) == 0
 
 
 def test_standby_takes_over_in_time_and_the_old_leader_is_fenced(redundant: Watched) -> None:
     """At 10 Hz the leader is stopped and resumed, at 50 Hz killed."""
     system = redundant
     epoch = system.tracking().epoch
-    leader, other = (
-        ("leader", "standby") if f"epoch {epoch}" in system.said("leader") else ("standby", "leader")
-    )  # a busy machine may have swapped them
-    died_ns = system.next_state_ns()
-    system.running[leader].send_signal(signal.SIGSTOP if system.dt_s == 0.1 else signal.SIGKILL)
+    leader = system.process(epoch)  # a busy machine may have swapped them
+    died_ns = system.fault(signal.SIGSTOP if system.dt_s == 0.1 else signal.SIGKILL, leader)
     second = system.led_by_another(epoch)
     assert second.mode is Mode.TRACKING
     took_s = 1e-9 * (system.answered_ns(second) - died_ns)
@@ -132,7 +43,7 @@ def test_standby_takes_over_in_time_and_the_old_leader_is_fenced(redundant: Watc
         until(lambda: "standby" in system.lives, "the old leader stands by")
         until(lambda: any(b"stepped_down" in received.payload for received in stepped_down.drain()), "it says so")
         system.answers(second, 20)
-        system.interrupt(other)
+        system.interrupt(system.process(second.epoch))
         third = system.led_by_another(second.epoch)
         system.answers(third, 10)
         assert Mode.STOPPED not in {command.mode for command in system.commands if command.epoch == second.epoch}, "it was relieved in motion"
@@ -165,9 +76,8 @@ def test_orders_hold_whoever_leads_and_of_two_that_stand_by_one_leads(tmp_path: 
         assert sample.parameter_version == 1
         system.answers(second, 10)
         assert {command.epoch for command in system.commands} == {first.epoch, second.epoch}
-        said = {role: json.loads(system.said(role).splitlines()[0])["text"] for role in ("standby", "third")}  # "1882540139530843 stands by ..."
-        low, high = sorted(said, key=lambda role: int(said[role].split()[0]) % (1 << NUMBER_BITS))
-        assert f"epoch {second.epoch}" in system.said(low), "the lower number leads"
+        low, high = sorted(("standby", "third"), key=system.number)
+        assert system.process(second.epoch) == low, "the lower number leads"
         assert "leads from now on" not in system.said(high)
 
         answer = rti_mpc("stop", system.config, "-e", system.endpoint)

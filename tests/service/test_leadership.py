@@ -97,17 +97,18 @@ class Puppet:
 class One:
     """One controller of several on a wire."""
 
-    def __init__(self, wire: Wire, *, standby: bool, number: int | None = None) -> None:
+    def __init__(self, wire: Wire, *, standby: bool, number: int | None = None, dt_s: float = DT_S) -> None:
         self.bus, self.puppet, self.wire = WireBus(wire), Puppet(), wire
-        self.leadership = Leadership(cast(Any, self.bus), cast(Any, self.puppet), Others(0, None), config_hash=HASH, dt_s=DT_S, standby=standby)
+        self.leadership = Leadership(cast(Any, self.bus), cast(Any, self.puppet), Others(0, None), config_hash=HASH, dt_s=dt_s, standby=standby)
         if number is not None:
             self.leadership.number = number
         self.leadership.declare()
         self._seq = 0
+        self._dt_ns = round(1e9 * dt_s)
 
     def see(self, k: float, late_ns: int = 0) -> bool:
         """Be shown the state of a sample; return whether it was answered."""
-        stamp_ns = round(k * DT_NS)
+        stamp_ns = round(k * self._dt_ns)
         state = State(1, round(10 * k), stamp_ns, np.zeros(1))
         self.leadership.hear(state, stamp_ns + late_ns)
         command = self.made(k)
@@ -119,9 +120,9 @@ class One:
     def made(self, k: float) -> Command:
         """A command that answers the state of a sample."""
         self._seq += 1
-        stamp_ns = round(k * DT_NS)
-        head = (self.puppet.epoch, self._seq, stamp_ns, 1, round(10 * k), stamp_ns, stamp_ns + DT_NS, HASH)
-        return Command(*head, Mode.TRACKING, QpStatus.SOLVED, DT_NS, np.zeros((1, 1)))
+        stamp_ns = round(k * self._dt_ns)
+        head = (self.puppet.epoch, self._seq, stamp_ns, 1, round(10 * k), stamp_ns, stamp_ns + self._dt_ns, HASH)
+        return Command(*head, Mode.TRACKING, QpStatus.SOLVED, self._dt_ns, np.zeros((1, 1)))
 
 
 @pytest.fixture
@@ -192,6 +193,22 @@ def test_state_shown_a_period_late_is_not_answered() -> None:
             leader.leadership.listen(local_ns)  # awake all the time
         assert leader.see(2, late_ns) == answered
         assert not standby.leadership.leading
+
+
+@pytest.mark.parametrize("dead", [False, True])
+@pytest.mark.parametrize("shown", [{5: 30, 6: 11, 7: 0}, {7: 12}], ids=["late", "lost"])  # states, and by how many ms they come late
+def test_host_that_holds_both_up_changes_no_leader(shown: dict[int, int], dead: bool) -> None:
+    """At 50 Hz, for 50 ms: the leader listens before it goes on, and whoever stands by waits for that, but for a dead one no longer."""
+    wire = Wire()
+    leader, standby = One(wire, standby=False, dt_s=0.02), One(wire, standby=True, dt_s=0.02)
+    for k in range(1, 5):
+        assert [one.see(k) for one in (leader, standby)] == [True, False]
+    answers = []
+    for k, late_ms in (shown | dict.fromkeys(range(8, 12), 0)).items():
+        answers += [(k, one) for one in ([standby] if dead else [standby, leader]) if one.see(k, late_ns=1_000_000 * late_ms)]
+    assert {one for _, one in answers} == {standby if dead else leader}
+    assert answers[-1][0] == 11
+    assert codes(standby) == (["took_over"] if dead else [])
 
 
 def test_leader_that_answers_while_it_is_being_replaced_stays_the_leader(pair: tuple[One, One]) -> None:

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot, a leader, and who stands by, as processes; every command on the bus is kept."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+
+from rti_mpc.epoch import NUMBER_BITS
+from rti_mpc.message import Command, Telemetry
+from rti_mpc.status import Mode
+from rti_mpc.wire.cdr import decode
+from service.cli import SHIPPED
+from tests.processes.system import KEYS, System, heard, until
+
+ARGUMENTS: dict[str, tuple[object, ...]] = {
+    "robot": ("sim", "--x0", "x=0.5"),  # at real speed: the promises are in the robot's time
+    "leader": ("run",),
+    "standby": ("run", "--standby"),
+    "third": ("run", "--standby"),
+    "reference": ("reference", "--scenario", "eight", "--duration", 600),
+}
+CONTROLLERS = {"leader", "standby", "third"}
+SPEED_LIMIT, TURN_LIMIT = 2.5, 4.0  # m/s^2, rad/s^2
+
+
+def configuration(folder: Path, dt_s: float, live: bool = False, more: str = "") -> Path:
+    """The shipped robot at another period, its slew limits per second the same."""
+    text = SHIPPED.read_text() + more
+    for old, new in (
+        ("dt_s = 0.1 ", f"dt_s = {dt_s} "),
+        ("[-0.25, 0.25]", f"[{-SPEED_LIMIT * dt_s}, {SPEED_LIMIT * dt_s}]"),
+        ("live = false", f"live = {str(live).lower()}"),
+        ("[-0.40, 0.40]", f"[{-TURN_LIMIT * dt_s}, {TURN_LIMIT * dt_s}]"),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / "robot.toml"
+    path.write_text(text)
+    return path
+
+
+class Watched(System):
+    """A system of which every command on the bus is kept, and all that a guard publishes."""
+
+    def __init__(self, folder: Path, dt_s: float, live: bool = False, more: str = "") -> None:
+        super().__init__(folder, configuration(folder, dt_s, live, more), **ARGUMENTS)
+        self.dt_s = dt_s
+        self.commands: list[Command] = []
+        self.actuation: list[Command] = []
+        self._inboxes = [
+            (self.bus.subscriber(key, capacity=8192), messages) for key, messages in ((KEYS.actuation, self.actuation), (KEYS.command, self.commands))
+        ]
+
+    def drive(self, *guards: str) -> None:
+        """Let a leader drive the robot, beside whom another stands by."""
+        self.start("robot", *guards, "leader")
+        until(lambda: "controller" in self.lives, "a leader")
+        self.start("standby", "reference")
+        until(lambda: "standby" in self.lives, "a standby")
+        heard(self.bus.subscriber(KEYS.shadow_telemetry), Telemetry, lambda sample: sample.mode is Mode.TRACKING)
+        self.state(lambda state: abs(state.x[3]) > 0.05)
+
+    def listen(self) -> list[Command]:
+        for inbox, messages in self._inboxes:  # first what the guard has made of commands: then these are here, too
+            messages += [decode(Command, received.payload) for received in inbox.drain()]
+        return self.commands
+
+    def number(self, role: str) -> int:
+        """The number at the end of all epochs of a controller, whose log begins with the first: ``epoch 123 controls``, ``123 stands by``."""
+        first = json.loads(self.said(role).splitlines()[0])["text"]
+        return int(first.removeprefix("epoch ").split()[0]) % (1 << NUMBER_BITS)
+
+    def process(self, epoch: int) -> str:
+        """Which controller an epoch is of."""
+        return next(role for role in CONTROLLERS & self.running.keys() if self.number(role) == epoch % (1 << NUMBER_BITS))
+
+    def led_by_another(self, epoch: int) -> Command:
+        """Wait for a command of a higher epoch."""
+        return until(lambda: next((command for command in self.listen() if command.epoch > epoch), None), "another epoch")
+
+    def answers(self, first: Command, count: int) -> None:
+        """Wait until a leader has sent so many commands more."""
+        until(lambda: any(command.epoch == first.epoch and command.seq >= first.seq + count for command in self.listen()), "more commands")
+
+    def samples_of_two_epochs(self) -> list[int]:
+        """States that more than one leader has answered."""
+        self.listen()
+        answers = {(command.state_seq, command.epoch) for command in self.commands}
+        return sorted(seq for seq in {seq for seq, _ in answers} if sum(seq == other for other, _ in answers) > 1)
+
+    def log(self) -> list[dict[str, str]]:
+        with (self.folder / "robot.csv").open(newline="") as file:
+            return [row for row in csv.DictReader(file) if None not in row.values()]
+
+    def answered_ns(self, command: Command) -> int:
+        """When the robot took a command, by its own log."""
+
+        def look() -> int | None:
+            rows = (row for row in self.log() if int(row["seq"]) == command.state_seq and row["command_seq"] == str(command.seq))
+            return next((int(row["stamp_ns"]) + round(1e3 * float(row["latency_us"])) for row in rows), None)
+
+        return until(look, "the robot's log tells of the command", pause_s=0.05)
+
+
+def within_limits(system: Watched) -> None:
+    """What acted never ran out, and never jumped."""
+    rows = system.log()
+    u = np.array([[float(row["u_c"]), float(row["omega_c"])] for row in rows])
+    assert np.all(np.abs(np.diff(u, axis=0)) <= np.array([SPEED_LIMIT, TURN_LIMIT]) * system.dt_s + 1e-9)  # rounding
+    assert int(rows[-1]["starved"]) == 0
