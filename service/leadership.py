@@ -159,6 +159,7 @@ class Leadership:
             if silent_ns >= self._silence_ns + rank * self._dt_ns and not self.misfit:
                 self._replaced = self._highest
                 self._lead()
+                self._quiet_ns = state.stamp_ns  # the silence was another's, and our first sample may be states away
                 text = f"leads from now on, with epoch {self.epoch}: nobody has answered a state for {1e-9 * silent_ns:.3f} s"
                 self._took_over = Notice(Severity.WARNING, "took_over", text)
         elif self._doubt_ns is None:

@@ -155,6 +155,16 @@ def test_states_between_samples_are_no_silence(pair: tuple[One, One]) -> None:
     assert [standby.see(4 + k / 5) for k in range(1, 9)] == [False] * 7 + [True]
 
 
+def test_one_that_takes_over_between_samples_answers_the_next_one(pair: tuple[One, One]) -> None:
+    """With ten states a period, and somebody else who stands by: the silence it ended is none of its own."""
+    _, standby = pair
+    One(standby.wire, standby=True, number=standby.leadership.number + 1)
+    for i in range(41, 60):
+        standby.leadership.hear(State(1, i, i * DT_NS // 10, np.zeros(1)), i * DT_NS // 10)
+    assert standby.leadership.leading
+    assert standby.see(6)
+
+
 def test_leader_that_has_slept_says_nothing_until_it_has_listened(pair: tuple[One, One]) -> None:
     leader, standby = pair
     assert [standby.see(k) for k in (5, 6, 7)] == [False, True, True]
