@@ -159,7 +159,7 @@ def file_outlet(path: Path, name: str) -> Outlet:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"")
-        stream.save(path)
+        stream.save(path, write_footer=False)  # or Rerun keeps the particulars of every chunk until the end
     except (OSError, RuntimeError) as error:
         raise ConfigError(f"rerun-save must be a file that can be written, got {str(path)!r} ({error})") from error
     once = iter([stream])

@@ -127,7 +127,7 @@ def children() -> Iterator[list[Child]]:
 def rows(path: Path, entity: str) -> list[tuple[int, float]]:
     """What a finished recording holds of a scalar: robot time in ns, value."""
     pairs = []
-    for chunk in RrdReader(path).store().stream().to_chunks():
+    for chunk in RrdReader(path).stream().to_chunks():
         if chunk.entity_path == f"/{entity}" and not chunk.is_static:
             batch = chunk.to_record_batch()
             times = batch.column("robot_time").to_numpy(zero_copy_only=False).astype(np.int64)

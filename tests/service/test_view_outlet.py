@@ -17,6 +17,7 @@ pytest.importorskip("rerun")
 import rerun as rr
 import rerun_cli
 from rerun.chunk import RrdReader
+from rerun_bindings import check_for_rrd_footer
 
 from rti_mpc.errors import ConfigError
 from rti_mpc.message import State
@@ -101,7 +102,14 @@ def test_a_closed_file_holds_everything_offered(tmp_path: Path) -> None:
         outlet.offer([state(k)])
     assert outlet.close()
     assert values(tmp_path / "folder" / "run.rrd") == list(range(1000))
-    assert RrdReader(tmp_path / "folder" / "run.rrd").store()  # complete: it has its footer
+
+
+def test_a_recording_has_no_footer_for_which_to_remember_every_chunk(tmp_path: Path) -> None:
+    """Rerun would keep the particulars of each in memory until the end: hundreds of MiB an hour."""
+    outlet = file_outlet(tmp_path / "run.rrd", "robot")
+    outlet.offer([Entry(0, INFO), state(0)])
+    assert outlet.close()
+    assert not check_for_rrd_footer(str(tmp_path / "run.rrd"))
 
 
 def test_a_recording_replaces_an_older_one(tmp_path: Path) -> None:
