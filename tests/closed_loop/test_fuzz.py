@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import time
 from pathlib import Path
@@ -31,6 +32,21 @@ def test_no_fuzzed_sample_leaves_the_limits_or_raises(measured: bool) -> None:
     happened = set(fuzz.seen)
     assert {"TRACKING", "HOLDING", "FALLBACK", "BRAKING", "STOPPED", "over budget", "reference", "jump", "refused at the door"} <= happened
     assert {"qp", "nan_model", "solver", "state_stale", "state_old", "state_refused", "robot_restarted", "clock_jumped", "gap"} <= happened
+
+
+def test_no_fuzzed_sample_leaves_a_reference_cycle() -> None:
+    """The daemon runs with the collector off: what only that frees would stay for good."""
+    fuzz = Fuzz(seed=5, measured=True)
+    run(fuzz, 100)
+    gc.collect()
+    gc.disable()
+    try:
+        run(fuzz, 700)
+        left = gc.collect()
+    finally:
+        gc.enable()
+    assert {"TRACKING", "FALLBACK", "BRAKING", "refused at the door", "over_budget", "reference"} <= set(fuzz.seen)
+    assert left == 0
 
 
 @pytest.mark.slow
