@@ -21,7 +21,7 @@ test-slow: $(READY)
 	$(BIN)/pytest -m slow $(ARGS)
 
 soak: $(READY)
-	$(BIN)/pytest -m slow -s tests/processes/test_soak.py --soak-s 1800 $(ARGS)
+	MALLOC_ARENA_MAX=2 $(BIN)/pytest -m slow -s tests/processes/test_soak.py --soak-s 1800 $(ARGS)
 
 bench: $(READY)
 	$(BIN)/pytest -m benchmark -s $(ARGS)

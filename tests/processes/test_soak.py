@@ -27,7 +27,7 @@ from rti_mpc.wire.cdr import decode
 from service import machine, realtime
 from service.robot_log import RobotLog
 from tests.bench.driven import Driven, driven, quantiles
-from tests.processes.system import ROOT, environment, until
+from tests.processes.system import ROOT, anonymous_bytes, environment, until
 
 pytestmark = pytest.mark.slow
 
@@ -37,7 +37,8 @@ HELD_UP_NS = 500_000  # lateness of a bare timer that explains missed periods
 AFTERMATH_NS = 50_000_000  # in which they may be: all that was held up is then done at once
 COLD = 400  # first samples, left out: everybody starts
 LOOK_S = 1.0
-WARM_UP_S = 60.0  # of allocators and ring buffers; a quarter of a shorter run
+ROLES = ("controller", "robot", "reference")
+WARM_UP_S = 600.0  # in which the arenas of the allocator meet their stalls; a quarter of a shorter run
 LONG_S = 900.0  # from which on a slope per hour can be told from a high-water mark that a stall has left
 MIB = 2**20
 
@@ -96,12 +97,6 @@ class Commands(threading.Thread):
             self.heard.append((decode(Command, received.payload).state_seq, time.monotonic_ns()))
 
 
-def anonymous_bytes(pid: int) -> int:
-    """Memory of a process that no file backs, in bytes."""
-    line = next(line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("RssAnon"))
-    return 1024 * int(line.split()[1])
-
-
 def growth(times_s: np.ndarray, mib: np.ndarray) -> float:
     """Fitted (Theil 1950, Sen 1968: the median of all slopes, which a single step does not move), in MiB per hour."""
     return 3600.0 * float(scipy.stats.theilslopes(mib, times_s).slope)
@@ -114,7 +109,7 @@ class Soak:
     first: Telemetry
     last: Telemetry
     commands: list[tuple[int, int]]
-    looks: np.ndarray  # time, s, and memory of controller and robot, MiB
+    looks: np.ndarray  # time, s, and memory of each of `ROLES`, MiB
     silences: int  # that the controller reported; it starts cold after each, and counts no sample as skipped
     log: RobotLog
 
@@ -155,7 +150,7 @@ def soak(folder: Path, duration_s: float) -> Soak:
         until_s = time.monotonic() + duration_s
         while time.monotonic() < until_s:
             time.sleep(LOOK_S)
-            looks.append((time.monotonic(), *(anonymous_bytes(robot.pids[role]) / MIB for role in ("controller", "robot"))))
+            looks.append((time.monotonic(), *(anonymous_bytes(robot.pids[role]) / MIB for role in ROLES)))
         last = decode(Telemetry, until(samples.try_recv, "a last sample").payload)
         for role in ("controller", "robot", "reference"):
             assert robot.children.end(role) == 0, role
@@ -183,7 +178,7 @@ def test_hours_of_samples_miss_no_period_lose_no_message_and_take_no_memory(
         for core, rows in enumerate(timers.ticks):
             held_up = (rows[:, 1] > HELD_UP_NS).sum()
             print(f"bare timer {core}      {quantiles(1e-3 * rows[:, 1])}; {held_up} of {len(rows)} later than {1e-6 * HELD_UP_NS:g} ms")
-        for role, used in zip(("controller", "robot"), warm[:, 1:].T, strict=True):
+        for role, used in zip(ROLES, warm[:, 1:].T, strict=True):
             print(f"{role:17} {used[-1]:.1f} MiB, {growth(warm[:, 0], used):+.2f} MiB/h fitted, {np.ptp(used):.2f} MiB between least and most")
     assert explained == len(missed_ns)
     assert account["rest"] >= 0 if seen.silences else account["rest"] == 0
