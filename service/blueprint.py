@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -19,12 +20,14 @@ TIMELINE = "robot_time"
 TRAIL_S = 90.0
 WINDOW_S = (-60.0, 15.0)  # around now; the legend lies on what is yet to come
 HALF_FIELD = 0.52  # tangent of half the viewer's vertical field of view
+GRID_M = 0.5
 MARGIN_M = 0.35  # a robot around a reference
 
 COLORS = {
     "reference": (150, 156, 168),
     "measured": (86, 160, 255),
     "command": (255, 176, 59),
+    "actuation": (38, 128, 118),
     "limit": (226, 86, 86),
     "error": (240, 110, 170),
     "prepare": (124, 200, 124),
@@ -40,11 +43,10 @@ COLORS = {
     "bad": (214, 70, 70),
 }
 PHASES = ("prepare", "feedback", "latency")
-LANES = {"mode": Mode, "status": QpStatus}
-LANE_COLORS = {
-    "mode": ("idle", "idle", "good", "good", "warning", "warning", "bad"),
-    "status": ("good", "warning", "warning", "warning", "bad", "bad", "idle"),
-}
+RUNGS = {"softened": "measured", "shifted": "warning", "braked": "bad", "rested": "latency"}  # of the ladder of fallbacks, as telemetry counts them
+MODES = dict(zip(Mode, ("idle", "idle", "good", "good", "warning", "warning", "bad"), strict=True))
+STATUSES = dict(zip(QpStatus, ("good", "warning", "warning", "warning", "bad", "bad", "idle"), strict=True))
+LANES: dict[str, dict[Any, str]] = {"guard": MODES, "mode": MODES, "status": STATUSES}  # a leader is any epoch
 
 
 @dataclass(frozen=True)
@@ -88,13 +90,14 @@ def blueprint(info: Info, frame: Frame | None = None) -> rrb.Blueprint:
     ]
     states = _series("States", ["state/**"])
     estimated = [_series("Disturbances", ["disturbance/**"])] if info.disturbances else []
-    left: rrb.Container = rrb.Vertical(states, *estimated) if info.position is None else rrb.Tabs(_world(frame or Frame()), states, *estimated)
-    lanes = rrb.StateTimelineView(origin="/lane", name="Mode and QP status", time_view=_time_axis())
+    tabs: list[rrb.View | rrb.Container] = [states, *estimated, _troubles()]
+    left = rrb.Vertical(*tabs) if info.position is None else rrb.Tabs(_world(frame or Frame()), *tabs)
+    lanes = rrb.StateTimelineView(origin="/lane", name="Modes, QP status and who leads", time_view=_time_axis())
     return rrb.Blueprint(
         rrb.Vertical(
-            rrb.Horizontal(left, rrb.Vertical(*series), column_shares=[1, 1]),
-            rrb.Horizontal(lanes, _events(), column_shares=[1, 1]),
-            row_shares=[9, 2],
+            rrb.Horizontal(left, rrb.Vertical(*series, row_shares=[4] * len(info.inputs) + [3, 3]), column_shares=[1, 1]),
+            rrb.Horizontal(lanes, _events(), column_shares=[2, 3]),
+            row_shares=[8, 3],
         ),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -111,9 +114,9 @@ def _world(frame: Frame) -> rrb.Spatial3DView:
     trail = rrb.VisibleTimeRanges([rrb.VisibleTimeRange(TIMELINE, start=start, end=rrb.TimeRangeBoundary.cursor_relative())])
     return rrb.Spatial3DView(
         origin="/world",
-        name="From above, y up",
+        name=f"From above, y up, grid {GRID_M:g} m",
         background=(16, 18, 22),
-        line_grid=rrb.LineGrid3D(visible=True, spacing=0.5, stroke_width=0.5, color=(255, 255, 255, 28)),
+        line_grid=rrb.LineGrid3D(visible=True, spacing=GRID_M, stroke_width=0.5, color=(255, 255, 255, 28)),
         eye_controls=rrb.EyeControls3D(position=(x, y - 0.01, frame.eye_height), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)),
         overrides={"world/trail": [trail]},
     )
@@ -124,7 +127,9 @@ def _time_axis() -> rrb.TimeAxis:
     return rrb.TimeAxis(view_range=rr.TimeRange(*boundaries))
 
 
-def _series(name: str, contents: list[str], axis_y: rrb.ScalarAxis | None = None) -> rrb.TimeSeriesView:
+def _series(
+    name: str, contents: list[str], axis_y: rrb.ScalarAxis | None = None, overrides: Mapping[Any, rr.SeriesLines] | None = None
+) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin="/",
         contents=[f"+ /{path}" for path in contents],
@@ -132,14 +137,15 @@ def _series(name: str, contents: list[str], axis_y: rrb.ScalarAxis | None = None
         axis_x=_time_axis(),
         axis_y=axis_y,
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightBottom),
+        overrides=overrides,
     )
 
 
 def _commands(info: Info, i: int) -> rrb.TimeSeriesView:
-    """Show a command between its limits, and the measured state it is about."""
-    measured = info.measured(i)
-    contents = [f"command/{info.inputs[i].name}/**"] + ([] if measured is None else [f"state/{info.states[measured].name}"])
-    return _series(f"Command {info.inputs[i]}", contents)
+    """Show a command between its limits, what a guard let through, and the measured state it is about."""
+    name, k = info.inputs[i].name, info.measured(i)
+    measured = {} if k is None else {f"state/{info.states[k].name}": _line("measured", "measured")}
+    return _series(f"Command {info.inputs[i]}", [f"actuation/{name}", f"command/{name}/**", *measured], overrides=measured)
 
 
 def _errors(info: Info) -> rrb.TimeSeriesView:
@@ -155,6 +161,15 @@ def _times(info: Info) -> rrb.Container:
     return rrb.Horizontal(
         _series("Phase times [us]", [f"telemetry/{name}_us" for name in PHASES]),
         _series(f"Left of the {period_ms:g} ms period [ms]" if axis else "Left of the period [ms]", ["slack/**"], axis),
+    )
+
+
+def _troubles() -> rrb.Container:
+    """Show what was sent instead of a plan, and how long a state takes to act."""
+    return rrb.Vertical(
+        _series("Samples since start, softened or without a plan of their own", [f"telemetry/{rung}" for rung in RUNGS]),
+        _series("From a state to the act of its command [s]", ["telemetry/delay_s", "telemetry/state_age_s"]),
+        name="Fallbacks and delay",
     )
 
 
@@ -177,6 +192,7 @@ STRIPS = {
     "world/trail": Strip("measured", 2.0, 0.004),
     "world/horizon": Strip("command", 4.0, 0.02),
 }
+LEGEND = {"reference": "reference", "driven": "measured", "planned": "command"}
 OBSTACLE_Z = -0.004  # [m], below everything
 CIRCLE: Array = np.column_stack([np.cos(angles := np.linspace(0, 2 * np.pi, 48, endpoint=False)), np.sin(angles)])
 ROBOT_Z = 0.008  # [m], between trail and horizon
@@ -185,6 +201,15 @@ ROBOT_Z = 0.008  # [m], between trail and horizon
 def looks(info: Info) -> dict[str, rr.AsComponents]:
     """Return what does not change about a recording, by entity."""
     return _series_looks(info) | _lane_looks() | ({} if info.position is None else _world_looks(info))
+
+
+def legend(frame: Frame) -> rr.Points3D:
+    """Return what tells the lines in the plane apart, at the bottom of what is seen."""
+    (x, y), reach = frame.center, HALF_FIELD * frame.eye_height
+    xy = np.array([(x + shift * reach, y - 0.88 * reach) for shift in (-0.6, 0.0, 0.6)])
+    return rr.Points3D(
+        lifted(xy, 0.0), labels=list(LEGEND), show_labels=True, colors=[COLORS[color] for color in LEGEND.values()], radii=rr.Radius.ui_points(4.0)
+    )
 
 
 def lifted(xy: Array, z: float) -> Array:
@@ -196,10 +221,12 @@ def _series_looks(info: Info) -> dict[str, rr.AsComponents]:
     looks: dict[str, rr.AsComponents] = {f"state/{label.name}": _line(str(label), "measured") for label in info.states}
     looks |= {f"disturbance/{label.name}": _line(str(label), "error") for label in info.disturbances}
     for label in info.inputs:
+        looks[f"actuation/{label.name}"] = _line("let through", "actuation", 6.0, rr.components.InterpolationMode.StepAfter)
         looks[f"command/{label.name}"] = _line("command", "command", interpolation=rr.components.InterpolationMode.StepAfter)
-        looks |= {f"command/{label.name}/{side}": _line(side, "limit", 1.0) for side in ("min", "max")}
+        looks |= {f"command/{label.name}/{side}": _line("limits", "limit", 1.0) for side in ("min", "max")}
     looks |= {f"error/{info.outputs[i].name}": _line(str(info.outputs[i]), "error") for i, _ in info.tracked}
     looks |= {f"telemetry/{phase}_us": _line(phase, phase) for phase in PHASES}
+    looks |= {f"telemetry/{rung}": _line(rung, color) for rung, color in RUNGS.items()}
     looks |= {"error/position": _line("position [mm]", "error"), "slack": _line("left", "feedback"), "slack/period": _line("period", "limit", 1.0)}
     return looks
 
@@ -207,7 +234,7 @@ def _series_looks(info: Info) -> dict[str, rr.AsComponents]:
 def _lane_looks() -> dict[str, rr.AsComponents]:
     looks: dict[str, rr.AsComponents] = {}
     for lane, values in LANES.items():
-        names, colors = [value.name for value in values], [COLORS[color] for color in LANE_COLORS[lane]]
+        names, colors = [value.name for value in values], [COLORS[color] for color in values.values()]
         looks[f"lane/{lane}"] = rr.StateConfiguration(values=names, labels=names, colors=colors)
     return looks
 

@@ -13,6 +13,7 @@ from rti_mpc.message import STAMP_ON_ARRIVAL, Command, Event, Notice, Reference,
 from rti_mpc.wire.bus import Bus, Received, Subscriber
 from rti_mpc.wire.intake import Intake
 from service.info import Info
+from service.playback import Actuation
 from service.recording import Entry
 from service.timeline import Timeline
 
@@ -36,6 +37,7 @@ class Listener:
 
     def __init__(self, bus: Bus, capacity: int = CAPACITY) -> None:
         keys = bus.keys
+        self._actuation = keys.actuation
         self.received = 0
         self._bad_infos = 0
         self._timeline = Timeline()
@@ -46,6 +48,7 @@ class Listener:
             (Reference, bus.subscriber(keys.reference, capacity=16, cached=True)),
             (Reference, bus.subscriber(keys.anchored, capacity=16, cached=True)),
             (Command, bus.subscriber(keys.command, capacity=capacity)),
+            (Command, bus.subscriber(keys.actuation, capacity=capacity)),
             (Telemetry, bus.subscriber(keys.telemetry, capacity=capacity)),
             (Event, bus.subscriber(keys.events, capacity=capacity, cached=True)),
         )
@@ -92,6 +95,8 @@ class Listener:
                     continue
                 if isinstance(message, State):
                     yield Entry(self._timeline.place_state(message.epoch, message.stamp_ns), message)
+                elif received.key == self._actuation:
+                    yield Entry(self._timeline.place(message.stamp_ns), Actuation(message))
                 elif message.stamp_ns != STAMP_ON_ARRIVAL:  # such a reference follows with its real stamp
                     yield Entry(self._timeline.place(message.stamp_ns), message)
 

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from rti_mpc.array import Array
 from rti_mpc.message import Command, Event, Reference, Severity, State, Telemetry
-from service.blueprint import LANES, STRIPS, TIMELINE, Frame, blueprint, lifted, looks
+from service.blueprint import RUNGS, STRIPS, TIMELINE, Frame, blueprint, legend, lifted, looks
 from service.info import Info, Label, Obstacle
+from service.playback import Actuation, Playback, Row
 from service.tracking_error import tracking_error
 
-Message = Info | Reference | State | Command | Telemetry | Event
+Message = Info | Reference | State | Command | Actuation | Telemetry | Event
 Columns = Iterable[rr.ComponentColumn]
 Times = NDArray[np.int64]
 
@@ -27,9 +28,10 @@ HELD = 10_000  # entries kept until an info tells their names
 SCALARS = (
     *("prepare_us", "feedback_us", "latency_us"),
     *("iterations", "res_prim", "res_dual", "cost", "violation"),
-    *("state_age_s", "slack_s", "delay_s", "skipped", "fallbacks", "softened", "parameter_version"),
+    *("state_age_s", "slack_s", "delay_s", "skipped", "fallbacks", *RUNGS, "parameter_version"),
 )
 LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
+MS = 1_000_000  # [ns], to which events lie: the column of times is not wider
 ROWS = 5000  # of a reference, drawn
 
 
@@ -62,11 +64,13 @@ class Recording:
         self._frame: Frame | None = None
         self._held: deque[Entry] = deque(maxlen=HELD)
         self._last: State | None = None
-        self._lanes: dict[str, int] = {}
+        self._playback = Playback()
+        self._lanes: dict[str, str] = {}
         self._writers: dict[type, Callable[[Times, list[Any]], None]] = {
             Reference: self._references,
             State: self._states,
             Command: self._commands,
+            Actuation: self._actuations,
             Telemetry: self._telemetry,
             Event: self._events,
         }
@@ -87,10 +91,11 @@ class Recording:
                 write(np.array([entry.time_ns for entry in fitting], np.int64), [entry.message for entry in fitting])
 
     def finish(self) -> None:
-        """Write what was held for want of an info."""
+        """Write what was held for want of an info, or of what comes next."""
         if self.info is None and self._held:
             widths = {name: getattr(e.message, name).shape[-1] for e in self._held for name in VECTORS if hasattr(e.message, name)}
             self._name(Info.unnamed(widths.get("x", 0), widths.get("u", 0), widths.get("y", widths.get("y_ref", 0))))
+        self._told(self._playback.end())
 
     def _info(self, info: Info) -> None:
         """Keep a description; take names from it, a controller's before a robot's."""
@@ -100,8 +105,8 @@ class Recording:
 
     def _name(self, info: Info) -> None:
         """Take names from a description, and write what was held for want of them."""
-        if self.info is not None and (info.states, info.outputs) != (self.info.states, self.info.outputs):
-            self._reference, self._last = None, None
+        if self.info is not None and _vectors(info) != _vectors(self.info):
+            self._reference, self._last, self._playback = None, None, Playback()
         self.info = info
         for path, archetype in looks(info).items():
             self.stream.log(path, archetype, static=True)
@@ -138,6 +143,7 @@ class Recording:
             frame = Frame.around(references[-1].y[:, pair])
             if frame != self._frame:
                 self._frame = frame
+                self.stream.log("world/legend", legend(frame), static=True)
                 self.stream.send_blueprint(blueprint(self.info, frame))
             self._strips("world/reference", times, [r.y[:: 1 + len(r.y) // ROWS, pair] for r in references])
 
@@ -170,10 +176,26 @@ class Recording:
     def _commands(self, times: Times, commands: list[Command]) -> None:
         assert self.info is not None
         u = np.array([command.u[0] for command in commands])
+        self._inputs("command", times, u)
         for i, label in enumerate(self.info.inputs):
-            self._scalars(f"command/{label.name}", times, u[:, i])
             for side, bounds in (("min", self.info.lbu), ("max", self.info.ubu)):
                 self._scalars(f"command/{label.name}/{side}", times, np.full(len(u), bounds[i]))
+
+    def _actuations(self, times: Times, actuations: list[Actuation]) -> None:
+        self._told(self._playback.add(times.tolist(), actuations))
+
+    def _told(self, rows: list[Row]) -> None:
+        """Write what a guard told the robot."""
+        if rows:
+            times = np.array([row.time_ns for row in rows], np.int64)
+            self._inputs("actuation", times, np.array([row.u for row in rows]))
+            self._lane("guard", times, [row.mode.name for row in rows])
+
+    def _inputs(self, stream: str, times: Times, u: Array) -> None:
+        """Write inputs, shape ``(n, nu)``."""
+        assert self.info is not None
+        for i, label in enumerate(self.info.inputs):
+            self._scalars(f"{stream}/{label.name}", times, u[:, i])
 
     def _telemetry(self, times: Times, samples: list[Telemetry]) -> None:
         assert self.info is not None
@@ -183,8 +205,9 @@ class Recording:
             self._scalars(f"disturbance/{label.name}", times, np.array([sample.d[i] if i < len(sample.d) else np.nan for sample in samples]))
         self._scalars("slack", times, np.array([1e3 * sample.slack_s for sample in samples]))
         self._scalars("slack/period", times, np.full(len(times), 1e3 * self.info.dt_s))
-        for lane in LANES:
-            self._lane(lane, times, [int(getattr(sample, lane)) for sample in samples])
+        self._lane("mode", times, [sample.mode.name for sample in samples])
+        self._lane("status", times, [sample.status.name for sample in samples])
+        self._lane("leader", times, [f"epoch {sample.epoch}" for sample in samples])
         if self.info.position is not None:
             self._obstacles(times, np.array([sample.stamp_ns for sample in samples], np.int64))
             self._strips("world/horizon", times, [sample.x[:, self.info.position] for sample in samples])
@@ -197,19 +220,20 @@ class Recording:
             scale = np.column_stack([r, r, np.ones_like(r)])
             self._columns(f"world/obstacle_{i}", times, rr.Transform3D.columns(translation=np.column_stack([x, y, 0 * x]), scale=scale))
 
-    def _lane(self, lane: str, times: Times, values: Sequence[int]) -> None:
+    def _lane(self, lane: str, times: Times, values: Sequence[str]) -> None:
+        """Write where a lane changes."""
         before = [self._lanes.get(lane), *values[:-1]]
         changed = [k for k, value in enumerate(values) if value != before[k]]
         self._lanes[lane] = values[-1]
         if changed:
-            self._columns(f"lane/{lane}", times[changed], rr.StateChange.columns(state=[LANES[lane](values[k]).name for k in changed]))
+            self._columns(f"lane/{lane}", times[changed], rr.StateChange.columns(state=[values[k] for k in changed]))
 
     def _events(self, times: Times, events: list[Event]) -> None:
         for source in sorted({event.source for event in events}):
             mine = [k for k, event in enumerate(events) if event.source == source]
             text = [f"{source}: {events[k].text} ({events[k].code})" for k in mine]
             columns = rr.TextLog.columns(text=text, level=[LEVELS[events[k].severity] for k in mine])
-            self._columns(f"event/{rr.escape_entity_path_part(source)}", times[mine], columns)
+            self._columns(f"event/{rr.escape_entity_path_part(source)}", times[mine] // MS * MS, columns)
 
 
 def located(obstacle: Obstacle, reference: Reference | None, stamps: NDArray[np.int64]) -> tuple[Array, Array, Array]:
@@ -225,3 +249,7 @@ def located(obstacle: Obstacle, reference: Reference | None, stamps: NDArray[np.
 def _positions(outputs: Sequence[Label]) -> tuple[int, int] | None:
     names = [label.name for label in outputs]
     return (names.index("x"), names.index("y")) if {"x", "y"} <= set(names) else None
+
+
+def _vectors(info: Info) -> tuple[tuple[Label, ...], ...]:
+    return info.states, info.inputs, info.outputs
