@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from queue import Queue
 from threading import Thread
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,11 +22,13 @@ pytest.importorskip("rerun")
 from rerun.chunk import RrdReader
 
 from rti_mpc.errors import ConfigError
-from rti_mpc.message import Event, Severity, State
+from rti_mpc.message import Command, Event, Severity, State, Telemetry
+from rti_mpc.status import Mode, QpStatus
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
 from service.listener import Listener
+from service.outlet import file_outlet
 from service.view import spawn_viewer, viewer_url
 from tests.processes.system import until
 from tests.service.test_view_outlet import Viewer as Screen
@@ -124,15 +127,20 @@ def children() -> Iterator[list[Child]]:
         child.kill()
 
 
-def rows(path: Path, entity: str) -> list[tuple[int, float]]:
+def rows(path: Path, entity: str, column: str = "Scalars:scalars") -> list[tuple[int, Any]]:
     """What a finished recording holds of a scalar: robot time in ns, value."""
     pairs = []
     for chunk in RrdReader(path).stream().to_chunks():
         if chunk.entity_path == f"/{entity}" and not chunk.is_static:
             batch = chunk.to_record_batch()
             times = batch.column("robot_time").to_numpy(zero_copy_only=False).astype(np.int64)
-            pairs += zip(times.tolist(), [v[0] for v in batch.column("Scalars:scalars").to_pylist()], strict=True)
+            pairs += zip(times.tolist(), [v[0] for v in batch.column(column).to_pylist()], strict=True)
     return pairs
+
+
+def changes(path: Path, lane: str) -> list[tuple[int, str]]:
+    """What a finished recording holds of a lane: robot time in ns, value from then on."""
+    return rows(path, lane, "StateChange:state")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -225,6 +233,46 @@ def test_a_listener_that_falls_behind_keeps_the_newest_and_counts_the_rest(port:
         assert [entry.message.seq for entry in entries if isinstance(entry.message, State)] == list(range(last - 9, last + 1))
         assert listener.lost >= 40 - 10
         assert listener.refused > 0
+
+
+def test_a_takeover_behind_a_guard_is_seen_in_the_recording(port: int, tmp_path: Path) -> None:
+    """Of a leader that dies after its third command, and a standby; the guard tells the robot a ramp between them."""
+    keys, endpoint, path = Keys(robot="r"), f"tcp/127.0.0.1:{port}", tmp_path / "run.rrd"
+    label = {"name": "x", "unit": "m", "angle": False}
+    outlet = file_outlet(path, "r")
+    with Bus(BusSettings(listen=(endpoint,)), keys) as robot, Bus(BusSettings(connect=(endpoint,)), keys) as bus:
+        listener = Listener(bus)
+        robot.publish_json(keys.info("controller"), {"role": "controller", "states": [label], "inputs": [{**label, "name": "f"}]})
+        state, telemetry = robot.publisher(keys.state, State), robot.publisher(keys.telemetry, Telemetry)
+        command, actuation = robot.publisher(keys.command, Command), robot.publisher(keys.actuation, Command)
+        heard = {"rows": 0}
+
+        def hear(rows: int) -> bool:
+            entries = listener.drain()
+            outlet.offer(entries)
+            heard["rows"] += len(entries)
+            return heard["rows"] >= rows
+
+        until(lambda: hear(1), "the description")
+        for k in range(1, 9):
+            stamp, epoch = k * 10**8, 5 if k <= 3 else 6
+            head = (stamp, 1, k, stamp, stamp + 10**8, 9)
+            state.put(State(1, k, stamp, np.ones(1)))
+            u, status = np.full((2, 1), float(k)), (Mode.TRACKING, QpStatus.SOLVED)
+            if k in (4, 5):
+                actuation.put(Command(8, k, *head, Mode.BRAKING, QpStatus.NONE, 10**8, 0.0 * u))
+            else:
+                command.put(Command(epoch, k, *head, *status, 10**8, u))
+                actuation.put(Command(8, k, *head, *status, 10**8, u))
+                telemetry.put(Telemetry(epoch, k, stamp, k, stamp, *status, 5, *(8 * [0.0]), 0.0, 0, 0, 1, *np.ones((2, 1, 1)), u, np.zeros((2, 0))))
+            until(lambda k=k: hear(1 + 4 * k - 2 * sum(gap <= k for gap in (4, 5))), f"sample {k}")
+    assert outlet.close()
+    commanded, acted = dict(rows(path, "command/f")), dict(rows(path, "actuation/f"))
+    assert list(commanded.values()) == [1.0, 2.0, 3.0, 6.0, 7.0, 8.0]
+    assert list(acted.values()) == [1.0, 2.0, 3.0, 0.0, 0.0, 6.0, 7.0, 8.0]
+    assert changes(path, "lane/leader") == [(1 * 10**8, "epoch 5"), (6 * 10**8, "epoch 6")]
+    assert changes(path, "lane/guard") == [(1 * 10**8, "TRACKING"), (4 * 10**8, "BRAKING"), (6 * 10**8, "TRACKING")]
+    assert changes(path, "lane/mode") == [(1 * 10**8, "TRACKING")]
 
 
 @pytest.mark.parametrize("address", ["nowhere", "host:port", "http://127.0.0.1:9876", ":9876"])

@@ -17,6 +17,7 @@ from rerun.chunk import RrdReader
 from rti_mpc.message import Command, End, Event, Reference, Severity, State, Telemetry
 from rti_mpc.status import Mode, QpStatus
 from service.info import Info
+from service.playback import Actuation
 from service.recording import Entry, Recording
 
 SECOND = 1_000_000_000
@@ -67,7 +68,8 @@ class Writer:
         self.recording = Recording(self.stream)
 
     def send(self, *messages: Any) -> None:
-        self.recording.send([Entry(getattr(message, "stamp_ns", 0), message) for message in messages])
+        stamped = [(getattr(message, "command", message), message) for message in messages]
+        self.recording.send([Entry(getattr(inner, "stamp_ns", 0), message) for inner, message in stamped])
 
     def read(self) -> dict[str, list[tuple[float, Any]]]:
         self.recording.finish()
@@ -125,6 +127,35 @@ def test_commands_lie_between_the_limits_there_are(writer: Writer) -> None:
     assert "command/omega_c/max" not in rows
 
 
+def test_what_the_guard_let_through_lies_beside_what_was_commanded(writer: Writer) -> None:
+    writer.send(PIONEER, command(0, [0.1, -1.0]), Actuation(command(0, [0.1, -1.0])))
+    writer.send(command(1, [0.5, 1.0]), Actuation(command(1, [0.2, 0.0])))
+    rows = writer.read()
+    assert rows["command/u_c"] == [(0.0, [0.1]), (1.0, [0.5])]
+    assert rows["actuation/u_c"] == [(0.0, [0.1]), (1.0, [0.2])]
+    assert rows["actuation/omega_c"] == [(0.0, [-1.0]), (1.0, [0.0])]
+
+
+def test_the_guards_lane_is_the_mode_of_what_acts(writer: Writer) -> None:
+    writer.send(PIONEER, telemetry(0), Actuation(command(0, [0.5, 0.0])))
+    writer.send(Actuation(replace(command(1, [0.0, 0.0]), mode=Mode.BRAKING)))
+    writer.send(telemetry(2), Actuation(command(2, [0.5, 0.0])))
+    rows = writer.read()
+    assert rows["lane/mode"] == [(0.0, ["TRACKING"])]
+    assert rows["lane/guard"] == [(0.0, ["TRACKING"]), (1.0, ["BRAKING"]), (2.0, ["TRACKING"])]
+
+
+def test_without_a_guard_nothing_of_it_is_recorded(writer: Writer) -> None:
+    writer.send(PIONEER, state(0, [0.0] * 5), command(0, [0.1, 0.1]), telemetry(0))
+    assert not [path for path in writer.read() if "guard" in path or "actuation" in path]
+
+
+def test_a_takeover_is_a_change_in_the_leaders_lane(writer: Writer) -> None:
+    writer.send(PIONEER, telemetry(0), telemetry(1))
+    writer.send(replace(telemetry(2), epoch=7), replace(telemetry(3), epoch=7))
+    assert writer.read()["lane/leader"] == [(0.0, ["epoch 2"]), (2.0, ["epoch 7"])]
+
+
 def test_obstacles_are_where_the_reference_says_and_by_themselves_without(writer: Writer) -> None:
     discs = [{"at": 7, "x": 1.0, "y": 2.0, "r": 0.3}, {"at": 10, "x": 3.0, "y": 4.0, "r": 0.2}]
     writer.send(described("controller", STATES, INPUTS, STATES[:3], obstacles=discs), telemetry(0))
@@ -142,6 +173,7 @@ def test_every_scalar_of_the_telemetry_is_recorded(writer: Writer) -> None:
     rows = writer.read()
     assert rows["telemetry/prepare_us"] == [(0.0, [100.0]), (1.0, [101.0])]
     assert rows["telemetry/fallbacks"] == [(0.0, [0.0]), (1.0, [1.0])]
+    assert {f"telemetry/{name}" for name in ("softened", "shifted", "braked", "rested", "delay_s")} <= rows.keys()
     assert [v for _, v in rows["slack"]] == [[pytest.approx(90.0)]] * 2
     assert [v for _, v in rows["slack/period"]] == [[pytest.approx(100.0)]] * 2
     assert [np.shape(strips) for _, strips in rows["world/horizon"]] == [(1, 4, 3)] * 2
