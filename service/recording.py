@@ -65,7 +65,7 @@ class Recording:
         self._held: deque[Entry] = deque(maxlen=HELD)
         self._last: State | None = None
         self._playback = Playback()
-        self._lanes: dict[str, str] = {}
+        self._lanes: dict[str, tuple[str, int]] = {}  # the last change of each: to what, and where it lies
         self._writers: dict[type, Callable[[Times, list[Any]], None]] = {
             Reference: self._references,
             State: self._states,
@@ -221,12 +221,17 @@ class Recording:
             self._columns(f"world/obstacle_{i}", times, rr.Transform3D.columns(translation=np.column_stack([x, y, 0 * x]), scale=scale))
 
     def _lane(self, lane: str, times: Times, values: Sequence[str]) -> None:
-        """Write where a lane changes."""
-        before = [self._lanes.get(lane), *values[:-1]]
-        changed = [k for k, value in enumerate(values) if value != before[k]]
-        self._lanes[lane] = values[-1]
-        if changed:
-            self._columns(f"lane/{lane}", times[changed], rr.StateChange.columns(state=[values[k] for k in changed]))
+        """Write where a lane changes, in the order it was told: a sample that braked ahead of time may lie behind the next one."""
+        value, since_ns = self._lanes.get(lane, ("", -1))
+        changes = []
+        for time_ns, new in zip(times.tolist(), values, strict=True):
+            if new != value:
+                value, since_ns = new, max(time_ns, since_ns + 1)
+                changes.append((since_ns, value))
+        self._lanes[lane] = value, since_ns
+        if changes:
+            begins, states = zip(*changes, strict=True)
+            self._columns(f"lane/{lane}", np.array(begins, np.int64), rr.StateChange.columns(state=states))
 
     def _events(self, times: Times, events: list[Event]) -> None:
         for source in sorted({event.source for event in events}):

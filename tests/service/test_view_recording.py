@@ -185,6 +185,13 @@ def test_the_mode_lane_holds_changes_only_across_batches(writer: Writer) -> None
     assert writer.read()["lane/mode"] == [(0.0, ["WAITING"]), (1.0, ["TRACKING"]), (4.0, ["FALLBACK"])]
 
 
+def test_a_lane_ends_with_what_was_told_last(writer: Writer) -> None:
+    """The ramp of a stale state is told to begin later than the sample that makes it unnecessary."""
+    writer.send(PIONEER, telemetry(0), telemetry(3, Mode.BRAKING))
+    writer.send(telemetry(2), telemetry(4))
+    assert writer.read()["lane/mode"] == [(0.0, ["TRACKING"]), (3.0, ["BRAKING"]), (pytest.approx(3.0, abs=1e-6), ["TRACKING"])]
+
+
 def test_the_trail_joins_batches_but_not_two_lives_of_the_robot(writer: Writer) -> None:
     writer.send(PIONEER, state(0, [0.0] * 5), state(1, [1.0] * 5))
     writer.send(state(2, [2.0] * 5), state(3, [7.0] * 5, epoch=2))
