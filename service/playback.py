@@ -72,7 +72,7 @@ class Playback:
         rows = []
         end_ns = min(end_ns, time_ns + command.valid_until_ns - command.stamp_ns)
         for begin_ns, u in zip(range(time_ns, end_ns, command.period_ns), command.u, strict=False):
-            if begin_ns + command.period_ns > self._played_ns:  # not over before the plan came
+            if min(begin_ns + command.period_ns, end_ns) > self._played_ns:  # not over before the plan came
                 self._played_ns = max(begin_ns, self._played_ns + 1)
                 rows.append(Row(self._played_ns, u, command.mode))
         return rows

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from rti_mpc.message import Command
 from rti_mpc.status import Mode, QpStatus
@@ -47,6 +48,12 @@ def test_a_plan_that_comes_late_acts_from_then_on() -> None:
     rows = played(ramp(100, [0.0] * 10), ramp(200, [0.0] * 10), plan(150, [1.0, 2.0]), plan(250, [3.0]), end=False)
     assert [time for time, _, _ in rows] == sorted(time for time, _, _ in rows)
     assert rows[-1][1:] == (1.0, "TRACKING")
+
+
+@pytest.mark.parametrize("late", [plan(0, [1.0]), plan(150, [1.0])])
+def test_what_is_over_before_it_comes_is_not_played(late: Actuation) -> None:
+    rows = played(ramp(100, [0.0] * 10), ramp(200, [0.0] * 10), late, plan(160, [2.0]))
+    assert [u for _, u, _ in rows] == 10 * [0.0] + [2.0]
 
 
 def test_rows_do_not_depend_on_how_plans_were_batched() -> None:
