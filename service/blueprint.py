@@ -96,7 +96,7 @@ def blueprint(info: Info, frame: Frame | None = None) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(left, rrb.Vertical(*series, row_shares=[4] * len(info.inputs) + [3, 3]), column_shares=[1, 1]),
-            rrb.Horizontal(lanes, _events(), column_shares=[2, 3]),
+            rrb.Horizontal(lanes, _events(), column_shares=[1, 2]),
             row_shares=[8, 3],
         ),
         rrb.BlueprintPanel(state="collapsed"),
@@ -220,10 +220,12 @@ def lifted(xy: Array, z: float) -> Array:
 def _series_looks(info: Info) -> dict[str, rr.AsComponents]:
     looks: dict[str, rr.AsComponents] = {f"state/{label.name}": _line(str(label), "measured") for label in info.states}
     looks |= {f"disturbance/{label.name}": _line(str(label), "error") for label in info.disturbances}
-    for label in info.inputs:
+    for label, low, high in zip(info.inputs, info.lbu, info.ubu, strict=True):
         looks[f"actuation/{label.name}"] = _line("let through", "actuation", 6.0, rr.components.InterpolationMode.StepAfter)
         looks[f"command/{label.name}"] = _line("command", "command", interpolation=rr.components.InterpolationMode.StepAfter)
-        looks |= {f"command/{label.name}/{side}": _line("limits", "limit", 1.0) for side in ("min", "max")}
+        said = f"±{high:g}" if low == -high else f"{low:g} to {high:g}"
+        limits = _line(f"limits {said}", "limit", 1.0)  # of one name: one entry of the legend, and the scale of a plot too low for ticks
+        looks |= {f"command/{label.name}/{side}": limits for side in ("min", "max")}
     looks |= {f"error/{info.outputs[i].name}": _line(str(info.outputs[i]), "error") for i, _ in info.tracked}
     looks |= {f"telemetry/{phase}_us": _line(phase, phase) for phase in PHASES}
     looks |= {f"telemetry/{rung}": _line(rung, color) for rung, color in RUNGS.items()}
