@@ -229,6 +229,7 @@ def _series_looks(info: Info) -> dict[str, rr.AsComponents]:
     looks |= {f"error/{info.outputs[i].name}": _line(str(info.outputs[i]), "error") for i, _ in info.tracked}
     looks |= {f"telemetry/{phase}_us": _line(phase, phase) for phase in PHASES}
     looks |= {f"telemetry/{rung}": _line(rung, color) for rung, color in RUNGS.items()}
+    looks |= {"telemetry/delay_s": _line("delay", "measured"), "telemetry/state_age_s": _line("age of the state", "idle")}
     looks |= {"error/position": _line("position [mm]", "error"), "slack": _line("left", "feedback"), "slack/period": _line("period", "limit", 1.0)}
     return looks
 
