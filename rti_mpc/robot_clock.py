@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 WINDOW_NS = 1_000_000_000  # local time over which the rate is measured
 EACH_STATE = 1.05  # factor by which one state may change the rate
 LEAP_NS = 250_000_000  # robot time by which a clock that has jumped is ahead
 DRIFT = 0.1  # share by which the rate may be wrong, where states come late now and then
+RECENT = 8  # states, by the least late of which lateness is told
 FASTEST = 10.0  # rate of a robot whose second state is still to come, at most
 
 
@@ -22,7 +25,7 @@ class RobotClock:
         arrival_ns: When it arrived, local monotonic time.
         rate: Robot seconds per local second; assumed low until measured, or a slow simulation would be taken for a dead robot.
         rate_most: What it is at most: until measured, as fast as states have come so far.
-        late_ns: By how much the last state came later than those before it had, robot time.
+        late_ns: By how much the last state came later than the least late of those before it, robot time.
         doubt_ns: By how much that may be wrong: a clock that was not heard for a while has gone on faster or slower than thought.
         leapt: Whether the last stamp was far ahead of its time: the robot's clock has jumped.
         period_ns: Time between states, robot time, smoothed; 0 until two have come.
@@ -49,6 +52,7 @@ class RobotClock:
         self._anchor: tuple[int, int] | None = None
         self._old: tuple[int, int] | None = None  # stamp and arrival of the last state, if that was not fresh
         self._measured = False  # whether the rate is
+        self._recent: deque[tuple[int, int]] = deque(maxlen=RECENT)  # stamps and arrivals
         self.late_ns = self.doubt_ns = 0
         self.leapt = False
 
@@ -67,16 +71,16 @@ class RobotClock:
         follow at once. If the next one takes its time, it is the robot's clock
         that has waited, as a simulation's may, and goes on from here.
         """
-        late = self._anchor is not None
         ahead_ns = stamp_ns - self.now_ns(arrival_ns)
         leaps = self._measured and ahead_ns > max(self._most_ns, LEAP_NS) and not self.leapt
         if self._anchor is None or leaps:
             self._anchor = (stamp_ns, arrival_ns)
+            self._recent.clear()
         elif -ahead_ns > self._most_ns:
             old, self._old = self._old, (stamp_ns, arrival_ns)
             if old is None or 2 * self.rate * (arrival_ns - old[1]) < stamp_ns - old[0]:
                 return False
-            late = False
+            self._recent.clear()
             self.rate = self._rate(stamp_ns - old[0], arrival_ns - old[1])
             self._anchor = (stamp_ns, arrival_ns)
         elif stamp_ns > self.stamp_ns:
@@ -94,8 +98,10 @@ class RobotClock:
         if self._measured:
             self.rate_most = self.rate
         self._old, self.leapt = None, leaps
-        self.late_ns = max(0, -ahead_ns) if late else 0
-        self.doubt_ns = round(DRIFT * self.rate * (arrival_ns - self.arrival_ns)) if late else 0
+        self.late_ns = max((stamp + round((arrival_ns - arrival) * self.rate) - stamp_ns for stamp, arrival in self._recent), default=0)
+        self.late_ns = max(0, self.late_ns)
+        self.doubt_ns = round(DRIFT * self.rate * (arrival_ns - self.arrival_ns)) if self._recent else 0
+        self._recent.append((stamp_ns, arrival_ns))
         self._seq, self.stamp_ns, self.arrival_ns = seq, stamp_ns, arrival_ns
         return True
 
