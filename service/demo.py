@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from rti_mpc.errors import ConfigError
 from rti_mpc.message import Command, State
 from rti_mpc.status import Mode, QpStatus
 from rti_mpc.trajectory import Heading, Trajectory, find_trajectory
@@ -132,12 +133,15 @@ def main(config: Config, scenario: str, **options: Any) -> int:
         Exit status: 0 if the robot was driven to the end.
 
     Raises:
-        ConfigError: The scenario is none, or does not fit the robot.
+        ConfigError: The scenario is none, or does not fit the robot, or the folder cannot be written.
     """
     console = Console()
     run = plan(config, scenario, **options)
-    run.folder.mkdir(parents=True, exist_ok=True)
-    (run.folder / "config.toml").write_text(toml.write(run.config), encoding="utf-8")
+    try:
+        run.folder.mkdir(parents=True, exist_ok=True)
+        (run.folder / "config.toml").write_text(toml.write(run.config), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"--out must be a folder that can be written, got {run.folder}: {error.strerror}") from error
     stop = stop_on_signals()
     signal.signal(signal.SIGHUP, lambda *_: stop.set())
     try:

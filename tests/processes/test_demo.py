@@ -119,3 +119,10 @@ def test_what_cannot_be_run_is_refused_before_anything_starts(tmp_path: Path, op
     done = rti_mpc("demo", option, value, "--out", tmp_path / "out")
     assert done.returncode == 2
     assert not (tmp_path / "out").exists()
+
+
+def test_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    done = rti_mpc("demo", "--out", tmp_path / "file" / "out")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"rti-mpc: --out must be a folder that can be written, got {tmp_path}/file/out: Not a directory\n"

@@ -76,3 +76,16 @@ def test_missing_viewer_is_one_line_that_says_what_to_install(tmp_path: Path) ->
     done = rti_mpc("view", PYTHONPATH=str(tmp_path))
     assert done.returncode == 2
     assert done.stderr == "rti-mpc: rerun must be installed for this command: pip install 'rti-mpc[view]'\n"
+
+
+def test_news_of_matplotlib_is_not_ours_to_tell() -> None:
+    """It tells of fonts it has found, once on a machine: in the middle of a newcomer's first demo."""
+    say = """
+import logging
+from service import log
+log.start()
+for name in ("matplotlib.font_manager", "controller"):
+    logging.getLogger(name).info("news")
+"""
+    done = subprocess.run([sys.executable, "-c", say], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout == '{"level": "INFO", "logger": "controller", "text": "news"}\n'
