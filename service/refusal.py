@@ -91,7 +91,8 @@ def meant(key: str, tree: dict[str, str]) -> str:
     """Return the same key elsewhere, or the nearest beside this one, or all that are beside it."""
     section, _, name = key.rpartition(".")
     beside = {other.rpartition(".")[2]: other for other in tree if other.rpartition(".")[0] == section}
-    near = [other for other in tree if other.rpartition(".")[2] == name] + [beside[n] for n in get_close_matches(name, beside, 1)]
+    near = [other for other in tree if other.rpartition(".")[2] == name]
+    near += [other for n, other in beside.items() if n.lower() == name.lower()] + [beside[n] for n in get_close_matches(name, beside, 1)]
     return f"perhaps {near[0]} is meant ({tree[near[0]]})" if near else known(beside)
 
 

@@ -45,6 +45,7 @@ WRONG = [
     ("N = 20", "N = 20\nN_u = 21", ["ocp.N_u", "at most ocp.N = 20", "21"]),
     ("N = 20", "N = 20\nstale_s = 0.1", ["ocp.stale_s", "timing.stale_s"]),
     ("N = 20", "N = 20\nhorizon = 7", ["ocp.horizon", "N, N_u, dt_s"]),
+    ("N = 20", "n = 20", ["ocp.n is unknown", "perhaps ocp.N is meant", "in stages", "20"]),
     ('integrator = "rk4"', 'integrator = "rk5"', ["ocp.integrator", "'rk4' or 'euler'", "'rk5'"]),
     ("psi = 0.05", "psi = -0.05", ["ocp.weights.Q.psi", "at least 0", "-0.05"]),
     ("psi = 0.05", "phi = 0.05", ["ocp.weights.Q.phi", "no output", "psi [rad]"]),
