@@ -20,6 +20,7 @@ FORBIDDEN = {
     "sim": {"service", "osqp", "pydantic", "typer"},
 }
 EXCEPT = {"service/cli.py"}
+CLOCKS = {"time", "datetime", "threading", "multiprocessing", "concurrent", "random"}  # what would make two runs of one sample differ
 
 # Who alone imports a package, wherever in the file.
 ALONE = {
@@ -106,6 +107,12 @@ def test_layer_does_not_import_upwards(layer: str) -> None:
     for path in files(layer):
         if path.relative_to(ROOT).as_posix() not in EXCEPT:
             assert not roots(path) & FORBIDDEN[layer], path
+
+
+def test_library_has_no_clock_and_no_thread_but_on_the_wire() -> None:
+    for path in files("rti_mpc"):
+        if path.parent.name != "wire":
+            assert not roots(path) & CLOCKS, path
 
 
 @pytest.mark.parametrize("package", ALONE)

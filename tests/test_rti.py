@@ -58,17 +58,18 @@ def unmoving(rti: Rti) -> tuple[Array, ...]:
 
 
 @pytest.mark.parametrize(
-    ("formulation", "changes", "settings"),
+    ("formulation", "solver", "changes"),
     [
-        ("sequential", {"method": "euler"}, TIGHT),
-        ("simultaneous", NARROW, TIGHT),
-        ("simultaneous", {"N": 10, "N_u": 4} | NARROW, replace(TIGHT, scaling=10)),
+        ("sequential", "riccati", {"method": "euler"}),
+        ("simultaneous", "riccati", NARROW),
+        ("simultaneous", "riccati", {"N": 10, "N_u": 4} | NARROW),
+        ("simultaneous", "osqp", {"N": 10, "N_u": 4} | NARROW),
     ],
-    ids=["paper_euler", "rk4_with_state_bounds", "held_inputs_with_state_bounds"],
+    ids=["paper_euler", "rk4_with_state_bounds", "held_inputs_with_state_bounds", "osqp"],
 )
-def test_rti_converges_to_the_nonlinear_solution_when_the_state_is_held(formulation: str, changes: dict[str, Any], settings: SolverSettings) -> None:
+def test_rti_converges_to_the_nonlinear_solution_when_the_state_is_held(formulation: str, solver: str, changes: dict[str, Any]) -> None:
     ocp = pioneer(**changes)
-    rti = Rti(ocp, settings, formulation=formulation, compile=False)
+    rti = Rti(ocp, replace(TIGHT, scaling=10), formulation=formulation, solver=solver, compile=False)
     solve = nlp(ocp)
     active = np.zeros(3)
     for x0, y_ref, u_prev in near_the_eight(ocp, seed=1, count=50):

@@ -78,8 +78,8 @@ def test_delayed_states_arrive_late_with_their_old_stamp() -> None:
 def test_same_seed_gives_the_same_run() -> None:
     settings = replace(SETTINGS, noise_std=np.full(5, 0.01), dropout=0.3, actuator_lag_s=0.05, actuator_delay_s=0.02)
 
-    def run() -> list[float]:
-        robot = Lockstep(settings)
+    def run(seed: int = 1) -> list[float]:
+        robot = Lockstep(replace(settings, seed=seed))
         trace = []
         for seq in range(1, 30):
             trace += robot.tick().x.tolist()
@@ -87,6 +87,7 @@ def test_same_seed_gives_the_same_run() -> None:
         return trace
 
     assert run() == run()
+    assert run() != run(seed=2)
 
 
 def test_robot_does_not_grow_the_heap() -> None:
