@@ -86,12 +86,11 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
                 file=sys.stderr,
             )
             return 1
-        leadership = Leadership(bus, controller, others, config_hash=config.config_hash, dt_s=rti.ocp.dt, standby=standby)
+        ocp = rti.ocp
+        leadership = Leadership(bus, controller, others, config_hash=config.config_hash, dt_s=ocp.dt, nu=ocp.model.nu, standby=standby)
         daemon = Daemon(config, controller, bus, leadership, params, lock, rti, outcomes)
         bus.serve(bus.keys.request, daemon.orders.answer)
-        log.info(
-            "epoch %d controls %s every %g s" if leadership.leading else "%d stands by %s, every %g s", leadership.epoch, config.robot, rti.ocp.dt
-        )
+        log.info("epoch %d controls %s every %g s" if leadership.leading else "%d stands by %s, every %g s", leadership.epoch, config.robot, ocp.dt)
         if outcomes:
             level = logging.INFO if all(outcome.granted for outcome in outcomes) else logging.WARNING
             log.log(level, "real time: %s", "; ".join(map(str, outcomes)))
@@ -279,7 +278,7 @@ class Daemon:
                 return  # the other thread took it
             log.log(LEVELS[notice.severity], "%s", notice.text)
             announcer.say(notice.severity, notice.code, notice.text, self._controller.robot_now_ns(now_ns))
-        for intake in (self._states_in, self._references.planners, self._references.leaders):
+        for intake in (self._states_in, self._references.planners, self._references.leaders, self._leadership.commands_in):
             for refusal in intake.notices(now_ns):
                 log.warning("%s", refusal.text)
                 announcer.say(refusal.severity, refusal.code, refusal.text, self._controller.robot_now_ns(now_ns))

@@ -34,6 +34,7 @@ from rti_mpc.message import Command, Notice, Severity, State
 from rti_mpc.status import Mode
 from rti_mpc.wire.bus import Bus, Received
 from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.intake import Intake
 
 LEADER, STANDBY = "controller", "standby"  # roles
 HEARING_S = 0.5  # for which a starting controller listens for others
@@ -91,12 +92,14 @@ class Leadership:
     Whether one controller leads or stands by.
 
     Attributes:
+        commands_in: Door of what other controllers send.
         leading: Whether it leads.
         epoch: Of its commands; those of the robot's first leader are the Unix seconds at its start, times ``2 ** NUMBER_BITS``, or above.
         misfit: Why it can neither lead nor stand by: the leader has another configuration. Empty while it can.
     """
 
-    def __init__(self, bus: Bus, controller: Controller, others: Others, *, config_hash: int, dt_s: float, standby: bool) -> None:
+    def __init__(self, bus: Bus, controller: Controller, others: Others, *, config_hash: int, dt_s: float, nu: int, standby: bool) -> None:
+        self.commands_in = Intake(Command, SILENCE_S, {"u": nu})
         self.number = secrets.randbits(NUMBER_BITS)
         self.epoch = epoch_above(max(others.epoch, time.time_ns() // 1_000_000_000 << NUMBER_BITS), self.number)
         self.leading = False
@@ -229,7 +232,7 @@ class Leadership:
     def _heard(self) -> Iterator[Command]:
         """Yield what others have commanded since the last call."""
         while (received := self._commands.try_recv()) is not None:
-            if (command := decoded(received)) is not None:
+            if (command := self.commands_in.read(received)) is not None:
                 yield command
 
     def _stand_by(self) -> None:

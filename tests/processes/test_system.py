@@ -4,18 +4,21 @@
 from __future__ import annotations
 
 import csv
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rti_mpc.message import Command, End, Reference, State, Telemetry
+from rti_mpc.message import Command, End, Event, Reference, State, Telemetry
 from rti_mpc.status import Mode
+from rti_mpc.wire import cdr
 from rti_mpc.wire.bus import Bus
-from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.cdr import decode, encode
 from rti_mpc.wire.session import BusSettings
 from service.cli import SHIPPED
 from tests.processes.system import CONFIG, KEYS, SPEED, System, heard, rti_mpc, until
@@ -149,22 +152,47 @@ def test_second_controller_refuses_to_start_beside_a_live_one(driven: System) ->
     assert driven.tracking().epoch == before.epoch
 
 
-def test_malformed_payloads_are_counted_and_published_while_control_goes_on(driven: System) -> None:
-    states, references = driven.bus.publisher(KEYS.state, State), driven.bus.publisher(KEYS.reference, Reference)
-    heard(driven.bus.subscriber(KEYS.command), Command, lambda _: True)
-    garbage = (b"", b"\x00\x00\x00\x00", b"\x00\x01\x00\x00" + bytes(24), b"\x00\x01\x00\x00" + b"\xff" * 4000)
-    before = driven.sample()
+def malformed(message: State | Command, rows: str) -> dict[str, bytes]:
+    """What is no message, by words of its refusal."""
+    whole, values = encode(message), getattr(message, rows)
+    return {
+        "got no bytes": b"",
+        "must hold": whole[:-1],
+        "must end after": whole + bytes(4),
+        "big-endian": b"\x00\x00" + whole[2:],
+        "must be finite": encode(replace(message, **{rows: np.full_like(values, np.nan)})),
+        "numbers a row": encode(replace(message, **{rows: np.concatenate([values, values[..., :1]], axis=-1)})),
+        "@2'": whole,
+    }
 
-    def send() -> None:
-        for payload in garbage:
-            states.put_bytes(payload)
-            references.put_bytes(payload)
 
-    event = driven.event("message_refused", "controller", send)
-    assert "refused so far" in event.text
-    after = heard(driven.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.seq > before.seq + 20)
-    assert after.mode is Mode.TRACKING
-    assert after.fallbacks == before.fallbacks
+def test_payload_of_every_malformed_kind_is_counted_and_published_while_control_goes_on(driven: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    """States to the controller and commands to the robot; of a flood of them each publishes one event a second."""
+    ours = driven.bus.publisher(KEYS.state, State), driven.bus.publisher(KEYS.command, Command)
+    with monkeypatch.context() as later:
+        later.setattr(cdr, "VERSION", 2)
+        foreign = driven.bus.publisher(KEYS.state, State), driven.bus.publisher(KEYS.command, Command)
+    kinds = malformed(driven.state(lambda _: True), "x"), malformed(driven.tracking(), "u")
+    before, events, start_s = driven.sample(), driven.bus.subscriber(KEYS.events, capacity=1024), time.monotonic()
+
+    def send(words: str) -> None:
+        for publisher, payloads in zip(foreign if "@2" in words else ours, kinds, strict=True):
+            publisher.put_bytes(payloads[words])
+
+    for words in kinds[0]:
+        for role in ("controller", "robot"):
+            until(lambda: words in driven.event("message_refused", role, partial(send, words)).text, f"{role} says {words}")  # noqa: B023
+    took_s = time.monotonic() - start_s
+    refused = [event for event in (decode(Event, received.payload) for received in events.drain()) if event.code == "message_refused"]
+    for role in ("controller", "robot"):
+        texts = [event.text for event in refused if event.source == role]
+        assert len(kinds[0]) <= len(texts) <= took_s + 2.0
+        counts = [int(text.rpartition("; ")[2].split()[0]) for text in texts]
+        assert all(np.diff(counts) > 1), "each counts those of which nothing was published"
+    after = driven.sample()
+    assert after.seq > before.seq + 20
+    assert (after.epoch, after.softened) == (before.epoch, before.softened)
+    assert driven.tracking().epoch == before.epoch
 
 
 def test_second_publisher_takes_nothing_over(driven: System) -> None:

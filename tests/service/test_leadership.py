@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
@@ -14,7 +14,7 @@ import pytest
 from rti_mpc.message import Command, Notice, State
 from rti_mpc.status import Mode, QpStatus
 from rti_mpc.wire.bus import Received
-from rti_mpc.wire.cdr import encode
+from rti_mpc.wire.cdr import encode, encoding
 from rti_mpc.wire.keys import Keys
 from service.leadership import NUMBER_BITS, Leadership, Others, epoch_above
 
@@ -29,10 +29,10 @@ class Wire:
 
     buses: list[WireBus] = field(default_factory=list)
 
-    def put(self, sender: WireBus, payload: bytes) -> None:
+    def put(self, sender: WireBus, payload: bytes, kind: str = encoding(Command)) -> None:
         for bus in self.buses:
             if bus is not sender:
-                bus.commands.append(Received(payload, "", ""))
+                bus.commands.append(Received(payload, kind, ""))
 
     def show(self, role: str, present: bool) -> None:
         for bus in self.buses:
@@ -99,7 +99,8 @@ class One:
 
     def __init__(self, wire: Wire, *, standby: bool, number: int | None = None, dt_s: float = DT_S) -> None:
         self.bus, self.puppet, self.wire = WireBus(wire), Puppet(), wire
-        self.leadership = Leadership(cast(Any, self.bus), cast(Any, self.puppet), Others(0, None), config_hash=HASH, dt_s=dt_s, standby=standby)
+        bus, puppet = cast(Any, self.bus), cast(Any, self.puppet)
+        self.leadership = Leadership(bus, puppet, Others(0, None), config_hash=HASH, dt_s=dt_s, nu=1, standby=standby)
         if number is not None:
             self.leadership.number = number
         self.leadership.declare()
@@ -340,3 +341,15 @@ def test_never_two_answer_a_state_and_nearly_every_state_is_answered_though_cont
             answered.append(sum(one.see(k) for one, rest in zip(ones, asleep, strict=True) if rest == 0))
     assert max(answered) == 1
     assert np.mean(answered) > 0.9
+
+
+def test_what_is_no_command_for_this_robot_unseats_nobody_and_is_counted(pair: tuple[One, One]) -> None:
+    """Of a robot with more inputs, or of a version to come: it says that it leads, and it cannot be played."""
+    leader, standby = pair
+    command = replace(standby.made(5), epoch=leader.leadership.epoch + 1)
+    leader.wire.put(standby.bus, encode(replace(command, u=np.zeros((1, 2)))))
+    leader.wire.put(standby.bus, encode(command), encoding(Command).replace("@1", "@2"))
+    assert leader.see(5)
+    assert leader.leadership.leading
+    assert leader.leadership.commands_in.refused == {"length": 1, "version": 1}
+    assert not leader.puppet.heard
