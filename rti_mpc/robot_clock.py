@@ -72,6 +72,7 @@ class RobotClock:
         that has waited, as a simulation's may, and goes on from here.
         """
         ahead_ns = stamp_ns - self.now_ns(arrival_ns)
+        since_ns = self.arrival_ns or arrival_ns
         leaps = self._measured and ahead_ns > max(self._most_ns, LEAP_NS) and not self.leapt
         if self._anchor is None or leaps:
             self._anchor = (stamp_ns, arrival_ns)
@@ -81,6 +82,7 @@ class RobotClock:
             if old is None or 2 * self.rate * (arrival_ns - old[1]) < stamp_ns - old[0]:
                 return False
             self._recent.clear()
+            since_ns = old[1]
             self.rate = self._rate(stamp_ns - old[0], arrival_ns - old[1])
             self._anchor = (stamp_ns, arrival_ns)
         elif stamp_ns > self.stamp_ns:
@@ -98,9 +100,8 @@ class RobotClock:
         if self._measured:
             self.rate_most = self.rate
         self._old, self.leapt = None, leaps
-        self.late_ns = max((stamp + round((arrival_ns - arrival) * self.rate) - stamp_ns for stamp, arrival in self._recent), default=0)
-        self.late_ns = max(0, self.late_ns)
-        self.doubt_ns = round(DRIFT * self.rate * (arrival_ns - self.arrival_ns)) if self._recent else 0
+        self.late_ns = max([0, *(stamp + round((arrival_ns - arrival) * self.rate) - stamp_ns for stamp, arrival in self._recent)])
+        self.doubt_ns = round(DRIFT * self.rate * (arrival_ns - since_ns))
         self._recent.append((stamp_ns, arrival_ns))
         self._seq, self.stamp_ns, self.arrival_ns = seq, stamp_ns, arrival_ns
         return True

@@ -48,6 +48,22 @@ def test_rate_is_at_most_as_fast_as_states_have_come_until_it_is_known() -> None
     assert ticking(4.0, count=30).rate_most == pytest.approx(4.0)
 
 
+def test_lateness_of_one_state_after_another_adds_up() -> None:
+    clock = ticking(1.0)
+    for i, late_ms in enumerate((30, 70), start=1):
+        stamp_ns = clock.stamp_ns + 100 * MS
+        clock.observe(30 + i, stamp_ns, stamp_ns - 5_000 * MS + late_ms * MS)
+        assert clock.late_ns == pytest.approx(late_ms * MS, abs=10 * MS)  # the rate follows a little
+
+
+def test_lateness_is_in_doubt_after_a_silence() -> None:
+    clock = ticking(1.0)
+    clock.observe(31, clock.stamp_ns + 100 * MS, clock.arrival_ns + 100 * MS)
+    assert clock.doubt_ns == pytest.approx(10 * MS, rel=1e-3)
+    clock.observe(32, clock.stamp_ns + 2000 * MS, clock.arrival_ns + 2000 * MS)
+    assert clock.doubt_ns == pytest.approx(200 * MS, rel=1e-3)
+
+
 def test_clock_that_has_jumped_runs_as_fast_as_before() -> None:
     clock = ticking(4.0)
     rate = clock.rate
