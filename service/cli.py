@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from rti_mpc.errors import RtiMpcError
+from rti_mpc.errors import ConfigError, RtiMpcError
 from service import log
 from service.config import Config, load
 
@@ -37,7 +37,19 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+
+def claimed(path: Path | None) -> Path | None:
+    """Make sure that a file can be written, before minutes are spent on what it is to hold."""
+    try:
+        if path is not None:
+            path.touch()
+    except OSError as error:
+        raise ConfigError(f"--json must be a file that can be written, got {path}: {error.strerror}") from error
+    return path
+
+
 ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="The robot's TOML file.", show_default="the shipped pioneer_3dx.toml")]
+JsonPath = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write it as JSON, too.", callback=claimed)]
 
 
 def options(
@@ -233,7 +245,7 @@ def demo(
 def faults(
     config: ConfigPath = SHIPPED,
     only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="One fault of the matrix; repeatable.", show_default="all")] = None,
-    path: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the matrix as JSON.")] = None,
+    path: JsonPath = None,
 ) -> None:
     """Break every part of a running system in turn, and print what the robot did: the fault matrix."""
     from service.faults.run import main
@@ -250,7 +262,7 @@ def bench(
     interpreted: Annotated[bool, typer.Option("--interpreted", help="Also without a compiler.")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="A first look: eight seconds of driving.")] = False,
     costs: Annotated[bool, typer.Option("--costs", help="Also closed-loop costs against exact QPs and converged NMPC.")] = False,
-    path: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the rows as JSON.")] = None,
+    path: JsonPath = None,
 ) -> None:
     """Measure what a sample costs, by horizon and formulation, beside IPOPT on the same states."""
     from service.bench import HORIZONS, main
@@ -282,7 +294,7 @@ def check(config: ConfigPath = SHIPPED) -> None:
 @app.command()
 def doctor(
     config: ConfigPath = SHIPPED,
-    path: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write what was found as JSON.")] = None,
+    path: JsonPath = None,
 ) -> None:
     """Examine this host: scheduler, clock, timers, bus, compiler, and which period the loop can keep here."""
     from service.doctor import main

@@ -12,6 +12,7 @@ rest, and the last state it sends is the one in which it stands.
 from __future__ import annotations
 
 import gc
+import logging
 import time
 from collections import deque
 from dataclasses import dataclass
@@ -38,6 +39,8 @@ from sim.settings import RobotSettings
 ROLE = "robot"
 STANDING = 1e-6  # change of the state in a period, in any unit, below which the robot stands
 COAST_NS = 10_000_000_000  # robot time after which it is taken to stand anyway
+
+logger = logging.getLogger(ROLE)
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,7 @@ def main(
         life = {"role": ROLE, "epoch": robot.body.epoch, "speed": speed, "state_period_s": settings.state_period_s}
         bus.publish_json(keys.info(ROLE), {**describe(settings.model), **(info or {}), **life})
         bus.alive(ROLE)
+        logger.info("epoch %d of %s, %s, at %g times real speed", robot.body.epoch, keys.robot, settings.model.name, speed)
         gc.collect()
         gc.freeze()
         robot.run(stop, None if duration_s is None else round(1e9 * duration_s))
@@ -156,6 +160,7 @@ class Robot:
         if last is not None:
             self._send(last)
         self._announcer.say(Severity.INFO, "robot_stopped", "the robot was stopped and stands", body.now_ns)
+        logger.info("stopped, and stands")
         self._log.close()
         return RobotSummary(self._sent, 1e-9 * self._held_up_ns, body.counters)
 

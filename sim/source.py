@@ -9,6 +9,7 @@ one, for as long as the source lives.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from threading import Event
@@ -28,6 +29,8 @@ ROLE = "reference"
 LOOK_S = 0.02  # between two looks at the robot: waking for every state would take a core from those who control
 LOOK_AGAIN_NS = 500_000_000  # after which it is looked whether the robot was restarted
 STALE_S = 1.0  # silence of the robot after which the reference is anchored to another one, even of a lower epoch
+
+logger = logging.getLogger(ROLE)
 
 
 def main(
@@ -69,6 +72,7 @@ def main(
     with Bus(bus_settings, keys, stop=stop) as bus:
         source = Source(bus, trajectory, y, p, round(1e9 * period_s))
         bus.alive(ROLE)
+        logger.info("%s, heading %s, for %s", trajectory.name, heading, keys.robot)
         while not stop.wait(LOOK_S):
             source.look()
     return source.anchored
@@ -126,3 +130,4 @@ class Source:
         self._publisher.put(Reference(self._epoch, self.anchored, stamp_ns, self._period_ns, self._trajectory.end, self._y, self._p))
         text = f"{self._trajectory.name} for {self._trajectory.duration_s:.1f} s from {1e-9 * stamp_ns:.3f} s of the robot on"
         self._announcer.say(Severity.INFO, "reference_published", text, stamp_ns)
+        logger.info("%s", text)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import threading
 import time
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ import zenoh
 from rti_mpc.errors import ConfigError
 
 RENDEZVOUS = "tcp/127.0.0.1:7447"
+ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws)/.+:\d+([?#].*)?$|(?!(tcp|tls|udp|quic|ws)/)[a-z_-]+/.+")  # those without a port are Zenoh's to judge
 CLIENT_TIMEOUT_MS = 500  # one attempt to reach a router
 RETRY_S = 0.1  # between two looks for somebody who is not there yet
 
@@ -72,8 +74,11 @@ def zenoh_config(settings: BusSettings) -> zenoh.Config:
     Zenoh configuration of a process.
 
     Raises:
-        ConfigError: If Zenoh refuses a value, or cannot read the file.
+        ConfigError: An endpoint is none, Zenoh refuses a value, or cannot read the file.
     """
+    for endpoint in (*settings.listen, *settings.connect):
+        if not ENDPOINT.match(endpoint):
+            raise ConfigError(f"bus: an endpoint must be a protocol, an address and a port, such as {RENDEZVOUS}, got {endpoint!r}")
     name = str(settings.config)
     try:
         config = zenoh.Config() if settings.config is None else zenoh.Config.from_file(settings.config)

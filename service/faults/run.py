@@ -61,11 +61,9 @@ def main(config_path: Path, only: Sequence[str], path: Path | None) -> int:
         Exit status: 0 if every promise was kept.
 
     Raises:
-        ConfigError: A name is none, the robot cannot be guarded or has no pose to start from, or the file cannot be written.
+        ConfigError: A name is none, or the robot cannot be guarded or has no pose to start from.
     """
     faults = chosen(only)
-    if path is not None:
-        claim(path)
     config = prepared(load(config_path))
     stop = stop_on_signals()
     signal.signal(signal.SIGHUP, lambda *_: stop.set())
@@ -99,19 +97,6 @@ def chosen(only: Sequence[str]) -> list[Fault]:
     if only and any(fault.viewer for fault in faults):
         raise ModuleNotFoundError(name="rerun")
     return [fault for fault in faults if not fault.viewer]
-
-
-def claim(path: Path) -> None:
-    """
-    Make sure that a file can be written, before minutes are spent on what it is to hold.
-
-    Raises:
-        ConfigError: It cannot.
-    """
-    try:
-        path.touch()
-    except OSError as error:
-        raise ConfigError(f"--json must be a file that can be written, got {path}: {error.strerror}") from error
 
 
 def prepared(config: Config) -> Config:

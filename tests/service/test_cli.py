@@ -56,6 +56,13 @@ def test_bad_option_is_exit_status_2() -> None:
     assert "sim.x0.phi is no state of the model, perhaps psi [rad] is meant" in done.stderr
 
 
+@pytest.mark.parametrize("command", ["bench", "doctor", "faults"])
+def test_file_that_cannot_be_written_is_refused_before_anything_is_measured(command: str, tmp_path: Path) -> None:
+    done = rti_mpc(command, "--json", str(tmp_path / "nowhere" / "found.json"))
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert done.stderr.startswith("rti-mpc: --json must be a file that can be written")
+
+
 @pytest.mark.parametrize("command", ["stop", "enable"])
 def test_operator_is_told_in_one_line_when_nobody_answers(command: str) -> None:
     done = rti_mpc(command, "--timeout", "0.3", "-e", "tcp/127.0.0.1:1")

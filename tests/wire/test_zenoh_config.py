@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,6 @@ def test_given_settings_win_over_the_file_and_the_file_over_defaults(tmp_path: P
     ("settings", "word"),
     [
         (BusSettings(mode="peeer"), "mode"),
-        (BusSettings(connect=("nonsense",)), "connect/endpoints"),
         (BusSettings(cfg=("no/such/key:1",)), "no/such/key"),
         (BusSettings(cfg=("transport/link/tx/lease:soon",)), "transport/link/tx/lease"),
         (BusSettings(config=Path("missing.json5")), "missing.json5"),
@@ -84,3 +84,18 @@ def test_an_endpoint_already_taken_is_refused() -> None:
         taken.listen()
         with pytest.raises(ConfigError, match="in use"):
             Bus(BusSettings(listen=(f"tcp/127.0.0.1:{taken.getsockname()[1]}",), connect=()), Keys())
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1", "127.0.0.1:7447", "tcp/", "tls/robot.local", ""])
+def test_endpoint_that_is_none_is_refused_with_one_that_would_be(endpoint: str) -> None:
+    """Zenoh would look for it for ever."""
+    for settings in (BusSettings(connect=(endpoint,)), BusSettings(listen=(endpoint,))):
+        with pytest.raises(ConfigError, match=re.escape(f"such as {RENDEZVOUS}, got {endpoint!r}")):
+            zenoh_config(settings)
+
+
+@pytest.mark.parametrize(
+    "endpoint", [RENDEZVOUS, "tcp/[::1]:7447", "tls/robot.local:7447#iface=eth0", "unixsock-stream//run/zenoh.sock", "serial//dev/tty0"]
+)
+def test_endpoints_of_every_kind_are_taken(endpoint: str) -> None:
+    assert value(BusSettings(connect=(endpoint,)), "connect/endpoints") == [endpoint]
