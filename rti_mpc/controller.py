@@ -16,8 +16,6 @@ What follows a gap starts cold, and acts late enough to be there in time.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from rti_mpc.array import Array
@@ -26,6 +24,7 @@ from rti_mpc.delay import DelayEstimator
 from rti_mpc.envelope import Envelope
 from rti_mpc.grid import Grid
 from rti_mpc.grid import Timing as Timing
+from rti_mpc.issued import Issued
 from rti_mpc.ladder import Ladder
 from rti_mpc.message import STAMP_ON_ARRIVAL, Command, End, Reference, Severity, State, Telemetry
 from rti_mpc.mode import ModeMachine
@@ -66,9 +65,6 @@ class Controller:
     ) -> None:
         ocp, model = rti.ocp, rti.ocp.model
         self._rti = rti
-        self._epoch = epoch
-        self._config_hash = config_hash
-        self._seq = 0
         self._stale_ns = round(1e9 * timing.stale_s)
         self._valid_ns = round(1e9 * timing.valid_s)
         self._u_rest: Array = np.array(model.u_rest)
@@ -84,7 +80,6 @@ class Controller:
         self._states = StateStream(model, self._stale_ns, self.grid.dt_ns, observer)
         self.np_ = model.np_ - len(self._states.d)
         self._track = Track(model, ocp.N, self.grid.dt_ns)
-        self._arriving: tuple[Reference, Array] | None = None  # waits for a state, to start at or to put its angles next to
         self._sent = Sent(self._u_rest, ocp.lbdu, ocp.ubdu, self.grid.dt_ns)
         self._prediction = Prediction(model, self._sent, compile=compile)
         self._x0 = self._prediction.x
@@ -92,9 +87,7 @@ class Controller:
         self._reach: tuple[Array, Array] = (np.zeros((2, model.nu)), np.zeros((2, model.nu)))  # what the first rows at t_k may be
         self._overran = False  # whether the last sample was over its budget
         self._stopped = ""  # why an operator's stop is latched
-        self._command: Command | None = None
-        self._plan: Command | None = None  # the last one with a plan of its own
-        self._before: tuple[Command | None, Command | None] = (None, None)  # those two before the last command
+        self._issued = Issued(epoch, config_hash, self.grid.dt_ns)
         self._record = Record(rti, self._tuning)
         self._blockage = Blockage(rti)
         self._delay = DelayEstimator(model, self.grid.dt_ns, self.grid.most_ns, compile=compile) if timing.delay_s is None else None
@@ -128,8 +121,8 @@ class Controller:
         self._prediction.p[self.np_ :] = self._states.d
         if self.mode is Mode.IDLE:
             self._modes.enter(Mode.WAITING, "first state")
-        if self._arriving is not None:
-            self._anchor(*self._arriving)
+        if self._track.arriving:
+            self._anchor(state)
         grid, period_ns = self.grid, self._states.clock.period_ns
         if not (self._track.loaded or self._stopped) or grid.early(state.stamp_ns, period_ns):
             return None
@@ -155,11 +148,8 @@ class Controller:
         if misfit := self._track.misfit(reference, self.np_):
             self._modes.say(Severity.WARNING, "reference_refused", misfit)
             return None
-        laid = reference, self._track.lay_out(reference) if rows is None else rows
-        if self._states.last is None:
-            self._arriving = laid
-            return None
-        anchored = self._anchor(*laid)
+        self._track.arriving = reference, self._track.lay_out(reference) if rows is None else rows
+        anchored = None if self._states.last is None else self._anchor(self._states.last)
         return anchored if reference.stamp_ns == STAMP_ON_ARRIVAL else None
 
     def stop(self, reason: str) -> None:
@@ -188,7 +178,7 @@ class Controller:
             OcpError: The problem differs in more than these.
         """
         self._tuning.change(ocp, version)
-        return self._seq + 1 + self._loaded
+        return self._issued.seq + 1 + self._loaded
 
     def overhear(self, command: Command) -> None:
         """Take note of a command of the controller that this one shadows."""
@@ -198,7 +188,7 @@ class Controller:
 
     def lead(self, epoch: int) -> None:
         """Let what is made here act from the next command on; it goes on from what has acted so far."""
-        self._epoch, self.shadowing = epoch, False
+        self._issued.epoch, self.shadowing = epoch, False
         if self._loaded:
             self._load(shift=False)
 
@@ -239,8 +229,7 @@ class Controller:
         self._overran = True
         if not self.shadowing:
             self._sent.withdraw(command)
-        self._seq -= 1
-        self._command, self._plan = self._before
+        self._issued.withdraw()
         failure = f"a sample was {1e-9 * (now_ns - command.stamp_ns):.3f} s late"
         if self._plays_on(now_ns, counted=command.mode is Mode.FALLBACK):
             self._modes.enter(Mode.FALLBACK, f"{failure}: the previous plan plays on", Severity.WARNING, "over_budget")
@@ -256,7 +245,7 @@ class Controller:
 
     def prepare(self) -> None:
         """Prepare the next sample: fix `t_k`, look the reference up, shift, linearize and load the QP."""
-        self._record.keep(self._seq)
+        self._record.keep(self._issued.seq)
         self._look_ahead()
         self._sent.settle()
         state = self._states.last
@@ -276,8 +265,8 @@ class Controller:
     def _measure_delay(self, estimator: DelayEstimator, stamp_ns: int) -> None:
         """Learn from the state of the last sample, and let the grid follow."""
         estimator.observe(self._states.x, stamp_ns)
-        if self._command is not None and not self.shadowing:
-            estimator.sent(self._command)
+        if self._issued.last is not None and not self.shadowing:
+            estimator.sent(self._issued.last)
         self._sent.delay_ns = estimator.delay_ns
         self.grid.adapt(estimator.delay_ns)
 
@@ -304,7 +293,8 @@ class Controller:
     def _rejoin(self, stamp_ns: int, behind: int) -> None:
         """Bring plan and grid to a state that the grid has not expected: one that comes late, or the first after a gap."""
         self.skipped += behind
-        if behind and self._command is not None and stamp_ns + self.grid.delay_ns < self._command.valid_until_ns:  # what was sent still acts
+        last = self._issued.last
+        if behind and last is not None and stamp_ns + self.grid.delay_ns < last.valid_until_ns:  # what was sent still acts
             self.grid.catch_up(behind, stamp_ns)
             if self._loaded:
                 for _ in range(behind - 1):
@@ -314,7 +304,7 @@ class Controller:
         if behind:
             self._modes.say(Severity.WARNING, "gap", f"no sample for {behind} periods: starting cold")
         self._loaded = False
-        self._plan = None
+        self._issued.plan = None
         self.ladder.failed = 0
         clock = self._states.clock
         if clock.late_ns + clock.doubt_ns < BUDGET * self.grid.dt_ns:
@@ -339,8 +329,8 @@ class Controller:
         if not self._overran:
             self._modes.enter(mode, reason)
         valid_until_ns = min(act_ns + self._rti.ocp.N * self.grid.dt_ns, state.stamp_ns + self.grid.delay_ns + self._valid_ns)
-        self._plan = self._issue(state, act_ns, valid_until_ns, mode, status, self.envelope.fit(self._rti.u, self._reach))
-        return self._plan
+        self._issued.plan = command = self._issue(state, act_ns, valid_until_ns, mode, status, self.envelope.fit(self._rti.u, self._reach))
+        return command
 
     def _feedback_cold(self) -> QpStatus:
         """Solve a first sample: the guess stays where the robot is, and is iterated on."""
@@ -356,12 +346,13 @@ class Controller:
 
     def _plays_on(self, now_ns: int, *, counted: bool = False) -> bool:
         """Whether the previous plan may serve a sample that has none of its own."""
-        left = self._plan is not None and now_ns < self._plan.valid_until_ns
+        plan = self._issued.plan
+        left = plan is not None and now_ns < plan.valid_until_ns
         return left if counted else self.ladder.fall(plan_left=left)
 
     def _fall_back(self, state: State, status: QpStatus) -> Command:
         """Replace a plan that could not be made."""
-        act_ns, plan, failure = self.grid.act_ns, self._plan, f"the QP is {status.name.lower()}"
+        act_ns, plan, failure = self.grid.act_ns, self._issued.plan, f"the QP is {status.name.lower()}"
         if self._plays_on(act_ns) and plan is not None:
             self._modes.enter(Mode.FALLBACK, f"{failure}: playing the previous plan", Severity.WARNING, "qp_failed")
             rows = self.envelope.refit(plan.u, round((act_ns - plan.stamp_ns) / plan.period_ns), self._reach)
@@ -379,14 +370,14 @@ class Controller:
         rows = self.envelope.ramp(self._sent.reach(act_ns))
         if not wanted:
             self.ladder.brake(at_rest=bool((rows[0] == self._u_rest).all()))
-        self._plan = None
+        self._issued.plan = None
         self._loaded = False
         return self._issue(state, act_ns, act_ns + self._valid_ns, self.mode, status, rows)
 
     def standstill(self, local_ns: int) -> Command | None:
         """Return the last command of a life: to rest as fast as the slew limits allow; None if nothing was ever commanded."""
         state = self._states.last
-        if self._command is None or state is None:
+        if self._issued.last is None or state is None:
             return None
         return self._brake(state, self.robot_now_ns(local_ns) + self.grid.delay_ns, QpStatus.NONE, wanted=True)
 
@@ -394,30 +385,16 @@ class Controller:
 
     def _issue(self, state: State, act_ns: int, valid_until_ns: int, mode: Mode, status: QpStatus, u: Array) -> Command:
         """Make a command of a plan, shape ``(N, nu)``."""
-        self._seq += 1
-        self._before = (self._command, self._plan)
-        self._command = Command(
-            epoch=self._epoch,
-            seq=self._seq,
-            stamp_ns=act_ns,
-            state_epoch=state.epoch,
-            state_seq=state.seq,
-            state_stamp_ns=state.stamp_ns,
-            valid_until_ns=valid_until_ns,
-            config_hash=self._config_hash,
-            mode=mode,
-            status=status,
-            period_ns=self.grid.dt_ns,
-            u=u,
-        )
+        command = self._issued.make(state, act_ns, valid_until_ns, mode, status, u)
         if not self.shadowing:
-            self._sent.append(self._command)
-        return self._command
+            self._sent.append(command)
+        return command
 
     @property
     def at_rest(self) -> bool:
         """Whether the last command is rest from its first row on, or there never was one."""
-        return self._command is None or np.array_equal(self._command.u[0], self._u_rest)
+        last = self._issued.last
+        return last is None or np.array_equal(last.u[0], self._u_rest)
 
     def slack_s(self, local_ns: int) -> float:
         """Return robot time, s, from a local monotonic time to the state of the next sample."""
@@ -429,25 +406,20 @@ class Controller:
 
     def telemetry(self, *, prepare_us: float, feedback_us: float, latency_us: float, slack_s: float) -> Telemetry:
         """Describe the last sample; the times are the caller's, who has a clock."""
-        assert self._command is not None
+        assert self._issued.last is not None
         times = prepare_us, feedback_us, latency_us, slack_s
         return self._record.telemetry(
-            self._command, self._x0, self._states.d, times, delay_s=1e-9 * self.grid.delay_ns, skipped=self.skipped, ladder=self.ladder
+            self._issued.last, self._x0, self._states.d, times, delay_s=1e-9 * self.grid.delay_ns, skipped=self.skipped, ladder=self.ladder
         )
 
     # Small parts.
 
-    def _anchor(self, reference: Reference, rows: Array) -> Reference:
-        """Follow a checked reference, from the last state on if it is to start on arrival."""
-        state = self._states.last
-        assert state is not None
-        self._arriving = None
-        if reference.stamp_ns == STAMP_ON_ARRIVAL:
-            reference = replace(reference, stamp_ns=state.stamp_ns)
-        self._track.load(reference, rows, self._states.x, state.stamp_ns)
+    def _anchor(self, state: State) -> Reference:
+        """Follow the reference that has arrived, from the last state on if it is to start on arrival."""
+        anchored = self._track.anchor(self._states.x, state.stamp_ns)
         if self._loaded and self.grid.running:
             self._load(shift=False)
-        return reference
+        return anchored
 
     def _forget(self, arrival: Arrival, stamp_ns: int) -> None:
         """Keep nothing of the robot's last life, or of the time before its clock jumped but that it brakes since then."""
@@ -461,5 +433,5 @@ class Controller:
             self._blockage.clear()
         if self._delay is not None:
             self._delay.clear()
-        self._plan = None
+        self._issued.plan = None
         self._overran = self._loaded = self.grid.running = False

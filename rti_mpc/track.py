@@ -12,10 +12,12 @@ thread may call; to follow the result takes the same time for all.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.message import End, Reference
+from rti_mpc.message import STAMP_ON_ARRIVAL, End, Reference
 from rti_mpc.model import Model
 
 TWO_PI = 2.0 * np.pi
@@ -28,6 +30,7 @@ class Track:
     Attributes:
         y_ref: Reference at nodes 1 to N of the last `look_up`, shape ``(N, ny)``.
         p: Stage parameters at nodes 0 to N of the last `look_up`, shape ``(N + 1, np)``.
+        arriving: A reference, checked, and what `lay_out` makes of it, until `anchor` has a state to start at or to put its angles next to.
     """
 
     def __init__(self, model: Model, N: int, dt_ns: int) -> None:
@@ -37,6 +40,7 @@ class Track:
         self._angles = [j for j, signal in enumerate(model.outputs) if signal.angle]
         self._output = model.h()
         self._nodes_ns = np.arange(N + 1) * dt_ns
+        self.arriving: tuple[Reference, Array] | None = None
         self._reference: Reference | None = None
         self._rows: Array = np.zeros((1, model.ny))
         self._turns: Array = np.zeros(model.ny)  # whole ones, from the angles as they came to those nearest to the robot's
@@ -59,7 +63,7 @@ class Track:
 
     def lay_out(self, reference: Reference) -> Array:
         """
-        Return the rows of a reference as `load` wants them: outputs, angles unwrapped along time, and the parameters given. Changes nothing here.
+        Return the rows of a reference as `anchor` wants them: outputs, angles unwrapped along time, and the parameters given. Changes nothing here.
 
         Args:
             reference: Checked: of the model's `ny`, and of the first of its `np` or none; the others are nominal.
@@ -69,21 +73,24 @@ class Track:
             rows[:, j] = np.unwrap(rows[:, j])
         return rows
 
-    def load(self, reference: Reference, rows: Array, x: Array, stamp_ns: int) -> None:
+    def anchor(self, x: Array, stamp_ns: int) -> Reference:
         """
-        Follow a reference from now on.
+        Follow the reference that has arrived, and return it: from the state on if it was to start on arrival.
 
         Args:
-            reference: It.
-            rows: What `lay_out` makes of it.
             x: State, shape ``(nx,)``, whose outputs the angles are put nearest to.
             stamp_ns: Time of that state.
         """
+        assert self.arriving is not None
+        (reference, rows), self.arriving = self.arriving, None
+        if reference.stamp_ns == STAMP_ON_ARRIVAL:
+            reference = replace(reference, stamp_ns=stamp_ns)
         self._reference, self._rows = reference, rows
         now = min(max(0, round((stamp_ns - reference.stamp_ns) / reference.period_ns)), len(rows) - 1)
         outputs = np.array(self._output(x, self._nominal[0])).ravel()
         for j in self._angles:
             self._turns[j] = TWO_PI * np.round((outputs[j] - rows[now, j]) / TWO_PI)
+        return reference
 
     def clear(self) -> None:
         """Follow nothing."""

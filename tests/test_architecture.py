@@ -57,7 +57,7 @@ ALONE = {
 FLOW: tuple[set[str], ...] = (
     {"errors", "array", "status", "robot_clock", "ladder", "grid", "epoch"},
     {"message", "polyline"},
-    {"heading", "mode", "schedule"},
+    {"heading", "mode", "schedule", "issued"},
     {"trajectory", "guard", "sent"},
     {"model"},
     {"pioneer_3dx", "integrator", "track", "obstacle", "disturbance"},

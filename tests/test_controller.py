@@ -655,7 +655,7 @@ def test_last_command_of_a_life_is_a_standstill(on_the_circle: tuple[Controller,
     command = controller.standstill(body.now_ns)
     assert command is not None
     np.testing.assert_array_equal(command.u, 0.0)
-    assert command.seq == controller._seq
+    assert command.seq == controller._issued.seq
     assert body.accept(command) == ""
 
 

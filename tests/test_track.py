@@ -31,7 +31,8 @@ def turning(rows: int, wrapped: bool) -> Array:
 
 
 def follow(track: Track, message: Reference, x: Array, stamp_ns: int) -> None:
-    track.load(message, track.lay_out(message), x, stamp_ns)
+    track.arriving = message, track.lay_out(message)
+    track.anchor(x, stamp_ns)
 
 
 def looked_up(y: Array, t_ms: float, x: Array = X, **options: int) -> Array:

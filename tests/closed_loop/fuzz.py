@@ -166,7 +166,7 @@ class Fuzz:
             self.seen["over budget"] += 1
         self._publish(command, self._busy_ns + self._latency_ns())
         controller.prepare()
-        if rng.random() < 0.05 and controller._command is not None:
+        if rng.random() < 0.05 and controller._issued.last is not None:
             encode(controller.telemetry(prepare_us=1.0, feedback_us=1.0, latency_us=1.0, slack_s=0.1))
 
     def _publish(self, command: Command | None, arrival_ns: int) -> None:
