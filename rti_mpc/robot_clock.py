@@ -53,6 +53,7 @@ class RobotClock:
         self._old: tuple[int, int] | None = None  # stamp and arrival of the last state, if that was not fresh
         self._measured = False  # whether the rate is
         self._recent: deque[tuple[int, int]] = deque(maxlen=RECENT)  # stamps and arrivals
+        self._in_a_row = 0  # states that came late by a quarter of a period and more
         self.late_ns = self.doubt_ns = 0
         self.leapt = False
 
@@ -84,27 +85,36 @@ class RobotClock:
             self._recent.clear()
             since_ns = old[1]
             self.rate = self._rate(stamp_ns - old[0], arrival_ns - old[1])
+            self.rate_most = max(self.rate_most, self.rate)
             self._anchor = (stamp_ns, arrival_ns)
         elif stamp_ns > self.stamp_ns:
             period_ns = (stamp_ns - self.stamp_ns) / max(1, seq - self._seq)
             self.period_ns += (min(period_ns, 2.0 * self.period_ns) - self.period_ns) * 0.1 if self.period_ns else period_ns
-            elapsed_ns = arrival_ns - self._anchor[1]
-            if not self._measured:
-                self.rate_most = self._rate(stamp_ns - self._anchor[0], max(1, elapsed_ns))
-            if elapsed_ns >= WINDOW_NS // 4:
-                rate = self._rate(stamp_ns - self._anchor[0], elapsed_ns)  # little by little: it may be this state that is late
-                self.rate = min(max(rate, self.rate / EACH_STATE), self.rate * EACH_STATE) if self._measured else rate
-                self._measured = True
-            if elapsed_ns >= WINDOW_NS:
-                self._anchor = (stamp_ns, arrival_ns)
-        if self._measured:
-            self.rate_most = self.rate
+            self._measure(stamp_ns, arrival_ns, *self._anchor)
         self._old, self.leapt = None, leaps
-        self.late_ns = max([0, *(stamp + round((arrival_ns - arrival) * self.rate) - stamp_ns for stamp, arrival in self._recent)])
+        self.late_ns = self._late_ns(stamp_ns, arrival_ns)
         self.doubt_ns = round(DRIFT * self.rate * (arrival_ns - since_ns))
         self._recent.append((stamp_ns, arrival_ns))
         self._seq, self.stamp_ns, self.arrival_ns = seq, stamp_ns, arrival_ns
         return True
+
+    def _measure(self, stamp_ns: int, arrival_ns: int, stamp_0_ns: int, arrival_0_ns: int) -> None:
+        """Measure the rate, from one state that came in time to another; or to one that came late, if all lately did."""
+        elapsed_ns = arrival_ns - arrival_0_ns
+        rate = self._rate(stamp_ns - stamp_0_ns, max(1, elapsed_ns))
+        if not self._measured:
+            self.rate_most = rate
+        self._in_a_row = self._in_a_row + 1 if self._late_ns(stamp_ns, arrival_ns) > self.period_ns / 4 else 0
+        if 0 < self._in_a_row < RECENT or elapsed_ns < WINDOW_NS // 4:
+            return
+        self.rate = min(max(rate, self.rate / EACH_STATE), self.rate * EACH_STATE) if self._measured else rate
+        self.rate_most, self._measured = self.rate, True
+        if elapsed_ns >= WINDOW_NS:
+            self._anchor = (stamp_ns, arrival_ns)
+
+    def _late_ns(self, stamp_ns: int, arrival_ns: int) -> int:
+        """Return by how much a state comes later than the least late of those before it."""
+        return max([0, *(stamp + round((arrival_ns - arrival) * self.rate) - stamp_ns for stamp, arrival in self._recent)])
 
     def _rate(self, robot_ns: int, local_ns: int) -> float:
         return min(max(robot_ns / local_ns, 1e-3), 1e3)

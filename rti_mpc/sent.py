@@ -11,6 +11,9 @@ from rti_mpc.array import Array
 from rti_mpc.message import Command
 from rti_mpc.schedule import EVER_NS, Schedule, end_ns
 
+TRANSIT = 0.1  # of a period, that a command may be on its way: the plan before acts until then
+WINDOW = 0.75  # of a period, before which what acted for that long does not count: or no plan could turn round
+
 
 class Sent:
     """
@@ -27,7 +30,10 @@ class Sent:
         self._alone: tuple[int, Array] = (EVER_NS, u_rest)  # when the robot last stopped braking on its own, and from which input
         self._slew = (lbdu, ubdu)  # per dt
         self._dt_ns = dt_ns
-        self._schedule = Schedule(u_rest, 1e9 * np.minimum(-lbdu, ubdu) / dt_ns)
+        self._transit_ns, self._window_ns = round(TRANSIT * dt_ns), round(WINDOW * dt_ns)
+        slew = 1e9 * np.minimum(-lbdu, ubdu) / dt_ns
+        self._schedule = Schedule(u_rest, slew)
+        self._slowest = Schedule(u_rest, slew)  # if each command was on its way for as long as it may be
 
     def append(self, command: Command) -> None:
         """Remember a command, unless it has expired before its time: the robot refuses it."""
@@ -39,10 +45,13 @@ class Sent:
             if braking:
                 self._alone = start_ns, before.copy()
             self._schedule.add(command, start_ns, end_ns(command))
+        slowest_ns = max(start_ns, self._left_ns + self._transit_ns)
+        if slowest_ns < end_ns(command):
+            self._slowest.add(command, slowest_ns, end_ns(command))
 
     def leave(self, command: Command, now_ns: int) -> None:
         """Take note of when the last command leaves: what was sent before acts at least until then."""
-        self._left_ns, self._late = max(self._left_ns, now_ns), command if now_ns > command.stamp_ns else None
+        self._left_ns, self._late = max(self._left_ns, now_ns), command if now_ns + self._transit_ns > command.stamp_ns else None
 
     def settle(self) -> None:
         """Remember what `leave` has noted."""
@@ -53,16 +62,18 @@ class Sent:
     def withdraw(self, command: Command) -> None:
         """Forget the last command: it was not sent after all."""
         self._schedule.withdraw(command)
+        self._slowest.withdraw(command)
 
     def brake(self, before_ns: int, now_ns: int) -> None:
         """Assume that the robot, whose clock has jumped from one time to another, brakes from what acted."""
         self._left_ns = EVER_NS
-        self._schedule.brake(self.at(before_ns)[0], now_ns)
+        u = self.at(before_ns)[0]
+        self._schedule.brake(u, now_ns)
+        self._slowest.brake(u, now_ns)
 
     def clear(self) -> None:
         """Forget everything: the robot was restarted, and stands."""
-        self._left_ns = EVER_NS
-        self._schedule.brake(self._schedule.u_rest, EVER_NS)
+        self.brake(EVER_NS, EVER_NS)
 
     def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Array, float]]:
         """Yield the inputs that act between two times, shape ``(nu,)``, each with for how long, s; backward, the one that acts at the end."""
@@ -86,23 +97,25 @@ class Sent:
         Row 0 takes over at a time, or late by up to a period. It is to be within
         the slew limits of every input that acts in the period before, and of those
         that act until it arrives; so is row 1 of the latter. Then the inputs change
-        by no more than the limits within any period, whenever the plan arrives.
+        by no more than the limits within any period, whenever the plan arrives, and
+        within three quarters of one, however long commands are on their way.
         Where the robot brakes on its own, that leaves it the speed it has; a plan
         that has ended this may be late, too, and the robot have braked on.
         """
         acting = self.at(t_ns)[0]
-        second = self._near(acting + self._slew[0], acting + self._slew[1], t_ns, t_ns + self._dt_ns - 1)
+        second = self._near(self._schedule, acting + self._slew[0], acting + self._slew[1], t_ns, t_ns + self._dt_ns - 1)
         ended_ns, u = self._alone
         if abs(t_ns - ended_ns) < self._dt_ns:
             way, share = self._schedule.u_rest - u, (t_ns + self._dt_ns - ended_ns) / self._dt_ns
             second = self._within(*second, u + np.clip(way, share * self._slew[0], share * self._slew[1]))
-        first = self._near(*second, t_ns - self._dt_ns + 1, t_ns)
+        first = self._near(self._schedule, *second, t_ns - self._dt_ns + 1, t_ns)
+        first = self._near(self._slowest, *first, t_ns - self._window_ns, t_ns + self._transit_ns)
         return np.array([first[0], second[0]]), np.array([first[1], second[1]])
 
-    def _near(self, lowest: Array, highest: Array, at_ns: int, last_ns: int) -> tuple[Array, Array]:
+    def _near(self, schedule: Schedule, lowest: Array, highest: Array, at_ns: int, last_ns: int) -> tuple[Array, Array]:
         """Narrow an interval to what is within the slew limits of all inputs from one time to another; if nothing is, to what comes nearest."""
         while at_ns <= last_ns:
-            u, change_ns = self.at(at_ns)
+            u, change_ns, _ = schedule.at(at_ns)
             lowest, highest = self._within(lowest, highest, u)
             at_ns = change_ns if at_ns == last_ns else min(change_ns, last_ns)
         return lowest, highest

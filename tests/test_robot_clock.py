@@ -86,6 +86,14 @@ def test_rate_follows_a_simulation_that_is_slowed_down() -> None:
     assert clock.rate == pytest.approx(0.5, rel=1e-3)
 
 
+def test_rate_does_not_follow_states_that_come_late_now_and_then() -> None:
+    clock, rates = ticking(1.0, count=300), []
+    for i in range(1, 50):
+        clock.observe(300 + i, clock.stamp_ns + 100 * MS, 29_900 * MS + i * 100 * MS + (90 * MS if i % 4 else 0))
+        rates.append(clock.rate)
+    assert rates == pytest.approx([1.0] * len(rates), rel=1e-3)
+
+
 def test_period_is_that_of_the_robot_where_states_are_lost() -> None:
     clock = RobotClock()
     for i in range(0, 60, 3):

@@ -97,6 +97,17 @@ def test_reach_keeps_to_all_inputs_of_the_period_before_and_after() -> None:
     np.testing.assert_allclose(highest, [[0.3 + 0.2, -0.2 + 0.3], [0.4 + 0.2, -0.2 + 0.3]])
 
 
+def test_reach_keeps_to_a_row_that_acts_while_the_next_command_is_on_its_way() -> None:
+    """Sent a millisecond before the row begins, it may arrive ten after; what comes right after it must not be far from either."""
+    ramp = command(2, 99, np.tile([0.2, 0.0], (3, 1)))
+    memory = sent(command(1, 0, np.array([[0.2, 0.0], [0.3, 0.3], [0.3, 0.3]])), ramp)
+    memory.leave(ramp, 99 * MS)
+    memory.settle()
+    lowest, highest = memory.reach(DT)
+    np.testing.assert_allclose(lowest[0], [0.3 - 0.2, 0.3 - 0.3])
+    np.testing.assert_allclose(highest[0], [0.2 + 0.2, 0.0 + 0.3])
+
+
 def test_robot_that_brakes_on_its_own_is_taken_over_at_the_speed_it_has() -> None:
     """Whenever in the period the command arrives, the robot has not to take back more than its braking."""
     memory = sent(command(1, 0, np.tile([0.8, -1.2], (5, 1)), valid_ms=100))
