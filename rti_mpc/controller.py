@@ -226,10 +226,13 @@ class Controller:
             if not self.shadowing:
                 self._sent.leave(command, now_ns)
             return command
-        self._overran = True
         if not self.shadowing:
             self._sent.withdraw(command)
         self._issued.withdraw()
+        if not self._states.clock.ticks:  # nobody knows how late it is: the second state of a life tells
+            self.grid.running = self._loaded = False
+            return None
+        self._overran = True
         failure = f"a sample was {1e-9 * (now_ns - command.stamp_ns):.3f} s late"
         if self._plays_on(now_ns, counted=command.mode is Mode.FALLBACK):
             self._modes.enter(Mode.FALLBACK, f"{failure}: the previous plan plays on", Severity.WARNING, "over_budget")

@@ -166,6 +166,20 @@ def test_sample_right_after_a_restart_is_held_to_its_budget_though_the_speed_of_
     assert controller.in_time(command, arrival_ns + 25 * MS) is None
 
 
+def test_first_sample_of_a_life_is_sent_at_once_or_left_out_without_a_word(rti: FaultyRti) -> None:
+    """Before a second state has come the robot's clock may run at any speed."""
+    controller, body = Controller(rti, Timing(), compile=False), robot(circle())
+    controller.receive_reference(reference(circle()))
+    first = controller.receive_state(body.tick(), body.now_ns)
+    assert first is not None
+    controller.notices.clear()
+    assert controller.in_time(first, body.now_ns + 10 * MS) is None
+    controller.prepare()
+    second = sample(controller, body, took_ms=10)
+    assert second is not None
+    assert (second.seq, codes(controller), controller.ladder) == (first.seq, [], Ladder())
+
+
 # Gaps.
 
 
