@@ -224,7 +224,7 @@ class Controller:
                 self._overran = False
                 self._modes.enter(command.mode, "samples are in time again")
             if not self.shadowing:
-                self._sent.leave(command, now_ns)
+                self._sent.leave(now_ns)
             return command
         if not self.shadowing:
             self._sent.withdraw(command)
@@ -241,7 +241,7 @@ class Controller:
             self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "over_budget")
         assert self._states.last is not None
         if not self.shadowing:
-            self._sent.leave(command, now_ns)
+            self._sent.leave(now_ns)
         return self._brake(self._states.last, now_ns + self.grid.delay_ns, command.status)
 
     # The two phases.

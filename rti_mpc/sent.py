@@ -26,7 +26,7 @@ class Sent:
     def __init__(self, u_rest: Array, lbdu: Array, ubdu: Array, dt_ns: int) -> None:
         self.delay_ns = 0
         self._left_ns = EVER_NS  # when the last command left at the earliest
-        self._late: Command | None = None  # the last one, if it left after its time
+        self._unsettled: Command | None = None  # the last one, until it is known when it left
         self._alone: tuple[int, Array] = (EVER_NS, u_rest)  # when the robot last stopped braking on its own, and from which input
         self._slew = (lbdu, ubdu)  # per dt
         self._dt_ns = dt_ns
@@ -37,36 +37,50 @@ class Sent:
 
     def append(self, command: Command) -> None:
         """Remember a command, unless it has expired before its time: the robot refuses it."""
-        self._late = None
+        self.settle()
         self._left_ns += 1  # commands leave one after the other, whatever our idea of the robot's clock
-        start_ns = max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, self._left_ns)
+        self._unsettled = command
+        self._believe(command)
+
+    def leave(self, now_ns: int) -> None:
+        """Take note of when the last command leaves: what was sent before acts at least until then."""
+        self._left_ns = max(self._left_ns, now_ns)
+
+    def settle(self) -> None:
+        """Remember what `leave` has noted."""
+        command, self._unsettled = self._unsettled, None
+        if command is None:
+            return
+        if self._left_ns > command.stamp_ns:
+            self._schedule.withdraw(command)
+            self._believe(command)
+        start_ns = max(self._start_ns(command), self._left_ns + self._transit_ns)
+        if start_ns < end_ns(command):
+            self._slowest.add(command, start_ns, end_ns(command))
+
+    def withdraw(self, command: Command) -> None:
+        """Forget the last command: it was not sent after all."""
+        if self._unsettled is command:
+            self._unsettled = None
+        else:
+            self._slowest.withdraw(command)
+        self._schedule.withdraw(command)
+
+    def _believe(self, command: Command) -> None:
+        """Let a command act as soon as it can."""
+        start_ns = self._start_ns(command)
         if start_ns < end_ns(command):
             before, _, braking = self._schedule.at(start_ns - 1)
             if braking:
                 self._alone = start_ns, before.copy()
             self._schedule.add(command, start_ns, end_ns(command))
-        slowest_ns = max(start_ns, self._left_ns + self._transit_ns)
-        if slowest_ns < end_ns(command):
-            self._slowest.add(command, slowest_ns, end_ns(command))
 
-    def leave(self, command: Command, now_ns: int) -> None:
-        """Take note of when the last command leaves: what was sent before acts at least until then."""
-        self._left_ns, self._late = max(self._left_ns, now_ns), command if now_ns + self._transit_ns > command.stamp_ns else None
-
-    def settle(self) -> None:
-        """Remember what `leave` has noted."""
-        if (late := self._late) is not None:
-            self.withdraw(late)
-            self.append(late)
-
-    def withdraw(self, command: Command) -> None:
-        """Forget the last command: it was not sent after all."""
-        self._schedule.withdraw(command)
-        self._slowest.withdraw(command)
+    def _start_ns(self, command: Command) -> int:
+        return max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, self._left_ns)
 
     def brake(self, before_ns: int, now_ns: int) -> None:
         """Assume that the robot, whose clock has jumped from one time to another, brakes from what acted."""
-        self._left_ns = EVER_NS
+        self._left_ns, self._unsettled = EVER_NS, None
         u = self.at(before_ns)[0]
         self._schedule.brake(u, now_ns)
         self._slowest.brake(u, now_ns)
@@ -102,6 +116,7 @@ class Sent:
         Where the robot brakes on its own, that leaves it the speed it has; a plan
         that has ended this may be late, too, and the robot have braked on.
         """
+        self.settle()
         acting = self.at(t_ns)[0]
         second = self._near(self._schedule, acting + self._slew[0], acting + self._slew[1], t_ns, t_ns + self._dt_ns - 1)
         ended_ns, u = self._alone

@@ -101,7 +101,7 @@ def test_reach_keeps_to_a_row_that_acts_while_the_next_command_is_on_its_way() -
     """Sent a millisecond before the row begins, it may arrive ten after; what comes right after it must not be far from either."""
     ramp = command(2, 99, np.tile([0.2, 0.0], (3, 1)))
     memory = sent(command(1, 0, np.array([[0.2, 0.0], [0.3, 0.3], [0.3, 0.3]])), ramp)
-    memory.leave(ramp, 99 * MS)
+    memory.leave(99 * MS)
     memory.settle()
     lowest, highest = memory.reach(DT)
     np.testing.assert_allclose(lowest[0], [0.3 - 0.2, 0.3 - 0.3])
