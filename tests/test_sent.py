@@ -86,8 +86,10 @@ def test_command_that_has_expired_before_its_time_is_none() -> None:
 
 def test_cleared_memory_is_rest() -> None:
     memory = sent(command(1, 0, plan(0.5)))
+    memory.brake(10 * MS, 10 * MS)
     memory.clear()
-    np.testing.assert_array_equal(memory.at(50 * MS)[0], [0.0, 0.0])
+    np.testing.assert_array_equal(memory.at(0)[0], [0.0, 0.0])
+    np.testing.assert_array_equal(memory.reach(50 * MS), [[-SLEW, -SLEW], [SLEW, SLEW]])
 
 
 def test_reach_keeps_to_all_inputs_of_the_period_before_and_after() -> None:
