@@ -13,7 +13,7 @@ from threading import Event
 from urllib.parse import urlsplit
 
 from rti_mpc.errors import ConfigError
-from rti_mpc.message import Notice
+from rti_mpc.message import Notice, Severity
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.interrupt import stop_on_signals
@@ -62,26 +62,31 @@ def main(
     with Bus(bus_settings, keys, stop=stop) as bus:
         listener = Listener(bus)
         outlets = [file_outlet(rerun_save, keys.robot)] if rerun_save is not None else []
-        if rerun_spawn:
-            spawn_viewer(url, rerun_memory_limit)
+        spawned = spawn_viewer(url, rerun_memory_limit) if rerun_spawn else None
         if rerun_spawn or rerun_connect is not None:
             outlets.append(viewer_outlet(url, keys.robot))
         bus.alive(ROLE)
         log.info("listening to %s", keys.stream("*"))
-        pump(listener, outlets, Announcer(bus, ROLE, time.time_ns() // 1_000_000_000), stop)
+        pump(listener, outlets, spawned, Announcer(bus, ROLE, time.time_ns() // 1_000_000_000), stop)
     log.info("%d messages, %d lost, %d refused", listener.received, listener.lost, listener.refused)
     complete = [outlet.close() for outlet in outlets]
     notices(outlets)
     return 0 if rerun_save is None or complete[0] else 1
 
 
-def pump(listener: Listener, outlets: Sequence[Outlet], announcer: Announcer, stop: Event) -> None:
-    """Pass on what is heard until told to stop, and then what is still there; say where an outlet failed, to the bus and to the others."""
+def pump(listener: Listener, outlets: Sequence[Outlet], spawned: subprocess.Popen[bytes] | None, announcer: Announcer, stop: Event) -> None:
+    """Pass on what is heard until told to stop, and then what is still there; say where an outlet or viewer failed, to the bus and to the others."""
     stopped = False
     while not stopped:
         stopped = stop.wait(PERIOD_S)
         entries = listener.drain()
-        for notice in notices(outlets):
+        said = notices(outlets)
+        if spawned is not None and spawned.poll() is not None:
+            text = "the Rerun viewer has ended; where there is no screen, --rerun-save records to a file"
+            said.append(Notice(Severity.WARNING, "viewer_ended", text))
+            log.warning("%s", text)
+            spawned = None
+        for notice in said:
             announcer.say(notice.severity, notice.code, notice.text, listener.now_ns)
             entries.append(listener.own(notice))
         for outlet in outlets:
@@ -114,7 +119,7 @@ def viewer_url(address: str) -> str:
     return url
 
 
-def spawn_viewer(url: str, memory_limit: str) -> None:
+def spawn_viewer(url: str, memory_limit: str) -> subprocess.Popen[bytes]:
     """
     Start a viewer on loopback that outlives us.
 
@@ -127,4 +132,4 @@ def spawn_viewer(url: str, memory_limit: str) -> None:
     if address.hostname not in ("127.0.0.1", "localhost"):
         raise ConfigError(f"rerun-spawn must be on 127.0.0.1, got {url!r}")
     options = ["--bind", "127.0.0.1", "--port", str(address.port), "--memory-limit", memory_limit, "--expect-data-soon"]
-    subprocess.Popen([sys.executable, "-m", "rerun_cli", *options], start_new_session=True, stdin=subprocess.DEVNULL)
+    return subprocess.Popen([sys.executable, "-m", "rerun_cli", *options], start_new_session=True, stdin=subprocess.DEVNULL)

@@ -286,6 +286,17 @@ def test_an_address_becomes_a_url_of_reruns() -> None:
     assert viewer_url("rerun+https://host:9000/proxy") == "rerun+https://host:9000/proxy"
 
 
+def test_a_spawned_viewer_that_has_ended_is_told_of(port: int, children: list[Child], tmp_path: Path) -> None:
+    """Its own words are lost among others; Rerun ends at once where there is no screen."""
+    no_screen = "import os\nos.environ.pop('DISPLAY', None)\nos.environ.pop('WAYLAND_DISPLAY', None)\n"
+    source = no_screen + VIEWER.replace("rerun_connect=live", "rerun_connect=live, rerun_spawn=True")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        live = f"127.0.0.1:{probe.getsockname()[1]}"
+    children.append(Child(source, port, tmp_path / "run.rrd", live))
+    children[0].wait_for("the Rerun viewer has ended")
+
+
 def test_a_viewer_is_spawned_on_loopback_only() -> None:
     with pytest.raises(ConfigError, match="rerun-spawn must be on 127"):
         spawn_viewer("rerun+http://192.0.2.1:9876/proxy", "25%")
