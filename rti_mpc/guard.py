@@ -108,6 +108,7 @@ class Guard:
         self._leader = (0, -1)  # epoch and sequence number of the last command that was in order
         self._told_ns = EVER_NS  # until when the robot knows what to do
         self._engaged = False  # whether this robot was ever told anything
+        self._untold = False  # whether it is still to be told to brake
         self._stopped = False
         self._waiting = False  # whether it was said that commands wait for `_open_ns`
 
@@ -207,7 +208,7 @@ class Guard:
             if now_ns - self._state.stamp_ns > 10 * self._stale_ns:
                 return None  # nobody is there to be told to stand
             u, period_ns = u[:1], TOLD * STEP_NS
-        self._told_ns = start_ns + TOLD * STEP_NS
+        self._told_ns, self._untold = start_ns + TOLD * STEP_NS, False
         state = self._state
         return self._numbered(
             Command(
@@ -240,6 +241,8 @@ class Guard:
             return "no_state: no state of the robot was heard yet"
         if self._stopped:
             return "stopped: the guard is being stopped"
+        if self._untold:
+            return "held: the robot is told to brake first"
         if command.epoch < epoch:
             return f"fenced: epoch {epoch} has taken over"
         if command.epoch == epoch and command.seq <= seq:
@@ -329,7 +332,7 @@ class Guard:
         self._schedule.brake(self._limits.u_rest, EVER_NS)
         self._leader = 0, -1
         self._told_ns = EVER_NS
-        self._engaged = self.passing = self._late = False
+        self._engaged = self._untold = self.passing = self._late = False
 
     def _jump(self, state: State, local_ns: int, where: str) -> None:
         """Go on from a clock that has jumped: the robot brakes from what acts."""
@@ -348,8 +351,8 @@ class Guard:
 
     def _brake(self, before_ns: int, now_ns: int) -> None:
         """Let the robot brake now from what acts at a time, which may be one of another clock."""
-        self._schedule.brake(self._schedule.at(before_ns)[0], now_ns)
-        self._told_ns = now_ns
+        self._schedule.cut(before_ns, now_ns)
+        self._told_ns, self._untold = now_ns, self._engaged
         self.passing = False
 
     def _say(self, severity: Severity, code: str, text: str) -> None:

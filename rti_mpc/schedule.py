@@ -94,6 +94,17 @@ class Schedule:
         self._plans.clear()
         self._plans.append(Plan(t_ns, t_ns, t_ns, 1, np.array(u, dtype=np.float64)[None], np.array(u, dtype=np.float64)))
 
+    def cut(self, t_ns: int, now_ns: int) -> None:
+        """Let what acts at a time end there, and drop what would follow; the clock has jumped since, and shows another time."""
+        plan = next((plan for plan in reversed(self._plans) if plan.start_ns <= t_ns), None)
+        if plan is None:  # a time that is forgotten
+            self.brake(self._plans[0].before, now_ns)
+            return
+        shift_ns = now_ns - t_ns
+        start_ns, end_ns, stamp_ns = plan.start_ns + shift_ns, min(plan.end_ns, t_ns) + shift_ns, plan.stamp_ns + shift_ns
+        self._plans.clear()
+        self._plans.append(Plan(start_ns, end_ns, stamp_ns, plan.period_ns, plan.u, plan.before))
+
     def add(self, command: Command, start_ns: int, end_ns: int) -> None:
         """Put a command in line, from `start_ns` until `end_ns`; those that would start after it never act."""
         plans, before = self._plans, self.at(start_ns - 1)[0].copy()

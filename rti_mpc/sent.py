@@ -80,16 +80,15 @@ class Sent:
 
     def brake(self, before_ns: int, now_ns: int) -> None:
         """Assume that the robot, whose clock has jumped from one time to another, brakes from what acted."""
-        self._begin(self.at(before_ns)[0], now_ns)
+        self._left_ns, self._unsettled = EVER_NS, None
+        for schedule in (self._schedule, self._slowest):
+            schedule.cut(before_ns, now_ns)
 
     def clear(self) -> None:
         """Forget everything: the robot was restarted, and stands."""
-        self._begin(self._schedule.u_rest, EVER_NS)
-
-    def _begin(self, u: Array, now_ns: int) -> None:
         self._left_ns, self._unsettled = EVER_NS, None
         for schedule in (self._schedule, self._slowest):
-            schedule.brake(u, now_ns)
+            schedule.brake(schedule.u_rest, EVER_NS)
 
     def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Array, float]]:
         """Yield the inputs that act between two times, shape ``(nu,)``, each with for how long, s; backward, the one that acts at the end."""

@@ -405,6 +405,22 @@ def test_clock_that_jumps_is_answered_by_braking(scene: Scene, jump_ms: int) -> 
     scene.refused = 0  # told in the old time, before a state has shown the new one
 
 
+def test_nothing_passes_after_a_jump_until_the_robot_was_told_to_brake(scene: Scene) -> None:
+    """It goes on with the plan it has until then, while a command would be approached from the ramp."""
+    scene.drive(1000)
+    scene.send()
+    assert scene.state is not None
+    jumped = replace(scene.state, seq=scene.state.seq + 1, stamp_ns=scene.now_ns + 5000 * MS)
+    scene.guard.receive_state(jumped, scene.local_ns)
+    answer = {"stamp_ns": jumped.stamp_ns, "state_stamp_ns": jumped.stamp_ns, "valid_until_ns": jumped.stamp_ns + 250 * MS}
+    assert scene.guard.receive_command(scene.command(STEP, **answer), scene.local_ns) is None
+    assert scene.said()[-2:] == ["clock_jumped", "command_held"]
+    told = scene.guard.tick(scene.local_ns)
+    assert told is not None
+    assert told.mode is Mode.BRAKING
+    assert scene.guard.receive_command(scene.command(STEP, **answer), scene.local_ns) is not None
+
+
 def test_starting_guard_waits_until_what_another_one_told_the_robot_has_run_out(scene: Scene) -> None:
     """It knows nothing of that: 300 ms and the ramp from the bounds."""
     scene.drive(1000)

@@ -92,3 +92,22 @@ def test_what_is_forgotten_was_over() -> None:
     plans.forget(1500 * MS)
     assert len(plans) == 5
     np.testing.assert_array_equal(trace(plans, 1500, 2600), before)
+
+
+@pytest.mark.parametrize("by_ms", [0, 5000, -5000])
+@pytest.mark.parametrize("cut_ms", [50, 101, 150, 230, 300])
+def test_what_acts_is_cut_at_a_time_that_is_now_another_one(by_ms: int, cut_ms: int) -> None:
+    """The ramp that follows is that of a plan which was valid until then, with its last row's jump paid for."""
+    rows = np.array([[0.5, 0.7], [0.25, 0.3], [0.25, 0.3]])
+    plans, expired = schedule(command(rows, valid_ms=250)), schedule(command(rows, valid_ms=min(cut_ms, 250)))
+    plans.add(command(rows, stamp_ms=400), 400 * MS, 650 * MS)  # which never acts
+    plans.cut(cut_ms * MS, (cut_ms + by_ms) * MS)
+    np.testing.assert_allclose(trace(plans, cut_ms + by_ms, cut_ms + by_ms + 600), trace(expired, cut_ms, cut_ms + 600), atol=1e-12)
+
+
+def test_time_that_is_forgotten_is_cut_at_what_acted_before() -> None:
+    plans = schedule()
+    plans.brake(np.array([0.4, 0.0]), 0)
+    plans.cut(-100 * MS, 900 * MS)
+    np.testing.assert_allclose(plans.at(900 * MS - 1)[0], [0.4, 0.0])
+    np.testing.assert_allclose(plans.at(900 * MS)[0], [0.375, 0.0])
