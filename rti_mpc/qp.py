@@ -94,7 +94,7 @@ class Qp:
     @property
     def sound(self) -> bool:
         """Whether all of it is finite, and of a size that a factorization survives: OSQP prints, in the middle of a sample, what it refuses."""
-        return bool(abs(self.checksum[0]) < INFINITY)
+        return bool(abs(self.checksum[0]) < 1e6 * INFINITY)  # of which it holds one for each bound that is absent
 
     def reduced_hessian(self) -> Array:
         """Return the Hessian in the inputs alone, the states eliminated by the dynamics; of a QP without slacks."""

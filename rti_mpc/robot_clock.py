@@ -9,7 +9,8 @@ WINDOW_NS = 1_000_000_000  # local time over which the rate is measured
 EACH_STATE = 1.05  # factor by which one state may change the rate
 LEAP_NS = 250_000_000  # robot time by which a clock that has jumped is ahead
 DRIFT = 0.1  # share by which the rate may be wrong, where states come late now and then
-RECENT = 8  # states, by the least late of which lateness is told
+RECENT = 2  # states, by the least late of which lateness is told: more, and a clock that has waited looked late for as long
+SETTLING = 20  # states after which the rate is known well enough for that
 FASTEST = 10.0  # rate of a robot whose second state is still to come, at most
 
 
@@ -54,14 +55,15 @@ class RobotClock:
         self._measured = False  # whether the rate is
         self._recent: deque[tuple[int, int]] = deque(maxlen=RECENT)  # stamps and arrivals
         self._in_a_row = 0  # states that came late by a quarter of a period and more
+        self._settling = SETTLING  # states still to come
         self.late_ns = self.doubt_ns = 0
         self.leapt = False
 
     def jump(self) -> None:
         """Forget stamps and arrivals, but not how fast the clock runs: it has jumped."""
-        known = self.rate, self.rate_most, self._measured
+        known = self.rate, self.rate_most, self._measured, self._settling
         self.reset()
-        self.rate, self.rate_most, self._measured = known
+        self.rate, self.rate_most, self._measured, self._settling = known
 
     def observe(self, seq: int, stamp_ns: int, arrival_ns: int) -> bool:
         """
@@ -94,19 +96,22 @@ class RobotClock:
         self._old, self.leapt = None, leaps
         self.late_ns = self._late_ns(stamp_ns, arrival_ns)
         self.doubt_ns = round(DRIFT * self.rate * (arrival_ns - since_ns))
+        if self._settling:
+            self._recent.clear()
         self._recent.append((stamp_ns, arrival_ns))
         self._seq, self.stamp_ns, self.arrival_ns = seq, stamp_ns, arrival_ns
         return True
 
     def _measure(self, stamp_ns: int, arrival_ns: int, stamp_0_ns: int, arrival_0_ns: int) -> None:
-        """Measure the rate, from one state that came in time to another; or to one that came late, if all lately did."""
+        """Measure the rate, from one state that came in time to another; or to one that came late, if the one before did."""
         elapsed_ns = arrival_ns - arrival_0_ns
         rate = self._rate(stamp_ns - stamp_0_ns, max(1, elapsed_ns))
         if not self._measured:
             self.rate_most = rate
         self._in_a_row = self._in_a_row + 1 if self._late_ns(stamp_ns, arrival_ns) > self.period_ns / 4 else 0
-        if 0 < self._in_a_row < RECENT or elapsed_ns < WINDOW_NS // 4:
+        if (0 < self._in_a_row < RECENT and not self._settling) or elapsed_ns < WINDOW_NS // 4:
             return
+        self._settling = max(0, self._settling - 1)
         self.rate = min(max(rate, self.rate / EACH_STATE), self.rate * EACH_STATE) if self._measured else rate
         self.rate_most, self._measured = self.rate, True
         if elapsed_ns >= WINDOW_NS:
@@ -122,7 +127,7 @@ class RobotClock:
     @property
     def ticks(self) -> bool:
         """Whether anything is known of the rate: two states have come."""
-        return self._measured or len(self._recent) > 1
+        return self.rate_most != FASTEST
 
     def latest_ns(self, local_ns: int) -> int:
         """Return what robot time is at a local time at most, for a state that came as late as the last one did."""

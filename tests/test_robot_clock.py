@@ -53,7 +53,7 @@ def test_lateness_of_one_state_after_another_adds_up() -> None:
     for i, late_ms in enumerate((30, 70), start=1):
         stamp_ns = clock.stamp_ns + 100 * MS
         clock.observe(30 + i, stamp_ns, stamp_ns - 5_000 * MS + late_ms * MS)
-        assert clock.late_ns == pytest.approx(late_ms * MS, abs=10 * MS)  # the rate follows a little
+        assert clock.late_ns == pytest.approx(late_ms * MS, abs=15 * MS)  # the rate follows, by a twentieth at a time
 
 
 def test_lateness_is_in_doubt_after_a_silence() -> None:
@@ -89,7 +89,7 @@ def test_rate_follows_a_simulation_that_is_slowed_down() -> None:
 def test_rate_does_not_follow_states_that_come_late_now_and_then() -> None:
     clock, rates = ticking(1.0, count=300), []
     for i in range(1, 50):
-        clock.observe(300 + i, clock.stamp_ns + 100 * MS, 29_900 * MS + i * 100 * MS + (90 * MS if i % 4 else 0))
+        clock.observe(300 + i, clock.stamp_ns + 100 * MS, 29_900 * MS + i * 100 * MS + (0 if i % 4 else 90 * MS))
         rates.append(clock.rate)
     assert rates == pytest.approx([1.0] * len(rates), rel=1e-3)
 
