@@ -22,6 +22,8 @@ from tests.processes.record import GUARDED, MS, STANDING, recorded, within_slew
 from tests.processes.system import KEYS, until
 from tests.processes.watched import Watched
 
+pytestmark = pytest.mark.slow
+
 DT_S = 0.1
 PROMISE_MS = 300.0  # three periods
 FORGED = 1  # configuration hash by which a command of this test is known again
