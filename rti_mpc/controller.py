@@ -242,7 +242,8 @@ class Controller:
         assert self._states.last is not None
         if not self.shadowing:
             self._sent.leave(now_ns)
-        return self._brake(self._states.last, now_ns + self.grid.delay_ns, command.status)
+        counted = command.mode in (Mode.BRAKING, Mode.STOPPED)
+        return self._brake(self._states.last, now_ns + self.grid.delay_ns, command.status, wanted=counted)
 
     # The two phases.
 

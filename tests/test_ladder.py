@@ -134,6 +134,16 @@ def test_samples_over_budget_brake_when_no_plan_is_left(driving: tuple[Controlle
     assert controller.mode is again.mode is Mode.TRACKING
 
 
+def test_ramp_that_is_late_itself_is_counted_once(driving: tuple[Controller, Lockstep], rti: FaultyRti) -> None:
+    controller, body = driving
+    fail(rti, "qp", 10)
+    for _ in range(6):
+        sample(controller, body)
+    before = controller.ladder.fallbacks
+    assert sample(controller, body, took_ms=110) is not None
+    assert controller.ladder.fallbacks == before + 1
+
+
 def test_sample_inside_its_budget_is_sent_as_it_is(driving: tuple[Controller, Lockstep]) -> None:
     controller, body = driving
     command = sample(controller, body, took_ms=70)
