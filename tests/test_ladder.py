@@ -136,7 +136,7 @@ def test_samples_over_budget_brake_when_no_plan_is_left(driving: tuple[Controlle
 
 def test_ramp_that_is_late_itself_is_counted_once(driving: tuple[Controller, Lockstep], rti: FaultyRti) -> None:
     controller, body = driving
-    fail(rti, "qp", 10)
+    fail(rti, "qp", 6)  # one sample is prepared already
     for _ in range(6):
         sample(controller, body)
     before = controller.ladder.fallbacks
