@@ -86,7 +86,8 @@ class RobotClock:
                 return False
             self._recent.clear()
             since_ns = old[1]
-            self.rate = self._rate(stamp_ns - old[0], arrival_ns - old[1])
+            rate = self._rate(stamp_ns - old[0], arrival_ns - old[1])
+            self.rate = min(self.rate, rate) if self._measured else rate  # what was held up together comes at once, though no clock runs faster
             self.rate_most = max(self.rate_most, self.rate)
             self._anchor = (stamp_ns, arrival_ns)
         elif stamp_ns > self.stamp_ns:

@@ -94,6 +94,17 @@ def test_rate_does_not_follow_states_that_come_late_now_and_then() -> None:
     assert rates == pytest.approx([1.0] * len(rates), rel=1e-3)
 
 
+def test_states_that_were_held_up_together_show_no_faster_clock() -> None:
+    """Or all that come after them would look late, and no sample be answered in time until the rate is measured again."""
+    clock = ticking(1.0)
+    stamp_ns, arrival_ns = clock.stamp_ns, clock.arrival_ns + 300 * MS
+    assert not clock.observe(31, stamp_ns + 100 * MS, arrival_ns + 100 * MS)
+    for i in range(2, 20):
+        assert clock.observe(30 + i, stamp_ns + i * 100 * MS, arrival_ns - 40 * MS + i * 100 * MS)
+        assert clock.rate == pytest.approx(1.0, rel=1e-3)
+        assert clock.late_ns == 0
+
+
 def test_period_is_that_of_the_robot_where_states_are_lost() -> None:
     clock = RobotClock()
     for i in range(0, 60, 3):
