@@ -176,7 +176,7 @@ class Guard:
         u = self._approach(command, start_ns)
         if not self.passing:
             self.passing = True
-            self._say(Severity.INFO, "guard_passing", f"commands of epoch {command.epoch} pass")
+            self._say(Severity.INFO, "guard_passing", f"commands of epoch {command.epoch} pass", change=True)
         passed = replace(command, valid_until_ns=min(command.valid_until_ns, until_ns), u=u)
         self._schedule.add(passed, start_ns, until_ns)
         self._engaged, self._told_ns = True, until_ns
@@ -198,7 +198,7 @@ class Guard:
             self.passing = False
             moving = not np.array_equal(self._schedule.at(now_ns)[0], self._limits.u_rest)
             text = f"the last plan has ended: {'braking to rest' if moving else 'standing'}"
-            self._say(Severity.ERROR if moving else Severity.WARNING, "guard_braking", text)
+            self._say(Severity.ERROR if moving else Severity.WARNING, "guard_braking", text, change=True)
         if self._told_ns - now_ns > LEAD_NS * self._clock.rate:
             return None
         start_ns = max(self._told_ns, now_ns)
@@ -355,5 +355,5 @@ class Guard:
         self._told_ns, self._untold = now_ns, self._engaged
         self.passing = False
 
-    def _say(self, severity: Severity, code: str, text: str) -> None:
-        self.notices.append(Notice(severity, code, text))
+    def _say(self, severity: Severity, code: str, text: str, *, change: bool = False) -> None:
+        self.notices.append(Notice(severity, code, text, change))

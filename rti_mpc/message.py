@@ -199,8 +199,10 @@ class Notice:
     Attributes:
         code: Stable word for machines, such as ``state_stale``.
         text: One sentence for people.
+        change: Whether it is a change of mode: those are told each, faults of one code now and then.
     """
 
     severity: Severity
     code: str
     text: str
+    change: bool = False

@@ -40,7 +40,7 @@ class ModeMachine:
         if mode is self.mode:
             return
         assert mode in TRANSITIONS[self.mode], f"{self.mode.name} to {mode.name}"
-        self.say(severity, code, f"{self.mode.name.lower()} to {mode.name.lower()}: {reason}")
+        self.notices.append(Notice(severity, code, f"{self.mode.name.lower()} to {mode.name.lower()}: {reason}", change=True))
         self.mode = mode
 
     def say(self, severity: Severity, code: str, text: str) -> None:

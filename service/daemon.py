@@ -30,13 +30,14 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.controller import Controller, Timing
 from rti_mpc.errors import ConfigError
-from rti_mpc.message import Command, Severity, State, Telemetry
+from rti_mpc.message import Command, State, Telemetry
 from rti_mpc.rti import Rti
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.interrupt import stop_on_signals
 from service import realtime
+from service.announce import announce
 from service.config import Config
 from service.description import describe
 from service.leadership import HEARING_S, LEADER, STANDBY, Leadership, differ, hear_others
@@ -276,12 +277,7 @@ class Daemon:
                 notice = self._controller.notices.popleft()
             except IndexError:
                 return  # the other thread took it
-            log.log(LEVELS[notice.severity], "%s", notice.text)
-            announcer.say(notice.severity, notice.code, notice.text, self._controller.robot_now_ns(now_ns))
+            announce(log, announcer, notice, self._controller.robot_now_ns(now_ns))
         for intake in (self._states_in, self._references.planners, self._references.leaders, self._leadership.commands_in):
             for refusal in intake.notices(now_ns):
-                log.warning("%s", refusal.text)
-                announcer.say(refusal.severity, refusal.code, refusal.text, self._controller.robot_now_ns(now_ns))
-
-
-LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
+                announce(log, announcer, refusal, self._controller.robot_now_ns(now_ns))

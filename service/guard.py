@@ -21,13 +21,14 @@ import rti_mpc
 from rti_mpc.epoch import NUMBER_BITS, epoch_above
 from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.guard import Guard
-from rti_mpc.message import Command, Severity, State
+from rti_mpc.message import Command, State
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import Bus, Received, Subscriber
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.session import BusSettings
+from service.announce import announce
 from service.config import Config
 
 ROLE = "guard"
@@ -158,12 +159,10 @@ class Process:
         stamp_ns = self._guard.robot_now_ns(local_ns)
         while self._guard.notices:
             notice = self._guard.notices.popleft()
-            if self._announcer.say(notice.severity, notice.code, notice.text, stamp_ns):
-                log.log(LEVELS[notice.severity], "%s", notice.text)
+            announce(log, self._announcer, notice, stamp_ns)
         for intake in (self._states, self._commands):
             for refusal in intake.notices(local_ns):
-                log.warning("%s", refusal.text)
-                self._announcer.say(refusal.severity, refusal.code, refusal.text, stamp_ns)
+                announce(log, self._announcer, refusal, stamp_ns)
 
     def _follow(self, act: Callable[[Received], None], subscriber: Subscriber) -> None:
         """Run a loop; what nobody foresaw ends in a ramp to rest and a non-zero exit, for the supervisor to restart."""
@@ -173,6 +172,3 @@ class Process:
         except Exception:
             log.exception("stopping after an unforeseen error")
             self._crashed.set()
-
-
-LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}

@@ -29,12 +29,11 @@ from typing import Any
 
 from rti_mpc.controller import Controller
 from rti_mpc.epoch import NUMBER_BITS, epoch_above
-from rti_mpc.errors import MessageError
 from rti_mpc.message import Command, Notice, Severity, State
 from rti_mpc.status import Mode
 from rti_mpc.wire.bus import Bus, Received
-from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.intake import Intake
+from service.guard import epoch_of
 
 LEADER, STANDBY = "controller", "standby"  # roles
 HEARING_S = 0.5  # for which a starting controller listens for others
@@ -64,18 +63,10 @@ def hear_others(bus: Bus, stop: Event) -> Others:
     commands = [bus.subscriber(key) for key in (bus.keys.command, bus.keys.actuation)]
     infos = bus.subscriber(bus.keys.info(LEADER), capacity=8, cached=True)
     stop.wait(HEARING_S)
-    heard = [command for subscriber in commands if (command := decoded(subscriber.try_recv())) is not None]
+    heard = [epoch_of(subscriber.try_recv()) for subscriber in commands]
     leaders = [(info["epoch"], info["config_hash"]) for info in map(leader_info, infos.drain()) if info is not None]
-    epoch = max([command.epoch for command in heard] + [epoch for epoch, _ in leaders], default=0)
+    epoch = max(heard + [epoch for epoch, _ in leaders])
     return Others(epoch, max(leaders)[1] if leaders else None)
-
-
-def decoded(received: Received | None) -> Command | None:
-    """Return the command in a payload, if it is one."""
-    try:
-        return None if received is None else decode(Command, received.payload)
-    except MessageError:
-        return None
 
 
 def leader_info(received: Received) -> dict[str, Any] | None:

@@ -18,6 +18,7 @@ from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
+from service.announce import announce
 from service.listener import Listener
 from service.outlet import Outlet, file_outlet, viewer_outlet
 
@@ -70,7 +71,8 @@ def main(
         pump(listener, outlets, spawned, Announcer(bus, ROLE, time.time_ns() // 1_000_000_000), stop)
     log.info("%d messages, %d lost, %d refused", listener.received, listener.lost, listener.refused)
     complete = [outlet.close() for outlet in outlets]
-    notices(outlets)
+    for notice in notices(outlets):
+        log.error("%s", notice.text)
     return 0 if rerun_save is None or complete[0] else 1
 
 
@@ -84,21 +86,17 @@ def pump(listener: Listener, outlets: Sequence[Outlet], spawned: subprocess.Pope
         if spawned is not None and spawned.poll() is not None:
             text = "the Rerun viewer has ended; where there is no screen, --rerun-save records to a file"
             said.append(Notice(Severity.WARNING, "viewer_ended", text))
-            log.warning("%s", text)
             spawned = None
         for notice in said:
-            announcer.say(notice.severity, notice.code, notice.text, listener.now_ns)
+            announce(log, announcer, notice, listener.now_ns)
             entries.append(listener.own(notice))
         for outlet in outlets:
             outlet.offer(entries)
 
 
 def notices(outlets: Sequence[Outlet]) -> list[Notice]:
-    """Take and log what outlets have to say."""
-    taken = [outlet.notices.popleft() for outlet in outlets for _ in range(len(outlet.notices))]
-    for notice in taken:
-        log.error("%s", notice.text)
-    return taken
+    """Take what outlets have to say."""
+    return [outlet.notices.popleft() for outlet in outlets for _ in range(len(outlet.notices))]
 
 
 def viewer_url(address: str) -> str:

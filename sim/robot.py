@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 import rti_mpc
-from rti_mpc.message import Command, Severity, State
+from rti_mpc.message import Command, Notice, Severity, State
 from rti_mpc.model import Model
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import Bus, BusSettings, Received, Subscriber
@@ -159,7 +159,7 @@ class Robot:
             last = body.sensor.take(body.now_ns) or last
         if last is not None:
             self._send(last)
-        self._announcer.say(Severity.INFO, "robot_stopped", "the robot was stopped and stands", body.now_ns)
+        self._announcer.say(Notice(Severity.INFO, "robot_stopped", "the robot was stopped and stands"), body.now_ns)
         logger.info("stopped, and stands")
         self._log.close()
         return RobotSummary(self._sent, 1e-9 * self._held_up_ns, body.counters)
@@ -174,18 +174,19 @@ class Robot:
         late_ns = self.clock.set_back(due_ns)
         self._held_up_ns += late_ns
         text = f"the simulation was held up for {1e-6 * late_ns:.1f} ms, {1e-6 * self._held_up_ns:.1f} ms in all: the robot's clock waited"
-        self._announcer.say(Severity.WARNING, "simulation_held_up", text, due_ns)
+        self._announcer.say(Notice(Severity.WARNING, "simulation_held_up", text), due_ns)
 
     def _live(self, to_ns: int) -> None:
         """Advance to a time with the commands that arrived by then, measure, send."""
         while self._inbox and self.clock.at_ns(self._inbox[0][1]) <= to_ns:
             self._take(*self._inbox.popleft())
         for notice in self._intake.notices(time.monotonic_ns()):
-            self._announcer.say(notice.severity, notice.code, notice.text, to_ns)
+            self._announcer.say(notice, to_ns)
         starved = self.body.counters.starved
         self._advance(to_ns)
         if self.body.counters.starved > starved:
-            self._announcer.say(Severity.ERROR, "command_ran_out", "no valid command is left: the robot brakes to rest on its own", to_ns)
+            ran_out = Notice(Severity.ERROR, "command_ran_out", "no valid command is left: the robot brakes to rest on its own")
+            self._announcer.say(ran_out, to_ns)
         while (state := self.body.sensor.take(to_ns)) is not None:
             self._send(state)
 
@@ -199,7 +200,7 @@ class Robot:
         reason = self.body.accept(command, arrival_ns)
         if reason:
             text = f"command {command.seq} of epoch {command.epoch} was refused: {reason.replace('_', ' ')}"
-            self._announcer.say(Severity.WARNING, f"command_{reason}", text, arrival_ns)
+            self._announcer.say(Notice(Severity.WARNING, f"command_{reason}", text), arrival_ns)
         else:
             self._log.answered(command.state_seq, command.seq, monotonic_ns)
 

@@ -17,7 +17,7 @@ from threading import Event
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.message import Reference, Severity, State
+from rti_mpc.message import Notice, Reference, Severity, State
 from rti_mpc.trajectory import Heading, Trajectory, rows
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
@@ -122,12 +122,12 @@ class Source:
             self._robot_epoch = state.epoch
             self._anchor(state.stamp_ns)
         for notice in self._intake.notices(now_ns):
-            self._announcer.say(notice.severity, notice.code, notice.text, 0 if state is None else state.stamp_ns)
+            self._announcer.say(notice, 0 if state is None else state.stamp_ns)
 
     def _anchor(self, stamp_ns: int) -> None:
         """Publish the reference from a time on."""
         self.anchored += 1
         self._publisher.put(Reference(self._epoch, self.anchored, stamp_ns, self._period_ns, self._trajectory.end, self._y, self._p))
         text = f"{self._trajectory.name} for {self._trajectory.duration_s:.1f} s from {1e-9 * stamp_ns:.3f} s of the robot on"
-        self._announcer.say(Severity.INFO, "reference_published", text, stamp_ns)
+        self._announcer.say(Notice(Severity.INFO, "reference_published", text), stamp_ns)
         logger.info("%s", text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 
-from rti_mpc.message import Event, Severity
+from rti_mpc.message import Event, Notice, Severity
 from rti_mpc.wire.bus import Bus
 
 PERIOD_NS = 1_000_000_000  # monotonic, between two events of one code
@@ -26,12 +26,13 @@ class Announcer:
         self._seq = 0
         self._last_ns: dict[str, int] = {}  # by code
 
-    def say(self, severity: Severity, code: str, text: str, stamp_ns: int) -> bool:
-        """Publish an event; a fault not, if one of its code just was. Return whether it was published."""
-        now_ns = time.monotonic_ns()
-        if severity is Severity.INFO or now_ns - self._last_ns.get(code, -PERIOD_NS) >= PERIOD_NS:
+    def say(self, notice: Notice, stamp_ns: int) -> bool:
+        """Publish a notice; a fault not, if one of its code just was. Return whether it was published."""
+        now_ns, code = time.monotonic_ns(), notice.code
+        each = notice.change or notice.severity is Severity.INFO
+        due = each or now_ns - self._last_ns.get(code, -PERIOD_NS) >= PERIOD_NS
+        if due:
             self._last_ns[code] = now_ns
             self._seq += 1
-            self._publisher.put(Event(self._epoch, self._seq, stamp_ns, self.role, severity, code, text))
-            return True
-        return False
+            self._publisher.put(Event(self._epoch, self._seq, stamp_ns, self.role, notice.severity, code, notice.text))
+        return due
