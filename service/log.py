@@ -5,7 +5,14 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
+from contextlib import suppress
+from queue import Full, Queue
+from threading import Thread
+
+WAITING = 1000  # lines
+CLOSE_S = 1.0  # to write at the end what still waits, at most
 
 
 class JsonLines(logging.Formatter):
@@ -19,9 +26,51 @@ class JsonLines(logging.Formatter):
         return json.dumps(line)
 
 
+class Aside(logging.Handler):
+    """
+    Writes in a thread of its own, and drops what waits in vain.
+
+    A terminal that hangs, as with Ctrl-S or a lost connection, or a pipe that nobody
+    reads, would otherwise hold up whoever has something to say: a controller, or
+    its guard. (`logging.handlers.QueueListener` waits for it without limit at the end.)
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        super().__init__()
+        self._descriptor = descriptor
+        self._lines: Queue[tuple[int, str] | None] = Queue(WAITING)  # each with how many before it were dropped
+        self._dropped = 0  # since the last one that was not
+        self._thread = Thread(target=self._write, name="log", daemon=True)
+        self._thread.start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Leave a record to be written."""
+        try:
+            self._lines.put_nowait((self._dropped, self.format(record)))
+            self._dropped = 0
+        except Full:
+            self._dropped += 1
+
+    def close(self) -> None:
+        """Wait until all is written, within a bounded time."""
+        with suppress(Full):
+            self._lines.put(None, timeout=CLOSE_S)
+            self._thread.join(CLOSE_S)
+        super().close()
+
+    def _write(self) -> None:
+        """Write what there is, past the buffers of `sys.stdout`, which a process cannot end without."""
+        for dropped, line in iter(self._lines.get, None):
+            if dropped:
+                text = f"{dropped} lines are lost: standard output did not take them"
+                line = self.format(logging.makeLogRecord({"name": "log", "levelname": "WARNING", "msg": text})) + "\n" + line
+            with suppress(OSError):  # nobody reads it any more, or its disk is full
+                os.write(self._descriptor, f"{line}\n".encode())
+
+
 def start() -> None:
     """Send all records from INFO on to standard output."""
-    handler = logging.StreamHandler(sys.stdout)
+    handler = Aside(sys.stdout.fileno())
     people = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S")
     handler.setFormatter(people if sys.stdout.isatty() else JsonLines())
     logging.basicConfig(level=logging.INFO, handlers=[handler])

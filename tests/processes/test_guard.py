@@ -8,8 +8,10 @@ robot stands within 2.5 s, and it stays so.
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
@@ -129,3 +131,21 @@ def test_ctrl_c_ends_the_guard_with_a_ramp_to_rest(driven: System) -> None:
     stopped_in_time(recorded(driven, stopped_ns, 2700))
     assert "Traceback" not in driven.said("guard")
     assert CONFIG.guard.enabled is False, "the quickstart needs none"
+
+
+def test_terminals_that_hang_keep_nobody_from_driving_the_robot(tmp_path: Path) -> None:
+    """What they say is taken by nobody from the first line on, as after Ctrl-S, or where a connection was lost."""
+    (tmp_path / "robot.toml").write_text(SHIPPED.read_text() + GUARDED)
+    roles = ("robot", "guard", "controller", "reference")
+    with System(tmp_path, tmp_path / "robot.toml") as system, ExitStack() as stack:
+        for role in roles:
+            os.mkfifo(tmp_path / f"{role}.log")
+            terminal = os.open(tmp_path / f"{role}.log", os.O_RDWR | os.O_NONBLOCK)
+            stack.callback(os.close, terminal)
+            with suppress(BlockingIOError):
+                while True:
+                    os.write(terminal, bytes(4096))
+        system.start(*roles)
+        system.tracking()
+        system.state(lambda state: abs(state.x[3]) > 0.03)
+        assert [system.interrupt(role)[0] for role in roles] == [0, 0, 0, 0]

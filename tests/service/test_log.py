@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a process says; to nobody, too."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from threading import Timer
+
+import pytest
+
+from service.log import WAITING
+from tests.processes.system import PATIENCE_S, ROOT, environment
+
+TAKEN = 65536 // 60  # lines that the pipe takes before anybody reads it, of 60 bytes and more
+LINES = 10 * (TAKEN + WAITING)
+TALK = f"""
+import logging, sys
+from service import log
+log.start()
+news = logging.getLogger("controller")
+for k in range({LINES}):
+    news.info("news %d", k)
+print("said", file=sys.stderr, flush=True)
+sys.stdin.read()
+news.info("the last news")
+"""
+
+
+@pytest.fixture
+def talker() -> Iterator[subprocess.Popen[str]]:
+    """A process that has said more than anybody listens to, and waits for the end of its input."""
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", TALK], cwd=ROOT, env=environment(), stdin=pipe, stdout=pipe, stderr=pipe, text=True) as talker:
+        watchdog = Timer(PATIENCE_S, talker.kill)
+        watchdog.start()
+        try:
+            assert talker.stderr is not None
+            assert talker.stderr.readline() == "said\n"
+            yield talker
+        finally:
+            watchdog.cancel()
+            talker.kill()
+
+
+def test_standard_output_that_hangs_delays_nobody_and_lets_a_process_end(talker: subprocess.Popen[str]) -> None:
+    assert talker.stdin is not None
+    talker.stdin.close()
+    assert talker.wait() == 0
+
+
+def test_standard_output_that_goes_on_is_told_what_it_has_missed(talker: subprocess.Popen[str]) -> None:
+    assert talker.stdin is not None and talker.stdout is not None
+    lines = [talker.stdout.readline() for _ in range(TAKEN + WAITING // 2)]  # so there is room for one more
+    talker.stdin.close()
+    texts = [json.loads(line)["text"] for line in [*lines, *talker.stdout]]
+    told = sum(text.startswith("news") for text in texts)
+    lost = [int(text.split()[0]) for text in texts if "lost" in text]
+    assert lost
+    assert told + sum(lost) == LINES
+    assert texts[-1] == "the last news"
+    assert talker.wait() == 0
