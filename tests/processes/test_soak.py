@@ -3,7 +3,9 @@
 Hours in small: 200 samples a second in real time, by real processes, for as long as `--soak-s` says; `make soak` says half an hour.
 
 Beside them a bare timer runs on each core. It computes nothing, so what makes it
-late is the host, and a period missed at such a moment is the host's.
+late is the host, and a period missed at such a moment is the host's. A second one
+goes before everybody else (SCHED_FIFO, where that is allowed): what it meets the
+host alone has done, and it tells how much is explained if nothing else counts.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +38,7 @@ DT_S = 0.005
 TICK_S = 0.002  # of the bare timers: whatever holds a core up for most of a period meets one
 HELD_UP_NS = 500_000  # lateness of a bare timer that explains missed periods
 AFTERMATH_NS = 50_000_000  # in which they may be: all that was held up is then done at once
+FIRST, SOON_NS = 50, 10_000_000  # priority of the timers that see the host alone, and their aftermath: two periods
 COLD = 400  # first samples, left out: everybody starts
 LOOK_S = 1.0
 ROLES = ("controller", "robot", "reference")
@@ -44,9 +48,13 @@ MIB = 2**20
 
 TIMER = """
 import os, signal, sys
+from contextlib import suppress
 import numpy as np
 from service.jitter import bare_timer
 os.sched_setaffinity(0, {int(sys.argv[1])})
+with suppress(PermissionError):
+    if priority := int(sys.argv[4]):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
 going = [True]
 signal.signal(signal.SIGINT, lambda *_: going.clear())
 np.save(sys.argv[2], bare_timer(float(sys.argv[3]), lambda: going))
@@ -56,13 +64,15 @@ np.save(sys.argv[2], bare_timer(float(sys.argv[3]), lambda: going))
 class Timers:
     """A bare timer on each core; `ticks` holds when each was due and how late it was, ns, once they have ended."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, priority: int, aftermath_ns: int) -> None:
         self.ticks: list[np.ndarray] = []
-        self._paths = {core: folder / f"timer-{core}.npy" for core in realtime.available()}
+        self._paths = {core: folder / f"timer-{core}-{priority}.npy" for core in realtime.available()}
+        self._priority = str(priority)
+        self._aftermath_ns = aftermath_ns
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        commands = [[sys.executable, "-c", TIMER, str(core), str(path), str(TICK_S)] for core, path in self._paths.items()]
+        commands = [[sys.executable, "-c", TIMER, str(core), str(path), str(TICK_S), self._priority] for core, path in self._paths.items()]
         timers = [subprocess.Popen(command, cwd=ROOT, env=environment()) for command in commands]
         try:
             yield
@@ -76,12 +86,17 @@ class Timers:
     def held_up(self, at_ns: np.ndarray) -> np.ndarray:
         """Whether the host held a core up about these times, shape ``(n,)``."""
         stalls = np.concatenate([rows[rows[:, 1] > HELD_UP_NS] for rows in self.ticks])
-        from_ns, to_ns = stalls[:, 0] - AFTERMATH_NS, stalls.sum(axis=1) + AFTERMATH_NS
+        from_ns, to_ns = stalls[:, 0] - self._aftermath_ns, stalls.sum(axis=1) + self._aftermath_ns
         return np.array([bool(((from_ns < at) & (at < to_ns)).any()) for at in at_ns], bool)
 
     def share(self, from_ns: float, to_ns: float) -> float:
         """The share of a time in which the host held a core up."""
         return float(self.held_up(np.linspace(from_ns, to_ns, 1000)).mean())
+
+    def late(self, from_ns: float, to_ns: float) -> float:
+        """The share of ticks in a time that were late."""
+        ticks = np.concatenate(self.ticks)
+        return float((ticks[(from_ns <= ticks[:, 0]) & (ticks[:, 0] < to_ns), 1] > HELD_UP_NS).mean())
 
 
 class Commands(threading.Thread):
@@ -139,6 +154,14 @@ class Soak:
         return np.interp(seq, *np.array(self.commands, float).T)
 
 
+def by_minute(seen: Soak, missed_ns: np.ndarray, timers: Timers) -> list[tuple[float, float]]:
+    """Each minute, the quietest first: the share of late ticks of the bare timers, and of missed periods."""
+    from_s, to_s = seen.looks[[0, -1], 0]
+    edges = 1e9 * np.linspace(from_s, to_s, 1 + max(1, int((to_s - from_s) // 60.0)))
+    missed, _ = np.histogram(missed_ns, edges)
+    return sorted((timers.late(*between), 1e9 * DT_S * count / np.ptp(between)) for between, count in zip(pairwise(edges), missed, strict=True))
+
+
 def soak(folder: Path, duration_s: float) -> Soak:
     """Drive, and look at the memory."""
     looks = []
@@ -162,25 +185,29 @@ def test_hours_of_samples_miss_no_period_lose_no_message_and_take_no_memory(
     tmp_path: Path, pytestconfig: pytest.Config, capsys: pytest.CaptureFixture[str]
 ) -> None:
     duration_s = float(pytestconfig.getoption("--soak-s"))
-    timers = Timers(tmp_path)
-    with timers.running():
+    timers, first = Timers(tmp_path, priority=0, aftermath_ns=AFTERMATH_NS), Timers(tmp_path, priority=FIRST, aftermath_ns=SOON_NS)
+    with timers.running(), first.running():
         seen = soak(tmp_path, duration_s)
     account, missed_ns = seen.account(), seen.missed_ns()
-    explained = int(timers.held_up(missed_ns).sum())
     warm = seen.looks[seen.looks[:, 0] > seen.looks[0, 0] + min(WARM_UP_S, 0.25 * duration_s)]
     with capsys.disabled():
         print(f"\n{machine.describe()}")
         print(f"{duration_s:g} s at {1 / DT_S:g} Hz, {seen.span.sum()} states: {account}, {seen.silences} silences, {seen.log.counters}")
-        print(
-            f"state to command  {quantiles(seen.log.latency_us[seen.span])}; {len(missed_ns)} missed the period, {explained} of them while the host"
-        )
-        print(f"held a core up, as it did in {timers.share(*(1e9 * seen.looks[[0, -1], 0])):.1%} of the time")
-        for core, rows in enumerate(timers.ticks):
-            held_up = (rows[:, 1] > HELD_UP_NS).sum()
-            print(f"bare timer {core}      {quantiles(1e-3 * rows[:, 1])}; {held_up} of {len(rows)} later than {1e-6 * HELD_UP_NS:g} ms")
+        print(f"state to command  {quantiles(seen.log.latency_us[seen.span])}; {len(missed_ns)} missed the period")
+        between = 1e9 * seen.looks[[0, -1], 0]
+        for which, those in {"a bare timer": timers, "one that goes before everybody": first}.items():
+            print(
+                f"{those.held_up(missed_ns).sum()} of them while the host held up {which}, as in {those.share(*between):.1%} of the time; its ticks:"
+            )
+            for rows in those.ticks:
+                late = (rows[:, 1] > HELD_UP_NS).mean()
+                print(f"                  {quantiles(1e-3 * rows[:, 1])}, {late:.2%} of them later than {1e-6 * HELD_UP_NS:g} ms")
+        minutes = by_minute(seen, missed_ns, first)
+        for which, (late, missed) in {"quietest": minutes[0], "loudest": minutes[-1]}.items():
+            print(f"the {which} minute: of the latter {late:.2%}, and {missed:.2%} of all periods missed")
         for role, used in zip(ROLES, warm[:, 1:].T, strict=True):
             print(f"{role:17} {used[-1]:.1f} MiB, {growth(warm[:, 0], used):+.2f} MiB/h fitted, {np.ptp(used):.2f} MiB between least and most")
-    assert explained == len(missed_ns)
+    assert timers.held_up(missed_ns).all()
     assert account["rest"] >= 0 if seen.silences else account["rest"] == 0
     for used in warm[:, 1:].T:
         assert growth(warm[:, 0], used) < 1.0 if duration_s >= LONG_S else np.ptp(used) < 1.0
