@@ -133,6 +133,7 @@ def test_ctrl_c_ends_the_guard_with_a_ramp_to_rest(driven: System) -> None:
     assert CONFIG.guard.enabled is False, "the quickstart needs none"
 
 
+@pytest.mark.slow
 def test_terminals_that_hang_keep_nobody_from_driving_the_robot(tmp_path: Path) -> None:
     """What they say is taken by nobody from the first line on, as after Ctrl-S, or where a connection was lost."""
     (tmp_path / "robot.toml").write_text(SHIPPED.read_text() + GUARDED)

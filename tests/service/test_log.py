@@ -14,8 +14,9 @@ import pytest
 from service.log import WAITING
 from tests.processes.system import PATIENCE_S, ROOT, environment
 
-TAKEN = 65536 // 60  # lines that the pipe takes before anybody reads it, of 60 bytes and more
-LINES = 10 * (TAKEN + WAITING)
+PIPE_BYTES = 4096
+TAKEN = PIPE_BYTES // 60  # lines that the pipe takes before anybody reads it, of 60 bytes and more
+LINES = 10 * WAITING
 TALK = f"""
 import logging, sys
 from service import log
@@ -33,7 +34,8 @@ news.info("the last news")
 def talker() -> Iterator[subprocess.Popen[str]]:
     """A process that has said more than anybody listens to, and waits for the end of its input."""
     pipe = subprocess.PIPE
-    with subprocess.Popen([sys.executable, "-c", TALK], cwd=ROOT, env=environment(), stdin=pipe, stdout=pipe, stderr=pipe, text=True) as talker:
+    command = [sys.executable, "-c", TALK]
+    with subprocess.Popen(command, cwd=ROOT, env=environment(), stdin=pipe, stdout=pipe, stderr=pipe, pipesize=PIPE_BYTES, text=True) as talker:
         watchdog = Timer(PATIENCE_S, talker.kill)
         watchdog.start()
         try:
@@ -53,7 +55,7 @@ def test_standard_output_that_hangs_delays_nobody_and_lets_a_process_end(talker:
 
 def test_standard_output_that_goes_on_is_told_what_it_has_missed(talker: subprocess.Popen[str]) -> None:
     assert talker.stdin is not None and talker.stdout is not None
-    lines = [talker.stdout.readline() for _ in range(TAKEN + WAITING // 2)]  # so there is room for one more
+    lines = [talker.stdout.readline() for _ in range(2 * TAKEN)]  # some of which had waited: so there is room for one more
     talker.stdin.close()
     texts = [json.loads(line)["text"] for line in [*lines, *talker.stdout]]
     told = sum(text.startswith("news") for text in texts)
