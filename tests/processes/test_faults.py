@@ -25,7 +25,11 @@ def matrix(path: Path, *names: str, timeout_s: float = 120.0) -> dict[str, dict[
 
 @pytest.mark.parametrize(
     "names",
-    [("controller_killed", "guard_and_controller_killed"), ("link_cut",), pytest.param(("state_nan",), marks=pytest.mark.slow)],
+    [
+        ("controller_killed", "guard_and_controller_killed"),
+        pytest.param(("link_cut",), marks=pytest.mark.slow),
+        pytest.param(("state_nan",), marks=pytest.mark.slow),
+    ],
     ids="-".join,
 )
 def test_robot_stops_in_time_and_drives_again(tmp_path: Path, names: tuple[str, ...]) -> None:

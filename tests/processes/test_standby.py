@@ -55,6 +55,7 @@ def test_standby_takes_over_in_time_and_the_old_leader_is_fenced(redundant: Watc
     within_limits(system)
 
 
+@pytest.mark.slow
 def test_orders_hold_whoever_leads_and_of_two_that_stand_by_one_leads(tmp_path: Path) -> None:
     with Watched(tmp_path, 0.1, live=True) as system:
         system.start("robot", "leader", "reference")
