@@ -50,6 +50,8 @@ class Aside(logging.Handler):
             self._dropped = 0
         except Full:
             self._dropped += 1
+        except Exception:  # as every handler does: a record that cannot be formatted ends nobody's loop
+            self.handleError(record)
 
     def close(self) -> None:
         """Wait until all is written, within a bounded time."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ from threading import Timer
 
 import pytest
 
-from service.log import WAITING
+from service.log import WAITING, Aside
 from tests.processes.system import PATIENCE_S, ROOT, environment
 
 PIPE_BYTES = 4096
@@ -64,3 +65,13 @@ def test_standard_output_that_goes_on_is_told_what_it_has_missed(talker: subproc
     assert told + sum(lost) == LINES
     assert texts[-1] == "the last news"
     assert talker.wait() == 0
+
+
+def test_record_that_cannot_be_formatted_ends_nobody(capfd: pytest.CaptureFixture[str]) -> None:
+    handler = Aside(1)
+    handler.handle(logging.makeLogRecord({"name": "controller", "msg": "%d", "args": ("no number",)}))
+    handler.handle(logging.makeLogRecord({"name": "controller", "msg": "news"}))
+    handler.close()
+    out, err = capfd.readouterr()
+    assert out == "news\n"
+    assert "Logging error" in err
