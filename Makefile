@@ -9,7 +9,7 @@ UV := $(shell command -v uv)
 FITS := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 PYTHON = $(shell for python in python3 python3.13 python3.12 python3.11 python3.14; do $$python -c '$(FITS)' 2>/dev/null && echo $$python && break; done)
 
-.PHONY: demo test test-slow soak bench lint format types lock clean
+.PHONY: demo test test-slow soak bench lint format types msg lock clean
 
 demo: $(READY)
 	$(BIN)/rti-mpc demo $(ARGS)
@@ -36,6 +36,9 @@ format: $(READY)
 
 types: $(READY)
 	$(BIN)/mypy
+
+msg: $(READY)
+	$(BIN)/python -m rti_mpc.wire.msg deploy/msg
 
 lock:
 	$(if $(UV),,$(error make lock needs uv: pip install uv))

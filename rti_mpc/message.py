@@ -43,12 +43,18 @@ class State:
 
     Attributes:
         x: State estimate, shape ``(nx,)``. Angles may wrap.
+        u: Inputs that act at `stamp_ns`, shape ``(nu,)``; empty if the robot does not report them.
+        command_epoch: Epoch of the command that `u` comes from; 0: the robot's own ramp, or not reported.
+        command_seq: Its sequence number.
     """
 
     epoch: int
     seq: int
     stamp_ns: int
     x: Array
+    u: Array = field(default_factory=lambda: np.zeros(0))
+    command_epoch: int = 0
+    command_seq: int = 0
 
 
 @dataclass(slots=True)
@@ -89,6 +95,10 @@ class Command:
         status: Outcome of the QP behind this command.
         period_ns: Time between rows.
         u: Inputs, shape ``(N, nu)``, held inputs expanded.
+        rest_period_ns: Time between rows of the way to rest; 0 where there are none.
+        u_rest: Way to rest from `valid_until_ns` on, shape ``(M, nu)``; no rows: inside the slew limits to rest.
+        x_rest: States along it, shape ``(M, nx)``; no rows where no feedback is needed.
+        K: Gain on the way to rest, shape ``(nu, nx)``: :math:`u = u_{rest} - K (x - x_{rest})`; no rows where no feedback is needed.
     """
 
     epoch: int
@@ -103,6 +113,10 @@ class Command:
     status: QpStatus
     period_ns: int
     u: Array
+    rest_period_ns: int = 0
+    u_rest: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    x_rest: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    K: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 @dataclass(slots=True)

@@ -348,7 +348,7 @@ def test_what_is_no_command_for_this_robot_unseats_nobody_and_is_counted(pair: t
     leader, standby = pair
     command = replace(standby.made(5), epoch=leader.leadership.epoch + 1)
     leader.wire.put(standby.bus, encode(replace(command, u=np.zeros((1, 2)))))
-    leader.wire.put(standby.bus, encode(command), encoding(Command).replace("@1", "@2"))
+    leader.wire.put(standby.bus, encode(command), encoding(Command).replace("@2", "@1"))
     assert leader.see(5)
     assert leader.leadership.leading
     assert leader.leadership.commands_in.refused == {"length": 1, "version": 1}

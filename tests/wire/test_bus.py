@@ -323,7 +323,7 @@ def test_whatever_peers_send_is_counted_and_the_next_message_passes(join: Any, e
         publisher.put(b"\x01\x02\x03", encoding=encoding(State))
         publisher.put(b"", encoding=encoding(State), attachment=b"\x00")
         publisher.put(b"\x00\x00\x00\x00", encoding=encoding(State))
-        publisher.put(np.random.default_rng(5).bytes(10**6), encoding=encoding(State).replace("@1", "@2"))
+        publisher.put(np.random.default_rng(5).bytes(10**6), encoding=encoding(State).replace("@2", "@1"))
         publisher.delete()
         samples = [received(states) for _ in range(6)]
         assert [intake.accept(sample, n) for n, sample in enumerate(samples)] == [None] * 6

@@ -17,14 +17,16 @@ from rti_mpc.errors import MessageError
 from rti_mpc.message import STAMP_ON_ARRIVAL, Command, End, Event, Reference, Severity, State, Telemetry
 from rti_mpc.status import Mode, QpStatus
 from rti_mpc.wire.cdr import PACKAGE, REASONS, Message, Refused, decode, encode, encoding, schema
+from rti_mpc.wire.layout import LAYOUTS, msg_text
 
 ROOT = Path(__file__).parents[2]
 RNG = np.random.default_rng(1)
 HUGE = 2**64 - 1
 
-STATE = State(HUGE, 7, -5, RNG.normal(size=5))
+STATE = State(HUGE, 7, -5, RNG.normal(size=5), RNG.normal(size=2), HUGE, 3)
 REFERENCE = Reference(1, 2, STAMP_ON_ARRIVAL, 10**8, End.STOP, RNG.normal(size=(4, 3)), RNG.normal(size=(4, 2)))
-COMMAND = Command(1, 2, 3, HUGE, 5, -6, 2**63 - 1, HUGE, Mode.TRACKING, QpStatus.MAX_ITER, 10**8, RNG.normal(size=(7, 2)))
+COMMAND = Command(1, 2, 3, HUGE, 5, -6, 2**62 - 1, HUGE, Mode.TRACKING, QpStatus.MAX_ITER, 10**8, RNG.normal(size=(7, 2)))
+WAY = {"rest_period_ns": 10**7, "u_rest": RNG.normal(size=(3, 2)), "x_rest": RNG.normal(size=(3, 5)), "K": RNG.normal(size=(2, 5))}
 NUMBERS = {"res_prim": 1e-3, "res_dual": np.nan, "cost": np.inf, "violation": 0.0}
 TIMES = {"prepare_us": 1.5, "feedback_us": 2.5, "latency_us": 3.5, "state_age_s": 0.1, "slack_s": -0.5, "delay_s": 0.05}
 COUNTS = {"skipped": 8, "fallbacks": 9, "softened": 11, "shifted": 2, "braked": 3, "rested": 4, "parameter_version": 10}
@@ -34,12 +36,15 @@ EVENT = Event(1, 2, 3, "robot", Severity.ERROR, "command_expired", "Räder stehe
 
 MESSAGES: list[Message] = [
     STATE,
-    replace(STATE, x=np.zeros(1)),
+    replace(STATE, x=np.zeros(1), u=np.zeros(0), command_epoch=0, command_seq=0),
     REFERENCE,
     replace(REFERENCE, p=np.zeros((4, 0))),
     replace(REFERENCE, y=np.zeros((1, 1)), p=np.zeros((1, 1)), end=End.HOLD),
     COMMAND,
     replace(COMMAND, u=np.zeros((1, 1)), mode=Mode.STOPPED, status=QpStatus.NONE),
+    replace(COMMAND, rest_period_ns=10**7, u_rest=RNG.normal(size=(3, 2))),
+    replace(COMMAND, **WAY),
+    replace(COMMAND, **(WAY | {"u": RNG.normal(size=(1, 1)), "u_rest": np.zeros((3, 1)), "K": np.zeros((1, 5))})),
     TELEMETRY,
     replace(TELEMETRY, x0=np.zeros(0), x=np.zeros((0, 5)), u=np.zeros((0, 2)), y_ref=np.zeros((0, 3))),
     replace(TELEMETRY, y_ref=np.zeros((0, 3))),
@@ -89,6 +94,12 @@ def test_msg_files_list_the_enumerations_we_use() -> None:
             assert f"uint8 {member.name}={int(member)}\n" in text
 
 
+@pytest.mark.parametrize("cls", LAYOUTS)
+def test_msg_files_and_dataclasses_have_the_fields_of_the_table_in_its_order(cls: type[Message]) -> None:
+    assert (ROOT / "deploy" / "msg" / f"{cls.__name__}.msg").read_text() == msg_text(cls), "run `make msg`"
+    assert [field.name for field in fields(cls)] == [field.name for field in LAYOUTS[cls]]
+
+
 @pytest.mark.parametrize("message", MESSAGES)
 def test_decoded_messages_have_the_shapes_and_own_their_arrays(message: Message) -> None:
     decoded = decode(type(message), encode(message))
@@ -96,7 +107,7 @@ def test_decoded_messages_have_the_shapes_and_own_their_arrays(message: Message)
         before, after = getattr(message, field.name), getattr(decoded, field.name)
         assert type(after) is type(before)
         if isinstance(before, np.ndarray):
-            assert after.shape == before.shape
+            assert after.shape == before.shape or before.size == after.size == 0
             assert after.dtype == np.float64
             assert after.flags.c_contiguous
             assert after.flags.writeable
@@ -110,7 +121,7 @@ def test_strided_arrays_are_encoded_by_value() -> None:
 
 
 def test_encoding_names_the_schema_and_its_major_version() -> None:
-    assert encoding(State) == "application/cdr;rti_mpc_msgs/msg/State@1"
+    assert encoding(State) == "application/cdr;rti_mpc_msgs/msg/State@2"
 
 
 def words(message: Message, at: int, *values: int) -> bytes:
@@ -139,8 +150,12 @@ MALFORMED = [
     (State, b"\x00\x03" + ONE_STATE[2:], "header"),
     (State, b"\x00\x07" + ONE_STATE[2:], "header"),
     (State, words(STATE, 24, 2**32 - 1), "truncated"),
-    (State, words(STATE, 24, 6), "truncated"),
-    (State, words(STATE, 24, 4), "oversized"),
+    (State, words(STATE, 72, 2**32 - 1), "truncated"),
+    (State, words(STATE, 72, 1), "oversized"),
+    (State, encode(replace(STATE, u=np.array([np.nan]))), "not_finite"),
+    (State, encode(replace(STATE, stamp_ns=2**62)), "value"),
+    (State, encode(replace(STATE, stamp_ns=2**63 - 1)), "value"),
+    (State, encode(replace(STATE, stamp_ns=-(2**63))), "value"),
     (State, encode(replace(STATE, x=np.zeros(0))), "length"),
     (State, encode(replace(STATE, x=np.array([1.0, np.nan]))), "not_finite"),
     (State, encode(replace(STATE, x=np.array([np.inf, -np.inf]))), "not_finite"),
@@ -158,12 +173,23 @@ MALFORMED = [
     (Reference, byte(REFERENCE, 32, 2), "value"),
     (Command, encode(replace(COMMAND, u=np.array([[np.nan]]))), "not_finite"),
     (Command, encode(replace(COMMAND, u=np.zeros((0, 2)))), "length"),
+    (Reference, encode(replace(REFERENCE, stamp_ns=STAMP_ON_ARRIVAL + 1)), "value"),
+    (Reference, encode(replace(REFERENCE, period_ns=2**62)), "value"),
     (Command, encode(replace(COMMAND, period_ns=0)), "value"),
+    (Command, encode(replace(COMMAND, period_ns=2**62)), "value"),
+    (Command, encode(replace(COMMAND, stamp_ns=-(2**62))), "value"),
+    (Command, encode(replace(COMMAND, state_stamp_ns=2**62)), "value"),
+    (Command, encode(replace(COMMAND, valid_until_ns=2**63 - 1)), "value"),
+    (Command, encode(replace(COMMAND, **(WAY | {"rest_period_ns": 0}))), "value"),
+    (Command, encode(replace(COMMAND, **(WAY | {"rest_period_ns": -1}))), "value"),
+    (Command, encode(replace(COMMAND, **(WAY | {"x_rest": np.zeros((2, 5))}))), "length"),
+    (Command, encode(replace(COMMAND, **(WAY | {"K": np.zeros((1, 5))}))), "length"),
+    (Command, encode(replace(COMMAND, **(WAY | {"u_rest": np.full((3, 2), np.nan)}))), "not_finite"),
     (Command, byte(COMMAND, 64, 7), "value"),
     (Command, byte(COMMAND, 65, 255), "value"),
     (Command, words(COMMAND, 80, 3), "length"),
     (Telemetry, byte(TELEMETRY, 40, 99), "value"),
-    (Telemetry, words(TELEMETRY, 180, 4), "length"),
+    (Telemetry, words(TELEMETRY, 184, 4), "length"),
     (Telemetry, encode(TELEMETRY)[:-8], "truncated"),
     (Event, words(EVENT, 24, 2**32 - 1), "truncated"),
     (Event, words(EVENT, 24, 0), "text"),

@@ -35,10 +35,10 @@ def test_a_message_from_our_source_passes() -> None:
     [
         ("", "encoding"),
         ("zenoh/bytes", "encoding"),
-        ("application/json;rti_mpc_msgs/msg/State@1", "encoding"),
+        ("application/json;rti_mpc_msgs/msg/State@2", "encoding"),
         ("application/cdr", "schema"),
-        ("application/cdr;rti_mpc_msgs/msg/Command@1", "schema"),
-        ("application/cdr;rti_mpc_msgs/msg/State@2", "version"),
+        ("application/cdr;rti_mpc_msgs/msg/Command@2", "schema"),
+        ("application/cdr;rti_mpc_msgs/msg/State@1", "version"),
         ("application/cdr;rti_mpc_msgs/msg/State", "version"),
         ("x" * 10**6, "encoding"),
     ],
