@@ -93,7 +93,7 @@ class Recording:
     def finish(self) -> None:
         """Write what was held for want of an info, or of what comes next."""
         if self.info is None and self._held:
-            widths = {name: getattr(e.message, name).shape[-1] for e in self._held for name in VECTORS if hasattr(e.message, name)}
+            widths = {name: width for entry in self._held for name, width in _widths(entry.message).items()}
             self._name(Info.unnamed(widths.get("x", 0), widths.get("u", 0), widths.get("y", widths.get("y_ref", 0))))
         self._told(self._playback.end())
 
@@ -116,9 +116,7 @@ class Recording:
 
     def _fits(self, message: Message) -> bool:
         """Whether the vectors of a message are as long as the info says: it may be about another model."""
-        return self.info is None or all(
-            getattr(message, name).shape[-1] == len(getattr(self.info, labels)) for name, labels in VECTORS.items() if hasattr(message, name)
-        )
+        return self.info is None or all(width == len(getattr(self.info, VECTORS[name])) for name, width in _widths(message).items())
 
     def _columns(self, path: str, times: Times, *columns: Columns) -> None:
         index = rr.TimeColumn(TIMELINE, duration=times.astype("timedelta64[ns]"))
@@ -254,6 +252,12 @@ def located(obstacle: Obstacle, reference: Reference | None, stamps: NDArray[np.
 def _positions(outputs: Sequence[Label]) -> tuple[int, int] | None:
     names = [label.name for label in outputs]
     return (names.index("x"), names.index("y")) if {"x", "y"} <= set(names) else None
+
+
+def _widths(message: Message) -> dict[str, int]:
+    """Return how many numbers the vectors of a message have, or the rows of its matrices; inputs that a state does not report are left out."""
+    arrays = {name: getattr(message, name) for name in VECTORS if hasattr(message, name)}
+    return {name: array.shape[-1] for name, array in arrays.items() if array.ndim > 1 or array.size}
 
 
 def _vectors(info: Info) -> tuple[tuple[Label, ...], ...]:
