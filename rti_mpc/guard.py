@@ -110,6 +110,8 @@ class Guard:
         self._engaged = False  # whether this robot was ever told anything
         self._untold = False  # whether it is still to be told to brake
         self._stopped = False
+        self._latched = ""  # why an operator's stop is latched
+        self._rest_by_ns = EVER_NS  # robot time from which a latched guard passes rest only, and no way there any more
         self._waiting = False  # whether it was said that commands wait for `_open_ns`
 
     def robot_now_ns(self, local_ns: int) -> int:
@@ -194,11 +196,8 @@ class Guard:
             return None
         now_ns = self._clock.now_ns(local_ns)
         self._schedule.forget(now_ns - 2 * self._dt_ns)
-        if self.passing and self._schedule.at(now_ns)[2]:
-            self.passing = False
-            moving = not np.array_equal(self._schedule.at(now_ns)[0], self._limits.u_rest)
-            text = f"the last plan has ended: {'braking to rest' if moving else 'standing'}"
-            self._say(Severity.ERROR if moving else Severity.WARNING, "guard_braking", text, change=True)
+        if self.passing:
+            self._watch(now_ns)
         if self._told_ns - now_ns > LEAD_NS * self._clock.rate:
             return None
         start_ns = max(self._told_ns, now_ns)
@@ -227,10 +226,40 @@ class Guard:
             )
         )
 
+    def _watch(self, now_ns: int) -> None:
+        """Brake where the last plan ends, or goes on for longer than a latched stop lets it."""
+        u, _, ended = self._schedule.at(now_ns)
+        moving = not np.array_equal(u, self._limits.u_rest)
+        if ended:
+            self.passing = False
+            text = f"the last plan has ended: {'braking to rest' if moving else 'standing'}"
+            self._say(Severity.ERROR if moving else Severity.WARNING, "guard_braking", text, change=True)
+        elif moving and self._latched and now_ns >= self._rest_by_ns:
+            self._brake(now_ns, now_ns)
+            self._say(Severity.ERROR, "guard_braking", "the robot was to stand by now: braking to rest", change=True)
+
     def stop(self, local_ns: int) -> None:
         """Take no command any more: from now on the robot is told to ramp to rest, and to stand."""
         self._stopped = True
         self._brake(self._clock.now_ns(local_ns), self._clock.now_ns(local_ns))
+
+    def latch(self, reason: str, local_ns: int) -> None:
+        """
+        Pass only ways to rest until `enable`, and rest alone once there was time to get there.
+
+        The last plan plays on meanwhile, up to its end: it is the controller's to
+        ramp down, and the guard's if the controller does not.
+        """
+        if not self._latched:
+            self._latched = reason
+            self._rest_by_ns = self._clock.now_ns(local_ns) + round(1e9 * self._limits.settling_s)
+            self._say(Severity.INFO, "stop", f"stop: {reason}", change=True)
+
+    def enable(self) -> None:
+        """Release a `latch`."""
+        if self._latched:
+            self._latched = ""
+            self._say(Severity.INFO, "enable", "released by an operator", change=True)
 
     # Commands.
 
@@ -262,7 +291,24 @@ class Guard:
         change, share = np.diff(u, axis=0), self._share(command)
         if (change < share * limits.lbdu - ROUNDING).any() or (change > share * limits.ubdu + ROUNDING).any():
             return f"out_of_slew: rows change by up to {np.abs(change).max(axis=0).tolist()}"
+        if self._latched and not self._comes_to_rest(command, now_ns):
+            return f"stopped: {self._latched}; only ways to rest pass"
         return ""
+
+    def _comes_to_rest(self, command: Command, now_ns: int) -> bool:
+        """Whether the rows that act only approach rest, from what acts before them, and stay there; long after a `latch`, whether they are rest."""
+        first, before = self._joint(command, max(command.stamp_ns, now_ns))
+        way = np.vstack([before, command.u[first:]]) - self._limits.u_rest
+        if now_ns >= self._rest_by_ns:
+            way[0] = 0.0
+        lower, upper = np.minimum(way[:-1], 0.0) - ROUNDING, np.maximum(way[:-1], 0.0) + ROUNDING
+        return bool((np.abs(way[-1]) <= ROUNDING).all() and ((way[1:] >= lower) & (way[1:] <= upper)).all())
+
+    def _joint(self, command: Command, start_ns: int) -> tuple[int, Array]:
+        """Return the row of a command that acts first, and the input that acts before it."""
+        first = max(0, (start_ns - command.stamp_ns) // command.period_ns)
+        now, _, braking = self._schedule.at(start_ns - 1)
+        return first, now if braking else self._schedule.at(command.stamp_ns + first * command.period_ns - 1)[0]
 
     def _follow(self, command: Command) -> None:
         """Take the source of a command in order for the leader: no lower epoch will pass again in this life of the robot."""
@@ -283,10 +329,7 @@ class Guard:
         """
         limits, scale = self._limits, self._share(command)
         u = np.clip(command.u, limits.lbu, limits.ubu)
-        first = max(0, (start_ns - command.stamp_ns) // command.period_ns)
-        now, _, braking = self._schedule.at(start_ns - 1)
-        if not braking:
-            now = self._schedule.at(command.stamp_ns + first * command.period_ns - 1)[0]
+        first, now = self._joint(command, start_ns)
         acted = np.array([now, *(self._schedule.at(start_ns - round(share * self._dt_ns))[0] for share in WINDOW)])
         lower = np.minimum(acted.max(axis=0) + limits.lbdu, now)
         upper = np.maximum(acted.min(axis=0) + limits.ubdu, now)
@@ -353,6 +396,7 @@ class Guard:
         """Let the robot brake now from what acts at a time, which may be one of another clock."""
         self._schedule.cut(before_ns, now_ns)
         self._told_ns, self._untold = now_ns, self._engaged
+        self._rest_by_ns = EVER_NS  # of another clock, perhaps
         self.passing = False
 
     def _say(self, severity: Severity, code: str, text: str, *, change: bool = False) -> None:

@@ -467,6 +467,90 @@ def test_stopped_guard_ramps_to_rest_and_takes_no_command(scene: Scene) -> None:
     assert (-np.diff(inputs[-60:], axis=0) <= 0.2 * STEP + 1e-12).all()
 
 
+REASON = "asked for by ada@lab"
+WAY = np.array([max(0.0, 0.25 - 0.25 * k) * np.array([1.0, 0.6]) for k in range(20)])  # of a controller that is stopped at FULL
+
+
+def test_latched_guard_passes_the_way_to_rest_and_then_rest(scene: Scene) -> None:
+    scene.drive(1000)
+    scene.guard.latch(REASON, scene.local_ns)
+    passed = scene.send(WAY)
+    assert passed is not None
+    np.testing.assert_array_equal(passed.u, WAY)
+    scene.wait(300)
+    assert not scene.actuator.u.any()
+    for _ in range(10):
+        assert scene.send(np.zeros(2)) is not None
+        scene.wait(100)
+    assert "command_stopped" not in scene.said()
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        np.tile(FULL, (20, 1)),  # goes on
+        np.vstack([WAY[:1], WAY[:-1]])[:4] + 0.01,  # does not arrive
+        np.vstack([WAY[:2], np.tile([0.05, 0.0], (10, 1)), WAY[-1:]]),  # moves again
+        np.vstack([0.8 * WAY[:1], -0.1 * WAY[:1], WAY[2:]]),  # goes beyond rest
+        np.vstack([FULL * np.array([1.0, 1.1]), WAY]),  # turns faster first
+    ],
+    ids=["goes on", "does not arrive", "moves again", "goes beyond rest", "turns faster"],
+)
+def test_latched_guard_passes_nothing_but_ways_to_rest_and_brakes_in_time_if_none_comes(scene: Scene, rows: Array) -> None:
+    scene.drive(1000)
+    scene.said()
+    scene.guard.latch(REASON, scene.local_ns)
+    assert scene.send(rows) is None
+    assert scene.said() == ["stop", "command_stopped"]
+    for _ in range(5):
+        scene.send(rows)
+        scene.wait(100)
+    assert not scene.actuator.u.any(), "the last plan before has ended, and the guard has braked"
+    assert scene.actuator.counters.starved == 0
+    assert scene.send(rows) is None
+
+
+def test_controller_that_ramps_down_anew_with_every_command_does_not_drive_on_against_a_latched_guard(scene: Scene) -> None:
+    """Each of its plans is a way to rest, whose first row alone would ever act."""
+    scene.drive(1000)
+    scene.guard.latch(REASON, scene.local_ns)
+    stubborn = np.vstack([FULL, FULL - [0.25, 0.3], WAY[1:]])
+    assert scene.send(stubborn) is not None, "nearer to rest in every row"
+    for _ in range(20):
+        scene.wait(100)
+        scene.send(stubborn)
+    assert not scene.actuator.u.any()
+    times, inputs = scene.trace()
+    moving = times[np.abs(inputs).max(axis=1) > 0.0]
+    assert moving.max() - 2000 <= 1e3 * LIMITS.settling_s + 200 + 30, "once it should stand, the guard brakes; it looks every 10 ms"
+
+
+def test_controller_that_knows_of_no_stop_does_not_drive_a_robot_whose_guard_was_restarted_latched(scene: Scene) -> None:
+    scene.power_up()
+    scene.guard.latch(REASON, scene.local_ns)
+    scene.ready()
+    for _ in range(10):
+        assert scene.send(FULL * 0.5) is None
+        scene.wait(100)
+    assert not scene.actuator.u.any()
+    scene.guard.enable()
+    assert scene.send(FULL * 0.5) is not None
+    assert scene.said()[-2:] == ["enable", "guard_passing"]
+
+
+def test_latch_before_the_first_state_and_across_another_life_of_the_robot_holds() -> None:
+    scene = Scene()
+    scene.guard.latch(REASON, scene.local_ns)
+    scene.ready()
+    assert scene.send(FULL * 0.5) is None
+    assert scene.send(np.zeros(2)) is not None
+    scene.epoch += 1
+    scene.actuator = Actuator(np.zeros(2), LIMITS.slew, scene.epoch)
+    scene.wait(200)
+    assert scene.send(FULL * 0.5) is None
+    assert scene.send(np.zeros(2)) is not None
+
+
 @pytest.mark.parametrize("rate", [0.5, 4.0])
 def test_simulated_time_runs_at_its_own_rate(rate: float) -> None:
     scene = Scene(rate).ready()
