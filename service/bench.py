@@ -34,6 +34,7 @@ from rti_mpc.solver import SolverSettings
 from rti_mpc.status import QpStatus
 from rti_mpc.trajectory import eight, positioning, rows
 from service import machine
+from service.console import table_console
 from service.parts import PARTS, Parts
 from service.yardstick import Ipopt
 
@@ -234,7 +235,7 @@ def main(
     for solver in solvers:
         check_name(solver)
     entries += tuple((solver, formulation) for solver in solvers for formulation in FORMULATIONS)
-    console = Console()
+    console = table_console()
     console.print(", ".join(f"{name} {value}" for name, value in machine.describe().items()), soft_wrap=True)
     result: list[dict[str, Any]] = []
     with Progress(console=console, transient=True) as progress:

@@ -259,12 +259,19 @@ def bench(
         list[int] | None, typer.Option("--horizon", "-n", min=2, help="Stages; repeatable.", show_default="7, 20, 50, 100, 200")
     ] = None,
     solver: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Another QP solver of qpsolvers, such as daqp; repeatable.")] = None,
+    problem: Annotated[
+        list[str] | None, typer.Option(metavar="FAMILY", help="Measure a problem family instead, such as slalom, or all of them; repeatable.")
+    ] = None,
     interpreted: Annotated[bool, typer.Option("--interpreted", help="Also without a compiler.")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="A first look: eight seconds of driving.")] = False,
     costs: Annotated[bool, typer.Option("--costs", help="Also closed-loop costs against exact QPs and converged NMPC.")] = False,
     path: JsonPath = None,
 ) -> None:
     """Measure what a sample costs, by horizon and formulation, beside IPOPT on the same states."""
+    if problem:
+        from service import family_bench
+
+        raise typer.Exit(family_bench.main(problem, horizon or (), solver or family_bench.SOLVERS, quick=quick, path=path))
     from service.bench import HORIZONS, main
 
     raise typer.Exit(main(tuple(horizon or HORIZONS), solvers=tuple(solver or ()), interpreted=interpreted, quick=quick, costs=costs, path=path))

@@ -30,57 +30,95 @@ OPTIONS: dict[str, Any] = {
 
 class Ipopt:
     """
-    Converged NMPC: multiple shooting, states and inputs as variables, bounds on states hard.
+    Converged NMPC: multiple shooting, states, inputs and slacks as variables.
 
     Attributes:
         u: First input of the last solution, shape ``(nu,)``.
+
+    Args:
+        ocp: The problem.
+        softened: Whether bounds on states and general constraints have slacks, at the problem's weights; hard otherwise.
     """
 
-    def __init__(self, ocp: Ocp) -> None:
-        model, N = ocp.model, ocp.N
-        self._nx, self._nu, self._N = nx, nu, _ = model.nx, model.nu, N
-        x, u = ca.SX.sym("x", nx, N + 1), ca.SX.sym("u", nu, N)
-        x0, u_prev, y_ref = ca.SX.sym("x0", nx), ca.SX.sym("u_prev", nu), ca.SX.sym("y_ref", model.ny, N)
-        phi, p = ocp.phi(), ca.DM(model.p_nominal)
-        h = ca.Function("h", [model.x, model.p], [model.y_expr])
-        cost, rows = ca.SX(0), [x[:, 0] - x0]
+    def __init__(self, ocp: Ocp, *, softened: bool = False) -> None:
+        model, N, N_u, soft = ocp.model, ocp.N, ocp.N_u, list(ocp.soft)
+        ng = len(ocp.lg) if softened else 0
+        self._nx, self._nu, self._ng, self._N, self._N_u = model.nx, model.nu, ng, N, N_u
+        x, u, s = ca.SX.sym("x", model.nx, N + 1), ca.SX.sym("u", model.nu, N_u), ca.SX.sym("s", ng, N)
+        x0, u_prev = ca.SX.sym("x0", model.nx), ca.SX.sym("u_prev", model.nu)
+        y_ref, p = ca.SX.sym("y_ref", model.ny, N), ca.SX.sym("p", model.np_, N + 1)
+        phi = ocp.phi()
+        outputs = ca.Function("outputs", [model.x, model.u, model.p], [model.y_expr, model.x[soft], ocp.h_expr])
+        z, Z = np.concatenate([ocp.z[soft], ocp.zh]), np.concatenate([ocp.Z[soft], ocp.Zh])
+        slewed = bool(np.isfinite([ocp.lbdu, ocp.ubdu]).any())
+        none: Array = np.zeros(model.nx)
+        cost, rows = ca.SX(0), [(x[:, 0] - x0, none, none)]
         for k in range(N):
-            rows.append(phi(x[:, k], u[:, k], p) - x[:, k + 1])
-            e = h(x[:, k + 1], p) - y_ref[:, k]
-            du = u[:, k] - (u[:, k - 1] if k else u_prev)
-            cost += ocp.delta[k] * ca.bilin(ca.DM(ocp.Q), e, e) + ocp.lambda_[k] * ca.bilin(ca.DM(ocp.R), du, du)
-        nlp = {"x": ca.veccat(x, u), "f": cost, "g": ca.veccat(*rows), "p": ca.veccat(x0, u_prev, y_ref)}
+            held = u[:, min(k, N_u - 1)]
+            rows.append((phi(x[:, k], held, p[:, k]) - x[:, k + 1], none, none))
+            y, bounded, h = outputs(x[:, k + 1], held, p[:, k + 1])
+            e = y - y_ref[:, k]
+            cost += ca.bilin(ca.DM(ocp.delta[k] * ocp.Q + (ocp.Q_e if k == N - 1 else 0.0)), e, e)
+            if softened:
+                g, infinite = ca.vertcat(bounded, h), np.full(ng, np.inf)
+                rows += [(g + s[:, k], ocp.lg, infinite), (g - s[:, k], -infinite, ocp.ug)]
+                cost += ca.dot(z, s[:, k]) + 0.5 * ca.dot(Z, s[:, k] ** 2)
+            else:
+                rows.append((h, ocp.lh, ocp.uh))
+            if k < N_u:
+                du = held - (u[:, k - 1] if k else u_prev)
+                cost += ocp.lambda_[k] * ca.bilin(ca.DM(ocp.R), du, du)
+                if slewed:
+                    rows.append((du, ocp.lbdu, ocp.ubdu))
+        nlp = {"x": ca.veccat(x, u, s), "f": cost, "g": ca.veccat(*(row for row, _, _ in rows)), "p": ca.veccat(x0, u_prev, y_ref, p)}
         self._solver = ca.nlpsol("ipopt", "ipopt", nlp, OPTIONS)
-        free = np.full(nx, np.inf)
-        self._lb = np.concatenate([-free, np.tile(ocp.lbx, N), np.tile(ocp.lbu, N)])
-        self._ub = np.concatenate([free, np.tile(ocp.ubx, N), np.tile(ocp.ubu, N)])
-        self.u: Array = np.zeros(nu)
+        self._lbg, self._ubg = (np.concatenate(bounds) for bounds in list(zip(*rows, strict=True))[1:])
+        free, slack = np.full(model.nx, np.inf), np.zeros(N * ng)
+        lbx, ubx = (-free, free) if softened else (ocp.lbx, ocp.ubx)
+        self._lb = np.concatenate([-free, np.tile(lbx, N), np.tile(ocp.lbu, N_u), slack])
+        self._ub = np.concatenate([free, np.tile(ubx, N), np.tile(ocp.ubu, N_u), slack + np.inf])
+        self._p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
+        self.u: Array = np.zeros(model.nu)
 
-    def reset(self, x0: Array) -> None:
-        """Start cold, where the robot is."""
-        self._z = np.concatenate([np.tile(x0, self._N + 1), np.zeros(self._N * self._nu)])
-        self._lam_z, self._lam_g = np.zeros_like(self._z), np.zeros((self._N + 1) * self._nx)
+    def reset(self, x0: Array, u0: Array | None = None) -> None:
+        """Start cold, where the robot is; the inputs at `u0`, shape ``(nu,)``, 0 if left out."""
+        inputs = np.zeros(self._nu) if u0 is None else u0
+        self._z = np.concatenate([np.tile(x0, self._N + 1), np.tile(inputs, self._N_u), np.zeros(self._N * self._ng)])
+        self._lam_z, self._lam_g = np.zeros_like(self._z), np.zeros_like(self._lbg)
 
-    def solve(self, x0: Array, u_prev: Array, y_ref: Array) -> Array:
-        """Return the first input of the optimal plan, shape ``(nu,)``; `y_ref` at nodes 1 to N, shape ``(N, ny)``."""
+    def solve(self, x0: Array, u_prev: Array, y_ref: Array, p: Array | None = None) -> Array:
+        """
+        Return the first input of the optimal plan, shape ``(nu,)``.
+
+        Args:
+            x0: State at node 0, shape ``(nx,)``.
+            u_prev: Input before the plan, shape ``(nu,)``.
+            y_ref: Reference at nodes 1 to N, shape ``(N, ny)``.
+            p: Stage parameters at nodes 0 to N, shape ``(N + 1, np)``; nominal ones if left out.
+        """
         result = self._solver(
             x0=self._z,
             lam_x0=self._lam_z,
             lam_g0=self._lam_g,
-            p=np.concatenate([x0, u_prev, y_ref.ravel()]),
-            lbg=0,
-            ubg=0,
+            p=np.concatenate([x0, u_prev, y_ref.ravel(), (self._p if p is None else p).ravel()]),
+            lbg=self._lbg,
+            ubg=self._ubg,
             lbx=self._lb,
             ubx=self._ub,
         )
         z, lam_z, lam_g = (np.array(result[name]).ravel() for name in ("x", "lam_x", "lam_g"))
         to_u = (self._N + 1) * self._nx
+        to_s = to_u + self._N_u * self._nu
         self.u = z[to_u : to_u + self._nu].copy()
-        self._z, self._lam_z = (np.concatenate([shifted(v[:to_u], self._nx), shifted(v[to_u:], self._nu)]) for v in (z, lam_z))
-        self._lam_g = shifted(lam_g, self._nx)
+        widths = (slice(0, to_u), self._nx), (slice(to_u, to_s), self._nu), (slice(to_s, None), self._ng)
+        self._z, self._lam_z = (np.concatenate([shifted(v[part], width) for part, width in widths]) for v in (z, lam_z))
+        first, stages = lam_g[: self._nx], lam_g[self._nx :]
+        if self._N_u == self._N:  # as many rows in each stage, the dynamics first
+            first, stages = stages[: self._nx], shifted(stages, len(stages) // self._N)
+        self._lam_g = np.concatenate([first, stages])
         return self.u
 
 
 def shifted(values: Array, width: int) -> Array:
     """Return stages of a width moved on by one, the last repeated."""
-    return np.concatenate([values[width:], values[-width:]])
+    return np.concatenate([values[width:], values[-width:]]) if width else values
