@@ -49,6 +49,7 @@ ALONE = {
         ),
         "sim/plant.py",
         "service/yardstick.py",
+        "service/families.py",
         "service/paper/slsqp.py",
     },
 }
