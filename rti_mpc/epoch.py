@@ -2,15 +2,36 @@
 """
 Epochs: one life of a publisher, higher than all it knows of.
 
-The low bits are the number of its owner, drawn at its start: whatever two
-processes have heard, they never arrive at the same epoch.
+Those of controllers and guards are Unix seconds times ``2 ** NUMBER_BITS``, or above:
+the low bits are the number of their owner, drawn at its start, so that whatever two
+processes have heard, they never arrive at the same epoch. Robots and planners count
+from lower numbers, such as the milliseconds or seconds since 1970.
+
+Receivers prefer the highest epoch, so one that nothing can exceed would shut everybody
+else out. `highest_believed` leaves room above whatever it lets pass: the owner of the
+next epoch needs `2 ** NUMBER_BITS` of it, and to use all of it up takes ``2 ** 41`` messages.
 """
 
 from __future__ import annotations
 
 NUMBER_BITS = 20
+BELIEVED = 1 << 52  # above the Unix seconds times 2 ** NUMBER_BITS: whose clock stands at 1970 still believes the epochs of 2105
+SUCCESSION = 1 << 22  # above the highest known: room for four more owners
+SKEW_S = 1 << 28  # by which the clock of a process that takes an epoch may be behind that of one that chooses it, s: eight years
+SEQ_AHEAD = 1_000_000  # messages of one epoch that may be missing between two; more is no loss but another's counting
 
 
 def epoch_above(epoch: int, number: int) -> int:
     """Return the lowest epoch above another that ends with a number of `NUMBER_BITS`."""
     return epoch + 1 + (number - epoch - 1) % (1 << NUMBER_BITS)
+
+
+def highest_believed(unix_s: int, known: int = 0) -> int:
+    """
+    Return the highest epoch that is one.
+
+    Args:
+        unix_s: Unix time, s; whoever chooses an epoch above those it believes says it is `SKEW_S` earlier, or others might not believe that.
+        known: Highest epoch followed so far, 0 if there is none.
+    """
+    return max(BELIEVED + (unix_s << NUMBER_BITS), known + SUCCESSION)

@@ -74,7 +74,7 @@ FLOW: tuple[set[str], ...] = (
     {"record", "blockage"},
     {"controller"},
 )
-BEFORE_WIRE = {"errors", "array", "status", "message"}
+BEFORE_WIRE = {"errors", "array", "status", "message", "epoch"}
 
 
 def imported(path: Path) -> set[str]:

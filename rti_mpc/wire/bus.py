@@ -16,21 +16,27 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic
 
 import zenoh
 from zenoh import ext
 
+from rti_mpc.epoch import SKEW_S
+from rti_mpc.errors import MessageError
+from rti_mpc.wire import document
 from rti_mpc.wire.cdr import M, encode, encoding
-from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.keys import Keys, most_bytes, role_of
 from rti_mpc.wire.session import BusSettings as BusSettings
 from rti_mpc.wire.session import open_session
 
 CLOSE_TIMEOUT_S = 0.5
 HEARTBEAT_S = 1.0  # of a cached publisher, which tells the number of its last message
 MOST_BYTES = 32_768  # of a request: to parse JSON holds the interpreter's lock, for 30 ms a megabyte
+ENCODING = 256  # characters of one that are looked at
+TOKENS = 1024  # changes of presence that may wait
 RETRY_S = 0.1  # between two looks for somebody who is not there yet
 
 
@@ -40,14 +46,21 @@ class Received:
     A payload as it came, not yet looked at.
 
     Attributes:
-        payload: Its bytes.
+        payload: Its bytes; none where they are more than its key takes.
         encoding: What the sender says they are.
         key: Where it was published.
+        withheld: How many bytes were sent, where there are none in `payload` for it.
     """
 
     payload: bytes
     encoding: str
     key: str
+    withheld: int = 0
+
+    @property
+    def size(self) -> int:
+        """How many bytes were sent."""
+        return self.withheld or len(self.payload)
 
 
 give_way: Callable[[], None] = getattr(os, "sched_yield", lambda: None)  # not on every system
@@ -95,6 +108,7 @@ class Subscriber:
         self._subscriber = subscriber
         self._handler = subscriber.handler
         self._key = "" if "*" in key else key
+        self._most = most_bytes(key)
         self._own = own  # a cache answers its own session, too
         self._encoding: tuple[zenoh.Encoding | None, str] = None, ""  # the last one, and its text: to compare costs a fifth of making it
 
@@ -125,8 +139,11 @@ class Subscriber:
         if self._own and (info := sample.source_info) is not None and str(info.source_id.zid) == self._own:
             return None
         if sample.encoding != self._encoding[0]:
-            self._encoding = sample.encoding, str(sample.encoding)
-        return Received(sample.payload.to_bytes(), self._encoding[1], self._key or str(sample.key_expr))
+            self._encoding = sample.encoding, str(sample.encoding)[:ENCODING]
+        key, size = self._key or str(sample.key_expr), len(sample.payload)
+        if size > self._most:
+            return Received(b"", self._encoding[1], key, withheld=size)  # not even copied
+        return Received(sample.payload.to_bytes(), self._encoding[1], key)
 
 
 class Bus:
@@ -154,6 +171,7 @@ class Bus:
         self.keys = keys
         self.closed = False
         self._session = open_session(settings, timeout_s, stop)
+        self._unix_s = time.time_ns() // 1_000_000_000
         self._declared: list[Any] = []  # a token or queryable lives as long as its object
         self._json: dict[str, Publisher[Any]] = {}
 
@@ -202,6 +220,18 @@ class Bus:
         recovery = ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
         subscriber = ext.declare_advanced_subscriber(self._session, key, ring, allowed_origin=origin, history=history, recovery=recovery)
         return Subscriber(subscriber, key, own=str(self._session.info.zid()))
+
+    def intake(self, cls: type[M], stale_s: float, widths: Mapping[str, int] | None = None, *, chooses: bool = False) -> Intake[M]:
+        """
+        Return a door for messages of one class, that knows what epochs may be now.
+
+        Args:
+            cls: Class of the messages.
+            stale_s: Time without an accepted message after which another source may take over.
+            widths: Numbers a row must have, by array.
+            chooses: Whether an epoch is chosen above those heard: then less is believed than others will.
+        """
+        return Intake(cls, stale_s, widths, unix_s=self._unix_s - SKEW_S * chooses)
 
     def publish_json(self, key: str, value: dict[str, Any]) -> None:
         """Publish a JSON object that late joiners get, too."""
@@ -264,7 +294,7 @@ class Bus:
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
             )
-            answers = [_json_object(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None]
+            answers = [_object(reply.ok.payload, document.MOST_BYTES) for reply in replies if reply.ok is not None]
             if answers:
                 return min(answers, key=lambda answer: answer.get("ok") is True)
             time.sleep(min(RETRY_S, left_s))  # nobody serves it yet
@@ -290,10 +320,15 @@ class Bus:
 
     def watch_alive(self, callback: Callable[[str, bool], None]) -> None:
         """Call back, in a thread of its own, with a role and whether it is present, for those present now and at every change."""
-        ring: Any = zenoh.handlers.RingChannel(256)
+        ring: Any = zenoh.handlers.RingChannel(TOKENS)
         subscriber = self._session.liveliness().declare_subscriber(self.keys.lives, ring, history=True)
         self._declared.append(subscriber)
-        self._follow(subscriber.handler, lambda sample: callback(str(sample.key_expr).rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT))
+
+        def tell(sample: zenoh.Sample) -> None:
+            if role := role_of(str(sample.key_expr)):
+                callback(role, sample.kind == zenoh.SampleKind.PUT)
+
+        self._follow(subscriber.handler, tell)
 
     def _follow(self, handler: Any, act: Callable[[Any], None]) -> None:
         def follow() -> None:
@@ -307,21 +342,18 @@ class Bus:
         threading.Thread(target=follow, daemon=True).start()
 
 
-def _json_object(payload: bytes) -> dict[str, Any]:
+def _object(payload: zenoh.ZBytes | None, most: int) -> dict[str, Any]:
+    """Return the JSON object in a payload, or a refusal."""
+    size = 0 if payload is None else len(payload)
     try:
-        value = json.loads(payload)
-    except (ValueError, RecursionError):
-        value = None
-    return value if isinstance(value, dict) else {"ok": False, "error": "message must be a JSON object"}
+        return document.read(b"" if payload is None or size > most else payload.to_bytes(), size, most)
+    except MessageError as error:
+        return {"ok": False, "error": str(error)}
 
 
 def _answer(key: str, query: zenoh.Query, handler: Callable[[dict[str, Any]], dict[str, Any] | None]) -> None:
     with query:
-        payload = query.payload
-        if payload is not None and len(payload) > MOST_BYTES:
-            request: dict[str, Any] = {"ok": False, "error": f"request must have at most {MOST_BYTES} bytes, got {len(payload)}"}
-        else:
-            request = _json_object(payload.to_bytes() if payload is not None else b"")
+        request = _object(query.payload, MOST_BYTES)
         try:
             answer = request if request.get("ok") is False else handler(request)
             if answer is None:

@@ -24,13 +24,14 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.errors import MessageError
 from rti_mpc.message import Command, Event, Reference, State, Telemetry
-from rti_mpc.wire.layout import LAYOUTS, Field
+from rti_mpc.wire.layout import LAYOUTS, NUMBER_LIMIT, SHORTEST_NS, Field
 
 Message = State | Reference | Command | Telemetry | Event
 M = TypeVar("M", bound=Message)
 
 PACKAGE = "rti_mpc_msgs/msg"
 VERSION = 2  # major: a receiver refuses any other
+QUOTE = 40  # characters of a peer's own words in an error
 HEADER = b"\x00\x01\x00\x00"
 START = len(HEADER)  # alignment counts from here
 
@@ -57,7 +58,10 @@ class Refused(MessageError):
         super().__init__(text)
 
 
-REASONS = ("empty", "truncated", "oversized", "big_endian", "header", "length", "not_finite", "value", "text", "encoding", "version", "schema")
+REASONS = (
+    *("empty", "truncated", "oversized", "big_endian", "header", "length", "not_finite", "value", "text"),
+    *("encoding", "version", "schema", "epoch"),
+)
 
 
 def schema(cls: type[Any]) -> str:
@@ -209,8 +213,8 @@ def _array_reader(field: Field, *, width_at: int | None) -> Reader:
         array = np.frombuffer(payload, "<f8", size, START + offset).astype(np.float64)
         if field.filled and not size:
             raise Refused("length", f"{name} must hold at least one row, got none")
-        if field.finite and not (finite := np.isfinite(array)).all():
-            raise Refused("not_finite", f"{name} must be finite, got {array[~finite][0]} among {size} numbers")
+        if field.finite and not (fits := np.abs(array) <= NUMBER_LIMIT).all():
+            raise Refused("not_finite", f"{name} must be finite and at most {NUMBER_LIMIT:g}, got {array[~fits][0]} among {size} numbers")
         values.append(_rows(array, width, name) if field.width else array)
         return end
 
@@ -237,7 +241,9 @@ def _rows(flat: Array, width: int, name: str) -> Array:
 def _string_writer(field: Field) -> Writer:
     def write(message: Any, offset: int) -> bytes:
         text: str = getattr(message, field.name)
-        encoded = text.encode("utf-8", "replace") + b"\x00"
+        if not text.isprintable():  # such as a line break in somebody else's words
+            text = "".join(c if c.isprintable() else " " for c in text)
+        encoded = text.encode("utf-8", "replace")[: field.high and field.high - 1].decode("utf-8", "ignore").encode() + b"\x00"
         return bytes(-offset % 4) + WORD.pack(len(encoded)) + encoded
 
     return write
@@ -251,13 +257,18 @@ def _string_reader(field: Field) -> Reader:
         end = offset + size
         if START + end > len(payload):
             raise Refused("truncated", f"{name} must hold the {size} bytes it declares, got {len(payload) - START - offset}")
+        if field.high is not None and size > field.high:
+            raise Refused("text", f"{name} must have at most {field.high} bytes, got {size}")
         encoded = payload[START + offset : START + end]
         if encoded[-1:] != b"\x00":
             raise Refused("text", f"{name} must end with a zero byte")
         try:
-            values.append(encoded[:-1].decode("utf-8"))
+            text = encoded[:-1].decode("utf-8")
         except UnicodeDecodeError as error:
             raise Refused("text", f"{name} must be UTF-8, got {error.reason} at byte {error.start}") from None
+        if not text.isprintable():
+            raise Refused("text", f"{name} must hold characters that can be printed, got {text[:QUOTE]!r}")
+        values.append(text)
         return end
 
     return read
@@ -276,8 +287,8 @@ def _check_reference(message: Reference) -> None:
 
 def _check_command(message: Command) -> None:
     rows, states, gain = len(message.u_rest), len(message.x_rest), message.K.shape
-    if rows and not message.rest_period_ns:
-        raise Refused("value", f"rest_period_ns must be above 0 for a way to rest of {rows} rows, got 0")
+    if rows and message.rest_period_ns < SHORTEST_NS:
+        raise Refused("value", f"rest_period_ns must be at least {SHORTEST_NS} for a way to rest of {rows} rows, got {message.rest_period_ns}")
     if states not in (0, rows):
         raise Refused("length", f"x_rest must hold {rows} rows, as many as u_rest, or none, got {states}")
     if gain[0] not in (0, message.u.shape[1]):

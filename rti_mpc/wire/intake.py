@@ -7,8 +7,10 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Generic, Protocol
 
+from rti_mpc.epoch import highest_believed
 from rti_mpc.message import Notice, Severity
 from rti_mpc.wire.cdr import VERSION, M, Refused, decode, encoding
+from rti_mpc.wire.layout import MOST_BYTES
 from rti_mpc.wire.source import Source, Verdict
 
 QUOTE = 120  # characters of a peer's own words in a notice
@@ -25,6 +27,10 @@ class Payload(Protocol):
     def encoding(self) -> str:
         """What the sender says they are."""
 
+    @property
+    def size(self) -> int:
+        """How many bytes were sent; where they are more than the key takes, `payload` is empty."""
+
 
 class Intake(Generic[M]):
     """
@@ -35,33 +41,45 @@ class Intake(Generic[M]):
         refused: Malformed payloads by reason, one of `rti_mpc.wire.cdr.REASONS`.
     """
 
-    def __init__(self, cls: type[M], stale_s: float, widths: Mapping[str, int] | None = None, quiet_s: float = 1.0) -> None:
+    def __init__(self, cls: type[M], stale_s: float, widths: Mapping[str, int] | None = None, quiet_s: float = 1.0, unix_s: int = 0) -> None:
         """
         Open the door.
 
         Args:
             cls: Class of the messages.
-            stale_s: Silence of the source after which another may take over.
+            stale_s: Time without an accepted message after which another source may take over.
             widths: Numbers a row must have, by array, such as ``{"x": 5}``; stage parameters may be left out.
             quiet_s: Shortest time between two notices of one code.
+            unix_s: Unix time, s, that limits epochs, see `rti_mpc.epoch.highest_believed`.
         """
         self.source = Source(round(1e9 * stale_s))
         self.refused: Counter[str] = Counter()
         self._cls = cls
+        self._unix_s = unix_s
         self._encoding = encoding(cls)
         self._widths = tuple((widths or {}).items())
         self._quiet_ns = round(1e9 * quiet_s)
         self._pending: dict[str, Notice] = {}
         self._said_ns: dict[str, int] = {}
 
-    def read(self, received: Payload) -> M | None:
-        """Message in a payload, whoever sent it; None if it is malformed."""
+    def read(self, received: Payload, known: int = 0) -> M | None:
+        """
+        Message in a payload, whoever sent it; None if it is malformed, or of an epoch that is none.
+
+        Args:
+            received: Payload and encoding as they came.
+            known: Highest epoch that the caller follows, besides the one of `source`.
+        """
         try:
             if received.encoding != self._encoding:
                 raise self._encoding_error(received.encoding)
+            if received.size > MOST_BYTES[self._cls]:
+                raise Refused("oversized", f"message must have at most {MOST_BYTES[self._cls]} bytes, got {received.size}")
             message = decode(self._cls, received.payload)
             for name, width in self._widths:
                 self._check_width(message, name, width)
+            if message.epoch > (limit := highest_believed(self._unix_s, max(known, self.source.epoch or 0))):
+                raise Refused("epoch", f"epoch must be at most {limit}, got {message.epoch}")
         except Refused as error:
             self.refused[error.reason] += 1
             self._note(Severity.WARNING, "message_refused", f"{error}; {self.refused.total()} refused so far")
@@ -96,7 +114,8 @@ class Intake(Generic[M]):
         """Take what there is to publish now: per code the latest, and not again before `quiet_s` has passed."""
         if not self._pending:
             return []
-        due = [code for code in self._pending if now_ns - self._said_ns.get(code, now_ns - self._quiet_ns) >= self._quiet_ns]
+        pending = list(self._pending)  # at once: other threads add to it
+        due = [code for code in pending if now_ns - self._said_ns.get(code, now_ns - self._quiet_ns) >= self._quiet_ns]
         self._said_ns.update(dict.fromkeys(due, now_ns))
         return [self._pending.pop(code) for code in due]
 

@@ -3,9 +3,27 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from rti_mpc.errors import ConfigError
+from rti_mpc.message import Command, Event, Reference, State, Telemetry
+from rti_mpc.wire import document
+from rti_mpc.wire.layout import MOST_BYTES
+
+ROLES = ("controller", "standby", "guard", "robot", "reference", "viewer")  # of whom there is always heard, whoever else there is
+ROLE = re.compile(r"[a-z][a-z0-9_]{0,31}(\.[0-9]{1,7})?", re.ASCII)  # one of several is numbered, such as standby.17
+
+# Longest payload of a stream, by its first word, in bytes; of others as much as of a command.
+LONGEST: dict[str, int] = {
+    "state": MOST_BYTES[State],
+    "reference": MOST_BYTES[Reference],
+    "command": MOST_BYTES[Command],
+    "actuation": MOST_BYTES[Command],
+    "telemetry": MOST_BYTES[Telemetry],
+    "event": MOST_BYTES[Event],
+    "info": document.MOST_BYTES,
+}
 
 RESERVED = set("*$?#")  # wildcards and selectors of Zenoh
 
@@ -99,3 +117,14 @@ class Keys:
     def alive(self, role: str) -> str:
         """Liveliness token of one role."""
         return self.stream(f"alive/{role}")
+
+
+def role_of(key: str) -> str:
+    """Return the role that a key of an event, a description or a token ends with; empty if it is no name of one."""
+    role = key.rpartition("/")[2]
+    return role if ROLE.fullmatch(role) else ""
+
+
+def most_bytes(key: str) -> int:
+    """Return how many bytes a payload on a key may have; its wildcards may stand for roles."""
+    return next((LONGEST[word] for word in reversed(key.split("/")) if word in LONGEST), MOST_BYTES[Command])

@@ -18,6 +18,8 @@ from rti_mpc.status import Mode, QpStatus
 
 STAMP_LIMIT_NS = 2**62  # magnitude that no time reaches: sums of two stamps, or of a stamp and a duration, fit an int64
 PERIOD_LIMIT_NS = 3_600_000_000_000  # longest time between rows: one hour
+SHORTEST_NS = 100_000  # between rows that a robot plays, as the shortest period of a controller: each costs time to play
+NUMBER_LIMIT = 1e18  # magnitude of a state, an input, a reference, in any unit: sums and products of such are finite
 
 
 @dataclass(frozen=True)
@@ -31,10 +33,10 @@ class Field:
         about: Meaning and unit, the comment in the ``.msg`` file.
         member_of: Enumeration of which the number is a member.
         low: Least value of an integer, None without a limit.
-        high: Largest value of an integer, None without a limit.
+        high: Largest value of an integer, or most bytes of a string with its final zero, None without a limit.
         also: A value outside these limits that is allowed all the same.
         width: Name of the row width of a matrix; a vector has none.
-        finite: Whether all numbers of an array must be finite.
+        finite: Whether all numbers of an array must be finite, and at most `NUMBER_LIMIT`.
         filled: Whether an array must have numbers at all.
     """
 
@@ -99,7 +101,7 @@ LAYOUTS: dict[type[Any], tuple[Field, ...]] = {
         Field("config_hash", "uint64", "configuration of the controller, as in info"),
         Field("mode", "uint8", "what the controller was doing: IDLE ... STOPPED", member_of=Mode),
         Field("status", "uint8", "outcome of the QP behind this command: SOLVED ... NONE", member_of=QpStatus),
-        Field("period_ns", "int64", "ns between rows", low=1, high=PERIOD_LIMIT_NS),
+        Field("period_ns", "int64", "ns between rows", low=SHORTEST_NS, high=PERIOD_LIMIT_NS),
         Field("u", "float64[]", "rows of nu, SI units in the order of the model's inputs", width="nu", finite=True, filled=True),
         Field("rest_period_ns", "int64", "ns between rows of the way to rest; 0 where there are none", low=0, high=PERIOD_LIMIT_NS),
         Field(
@@ -140,11 +142,18 @@ LAYOUTS: dict[type[Any], tuple[Field, ...]] = {
     ),
     Event: (
         *_head("ns of the robot's clock"),
-        Field("source", "string", "role of the publisher: controller, robot, reference, guard"),
+        Field("source", "string", "role of the publisher: controller, robot, reference, guard", high=64),
         Field("severity", "uint8", "INFO, WARNING: we coped, ERROR: something was lost or stopped", member_of=Severity),
-        Field("code", "string", "stable word for machines, such as state_stale"),
-        Field("text", "string", "one sentence for people"),
+        Field("code", "string", "stable word for machines, such as state_stale", high=64),
+        Field("text", "string", "one sentence for people", high=4096),
     ),
+}
+MOST_BYTES: dict[type[Any], int] = {
+    State: 1 << 16,
+    Reference: 1 << 23,  # 349,000 rows of three outputs; a session reassembles nothing longer, whatever its key
+    Command: 1 << 20,
+    Telemetry: 1 << 21,
+    Event: 1 << 13,
 }
 ABOUT: dict[type[Any], str] = {
     State: "The robot's state, published by the robot.",

@@ -4,21 +4,25 @@ One source a key.
 
 Several processes may publish on one key: a robot that was started twice, a
 planner forgotten in another terminal. A receiver locks to one epoch and takes
-nothing else, unless the epoch is higher (a restart) or its own has gone stale.
+nothing else, unless the epoch is higher (a restart) or nothing of its own was
+accepted for long: a single message of whatever number deafens nobody for longer.
 """
 
 from __future__ import annotations
 
 from enum import Enum
 
+from rti_mpc.epoch import SEQ_AHEAD
+
 
 class Verdict(Enum):
     """What a message is to a receiver."""
 
-    NEW = "new"  # accepted, the first of a source: whatever is remembered of another no longer holds
+    NEW = "new"  # accepted, the first of a source, or of another count of it: whatever is remembered of the last no longer holds
     NEXT = "next"  # accepted
     REPEATED = "repeated"  # refused: the last accepted message once more, as caches send it
     OLD = "old"  # refused: a later sequence number was accepted before
+    AHEAD = "too far ahead"  # refused: so many messages are not lost between two
     FOREIGN = "foreign"  # refused: somebody else's, while our source is alive
 
     @property
@@ -32,7 +36,7 @@ class Source:
     The source a receiver is locked to.
 
     Attributes:
-        stale_ns: Silence after which another epoch may take over, even a lower one.
+        stale_ns: Time without an accepted message after which any other is the first of a source, whatever its epoch and number.
         epoch: Epoch of the source, None before the first message.
         seq: Sequence number of its last accepted message.
         lost: Messages missing between accepted ones.
@@ -45,7 +49,7 @@ class Source:
         self.seq = 0
         self.lost = 0
         self.dropped = 0
-        self._heard_ns = 0
+        self._accepted_ns = 0
 
     def accept(self, epoch: int, seq: int, now_ns: int) -> Verdict:
         """
@@ -62,12 +66,14 @@ class Source:
             return verdict
         if verdict is Verdict.NEXT:
             self.lost += seq - self.seq - 1
-        self.epoch, self.seq, self._heard_ns = epoch, seq, now_ns
+        self.epoch, self.seq, self._accepted_ns = epoch, seq, now_ns
         return verdict
 
     def _judge(self, epoch: int, seq: int, now_ns: int) -> Verdict:
-        if epoch == self.epoch:
-            return Verdict.NEXT if seq > self.seq else Verdict.REPEATED if seq == self.seq else Verdict.OLD
-        if self.epoch is None or epoch > self.epoch or now_ns - self._heard_ns > self.stale_ns:
+        if epoch == self.epoch and seq == self.seq:
+            return Verdict.REPEATED
+        if epoch == self.epoch and self.seq < seq <= self.seq + SEQ_AHEAD:
+            return Verdict.NEXT
+        if self.epoch is None or epoch > self.epoch or now_ns - self._accepted_ns > self.stale_ns:
             return Verdict.NEW
-        return Verdict.FOREIGN
+        return Verdict.FOREIGN if epoch < self.epoch else Verdict.OLD if seq < self.seq else Verdict.AHEAD

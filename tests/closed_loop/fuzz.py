@@ -38,6 +38,10 @@ class Payload:
     payload: bytes
     encoding: str
 
+    @property
+    def size(self) -> int:
+        return len(self.payload)
+
 
 class Fuzz:
     """

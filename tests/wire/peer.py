@@ -26,7 +26,7 @@ def echo(bus: Bus) -> None:
     bus.alive("controller")
     while (received := states.recv()) is not None:
         state = decode(State, received.payload)
-        commands.put(Command(1, state.seq, 0, 1, state.seq, 0, 1, 0, Mode.TRACKING, QpStatus.SOLVED, 1, np.ones((7, 2))))
+        commands.put(Command(1, state.seq, 0, 1, state.seq, 0, 1, 0, Mode.TRACKING, QpStatus.SOLVED, 10**8, np.ones((7, 2))))
         for seq in range(10):
             telemetry.put(Event(1, seq, 0, "controller", Severity.INFO, "load", 6000 * "x"))
 

@@ -22,7 +22,7 @@ from rti_mpc.message import Command, End, Event, Reference, Severity, State
 from rti_mpc.wire.bus import Bus, BusSettings, Received, Subscriber
 from rti_mpc.wire.cdr import decode, encoding
 from rti_mpc.wire.intake import Intake
-from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.keys import Keys, most_bytes
 
 ROOT = Path(__file__).parents[2]
 KEYS = Keys(robot="test")
@@ -314,6 +314,20 @@ def test_large_references_pass(join: Any) -> None:
     assert np.array_equal(decode(Reference, received(references).payload).y, large.y)
 
 
+def test_what_is_longer_than_its_key_takes_is_withheld_and_what_no_key_takes_never_comes(join: Any, endpoint: str) -> None:
+    robot = join(robot=True)
+    keys = (KEYS.state, KEYS.command, KEYS.info("robot"))
+    subscribers = [robot.subscriber(key, capacity=4) for key in keys]
+    with stranger(endpoint) as session:
+        for key, subscriber in zip(keys, subscribers, strict=True):
+            with session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK) as publisher:
+                eventually(lambda publisher=publisher: publisher.matching_status.matching)
+                for size in (1 << 24, most_bytes(key) + 1, most_bytes(key)):
+                    publisher.put(bytes(size))
+            got = [received(subscriber), received(subscriber)]
+            assert [(sample.size, len(sample.payload)) for sample in got] == [(most_bytes(key) + 1, 0), 2 * (most_bytes(key),)]
+
+
 def test_whatever_peers_send_is_counted_and_the_next_message_passes(join: Any, endpoint: str) -> None:
     robot = join(robot=True)
     states, intake = robot.subscriber(KEYS.state, capacity=16), Intake(State, stale_s=1.0, widths={"x": 5})
@@ -376,7 +390,7 @@ def test_request_that_would_take_long_to_parse_is_refused_unread(join: Any, endp
     robot = join(robot=True)
     robot.serve(KEYS.request, lambda request: {"ok": True})
     with stranger(endpoint) as session:
-        for size, answer in ((32_768, '{"ok": true}'), (32_769, '{"ok": false, "error": "request must have at most 32768 bytes, got 32769"}')):
+        for size, answer in ((32_768, '{"ok": true}'), (32_769, '{"ok": false, "error": "message must have at most 32768 bytes, got 32769"}')):
             (reply,) = session.get(KEYS.request, payload=b"{}".ljust(size), timeout=TIMEOUT_S)
             assert reply.ok.payload.to_string() == answer
 

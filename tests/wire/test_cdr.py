@@ -197,6 +197,9 @@ MALFORMED = [
     (Event, byte(EVENT, 28, 0xFF), "text"),
     (Event, byte(EVENT, 34, 3), "value"),
     (Event, encode(EVENT) + b"\x00", "oversized"),
+    (Event, encode(EVENT).replace(b"stehen", b"ste\x1b[m"), "text"),
+    (Event, encode(EVENT).replace(b"stehen", b"st\neen"), "text"),
+    (Event, encode(replace(EVENT, source=60 * "r")).replace(b"\x3d\x00\x00\x00rr", b"\x41\x00\x00\x00rr"), "text"),
     (Event, encode(STATE), "text"),
 ]
 
@@ -253,8 +256,26 @@ def test_declared_lengths_allocate_nothing() -> None:
     assert peak < 100_000
 
 
-def test_the_largest_numbers_are_accepted() -> None:
-    assert decode(State, encode(replace(STATE, x=np.array([1e308, -1e308])))).x[0] == 1e308
+@pytest.mark.parametrize("name", ["x", "u"])
+def test_numbers_whose_squares_are_finite_are_accepted_and_no_larger_ones(name: str) -> None:
+    largest = np.array([1e18, -1e18, 5e-324, -0.0])
+    assert np.array_equal(getattr(decode(State, encode(replace(STATE, **{name: largest}))), name), largest)
+    with pytest.raises(Refused, match=f"{name} must be finite and at most 1e"):
+        decode(State, encode(replace(STATE, **{name: np.array([1e308])})))
+
+
+def test_rows_that_a_robot_plays_last_as_long_as_the_shortest_period_of_a_controller() -> None:
+    assert decode(Command, encode(replace(COMMAND, period_ns=100_000))).period_ns == 100_000
+    for wrong in ({"period_ns": 99_999}, WAY | {"rest_period_ns": 99_999}):
+        with pytest.raises(Refused, match="period_ns must be"):
+            decode(Command, encode(replace(COMMAND, **wrong)))
+
+
+def test_texts_are_printed_as_one_line_and_cut_to_what_receivers_take() -> None:
+    said = decode(Event, encode(replace(EVENT, code=100 * "c", text="first\nsecond\x1b[31m \ud800 " + 5000 * "ä")))
+    assert said.code == 63 * "c"
+    assert said.text.startswith("first second [31m ")
+    assert 4090 < len(said.text.encode()) < 4096
 
 
 @pytest.mark.parametrize("module", ["rti_mpc.wire", "rti_mpc.wire.cdr", "rti_mpc.wire.intake", "rti_mpc.wire.bus"])

@@ -6,11 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rti_mpc.epoch import SKEW_S, epoch_above, highest_believed
 from rti_mpc.message import Command, End, Reference, Severity, State
 from rti_mpc.status import Mode, QpStatus
 from rti_mpc.wire.bus import Received
 from rti_mpc.wire.cdr import Message, encode, encoding
 from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.layout import MOST_BYTES
 
 STATE = State(5, 1, 0, np.arange(5.0))
 REFERENCE = Reference(5, 1, 0, 10**8, End.HOLD, np.zeros((4, 3)), np.zeros((4, 0)))
@@ -90,6 +92,50 @@ def test_a_restarted_publisher_takes_over_and_is_announced() -> None:
     assert intake.notices(0) == []
     assert intake.accept(received(replace(STATE, epoch=6, seq=0)), 1) is not None
     assert [notice.code for notice in intake.notices(1)] == ["source_changed"]
+
+
+YEAR_2026, YEAR_2105 = 1_770_000_000, 4_270_000_000
+
+
+@pytest.mark.parametrize(
+    ("unix_s", "followed", "epoch", "passes"),
+    [
+        (0, None, YEAR_2105 << 20, True),  # our clock stands at 1970, theirs does not
+        (0, None, 1 << 52, True),
+        (0, None, (1 << 52) + 1, False),
+        (YEAR_2026, None, 0, True),
+        (YEAR_2026, None, 1000 * YEAR_2026, True),  # a robot's, ms
+        (YEAR_2026, None, (YEAR_2026 << 20) + 2**52, True),
+        (YEAR_2026, None, (YEAR_2026 << 20) + 2**52 + 1, False),
+        (YEAR_2026, 1 << 60, (1 << 60) + (1 << 22), True),  # above whatever was let pass others can be
+        (YEAR_2026, 1 << 60, (1 << 60) + (1 << 22) + 1, False),
+        (YEAR_2026, 5, 2**63, False),
+        (YEAR_2026, 5, 2**64 - 1, False),
+    ],
+)
+def test_epochs_are_believed_that_time_can_have_reached(unix_s: int, followed: int | None, epoch: int, passes: bool) -> None:
+    intake = Intake(State, stale_s=1.0, unix_s=unix_s)
+    intake.source.epoch = followed
+    assert (intake.accept(received(replace(STATE, epoch=epoch)), 0) is not None) is passes
+    assert intake.refused["epoch"] == (not passes)
+
+
+def test_whoever_succeeds_the_highest_epoch_that_was_believed_is_believed_by_those_whose_clocks_are_eight_years_behind() -> None:
+    chooser, taker = (Intake(State, stale_s=1.0, unix_s=unix_s) for unix_s in (YEAR_2026 - SKEW_S, YEAR_2026 - SKEW_S + 1))
+    highest = highest_believed(YEAR_2026 - SKEW_S)
+    assert chooser.read(received(replace(STATE, epoch=highest))) is not None
+    for number in range(0, 1 << 20, 99_991):
+        assert taker.read(received(replace(STATE, epoch=epoch_above(highest, number)))) is not None
+
+
+@pytest.mark.parametrize("message", [STATE, REFERENCE, COMMAND])
+def test_what_is_longer_than_its_key_takes_is_refused_unread(message: Message) -> None:
+    intake, most = Intake(type(message), stale_s=1.0), MOST_BYTES[type(message)]
+    assert intake.accept(Received(b"", encoding(type(message)), "key", withheld=most + 1), 0) is None
+    assert intake.accept(replace(received(message), payload=encode(message).ljust(most + 1)), 0) is None
+    assert intake.refused == {"oversized": 2}
+    (notice,) = intake.notices(0)
+    assert f"at most {most} bytes, got {most + 1}" in notice.text
 
 
 def test_what_a_cache_repeats_is_dropped_in_silence() -> None:

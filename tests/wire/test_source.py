@@ -22,11 +22,28 @@ def test_the_next_message_is_accepted_and_gaps_are_counted(source: Source) -> No
     assert source.lost == 2
 
 
-def test_repeated_and_old_messages_are_dropped_however_late(source: Source) -> None:
-    assert source.accept(5, 10, 1) is Verdict.REPEATED
-    assert source.accept(5, 9, 10 * STALE_NS) is Verdict.OLD
+def test_repeated_messages_are_dropped_however_late_and_old_ones_while_the_source_lives(source: Source) -> None:
+    assert source.accept(5, 9, STALE_NS) is Verdict.OLD
+    assert source.accept(5, 10, 10 * STALE_NS) is Verdict.REPEATED
     assert source.dropped == 2
     assert source.seq == 10
+
+
+def test_a_message_far_ahead_is_no_loss_of_those_between(source: Source) -> None:
+    assert source.accept(5, 10 + 10**6, 1) is Verdict.NEXT
+    assert source.accept(5, 11 + 2 * 10**6, 2) is Verdict.AHEAD
+    assert source.accept(5, 2**64 - 1, 3) is Verdict.AHEAD
+    assert source.lost == 10**6 - 1
+
+
+@pytest.mark.parametrize("seq", [10 + 10**6, 2**64 - 1])
+def test_a_source_of_which_nothing_is_accepted_is_left_though_it_goes_on(seq: int) -> None:
+    source = Source(STALE_NS)
+    source.accept(5, seq, 0)  # somebody else's, in the name of ours
+    heard = [source.accept(5, n, n) for n in range(1, 2 * STALE_NS)]
+    assert set(heard[:STALE_NS]) == {Verdict.OLD}
+    assert heard[STALE_NS] is Verdict.NEW
+    assert set(heard[STALE_NS + 1 :]) == {Verdict.NEXT}
 
 
 def test_a_higher_epoch_takes_over_at_once(source: Source) -> None:

@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 
 from rti_mpc.errors import ConfigError
+from rti_mpc.message import Reference
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.layout import MOST_BYTES
 from rti_mpc.wire.session import RENDEZVOUS, BusSettings, zenoh_config
 
 SHIPPED = Path(__file__).parents[2] / "deploy" / "zenoh"
@@ -23,10 +25,10 @@ def value(settings: BusSettings, name: str) -> Any:
 
 
 @pytest.mark.parametrize("settings", [BusSettings(), *(BusSettings(config=SHIPPED / f"{mode}.json5") for mode in ("peer", "client", "router"))])
-def test_multicast_is_off_and_hangs_are_noticed_soon(settings: BusSettings) -> None:
+def test_multicast_is_off_hangs_are_noticed_soon_and_no_message_is_larger_than_a_reference(settings: BusSettings) -> None:
     assert value(settings, "scouting/multicast/enabled") is False
     assert value(settings, "transport/link/tx/lease") == 2000
-    assert value(settings, "transport/link/rx/max_message_size") == 1 << 26
+    assert value(settings, "transport/link/rx/max_message_size") == MOST_BYTES[Reference] + 4096
 
 
 @pytest.mark.parametrize("mode", ["peer", "client", "router"])

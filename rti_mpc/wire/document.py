@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+JSON objects as peers send them: descriptions, requests and answers.
+
+To parse JSON holds the interpreter's lock, 30 ms a megabyte, so nothing long is
+parsed, and whatever is accepted may be converted, compared and printed without
+a thought: no number is infinite or longer than 64 bits, nothing is deep, all text is text.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+from rti_mpc.wire.cdr import Refused
+
+MOST_BYTES = 1 << 16  # of a description; a request has less
+DEEPEST = 16  # objects and lists inside one another
+LARGEST = 1 << 64  # magnitude that no integer reaches
+DIGITS = 20  # that such an integer has at most
+
+
+def read(payload: bytes, size: int | None = None, most: int = MOST_BYTES) -> dict[str, Any]:
+    """
+    Return the JSON object in a payload.
+
+    Args:
+        payload: Its bytes.
+        size: How many were sent, where they are withheld.
+        most: How many there may be.
+
+    Raises:
+        MessageError: It is none, or too long, too deep, or has a number that is none.
+    """
+    size = len(payload) if size is None else size
+    if size > most:
+        raise Refused("oversized", f"message must have at most {most} bytes, got {size}")
+    try:
+        value = json.loads(payload, parse_int=_integer, parse_float=_number, parse_constant=_number)
+        json.dumps(value, ensure_ascii=False).encode()  # which half of a surrogate pair cannot
+    except Refused:
+        raise
+    except (ValueError, RecursionError):
+        raise Refused("text", "message must be a JSON object") from None
+    if not isinstance(value, dict):
+        raise Refused("text", "message must be a JSON object")
+    level: list[Any] = [value]
+    for _ in range(DEEPEST):
+        level = [inner for outer in level for inner in (outer.values() if isinstance(outer, dict) else outer) if isinstance(inner, (dict, list))]
+        if not level:
+            return value
+    raise Refused("value", f"message must hold at most {DEEPEST} objects and lists inside one another")
+
+
+def _integer(text: str) -> int:
+    if len(text) > 1 + DIGITS or not -LARGEST < (number := int(text)) < LARGEST:
+        raise Refused("value", f"an integer must be below 2^64, got {text[:DIGITS]}")
+    return number
+
+
+def _number(text: str) -> float:
+    if not math.isfinite(number := float(text)):
+        raise Refused("value", f"a number must be finite, got {text[:DIGITS]}")
+    return number
