@@ -15,7 +15,11 @@ demo: $(READY)
 	$(BIN)/rti-mpc demo $(ARGS)
 
 test: $(READY)
-	$(BIN)/pytest $(ARGS)
+	$(PARALLEL) $(ARGS) $(NONE_IS_FINE)
+	$(SERIAL) $(ARGS) $(NONE_IS_FINE)
+
+test-busy: $(READY)
+	$(BIN)/python tests/busy.py $(ARGS)
 
 test-slow: $(READY)
 	$(BIN)/pytest -m slow $(ARGS)

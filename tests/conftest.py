@@ -1,9 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
 import pytest
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # before NumPy is loaded: workers share the cores, and threads of their algebra would fight for them
+    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+from service.host import Host
+
+PROCESSES = Path(__file__).parent / "processes"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--guard", metavar="COMMAND", help="the guard that tests/guard_conformance judges, run as COMMAND CONFIG.toml -e ENDPOINT; ours")
     parser.addoption("--soak-s", type=float, default=20.0, metavar="SECONDS", help="how long the soak test drives the robot (default: 20)")
+
+
+@pytest.hookimpl(tryfirst=True)  # before marks choose
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if PROCESSES in item.path.parents:
+            item.add_marker(pytest.mark.serial)
+
+
+@pytest.fixture(scope="session")
+def host() -> Iterator[Host]:
+    """The witness of the host: a promise in milliseconds is held with `tests.in_time`."""
+    with Host() as host:
+        yield host

@@ -121,7 +121,7 @@ def measure(log: RobotLog, reference: Array, incident: Incident, limits: Limits)
         stale=0 if zero is None else int((moving & (t > t[zero]) & (t < fresh_ns(log, incident))).sum()),
         step_share=max(step_share(log.u[seen], limits), 0.0 if zero is None or brake is None else ramp_share(log, limits, brake, zero)),
         recovery_s=after(incident.mend_ns, int(driven[0])) if driven.size else None,
-        missed=missed(log, incident, limits.dt_s),
+        missed=len(missed_ns(log, incident, limits.dt_s)),
         error_m=float(error.max()),
         final_error_m=float(error[-1]),
     )
@@ -186,11 +186,12 @@ def ramp_share(log: RobotLog, limits: Limits, brake: int, zero: int) -> float:
     return share
 
 
-def missed(log: RobotLog, incident: Incident, dt_s: float) -> int:
-    """Return how many samples were left out between states that were answered."""
+def missed_ns(log: RobotLog, incident: Incident, dt_s: float) -> NDArray[np.int64]:
+    """Return when the samples were due that were left out between states that were answered, in robot time, shape ``(n,)``."""
     period_ns = 1e9 * dt_s
     near = (log.stamp_ns >= incident.fault_ns - 2 * period_ns) & (log.stamp_ns <= incident.mend_ns)
     stamps = log.stamp_ns[near & np.isfinite(log.latency_us)]
     silent_ns = incident.mend_ns - (stamps[-1] if stamps.size else incident.fault_ns)  # the last sample need not be over
     gaps = np.append(np.round(np.diff(stamps) / period_ns), silent_ns // period_ns)
-    return int(np.maximum(gaps - 1, 0).sum())
+    before = stamps if stamps.size else [incident.fault_ns]
+    return np.concatenate([stamp + period_ns * np.arange(1, gap) for stamp, gap in zip(before, gaps, strict=True)]).astype(np.int64)

@@ -56,6 +56,10 @@ class Observer:
         stamp_ns, arrival_ns, _ = self._states[-1]
         return stamp_ns + time.monotonic_ns() - arrival_ns
 
+    def arrival_ns(self, stamp_ns: int) -> int:
+        """Return when, by the monotonic clock, the first state of a time or later has come; if none has, when the last one has."""
+        return next((arrival_ns for stamp, arrival_ns, _ in self._states.copy() if stamp >= stamp_ns), self._states[-1][1])
+
     def speed_m_s(self) -> float:
         """Speed over the last states; 0 if they do not come."""
         states = list(self._states)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from rich.console import Console, Group
@@ -30,11 +30,13 @@ class Row:
         fault: What was done.
         measured: What the robot did; None if nothing could be measured.
         broken: What is not within the promise.
+        excused: What is not, either, but the host alone explains it.
     """
 
     fault: Fault
     measured: Measured | None
     broken: list[str]
+    excused: list[str] = field(default_factory=list)
 
     @property
     def did(self) -> str:
@@ -59,6 +61,7 @@ class Row:
             "promise": self.fault.promise.text,
             "kept": not self.broken,
             "broken": self.broken,
+            "excused": self.excused,
             "robot": self.did,
             **({} if self.measured is None else asdict(self.measured)),
         }
@@ -66,7 +69,7 @@ class Row:
     def cells(self) -> tuple[str, ...]:
         """Return the cells of the table."""
         promised = self.fault.promise.at_most
-        measured, verdict = self.measured, "yes" if not self.broken else "NO"
+        measured, verdict = self.measured, "NO" if self.broken else "host" if self.excused else "yes"
         if measured is None:
             return (self.fault.name, self.did, *[NONE] * (len(COLUMNS) - 3), verdict)
         return (
@@ -124,15 +127,15 @@ class Report(Redrawn):
         """Add a row; without a terminal, as a line."""
         self.rows.append(row)
         if not self.live:
-            said = "kept" if not row.broken else "; ".join(row.broken)
+            said = "; ".join([*row.broken, *row.excused]) or "kept"
             self.console.print(f"{len(self.rows)} of {self._count}: {row.fault.name}, the robot {row.did}: {said}", soft_wrap=True, markup=False)
 
     def conclude(self) -> None:
-        """Print the whole, and what was not kept."""
+        """Print the whole, and what was not kept, or is excused."""
         self.console.print(self._table())
         for row in self.rows:
-            if row.broken:
-                self.console.print(f"{row.fault.name}: {row.fault.promise.text}: {'; '.join(row.broken)}", soft_wrap=True, markup=False)
+            if words := [*row.broken, *row.excused]:
+                self.console.print(f"{row.fault.name}: {row.fault.promise.text}: {'; '.join(words)}", soft_wrap=True, markup=False)
         kept = sum(not row.broken for row in self.rows)
         about = machine.describe()
         self.console.print(

@@ -27,12 +27,14 @@ from rti_mpc.trajectory import find_trajectory
 from rti_mpc.wire.interrupt import stop_on_signals
 from service.config import Config, check_tree, load
 from service.demo import Failed, configured
-from service.faults.measure import Incident, Measured, measure, positions
+from service.faults.excuse import excuses, explained
+from service.faults.measure import Incident, measure, missed_ns, positions
 from service.faults.relay import ROLE as RELAY
 from service.faults.report import Report, Row, report_console
 from service.faults.system import HEADING, SCENARIO, System, Wiring
 from service.faults.table import FAULTS, Fault
 from service.fit import check_model
+from service.host import Host
 
 STATE_PERIOD_S = 0.01  # of the robot, and so of its record: what times are known to
 COMPANY = {
@@ -68,8 +70,8 @@ def main(config_path: Path, only: Sequence[str], path: Path | None) -> int:
     stop = stop_on_signals()
     signal.signal(signal.SIGHUP, lambda *_: stop.set())
     folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
-    with Report(console := report_console(), len(faults)) as report:
-        inject(config, faults, folder, report, stop)
+    with Host() as host, Report(console := report_console(), len(faults)) as report:
+        inject(config, faults, folder, report, stop, host)
     report.conclude()
     if report.kept:
         shutil.rmtree(folder)
@@ -111,7 +113,7 @@ def prepared(config: Config) -> Config:
     return config
 
 
-def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Report, stop: Event) -> None:
+def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Report, stop: Event, host: Host) -> None:
     """Inject faults until there are none left, or we are stopped."""
     limits = config.guard_limits()
     system: System | None = None
@@ -125,7 +127,7 @@ def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Report
                     report.say(fault, f"starting {fault.wiring.value}")
                     system = stack.enter_context(System(config, fault.wiring, folder / f"{number}", stop))
                 make_ready(system, fault, report)
-                row = Row(fault, measured := suffer(system, fault, limits, report), fault.promise.broken(measured))
+                row = suffer(system, fault, limits, report, host)
             except (Failed, ConfigError) as error:
                 row = Row(fault, None, [str(error)])
             if stop.is_set():
@@ -152,9 +154,9 @@ def make_ready(system: System, fault: Fault, report: Report) -> None:
     system.wait(lambda: system.driven(error_m), "the robot to be driven")
 
 
-def suffer(system: System, fault: Fault, limits: Limits, report: Report) -> Measured:
+def suffer(system: System, fault: Fault, limits: Limits, report: Report, host: Host) -> Row:
     """
-    Break, wait, mend, wait, and measure.
+    Break, wait, mend, wait, measure, and ask the host's witness.
 
     Raises:
         Failed: Nothing can be measured.
@@ -177,8 +179,14 @@ def suffer(system: System, fault: Fault, limits: Limits, report: Report) -> Meas
     system.wait(lambda: system.logged_ns() >= end_ns, "the robot's record", FLUSH_S)
     if system.stopped:
         raise Failed("stopped")
-    log = system.log()
-    return measure(log, positions(reference, log.stamp_ns), Incident(fault_ns, mend_ns, end_ns), limits)
+    log, incident = system.log(), Incident(fault_ns, mend_ns, end_ns)
+    measured, missed = measure(log, positions(reference, log.stamp_ns), incident, limits), missed_ns(log, incident, limits.dt_s)
+
+    def held_up_ms(from_ns: int, to_ns: int) -> float:
+        return host.held_up_ms(system.observer.arrival_ns(from_ns), system.observer.arrival_ns(to_ns))
+
+    excused = excuses(measured, missed, incident, system.period_ns, held_up_ms)
+    return Row(fault, measured, fault.promise.broken(measured, excused), explained(fault.promise, measured, excused))
 
 
 def recovered(system: System, mend_ns: int) -> None:

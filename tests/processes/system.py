@@ -19,11 +19,13 @@ from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import M, decode
 from service.cli import SHIPPED
 from service.config import load
+from service.host import Host
+from tests.in_time import in_time
 
 ROOT = Path(__file__).parents[2]
 CONFIG = load(SHIPPED)
 KEYS = CONFIG.keys()
-PATIENCE_S = 20.0  # to start processes and hear of them; the first controller on a machine compiles
+PATIENCE_S = 60.0  # to start processes and hear of them on a host that is busy; the first controller on a machine compiles
 SPEED = 4.0
 ARGUMENTS: dict[str, tuple[object, ...]] = {
     "robot": ("sim", "--speed", SPEED, "--x0", "x=0.5"),
@@ -44,7 +46,7 @@ def command_line(*arguments: object) -> list[str]:
     return [sys.executable, "-c", "from service.cli import main; main()", *map(str, arguments)]
 
 
-def rti_mpc(*arguments: object, timeout_s: float = 30.0) -> subprocess.CompletedProcess[str]:
+def rti_mpc(*arguments: object, timeout_s: float = 120.0) -> subprocess.CompletedProcess[str]:
     """Run a command to its end."""
     return subprocess.run(command_line(*arguments), cwd=ROOT, env=environment(), capture_output=True, text=True, timeout=timeout_s)
 
@@ -63,6 +65,7 @@ class System:
         self.endpoint = free_endpoint()
         self.running: dict[str, subprocess.Popen[bytes]] = {}
         self.lives: set[str] = set()
+        self.fault_at_ns = 0  # when the last fault began, by the monotonic clock
         self._stack = ExitStack()
         self.bus = self._stack.enter_context(Bus(BusSettings(connect=(self.endpoint,)), KEYS))
         self.bus.watch_alive(lambda role, present: (self.lives.add if present else self.lives.discard)(role))
@@ -91,18 +94,19 @@ class System:
 
     def fault(self, number: signal.Signals, *roles: str) -> int:
         """Send a signal; return the robot's time at it, at real speed within a few ms."""
+        self.fault_at_ns = time.monotonic_ns()
         now_ns = self.state(lambda _: True).stamp_ns
         for role in roles:
             self.running[role].send_signal(number)
         return now_ns
 
-    def interrupt(self, role: str) -> tuple[int, float]:
-        """Press Ctrl-C; return the exit status, and how long it took in s."""
+    def interrupt(self, role: str) -> int:
+        """Press Ctrl-C; return the exit status."""
         process = self.running.pop(role)
-        start_s = time.monotonic()
+        self.fault_at_ns = time.monotonic_ns()
         process.send_signal(signal.SIGINT)
         try:
-            return process.wait(10.0), time.monotonic() - start_s
+            return process.wait(PATIENCE_S)
         finally:
             process.kill()
 
@@ -133,6 +137,13 @@ class System:
 
     def state(self, condition: Callable[[State], bool]) -> State:
         return heard(self.bus.subscriber(KEYS.state), State, condition)
+
+
+def interrupted_in_time(host: Host, system: System, role: str, limit_ms: float = 1000.0) -> int:
+    """Press Ctrl-C, hold the process to a time for its end, and return its exit status."""
+    status = system.interrupt(role)
+    in_time(host, f"the end of the {role}", 1e-6 * (time.monotonic_ns() - system.fault_at_ns), limit_ms, system.fault_at_ns)
+    return status
 
 
 def heard(subscriber: Subscriber, cls: type[M], condition: Callable[[M], bool]) -> M:

@@ -8,6 +8,8 @@ import json
 import os
 import signal
 import subprocess
+import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +17,16 @@ import pytest
 
 from service.cli import SHIPPED
 from service.config import load
-from tests.processes.system import ROOT, command_line, environment, rti_mpc, until
+from service.host import Host
+from tests.in_time import explained
+from tests.processes.system import PATIENCE_S, ROOT, command_line, environment, rti_mpc, until
 
 pytest.importorskip("rerun")
 pytest.importorskip("matplotlib")
 from rerun.chunk import RrdReader
 
+SPEED = 3
+HELD_UP_MS = 0.5 * 100.0 / SPEED  # half a period: what a sample that is missed has met, at least
 QUANTILES = ("prepare_us", "feedback_us", "latency_us", "echo_us")
 ASKED_FOR = {
     *("scenario", "samples", "max_error_mm", "rms_error_mm", "final_error_mm", "final_speed_mm_s"),
@@ -29,17 +35,31 @@ ASKED_FOR = {
 }
 
 
+@dataclass(frozen=True)
+class Demo:
+    """What a demo left, and when it ran, by the monotonic clock."""
+
+    folder: Path
+    printed: str
+    from_ns: int
+    to_ns: int
+
+
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a demo: twenty-four seconds of the circle."""
-    folder = tmp_path_factory.mktemp("demo") / "out"
-    done = rti_mpc("demo", "--scenario", "circle", "--duration", 24, "--speed", 3, "--out", folder, timeout_s=90.0)
+def demo(tmp_path_factory: pytest.TempPathFactory, host: Host) -> Demo:
+    """Twenty-four seconds of the circle."""
+    folder, from_ns = tmp_path_factory.mktemp("demo") / "out", time.monotonic_ns()
+    done = rti_mpc("demo", "--scenario", "circle", "--duration", 24, "--speed", SPEED, "--out", folder)
     assert done.returncode == 0, done.stdout + done.stderr
-    (folder / "stdout").write_text(done.stdout)
-    return folder
+    return Demo(folder, done.stdout, from_ns, time.monotonic_ns())
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
+def folder(demo: Demo) -> Path:
+    return demo.folder
+
+
+@pytest.fixture
 def summary(folder: Path) -> Any:
     return json.loads((folder / "summary.json").read_text())
 
@@ -47,19 +67,23 @@ def summary(folder: Path) -> Any:
 def test_summary_holds_what_it_promises(summary: Any) -> None:
     assert summary.keys() >= ASKED_FOR
     assert (summary["scenario"], summary["heading"], summary["driven"]) == ("circle", "none", True)
-    assert 235 <= summary["samples"] <= 241
-    assert summary["states"] == 241
+    assert 0 < summary["samples"] <= summary["states"] == 241
     for name in QUANTILES:
         assert 0.0 < summary[name]["p50"] <= summary[name]["p99"] <= summary[name]["max"], name
     assert summary["latency_us"]["p50"] > summary["feedback_us"]["p50"]
     assert summary["machine"]["cores"] == os.cpu_count()
 
 
-def test_robot_is_driven_onto_its_path_inside_its_bounds(summary: Any) -> None:
+def test_robot_is_driven_onto_its_path_at_every_sample_that_the_host_leaves_us(summary: Any, demo: Demo, host: Host) -> None:
     """Twelve seconds after its start half a metre away; two laps are measured by the demo itself, on a machine that does nothing else."""
     assert summary["transient_s"] == 12.0
-    assert summary["rms_error_mm"] < 5.0
-    assert summary["fallbacks"] == 0
+    missed = 241 - 6 - summary["samples"] + summary["fallbacks"]  # before its first sample a controller has to hear of the robot
+    if missed > 0 or summary["rms_error_mm"] >= 5.0:
+        what = f"{missed} samples are missing, and the error is {summary['rms_error_mm']:.1f} mm rms"
+        assert explained(host, what, max(missed, 1) * HELD_UP_MS, demo.from_ns, demo.to_ns)
+
+
+def test_inputs_stay_inside_their_bounds(summary: Any) -> None:
     assert summary["commanded_inputs_in_bounds"]
     assert summary["commanded_increments_in_bounds"]
     assert summary["applied_inputs_in_bounds"]
@@ -83,21 +107,23 @@ def test_folder_holds_record_figure_and_recording(folder: Path) -> None:
     assert "Traceback" not in "".join(path.read_text() for path in (folder / "logs").iterdir())
 
 
-def test_output_says_how_to_look_at_it(folder: Path) -> None:
-    printed = (folder / "stdout").read_text()
-    for words in ("of 24 s", "bare echo", "heading none", str(folder / "run.png"), f"rerun {folder / 'run.rrd'}"):
-        assert words in printed, words
+def test_output_says_how_to_look_at_it(demo: Demo) -> None:
+    for words in ("of 24 s", "bare echo", "heading none", str(demo.folder / "run.png"), f"rerun {demo.folder / 'run.rrd'}"):
+        assert words in demo.printed, words
 
 
+@pytest.mark.slow
 def test_waypoints_of_a_file_are_driven_too(tmp_path: Path) -> None:
     (tmp_path / "square.csv").write_text("x,y\n0,0\n1,0\n1,1\n0,1\n0,0\n")
-    done = rti_mpc("demo", "--scenario", tmp_path / "square.csv", "--duration", 6, "--speed", 6, "--out", tmp_path / "out", timeout_s=60.0)
+    done = rti_mpc("demo", "--scenario", tmp_path / "square.csv", "--duration", 6, "--speed", 6, "--out", tmp_path / "out")
     assert done.returncode == 0, done.stdout + done.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["scenario"], summary["heading"]) == ("square", "consistent")
 
 
-@pytest.mark.parametrize(("number", "status", "last_words"), [(signal.SIGINT, 1, "not driven to the end"), (signal.SIGKILL, -9, "")])
+@pytest.mark.parametrize(
+    ("number", "status", "last_words"), [pytest.param(signal.SIGINT, 1, "not driven to the end", marks=pytest.mark.slow), (signal.SIGKILL, -9, "")]
+)
 def test_demo_that_is_ended_leaves_no_process_behind(tmp_path: Path, number: signal.Signals, status: int, last_words: str) -> None:
     log = (tmp_path / "demo.log").open("wb")
     command = command_line("demo", "--out", tmp_path / "out")
@@ -107,7 +133,7 @@ def test_demo_that_is_ended_leaves_no_process_behind(tmp_path: Path, number: sig
             children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
             assert len(children) == 5
             demo.send_signal(number)
-            assert demo.wait(20.0) == status
+            assert demo.wait(PATIENCE_S) == status
         finally:
             demo.kill()
     until(lambda: not [pid for pid in children if Path(f"/proc/{pid}").exists()], "all are gone")

@@ -14,7 +14,7 @@ from service.faults.table import FAULTS
 from tests.processes.system import rti_mpc
 
 
-def matrix(path: Path, *names: str, timeout_s: float = 120.0) -> dict[str, dict[str, Any]]:
+def matrix(path: Path, *names: str, timeout_s: float = 180.0) -> dict[str, dict[str, Any]]:
     """Rows by name, as written to a file; the exit status is what they say."""
     done = rti_mpc("faults", *(word for name in names for word in ("--only", name)), "--json", path, timeout_s=timeout_s)
     rows = json.loads(path.read_text())
@@ -26,7 +26,8 @@ def matrix(path: Path, *names: str, timeout_s: float = 120.0) -> dict[str, dict[
 @pytest.mark.parametrize(
     "names",
     [
-        ("controller_killed", "guard_and_controller_killed"),
+        ("controller_killed",),
+        pytest.param(("guard_and_controller_killed",), marks=pytest.mark.slow),
         pytest.param(("link_cut",), marks=pytest.mark.slow),
         pytest.param(("state_nan",), marks=pytest.mark.slow),
     ],
@@ -37,9 +38,8 @@ def test_robot_stops_in_time_and_drives_again(tmp_path: Path, names: tuple[str, 
     assert tuple(rows) == names
     for row in rows.values():
         assert row["kept"], row
-        assert 0.0 < row["brake_s"] <= BRAKES["brake_s"] == 0.3
-        assert row["brake_s"] <= row["zero_s"] <= BRAKES["zero_s"] == 0.5
-        assert row["zero_s"] < row["still_s"] <= 2.5
+        assert 0.0 < row["brake_s"] <= row["zero_s"] < row["still_s"]
+        assert row["excused"] or (row["brake_s"] <= BRAKES["brake_s"] == 0.3 and row["zero_s"] <= BRAKES["zero_s"] == 0.5 and row["still_s"] <= 2.5)
         assert row["recovery_s"] > 0.0
         assert row["robot"] == "braked, stood, drove again"
 
@@ -53,8 +53,5 @@ def test_unknown_fault_is_one_line_that_names_all_there_are() -> None:
 
 @pytest.mark.slow
 def test_whole_matrix_is_within_its_promises(tmp_path: Path) -> None:
-    """A host that is busy with others may miss a sample, so what was not kept is looked at once more; no promise may break twice."""
-    rows = matrix(tmp_path / "faults.json", timeout_s=900.0)
-    if again := [name for name, row in rows.items() if not row["kept"]]:
-        rows |= matrix(tmp_path / "again.json", *again, timeout_s=900.0)
+    rows = matrix(tmp_path / "faults.json", timeout_s=1800.0)
     assert {name: row["broken"] for name, row in rows.items() if not row["kept"]} == {}

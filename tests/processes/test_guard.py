@@ -19,8 +19,10 @@ import pytest
 from rti_mpc.message import Command
 from rti_mpc.wire.cdr import decode
 from service.cli import SHIPPED
+from service.host import Host
+from tests.in_time import in_time
 from tests.processes.record import GUARDED, MS, Record, recorded, within_slew
-from tests.processes.system import CONFIG, KEYS, System, rti_mpc, until
+from tests.processes.system import CONFIG, KEYS, System, interrupted_in_time, rti_mpc, until
 
 SPEED_M_S = 0.5
 
@@ -49,32 +51,37 @@ def driven(system: System) -> System:
     return system
 
 
-def stopped_in_time(record: Record) -> None:
-    assert record.braking_ms <= 300.0
-    assert record.zero_ms <= 500.0
-    assert record.standing_ms <= 2500.0
+def braked_in_time(host: Host, system: System, record: Record) -> None:
+    in_time(host, "braking", record.braking_ms, 300.0, system.fault_at_ns)
+    in_time(host, "the command zero", record.zero_ms, 500.0, system.fault_at_ns)
+
+
+def stopped_in_time(host: Host, system: System, record: Record) -> None:
+    braked_in_time(host, system, record)
+    in_time(host, "standing", record.standing_ms, 2500.0, system.fault_at_ns)
     assert not record.inputs[record.times >= record.zero_ms].any()
     within_slew(record)
 
 
-@pytest.mark.parametrize("killed", [("controller",), ("guard",), ("controller", "guard")], ids="+".join)
-def test_robot_stops_in_time_when_somebody_is_killed_and_is_driven_again_after_a_restart(driven: System, killed: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("killed", [("controller",), pytest.param(("guard",), marks=pytest.mark.slow), ("controller", "guard")], ids="+".join)
+def test_robot_stops_in_time_when_somebody_is_killed_and_is_driven_again_after_a_restart(driven: System, host: Host, killed: tuple[str, ...]) -> None:
     """Without a guard by the robot's own watchdog, which still has the plan."""
     fault_ns = driven.fault(signal.SIGKILL, *killed)
     for role in killed:
         driven.kill(role)
     record = recorded(driven, fault_ns, 2700)
     print(f"\n{'+'.join(killed)} killed: braking {record.braking_ms:.0f}, zero {record.zero_ms:.0f}, standing {record.standing_ms:.0f} ms")
-    stopped_in_time(record)
+    stopped_in_time(host, driven, record)
     driven.start(*killed)
     driven.state(lambda state: bool(state.x[3] > 0.9 * SPEED_M_S))
 
 
 @pytest.mark.parametrize("role", ["controller", "guard"])
-def test_nothing_stale_acts_when_somebody_was_stopped_and_goes_on(driven: System, role: str) -> None:
+def test_nothing_stale_acts_when_somebody_was_stopped_and_goes_on(driven: System, host: Host, role: str) -> None:
     """``kill -STOP; sleep 1.5; kill -CONT``"""
     actuation = driven.bus.subscriber(KEYS.actuation, capacity=4096)
     fault_ns = driven.fault(signal.SIGSTOP, role)
+    stopped_at_ns = driven.fault_at_ns
     try:
         driven.state(lambda state: state.stamp_ns >= fault_ns + 1500 * MS)
     finally:
@@ -82,8 +89,8 @@ def test_nothing_stale_acts_when_somebody_was_stopped_and_goes_on(driven: System
     driven.state(lambda state: bool(state.x[3] > 0.9 * SPEED_M_S))
     record = recorded(driven, fault_ns, (resumed_ns - fault_ns) // MS + 500)
     print(f"\n{role} stopped: braking {record.braking_ms:.0f}, zero {record.zero_ms:.0f} ms")
-    assert record.braking_ms <= 300.0
-    assert record.zero_ms <= 500.0
+    driven.fault_at_ns = stopped_at_ns
+    braked_in_time(host, driven, record)
     resumed_ms = (resumed_ns - fault_ns) / MS
     assert not record.inputs[(record.times >= record.zero_ms) & (record.times < resumed_ms)].any()
     within_slew(record)
@@ -119,16 +126,15 @@ def test_configuration_without_a_guard_is_one_line_and_exit_status_2() -> None:
     assert (done.returncode, done.stderr) == (2, "rti-mpc: guard.enabled must be true for the robot to take what a guard passes on, got false\n")
 
 
-def test_ctrl_c_ends_the_guard_with_a_ramp_to_rest(driven: System) -> None:
+def test_ctrl_c_ends_the_guard_with_a_ramp_to_rest(driven: System, host: Host) -> None:
     """The last test: the robot stays where it is."""
     actuation = driven.bus.subscriber(KEYS.actuation, capacity=4096)
     stopped_ns = driven.state(lambda _: True).stamp_ns
-    status, took_s = driven.interrupt("guard")
-    assert (status, took_s < 1.0) == (0, True), took_s
+    assert interrupted_in_time(host, driven, "guard") == 0
     until(lambda: "guard" not in driven.lives, "the guard is gone")
     last = decode(Command, actuation.drain()[-1].payload)
     assert not last.u[-1].any()
-    stopped_in_time(recorded(driven, stopped_ns, 2700))
+    stopped_in_time(host, driven, recorded(driven, stopped_ns, 2700))
     assert "Traceback" not in driven.said("guard")
     assert CONFIG.guard.enabled is False, "the quickstart needs none"
 
@@ -149,4 +155,4 @@ def test_terminals_that_hang_keep_nobody_from_driving_the_robot(tmp_path: Path) 
         system.start(*roles)
         system.tracking()
         system.state(lambda state: abs(state.x[3]) > 0.03)
-        assert [system.interrupt(role)[0] for role in roles] == [0, 0, 0, 0]
+        assert [system.interrupt(role) for role in roles] == [0, 0, 0, 0]

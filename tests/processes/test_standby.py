@@ -14,6 +14,8 @@ import pytest
 from rti_mpc.message import Telemetry
 from rti_mpc.status import Mode
 from rti_mpc.wire.cdr import decode
+from service.host import Host
+from tests.in_time import in_time
 from tests.processes.system import KEYS, heard, rti_mpc, until
 from tests.processes.watched import Watched, configuration, within_limits
 
@@ -26,7 +28,7 @@ def redundant(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Watche
         yield system
 
 
-def test_standby_takes_over_in_time_and_the_old_leader_is_fenced(redundant: Watched) -> None:
+def test_standby_takes_over_in_time_and_the_old_leader_is_fenced(redundant: Watched, host: Host) -> None:
     """At 10 Hz the leader is stopped and resumed, at 50 Hz killed."""
     system = redundant
     epoch = system.tracking().epoch
@@ -36,7 +38,7 @@ def test_standby_takes_over_in_time_and_the_old_leader_is_fenced(redundant: Watc
     assert second.mode is Mode.TRACKING
     took_s = 1e-9 * (system.answered_ns(second) - died_ns)
     print(f"dt = {system.dt_s} s: took over {1e3 * took_s:.1f} ms after the leader's death, {1e3 * max(3 * system.dt_s, 0.05):.0f} promised")
-    assert took_s <= max(3 * system.dt_s, 0.05)
+    in_time(host, "the takeover", 1e3 * took_s, 1e3 * max(3 * system.dt_s, 0.05), system.fault_at_ns)
     if system.dt_s == 0.1:
         stepped_down = system.bus.subscriber(KEYS.event("standby"), capacity=64)
         system.running[leader].send_signal(signal.SIGCONT)

@@ -21,7 +21,9 @@ from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.cdr import decode, encode
 from rti_mpc.wire.session import BusSettings
 from service.cli import SHIPPED
-from tests.processes.system import CONFIG, KEYS, SPEED, System, heard, rti_mpc, until
+from service.host import Host
+from tests.in_time import MS, in_time
+from tests.processes.system import CONFIG, KEYS, SPEED, System, heard, interrupted_in_time, rti_mpc, until
 
 STANDING = 1e-3  # m/s, rad/s
 
@@ -68,26 +70,22 @@ def test_processes_start_in_any_order(system: System, order: tuple[str, ...]) ->
     until(lambda: set(order) <= system.lives, "all have met")
 
 
-def test_ctrl_c_ends_each_process_within_a_second_and_the_last_command_is_a_standstill(system: System) -> None:
+def test_ctrl_c_ends_each_process_within_a_second_and_the_last_command_is_a_standstill(system: System, host: Host) -> None:
     pytest.importorskip("rerun")
     commands = system.bus.subscriber(KEYS.command, capacity=4096)
     system.start("robot", "controller", "reference", "viewer")
     system.tracking()
     system.state(moves)
     until(lambda: "viewer" in system.lives, "the viewer is there")
-    status, took_s = system.interrupt("viewer")
-    assert (status, took_s < 2.0) == (0, True), took_s  # a second, on a machine that is busy: it has a recording to finish
-    status, took_s = system.interrupt("reference")
-    assert (status, took_s < 1.0) == (0, True), took_s
+    assert interrupted_in_time(host, system, "viewer", 2000.0) == 0  # it has a recording to finish
+    assert interrupted_in_time(host, system, "reference") == 0
     system.tracking()  # the reference was published whole, and outlives its source
-    status, took_s = system.interrupt("controller")
-    assert (status, took_s < 1.0) == (0, True), took_s
+    assert interrupted_in_time(host, system, "controller") == 0
     until(lambda: "controller" not in system.lives, "the controller is gone")
     last = decode(Command, commands.drain()[-1].payload)
     assert (last.mode, np.abs(last.u).max()) == (Mode.STOPPED, 0.0)
     system.state(rests)
-    status, took_s = system.interrupt("robot")
-    assert (status, took_s < 1.0) == (0, True), took_s
+    assert interrupted_in_time(host, system, "robot") == 0
     assert "Traceback" not in "".join(map(system.said, ("controller", "robot", "reference", "viewer")))
 
 
@@ -104,16 +102,18 @@ def test_controller_recovers_when_the_robot_is_killed_and_restarted(system: Syst
     assert state.epoch == again.state_epoch
 
 
-def test_robot_brakes_and_stands_when_the_controller_is_killed_and_another_one_takes_over(system: System) -> None:
+def test_robot_brakes_and_stands_when_the_controller_is_killed_and_another_one_takes_over(system: System, host: Host) -> None:
     """Its last command ends 250 ms after its state; then the robot brakes inside its slew limits, and coasts."""
     system.start("robot", "controller", "reference")
     first = system.tracking()
     driving = system.state(lambda state: state.x[3] > 0.1)
+    killed_at_ns = time.monotonic_ns()
     system.kill("controller")
     standing = system.state(rests)
     slew_s = driving.x[3] / (0.25 / CONFIG.ocp.dt_s)
     coast_s = 0.25 * np.log(0.5 / STANDING)  # the plant's time constant is below 0.25 s
-    assert 1e-9 * (standing.stamp_ns - driving.stamp_ns) < 0.25 + slew_s + coast_s + 2 * CONFIG.ocp.dt_s + 0.05 * SPEED
+    limit_s = 0.25 + slew_s + coast_s + 2 * CONFIG.ocp.dt_s + 0.05 * SPEED
+    in_time(host, "standing", (standing.stamp_ns - driving.stamp_ns) / MS / SPEED, 1e3 * limit_s / SPEED, killed_at_ns)
     system.start("controller")
     again = system.tracking(first.state_epoch)
     until(lambda: system.tracking().epoch > first.epoch, "another epoch")

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A witness of the host: how long it kept its cores from a process and all that it has started.
+
+On each core a bare timer, which computes nothing, tells when that core stood still.
+One of them adds up how long each thread of the watched processes was ready to run
+and had no core (`schedstat` in `proc(5)`). What one process waits for the next,
+so the sum over all of them bounds what a chain of them may be late by.
+
+`python -m service.host FILE CORE PID` is one such timer; a PID of 0 watches nobody.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from types import TracebackType
+
+from service.realtime import available
+
+TICK_NS = 2_000_000
+LATE_NS = 500_000  # from which on a tick is late: a core that sleeps deeply needs less to wake
+TICKS = 5  # a row: 10 ms
+ROWS = 10  # between two looks for new threads: 0.1 s
+ROW = struct.Struct("<4q")  # from, to, lateness of ticks, waiting of threads; all ns, the first two by the monotonic clock
+PATIENCE_S = 10.0  # for the timers to have seen what is asked for
+
+
+class Host:
+    """Watches this process and all its descendants, from when it is entered until it is left."""
+
+    def __enter__(self) -> Host:
+        with ExitStack() as stack:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rti-mpc-host-")))
+            self._timers = [Timer(folder, core, os.getpid() if core == available()[0] else 0, stack) for core in available()]
+            self.held_up_ms(time.monotonic_ns(), time.monotonic_ns())
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        self._stack.close()
+
+    def held_up_ms(self, from_ns: int, to_ns: int) -> float:
+        """
+        Return for how long the host held the watched processes up in a time that has passed, all cores and threads added up, ms.
+
+        Args:
+            from_ns: From when on, by the monotonic clock.
+            to_ns: To when.
+
+        Raises:
+            TimeoutError: A timer has not come to its end within ten seconds.
+        """
+        return 1e-6 * sum(row[2] + row[3] for timer in self._timers for row in timer.rows(from_ns, to_ns))
+
+
+class Timer:
+    """A bare timer in a process of its own, and what it has written so far."""
+
+    def __init__(self, folder: Path, core: int, watched: int, stack: ExitStack) -> None:
+        self._file = stack.enter_context((folder / str(core)).open("w+b", buffering=0))
+        self._rows: list[tuple[int, ...]] = []
+        command = [sys.executable, "-m", "service.host", str(folder / str(core)), str(core), str(watched)]
+        self.process = subprocess.Popen(command, cwd=Path(__file__).parents[1], stdin=subprocess.DEVNULL, process_group=0)
+        stack.callback(self.process.wait)
+        stack.callback(self.process.kill)
+
+    def rows(self, from_ns: int, to_ns: int) -> Iterator[tuple[int, ...]]:
+        """Wait until it has seen a time whole, and return what it saw then, the last first."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not self._rows or self._rows[-1][1] < to_ns:
+            if time.monotonic() > deadline_s:
+                raise TimeoutError(f"the host's witness must tell every {1e-6 * TICKS * TICK_NS:g} ms, and was silent for {PATIENCE_S:g} s")
+            time.sleep(1e-9 * TICK_NS)
+            self._rows += ROW.iter_unpack(self._file.read())  # a row is written at once
+        for row in reversed(self._rows):
+            if row[1] < from_ns:
+                return
+            if row[0] <= to_ns:
+                yield row
+
+
+class Threads:
+    """All threads of a process and its descendants, but for our own, and how long each has waited for a core."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._open: dict[str, int] = {}  # descriptor by path
+        self._waited_ns: dict[str, int] = {}
+        self.look()
+        self.waited_ns()
+
+    def look(self) -> None:
+        """Find the threads there are now."""
+        pids = [str(self._pid)] if self._pid else []
+        for pid in pids:
+            with suppress(OSError):  # it ends meanwhile
+                for thread in os.listdir(f"/proc/{pid}/task"):
+                    with open(f"/proc/{pid}/task/{thread}/children") as children:
+                        pids += [child for child in children.read().split() if int(child) != os.getpid()]
+                    path = f"/proc/{pid}/task/{thread}/schedstat"
+                    if path not in self._open:
+                        self._open[path] = os.open(path, os.O_RDONLY)
+
+    def waited_ns(self) -> int:
+        """Return what they have waited since the last call, ns."""
+        total_ns = 0
+        for path, descriptor in list(self._open.items()):
+            try:
+                waited_ns = int(os.pread(descriptor, 128, 0).split()[1])
+            except OSError:  # it has ended
+                os.close(self._open.pop(path))
+                self._waited_ns.pop(path, None)
+                continue
+            total_ns += waited_ns - self._waited_ns.get(path, 0)
+            self._waited_ns[path] = waited_ns
+        return total_ns
+
+
+def main(path: str, core: int, pid: int) -> None:
+    """Write a row every ten milliseconds for as long as our parent lives."""
+    os.sched_setaffinity(0, {core})
+    parent, threads, number = os.getppid(), Threads(pid), 0
+    since_ns = due_ns = time.monotonic_ns()
+    with Path(path).open("ab", buffering=0) as file:
+        while os.getppid() == parent:
+            late_ns = 0
+            for _ in range(TICKS):
+                due_ns += TICK_NS
+                due_ns += max(0, time.monotonic_ns() - due_ns) // TICK_NS * TICK_NS  # those that were slept through are not made up for
+                time.sleep(max(0.0, 1e-9 * (due_ns - time.monotonic_ns())))
+                if (lateness_ns := time.monotonic_ns() - due_ns) > LATE_NS:
+                    late_ns += lateness_ns
+            if (number := number + 1) % ROWS == 0:
+                threads.look()
+            waited_ns, now_ns = threads.waited_ns(), time.monotonic_ns()
+            file.write(ROW.pack(since_ns, now_ns, late_ns, waited_ns))
+            since_ns = now_ns
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))

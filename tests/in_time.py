@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Promises in milliseconds, held on a host that may be busy with others: beyond one only by what its witness has seen."""
+
+from __future__ import annotations
+
+from service.host import Host
+
+MS = 1_000_000
+BEFORE_NS = 50 * MS  # what has just been sent when something begins may be held up already
+
+
+def in_time(host: Host, what: str, took_ms: float, limit_ms: float, since_ns: int) -> None:
+    """Hold what began at an instant of the monotonic clock to its limit; what the host took of the time is shown, and not held against it."""
+    late_ms = took_ms - limit_ms
+    assert late_ms <= 0.0 or explained(host, f"{what} took {took_ms:.0f} ms of {limit_ms:.0f}", late_ms, since_ns, since_ns + round(took_ms * MS))
+
+
+def explained(host: Host, what: str, by_ms: float, from_ns: int, to_ns: int) -> bool:
+    """Whether the host held processes up for at least so long in a time of the monotonic clock; says so."""
+    held_up_ms = host.held_up_ms(from_ns - BEFORE_NS, to_ns)
+    print(f"\n{what}, while the host held processes up for {held_up_ms:.0f} ms, where {by_ms:.0f} would explain it")
+    return held_up_ms >= by_ms
