@@ -26,6 +26,7 @@ from tests.in_time import MS, in_time
 from tests.processes.system import CONFIG, KEYS, SPEED, System, heard, interrupted_in_time, rti_mpc, until
 
 STANDING = 1e-3  # m/s, rad/s
+OTHER_VERSION = f"@{cdr.VERSION + 1}"  # in a refusal
 
 
 @pytest.fixture
@@ -163,12 +164,12 @@ def malformed(message: State | Command, rows: str) -> dict[str, bytes]:
     whole, values = encode(message), getattr(message, rows)
     return {
         "got no bytes": b"",
-        "must hold": whole[:-1],
+        "must hold at least": whole[:40],
         "must end after": whole + bytes(4),
         "big-endian": b"\x00\x00" + whole[2:],
         "must be finite": encode(replace(message, **{rows: np.full_like(values, np.nan)})),
         "numbers a row": encode(replace(message, **{rows: np.concatenate([values, values[..., :1]], axis=-1)})),
-        "@2'": whole,
+        OTHER_VERSION: whole,
     }
 
 
@@ -176,13 +177,13 @@ def test_payload_of_every_malformed_kind_is_counted_and_published_while_control_
     """States to the controller and commands to the robot; of a flood of them each publishes one event a second."""
     ours = driven.bus.publisher(KEYS.state, State), driven.bus.publisher(KEYS.command, Command)
     with monkeypatch.context() as later:
-        later.setattr(cdr, "VERSION", 2)
+        later.setattr(cdr, "VERSION", cdr.VERSION + 1)
         foreign = driven.bus.publisher(KEYS.state, State), driven.bus.publisher(KEYS.command, Command)
     kinds = malformed(driven.state(lambda _: True), "x"), malformed(driven.tracking(), "u")
     before, events, start_s = driven.sample(), driven.bus.subscriber(KEYS.events, capacity=1024), time.monotonic()
 
     def send(words: str) -> None:
-        for publisher, payloads in zip(foreign if "@2" in words else ours, kinds, strict=True):
+        for publisher, payloads in zip(foreign if words == OTHER_VERSION else ours, kinds, strict=True):
             publisher.put_bytes(payloads[words])
 
     for words in kinds[0]:
@@ -210,7 +211,7 @@ def test_second_publisher_takes_nothing_over(driven: System) -> None:
     def lie() -> None:
         seq = next(seqs)
         states.put(State(true.epoch - 1, seq, true.stamp_ns + 10**12, np.full(5, 9.0)))
-        commands.put(replace(command, epoch=command.epoch - 1, seq=seq, valid_until_ns=2**62, u=np.full((20, 2), 0.5)))
+        commands.put(replace(command, epoch=command.epoch - 1, seq=seq, valid_until_ns=2**62 - 1, u=np.full((20, 2), 0.5)))
 
     before = driven.sample()
     assert str(true.epoch) in driven.event("source_refused", "controller", lie).text
