@@ -9,6 +9,8 @@ no bus and no viewer, and this file alone knows both `service` and `sim`.
 from __future__ import annotations
 
 import inspect
+import json
+import platform
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,7 +19,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer.core import TyperGroup
 
+import rti_mpc
 from rti_mpc.errors import ConfigError, RtiMpcError
 from service import log
 from service.config import Config, load
@@ -29,13 +33,45 @@ HERE = Path(__file__).parent
 SHIPPED = (HERE / "deploy" if (HERE / "deploy").is_dir() else HERE.parent / "deploy") / "pioneer_3dx.toml"  # in the wheel, in a clone
 EXTRAS = {"rerun": "view", "rerun_cli": "view", "matplotlib": "figure"}  # what a robot's own installation leaves out
 
+
+class Commands(TyperGroup):
+    """Group whose list of commands holds whole sentences, wrapped where the terminal is narrow; Click cuts them off."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the list of commands."""
+        rows = [(name, self.commands[name].get_short_help_str(limit=sys.maxsize)) for name in self.list_commands(ctx)]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
+
+
 app = typer.Typer(
+    cls=Commands,
     help="Real-time nonlinear model predictive control as a service, over Zenoh.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+
+
+def print_version(wanted: bool) -> None:
+    """Print the versions that decide what a command does."""
+    if wanted:
+        from rti_mpc.wire import cdr
+        from service import machine
+
+        packages = ", ".join(f"{name} {version}" for name, version in machine.packages().items())
+        typer.echo(f"rti-mpc {rti_mpc.__version__}, messages of version {cdr.VERSION}, Python {platform.python_version()}, {packages}")
+        raise typer.Exit
+
+
+@app.callback()
+def top(
+    version: Annotated[
+        bool, typer.Option("--version", callback=print_version, is_eager=True, help="Print the version, and those it builds on.")
+    ] = False,
+) -> None:
+    """Real-time nonlinear model predictive control as a service, over Zenoh."""
 
 
 def claimed(path: Path | None) -> Path | None:
@@ -296,6 +332,14 @@ def check(config: ConfigPath = SHIPPED) -> None:
     from service.check import main
 
     raise typer.Exit(main(config))
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of a robot's TOML file, by which editors complete and check it."""
+    typer.echo(
+        json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "rti-mpc robot", **Config.model_json_schema()}, indent=1)
+    )
 
 
 @app.command()

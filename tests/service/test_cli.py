@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
+import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -31,14 +34,14 @@ def test_help_of_every_command_explains_every_option(command: str) -> None:
     assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
 
 
-@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "check", "demo", "doctor", "faults", "paper"}))
+@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "check", "demo", "doctor", "faults", "paper", "schema"}))
 def test_every_process_takes_the_options_of_zenoh_programs(command: str) -> None:
     parameters = typer.main.get_group(app).commands[command].params
     options = {option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)}
     assert set(ZENOH) | {"-m", "-e", "-l", "-c"} <= options
 
 
-@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "demo", "paper"}))
+@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "demo", "paper", "schema"}))
 def test_bad_configuration_is_one_line_and_exit_status_2(command: str, tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(SHIPPED.read_text().replace("dt_s", "dt_ms"))
@@ -96,3 +99,28 @@ for name in ("matplotlib.font_manager", "controller"):
 """
     done = subprocess.run([sys.executable, "-c", say], cwd=ROOT, capture_output=True, text=True)
     assert done.stdout == '{"level": "INFO", "logger": "controller", "text": "news"}\n'
+
+
+def test_list_of_commands_holds_whole_sentences_on_a_narrow_terminal() -> None:
+    done = rti_mpc("--help", COLUMNS="80")
+    assert "..." not in done.stdout.partition("Commands:")[2]
+    for command in typer.main.get_group(app).commands.values():
+        assert command.get_short_help_str(limit=1000) in " ".join(done.stdout.split())
+    assert max(len(line) for line in done.stdout.splitlines()) <= 80
+
+
+def test_version_names_what_decides_what_a_command_does() -> None:
+    done = rti_mpc("--version")
+    assert (done.returncode, done.stderr) == (0, "")
+    for word in (f"rti-mpc {metadata.version('rti-mpc')}", "messages of version 2", f"osqp {metadata.version('osqp')}"):
+        assert word in done.stdout
+
+
+def test_schema_for_editors_describes_every_table_and_refuses_unknown_keys() -> None:
+    schema = json.loads(rti_mpc("schema").stdout)
+    shipped = tomllib.loads(SHIPPED.read_text())
+    assert shipped.keys() <= schema["properties"].keys()
+    assert schema["additionalProperties"] is False
+    for table in schema["$defs"].values():
+        assert table["additionalProperties"] is False
+        assert all("description" in field for field in table["properties"].values()), table["title"]
