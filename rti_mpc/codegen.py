@@ -2,9 +2,9 @@
 """
 Compile CasADi functions, and bind them to arrays that the caller owns.
 
-The shared object is cached by content in the user's cache directory. Without a
-compiler CasADi's virtual machine evaluates the same function into the same
-arrays: slower, equal to rounding.
+The shared object is cached by content, see `rti_mpc.cache`. Without a compiler
+CasADi's virtual machine evaluates the same function into the same arrays: slower,
+equal to rounding.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -22,24 +23,21 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.cache import cache_dir, keep, own, sealed
 from rti_mpc.errors import ShapeError
 
 # No contraction into fused operations and no fast-math: a machine with a compiler and one without agree to rounding.
 FLAGS = ("-O2", "-ffp-contract=off", "-shared", "-fPIC", "-w")
 
 
-def cache_dir() -> Path:
-    """Return where compiled functions are kept (XDG base directory specification)."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rti_mpc"
-
-
 def compiled(*functions: ca.Function) -> list[ca.Function]:
     """
     Return functions as machine code, or themselves where there is no compiler.
 
-    They are compiled together, which takes half as long as one by one. A build
-    that fails for whatever reason, a full disk or a broken compiler, is not an
-    error: the virtual machine takes over.
+    They are compiled together, which takes half as long as one by one. A cache
+    that cannot be used, or trusted, costs the compilation at every start; a
+    build that fails, a broken compiler, is no error either: the virtual machine
+    takes over. A warning says which, in one line.
 
     Args:
         functions: Of different names.
@@ -52,24 +50,58 @@ def compiled(*functions: ca.Function) -> list[ca.Function]:
         generator.add(function)
     source = generator.dump()
     key = hashlib.sha256("\0".join((source, compiler, *FLAGS, os.uname().machine)).encode()).hexdigest()[:32]
-    library = cache_dir() / f"{functions[0].name()}-{key}.so"
+    name = f"{functions[0].name()}-{key}.so"
     try:
-        if not library.exists():
-            build(compiler, source, library)
-        return [ca.external(function.name(), str(library)) for function in functions]
-    except (OSError, subprocess.CalledProcessError, RuntimeError):
+        try:
+            folder = cache_dir()
+            own(folder)
+            return load(functions, folder / name, key, compiler, source)
+        except OSError as error:
+            warnings.warn(f"compiled code is not kept for the next start: {error}", stacklevel=2)
+        with tempfile.TemporaryDirectory(prefix="rti_mpc-") as private:
+            return load(functions, Path(private) / name, key, compiler, source)
+    except (OSError, subprocess.CalledProcessError) as error:
+        warnings.warn(f"{functions[0].name()} is interpreted, several times slower than compiled: {_brief(error)}", stacklevel=2)
         return list(functions)
 
 
-def build(compiler: str, source: str, library: Path) -> None:
-    """Compile into a temporary directory, then move: two processes that start at once never see half a file."""
-    library.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=library.parent) as folder:
+def load(functions: Sequence[ca.Function], library: Path, key: str, compiler: str, source: str) -> list[ca.Function]:
+    """
+    Load functions from a file, which is made first if it is not there, whole and ours.
+
+    Raises:
+        OSError: The file cannot be written, or not be loaded.
+        CalledProcessError: The compiler failed.
+    """
+    if not sealed(library, key):
+        keep(library, key, build(compiler, source))
+    try:
+        path = os.fsencode(library).decode()  # CasADi wants UTF-8, whatever the locale is
+        return [ca.external(function.name(), path) for function in functions]
+    except (RuntimeError, UnicodeDecodeError) as error:
+        why = str(error).partition("Error code: ")[2] or str(error)
+        raise OSError(f"{library} cannot be loaded: {_first_line(why)}") from None
+
+
+def build(compiler: str, source: str) -> bytes:
+    """Compile, and return the shared object."""
+    with tempfile.TemporaryDirectory(prefix="rti_mpc-") as folder:
         code = Path(folder) / "function.c"
-        code.write_text(source)
+        code.write_text(source, encoding="utf-8")
         made = code.with_suffix(".so")
-        subprocess.run([compiler, *FLAGS, "-o", str(made), str(code), "-lm"], check=True, capture_output=True)
-        made.replace(library)
+        environment = {"PATH": os.defpath, **os.environ}  # where the compiler was looked for, for its linker
+        subprocess.run([compiler, *FLAGS, "-o", str(made), str(code), "-lm"], check=True, capture_output=True, env=environment)
+        return made.read_bytes()
+
+
+def _brief(error: Exception) -> str:
+    """Return the first line of an error, a compiler's own where it has one."""
+    said = getattr(error, "stderr", None)
+    return _first_line(said.decode(errors="replace") if said else str(error))
+
+
+def _first_line(text: str) -> str:
+    return text.strip().partition("\n")[0]
 
 
 def bind(function: ca.Function, arguments: Sequence[Array], results: Sequence[Array]) -> Callable[[], None]:

@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rti_mpc.array import Array
-from rti_mpc.codegen import cache_dir
+from rti_mpc.cache import cache_dir, own
 from rti_mpc.controller import Controller, Timing
 from rti_mpc.message import Command, End, Reference, State
 from rti_mpc.status import Mode, QpStatus
@@ -84,7 +84,7 @@ def examine(config: Config) -> dict[str, Any]:
         "timer_us": quantiles(np.array(1e-3) * bare_timer(TICK_S, lambda: next(ticks) < TICKS)[:, 1]),
         "round_trip_us": quantiles(round_trip_us(config)),
         "compiler": compiler(),
-        "cache": {"path": str(cache_dir()), "writable": writable(cache_dir())},
+        "cache": cache(),
         "extras": {name: installed(name) for name in EXTRAS},
     }
     prepare_us, feedback_us = phases_us(config)
@@ -175,14 +175,14 @@ def compiler() -> str | None:
     return subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout.partition("\n")[0] if path else None
 
 
-def writable(folder: Path) -> bool:
-    """Whether files can be made in a folder, or in it once it is made."""
+def cache() -> dict[str, Any]:
+    """Say where compiled code is kept, and what keeps it from being kept there, if anything does."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return True
-    except OSError:
-        return False
+        folder = cache_dir()
+        own(folder)
+    except OSError as error:
+        return {"path": None, "error": str(error)}
+    return {"path": str(folder), "error": None}
 
 
 def installed(name: str) -> str | None:
@@ -206,7 +206,7 @@ def rows(report: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     yield "bare timer loop", said(report["timer_us"]), f"how late it wakes, every {1e3 * TICK_S:g} ms"
     yield "Zenoh round trip", said(report["round_trip_us"]), "a state out, a command in, nothing between"
     yield "compiler", report["compiler"] or "none", "what it compiled is cached" if report["compiler"] else "preparation takes several times longer"
-    yield "cache", cache["path"], "can be written" if cache["writable"] else "CANNOT be written: compiles at every start"
+    yield "cache", cache["path"] or "none", "is kept" if cache["error"] is None else f"compiles at EVERY start: {cache['error']}"
     for name, found in report["extras"].items():
         yield name, found or "not installed", f"pip install 'rti-mpc[{EXTRAS[name]}]'" if found is None else ""
     yield "versions", ", ".join(f"{name} {found}" for name, found in {"python": host["python"], **host["packages"]}.items()), host["system"]

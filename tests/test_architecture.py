@@ -56,7 +56,7 @@ ALONE = {
 
 # Inside the library, a file imports only from groups before its own.
 FLOW: tuple[set[str], ...] = (
-    {"errors", "array", "status", "robot_clock", "ladder", "grid", "epoch"},
+    {"errors", "array", "status", "robot_clock", "ladder", "grid", "epoch", "cache"},
     {"message", "polyline", "latch"},
     {"heading", "mode", "schedule", "issued"},
     {"trajectory", "guard", "sent"},

@@ -3,7 +3,11 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
+import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +17,12 @@ import pytest
 
 from rti_mpc import codegen
 from rti_mpc.array import Array
-from rti_mpc.codegen import bind, cache_dir, compiled
+from rti_mpc.cache import cache_dir
+from rti_mpc.codegen import bind, compiled
 from rti_mpc.errors import ShapeError
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler on this machine")
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
 
 
 @pytest.fixture
@@ -56,6 +62,109 @@ def test_second_build_comes_from_the_cache(cache: Path, monkeypatch: pytest.Monk
     assert compiled(product())[0].class_name() == "External"
 
 
+def truncated(library: Path, size: int) -> None:
+    os.truncate(library, size)
+
+
+def swapped(library: Path, text: str) -> None:
+    """As a program with our rights may, or a backup: a shared object of another content under this name."""
+    source = library.with_name("other.c")
+    source.write_text(text)
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", library, source], check=True)
+    source.unlink()
+
+
+def another_problem(library: Path) -> None:
+    """The same function names, whole and sealed, other numbers."""
+    x, y = ca.SX.sym("A", 2, 3), ca.SX.sym("b", 3)
+    compiled(ca.Function("product", [x, y], [2.0 * x @ y, x @ y], ["A", "b"], ["c", "s"]))
+    (other,) = set(library.parent.iterdir()) - {library}
+    other.replace(library)
+
+
+def linked(library: Path) -> None:
+    library.rename(library.with_suffix(".moved"))
+    library.symlink_to(library.with_suffix(".moved"))
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "harm",
+    [
+        lambda library: truncated(library, 0),
+        lambda library: truncated(library, 8192),
+        lambda library: truncated(library, library.stat().st_size - 1),
+        lambda library: library.write_bytes(library.read_bytes()[:-1] + b"x"),
+        lambda library: swapped(library, "__attribute__((constructor)) static void f(void) { __builtin_trap(); }"),
+        another_problem,
+        linked,
+        lambda library: library.chmod(0o666),
+        pytest.param(lambda library: os.chown(library, 12345, 12345), marks=needs_root),
+    ],
+    ids=["emptied", "cut off", "a byte short", "a byte changed", "swapped", "of another problem", "a link", "writable by all", "another's"],
+)
+def test_file_in_the_cache_that_is_not_whole_and_ours_is_built_anew_and_never_loaded(cache: Path, harm: Callable[[Path], None]) -> None:
+    compiled(product())
+    (library,) = cache.iterdir()
+    content = library.read_bytes()
+    harm(library)
+    (fast,) = compiled(product())
+    A, b, c, s = arrays()
+    bind(fast, (A, b), (c, s))()
+    np.testing.assert_allclose(c, A.T @ b, rtol=1e-15)
+    assert (library.read_bytes(), library.is_symlink(), library.stat().st_mode & 0o777) == (content, False, 0o600)
+    assert library.stat().st_uid == os.geteuid()
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("harm", "told"),
+    [
+        (lambda cache: cache.chmod(0o777), "nobody else may write: chown it, and chmod 700"),
+        (lambda cache: cache.parent.chmod(0o777), "above .*rti_mpc, must belong to root or this user, and not be writable by all"),
+        pytest.param(lambda cache: os.chown(cache, 12345, 12345), "a folder of this user", marks=needs_root),
+    ],
+    ids=["writable by all", "in a folder writable by all", "another's"],
+)
+def test_folder_that_others_may_write_is_not_used_and_said_so_once_in_one_line(cache: Path, harm: Callable[[Path], None], told: str) -> None:
+    compiled(product())
+    (library,) = cache.iterdir()
+    swapped(library, "__attribute__((constructor)) static void f(void) { __builtin_trap(); }")
+    harm(cache)
+    with pytest.warns(UserWarning, match=told) as warned:
+        assert compiled(product())[0].class_name() == "External", "compiled all the same"
+    assert ["\n" in str(warning.message) for warning in warned] == [False]
+
+
+@needs_compiler
+@pytest.mark.parametrize("environment", [{}, {"XDG_CACHE_HOME": "relative"}], ids=["nothing", "a relative folder"])
+def test_user_without_a_home_compiles_without_a_cache(environment: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+
+    def nobody(uid: int) -> None:
+        raise KeyError(uid)
+
+    monkeypatch.setattr("pwd.getpwuid", nobody)
+    with pytest.warns(UserWarning, match="XDG_CACHE_HOME or HOME must name a folder"):
+        assert compiled(product())[0].class_name() == "External"
+
+
+@needs_compiler
+def test_disk_that_fills_up_leaves_nothing_half_written(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.warns(UserWarning) as warned:
+        compiled(product())
+    assert "No space left on device" in str(warned[0].message)
+    assert list(cache.iterdir()) == []
+
+
+def full_disk(_: int) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
 @needs_compiler
 def test_another_function_of_the_same_name_is_built_anew(cache: Path) -> None:
     x = ca.SX.sym("x")
@@ -77,14 +186,18 @@ def test_compiler_that_fails_or_lies_is_no_error(cache: Path, tmp_path: Path, mo
     broken.chmod(0o755)
     monkeypatch.setattr(shutil, "which", lambda _: str(broken))
     function = product()
-    assert compiled(function)[0] is function
+    with pytest.warns(UserWarning) as warned:
+        assert compiled(function)[0] is function
+    assert str(warned[-1].message).startswith("product is interpreted, several times slower than compiled")
+    assert not any("\n" in str(warning.message) for warning in warned)
 
 
+@needs_compiler
 def test_cache_that_cannot_be_written_is_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    function = product()
-    assert compiled(function)[0] is function or shutil.which("cc") is None
+    with pytest.warns(UserWarning, match="compiled code is not kept for the next start: .*Not a directory"):
+        assert compiled(product())[0].class_name() == "External"
 
 
 @pytest.mark.parametrize("make", [compiled, lambda function: [function]], ids=["compiled", "interpreted"])

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Cache of compiled code: one file per problem, in a folder that nobody else may write.
+
+What is loaded runs with our rights, and what is cut off ends the process by
+SIGBUS. So a file is loaded only if it is ours, nobody else may write it, and it
+is whole: it ends with its seal, a hash of its key and content. It comes into
+being by a rename, so that neither another process nor a power cut sees half of
+it. Whatever is wrong is built anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+from pathlib import Path
+
+SEAL_BYTES = hashlib.sha256().digest_size
+OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+
+
+def cache_dir() -> Path:
+    """
+    Return where compiled code is kept (XDG base directory specification).
+
+    Raises:
+        OSError: Nothing says where.
+    """
+    given = os.environ.get("XDG_CACHE_HOME", "")
+    if os.path.isabs(given):  # the specification: a relative one is ignored
+        return Path(given) / "rti_mpc"
+    try:
+        return Path.home() / ".cache" / "rti_mpc"
+    except RuntimeError:
+        raise OSError("XDG_CACHE_HOME or HOME must name a folder for it") from None
+
+
+def own(folder: Path) -> None:
+    """
+    Make a folder that nobody else may write, or make sure that it is one.
+
+    Raises:
+        OSError: It cannot be made, or others could put a file there, or another folder in its place.
+    """
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    folder = folder.resolve()
+    if not _ours(folder.stat()):
+        raise OSError(f"{folder} must be a folder of this user that nobody else may write: chown it, and chmod 700")
+    for parent in folder.parents:
+        state = parent.stat()
+        if state.st_uid not in (0, os.geteuid()) or (state.st_mode & stat.S_IWOTH and not state.st_mode & stat.S_ISVTX):
+            raise OSError(f"{parent}, above {folder}, must belong to root or this user, and not be writable by all")
+
+
+def sealed(path: Path, key: str) -> bool:
+    """Whether a file holds, whole, what was kept under a key by this user."""
+    try:
+        state = path.lstat()
+        if not (stat.S_ISREG(state.st_mode) and _ours(state)):
+            return False
+        content = path.read_bytes()
+    except OSError:
+        return False
+    return content[-SEAL_BYTES:] == _seal(key, content[:-SEAL_BYTES])
+
+
+def keep(path: Path, key: str, content: bytes) -> None:
+    """
+    Put a sealed file in place, all of it or nothing; a loader ignores what follows the end of a shared object.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    temporary = path.with_name(f"{path.name}.{os.getpid()}")
+    try:
+        with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600), "wb") as file:
+            file.write(content + _seal(key, content))
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def _ours(state: os.stat_result) -> bool:
+    """Whether something belongs to this user and nobody else may write it."""
+    return state.st_uid == os.geteuid() and not state.st_mode & OTHERS_WRITE
+
+
+def _seal(key: str, content: bytes) -> bytes:
+    return hashlib.sha256(key.encode() + b"\0" + content).digest()
