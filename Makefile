@@ -9,7 +9,7 @@ UV := $(shell command -v uv)
 FITS := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 PYTHON = $(shell for python in python3 python3.13 python3.12 python3.11 python3.14; do $$python -c '$(FITS)' 2>/dev/null && echo $$python && break; done)
 
-.PHONY: demo test test-slow soak bench lint format types msg lock clean
+.PHONY: demo test test-slow soak ends bench lint format types msg lock clean
 
 demo: $(READY)
 	$(BIN)/rti-mpc demo $(ARGS)
@@ -26,6 +26,9 @@ test-slow: $(READY)
 
 soak: $(READY)
 	MALLOC_ARENA_MAX=2 $(BIN)/pytest -m slow -s tests/processes/test_soak.py --soak-s 1800 $(ARGS)
+
+ends: $(READY)
+	$(BIN)/pytest -m slow -s tests/processes/test_ends.py --ends 50 $(ARGS)
 
 bench: $(READY)
 	$(BIN)/pytest -m benchmark -s $(ARGS)

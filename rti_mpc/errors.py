@@ -7,6 +7,7 @@ Errors raised on purpose.
     - ShapeError       an array has the wrong shape, dtype or layout
   + ConfigError        a configuration value is missing, unknown or out of range
   + MessageError       bytes from the wire are not a message of ours
+  + Stopped            the process was stopped while it waited for somebody
 
 A QP that does not converge is *not* an exception: it is a `QpStatus` in the
 telemetry, and the controller decides what to command.
@@ -49,3 +50,7 @@ class ConfigError(RtiMpcError):
 
 class MessageError(RtiMpcError):
     """Bytes from the wire are not a message of ours."""
+
+
+class Stopped(RtiMpcError):
+    """The process was stopped while it waited for somebody: no fault, and nothing was begun."""

@@ -16,14 +16,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
 from typer.core import TyperGroup
 
 import rti_mpc
-from rti_mpc.errors import ConfigError, RtiMpcError
-from service import log
+from rti_mpc.errors import ConfigError
+from service import entry, log
 from service.config import Config, load
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 HERE = Path(__file__).parent
 SHIPPED = (HERE / "deploy" if (HERE / "deploy").is_dir() else HERE.parent / "deploy") / "pioneer_3dx.toml"  # in the wheel, in a clone
-EXTRAS = {"rerun": "view", "rerun_cli": "view", "matplotlib": "figure"}  # what a robot's own installation leaves out
 
 
 class Commands(TyperGroup):
@@ -353,19 +352,9 @@ def doctor(
     raise typer.Exit(main(config, path))
 
 
-def main() -> None:
+def main() -> NoReturn:
     """Run the command line; what it refuses is one line, with exit status 2."""
-    log.start()
-    try:
-        app()
-    except RtiMpcError as error:
-        refusal = str(error)
-    except ModuleNotFoundError as error:
-        if error.name not in EXTRAS:
-            raise
-        refusal = f"{error.name} must be installed for this command: pip install 'rti-mpc[{EXTRAS[error.name]}]'"
-    print(f"rti-mpc: {refusal}", file=sys.stderr)
-    sys.exit(2)
+    entry.enter(log.start, app)
 
 
 if __name__ == "__main__":

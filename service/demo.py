@@ -11,7 +11,6 @@ been driven for long enough. Robot and controller go before everything else.
 from __future__ import annotations
 
 import json
-import signal
 import socket
 import sys
 import time
@@ -143,7 +142,6 @@ def main(config: Config, scenario: str, **options: Any) -> int:
     except OSError as error:
         raise ConfigError(f"--out must be a folder that can be written, got {run.folder}: {error.strerror}") from error
     stop = stop_on_signals()
-    signal.signal(signal.SIGHUP, lambda *_: stop.set())
     try:
         outcome = drive(run, console, stop)
     except Failed as error:

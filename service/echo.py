@@ -19,6 +19,7 @@ from rti_mpc.wire.bus import Bus, BusSettings, Publisher, Subscriber
 from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
+from service import entry
 
 ROLE = "echo"
 PING, PONG = "echo/ping", "echo/pong"
@@ -99,4 +100,4 @@ def _answer(pings: Subscriber, pongs: Publisher[Command], payload: bytes) -> Non
 
 if __name__ == "__main__":
     _, endpoint, prefix, robot, size = sys.argv
-    main(BusSettings(connect=(endpoint,)), Keys(prefix, robot), int(size))
+    entry.enter(lambda: main(BusSettings(connect=(endpoint,)), Keys(prefix, robot), int(size)))

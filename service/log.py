@@ -7,12 +7,13 @@ import json
 import logging
 import os
 import sys
+import warnings
 from contextlib import suppress
 from queue import Full, Queue
 from threading import Thread
 
 WAITING = 1000  # lines
-CLOSE_S = 1.0  # to write at the end what still waits, at most
+CLOSE_S = 0.5  # to write at the end what still waits, at most
 
 
 class JsonLines(logging.Formatter):
@@ -67,7 +68,7 @@ class Aside(logging.Handler):
                 text = f"{dropped} lines are lost: standard output did not take them"
                 line = self.format(logging.makeLogRecord({"name": "log", "levelname": "WARNING", "msg": text})) + "\n" + line
             with suppress(OSError):  # nobody reads it any more, or its disk is full
-                os.write(self._descriptor, f"{line}\n".encode())
+                os.write(self._descriptor, f"{line}\n".encode(errors="backslashreplace"))
 
 
 def start() -> None:
@@ -76,4 +77,7 @@ def start() -> None:
     people = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S")
     handler.setFormatter(people if sys.stdout.isatty() else JsonLines())
     logging.basicConfig(level=logging.INFO, handlers=[handler])
+    warnings.showwarning = lambda message, *_, **__: logging.getLogger("rti_mpc").warning(
+        "%s", message
+    )  # the library's: one line, not where it is from
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it tells of fonts it has found, in the middle of a first demo's sum

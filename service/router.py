@@ -4,40 +4,31 @@
 from __future__ import annotations
 
 import logging
-import signal
 from dataclasses import replace
 from threading import Event
-from types import FrameType
 
 from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 
 log = logging.getLogger("router")
 
 
-def main(settings: BusSettings, keys: Keys) -> None:
+def main(settings: BusSettings, keys: Keys, *, stop: Event | None = None) -> None:
     """
-    Route until interrupted or terminated.
+    Route until stopped.
 
     Args:
         settings: How to join the bus; the mode is the router's, and without an endpoint to listen on it takes the rendezvous.
         keys: Where to show presence, as `router`.
+        stop: Stops the router when set; SIGINT, SIGTERM and SIGHUP if there is none.
 
     Raises:
         ConfigError: If an endpoint is taken, or Zenoh refuses a setting.
     """
-    done = Event()
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        done.set()
-
-    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with Bus(replace(settings, mode="router"), keys) as bus:
-            bus.alive("router")
-            log.info("routing")
-            done.wait()
-        log.info("stopped")
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+    stop = stop or stop_on_signals()
+    with Bus(replace(settings, mode="router"), keys, stop=stop) as bus:
+        bus.alive("router")
+        log.info("routing")
+        stop.wait()
+    log.info("stopped")

@@ -167,6 +167,7 @@ class Bus:
 
         Raises:
             ConfigError: Zenoh refuses a setting, an endpoint is taken, or no router was there in time.
+            Stopped: The wait was ended by `stop`.
         """
         self.keys = keys
         self.closed = False

@@ -24,7 +24,7 @@ from typing import Any
 
 import zenoh
 
-from rti_mpc.errors import ConfigError
+from rti_mpc.errors import ConfigError, Stopped
 from rti_mpc.message import Reference
 from rti_mpc.wire.layout import MOST_BYTES
 
@@ -118,7 +118,13 @@ def _brief(error: Exception) -> str:
 
 
 def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event | None) -> zenoh.Session:
-    """Open a session; a client waits for its router, unless it is stopped."""
+    """
+    Open a session; a client waits for its router.
+
+    Raises:
+        ConfigError: Zenoh refuses a setting, or no router was there in time.
+        Stopped: The wait was ended.
+    """
     deadline_s = time.monotonic() + timeout_s
     os.environ.setdefault("ZENOH_RUNTIME", THREADS)
     while True:
@@ -127,6 +133,8 @@ def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event 
         except zenoh.ZError as error:
             if "Unable to connect" not in str(error):
                 raise ConfigError(f"bus: endpoints must be free and valid, got: {_brief(error)}") from None
-            if time.monotonic() > deadline_s or (stop is not None and stop.is_set()):
+            if stop is not None and stop.is_set():
+                raise Stopped(f"stopped before a router was there at {', '.join(settings.connect)}") from None
+            if time.monotonic() > deadline_s:
                 raise ConfigError(f"bus: a router must be reachable at {', '.join(settings.connect)}, none has answered") from None
             time.sleep(RETRY_S)

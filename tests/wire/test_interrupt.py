@@ -8,6 +8,8 @@ import time
 from pathlib import Path
 from threading import Timer
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 LOOP = """
 import sys, threading
@@ -47,4 +49,32 @@ def test_ctrl_c_never_hangs_a_process_that_waits_for_it() -> None:
             assert process.wait(5.0) == 0
         finally:
             patience.cancel()
+            process.kill()
+
+
+WAIT = """
+from rti_mpc.wire.interrupt import stop_on_signals
+
+stop = stop_on_signals()
+print("ready", flush=True)
+while not stop.wait(0.01):
+    pass
+print("stopped", flush=True)
+"""
+
+
+@pytest.mark.parametrize(("command", "numbers"), [([], [signal.SIGHUP]), ([], [signal.SIGTERM]), (["nohup"], [signal.SIGHUP, signal.SIGINT])])
+def test_terminal_that_hangs_up_stops_a_process_unless_it_was_started_to_outlive_it(command: list[str], numbers: list[int]) -> None:
+    with subprocess.Popen([*command, sys.executable, "-c", WAIT], cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ready\n"
+            for number in numbers[:-1]:
+                process.send_signal(number)
+                with pytest.raises(subprocess.TimeoutExpired):
+                    process.wait(0.5)
+            process.send_signal(numbers[-1])
+            assert process.stdout.readline() == "stopped\n"
+            assert process.wait(5.0) == 0
+        finally:
             process.kill()

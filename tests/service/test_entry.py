@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rti_mpc.message import State
+from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.keys import Keys
+from service.cli import SHIPPED
+from tests.processes.system import CONFIG, free_endpoint
+
+ROOT = Path(__file__).parents[2]
+KEYS = Keys(robot="test")
+LISTENER = """
+import sys, threading, time
+from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.keys import Keys
+from service.entry import enter
+
+class Slow:
+    def __del__(self):
+        time.sleep(0.2)  # with all the modules around it, as an interpreter takes that has many to clear
+
+slow = Slow()
+
+def main():
+    bus = Bus(BusSettings(connect=(sys.argv[1],)), Keys(robot="test"))
+    heard = threading.Event()
+    def follow(subscriber):
+        for _ in iter(subscriber.recv, None):
+            heard.set()
+    for _ in range(4):
+        threading.Thread(target=follow, args=(bus.subscriber(bus.keys.state),), daemon=True).start()
+    assert heard.wait(20.0)
+
+enter(main)
+"""
+
+
+def run(code: str, *arguments: str, **options: object) -> subprocess.CompletedProcess[bytes]:
+    return subprocess.run([sys.executable, "-c", code, *arguments], cwd=ROOT, stderr=subprocess.PIPE, timeout=60, **options)  # type: ignore[call-overload,no-any-return]
+
+
+@contextmanager
+def flooded(endpoint: str) -> Iterator[None]:
+    """States without a pause."""
+    with Bus(BusSettings(listen=(endpoint,), connect=()), KEYS) as bus:
+        states, over = bus.publisher(KEYS.state, State, realtime=True), threading.Event()
+
+        def publish() -> None:
+            seq = 0
+            while not over.is_set():
+                states.put(State(1, seq := seq + 1, seq, np.zeros(5)))
+
+        flood = threading.Thread(target=publish)
+        flood.start()
+        try:
+            yield
+        finally:
+            over.set()
+            flood.join()
+
+
+def test_process_ends_well_while_its_threads_are_inside_zenoh() -> None:
+    """As they are where the bus could not be closed in time: what comes for them meets an interpreter that is going down."""
+    endpoint = free_endpoint()
+    with flooded(endpoint):
+        done = run(LISTENER, endpoint)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize(
+    ("step", "status", "said"),
+    [
+        ("pass", 0, ""),
+        ("sys.exit(3)", 3, ""),
+        ("raise ConfigError('a must be 1, got 2')", 2, "rti-mpc: a must be 1, got 2\n"),
+        ("raise Stopped('while waiting')", 0, ""),
+        ("raise KeyboardInterrupt", 130, ""),
+        ("raise ModuleNotFoundError(name='rerun')", 2, "rti-mpc: rerun must be installed for this command: pip install 'rti-mpc[view]'\n"),
+        ("os.write(1, b'x'); threading.Thread(target=time.sleep, args=(60,)).start()", 0, ""),
+        ("atexit.register(time.sleep, 60)", 0, ""),
+        ("atexit.register(print, 'last', file=sys.stderr)", 0, "last\n"),
+        ("sys.stderr.write('unended')", 0, "unended"),
+    ],
+)
+def test_process_ends_with_the_status_of_what_it_did_and_says_it_in_one_line(step: str, status: int, said: str) -> None:
+    code = "import atexit, os, sys, threading, time\nfrom rti_mpc.errors import *\nfrom service.entry import enter\ndef main():\n  "
+    done = run(f"{code}{step}\nenter(main)", stdout=subprocess.PIPE)
+    assert (done.returncode, done.stderr.decode()) == (status, said)
+
+
+def test_fault_of_our_own_keeps_its_traceback() -> None:
+    done = run("from service.entry import enter\nenter(lambda: 1 / 0)")
+    assert done.returncode == 1
+    assert b"Traceback" in done.stderr
+    assert b"ZeroDivisionError" in done.stderr
+
+
+def shell(command: str, *arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """A command of ours, as `$run`, in a shell, with the environment of a terminal that knows ASCII only."""
+    line = f"{sys.executable} -c 'from service.cli import main; main()'"
+    ascii_only = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        ["bash", "-c", command.replace("$run", line), "bash", *map(str, arguments)],
+        cwd=ROOT,
+        env={**os.environ, **ascii_only, **environment},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+FULL = f"rti-mpc: standard output must take what is printed, got: {os.strerror(errno.ENOSPC)}\n"
+
+
+@pytest.mark.parametrize(
+    ("command", "status", "stdout", "stderr"),
+    [
+        ("$run check >&-", 0, "", ""),
+        ("$run --help <&- >&- 2>&-", 0, "", ""),
+        ("$run check > /dev/full", 1, "", FULL),
+        ("$run --help > /dev/full", 1, "", FULL),
+        ("$run --help > /dev/full 2>&1", 1, "", ""),
+        ("$run check nowhere.toml 2> /dev/full", 2, "", ""),
+        ("$run check nowhere.toml 2>&-", 2, "", ""),
+        ("$run stop --timeout 0.1 -e tcp/127.0.0.1:1 >&- 2>&-", 1, "", ""),
+        ("$run check | head -c 1; exit ${PIPESTATUS[0]}", 128 + signal.SIGPIPE, "/", ""),
+    ],
+)
+def test_output_that_is_closed_full_or_not_read_to_its_end_is_one_line_at_most(command: str, status: int, stdout: str, stderr: str) -> None:
+    done = shell(command)
+    assert (done.returncode, done.stdout, done.stderr) == (status, stdout, stderr)
+
+
+@pytest.mark.parametrize("output", ["> /dev/full", ">&-", "| true"])
+def test_log_that_nobody_takes_ends_nobody(output: str) -> None:
+    endpoint = free_endpoint()
+    line = f"{sys.executable} -c 'from service.cli import main; main()' router {SHIPPED} -l {endpoint} {output}; exit ${{PIPESTATUS[0]}}"
+    with (
+        subprocess.Popen(["bash", "-c", line], cwd=ROOT, stderr=subprocess.PIPE, process_group=0) as process,
+        Bus(BusSettings(mode="client", connect=(endpoint,)), CONFIG.keys()) as bus,
+    ):
+        try:
+            assert bus.is_alive("router", 20.0)
+            subprocess.run(["pkill", "-TERM", "-P", str(process.pid)], check=True)
+            assert process.wait(20.0) == 0
+            assert process.stderr is not None
+            assert process.stderr.read() == b""
+        finally:
+            os.killpg(process.pid, signal.SIGKILL) if process.poll() is None else None
+
+
+def test_path_with_an_umlaut_is_printed_as_it_is_where_only_ascii_is_known(tmp_path: Path) -> None:
+    folder = tmp_path / "Jürgen"
+    folder.mkdir()
+    (folder / "röbot.toml").write_bytes(SHIPPED.read_bytes())
+    done = shell('$run check "$1"', folder / "röbot.toml", XDG_CACHE_HOME=str(folder))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith(f"{folder}/röbot.toml: N = 20")
+    assert list((folder / "rti_mpc").glob("*.so"))
+    done = shell('$run check "$1"', folder / "nö.toml")
+    assert (done.returncode, done.stderr) == (2, f"rti-mpc: {folder}/nö.toml: must be a readable file, got No such file or directory\n")
+
+
+def test_warning_of_the_library_is_one_line_of_the_log() -> None:
+    code = "import warnings\nfrom service import entry, log\nentry.enter(log.start, lambda: warnings.warn('slow', stacklevel=1))"
+    done = run(code, stdout=subprocess.PIPE)
+    assert json.loads(done.stdout) == {"level": "WARNING", "logger": "rti_mpc", "text": "slow"}
+    assert done.stderr == b""
