@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.epoch import epoch_above
+from rti_mpc.epoch import SEQ_AHEAD, epoch_above
 from rti_mpc.message import Command, Notice, Severity, State
 from rti_mpc.robot_clock import RobotClock
 from rti_mpc.schedule import EVER_NS, STEP_NS, Schedule, end_ns, unfit
@@ -30,6 +30,7 @@ VALID_NS = 300_000_000  # after its state, and the delay, in which a command may
 EARLY_NS = 50_000_000  # local time by which a state that a command answers may be ahead of our idea of the robot's clock
 LATE_NS = 50_000_000  # local time by which a state is late if it has waited on the way, and says nothing of the time now
 JUMP_NS = 250_000_000  # by which a clock has jumped
+LEFT_NS = 250_000_000  # robot time without a command in order after which the leader may count anew
 HELD_UP_NS = 250_000_000  # local time without a tick after which this process was held up
 LEAD_NS = 30_000_000  # local time by which the robot is told of the ramp before it is due
 TOLD = 10  # steps of the ramp in a command of our own
@@ -106,6 +107,7 @@ class Guard:
         self._awake_ns = 0  # local time of the last call
         self._open_ns = EVER_NS  # robot time from which commands pass
         self._leader = (0, -1)  # epoch and sequence number of the last command that was in order
+        self._led_ns = EVER_NS  # robot time of it
         self._told_ns = EVER_NS  # until when the robot knows what to do
         self._engaged = False  # whether this robot was ever told anything
         self._untold = False  # whether it is still to be told to brake
@@ -164,6 +166,7 @@ class Guard:
         reason = self._objection(command, now_ns, until_ns)
         if not reason:
             self._follow(command)
+            self._led_ns = now_ns
             if now_ns < self._open_ns:
                 if not self._waiting:
                     self._say(Severity.INFO, "guard_starting", "commands wait until what an earlier guard may have told the robot has run out")
@@ -274,8 +277,10 @@ class Guard:
             return "held: the robot is told to brake first"
         if command.epoch < epoch:
             return f"fenced: epoch {epoch} has taken over"
-        if command.epoch == epoch and command.seq <= seq:
-            return "repeated" if command.seq == seq else f"old: {seq} has passed"
+        if command.epoch == epoch and command.seq == seq:
+            return "repeated"
+        if command.epoch == epoch and now_ns - self._led_ns <= LEFT_NS and not seq < command.seq <= seq + SEQ_AHEAD:
+            return f"old: {seq} has passed" if command.seq < seq else f"ahead: the last one was {seq}"
         if reason := unfit(command, len(limits.u_rest), self._state.epoch):
             return reason
         if now_ns - self._clock.stamp_ns > max(self._stale_ns, 2.5 * self._clock.period_ns):

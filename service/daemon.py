@@ -33,8 +33,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.message import Command, State, Telemetry
 from rti_mpc.rti import Rti
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
-from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.bus import WAITING, Bus, BusSettings, Subscriber
 from rti_mpc.wire.interrupt import stop_on_signals
 from service import realtime
 from service.announce import announce
@@ -46,7 +45,6 @@ from service.params import Params
 from service.references import References
 
 TICK_S = 0.01  # between two looks for silence
-PLANNERS = 16  # whose references may wait for one who has just started, all at once
 RAMP_S = 0.6  # of a controller that is being stopped, to bring the robot to rest
 WARM_UP = 20  # solves before the first command: the first real sample is not the first call
 
@@ -137,19 +135,20 @@ class Daemon:
         self.orders = Orders(controller, rti, params, lock, lambda: leadership.leading, self._describe)
         self._lock = lock
         self._telling = Lock()
+        self._told = 0  # descriptions published
         self._ending = False
         self._crashed = Event()
         self._announcer: Announcer | None = None
         self._commands = bus.publisher(keys.command, Command, realtime=True)
         self._telemetries = {role: bus.publisher(key, Telemetry) for role, key in ((LEADER, keys.telemetry), (STANDBY, keys.shadow_telemetry))}
-        self._states_in = Intake(State, config.stale_s, {"x": model.nx})
+        self._states_in = bus.intake(State, config.stale_s, {"x": model.nx})
         self._references = References(bus, controller, model.ny)
         self._prepare_us = 0.0
         self._ticked_ns = 0
         self._threads = [
             Thread(
                 target=self._guarded,
-                args=(act, bus.subscriber(key, capacity=PLANNERS if cached else 1, cached=cached)),
+                args=(act, bus.subscriber(key, capacity=WAITING, cached=cached)),
                 name=act.__name__,
                 daemon=True,
             )
@@ -190,7 +189,7 @@ class Daemon:
         controller, intake = self._controller, self._states_in
         for received in iter(subscriber.recv, None):
             arrival_ns = time.monotonic_ns()
-            state = intake.accept(received, arrival_ns)
+            state = intake.newest((received, *subscriber.drain()), arrival_ns)
             command = None
             if state is not None:
                 with self._lock:
@@ -247,9 +246,6 @@ class Daemon:
             self._introduce()
         if (info := self._leadership.leader()) is not None:
             self.orders.adopt(info)
-        if self._leadership.misfit:
-            log.error("%s", self._leadership.misfit)
-            self._crashed.set()
         self._announce()
 
     def _introduce(self) -> None:
@@ -263,7 +259,9 @@ class Daemon:
         """Publish what this controller is."""
         with self._telling:
             role, config = self._leadership.role, self._config
-            about = {"role": role, "epoch": self._leadership.epoch, "config_hash": config.config_hash, "stale_s": config.stale_s}
+            self._told += 1
+            life = {"role": role, "epoch": self._leadership.epoch, "seq": self._told}
+            about = {**life, "config_hash": config.config_hash, "stale_s": config.stale_s}
             model = {**describe(self._params.ocp, self._controller.np_), "formulation": self._formulation, "realtime": self._granted}
             self._bus.publish_json(self._bus.keys.info(role), {**model, **about, **self.orders.describe()})
 

@@ -19,13 +19,11 @@ from threading import Event, Lock, Thread
 
 import rti_mpc
 from rti_mpc.epoch import NUMBER_BITS, epoch_above
-from rti_mpc.errors import ConfigError, MessageError
+from rti_mpc.errors import ConfigError
 from rti_mpc.guard import Guard
 from rti_mpc.message import Command, State
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import Bus, Received, Subscriber
-from rti_mpc.wire.cdr import decode
-from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.bus import WAITING, Bus, Received, Subscriber
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.session import BusSettings
 from service.announce import announce
@@ -34,7 +32,6 @@ from service.config import Config
 ROLE = "guard"
 HEARING_S = 0.5  # for which a starting guard listens for another
 RAMP_S = 3.0  # of a guard that is being stopped, to bring the robot to rest, at most
-WAITING = 8  # commands or states that wait at most, while this process is held up
 
 log = logging.getLogger(ROLE)
 
@@ -58,25 +55,17 @@ def main(config: Config, bus_settings: BusSettings, *, stop: Event | None = None
         raise ConfigError("guard.enabled must be true for the robot to take what a guard passes on, got false")
     stop = stop or stop_on_signals()
     with Bus(bus_settings, config.keys(), stop=stop) as bus:
-        heard = bus.subscriber(bus.keys.actuation)
+        heard, intake = bus.subscriber(bus.keys.actuation, capacity=WAITING), bus.intake(Command, HEARING_S, chooses=True)
         if bus.is_alive(ROLE, HEARING_S):
             print(f"rti-mpc: {config.robot} already has a guard: stop it first, or give this robot another name", file=sys.stderr)
             return 1
-        known = max(time.time_ns() // 1_000_000_000 << NUMBER_BITS, epoch_of(heard.try_recv()))
+        known = max(time.time_ns() // 1_000_000_000 << NUMBER_BITS, intake.highest_epoch(heard.drain()))
         epoch = epoch_above(known, secrets.randbits(NUMBER_BITS))
         process = Process(config, bus, epoch)
         bus.publish_json(bus.keys.info(ROLE), {**describe(config), "epoch": epoch})
         bus.alive(ROLE)
         log.info("epoch %d guards %s", epoch, config.robot)
         return process.run(stop)
-
-
-def epoch_of(received: Received | None) -> int:
-    """Return the epoch of a command as it came, 0 if there is none."""
-    try:
-        return 0 if received is None else decode(Command, received.payload).epoch
-    except MessageError:
-        return 0
 
 
 def describe(config: Config) -> dict[str, object]:
@@ -107,8 +96,8 @@ class Process:
         self._crashed = Event()
         self._announcer = Announcer(bus, ROLE, epoch)
         self._actuation = bus.publisher(keys.actuation, Command, realtime=True)
-        self._states = Intake(State, config.stale_s)
-        self._commands = Intake(Command, config.stale_s, {"u": len(limits.u_rest)})
+        self._states = bus.intake(State, config.stale_s)
+        self._commands = bus.intake(Command, config.stale_s, {"u": len(limits.u_rest)})
         self._threads = [
             Thread(target=self._follow, args=(act, bus.subscriber(key, capacity=WAITING)), name=act.__name__, daemon=True)
             for act, key in ((self._state, keys.state), (self._command, keys.command))
@@ -141,7 +130,7 @@ class Process:
 
     def _command(self, received: Received) -> None:
         """Pass a command on at once, if it is in order."""
-        command = self._commands.read(received)
+        command = self._commands.read(received, known=self._guard.epoch)
         if command is None:
             return
         with self._lock:

@@ -19,7 +19,7 @@ whatever two controllers have heard, they never arrive at the same one.
 
 from __future__ import annotations
 
-import json
+import re
 import secrets
 import time
 from collections.abc import Iterator, Mapping
@@ -28,12 +28,12 @@ from threading import Event
 from typing import Any
 
 from rti_mpc.controller import Controller
-from rti_mpc.epoch import NUMBER_BITS, epoch_above
+from rti_mpc.epoch import NUMBER_BITS, SEQ_AHEAD, SKEW_S, epoch_above, highest_believed
+from rti_mpc.errors import MessageError
 from rti_mpc.message import Command, Notice, Severity, State
 from rti_mpc.status import Mode
-from rti_mpc.wire.bus import Bus, Received
-from rti_mpc.wire.intake import Intake
-from service.guard import epoch_of
+from rti_mpc.wire import document
+from rti_mpc.wire.bus import WAITING, Bus, Received
 
 LEADER, STANDBY = "controller", "standby"  # roles
 HEARING_S = 0.5  # for which a starting controller listens for others
@@ -41,6 +41,10 @@ SILENCE_PERIODS = 1.5  # of the leader, by the states it did not answer, after w
 SILENCE_S = 0.03  # at least, robot time
 ASLEEP_S = 0.03  # without a look at the clock, at least: less is a busy machine
 DOUBT_S = 0.03  # for which a leader in doubt listens, local time
+COMPANY = 16  # others standing by of whom is known: a name costs nothing
+RANKS = 3  # periods that one who stands by leaves to those of a lower number, at most
+NUMBERED = re.compile(rf"{STANDBY}\.([0-9]{{1,7}})")  # role of one who stands by
+OWN = 2**64  # above every sequence number: nobody else's command of our epoch counts
 UNREADY = (Mode.IDLE, Mode.WAITING)  # with nothing to command
 
 
@@ -60,22 +64,25 @@ class Others:
 
 def hear_others(bus: Bus, stop: Event) -> Others:
     """Listen for `HEARING_S`."""
-    commands = [bus.subscriber(key) for key in (bus.keys.command, bus.keys.actuation)]
-    infos = bus.subscriber(bus.keys.info(LEADER), capacity=8, cached=True)
+    commands = [bus.subscriber(key, capacity=WAITING) for key in (bus.keys.command, bus.keys.actuation)]
+    infos = bus.subscriber(bus.keys.info(LEADER), capacity=WAITING, cached=True)
+    intake = bus.intake(Command, HEARING_S, chooses=True)
     stop.wait(HEARING_S)
-    heard = [epoch_of(subscriber.try_recv()) for subscriber in commands]
-    leaders = [(info["epoch"], info["config_hash"]) for info in map(leader_info, infos.drain()) if info is not None]
-    epoch = max(heard + [epoch for epoch, _ in leaders])
-    return Others(epoch, max(leaders)[1] if leaders else None)
+    epoch = max(intake.highest_epoch(subscriber.drain()) for subscriber in commands)
+    highest = highest_believed(time.time_ns() // 1_000_000_000 - SKEW_S, epoch)
+    leaders = [info for received in infos.drain() if (info := leader_info(received, highest)) is not None]
+    leader = max(leaders, key=lambda info: (info["epoch"], info["seq"]), default=None)
+    return Others(epoch, None) if leader is None else Others(max(epoch, leader["epoch"]), leader["config_hash"])
 
 
-def leader_info(received: Received) -> dict[str, Any] | None:
-    """Return a leader's description of itself, if it is one."""
+def leader_info(received: Received, highest: int) -> dict[str, Any] | None:
+    """Return a leader's description of itself, if it is one; its epoch is at most `highest`."""
     try:
-        info = json.loads(received.payload)
-        return info if isinstance(info["epoch"], int) and isinstance(info["config_hash"], int) else None
-    except (ValueError, RecursionError, KeyError, TypeError):
+        info = document.read(received.payload, received.size)
+    except MessageError:
         return None
+    whole = all(type(number := info.get(name)) is int and number >= 0 for name in ("epoch", "seq", "config_hash"))
+    return info if whole and info["epoch"] <= highest else None
 
 
 class Leadership:
@@ -86,13 +93,14 @@ class Leadership:
         commands_in: Door of what other controllers send.
         leading: Whether it leads.
         epoch: Of its commands; those of the robot's first leader are the Unix seconds at its start, times ``2 ** NUMBER_BITS``, or above.
-        misfit: Why it can neither lead nor stand by: the leader has another configuration. Empty while it can.
+        misfit: Why it takes over from nobody: whoever leads has another configuration, and ours never led. Empty while it may.
     """
 
     def __init__(self, bus: Bus, controller: Controller, others: Others, *, config_hash: int, dt_s: float, nu: int, standby: bool) -> None:
-        self.commands_in = Intake(Command, SILENCE_S, {"u": nu})
+        unix_s = time.time_ns() // 1_000_000_000
+        self.commands_in = bus.intake(Command, SILENCE_S, {"u": nu}, chooses=True)
         self.number = secrets.randbits(NUMBER_BITS)
-        self.epoch = epoch_above(max(others.epoch, time.time_ns() // 1_000_000_000 << NUMBER_BITS), self.number)
+        self.epoch = epoch_above(max(others.epoch, unix_s << NUMBER_BITS), self.number)
         self.leading = False
         self.misfit = ""
         self._bus = bus
@@ -101,17 +109,19 @@ class Leadership:
         self._dt_ns = round(1e9 * dt_s)
         self._silence_ns = round(1e9 * max(SILENCE_PERIODS * dt_s, SILENCE_S))
         self._late_ns = -((self._dt_ns - self._silence_ns) // self._dt_ns) * self._dt_ns  # age of a state not answered at which another leads
-        self._highest = 0  # epoch heard of a controller; a guard counts its own
+        self._unix_s = unix_s
+        self._last = (0, -1)  # epoch and sequence number of the last command of the highest epoch, ours included; a guard counts its own
+        self._belongs = False  # whether a controller of this configuration has ever led this robot
         self._robot_epoch = 0
         self._seen_ns = 0  # stamp of the last state
         self._quiet_ns = 0  # stamp of the last state that the leader, we or another, is known to have answered, or from which on we listen
         self._doubt_ns: int | None = None  # local time from which on this leader is in doubt
-        self._replaced = 0  # epoch of the leader before
+        self._replaced = (0, -1)  # the last command of the leader before
         self._took_over: Notice | None = None  # until the first command
         self._looked_ns = time.monotonic_ns()
-        self._infos = bus.subscriber(bus.keys.info(LEADER), capacity=8, cached=True)
-        self._info: dict[str, Any] | None = None  # of the highest epoch, until it is read
-        self._commands = bus.subscriber(bus.keys.command, capacity=8)
+        self._infos = bus.subscriber(bus.keys.info(LEADER), capacity=WAITING, cached=True)
+        self._told = (0, -1)  # epoch and sequence number of the last description of a leader that was read
+        self._commands = bus.subscriber(bus.keys.command, capacity=WAITING)
         self._tokens: dict[str, Any] = {}
         self._company: set[int] = set()  # numbers of those who stand by
         self._accompanied = False  # whether there ever was one
@@ -149,9 +159,9 @@ class Leadership:
             self._quiet_ns = state.stamp_ns + max(0, min(late_ns, self._late_ns)) + round(1e9 * DOUBT_S)
         silent_ns = state.stamp_ns - self._quiet_ns
         if not self.leading:
-            rank = sum(number < self.number for number in self._company)
+            rank = min(RANKS, sum(number < self.number for number in self._company))
             if silent_ns >= self._silence_ns + rank * self._dt_ns and not self.misfit:
-                self._replaced = self._highest
+                self._replaced = self._last
                 self._lead()
                 self._quiet_ns = state.stamp_ns  # the silence was another's, and our first sample may be states away
                 text = f"leads from now on, with epoch {self.epoch}: nobody has answered a state for {1e-9 * silent_ns:.3f} s"
@@ -169,9 +179,9 @@ class Leadership:
             return False
         if self._took_over is not None:
             notice, self._took_over = self._took_over, None
-            late = [heard for heard in self._heard() if heard.epoch >= self._replaced]
+            late = list(self._heard(self._replaced))
             if late:
-                self._highest = self._replaced
+                self._last = self._replaced
                 self._stand_by()
                 for command in late:
                     self._follow(command)
@@ -190,20 +200,22 @@ class Leadership:
         slept_ns, before_ns, self._looked_ns = local_ns - self._looked_ns, self._looked_ns, local_ns
         if slept_ns > 1e9 * ASLEEP_S and self._controller.robot_now_ns(local_ns) - self._controller.robot_now_ns(before_ns) > self._silence_ns:
             self._doubt(local_ns)
-        for command in self._heard():
-            if command.epoch >= self._highest:
-                self._follow(command)
+        for command in self._heard(self._last):
+            self._follow(command)
 
     def leader(self) -> Mapping[str, Any] | None:
         """Return what the leader has last said of itself, once; None while this one leads."""
-        for info in map(leader_info, self._infos.drain()):
-            if info is not None and (self._info is None or info["epoch"] >= self._info["epoch"]):
-                self._info = info
-        if self.leading or self._info is None or self._info["epoch"] < self._highest:
+        waiting = self._infos.drain()
+        if self.leading:
             return None
-        info, self._info = self._info, None
-        self._fit(info["config_hash"])
-        return info
+        news, highest = None, highest_believed(self._unix_s - SKEW_S, self._last[0])
+        for received in waiting:
+            info = leader_info(received, highest)
+            if info is not None and info["epoch"] >= self._last[0] and (info["epoch"], info["seq"]) > self._told:
+                news, self._told = info, (info["epoch"], info["seq"])
+        if news is not None:
+            self._fit(news["config_hash"])
+        return news
 
     def declare(self) -> bool:
         """Show on the bus which role is played, if that has changed, and tell whether it has; off the path from state to command."""
@@ -216,14 +228,19 @@ class Leadership:
         return True
 
     def _lead(self) -> None:
-        self.epoch = self._highest = epoch_above(max(self.epoch - 1, self._highest), self.number)
-        self.leading = True
+        self.epoch = epoch_above(max(self.epoch - 1, self._last[0]), self.number)
+        self._last = self.epoch, OWN
+        self.leading = self._belongs = True
         self._controller.lead(self.epoch)
 
-    def _heard(self) -> Iterator[Command]:
-        """Yield what others have commanded since the last call."""
+    def _heard(self, last: tuple[int, int]) -> Iterator[Command]:
+        """Yield what others have commanded since the last call and after a command, for this life of the robot: all else does not act."""
         while (received := self._commands.try_recv()) is not None:
-            if (command := self.commands_in.read(received)) is not None:
+            command = self.commands_in.read(received, known=last[0])
+            if command is None or (self._robot_epoch and command.state_epoch != self._robot_epoch):
+                continue
+            if command.epoch > last[0] or (command.epoch == last[0] and last[1] < command.seq <= last[1] + SEQ_AHEAD):
+                last = command.epoch, command.seq
                 yield command
 
     def _stand_by(self) -> None:
@@ -239,26 +256,35 @@ class Leadership:
 
     def _follow(self, command: Command) -> None:
         """Let somebody else's command act: its epoch is the highest."""
-        self._highest = command.epoch
+        self._last = command.epoch, command.seq
         self._fit(command.config_hash)
         if self.leading:
             self._stand_by()
-            text = f"stands by: epoch {command.epoch} leads, ours was {self.epoch}"
+            whose = "" if command.config_hash == self._config_hash else f" of another configuration, {command.config_hash:016x},"
+            text = f"stands by: epoch {command.epoch}{whose} leads, ours was {self.epoch}"
             self._controller.notices.append(Notice(Severity.WARNING, "stepped_down", text))
         self._controller.overhear(command)
         if command.state_epoch == self._robot_epoch:
             self._quiet_ns = max(self._quiet_ns, command.state_stamp_ns)
 
     def _fit(self, config_hash: int) -> None:
-        if config_hash != self._config_hash:
-            self.misfit = differ(config_hash, self._config_hash)
+        """Take over from whoever falls silent, if a controller of our configuration has ever led; else from none of another one."""
+        self._belongs |= config_hash == self._config_hash
+        misfit = "" if self._belongs else differ(config_hash, self._config_hash)
+        if misfit and misfit != self.misfit:
+            self._controller.notices.append(Notice(Severity.ERROR, "misfit", f"{misfit}: it takes over from nobody"))
+        self.misfit = misfit
 
     def _meet(self, role: str, present: bool) -> None:
         """Count who stands by; in a thread of the bus."""
-        kind, _, number = role.partition(".")
-        if kind == STANDBY and number.isdigit() and int(number) != self.number:
-            self._company = self._company | {int(number)} if present else self._company - {int(number)}
-            self._accompanied = True
+        numbered = NUMBERED.fullmatch(role)
+        if numbered is None or (number := int(numbered[1])) == self.number:
+            return
+        if not present:
+            self._company = self._company - {number}
+        elif len(self._company) < COMPANY:
+            self._company = self._company | {number}
+        self._accompanied = True
 
 
 def differ(leader: int, ours: int) -> str:

@@ -14,7 +14,7 @@ from threading import Condition
 from typing import Any
 
 from rti_mpc.controller import Controller
-from rti_mpc.errors import ConfigError, OcpError
+from rti_mpc.errors import ConfigError, RtiMpcError
 from rti_mpc.message import Notice, Severity
 from rti_mpc.rti import Rti
 from service import injection
@@ -78,10 +78,10 @@ class Orders:
         try:
             self._stop(str(info["stopped"]))
             version = self._params.version
-            self._params.adopt(int(info["parameters"]["version"]), dict(info["parameters"]["changes"]))
+            self._params.adopt(info["parameters"]["version"], dict(info["parameters"]["changes"]))
             if self._params.version != version:
                 self._say("parameters_changed", f"parameters of version {self._params.version}, as the leader has them")
-        except (KeyError, TypeError, ValueError, ConfigError, OcpError) as error:
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RtiMpcError) as error:
             self._say("leader_not_understood", f"the leader's description must hold its orders, got a fault at {error}", Severity.WARNING)
 
     def _stop(self, reason: str) -> None:

@@ -29,6 +29,7 @@ from service.refusal import entries, explain
 
 WEIGHTS = ("ocp.weights.Q", "ocp.weights.R", "ocp.weights.delta", "ocp.weights.lambda", "ocp.bounds.soft_weight")
 BOUNDS = ("ocp.bounds.inputs", "ocp.bounds.increments", "ocp.bounds.states")
+VERSIONS = 2**32  # as many as telemetry can tell
 PATIENCE = 2  # periods, for a sample
 SAMPLE = ("x", "u", "u_prev", "y_ref", "p")  # of an `Rti`
 
@@ -80,6 +81,8 @@ class Params:
         Raises:
             ConfigError: It does not fit.
         """
+        if type(version) is not int or not 0 <= version < VERSIONS:
+            raise ConfigError(f"version of parameters must be an integer from 0 to {VERSIONS - 1}, got {version!r}")
         if version != self.version:
             self._take(*changed(self._file, self.ocp, changes), version, dict(changes))
 

@@ -16,7 +16,6 @@ from rti_mpc.array import Array
 from rti_mpc.controller import Controller
 from rti_mpc.message import STAMP_ON_ARRIVAL, Reference
 from rti_mpc.wire.bus import Bus, Subscriber
-from rti_mpc.wire.intake import Intake
 
 STALE_S = 60.0  # silence of a planner after which one of a lower epoch may take over; a restarted one has a higher
 
@@ -34,7 +33,7 @@ class References:
 
     def __init__(self, bus: Bus, controller: Controller, ny: int) -> None:
         widths = {"y": ny, "p": controller.np_}
-        self.planners, self.leaders = Intake(Reference, STALE_S, widths), Intake(Reference, STALE_S, widths)
+        self.planners, self.leaders = bus.intake(Reference, STALE_S, widths), bus.intake(Reference, STALE_S, widths)
         self._controller = controller
         self._inbox: deque[tuple[Reference, Array | None]] = deque(maxlen=1)
         self._publisher = bus.publisher(bus.keys.anchored, Reference, cached=True)

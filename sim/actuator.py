@@ -76,14 +76,11 @@ class Actuator:
         """
         early = command.state_stamp_ns > arrival_ns + EARLY_NS
         arrival_ns += self._delay_ns
-        verdict = self._source.accept(command.epoch, command.seq, arrival_ns)
+        reason = "switched_off" if self._off else unfit(command, len(self.u), self._robot_epoch) or ("early" if early else "")
+        if not reason:  # what could not act locks nobody out
+            verdict = self._source.accept(command.epoch, command.seq, arrival_ns)
+            reason = "" if verdict.accepted else verdict.value
         self.counters.lost = self._source.lost
-        if self._off:
-            reason = "switched_off"
-        elif not verdict.accepted:
-            reason = verdict.value
-        else:
-            reason = unfit(command, len(self.u), self._robot_epoch) or ("early" if early else "")
         start_ns = max(command.stamp_ns, arrival_ns)
         if not reason and end_ns(command) <= start_ns:
             reason = "expired"

@@ -25,9 +25,9 @@ import numpy as np
 import rti_mpc
 from rti_mpc.message import Command, Notice, Severity, State
 from rti_mpc.model import Model
+from rti_mpc.schedule import unfit
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import Bus, BusSettings, Received, Subscriber
-from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.bus import WAITING, Bus, BusSettings, Subscriber
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from sim.actuator import STALE_NS, Counters
@@ -127,11 +127,13 @@ class Robot:
         self._log = Log(log, settings.model)
         self._states = bus.publisher(bus.keys.state, State, realtime=True)
         self._announcer = Announcer(bus, ROLE, self.body.epoch)
-        self._inbox: deque[tuple[Received, int]] = deque(maxlen=64)  # with the monotonic time of arrival
-        self._intake = Intake(Command, 1e-9 * STALE_NS / speed, {"u": settings.model.nu})
+        self._inbox: deque[tuple[Command, int]] = deque(maxlen=64)  # with the monotonic time of arrival
+        nu, epoch = settings.model.nu, self.body.epoch
+        self._intake = bus.intake(Command, 1e-9 * STALE_NS / speed, {"u": nu}, unfit=lambda command: unfit(command, nu, epoch))
+        self._refused = 0  # by the door, so far
         self._sent = 0
         self._held_up_ns = 0
-        Thread(target=self._receive, args=(bus.subscriber(key, capacity=8),), daemon=True).start()
+        Thread(target=self._receive, args=(bus.subscriber(key, capacity=WAITING),), daemon=True).start()
         self.clock = Clock(speed)
 
     def run(self, stop: Event, until_ns: int | None = None) -> None:
@@ -165,9 +167,11 @@ class Robot:
         return RobotSummary(self._sent, 1e-9 * self._held_up_ns, body.counters)
 
     def _receive(self, subscriber: Subscriber) -> None:
-        """Note every command with the time of its arrival; a thread of its own."""
+        """Note every command from our source with the time of its arrival; a thread of its own. What is not for us takes nobody's place."""
         for received in iter(subscriber.recv, None):
-            self._inbox.append((received, time.monotonic_ns()))
+            arrival_ns = time.monotonic_ns()
+            if (command := self._intake.accept(received, arrival_ns)) is not None:
+                self._inbox.append((command, arrival_ns))
 
     def _hold(self, due_ns: int) -> None:
         """Set the clock back to a time that this process missed."""
@@ -182,6 +186,9 @@ class Robot:
             self._take(*self._inbox.popleft())
         for notice in self._intake.notices(time.monotonic_ns()):
             self._announcer.say(notice, to_ns)
+        refused = self._intake.refused.total() + self._intake.source.dropped
+        self.body.counters.refused += refused - self._refused
+        self._refused = refused
         starved = self.body.counters.starved
         self._advance(to_ns)
         if self.body.counters.starved > starved:
@@ -190,12 +197,8 @@ class Robot:
         while (state := self.body.sensor.take(to_ns)) is not None:
             self._send(state)
 
-    def _take(self, received: Received, monotonic_ns: int) -> None:
+    def _take(self, command: Command, monotonic_ns: int) -> None:
         """Hand a command to the actuators."""
-        command = self._intake.accept(received, monotonic_ns)
-        if command is None:
-            self.body.counters.refused += 1
-            return
         arrival_ns = max(self.body.now_ns, self.clock.at_ns(monotonic_ns))
         reason = self.body.accept(command, arrival_ns)
         if reason:

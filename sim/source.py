@@ -20,8 +20,7 @@ from rti_mpc.array import Array
 from rti_mpc.message import Notice, Reference, Severity, State
 from rti_mpc.trajectory import Heading, Trajectory, rows
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
-from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.bus import WAITING, Bus, BusSettings, Subscriber
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 
@@ -97,7 +96,7 @@ class Source:
         self._bus = bus
         self._states: Subscriber | None = None
         self._look_again_ns = 0
-        self._intake = Intake(State, STALE_S)
+        self._intake = bus.intake(State, STALE_S)
         self._robot_epoch = -1
 
     def look(self) -> None:
@@ -111,13 +110,11 @@ class Source:
         if self._states is None:
             if now_ns < self._look_again_ns:
                 return
-            self._states = self._bus.subscriber(self._bus.keys.state)
-        received = self._states.try_recv()
-        if received is None:
-            return
-        self._states = None
-        self._look_again_ns = now_ns + LOOK_AGAIN_NS
-        state = self._intake.accept(received, now_ns)
+            self._states = self._bus.subscriber(self._bus.keys.state, capacity=WAITING)
+        state = self._intake.newest(self._states.drain(), now_ns)
+        if state is not None:
+            self._states = None
+            self._look_again_ns = now_ns + LOOK_AGAIN_NS
         if state is not None and state.epoch != self._robot_epoch:
             self._robot_epoch = state.epoch
             self._anchor(state.stamp_ns)

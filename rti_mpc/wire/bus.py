@@ -18,6 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Generic
 
 import zenoh
@@ -36,6 +37,7 @@ CLOSE_TIMEOUT_S = 0.5
 HEARTBEAT_S = 1.0  # of a cached publisher, which tells the number of its last message
 MOST_BYTES = 32_768  # of a request: to parse JSON holds the interpreter's lock, for 30 ms a megabyte
 ENCODING = 256  # characters of one that are looked at
+WAITING = 1024  # samples that wait for a receiver: half a second of it being held up, at 2000 a second of anybody's
 TOKENS = 1024  # changes of presence that may wait
 RETRY_S = 0.1  # between two looks for somebody who is not there yet
 
@@ -104,8 +106,9 @@ class Publisher(Generic[M]):
 class Subscriber:
     """Receives from one key expression into a ring: the newest samples, oldest first. After `Bus.close`, nothing."""
 
-    def __init__(self, subscriber: zenoh.Subscriber[Any] | ext.AdvancedSubscriber[Any], key: str, own: str) -> None:
+    def __init__(self, subscriber: zenoh.Subscriber[Any] | ext.AdvancedSubscriber[Any], key: str, capacity: int, own: str) -> None:
         self._subscriber = subscriber
+        self._capacity = capacity
         self._handler = subscriber.handler
         self._key = "" if "*" in key else key
         self._most = most_bytes(key)
@@ -132,8 +135,8 @@ class Subscriber:
         return None
 
     def drain(self) -> list[Received]:
-        """All samples there are now, oldest first."""
-        return list(iter(self.try_recv, None))
+        """All samples there are now, oldest first, and of those that come meanwhile no more than the ring holds."""
+        return list(islice(iter(self.try_recv, None), self._capacity))
 
     def _received(self, sample: zenoh.Sample) -> Received | None:
         if self._own and (info := sample.source_info) is not None and str(info.source_id.zid) == self._own:
@@ -210,19 +213,28 @@ class Bus:
 
         Args:
             key: What to listen to; may hold wildcards.
-            capacity: Samples kept, the oldest dropped first.
+            capacity: Samples kept, the oldest dropped first. A receiver that wants the last message alone keeps `WAITING` all the
+                same, and takes the newest that is accepted: what anybody sends behind it must not push it out.
             cached: Whether to ask publishers for their last message, those which come later included.
         """
         ring: Any = zenoh.handlers.RingChannel(capacity)
         origin = zenoh.Locality.REMOTE
         if not cached:
-            return Subscriber(self._session.declare_subscriber(key, ring, allowed_origin=origin), key, own="")
+            return Subscriber(self._session.declare_subscriber(key, ring, allowed_origin=origin), key, capacity, own="")
         history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
         recovery = ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
         subscriber = ext.declare_advanced_subscriber(self._session, key, ring, allowed_origin=origin, history=history, recovery=recovery)
-        return Subscriber(subscriber, key, own=str(self._session.info.zid()))
+        return Subscriber(subscriber, key, capacity, own=str(self._session.info.zid()))
 
-    def intake(self, cls: type[M], stale_s: float, widths: Mapping[str, int] | None = None, *, chooses: bool = False) -> Intake[M]:
+    def intake(
+        self,
+        cls: type[M],
+        stale_s: float,
+        widths: Mapping[str, int] | None = None,
+        *,
+        chooses: bool = False,
+        unfit: Callable[[M], str] = lambda _: "",
+    ) -> Intake[M]:
         """
         Return a door for messages of one class, that knows what epochs may be now.
 
@@ -231,8 +243,9 @@ class Bus:
             stale_s: Time without an accepted message after which another source may take over.
             widths: Numbers a row must have, by array.
             chooses: Whether an epoch is chosen above those heard: then less is believed than others will.
+            unfit: Why a message cannot be for us, as a code; empty if it can.
         """
-        return Intake(cls, stale_s, widths, unix_s=self._unix_s - SKEW_S * chooses)
+        return Intake(cls, stale_s, widths, unix_s=self._unix_s - SKEW_S * chooses, unfit=unfit)
 
     def publish_json(self, key: str, value: dict[str, Any]) -> None:
         """Publish a JSON object that late joiners get, too."""

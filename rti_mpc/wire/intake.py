@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Generic, Protocol
 
 from rti_mpc.epoch import highest_believed
@@ -38,10 +38,18 @@ class Intake(Generic[M]):
 
     Attributes:
         source: The source it is locked to, with its counts of lost and dropped messages.
-        refused: Malformed payloads by reason, one of `rti_mpc.wire.cdr.REASONS`.
+        refused: Payloads that were no message, or none for us, by reason: one of `rti_mpc.wire.cdr.REASONS`, or of `unfit`.
     """
 
-    def __init__(self, cls: type[M], stale_s: float, widths: Mapping[str, int] | None = None, quiet_s: float = 1.0, unix_s: int = 0) -> None:
+    def __init__(
+        self,
+        cls: type[M],
+        stale_s: float,
+        widths: Mapping[str, int] | None = None,
+        quiet_s: float = 1.0,
+        unix_s: int = 0,
+        unfit: Callable[[M], str] = lambda _: "",
+    ) -> None:
         """
         Open the door.
 
@@ -51,11 +59,14 @@ class Intake(Generic[M]):
             widths: Numbers a row must have, by array, such as ``{"x": 5}``; stage parameters may be left out.
             quiet_s: Shortest time between two notices of one code.
             unix_s: Unix time, s, that limits epochs, see `rti_mpc.epoch.highest_believed`.
+            unfit: Why a message cannot be for us, as a code such as ``foreign_epoch``; empty if it can. Its source is then not judged at all.
         """
         self.source = Source(round(1e9 * stale_s))
         self.refused: Counter[str] = Counter()
         self._cls = cls
+        self._name = cls.__name__.lower()
         self._unix_s = unix_s
+        self._unfit = unfit
         self._encoding = encoding(cls)
         self._widths = tuple((widths or {}).items())
         self._quiet_ns = round(1e9 * quiet_s)
@@ -97,6 +108,11 @@ class Intake(Generic[M]):
         message = self.read(received)
         if message is None:
             return None
+        if reason := self._unfit(message):
+            self.refused[reason] += 1
+            text = f"epoch {message.epoch}, seq {message.seq} was refused: {reason.replace('_', ' ')}"
+            self._note(Severity.WARNING, f"{self._name}_{reason}", text)
+            return None
         before = self.source.epoch
         verdict = self.source.accept(message.epoch, message.seq, now_ns)
         if verdict is Verdict.NEXT:
@@ -110,17 +126,32 @@ class Intake(Generic[M]):
             self._note(Severity.WARNING, "source_refused", f"{text}; {self.source.dropped} dropped so far")
         return None
 
+    def newest(self, waiting: Iterable[Payload], now_ns: int) -> M | None:
+        """Last of several payloads, oldest first, that is accepted, whatever has come behind it; None if none is."""
+        message = None
+        for received in waiting:
+            message = self.accept(received, now_ns) or message
+        return message
+
+    def highest_epoch(self, waiting: Iterable[Payload]) -> int:
+        """Highest epoch among several payloads, whoever sent them; 0 if none is a message."""
+        epoch = 0
+        for received in waiting:
+            if (message := self.read(received, epoch)) is not None:
+                epoch = max(epoch, message.epoch)
+        return epoch
+
     def notices(self, now_ns: int) -> list[Notice]:
         """Take what there is to publish now: per code the latest, and not again before `quiet_s` has passed."""
         if not self._pending:
             return []
-        pending = list(self._pending)  # at once: other threads add to it
+        pending = list(self._pending)  # at once: other threads add to it and take from it
         due = [code for code in pending if now_ns - self._said_ns.get(code, now_ns - self._quiet_ns) >= self._quiet_ns]
         self._said_ns.update(dict.fromkeys(due, now_ns))
-        return [self._pending.pop(code) for code in due]
+        return [notice for code in due if (notice := self._pending.pop(code, None)) is not None]
 
     def _note(self, severity: Severity, code: str, text: str) -> None:
-        self._pending[code] = Notice(severity, code, f"{self._cls.__name__.lower()}: {text}")
+        self._pending[code] = Notice(severity, code, f"{self._name}: {text}")
 
     def _check_width(self, message: M, name: str, width: int) -> None:
         got = getattr(message, name).shape[-1]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -11,10 +12,12 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from rti_mpc.epoch import SKEW_S, highest_believed
 from rti_mpc.message import Command, Notice, State
 from rti_mpc.status import Mode, QpStatus
 from rti_mpc.wire.bus import Received
 from rti_mpc.wire.cdr import encode, encoding
+from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
 from service.leadership import NUMBER_BITS, Leadership, Others, epoch_above
 
@@ -61,6 +64,10 @@ class WireBus:
 
         return Subscriber()
 
+    def intake(self, cls: Any, stale_s: float, widths: Any, *, chooses: bool) -> Any:
+        assert chooses
+        return Intake(cls, stale_s, widths, unix_s=time.time_ns() // 10**9 - SKEW_S)
+
     def watch_alive(self, callback: Callable[[str, bool], None]) -> None:
         self.watch = callback
 
@@ -97,10 +104,10 @@ class Puppet:
 class One:
     """One controller of several on a wire."""
 
-    def __init__(self, wire: Wire, *, standby: bool, number: int | None = None, dt_s: float = DT_S) -> None:
+    def __init__(self, wire: Wire, *, standby: bool, number: int | None = None, dt_s: float = DT_S, config_hash: int = HASH) -> None:
         self.bus, self.puppet, self.wire = WireBus(wire), Puppet(), wire
         bus, puppet = cast(Any, self.bus), cast(Any, self.puppet)
-        self.leadership = Leadership(bus, puppet, Others(0, None), config_hash=HASH, dt_s=dt_s, nu=1, standby=standby)
+        self.leadership = Leadership(bus, puppet, Others(0, None), config_hash=config_hash, dt_s=dt_s, nu=1, standby=standby)
         if number is not None:
             self.leadership.number = number
         self.leadership.declare()
@@ -309,13 +316,76 @@ def test_controller_with_nothing_to_command_takes_over_nothing(pair: tuple[One, 
     assert [standby.see(k) for k in (12, 13)] == [False, True]
 
 
-def test_leader_of_another_configuration_is_not_followed(pair: tuple[One, One]) -> None:
-    leader, standby = pair
-    standby.leadership._config_hash = 8
-    leader.see(5)
-    standby.see(5)
+def test_one_that_stands_by_takes_over_from_no_leader_of_another_configuration_and_says_so_once() -> None:
+    wire = Wire()
+    leader, standby = One(wire, standby=False), One(wire, standby=True, config_hash=8)
+    for k in range(1, 6):
+        leader.see(k)
+        standby.see(k)
     assert f"{HASH:016x}" in standby.leadership.misfit
     assert [standby.see(k) for k in range(6, 10)] == [False] * 4
+    assert codes(standby) == ["misfit"]
+
+
+def test_a_command_of_another_configuration_ends_neither_leader_nor_standby(pair: tuple[One, One]) -> None:
+    """Those that have led this robot, or stood by for one that did, go on when it is silent."""
+    leader, standby = pair
+    forged = replace(leader.made(4), epoch=leader.leadership.epoch + 1, config_hash=666)
+    leader.bus.commands.append(Received(encode(forged), encoding(Command), ""))
+    standby.bus.commands.append(Received(encode(forged), encoding(Command), ""))
+    answered = [[one.see(k) for one in pair] for k in range(5, 12)]
+    assert answered[0] == [False, False]
+    assert sum(map(any, answered)) >= 5
+    assert all(sum(both) <= 1 for both in answered)
+    assert f"{666:016x}" in next(notice.text for notice in leader.puppet.notices if notice.code == "stepped_down")
+    assert "misfit" not in codes(leader) + codes(standby)
+
+
+def test_replayed_commands_make_no_leader_step_down_and_no_standby_believe_in_them(pair: tuple[One, One]) -> None:
+    leader, standby = pair
+    sent = [replace(leader.made(k), epoch=leader.leadership.epoch, seq=k) for k in (1, 2, 3, 4)]
+    leader._seq = 4
+    for k in range(5, 12):
+        for command in sent:
+            for one in pair:
+                one.bus.commands.append(Received(encode(command), encoding(Command), ""))
+        assert [one.see(k) for one in pair] == [True, False]
+    assert codes(leader) == codes(standby) == []
+    assert [command.state_stamp_ns for command in standby.puppet.heard] == [k * DT_NS for k in range(1, 12)]
+
+
+@pytest.mark.parametrize(
+    "change", [{"epoch": 2**64 - 1}, {"epoch": 2**63}, {"epoch": 2**52, "state_epoch": 9}, {"state_epoch": 9}, {"seq": 2**64 - 1}]
+)
+def test_commands_that_act_on_no_robot_change_nobodys_role(pair: tuple[One, One], change: dict[str, int]) -> None:
+    leader = pair[0]
+    forged = replace(leader.made(4), **{"epoch": leader.leadership.epoch, "seq": 100} | change)
+    for k in range(5, 12):
+        for one in pair:
+            one.bus.commands.append(Received(encode(forged), encoding(Command), ""))
+        assert [one.see(k) for one in pair] == [True, False]
+    assert leader.leadership.epoch < 2**53
+
+
+def test_whoever_succeeds_the_highest_epoch_there_can_be_leads_with_one_that_all_believe(pair: tuple[One, One]) -> None:
+    leader, standby = pair
+    unix_s = time.time_ns() // 10**9
+    forged = replace(leader.made(4), epoch=highest_believed(unix_s - SKEW_S))
+    for one in pair:
+        one.bus.commands.append(Received(encode(forged), encoding(Command), ""))
+    answered = [[one.see(k) for one in pair] for k in range(5, 12)]
+    assert sum(map(any, answered)) >= 5
+    assert forged.epoch < max(leader.leadership.epoch, standby.leadership.epoch) <= highest_believed(unix_s)
+
+
+def test_a_hundred_names_keep_nobody_from_taking_over(pair: tuple[One, One]) -> None:
+    _, standby = pair
+    for number in range(100):
+        standby.bus.watch(f"standby.{number}", True)
+    for name in ("standby.²", "standby.", "standby.-1", "standby." + 5000 * "9", "standby.9" + 7 * "9", "", "."):
+        standby.bus.watch(name, True)
+        standby.bus.watch(name, False)
+    assert any(standby.see(k) for k in range(5, 10))
 
 
 def test_epochs_of_two_numbers_never_meet() -> None:

@@ -16,6 +16,7 @@ from rti_mpc.track import Track
 from rti_mpc.trajectory import circle
 from rti_mpc.wire.bus import Received
 from rti_mpc.wire.cdr import encode, encoding
+from rti_mpc.wire.intake import Intake
 from service.references import References
 from tests.loop import reference
 from tests.problems import pioneer
@@ -23,7 +24,7 @@ from tests.problems import pioneer
 
 def test_controlling_thread_does_nothing_for_each_row_of_a_reference(monkeypatch: pytest.MonkeyPatch) -> None:
     controller = Controller(Rti(pioneer(N=5), compile=False), Timing(), compile=False)
-    bus: Any = SimpleNamespace(keys=SimpleNamespace(anchored="anchored"), publisher=lambda *_, **__: None)
+    bus: Any = SimpleNamespace(intake=Intake, keys=SimpleNamespace(anchored="anchored"), publisher=lambda *_, **__: None)
     references = References(bus, controller, ny=3)
     message = reference(circle())
     waiting = iter([Received(encode(message), encoding(type(message)), "reference"), None])
