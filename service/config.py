@@ -206,12 +206,15 @@ class Config(Section):
         """Return what `sim.settings.RobotSettings` is made from; the slew limits are those of the increments."""
         model, sim = self.build_model().with_parameters(**self.sim.parameters), self.sim
         increments = zip(*bounds(self.ocp.bounds.increments, names(model.inputs)), strict=True)
+        lbu, ubu = bounds(self.ocp.bounds.inputs, names(model.inputs))
         return {
             "state_period_s": self.ocp.dt_s,
             **sim.model_dump(exclude_none=True, exclude={"parameters"}),
             "model": model,
             "x0": [sim.x0.get(state.name, 0.0) for state in model.states],
             "noise_std": [sim.noise_std.get(state.name, 0.0) for state in model.states],
+            "lbu": lbu,
+            "ubu": ubu,
             "slew": [min(-lower, upper) / self.ocp.dt_s for lower, upper in increments],
         }
 

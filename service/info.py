@@ -10,6 +10,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rti_mpc.errors import MessageError
+from rti_mpc.wire.document import read
+from rti_mpc.wire.keys import role_of
+
+LONGEST = 64  # characters of a name or a unit
+WIDEST = 512  # components of a vector, obstacles, or columns of a reference
 
 
 @dataclass(frozen=True)
@@ -92,19 +97,37 @@ class Info:
             MessageError: It is not one.
         """
         try:
-            vectors: dict[str, Any] = {name: tuple(Label(s["name"], s["unit"], bool(s["angle"])) for s in document.get(name, ())) for name in VECTORS}
+            vectors: dict[str, Any] = {name: tuple(_label(signal) for signal in _few(document.get(name, ()))) for name in VECTORS}
             bounds: dict[str, Any] = {name: _bounds(document.get(name), sign, len(vectors[vector])) for name, (vector, sign) in BOUNDS.items()}
             return cls(
                 role=str(document["role"]),
                 document=json.dumps(document, indent=2),
                 model=str(document.get("model", "")),
-                obstacles=tuple(Obstacle(int(o["at"]), *(float(o[part]) for part in "xyr")) for o in document.get("obstacles", ())),
+                obstacles=tuple(_obstacle(disc) for disc in _few(document.get("obstacles", ()))),
                 dt_s=float(document.get("dt_s", math.nan)),
                 **vectors,
                 **bounds,
             )
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             raise MessageError(f"info must be JSON of role, states, inputs, outputs, bounds as documented, got a fault at {error}") from error
+
+    @classmethod
+    def from_payload(cls, payload: bytes, size: int, key: str) -> Info:
+        """
+        Read a description as it came.
+
+        Args:
+            payload: Its bytes.
+            size: How many were sent.
+            key: Where it was published, which ends with the role that it describes.
+
+        Raises:
+            MessageError: It is none.
+        """
+        info = cls.from_json(read(payload, size))
+        if not info.role or info.role != role_of(key):
+            raise MessageError(f"info must be of the role that its key ends with, got {info.role[:LONGEST]!r} on {key[-LONGEST:]!r}")
+        return info
 
     @classmethod
     def unnamed(cls, nx: int, nu: int, ny: int) -> Info:
@@ -141,6 +164,26 @@ class Info:
 
 VECTORS = ("states", "inputs", "outputs", "disturbances")
 BOUNDS = {"lbu": ("inputs", -1), "ubu": ("inputs", 1), "lbx": ("states", -1), "ubx": ("states", 1)}
+
+
+def _few(values: Sequence[Any]) -> Sequence[Any]:
+    if len(values) > WIDEST:
+        raise ValueError(f"at most {WIDEST} components expected, got {len(values)}")
+    return values
+
+
+def _label(signal: Mapping[str, Any]) -> Label:
+    label = Label(signal["name"], signal["unit"], bool(signal["angle"]))
+    for text in (label.name, label.unit):
+        if not 0 < len(text) <= LONGEST or not text.isprintable():
+            raise ValueError(f"names and units of 1 to {LONGEST} printable characters expected, got {text[:LONGEST]!r}")
+    return label
+
+
+def _obstacle(disc: Mapping[str, Any]) -> Obstacle:
+    if not 0 <= (at := int(disc["at"])) < WIDEST:
+        raise ValueError(f"a column below {WIDEST} expected, got {at}")
+    return Obstacle(at, *(float(disc[part]) for part in "xyr"))
 
 
 def _bounds(values: Sequence[float | None] | None, sign: int, length: int) -> tuple[float, ...]:

@@ -3,15 +3,15 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator
 from typing import Any
 
 from rti_mpc.errors import MessageError
 from rti_mpc.message import STAMP_ON_ARRIVAL, Command, Event, Notice, Reference, State, Telemetry
-from rti_mpc.wire.bus import Bus, Received, Subscriber
+from rti_mpc.wire.bus import WAITING, Bus, Received, Subscriber
 from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.keys import admitted
 from service.info import Info
 from service.playback import Actuation
 from service.recording import Entry
@@ -19,7 +19,6 @@ from service.timeline import Timeline
 
 CAPACITY = 2048  # messages a stream may be ahead of us: 2 s at 1 kHz
 STALE_S = 2.0
-DOORS = 64  # keys listened to: a peer may invent roles, and must not fill our memory
 
 Door = Intake[Any]
 
@@ -41,12 +40,15 @@ class Listener:
         self.received = 0
         self._bad_infos = 0
         self._timeline = Timeline()
+        self._bus = bus
         self._doors: dict[str, Door] = {}
-        self._infos = bus.subscriber(keys.infos, capacity=DOORS, cached=True)
+        self._events: set[str] = set()  # keys of events
+        self._described: set[str] = set()  # keys of descriptions
+        self._infos = bus.subscriber(keys.infos, capacity=WAITING, cached=True)
         self._streams: tuple[tuple[type[Any], Subscriber], ...] = (
             (State, bus.subscriber(keys.state, capacity=capacity)),
-            (Reference, bus.subscriber(keys.reference, capacity=16, cached=True)),
-            (Reference, bus.subscriber(keys.anchored, capacity=16, cached=True)),
+            (Reference, bus.subscriber(keys.reference, capacity=WAITING, cached=True)),
+            (Reference, bus.subscriber(keys.anchored, capacity=WAITING, cached=True)),
             (Command, bus.subscriber(keys.command, capacity=capacity)),
             (Command, bus.subscriber(keys.actuation, capacity=capacity)),
             (Telemetry, bus.subscriber(keys.telemetry, capacity=capacity)),
@@ -80,11 +82,19 @@ class Listener:
         return [*entries, *self._notices(now_ns)]
 
     def _descriptions(self) -> Iterator[Entry]:
+        """Yield the last one of every role."""
+        infos: dict[str, Info] = {}
         for received in self._infos.drain():
             try:
-                yield Entry(self._timeline.now_ns, Info.from_json(json.loads(received.payload)))
-            except (MessageError, ValueError, RecursionError):
+                info = Info.from_payload(received.payload, received.size, received.key)
+            except MessageError:
                 self._bad_infos += 1
+                continue
+            if admitted(received.key, self._described):
+                self._described.add(received.key)
+                infos[received.key] = info
+        for info in infos.values():
+            yield Entry(self._timeline.now_ns, info)
 
     def _messages(self, now_ns: int) -> Iterator[Entry]:
         for cls, subscriber in self._streams:
@@ -101,9 +111,13 @@ class Listener:
                     yield Entry(self._timeline.place(message.stamp_ns), message)
 
     def _door(self, cls: type[Any], received: Received) -> Door | None:
-        if received.key not in self._doors and len(self._doors) < DOORS:
-            self._doors[received.key] = Intake(cls, STALE_S)
-        return self._doors.get(received.key)
+        """Return the door of a key; None for one role too many of those that send events."""
+        key = received.key
+        if key not in self._doors and (cls is not Event or admitted(key, self._events)):
+            self._doors[key] = self._bus.intake(cls, STALE_S)
+            if cls is Event:
+                self._events.add(key)
+        return self._doors.get(key)
 
     def _notices(self, now_ns: int) -> Iterator[Entry]:
         """Show what the doors have to say as events of our own."""

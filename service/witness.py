@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
-import json
 import time
+from contextlib import suppress
 
+from rti_mpc.errors import MessageError
 from rti_mpc.message import Event, Reference, Telemetry
-from rti_mpc.wire.bus import Bus
+from rti_mpc.wire.bus import WAITING, Bus
 from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.keys import admitted
 from service.info import Info
 
 CAPACITY = 4096  # samples between two looks: seconds, at any rate
-PLANNERS = 16  # references between two looks
 STALE_S = 60.0  # one life of each process is a run
 
 
@@ -34,10 +35,11 @@ class Witness:
         self.reference: Reference | None = None
         self.info: Info | None = None
         self.lives: set[str] = set()
-        self._samples, self._samples_in = bus.subscriber(bus.keys.telemetry, capacity=CAPACITY), Intake(Telemetry, STALE_S)
-        self._references, self._references_in = bus.subscriber(bus.keys.reference, capacity=PLANNERS, cached=True), Intake(Reference, STALE_S)
+        self._bus = bus
+        self._samples, self._samples_in = bus.subscriber(bus.keys.telemetry, capacity=CAPACITY), bus.intake(Telemetry, STALE_S)
+        self._references, self._references_in = bus.subscriber(bus.keys.reference, capacity=WAITING, cached=True), bus.intake(Reference, STALE_S)
         self._events, self._events_in = bus.subscriber(bus.keys.events, capacity=CAPACITY, cached=True), dict[str, Intake[Event]]()
-        self._infos = bus.subscriber(bus.keys.info("controller"), cached=True)
+        self._infos = bus.subscriber(bus.keys.info("controller"), capacity=WAITING, cached=True)
         bus.watch_alive(self._notice)
 
     @property
@@ -60,16 +62,20 @@ class Witness:
         for received in self._samples.drain():
             if (sample := self._samples_in.accept(received, now_ns)) is not None:
                 self.telemetry.append(sample)
-        for received in self._references.drain():
-            self.reference = self._references_in.accept(received, now_ns) or self.reference
+        self.reference = self._references_in.newest(self._references.drain(), now_ns) or self.reference
         for received in self._infos.drain():
-            self.info = Info.from_json(json.loads(received.payload))
+            with suppress(MessageError):
+                self.info = Info.from_payload(received.payload, received.size, received.key)
         for received in self._events.drain():
-            door = self._events_in.setdefault(received.key, Intake(Event, STALE_S))
-            if (event := door.accept(received, now_ns)) is not None:
+            if not admitted(received.key, self._events_in):
+                continue
+            if received.key not in self._events_in:
+                self._events_in[received.key] = self._bus.intake(Event, STALE_S)
+            if (event := self._events_in[received.key].accept(received, now_ns)) is not None:
                 self.events.append(event)
         return self
 
     def _notice(self, role: str, present: bool) -> None:
         """Note who comes and goes; called in a thread of the bus."""
-        (self.lives.add if present else self.lives.discard)(role)
+        if admitted(role, self.lives):
+            (self.lives.add if present else self.lives.discard)(role)

@@ -8,7 +8,7 @@ What was taken acts as `rti_mpc.schedule` says. No clock: time is told.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,7 +51,9 @@ class Actuator:
         braking: Whether no plan acts.
     """
 
-    def __init__(self, u_rest: Array, slew: Array, epoch: int, delay_ns: int = 0) -> None:
+    def __init__(
+        self, u_rest: Array, slew: Array, epoch: int, delay_ns: int = 0, bounds: tuple[float | Array, float | Array] = (-np.inf, np.inf)
+    ) -> None:
         self.u = np.array(u_rest, dtype=np.float64)
         self.counters = Counters()
         self.braking = True
@@ -60,6 +62,7 @@ class Actuator:
         self._robot_epoch = epoch
         self._delay_ns = delay_ns
         self._source = Source(STALE_NS)
+        self._bounds = bounds  # of the inputs, shape (nu,): a drive does no more, whatever it is told
         self._off = False
 
     @property
@@ -89,7 +92,7 @@ class Actuator:
             self.counters.refused += reason != "expired"
             return reason
         self.counters.late += arrival_ns >= command.stamp_ns + command.period_ns
-        self._schedule.add(command, start_ns, end_ns(command))
+        self._schedule.add(replace(command, u=np.clip(command.u, *self._bounds)), start_ns, end_ns(command))
         return ""
 
     def play(self, from_ns: int, to_ns: int) -> Iterator[tuple[int, Array]]:

@@ -43,7 +43,7 @@ class Lockstep:
         self.now_ns = 0
         self.epoch = epoch
         self.period_ns = settings.state_period_ns
-        self.actuator = Actuator(np.array(model.u_rest), settings.slew, epoch, round(1e9 * settings.actuator_delay_s))
+        self.actuator = Actuator(np.array(model.u_rest), settings.slew, epoch, round(1e9 * settings.actuator_delay_s), (settings.lbu, settings.ubu))
         self.sensor = Sensor(epoch, settings.noise_std, angles, round(1e9 * settings.sensor_delay_s), settings.dropout, settings.seed)
         self._plant = Plant(model, settings.x0, settings.state_period_s, settings.substeps, settings.actuator_lag_s)
         self.x: Array = self._plant.x

@@ -21,6 +21,8 @@ class RobotSettings:
         model: Model of the plant, with the plant's own parameters.
         x0: Initial state, shape ``(nx,)``.
         slew: Largest rate of each input while braking on its own, shape ``(nu,)``, in the input's unit per s; infinite by default.
+        lbu: Least of each input that the actuators do, whatever is commanded, shape ``(nu,)``; without a limit by default.
+        ubu: Most of each input.
         state_period_s: Time between states.
         substeps: RK4 steps a state period is cut into.
         noise_std: Standard deviation of the measured states, shape ``(nx,)``; zero by default.
@@ -37,6 +39,8 @@ class RobotSettings:
     model: Model
     x0: Array
     slew: Array = field(default_factory=lambda: np.empty(0))
+    lbu: Array = field(default_factory=lambda: np.empty(0))
+    ubu: Array = field(default_factory=lambda: np.empty(0))
     state_period_s: float = 0.1
     substeps: int = 20
     noise_std: Array = field(default_factory=lambda: np.empty(0))
@@ -49,7 +53,7 @@ class RobotSettings:
     def __post_init__(self) -> None:
         """Fill in defaults that depend on the model, and check."""
         nx, nu = self.model.nx, self.model.nu
-        for name, length, default in (("x0", nx, 0.0), ("slew", nu, np.inf), ("noise_std", nx, 0.0)):
+        for name, length, default in (("x0", nx, 0.0), ("slew", nu, np.inf), ("lbu", nu, -np.inf), ("ubu", nu, np.inf), ("noise_std", nx, 0.0)):
             given = np.array(getattr(self, name), dtype=np.float64)
             value = given if given.size or name == "x0" else np.full(length, default)
             if value.shape != (length,) or np.isnan(value).any():
@@ -59,6 +63,7 @@ class RobotSettings:
         for name, right, fits in (
             ("x0", "finite", bool(np.isfinite(self.x0).all())),
             ("slew", "above 0", bool((self.slew > 0.0).all())),
+            ("lbu", "at most the input at rest, and that at most ubu", self._reach_rest()),
             ("noise_std", "finite and at least 0", bool(np.isfinite(self.noise_std).all() and (self.noise_std >= 0.0).all())),
             ("state_period_s", "from 0.0001 to 10 s", 1e-4 <= self.state_period_s <= 10.0),
             ("substeps", "from 1 to 1000", 1 <= self.substeps <= 1000),
@@ -69,6 +74,9 @@ class RobotSettings:
         ):
             if not fits:
                 raise ConfigError(f"{name} must be {right}, got {getattr(self, name)}")
+
+    def _reach_rest(self) -> bool:
+        return bool((self.lbu <= np.array(self.model.u_rest)).all() and (self.ubu >= np.array(self.model.u_rest)).all())
 
     @property
     def state_period_ns(self) -> int:

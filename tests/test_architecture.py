@@ -54,6 +54,8 @@ ALONE = {
     },
 }
 
+LOCAL = {"rti_mpc/wire/session.py"}  # reads JSON that is not a peer's: Zenoh's own configuration
+
 # Inside the library, a file imports only from groups before its own.
 FLOW: tuple[set[str], ...] = (
     {"errors", "array", "status", "robot_clock", "ladder", "grid", "epoch", "cache"},
@@ -120,6 +122,19 @@ def test_library_has_no_clock_and_no_thread_but_on_the_wire() -> None:
 def test_foreign_package_is_behind_its_own_files(package: str) -> None:
     importers = {path.relative_to(ROOT).as_posix() for layer in PACKAGES for path in files(layer) if package in roots(path)}
     assert importers <= ALONE[package]
+
+
+def called(path: Path) -> set[str]:
+    """Names of all functions and methods a file calls, of what it imports or of a module: `decode(...)`, `json.loads(...)`."""
+    calls = [node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+    names = {func.id for func in calls if isinstance(func, ast.Name)}
+    return names | {f"{func.value.id}.{func.attr}" for func in calls if isinstance(func, ast.Attribute) and isinstance(func.value, ast.Name)}
+
+
+@pytest.mark.parametrize(("name", "doors"), [("decode", {"rti_mpc/wire/intake.py"}), ("json.loads", {"rti_mpc/wire/document.py"})])
+def test_what_peers_send_is_read_in_one_place(name: str, doors: set[str]) -> None:
+    callers = {path.relative_to(ROOT).as_posix() for layer in PACKAGES for path in files(layer) if name in called(path)}
+    assert callers - LOCAL == doors
 
 
 def test_data_flows_one_way_through_the_library() -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from rti_mpc.errors import ConfigError
@@ -11,7 +12,8 @@ from rti_mpc.message import Command, Event, Reference, State, Telemetry
 from rti_mpc.wire import document
 from rti_mpc.wire.layout import MOST_BYTES
 
-ROLES = ("controller", "standby", "guard", "robot", "reference", "viewer")  # of whom there is always heard, whoever else there is
+ROLES = ("controller", "standby", "guard", "robot", "reference", "viewer", "recorder", "router", "operator", "relay")  # known to everybody
+STRANGERS = 16  # other roles of which is heard: a name costs nothing
 ROLE = re.compile(r"[a-z][a-z0-9_]{0,31}(\.[0-9]{1,7})?", re.ASCII)  # one of several is numbered, such as standby.17
 
 # Longest payload of a stream, by its first word, in bytes; of others as much as of a command.
@@ -123,6 +125,19 @@ def role_of(key: str) -> str:
     """Return the role that a key of an event, a description or a token ends with; empty if it is no name of one."""
     role = key.rpartition("/")[2]
     return role if ROLE.fullmatch(role) else ""
+
+
+def admitted(key: str, known: Collection[str]) -> bool:
+    """
+    Return whether to listen to the role that a key ends with: of any in `ROLES`, and of `STRANGERS` others.
+
+    Args:
+        key: Of an event, a description or a token.
+        known: Keys of this stream that were admitted before.
+    """
+    if key in known or role_of(key) in ROLES:
+        return True
+    return bool(role_of(key)) and sum(role_of(other) not in ROLES for other in known) < STRANGERS
 
 
 def most_bytes(key: str) -> int:

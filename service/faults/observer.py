@@ -10,12 +10,12 @@ from threading import Thread
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.errors import MessageError
 from rti_mpc.message import Command, State
-from rti_mpc.wire.bus import Bus, Subscriber
-from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.bus import WAITING, Bus, Subscriber
+from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
 
+STALE_S = 0.25  # without a message after which another life is looked at
 LOOK_BACK_NS = 200_000_000  # over which speed is measured
 
 
@@ -32,8 +32,9 @@ class Observer:
         self.epoch = 0
         self.answered: set[int] = set()
         self._states: deque[tuple[int, int, Array]] = deque(maxlen=4096)  # stamp, local monotonic arrival, position
-        for act, key in ((self._receive, robot.state), (self._listen, bus.keys.command)):
-            Thread(target=act, args=(bus.subscriber(key, capacity=64),), daemon=True).start()
+        states, commands = bus.subscriber(robot.state, capacity=WAITING), bus.subscriber(bus.keys.command, capacity=WAITING)
+        Thread(target=self._receive, args=(states, bus.intake(State, STALE_S)), daemon=True).start()
+        Thread(target=self._listen, args=(commands, bus.intake(Command, STALE_S)), daemon=True).start()
 
     def forget(self) -> None:
         """Wait for another life of the robot."""
@@ -68,23 +69,18 @@ class Observer:
         first = next(state for state in states if states[-1][0] - state[0] <= LOOK_BACK_NS)
         return float(np.hypot(*(states[-1][2] - first[2]))) / max(1e-9 * (states[-1][0] - first[0]), 1e-3)
 
-    def _receive(self, subscriber: Subscriber) -> None:
+    def _receive(self, subscriber: Subscriber, intake: Intake[State]) -> None:
         """Note every state with the time of its arrival; a thread of its own."""
         for received in iter(subscriber.recv, None):
             arrival_ns = time.monotonic_ns()
-            try:
-                state = decode(State, received.payload)
-            except MessageError:
+            if (state := intake.read(received)) is None:
                 continue
             self.epoch = state.epoch
             self._states.append((state.stamp_ns, arrival_ns, state.x[:2]))
 
-    def _listen(self, subscriber: Subscriber) -> None:
+    def _listen(self, subscriber: Subscriber, intake: Intake[Command]) -> None:
         """Note which states were answered; a thread of its own."""
         for received in iter(subscriber.recv, None):
-            try:
-                command = decode(Command, received.payload)
-            except MessageError:
-                continue
-            if command.state_epoch == self.epoch:
+            command = intake.read(received)
+            if command is not None and command.state_epoch == self.epoch:
                 self.answered.add(command.state_seq)

@@ -19,15 +19,16 @@ from typing import Any
 
 import numpy as np
 
-from rti_mpc.errors import MessageError
 from rti_mpc.message import Command, State
-from rti_mpc.wire.bus import Bus, Publisher, Subscriber
-from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.bus import WAITING, Bus, Publisher, Subscriber
+from rti_mpc.wire.cdr import M
+from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.session import BusSettings
 
 ROLE = "relay"
+STALE_S = 0.25
 LATE_NS = 400_000_000
 JUMP_NS = 5_000_000_000
 
@@ -76,9 +77,10 @@ class Relay:
         self._stamp_ns = 0  # of the last state, as the robot sent it
         self._fault: tuple[str, int, deque[State]] = ("none", 0, deque())  # what, for how many states, those it holds back
         self._states = bus.publisher(keys.state, State, realtime=True)
-        self._follow(bus.subscriber(robot.state, capacity=64), self._change)
+        self._follow(bus.subscriber(robot.state, capacity=WAITING), bus.intake(State, STALE_S), self._change)
         for there, here in ((robot.command, keys.command), (robot.actuation, keys.actuation)):
-            self._follow(bus.subscriber(here, capacity=64), partial(self._pass, bus.publisher(there, Command, realtime=True)))
+            commands, publisher = bus.subscriber(here, capacity=WAITING), bus.publisher(there, Command, realtime=True)
+            self._follow(commands, bus.intake(Command, STALE_S), partial(self._pass, publisher))
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Change the states from now on: ``{"fault": NAME, "states": HOW_MANY}``, all of them without a number; answer since when, robot time."""
@@ -91,12 +93,8 @@ class Relay:
         self._fault = (name, request.get("states", 2**62), deque())
         return {"ok": True, "stamp_ns": self._stamp_ns}
 
-    def _change(self, payload: bytes) -> None:
+    def _change(self, state: State) -> None:
         """Pass a state on, or what becomes of it."""
-        try:
-            state = decode(State, payload)
-        except MessageError:
-            return
         name, states, held = self._fault
         self._stamp_ns = state.stamp_ns
         for changed in CHANGES[name](state, held):
@@ -104,18 +102,15 @@ class Relay:
         if name != "none" and self._fault[2] is held:
             self._fault = (name, states - 1, held) if states > 1 else ("none", 0, deque())
 
-    def _pass(self, publisher: Publisher[Command], payload: bytes) -> None:
+    def _pass(self, publisher: Publisher[Command], command: Command) -> None:
         """Pass a command back."""
-        try:
-            command = decode(Command, payload)
-        except MessageError:
-            return
         publisher.put(replace(command, **{name: getattr(command, name) - self._offset_ns for name in STAMPS}))
 
-    def _follow(self, subscriber: Subscriber, act: Callable[[bytes], None]) -> None:
+    def _follow(self, subscriber: Subscriber, intake: Intake[M], act: Callable[[M], None]) -> None:
         def follow() -> None:
             for received in iter(subscriber.recv, None):
-                act(received.payload)
+                if (message := intake.read(received)) is not None:
+                    act(message)
 
         Thread(target=follow, daemon=True).start()
 
