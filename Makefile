@@ -14,7 +14,7 @@ PARALLEL = $(BIN)/pytest -n auto --dist loadfile -m "not serial and not slow and
 SERIAL = $(BIN)/pytest -m "serial and not slow and not benchmark"
 NONE_IS_FINE = || [ $$? -eq 5 ]
 
-.PHONY: demo test test-busy test-slow soak ends bench lint format types msg lock clean
+.PHONY: demo test test-busy test-slow soak ends bench lint format types docs msg lock clean
 
 demo: $(READY)
 	$(BIN)/rti-mpc demo $(ARGS)
@@ -49,6 +49,10 @@ format: $(READY)
 types: $(READY)
 	$(BIN)/mypy
 
+docs: $(READY)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement docs/requirements.txt
+	NO_MKDOCS_2_WARNING=1 $(BIN)/properdocs build --quiet
+
 msg: $(READY)
 	$(BIN)/python -m rti_mpc.wire.msg deploy/msg
 
@@ -56,9 +60,11 @@ lock:
 	$(if $(UV),,$(error make lock needs uv: pip install uv))
 	uv pip compile --quiet --no-config --upgrade --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate \
 		--custom-compile-command "make lock" --extra view --extra figure --group dev --output-file constraints.txt pyproject.toml
+	uv pip compile --quiet --no-config --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate \
+		--custom-compile-command "make lock" --group docs --constraint constraints.txt --output-file docs/requirements.txt pyproject.toml
 
 clean:
-	rm -rf .venv .mypy_cache .pytest_cache .ruff_cache dist
+	rm -rf .venv site .mypy_cache .pytest_cache .ruff_cache dist
 
 ifdef UV
 $(READY): constraints.txt

@@ -71,8 +71,8 @@ class WeightSection(Section):
 
     Q: dict[str, Weight] = Field(description="weight of each output by name, in cost / unit of the output squared")
     R: dict[str, Weight] = Field(description="weight of each input's increment by name, in cost / unit of the input squared")
-    delta: Weights = Field(description="factor of Q, without unit: a constant, or one for each of the N stages")
-    lambda_: Weights = Field(alias="lambda", description="factor of R, without unit: a constant, or one for each of the N_u stages")
+    delta: Weights = Field(default=(1.0,), description="factor of Q, without unit: a constant, or one for each of the N stages")
+    lambda_: Weights = Field(default=(1.0,), alias="lambda", description="factor of R, without unit: a constant, or one for each of the N_u stages")
 
 
 class BoundSection(Section):
@@ -117,7 +117,7 @@ class OcpSection(Section):
     N: int = Field(ge=1, le=1000, description="horizon, in stages")
     N_u: int | None = Field(default=None, ge=1, description="control horizon, in stages; N if left out")
     dt_s: Period = Field(description="duration of a stage and period of the controller, in seconds")
-    integrator: Literal["rk4", "euler"] = Field(description="integrator of a stage")
+    integrator: Literal["rk4", "euler"] = Field(default="rk4", description="integrator of a stage")
     formulation: Literal["auto", "simultaneous", "sequential"] = Field(default="auto", description="of the QP; auto takes the faster one")
     weights: WeightSection = Field(description="the cost")
     bounds: BoundSection = Field(default=BoundSection(), description="bounds of inputs, increments, states and constraints")

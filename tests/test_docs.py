@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The documentation site: its tutorial is run word by word, and what it names exists."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+GENERATED = {"reference/configuration.md", "reference/messages.md", "reference/cli.md", "reference/python.md", "runbook.md", "guard.md"}
+
+
+def blocks(page: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
+
+
+def test_tutorial_of_your_robot_runs_word_by_word(tmp_path: Path) -> None:
+    module, script = blocks("your_robot.md", "python")
+    (table,) = blocks("your_robot.md", "toml")
+    for name, text in {"my_robot.py": module, "script.py": script, "car.toml": table}.items():
+        (tmp_path / name).write_text(text)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), str(ROOT)))}
+
+    def run(*arguments: str) -> str:
+        command = [sys.executable, *arguments]
+        return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True, timeout=120).stdout
+
+    assert run("script.py") == "off by 0.0 mm after 10 s\n"
+    assert "solved" in run("-c", "from service.cli import main; main()", "check", "car.toml")
+
+
+def test_every_page_of_the_site_exists_and_is_reached() -> None:
+    listed = set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2]))
+    written = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")}
+    assert listed == written | GENERATED
+
+
+@pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda page: page.name)
+def test_every_link_of_a_page_leads_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#h][^)#]*)", page.read_text()):
+        assert target in GENERATED or (page.parent / target).exists(), target
