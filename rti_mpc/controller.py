@@ -420,7 +420,7 @@ class Controller:
 
     def _anchor(self, state: State) -> Reference:
         """Follow the reference that has arrived, from the last state on if it is to start on arrival."""
-        anchored = self._track.anchor(self._states.x, state.stamp_ns)
+        anchored = self._track.anchor(state.stamp_ns)
         if self._loaded and self.grid.running:
             self._load(shift=False)
         return anchored

@@ -25,7 +25,7 @@ class Signal:
     Attributes:
         name: Unique within its vector; what configuration and viewers call it.
         unit: SI unit, ``"1"`` if none.
-        angle: Whether it wraps at :math:`\pm\pi` on the wire.
+        angle: Whether it is an angle in rad of which whole turns mean nothing: it may wrap at :math:`\pm\pi`, and the dynamics repeat with each turn.
     """
 
     name: str
@@ -124,7 +124,7 @@ class Model:
 
     def h(self) -> ca.Function:
         """Return the outputs at a node, ``h(x, p) -> y``."""
-        return ca.Function("h", [self.x, self.p], [self.y_expr])
+        return ca.Function("h", [self.x, self.p], [ca.densify(self.y_expr)])
 
     def with_parameters(self, **values: float) -> Model:
         """

@@ -37,6 +37,7 @@ from rti_mpc.simultaneous import simultaneous
 from rti_mpc.solver import Solver, SolverSettings
 from rti_mpc.status import QpStatus
 from rti_mpc.transcription import INFINITY
+from rti_mpc.turns import Turns
 
 FORMULATIONS = {"simultaneous": simultaneous, "sequential": sequential}
 SOLVERS = ("riccati", "osqp")  # the built-in ones; any other is one of qpsolvers
@@ -147,6 +148,7 @@ class Rti:
             return made.get(function.name(), function)
 
         self._shift = bind(made["shift"], (self.x, self.u, self.p), (x, u))
+        self._turns = Turns(ocp, x, self._x0, self.y_ref, self.p, (weights["lbx"], weights["ubx"]))
         self._cost: Array = np.zeros(1)
         self._evaluate = bind(made["cost"], (self.x, self.u, *guess.sample[2:]), (self._cost,))
         qps = [Qp(t, guess, make) for t in transcriptions]
@@ -180,6 +182,7 @@ class Rti:
         self.u[:] = np.clip(u_prev, self.ocp.lbu, self.ocp.ubu)
         self.x[:] = x0
         self._pending = False
+        self._turns.forget()
         self._backup = self.solvers[0]
         self._loaded = False
         self.solver = self._backup
@@ -208,7 +211,7 @@ class Rti:
         Shift the guess by one stage, linearize there and load the QP.
 
         Args:
-            y_ref: Reference at nodes 1 to N, shape ``(N, ny)``.
+            y_ref: Reference at nodes 1 to N, shape ``(N, ny)``; angles may wrap.
             p: Stage parameters at nodes 0 to N, shape ``(N + 1, np)``; those of the last sample if none are given.
             shift: Whether time goes on. Without, the same sample is iterated on.
             u_prev: Input that acts before the plan, shape ``(nu,)``, where it is not the first input of the last plan.
@@ -225,6 +228,7 @@ class Rti:
         if self._pending:
             self._keep()
         self.y_ref[...] = y_ref
+        self._turns.take_reference()
         if u_prev is not None:
             self.u_prev[...] = u_prev
         elif shift:
@@ -246,6 +250,10 @@ class Rti:
         """Linearize at the plan itself, and prepare the solver."""
         for guess, plan in self._pairs:
             guess[:] = plan
+        self._linearize()
+
+    def _linearize(self) -> None:
+        """Linearize at the guess as it is, and prepare the solver."""
         self._loaded = False
         if self.active_set is not None:
             self.active_set.linearize()
@@ -294,10 +302,12 @@ class Rti:
         solve starts cold: a failure never seeds what follows.
 
         Args:
-            x0: State at node 0, shape ``(nx,)``; angles continue those of the last sample.
+            x0: State at node 0, shape ``(nx,)``; angles may wrap: those of the plan continue the last one's.
         """
         self._x0[...] = x0
         self._pending = False
+        if self._turns.settle():
+            self._linearize()
         self.status = self._solve()
         self.taken = 1
         if self._change[0] > self.tolerance:

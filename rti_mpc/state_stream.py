@@ -7,13 +7,13 @@ from enum import Enum
 
 import numpy as np
 
+from rti_mpc.angle import whole_turns
 from rti_mpc.array import Array
 from rti_mpc.message import Notice, Severity, State
 from rti_mpc.model import Model
 from rti_mpc.observer import Observer
 from rti_mpc.robot_clock import RobotClock
 from rti_mpc.sent import Sent
-from rti_mpc.track import TWO_PI
 
 IN_RANGE = 1e9  # magnitude, in any unit, beyond which a number is no state
 
@@ -74,7 +74,7 @@ class StateStream:
         self.x[:] = state.x
         if self.last is not None:
             for j in self._angles:
-                self.x[j] += TWO_PI * round((before[j] - self.x[j]) / TWO_PI)
+                self.x[j] -= whole_turns(self.x[j] - before[j])
         self._before_ns = None if self.last is None else self.last.stamp_ns
         self.last = state
         return arrival
@@ -96,6 +96,8 @@ class StateStream:
             observer.frozen = not known
             for u, span_s in sent.spans(self._before_ns, last.stamp_ns):
                 observer.predict(u, span_s)
+            for j in self._angles:  # a turn between two states is no innovation
+                self.x[j] -= whole_turns(self.x[j] - observer.x[j])
             observer.correct(self.x)
         self.x[:] = observer.x
 

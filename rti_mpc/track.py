@@ -2,9 +2,10 @@
 """
 A reference, laid on the controller's stages.
 
-Angles are unwrapped along time, as a whole put nearest to where the robot is,
-and only then interpolated: a reference that crosses pi changes nothing. Past its
-last row a reference is held, never extrapolated; before its first, likewise.
+Angles are unwrapped along time, and only then interpolated: a reference that
+crosses pi changes nothing. In which turn the whole of it is followed is decided
+by `rti_mpc.turns`. Past its last row a reference is held, never extrapolated;
+before its first, likewise.
 
 What takes longer the more rows there are is done by `Track.lay_out`, which any
 thread may call; to follow the result takes the same time for all.
@@ -20,8 +21,6 @@ from rti_mpc.array import Array
 from rti_mpc.message import STAMP_ON_ARRIVAL, End, Reference
 from rti_mpc.model import Model
 
-TWO_PI = 2.0 * np.pi
-
 
 class Track:
     """
@@ -30,7 +29,7 @@ class Track:
     Attributes:
         y_ref: Reference at nodes 1 to N of the last `look_up`, shape ``(N, ny)``.
         p: Stage parameters at nodes 0 to N of the last `look_up`, shape ``(N + 1, np)``.
-        arriving: A reference, checked, and what `lay_out` makes of it, until `anchor` has a state to start at or to put its angles next to.
+        arriving: A reference, checked, and what `lay_out` makes of it, until `anchor` has a state to start at.
     """
 
     def __init__(self, model: Model, N: int, dt_ns: int) -> None:
@@ -38,12 +37,10 @@ class Track:
         self.p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
         self._nominal = self.p.copy()
         self._angles = [j for j, signal in enumerate(model.outputs) if signal.angle]
-        self._output = model.h()
         self._nodes_ns = np.arange(N + 1) * dt_ns
         self.arriving: tuple[Reference, Array] | None = None
         self._reference: Reference | None = None
         self._rows: Array = np.zeros((1, model.ny))
-        self._turns: Array = np.zeros(model.ny)  # whole ones, from the angles as they came to those nearest to the robot's
 
     def misfit(self, reference: Reference, right_np: int) -> str:
         """
@@ -73,23 +70,18 @@ class Track:
             rows[:, j] = np.unwrap(rows[:, j])
         return rows
 
-    def anchor(self, x: Array, stamp_ns: int) -> Reference:
+    def anchor(self, stamp_ns: int) -> Reference:
         """
         Follow the reference that has arrived, and return it: from the state on if it was to start on arrival.
 
         Args:
-            x: State, shape ``(nx,)``, whose outputs the angles are put nearest to.
-            stamp_ns: Time of that state.
+            stamp_ns: Time of the last state.
         """
         assert self.arriving is not None
         (reference, rows), self.arriving = self.arriving, None
         if reference.stamp_ns == STAMP_ON_ARRIVAL:
             reference = replace(reference, stamp_ns=stamp_ns)
         self._reference, self._rows = reference, rows
-        now = min(max(0, round((stamp_ns - reference.stamp_ns) / reference.period_ns)), len(rows) - 1)
-        outputs = np.array(self._output(x, self._nominal[0])).ravel()
-        for j in self._angles:
-            self._turns[j] = TWO_PI * np.round((outputs[j] - rows[now, j]) / TWO_PI)
         return reference
 
     def clear(self) -> None:
@@ -117,6 +109,6 @@ class Track:
         fraction = (at - below)[:, np.newaxis]
         values = rows[below] + fraction * (rows[np.minimum(below + 1, len(rows) - 1)] - rows[below])
         ny, given = self.y_ref.shape[1], rows.shape[1]
-        np.add(values[1:, :ny], self._turns, out=self.y_ref)
+        self.y_ref[:] = values[1:, :ny]
         self.p[:, : given - ny] = values[:, ny:]
         self.p[:, given - ny :] = self._nominal[:, given - ny :]

@@ -58,7 +58,7 @@ LOCAL = {"rti_mpc/wire/session.py"}  # reads JSON that is not a peer's: Zenoh's 
 
 # Inside the library, a file imports only from groups before its own.
 FLOW: tuple[set[str], ...] = (
-    {"errors", "array", "status", "robot_clock", "ladder", "grid", "epoch", "cache"},
+    {"errors", "array", "status", "robot_clock", "ladder", "grid", "epoch", "cache", "angle"},
     {"message", "polyline", "latch"},
     {"heading", "mode", "schedule", "issued"},
     {"trajectory", "guard", "sent"},
@@ -69,7 +69,7 @@ FLOW: tuple[set[str], ...] = (
     {"transcription"},
     {"simultaneous", "sequential", "riccati"},
     {"codegen"},
-    {"qp", "prediction", "observer", "envelope", "delay"},
+    {"qp", "prediction", "observer", "envelope", "delay", "turns"},
     {"solver", "active_set", "foreign_solver", "state_stream"},
     {"rti"},
     {"tuning"},

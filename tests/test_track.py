@@ -14,7 +14,6 @@ from tests.problems import beacon
 
 MS = 1_000_000
 N = 5
-X = np.zeros(5)
 
 
 def reference(y: Array, p: Array | None = None, stamp_ms: int = 0, period_ms: int = 20, end: End = End.HOLD) -> Reference:
@@ -30,14 +29,14 @@ def turning(rows: int, wrapped: bool) -> Array:
     return y
 
 
-def follow(track: Track, message: Reference, x: Array, stamp_ns: int) -> None:
+def follow(track: Track, message: Reference, stamp_ns: int = 0) -> None:
     track.arriving = message, track.lay_out(message)
-    track.anchor(x, stamp_ns)
+    track.anchor(stamp_ns)
 
 
-def looked_up(y: Array, t_ms: float, x: Array = X, **options: int) -> Array:
+def looked_up(y: Array, t_ms: float, **options: int) -> Array:
     track = Track(pioneer_3dx(), N, 100 * MS)
-    follow(track, reference(y, **options), x, 0)
+    follow(track, reference(y, **options))
     track.look_up(round(t_ms * MS))
     return track.y_ref.copy()
 
@@ -46,7 +45,7 @@ def test_nothing_is_followed_before_a_reference_and_after_it_is_cleared() -> Non
     track = Track(pioneer_3dx(), N, 100 * MS)
     assert not track.loaded
     assert track.ended(0) is None
-    follow(track, reference(turning(3, wrapped=False)), X, 0)
+    follow(track, reference(turning(3, wrapped=False)))
     assert track.loaded
     track.clear()
     assert not track.loaded
@@ -67,49 +66,19 @@ def test_slow_reference_is_interpolated_too() -> None:
 @pytest.mark.parametrize(("t_ms", "row"), [(-5000, 0), (10_000, 9)])
 def test_reference_is_held_before_its_first_and_after_its_last_row(t_ms: float, row: int) -> None:
     y = turning(10, wrapped=False)
-    y[:, 2] -= 2 * np.pi * np.round(y[row, 2] / (2 * np.pi))
     rows = looked_up(y, t_ms)
     np.testing.assert_allclose(rows[:, 0], np.full(N, row))
     np.testing.assert_allclose(np.ptp(rows, axis=0), 0.0)
 
 
 def test_heading_that_wraps_is_the_same_as_one_that_does_not() -> None:
-    x = np.array([0, 0, 2.4, 0, 0])
     for t_ms in (0, 333, 690):
-        np.testing.assert_allclose(looked_up(turning(60, wrapped=True), t_ms, x), looked_up(turning(60, wrapped=False), t_ms, x), atol=1e-12)
-
-
-@pytest.mark.parametrize("turns", [-3, 0, 2])
-def test_heading_is_put_nearest_to_the_robots(turns: int) -> None:
-    """However often either has gone round."""
-    x = np.array([0, 0, 2.4 + 2 * np.pi * turns, 0, 0])
-    rows = looked_up(turning(60, wrapped=True), 0, x)
-    np.testing.assert_allclose(rows[:, 2] - 2 * np.pi * turns, looked_up(turning(60, wrapped=False), 0, np.array([0, 0, 2.4, 0, 0]))[:, 2])
-
-
-def test_heading_is_put_nearest_where_the_robot_is_now_not_at_the_start() -> None:
-    """A reference received again half way round must not send the robot back a turn."""
-    y = np.column_stack([np.zeros((201, 2)), np.linspace(0.0, 4 * np.pi, 201)])
-    track = Track(pioneer_3dx(), N, 100 * MS)
-    follow(track, reference(y, period_ms=100), np.array([0, 0, 3 * np.pi, 0, 0]), 15_000 * MS)
-    track.look_up(15_000 * MS)
-    assert track.y_ref[0, 2] == pytest.approx(3 * np.pi + 0.02 * np.pi)
-
-
-def test_angles_of_outputs_are_compared_to_outputs() -> None:
-    """The bearing of a beacon is no state."""
-    model = beacon().model
-    track = Track(model, N, 100 * MS)
-    x = np.array([0.0, 0.0, -7.0])  # sees the beacon at atan2(3, 5) + 7
-    follow(track, reference(np.tile([5.0, 1.0], (10, 1))), x, 0)
-    track.look_up(0)
-    assert abs(track.y_ref[0, 1] - (np.arctan2(3, 5) + 7.0)) <= np.pi
-    np.testing.assert_allclose(np.remainder(track.y_ref[:, 1], 2 * np.pi), 1.0)
+        np.testing.assert_allclose(looked_up(turning(60, wrapped=True), t_ms), looked_up(turning(60, wrapped=False), t_ms), atol=1e-12)
 
 
 def test_reference_ends_with_its_last_row_and_says_what_then() -> None:
     track = Track(pioneer_3dx(), N, 100 * MS)
-    follow(track, reference(turning(11, wrapped=False), stamp_ms=1000, end=End.STOP), X, 0)
+    follow(track, reference(turning(11, wrapped=False), stamp_ms=1000, end=End.STOP))
     assert track.ended(1200 * MS) is None
     assert track.ended(1200 * MS + 1) is End.STOP
 
@@ -119,10 +88,10 @@ def test_parameters_are_looked_up_for_all_nodes_and_nominal_where_there_are_none
     track = Track(model, N, 100 * MS)
     y = np.zeros((20, 2))
     p = np.column_stack([np.arange(20.0), np.full(20, 3.0)])
-    follow(track, reference(y, p, period_ms=100), np.zeros(3), 0)
+    follow(track, reference(y, p, period_ms=100))
     track.look_up(250 * MS)
     np.testing.assert_allclose(track.p[:, 0], 2.5 + np.arange(6))
-    follow(track, reference(y), np.zeros(3), 0)
+    follow(track, reference(y))
     track.look_up(250 * MS)
     np.testing.assert_allclose(track.p, np.tile(model.p_nominal, (6, 1)))
 
@@ -136,7 +105,7 @@ def test_message_is_not_changed_and_may_change_later() -> None:
     before = y.copy()
     message = reference(y)
     track = Track(pioneer_3dx(), N, 100 * MS)
-    follow(track, message, X, 0)
+    follow(track, message)
     np.testing.assert_array_equal(message.y, before)
     track.look_up(0)
     first = track.y_ref.copy()
