@@ -18,10 +18,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
+from typing import NamedTuple
 
 from service.realtime import available
 
@@ -29,8 +31,22 @@ TICK_NS = 2_000_000
 LATE_NS = 500_000  # from which on a tick is late: a core that sleeps deeply needs less to wake
 TICKS = 5  # a row: 10 ms
 ROWS = 10  # between two looks for new threads: 0.1 s
-ROW = struct.Struct("<4q")  # from, to, lateness of ticks, waiting of threads; all ns, the first two by the monotonic clock
+LAYOUT = struct.Struct("<4q")
 PATIENCE_S = 10.0  # for the timers to have seen what is asked for
+
+
+class Row(NamedTuple):
+    """What one timer saw, ns: between two instants of the monotonic clock, by how much its ticks were late and for how long threads waited."""
+
+    since_ns: int
+    until_ns: int
+    late_ns: int
+    waited_ns: int
+
+    @property
+    def held_up_ns(self) -> int:
+        """Both."""
+        return self.late_ns + self.waited_ns
 
 
 class Host:
@@ -58,7 +74,29 @@ class Host:
         Raises:
             TimeoutError: A timer has not come to its end within ten seconds.
         """
-        return 1e-6 * sum(row[2] + row[3] for timer in self._timers for row in timer.rows(from_ns, to_ns))
+        return 1e-6 * sum(row.held_up_ns for timer in self._timers for row in timer.rows(from_ns, to_ns))
+
+    def worst_ms(self, from_ns: int, to_ns: int, within_ns: int) -> float:
+        """
+        Return for how long the host held the watched processes up at worst within some time, ms.
+
+        Args:
+            from_ns: From when on, by the monotonic clock.
+            to_ns: To when.
+            within_ns: How much time.
+
+        Raises:
+            TimeoutError: A timer has not come to its end within ten seconds.
+        """
+        rows = sorted(row for timer in self._timers for row in timer.rows(from_ns, to_ns))
+        recent, held_up_ns, worst_ns = deque[Row](), 0, 0
+        for row in rows:
+            recent.append(row)
+            held_up_ns += row.held_up_ns
+            while row.since_ns - recent[0].since_ns > within_ns:
+                held_up_ns -= recent.popleft().held_up_ns
+            worst_ns = max(worst_ns, held_up_ns)
+        return 1e-6 * worst_ns
 
 
 class Timer:
@@ -66,24 +104,24 @@ class Timer:
 
     def __init__(self, folder: Path, core: int, watched: int, stack: ExitStack) -> None:
         self._file = stack.enter_context((folder / str(core)).open("w+b", buffering=0))
-        self._rows: list[tuple[int, ...]] = []
+        self._rows: list[Row] = []
         command = [sys.executable, "-m", "service.host", str(folder / str(core)), str(core), str(watched)]
         self.process = subprocess.Popen(command, cwd=Path(__file__).parents[1], stdin=subprocess.DEVNULL, process_group=0)
         stack.callback(self.process.wait)
         stack.callback(self.process.kill)
 
-    def rows(self, from_ns: int, to_ns: int) -> Iterator[tuple[int, ...]]:
+    def rows(self, from_ns: int, to_ns: int) -> Iterator[Row]:
         """Wait until it has seen a time whole, and return what it saw then, the last first."""
         deadline_s = time.monotonic() + PATIENCE_S
-        while not self._rows or self._rows[-1][1] < to_ns:
+        while not self._rows or self._rows[-1].until_ns < to_ns:
             if time.monotonic() > deadline_s:
                 raise TimeoutError(f"the host's witness must tell every {1e-6 * TICKS * TICK_NS:g} ms, and was silent for {PATIENCE_S:g} s")
             time.sleep(1e-9 * TICK_NS)
-            self._rows += ROW.iter_unpack(self._file.read())  # a row is written at once
+            self._rows += map(Row._make, LAYOUT.iter_unpack(self._file.read()))  # a row is written at once
         for row in reversed(self._rows):
-            if row[1] < from_ns:
+            if row.until_ns < from_ns:
                 return
-            if row[0] <= to_ns:
+            if row.since_ns <= to_ns:
                 yield row
 
 
@@ -141,7 +179,7 @@ def main(path: str, core: int, pid: int) -> None:
             if (number := number + 1) % ROWS == 0:
                 threads.look()
             waited_ns, now_ns = threads.waited_ns(), time.monotonic_ns()
-            file.write(ROW.pack(since_ns, now_ns, late_ns, waited_ns))
+            file.write(LAYOUT.pack(since_ns, now_ns, late_ns, waited_ns))
             since_ns = now_ns
 
 

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import time
+
 from service.host import Host
 
 MS = 1_000_000
@@ -13,6 +15,14 @@ def in_time(host: Host, what: str, took_ms: float, limit_ms: float, since_ns: in
     """Hold what began at an instant of the monotonic clock to its limit; what the host took of the time is shown, and not held against it."""
     late_ms = took_ms - limit_ms
     assert late_ms <= 0.0 or explained(host, f"{what} took {took_ms:.0f} ms of {limit_ms:.0f}", late_ms, since_ns, since_ns + round(took_ms * MS))
+
+
+def on_time(host: Host, what: str, period_ms: float, since_ns: int) -> bool:
+    """Whether the host has not held processes up for half a period within any two, since an instant of the monotonic clock; says so if it has."""
+    worst_ms = host.worst_ms(since_ns - BEFORE_NS, time.monotonic_ns(), round(2 * period_ms * MS))
+    if late := worst_ms > 0.5 * period_ms:
+        print(f"\n{what} is not held to its numbers: within {2 * period_ms:.0f} ms the host held processes up for {worst_ms:.0f} ms")
+    return not late
 
 
 def explained(host: Host, what: str, by_ms: float, from_ns: int, to_ns: int) -> bool:

