@@ -21,6 +21,8 @@ from rti_mpc.array import Array
 from rti_mpc.message import STAMP_ON_ARRIVAL, End, Reference
 from rti_mpc.model import Model
 
+FAR_NS = 2**62  # before or after a whole reference
+
 
 class Track:
     """
@@ -104,7 +106,8 @@ class Track:
         """Write the reference from `t_ns` on, node 0 included for `p`, into `y_ref` and `p`."""
         assert self._reference is not None
         rows = self._rows
-        at = np.clip((self._nodes_ns + (t_ns - self._reference.stamp_ns)) / self._reference.period_ns, 0, len(rows) - 1)
+        since_ns = min(max(t_ns - self._reference.stamp_ns, -FAR_NS), FAR_NS)  # of two stamps that differ by more than an int64 holds
+        at = np.clip((self._nodes_ns + since_ns) / self._reference.period_ns, 0, len(rows) - 1)
         below = np.minimum(at.astype(np.intp), max(len(rows) - 2, 0))
         fraction = (at - below)[:, np.newaxis]
         values = rows[below] + fraction * (rows[np.minimum(below + 1, len(rows) - 1)] - rows[below])

@@ -194,6 +194,7 @@ STRIPS = {
 }
 LEGEND = {"reference": "reference", "driven": "measured", "planned": "command"}
 OBSTACLE_Z = -0.004  # [m], below everything
+FARTHEST = 1e38  # m, within single precision, in which Rerun draws
 CIRCLE: Array = np.column_stack([np.cos(angles := np.linspace(0, 2 * np.pi, 48, endpoint=False)), np.sin(angles)])
 ROBOT_Z = 0.008  # [m], between trail and horizon
 
@@ -213,8 +214,8 @@ def legend(frame: Frame) -> rr.Points3D:
 
 
 def lifted(xy: Array, z: float) -> Array:
-    """Return points in the plane, shape ``(..., 2)``, at a height, shape ``(..., 3)``."""
-    return np.concatenate([xy, np.full((*xy.shape[:-1], 1), z)], axis=-1)
+    """Return points in the plane, shape ``(..., 2)``, at a height, shape ``(..., 3)``; those beyond single precision where that ends."""
+    return np.concatenate([np.clip(xy, -FARTHEST, FARTHEST), np.full((*xy.shape[:-1], 1), z)], axis=-1)
 
 
 def _series_looks(info: Info) -> dict[str, rr.AsComponents]:

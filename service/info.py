@@ -12,6 +12,7 @@ from typing import Any
 from rti_mpc.errors import MessageError
 from rti_mpc.wire.document import read
 from rti_mpc.wire.keys import role_of
+from rti_mpc.wire.layout import NUMBER_LIMIT
 
 LONGEST = 64  # characters of a name or a unit
 WIDEST = 512  # components of a vector, obstacles, or columns of a reference
@@ -183,7 +184,10 @@ def _label(signal: Mapping[str, Any]) -> Label:
 def _obstacle(disc: Mapping[str, Any]) -> Obstacle:
     if not 0 <= (at := int(disc["at"])) < WIDEST:
         raise ValueError(f"a column below {WIDEST} expected, got {at}")
-    return Obstacle(at, *(float(disc[part]) for part in "xyr"))
+    obstacle = Obstacle(at, *(float(disc[part]) for part in "xyr"))
+    if not max(abs(obstacle.x), abs(obstacle.y), abs(obstacle.r)) <= NUMBER_LIMIT:
+        raise ValueError(f"a place within {NUMBER_LIMIT:g} expected, got {obstacle}")
+    return obstacle
 
 
 def _bounds(values: Sequence[float | None] | None, sign: int, length: int) -> tuple[float, ...]:

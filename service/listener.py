@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 from rti_mpc.errors import MessageError
 from rti_mpc.message import STAMP_ON_ARRIVAL, Command, Event, Notice, Reference, State, Telemetry
 from rti_mpc.wire.bus import WAITING, Bus, Received, Subscriber
 from rti_mpc.wire.intake import Intake
-from rti_mpc.wire.keys import admitted
+from rti_mpc.wire.keys import admitted, role_of
 from service.info import Info
 from service.playback import Actuation
 from service.recording import Entry
@@ -114,7 +115,7 @@ class Listener:
         """Return the door of a key; None for one role too many of those that send events."""
         key = received.key
         if key not in self._doors and (cls is not Event or admitted(key, self._events)):
-            self._doors[key] = self._bus.intake(cls, STALE_S)
+            self._doors[key] = self._bus.intake(cls, STALE_S, unfit=partial(_foreign, role_of(key)))
             if cls is Event:
                 self._events.add(key)
         return self._doors.get(key)
@@ -124,3 +125,8 @@ class Listener:
         for door in self._doors.values():
             for notice in door.notices(now_ns):
                 yield self.own(notice)
+
+
+def _foreign(role: str, message: Any) -> str:
+    """Say that an event tells another source than its key does."""
+    return "foreign_source" if isinstance(message, Event) and message.source != role else ""

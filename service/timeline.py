@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 GAP_NS = 1_000_000_000  # between two lives of a robot whose clock began again
+LAST_NS = 2**62  # a century and a half: the axis begins again rather than leave int64
 AHEAD_NS = 1_000_000_000  # commands act a little after the newest state; nothing is drawn later than this
 
 
@@ -31,6 +32,7 @@ class Timeline:
         if epoch != self._epoch:
             if self._epoch is not None and stamp_ns < self._latest_ns:
                 self._offset_ns += self._latest_ns + GAP_NS - stamp_ns
+                self._offset_ns *= self._offset_ns + stamp_ns < LAST_NS
             self._epoch, self._first_ns, self._latest_ns = epoch, stamp_ns, stamp_ns
         self._latest_ns = max(self._latest_ns, stamp_ns)
         return self._offset_ns + stamp_ns

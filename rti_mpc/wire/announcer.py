@@ -7,6 +7,7 @@ import time
 
 from rti_mpc.message import Event, Notice, Severity
 from rti_mpc.wire.bus import Bus
+from rti_mpc.wire.layout import STAMP_LIMIT_NS
 
 PERIOD_NS = 1_000_000_000  # monotonic, between two events of one code
 
@@ -34,5 +35,6 @@ class Announcer:
         if due:
             self._last_ns[code] = now_ns
             self._seq += 1
+            stamp_ns = min(max(stamp_ns, 1 - STAMP_LIMIT_NS), STAMP_LIMIT_NS - 1)  # of a clock that runs out of numbers
             self._publisher.put(Event(self._epoch, self._seq, stamp_ns, self.role, notice.severity, code, notice.text))
         return due

@@ -86,6 +86,14 @@ def test_a_robot_never_described_has_numbered_components() -> None:
         {**PIONEER, "lbu": [1.0]},
         {**PIONEER, "lbu": ["low", None]},
         {**PIONEER, "dt_s": "soon"},
+        {**PIONEER, "dt_s": 10**400},
+        {**PIONEER, "states": 1000 * PIONEER["states"]},
+        {**PIONEER, "states": [{"name": "x" * 65, "unit": "m", "angle": False}]},
+        {**PIONEER, "states": [{"name": "a\x1b[31m", "unit": "m", "angle": False}]},
+        {**PIONEER, "states": [{"name": 7, "unit": "m", "angle": False}]},
+        {**PIONEER, "obstacles": [{"at": -1, "x": 0.0, "y": 0.0, "r": 1.0}]},
+        {**PIONEER, "obstacles": [{"at": float("inf"), "x": 0.0, "y": 0.0, "r": 1.0}]},
+        {**PIONEER, "obstacles": [{"at": 0, "x": 1e300, "y": 0.0, "r": 1.0}]},
     ],
 )
 def test_a_description_that_is_none_is_refused(wrong: Any) -> None:

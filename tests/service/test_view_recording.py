@@ -245,3 +245,21 @@ def test_the_recording_carries_a_blueprint_for_its_application(writer: Writer) -
     writer.send(PIONEER, reference([[-3.0, 0.0, 0.0], [3.0, 1.0, 0.0]]), state(0, [0.0] * 5))
     writer.read()
     assert RrdReader(writer.path).blueprints()
+
+
+def test_absurd_numbers_are_written_or_left_out_and_what_is_honest_stays(writer: Writer) -> None:
+    """What the door lets in: of telemetry any number, of the others magnitudes up to 1e18, and stamps up to 2^62."""
+    largest, last_ns = 1e18, 2**62 - 1
+    writer.send(PIONEER, state(1, [1.0, 2.0, 0.1, 0.2, 0.3]))
+    for k, value in enumerate((np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324, -0.0)):
+        sample = telemetry(2 + k)
+        arrays = {name: np.full_like(getattr(sample, name), value) for name in ("x0", "x", "u", "y_ref")}
+        scalars = dict.fromkeys(("prepare_us", "slack_s", "cost", "state_age_s"), value)
+        writer.send(replace(sample, **arrays, **scalars, skipped=2**64 - 1, stamp_ns=last_ns, state_stamp_ns=-last_ns))
+    for value in (largest, -largest, 5e-324):
+        writer.send(reference([3 * [value], 3 * [-value]], stamp_ns=-last_ns))
+        writer.send(replace(reference([3 * [value]], stamp_ns=last_ns), period_ns=1), state(10, 5 * [value]), command(10, 2 * [value]))
+        writer.send(Actuation(replace(command(10, 2 * [value]), valid_until_ns=last_ns, period_ns=100_000)))
+    writer.send(state(12, [3.0, 4.0, 0.1, 0.2, 0.3], epoch=2))
+    rows = writer.read()
+    assert [row for row in rows["state/y"] if abs(row[1][0]) < 10.0 and row[1][0] > 1e-3] == [(1.0, [2.0]), (12.0, [4.0])]

@@ -38,3 +38,10 @@ def test_stamps_of_a_former_life_do_not_run_ahead_of_the_present_one() -> None:
 def test_what_comes_before_any_state_is_placed_where_a_clock_can_be() -> None:
     assert Timeline().place(STAMP_ON_ARRIVAL) == 0
     assert Timeline().place(12) == 12
+
+
+def test_the_axis_stays_within_int64_whatever_lives_of_a_robot_say() -> None:
+    timeline = Timeline()
+    for epoch, stamp_ns in enumerate(20 * [2**62 - 1, 1 - 2**62, 0, 2**62 - 1, 5]):
+        for placed in (timeline.place_state(epoch, stamp_ns), timeline.place(2**62 - 1), timeline.place(1 - 2**62), timeline.now_ns):
+            assert abs(placed) < 2**63
