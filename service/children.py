@@ -20,7 +20,8 @@ class Children:
 
     Ctrl-C reaches us alone, and so does a closed terminal: we end the others, in
     the order that is right. Where we cannot, killed ourselves, the kernel presses
-    Ctrl-C for each of them (`service.leash`).
+    Ctrl-C for each of them (`service.leash`). What they are to remember lies in our
+    folder: a stop of a real robot of the same name is neither obeyed nor released.
 
     Attributes:
         folder: Where their output goes, a file each.
@@ -52,7 +53,11 @@ class Children:
             Its process id.
         """
         command = [sys.executable, "-P", "-m", "service.leash", str(os.getpid()), module, *map(str, arguments)]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
+        environment = {
+            **os.environ,
+            "STATE_DIRECTORY": str(self.folder / "state"),
+            "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH")))),
+        }
         with self.log(name).open("ab" if name in self._logged else "wb") as log:
             child = subprocess.Popen(
                 command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, process_group=0

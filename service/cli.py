@@ -129,7 +129,18 @@ def process(command: Callable[..., int | None], *, with_model: bool = True) -> C
     return app.command()(run)
 
 
-Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", min=0.1, help="How long to wait for the controller's answer.")]
+Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", min=0.1, help="How long to wait for an answer.")]
+
+
+StatePath = Annotated[
+    Path | None,
+    typer.Option(
+        "--state",
+        metavar="DIR",
+        help="Folder that remembers an operator's stop.",
+        show_default="$STATE_DIRECTORY, $XDG_STATE_HOME/rti_mpc or ~/.local/state/rti_mpc",
+    ),
+]
 
 
 @process
@@ -137,19 +148,20 @@ def run(
     config: Config,
     bus: BusSettings,
     standby: Annotated[bool, typer.Option("--standby", help="Stand by while another controller leads, and take over when it falls silent.")] = False,
+    state: StatePath = None,
 ) -> int:
     """Control the robot: wait for its states and a reference, answer each with a command."""
     from service.daemon import main
 
-    return main(config, bus, standby=standby)
+    return main(config, bus, standby=standby, state=state)
 
 
 @partial(process, with_model=False)
-def guard(config: Config, bus: BusSettings) -> int:
+def guard(config: Config, bus: BusSettings, state: StatePath = None) -> int:
     """Stand between controller and robot: pass on what is fresh and inside the limits, brake when nothing is."""
     from service.guard import main
 
-    return main(config, bus)
+    return main(config, bus, state=state)
 
 
 @process
@@ -225,20 +237,20 @@ def router(config: Config, bus: BusSettings) -> None:
     main(bus, config.keys())
 
 
-@process
-def stop(config: Config, bus: BusSettings, timeout: Timeout = 2.0) -> int:
-    """Bring the robot to a standstill; only `enable` releases it."""
-    from service.request import main
+@partial(process, with_model=False)
+def stop(config: Config, bus: BusSettings, timeout: Timeout = 2.0, state: StatePath = None) -> int:
+    """Bring the robot to a standstill, across every restart; only `enable` releases it."""
+    from service.request import stop_or_enable
 
-    return main(bus, config.keys(), "stop", timeout)
+    return stop_or_enable(bus, config.keys(), "stop", timeout, guarded=config.guard.enabled, state=state)
 
 
-@process
-def enable(config: Config, bus: BusSettings, timeout: Timeout = 2.0) -> int:
+@partial(process, with_model=False)
+def enable(config: Config, bus: BusSettings, timeout: Timeout = 2.0, state: StatePath = None) -> int:
     """Release a robot that was stopped."""
-    from service.request import main
+    from service.request import stop_or_enable
 
-    return main(bus, config.keys(), "enable", timeout)
+    return stop_or_enable(bus, config.keys(), "enable", timeout, guarded=config.guard.enabled, state=state)
 
 
 @partial(process, with_model=False)

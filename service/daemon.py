@@ -22,6 +22,7 @@ import logging
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from threading import Condition, Event, Lock, Thread
 from typing import Any
 
@@ -30,6 +31,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.controller import Controller, Timing
 from rti_mpc.errors import ConfigError
+from rti_mpc.latch import Latch
 from rti_mpc.message import Command, State, Telemetry
 from rti_mpc.rti import Rti
 from rti_mpc.wire.announcer import Announcer
@@ -39,7 +41,9 @@ from service import realtime
 from service.announce import announce
 from service.config import Config
 from service.description import describe
+from service.latch_file import LatchFile
 from service.leadership import HEARING_S, LEADER, STANDBY, Leadership, differ, hear_others
+from service.operator_stop import OperatorStop
 from service.orders import Orders
 from service.params import Params
 from service.references import References
@@ -51,7 +55,7 @@ WARM_UP = 20  # solves before the first command: the first real sample is not th
 log = logging.getLogger(LEADER)
 
 
-def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, stop: Event | None = None) -> int:
+def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, state: Path | None = None, stop: Event | None = None) -> int:
     """
     Control one robot until stopped.
 
@@ -59,6 +63,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
         config: The robot.
         bus_settings: How to join the bus.
         standby: Whether to stand by while another controller leads.
+        state: Folder that remembers an operator's stop; None: the user's, or the service's.
         stop: Stops the controller when set; SIGINT and SIGTERM if there is none.
 
     Returns:
@@ -74,8 +79,18 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
     controller = Controller(rti, timing, config_hash=config.config_hash, observer=config.build_observer())
     lock = Condition()
     params = Params(config, controller, rti, lock)
+
+    def obey(latch: Latch) -> None:
+        with lock:
+            if latch.stopped:
+                controller.stop(latch.reason)
+            else:
+                controller.enable()
+
     outcomes = realtime.attempt(**config.realtime.model_dump())  # when all is compiled, and before any thread is started, for all of them
     with Bus(bus_settings, config.keys(), stop=stop) as bus:
+        operator_stop = OperatorStop(LatchFile(bus.keys, state), obey, controller.notices.append)
+        operator_stop.listen(bus)
         others = hear_others(bus, stop)
         if standby and others.config_hash not in (None, config.config_hash):
             raise ConfigError(differ(others.config_hash, config.config_hash))
@@ -87,7 +102,8 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
             return 1
         ocp = rti.ocp
         leadership = Leadership(bus, controller, others, config_hash=config.config_hash, dt_s=ocp.dt, nu=ocp.model.nu, standby=standby)
-        daemon = Daemon(config, controller, bus, leadership, params, lock, rti, outcomes)
+        daemon = Daemon(config, controller, bus, leadership, params, lock, rti, outcomes, operator_stop)
+        operator_stop.serve(bus, lambda: leadership.role, daemon.describe)
         bus.serve(bus.keys.request, daemon.orders.answer)
         log.info("epoch %d controls %s every %g s" if leadership.leading else "%d stands by %s, every %g s", leadership.epoch, config.robot, ocp.dt)
         if outcomes:
@@ -123,6 +139,7 @@ class Daemon:
         lock: Condition,
         rti: Rti,
         outcomes: Sequence[realtime.Outcome],
+        operator_stop: OperatorStop,
     ) -> None:
         keys, model = bus.keys, rti.ocp.model
         self._config = config
@@ -132,7 +149,8 @@ class Daemon:
         self._bus = bus
         self._leadership = leadership
         self._params = params
-        self.orders = Orders(controller, rti, params, lock, lambda: leadership.leading, self._describe)
+        self.orders = Orders(controller, rti, params, lock, operator_stop, lambda: leadership.leading, self.describe)
+        self._operator_stop = operator_stop
         self._lock = lock
         self._telling = Lock()
         self._told = 0  # descriptions published
@@ -181,6 +199,7 @@ class Daemon:
             if not relieved and (command := self._controller.standstill(time.monotonic_ns())) is not None:
                 self._commands.put(command)
         self._announce()
+        self._operator_stop.close()
         log.info("stopped")
         return int(self._crashed.is_set())
 
@@ -251,11 +270,11 @@ class Daemon:
     def _introduce(self) -> None:
         """Speak in the role that is played now."""
         role = self._leadership.role
-        self._describe()
+        self.describe()
         self._bus.withdraw_json(self._bus.keys.info(STANDBY if role == LEADER else LEADER))
         self._announcer = Announcer(self._bus, role, self._leadership.epoch)
 
-    def _describe(self) -> None:
+    def describe(self) -> None:
         """Publish what this controller is."""
         with self._telling:
             role, config = self._leadership.role, self._config

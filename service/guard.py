@@ -15,12 +15,14 @@ import secrets
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from threading import Event, Lock, Thread
 
 import rti_mpc
 from rti_mpc.epoch import NUMBER_BITS, epoch_above
 from rti_mpc.errors import ConfigError
 from rti_mpc.guard import Guard
+from rti_mpc.latch import Latch
 from rti_mpc.message import Command, State
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import WAITING, Bus, Received, Subscriber
@@ -28,6 +30,8 @@ from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.session import BusSettings
 from service.announce import announce
 from service.config import Config
+from service.latch_file import LatchFile
+from service.operator_stop import OperatorStop
 
 ROLE = "guard"
 HEARING_S = 0.5  # for which a starting guard listens for another
@@ -36,13 +40,14 @@ RAMP_S = 3.0  # of a guard that is being stopped, to bring the robot to rest, at
 log = logging.getLogger(ROLE)
 
 
-def main(config: Config, bus_settings: BusSettings, *, stop: Event | None = None) -> int:
+def main(config: Config, bus_settings: BusSettings, *, state: Path | None = None, stop: Event | None = None) -> int:
     """
     Guard one robot until stopped.
 
     Args:
         config: The robot, of whose model no more is known than its inputs' bounds.
         bus_settings: How to join the bus.
+        state: Folder that remembers an operator's stop; None: the user's, or the service's.
         stop: Stops the guard when set; SIGINT and SIGTERM if there is none.
 
     Returns:
@@ -61,8 +66,7 @@ def main(config: Config, bus_settings: BusSettings, *, stop: Event | None = None
             return 1
         known = max(time.time_ns() // 1_000_000_000 << NUMBER_BITS, intake.highest_epoch(heard.drain()))
         epoch = epoch_above(known, secrets.randbits(NUMBER_BITS))
-        process = Process(config, bus, epoch)
-        bus.publish_json(bus.keys.info(ROLE), {**describe(config), "epoch": epoch})
+        process = Process(config, bus, epoch, LatchFile(bus.keys, state))
         bus.alive(ROLE)
         log.info("epoch %d guards %s", epoch, config.robot)
         return process.run(stop)
@@ -88,8 +92,11 @@ def describe(config: Config) -> dict[str, object]:
 class Process:
     """One life of the guard on the bus."""
 
-    def __init__(self, config: Config, bus: Bus, epoch: int) -> None:
+    def __init__(self, config: Config, bus: Bus, epoch: int, file: LatchFile) -> None:
         limits, keys = config.guard_limits(), bus.keys
+        self._bus = bus
+        self._telling = Lock()
+        self._about = {**describe(config), "epoch": epoch}
         self._guard = Guard(limits, epoch=epoch, config_hash=config.config_hash)
         self._tick_s = config.guard.tick_s
         self._lock = Lock()
@@ -98,6 +105,10 @@ class Process:
         self._actuation = bus.publisher(keys.actuation, Command, realtime=True)
         self._states = bus.intake(State, config.stale_s)
         self._commands = bus.intake(Command, config.stale_s, {"u": len(limits.u_rest)})
+        self._operator_stop = OperatorStop(file, self._obey, self._guard.notices.append)
+        self._operator_stop.listen(bus)
+        self._operator_stop.serve(bus, lambda: ROLE, self._describe)
+        self._describe()
         self._threads = [
             Thread(target=self._follow, args=(act, bus.subscriber(key, capacity=WAITING)), name=act.__name__, daemon=True)
             for act, key in ((self._state, keys.state), (self._command, keys.command))
@@ -118,8 +129,22 @@ class Process:
             self._tick()
             time.sleep(self._tick_s)
         self._tick()
+        self._operator_stop.close()
         log.info("stopped")
         return int(self._crashed.is_set())
+
+    def _obey(self, latch: Latch) -> None:
+        """Do what an operator has asked for last."""
+        with self._lock:
+            if latch.stopped:
+                self._guard.latch(latch.reason, time.monotonic_ns())
+            else:
+                self._guard.enable()
+
+    def _describe(self) -> None:
+        """Publish what this guard is."""
+        with self._telling:
+            self._bus.publish_json(self._bus.keys.info(ROLE), {**self._about, **self._operator_stop.describe()})
 
     def _state(self, received: Received) -> None:
         """Take a state in."""

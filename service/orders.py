@@ -2,9 +2,9 @@
 """
 Standing orders: an operator's stop, and parameters. They hold whoever leads.
 
-A stop reaches every controller, and each obeys. A change of parameters is the
-leader's to grant. Both stand in its description, from which those that stand
-by take over what they have not heard themselves.
+A stop reaches every controller, and each obeys (`service.operator_stop`). A
+change of parameters is the leader's to grant. It stands in the leader's
+description, from which those that stand by take it over.
 """
 
 from __future__ import annotations
@@ -18,33 +18,34 @@ from rti_mpc.errors import ConfigError, RtiMpcError
 from rti_mpc.message import Notice, Severity
 from rti_mpc.rti import Rti
 from service import injection
+from service.operator_stop import REQUESTS, OperatorStop
 from service.params import Params
-
-OPERATOR = "asked for by an operator"
 
 
 class Orders:
-    """
-    The orders one controller has.
-
-    Attributes:
-        stopped: Why it is stopped; empty while it is not.
-    """
+    """The orders one controller has."""
 
     def __init__(
-        self, controller: Controller, rti: Rti, params: Params, lock: Condition, leading: Callable[[], bool], tell: Callable[[], None]
+        self,
+        controller: Controller,
+        rti: Rti,
+        params: Params,
+        lock: Condition,
+        stop: OperatorStop,
+        leading: Callable[[], bool],
+        tell: Callable[[], None],
     ) -> None:
-        self.stopped = ""
         self._rti = rti
         self._controller = controller
         self._params = params
         self._lock = lock
+        self._stop = stop
         self._leading = leading
         self._tell = tell  # publishes the description
 
     def describe(self) -> dict[str, Any]:
         """Return them as a part of the description."""
-        return {"stopped": self.stopped, "parameters": {"version": self._params.version, "changes": self._params.changes}}
+        return {**self._stop.describe(), "parameters": {"version": self._params.version, "changes": self._params.changes}}
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any] | None:
         """
@@ -54,43 +55,31 @@ class Orders:
             ConfigError: It is refused, and why.
         """
         what = request.get("request")
-        if what in ("stop", "enable"):
-            self._stop(OPERATOR if what == "stop" else "")
-            answer: dict[str, Any] = {}
-        elif what in ("params", "inject") and not self._leading():
+        if what in REQUESTS:  # also here, for those who know no key of its own
+            return self._stop.answer(request)
+        if what not in ("params", "inject"):
+            raise ConfigError(f"request must be stop, enable, params or inject, got {what!r}")
+        if not self._leading():
             return None
-        elif what == "inject":
+        if what == "inject":
             with self._lock:
                 return injection.answer(self._rti, request)
-        elif what == "params":
-            answer = self._params.answer(request)
-            if "from_seq" in answer:
-                text = ", ".join(f"{key} = {value}" for key, value in request["set"].items())
-                self._say("parameters_changed", f"parameters of version {self._params.version}, from command {answer['from_seq']} on: {text}")
-        else:
-            raise ConfigError(f"request must be stop, enable, params or inject, got {what!r}")
-        if self._leading():
-            self._tell()
+        answer = self._params.answer(request)
+        if "from_seq" in answer:
+            text = ", ".join(f"{key} = {value}" for key, value in request["set"].items())
+            self._say("parameters_changed", f"parameters of version {self._params.version}, from command {answer['from_seq']} on: {text}")
+        self._tell()
         return {"ok": True, "request": what, **answer}
 
     def adopt(self, info: Mapping[str, Any]) -> None:
         """Take over what a leader's description says."""
         try:
-            self._stop(str(info["stopped"]))
             version = self._params.version
             self._params.adopt(info["parameters"]["version"], dict(info["parameters"]["changes"]))
             if self._params.version != version:
                 self._say("parameters_changed", f"parameters of version {self._params.version}, as the leader has them")
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RtiMpcError) as error:
             self._say("leader_not_understood", f"the leader's description must hold its orders, got a fault at {error}", Severity.WARNING)
-
-    def _stop(self, reason: str) -> None:
-        with self._lock:
-            if reason:
-                self._controller.stop(reason)
-            elif self.stopped:
-                self._controller.enable()
-            self.stopped = reason
 
     def _say(self, code: str, text: str, severity: Severity = Severity.INFO) -> None:
         self._controller.notices.append(Notice(severity, code, text))

@@ -1,18 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An operator's request to the controller of one robot: asked once, the answer printed."""
+"""An operator's request to the processes of one robot, the answer printed."""
 
 from __future__ import annotations
 
+import getpass
 import json
+import os
+import socket
 import sys
+import time
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
-from rti_mpc.errors import ConfigError
-from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.errors import ConfigError, MessageError
+from rti_mpc.latch import Latch, read_latch
+from rti_mpc.wire.bus import RETRY_S, Bus, BusSettings
 from rti_mpc.wire.keys import Keys
 from service import toml
+from service.latch_file import LatchFile
+from service.operator_stop import MAX_NAME, now
+
+ASKED_S = 0.7  # until a stop is asked for again: who acts may hang, and another take over
+GUARD, LEADER = "guard", "controller"  # roles of those who may act
 
 
 def main(bus_settings: BusSettings, keys: Keys, request: str, timeout_s: float, **details: Any) -> int:
@@ -22,7 +35,7 @@ def main(bus_settings: BusSettings, keys: Keys, request: str, timeout_s: float, 
     Args:
         bus_settings: How to join the bus.
         keys: Which robot.
-        request: What is asked for, such as ``"stop"``.
+        request: What is asked for, such as ``"params"``.
         timeout_s: How long to wait for an answer.
         details: The rest of the request.
 
@@ -46,6 +59,78 @@ def ask(bus_settings: BusSettings, keys: Keys, request: dict[str, Any], timeout_
         return answer
     print(f"rti-mpc: {answer.get('error', 'refused without a reason')}", file=sys.stderr)
     return None
+
+
+def stop_or_enable(bus_settings: BusSettings, keys: Keys, what: str, timeout_s: float, *, guarded: bool, state: Path | None) -> int:
+    """
+    Stop or release a robot, and print the answer of whoever acts: its guard, if there is one, else the controller that leads.
+
+    Args:
+        bus_settings: How to join the bus.
+        keys: Which robot.
+        what: ``"stop"`` or ``"enable"``.
+        timeout_s: How long to wait for that answer.
+        guarded: Whether the robot takes what a guard passes on.
+        state: Folder in which it is noted where nobody answers; None: the user's.
+
+    Returns:
+        Exit status: 0 if whoever acts has confirmed, else 1.
+    """
+    answers: dict[str, dict[str, Any]] = {}
+    acting = GUARD if guarded else LEADER
+    with Bus(bus_settings, keys, timeout_s=timeout_s) as bus:
+        for answer in asked_again(bus, {"request": what, "by": operator()}, timeout_s):
+            answers[str(answer.get("role"))] = answer
+            acting = GUARD if GUARD in answers else acting
+            if answers.get(acting, {}).get("ok") is True:
+                print(json.dumps(answers[acting]))
+                if fault := answers[acting].get("not_stored"):
+                    print(f"rti-mpc: the {acting} obeys, but will have forgotten it after a restart: {fault}", file=sys.stderr)
+                return 0
+    refusals = [f"the {role} has not: {answer['error']}" for role, answer in answers.items() if answer.get("ok") is not True and "error" in answer]
+    confirmed = [role for role, answer in answers.items() if answer.get("ok") is True]
+    print(
+        f"rti-mpc: {keys.robot}: the {acting} has not confirmed {what} within {timeout_s:g} s; {' and '.join(confirmed) or 'nobody'} has",
+        *refusals,
+        *([] if answers else [noted(LatchFile(keys, state), what)]),
+        sep="; ",
+        file=sys.stderr,
+    )
+    return 1
+
+
+def asked_again(bus: Bus, request: dict[str, Any], timeout_s: float) -> Iterator[dict[str, Any]]:
+    """Yield answers to one request, which is asked again until the time is over; those who know of it by then are not to do it twice."""
+    deadline_s = time.monotonic() + timeout_s
+    latch = Latch()
+    while (left_s := deadline_s - time.monotonic()) > 0.0:
+        again = {"latch": asdict(latch)} if latch.counter else {}
+        for answer in bus.answers(bus.keys.stop, request | again, min(ASKED_S, left_s), urgent=True):
+            yield answer
+            with suppress(MessageError):
+                latch = max(latch, read_latch(answer.get("latch")))
+        time.sleep(min(RETRY_S, left_s))
+
+
+def noted(file: LatchFile, what: str) -> str:
+    """Note what nobody has confirmed for those who are started later, and say so."""
+    latch, _ = file.read()
+    changed = latch.change(stopped=what == "stop", reason=f"asked for by {operator()}", when=now())
+    try:
+        if changed != latch or file.path is None:
+            file.write(changed)
+    except OSError as error:
+        return f"it could not be noted either: {error.strerror}"
+    return f"what is started later with {file.path} is {changed}"
+
+
+def operator() -> str:
+    """Return who asks."""
+    try:
+        name = getpass.getuser()
+    except (KeyError, OSError):  # no name for this user
+        name = str(os.getuid())
+    return f"{name}@{socket.gethostname()}"[:MAX_NAME]
 
 
 def params(bus_settings: BusSettings, keys: Keys, words: Sequence[str], timeout_s: float) -> int:

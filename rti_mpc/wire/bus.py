@@ -16,7 +16,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Generic
@@ -300,19 +300,26 @@ class Bus:
         """
         deadline_s = time.monotonic() + timeout_s
         while (left_s := deadline_s - time.monotonic()) > 0.0:
-            replies = self._session.get(
-                key,
-                timeout=left_s,
-                payload=json.dumps(value).encode(),
-                encoding="application/json",
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,
-            )
-            answers = [_object(reply.ok.payload, document.MOST_BYTES) for reply in replies if reply.ok is not None]
-            if answers:
+            if answers := list(self.answers(key, value, left_s)):
                 return min(answers, key=lambda answer: answer.get("ok") is True)
             time.sleep(min(RETRY_S, left_s))  # nobody serves it yet
         raise TimeoutError(f"{key} must be served, got no answer within {timeout_s} s")
+
+    def answers(self, key: str, value: dict[str, Any], timeout_s: float, *, urgent: bool = False) -> Iterator[dict[str, Any]]:
+        """Yield the answers of all who serve a key, as they come; ``urgent``: the request goes before all else on its way."""
+        replies = self._session.get(
+            key,
+            timeout=timeout_s,
+            payload=json.dumps(value).encode(),
+            encoding="application/json",
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            priority=zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.DATA,
+            express=urgent,
+        )
+        for reply in replies:
+            if reply.ok is not None:
+                yield _object(reply.ok.payload, document.MOST_BYTES)
 
     def alive(self, role: str) -> zenoh.LivelinessToken:
         """Show presence in a role until the token is undeclared, the bus closed or the process gone."""

@@ -112,6 +112,11 @@ class Keys:
         return self.stream("request")
 
     @property
+    def stop(self) -> str:
+        """Queryable of controllers and guards for an operator's stop and its release, JSON; what else is asked for does not delay it."""
+        return self.stream("stop")
+
+    @property
     def lives(self) -> str:
         """All liveliness tokens, for watchers."""
         return self.alive("*")

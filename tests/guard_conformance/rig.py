@@ -76,7 +76,7 @@ class Rig:
         """Start a guard."""
         with (self._folder / "guard.log").open("ab") as log:
             command = [*self._guard, str(self.config), "-e", self._endpoint]
-            environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+            environment = {**os.environ, "PYTHONPATH": str(ROOT), "STATE_DIRECTORY": str(self._folder / "state")}
             self.process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT)
 
     def kill(self) -> None:

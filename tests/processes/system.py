@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -27,6 +30,7 @@ CONFIG = load(SHIPPED)
 KEYS = CONFIG.keys()
 PATIENCE_S = 60.0  # to start processes and hear of them on a host that is busy; the first controller on a machine compiles
 SPEED = 4.0
+STATE = Path(tempfile.mkdtemp(prefix="rti-mpc-state-"))  # of commands that belong to no system; never the user's own
 ARGUMENTS: dict[str, tuple[object, ...]] = {
     "robot": ("sim", "--speed", SPEED, "--x0", "x=0.5"),
     "controller": ("run",),
@@ -34,6 +38,7 @@ ARGUMENTS: dict[str, tuple[object, ...]] = {
     "guard": ("guard",),
 }
 T = TypeVar("T")
+atexit.register(shutil.rmtree, STATE, ignore_errors=True)
 
 
 def free_endpoint() -> str:
@@ -51,8 +56,8 @@ def rti_mpc(*arguments: object, timeout_s: float = 120.0) -> subprocess.Complete
     return subprocess.run(command_line(*arguments), cwd=ROOT, env=environment(), capture_output=True, text=True, timeout=timeout_s)
 
 
-def environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": str(ROOT)}
+def environment(state: Path = STATE) -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT), "STATE_DIRECTORY": str(state)}
 
 
 class System:
@@ -83,8 +88,8 @@ class System:
             command, *options = self.arguments[role]
             options += ["--log", self.folder / "robot.csv"] if role == "robot" else []
             with (self.folder / f"{role}.log").open("ab") as log:
-                arguments = command_line(command, self.config, "-e", self.endpoint, *options)
-                self.running[role] = subprocess.Popen(arguments, cwd=ROOT, env=environment(), stdout=log, stderr=subprocess.STDOUT)
+                arguments, state = command_line(command, self.config, "-e", self.endpoint, *options), self.folder / "state"
+                self.running[role] = subprocess.Popen(arguments, cwd=ROOT, env=environment(state), stdout=log, stderr=subprocess.STDOUT)
 
     def kill(self, role: str) -> None:
         """End a process without notice, as a crash does."""

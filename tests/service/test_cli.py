@@ -66,12 +66,21 @@ def test_file_that_cannot_be_written_is_refused_before_anything_is_measured(comm
     assert done.stderr.startswith("rti-mpc: --json must be a file that can be written")
 
 
-@pytest.mark.parametrize("command", ["stop", "enable"])
-def test_operator_is_told_in_one_line_when_nobody_answers(command: str) -> None:
-    done = rti_mpc(command, "--timeout", "0.3", "-e", "tcp/127.0.0.1:1")
-    assert done.returncode == 1
-    assert done.stdout == ""
-    assert done.stderr == "rti-mpc: pioneer has no controller that answers within 0.3 s: nothing was changed\n"
+def test_operator_is_told_in_one_line_that_nobody_has_confirmed_and_what_was_noted(tmp_path: Path) -> None:
+    path = tmp_path / "state" / "rti_mpc%2Fpioneer.json"
+    for command, counter in (("enable", 0), ("stop", 1), ("stop", 1), ("enable", 2)):
+        done = rti_mpc(command, "--timeout", "0.3", "-e", "tcp/127.0.0.1:1", "--state", str(path.parent))
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
+        assert done.stderr.startswith(f"rti-mpc: pioneer: the controller has not confirmed {command} within 0.3 s; nobody has; ")
+        assert f"what is started later with {path} is {'stopped since' if command == 'stop' else 'released'}" in done.stderr
+        assert path.exists() == (counter > 0)
+        assert not counter or json.loads(path.read_text())["counter"] == counter
+
+
+def test_operator_is_told_in_one_line_that_nothing_could_be_noted_either() -> None:
+    done = rti_mpc("stop", "--timeout", "0.3", "-e", "tcp/127.0.0.1:1", "--state", "/proc/none")
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
+    assert "nobody has; it could not be noted either: " in done.stderr
 
 
 def test_check_of_the_shipped_configuration_prints_both_phases_and_the_verdict() -> None:

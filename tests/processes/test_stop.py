@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An operator's stop among real processes: what outlives whom, and who confirms."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from subprocess import CompletedProcess
+
+import numpy as np
+import pytest
+import zenoh
+
+from rti_mpc.message import Command, State
+from rti_mpc.status import Mode
+from service.cli import SHIPPED
+from tests.processes.record import GUARDED
+from tests.processes.system import KEYS, System, heard, rti_mpc, until
+
+RATE = 300  # requests a second
+STANDING = 1e-3  # m/s, rad/s
+
+
+class Operated(System):
+    """A system, and its operator on the same host."""
+
+    def says(self, word: str, *options: object) -> CompletedProcess[str]:
+        return rti_mpc(word, self.config, "-e", self.endpoint, "--state", self.folder / "state", *options)
+
+    def stands(self, samples: int = 20) -> None:
+        """Wait for so many states; no input is anything but rest from now on."""
+        first = self.state(lambda _: True)
+        last = self.state(lambda state: state.seq >= first.seq + samples)
+        with (self.folder / "robot.csv").open(newline="") as file:
+            rows = [row for row in csv.DictReader(file) if None not in row.values() and first.seq <= int(row["seq"]) <= last.seq]
+        assert not np.array([[float(row["u_c"]), float(row["omega_c"])] for row in rows]).any()
+
+    def commanded_to_stand(self) -> None:
+        heard(self.bus.subscriber(KEYS.command), Command, lambda command: command.mode is Mode.STOPPED and not command.u.any())
+        self.stands()
+
+
+def moves(state: State) -> bool:
+    return bool(abs(state.x[3]) > 0.03)
+
+
+def rests(state: State) -> bool:
+    return bool(np.abs(state.x[3:]).max() < STANDING)
+
+
+@pytest.fixture
+def system(tmp_path: Path) -> Iterator[Operated]:
+    with Operated(tmp_path) as system:
+        yield system
+
+
+@pytest.fixture
+def guarded(tmp_path: Path) -> Iterator[Operated]:
+    (tmp_path / "robot.toml").write_text(SHIPPED.read_text() + GUARDED)
+    with Operated(tmp_path, tmp_path / "robot.toml") as system:
+        yield system
+
+
+def test_stop_outlives_a_controller_that_is_killed(system: Operated) -> None:
+    system.start("robot", "controller", "reference")
+    system.tracking()
+    system.state(moves)
+    done = system.says("stop")
+    assert (done.returncode, json.loads(done.stdout)["role"]) == (0, "controller"), done.stderr
+    system.state(rests)
+    system.kill("controller")
+    system.start("controller")
+    system.commanded_to_stand()
+    assert "stopped since" in system.said("controller")
+    assert system.says("enable").returncode == 0
+    system.tracking()
+    system.state(moves)
+
+
+@pytest.mark.slow
+def test_stop_said_to_nobody_is_noted_and_outlives_every_restart_until_it_is_released(system: Operated) -> None:
+    system.start("robot", "reference")
+    done = system.says("stop", "--timeout", 0.3)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "the controller has not confirmed stop within 0.3 s; nobody has; what is started later with" in done.stderr
+    for _ in range(2):
+        system.start("controller")
+        system.commanded_to_stand()
+        assert system.interrupt("controller") == 0
+    assert system.says("enable", "--timeout", 0.3).returncode == 1
+    system.start("controller")
+    system.tracking()
+    system.state(moves)
+
+
+@contextmanager
+def flood(endpoint: str) -> Iterator[list[float]]:
+    """Ask a controller for its parameters `RATE` times a second, and wait for no answer; the times at which it was asked, s."""
+    config = zenoh.Config()
+    for key, value in (("mode", '"peer"'), ("connect/endpoints", json.dumps([endpoint])), ("scouting/multicast/enabled", "false")):
+        config.insert_json5(key, value)
+    over, asked = threading.Event(), []
+
+    def ask() -> None:
+        start_s = time.monotonic()
+        while not over.is_set():
+            session.get(KEYS.request, lambda _: None, payload=b'{"request": "params", "get": true}', timeout=1.0)
+            asked.append(time.monotonic())
+            over.wait(max(0.0, start_s + len(asked) / RATE - time.monotonic()))
+
+    with zenoh.open(config) as session:
+        thread = threading.Thread(target=ask)
+        thread.start()
+        try:
+            until(lambda: len(asked) > RATE, "a second of requests")
+            yield asked
+        finally:
+            over.set()
+            thread.join()
+
+
+def test_stop_is_answered_beside_300_requests_a_second(system: Operated) -> None:
+    system.start("robot", "controller", "reference")
+    system.tracking()
+    with flood(system.endpoint) as asked:
+        took_s = []
+        for word in ("stop", "enable") * 5:  # of which three of five stops were lost where they waited with the others
+            start_s, before = time.monotonic(), len(asked)
+            answer = next(system.bus.answers(KEYS.stop, {"request": word}, 2.0, urgent=True))
+            took_s.append(time.monotonic() - start_s)
+            assert answer["ok"] is True
+            until(lambda: len(asked) > before + RATE // 5, "more requests")  # noqa: B023
+        print(f"\n{len(asked)} requests; stop and enable were answered within {1e3 * max(took_s):.0f} ms, median {1e3 * np.median(took_s):.1f}")
+    system.tracking()
+
+
+@pytest.mark.slow
+def test_stop_outlives_all_processes_of_a_guarded_robot_and_the_guard_tells_a_controller_of_another_host(guarded: Operated) -> None:
+    system, state = guarded, guarded.folder / "state"
+    system.start("robot", "guard", "controller", "reference")
+    system.tracking()
+    system.state(moves)
+    done = system.says("stop")
+    assert (done.returncode, json.loads(done.stdout)["role"]) == (0, "guard"), done.stderr
+    system.state(rests)
+
+    for role in ("controller", "guard", "robot", "reference"):
+        system.kill(role)
+    system.start("robot", "guard", "reference")
+    until(lambda: "guard" in system.lives, "a guard")
+    kept = state.rename(system.folder / "kept")  # the controller of another host knows of nothing
+    system.start("controller")
+    system.commanded_to_stand()
+    assert "stopped since" in system.said("guard")
+    assert "stopped since" not in system.said("controller")
+
+    system.kill("guard")
+    shutil.rmtree(kept)
+    shutil.rmtree(state)
+    system.start("guard")  # and now the guard hears it of the controller
+    until(lambda: (state / "rti_mpc%2Fpioneer.json").exists(), "it is stored again")
+    system.commanded_to_stand()
+
+    system.kill("controller")
+    done = system.says("enable")  # the guard alone is there, and acts
+    assert (done.returncode, json.loads(done.stdout)["role"]) == (0, "guard"), done.stderr
+    system.start("controller")
+    system.tracking()
+    system.state(moves)
+
+    system.kill("guard")
+    done = system.says("stop", "--timeout", 1.0)
+    assert done.returncode == 1
+    assert "the guard has not confirmed stop within 1 s; controller has" in done.stderr
