@@ -176,7 +176,8 @@ def rows(trajectory: Trajectory, period_s: float, heading: Heading = "consistent
         psi0: Initial consistent heading of an open path, in rad: its tangent by default. Closed paths have the heading that repeats.
 
     Returns:
-        Rows ``x, y, psi``, shape ``(M, 3)``, from time 0 to the duration; psi is unwrapped.
+        Rows ``x, y, psi``, shape ``(M, 3)``, from time 0 to the first at or after the duration, so that an open path ends at its last point; psi is
+        unwrapped.
 
     Raises:
         ConfigError: The period, the heading or `a` is out of range.
@@ -184,7 +185,8 @@ def rows(trajectory: Trajectory, period_s: float, heading: Heading = "consistent
     """
     if heading not in HEADINGS:
         raise ConfigError(f"heading must be one of {', '.join(HEADINGS)}, got {heading!r}")
-    t: Array = np.arange(int(trajectory.duration_s / _positive("period_s", period_s) + 1e-9) + 1) * np.float64(period_s)
+    periods = math.ceil(trajectory.duration_s / _positive("period_s", period_s) - 1e-9)  # all of the last one, where it is not a whole one
+    t: Array = np.arange(periods + 1) * np.float64(period_s)
     psi = tangent(trajectory.velocity, t)
     if heading == "consistent":
         _positive("a", a)

@@ -18,7 +18,7 @@ from rti_mpc.message import STAMP_ON_ARRIVAL, End, Reference, State
 from rti_mpc.rti import Rti
 from rti_mpc.solver import SolverSettings
 from rti_mpc.status import Mode, QpStatus
-from rti_mpc.trajectory import circle, eight, positioning
+from rti_mpc.trajectory import circle, eight, positioning, waypoints
 from sim.lockstep import Lockstep
 from tests.loop import MS, Run, drive, reference, robot
 from tests.problems import pioneer
@@ -409,6 +409,17 @@ def test_reference_that_ends_with_hold_is_held(controller: Controller) -> None:
     assert modes(run)[:10] == [Mode.TRACKING] * 10
     assert modes(run)[-1] is Mode.HOLDING
     assert controller.notices[-1].text == "tracking to holding: the reference has ended"
+    assert np.abs(run.x[-1][3:]).max() < 1e-3
+
+
+@pytest.mark.parametrize("speed_m_s", [0.21, 0.3])
+def test_robot_comes_to_rest_at_the_last_waypoint_of_an_open_path(controller: Controller, speed_m_s: float) -> None:
+    path = waypoints(np.array([[0.0, 0.0], [1.01, 0.0]]), speed_m_s)
+    body = robot(path)
+    controller.receive_reference(reference(path, period_ms=50))
+    run = drive(controller, body, path.duration_s + 15.0)
+    assert modes(run)[-1] is Mode.HOLDING
+    np.testing.assert_allclose(run.x[-1][:2], [1.01, 0.0], atol=1e-3)  # m: it is approached ever more slowly
     assert np.abs(run.x[-1][3:]).max() < 1e-3
 
 

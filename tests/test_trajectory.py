@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from rti_mpc.array import Array
 from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.heading import consistent, periodic
 from rti_mpc.message import End
-from rti_mpc.trajectory import HEADINGS, SCENARIOS, Trajectory, circle, eight, find_trajectory, positioning, rows, waypoints
+from rti_mpc.trajectory import HEADINGS, SCENARIOS, Heading, Trajectory, circle, eight, find_trajectory, positioning, rows, waypoints
 
 SQUARE = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0], [0.0, 0.0]])
 ZIGZAG = np.array([[0.0, 0.0], [1.5, 0.0], [2.0, 1.0], [3.5, 1.0]])
@@ -174,6 +175,25 @@ def test_open_waypoints_begin_and_end_at_their_points() -> None:
     trajectory = zigzag()
     np.testing.assert_allclose(trajectory.position(np.array([0.0, trajectory.duration_s, 1e3])), ZIGZAG[[0, -1, -1]], atol=1e-12)
     assert trajectory.end is End.HOLD
+
+
+@pytest.mark.parametrize("heading", HEADINGS)
+@pytest.mark.parametrize("speed_m_s", [0.25, 0.3, 1.0, 3.0, 20.0])
+@pytest.mark.parametrize("period_s", [0.05, 0.02, 0.7])
+def test_rows_of_an_open_path_end_at_its_last_point_whatever_the_speed(speed_m_s: float, period_s: float, heading: Heading) -> None:
+    """Its last row is held for ever; and its heading is the one it was reached with."""
+    for length in (1.0, 2.0, 3.33, 10.0):
+        y = rows(waypoints(np.array([[0.0, 0.0], [0.0, length]]), speed_m_s), period_s, heading)
+        np.testing.assert_allclose(y[-1], [0.0, length, np.pi / 2], atol=1e-9)
+        assert y[-2, 1] < length, "and no row more than that"
+
+
+@pytest.mark.parametrize("build", [*SCENARIOS.values(), square])
+@pytest.mark.parametrize("duration_s", [0.03, 2.0, 10.01, 0.3 + 1e-12])
+def test_rows_last_for_the_whole_duration_and_less_than_a_period_longer(build: Callable[[], Trajectory], duration_s: float) -> None:
+    y = rows(build().lasting(duration_s), 0.1, "tangent")
+    assert duration_s - 1e-9 <= 0.1 * (len(y) - 1) < duration_s + 0.1 - 1e-9
+    np.testing.assert_allclose(y[:, :2], build().position(0.1 * np.arange(len(y))))
 
 
 @pytest.mark.parametrize("corner_m", [0.0, 0.02, 0.15])
