@@ -44,6 +44,7 @@ class Promise:
 
 
 STOPS = Promise("stops, and drives again when mended", {**EVERYWHERE, **BRAKES, "still_s": 2.5, **AGAIN})
+STAYS = Promise("stops, stands whoever is restarted, and drives again when released", STOPS.at_most)
 PAUSES = Promise("brakes to zero, and drives again when mended", {**EVERYWHERE, **BRAKES, **AGAIN})
 KEEPS_ON = Promise("keeps on", {**EVERYWHERE, "missed": 0.0, "error_m": 0.01})
 RECOVERS = Promise("is driven again when mended", {**EVERYWHERE, **AGAIN})

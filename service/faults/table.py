@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from rti_mpc.message import Command, End, Reference, State
-from service.faults.promise import HOLDS, KEEPS_ON, PAUSES, RECOVERS, REJOINS, STOPS, WAITS, Promise
+from service.faults.promise import HOLDS, KEEPS_ON, PAUSES, RECOVERS, REJOINS, STAYS, STOPS, WAITS, Promise
 from service.faults.relay import ROLE as RELAY
 from service.faults.system import System, Wiring
 
@@ -95,6 +95,22 @@ def states(change: str, count: int | None = None) -> Act:
     """Change so many states, or all from now on; the fault is after the last one that passed as it was."""
     request = {"fault": change} | ({} if count is None else {"states": count})
     return lambda system: int(system.ask(system.keys.stream(RELAY), **request)["stamp_ns"])
+
+
+def stop_and_kill(*roles: str) -> Act:
+    """Say stop as an operator does, then SIGKILL, and start again what was killed, as a supervisor does."""
+
+    def act(system: System) -> None:
+        system.ask(system.keys.stop, request="stop")
+        system.kill(*roles)
+        system.ensure(*roles)
+
+    return act
+
+
+def enable(system: System) -> None:
+    """Release what an operator has stopped."""
+    system.ask(system.keys.stop, request="enable")
 
 
 def solver(failure: str, samples: int) -> Act:
@@ -195,6 +211,15 @@ FAULTS = (
     Fault("guard_killed", "SIGKILL of the guard", PEERS, STOPS, kill("guard"), start("guard")),
     Fault("guard_hung", "SIGSTOP of the guard", PEERS, STOPS, suspend("guard"), resume("guard")),
     Fault("guard_and_controller_killed", "SIGKILL of both", PEERS, STOPS, kill("guard", "controller"), start("guard", "controller")),
+    Fault("stop_then_controller_killed", "a stop, then SIGKILL of the controller", PEERS, STAYS, stop_and_kill("controller"), enable),
+    Fault(
+        "stop_then_both_killed",
+        "an operator's stop, then SIGKILL of guard and controller",
+        PEERS,
+        STAYS,
+        stop_and_kill("guard", "controller"),
+        enable,
+    ),
     Fault("qp_fails", "no solver finds anything", PEERS, STOPS, solver("qp", UNTIL_MENDED), solver_works),
     Fault("nan_model", "the model gives NaN", PEERS, STOPS, solver("nan_model", UNTIL_MENDED), solver_works),
     Fault("over_budget", "a sample takes 1.5 periods", PEERS, STOPS, solver("over_budget", UNTIL_MENDED), solver_works),
