@@ -13,7 +13,9 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.errors import ConfigError
+from rti_mpc.text_file import read_text_file
 
+MAX_CSV_BYTES = 1 << 26
 REVERSAL_RAD = 3.1  # turning more than this is driving back: such a corner has no arc
 
 
@@ -132,11 +134,11 @@ def read_csv(path: Path) -> Array:
     Raises:
         ConfigError: The file cannot be read, or a number in it: file, line and column are named.
     """
+    lines = read_text_file(path, "CSV with waypoints", MAX_CSV_BYTES).splitlines()
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            return np.array(list(_points(path, csv.reader(file))), dtype=np.float64).reshape(-1, 2)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{path}: must be a readable CSV file of waypoints, {error}") from error
+        return np.array(list(_points(path, csv.reader(lines))), dtype=np.float64).reshape(-1, 2)
+    except csv.Error as error:
+        raise ConfigError(f"{path}: must be CSV with waypoints, got {error}") from error
 
 
 def _points(path: Path, reader: Iterator[list[str]]) -> Iterator[tuple[float, float]]:

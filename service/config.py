@@ -12,7 +12,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +20,9 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from rti_mpc.errors import ConfigError, OcpError
-from service.refusal import explain, unknown_name
+from rti_mpc.text_file import read_text_file
+from service import toml
+from service.refusal import explain, quoted, unknown_name
 from service.schema import (
     BusSection,
     DebugSection,
@@ -308,8 +309,9 @@ def load(path: Path, *, with_model: bool = True) -> Config:
     Raises:
         ConfigError: One line: the file, the key, what must hold, what was got.
     """
+    content = read_text_file(path, "TOML")
     try:
-        config = Config.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        config = Config.model_validate(toml.read(content))
         if config.bus.config is not None:
             config = config.model_copy(update={"bus": config.bus.model_copy(update={"config": path.parent / config.bus.config})})
         check_tree(config)
@@ -317,12 +319,8 @@ def load(path: Path, *, with_model: bool = True) -> Config:
             from service.fit import check_model
 
             check_model(config)
-    except OSError as error:
-        raise ConfigError(f"{path}: must be a readable file, got {error.strerror}") from error
     except ValidationError as error:
         raise ConfigError(f"{path}: {explain(error, Config)}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: must be TOML, got {error}") from error
     except (ConfigError, OcpError) as error:
         raise ConfigError(f"{path}: {error}") from error
     return config
@@ -342,7 +340,7 @@ def check_tree(config: Config) -> None:
         raise ConfigError(f"ocp.N_u must be at most ocp.N = {ocp.N}, got {ocp.N_u}")
     for key, values, length in (("delta", ocp.weights.delta, ocp.N), ("lambda", ocp.weights.lambda_, config.N_u)):
         if len(values) not in (1, length):
-            raise ConfigError(f"ocp.weights.{key} must be a number or a list of {length}, one a stage, got {list(values)}")
+            raise ConfigError(f"ocp.weights.{key} must be a number or a list of {length}, one a stage, got {quoted(list(values))}")
     if config.bus.config is not None and not config.bus.config.is_file():
         raise ConfigError(f"bus.config must be a file, got {config.bus.config}")
     if config.guard.enabled:

@@ -16,6 +16,7 @@ import errno
 import io
 import logging
 import os
+import re
 import signal
 import sys
 import traceback
@@ -30,6 +31,8 @@ REFUSED = 2  # exit status: bad input, which no restart mends
 FAILED = 1  # exit status: all else that went wrong
 BY_SIGNAL = 128  # exit status of a process that a signal has ended, less the signal's number
 END_S = 1.0  # to write at the end what still waits to be written, at most
+MAX_LINE = 2000  # characters
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 EXTRAS = {"rerun": "view", "rerun_cli": "view", "matplotlib": "figure"}  # what a robot's own installation leaves out
 
 
@@ -121,8 +124,9 @@ def status_of(steps: Iterable[Callable[[], object]]) -> int:
         return FAILED
 
 
-def say(line: str) -> None:
-    """Print a line to standard error, if anybody takes it."""
+def say(text: str) -> None:
+    """Print one line to standard error, if anybody takes it; characters that steer a terminal are written as escapes."""
+    line = CONTROL.sub(lambda match: ascii(match[0])[1:-1], text[:MAX_LINE])
     with suppress(OSError):
         print(f"rti-mpc: {line}", file=sys.stderr, flush=True)
 

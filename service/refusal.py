@@ -13,6 +13,8 @@ from pydantic import BaseModel, ValidationError
 if TYPE_CHECKING:
     from rti_mpc.model import Signal
 
+QUOTE = 200  # characters of a value in a refusal
+
 # Pydantic's words, in those of a TOML file.
 WORDS = (
     (r"^Value error, ", ""),
@@ -33,13 +35,19 @@ def explain(error: ValidationError, tree: type[BaseModel]) -> str:
     loc, got, keys = complaint["loc"], complaint["input"], dict(entries(tree))
     key, what = dotted(loc), describe(loc, keys)
     if complaint["type"] == "extra_forbidden":
-        return f"{key} is unknown, {meant(described(loc), keys)}, got {got!r}"
+        return f"{key} is unknown, {meant(described(loc), keys)}, got {quoted(got)}"
     if complaint["type"] == "missing":
         return f"{key} is missing: {what}"
     must = complaint["msg"]
     for pattern, words in WORDS:
         must = re.sub(pattern, words, must)
-    return f"{key} ({what}) {must}, got {got!r}"
+    return f"{key} ({what}) {must}, got {quoted(got)}"
+
+
+def quoted(value: object) -> str:
+    """Return a value as text of bounded length."""
+    text = repr(value)
+    return text if len(text) <= QUOTE else f"{text[:QUOTE]}..."
 
 
 def unknown_name(key: str, table: Mapping[str, object], kind: str, signals: Sequence[Signal], *, complete: bool) -> str | None:
@@ -57,9 +65,10 @@ def unknown_name(key: str, table: Mapping[str, object], kind: str, signals: Sequ
     for name, got in table.items():
         if name not in units:
             near = [units[n] for n in get_close_matches(name, units, 1)]
-            return f"{key}.{name} is no {kind} of the model, " + (f"perhaps {near[0]} is meant" if near else known(units.values())) + f", got {got!r}"
+            meaning = f"perhaps {near[0]} is meant" if near else known(units.values())
+            return f"{key}.{name} is no {kind} of the model, {meaning}, got {quoted(got)}"
     missing = [unit for name, unit in units.items() if complete and name not in table]
-    return f"{key} must name every {kind} of the model, {missing[0]} is missing, got {dict(table)!r}" if missing else None
+    return f"{key} must name every {kind} of the model, {missing[0]} is missing, got {quoted(dict(table))}" if missing else None
 
 
 def entries(tree: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str]]:

@@ -9,7 +9,6 @@ import os
 import socket
 import sys
 import time
-import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict
@@ -178,7 +177,7 @@ def assigned(assignments: Sequence[str]) -> dict[str, Any]:
     for assignment in assignments:
         key, _, value = assignment.partition("=")
         try:
-            values[key.strip()] = tomllib.loads(f"value = {value}")["value"]
-        except tomllib.TOMLDecodeError:
+            (values[key.strip()],) = toml.read(f"value = {value}").values()
+        except (ConfigError, ValueError):
             raise ConfigError(f"params must be set by KEY=VALUE, the value as in the file, got {assignment}") from None
     return values

@@ -1,14 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A configuration as TOML again, so that a run leaves behind exactly what it was run with."""
+"""TOML: read with a bound on its depth, and a configuration written again, so that a run leaves behind exactly what it was run with."""
 
 from __future__ import annotations
 
 import json
 import math
+import tomllib
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from service.config import Config
+from rti_mpc.errors import ConfigError
+
+if TYPE_CHECKING:
+    from service.config import Config
+
+MAX_DEPTH = 16  # tables and lists inside each other; a configuration has five
+
+
+def read(text: str) -> dict[str, Any]:
+    """
+    Return the content of TOML.
+
+    Raises:
+        ConfigError: It is none, or nested deeper than `MAX_DEPTH`.
+    """
+    try:
+        content = tomllib.loads(text)
+    except ValueError as error:  # of a number with thousands of digits, too
+        raise ConfigError(f"must be TOML, got {error}") from None
+    except RecursionError:
+        content = None
+    if content is None or too_deep(content):
+        raise ConfigError(f"must be TOML of at most {MAX_DEPTH} tables and lists inside each other")
+    return content
+
+
+def too_deep(content: dict[str, Any]) -> bool:
+    """Whether more than `MAX_DEPTH` tables and lists are inside each other."""
+    level: list[Any] = [content]
+    for _ in range(MAX_DEPTH):
+        tables = [value for value in level if isinstance(value, dict | list)]
+        level = [inner for table in tables for inner in (table.values() if isinstance(table, dict) else table)]
+    return any(isinstance(value, dict | list) for value in level)
 
 
 def write(config: Config) -> str:

@@ -59,7 +59,8 @@ LOCAL = {"rti_mpc/wire/session.py"}  # reads JSON that is not a peer's: Zenoh's 
 # Inside the library, a file imports only from groups before its own.
 FLOW: tuple[set[str], ...] = (
     {"errors", "array", "status", "robot_clock", "ladder", "grid", "epoch", "cache", "angle"},
-    {"message", "polyline", "latch"},
+    {"message", "text_file", "latch"},
+    {"polyline"},
     {"heading", "mode", "schedule", "issued"},
     {"trajectory", "guard", "sent"},
     {"model"},
@@ -76,7 +77,7 @@ FLOW: tuple[set[str], ...] = (
     {"record", "blockage"},
     {"controller"},
 )
-BEFORE_WIRE = {"errors", "array", "status", "message", "epoch"}
+BEFORE_WIRE = {"errors", "array", "status", "message", "epoch", "text_file"}
 
 
 def imported(path: Path) -> set[str]:

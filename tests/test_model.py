@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -114,12 +115,48 @@ def test_model_of_ones_own_is_found_by_module_and_function() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("pioneer", "must be one of pioneer_3dx or an importable package.module:function, got 'pioneer'"),
+        ("pioneer", "must be one of pioneer_3dx or an importable package.module:function of your own, got 'pioneer'"),
         ("rti_mpc.nowhere:model", "No module named"),
-        ("rti_mpc.model:nothing", "has no attribute 'nothing'"),
-        ("builtins:dict", "must return a rti_mpc.model.Model, got dict"),
+        ("rti_mpc.model:nothing", "has no function nothing"),
+        ("numpy:zeros_like", r"numpy:zeros_like must return a model, it raised TypeError: "),
+        ("numpy:errstate", "numpy:errstate must return a rti_mpc.model.Model, got errstate"),
+        ("numpy:__version__", "has no function __version__"),
+        *(
+            (name, "package.module:function of your own, got")
+            for name in ("", ":", ":x", "a:", ".os:system", "os/x:y", "a b:c", "a:b:c", "..:x", "a.:b")
+        ),
+        *((name, f"{name.partition(':')[0]} is Python's own") for name in ("sys:exit", "os:abort", "os:fork", "builtins:dict", "antigravity:x")),
     ],
 )
 def test_model_that_does_not_exist_is_refused_with_what_would_be_right(name: str, message: str) -> None:
     with pytest.raises(OcpError, match=message):
         find_model(name)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("def model(:\n", "{module} must be importable, it raised SyntaxError in {file}, line 1: "),
+        ("x = 1\nraise ValueError('two\\nlines')", "{module} must be importable, it raised ValueError in {file}, line 2: two lines"),
+        ("import sys\nsys.exit()", "{module} must be importable, it raised SystemExit in {file}, line 2: nothing said"),
+        ("import rti_mpc.nowhere", "{module} must be importable, it raised ModuleNotFoundError in {file}, line 1: No module named 'rti_mpc.nowhere'"),
+        ("import sys\ndef model():\n    sys.exit(0)", "{module}:model must return a model, it raised SystemExit in {file}, line 3: 0"),
+        ("import numpy\ndef model():\n    numpy.zeros(-1)", "{module}:model must return a model, it raised ValueError in {file}, line 3: "),
+        ("def model():\n    return model()", "{module}:model must return a model, it raised RecursionError in {file}, line 2: "),
+        ("def model(x):\n    pass", "{module}:model must return a model, it raised TypeError: "),
+        ("def model():\n    pass", "{module}:model must return a rti_mpc.model.Model, got NoneType"),
+        ("model = 1", "of your own, got '{module}:model' ({module} has no function model)"),
+        ("\0", "{module} must be importable, it raised "),
+    ],
+)
+def test_what_a_users_module_raises_is_one_line_with_its_own_file_and_line(
+    text: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = f"theirs_{abs(hash(text))}"  # a module that was imported stays so
+    file = tmp_path / f"{module}.py"
+    file.write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(OcpError) as refusal:
+        find_model(f"{module}:model")
+    assert told.format(module=module, file=file) in str(refusal.value)
+    assert "\n" not in str(refusal.value)

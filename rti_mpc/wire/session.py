@@ -26,11 +26,13 @@ import zenoh
 
 from rti_mpc.errors import ConfigError, Stopped
 from rti_mpc.message import Reference
+from rti_mpc.text_file import read_text_file
 from rti_mpc.wire.layout import MOST_BYTES
 
 RENDEZVOUS = "tcp/127.0.0.1:7447"
 ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws)/.+:\d+([?#].*)?$|(?!(tcp|tls|udp|quic|ws)/)[a-z_-]+/.+")  # those without a port are Zenoh's to judge
 CLIENT_TIMEOUT_MS = 500  # one attempt to reach a router
+MAX_CONFIG_BYTES = 1 << 16  # of Zenoh's configuration: its parser goes down with every bracket
 RETRY_S = 0.1  # between two looks for somebody who is not there yet
 
 # Closing the link of a hung peer occupies a thread of Zenoh for its linger time, 10 s. By default there is one to send and
@@ -84,6 +86,8 @@ def zenoh_config(settings: BusSettings) -> zenoh.Config:
         if not ENDPOINT.match(endpoint):
             raise ConfigError(f"bus: an endpoint must be a protocol, an address and a port, such as {RENDEZVOUS}, got {endpoint!r}")
     name = str(settings.config)
+    if settings.config is not None:
+        read_text_file(settings.config, "Zenoh's configuration", MAX_CONFIG_BYTES)
     try:
         config = zenoh.Config() if settings.config is None else zenoh.Config.from_file(settings.config)
         untouched = zenoh.Config()
