@@ -22,6 +22,7 @@ from rti_mpc.array import Array
 from rti_mpc.blockage import Blockage
 from rti_mpc.delay import DelayEstimator
 from rti_mpc.envelope import Envelope
+from rti_mpc.errors import OcpError
 from rti_mpc.grid import Grid
 from rti_mpc.grid import Timing as Timing
 from rti_mpc.issued import Issued
@@ -29,7 +30,7 @@ from rti_mpc.ladder import Ladder
 from rti_mpc.message import STAMP_ON_ARRIVAL, Command, End, Reference, Severity, State, Telemetry
 from rti_mpc.mode import ModeMachine
 from rti_mpc.observer import Observer
-from rti_mpc.ocp import Ocp
+from rti_mpc.ocp import Ocp, restless
 from rti_mpc.prediction import Prediction
 from rti_mpc.record import Record
 from rti_mpc.rti import Rti
@@ -58,12 +59,17 @@ class Controller:
         np_: Parameters a row of a reference may carry: the model's, without the disturbances an observer estimates.
         envelope: What inputs may be.
         grid: When commands act.
+
+    Raises:
+        OcpError: Bounds leave out the input at which the robot rests.
     """
 
     def __init__(
         self, rti: Rti, timing: Timing, *, epoch: int = 1, config_hash: int = 0, observer: Observer | None = None, compile: bool = True
     ) -> None:
         ocp, model = rti.ocp, rti.ocp.model
+        if wrong := restless(ocp):
+            raise OcpError(wrong)
         self._rti = rti
         self._stale_ns = round(1e9 * timing.stale_s)
         self._valid_ns = round(1e9 * timing.valid_s)

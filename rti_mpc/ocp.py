@@ -71,7 +71,7 @@ class Ocp:
         Zh: L2 weight of their slacks, shape ``(nh,)``, given so or as a constant.
 
     Raises:
-        OcpError: An argument does not fit; the message names it, and what it must be.
+        OcpError: An argument does not fit; the message names it, and what it must be. A rest input that is declared, and not zero, must fit, too.
     """
 
     model: Model
@@ -166,6 +166,8 @@ class Ocp:
         for lower, upper in (("lbu", "ubu"), ("lbx", "ubx"), ("lh", "uh")):
             if not np.all(getattr(self, lower) < getattr(self, upper)):
                 raise OcpError(f"{lower} must lie below {upper}, got {getattr(self, lower)} and {getattr(self, upper)}")
+        if any(self.model.u_rest) and (wrong := restless(self)):
+            raise OcpError(wrong)
         if np.any(self.lbdu > 0) or np.any(self.ubdu < 0):
             raise OcpError(f"lbdu <= 0 <= ubdu must hold, or no input could be kept, got {self.lbdu} and {self.ubdu}")
 
@@ -189,6 +191,21 @@ class Ocp:
         model = self.model
         x_next = integrator(model, self.method)(model.x, model.u, model.p, self.dt)
         return ca.Function("phi", [model.x, model.u, model.p], [x_next], ["x", "u", "p"], ["x_next"])
+
+
+def restless(ocp: Ocp) -> str:
+    """
+    Return why a robot could not be brought to its rest input inside the bounds, empty if it can.
+
+    A problem whose model declares no rest other than zero may leave it out; whoever is to stop a robot may not.
+    """
+    for signal, rest, *limits in zip(ocp.model.inputs, ocp.model.u_rest, ocp.lbu, ocp.ubu, ocp.lbdu, ocp.ubdu, strict=True):
+        lower, upper, falling, rising = map(float, limits)
+        if not lower <= rest <= upper:
+            return f"the bounds of input {signal.name} must hold its rest, {rest:g} {signal.unit}, or it could not be stopped, got {[lower, upper]}"
+        if not falling < 0.0 < rising:
+            return f"the increments of input {signal.name} must hold lower < 0 < upper, or it could not be stopped, got {[falling, rising]}"
+    return ""
 
 
 def weights(name: str, value: ArrayLike, length: int) -> Array:

@@ -17,7 +17,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
 from rti_mpc.linearization import WEIGHTS
-from rti_mpc.ocp import Ocp
+from rti_mpc.ocp import Ocp, restless
 from rti_mpc.rti import Rti
 
 BOUNDS = ("lbu", "ubu", "lbdu", "ubdu")
@@ -56,7 +56,7 @@ class Tuning:
         Tune to the weights and bounds of an OCP, from the next `begin` on.
 
         Raises:
-            OcpError: Something else of it differs, such as which bounds there are.
+            OcpError: Something else of it differs, such as which bounds there are, or its bounds leave out rest.
         """
         built = self._rti.ocp
         for name in STRUCTURE:
@@ -65,6 +65,8 @@ class Tuning:
         for name in PRESENCE:
             if not np.array_equal(np.isfinite(getattr(ocp, name)), np.isfinite(getattr(built, name))):
                 raise OcpError(f"{name} must be finite where it was built so, and only there, got {getattr(ocp, name)}: it is compiled in")
+        if wrong := restless(ocp):
+            raise OcpError(wrong)
         self._wanted, self._wanted_version = ocp, version
         self._changed = True
 

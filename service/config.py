@@ -347,6 +347,6 @@ def check_tree(config: Config) -> None:
         for name in ocp.weights.R:
             if name not in ocp.bounds.inputs:
                 raise ConfigError(f"ocp.bounds.inputs must bound every input where a guard is enabled, {name} is missing")
-        for name, (lower, upper) in ocp.bounds.increments.items():
-            if not lower < 0.0 < upper:
-                raise ConfigError(f"ocp.bounds.increments.{name} must hold lower < 0 < upper where a guard is enabled, or it could not brake")
+        for name, (lower, upper) in ocp.bounds.inputs.items():
+            if not lower <= (rest := config.guard.u_rest.get(name, 0.0)) <= upper:
+                raise ConfigError(f"ocp.bounds.inputs.{name} must hold the input's rest, guard.u_rest = {rest:g}, got {[lower, upper]}")

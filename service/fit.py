@@ -42,7 +42,22 @@ def check_model(config: Config) -> Ocp:
         with_obstacles(model, [(0.0, 0.0, 1.0) for _ in config.ocp.obstacles])
     except OcpError as error:
         raise ConfigError(f"ocp.obstacles: {error}") from error
-    return config.build_ocp()
+    ocp = config.build_ocp()
+    check_rest(ocp)
+    return ocp
+
+
+def check_rest(ocp: Ocp) -> None:
+    """
+    Check that every input can be brought to its rest.
+
+    Raises:
+        ConfigError: Its bounds leave that out.
+    """
+    from rti_mpc.ocp import restless
+
+    if wrong := restless(ocp):
+        raise ConfigError(f"ocp.bounds: {wrong}")
 
 
 def check_names(config: Config, model: Model) -> None:

@@ -24,7 +24,7 @@ from rti_mpc.ocp import Ocp
 from rti_mpc.rti import Rti
 from rti_mpc.tuning import Tuning
 from service.config import Config, check_tree
-from service.fit import check_names
+from service.fit import check_names, check_rest
 from service.refusal import entries, explain
 
 WEIGHTS = ("ocp.weights.Q", "ocp.weights.R", "ocp.weights.delta", "ocp.weights.lambda", "ocp.bounds.soft_weight")
@@ -149,6 +149,7 @@ def changed(file: Config, ocp: Ocp, changes: Mapping[str, Any]) -> tuple[Config,
         check_tree(config)
         check_names(config, ocp.model)
         ocp = config.retuned(ocp)
+        check_rest(ocp)
     except ValidationError as error:
         raise ConfigError(explain(error, Config)) from error
     except OcpError as error:

@@ -22,9 +22,9 @@ def interval(value: object) -> object:
 
 
 def around_zero(value: tuple[float, float]) -> tuple[float, float]:
-    """Accept an interval that lets an input be kept."""
-    if not value[0] <= 0.0 <= value[1]:
-        raise ValueError("must hold lower <= 0 <= upper, or no input could be kept")
+    """Accept an interval in which an input can be raised, kept and lowered."""
+    if not value[0] < 0.0 < value[1]:
+        raise ValueError("must hold lower < 0 < upper, or the input could not be kept, or not brought to rest")
     return value
 
 

@@ -3,12 +3,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from rti_mpc.controller import Controller, Timing
 from rti_mpc.errors import OcpError
+from rti_mpc.ocp import Ocp, restless
+from rti_mpc.pioneer_3dx import pioneer_3dx
+from rti_mpc.rti import Rti
 from tests.problems import INF, PAPER, double_integrator, pioneer
 
 
@@ -66,6 +71,26 @@ def test_arrays_are_owned_and_read_only() -> None:
 def test_argument_that_does_not_fit_is_refused_by_name(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(OcpError, match=message):
         pioneer(**changes)
+
+
+def test_bounds_that_leave_out_a_declared_rest_are_refused_with_the_input_and_its_rest() -> None:
+    model = replace(pioneer_3dx(), u_rest=(0.1, 0.0))
+    limits = {name: value for name, value in PAPER.items() if name not in ("lbu", "ubu")}
+    assert Ocp(model, **limits, lbu=[0.1, 0.0], ubu=[0.3, 0.5])
+    with pytest.raises(OcpError, match=r"bounds of input u_c must hold its rest, 0.1 m/s, or it could not be stopped, got \[0.2, 0.3\]"):
+        Ocp(model, **limits, lbu=[0.2, -0.5], ubu=[0.3, 0.5])
+    with pytest.raises(OcpError, match="bounds of input omega_c must hold its rest, 0 rad/s"):
+        Ocp(model, **limits, lbu=[0.0, 0.1], ubu=[0.3, 0.5])
+
+
+def test_bounds_without_zero_are_a_problem_but_none_to_stop_a_robot_in() -> None:
+    """The library may solve it; who stops robots refuses it."""
+    ocp = pioneer(lbu=[0.2, -0.745])
+    assert "bounds of input u_c must hold its rest, 0 m/s" in restless(ocp)
+    assert "increments of input omega_c must hold lower < 0 < upper" in restless(pioneer(lbdu=[-0.25, 0.0]))
+    assert restless(pioneer()) == restless(pioneer(lbdu=-INF, ubdu=INF, lbu=-INF, ubu=INF)) == ""
+    with pytest.raises(OcpError, match="u_c must hold its rest"):
+        Controller(Rti(ocp, compile=False), Timing(), compile=False)
 
 
 def test_papers_problem_is_accepted_without_increment_bounds() -> None:

@@ -94,7 +94,7 @@ class Experiment:
 
     def reference(self) -> Array:
         """Return rows ``x, y, psi`` from time 0 to a horizon after the end, shape ``(samples + N + 1, 3)``; psi begins nearest to the robot's."""
-        longer = self.trajectory.lasting((self.samples + self.N + 0.5) * self.T0)
+        longer = self.trajectory.lasting((self.samples + self.N) * self.T0)
         y = rows(longer, self.T0, "consistent" if self.heading == "consistent" and self.a else "tangent", a=self.a or 1.0)
         if self.heading == "atan":
             y[:, 2] = np.arctan(np.tan(y[:, 2]))

@@ -56,7 +56,11 @@ WRONG = [
     ("u_c = [-0.5, 0.5]", "u_c = 0.5", ["ocp.bounds.inputs.u_c", "[lower, upper]", "0.5"]),
     ("u_c = [-0.5, 0.5]", "u_c = [0.5, -0.5]", ["ocp.bounds.inputs.u_c", "lower < upper", "[0.5, -0.5]"]),
     ("u_c = [-0.5, 0.5]", "u_c = [nan, 0.5]", ["ocp.bounds.inputs.u_c", "nan"]),
-    ("u_c = [-0.25, 0.25]", "u_c = [0.1, 0.25]", ["ocp.bounds.increments.u_c", "lower <= 0 <= upper", "0.1"]),
+    ("u_c = [-0.25, 0.25]", "u_c = [0.1, 0.25]", ["ocp.bounds.increments.u_c", "lower < 0 < upper", "0.1"]),
+    ("u_c = [-0.25, 0.25]", "u_c = [0.0, 0.25]", ["ocp.bounds.increments.u_c", "lower < 0 < upper", "brought to rest"]),
+    ("u_c = [-0.5, 0.5]", "u_c = [0.2, 0.3]", ["ocp.bounds", "bounds of input u_c must hold its rest, 0 m/s", "[0.2, 0.3]"]),
+    ("omega_c = [-0.745, 0.745]", "omega_c = [-inf, -0.1]", ["input omega_c must hold its rest, 0 rad/s", "[-inf, -0.1]"]),
+    ("u_c = [-0.5, 0.5]", "u_c = [inf, inf]", ["ocp.bounds.inputs.u_c", "lower < upper"]),
     ('name = "pioneer_3dx"', 'name = "pioneer_4dx"', ["model.name", "pioneer_4dx", "pioneer_3dx"]),
     ('robot = "pioneer"', 'robot = "two words"', ["robot", "letters, digits", "'two words'"]),
     ('robot = "pioneer"', "robot = 3", ["robot", "must be text", "3"]),
@@ -70,7 +74,7 @@ WRONG = [
     ("[ocp]", "[observer]\nmeasured = ['x', 'z']\n[ocp]", ["observer.measured.z", "no state", "x [m]"]),
     ("[ocp]", "[guard]\ntick_s = 0.1\n[ocp]", ["guard.tick_s", "at most 0.01", "0.1"]),
     ("[ocp]", "[guard]\nu_rest = { v = 1.0 }\n[ocp]", ["guard.u_rest.v", "no input", "u_c [m/s]"]),
-    ("[ocp]", "[guard]\nenabled = true\nu_rest = { u_c = 1.0 }\n[ocp]", ["guard.u_rest", "must be the model's", "'u_c': 0.0"]),
+    ("[ocp]", "[guard]\nenabled = true\nu_rest = { u_c = 0.1 }\n[ocp]", ["guard.u_rest", "must be the model's", "'u_c': 0.0"]),
     ("[ocp]", "[solver]\nname = 'dapq'\n[ocp]", ["solver.name", "'dapq'", "riccati, osqp", "daqp", "pip install 'qpsolvers[NAME]'"]),
     ("[ocp]", "[solver]\nname = 'daqp'\nrho = 2.0\n[ocp]", ["solver.rho", "osqp", "'daqp'", "2.0"]),
     ("soft_weight = 1e3", "soft_weight = -1.0", ["ocp.bounds.soft_weight", "L1", "at least 0", "-1.0"]),
@@ -263,7 +267,6 @@ GUARDED = SHIPPED.read_text() + "\n[guard]\nenabled = true\n"
             "inputs = { omega_c = [-1, 1], u_c = [-1, 1] }",
             ["the model's order ['u_c', 'omega_c']"],
         ),
-        ("u_c = [-0.25, 0.25]", "u_c = [0.0, 0.25]", ["ocp.bounds.increments.u_c", "lower < 0 < upper", "could not brake"]),
     ],
 )
 def test_guard_must_know_every_limit_in_the_order_of_the_wire(tmp_path: Path, text: str, instead: str, words: list[str]) -> None:
@@ -274,6 +277,14 @@ def test_guard_must_know_every_limit_in_the_order_of_the_wire(tmp_path: Path, te
     assert all(word in str(refusal.value) for word in words), refusal.value
     path.write_text(SHIPPED.read_text().replace(text, instead))
     load(path)  # nobody else minds
+
+
+def test_guard_that_loads_no_model_knows_that_bounds_leave_out_rest(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    for rest, instead in (("", "u_c = [0.2, 0.3]"), ("u_rest = { u_c = 0.6 }\n", "u_c = [-0.5, 0.5]")):
+        path.write_text(GUARDED.replace("u_c = [-0.5, 0.5]", instead) + rest)
+        with pytest.raises(ConfigError, match=r"ocp\.bounds\.inputs\.u_c must hold the input's rest, guard\.u_rest = 0"):
+            load(path, with_model=False)
 
 
 def test_limits_of_the_guard_are_those_of_the_problem(tmp_path: Path) -> None:

@@ -84,7 +84,16 @@ REFUSED: list[tuple[dict[str, Any], list[str]]] = [
     ({"ocp.bounds.inputs.u_c": [-0.6, 0.5]}, ["ocp.bounds.inputs.u_c", "inside the file's [-0.5, 0.5]", "guard", "[-0.6, 0.5]"]),
     ({"ocp.bounds.inputs.u_c": [0.3, 0.2]}, ["ocp.bounds.inputs.u_c", "lower < upper"]),
     ({"ocp.bounds.inputs.u_c": 0.3}, ["ocp.bounds.inputs.u_c", "[lower, upper]", "0.3"]),
-    ({"ocp.bounds.increments.u_c": [0.1, 0.2]}, ["ocp.bounds.increments.u_c", "lower <= 0 <= upper"]),
+    *(
+        ({"ocp.bounds.increments.u_c": increments}, ["ocp.bounds.increments.u_c", "lower < 0 < upper"])
+        for increments in ([0.1, 0.2], [-0.2, -0.1], [0.0, 0.25], [-0.25, 0.0])
+    ),
+    ({"ocp.bounds.increments.u_c": [0.0, 0.0]}, ["ocp.bounds.increments.u_c", "lower < upper"]),
+    ({"ocp.bounds.inputs.u_c": [0.2, 0.3]}, ["ocp.bounds", "input u_c must hold its rest, 0 m/s", "[0.2, 0.3]"]),
+    ({"ocp.bounds.inputs.u_c": [-0.5, 0.5], "ocp.bounds.inputs.omega_c": [-0.3, -0.2]}, ["omega_c must hold its rest, 0 rad/s", "[-0.3, -0.2]"]),
+    ({"ocp.bounds.inputs.u_c": [float("nan"), 0.3]}, ["ocp.bounds.inputs.u_c", "lower < upper"]),
+    ({"ocp.bounds.inputs.u_c": [-0.5, float("inf")]}, ["ocp.bounds.inputs.u_c", "inside the file's [-0.5, 0.5]"]),
+    ({"ocp.bounds.inputs.u_c": [-(10**400), 0.5]}, ["ocp.bounds.inputs.u_c"]),
     ({"ocp.bounds.states.x": [-1.0, 1.0]}, ["ocp.bounds.states.x", "not in the controller's file", "which bounds there are is fixed"]),
     ({"ocp.bounds.states.u": [-float("inf"), 0.5]}, ["ocp.bounds.states.u", "inside the file's [-0.5, 0.5]"]),
     ({"ocp.weights.Q.x": 1e200}, ["ocp.weights.Q.x", "at most 1000000000000000", "1e+200"]),
