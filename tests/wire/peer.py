@@ -13,6 +13,7 @@ from rti_mpc.status import Mode, QpStatus
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
+from service.entry import enter
 
 KEYS = Keys(robot="test")
 FAST = ("transport/link/tx/lease:600",)  # ms: hangs are noticed soon
@@ -64,4 +65,4 @@ def careless(bus: Bus) -> None:
 if __name__ == "__main__":
     what, endpoint, *listen = sys.argv[1:]
     settings = BusSettings(listen=(endpoint,) if listen else (), connect=(endpoint,), cfg=FAST)
-    globals()[what](Bus(settings, KEYS))
+    enter(lambda: globals()[what](Bus(settings, KEYS)))  # as every process of ours: the interpreter is not finalized around threads of Zenoh
