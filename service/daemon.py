@@ -88,7 +88,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
                 controller.enable()
 
     outcomes = realtime.attempt(**config.realtime.model_dump())  # when all is compiled, and before any thread is started, for all of them
-    with Bus(bus_settings, config.keys(), stop=stop) as bus:
+    with Bus(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
         operator_stop = OperatorStop(LatchFile(bus.keys, state), obey, controller.notices.append)
         operator_stop.listen(bus)
         others = hear_others(bus, stop)
@@ -160,6 +160,7 @@ class Daemon:
         self._commands = bus.publisher(keys.command, Command, realtime=True)
         self._telemetries = {role: bus.publisher(key, Telemetry) for role, key in ((LEADER, keys.telemetry), (STANDBY, keys.shadow_telemetry))}
         self._states_in = bus.intake(State, config.stale_s, {"x": model.nx})
+        bus.expect("state", lambda: self._states_in.source.epoch is not None)
         self._references = References(bus, controller, model.ny)
         self._prepare_us = 0.0
         self._ticked_ns = 0

@@ -59,7 +59,7 @@ def main(config: Config, bus_settings: BusSettings, *, state: Path | None = None
     if not config.guard.enabled:
         raise ConfigError("guard.enabled must be true for the robot to take what a guard passes on, got false")
     stop = stop or stop_on_signals()
-    with Bus(bus_settings, config.keys(), stop=stop) as bus:
+    with Bus(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
         heard, intake = bus.subscriber(bus.keys.actuation, capacity=WAITING), bus.intake(Command, HEARING_S, chooses=True)
         if bus.is_alive(ROLE, HEARING_S):
             print(f"rti-mpc: {config.robot} already has a guard: stop it first, or give this robot another name", file=sys.stderr)
@@ -104,6 +104,7 @@ class Process:
         self._announcer = Announcer(bus, ROLE, epoch)
         self._actuation = bus.publisher(keys.actuation, Command, realtime=True)
         self._states = bus.intake(State, config.stale_s)
+        bus.expect("state", lambda: self._states.source.epoch is not None)
         self._commands = bus.intake(Command, config.stale_s, {"u": len(limits.u_rest)})
         self._operator_stop = OperatorStop(file, self._obey, self._guard.notices.append)
         self._operator_stop.listen(bus)

@@ -60,8 +60,9 @@ def main(
     rerun_spawn |= rerun_connect is None and rerun_save is None
     url = viewer_url(rerun_connect or ADDRESS)
     stop = stop or stop_on_signals()
-    with Bus(bus_settings, keys, stop=stop) as bus:
+    with Bus(bus_settings, keys, stop=stop, say=log.warning) as bus:
         listener = Listener(bus)
+        bus.expect("message", lambda: listener.received)
         outlets = [file_outlet(rerun_save, keys.robot)] if rerun_save is not None else []
         spawned = spawn_viewer(url, rerun_memory_limit) if rerun_spawn else None
         if rerun_spawn or rerun_connect is not None:

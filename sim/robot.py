@@ -89,7 +89,7 @@ def main(
         ConfigError: A setting is out of range, an endpoint is taken.
     """
     stop = stop or stop_on_signals()
-    with Bus(bus_settings, keys, stop=stop) as bus:
+    with Bus(bus_settings, keys, stop=stop, say=logger.warning) as bus:
         robot = Robot(settings, bus, keys.actuation if guarded else keys.command, speed, log)
         life = {"role": ROLE, "epoch": robot.body.epoch, "speed": speed, "state_period_s": settings.state_period_s}
         bus.publish_json(keys.info(ROLE), {**describe(settings.model), **(info or {}), **life})
@@ -130,6 +130,7 @@ class Robot:
         self._inbox: deque[tuple[Command, int]] = deque(maxlen=64)  # with the monotonic time of arrival
         nu, epoch = settings.model.nu, self.body.epoch
         self._intake = bus.intake(Command, 1e-9 * STALE_NS / speed, {"u": nu}, unfit=lambda command: unfit(command, nu, epoch))
+        bus.expect("command", lambda: self._intake.source.epoch is not None)
         self._refused = 0  # by the door, so far
         self._sent = 0
         self._held_up_ns = 0

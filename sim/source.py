@@ -68,7 +68,7 @@ def main(
     y = rows(trajectory, period_s, heading, a, psi0)
     p: Array = np.empty((len(y), 0)) if parameters is None else parameters(period_s * np.arange(len(y), dtype=np.float64))
     stop = stop or stop_on_signals()
-    with Bus(bus_settings, keys, stop=stop) as bus:
+    with Bus(bus_settings, keys, stop=stop, say=logger.warning) as bus:
         source = Source(bus, trajectory, y, p, round(1e9 * period_s))
         bus.alive(ROLE)
         logger.info("%s, heading %s, for %s", trajectory.name, heading, keys.robot)
@@ -98,6 +98,7 @@ class Source:
         self._look_again_ns = 0
         self._intake = bus.intake(State, STALE_S)
         self._robot_epoch = -1
+        bus.expect("state", lambda: self.anchored)
 
     def look(self) -> None:
         """

@@ -30,8 +30,9 @@ from rti_mpc.wire import document
 from rti_mpc.wire.cdr import M, encode, encoding
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys, most_bytes, role_of
+from rti_mpc.wire.reach import remind
 from rti_mpc.wire.session import BusSettings as BusSettings
-from rti_mpc.wire.session import open_session
+from rti_mpc.wire.session import endpoints, open_session, zenoh_config
 
 CLOSE_TIMEOUT_S = 0.5
 HEARTBEAT_S = 1.0  # of a cached publisher, which tells the number of its last message
@@ -158,7 +159,15 @@ class Bus:
         closed: Whether `close` was called.
     """
 
-    def __init__(self, settings: BusSettings, keys: Keys, *, timeout_s: float = math.inf, stop: threading.Event | None = None) -> None:
+    def __init__(
+        self,
+        settings: BusSettings,
+        keys: Keys,
+        *,
+        timeout_s: float = math.inf,
+        stop: threading.Event | None = None,
+        say: Callable[[str], object] = lambda _: None,
+    ) -> None:
         """
         Join the bus.
 
@@ -167,6 +176,7 @@ class Bus:
             keys: Of which robot.
             timeout_s: How long a client waits for its router.
             stop: Ends that wait when set.
+            say: Takes a line about who is not reached.
 
         Raises:
             ConfigError: Zenoh refuses a setting, an endpoint is taken, or no router was there in time.
@@ -174,7 +184,10 @@ class Bus:
         """
         self.keys = keys
         self.closed = False
-        self._session = open_session(settings, timeout_s, stop)
+        self._say = say
+        self._config = zenoh_config(settings)
+        self._over = threading.Event()
+        self._session = open_session(settings, timeout_s, stop, say)
         self._unix_s = time.time_ns() // 1_000_000_000
         self._declared: list[Any] = []  # a token or queryable lives as long as its object
         self._json: dict[str, Publisher[Any]] = {}
@@ -190,9 +203,33 @@ class Bus:
         if self.closed:
             return
         self.closed = True
+        self._over.set()
         closing = threading.Thread(target=self._session.close, daemon=True)
         closing.start()
         closing.join(CLOSE_TIMEOUT_S)
+
+    def expect(self, what: str, heard: Callable[[], object]) -> None:
+        """
+        Remind of what does not come, and whom this process is linked to, until it has.
+
+        Args:
+            what: Such as ``"state"``.
+            heard: Whether it has come.
+        """
+
+        def wanted() -> str:
+            if heard():
+                return ""
+            try:
+                links = len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
+            except zenoh.ZError:  # the bus is closed
+                return ""
+            if links:
+                return f"no {what} of {self.keys.prefix}/{self.keys.robot} yet, from {links} others on the bus: is it running, and of this name?"
+            where = endpoints(self._config)
+            return f"not connected, no {what} yet: " + (f"nobody answers at {where}" if where else "nobody has come to the endpoints listened on")
+
+        remind(self._say, wanted, self._over)
 
     def publisher(self, key: str, cls: type[M], *, realtime: bool = False, cached: bool = False) -> Publisher[M]:
         """

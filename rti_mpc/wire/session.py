@@ -18,6 +18,7 @@ import os
 import re
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from rti_mpc.errors import ConfigError, Stopped
 from rti_mpc.message import Reference
 from rti_mpc.text_file import read_text_file
 from rti_mpc.wire.layout import MOST_BYTES
+from rti_mpc.wire.reach import remind
 
 RENDEZVOUS = "tcp/127.0.0.1:7447"
 ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws)/.+:\d+([?#].*)?$|(?!(tcp|tls|udp|quic|ws)/)[a-z_-]+/.+")  # those without a port are Zenoh's to judge
@@ -121,9 +123,21 @@ def _brief(error: Exception) -> str:
     return " ".join(str(error).split(" at /")[0].split())
 
 
-def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event | None) -> zenoh.Session:
+def endpoints(config: zenoh.Config) -> str:
+    """Return where a process connects to, and what may be wrong there, in words; empty if it waits for others to come."""
+    given = json.loads(config.get_json("connect/endpoints"))
+    text = ", ".join(given if isinstance(given, list) else [end for ends in given.values() for end in ends])
+    wrong = (
+        "nobody is there, the address is wrong, or a certificate is"
+        if "tls/" in text or "quic/" in text
+        else "nobody is there, or the address is wrong"
+    )
+    return f"{text}: {wrong}" if text else ""
+
+
+def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event | None, say: Callable[[str], object]) -> zenoh.Session:
     """
-    Open a session; a client waits for its router.
+    Open a session; a client waits for its router, and says so.
 
     Raises:
         ConfigError: Zenoh refuses a setting, or no router was there in time.
@@ -131,14 +145,21 @@ def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event 
     """
     deadline_s = time.monotonic() + timeout_s
     os.environ.setdefault("ZENOH_RUNTIME", THREADS)
-    while True:
-        try:
-            return zenoh.open(zenoh_config(settings))
-        except zenoh.ZError as error:
-            if "Unable to connect" not in str(error):
-                raise ConfigError(f"bus: endpoints must be free and valid, got: {_brief(error)}") from None
-            if stop is not None and stop.is_set():
-                raise Stopped(f"stopped before a router was there at {', '.join(settings.connect)}") from None
-            if time.monotonic() > deadline_s:
-                raise ConfigError(f"bus: a router must be reachable at {', '.join(settings.connect)}, none has answered") from None
-            time.sleep(RETRY_S)
+    config, opened, told = zenoh_config(settings), threading.Event(), False
+    try:
+        while True:
+            try:
+                return zenoh.open(config)
+            except zenoh.ZError as error:
+                if "Unable to connect" not in str(error):
+                    raise ConfigError(f"bus: endpoints must be free and valid, got: {_brief(error)}") from None
+                if stop is not None and stop.is_set():
+                    raise Stopped(f"stopped before a router was there at {', '.join(settings.connect)}") from None
+                if time.monotonic() > deadline_s:
+                    raise ConfigError(f"bus: a router must be reachable at {', '.join(settings.connect)}, none has answered") from None
+                if not told:
+                    told = True
+                    remind(say, lambda: f"not connected: no router answers at {endpoints(config)}", opened)
+                time.sleep(RETRY_S)
+    finally:
+        opened.set()
