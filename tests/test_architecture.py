@@ -61,7 +61,7 @@ FLOW: tuple[set[str], ...] = (
     {"errors", "array", "status", "robot_clock", "ladder", "grid", "epoch", "cache", "angle"},
     {"message", "text_file", "latch"},
     {"polyline"},
-    {"heading", "mode", "schedule", "issued"},
+    {"lives", "cadence", "heading", "mode", "schedule", "issued"},
     {"trajectory", "guard", "sent"},
     {"model"},
     {"pioneer_3dx", "integrator", "track", "obstacle", "disturbance"},
