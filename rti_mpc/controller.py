@@ -25,6 +25,7 @@ from rti_mpc.envelope import Envelope
 from rti_mpc.errors import OcpError
 from rti_mpc.grid import Grid
 from rti_mpc.grid import Timing as Timing
+from rti_mpc.guard import Limits
 from rti_mpc.issued import Issued
 from rti_mpc.ladder import Ladder
 from rti_mpc.message import STAMP_ON_ARRIVAL, Command, End, Reference, Severity, State, Telemetry
@@ -83,7 +84,8 @@ class Controller:
         self.envelope = Envelope(ocp, compile=compile)
         self._tuning = Tuning(rti, self.envelope.limits)
         self.grid = Grid(ocp.dt, timing)
-        self._states = StateStream(model, self._stale_ns, self.grid.dt_ns, observer)
+        limits = Limits(self._u_rest, ocp.lbu, ocp.ubu, ocp.lbdu, ocp.ubdu, ocp.dt, 1e-9 * self.grid.most_ns)
+        self._states = StateStream(model, self._stale_ns, self.grid.dt_ns, limits.settling_s, observer)
         self.np_ = model.np_ - len(self._states.d)
         self._track = Track(model, ocp.N, self.grid.dt_ns)
         self._sent = Sent(self._u_rest, ocp.lbdu, ocp.ubdu, self.grid.dt_ns)
@@ -92,6 +94,7 @@ class Controller:
         self._loaded = False  # whether the QP of t_k is prepared
         self._reach: tuple[Array, Array] = (np.zeros((2, model.nu)), np.zeros((2, model.nu)))  # what the first rows at t_k may be
         self._overran = False  # whether the last sample was over its budget
+        self._for_rival: tuple[int | None, tuple[Reference, Array] | None] = (None, None)  # the last reference, and which life might have begun then
         self._stopped = ""  # why an operator's stop is latched
         self._issued = Issued(epoch, config_hash, self.grid.dt_ns)
         self._record = Record(rti, self._tuning)
@@ -105,6 +108,14 @@ class Controller:
 
     # What comes in.
 
+    def follows(self, state: State) -> bool:
+        """Whether a state is of the life that is followed, or may be the first one."""
+        return self._states.last is None or state.epoch == self._states.last.epoch
+
+    def awaits(self, state: State) -> bool:
+        """Whether a state goes on from the last one, by life and number."""
+        return self.follows(state) and self._states.cadence.counts(state.seq)
+
     def receive_state(self, state: State, arrival_ns: int) -> Command | None:
         """
         Act on a state, if its sample is due.
@@ -117,12 +128,14 @@ class Controller:
             The command to publish at once, or None: then the state is only kept as the freshest.
         """
         arrival = self._states.receive(state, arrival_ns)
+        if (notice := self._states.notice) is not None:
+            self.notices.append(notice)
         if arrival is not Arrival.FRESH:
-            if (notice := self._states.notice) is not None:
-                self.notices.append(notice)
-            if arrival in (Arrival.REPEATED, Arrival.REFUSED, Arrival.OLD):
+            if arrival in (Arrival.REPEATED, Arrival.REFUSED, Arrival.FOREIGN, Arrival.OLD):
                 return None
-            self._forget(arrival, state.stamp_ns)
+            if arrival is Arrival.UNTIMED:
+                return self._give_up(state)
+            self._forget(arrival, state)
         self._states.estimate(self._sent, known=self.mode in (Mode.TRACKING, Mode.HOLDING))
         self._prediction.p[self.np_ :] = self._states.d
         if self.mode is Mode.IDLE:
@@ -130,7 +143,7 @@ class Controller:
         if self._track.arriving:
             self._anchor(state)
         grid, period_ns = self.grid, self._states.clock.period_ns
-        if not (self._track.loaded or self._stopped) or grid.early(state.stamp_ns, period_ns):
+        if not (self._track.loaded or self._stopped) or not self._states.cadence.known or grid.early(state.stamp_ns, period_ns):
             return None
         if (behind := grid.behind(state.stamp_ns)) or not grid.running:
             self._rejoin(state.stamp_ns, behind)
@@ -155,6 +168,7 @@ class Controller:
             self._modes.say(Severity.WARNING, "reference_refused", misfit)
             return None
         self._track.arriving = reference, self._track.lay_out(reference) if rows is None else rows
+        self._for_rival = self._states.lives.rival, self._track.arriving
         anchored = None if self._states.last is None else self._anchor(self._states.last)
         return anchored if reference.stamp_ns == STAMP_ON_ARRIVAL else None
 
@@ -224,6 +238,8 @@ class Controller:
         Returns:
             What to publish: the command; nothing if it is too late and the previous plan plays on in the robot's hands; or a ramp.
         """
+        if self._states.cadence.fault:
+            return command  # nobody knows how late it is, and none follows
         now_ns = self._states.clock.latest_ns(local_ns)
         if now_ns < command.stamp_ns + BUDGET * self.grid.dt_ns:
             if self._overran:
@@ -235,9 +251,6 @@ class Controller:
         if not self.shadowing:
             self._sent.withdraw(command)
         self._issued.withdraw()
-        if not self._states.clock.ticks:  # nobody knows how late it is: the second state of a life tells
-            self.grid.running = self._loaded = False
-            return None
         self._overran = True
         failure = f"a sample was {1e-9 * (now_ns - command.stamp_ns):.3f} s late"
         if self._plays_on(now_ns, counted=command.mode is Mode.FALLBACK):
@@ -326,9 +339,10 @@ class Controller:
         """Feedback: from a due state to the command that acts at `t_k`."""
         act_ns = self.grid.act_ns
         ending = self._track.ended(act_ns)
-        if self._stopped or ending is End.STOP:
-            mode, reason = (Mode.STOPPED, self._stopped) if self._stopped else (Mode.BRAKING, "the reference ended with STOP")
-            self._modes.enter(mode, reason)
+        disputed = self._states.lives.disputed
+        if self._stopped or disputed or ending is End.STOP:
+            why = "two robots use this name" if disputed else "the reference ended with STOP"
+            self._modes.enter(*((Mode.STOPPED, self._stopped) if self._stopped else (Mode.BRAKING, why)))
             return self._brake(state, act_ns, QpStatus.NONE, wanted=True)
         self._prediction.predict(self._states.x, state.stamp_ns, act_ns)
         status = self._rti.feedback(self._x0) if self._loaded else self._feedback_cold()
@@ -384,10 +398,29 @@ class Controller:
         self._loaded = False
         return self._issue(state, act_ns, act_ns + self._valid_ns, self.mode, status, rows)
 
+    def _give_up(self, state: State) -> Command | None:
+        """
+        End what is commanded to a robot whose clock is none: one command, each of whose rows is the next step to rest, and nothing after it.
+
+        Whichever row acts there, and for however long, it is inside the slew limits.
+        """
+        if self.mode is Mode.IDLE:
+            return None
+        act_ns, command = state.stamp_ns + self.grid.delay_ns, None
+        if self._issued.last is not None and (self._sent.at(state.stamp_ns)[0] != self._u_rest).any():
+            self._modes.enter(Mode.STOPPED if self._stopped else Mode.BRAKING, self._states.cadence.fault)
+            rows = self.envelope.ramp(self._sent.reach(act_ns))
+            valid_ns = max(1, round(self._valid_ns * min(1.0, self._states.cadence.rate)))  # as long as it should act, in the unit of the stamps
+            command = self._issue(state, act_ns, act_ns + valid_ns, self.mode, QpStatus.NONE, np.tile(rows[0], (len(rows), 1)))
+        self._issued.plan = None
+        self._overran = self._loaded = self.grid.running = False
+        self._modes.enter(Mode.IDLE, self._states.cadence.fault)
+        return command
+
     def standstill(self, local_ns: int) -> Command | None:
-        """Return the last command of a life: to rest as fast as the slew limits allow; None if nothing was ever commanded."""
+        """Return the last command of a life: to rest as fast as the slew limits allow; None if nothing was ever commanded, or its clock is none."""
         state = self._states.last
-        if self._issued.last is None or state is None:
+        if self._issued.last is None or state is None or self._states.cadence.fault:
             return None
         return self._brake(state, self.robot_now_ns(local_ns) + self.grid.delay_ns, QpStatus.NONE, wanted=True)
 
@@ -431,16 +464,18 @@ class Controller:
             self._load(shift=False)
         return anchored
 
-    def _forget(self, arrival: Arrival, stamp_ns: int) -> None:
+    def _forget(self, arrival: Arrival, state: State) -> None:
         """Keep nothing of the robot's last life, or of the time before its clock jumped but that it brakes since then."""
         if arrival is Arrival.NEW_LIFE:
             self._sent.clear()
         else:
-            self._sent.brake(self._states.before_ns, stamp_ns)
+            self._sent.brake(self._states.before_ns, state.stamp_ns)
         if arrival is not Arrival.JUMPED_AHEAD:
             self._modes.enter(Mode.IDLE, "another life of the robot, or of its clock")
             self._track.clear()
             self._blockage.clear()
+        if arrival is Arrival.NEW_LIFE and self._for_rival[0] == state.epoch:
+            self._track.arriving = self._for_rival[1]  # it came when the new life was heard, but not sure yet
         if self._delay is not None:
             self._delay.clear()
         self._issued.plan = None

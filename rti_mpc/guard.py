@@ -20,7 +20,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.cadence import Cadence
 from rti_mpc.epoch import SEQ_AHEAD, epoch_above
+from rti_mpc.lives import Heard, Lives
 from rti_mpc.message import Command, Notice, Severity, State
 from rti_mpc.robot_clock import RobotClock
 from rti_mpc.schedule import EVER_NS, STEP_NS, Schedule, end_ns, unfit
@@ -72,7 +74,8 @@ class Limits:
     def settling_s(self) -> float:
         """How long after its state a command of anybody may still move the inputs: to its end, and down the ramp."""
         way = np.maximum(np.abs(self.lbu - self.u_rest), np.abs(self.ubu - self.u_rest))
-        ramp = np.where(np.isfinite(self.slew), way / self.slew, 0.0)
+        limited = np.isfinite(self.slew)
+        ramp = np.where(limited, way / np.where(limited, self.slew, 1.0), 0.0)
         return self.delay_s + 1e-9 * VALID_NS + float(np.minimum(ramp, 10.0).max(initial=0.0))
 
 
@@ -99,6 +102,8 @@ class Guard:
         self._delay_ns = round(1e9 * limits.delay_s)
         self._stale_ns = round(1e9 * limits.stale_s)
         self._seq = 0
+        self._lives = Lives(limits.stale_s, limits.settling_s)
+        self._cadence = Cadence()
         self._clock = RobotClock()
         self._schedule = Schedule(limits.u_rest, limits.slew)  # what the robot was told by controllers, and its ramp after that
         self._state: State | None = None  # the last one that came in time
@@ -130,13 +135,20 @@ class Guard:
     def receive_state(self, state: State, local_ns: int) -> None:
         """Take the robot's clock, and the beginning of another of its lives, from a state."""
         self._wake(local_ns)
+        whose = self._lives.hear(state.epoch, local_ns, self._clock.rate)
+        if self._lives.notice is not None:
+            self.notices.append(self._lives.notice)
+            self._brake(self._clock.now_ns(local_ns), self._clock.now_ns(local_ns))
+        if whose is Heard.OTHER or not self._counts(state, local_ns, begins=whose is Heard.BEGINS):
+            return
         heard_ns, heard_local_ns = self._heard
-        if self._state is None or state.epoch != self._state.epoch:
+        if whose is Heard.BEGINS:
             self._begin(state)
         elif state.stamp_ns <= heard_ns:
             if heard_ns - state.stamp_ns <= JUMP_NS:
                 return
             self._jump(state, local_ns, "back")
+            self._cadence.jump()
         else:
             ahead_ns = state.stamp_ns - self._clock.now_ns(local_ns)
             late = ahead_ns < -LATE_NS * self._clock.rate
@@ -149,9 +161,7 @@ class Guard:
                 self._restart_clock()
             if ahead_ns > max(JUMP_NS, 2.5 * self._clock.period_ns):
                 self._jump(state, local_ns, "ahead")
-        self._heard = state.stamp_ns, local_ns
-        self._clock.observe(state.seq, state.stamp_ns, local_ns)
-        self._state = state
+        self._take(state, local_ns)
 
     def receive_command(self, command: Command, local_ns: int) -> Command | None:
         """
@@ -197,6 +207,8 @@ class Guard:
         self._wake(local_ns)
         if self._state is None or not self._engaged:
             return None
+        if self._cadence.fault:
+            return self._last_step(self._state) if self._untold else None
         now_ns = self._clock.now_ns(local_ns)
         self._schedule.forget(now_ns - 2 * self._dt_ns)
         if self.passing:
@@ -210,8 +222,19 @@ class Guard:
             if now_ns - self._state.stamp_ns > 10 * self._stale_ns:
                 return None  # nobody is there to be told to stand
             u, period_ns = u[:1], TOLD * STEP_NS
-        self._told_ns, self._untold = start_ns + TOLD * STEP_NS, False
-        state = self._state
+        return self._tell(start_ns, TOLD * STEP_NS, period_ns, u, self._state)
+
+    def _last_step(self, state: State) -> Command:
+        """Return the last command to a robot whose clock is none: each row is the next step to rest, whichever acts and for however long."""
+        t_ns = state.stamp_ns
+        lower, upper = self._within_reach(t_ns, self._schedule.at(t_ns - 1)[0])
+        u = np.tile(np.clip(self._limits.u_rest, lower, upper), (TOLD, 1))
+        valid_ns = max(1, round(VALID_NS * min(1.0, self._cadence.rate)))  # as long as it should act, in the unit of the stamps
+        return self._tell(t_ns, valid_ns, STEP_NS, u, state)
+
+    def _tell(self, start_ns: int, valid_ns: int, period_ns: int, u: Array, state: State) -> Command:
+        """Return a command of our own, which the robot is then told of."""
+        self._told_ns, self._untold = start_ns + valid_ns, False
         return self._numbered(
             Command(
                 epoch=0,
@@ -244,7 +267,8 @@ class Guard:
     def stop(self, local_ns: int) -> None:
         """Take no command any more: from now on the robot is told to ramp to rest, and to stand."""
         self._stopped = True
-        self._brake(self._clock.now_ns(local_ns), self._clock.now_ns(local_ns))
+        if not self._cadence.fault:
+            self._brake(self._clock.now_ns(local_ns), self._clock.now_ns(local_ns))
 
     def latch(self, reason: str, local_ns: int) -> None:
         """
@@ -273,6 +297,10 @@ class Guard:
             return "no_state: no state of the robot was heard yet"
         if self._stopped:
             return "stopped: the guard is being stopped"
+        if self._lives.disputed:
+            return "two_robots: it is not known which robot it is for"
+        if not self._cadence.known:
+            return f"untimed: {self._cadence.fault or 'two states must have shown how fast the clock of the robot runs'}"
         if self._untold:
             return "held: the robot is told to brake first"
         if command.epoch < epoch:
@@ -335,9 +363,7 @@ class Guard:
         limits, scale = self._limits, self._share(command)
         u = np.clip(command.u, limits.lbu, limits.ubu)
         first, now = self._joint(command, start_ns)
-        acted = np.array([now, *(self._schedule.at(start_ns - round(share * self._dt_ns))[0] for share in WINDOW)])
-        lower = np.minimum(acted.max(axis=0) + limits.lbdu, now)
-        upper = np.maximum(acted.min(axis=0) + limits.ubdu, now)
+        lower, upper = self._within_reach(start_ns, now)
         limited = False
         for row in u[first:]:
             if (row >= lower - ROUNDING).all() and (row <= upper + ROUNDING).all():
@@ -351,6 +377,11 @@ class Guard:
             self._say(Severity.WARNING, "slew_limited", text)
         return u
 
+    def _within_reach(self, start_ns: int, now: Array) -> tuple[Array, Array]:
+        """Return lowest and highest inputs, each of shape ``(nu,)``, within the slew limits of what acts `now` and in the period before."""
+        acted = np.array([now, *(self._schedule.at(start_ns - round(share * self._dt_ns))[0] for share in WINDOW)])
+        return np.minimum(acted.max(axis=0) + self._limits.lbdu, now), np.maximum(acted.min(axis=0) + self._limits.ubdu, now)
+
     def _share(self, command: Command) -> float:
         """Return how much of the slew limits over `dt` a row may use."""
         return min(1.0, command.period_ns / self._dt_ns)
@@ -361,6 +392,26 @@ class Guard:
         return replace(command, epoch=self.epoch, seq=self._seq)
 
     # Times and lives.
+
+    def _counts(self, state: State, local_ns: int, *, begins: bool) -> bool:
+        """Whether a state is another than before, of a clock that is one; where it no longer is, the robot is told one more step to rest."""
+        if begins:
+            self._cadence.reset()
+        untimed = bool(self._cadence.fault)
+        counts = self._cadence.observe(state.seq, state.stamp_ns, local_ns)
+        if self._cadence.notice is not None:
+            self.notices.append(self._cadence.notice)
+        if counts and untimed != bool(self._cadence.fault):
+            self._brake(state.stamp_ns, state.stamp_ns)
+            self._restart_clock()
+            self._take(state, local_ns)
+        return counts and not (untimed or self._cadence.fault)
+
+    def _take(self, state: State, local_ns: int) -> None:
+        """Go by the clock and the life of a state."""
+        self._heard = state.stamp_ns, local_ns
+        self._clock.observe(state.seq, state.stamp_ns, local_ns)
+        self._state = state
 
     def _wake(self, local_ns: int) -> None:
         """Note if this process was held up: what has waited meanwhile is judged by its age, after a state that came in time."""

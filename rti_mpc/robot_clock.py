@@ -125,11 +125,6 @@ class RobotClock:
     def _rate(self, robot_ns: int, local_ns: int) -> float:
         return min(max(robot_ns / local_ns, 1e-3), 1e3)
 
-    @property
-    def ticks(self) -> bool:
-        """Whether anything is known of the rate: two states have come."""
-        return self.rate_most != FASTEST
-
     def latest_ns(self, local_ns: int) -> int:
         """Return what robot time is at a local time at most, for a state that came as late as the last one did."""
         return self.stamp_ns + self.late_ns + round((local_ns - self.arrival_ns) * self.rate_most)

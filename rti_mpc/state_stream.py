@@ -9,6 +9,8 @@ import numpy as np
 
 from rti_mpc.angle import whole_turns
 from rti_mpc.array import Array
+from rti_mpc.cadence import Cadence
+from rti_mpc.lives import Heard, Lives
 from rti_mpc.message import Notice, Severity, State
 from rti_mpc.model import Model
 from rti_mpc.observer import Observer
@@ -23,6 +25,8 @@ class Arrival(Enum):
 
     FRESH = "fresh"  # to be acted on
     REPEATED = "repeated"  # not newer than the last one
+    FOREIGN = "foreign"  # of another robot, or of a life that is not sure yet
+    UNTIMED = "untimed"  # of a clock that is none: its stamps do not advance as nanoseconds
     REFUSED = "refused"  # no numbers of a robot
     OLD = "old"  # it has waited on its way
     NEW_LIFE = "new life"  # the first one after a restart of the robot
@@ -35,6 +39,8 @@ class StateStream:
     The states of one robot.
 
     Attributes:
+        lives: Which of the lives heard is followed, and whether two robots are there.
+        cadence: Whether its states count and its stamps are nanoseconds.
         last: The newest state, None before the first.
         x: That state, shape ``(nx,)``, its angles nearest to those of the one before; or the observer's estimate of it.
         d: Estimated disturbances, shape ``(nd,)``; none without an observer.
@@ -43,7 +49,19 @@ class StateStream:
         notice: What is to be said of the last state, None if it is like the one before.
     """
 
-    def __init__(self, model: Model, stale_ns: int, late_ns: int, observer: Observer | None = None) -> None:
+    def __init__(self, model: Model, stale_ns: int, late_ns: int, settling_s: float, observer: Observer | None = None) -> None:
+        """
+        Begin with no state.
+
+        Args:
+            model: The robot's.
+            stale_ns: Age from which a state is not used, robot time.
+            late_ns: Robot time by which a state may be late and still be fresh.
+            settling_s: How long after its state a command of anybody may still move the robot, robot time.
+            observer: Estimates disturbances, if there is one.
+        """
+        self.lives = Lives(1e-9 * stale_ns, settling_s)
+        self.cadence = Cadence()
         self.last: State | None = None
         self.x: Array = np.zeros(model.nx)
         self.d: Array = np.zeros(0) if observer is None else observer.d
@@ -65,10 +83,12 @@ class StateStream:
             arrival_ns: Local monotonic time.
         """
         self.before_ns = self.clock.now_ns(arrival_ns)
+        self.notice = None
         arrival, code, text = self._judge(state, arrival_ns)
-        self.notice = Notice(Severity.WARNING, code, text) if code and arrival is not self._said else None
+        if code and arrival is not self._said:
+            self.notice = Notice(Severity.WARNING, code, text)
         self._said = arrival
-        if arrival in (Arrival.REPEATED, Arrival.REFUSED):
+        if arrival in (Arrival.REPEATED, Arrival.REFUSED, Arrival.FOREIGN):
             return arrival
         before = self.x.copy()
         self.x[:] = state.x
@@ -103,20 +123,38 @@ class StateStream:
 
     def _judge(self, state: State, arrival_ns: int) -> tuple[Arrival, str, str]:
         """Judge a state, with the code and the text of what is to be said of it."""
-        last = self.last
         if not abs(state.x).max() <= IN_RANGE:
             return Arrival.REFUSED, "state_refused", f"a state must be finite and at most {IN_RANGE:g}, got {state.x.tolist()}"
-        judged = Arrival.FRESH, "", ""
-        if last is not None and state.epoch != last.epoch:
-            judged = Arrival.NEW_LIFE, "robot_restarted", "the robot was restarted: starting anew"
-        elif last is not None and state.stamp_ns <= last.stamp_ns:
+        heard = self.lives.hear(state.epoch, arrival_ns, self.clock.rate)
+        self.notice = self.lives.notice
+        if heard is Heard.OTHER:
+            return Arrival.FOREIGN, "", ""
+        began = heard is Heard.BEGINS and self.last is not None
+        if heard is Heard.BEGINS:
+            self.last = None
+            self.clock.reset()
+            self.cadence.reset()
+        untimed = bool(self.cadence.fault)
+        counts = self.cadence.observe(state.seq, state.stamp_ns, arrival_ns)
+        self.notice = self.notice or self.cadence.notice
+        if not counts:
+            return Arrival.REPEATED, "", ""
+        if self.cadence.fault:
+            return Arrival.UNTIMED, "", ""
+        if untimed:
+            self.clock.reset()
+            self.clock.observe(state.seq, state.stamp_ns, arrival_ns)
+            return Arrival.JUMPED_AHEAD, "clock_known", "the robot's stamps advance as nanoseconds again: starting cold"
+        last = self.last
+        judged = (Arrival.NEW_LIFE, "robot_restarted", "the robot was restarted: starting anew") if began else (Arrival.FRESH, "", "")
+        if last is not None and state.stamp_ns <= last.stamp_ns:
             back_ns = last.stamp_ns - state.stamp_ns
             if back_ns <= self._stale_ns:
                 return Arrival.REPEATED, "", ""
             judged = Arrival.JUMPED_BACK, "clock_jumped", f"the robot's clock went back {1e-9 * back_ns:.3f} s: starting anew"
-        if judged[0] is not Arrival.FRESH:
             self.last = None
-            self.clock.jump() if judged[0] is Arrival.JUMPED_BACK else self.clock.reset()
+            self.clock.jump()
+            self.cadence.jump()
         if not self.clock.observe(state.seq, state.stamp_ns, arrival_ns):
             return Arrival.OLD, "state_old", "states have waited on their way: they are not acted on"
         if self.clock.leapt:

@@ -206,38 +206,41 @@ class Daemon:
 
     def _control(self, subscriber: Subscriber) -> None:
         """Act on states as they come: the loop that counts."""
-        controller, intake = self._controller, self._states_in
         for received in iter(subscriber.recv, None):
             arrival_ns = time.monotonic_ns()
-            state = intake.newest((received, *subscriber.drain()), arrival_ns)
-            command = None
-            if state is not None:
-                with self._lock:
-                    if self._ending:
-                        return
-                    self._leadership.hear(state, arrival_ns)
-                    command = controller.receive_state(state, arrival_ns)
-                    acted_ns = time.monotonic_ns()
-                    if command is not None:
-                        command = controller.in_time(command, acted_ns)
-                        if command is not None:
-                            self._send(command)
-                        sent_ns = time.monotonic_ns()
-                        controller.prepare()
-                        prepared_ns = time.monotonic_ns()
-                        self._lock.notify_all()
-                    self._references.hand_over(self._leadership.leading)
-            if command is not None:
-                self._telemetries[self._leadership.role].put(
-                    controller.telemetry(
-                        prepare_us=self._prepare_us,
-                        feedback_us=1e-3 * (acted_ns - arrival_ns),
-                        latency_us=1e-3 * (sent_ns - arrival_ns),
-                        slack_s=controller.slack_s(prepared_ns),
-                    )
-                )
-                self._prepare_us = 1e-3 * (prepared_ns - sent_ns)
+            for state in self._states_in.newest_of_each((received, *subscriber.drain()), self._controller.awaits):
+                self._sample(state, arrival_ns)
             self._announce()
+
+    def _sample(self, state: State, arrival_ns: int) -> None:
+        """Act on one state."""
+        controller = self._controller
+        with self._lock:
+            if self._ending:
+                return
+            if controller.follows(state):
+                self._leadership.hear(state, arrival_ns)
+            command = controller.receive_state(state, arrival_ns)
+            acted_ns = time.monotonic_ns()
+            if command is not None:
+                command = controller.in_time(command, acted_ns)
+                if command is not None:
+                    self._send(command)
+                sent_ns = time.monotonic_ns()
+                controller.prepare()
+                prepared_ns = time.monotonic_ns()
+                self._lock.notify_all()
+            self._references.hand_over(self._leadership.leading)
+        if command is not None:
+            self._telemetries[self._leadership.role].put(
+                controller.telemetry(
+                    prepare_us=self._prepare_us,
+                    feedback_us=1e-3 * (acted_ns - arrival_ns),
+                    latency_us=1e-3 * (sent_ns - arrival_ns),
+                    slack_s=controller.slack_s(prepared_ns),
+                )
+            )
+            self._prepare_us = 1e-3 * (prepared_ns - sent_ns)
 
     def _send(self, command: Command) -> None:
         """Send a command, if it is ours to send."""

@@ -151,7 +151,7 @@ class Process:
         """Take a state in."""
         with self._lock:
             local_ns = time.monotonic_ns()
-            if (state := self._states.accept(received, local_ns)) is not None:
+            if (state := self._states.read(received)) is not None:
                 self._guard.receive_state(state, local_ns)
 
     def _command(self, received: Received) -> None:

@@ -31,7 +31,7 @@ from rti_mpc.wire.bus import WAITING, Bus, BusSettings, Subscriber
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from sim.actuator import STALE_NS, Counters
-from sim.clock import Clock
+from sim.clock import SLICE_S, Clock
 from sim.lockstep import Lockstep
 from sim.log import Log
 from sim.settings import RobotSettings
@@ -39,6 +39,8 @@ from sim.settings import RobotSettings
 ROLE = "robot"
 STANDING = 1e-6  # change of the state in a period, in any unit, below which the robot stands
 COAST_NS = 10_000_000_000  # robot time after which it is taken to stand anyway
+HEARING_S = 0.5  # for which a starting robot listens for another one of its name
+LEASE_S = 2.0  # after which the presence of a process that was killed, or hangs, has ended
 
 logger = logging.getLogger(ROLE)
 
@@ -90,6 +92,7 @@ def main(
     """
     stop = stop or stop_on_signals()
     with Bus(bus_settings, keys, stop=stop, say=logger.warning) as bus:
+        wait_for_another(bus, stop)
         robot = Robot(settings, bus, keys.actuation if guarded else keys.command, speed, log)
         life = {"role": ROLE, "epoch": robot.body.epoch, "speed": speed, "state_period_s": settings.state_period_s}
         bus.publish_json(keys.info(ROLE), {**describe(settings.model), **(info or {}), **life})
@@ -99,6 +102,20 @@ def main(
         gc.freeze()
         robot.run(stop, None if duration_s is None else round(1e9 * duration_s))
         return robot.finish()
+
+
+def wait_for_another(bus: Bus, stop: Event) -> None:
+    """Wait until no other robot of this name is present, for one lease at most: either it was killed and is about to vanish, or it lives."""
+    if not bus.is_alive(ROLE, HEARING_S):
+        return
+    logger.warning("another robot is present as %s: waiting for at most %g s until it is gone", bus.keys.robot, LEASE_S)
+    deadline_s = time.monotonic() + LEASE_S
+    while not stop.is_set() and time.monotonic() < deadline_s:
+        if not bus.is_alive(ROLE, SLICE_S):
+            logger.info("the other robot is gone")
+            return
+        stop.wait(SLICE_S)
+    logger.warning("two robots use the name %s: stop one of them, or give it another name", bus.keys.robot)
 
 
 def describe(model: Model) -> dict[str, Any]:

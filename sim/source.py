@@ -4,7 +4,8 @@ A reference source as a process: one trajectory, anchored to the robot's clock.
 
 It waits for a state, publishes the whole reference from that state's stamp on,
 and again for every robot that starts anew. Whoever joins late gets the last
-one, for as long as the source lives.
+one, for as long as the source lives. A second robot of the name, or a forged
+state, gets none while the first one lives.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from threading import Event
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.lives import Heard, Lives
 from rti_mpc.message import Notice, Reference, Severity, State
 from rti_mpc.trajectory import Heading, Trajectory, rows
 from rti_mpc.wire.announcer import Announcer
@@ -27,7 +29,7 @@ from rti_mpc.wire.keys import Keys
 ROLE = "reference"
 LOOK_S = 0.02  # between two looks at the robot: waking for every state would take a core from those who control
 LOOK_AGAIN_NS = 500_000_000  # after which it is looked whether the robot was restarted
-STALE_S = 1.0  # silence of the robot after which the reference is anchored to another one, even of a lower epoch
+STALE_S = 1.0  # silence of the robot, and time for which another one is heard alone, after which the reference is anchored to that one
 
 logger = logging.getLogger(ROLE)
 
@@ -97,28 +99,29 @@ class Source:
         self._states: Subscriber | None = None
         self._look_again_ns = 0
         self._intake = bus.intake(State, STALE_S)
-        self._robot_epoch = -1
+        self._lives = Lives(STALE_S, STALE_S)
         bus.expect("state", lambda: self.anchored)
 
     def look(self) -> None:
         """
         Publish if a robot has started since the last look.
 
-        One state now and then tells. A subscription in between would wake this
-        process at every state, while robot and controller want the processor.
+        One state now and then tells, and more where there may be more than one
+        robot. A subscription in between would wake this process at every state,
+        while robot and controller want the processor.
         """
         now_ns = time.monotonic_ns()
         if self._states is None:
             if now_ns < self._look_again_ns:
                 return
             self._states = self._bus.subscriber(self._bus.keys.state, capacity=WAITING)
-        state = self._intake.newest(self._states.drain(), now_ns)
-        if state is not None:
+        state = None
+        for state in self._intake.newest_of_each(self._states.drain()):
+            if self._lives.hear(state.epoch, now_ns) is Heard.BEGINS:
+                self._anchor(state.stamp_ns)
+        if state is not None and self._lives.rival is None:
             self._states = None
             self._look_again_ns = now_ns + LOOK_AGAIN_NS
-        if state is not None and state.epoch != self._robot_epoch:
-            self._robot_epoch = state.epoch
-            self._anchor(state.stamp_ns)
         for notice in self._intake.notices(now_ns):
             self._announcer.say(notice, 0 if state is None else state.stamp_ns)
 

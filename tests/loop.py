@@ -55,6 +55,8 @@ def drive(
     latency_s: float = 0.0,
     sees: Callable[[State], State | None] = lambda state: state,
     run: Run | None = None,
+    local_0_ns: int = 0,
+    rate: float = 1.0,
 ) -> Run:
     """
     Close the loop until a robot time.
@@ -66,6 +68,8 @@ def drive(
         latency_s: From a state to the arrival of its command.
         sees: What becomes of a state on its way: itself, another one, or None for a lost one.
         run: A run to go on with.
+        local_0_ns: Local time when the robot's clock is 0.
+        rate: Robot seconds per local second.
     """
     run = Run() if run is None else run
     while body.now_ns < round(1e9 * duration_s):
@@ -74,7 +78,8 @@ def drive(
         run.x.append(body.x.copy())
         run.u.append(body.u.copy())
         seen = sees(state)
-        command = controller.receive_state(seen, body.now_ns) if seen is not None else controller.tick(body.now_ns)
+        local_ns = local_0_ns + round(body.now_ns / rate)
+        command = controller.receive_state(seen, local_ns) if seen is not None else controller.tick(local_ns)
         if command is not None:
             run.commands.append(command)
             if reason := body.accept(command, body.now_ns + round(1e9 * latency_s)):

@@ -164,30 +164,28 @@ def test_sample_right_after_a_restart_is_held_to_its_budget_though_the_speed_of_
     """At four times real speed 25 ms are a period; a rate assumed low would take them for 2.5."""
     speed, controller, body = 4, Controller(rti, Timing(), compile=False), robot(circle())
     controller.receive_reference(reference(circle()))
-    for _ in range(2):
+    for k in range(4):
         arrival_ns = (state := body.tick()).stamp_ns // speed
         command = controller.receive_state(state, arrival_ns)
-        assert command is not None
-        assert controller.in_time(command, arrival_ns + 1 * MS) is command
-        controller.prepare()
+        assert (command is not None) == (k >= 2), "the first two show how fast the clock runs, roughly"
+        if command is not None:
+            assert controller.in_time(command, arrival_ns + 1 * MS) is command
+            controller.prepare()
     arrival_ns = (state := body.tick()).stamp_ns // speed
     command = controller.receive_state(state, arrival_ns)
     assert command is not None
     assert controller.in_time(command, arrival_ns + 25 * MS) is None
 
 
-def test_first_sample_of_a_life_is_sent_at_once_or_left_out_without_a_word(rti: FaultyRti) -> None:
+def test_first_state_of_a_life_is_left_unanswered_without_a_word(rti: FaultyRti) -> None:
     """Before a second state has come the robot's clock may run at any speed."""
     controller, body = Controller(rti, Timing(), compile=False), robot(circle())
     controller.receive_reference(reference(circle()))
-    first = controller.receive_state(body.tick(), body.now_ns)
-    assert first is not None
+    assert controller.receive_state(body.tick(), body.now_ns) is None
     controller.notices.clear()
-    assert controller.in_time(first, body.now_ns + 10 * MS) is None
-    controller.prepare()
     second = sample(controller, body, took_ms=10)
     assert second is not None
-    assert (second.seq, codes(controller), controller.ladder) == (first.seq, [], Ladder())
+    assert (second.seq, codes(controller), controller.ladder) == (1, ["mode"], Ladder())
 
 
 # Gaps.

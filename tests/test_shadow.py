@@ -58,7 +58,7 @@ def take_over(samples: int, dies_at: int, delay_s: float = 0.0, *, hears: bool =
         if k == dies_at + 1:
             shadow.lead(2)
         own = shadow.receive_state(state, body.now_ns)
-        assert own is not None
+        assert (own is None) == (k == 0), "the second state tells how fast the robot's clock runs"
         shadow.prepare()
         if command is not None:
             leader.prepare()
@@ -69,6 +69,7 @@ def take_over(samples: int, dies_at: int, delay_s: float = 0.0, *, hears: bool =
         elif k == dies_at and late:
             shadow.overhear(last)
         elif k > dies_at:
+            assert own is not None
             assert not body.accept(own, body.now_ns)
             taken.append(own)
     return np.array(applied), taken

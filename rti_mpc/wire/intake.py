@@ -133,6 +133,23 @@ class Intake(Generic[M]):
             message = self.accept(received, now_ns) or message
         return message
 
+    def newest_of_each(self, waiting: Iterable[Payload], counts: Callable[[M], bool] = lambda _: True) -> list[M]:
+        """
+        Last of several payloads for each epoch, where the receiver itself is to judge all sources.
+
+        Args:
+            waiting: Payloads, oldest first.
+            counts: Whether a message goes on from what was received before: one that does not, such as a replayed one, takes the place of none.
+        """
+        newest: dict[int, M] = {}
+        for received in waiting:
+            if (message := self.read(received)) is None:
+                continue
+            before = newest.get(message.epoch)
+            if before is None or (counts(message) and not (counts(before) and before.seq > message.seq)):
+                newest[message.epoch] = message
+        return list(newest.values())
+
     def highest_epoch(self, waiting: Iterable[Payload]) -> int:
         """Highest epoch among several payloads, whoever sent them; 0 if none is a message."""
         epoch = 0

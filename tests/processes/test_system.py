@@ -203,22 +203,26 @@ def test_payload_of_every_malformed_kind_is_counted_and_published_while_control_
 
 
 def test_second_publisher_takes_nothing_over(driven: System) -> None:
-    """Neither a state of an older life of the robot, nor a command of an older controller."""
+    """Neither a command of an older controller, nor a state of another life of the robot: while that is heard the robot stands, and then goes on."""
     states, commands = driven.bus.publisher(KEYS.state, State), driven.bus.publisher(KEYS.command, Command)
     true, command = driven.state(lambda _: True), driven.tracking()
     seqs = iter(range(10**6, 10**9))
 
-    def lie() -> None:
-        seq = next(seqs)
-        states.put(State(true.epoch - 1, seq, true.stamp_ns + 10**12, np.full(5, 9.0)))
-        commands.put(replace(command, epoch=command.epoch - 1, seq=seq, valid_until_ns=2**62 - 1, u=np.full((20, 2), 0.5)))
+    def order() -> None:
+        commands.put(replace(command, epoch=command.epoch - 1, seq=next(seqs), valid_until_ns=2**62 - 1, u=np.full((20, 2), 0.5)))
 
-    before = driven.sample()
-    assert str(true.epoch) in driven.event("source_refused", "controller", lie).text
-    assert str(command.epoch) in driven.event("source_refused", "robot", lie).text
-    after = heard(driven.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.seq > before.seq + 20)
-    assert after.mode is Mode.TRACKING
-    assert np.abs(after.x0).max() < 8.0
+    def live() -> None:
+        states.put(State(true.epoch + 1, next(seqs), true.stamp_ns + 10**12, np.full(5, 9.0)))
+
+    assert str(command.epoch) in driven.event("source_refused", "robot", order).text
+    before, telemetry = driven.sample(), driven.bus.subscriber(KEYS.telemetry, capacity=1024)
+    text = driven.event("two_robots", "controller", live).text
+    assert str(true.epoch) in text
+    assert str(true.epoch + 1) in text
+    heard(driven.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.seq > before.seq + 20 and sample.mode is Mode.TRACKING)
+    samples = [decode(Telemetry, received.payload) for received in telemetry.drain()]
+    assert any(sample.mode is Mode.BRAKING for sample in samples)
+    assert max(np.abs(sample.x0).max() for sample in samples) < 8.0
     assert driven.tracking().epoch == command.epoch
 
 
