@@ -21,7 +21,8 @@ import scipy.sparse as sp
 
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
-from rti_mpc.qp import Qp
+from rti_mpc.qp import Qp, QpData
+from rti_mpc.scaled import Scaled
 from rti_mpc.status import QpStatus
 
 if TYPE_CHECKING:
@@ -44,8 +45,8 @@ class ForeignSolver:
         qp: The problem.
         cold: Whether the next solve forgets the last: it does in any case.
         iterations: Iterations of the last solve; 0 of a solver that does not tell.
-        res_prim: Primal residual of the last solve, infinity norm.
-        res_dual: Dual residual of the last solve, infinity norm.
+        res_prim: Primal residual of the last solve, infinity norm, relative to the scales.
+        res_dual: Dual residual of the last solve, infinity norm, relative to the scales.
 
     Raises:
         OcpError: There is no such solver here, or it cannot solve.
@@ -61,11 +62,12 @@ class ForeignSolver:
         self.res_prim = self.res_dual = 0.0
         self._sound = True
         dense = name not in qpsolvers.sparse_solvers
-        self._equal, self._above, self._below = qp.sides()
-        self._problem: Any = qp.to_problem()
-        numbers = numbered(qp)
+        self._scaled = scaled = Scaled(qp)
+        self._equal, self._above, self._below = scaled.sides()
+        self._problem: Any = scaled.to_problem()
+        numbers = numbered(scaled)
         self._updates: list[Callable[[], None]] = []
-        for matrix, data in (("P", qp.P.data), ("G", qp.A.data), ("A", qp.A.data)):
+        for matrix, data in (("P", scaled.P.data), ("G", scaled.A.data), ("A", scaled.A.data)):
             made, update = following(getattr(numbers, matrix), data, dense)
             setattr(self._problem, matrix, made)
             self._updates.append(update)
@@ -80,6 +82,7 @@ class ForeignSolver:
         self.qp.linearize()
         self._sound = self.qp.sound
         if self._sound:
+            self._scaled.matrices()
             for update in self._updates:
                 update()
 
@@ -91,8 +94,9 @@ class ForeignSolver:
         """Embed the initial state, solve, and make the plan."""
         if not self._sound:
             return QpStatus.FAILED
-        qp, problem = self.qp, self._problem
-        qp.embed()
+        qp, problem = self._scaled, self._problem
+        self.qp.embed()
+        qp.vectors()
         problem.q[:] = qp.q
         np.concatenate((qp.u[self._above], -qp.l[self._below]), out=problem.h)
         problem.b[:] = qp.u[self._equal]
@@ -104,8 +108,7 @@ class ForeignSolver:
         self.iterations = iterations(solution)
         if status.usable:
             self.res_prim, self.res_dual = residuals(problem, solution)
-            qp.z[:] = solution.x
-            qp.step()
+            qp.plan(np.asarray(solution.x))
         return status
 
     def _call(self) -> qpsolvers.Solution:
@@ -156,7 +159,7 @@ def residuals(problem: Any, solution: qpsolvers.Solution) -> tuple[float, float]
     return float(primal), float(np.max(np.abs(problem.P @ x + problem.q + problem.G.T @ solution.z + problem.A.T @ solution.y)))
 
 
-def numbered(qp: Qp) -> qpsolvers.Problem:
+def numbered(qp: QpData) -> qpsolvers.Problem:
     """Return the problem with numbers in its matrices: which nonzero of the QP's an entry is, counted from 1, negative where its sign changes."""
     kept = [(matrix, matrix.data.copy()) for matrix in (qp.P, qp.A)]
     for matrix, _ in kept:

@@ -48,6 +48,7 @@ class Linearization:
         y_ref: Reference, shape ``(ny, N)``.
         p: Stage parameters, shape ``(np, N + 1)``.
         w: The weights and bounds, by the names in `WEIGHTS`.
+        scale_x: What states are measured by inside the solvers, shape ``(nx, 1)``; `scale_u`, inputs; `scale_g`, what has softened bounds.
         A: Sensitivities to the state, nonzeros of `A_k` column by column, shape ``(nnz, N)``.
         B: Sensitivities to the input, nonzeros of `B_k`, shape ``(nnz, N)``.
         A_k: Pattern of one A, shape ``(nx, nx)``.
@@ -79,6 +80,8 @@ class Linearization:
         self.y_ref = ca.MX.sym("y_ref", model.ny, N)
         self.p = ca.MX.sym("p", model.np_, N + 1)
         self.w = {name: ca.MX.sym(name, *np.shape(getattr(ocp, name))) for name in WEIGHTS}
+        self._scale = ca.MX.sym("scale", nx + nu + len(ocp.lg))
+        self.scale_x, self.scale_u, self.scale_g = self._scale[:nx], self._scale[nx : nx + nu], self._scale[nx + nu :]
 
         stage, self.A_k, self.B_k = linearize(ocp)
         held = ca.horzcat(self.u, ca.repmat(self.u[:, -1], 1, N - N_u))
@@ -105,14 +108,19 @@ class Linearization:
         self.R = self.w["R"] * pattern(ocp.R)
         self.force = (self.R @ self.increments) * ca.repmat(self.w["lambda_"].T, nu, 1)
         self.cost = ca.sum2(nodes[nx, :]) + ca.dot(self.increments, self.force)
-        self.damping = damping(ocp) * self.cost
+        self.damping = damping(ocp) * self.cost / self.scale_u**2
         self.checksum = ca.sum1(ca.vec(stages)) + ca.sum1(ca.vec(nodes)) + self.cost + ca.sum1(ca.vec(self.b))
         self.checksum += ca.sum1(ca.vec(bounded))
 
     @property
     def arguments(self) -> list[ca.MX]:
         """What the data of a sample depends on, in the order of all compiled functions."""
-        return [*self.sample, *self.w.values()]
+        return [*self.sample, *self.weights]
+
+    @property
+    def weights(self) -> list[ca.MX]:
+        """What stays from sample to sample: weights and bounds, in the order of `WEIGHTS`, and the scale."""
+        return [*self.w.values(), self._scale]
 
     @property
     def sample(self) -> list[ca.MX]:
@@ -141,7 +149,7 @@ def linearize(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
     x_next = ocp.phi()(model.x, model.u, model.p)
     A = ca.jacobian(x_next, model.x)
     B = ca.jacobian(x_next, model.u)
-    out = ca.cse(ca.densify(ca.vertcat(x_next, A.nz[:], B.nz[:])))
+    out = ca.cse(ca.densify(ca.vertcat(x_next, nonzeros(A), nonzeros(B))))
     return ca.Function("stage", [model.x, model.u, model.p], [out]), A.sparsity(), B.sparsity()
 
 
@@ -159,7 +167,7 @@ def gauss_newton(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity]:
     C = ca.jacobian(model.y_expr, model.x)
     e = model.y_expr - y_ref
     H = C.T @ W @ C
-    out = ca.cse(ca.densify(ca.vertcat(C.T @ (W @ e), e.T @ (W @ e), H.nz[:])))
+    out = ca.cse(ca.densify(ca.vertcat(C.T @ (W @ e), e.T @ (W @ e), nonzeros(H))))
     return ca.Function("node", [model.x, model.p, y_ref, weight], [out]), H.sparsity()
 
 
@@ -173,8 +181,13 @@ def constraints(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
     model = ocp.model
     g = ca.vertcat(model.x[list(ocp.soft), 0], ocp.h_expr)
     G_x, G_u = ca.jacobian(g, model.x), ca.jacobian(g, model.u)
-    out = ca.cse(ca.densify(ca.vertcat(g, G_x.nz[:], G_u.nz[:])))
+    out = ca.cse(ca.densify(ca.vertcat(g, nonzeros(G_x), nonzeros(G_u))))
     return ca.Function("constraint", [model.x, model.u, model.p], [out]), G_x.sparsity(), G_u.sparsity()
+
+
+def nonzeros(matrix: Any) -> Any:
+    """Return the nonzeros of a matrix, column by column, as a column: CasADi's own `nz` is a row for a matrix of one row."""
+    return ca.vec(matrix.nz[:])
 
 
 def output_pattern(ocp: Ocp) -> ca.DM:
@@ -195,28 +208,22 @@ def shift(ocp: Ocp) -> ca.Function:
     return ca.Function("shift", [x, u, p], [ca.horzcat(x[:, 1:], x_next), ca.horzcat(u[:, 1:], u[:, -1])])
 
 
-def change(ocp: Ocp, u: Any, before: Any) -> Any:
-    """Return the size of a step as an expression: what an input changes by at most, relative to half its range, or to its unit if that has no end."""
-    return ca.mmax(ca.fabs(u - before) / ca.repmat(ca.DM(half_range(ocp)), 1, u.shape[1]))
+def change(lin: Linearization, u: Any) -> Any:
+    """Return the size of a step from the guess to inputs `u` as an expression: what an input changes by at most, relative to its scale."""
+    return ca.mmax(ca.fabs(u - lin.u) / ca.repmat(lin.scale_u, 1, u.shape[1]))
 
 
-def damping(ocp: Ocp) -> ca.DM:
-    """Return the damping of steps in each input relative to the cost, shape ``(nu, 1)``: none for a linear model, whose full step is exact."""
+def damping(ocp: Ocp) -> float:
+    """Return the damping of a step of the scale of an input, relative to the cost: none for a linear model, whose full step is exact."""
     model = ocp.model
     variables = ca.vertcat(model.x, model.u)
     first = ca.jacobian(ca.vertcat(model.f_expl_expr, model.y_expr), variables)
     linear = ca.jacobian(ca.vec(first), variables).nnz() == 0
-    return ca.DM.zeros(model.nu) if linear else ca.DM(DAMPING / half_range(ocp) ** 2)
-
-
-def half_range(ocp: Ocp) -> np.ndarray[Any, Any]:
-    """Return half the range of each input, or its unit if that has no end."""
-    half = 0.5 * (ocp.ubu - ocp.lbu)
-    return np.where(np.isfinite(half), half, 1.0)
+    return 0.0 if linear else DAMPING
 
 
 def plan_cost(ocp: Ocp) -> ca.Function:
-    """Build ``(x, u, u_prev, y_ref, p, *WEIGHTS) -> cost``: the cost (4) of a plan and its penalties, nothing of it linearized."""
+    """Build ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale) -> cost``: the cost (4) of a plan and its penalties, nothing of it linearized."""
     lin = Linearization(ocp)
     lg, ug, zg, Zg = (ca.repmat(e, 1, ocp.N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg))
     s = ca.fmax(0, ca.fmax(lin.g - ug, lg - lin.g))

@@ -29,10 +29,10 @@ class Guess:
     Where the QPs of an OCP are made, and what comes out: arrays that all of them share.
 
     Attributes:
-        sample: x, u, u_prev, y_ref, p, and the weights, in the order of `Linearization.arguments`.
+        sample: x, u, u_prev, y_ref, p, the weights, and the scale, in the order of `Linearization.arguments`.
         x0: State embedded at node 0, shape ``(nx,)``.
-        plan: States and inputs after the full step, shapes as the guess; by how much the states exceed their bounds, and the size of the step, see
-            `rti_mpc.linearization.change`, each of shape ``(1,)``.
+        plan: States and inputs after the full step, shapes as the guess; by how much softened bounds are exceeded, as it is and relative to their
+            scale, shape ``(2,)``; the size of the step, see `rti_mpc.linearization.change`, shape ``(1,)``.
     """
 
     sample: tuple[Array, ...]
@@ -40,9 +40,9 @@ class Guess:
     plan: tuple[Array, Array, Array, Array]
 
 
-class Qp:
+class QpData:
     """
-    A QP of fixed pattern.
+    The data of a QP of fixed pattern.
 
     Attributes:
         P: Upper triangle of the Hessian, shape ``(n, n)``.
@@ -50,60 +50,13 @@ class Qp:
         A: Constraint matrix, shape ``(m, n)``.
         l: Lower bounds, shape ``(m,)``; minus `INFINITY` where there is none.
         u: Upper bounds, shape ``(m,)``; `INFINITY` where there is none.
-        z: Where the solver puts its solution, shape ``(n,)``.
-        cost: The cost (4) at the guess, shape ``(1,)``.
-        checksum: Sum of all of this, finite if and only if it is, shape ``(1,)``.
-        watched: For each softened row, the last ones, those by which it is known to act, see `Transcription`; shape ``(rows, 4)``.
-        varies_P: Whether the Hessian changes from sample to sample.
-        varies_A: Whether the constraint matrix does.
-        fill: Writes all but `z` from the guess: slow, uncompiled, after a change of weights.
-        linearize: Writes of that what changes from sample to sample.
-        embed: Writes the initial state into it.
-        step: Makes the plan of `z`.
     """
 
-    fill: Callable[[], None]
-    linearize: Callable[[], None]
-    embed: Callable[[], None]
-    step: Callable[[], None]
-
-    def __init__(self, transcription: Transcription, guess: Guess, make: Callable[[ca.Function], ca.Function]) -> None:
-        m, n = transcription.A.shape
-        self.P: sp.csc_matrix[Any] = sp.csc_matrix(transcription.P, copy=True)
-        self.q: Array = np.zeros(n)
-        self.A: sp.csc_matrix[Any] = sp.csc_matrix(transcription.A, copy=True)
-        self.l: Array = np.zeros(m)
-        self.u: Array = np.zeros(m)
-        self.z: Array = np.zeros(n)
-        self.cost: Array = np.zeros(1)
-        self.checksum: Array = np.zeros(1)
-        memory: Array = np.zeros(transcription.everything.numel_out(5))
-        self._eliminable = transcription.eliminable
-        self.watched = transcription.watched
-        self.varies_P, self.varies_A = 1 in transcription.varying, 2 in transcription.varying
-
-        outputs = (self.q, self.P.data, self.A.data, self.l, self.u, memory, self.cost, self.checksum)
-        self.fill = bind(transcription.everything, guess.sample, outputs)
-        self.linearize = bind(make(transcription.data), guess.sample, [outputs[i] for i in transcription.varying])
-        x, u, u_prev, *_ = guess.sample
-        weights = guess.sample[5:]
-        targets = [getattr(self, name)[place] for name, place in transcription.embedded]
-        self.embed = bind(make(transcription.embed), (guess.x0, x, memory), targets)
-        self.step = bind(make(transcription.step), (x, u, u_prev, self.z, guess.x0, memory, *weights), guess.plan)
-
-    @property
-    def sound(self) -> bool:
-        """Whether all of it is finite, and of a size that a factorization survives: OSQP prints, in the middle of a sample, what it refuses."""
-        return bool(abs(self.checksum[0]) < 1e6 * INFINITY)  # of which it holds one for each bound that is absent
-
-    def reduced_hessian(self) -> Array:
-        """Return the Hessian in the inputs alone, the states eliminated by the dynamics; of a QP without slacks."""
-        k = self._eliminable
-        P = (self.P + sp.triu(self.P, k=1).T).toarray()
-        A = self.A.toarray()
-        response = -np.linalg.solve(A[:k, :k], A[:k, k:])
-        beside = response.T @ P[:k, k:]
-        return np.asarray(response.T @ P[:k, :k] @ response + beside + beside.T + P[k:, k:])
+    P: sp.csc_matrix[Any]
+    q: Array
+    A: sp.csc_matrix[Any]
+    l: Array  # noqa: E741 - OSQP's own name
+    u: Array
 
     def sides(self) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any]]:
         """Return which rows are equations, and which of the others have an upper and a lower bound, each of shape ``(m,)``."""
@@ -129,6 +82,75 @@ class Qp:
             sp.csc_matrix(A[equal]),
             self.u[equal],
         )
+
+
+class Qp(QpData):
+    """
+    The QP of a sample, in the units of the model, filled by compiled code.
+
+    Attributes:
+        z: Where the solver puts its solution, shape ``(n,)``.
+        cost: The cost (4) at the guess, shape ``(1,)``.
+        checksum: Sum of all of this, finite if and only if it is, shape ``(1,)``.
+        watched: For each softened row, the last ones, those by which it is known to act, see `Transcription`; shape ``(rows, 4)``.
+        varies_P: Whether the Hessian changes from sample to sample.
+        varies_A: Whether the constraint matrix does.
+        fill: Writes all but `z` from the guess: slow, uncompiled, after a change of weights.
+        linearize: Writes of that what changes from sample to sample.
+        embed: Writes the initial state into it.
+        step: Makes the plan of `z`.
+    """
+
+    fill: Callable[[], None]
+    linearize: Callable[[], None]
+    embed: Callable[[], None]
+    step: Callable[[], None]
+
+    def __init__(self, transcription: Transcription, guess: Guess, make: Callable[[ca.Function], ca.Function]) -> None:
+        m, n = transcription.A.shape
+        self.P = sp.csc_matrix(transcription.P, copy=True)
+        self.q = np.zeros(n)
+        self.A = sp.csc_matrix(transcription.A, copy=True)
+        self.l = np.zeros(m)
+        self.u = np.zeros(m)
+        self.z: Array = np.zeros(n)
+        self.cost: Array = np.zeros(1)
+        self.checksum: Array = np.zeros(1)
+        memory: Array = np.zeros(transcription.everything.numel_out(5))
+        self._eliminable = transcription.eliminable
+
+        self._scale, self._columns, self._rows = guess.sample[-1], transcription.columns, transcription.rows
+        self.watched = transcription.watched
+        self.varies_P, self.varies_A = 1 in transcription.varying, 2 in transcription.varying
+
+        outputs = (self.q, self.P.data, self.A.data, self.l, self.u, memory, self.cost, self.checksum)
+        self.fill = bind(transcription.everything, guess.sample, outputs)
+        self.linearize = bind(make(transcription.data), guess.sample, [outputs[i] for i in transcription.varying])
+        x, u, u_prev, *_ = guess.sample
+        weights = guess.sample[5:]
+        targets = [getattr(self, name)[place] for name, place in transcription.embedded]
+        self.embed = bind(make(transcription.embed), (guess.x0, x, memory), targets)
+        self.step = bind(make(transcription.step), (x, u, u_prev, self.z, guess.x0, memory, *weights), guess.plan)
+
+    @property
+    def sound(self) -> bool:
+        """Whether all of it is finite, and of a size that a factorization survives: OSQP prints, in the middle of a sample, what it refuses."""
+        return bool(abs(self.checksum[0]) < 1e6 * INFINITY)  # of which it holds one for each bound that is absent
+
+    def scales(self) -> tuple[Array, Array]:
+        """Return what variables and rows are measured by, shapes ``(n,)`` and ``(m,)``; a slack's unit is a part of what it softens already."""
+        return self._scale[self._columns], self._scale[self._rows]
+
+    def reduced_hessian(self) -> Array:
+        """Return the Hessian in the inputs alone, measured by their scales, the states eliminated by the dynamics; of a QP without slacks."""
+        k = self._eliminable
+        P = (self.P + sp.triu(self.P, k=1).T).toarray()
+        A = self.A.toarray()
+        response = -np.linalg.solve(A[:k, :k], A[:k, k:])
+        beside = response.T @ P[:k, k:]
+        reduced = response.T @ P[:k, :k] @ response + beside + beside.T + P[k:, k:]
+        scale = self._scale[self._columns[k:]]
+        return np.asarray(scale[:, None] * reduced * scale)
 
 
 def step_size(qp: Qp) -> float:

@@ -25,12 +25,12 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from rti_mpc.linearization import Linearization, change, shift
+from rti_mpc.linearization import Linearization, change, nonzeros, shift
 from rti_mpc.ocp import Ocp
 from rti_mpc.transcription import INFINITY
 
-TOLERANCE = 1e-9  # by which a bound may be crossed before it acts: rounding must not decide
-SLACKENED = 1e-6  # pull, the wrong way, at which that penalty is let go
+TOLERANCE = 1e-9  # by which a bound may be crossed before it acts, relative to its scale: rounding must not decide
+RELEASE = 1e-6  # multiplier of the wrong sign, times the scale, in units of the normalised cost, from which a bound is released
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +42,13 @@ class Recursion:
     ``(nu, N_u)``, and of what has softened bounds, shape ``(ng, N)``, one after the other.
 
     Attributes:
-        linearize: ``(x, u, u_prev, y_ref, p, *WEIGHTS) -> stages``.
-        advance: ``(x, u, u_prev, y_ref, p, *WEIGHTS, places) -> (x+, u+, places+, stages)``: the same of a plan moved on by one stage.
-        gains: ``(stages, u, *WEIGHTS, places, stiff) -> gains``; `stiff` is the weight of the penalty that holds what is at its bound.
-        roll_out: ``(x, u, u_prev, x0, stages, gains, *WEIGHTS, places, stiff) -> (x+, u+, violation, change, changes, places+)``: the full step, by
-            how much it exceeds softened bounds, its size, and how many places change: -1 if data, gains or plan are not finite.
+        linearize: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale) -> stages``.
+        advance: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale, places) -> (x+, u+, places+, stages)``: the same of a plan moved on by one stage.
+        gains: ``(stages, u, *WEIGHTS, scale, places, stiff) -> gains``; `stiff` is the weight of the penalty that holds what is at its bound, for
+            what is measured by its scale.
+        roll_out: ``(x, u, u_prev, x0, stages, gains, *WEIGHTS, scale, places, stiff) -> (x+, u+, violation, change, changes, places+)``: the full
+            step, by how much it exceeds softened bounds, as it is and relative to their scale, its size, and how many places change: -1 if data,
+            gains or plan are not finite.
     """
 
     linearize: ca.Function
@@ -70,12 +72,11 @@ def riccati(ocp: Ocp) -> Recursion:
     moved = ca.veccat(*(ca.horzcat(kind[:, 1:], kind[:, -1]) for kind in places))
     advance = ca.Function("advance", [*lin.arguments, flat], [x, u, moved, linearize(x, u, *lin.arguments[2:])])
     stiff = ca.MX.sym("stiff")
-    weights = list(lin.w.values())
-    gains = ca.Function("gains", [stages, lin.u, *weights, flat, stiff], [backward(ocp, lin, forms, places, stiff)])
+    gains = ca.Function("gains", [stages, lin.u, *lin.weights, flat, stiff], [backward(ocp, lin, forms, places, stiff)])
     x0 = ca.MX.sym("x0", ocp.model.nx)
     found = ca.MX.sym("gains", *gains.size_out(0))
     rolled = forward(ocp, lin, forms, x0, found, places, stiff)
-    roll_out = ca.Function("roll_out", [lin.x, lin.u, lin.u_prev, x0, stages, found, *weights, flat, stiff], rolled)
+    roll_out = ca.Function("roll_out", [lin.x, lin.u, lin.u_prev, x0, stages, found, *lin.weights, flat, stiff], rolled)
     return Recursion(linearize, advance, gains, roll_out)
 
 
@@ -104,16 +105,17 @@ class Stage:
         self.G = ca.horzcat(G_x, G_u)
         self.b, self.h = ca.SX.sym("b", nx), ca.SX.sym("h", nx)
         self.g, self.lg, self.ug, self.zg, self.Zg, self.place = (ca.SX.sym(name, ng) for name in ("g", "lg", "ug", "zg", "Zg", "place"))
-        self.stiff = ca.SX.sym("stiff")
+        self.stiff, self.scale = ca.SX.sym("stiff", ng), ca.SX.sym("scale", ng)
         self.dynamics = [nz["A"], nz["B"], self.b]
-        self.soft = [self.g, nz["G_x"], nz["G_u"], self.lg, self.ug, self.zg, self.Zg, self.place, self.stiff]
+        self.soft = [self.g, nz["G_x"], nz["G_u"], self.lg, self.ug, self.zg, self.Zg, self.place, self.stiff, self.scale]
         self.cost = [nz["H"], self.h]
 
 
 def soft_stages(lin: Linearization, forms: list[ca.MX], places: ca.MX, stiff: ca.MX) -> list[list[ca.MX]]:
     """Return, for each stage, what `Stage.soft` stands for."""
     varying = [ca.horzsplit(form) if form.size1() else [ca.MX(0, 1)] * form.size2() for form in (*forms[7:10], places)]
-    return [[g, g_x, g_u, lin.lg, lin.ug, lin.zg, lin.Zg, place, stiff] for g, g_x, g_u, place in zip(*varying, strict=True)]
+    each = stiff / lin.scale_g**2
+    return [[g, g_x, g_u, lin.lg, lin.ug, lin.zg, lin.Zg, place, each, lin.scale_g] for g, g_x, g_u, place in zip(*varying, strict=True)]
 
 
 def backward(ocp: Ocp, lin: Linearization, forms: list[ca.MX], places: list[ca.MX], stiff: ca.MX) -> ca.MX:
@@ -124,14 +126,14 @@ def backward(ocp: Ocp, lin: Linearization, forms: list[ca.MX], places: list[ca.M
     soft = soft_stages(lin, forms, places[2], stiff)
     u, at, at_increment = (ca.horzsplit(e) for e in (lin.u, *places[:2]))
     lambda_ = ca.vertsplit(w["lambda_"])
-    R, damping = lin.R.nz[:], forms[10]
+    R, damping, of_input = nonzeros(lin.R), forms[10], stiff / lin.scale_u**2
     P, p = ca.MX.zeros(n * (n + 1) // 2), ca.MX.zeros(n)
     gains = []
     for k in reversed(range(N)):
         stage = A[k], B[k], b[k], *soft[k], H[k], h[k], P, p
         if k < N_u:
             bounds = w["lbu"], w["ubu"], w["lbdu"], w["ubdu"]
-            P, p, gain = free(*stage, R, damping, lambda_[k], force[k], increment[k], u[k], at[k], at_increment[k], *bounds)
+            P, p, gain = free(*stage, R, damping, lambda_[k], force[k], increment[k], u[k], at[k], at_increment[k], *bounds, of_input)
             gains.append(gain)
         else:
             P, p = held(*stage)
@@ -161,25 +163,26 @@ def backward_stage(ocp: Ocp, lin: Linearization, free: bool) -> ca.Function:
     inputs = [*of.dynamics, *of.soft, *of.cost, P_nz, p]
     if not free:
         Qss, qs = ca.blockcat([[Qxx, Qux.T], [Qux, Quu]]), ca.vertcat(qx, qu)
-        return ca.Function("held", inputs, ca.cse([ca.densify(Qss)[upper].nz[:], ca.densify(qs)]))
+        return ca.Function("held", inputs, ca.cse([nonzeros(ca.densify(Qss)[upper]), ca.densify(qs)]))
 
     R_nz, lambda_ = ca.SX.sym("R", lin.R.sparsity().nnz()), ca.SX.sym("lambda")
     damping = ca.SX.sym("damping", nu)
     force_guess, increment, u, place, at, lbu, ubu, lbdu, ubdu = (
         ca.SX.sym(name, nu) for name in ("force", "increment", "u", "place", "at", "lbu", "ubu", "lbdu", "ubdu")
     )
+    stiff = ca.SX.sym("stiff", nu)
     R = ca.SX(lin.R.sparsity(), R_nz) * lambda_
-    weight, pull = hold(of.stiff, at, increment, lbdu, ubdu)
+    weight, pull = hold(stiff, at, increment, lbdu, ubdu)
     R, force = R + ca.diag(weight), force_guess + pull
-    weight, pull = hold(of.stiff, place, u, lbu, ubu)
+    weight, pull = hold(stiff, place, u, lbu, ubu)
     Quu, qu = Quu + R + ca.diag(weight + damping), qu + force + pull
     Qus = ca.horzcat(Qux, -R)
     gain = cholesky_solve(Quu, ca.horzcat(Qus, qu))
     # The cost with du = -K s - kappa in it.
     P_before = ca.diagcat(Qxx, R) - Qus.T @ gain[:, :n]
     p_before = ca.vertcat(qx, -force) - Qus.T @ gain[:, n]
-    out = [ca.densify(P_before)[upper].nz[:], ca.densify(p_before), ca.densify(ca.vec(gain))]
-    return ca.Function("free", [*inputs, R_nz, damping, lambda_, force_guess, increment, u, place, at, lbu, ubu, lbdu, ubdu], ca.cse(out))
+    out = [nonzeros(ca.densify(P_before)[upper]), ca.densify(p_before), ca.densify(ca.vec(gain))]
+    return ca.Function("free", [*inputs, R_nz, damping, lambda_, force_guess, increment, u, place, at, lbu, ubu, lbdu, ubdu, stiff], ca.cse(out))
 
 
 def hold(stiff: ca.SX, place: ca.SX, value: ca.SX, lower: ca.SX, upper: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -211,10 +214,10 @@ def forward(ocp: Ocp, lin: Linearization, forms: list[ca.MX], x0: ca.MX, gains: 
     A, B, b, _, _, _, increment = (ca.horzsplit(form) for form in forms[:7])
     soft = soft_stages(lin, forms, places[2], stiff)
     x, u, gain, at, at_increment = (ca.horzsplit(e) for e in (lin.x, lin.u, gains, *places[:2]))
-    bounds = (w["lbu"], w["ubu"], w["lbdu"], w["ubdu"])
+    bounds = (w["lbu"], w["ubu"], w["lbdu"], w["ubdu"], stiff / lin.scale_u**2, lin.scale_u)
     s = ca.vertcat(x0 - x[0], ca.MX.zeros(ocp.model.nu))
     before = lin.u_prev
-    verdict = ca.MX(ca.DM([0, -INFINITY]))  # changes, violation
+    verdict = ca.MX(ca.DM([0, -INFINITY, -INFINITY]))  # changes, violation, violation relative to scale
     states, inputs = [x0], []
     found: tuple[list[ca.MX], ...] = ([], [], [])
     for k in range(N):
@@ -231,19 +234,20 @@ def forward(ocp: Ocp, lin: Linearization, forms: list[ca.MX], x0: ca.MX, gains: 
     x_plan, u_plan = ca.horzcat(*states), ca.horzcat(*inputs)
     finite = forms[-1] + ca.sum1(ca.vec(u_plan)) + ca.sumsqr(x_plan) ** 2  # overflows for what is no state
     changes = ca.if_else(ca.fabs(finite) < np.inf, verdict[0], -1)
-    return [x_plan, u_plan, verdict[1], change(ocp, u_plan, lin.u), changes, ca.veccat(*(ca.horzcat(*kind) for kind in found))]
+    return [x_plan, u_plan, verdict[1:], change(lin, u_plan), changes, ca.veccat(*(ca.horzcat(*kind) for kind in found))]
 
 
 def forward_stage(ocp: Ocp, lin: Linearization, free: bool) -> ca.Function:
     """Build one stage of the roll-out."""
     of = Stage(ocp, lin)
     nx, nu, n = of.nx, of.nu, of.n
-    x_next, s, verdict = ca.SX.sym("x_next", nx), ca.SX.sym("s", n), ca.SX.sym("verdict", 2)
+    x_next, s, verdict = ca.SX.sym("x_next", nx), ca.SX.sym("s", n), ca.SX.sym("verdict", 3)
     gain = ca.SX.sym("gain", nu * (n + 1))
     increment, u, before, place, pace, lbu, ubu, lbdu, ubdu = (
         ca.SX.sym(name, nu) for name in ("increment", "u", "before", "place", "pace", "lbu", "ubu", "lbdu", "ubdu")
     )
-    changes, worst = ca.vertsplit(verdict)
+    stiff, scale = ca.SX.sym("stiff", nu), ca.SX.sym("scale", nu)
+    changes, worst, share = ca.vertsplit(verdict)
 
     K = ca.reshape(gain, nu, n + 1)
     du = -(K[:, :n] @ s + K[:, n]) if free else s[nx:]
@@ -253,27 +257,28 @@ def forward_stage(ocp: Ocp, lin: Linearization, free: bool) -> ca.Function:
     acts = ca.SX(of.ng, 1)
     for j in range(of.ng):
         over, under = exceeded(value[j], of.lg[j], of.ug[j], ocp.lg[j], ocp.ug[j])
-        worst = ca.fmax(worst, ca.fmax(over, under))
-        acts[j] = belongs(of.place[j], of.stiff, over, under, of.zg[j] / 2)
+        exceeds = ca.fmax(over, under)
+        worst, share = ca.fmax(worst, exceeds), ca.fmax(share, exceeds / of.scale[j])
+        acts[j] = belongs(of.place[j], of.stiff[j], of.scale[j], over, under, of.zg[j] / 2)
         changes += acts[j] != of.place[j]
     inputs = [*of.dynamics, *of.soft, x_next, s, verdict]
     outputs = [x_next + dx, end]
     if not free:
-        return ca.Function("coast", inputs, ca.cse([*outputs, ca.vertcat(changes, worst), ca.densify(acts)]))
+        return ca.Function("coast", inputs, ca.cse([*outputs, ca.vertcat(changes, worst, share), ca.densify(acts)]))
 
     found = []
     for value, at, lower, upper, lb, ub in (
         (u + du, place, lbu, ubu, ocp.lbu, ocp.ubu),
         (increment + du - s[nx:], pace, lbdu, ubdu, ocp.lbdu, ocp.ubdu),
     ):
-        now = [belongs(at[j], of.stiff, *exceeded(value[j], lower[j], upper[j], lb[j], ub[j]), INFINITY) for j in range(nu)]
+        now = [belongs(at[j], stiff[j], scale[j], *exceeded(value[j], lower[j], upper[j], lb[j], ub[j]), INFINITY) for j in range(nu)]
         found.append(ca.densify(ca.vertcat(*now)))
         changes += ca.sum1(found[-1] != at)
     # Bounds are met exactly, as an actuator wants them.
     u_plan = ca.fmax(ca.fmin(u + du, before + ubdu), before + lbdu)
     u_plan = ca.fmax(ca.fmin(u_plan, ubu), lbu)
-    outputs += [ca.vertcat(changes, worst), ca.densify(acts), u_plan, *found]
-    return ca.Function("forward", [*inputs, gain, increment, u, before, place, pace, lbu, ubu, lbdu, ubdu], ca.cse(outputs))
+    outputs += [ca.vertcat(changes, worst, share), ca.densify(acts), u_plan, *found]
+    return ca.Function("forward", [*inputs, gain, increment, u, before, place, pace, lbu, ubu, lbdu, ubdu, stiff, scale], ca.cse(outputs))
 
 
 def exceeded(value: ca.SX, lower: ca.SX, upper: ca.SX, lb: float, ub: float) -> tuple[ca.SX, ca.SX]:
@@ -282,11 +287,12 @@ def exceeded(value: ca.SX, lower: ca.SX, upper: ca.SX, lb: float, ub: float) -> 
     return value - upper if np.isfinite(ub) else absent, lower - value if np.isfinite(lb) else absent
 
 
-def belongs(place: ca.SX, stiff: ca.SX, over: ca.SX, under: ca.SX, most: ca.SX | float) -> ca.SX:
+def belongs(place: ca.SX, stiff: ca.SX, scale: ca.SX, over: ca.SX, under: ca.SX, most: ca.SX | float) -> ca.SX:
     """Return where something belongs that exceeds its bounds by so much; `most` is the pull that brings it beyond, if they are softened."""
+    tolerance = TOLERANCE * scale
     side = ca.sign(place)
     by = ca.if_else(place > 0, over, under)
-    free = (over > TOLERANCE) - (under > TOLERANCE)
-    held = ca.if_else(stiff * by > most, 2 * side, side * (stiff * by > -SLACKENED))
-    beyond = ca.if_else(by < -TOLERANCE, side, 2 * side)
+    free = (over > tolerance) - (under > tolerance)
+    held = ca.if_else(stiff * by > most, 2 * side, side * (stiff * by * scale > -RELEASE))
+    beyond = ca.if_else(by < -tolerance, side, 2 * side)
     return ca.SX(ca.if_else(place == 0, free, ca.if_else(ca.fabs(place) == 1, held, beyond)))

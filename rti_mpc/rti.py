@@ -32,6 +32,7 @@ from rti_mpc.linearization import WEIGHTS, plan_cost, shift
 from rti_mpc.ocp import Ocp
 from rti_mpc.qp import Guess, Qp, step_size
 from rti_mpc.riccati import riccati
+from rti_mpc.scale import scale
 from rti_mpc.sequential import sequential
 from rti_mpc.simultaneous import simultaneous
 from rti_mpc.solver import Solver, SolverSettings
@@ -46,7 +47,7 @@ SOLVED = QpStatus.SOLVED  # an enumeration looks its members up slowly
 ITERATIONS = 3  # a sample, at most, and
 TOLERANCE = 0.015  # the step from which there is another: what converged NMPC costs in closed loop, within 0.5 %, see docs/engine.md
 COSTS = ("delta", "lambda_", "z", "Z", "Q_e", "zh", "Zh")  # weights that carry the scale of the cost
-TOUCHING = 1e-3  # distance from its bound, in units of the state, at which a plan counts as having left it
+TOUCHING = 2e-3  # distance from a softened bound, relative to its scale, from which on a plan counts as having left it
 
 
 class Rti:
@@ -60,13 +61,14 @@ class Rti:
         ocp: The problem.
         formulation: ``"simultaneous"`` or ``"sequential"``.
         iterations: QPs a sample, at most: 1 is the plain real-time iteration, many with a small tolerance converged SQP.
-        tolerance: Change of the inputs by one iteration, relative to half their range, from which on another follows.
+        tolerance: Change of the inputs by one iteration, relative to their scale, half their range, from which on another follows.
         taken: Iterations of the last feedback.
         x: States of the plan, shape ``(N + 1, nx)``: of the last feedback, and the next guess.
         u: Inputs of the plan, shape ``(N_u, nu)``. Row 0 is the command.
         u_prev: Input before the plan, shape ``(nu,)``: what increments are counted from.
         y_ref: Reference rows of the current sample, shape ``(N, ny)``.
         p: Stage parameters of the current sample, shape ``(N + 1, np)``.
+        scale: What states, inputs and softened bounds are measured by inside, see `rti_mpc.scale`; shape ``(nx + nu + ng,)``.
         guess: Where the current sample is linearized, and what the solvers read and write.
         active_set: What is tried first; None if the solver is another.
         solvers: The QP solvers, each with its QP: without softened bounds and, if there are any, with them.
@@ -126,12 +128,13 @@ class Rti:
         self._rows = self.y_ref.shape
         self._pending = False  # whether a sample was prepared and has had no feedback
         self._x0: Array = np.zeros(model.nx)
-        self._violation: Array = np.zeros(1)
+        self._violation: Array = np.zeros(2)  # of softened bounds, as it is and relative to their scales
         change: Array = np.zeros(1)
         self._change = change.data
         # OSQP has its own infinity, and reads no other.
         weights = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS}
-        guess = Guess((x, u, self.u_prev, self.y_ref, self.p, *weights.values()), self._x0, (self.x, self.u, self._violation, change))
+        self.scale: Array = np.ones(model.nx + model.nu + len(ocp.lg))
+        guess = Guess((x, u, self.u_prev, self.y_ref, self.p, *weights.values(), self.scale), self._x0, (self.x, self.u, self._violation, change))
 
         self.guess = guess
         transcribe = FORMULATIONS[formulation]
@@ -157,6 +160,7 @@ class Rti:
         qps[0].fill()
         if not qps[0].sound:
             raise OcpError(f"model {model.name} must be finite and differentiable around the zero state")
+        self.scale[:] = scale(ocp, self.x, self.u, self.y_ref, self.p)
         # The cost normalised, so that one step size of ADMM, and one tolerance, fit every problem.
         self._cost_scale = 1.0 / step_size(qps[0])
         for name in COSTS:
@@ -337,7 +341,7 @@ class Rti:
     def _solve_qp(self) -> QpStatus:
         """Solve with the QP solver."""
         self.solver = self._backup
-        if not np.isfinite(self._x0).all():
+        if not (np.abs(self._x0) < INFINITY).all():  # nor NaN
             return QpStatus.FAILED
         violation = self._violation
         if not self._loaded:
@@ -352,7 +356,7 @@ class Rti:
             if not isfinite(self._cost[0]):  # numbers of such a size that they overflowed inside the solver
                 self.solver.cold = True
                 return QpStatus.FAILED
-            if violation[0] < -TOUCHING:
+            if violation[1] < -TOUCHING:
                 self._backup = self.solvers[0]
         return status
 
@@ -364,10 +368,10 @@ class Rti:
 
     @property
     def violation(self) -> float:
-        """By how much the plan's states exceed their bounds at most, in the unit of the state; 0 if they do not."""
+        """By how much the plan exceeds a softened bound at most, in the unit of what is bounded; 0 if it exceeds none."""
         return max(0.0, float(self._violation[0]))
 
     @property
     def touches(self) -> bool:
         """Whether the last plan is at a softened bound, or beyond it."""
-        return bool(self._violation[0] > -TOUCHING)
+        return bool(self._violation[1] > -TOUCHING)

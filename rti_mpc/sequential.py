@@ -38,6 +38,7 @@ from rti_mpc.transcription import (
     finite,
     head,
     input_rows,
+    measured_by,
 )
 
 
@@ -126,6 +127,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
     n = to_s + N * ng
 
     A, rows = Blocks(), Rows()
+    _, by_input, by_bound = measured_by(ocp)
     input_rows(ocp, lin, rows, A, 0)
     first_soft = rows.count
 
@@ -137,7 +139,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
         for i in range(N) if at else ():
             G_x, G_u = (ca.densify(ca.MX(sparsity, e[:, i])[at, :]) for sparsity, e in ((lin.G_x, lin.g_x), (lin.G_u, lin.g_u)))
             value = lin.g[at, i] + G_x @ condensed.c[i]
-            row = rows.add(None if sign < 0 else limit[at], value, limit[at] if sign < 0 else None)
+            row = rows.add(None if sign < 0 else limit[at], value, limit[at] if sign < 0 else None, by_bound[at])
             response = G_x @ condensed.G[i]
             response = ca.horzcat(response[:, :-nu], response[:, -nu:] + G_u)
             A.place_values(ca.vec(response), [(row, 0, ca.Sparsity.dense(*response.shape))])
@@ -149,11 +151,11 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
     end_soft = rows.count
     if ng:
         slack = ca.MX.zeros(ng, N)
-        row = rows.add(slack, slack, None)
+        row = rows.add(slack, slack, None, by_bound)
         rows.follow(row, ng, sides)
         A.place(row, to_s, sp.eye_array(N * ng))
     if not rows.count:
-        A.place(rows.add(None, ca.MX.zeros(1), None), 0, sp.csc_array(np.eye(1)))  # OSQP wants a row
+        A.place(rows.add(None, ca.MX.zeros(1), None, by_input[:1]), 0, sp.csc_array(np.eye(1)))  # OSQP wants a row
 
     P = Blocks()
     for k in range(N_u):
@@ -186,6 +188,8 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
         embed=embed(ocp, kind, memory.numel(), sum(e.numel() for e in known), end_soft - first_soft),
         embedded=(("q", slice(0, to_s)), *((name, slice(first_soft, end_soft)) for name in ("l", "u") if ng)),
         step=full_step(ocp, kind, lin, n, memory.numel()),
+        columns=np.concatenate([np.tile(by_input, N_u), np.tile(by_bound[:ng], N)]),
+        rows=np.array(rows.scales),
         eliminable=0,
         watched=rows.watched_from(first_soft),
     )
@@ -228,5 +232,5 @@ def full_step(ocp: Ocp, kind: str, lin: Linearization, n: int, remembered: int) 
     deviation = x0 - x[:, 0]
     dx = ca.horzcat(deviation, advance(deviation, A, B, ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u)), b))
     u_plan = clipped(u + du, u_prev, w)
-    plan = [x + dx, u_plan, known.violation(dx, du, w), change(ocp, u_plan, u)]
-    return ca.Function(f"step_{kind}", [x, u, u_prev, z, x0, known.memory, *w.values()], plan)
+    plan = [x + dx, u_plan, known.violation(dx, du, w), change(lin, u_plan)]
+    return ca.Function(f"step_{kind}", [x, u, u_prev, z, x0, known.memory, *lin.weights], plan)

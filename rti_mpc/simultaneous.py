@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
-from rti_mpc.linearization import Linearization, change
+from rti_mpc.linearization import Linearization, change, nonzeros
 from rti_mpc.ocp import Ocp
 from rti_mpc.transcription import (
     KINDS,
@@ -32,6 +32,7 @@ from rti_mpc.transcription import (
     finite,
     head,
     input_rows,
+    measured_by,
     picked,
 )
 
@@ -52,11 +53,12 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
     n = to_s + N * ng
 
     A, rows = Blocks(), Rows()
+    by_state, by_input, by_bound = measured_by(ocp)
     zero = ca.MX.zeros(nx)
-    A.place(rows.add(zero, zero, zero), 0, sp.eye_array(nx))
+    A.place(rows.add(zero, zero, zero, by_state), 0, sp.eye_array(nx))
 
     # Dynamics: A_k dx_k + B_k du_k - dx_{k+1} = -b_k.
-    row = rows.add(ca.MX.zeros(lin.b.shape), lin.b, ca.MX.zeros(lin.b.shape))
+    row = rows.add(ca.MX.zeros(lin.b.shape), lin.b, ca.MX.zeros(lin.b.shape), by_state)
     A.place_values(ca.vec(lin.A), [(row + k * nx, k * nx, lin.A_k) for k in range(N)])
     A.place_values(ca.vec(lin.B), [(row + k * nx, to_du + min(k, N_u - 1) * nu, lin.B_k) for k in range(N)])
     A.place(row, nx, -sp.eye_array(N * nx))
@@ -70,18 +72,18 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
         at = finite(bounds) if ng else []
         if at:
             side = each(limit[at], N)
-            row = rows.add(None if sign < 0 else side, lin.g[at, :], side if sign < 0 else None)
+            row = rows.add(None if sign < 0 else side, lin.g[at, :], side if sign < 0 else None, by_bound[at])
             places = [(row + i * len(at), nx + i * nx, to_du + min(i, N_u - 1) * nu) for i in range(N)]  # row, column of dx, column of du
-            for column, nonzeros, sparsity in ((1, lin.g_x, lin.G_x), (2, lin.g_u, lin.G_u)):
+            for column, values, sparsity in ((1, lin.g_x, lin.G_x), (2, lin.g_u, lin.G_u)):
                 chosen, block = picked(sparsity, at)
                 if chosen:
-                    A.place_values(ca.vec(nonzeros[chosen, :]), [(place[0], place[column], block) for place in places])
+                    A.place_values(ca.vec(values[chosen, :]), [(place[0], place[column], block) for place in places])
             A.place(row, to_s, sign * SLACK_UNIT * sp.kron(sp.eye_array(N), np.eye(ng)[at]))
             rows.chain(row, len(at))
             sides.append((row, at))
     if ng:
         slack = ca.MX.zeros(ng, N)
-        row = rows.add(slack, slack, None)
+        row = rows.add(slack, slack, None, by_bound)
         rows.follow(row, ng, sides)
         A.place(row, to_s, sp.eye_array(N * ng))
 
@@ -92,9 +94,9 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
     for k in range(N_u):
         at_k = to_du + k * nu
         diagonal, beside = lin.increment_hessian(k)
-        P.place_values(ca.triu(diagonal).nz[:], [(at_k, at_k, ca.triu(diagonal).sparsity())])
+        P.place_values(nonzeros(ca.triu(diagonal)), [(at_k, at_k, ca.triu(diagonal).sparsity())])
         if beside is not None:
-            P.place_values(beside.nz[:], [(at_k, at_k + nu, beside.sparsity())])
+            P.place_values(nonzeros(beside), [(at_k, at_k + nu, beside.sparsity())])
     if ng:
         P.place_values(ca.repmat(SLACK_UNIT**2 / 2 * lin.Zg, N), [(to_s, to_s, ca.Sparsity.diag(N * ng))])
     q = ca.vertcat(zero, ca.vec(lin.gradient), ca.vec(lin.increment_gradient()), *([ca.repmat(SLACK_UNIT / 2 * lin.zg, N)] if ng else []))
@@ -113,6 +115,8 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
         embed=embed(ocp, kind, memory.numel()),
         embedded=(("l", slice(0, nx)), ("u", slice(0, nx))),
         step=full_step(ocp, kind, lin, n, memory.numel()),
+        columns=np.concatenate([np.tile(by_state, N + 1), np.tile(by_input, N_u), np.tile(by_bound[:ng], N)]),
+        rows=np.array(rows.scales),
         eliminable=to_du,
         watched=rows.watched_from(first_soft),
     )
@@ -135,5 +139,5 @@ def full_step(ocp: Ocp, kind: str, lin: Linearization, n: int, remembered: int) 
     to_du, to_s = x.numel(), x.numel() + u.numel()
     dx, du = ca.reshape(z[:to_du], x.shape), ca.reshape(z[to_du:to_s], u.shape)
     u_plan = clipped(u + du, u_prev, w)
-    plan = [x + dx, u_plan, known.violation(dx, du, w), change(ocp, u_plan, u)]
-    return ca.Function(f"step_{kind}", [x, u, u_prev, z, x0, known.memory, *w.values()], plan)
+    plan = [x + dx, u_plan, known.violation(dx, du, w), change(lin, u_plan)]
+    return ca.Function(f"step_{kind}", [x, u, u_prev, z, x0, known.memory, *lin.weights], plan)

@@ -18,6 +18,7 @@ import numpy as np
 import osqp
 
 from rti_mpc.qp import Qp
+from rti_mpc.scaled import Scaled
 from rti_mpc.status import QpStatus
 
 # OSQP's codes, https://osqp.org/docs/interfaces/status_values.html, in its version 1.1.
@@ -71,14 +72,15 @@ class Solver:
         self.qp = qp
         self.cold = False
         self._sound = True
+        self._scaled = scaled = Scaled(qp)
         self._zero = (np.zeros_like(qp.q), np.zeros_like(qp.l))
         public = osqp.OSQP(algebra="builtin")
         public.setup(
-            qp.P,
-            qp.q,
-            qp.A.copy(),  # OSQP keeps what it is given, and writes into it
-            qp.l,
-            qp.u,
+            scaled.P.copy(),  # OSQP keeps what it is given, and writes into it
+            scaled.q,
+            scaled.A.copy(),
+            scaled.l,
+            scaled.u,
             verbose=False,
             eps_abs=settings.eps,
             eps_rel=settings.eps,
@@ -94,27 +96,28 @@ class Solver:
         self._osqp = public._solver
         self._info = self._osqp.info
         self._solution = self._osqp.solution
-        refused = self._osqp.update_data_mat(P_x=qp.P.data, P_i=None, A_x=qp.A.data, A_i=None)
+        refused = self._osqp.update_data_mat(P_x=scaled.P.data, P_i=None, A_x=scaled.A.data, A_i=None)
         assert not refused, "OSQP must have kept the patterns it was given"
-        self._P_x = qp.P.data if qp.varies_P else None
+        self._P_x = scaled.P.data if qp.varies_P else None
         # The softened rows, the last of all, are weighed by whether they act; OSQP sees what comes of that.
         self._soft = slice(len(qp.l) - len(qp.watched), None)
         self._active = np.zeros(len(qp.watched), dtype=bool)
         self._scale = np.ones_like(qp.l)
         weighed = len(qp.watched) > 0
-        self._A_x, self._l, self._u = (array.copy() if weighed else array for array in (qp.A.data, qp.l, qp.u))
+        self._A_x, self._l, self._u = (array.copy() if weighed else array for array in (scaled.A.data, scaled.l, scaled.u))
 
     def load(self) -> None:
         """Linearize at the guess, and take over the new matrices, factorization included; off the path from state to command."""
-        qp = self.qp
+        qp, scaled = self.qp, self._scaled
         qp.linearize()
         self._sound = qp.sound
         if not self._sound:  # or OSQP would never recover
             return
+        scaled.matrices()
         changed = qp.varies_A or self._P_x is not None
-        if self._A_x is not qp.A.data:
+        if self._A_x is not scaled.A.data:
             changed |= self._weigh()
-            np.multiply(qp.A.data, self._scale[qp.A.indices], out=self._A_x)
+            np.multiply(scaled.A.data, self._scale[qp.A.indices], out=self._A_x)
         if changed:
             self._sound = not self._osqp.update_data_mat(P_x=self._P_x, P_i=None, A_x=self._A_x, A_i=None)  # refused: no factorization
         if self.cold:
@@ -124,7 +127,7 @@ class Solver:
     def refill(self) -> None:
         """Take over, with the next `load`, what no sample changes, too: after a change of weights."""
         self.qp.fill()
-        self._P_x = self.qp.P.data
+        self._P_x = self._scaled.P.data
 
     def _weigh(self) -> bool:
         """
@@ -149,19 +152,19 @@ class Solver:
         if not self._sound:
             self.cold = True
             return QpStatus.FAILED
-        qp, workspace = self.qp, self._osqp
-        qp.embed()
-        if self._l is not qp.l:
-            np.multiply(qp.l, self._scale, out=self._l)
-            np.multiply(qp.u, self._scale, out=self._u)
-        if workspace.update_data_vec(q=qp.q, l=self._l, u=self._u):  # refused: what it holds is another problem
+        scaled, workspace = self._scaled, self._osqp
+        self.qp.embed()
+        scaled.vectors()
+        if self._l is not scaled.l:
+            np.multiply(scaled.l, self._scale, out=self._l)
+            np.multiply(scaled.u, self._scale, out=self._u)
+        if workspace.update_data_vec(q=scaled.q, l=self._l, u=self._u):  # refused: what it holds is another problem
             self.cold = True
             return QpStatus.FAILED
         workspace.solve()
         status = STATUS.get(self._info.status_val, QpStatus.FAILED)
         if status.usable:
-            qp.z[:] = self._solution.x
-            qp.step()
+            scaled.plan(self._solution.x)
         else:
             self.cold = True  # a failed solve never seeds the next
         return status
@@ -173,12 +176,12 @@ class Solver:
 
     @property
     def res_prim(self) -> float:
-        """Primal residual of the last solve, infinity norm."""
+        """Primal residual of the last solve, infinity norm, relative to the scales."""
         return float(self._info.prim_res)
 
     @property
     def res_dual(self) -> float:
-        """Dual residual of the last solve, infinity norm."""
+        """Dual residual of the last solve, infinity norm, relative to the scales."""
         return float(self._info.dual_res)
 
     @property

@@ -32,14 +32,16 @@ class Transcription:
     Attributes:
         P: Pattern of the upper triangle of the Hessian, shape ``(n, n)``.
         A: Pattern of the constraint matrix, shape ``(m, n)``.
-        everything: ``(x, u, u_prev, y_ref, p, *WEIGHTS) -> (q, P_data, A_data, l, u, memory, cost, checksum)``; `memory` is what `embed` and `step`
-            want to know, and `checksum` is finite if and only if all the others are.
+        everything: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale) -> (q, P_data, A_data, l, u, memory, cost, checksum)``; `memory` is what `embed` and
+            `step` want to know, and `checksum` is finite if and only if all the others are.
         varying: Which of these eight change from sample to sample.
         data: As `everything`, but returns only what varies.
         embed: ``(x0, x, memory) -> `` what of the QP depends on the initial state.
         embedded: Where that goes: attribute of the QP, and place in it.
-        step: ``(x, u, u_prev, z, x0, memory, *WEIGHTS) -> (x+, u+, violation, change)``: the full step, by how much it exceeds softened bounds,
-            and its size.
+        step: ``(x, u, u_prev, z, x0, memory, *WEIGHTS, scale) -> (x+, u+, violation, change)``: the full step, by how much it exceeds softened
+            bounds, as it is and relative to their scale, and its size.
+        columns: Which entry of the scale each variable is measured by, see `rti_mpc.scale`; shape ``(n,)``.
+        rows: Which entry each row is measured by; shape ``(m,)``.
         eliminable: States in z, which as many first rows determine.
         watched: For each softened row, the last rows of all, those by which it is known a stage earlier to act: itself and its like one stage
             later; for the sign of a slack, those of the bounds that it softens. Counted from the first of them; shape ``(rows, 4)``.
@@ -53,6 +55,8 @@ class Transcription:
     embed: ca.Function
     embedded: tuple[tuple[str, slice], ...]
     step: ca.Function
+    columns: np.ndarray[Any, Any]
+    rows: np.ndarray[Any, Any]
     eliminable: int
     watched: np.ndarray[Any, Any]
 
@@ -103,14 +107,20 @@ class Rows:
         self.upper: list[ca.MX] = []
         self.count = 0
         self.watched: list[list[int]] = []
+        self.scales: list[int] = []
 
-    def add(self, lb: ca.MX | None, value: ca.MX, ub: ca.MX | None) -> int:
-        """Append rows whose left-hand side is `value` at the guess; None: no bound. Return the first of them."""
+    def add(self, lb: ca.MX | None, value: ca.MX, ub: ca.MX | None, scales: np.ndarray[Any, Any]) -> int:
+        """
+        Append rows whose left-hand side is `value` at the guess; None: no bound. Return the first of them.
+
+        `scales` says which entry of the scale each row of a column of `value` is measured by.
+        """
         first = self.count
         absent = ca.MX(ca.DM.ones(value.numel()) * INFINITY)
         self.lower.append(-absent if lb is None else ca.vec(lb - value))
         self.upper.append(absent if ub is None else ca.vec(ub - value))
         self.count += value.numel()
+        self.scales += scales.tolist() * value.size2()
         self.watched += [[row] * 4 for row in range(first, self.count)]
         return first
 
@@ -135,11 +145,18 @@ def input_rows(ocp: Ocp, lin: Linearization, rows: Rows, A: Blocks, to_du: int) 
     """Append the bounds on inputs and on increments."""
     N_u, nu = ocp.N_u, ocp.model.nu
     difference = sp.eye_array(N_u) - sp.eye_array(N_u, k=-1)
+    _, by_input, _ = measured_by(ocp)
     for lb, value, ub, over in (("lbu", lin.u, "ubu", sp.eye_array(N_u)), ("lbdu", lin.increments, "ubdu", difference)):
         at = finite(getattr(ocp, lb), getattr(ocp, ub))
         if at:
-            row = rows.add(each(lin.w[lb][at], N_u), value[at, :], each(lin.w[ub][at], N_u))
+            row = rows.add(each(lin.w[lb][at], N_u), value[at, :], each(lin.w[ub][at], N_u), by_input[at])
             A.place(row, to_du, sp.kron(over, np.eye(nu)[at]))
+
+
+def measured_by(ocp: Ocp) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Return the entries of the scale that belong to states, to inputs and to what has softened bounds."""
+    nx, nu = ocp.model.nx, ocp.model.nu
+    return np.arange(nx), nx + np.arange(nu), nx + nu + np.arange(len(ocp.lg))
 
 
 def clipped(u: ca.MX, u_prev: ca.MX, w: dict[str, ca.MX]) -> ca.MX:
@@ -176,19 +193,27 @@ class Remembered:
         self.rest = self.memory[ends[-1] :]
 
     def violation(self, dx: ca.MX, du: ca.MX, w: dict[str, ca.MX]) -> ca.MX:
-        """Return by how much a plan exceeds the linearized constraints at most, negative if it keeps them all; `dx` from node 0 on."""
+        """
+        Return by how much a plan exceeds the linearized constraints at most, as it is and relative to their scale; `dx` from node 0 on.
+
+        Negative if it keeps them all.
+        """
         ocp, lin = self._ocp, self._lin
         ng, N = len(ocp.lg), ocp.N
         if not ng:
-            return ca.MX(-INFINITY)
-        g, g_x, g_u, lg, ug = (ca.SX.sym(n, e.shape[0]) for n, e in zip(("g", "g_x", "g_u", "lg", "ug"), (*head(lin), lin.lg, lin.ug), strict=True))
+            return ca.MX(ca.DM([-INFINITY, -INFINITY]))
+        names = ("g", "g_x", "g_u", "lg", "ug", "scale")
+        g, g_x, g_u, lg, ug, scale = (ca.SX.sym(n, e.shape[0]) for n, e in zip(names, (*head(lin), lin.lg, lin.ug, lin.scale_g), strict=True))
         dx_i, du_i = ca.SX.sym("dx", dx.shape[0]), ca.SX.sym("du", du.shape[0])
         value = g + ca.SX(lin.G_x, g_x) @ dx_i + ca.SX(lin.G_u, g_u) @ du_i
-        excess = [*((value - ug)[j] for j in finite(ocp.ug)), *((lg - value)[j] for j in finite(ocp.lg))]
-        worst = ca.Function("worst", [g, g_x, g_u, dx_i, du_i, lg, ug], [ca.mmax(ca.vertcat(*excess))]).map(N)
-        limits = softened_bounds(ocp, w)
+        excess = [(value - ug)[j] for j in finite(ocp.ug)] + [(lg - value)[j] for j in finite(ocp.lg)]
+        scales = [scale[j] for j in (*finite(ocp.ug), *finite(ocp.lg))]
+        shares = [by / one for by, one in zip(excess, scales, strict=True)]
+        worst = ca.Function("worst", [g, g_x, g_u, dx_i, du_i, lg, ug, scale], [ca.vertcat(*(ca.mmax(ca.vertcat(*of)) for of in (excess, shares)))])
+        limits = (*softened_bounds(ocp, w), lin.scale_g)
         held = ca.horzcat(du, ca.repmat(du[:, -1], 1, N - ocp.N_u))
-        return ca.MX(ca.mmax(worst(*self._parts, dx[:, 1:], held, *(each(limit, N) for limit in limits))))
+        found = worst.map(N)(*self._parts, dx[:, 1:], held, *(each(limit, N) for limit in limits))
+        return ca.vertcat(*(ca.mmax(row) for row in ca.vertsplit(found)))
 
 
 def softened_bounds(ocp: Ocp, w: dict[str, Any]) -> tuple[Any, Any]:

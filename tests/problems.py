@@ -94,3 +94,18 @@ def arc(t: Array, psi0: float = 0.0) -> Array:
     """Rows ``x, y, psi`` of the paper's eight and its tangent at times t, shape ``(N, 3)``; psi nearest to `psi0` at the start."""
     psi = np.unwrap(np.arctan2(np.cos(t / 5) / 5, np.cos(t / 10) / 10))
     return np.column_stack([np.sin(t / 10), np.sin(t / 5), psi + 2 * np.pi * np.round((psi0 - psi[0]) / (2 * np.pi))])
+
+
+def cart(newtons: float = 1.0) -> Model:
+    """A vehicle of 1500 kg, 2 states, 1 input, linear: its drive force in units of so many N."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    return Model(
+        name="cart",
+        x=x,
+        u=u,
+        f_expl_expr=ca.vertcat(x[1], (u * newtons - 200 * x[1]) / 1500),
+        y_expr=x[0],
+        states=(Signal("r", "m"), Signal("v", "m/s")),
+        inputs=(Signal("F", "N"),),
+        outputs=(Signal("r", "m"),),
+    )

@@ -41,7 +41,7 @@ def test_matrices_updated_in_place_are_those_of_the_problem_written_anew(build: 
     one = Rti(build(), formulation=formulation, solver=name, iterations=1, compile=False)
     for seed in (1, 2):
         assert solve(one, seed) is QpStatus.SOLVED
-        ours, anew = one.solver._problem, one.qp.to_problem()
+        ours, anew = one.solver._problem, one.solver._scaled.to_problem()
         for part in "PGA":
             mine, theirs = getattr(ours, part), getattr(anew, part).toarray()
             np.testing.assert_array_equal(mine if name == "daqp" else mine.toarray(), theirs)

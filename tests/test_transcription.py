@@ -168,12 +168,13 @@ def test_hessian_is_the_gauss_newton_approximation_and_the_damping(name: str) ->
     for seed in (4, 5):
         rti = at_random(name, seed=seed)
         ocp, problem = rti.ocp, ByHand(rti)
+        nx, nu = ocp.model.nx, ocp.model.nu
         J = jacobian(problem.residuals, problem.guess)
         expected = J.T @ J
         slacks = len(problem.guess) - ocp.N * len(ocp.lg)
         steps = range(slacks - rti.u.size, slacks)
         residuals = problem.residuals(problem.guess)
-        expected[steps, steps] += np.tile(np.array(damping(ocp)).ravel(), ocp.N_u) * (residuals @ residuals)
+        expected[steps, steps] += np.tile(damping(ocp) / rti.scale[nx : nx + nu] ** 2, ocp.N_u) * (residuals @ residuals)
         expected[slacks:, slacks:] = np.diag(0.5 * rti._cost_scale * SLACK_UNIT**2 * np.tile([*ocp.Z[list(ocp.soft)], *ocp.Zh], ocp.N))
         np.testing.assert_allclose(hessian(whole(rti)), expected, rtol=1e-7, atol=1e-6)
 
