@@ -108,6 +108,11 @@ class Controller:
 
     # What comes in.
 
+    @property
+    def heard(self) -> bool:
+        """Whether a state of the robot has come."""
+        return self._states.last is not None
+
     def follows(self, state: State) -> bool:
         """Whether a state is of the life that is followed, or may be the first one."""
         return self._states.last is None or state.epoch == self._states.last.epoch

@@ -126,6 +126,11 @@ class Guard:
         return 0 if self._state is None else self._clock.now_ns(local_ns)
 
     @property
+    def heard(self) -> bool:
+        """Whether a state of the robot has come."""
+        return self._state is not None
+
+    @property
     def at_rest(self) -> bool:
         """Whether the robot was told to stand, or never to move."""
         return not self._engaged or bool(np.array_equal(self._schedule.at(self._told_ns - 1)[0], self._limits.u_rest))

@@ -104,7 +104,7 @@ class Process:
         self._announcer = Announcer(bus, ROLE, epoch)
         self._actuation = bus.publisher(keys.actuation, Command, realtime=True)
         self._states = bus.intake(State, config.stale_s)
-        bus.expect("state", lambda: self._states.source.epoch is not None)
+        bus.expect("state", lambda: self._guard.heard)
         self._commands = bus.intake(Command, config.stale_s, {"u": len(limits.u_rest)})
         self._operator_stop = OperatorStop(file, self._obey, self._guard.notices.append)
         self._operator_stop.listen(bus)
