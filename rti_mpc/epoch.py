@@ -8,16 +8,18 @@ processes have heard, they never arrive at the same epoch. Robots and planners c
 from lower numbers, such as the milliseconds or seconds since 1970.
 
 Receivers prefer the highest epoch, so one that nothing can exceed would shut everybody
-else out. `highest_believed` leaves room above whatever it lets pass: the owner of the
-next epoch needs `2 ** NUMBER_BITS` of it, and to use all of it up takes ``2 ** 41`` messages.
+else out. `highest_believed` limits them by the time of day, which goes on: whatever is
+let pass, an epoch above it is believed by those who have followed it at once, by all
+others a second later. Whoever chooses an epoch believes a little more than those who
+take it, so that it does not miss what they follow where clocks differ.
 """
 
 from __future__ import annotations
 
 NUMBER_BITS = 20
 BELIEVED = 1 << 52  # above the Unix seconds times 2 ** NUMBER_BITS: whose clock stands at 1970 still believes the epochs of 2105
-SUCCESSION = 1 << 22  # above the highest known: room for four more owners
-SKEW_S = 1 << 28  # by which the clock of a process that takes an epoch may be behind that of one that chooses it, s: eight years
+SKEW = 1 << 26  # more, for whoever chooses an epoch above those it believes: clocks may differ by a minute
+SUCCESSION = 1 << 22  # above the highest one followed: room for four more owners
 SEQ_AHEAD = 1_000_000  # messages of one epoch that may be missing between two; more is no loss but another's counting
 
 
@@ -26,12 +28,13 @@ def epoch_above(epoch: int, number: int) -> int:
     return epoch + 1 + (number - epoch - 1) % (1 << NUMBER_BITS)
 
 
-def highest_believed(unix_s: int, known: int = 0) -> int:
+def highest_believed(unix_s: int, known: int = 0, *, choosing: bool = False) -> int:
     """
     Return the highest epoch that is one.
 
     Args:
-        unix_s: Unix time, s; whoever chooses an epoch above those it believes says it is `SKEW_S` earlier, or others might not believe that.
+        unix_s: Unix time, s.
         known: Highest epoch followed so far, 0 if there is none.
+        choosing: Whether an epoch is to be chosen above all that are believed.
     """
-    return max(BELIEVED + (unix_s << NUMBER_BITS), known + SUCCESSION)
+    return max(BELIEVED + SKEW * choosing + (unix_s << NUMBER_BITS), known + SUCCESSION)

@@ -25,7 +25,7 @@ from rti_mpc.guard import Guard
 from rti_mpc.latch import Latch
 from rti_mpc.message import Command, State
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import WAITING, Bus, Received, Subscriber
+from rti_mpc.wire.bus import WAITING, Bus, Received, Subscriber, unix_s
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.session import BusSettings
 from service.announce import announce
@@ -60,11 +60,11 @@ def main(config: Config, bus_settings: BusSettings, *, state: Path | None = None
         raise ConfigError("guard.enabled must be true for the robot to take what a guard passes on, got false")
     stop = stop or stop_on_signals()
     with Bus(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
-        heard, intake = bus.subscriber(bus.keys.actuation, capacity=WAITING), bus.intake(Command, HEARING_S, chooses=True)
+        heard, intake = bus.subscriber(bus.keys.actuation, capacity=WAITING), bus.intake(Command, HEARING_S, choosing=True)
         if bus.is_alive(ROLE, HEARING_S):
             print(f"rti-mpc: {config.robot} already has a guard: stop it first, or give this robot another name", file=sys.stderr)
             return 1
-        known = max(time.time_ns() // 1_000_000_000 << NUMBER_BITS, intake.highest_epoch(heard.drain()))
+        known = max(unix_s() << NUMBER_BITS, intake.highest_epoch(heard.drain()))
         epoch = epoch_above(known, secrets.randbits(NUMBER_BITS))
         process = Process(config, bus, epoch, LatchFile(bus.keys, state))
         bus.alive(ROLE)

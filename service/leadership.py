@@ -28,12 +28,12 @@ from threading import Event
 from typing import Any
 
 from rti_mpc.controller import Controller
-from rti_mpc.epoch import NUMBER_BITS, SEQ_AHEAD, SKEW_S, epoch_above, highest_believed
+from rti_mpc.epoch import NUMBER_BITS, SEQ_AHEAD, epoch_above, highest_believed
 from rti_mpc.errors import MessageError
 from rti_mpc.message import Command, Notice, Severity, State
 from rti_mpc.status import Mode
 from rti_mpc.wire import document
-from rti_mpc.wire.bus import WAITING, Bus, Received
+from rti_mpc.wire.bus import WAITING, Bus, Received, unix_s
 
 LEADER, STANDBY = "controller", "standby"  # roles
 HEARING_S = 0.5  # for which a starting controller listens for others
@@ -66,10 +66,10 @@ def hear_others(bus: Bus, stop: Event) -> Others:
     """Listen for `HEARING_S`."""
     commands = [bus.subscriber(key, capacity=WAITING) for key in (bus.keys.command, bus.keys.actuation)]
     infos = bus.subscriber(bus.keys.info(LEADER), capacity=WAITING, cached=True)
-    intake = bus.intake(Command, HEARING_S, chooses=True)
+    intake = bus.intake(Command, HEARING_S, choosing=True)
     stop.wait(HEARING_S)
     epoch = max(intake.highest_epoch(subscriber.drain()) for subscriber in commands)
-    highest = highest_believed(time.time_ns() // 1_000_000_000 - SKEW_S, epoch)
+    highest = highest_believed(unix_s(), epoch, choosing=True)
     leaders = [info for received in infos.drain() if (info := leader_info(received, highest)) is not None]
     leader = max(leaders, key=lambda info: (info["epoch"], info["seq"]), default=None)
     return Others(epoch, None) if leader is None else Others(max(epoch, leader["epoch"]), leader["config_hash"])
@@ -97,10 +97,9 @@ class Leadership:
     """
 
     def __init__(self, bus: Bus, controller: Controller, others: Others, *, config_hash: int, dt_s: float, nu: int, standby: bool) -> None:
-        unix_s = time.time_ns() // 1_000_000_000
-        self.commands_in = bus.intake(Command, SILENCE_S, {"u": nu}, chooses=True)
+        self.commands_in = bus.intake(Command, SILENCE_S, {"u": nu}, choosing=True)
         self.number = secrets.randbits(NUMBER_BITS)
-        self.epoch = epoch_above(max(others.epoch, unix_s << NUMBER_BITS), self.number)
+        self.epoch = epoch_above(max(others.epoch, unix_s() << NUMBER_BITS), self.number)
         self.leading = False
         self.misfit = ""
         self._bus = bus
@@ -109,7 +108,6 @@ class Leadership:
         self._dt_ns = round(1e9 * dt_s)
         self._silence_ns = round(1e9 * max(SILENCE_PERIODS * dt_s, SILENCE_S))
         self._late_ns = -((self._dt_ns - self._silence_ns) // self._dt_ns) * self._dt_ns  # age of a state not answered at which another leads
-        self._unix_s = unix_s
         self._last = (0, -1)  # epoch and sequence number of the last command of the highest epoch, ours included; a guard counts its own
         self._belongs = False  # whether a controller of this configuration has ever led this robot
         self._robot_epoch = 0
@@ -208,7 +206,7 @@ class Leadership:
         waiting = self._infos.drain()
         if self.leading:
             return None
-        news, highest = None, highest_believed(self._unix_s - SKEW_S, self._last[0])
+        news, highest = None, highest_believed(unix_s(), self._last[0], choosing=True)
         for received in waiting:
             info = leader_info(received, highest)
             if info is not None and info["epoch"] >= self._last[0] and (info["epoch"], info["seq"]) > self._told:

@@ -20,6 +20,7 @@ PROCESSES = Path(__file__).parent / "processes"
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--guard", metavar="COMMAND", help="the guard that tests/guard_conformance judges, run as COMMAND CONFIG.toml -e ENDPOINT; ours")
     parser.addoption("--soak-s", type=float, default=20.0, metavar="SECONDS", help="how long the soak test drives the robot (default: 20)")
+    parser.addoption("--attack", type=int, default=20_000, metavar="MESSAGES", help="how many hostile messages processes bear (default: 20000)")
     parser.addoption("--ends", type=int, default=5, metavar="COUNT", help="how often each kind of process is ended (default: 5)")
 
 

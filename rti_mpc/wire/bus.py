@@ -24,7 +24,6 @@ from typing import Any, Generic
 import zenoh
 from zenoh import ext
 
-from rti_mpc.epoch import SKEW_S
 from rti_mpc.errors import MessageError
 from rti_mpc.wire import document
 from rti_mpc.wire.cdr import M, encode, encoding
@@ -67,6 +66,11 @@ class Received:
 
 
 give_way: Callable[[], None] = getattr(os, "sched_yield", lambda: None)  # not on every system
+
+
+def unix_s() -> int:
+    """Return the Unix time, s: of no two hosts the same, and good enough to tell what epochs there can be."""
+    return time.time_ns() // 1_000_000_000
 
 
 class Publisher(Generic[M]):
@@ -188,7 +192,6 @@ class Bus:
         self._config = zenoh_config(settings)
         self._over = threading.Event()
         self._session = open_session(settings, timeout_s, stop, say)
-        self._unix_s = time.time_ns() // 1_000_000_000
         self._declared: list[Any] = []  # a token or queryable lives as long as its object
         self._json: dict[str, Publisher[Any]] = {}
 
@@ -269,7 +272,7 @@ class Bus:
         stale_s: float,
         widths: Mapping[str, int] | None = None,
         *,
-        chooses: bool = False,
+        choosing: bool = False,
         unfit: Callable[[M], str] = lambda _: "",
     ) -> Intake[M]:
         """
@@ -279,10 +282,10 @@ class Bus:
             cls: Class of the messages.
             stale_s: Time without an accepted message after which another source may take over.
             widths: Numbers a row must have, by array.
-            chooses: Whether an epoch is chosen above those heard: then less is believed than others will.
+            choosing: Whether an epoch is chosen above those heard.
             unfit: Why a message cannot be for us, as a code; empty if it can.
         """
-        return Intake(cls, stale_s, widths, unix_s=self._unix_s - SKEW_S * chooses, unfit=unfit)
+        return Intake(cls, stale_s, widths, unix_s=unix_s, choosing=choosing, unfit=unfit)
 
     def publish_json(self, key: str, value: dict[str, Any]) -> None:
         """Publish a JSON object that late joiners get, too."""

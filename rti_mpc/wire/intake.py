@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from typing import Generic, Protocol
 
-from rti_mpc.epoch import highest_believed
+from rti_mpc.epoch import BELIEVED, highest_believed
 from rti_mpc.message import Notice, Severity
 from rti_mpc.wire.cdr import VERSION, M, Refused, decode, encoding
 from rti_mpc.wire.layout import MOST_BYTES
@@ -47,7 +47,8 @@ class Intake(Generic[M]):
         stale_s: float,
         widths: Mapping[str, int] | None = None,
         quiet_s: float = 1.0,
-        unix_s: int = 0,
+        unix_s: Callable[[], int] = lambda: 0,
+        choosing: bool = False,
         unfit: Callable[[M], str] = lambda _: "",
     ) -> None:
         """
@@ -58,7 +59,8 @@ class Intake(Generic[M]):
             stale_s: Time without an accepted message after which another source may take over.
             widths: Numbers a row must have, by array, such as ``{"x": 5}``; stage parameters may be left out.
             quiet_s: Shortest time between two notices of one code.
-            unix_s: Unix time, s, that limits epochs, see `rti_mpc.epoch.highest_believed`.
+            unix_s: Tells the Unix time, s, which limits epochs, see `rti_mpc.epoch.highest_believed`.
+            choosing: Whether an epoch is chosen above those heard.
             unfit: Why a message cannot be for us, as a code such as ``foreign_epoch``; empty if it can. Its source is then not judged at all.
         """
         self.source = Source(round(1e9 * stale_s))
@@ -66,6 +68,7 @@ class Intake(Generic[M]):
         self._cls = cls
         self._name = cls.__name__.lower()
         self._unix_s = unix_s
+        self._choosing = choosing
         self._unfit = unfit
         self._encoding = encoding(cls)
         self._widths = tuple((widths or {}).items())
@@ -89,8 +92,8 @@ class Intake(Generic[M]):
             message = decode(self._cls, received.payload)
             for name, width in self._widths:
                 self._check_width(message, name, width)
-            if message.epoch > (limit := highest_believed(self._unix_s, max(known, self.source.epoch or 0))):
-                raise Refused("epoch", f"epoch must be at most {limit}, got {message.epoch}")
+            if message.epoch > BELIEVED:  # above all that honest clocks make: only then is there a clock to be read
+                self._check_epoch(message.epoch, max(known, self.source.epoch or 0))
         except Refused as error:
             self.refused[error.reason] += 1
             self._note(Severity.WARNING, "message_refused", f"{error}; {self.refused.total()} refused so far")
@@ -174,6 +177,11 @@ class Intake(Generic[M]):
         got = getattr(message, name).shape[-1]
         if got != width and not (name == "p" and got == 0):
             raise Refused("length", f"{name} must hold {width} numbers a row, got {got}")
+
+    def _check_epoch(self, epoch: int, known: int) -> None:
+        limit = highest_believed(self._unix_s(), known, choosing=self._choosing)
+        if epoch > limit:
+            raise Refused("epoch", f"epoch must be at most {limit}, got {epoch}")
 
     def _encoding_error(self, got: str) -> Refused:
         kind, _, schema = got.partition(";")

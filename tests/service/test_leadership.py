@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -12,10 +11,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from rti_mpc.epoch import SKEW_S, highest_believed
+from rti_mpc.epoch import highest_believed
 from rti_mpc.message import Command, Notice, State
 from rti_mpc.status import Mode, QpStatus
-from rti_mpc.wire.bus import Received
+from rti_mpc.wire.bus import Received, unix_s
 from rti_mpc.wire.cdr import encode, encoding
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
@@ -64,9 +63,8 @@ class WireBus:
 
         return Subscriber()
 
-    def intake(self, cls: Any, stale_s: float, widths: Any, *, chooses: bool) -> Any:
-        assert chooses
-        return Intake(cls, stale_s, widths, unix_s=time.time_ns() // 10**9 - SKEW_S)
+    def intake(self, cls: Any, stale_s: float, widths: Any, *, choosing: bool) -> Any:
+        return Intake(cls, stale_s, widths, unix_s=unix_s, choosing=choosing)
 
     def watch_alive(self, callback: Callable[[str, bool], None]) -> None:
         self.watch = callback
@@ -369,13 +367,13 @@ def test_commands_that_act_on_no_robot_change_nobodys_role(pair: tuple[One, One]
 
 def test_whoever_succeeds_the_highest_epoch_there_can_be_leads_with_one_that_all_believe(pair: tuple[One, One]) -> None:
     leader, standby = pair
-    unix_s = time.time_ns() // 10**9
-    forged = replace(leader.made(4), epoch=highest_believed(unix_s - SKEW_S))
+    highest = highest_believed(unix_s())
+    forged = replace(leader.made(4), epoch=highest)
     for one in pair:
         one.bus.commands.append(Received(encode(forged), encoding(Command), ""))
     answered = [[one.see(k) for one in pair] for k in range(5, 12)]
     assert sum(map(any, answered)) >= 5
-    assert forged.epoch < max(leader.leadership.epoch, standby.leadership.epoch) <= highest_believed(unix_s)
+    assert forged.epoch < max(leader.leadership.epoch, standby.leadership.epoch) <= highest_believed(0, highest)
 
 
 def test_a_hundred_names_keep_nobody_from_taking_over(pair: tuple[One, One]) -> None:

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Real processes among a thousand hostile messages a second: nobody ends, and as many samples are answered as without.
+
+`pytest -m slow -s tests/processes/test_attack.py --attack 1000000` sends a million; in blocks of ten seconds, each beside an equal one without.
+"""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rti_mpc.epoch import highest_believed
+from rti_mpc.message import Command
+from rti_mpc.wire.bus import unix_s
+from service.cli import SHIPPED
+from service.host import Host
+from tests.in_time import on_time
+from tests.processes.attack import RATE_HZ, Attack
+from tests.processes.system import KEYS, System, until
+
+BLOCK = 10 * RATE_HZ  # messages
+BOUND, SLEW = np.array([0.5, 0.745]), np.array([0.25, 0.40])  # of the shipped configuration
+PERIOD_MS = 100.0
+STATES = 3  # behind the end of a block, for the last answers to be written
+
+
+@pytest.fixture(params=["guarded", "alone"])
+def system(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[System]:
+    """Robot, controller, standby, reference and viewer, and a guard or none."""
+    guarded = request.param == "guarded"
+    (tmp_path / "robot.toml").write_text(SHIPPED.read_text() + ("\n[guard]\nenabled = true\n" if guarded else ""))
+    roles = {"robot": ("sim", "--x0", "x=0.5"), "standby": ("run", "--standby"), "viewer": ("view", "--rerun-save", tmp_path / "run.rrd")}
+    with System(tmp_path, tmp_path / "robot.toml", **roles) as system:
+        system.start("robot")
+        system.opened("robot")
+        system.start(*["guard"][:guarded], "controller", "reference", "viewer")
+        until(lambda: "controller" in system.lives, "the controller leads")
+        system.start("standby")
+        until(lambda: {"standby", "viewer"} <= system.lives, "the others are there")
+        system.tracking()
+        yield system
+
+
+def rows(system: System) -> list[dict[str, str]]:
+    with (system.folder / "robot.csv").open(newline="") as file:
+        return [row for row in csv.DictReader(file) if row["starved"]]
+
+
+def answered(system: System, from_ns: int, to_ns: int) -> tuple[int, int]:
+    """States between two stamps, and those of them that were answered."""
+    until(lambda: int(rows(system)[-1]["stamp_ns"]) >= to_ns, "the record is written", pause_s=0.1)
+    block = [row for row in rows(system) if from_ns <= int(row["stamp_ns"]) < to_ns]
+    return len(block), sum(bool(row["command_seq"]) for row in block)
+
+
+def stamp_ns(system: System) -> int:
+    return system.state(lambda _: True).stamp_ns
+
+
+def within_limits(system: System) -> None:
+    inputs = np.array([[float(row["u_c"]), float(row["omega_c"])] for row in rows(system)])
+    assert (np.abs(inputs) <= BOUND + 1e-6).all()
+    assert (np.abs(np.diff(inputs, axis=0)) <= SLEW + 1e-6).all(), np.abs(np.diff(inputs, axis=0)).max(axis=0)
+
+
+def unharmed(system: System) -> None:
+    for role, process in system.running.items():
+        assert process.poll() is None, f"{role} has ended: {system.said(role)[-2000:]}"
+        for wrong in ("Traceback", "Exception", "unforeseen", "panicked"):
+            assert wrong not in system.said(role), system.said(role)[-2000:]
+
+
+@pytest.mark.slow
+def test_a_thousand_hostile_messages_a_second_cost_no_sample_and_end_nobody(system: System, host: Host, request: pytest.FixtureRequest) -> None:
+    messages = request.config.getoption("--attack")
+    began_ns = time.monotonic_ns()
+    shares: dict[str, list[int]] = {"with": [0, 0], "without": [0, 0]}
+    with Attack(system.endpoint, KEYS, seed=1) as attack:
+        for _ in range(max(1, messages // BLOCK)):
+            for name in shares:
+                from_ns = stamp_ns(system)
+                if name == "with":
+                    attack.run(min(BLOCK, messages))
+                else:
+                    until(lambda from_ns=from_ns: stamp_ns(system) >= from_ns + 1e9 * min(BLOCK, messages) / RATE_HZ, "a block is over", pause_s=0.1)
+                states, answers = answered(system, from_ns, stamp_ns(system) - STATES * round(1e6 * PERIOD_MS))
+                shares[name][0] += states
+                shares[name][1] += answers
+            unharmed(system)
+        percent = {name: 100.0 * answers / states for name, (states, answers) in shares.items()}
+        print(f"\n{attack.sent} messages: {percent['with']:.2f} % of {shares['with'][0]} samples answered, {percent['without']:.2f} % without")
+        if on_time(host, "the share", PERIOD_MS, began_ns):
+            assert percent["with"] >= percent["without"] - 100.0 / shares["with"][0]
+        within_limits(system)
+
+        epoch = system.tracking().epoch
+        system.kill("controller" if attack.last(Command, "command").epoch == epoch else "standby")
+        until(lambda: system.tracking().epoch > epoch, "another takes over, whatever names there are")
+        unharmed(system)
+
+        for above in (1, 1 << 20, 1 << 40, 0):  # well-formed, of a higher epoch; the last is the highest there can be
+            command = attack.last(Command, "command")
+            forged = command.epoch + above if above else highest_believed(unix_s())
+            attack.forge(Command, "command", epoch=forged, u=np.tile(-BOUND, (20, 1)), config_hash=666)
+            until(lambda forged=forged: system.tracking().epoch > forged, "the robot is driven again, with a higher epoch")
+        within_limits(system)
+        unharmed(system)
+
+    system.kill("robot")  # one honest life later
+    system.start("robot")
+    system.opened("robot")
+    life = until(lambda: system.state(lambda _: True).epoch, "the robot is there")
+    system.tracking(life)
+    from_ns = stamp_ns(system)
+    until(lambda: stamp_ns(system) >= from_ns + 5e9, "five seconds later", pause_s=0.1)
+    states, answers = answered(system, from_ns, stamp_ns(system) - STATES * round(1e6 * PERIOD_MS))
+    assert answers >= states - 1 or not on_time(host, "an honest life", PERIOD_MS, began_ns)
+    assert system.interrupt("viewer") == 0, system.said("viewer")[-2000:]
