@@ -14,7 +14,7 @@ PARALLEL = $(BIN)/pytest -n auto --dist loadfile -m "not serial and not slow and
 SERIAL = $(BIN)/pytest -m "serial and not slow and not benchmark"
 NONE_IS_FINE = || [ $$? -eq 5 ]
 
-.PHONY: demo test test-busy test-slow soak ends bench lint format types docs msg lock clean
+.PHONY: demo test test-busy test-slow soak attack ends bench lint format types docs msg lock clean
 
 demo: $(READY)
 	$(BIN)/rti-mpc demo $(ARGS)
@@ -31,6 +31,9 @@ test-slow: $(READY)
 
 soak: $(READY)
 	MALLOC_ARENA_MAX=2 $(BIN)/pytest -m slow -s tests/processes/test_soak.py --soak-s 1800 $(ARGS)
+
+attack: $(READY)
+	$(BIN)/pytest -m slow -s tests/processes/test_attack.py --attack 1000000 $(ARGS)
 
 ends: $(READY)
 	$(BIN)/pytest -m slow -s tests/processes/test_ends.py --ends 50 $(ARGS)

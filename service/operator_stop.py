@@ -20,13 +20,12 @@ from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.latch import Latch, merge, read_latch, shown
 from rti_mpc.message import Notice, Severity
 from rti_mpc.wire import document
-from rti_mpc.wire.bus import Bus, Received
+from rti_mpc.wire.bus import WAITING, Bus, Received
 from service.latch_file import LatchFile
 
 REQUESTS = ("stop", "enable")
 OPERATOR = "an operator"
 MAX_NAME = 100  # characters of who asks
-WAITING = 16  # descriptions that wait at most
 STORING_S = 0.5  # that an answer waits for the disk
 RETRY_S = 10.0  # between two attempts to store
 

@@ -126,7 +126,7 @@ def test_robot_plays_absurd_commands_or_not_and_then_an_honest_controllers() -> 
         assert (np.abs(body.u) <= BOUND).all()
     assert taken > 3
     body.advance(body.now_ns + 300 * MS)  # of silence
-    assert body.accept(honest(body.now_ns, 1, 1)) == ""
+    assert body.accept(honest(body.now_ns, 1, 1, epoch=2**53)) == "", "of a controller that has heard the others"
 
 
 def test_guard_passes_nothing_outside_the_limits_of_absurd_commands_and_then_an_honest_controllers() -> None:

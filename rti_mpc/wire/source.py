@@ -6,6 +6,8 @@ Several processes may publish on one key: a robot that was started twice, a
 planner forgotten in another terminal. A receiver locks to one epoch and takes
 nothing else, unless the epoch is higher (a restart) or nothing of its own was
 accepted for long: a single message of whatever number deafens nobody for longer.
+Its own epoch under other numbers must have counted on for as long, too: what is
+sent again by somebody who has recorded it does not.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ class Source:
     The source a receiver is locked to.
 
     Attributes:
-        stale_ns: Time without an accepted message after which any other is the first of a source, whatever its epoch and number.
+        stale_ns: Time without an accepted message after which another epoch may take over, even a lower one.
         epoch: Epoch of the source, None before the first message.
         seq: Sequence number of its last accepted message.
         lost: Messages missing between accepted ones.
@@ -50,6 +52,7 @@ class Source:
         self.lost = 0
         self.dropped = 0
         self._accepted_ns = 0
+        self._other_count = (2**64, 0)  # the last number that was refused of our epoch, and since when those went up
 
     def accept(self, epoch: int, seq: int, now_ns: int) -> Verdict:
         """
@@ -74,6 +77,11 @@ class Source:
             return Verdict.REPEATED
         if epoch == self.epoch and self.seq < seq <= self.seq + SEQ_AHEAD:
             return Verdict.NEXT
-        if self.epoch is None or epoch > self.epoch or now_ns - self._accepted_ns > self.stale_ns:
+        since_ns = self._accepted_ns
+        if epoch == self.epoch:
+            last, begun_ns = self._other_count
+            begun_ns = begun_ns if last < seq <= last + SEQ_AHEAD else now_ns
+            self._other_count, since_ns = (seq, begun_ns), max(since_ns, begun_ns)
+        if self.epoch is None or epoch > self.epoch or now_ns - since_ns > self.stale_ns:
             return Verdict.NEW
         return Verdict.FOREIGN if epoch < self.epoch else Verdict.OLD if seq < self.seq else Verdict.AHEAD

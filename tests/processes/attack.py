@@ -22,8 +22,7 @@ RATE_HZ = 1000
 BATCH = 10  # messages at once
 MEMORY = 500  # messages a key of which some are replayed
 REPLAYED_S = 1.0  # at least, since a message that is replayed was sent
-HUGE = {"info/controller": 50 << 20, "command": 60 << 20}  # bytes, once in `EACH` messages
-EACH = 10_000
+HUGE = {"info/controller": 50 << 20, "command": 60 << 20}  # bytes, once in a `run`
 
 CLASSES: dict[str, type[Any]] = {
     "state": State,
@@ -88,14 +87,14 @@ class Attack:
 
     def run(self, messages: int) -> None:
         """Send so many, at `RATE_HZ`."""
-        due_s = time.monotonic()
-        for k in range(0, messages, BATCH):
+        due_s, last = time.monotonic(), self.sent + messages
+        for stream, size in HUGE.items():
+            self._put(stream, bytes(size), "application/json", block=True)
+        while self.sent < last:
             self.listen()
-            for _ in range(BATCH):
+            due = self.sent + BATCH
+            while self.sent < due:
                 self._send()
-            if k % EACH == 0:
-                for stream, size in HUGE.items():
-                    self._put(stream, bytes(size), "application/json", block=True)
             due_s += BATCH / RATE_HZ
             time.sleep(max(0.0, due_s - time.monotonic()))
 

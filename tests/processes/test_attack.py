@@ -2,7 +2,7 @@
 """
 Real processes among a thousand hostile messages a second: nobody ends, and as many samples are answered as without.
 
-`pytest -m slow -s tests/processes/test_attack.py --attack 1000000` sends a million; in blocks of ten seconds, each beside an equal one without.
+`make attack` sends a million, in blocks of ten seconds, each beside an equal one without.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rti_mpc.array import Array
 from rti_mpc.epoch import highest_believed
 from rti_mpc.message import Command
 from rti_mpc.wire.bus import unix_s
@@ -27,6 +28,7 @@ from tests.processes.system import KEYS, System, until
 BLOCK = 10 * RATE_HZ  # messages
 BOUND, SLEW = np.array([0.5, 0.745]), np.array([0.25, 0.40])  # of the shipped configuration
 PERIOD_MS = 100.0
+CHANCE = 3  # standard deviations by which two equal counts of what a busy host makes late may differ
 STATES = 3  # behind the end of a block, for the last answers to be written
 
 
@@ -63,10 +65,10 @@ def stamp_ns(system: System) -> int:
     return system.state(lambda _: True).stamp_ns
 
 
-def within_limits(system: System) -> None:
+def within_limits(system: System, slew: Array) -> None:
     inputs = np.array([[float(row["u_c"]), float(row["omega_c"])] for row in rows(system)])
     assert (np.abs(inputs) <= BOUND + 1e-6).all()
-    assert (np.abs(np.diff(inputs, axis=0)) <= SLEW + 1e-6).all(), np.abs(np.diff(inputs, axis=0)).max(axis=0)
+    assert (np.abs(np.diff(inputs, axis=0)) <= slew + 1e-6).all(), np.abs(np.diff(inputs, axis=0)).max(axis=0)
 
 
 def unharmed(system: System) -> None:
@@ -79,7 +81,6 @@ def unharmed(system: System) -> None:
 @pytest.mark.slow
 def test_a_thousand_hostile_messages_a_second_cost_no_sample_and_end_nobody(system: System, host: Host, request: pytest.FixtureRequest) -> None:
     messages = request.config.getoption("--attack")
-    began_ns = time.monotonic_ns()
     shares: dict[str, list[int]] = {"with": [0, 0], "without": [0, 0]}
     with Attack(system.endpoint, KEYS, seed=1) as attack:
         for _ in range(max(1, messages // BLOCK)):
@@ -95,9 +96,9 @@ def test_a_thousand_hostile_messages_a_second_cost_no_sample_and_end_nobody(syst
             unharmed(system)
         percent = {name: 100.0 * answers / states for name, (states, answers) in shares.items()}
         print(f"\n{attack.sent} messages: {percent['with']:.2f} % of {shares['with'][0]} samples answered, {percent['without']:.2f} % without")
-        if on_time(host, "the share", PERIOD_MS, began_ns):
-            assert percent["with"] >= percent["without"] - 100.0 / shares["with"][0]
-        within_limits(system)
+        left = {name: states - answers for name, (states, answers) in shares.items()}
+        assert left["with"] - left["without"] <= 1 + CHANCE * sum(left.values()) ** 0.5
+        within_limits(system, slew=SLEW)
 
         epoch = system.tracking().epoch
         system.kill("controller" if attack.last(Command, "command").epoch == epoch else "standby")
@@ -109,7 +110,7 @@ def test_a_thousand_hostile_messages_a_second_cost_no_sample_and_end_nobody(syst
             forged = command.epoch + above if above else highest_believed(unix_s())
             attack.forge(Command, "command", epoch=forged, u=np.tile(-BOUND, (20, 1)), config_hash=666)
             until(lambda forged=forged: system.tracking().epoch > forged, "the robot is driven again, with a higher epoch")
-        within_limits(system)
+        within_limits(system, slew=SLEW if "guard" in system.running else np.array(np.inf))
         unharmed(system)
 
     system.kill("robot")  # one honest life later
@@ -117,8 +118,8 @@ def test_a_thousand_hostile_messages_a_second_cost_no_sample_and_end_nobody(syst
     system.opened("robot")
     life = until(lambda: system.state(lambda _: True).epoch, "the robot is there")
     system.tracking(life)
-    from_ns = stamp_ns(system)
+    from_ns, honest_ns = stamp_ns(system), time.monotonic_ns()
     until(lambda: stamp_ns(system) >= from_ns + 5e9, "five seconds later", pause_s=0.1)
     states, answers = answered(system, from_ns, stamp_ns(system) - STATES * round(1e6 * PERIOD_MS))
-    assert answers >= states - 1 or not on_time(host, "an honest life", PERIOD_MS, began_ns)
+    assert answers >= states - 1 or not on_time(host, "an honest life", PERIOD_MS, honest_ns)
     assert system.interrupt("viewer") == 0, system.said("viewer")[-2000:]

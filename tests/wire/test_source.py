@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from rti_mpc.wire.source import Source, Verdict
@@ -41,9 +42,16 @@ def test_a_source_of_which_nothing_is_accepted_is_left_though_it_goes_on(seq: in
     source = Source(STALE_NS)
     source.accept(5, seq, 0)  # somebody else's, in the name of ours
     heard = [source.accept(5, n, n) for n in range(1, 2 * STALE_NS)]
-    assert set(heard[:STALE_NS]) == {Verdict.OLD}
-    assert heard[STALE_NS] is Verdict.NEW
-    assert set(heard[STALE_NS + 1 :]) == {Verdict.NEXT}
+    assert set(heard[: STALE_NS + 1]) == {Verdict.OLD}
+    assert heard[STALE_NS + 1] is Verdict.NEW
+    assert set(heard[STALE_NS + 2 :]) == {Verdict.NEXT}
+
+
+def test_what_is_sent_again_takes_nothing_over_however_long_the_source_is_silent(source: Source) -> None:
+    rng = np.random.default_rng(1)
+    for now_ns in range(1, 20 * STALE_NS):
+        assert source.accept(5, int(rng.integers(10)), now_ns) is Verdict.OLD
+    assert source.accept(5, 11, 20 * STALE_NS) is Verdict.NEXT
 
 
 def test_a_higher_epoch_takes_over_at_once(source: Source) -> None:
