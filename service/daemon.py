@@ -218,7 +218,7 @@ class Daemon:
         with self._lock:
             if self._ending:
                 return
-            if controller.follows(state):
+            if controller.awaits(state):  # not for one that is replayed
                 self._leadership.hear(state, arrival_ns)
             command = controller.receive_state(state, arrival_ns)
             acted_ns = time.monotonic_ns()
