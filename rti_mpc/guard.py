@@ -193,7 +193,10 @@ class Guard:
             self._say(Severity.WARNING, f"command_{code}", text)
             return None
         start_ns = max(command.stamp_ns, now_ns)
-        u = self._approach(command, start_ns)
+        u, limited = self._approach(command, start_ns)
+        if limited:
+            text = f"command {command.seq} of epoch {command.epoch} begins too far from what acts: approached inside the slew limits"
+            self._say(Severity.WARNING, "slew_limited", text)
         if not self.passing:
             self.passing = True
             self._say(Severity.INFO, "guard_passing", f"commands of epoch {command.epoch} pass", change=True)
@@ -334,19 +337,13 @@ class Guard:
         return ""
 
     def _comes_to_rest(self, command: Command, now_ns: int) -> bool:
-        """Whether the rows that act only approach rest, from what acts before them, and stay there; long after a `latch`, whether they are rest."""
-        first, before = self._joint(command, max(command.stamp_ns, now_ns))
-        way = np.vstack([before, command.u[first:]]) - self._limits.u_rest
-        if now_ns >= self._rest_by_ns:
-            way[0] = 0.0
+        """Whether the rows that would act only approach rest, from what acts now, and stay there; long after a `latch`, whether they are rest."""
+        start_ns = max(command.stamp_ns, now_ns)
+        first = (start_ns - command.stamp_ns) // command.period_ns
+        before = self._limits.u_rest if now_ns >= self._rest_by_ns else self._schedule.at(start_ns - 1)[0]
+        way = np.vstack([before, self._approach(command, start_ns)[0][first:]]) - self._limits.u_rest
         lower, upper = np.minimum(way[:-1], 0.0) - ROUNDING, np.maximum(way[:-1], 0.0) + ROUNDING
         return bool((np.abs(way[-1]) <= ROUNDING).all() and ((way[1:] >= lower) & (way[1:] <= upper)).all())
-
-    def _joint(self, command: Command, start_ns: int) -> tuple[int, Array]:
-        """Return the row of a command that acts first, and the input that acts before it."""
-        first = max(0, (start_ns - command.stamp_ns) // command.period_ns)
-        now, _, braking = self._schedule.at(start_ns - 1)
-        return first, now if braking else self._schedule.at(command.stamp_ns + first * command.period_ns - 1)[0]
 
     def _follow(self, command: Command) -> None:
         """Take the source of a command in order for the leader: no lower epoch will pass again in this life of the robot."""
@@ -356,9 +353,9 @@ class Guard:
         if command.epoch > self.epoch:
             self.epoch = epoch_above(command.epoch, self.epoch)  # with our own number: never that of another guard, whose numbering is not ours
 
-    def _approach(self, command: Command, start_ns: int) -> Array:
+    def _approach(self, command: Command, start_ns: int) -> tuple[Array, bool]:
         """
-        Return the rows of a command, from that on which acts first no faster than the slew limits from what acts before.
+        Return the rows of a command, from that on which acts first no faster than the slew limits from what acts before; and whether any was moved.
 
         A controller that has heard nothing of a gap goes on where it believes the
         robot to be; the robot has braked meanwhile. The next row of the plan before,
@@ -367,7 +364,10 @@ class Guard:
         """
         limits, scale = self._limits, self._share(command)
         u = np.clip(command.u, limits.lbu, limits.ubu)
-        first, now = self._joint(command, start_ns)
+        first = max(0, (start_ns - command.stamp_ns) // command.period_ns)
+        now, _, braking = self._schedule.at(start_ns - 1)
+        if not braking:
+            now = self._schedule.at(command.stamp_ns + first * command.period_ns - 1)[0]
         lower, upper = self._within_reach(start_ns, now)
         limited = False
         for row in u[first:]:
@@ -377,10 +377,7 @@ class Guard:
             if limited:  # not from the first to the second: should this one come late, the robot begins there
                 lower, upper = row + scale * limits.lbdu, row + scale * limits.ubdu
             limited = True
-        if limited:
-            text = f"command {command.seq} of epoch {command.epoch} begins too far from what acts: approached inside the slew limits"
-            self._say(Severity.WARNING, "slew_limited", text)
-        return u
+        return u, limited
 
     def _within_reach(self, start_ns: int, now: Array) -> tuple[Array, Array]:
         """Return lowest and highest inputs, each of shape ``(nu,)``, within the slew limits of what acts `now` and in the period before."""

@@ -62,7 +62,7 @@ def ask(bus_settings: BusSettings, keys: Keys, request: dict[str, Any], timeout_
 
 def stop_or_enable(bus_settings: BusSettings, keys: Keys, what: str, timeout_s: float, *, guarded: bool, state: Path | None) -> int:
     """
-    Stop or release a robot, and print the answer of whoever acts: its guard, if there is one, else the controller that leads.
+    Stop or release a robot, and print the answer of whoever acts: the guard of one that is guarded, else the controller that leads.
 
     Args:
         bus_settings: How to join the bus.
@@ -74,23 +74,29 @@ def stop_or_enable(bus_settings: BusSettings, keys: Keys, what: str, timeout_s: 
 
     Returns:
         Exit status: 0 if whoever acts has confirmed, else 1.
+
+    Raises:
+        ConfigError: The bus cannot be joined.
     """
     answers: dict[str, dict[str, Any]] = {}
     acting = GUARD if guarded else LEADER
-    with Bus(bus_settings, keys, timeout_s=timeout_s) as bus:
-        for answer in asked_again(bus, {"request": what, "by": operator()}, timeout_s):
-            answers[str(answer.get("role"))] = answer
-            acting = GUARD if GUARD in answers else acting
-            if answers.get(acting, {}).get("ok") is True:
-                print(json.dumps(answers[acting]))
-                if fault := answers[acting].get("not_stored"):
-                    print(f"rti-mpc: the {acting} obeys, but will have forgotten it after a restart: {fault}", file=sys.stderr)
-                return 0
-    refusals = [f"the {role} has not: {answer['error']}" for role, answer in answers.items() if answer.get("ok") is not True and "error" in answer]
+    try:
+        with Bus(bus_settings, keys, timeout_s=timeout_s) as bus:
+            for answer in asked_again(bus, {"request": what, "by": operator()}, timeout_s):
+                answers[str(answer.get("role", "somebody"))] = answer
+                if answers.get(acting, {}).get("ok") is True:
+                    break
+    except ConfigError as error:  # no router, for one
+        raise ConfigError(f"{error}; nobody was asked to {what}; {noted(LatchFile(keys, state), what)}") from error
     confirmed = [role for role, answer in answers.items() if answer.get("ok") is True]
+    if acting in confirmed:
+        print(json.dumps(answers[acting]))
+        if fault := answers[acting].get("not_stored"):
+            print(f"rti-mpc: the {acting} obeys, but will have forgotten it after a restart: {fault}", file=sys.stderr)
+        return 0
     print(
         f"rti-mpc: {keys.robot}: the {acting} has not confirmed {what} within {timeout_s:g} s; {' and '.join(confirmed) or 'nobody'} has",
-        *refusals,
+        *(f"{role}: {answer['error']}" for role, answer in answers.items() if "error" in answer),
         *([] if answers else [noted(LatchFile(keys, state), what)]),
         sep="; ",
         file=sys.stderr,

@@ -536,6 +536,31 @@ def test_controller_that_ramps_down_anew_with_every_command_does_not_drive_on_ag
     assert moving.max() - 2000 <= 1e3 * LIMITS.settling_s + 200 + 30, "once it should stand, the guard brakes; it looks every 10 ms"
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_moves_a_robot_away_from_rest_while_a_stop_is_latched_whatever_is_commanded(seed: int) -> None:
+    """Ways to rest, late and early ones, and random plans."""
+    rng = np.random.default_rng(seed)
+    scene = Scene().ready()
+    passed = 0
+    for _ in range(25):
+        scene.drive(600, rng.uniform(-BOUND, BOUND))
+        scene.wait(int(rng.integers(0, 8)) * 10)
+        scene.guard.latch(REASON, scene.local_ns)
+        scene.inputs.clear()
+        for _ in range(15):
+            factors = rng.choice([rng.uniform(0.5, 1.0), 1.1, -0.2]) * np.append(np.linspace(1.0, 0.0, int(rng.integers(2, 6))), np.zeros(4))
+            rows = np.outer(factors, scene.actuator.u) + (rng.uniform(-0.02, 0.02, 2) if rng.random() < 0.3 else 0.0)
+            passed += scene.send(np.clip(rows, -BOUND, BOUND), stamp_ns=scene.now_ns - int(rng.integers(-3, 9)) * 10 * MS) is not None
+            scene.wait(int(rng.integers(1, 11)) * 10)
+        scene.wait(600)
+        way = np.abs(scene.inputs)
+        assert (np.diff(way, axis=0) <= 1e-6).all(), "the rounding that the guard allows"
+        assert not scene.actuator.u.any()
+        scene.guard.enable()
+        scene.wait(-scene.now_ns // MS % 100)
+    assert passed > 10
+
+
 def test_controller_that_knows_of_no_stop_does_not_drive_a_robot_whose_guard_was_restarted_latched(scene: Scene) -> None:
     scene.power_up()
     scene.guard.latch(REASON, scene.local_ns)

@@ -229,24 +229,28 @@ def test_clock_that_jumps_lets_nothing_old_pass(rig: Rig, ms: int) -> None:
 def test_stopped_guard_passes_only_ways_to_rest_and_so_does_one_that_was_restarted(rig: Rig) -> None:
     """Whatever a controller commands that has not heard of the stop."""
 
-    def says(what: str) -> bool:
-        return any(answer["ok"] is True for answer in rig.bus.answers(rig.bus.keys.stop, {"request": what}, 5.0))
+    def says(what: str) -> None:
+        assert any(answer["ok"] is True for answer in rig.bus.answers(rig.bus.keys.stop, {"request": what}, 5.0))
+
+    def rests_only() -> None:
+        before = len(rig.heard)
+        while not any(told.config_hash == 77 for _, told in rig.heard[before:]):
+            assert rig.now_ns < deadline_ns, "rest must pass"
+            rig.run(100, lambda _: rig.command(np.zeros(2), config_hash=77))
+        rig.run(400, rig.towards(rig.ubu))
+        assert not rig.actuator.u.any()
 
     rig.drive()
-    assert says("stop")
-    stopped_ns = rig.now_ns
+    says("stop")
+    stopped_ns, deadline_ns = rig.now_ns, rig.now_ns + round(2e9 * PATIENCE_S)
     rig.run(900, rig.towards(rig.ubu))
     times, inputs = rig.acting(stopped_ns)
     assert not inputs[times > 600.0].any(), "the last plan before ends 300 ms after its state, its ramp 200 ms later"
-    before = len(rig.heard)
-    rig.run(300, lambda _: rig.command(np.zeros(2), config_hash=77))
-    assert any(told.config_hash == 77 for _, told in rig.heard[before:]), "rest passes"
+    rests_only()
     rig.kill()
     rig.start()
-    for _ in range(20):
-        rig.run(100, rig.towards(rig.ubu))
-    assert not rig.actuator.u.any()
-    assert says("enable")
+    rests_only()
+    says("enable")
     rig.drive()
 
 

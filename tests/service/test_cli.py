@@ -77,6 +77,13 @@ def test_operator_is_told_in_one_line_that_nobody_has_confirmed_and_what_was_not
         assert not counter or json.loads(path.read_text())["counter"] == counter
 
 
+def test_stop_that_meets_no_router_is_noted_all_the_same(tmp_path: Path) -> None:
+    done = rti_mpc("stop", "--timeout", "0.3", "-m", "client", "-e", "tcp/127.0.0.1:1", "--state", str(tmp_path))
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert "; nobody was asked to stop; what is started later with" in done.stderr
+    assert json.loads((tmp_path / "rti_mpc%2Fpioneer.json").read_text())["stopped"] is True
+
+
 def test_operator_is_told_in_one_line_that_nothing_could_be_noted_either() -> None:
     done = rti_mpc("stop", "--timeout", "0.3", "-e", "tcp/127.0.0.1:1", "--state", "/proc/none")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
