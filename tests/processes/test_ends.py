@@ -8,13 +8,12 @@ finalizes aborts the process (status 134); a link to somebody who hangs is close
 
 from __future__ import annotations
 
-import os
-import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -25,6 +24,7 @@ import pytest
 from service.cli import SHIPPED
 from service.host import Host
 from tests.in_time import explained
+from tests.processes.network import ip, missing, name_of
 from tests.processes.system import ROOT, command_line, environment, free_endpoint, until
 
 pytestmark = pytest.mark.slow
@@ -33,6 +33,7 @@ RAMP_S = 0.6  # that a controller or guard may take to bring the robot to rest; 
 END_S = 2.0  # from the end of the ramp to the end of the process
 PATIENCE_S = 120.0  # for all to be driven: a busy host takes its time
 ENDPOINT = "tcp/127.0.0.1:7447"  # of a network of its own
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 LIVING = {  # what each process says once it can be ended, and the words that start it
     "router": ("routing", ("router",)),
     "robot": ("times real speed", ("sim",)),
@@ -40,16 +41,45 @@ LIVING = {  # what each process says once it can be ended, and the words that st
     "controller": ("waiting to tracking", ("run",)),
     "reference": ("s of the robot on", ("reference",)),
     "standby": ("waiting to tracking", ("run", "--standby")),
-    "viewer": ("open", ("view",)),
+    **({"viewer": ("open", ("view",))} if find_spec("rerun") else {}),
 }
 
 
-@dataclass
+@dataclass(frozen=True)
+class Before:
+    """What happens just before the end: a signal to one process, or the network is gone."""
+
+    router: bool  # whether all are clients of one, or peers
+    victim: str = ""
+    number: signal.Signals = signal.SIGKILL
+    cut: bool = False
+
+    @property
+    def ended(self) -> set[str]:
+        return LIVING.keys() - {self.victim} - (set() if self.router else {"router"})
+
+
+BEFORE = {
+    "nothing": Before(router=False),
+    "nothing, behind a router": Before(router=True),
+    "a peer is killed": Before(router=False, victim="robot"),
+    "a peer hangs": Before(router=False, victim="robot", number=signal.SIGSTOP),
+    "a client is killed": Before(router=True, victim="robot"),
+    "a client hangs": Before(router=True, victim="robot", number=signal.SIGSTOP),
+    "the router is killed": Before(router=True, victim="router"),
+    "the router hangs": Before(router=True, victim="router", number=signal.SIGSTOP),
+    "the network of peers is gone": Before(router=False, cut=True),
+    "the network of clients is gone": Before(router=True, cut=True),
+}
+
+
+@dataclass(frozen=True)
 class Ending:
     """How one process ended."""
 
     role: str
     before: str
+    number: signal.Signals
     status: int
     signal_ns: int
     took_s: float
@@ -62,117 +92,76 @@ class Ending:
         return self.status == 0 and in_time and "FATAL" not in self.said and "Traceback" not in self.said
 
 
-@dataclass
-class Network:
-    """One robot's processes, in a network of their own where the host allows it."""
+class Round:
+    """One robot that is driven by everybody there is, all of whom end at once."""
 
-    folder: Path
-    router: bool
-    namespace: str | None
-    endpoint: str
-    running: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
+    def __init__(self, folder: Path, before: str) -> None:
+        self.folder = folder
+        self._before, self._name = BEFORE[before], before
+        self._namespace = name_of("ends") if self._before.cut else ""
+        self._endpoint = ENDPOINT if self._before.cut else free_endpoint()
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._stack = ExitStack()
 
-    def start(self, role: str) -> None:
-        _, words = LIVING[role]
-        command, *options = words
-        options += ["--rerun-save", str(self.folder / "run.rrd")] if role == "viewer" else []
-        options += ["-l", self.endpoint] if role == "router" else ["-m", "client" if self.router else "peer", "-e", self.endpoint]
-        line = command_line(command, self.folder / "robot.toml", *options)
-        if self.namespace is not None:
-            line = ["ip", "netns", "exec", self.namespace, *line]
-        with (self.folder / f"{role}.log").open("wb") as log:
-            self.running[role] = subprocess.Popen(line, cwd=ROOT, env=environment(), stdout=log, stderr=subprocess.STDOUT)
+    def __enter__(self) -> Round:
+        self.folder.mkdir()
+        (self.folder / "robot.toml").write_text(SHIPPED.read_text() + "\n[guard]\nenabled = true\n")
+        with ExitStack() as stack:
+            if self._namespace:
+                ip("netns", "add", self._namespace)
+                stack.callback(ip, "netns", "del", self._namespace)
+                ip("-n", self._namespace, "link", "set", "lo", "up")
+            for role in LIVING:
+                if role == "standby":
+                    self._living("controller")
+                if role != "router" or self._before.router:
+                    self._running[role] = process = self._start(role)
+                    stack.callback(process.wait)
+                    stack.callback(process.kill)
+            for role in self._running:
+                self._living(role)
+            self._stack = stack.pop_all()
+        return self
 
-    def drive(self) -> None:
-        """Start everybody, and wait until the robot is driven and all have met."""
-        roles = [role for role in LIVING if (role != "router" or self.router) and (role != "viewer" or find_spec("rerun"))]
-        for role in roles:
-            if role == "standby":
-                self.living("controller")
-            self.start(role)
-        for role in roles:
-            self.living(role)
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
 
-    def living(self, role: str) -> None:
-        words, _ = LIVING[role]
-        until(lambda: words in self.said(role) or self.running[role].poll() is not None, f"{role} says {words!r}", 0.02, PATIENCE_S)
-        assert self.running[role].poll() is None, self.said(role)
-
-    def said(self, role: str) -> str:
-        return (self.folder / f"{role}.log").read_text(errors="replace")
-
-    def kill(self, role: str) -> None:
-        process = self.running.pop(role)
-        process.kill()
-        process.wait()
-
-    def end(self, before: str) -> Iterator[Ending]:
-        """End all that run and are not stopped, all at once."""
+    def end(self, pause_s: float, number: signal.Signals) -> Iterator[Ending]:
+        """Let happen what happens before, and end all others, a while later."""
+        if self._before.cut:
+            ip("-n", self._namespace, "link", "set", "lo", "down")
+        if self._before.victim:
+            self._running.pop(self._before.victim).send_signal(self._before.number)
+        time.sleep(pause_s)
         signal_ns = time.monotonic_ns()
-        for process in self.running.values():
-            process.send_signal(signal.SIGTERM)
-        left = dict(self.running)
+        for process in self._running.values():
+            process.send_signal(number)
+        left = dict(self._running)
         while left and (took_s := 1e-9 * (time.monotonic_ns() - signal_ns)) < PATIENCE_S:
             for role, process in list(left.items()):
                 if (status := process.poll()) is not None:
-                    yield Ending(role, before, status, signal_ns, took_s, self.said(role))
+                    yield Ending(role, self._name, number, status, signal_ns, took_s, self._said(role))
                     del left[role]
             time.sleep(2e-3)
         for role in left:
-            yield Ending(role, before, -signal.SIGKILL, signal_ns, PATIENCE_S, self.said(role))
+            yield Ending(role, self._name, number, -signal.SIGKILL, signal_ns, PATIENCE_S, self._said(role))
 
+    def _start(self, role: str) -> subprocess.Popen[bytes]:
+        _, (command, *options) = LIVING[role]
+        options += ["--rerun-save", str(self.folder / "run.rrd")] if role == "viewer" else []
+        options += ["-l", self._endpoint] if role == "router" else ["-m", "client" if self._before.router else "peer", "-e", self._endpoint]
+        inside = ["ip", "netns", "exec", self._namespace] if self._namespace else []
+        with (self.folder / f"{role}.log").open("wb") as log:
+            line = [*inside, *command_line(command, self.folder / "robot.toml", *options)]
+            return subprocess.Popen(line, cwd=ROOT, env=environment(self.folder / "state"), stdout=log, stderr=subprocess.STDOUT)
 
-def hang(role: str) -> Callable[[Network], None]:
-    def act(network: Network) -> None:
-        network.running.pop(role).send_signal(signal.SIGSTOP)
+    def _living(self, role: str) -> None:
+        words, _ = LIVING[role]
+        until(lambda: words in self._said(role) or self._running[role].poll() is not None, f"{role} says {words!r}", 0.02, PATIENCE_S)
+        assert self._running[role].poll() is None, self._said(role)
 
-    return act
-
-
-def cut(network: Network) -> None:
-    subprocess.run(["ip", "-n", network.namespace or "", "link", "set", "lo", "down"], check=True)
-
-
-BEFORE: dict[str, tuple[bool, Callable[[Network], None]]] = {  # what happens just before, and whether there is a router
-    "nothing": (False, lambda _: None),
-    "a peer is killed": (False, lambda network: network.kill("robot")),
-    "the router is killed": (True, lambda network: network.kill("router")),
-    "a peer hangs": (False, hang("robot")),
-    "the router hangs": (True, hang("router")),
-    "a client is killed": (True, lambda network: network.kill("robot")),
-    "the network is gone": (True, cut),
-    "the network of peers is gone": (False, cut),
-}
-
-
-@contextmanager
-def network(folder: Path, *, router: bool, own: bool) -> Iterator[Network]:
-    folder.mkdir()
-    (folder / "robot.toml").write_text(SHIPPED.read_text() + "\n[guard]\nenabled = true\n")
-    namespace = f"ends-{os.getpid()}" if own else None
-    if namespace is not None:
-        subprocess.run(["ip", "netns", "add", namespace], check=True)
-        subprocess.run(["ip", "-n", namespace, "link", "set", "lo", "up"], check=True)
-    made = Network(folder, router, namespace, ENDPOINT if own else free_endpoint())
-    everybody = []
-    try:
-        made.drive()
-        everybody = list(made.running.values())
-        yield made
-    finally:
-        for process in {*everybody, *made.running.values()}:
-            process.kill()
-            process.wait()
-        if namespace is not None:
-            subprocess.run(["ip", "netns", "delete", namespace], check=True)
-
-
-def isolates() -> bool:
-    """Whether this host lets us make networks of our own."""
-    name = f"probe-{os.getpid()}"
-    if shutil.which("ip") is None or subprocess.run(["ip", "netns", "add", name], capture_output=True).returncode:
-        return False
-    return subprocess.run(["ip", "netns", "delete", name]).returncode == 0
+    def _said(self, role: str) -> str:
+        return (self.folder / f"{role}.log").read_text(errors="replace")
 
 
 def test_every_kind_of_process_ends_with_status_0_whatever_has_just_happened_to_its_links(
@@ -180,25 +169,24 @@ def test_every_kind_of_process_ends_with_status_0_whatever_has_just_happened_to_
 ) -> None:
     count: int = pytestconfig.getoption("--ends")
     rng = np.random.default_rng(1)
-    befores = [before for before, (_, act) in BEFORE.items() if act is not cut or isolates()]
+    befores = [name for name, before in BEFORE.items() if not before.cut or missing() is None]
     endings: list[Ending] = []
-    for n in range(10 * count):
-        ended = [sum(ending.role == role for ending in endings) for role in LIVING if role != "viewer" or find_spec("rerun")]
-        if min(ended) >= count:
-            break
-        before = befores[n % len(befores)]
-        router, act = BEFORE[before]
-        with network(tmp_path / str(n), router=router, own=act is cut) as made:
-            act(made)
+    used: Counter[str] = Counter()
+    ended = Counter(dict.fromkeys(LIVING, 0))
+    while min(ended.values()) < count:
+        least = min(ended, key=lambda role: ended[role])
+        before = min((name for name in befores if least in BEFORE[name].ended), key=lambda name: used[name])
+        used[before] += 1
+        with Round(tmp_path / str(used.total()), before) as made:
             # Links are lost in their own time, and ends meet every part of it.
-            time.sleep(rng.choice([0.0, rng.uniform(0.0, 0.1), rng.uniform(0.0, 2.0)]))
-            endings += made.end(before)
-    print()
+            pause_s = rng.choice([0.0, rng.uniform(0.0, 0.1), rng.uniform(0.0, 2.0)])
+            endings += made.end(pause_s, SIGNALS[used.total() % len(SIGNALS)])
+        ended = Counter({role: sum(ending.role == role for ending in endings) for role in LIVING})
+    print("", *(f"{number:3} rounds after {before}" for before, number in used.items()), sep="\n")
     for role in LIVING:
         times_s = [ending.took_s for ending in endings if ending.role == role]
-        if times_s:
-            print(f"{role:10} {len(times_s)} ends, from signal to end p50 {np.median(times_s):.2f}, max {max(times_s):.2f} s")
+        print(f"{role:10} {len(times_s)} ends, from signal to end p50 {np.median(times_s):.2f}, max {max(times_s):.2f} s")
     bad = [ending for ending in endings if not ending.clean(host)]
     for ending in bad:
-        print(f"{ending.role} after {ending.before!r}: status {ending.status}, {ending.took_s:.2f} s\n{ending.said[-2000:]}")
+        print(f"{ending}\n{ending.said[-2000:]}")
     assert not bad
