@@ -31,6 +31,7 @@ from rti_mpc.solver import SolverSettings
 from rti_mpc.status import QpStatus
 from service.config import Config, load
 from service.excursion import Bounds, excursions
+from service.fit import check_stop
 
 SAMPLES = 200
 OPINIONS = 20  # samples of these whose QP the second solver is asked about
@@ -79,6 +80,7 @@ class Report:
 def main(path: Path) -> int:
     """Check a configuration, print what was found, and return the exit status: 0 if every sample was usable and both solvers agree."""
     config = load(path)
+    check_stop(config)
     console = Console()
     report = check(config, track(range(SAMPLES), "solving", console=console, transient=True, disable=not console.is_terminal))
     table = Table("phase, us", "p50", "p99", "max")

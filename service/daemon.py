@@ -41,6 +41,7 @@ from service import realtime
 from service.announce import announce
 from service.config import Config
 from service.description import describe
+from service.fit import check_stop
 from service.latch_file import LatchFile
 from service.leadership import HEARING_S, LEADER, STANDBY, Leadership, differ, hear_others
 from service.operator_stop import OperatorStop
@@ -70,8 +71,9 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
         Exit status: 0 when stopped, 1 when another controller is there or an unforeseen error ended this one.
 
     Raises:
-        ConfigError: The leader has another configuration than its standby.
+        ConfigError: A stop would not bring the robot to rest, or the leader has another configuration than its standby.
     """
+    check_stop(config)
     stop = stop or stop_on_signals()
     rti = config.build_rti()
     warm_up(rti)

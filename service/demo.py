@@ -38,6 +38,7 @@ from service.children import Children
 from service.config import Config
 from service.echo import ROLE as ECHO
 from service.echo import Echo
+from service.fit import check_stop
 from service.summary import Outcome, summarize
 from service.witness import Witness
 
@@ -132,8 +133,9 @@ def main(config: Config, scenario: str, **options: Any) -> int:
         Exit status: 0 if the robot was driven to the end.
 
     Raises:
-        ConfigError: The scenario is none, or does not fit the robot, or the folder cannot be written.
+        ConfigError: A stop would not bring the robot to rest, the scenario is none, or does not fit the robot, or the folder cannot be written.
     """
+    check_stop(config)
     console = Console()
     run = plan(config, scenario, **options)
     try:

@@ -60,6 +60,22 @@ def check_rest(ocp: Ocp) -> None:
         raise ConfigError(f"ocp.bounds: {wrong}")
 
 
+def check_stop(config: Config) -> None:
+    """
+    Check that a stop brings the robot to rest, unless its file says that it does not.
+
+    Raises:
+        ConfigError: It coasts, or falls; what was seen of it is said.
+    """
+    from rti_mpc.rest import motion_at_rest
+
+    if config.model.stop == "rests" and (seen := motion_at_rest(config.build_ocp())):
+        raise ConfigError(
+            f"model.name: a stop must bring {config.model.name} to rest: {seen}; let its inputs command speeds, "
+            f'or say that it is let go by stop = "coasts" in [model]'
+        )
+
+
 def check_names(config: Config, model: Model) -> None:
     """
     Check that names are those of the model.

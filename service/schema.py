@@ -64,6 +64,9 @@ class ModelSection(Section):
 
     name: str = Field(description="a shipped model, or package.module:function of your own")
     parameters: dict[str, float] = Field(default={}, description="parameters that differ from the model's by name, each in its own unit")
+    stop: Literal["rests", "coasts"] = Field(
+        default="rests", description="what a stop, its inputs at rest, does to the robot: it rests, which is checked, or it coasts or falls"
+    )
 
 
 class WeightSection(Section):

@@ -29,6 +29,7 @@ ALONE = {
     "rerun": {"service/blueprint.py", "service/outlet.py", "service/recording.py", "service/view.py"},
     "qpsolvers": {"rti_mpc/qp.py", "rti_mpc/foreign_solver.py"},
     "casadi": {
+        "rti_mpc/rest.py",
         *(f"rti_mpc/{name}.py" for name in ("simultaneous", "sequential", "terminal", "obstacle", "blockage", "disturbance", "observer")),
         *(
             f"rti_mpc/{name}.py"
@@ -68,7 +69,7 @@ FLOW: tuple[set[str], ...] = (
     {"model"},
     {"pioneer_3dx", "integrator", "track", "obstacle", "disturbance"},
     {"ocp"},
-    {"linearization", "terminal"},
+    {"linearization", "terminal", "rest"},
     {"transcription", "scale"},
     {"simultaneous", "sequential", "riccati"},
     {"codegen"},

@@ -16,7 +16,10 @@ from rti_mpc.model import Model, Signal
 from rti_mpc.pioneer_3dx import pioneer_3dx
 from rti_mpc.solver import Solver
 from rti_mpc.terminal import lqr_weight
+from rti_mpc.wire.bus import BusSettings
+from service import check, daemon, demo
 from service.config import Config, load
+from service.fit import check_stop
 from sim.settings import RobotSettings
 
 ROOT = Path(__file__).parents[2]
@@ -297,3 +300,24 @@ def test_limits_of_the_guard_are_those_of_the_problem(tmp_path: Path) -> None:
     np.testing.assert_allclose(limits.slew, [2.5, 4.0])
     assert limits.settling_s == pytest.approx(0.3 + 0.2)
     assert config.config_hash == load(SHIPPED).config_hash
+
+
+def coasting() -> Model:
+    """The robot, its forward speed kept up by nothing but its input's acceleration."""
+    model = pioneer_3dx()
+    rates = ca.vertsplit(model.f_expl_expr)
+    return replace(model, f_expl_expr=ca.vertcat(*rates[:3], model.u[0], rates[4]))
+
+
+def test_robot_that_a_stop_does_not_bring_to_rest_is_refused_unless_its_file_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    check_stop(load(SHIPPED))
+    path.write_text(SHIPPED.read_text().replace('"pioneer_3dx"', '"tests.service.test_config:coasting"'))
+    for refuse in (lambda: check.main(path), lambda: daemon.main(load(path), BusSettings()), lambda: demo.main(load(path), "eight")):
+        with pytest.raises(ConfigError) as refusal:
+            refuse()
+        assert "\n" not in str(refusal.value)
+        for words in ("tests.service.test_config:coasting", "10 s after its inputs have come to rest", "m per second", 'stop = "coasts"'):
+            assert words in str(refusal.value)
+    path.write_text(path.read_text().replace("[model]", '[model]\nstop = "coasts"'))
+    check_stop(load(path))
