@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rti_mpc.approach import Increments
 from rti_mpc.array import Array
 from rti_mpc.cadence import Cadence
 from rti_mpc.epoch import SEQ_AHEAD, epoch_above
@@ -37,7 +38,6 @@ HELD_UP_NS = 250_000_000  # local time without a tick after which this process w
 LEAD_NS = 30_000_000  # local time by which the robot is told of the ramp before it is due
 TOLD = 10  # steps of the ramp in a command of our own
 ROUNDING = 1e-6  # of an input, in its unit: above any rounding, single precision included, and below what an actuator resolves
-WINDOW = (0.25, 0.5, 0.75, 0.95)  # of dt: when what acted before counts against the slew limits; the milliseconds of a command's way lie between
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,8 @@ class Guard:
         self._lives = Lives(limits.stale_s, limits.settling_s)
         self._cadence = Cadence()
         self._clock = RobotClock()
-        self._schedule = Schedule(limits.u_rest, limits.slew)  # what the robot was told by controllers, and its ramp after that
+        increments = Increments(limits.lbdu, limits.ubdu, self._dt_ns)
+        self._schedule = Schedule(limits.u_rest, limits.slew, increments)  # what the robot was told by controllers, and its ramp after that
         self._state: State | None = None  # the last one that came in time
         self._heard = (0, 0)  # stamp of the last state, and local time of its arrival
         self._late = False  # whether that one had waited on the way
@@ -193,17 +194,17 @@ class Guard:
             self._say(Severity.WARNING, f"command_{code}", text)
             return None
         start_ns = max(command.stamp_ns, now_ns)
-        u, limited = self._approach(command, start_ns)
-        if limited:
+        u = np.clip(command.u, self._limits.lbu, self._limits.ubu)
+        passed = self._numbered(replace(command, valid_until_ns=min(command.valid_until_ns, until_ns), u=u))
+        passed.u = self._schedule.add(passed, start_ns, until_ns)
+        if (np.abs(passed.u - u) > ROUNDING).any():
             text = f"command {command.seq} of epoch {command.epoch} begins too far from what acts: approached inside the slew limits"
             self._say(Severity.WARNING, "slew_limited", text)
         if not self.passing:
             self.passing = True
             self._say(Severity.INFO, "guard_passing", f"commands of epoch {command.epoch} pass", change=True)
-        passed = replace(command, valid_until_ns=min(command.valid_until_ns, until_ns), u=u)
-        self._schedule.add(passed, start_ns, until_ns)
         self._engaged, self._told_ns = True, until_ns
-        return self._numbered(passed)
+        return passed
 
     def tick(self, local_ns: int) -> Command | None:
         """
@@ -235,8 +236,7 @@ class Guard:
     def _last_step(self, state: State) -> Command:
         """Return the last command to a robot whose clock is none: each row is the next step to rest, whichever acts and for however long."""
         t_ns = state.stamp_ns
-        lower, upper = self._within_reach(t_ns, self._schedule.at(t_ns - 1)[0])
-        u = np.tile(np.clip(self._limits.u_rest, lower, upper), (TOLD, 1))
+        u = np.tile(self._schedule.nearest(self._limits.u_rest, t_ns), (TOLD, 1))
         valid_ns = max(1, round(VALID_NS * min(1.0, self._cadence.rate)))  # as long as it should act, in the unit of the stamps
         return self._tell(t_ns, valid_ns, STEP_NS, u, state)
 
@@ -341,7 +341,7 @@ class Guard:
         start_ns = max(command.stamp_ns, now_ns)
         first = (start_ns - command.stamp_ns) // command.period_ns
         before = self._limits.u_rest if now_ns >= self._rest_by_ns else self._schedule.at(start_ns - 1)[0]
-        way = np.vstack([before, self._approach(command, start_ns)[0][first:]]) - self._limits.u_rest
+        way = np.vstack([before, self._approach(command, start_ns)[first:]]) - self._limits.u_rest
         lower, upper = np.minimum(way[:-1], 0.0) - ROUNDING, np.maximum(way[:-1], 0.0) + ROUNDING
         return bool((np.abs(way[-1]) <= ROUNDING).all() and ((way[1:] >= lower) & (way[1:] <= upper)).all())
 
@@ -353,36 +353,9 @@ class Guard:
         if command.epoch > self.epoch:
             self.epoch = epoch_above(command.epoch, self.epoch)  # with our own number: never that of another guard, whose numbering is not ours
 
-    def _approach(self, command: Command, start_ns: int) -> tuple[Array, bool]:
-        """
-        Return the rows of a command, from that on which acts first no faster than the slew limits from what acts before; and whether any was moved.
-
-        A controller that has heard nothing of a gap goes on where it believes the
-        robot to be; the robot has braked meanwhile. The next row of the plan before,
-        played for the milliseconds that a command takes on the way, does not count:
-        limits around both it and the row before would not let a plan turn round.
-        """
-        limits, scale = self._limits, self._share(command)
-        u = np.clip(command.u, limits.lbu, limits.ubu)
-        first = max(0, (start_ns - command.stamp_ns) // command.period_ns)
-        now, _, braking = self._schedule.at(start_ns - 1)
-        if not braking:
-            now = self._schedule.at(command.stamp_ns + first * command.period_ns - 1)[0]
-        lower, upper = self._within_reach(start_ns, now)
-        limited = False
-        for row in u[first:]:
-            if (row >= lower - ROUNDING).all() and (row <= upper + ROUNDING).all():
-                break
-            np.clip(row, lower, upper, out=row)
-            if limited:  # not from the first to the second: should this one come late, the robot begins there
-                lower, upper = row + scale * limits.lbdu, row + scale * limits.ubdu
-            limited = True
-        return u, limited
-
-    def _within_reach(self, start_ns: int, now: Array) -> tuple[Array, Array]:
-        """Return lowest and highest inputs, each of shape ``(nu,)``, within the slew limits of what acts `now` and in the period before."""
-        acted = np.array([now, *(self._schedule.at(start_ns - round(share * self._dt_ns))[0] for share in WINDOW)])
-        return np.minimum(acted.max(axis=0) + self._limits.lbdu, now), np.maximum(acted.min(axis=0) + self._limits.ubdu, now)
+    def _approach(self, command: Command, start_ns: int) -> Array:
+        """Return the rows of a command as they would act from a time on."""
+        return self._schedule.approached(replace(command, u=np.clip(command.u, self._limits.lbu, self._limits.ubu)), start_ns)
 
     def _share(self, command: Command) -> float:
         """Return how much of the slew limits over `dt` a row may use."""

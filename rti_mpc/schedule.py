@@ -4,9 +4,10 @@ Which input acts when: the command contract as a function of time.
 
 Row ``i`` of the newest plan whose time has come acts from ``stamp_ns + i * period_ns``,
 never before it arrived; a plan ahead of its time waits while the previous one plays on.
-Nothing acts from the plan's end on: then the inputs ramp to rest inside the slew limits,
-and stay there. Whoever knows the plans knows what acts: the robot plays them, the guard
-tells from them what the robot does.
+A plan that begins elsewhere than the inputs are is approached inside the slew limits
+(`rti_mpc.approach`). Nothing acts from the plan's end on: then the inputs ramp to rest
+inside the slew limits, and stay there. Whoever knows the plans knows what acts: the robot
+plays them, guard and controller tell from them what the robot does.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rti_mpc.approach import Increments, approach, segments, within
 from rti_mpc.array import Array
 from rti_mpc.message import Command
 
@@ -24,6 +26,7 @@ NEVER_NS = 2**63
 EVER_NS = -(2**62)
 WAITING = 64  # plans ahead of their time kept at most
 ROUNDING = 1e-9  # of a way to rest that is a whole number of steps
+OWN = (0, 0)  # source of what no command has asked for
 
 
 def unfit(command: Command, nu: int, robot_epoch: int) -> str:
@@ -48,8 +51,10 @@ class Plan:
     Attributes:
         stamp_ns: When row 0 would act.
         period_ns: Time between rows.
-        u: Rows, shape ``(n, nu)``.
+        u: Rows as they act, shape ``(n, nu)``.
         before: Input that acted before it, shape ``(nu,)``.
+        source: Epoch and sequence number of the command it comes from; zeros: the robot's own.
+        pause_ns: After its end, until the ramp to rest begins, shape ``(nu,)``; None until somebody asks.
     """
 
     start_ns: int
@@ -58,6 +63,8 @@ class Plan:
     period_ns: int
     u: Array
     before: Array
+    source: tuple[int, int] = OWN
+    pause_ns: Array | None = None
 
     def row(self, t_ns: int) -> int:
         """Return the row of a time."""
@@ -68,20 +75,22 @@ class Schedule:
     """
     The plans of one robot.
 
-    The ramp to rest goes at the rate of the slew limits, less what a last row has
+    The ramp to rest goes at the rate of the slew limits, less what the last rows have
     just used up of them: over any duration the change stays inside.
     """
 
-    def __init__(self, u_rest: Array, slew: Array) -> None:
+    def __init__(self, u_rest: Array, slew: Array, increments: Increments | None = None) -> None:
         """
         Begin at rest.
 
         Args:
             u_rest: Input at rest, shape ``(nu,)``.
-            slew: Largest rate of each input, shape ``(nu,)``, in the input's unit per s; infinite where there is no limit.
+            slew: Largest rate of the ramp to rest, shape ``(nu,)``, in the input's unit per s; infinite where there is no limit.
+            increments: Slew limits inside which plans are approached; None: their rows act as they are.
         """
         self.u_rest: Array = np.array(u_rest, dtype=np.float64)
         self._slew = 1e-9 * np.asarray(slew, dtype=np.float64)  # per ns
+        self._increments = increments
         self._plans: deque[Plan] = deque()  # by start; those of the past as far as `forget` has left them
         self.brake(self.u_rest, EVER_NS)
 
@@ -96,23 +105,36 @@ class Schedule:
 
     def cut(self, t_ns: int, now_ns: int) -> None:
         """Let what acts at a time end there, and drop what would follow; the clock has jumped since, and shows another time."""
-        plan = next((plan for plan in reversed(self._plans) if plan.start_ns <= t_ns), None)
-        if plan is None:  # a time that is forgotten
-            self.brake(self._plans[0].before, now_ns)
+        plans, shift_ns = self._plans, now_ns - t_ns
+        while plans and plans[-1].start_ns > t_ns:
+            before = plans.pop().before
+        if not plans:  # a time that is forgotten
+            self.brake(before, now_ns)
             return
-        shift_ns = now_ns - t_ns
-        start_ns, end_ns, stamp_ns = plan.start_ns + shift_ns, min(plan.end_ns, t_ns) + shift_ns, plan.stamp_ns + shift_ns
-        self._plans.clear()
-        self._plans.append(Plan(start_ns, end_ns, stamp_ns, plan.period_ns, plan.u, plan.before))
+        plans[-1].end_ns, plans[-1].pause_ns = min(plans[-1].end_ns, t_ns), None
+        for plan in plans:
+            plan.start_ns += shift_ns
+            plan.end_ns += shift_ns
+            plan.stamp_ns += shift_ns
 
-    def add(self, command: Command, start_ns: int, end_ns: int) -> None:
-        """Put a command in line, from `start_ns` until `end_ns`; those that would start after it never act."""
+    def add(self, command: Command, start_ns: int, end_ns: int) -> Array:
+        """
+        Put a command in line, from `start_ns` until `end_ns`; those that would start after it never act.
+
+        Returns:
+            Its rows as they will act, shape ``(n, nu)``.
+        """
         plans, before = self._plans, self.at(start_ns - 1)[0].copy()
         while plans and plans[-1].start_ns >= start_ns:
             plans.pop()
-        plans.append(Plan(start_ns, end_ns, command.stamp_ns, command.period_ns, command.u.copy(), before))
+        u, limits = command.u, self._increments
+        if limits is not None:
+            u = approach(u, command.stamp_ns, command.period_ns, start_ns, segments(self.at, start_ns - limits.dt_ns, start_ns), limits)
+        u = u.copy() if u is command.u else u
+        plans.append(Plan(start_ns, end_ns, command.stamp_ns, command.period_ns, u, before, (command.epoch, command.seq)))
         if len(plans) > WAITING:
             del plans[1]
+        return u
 
     def withdraw(self, command: Command) -> None:
         """Take the last plan back, if it is this command's: it will not act."""
@@ -120,9 +142,27 @@ class Schedule:
             self._plans.pop()
 
     def forget(self, t_ns: int) -> None:
-        """Drop what is over before a time."""
+        """Drop what is over before a time, and counts against no limit any more."""
+        t_ns -= self._increments.dt_ns if self._increments is not None else 0
         while len(self._plans) > 1 and self._plans[1].start_ns <= t_ns:
             self._plans.popleft()
+
+    def approached(self, command: Command, start_ns: int) -> Array:
+        """Return the rows of a command, shape ``(n, nu)``, as they would act from a time on."""
+        limits, u = self._increments, command.u
+        if limits is None:
+            return u
+        return approach(u, command.stamp_ns, command.period_ns, start_ns, segments(self.at, start_ns - limits.dt_ns, start_ns), limits)
+
+    def nearest(self, u: Array, t_ns: int) -> Array:
+        """Return what is nearest to an input, shape ``(nu,)``, of those that may begin to act at a time, inside the slew limits."""
+        limits = self._increments
+        return u if limits is None else within(u, segments(self.at, t_ns - limits.dt_ns, t_ns), t_ns - limits.dt_ns, limits)
+
+    def source(self, t_ns: int) -> tuple[int, int]:
+        """Return epoch and sequence number of the command whose plan acts at a time; zeros where none does."""
+        plan = next((plan for plan in reversed(self._plans) if plan.start_ns <= t_ns), None)
+        return OWN if plan is None or t_ns >= plan.end_ns else plan.source
 
     def at(self, t_ns: int) -> tuple[Array, int, bool]:
         """Return the input that acts at a time, shape ``(nu,)``, until when it does, and whether no plan acts."""
@@ -142,20 +182,30 @@ class Schedule:
 
     def _ramp(self, plan: Plan, t_ns: int) -> tuple[Array, int]:
         """Return the input at a time after the end of a plan, and when the ramp steps next."""
-        row = plan.row(plan.end_ns - 1)
-        row_ns = plan.stamp_ns + row * plan.period_ns
-        last = plan.u[row]
-        jump = last - (plan.u[row - 1] if row and row_ns > plan.start_ns else plan.before)
+        last = plan.u[plan.row(plan.end_ns - 1)]
         way = self.u_rest - last
-        # A last row that has gone this way itself goes on counting until its jump is paid for, which it is after its period.
-        paid_ns = np.where(jump * way > 0.0, np.minimum(np.abs(jump) / self._slew, plan.period_ns), 0.0)
-        begin_ns = np.where(paid_ns > 0.0, np.maximum(0.0, max(plan.start_ns, row_ns) + STEP_NS - plan.end_ns + paid_ns), 0.0)  # after the end
-        after_ns = t_ns - plan.end_ns
-        steps = np.floor((after_ns - begin_ns) / STEP_NS) + 1.0
+        if plan.pause_ns is None:
+            plan.pause_ns = self._pause_ns(plan, last, way)
+        steps = np.floor((t_ns - plan.end_ns - plan.pause_ns) / STEP_NS) + 1.0
         with np.errstate(invalid="ignore"):  # no slew limit, no step: 0 * inf is no way at all
             reach = np.where(steps > 0.0, steps * (STEP_NS * self._slew), 0.0)
         rests = np.abs(way) <= reach * (1.0 + ROUNDING)
         if rests.all():
             return self.u_rest, NEVER_NS
-        next_ns = begin_ns + STEP_NS * np.maximum(steps, 0.0)
+        next_ns = plan.pause_ns + STEP_NS * np.maximum(steps, 0.0)
         return np.where(rests, self.u_rest, last + np.clip(way, -reach, reach)), plan.end_ns + int(np.ceil(next_ns[~rests].min()))
+
+    def _pause_ns(self, plan: Plan, last: Array, way: Array) -> Array:
+        """
+        Return how long after its end the ramp waits until earlier jumps to the same side are paid for, shape ``(nu,)``.
+
+        An input that acted until some time goes on counting until the ramp, had it begun then, would be at the last row.
+        """
+        window_ns = plan.period_ns if self._increments is None else self._increments.dt_ns
+        pause_ns: Array = np.zeros(len(last))
+        for until_ns, u in segments(self.at, plan.end_ns - window_ns, plan.end_ns):
+            jump = last - u
+            with np.errstate(invalid="ignore"):
+                paid_ns = np.where(jump * way > 0.0, np.minimum(np.abs(jump) / self._slew, window_ns), -np.inf)
+            pause_ns = np.maximum(pause_ns, until_ns + STEP_NS - plan.end_ns + paid_ns)
+        return np.ceil(pause_ns)  # whole ns: where a step begins, it has begun

@@ -205,18 +205,24 @@ class Config(Section):
 
     def robot_settings(self) -> dict[str, Any]:
         """Return what `sim.settings.RobotSettings` is made from; the slew limits are those of the increments."""
+        import numpy as np
+
+        from rti_mpc.approach import Increments
+
         model, sim = self.build_model().with_parameters(**self.sim.parameters), self.sim
-        increments = zip(*bounds(self.ocp.bounds.increments, names(model.inputs)), strict=True)
+        lbdu, ubdu = bounds(self.ocp.bounds.increments, names(model.inputs))
+        increments = Increments(np.array(lbdu), np.array(ubdu), round(1e9 * self.ocp.dt_s))
         lbu, ubu = bounds(self.ocp.bounds.inputs, names(model.inputs))
         return {
             "state_period_s": self.ocp.dt_s,
-            **sim.model_dump(exclude_none=True, exclude={"parameters"}),
+            **sim.model_dump(exclude_none=True, exclude={"parameters", "approaches"}),
             "model": model,
             "x0": [sim.x0.get(state.name, 0.0) for state in model.states],
             "noise_std": [sim.noise_std.get(state.name, 0.0) for state in model.states],
             "lbu": lbu,
             "ubu": ubu,
-            "slew": [min(-lower, upper) / self.ocp.dt_s for lower, upper in increments],
+            "slew": [min(-lower, upper) / self.ocp.dt_s for lower, upper in zip(lbdu, ubdu, strict=True)],
+            "increments": increments if sim.approaches else None,
         }
 
     def guard_limits(self) -> Limits:

@@ -226,4 +226,6 @@ class SimSection(Section):
     dropout: float | None = Field(default=None, ge=0, lt=1, description="share of states lost on the way, without unit")
     actuator_delay_s: Duration | None = Field(default=None, description="from a command being due to the input moving, in seconds of the robot")
     actuator_lag_s: Duration | None = Field(default=None, description="time constant of the inputs, in seconds of the robot")
+    reports_inputs: bool | None = Field(default=None, description="whether states tell which inputs act; true if left out")
+    approaches: bool = Field(default=True, description="whether the robot itself approaches a command inside the slew limits, from what really acts")
     seed: int | None = Field(default=None, ge=0, description="seed of noise and dropout")

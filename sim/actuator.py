@@ -2,7 +2,8 @@
 """
 The robot's side of the command contract: what is taken, what is refused, and what became of it.
 
-What was taken acts as `rti_mpc.schedule` says. No clock: time is told.
+What was taken acts as `rti_mpc.schedule` says, approached inside the slew limits
+from what really acts, whatever was lost before. No clock: time is told.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rti_mpc.approach import Increments
 from rti_mpc.array import Array
 from rti_mpc.message import Command
-from rti_mpc.schedule import Schedule, end_ns, unfit
+from rti_mpc.schedule import OWN, Schedule, end_ns, unfit
 from rti_mpc.wire.source import Source
 
 EARLY_NS = 250_000_000  # by which a state that is answered may be ahead of the robot's clock: a guard knows that clock no better
@@ -47,17 +49,36 @@ class Actuator:
 
     Attributes:
         u: Input demanded now, shape ``(nu,)``.
+        source: Epoch and sequence number of the command it comes from; zeros: the ramp of the robot itself.
         counters: What became of commands.
         braking: Whether no plan acts.
     """
 
     def __init__(
-        self, u_rest: Array, slew: Array, epoch: int, delay_ns: int = 0, bounds: tuple[float | Array, float | Array] = (-np.inf, np.inf)
+        self,
+        u_rest: Array,
+        slew: Array,
+        epoch: int,
+        delay_ns: int = 0,
+        bounds: tuple[float | Array, float | Array] = (-np.inf, np.inf),
+        increments: Increments | None = None,
     ) -> None:
+        """
+        Begin at rest.
+
+        Args:
+            u_rest: Input at rest, shape ``(nu,)``.
+            slew: Largest rate of the ramp to rest, shape ``(nu,)``, in the input's unit per s.
+            epoch: Life of the robot that commands must be for.
+            delay_ns: Time from the arrival of a command to the instant from which it can act.
+            bounds: Of the inputs, shape ``(nu,)``: a drive does no more, whatever it is told.
+            increments: Slew limits inside which plans are approached; None: their rows are played as they come.
+        """
         self.u = np.array(u_rest, dtype=np.float64)
+        self.source = OWN
         self.counters = Counters()
         self.braking = True
-        self._schedule = Schedule(u_rest, slew)
+        self._schedule = Schedule(u_rest, slew, increments)
         self._now_ns = 0
         self._robot_epoch = epoch
         self._delay_ns = delay_ns
@@ -108,7 +129,7 @@ class Actuator:
             u, change_ns, braking = self._schedule.at(t)
             begins, self.braking = braking and not self.braking, braking
             self.counters.starved += begins and not (self._off or self.at_rest)
-            self.u[:] = u
+            self.u[:], self.source = u, self._schedule.source(t)
             t = self._now_ns = min(change_ns, to_ns)
             yield t, self.u
 

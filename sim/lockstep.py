@@ -20,7 +20,7 @@ from rti_mpc.array import Array
 from rti_mpc.message import Command, State
 from sim.actuator import Actuator, Counters
 from sim.plant import Plant
-from sim.sensor import Sensor
+from sim.sensor import NOTHING, Sensor
 from sim.settings import RobotSettings
 
 
@@ -43,11 +43,19 @@ class Lockstep:
         self.now_ns = 0
         self.epoch = epoch
         self.period_ns = settings.state_period_ns
-        self.actuator = Actuator(np.array(model.u_rest), settings.slew, epoch, round(1e9 * settings.actuator_delay_s), (settings.lbu, settings.ubu))
+        self.actuator = Actuator(
+            np.array(model.u_rest),
+            settings.slew,
+            epoch,
+            round(1e9 * settings.actuator_delay_s),
+            (settings.lbu, settings.ubu),
+            settings.increments,
+        )
         self.sensor = Sensor(epoch, settings.noise_std, angles, round(1e9 * settings.sensor_delay_s), settings.dropout, settings.seed)
         self._plant = Plant(model, settings.x0, settings.state_period_s, settings.substeps, settings.actuator_lag_s)
         self.x: Array = self._plant.x
         self.u: Array = self._plant.u
+        self._reports_inputs = settings.reports_inputs
         self._next_ns = 0
 
     @property
@@ -75,7 +83,9 @@ class Lockstep:
         if self.now_ns < self._next_ns:
             return None
         self._next_ns = (self.now_ns // self.period_ns + 1) * self.period_ns
-        return self.sensor.measure(self.x, self.now_ns)
+        actuator = self.actuator
+        acting = (actuator.u, *actuator.source) if self._reports_inputs else NOTHING
+        return self.sensor.measure(self.x, self.now_ns, *acting)
 
     def tick(self) -> State:
         """Advance to the next state that is not lost, and return it."""

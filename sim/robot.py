@@ -95,6 +95,7 @@ def main(
         wait_for_another(bus, stop)
         robot = Robot(settings, bus, keys.actuation if guarded else keys.command, speed, log)
         life = {"role": ROLE, "epoch": robot.body.epoch, "speed": speed, "state_period_s": settings.state_period_s}
+        life |= {"reports_inputs": settings.reports_inputs, "approaches": settings.increments is not None}
         bus.publish_json(keys.info(ROLE), {**describe(settings.model), **(info or {}), **life})
         bus.alive(ROLE)
         logger.info("epoch %d of %s, %s, at %g times real speed", robot.body.epoch, keys.robot, settings.model.name, speed)

@@ -10,6 +10,8 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.message import State
 
+NOTHING: tuple[Array, int, int] = (np.zeros(0), 0, 0)  # told of what acts
+
 
 class Sensor:
     """
@@ -45,13 +47,25 @@ class Sensor:
         """When the next state on the way is due; far in the future if there is none."""
         return self._on_the_way[0].stamp_ns + self._delay_ns if self._on_the_way else 2**63
 
-    def measure(self, x: Array, stamp_ns: int) -> int:
-        """Measure the true state, shape ``(nx,)``; return the sequence number."""
+    def measure(self, x: Array, stamp_ns: int, u: Array = NOTHING[0], command_epoch: int = 0, command_seq: int = 0) -> int:
+        """
+        Measure.
+
+        Args:
+            x: True state, shape ``(nx,)``.
+            stamp_ns: The time now.
+            u: Input that the actuators are asked for, before any lag of theirs, shape ``(nu,)``; empty: not to be told.
+            command_epoch: Epoch of the command it comes from.
+            command_seq: Its sequence number; 0: the ramp of the robot itself.
+
+        Returns:
+            The sequence number of the state.
+        """
         self._seq += 1
         measured = x + self._noise_std * self._random.standard_normal(len(x))
         measured[self._angles] = np.pi - np.remainder(np.pi - measured[self._angles], 2 * np.pi)
         if self._random.random() >= self._dropout:
-            self._on_the_way.append(State(self._epoch, self._seq, stamp_ns, measured))
+            self._on_the_way.append(State(self._epoch, self._seq, stamp_ns, measured, u.copy(), command_epoch, command_seq))
         return self._seq
 
     def take(self, now_ns: int) -> State | None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from rti_mpc.approach import Increments
 from rti_mpc.array import Array
 from rti_mpc.errors import ConfigError
 from rti_mpc.model import Model
@@ -23,6 +24,8 @@ class RobotSettings:
         slew: Largest rate of each input while braking on its own, shape ``(nu,)``, in the input's unit per s; infinite by default.
         lbu: Least of each input that the actuators do, whatever is commanded, shape ``(nu,)``; without a limit by default.
         ubu: Most of each input.
+        increments: Slew limits inside which it approaches what is commanded, from what really acts; None: it plays rows as they come.
+        reports_inputs: Whether its states tell which inputs act, and whose command they come from.
         state_period_s: Time between states.
         substeps: RK4 steps a state period is cut into.
         noise_std: Standard deviation of the measured states, shape ``(nx,)``; zero by default.
@@ -41,6 +44,8 @@ class RobotSettings:
     slew: Array = field(default_factory=lambda: np.empty(0))
     lbu: Array = field(default_factory=lambda: np.empty(0))
     ubu: Array = field(default_factory=lambda: np.empty(0))
+    increments: Increments | None = None
+    reports_inputs: bool = True
     state_period_s: float = 0.1
     substeps: int = 20
     noise_std: Array = field(default_factory=lambda: np.empty(0))

@@ -62,7 +62,7 @@ LOCAL = {"rti_mpc/wire/session.py"}  # reads JSON that is not a peer's: Zenoh's 
 # Inside the library, a file imports only from groups before its own.
 FLOW: tuple[set[str], ...] = (
     {"errors", "array", "status", "robot_clock", "ladder", "grid", "epoch", "cache", "angle"},
-    {"message", "text_file", "latch"},
+    {"message", "approach", "text_file", "latch"},
     {"polyline"},
     {"lives", "cadence", "heading", "mode", "schedule", "issued"},
     {"trajectory", "guard", "sent"},
