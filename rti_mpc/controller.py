@@ -42,6 +42,7 @@ from rti_mpc.track import Track
 from rti_mpc.tuning import Tuning
 
 BUDGET = 0.75  # of a period, after the time at which a command acts, in which it may leave; the rest is for messages on their way
+UNREPORTED = "the robot does not report which inputs act: commands are believed to act, and only the robot itself or a guard can cover their loss"
 ITERATIONS_COLD = 3  # iterations of a first sample, whose guess is one state and one input
 
 
@@ -94,6 +95,7 @@ class Controller:
         self._loaded = False  # whether the QP of t_k is prepared
         self._reach: tuple[Array, Array] = (np.zeros((2, model.nu)), np.zeros((2, model.nu)))  # what the first rows at t_k may be
         self._overran = False  # whether the last sample was over its budget
+        self._unreported = False  # whether it was said that the robot does not report its inputs
         self._for_rival: tuple[int | None, tuple[Reference, Array] | None] = (None, None)  # the last reference, and which life might have begun then
         self._stopped = ""  # why an operator's stop is latched
         self._issued = Issued(epoch, config_hash, self.grid.dt_ns)
@@ -141,10 +143,16 @@ class Controller:
             if arrival is Arrival.UNTIMED:
                 return self._give_up(state)
             self._forget(arrival, state)
-        self._states.estimate(self._sent, known=self.mode in (Mode.TRACKING, Mode.HOLDING))
+        surprised = self._hear(state)
+        self._states.estimate(self._sent, known=self.mode in (Mode.TRACKING, Mode.HOLDING) and not surprised)
         self._prediction.p[self.np_ :] = self._states.d
+        if surprised and self._loaded and self.grid.running:
+            self._load(shift=False)
         if self.mode is Mode.IDLE:
             self._modes.enter(Mode.WAITING, "first state")
+            if not len(state.u) and not self._unreported:
+                self._unreported = True
+                self._modes.say(Severity.WARNING, "inputs_unreported", UNREPORTED)
         if self._track.arriving:
             self._anchor(state)
         grid, period_ns = self.grid, self._states.clock.period_ns
@@ -292,6 +300,7 @@ class Controller:
 
     def _measure_delay(self, estimator: DelayEstimator, stamp_ns: int) -> None:
         """Learn from the state of the last sample, and let the grid follow."""
+        estimator.hear(self._sent.confirmed)
         estimator.observe(self._states.x, stamp_ns)
         if self._issued.last is not None and not self.shadowing:
             estimator.sent(self._issued.last)
@@ -461,6 +470,14 @@ class Controller:
         )
 
     # Small parts.
+
+    def _hear(self, state: State) -> bool:
+        """Learn which input acts from a robot that reports it; return whether that was not known."""
+        if not len(state.u):
+            return False
+        limits, believed = self.envelope.limits, self._sent.at(state.stamp_ns - 1)[0]  # which is outside after bounds were tightened
+        u = np.minimum(np.maximum(state.u, np.minimum(limits["lbu"], believed)), np.maximum(limits["ubu"], believed))
+        return self._sent.correct(state.stamp_ns, u, (state.command_epoch, state.command_seq))
 
     def _anchor(self, state: State) -> Reference:
         """Follow the reference that has arrived, from the last state on if it is to start on arrival."""

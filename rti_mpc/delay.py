@@ -35,6 +35,7 @@ FORGETTING = 0.98  # in a step that says something: the last fifty count
 TELLING = 0.1  # in normalised squared errors, by which the candidates must differ for a step to say something
 BELIEVED = 20.0  # in normalised squared errors, by which another candidate must be better: noise alone is 4.5 sigma away from it
 WILD = 1e6  # error of a state, in its unit, from which on it says nothing
+STEADY = 10  # reports in a row after which what was learnt is right
 FINEST = 1e-4  # error of a state, in its unit, below which none is told from another
 
 
@@ -55,6 +56,8 @@ class DelayEstimator:
         self._u_rest: Array = np.array(model.u_rest)
         self._commands: deque[Command] = deque(maxlen=5 + most_ns // dt_ns)
         self._last: tuple[Array, int] | None = None  # state and its stamp
+        self._kept: tuple[Array, Array, int] | None = None  # costs, variances and estimate while commands acted as believed
+        self._interrupted = False  # whether they do not any more
         self._x: Array = np.zeros(model.nx)
         self._next: Array = np.zeros(model.nx)
         self._u: Array = np.zeros(model.nu)
@@ -71,6 +74,24 @@ class DelayEstimator:
         """Forget states and commands, of another life of the robot. What was learnt is kept."""
         self._commands.clear()
         self._last = None
+
+    def hear(self, confirmed: int) -> None:
+        """
+        Take back what was learnt from responses to commands that were lost.
+
+        Args:
+            confirmed: Reports of the robot in a row that have named the command which was to act; 0 where it does not report.
+        """
+        if confirmed >= STEADY:
+            self._kept = self._costs.copy(), self._variance.copy(), self.delay_ns
+        elif self._kept is None:
+            return
+        elif not confirmed:
+            self._interrupted = True
+        elif self._interrupted:
+            self._costs[:], self._variance[:], self.delay_ns = self._kept
+            self._kept, self._interrupted = None, False
+            self.clear()
 
     def observe(self, x: Array, stamp_ns: int) -> None:
         """

@@ -21,12 +21,13 @@ import numpy as np
 
 from rti_mpc.approach import Increments
 from rti_mpc.array import Array
+from rti_mpc.belief import Belief
 from rti_mpc.cadence import Cadence
 from rti_mpc.epoch import SEQ_AHEAD, epoch_above
 from rti_mpc.lives import Heard, Lives
 from rti_mpc.message import Command, Notice, Severity, State
 from rti_mpc.robot_clock import RobotClock
-from rti_mpc.schedule import EVER_NS, STEP_NS, Schedule, end_ns, unfit
+from rti_mpc.schedule import EVER_NS, STEP_NS, end_ns, unfit
 from rti_mpc.status import Mode, QpStatus
 
 VALID_NS = 300_000_000  # after its state, and the delay, in which a command may act at most, whatever it says itself
@@ -106,7 +107,7 @@ class Guard:
         self._cadence = Cadence()
         self._clock = RobotClock()
         increments = Increments(limits.lbdu, limits.ubdu, self._dt_ns)
-        self._schedule = Schedule(limits.u_rest, limits.slew, increments)  # what the robot was told by controllers, and its ramp after that
+        self._schedule = Belief(limits.u_rest, limits.slew, increments)  # what the robot was told by controllers, and its ramp after that
         self._state: State | None = None  # the last one that came in time
         self._heard = (0, 0)  # stamp of the last state, and local time of its arrival
         self._late = False  # whether that one had waited on the way
@@ -168,6 +169,8 @@ class Guard:
             if ahead_ns > max(JUMP_NS, 2.5 * self._clock.period_ns):
                 self._jump(state, local_ns, "ahead")
         self._take(state, local_ns)
+        if len(state.u) == len(self._limits.u_rest):
+            self._schedule.correct(state.stamp_ns, np.clip(state.u, self._limits.lbu, self._limits.ubu), (state.command_epoch, state.command_seq))
 
     def receive_command(self, command: Command, local_ns: int) -> Command | None:
         """

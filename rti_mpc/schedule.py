@@ -13,7 +13,7 @@ plays them, guard and controller tell from them what the robot does.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,6 +51,7 @@ class Plan:
     Attributes:
         stamp_ns: When row 0 would act.
         period_ns: Time between rows.
+        asked: Rows as they were commanded, shape ``(n, nu)``.
         u: Rows as they act, shape ``(n, nu)``.
         before: Input that acted before it, shape ``(nu,)``.
         source: Epoch and sequence number of the command it comes from; zeros: the robot's own.
@@ -61,6 +62,7 @@ class Plan:
     end_ns: int
     stamp_ns: int
     period_ns: int
+    asked: Array
     u: Array
     before: Array
     source: tuple[int, int] = OWN
@@ -101,7 +103,8 @@ class Schedule:
     def brake(self, u: Array, t_ns: int) -> None:
         """Drop every plan: the inputs ramp to rest from `u`, shape ``(nu,)``, beginning at a time."""
         self._plans.clear()
-        self._plans.append(Plan(t_ns, t_ns, t_ns, 1, np.array(u, dtype=np.float64)[None], np.array(u, dtype=np.float64)))
+        u = np.array(u, dtype=np.float64)
+        self._plans.append(Plan(t_ns, t_ns, t_ns, 1, u[None], u[None], u))
 
     def cut(self, t_ns: int, now_ns: int) -> None:
         """Let what acts at a time end there, and drop what would follow; the clock has jumped since, and shows another time."""
@@ -117,24 +120,40 @@ class Schedule:
             plan.end_ns += shift_ns
             plan.stamp_ns += shift_ns
 
-    def add(self, command: Command, start_ns: int, end_ns: int) -> Array:
+    def add(self, command: Command, start_ns: int, end_ns: int, *, approached: bool = True) -> Array:
         """
-        Put a command in line, from `start_ns` until `end_ns`; those that would start after it never act.
+        Put a command in line; those that would start after it never act.
+
+        Args:
+            command: The command.
+            start_ns: When it begins to act.
+            end_ns: When it ends.
+            approached: Whether its rows are brought inside the slew limits of what acts before, if this schedule has any.
 
         Returns:
             Its rows as they will act, shape ``(n, nu)``.
         """
-        plans, before = self._plans, self.at(start_ns - 1)[0].copy()
+        u = command.u.copy()
+        plan = Plan(start_ns, end_ns, command.stamp_ns, command.period_ns, u, u, u[0], (command.epoch, command.seq))
+        return self._put(plan, self._increments if approached else None)
+
+    def _put(self, plan: Plan, limits: Increments | None) -> Array:
+        """Put a plan in line, approached inside limits from what acts before it."""
+        plans, start_ns = self._plans, plan.start_ns
+        plan.before = self.at(start_ns - 1)[0].copy()
         while plans and plans[-1].start_ns >= start_ns:
             plans.pop()
-        u, limits = command.u, self._increments
+        plan.u, plan.pause_ns = plan.asked, None
         if limits is not None:
-            u = approach(u, command.stamp_ns, command.period_ns, start_ns, segments(self.at, start_ns - limits.dt_ns, start_ns), limits)
-        u = u.copy() if u is command.u else u
-        plans.append(Plan(start_ns, end_ns, command.stamp_ns, command.period_ns, u, before, (command.epoch, command.seq)))
+            plan.u = approach(plan.asked, plan.stamp_ns, plan.period_ns, start_ns, segments(self.at, start_ns - limits.dt_ns, start_ns), limits)
+        plans.append(plan)
         if len(plans) > WAITING:
             del plans[1]
-        return u
+        return plan.u
+
+    def copy(self, other: Schedule) -> None:
+        """Hold the same plans as another one."""
+        self._plans = deque(replace(plan) for plan in other._plans)
 
     def withdraw(self, command: Command) -> None:
         """Take the last plan back, if it is this command's: it will not act."""

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inputs already sent: what the robot does until the next command acts."""
+"""
+The inputs already sent: what the robot does until the next command acts.
+
+Commands are believed to act as soon as they can, until a robot that reports what acts
+tells otherwise (`rti_mpc.belief`).
+"""
 
 from __future__ import annotations
 
@@ -7,7 +12,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rti_mpc.approach import Increments
 from rti_mpc.array import Array
+from rti_mpc.belief import Belief
 from rti_mpc.message import Command
 from rti_mpc.schedule import EVER_NS, Schedule, end_ns
 
@@ -32,15 +39,15 @@ class Sent:
         self._dt_ns = dt_ns
         self._transit_ns, self._window_ns = round(TRANSIT * dt_ns), round(WINDOW * dt_ns)
         slew = 1e9 * np.minimum(-lbdu, ubdu) / dt_ns
-        self._schedule = Schedule(u_rest, slew)
-        self._slowest = Schedule(u_rest, slew)  # if each command was on its way for as long as it may be
+        increments = Increments(lbdu, ubdu, dt_ns)
+        self._schedule = Belief(u_rest, slew, increments)
+        self._slowest = Schedule(u_rest, slew, increments)  # if each command was on its way for as long as it may be
 
     def append(self, command: Command) -> None:
         """Remember a command, unless it has expired before its time: the robot refuses it."""
         self.settle()
         self._left_ns += 1  # commands leave one after the other, whatever our idea of the robot's clock
         self._unsettled = command
-        self._believe(command)
 
     def leave(self, now_ns: int) -> None:
         """Take note of when the last command leaves: what was sent before acts at least until then."""
@@ -51,35 +58,41 @@ class Sent:
         command, self._unsettled = self._unsettled, None
         if command is None:
             return
-        if self._left_ns > command.stamp_ns:
-            self._schedule.withdraw(command)
-            self._believe(command)
-        start_ns = max(self._start_ns(command), self._left_ns + self._transit_ns)
-        if start_ns < end_ns(command):
-            self._slowest.add(command, start_ns, end_ns(command))
-
-    def withdraw(self, command: Command) -> None:
-        """Forget the last command: it was not sent after all."""
-        if self._unsettled is command:
-            self._unsettled = None
-        else:
-            self._slowest.withdraw(command)
-        self._schedule.withdraw(command)
-
-    def _believe(self, command: Command) -> None:
-        """Let a command act as soon as it can."""
-        start_ns = self._start_ns(command)
+        start_ns = max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, self._left_ns)
         if start_ns < end_ns(command):
             before, _, braking = self._schedule.at(start_ns - 1)
             if braking:
                 self._alone = start_ns, before.copy()
-            self._schedule.add(command, start_ns, end_ns(command))
+            self._schedule.add(command, start_ns, end_ns(command), approached=False)
+        start_ns = max(start_ns, self._left_ns + self._transit_ns)
+        if start_ns < end_ns(command):
+            self._slowest.add(command, start_ns, end_ns(command), approached=False)
 
-    def _start_ns(self, command: Command) -> int:
-        return max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, self._left_ns)
+    def correct(self, t_ns: int, u: Array, source: tuple[int, int]) -> bool:
+        """Take note of what the robot reports to act, as `Belief.correct`; return whether that was not known."""
+        self.settle()
+        changed = self._schedule.correct(t_ns, u, source)
+        if changed:
+            self._slowest.copy(self._schedule)
+            self._alone = EVER_NS, self._schedule.u_rest
+        return changed
+
+    def withdraw(self, command: Command) -> None:
+        """Forget the last command: it was not sent after all."""
+        if self._unsettled is not None:
+            self._unsettled = None if self._unsettled is command else self._unsettled
+            return
+        for schedule in (self._schedule, self._slowest):
+            schedule.withdraw(command)
+
+    @property
+    def confirmed(self) -> int:
+        """Reports of the robot in a row that have named the command which was to act."""
+        return self._schedule.confirmed
 
     def brake(self, before_ns: int, now_ns: int) -> None:
         """Assume that the robot, whose clock has jumped from one time to another, brakes from what acted."""
+        self.settle()
         self._left_ns, self._unsettled = EVER_NS, None
         for schedule in (self._schedule, self._slowest):
             schedule.cut(before_ns, now_ns)
@@ -92,6 +105,7 @@ class Sent:
 
     def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Array, float]]:
         """Yield the inputs that act between two times, shape ``(nu,)``, each with for how long, s; backward, the one that acts at the end."""
+        self.settle()
         if to_ns < from_ns:
             yield self.at(to_ns)[0], 1e-9 * (to_ns - from_ns)
         while from_ns < to_ns:
@@ -102,6 +116,7 @@ class Sent:
 
     def at(self, t_ns: int) -> tuple[Array, int]:
         """Return the input that acts at a time, shape ``(nu,)``, and when it next changes."""
+        self.settle()
         u, change_ns, _ = self._schedule.at(t_ns)
         return u, change_ns
 

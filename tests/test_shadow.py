@@ -40,7 +40,9 @@ def controller(role: str, delay_s: float = 0.0) -> Controller:
     return one
 
 
-def take_over(samples: int, dies_at: int, delay_s: float = 0.0, *, hears: bool = True, late: bool = False) -> tuple[Array, list[Command]]:
+def take_over(
+    samples: int, dies_at: int, delay_s: float = 0.0, *, hears: bool = True, late: bool = False, reports: bool = False
+) -> tuple[Array, list[Command]]:
     """
     Inputs that acted, one row a state, and the commands of who took over.
 
@@ -49,7 +51,7 @@ def take_over(samples: int, dies_at: int, delay_s: float = 0.0, *, hears: bool =
     """
     leader, shadow = controller("leader", delay_s), controller("shadow", delay_s)
     shadow.shadowing = True
-    body = robot(eight())
+    body = robot(eight(), reports_inputs=reports)
     applied, taken = [], []
     for k in range(samples):
         state = body.tick()
@@ -99,6 +101,11 @@ def test_shadow_that_hears_nothing_would_jump() -> None:
     """What it hears is what keeps the limits: the test above could fail."""
     applied, _ = take_over(10, 6, hears=False)
     assert np.any(np.abs(np.diff(applied, axis=0)) > 2 * STEP)
+
+
+def test_shadow_that_hears_nothing_goes_on_from_what_the_robot_reports() -> None:
+    applied, _ = take_over(10, 6, hears=False, reports=True)
+    assert np.all(np.abs(np.diff(applied, axis=0)) <= STEP + ROUNDING)
 
 
 # Retuned while it runs.

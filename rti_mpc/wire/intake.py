@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Generic, Protocol
 
 from rti_mpc.epoch import BELIEVED, highest_believed
-from rti_mpc.message import Notice, Severity
+from rti_mpc.message import Notice, Reference, Severity, State
 from rti_mpc.wire.cdr import VERSION, M, Refused, decode, encoding
 from rti_mpc.wire.layout import MOST_BYTES
 from rti_mpc.wire.source import Source, Verdict
 
+OPTIONAL = {(Reference, "p"), (State, "u")}  # arrays that may be left out: nominal parameters, inputs that are not reported
 QUOTE = 120  # characters of a peer's own words in a notice
 
 
@@ -57,7 +58,7 @@ class Intake(Generic[M]):
         Args:
             cls: Class of the messages.
             stale_s: Time without an accepted message after which another source may take over.
-            widths: Numbers a row must have, by array, such as ``{"x": 5}``; stage parameters may be left out.
+            widths: Numbers a row must have, by array, such as ``{"x": 5}``; those of `OPTIONAL` may be left out.
             quiet_s: Shortest time between two notices of one code.
             unix_s: Tells the Unix time, s, which limits epochs, see `rti_mpc.epoch.highest_believed`.
             choosing: Whether an epoch is chosen above those heard.
@@ -175,7 +176,7 @@ class Intake(Generic[M]):
 
     def _check_width(self, message: M, name: str, width: int) -> None:
         got = getattr(message, name).shape[-1]
-        if got != width and not (name == "p" and got == 0):
+        if got != width and not (got == 0 and (self._cls, name) in OPTIONAL):
             raise Refused("length", f"{name} must hold {width} numbers a row, got {got}")
 
     def _check_epoch(self, epoch: int, known: int) -> None:
