@@ -72,13 +72,16 @@ class Belief(Schedule):
         if self._expects(source, t_ns) and self._plays(u, t_ns):
             self.confirmed += source[1] > 0
             return False
-        self.confirmed = 0
         plans, coming = self._plans, deque[Plan]()
         while plans and plans[-1].start_ns > t_ns - self._tolerance_ns:
             coming.appendleft(plans.pop())
+        held = len(plans)
         self._find(source, u, t_ns, before_ns, coming)
-        if not (plans and self._plays(u, t_ns)):
+        known = len(plans) > 0 and self._plays(u, t_ns)
+        if not known:
             self._take(source, u, t_ns, before_ns)
+        if not known or len(plans) < held:
+            self.confirmed = 0
         for plan in coming:
             if (start_ns := max(plan.start_ns, t_ns)) < plan.end_ns:
                 self._put(replace(plan, start_ns=start_ns), self._increments)

@@ -161,7 +161,7 @@ class Daemon:
         self._announcer: Announcer | None = None
         self._commands = bus.publisher(keys.command, Command, realtime=True)
         self._telemetries = {role: bus.publisher(key, Telemetry) for role, key in ((LEADER, keys.telemetry), (STANDBY, keys.shadow_telemetry))}
-        self._states_in = bus.intake(State, config.stale_s, {"x": model.nx})
+        self._states_in = bus.intake(State, config.stale_s, {"x": model.nx, "u": model.nu})
         bus.expect("state", lambda: controller.heard)
         self._references = References(bus, controller, model.ny)
         self._prepare_us = 0.0

@@ -103,7 +103,7 @@ class Process:
         self._crashed = Event()
         self._announcer = Announcer(bus, ROLE, epoch)
         self._actuation = bus.publisher(keys.actuation, Command, realtime=True)
-        self._states = bus.intake(State, config.stale_s)
+        self._states = bus.intake(State, config.stale_s, {"u": len(limits.u_rest)})
         bus.expect("state", lambda: self._guard.heard)
         self._commands = bus.intake(Command, config.stale_s, {"u": len(limits.u_rest)})
         self._operator_stop = OperatorStop(file, self._obey, self._guard.notices.append)

@@ -70,6 +70,15 @@ def test_rows_of_another_width_are_refused(message: Message, widths: dict[str, i
     assert intake.source.epoch is None
 
 
+def test_inputs_of_a_state_may_be_left_out_but_not_be_of_another_number() -> None:
+    intake = Intake(State, stale_s=1.0, widths={"x": 5, "u": 2})
+    assert intake.accept(received(replace(STATE, seq=1, u=np.zeros(0))), 0) is not None
+    assert intake.accept(received(replace(STATE, seq=2, u=np.zeros(2))), 1) is not None
+    assert intake.accept(received(replace(STATE, seq=3, u=np.zeros(3))), 2) is None
+    assert Intake(State, stale_s=1.0, widths={"x": 5}).accept(received(replace(STATE, x=np.zeros(0))), 0) is None
+    assert Intake(Command, stale_s=1.0, widths={"u": 2}).accept(received(replace(COMMAND, u=np.zeros((7, 0)))), 0) is None
+
+
 def test_stage_parameters_may_be_left_out() -> None:
     assert Intake(Reference, stale_s=1.0, widths={"y": 3, "p": 4}).accept(received(REFERENCE), 0) is not None
 
