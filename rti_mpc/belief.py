@@ -3,8 +3,8 @@
 Which input acts when, as its sender believes it: corrected by what the robot reports.
 
 A state of a robot that reports tells which input acts at its stamp, and the command
-that it comes from. Commands that should have acted by then and do not are taken out:
-they are lost or late, and what acts instead is the plan before, or the robot's own
+that it comes from. Commands that should have acted by then and do not are believed to
+come next, and taken out a period later: they are lost, and what acts instead is the plan before, or the robot's own
 ramp. One that comes late after all is put back. Where the report names a command that
 is not known (a guard has numbers of its own), the input itself tells how many of the
 last commands are missing; an input that no plan explains is taken as it is.
@@ -21,7 +21,8 @@ from rti_mpc.approach import Increments
 from rti_mpc.array import Array
 from rti_mpc.schedule import EVER_NS, Plan, Schedule
 
-TOLERANCE = 0.1  # of a period, by which a command may act later than believed and not be missing
+TOLERANCE = 0.1  # of a period, by which a command may act sooner or later than believed
+OVERDUE = 1.0  # periods after which a command that does not act is missing; until then it is about to come
 SAME = 1e-6  # of an input, in its unit and relative: above the rounding of single precision
 MISSING = 8  # plans taken out that are remembered: any of them may still come
 
@@ -40,6 +41,7 @@ class Belief(Schedule):
         self.confirmed = 0
         self._reported_ns = EVER_NS  # stamp of the last report
         self._period_ns = increments.dt_ns
+        self._overdue_ns = round(OVERDUE * increments.dt_ns)
         self._tolerance_ns = round(TOLERANCE * increments.dt_ns)
         super().__init__(u_rest, slew, increments)
 
@@ -73,11 +75,11 @@ class Belief(Schedule):
             self.confirmed += source[1] > 0
             return False
         plans, coming = self._plans, deque[Plan]()
-        while plans and plans[-1].start_ns > t_ns - self._tolerance_ns:
+        while plans and plans[-1].start_ns > t_ns - self._overdue_ns:
             coming.appendleft(plans.pop())
         held = len(plans)
         self._find(source, u, t_ns, before_ns, coming)
-        known = len(plans) > 0 and self._plays(u, t_ns)
+        known = len(plans) > 0 and self._plays(u, t_ns, or_after=not coming)
         if not known:
             self._take(source, u, t_ns, before_ns)
         if not known or len(plans) < held:
@@ -96,10 +98,11 @@ class Belief(Schedule):
                 return plan.end_ns <= t_ns + self._tolerance_ns if not source[1] else all(plan.source[0] != source[0] for plan in self._plans)
         return False
 
-    def _plays(self, u: Array, t_ns: int) -> bool:
-        """Whether an input is believed to act at a time, or nearly then."""
+    def _plays(self, u: Array, t_ns: int, *, or_after: bool = True) -> bool:
+        """Whether an input is believed to act at a time, or nearly then; shortly before it only, unless `or_after`."""
         most = SAME * (1.0 + np.abs(u))
-        return any((np.abs(self.at(t)[0] - u) <= most).all() for t in (t_ns - 1, t_ns, t_ns - self._tolerance_ns, t_ns + self._tolerance_ns))
+        times = (t_ns - 1, t_ns, t_ns - self._tolerance_ns, t_ns + self._tolerance_ns) if or_after else (t_ns - 1, t_ns - self._tolerance_ns)
+        return any((np.abs(self.at(t)[0] - u) <= most).all() for t in times)
 
     def _find(self, source: tuple[int, int], u: Array, t_ns: int, before_ns: int, coming: deque[Plan]) -> None:
         """Leave of the plans whose time has come those up to the one that acts."""
