@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
 import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -68,7 +67,6 @@ def main(config_path: Path, only: Sequence[str], path: Path | None) -> int:
     faults = chosen(only)
     config = prepared(load(config_path))
     stop = stop_on_signals()
-    signal.signal(signal.SIGHUP, lambda *_: stop.set())
     folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
     with Host() as host, Report(console := report_console(), len(faults)) as report:
         inject(config, faults, folder, report, stop, host)
