@@ -57,7 +57,7 @@ def rti_mpc(*arguments: object, timeout_s: float = 120.0) -> subprocess.Complete
 
 
 def environment(state: Path = STATE) -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": str(ROOT), "STATE_DIRECTORY": str(state)}
+    return {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONFAULTHANDLER": "1", "STATE_DIRECTORY": str(state)}
 
 
 class System:
@@ -112,6 +112,10 @@ class System:
         process.send_signal(signal.SIGINT)
         try:
             return process.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGABRT)  # where every thread is, to its log
+            process.wait(PATIENCE_S)
+            raise AssertionError(f"{role} does not end:\n{self.said(role)}") from None
         finally:
             process.kill()
 

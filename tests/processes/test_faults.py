@@ -27,12 +27,13 @@ def matrix(path: Path, *names: str, timeout_s: float = 180.0) -> dict[str, dict[
     "names",
     [
         ("controller_killed",),
-        pytest.param(("guard_and_controller_killed",), marks=pytest.mark.slow),
-        pytest.param(("link_cut",), marks=pytest.mark.slow),
-        pytest.param(("state_nan",), marks=pytest.mark.slow),
+        ("guard_and_controller_killed",),
+        ("link_cut",),
+        ("state_nan",),
     ],
     ids="-".join,
 )
+@pytest.mark.slow
 def test_robot_stops_in_time_and_drives_again(tmp_path: Path, names: tuple[str, ...]) -> None:
     rows = matrix(tmp_path / "faults.json", *names)
     assert tuple(rows) == names

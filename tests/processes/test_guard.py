@@ -63,7 +63,9 @@ def stopped_in_time(host: Host, system: System, record: Record) -> None:
     within_slew(record)
 
 
-@pytest.mark.parametrize("killed", [("controller",), pytest.param(("guard",), marks=pytest.mark.slow), ("controller", "guard")], ids="+".join)
+@pytest.mark.parametrize(
+    "killed", [*(pytest.param((role,), marks=pytest.mark.slow) for role in ("controller", "guard")), ("controller", "guard")], ids="+".join
+)
 def test_robot_stops_in_time_when_somebody_is_killed_and_is_driven_again_after_a_restart(driven: System, host: Host, killed: tuple[str, ...]) -> None:
     """Without a guard by the robot's own watchdog, which still has the plan."""
     fault_ns = driven.fault(signal.SIGKILL, *killed)

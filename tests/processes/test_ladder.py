@@ -64,7 +64,7 @@ def test_other_solver_takes_over_without_anybody_noticing(driven: System, host: 
         assert (after.softened - before.softened, after.fallbacks) == (10, before.fallbacks)
 
 
-@pytest.mark.parametrize(("failure", "samples"), [("qp", 8), ("nan_model", 8)])
+@pytest.mark.parametrize(("failure", "samples"), [("qp", 8), pytest.param("nan_model", 8, marks=pytest.mark.slow)])
 def test_failures_lead_down_the_ladder_and_up_again(driven: System, host: Host, failure: str, samples: int) -> None:
     before, begun_ns = recovered(driven, 50), time.monotonic_ns()  # a second: no more often is one kind of fault published
     events = driven.bus.subscriber(KEYS.event("controller"), capacity=64)

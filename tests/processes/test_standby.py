@@ -20,7 +20,7 @@ from tests.processes.system import KEYS, heard, rti_mpc, until
 from tests.processes.watched import Watched, configuration, within_limits
 
 
-@pytest.fixture(params=[0.1, 0.02], ids=["10Hz", "50Hz"])
+@pytest.fixture(params=[0.1, pytest.param(0.02, marks=pytest.mark.slow)], ids=["10Hz", "50Hz"])
 def redundant(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Watched]:
     """A robot that is being driven by a leader, beside whom another stands by."""
     with Watched(tmp_path, request.param) as system:
@@ -95,6 +95,7 @@ def test_orders_hold_whoever_leads_and_of_two_that_stand_by_one_leads(tmp_path: 
         assert system.samples_of_two_epochs() == []
 
 
+@pytest.mark.slow
 def test_standby_of_another_configuration_is_refused(tmp_path: Path) -> None:
     with Watched(tmp_path, 0.1) as system:
         system.start("robot", "leader")

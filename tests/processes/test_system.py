@@ -122,6 +122,7 @@ def test_robot_brakes_and_stands_when_the_controller_is_killed_and_another_one_t
     system.state(moves)
 
 
+@pytest.mark.slow
 def test_of_several_planners_a_controller_that_starts_after_them_follows_the_latest(system: System) -> None:
     """All their references come at once, in any order."""
     keys, latest = system.bus.keys, 5
@@ -173,6 +174,7 @@ def malformed(message: State | Command, rows: str) -> dict[str, bytes]:
     }
 
 
+@pytest.mark.slow
 def test_payload_of_every_malformed_kind_is_counted_and_published_while_control_goes_on(driven: System, monkeypatch: pytest.MonkeyPatch) -> None:
     """States to the controller and commands to the robot; of a flood of them each publishes one event a second."""
     ours = driven.bus.publisher(KEYS.state, State), driven.bus.publisher(KEYS.command, Command)
