@@ -140,12 +140,13 @@ class Schedule:
     def _put(self, plan: Plan, limits: Increments | None) -> Array:
         """Put a plan in line, approached inside limits from what acts before it."""
         plans, start_ns = self._plans, plan.start_ns
+        plan.u, plan.pause_ns = plan.asked, None
+        if limits is not None:
+            acted = segments(self.at, start_ns - limits.dt_ns, start_ns)
+            plan.u = approach(plan.asked, plan.stamp_ns, plan.period_ns, start_ns, acted, limits)
         plan.before = self.at(start_ns - 1)[0].copy()
         while plans and plans[-1].start_ns >= start_ns:
             plans.pop()
-        plan.u, plan.pause_ns = plan.asked, None
-        if limits is not None:
-            plan.u = approach(plan.asked, plan.stamp_ns, plan.period_ns, start_ns, segments(self.at, start_ns - limits.dt_ns, start_ns), limits)
         plans.append(plan)
         if len(plans) > WAITING:
             del plans[1]

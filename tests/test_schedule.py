@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rti_mpc.approach import Increments
 from rti_mpc.array import Array
 from rti_mpc.message import Command
 from rti_mpc.schedule import STEP_NS, Schedule, end_ns
@@ -111,3 +112,13 @@ def test_time_that_is_forgotten_is_cut_at_what_acted_before() -> None:
     plans.cut(-100 * MS, 900 * MS)
     np.testing.assert_allclose(plans.at(900 * MS - 1)[0], [0.4, 0.0])
     np.testing.assert_allclose(plans.at(900 * MS)[0], [0.375, 0.0])
+
+
+def test_plan_that_replaces_all_that_is_remembered_is_approached_from_what_acted_before() -> None:
+    plans = Schedule(np.zeros(2), SLEW, Increments(np.array([-0.25, -0.4]), np.array([0.25, 0.4]), 100 * MS))
+    late = command(np.full((4, 2), 0.1), stamp_ms=1000)
+    plans.add(late, late.stamp_ns, end_ns(late))
+    plans.forget(2000 * MS)
+    sooner = command(np.full((4, 2), 0.5), stamp_ms=900)
+    plans.add(sooner, sooner.stamp_ns, end_ns(sooner))
+    np.testing.assert_array_equal(plans.at(900 * MS)[0], [0.25, 0.4])

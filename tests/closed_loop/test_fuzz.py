@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.closed_loop.fuzz import Fuzz
+from tests.closed_loop.lossy import Lossy
 
 SHORT = 5_000
 MILLION = 50_000 if "CI" in os.environ else 1_000_000
@@ -60,3 +61,24 @@ def test_no_sample_of_a_million_leaves_the_limits_or_raises(seed: int) -> None:
     grown = resident_bytes() - before
     print(f"\n{fuzz.samples} samples in {time.monotonic() - start_s:.0f} s, memory grown by {grown / 2**20:.2f} MiB: {dict(fuzz.seen)}")
     assert grown < 2**22  # bytes; of 800,000 samples
+
+
+LOSSY = [(False, True), (True, True), (False, False), (True, False)]
+LOSSY_NAMES = ["no guard", "guard", "no guard, no reports", "guard, no reports"]
+
+
+@pytest.mark.parametrize(("guarded", "reports"), LOSSY, ids=LOSSY_NAMES)
+def test_no_input_leaves_its_limits_whatever_is_lost_late_repeated_or_reordered_on_any_link(guarded: bool, reports: bool) -> None:
+    fuzz = Lossy(seed=1, guarded=guarded, reports=reports)
+    run(fuzz, SHORT)
+    assert {"TRACKING", "BRAKING", "accepted", "lost to robot", "lost to standby", "lost to controller", "takeover", "jump"} <= set(fuzz.seen)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("guarded", [False, True], ids=["no guard", "guard"])
+@pytest.mark.parametrize("seed", [2, 3])
+def test_no_sample_of_a_million_leaves_its_limits_on_links_that_lose(seed: int, guarded: bool) -> None:
+    start_s = time.monotonic()
+    fuzz = Lossy(seed=seed, guarded=guarded)
+    run(fuzz, int(os.environ.get("FUZZ_SAMPLES", MILLION)))
+    print(f"\n{fuzz.samples} samples in {time.monotonic() - start_s:.0f} s: {dict(fuzz.seen)}")
