@@ -121,9 +121,8 @@ def test_waypoints_of_a_file_are_driven_too(tmp_path: Path) -> None:
     assert (summary["scenario"], summary["heading"]) == ("square", "consistent")
 
 
-@pytest.mark.parametrize(
-    ("number", "status", "last_words"), [pytest.param(signal.SIGINT, 1, "not driven to the end", marks=pytest.mark.slow), (signal.SIGKILL, -9, "")]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "status", "last_words"), [(signal.SIGINT, 1, "not driven to the end"), (signal.SIGKILL, -9, "")])
 def test_demo_that_is_ended_leaves_no_process_behind(tmp_path: Path, number: signal.Signals, status: int, last_words: str) -> None:
     log = (tmp_path / "demo.log").open("wb")
     command = command_line("demo", "--out", tmp_path / "out")

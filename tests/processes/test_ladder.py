@@ -85,6 +85,7 @@ def test_failures_lead_down_the_ladder_and_up_again(driven: System, host: Host, 
     assert {"qp_failed", "no_plan"} <= set(codes(events))
 
 
+@pytest.mark.slow
 def test_samples_over_budget_are_not_sent_and_leave_the_loop_in_phase(driven: System, host: Host) -> None:
     before, begun_ns = recovered(driven, 50), time.monotonic_ns()  # a second: no more often is one kind of fault published
     events = driven.bus.subscriber(KEYS.event("controller"), capacity=64)
@@ -149,6 +150,7 @@ def test_failure_that_cannot_be_injected_is_refused_with_what_can(driven: System
     assert "must be" in answer["error"]
 
 
+@pytest.mark.slow
 def test_nothing_fails_on_request_unless_the_configuration_says_so(tmp_path: Path) -> None:
     with System(tmp_path) as system:
         system.start("robot", "controller")

@@ -110,6 +110,7 @@ def test_standby_of_another_configuration_is_refused(tmp_path: Path) -> None:
         assert "ours" in done.stderr
 
 
+@pytest.mark.slow
 def test_standby_without_a_leader_leads(tmp_path: Path) -> None:
     with Watched(tmp_path, 0.1) as system:
         system.start("robot", "standby", "reference")

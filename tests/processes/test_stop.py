@@ -125,6 +125,7 @@ def flood(endpoint: str) -> Iterator[list[float]]:
             thread.join()
 
 
+@pytest.mark.slow
 def test_stop_is_answered_beside_300_requests_a_second(system: Operated) -> None:
     system.start("robot", "controller", "reference")
     system.tracking()

@@ -90,6 +90,7 @@ def test_ctrl_c_ends_each_process_within_a_second_and_the_last_command_is_a_stan
     assert "Traceback" not in "".join(map(system.said, ("controller", "robot", "reference", "viewer")))
 
 
+@pytest.mark.slow
 def test_controller_recovers_when_the_robot_is_killed_and_restarted(system: System) -> None:
     system.start("controller", "reference", "robot")
     first = system.tracking()
