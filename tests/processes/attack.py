@@ -20,6 +20,8 @@ from rti_mpc.wire.keys import Keys
 
 RATE_HZ = 1000
 BATCH = 10  # messages at once
+CROWD_HZ = 2000  # on each of two keys
+CROWD = 10  # messages at once
 MEMORY = 500  # messages a key of which some are replayed
 REPLAYED_S = 1.0  # at least, since a message that is replayed was sent
 HUGE = {"info/controller": 50 << 20, "command": 60 << 20}  # bytes, once in a `run`
@@ -98,12 +100,34 @@ class Attack:
             due_s += BATCH / RATE_HZ
             time.sleep(max(0.0, due_s - time.monotonic()))
 
+    def crowd(self, seconds: float) -> None:
+        """Send twenty messages that are none behind each state, and 2000 a second of an old state and of somebody else's command."""
+        states = self._session.declare_subscriber(self._keys.state, zenoh.handlers.RingChannel(16), allowed_origin=zenoh.Locality.REMOTE)
+        others = {"state": encode(self.last(State, "state")), "command": encode(replace(self.last(Command, "command"), epoch=1, seq=1))}
+        due_s = end_s = time.monotonic() + seconds
+        due_s -= seconds
+        while due_s < end_s:
+            while states.try_recv() is not None:
+                for _ in range(20):
+                    self._put("state", self._rng.bytes(100), encoding(State))
+            for stream, payload in others.items():
+                for _ in range(CROWD):
+                    self._put(stream, payload, encoding(CLASSES[stream]))
+            due_s += CROWD / CROWD_HZ
+            time.sleep(max(0.0, due_s - time.monotonic()))
+        states.undeclare()
+
     def listen(self) -> None:
         """Remember what others send."""
         while (sample := self._memory.try_recv()) is not None:
             stream = str(sample.key_expr).removeprefix(self._keys.stream(""))
             if len(sample.payload) < 1 << 20:
                 self._heard[stream].append((time.monotonic(), sample.payload.to_bytes(), str(sample.encoding)))
+
+    def heard(self, stream: str) -> bool:
+        """Whether others have sent anything on a stream."""
+        self.listen()
+        return bool(self._heard[stream])
 
     def forge(self, cls: type[Any], stream: str, **change: Any) -> None:
         """Send the last message of a stream with some fields of another value: well-formed."""
