@@ -95,7 +95,8 @@ class Lossy(Fuzz):
         standby = self._standby
         if isinstance(message, Command):
             standby.overhear(message)
-        elif standby.receive_state(message, self.local_ns(self._now_ns)) is not None:
+        elif (command := standby.receive_state(message, local_ns := self.local_ns(self._now_ns))) is not None:
+            standby.in_time(command, local_ns + MS)
             standby.prepare()
         standby.notices.clear()
 

@@ -70,7 +70,7 @@ LOSSY_NAMES = ["no guard", "guard", "no guard, no reports", "guard, no reports"]
 @pytest.mark.parametrize(("guarded", "reports"), LOSSY, ids=LOSSY_NAMES)
 def test_no_input_leaves_its_limits_whatever_is_lost_late_repeated_or_reordered_on_any_link(guarded: bool, reports: bool) -> None:
     fuzz = Lossy(seed=1, guarded=guarded, reports=reports)
-    run(fuzz, SHORT)
+    run(fuzz, SHORT // 2)
     assert {"TRACKING", "BRAKING", "accepted", "lost to robot", "lost to standby", "lost to controller", "takeover", "jump"} <= set(fuzz.seen)
 
 
