@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A link or a sensor gone wrong: the robot's states pass through a process that changes them on request.
+A link or a sensor gone wrong: the robot's states pass through a process that changes them on request, or that loses what is commanded.
 
 The robot lives under one prefix, whoever hears the changed states under another.
 What is commanded passes back as it is, but for a clock that has jumped: its stamps
@@ -65,6 +65,7 @@ CHANGES: dict[str, Change] = {
     "nan": lambda state, _: [replace(state, x=np.where(np.arange(len(state.x)), state.x, np.nan))],
     "short": lambda state, _: [replace(state, x=state.x[:-1])],
 }
+LOST = "commands_lost"  # states pass, commands do not
 JUMPS = {"ahead": JUMP_NS, "behind": -JUMP_NS}  # of the robot's clock
 
 
@@ -74,6 +75,7 @@ class Relay:
     def __init__(self, bus: Bus, robot: Keys) -> None:
         keys = bus.keys
         self._offset_ns = 0
+        self._losing = False  # whether commands are lost
         self._stamp_ns = 0  # of the last state, as the robot sent it
         self._fault: tuple[str, int, deque[State]] = ("none", 0, deque())  # what, for how many states, those it holds back
         self._states = bus.publisher(keys.state, State, realtime=True)
@@ -88,9 +90,10 @@ class Relay:
         if name in JUMPS:
             self._offset_ns += JUMPS[name]
             return {"ok": True, "stamp_ns": self._stamp_ns}
-        if name not in CHANGES:
-            return {"ok": False, "error": f"fault must be one of {', '.join([*CHANGES, *JUMPS])}, got {name!r}"}
-        self._fault = (name, request.get("states", 2**62), deque())
+        if name not in CHANGES and name != LOST:
+            return {"ok": False, "error": f"fault must be one of {', '.join([*CHANGES, *JUMPS, LOST])}, got {name!r}"}
+        self._losing = name == LOST
+        self._fault = ("none" if self._losing else name, request.get("states", 2**62), deque())
         return {"ok": True, "stamp_ns": self._stamp_ns}
 
     def _change(self, state: State) -> None:
@@ -103,7 +106,9 @@ class Relay:
             self._fault = (name, states - 1, held) if states > 1 else ("none", 0, deque())
 
     def _pass(self, publisher: Publisher[Command], command: Command) -> None:
-        """Pass a command back."""
+        """Pass a command back, if the link does."""
+        if self._losing:
+            return
         publisher.put(replace(command, **{name: getattr(command, name) - self._offset_ns for name in STAMPS}))
 
     def _follow(self, subscriber: Subscriber, intake: Intake[M], act: Callable[[M], None]) -> None:

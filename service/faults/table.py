@@ -15,6 +15,7 @@ from typing import Any
 
 from rti_mpc.message import Command, End, Reference, State
 from service.faults.promise import HOLDS, KEEPS_ON, PAUSES, RECOVERS, REJOINS, STAYS, STOPS, WAITS, Promise
+from service.faults.relay import LOST
 from service.faults.relay import ROLE as RELAY
 from service.faults.system import System, Wiring
 
@@ -22,6 +23,7 @@ Act = Callable[[System], int | None]
 
 HOLD_S = 3.5
 PAUSE_S = 1.5
+LOSS_S = 0.8
 MALFORMED = 10_000
 GARBAGE = (b"", b"\x00\x00\x00\x00", b"\x00\x01\x00\x00" + bytes(24), b"\x00\x01\x00\x00" + b"\xff" * 400)  # none is a message
 SLICE_S, SHARE = 0.1, 0.05  # of time a slow process gets
@@ -232,6 +234,7 @@ FAULTS = (
     Fault("router_killed", "SIGKILL of the router", ROUTER, STOPS, kill("router"), start("router")),
     Fault("state_duplicated", "every state comes three times", LINK, KEEPS_ON, states("duplicated"), states("none")),
     Fault("state_reordered", "every two states in the wrong order", LINK, KEEPS_ON, states("reordered"), states("none")),
+    Fault("commands_lost", f"commands are lost for {LOSS_S:g} s, states are not", LINK, PAUSES, states(LOST), states("none"), LOSS_S),
     Fault("state_late", "every state 0.4 s late", LINK, STOPS, states("late"), states("none")),
     Fault("state_nan_once", "one state with a NaN", SENSOR, KEEPS_ON, states("nan", 1), nothing),
     Fault("state_nan", "every state with a NaN", SENSOR, STOPS, states("nan"), states("none")),
