@@ -145,7 +145,8 @@ class Guard:
         whose = self._lives.hear(state.epoch, local_ns, self._clock.rate)
         if self._lives.notice is not None:
             self.notices.append(self._lives.notice)
-            self._brake(self._clock.now_ns(local_ns), self._clock.now_ns(local_ns))
+            begin_ns = self._clock.now_ns(local_ns) + round(LEAD_NS * self._clock.rate)  # the robot is told before it is due
+            self._brake(begin_ns, begin_ns)
         if whose is Heard.OTHER or not self._counts(state, local_ns, begins=whose is Heard.BEGINS):
             return
         heard_ns, heard_local_ns = self._heard
