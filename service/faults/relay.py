@@ -61,6 +61,7 @@ CHANGES: dict[str, Change] = {
     "frozen": frozen,
     "late": late,
     "duplicated": lambda state, _: [state, state, state],
+    "microseconds": lambda state, _: [replace(state, stamp_ns=state.stamp_ns // 1000)],
     "reordered": reordered,
     "nan": lambda state, _: [replace(state, x=np.where(np.arange(len(state.x)), state.x, np.nan))],
     "short": lambda state, _: [replace(state, x=state.x[:-1])],

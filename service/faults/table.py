@@ -146,6 +146,12 @@ def restart(*roles: str) -> Act:
     return lambda system: system.restart(*roles)
 
 
+def clock_in_ns(system: System) -> None:
+    """Let the robot's stamps be nanoseconds again; a reference on its clock is to be sent anew, for that has gone back."""
+    states("none")(system)
+    system.restart("reference")
+
+
 def fill_disk(system: System) -> None:
     """Let every write of viewer and controller to a file fail."""
     system.limit_files(0, "viewer", "controller")
@@ -240,6 +246,7 @@ FAULTS = (
     Fault("state_nan", "every state with a NaN", SENSOR, STOPS, states("nan"), states("none")),
     Fault("state_wrong_length", "every state one number short", SENSOR, STOPS, states("short"), states("none")),
     Fault("state_frozen", "the same state again and again", SENSOR, STOPS, states("frozen"), states("none")),
+    Fault("clock_in_us", "the robot's stamps change from ns to us", SENSOR, STOPS, states("microseconds"), clock_in_ns),
     Fault("clock_back", "the robot's clock jumps back by 5 s", SENSOR, STOPS, states("behind"), restart("reference")),
     Fault("clock_ahead", "the robot's clock jumps ahead by 5 s", SENSOR, RECOVERS, states("ahead"), nothing),
 )
