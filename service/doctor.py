@@ -149,9 +149,20 @@ def phases_us(config: Config) -> tuple[Array, Array]:
     gc.collect()
     gc.freeze()
     gc.disable()
+    seq = 0
+
+    def answer() -> Command | None:
+        """Answer the next state; None while the rate of the robot's clock is not known."""
+        nonlocal seq
+        seq += 1
+        return controller.receive_state(State(1, seq, seq * dt_ns, x), seq * dt_ns)
+
+    while answer() is None:
+        pass
+    controller.prepare()
     for k in paced(SAMPLES):
         arrival_ns = time.monotonic_ns()
-        command = controller.receive_state(State(1, k + 1, k * dt_ns, x), k * dt_ns)
+        command = answer()
         assert command is not None
         encode(command)
         commanded_ns = time.monotonic_ns()
