@@ -62,6 +62,7 @@ CHANGES: dict[str, Change] = {
     "late": late,
     "duplicated": lambda state, _: [state, state, state],
     "microseconds": lambda state, _: [replace(state, stamp_ns=state.stamp_ns // 1000)],
+    "twins": lambda state, _: [state, replace(state, epoch=state.epoch + 1)],
     "reordered": reordered,
     "nan": lambda state, _: [replace(state, x=np.where(np.arange(len(state.x)), state.x, np.nan))],
     "short": lambda state, _: [replace(state, x=state.x[:-1])],

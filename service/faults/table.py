@@ -24,6 +24,7 @@ Act = Callable[[System], int | None]
 HOLD_S = 3.5
 PAUSE_S = 1.5
 LOSS_S = 0.8
+TWINS_S = 1.0
 MALFORMED = 10_000
 GARBAGE = (b"", b"\x00\x00\x00\x00", b"\x00\x01\x00\x00" + bytes(24), b"\x00\x01\x00\x00" + b"\xff" * 400)  # none is a message
 SLICE_S, SHARE = 0.1, 0.05  # of time a slow process gets
@@ -245,6 +246,7 @@ FAULTS = (
     Fault("state_nan_once", "one state with a NaN", SENSOR, KEEPS_ON, states("nan", 1), nothing),
     Fault("state_nan", "every state with a NaN", SENSOR, STOPS, states("nan"), states("none")),
     Fault("state_wrong_length", "every state one number short", SENSOR, STOPS, states("short"), states("none")),
+    Fault("two_robots", f"a second robot of this name lives for {TWINS_S:g} s", SENSOR, PAUSES, states("twins"), states("none"), TWINS_S),
     Fault("state_frozen", "the same state again and again", SENSOR, STOPS, states("frozen"), states("none")),
     Fault("clock_in_us", "the robot's stamps change from ns to us", SENSOR, STOPS, states("microseconds"), clock_in_ns),
     Fault("clock_back", "the robot's clock jumps back by 5 s", SENSOR, STOPS, states("behind"), restart("reference")),
