@@ -14,7 +14,7 @@ from tests.closed_loop.fuzz import Fuzz
 from tests.closed_loop.lossy import Lossy
 
 SHORT = 5_000
-MILLION = 50_000 if "CI" in os.environ else 1_000_000
+MILLION = 20_000 if "CI" in os.environ else 1_000_000
 
 
 def resident_bytes() -> int:
