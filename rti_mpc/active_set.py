@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What solves nearly every sample: the recursion of `rti_mpc.riccati`, repeated until no place changes.
+Active-set solver on the Riccati recursion. Solves nearly every sample without a QP solver.
 
 The places are remembered from sample to sample and shifted with the plan, so
 that one roll-out mostly does. When they do not settle, the penalty that holds
-what is at its bound is softened and stiffened again in steps.
+what is at its bound is softened and stiffened again in steps. A plan is certified
+from the problem's own data, and refined where the penalty has given way.
 """
 
 from __future__ import annotations
@@ -16,12 +17,18 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind
+from rti_mpc.places import Places
 from rti_mpc.qp import Guess
-from rti_mpc.riccati import Recursion
+from rti_mpc.status import QpStatus
 
 ROLL_OUTS = 6  # at most from where the last sample left off; more places change than that only when much happens at once
 PATH = tuple(10.0**k for k in range(1, 10))  # of the penalty then: soft ones are settled whatever the start, and each leads to the next
 ROLL_OUTS_EACH = 100  # at most on each step of that path
+REFINEMENTS = 2  # at most of a plan that is not certified
+FEASIBLE = 1e-9  # violation of dynamics, bounds and increments, relative to their scales, up to which a plan is certified
+OPTIMAL = 1e-6  # share of 1 plus its cost, normalised, by which a certified plan may cost more than the optimum
+NEARLY_FEASIBLE, NEARLY_OPTIMAL = 1e-6, 1e-2  # the same of a plan that may be commanded, as inaccurate
+SOLVED, INACCURATE, FAILED = QpStatus.SOLVED, QpStatus.INACCURATE, QpStatus.FAILED  # an enumeration looks its members up slowly
 PATIENCE = 3  # roll-outs in which the changes may become no fewer, before places change one at a time
 
 
@@ -34,30 +41,35 @@ class ActiveSet:
         linearize: Does so at the guess as it is.
         gain: Computes the gains; after either of these, that is all of the preparation.
         iterations: Roll-outs of the last solve.
-        res_prim: Primal residual of the last solve: rounding.
-        res_dual: Dual residual of the last solve: rounding.
+        res_prim: Largest violation of dynamics, bounds and increments by the last plan that was certified, relative to their scales.
+        res_dual: Largest amount by which the cost of that plan can be above the optimum, relative to 1 plus its cost, normalised.
     """
 
-    res_prim = 0.0
-    res_dual = 0.0
-
-    def __init__(self, recursion: Recursion, guess: Guess, make: Callable[[ca.Function], ca.Function]) -> None:
+    def __init__(self, functions: Places, certificate: ca.Function, guess: Guess, make: Callable[[ca.Function], ca.Function]) -> None:
         x, u, u_prev, *_ = guess.sample
         weights = guess.sample[5:]
-        stages: Array = np.zeros(recursion.linearize.numel_out(0))
-        gains: Array = np.zeros(recursion.gains.numel_out(0))
+        stages: Array = np.zeros(functions.linearize.numel_out(0))
+        gains: Array = np.zeros(functions.gains.numel_out(0))
         # Like the guess and the plan made at it: these are found at those, and the next ones are those moved on by a stage.
-        self._places: Array = np.zeros(recursion.roll_out.numel_out(5))
+        self._places: Array = np.zeros(functions.roll_out.numel_out(5))
         self._found = np.zeros_like(self._places)
         changes: Array = np.zeros(1)
         self._changes = changes.data
         self._stiff = np.full(1, PATH[-1])
-        self.advance = bind(make(recursion.advance), (*guess.plan[:2], *guess.sample[2:], self._found), (x, u, self._places, stages))
-        self.linearize = bind(make(recursion.linearize), guess.sample, (stages,))
-        self.gain = bind(make(recursion.gains), (stages, u, *weights, self._places, self._stiff), (gains,))
-        rolled = (x, u, u_prev, guess.x0, stages, gains, *weights, self._places, self._stiff)
-        self._roll_out = bind(make(recursion.roll_out), rolled, (*guess.plan, changes, self._found))
+        self.advance = bind(make(functions.advance), (*guess.plan[:2], *guess.sample[2:], self._found), (x, u, self._places, stages))
+        self.linearize = bind(make(functions.linearize), guess.sample, (stages,))
+        self.gain = bind(make(functions.gains), (stages, u, *weights, self._places, self._stiff), (gains,))
+        multipliers: Array = np.zeros(functions.roll_out.numel_out(6))
+        fixed = (stages, gains, *weights, self._places, self._stiff)
+        self._roll_out = bind(make(functions.roll_out), (x, u, u_prev, guess.x0, *fixed), (*guess.plan, changes, self._found, multipliers))
+        plan, slopes = guess.plan[:2], np.zeros_like(u)
+        verdict: tuple[Array, ...] = tuple(np.zeros(1) for _ in range(3))
+        self._verdict = tuple(array.data for array in verdict)
+        self._certify = bind(make(certificate), (x, u, u_prev, guess.x0, stages, *plan, multipliers, *weights), (slopes, *verdict))
+        self._refine = bind(make(functions.refine), (x, u, u_prev, *fixed, slopes, *plan, multipliers), (*plan, multipliers))
+        self._refined = (*plan, multipliers)
         self.iterations = 0
+        self.res_prim = self.res_dual = 0.0
 
     def forget(self) -> None:
         """Start cold: no bound acts."""
@@ -66,6 +78,30 @@ class ActiveSet:
     def keep(self) -> None:
         """Let the places be those of a guess that is the plan."""
         self._found[:] = self._places
+
+    def certified(self) -> QpStatus:
+        """Return what the last plan is for its QP, from the problem's own data; it is refined where it is not yet the solution."""
+        status = self._judged()
+        for _ in range(REFINEMENTS):
+            if status is SOLVED:
+                break
+            gap, before = self.res_dual, [array.copy() for array in self._refined]
+            self._refine()
+            status = self._judged()
+            if not self.res_dual < gap:  # where places are degenerate, a step may lead away
+                for array, kept in zip(self._refined, before, strict=True):
+                    array[:] = kept
+                return self._judged()
+        return status
+
+    def _judged(self) -> QpStatus:
+        """Judge the plan as it is."""
+        self._certify()
+        primal, gap, cost = (part[0] for part in self._verdict)
+        self.res_prim, self.res_dual = primal, gap / (1.0 + cost)
+        if primal <= FEASIBLE and self.res_dual <= OPTIMAL:
+            return SOLVED
+        return INACCURATE if primal <= NEARLY_FEASIBLE and self.res_dual <= NEARLY_OPTIMAL else FAILED
 
     def solve(self) -> bool:
         """Find the places, and make the plan; tell whether they settled, and numbers are finite."""

@@ -27,7 +27,7 @@ from rti_mpc.cache import cache_dir, keep, own, sealed
 from rti_mpc.errors import ShapeError
 
 # No contraction into fused operations and no fast-math: a machine with a compiler and one without agree to rounding.
-FLAGS = ("-O2", "-ffp-contract=off", "-shared", "-fPIC", "-w")
+FLAGS = ("-O3", "-std=gnu89", "-fno-semantic-interposition", "-ffp-contract=off", "-shared", "-fPIC", "-w")
 
 
 def compiled(*functions: ca.Function) -> list[ca.Function]:

@@ -69,6 +69,7 @@ class Linearization:
         R: The increment weight, sparse.
         cost: The cost (4) at the guess.
         checksum: Finite if and only if everything above is.
+        forms: What of these a structured solver needs, in the order of `stages`, all of them in one column.
     """
 
     def __init__(self, ocp: Ocp) -> None:
@@ -111,6 +112,9 @@ class Linearization:
         self.damping = damping(ocp) * self.cost / self.scale_u**2
         self.checksum = ca.sum1(ca.vec(stages)) + ca.sum1(ca.vec(nodes)) + self.cost + ca.sum1(ca.vec(self.b))
         self.checksum += ca.sum1(ca.vec(bounded))
+        self.forms = [self.A, self.B, self.b, self.hessian, self.gradient, self.force, self.increments, self.g, self.g_x, self.g_u]
+        self.forms += [self.damping, self.checksum, self.cost]
+        self.stages = ca.veccat(*self.forms)
 
     @property
     def arguments(self) -> list[ca.MX]:
@@ -136,6 +140,12 @@ class Linearization:
         last = k == self.u.shape[1] - 1
         following = 0 if last else self.w["lambda_"][k + 1]
         return self.R * (self.w["lambda_"][k] + following) + ca.diag(self.damping), None if last else -self.R * following
+
+
+def divided(flat: ca.MX, like: list[ca.MX]) -> list[ca.MX]:
+    """Divide a column into expressions of given shapes."""
+    ends = np.cumsum([0, *(one.numel() for one in like)]).tolist()
+    return [ca.reshape(part, one.shape) for part, one in zip(ca.vertsplit(flat, ends), like, strict=True)]
 
 
 def linearize(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:

@@ -129,8 +129,8 @@ class Telemetry:
         state_seq: Sequence number of the state it answers.
         state_stamp_ns: Stamp of that state.
         iterations: Iterations of the QP solver.
-        res_prim: Primal residual of the QP, infinity norm.
-        res_dual: Dual residual of the QP, infinity norm.
+        res_prim: Violation of dynamics, bounds and increments by the plan, relative to range; of another solver its primal residual.
+        res_dual: Bound on what the plan costs above the optimum, relative to 1 plus its cost, normalised; of another solver its dual residual.
         cost: The cost (4) of the plan.
         violation: Largest slack of a softened bound in the plan, in that state's unit.
         prepare_us: Time of the preparation phase before this sample.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-The QP of a sample, solved exactly by a Riccati recursion over a set of active bounds.
+Riccati recursion for the QP of a sample, its bounds as quadratic terms: what the active set and the interior point are made of.
 
 The increments couple an input to the one before, so the recursion is in
 :math:`s_k = (\Delta x_k, \Delta u_{k-1})`. From the cost-to-go
@@ -10,12 +10,10 @@ The increments couple an input to the one before, so the recursion is in
 
     \tfrac12 \Delta u_k^T Q_{uu} \Delta u_k + \Delta u_k^T (Q_{us} s_k + q_u) ,
 
-and from these the gains. Bounds enter by the *place* of what they bound: at a
-bound it is held by a penalty too stiff to give way noticeably; beyond a softened
-one it pays for it; elsewhere it is free. Rolled out from the initial state,
-whatever crosses a bound is placed there, and what a bound holds back no more is
-set free: a primal-dual active set method [Hintermueller2003]_. A roll-out that
-changes no place is the solution.
+and from these the gains. Each bounded *row* d, an input, an increment or what has
+softened bounds, adds :math:`\tfrac12 W d^2 + v d` in its deviation from the guess;
+weight W and pull v are the solver's. With the gains known, other pulls cost a sweep
+over vectors alone.
 """
 
 from __future__ import annotations
@@ -23,67 +21,102 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import casadi as ca
-import numpy as np
 
-from rti_mpc.linearization import Linearization, change, nonzeros, shift
+from rti_mpc.linearization import Linearization, nonzeros
 from rti_mpc.ocp import Ocp
-from rti_mpc.transcription import INFINITY
 
-TOLERANCE = 1e-9  # by which a bound may be crossed before it acts, relative to its scale: rounding must not decide
-RELEASE = 1e-6  # multiplier of the wrong sign, times the scale, in units of the normalised cost, from which a bound is released
+Columns = list[ca.MX]  # one expression per stage
 
 
 @dataclass(frozen=True, eq=False)
-class Recursion:
-    """
-    The functions of the two phases.
+class Rows:
+    """A number for each bounded row: inputs and increments, shapes ``(nu, N_u)``, and what has softened bounds, shape ``(ng, N)``."""
 
-    The places are 0 for what is free, -1 and 1 at the lower and the upper bound, -2 and 2 beyond a softened one: of inputs and of increments, shapes
-    ``(nu, N_u)``, and of what has softened bounds, shape ``(ng, N)``, one after the other.
+    inputs: ca.MX
+    increments: ca.MX
+    softened: ca.MX
+
+    def columns(self) -> tuple[Columns, Columns, Columns]:
+        """Return these stage by stage."""
+        return columns(self.inputs), columns(self.increments), columns(self.softened)
+
+
+def columns(matrix: ca.MX) -> Columns:
+    """Return a matrix column by column, one without rows as well."""
+    return list(ca.horzsplit(matrix)) if matrix.size1() else [ca.MX(0, 1)] * matrix.size2()
+
+
+class Riccati:
+    """
+    The recursion of an OCP, in expressions.
 
     Attributes:
-        linearize: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale) -> stages``.
-        advance: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale, places) -> (x+, u+, places+, stages)``: the same of a plan moved on by one stage.
-        gains: ``(stages, u, *WEIGHTS, scale, places, stiff) -> gains``; `stiff` is the weight of the penalty that holds what is at its bound, for
-            what is measured by its scale.
-        roll_out: ``(x, u, u_prev, x0, stages, gains, *WEIGHTS, scale, places, stiff) -> (x+, u+, violation, change, changes, places+)``: the full
-            step, by how much it exceeds softened bounds, as it is and relative to their scale, its size, and how many places change: -1 if data,
-            gains or plan are not finite.
+        size: Entries of the gains of one stage: K and kappa of ``du = -K s - kappa``, and the Cholesky factor of ``Q_uu``.
     """
 
-    linearize: ca.Function
-    advance: ca.Function
-    gains: ca.Function
-    roll_out: ca.Function
+    def __init__(self, ocp: Ocp, lin: Linearization) -> None:
+        self._ocp, self._lin = ocp, lin
+        nx, nu = ocp.model.nx, ocp.model.nu
+        self._n = n = nx + nu
+        self._ends = (nu * n, nu * (n + 1))
+        self.size = nu * (n + 1) + nu * (nu + 1) // 2
+        self._backward = [backward_stage(ocp, lin, free) for free in (False, True)]
+        self._sweep = [sweep_stage(ocp, lin, free) for free in (False, True)]
+        self._forward = [forward_stage(ocp, lin, free) for free in (False, True)]
 
+    def gains(self, forms: list[ca.MX], weight: Rows, pull: Rows) -> ca.MX:
+        """Return the gains of all stages with an input, one a column, shape ``(size, N_u)``."""
+        N, N_u, n, w = self._ocp.N, self._ocp.N_u, self._n, self._lin.w
+        A, B, b, H, h, force, _, _, g_x, g_u = (columns(form) for form in forms[:10])
+        weights, pulls = weight.columns(), pull.columns()
+        lambda_ = ca.vertsplit(w["lambda_"])
+        R, damping = nonzeros(self._lin.R), forms[10]
+        P, p = ca.MX.zeros(n * (n + 1) // 2), ca.MX.zeros(n)
+        found = []
+        for k in reversed(range(N)):
+            stage = A[k], B[k], b[k], H[k], h[k], g_x[k], g_u[k], weights[2][k], pulls[2][k], P, p
+            if k < N_u:
+                P, p, gain = self._backward[1](*stage, R, damping, lambda_[k], force[k], weights[0][k], pulls[0][k], weights[1][k], pulls[1][k])
+                found.append(gain)
+            else:
+                P, p = self._backward[0](*stage)
+        return ca.horzcat(*reversed(found))
 
-def riccati(ocp: Ocp) -> Recursion:
-    """Build the recursion of an OCP."""
-    lin = Linearization(ocp)
-    forms = [lin.A, lin.B, lin.b, lin.hessian, lin.gradient, lin.force, lin.increments, lin.g, lin.g_x, lin.g_u, lin.damping, lin.checksum]
-    linearize = ca.Function("linearize", lin.arguments, [ca.veccat(*forms)])
+    def corrected(self, forms: list[ca.MX], gains: ca.MX, pull: Rows) -> ca.MX:
+        """Return gains whose kappa is that of pulls alone: rolled out from s = 0 without defects they make the change that these pulls make."""
+        A, B, _, _, _, _, _, _, g_x, g_u = (columns(form) for form in forms[:10])
+        pulls, gain = pull.columns(), columns(gains)
+        p = ca.MX.zeros(self._n)
+        kappas = []
+        for k in reversed(range(self._ocp.N)):
+            stage = A[k], B[k], g_x[k], g_u[k], pulls[2][k], p
+            if k < self._ocp.N_u:
+                p, kappa = self._sweep[1](*stage, gain[k], pulls[0][k], pulls[1][k])
+                kappas.append(kappa)
+            else:
+                p = self._sweep[0](*stage)
+        K, _, L = ca.vertsplit(gains, [0, *self._ends, self.size])
+        return ca.vertcat(K, ca.horzcat(*reversed(kappas)), L)
 
-    stages = ca.MX.sym("stages", linearize.numel_out(0))
-    forms = divided(stages, forms)
-    kinds = (lin.u, lin.u, lin.g)
-    flat = ca.MX.sym("places", sum(kind.numel() for kind in kinds))
-    places = divided(flat, kinds)
-    x, u = shift(ocp)(lin.x, lin.u, lin.p)
-    moved = ca.veccat(*(ca.horzcat(kind[:, 1:], kind[:, -1]) for kind in places))
-    advance = ca.Function("advance", [*lin.arguments, flat], [x, u, moved, linearize(x, u, *lin.arguments[2:])])
-    stiff = ca.MX.sym("stiff")
-    gains = ca.Function("gains", [stages, lin.u, *lin.weights, flat, stiff], [backward(ocp, lin, forms, places, stiff)])
-    x0 = ca.MX.sym("x0", ocp.model.nx)
-    found = ca.MX.sym("gains", *gains.size_out(0))
-    rolled = forward(ocp, lin, forms, x0, found, places, stiff)
-    roll_out = ca.Function("roll_out", [lin.x, lin.u, lin.u_prev, x0, stages, found, *lin.weights, flat, stiff], rolled)
-    return Recursion(linearize, advance, gains, roll_out)
-
-
-def divided(flat: ca.MX, like: list[ca.MX] | tuple[ca.MX, ...]) -> list[ca.MX]:
-    """Divide a column into expressions of given shapes."""
-    ends = np.cumsum([0, *(one.numel() for one in like)]).tolist()
-    return [ca.reshape(part, one.shape) for part, one in zip(ca.vertsplit(flat, ends), like, strict=True)]
+    def rolled(self, forms: list[ca.MX], gains: ca.MX, s: ca.MX, *, defects: bool) -> tuple[ca.MX, ca.MX, Rows]:
+        """Return the steps in states, shape ``(nx, N + 1)``, and in inputs, shape ``(nu, N_u)``, and the rows, all in deviations, from s on."""
+        A, B, b, _, _, _, _, _, g_x, g_u = (columns(form) for form in forms[:10])
+        gain, nx = columns(gains), self._ocp.model.nx
+        nothing = ca.MX.zeros(nx)
+        states, inputs, increments, softened = [s[:nx]], [], [], []
+        for k in range(self._ocp.N):
+            stage = A[k], B[k], b[k] if defects else nothing, g_x[k], g_u[k], s
+            if k < self._ocp.N_u:
+                after, value, increment = self._forward[1](*stage, gain[k])
+                increments.append(increment)
+                inputs.append(after[nx:])
+            else:
+                after, value = self._forward[0](*stage)
+            s = after
+            states.append(s[:nx])
+            softened.append(value)
+        du = ca.horzcat(*inputs)
+        return ca.horzcat(*states), du, Rows(du, ca.horzcat(*increments), ca.horzcat(*softened))
 
 
 class Stage:
@@ -93,51 +126,27 @@ class Stage:
     Attributes:
         A: Sensitivities to the state; `B`, to the input; `b`, the defect.
         H: Hessian of the outputs at the end; `h`, their gradient.
-        G: Sensitivities of what has softened bounds to s at the end, shape ``(ng, nx + nu)``; `g`, its value at the guess.
+        G: Sensitivities of what has softened bounds to s at the end, shape ``(ng, nx + nu)``.
     """
 
     def __init__(self, ocp: Ocp, lin: Linearization) -> None:
-        nx, nu, ng = ocp.model.nx, ocp.model.nu, len(ocp.lg)
-        self.nx, self.nu, self.n, self.ng = nx, nu, nx + nu, ng
+        nx, nu = ocp.model.nx, ocp.model.nu
+        self.nx, self.nu, self.n, self.ng = nx, nu, nx + nu, len(ocp.lg)
         patterns = {"A": lin.A_k, "B": lin.B_k, "H": lin.H_i, "G_x": lin.G_x, "G_u": lin.G_u}
         nz = {name: ca.SX.sym(name, pattern.nnz()) for name, pattern in patterns.items()}
         self.A, self.B, self.H, G_x, G_u = (ca.SX(pattern, nz[name]) for name, pattern in patterns.items())
         self.G = ca.horzcat(G_x, G_u)
         self.b, self.h = ca.SX.sym("b", nx), ca.SX.sym("h", nx)
-        self.g, self.lg, self.ug, self.zg, self.Zg, self.place = (ca.SX.sym(name, ng) for name in ("g", "lg", "ug", "zg", "Zg", "place"))
-        self.stiff, self.scale = ca.SX.sym("stiff", ng), ca.SX.sym("scale", ng)
-        self.dynamics = [nz["A"], nz["B"], self.b]
-        self.soft = [self.g, nz["G_x"], nz["G_u"], self.lg, self.ug, self.zg, self.Zg, self.place, self.stiff, self.scale]
+        self.matrices = [nz["A"], nz["B"]]
         self.cost = [nz["H"], self.h]
+        self.softened = [nz["G_x"], nz["G_u"]]
 
-
-def soft_stages(lin: Linearization, forms: list[ca.MX], places: ca.MX, stiff: ca.MX) -> list[list[ca.MX]]:
-    """Return, for each stage, what `Stage.soft` stands for."""
-    varying = [ca.horzsplit(form) if form.size1() else [ca.MX(0, 1)] * form.size2() for form in (*forms[7:10], places)]
-    each = stiff / lin.scale_g**2
-    return [[g, g_x, g_u, lin.lg, lin.ug, lin.zg, lin.Zg, place, each, lin.scale_g] for g, g_x, g_u, place in zip(*varying, strict=True)]
-
-
-def backward(ocp: Ocp, lin: Linearization, forms: list[ca.MX], places: list[ca.MX], stiff: ca.MX) -> ca.MX:
-    """Return the gains of all stages with an input, one a column, K and then kappa: ``du = -K s - kappa``."""
-    N, N_u, n, w = ocp.N, ocp.N_u, ocp.model.nx + ocp.model.nu, lin.w
-    free, held = backward_stage(ocp, lin, True), backward_stage(ocp, lin, False)
-    A, B, b, H, h, force, increment = (ca.horzsplit(form) for form in forms[:7])
-    soft = soft_stages(lin, forms, places[2], stiff)
-    u, at, at_increment = (ca.horzsplit(e) for e in (lin.u, *places[:2]))
-    lambda_ = ca.vertsplit(w["lambda_"])
-    R, damping, of_input = nonzeros(lin.R), forms[10], stiff / lin.scale_u**2
-    P, p = ca.MX.zeros(n * (n + 1) // 2), ca.MX.zeros(n)
-    gains = []
-    for k in reversed(range(N)):
-        stage = A[k], B[k], b[k], *soft[k], H[k], h[k], P, p
-        if k < N_u:
-            bounds = w["lbu"], w["ubu"], w["lbdu"], w["ubdu"]
-            P, p, gain = free(*stage, R, damping, lambda_[k], force[k], increment[k], u[k], at[k], at_increment[k], *bounds, of_input)
-            gains.append(gain)
-        else:
-            P, p = held(*stage)
-    return ca.horzcat(*reversed(gains))
+    def gain(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """Return symbols of the gains of a stage, all in a column, and of these K, kappa and the Cholesky factor."""
+        lower = ca.Sparsity.lower(self.nu)
+        column = ca.SX.sym("gain", self.nu * (self.n + 1) + lower.nnz())
+        K, kappa, L = ca.vertsplit(column, [0, self.nu * self.n, self.nu * (self.n + 1), column.numel()])
+        return column, ca.reshape(K, self.nu, self.n), kappa, ca.SX(lower, L)
 
 
 def backward_stage(ocp: Ocp, lin: Linearization, free: bool) -> ca.Function:
@@ -146,12 +155,8 @@ def backward_stage(ocp: Ocp, lin: Linearization, free: bool) -> ca.Function:
     nx, nu, n = of.nx, of.nu, of.n
     upper = ca.Sparsity.upper(n)
     P_nz, p = ca.SX.sym("P", upper.nnz()), ca.SX.sym("p", n)
-    P = ca.triu2symm(ca.SX(upper, P_nz))
-
-    held_back, pull = hold(of.stiff, of.place, of.g, of.lg, of.ug)
-    beyond = ca.fabs(of.place) == 2
-    pull += beyond / 2 * (of.Zg * (of.g - ca.if_else(of.place > 0, of.ug, of.lg)) + ca.sign(of.place) * of.zg)
-    P = P + of.G.T @ ca.diag(held_back + beyond * of.Zg / 2) @ of.G
+    weight, pull = ca.SX.sym("weight", of.ng), ca.SX.sym("pull", of.ng)
+    P = ca.triu2symm(ca.SX(upper, P_nz)) + of.G.T @ ca.diag(weight) @ of.G
     p_end = p + of.G.T @ pull
 
     A, B = of.A, of.B
@@ -160,139 +165,74 @@ def backward_stage(ocp: Ocp, lin: Linearization, free: bool) -> ca.Function:
     Qxx, Qux, Quu = A.T @ Pxx @ A, PB.T @ A, B.T @ PB + Pxu.T @ B + Puu
     px = p_end[:nx] + of.h + Pxx @ of.b
     qx, qu = A.T @ px, B.T @ px + p_end[nx:] + Pxu.T @ of.b
-    inputs = [*of.dynamics, *of.soft, *of.cost, P_nz, p]
+    inputs = [*of.matrices, of.b, *of.cost, *of.softened, weight, pull, P_nz, p]
     if not free:
         Qss, qs = ca.blockcat([[Qxx, Qux.T], [Qux, Quu]]), ca.vertcat(qx, qu)
         return ca.Function("held", inputs, ca.cse([nonzeros(ca.densify(Qss)[upper]), ca.densify(qs)]))
 
     R_nz, lambda_ = ca.SX.sym("R", lin.R.sparsity().nnz()), ca.SX.sym("lambda")
-    damping = ca.SX.sym("damping", nu)
-    force_guess, increment, u, place, at, lbu, ubu, lbdu, ubdu = (
-        ca.SX.sym(name, nu) for name in ("force", "increment", "u", "place", "at", "lbu", "ubu", "lbdu", "ubdu")
-    )
-    stiff = ca.SX.sym("stiff", nu)
-    R = ca.SX(lin.R.sparsity(), R_nz) * lambda_
-    weight, pull = hold(stiff, at, increment, lbdu, ubdu)
-    R, force = R + ca.diag(weight), force_guess + pull
-    weight, pull = hold(stiff, place, u, lbu, ubu)
-    Quu, qu = Quu + R + ca.diag(weight + damping), qu + force + pull
+    names = ("damping", "force", "weight_u", "pull_u", "weight_du", "pull_du")
+    damping, force, weight_u, pull_u, weight_du, pull_du = symbols = [ca.SX.sym(name, nu) for name in names]
+    R = ca.SX(lin.R.sparsity(), R_nz) * lambda_ + ca.diag(weight_du)
+    force = force + pull_du
+    Quu, qu = Quu + R + ca.diag(weight_u + damping), qu + force + pull_u
     Qus = ca.horzcat(Qux, -R)
-    gain = cholesky_solve(Quu, ca.horzcat(Qus, qu))
+    L = cholesky(Quu)
+    gain = cholesky_solve(L, ca.horzcat(Qus, qu))
     # The cost with du = -K s - kappa in it.
     P_before = ca.diagcat(Qxx, R) - Qus.T @ gain[:, :n]
     p_before = ca.vertcat(qx, -force) - Qus.T @ gain[:, n]
-    out = [nonzeros(ca.densify(P_before)[upper]), ca.densify(p_before), ca.densify(ca.vec(gain))]
-    return ca.Function("free", [*inputs, R_nz, damping, lambda_, force_guess, increment, u, place, at, lbu, ubu, lbdu, ubdu, stiff], ca.cse(out))
+    found = ca.vertcat(ca.vec(ca.densify(gain)), nonzeros(L))
+    out = [nonzeros(ca.densify(P_before)[upper]), ca.densify(p_before), found]
+    return ca.Function("free", [*inputs, R_nz, damping, lambda_, *symbols[1:]], ca.cse(out))
 
 
-def hold(stiff: ca.SX, place: ca.SX, value: ca.SX, lower: ca.SX, upper: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return weight and gradient of the penalty on values that are placed at their bounds."""
-    weight = stiff * (ca.fabs(place) == 1)
-    return weight, weight * (value - ca.if_else(place > 0, upper, lower))
+def sweep_stage(ocp: Ocp, lin: Linearization, free: bool) -> ca.Function:
+    """Build one stage of the recursion for the pulls alone, the matrices known."""
+    of = Stage(ocp, lin)
+    p, pull = ca.SX.sym("p", of.n), ca.SX.sym("pull", of.ng)
+    p_end = p + of.G.T @ pull
+    qx, qu = of.A.T @ p_end[: of.nx], of.B.T @ p_end[: of.nx] + p_end[of.nx :]
+    inputs = [*of.matrices, *of.softened, pull, p]
+    if not free:
+        return ca.Function("sweep_held", inputs, ca.cse([ca.densify(ca.vertcat(qx, qu))]))
+    column, K, _, L = of.gain()
+    pull_u, pull_du = ca.SX.sym("pull_u", of.nu), ca.SX.sym("pull_du", of.nu)
+    qu = qu + pull_u + pull_du
+    p_before = ca.vertcat(qx, -pull_du) - K.T @ qu
+    return ca.Function("sweep_free", [*inputs, column, pull_u, pull_du], ca.cse([ca.densify(p_before), ca.densify(cholesky_solve(L, qu))]))
 
 
-def cholesky_solve(M: ca.SX, rhs: ca.SX) -> ca.SX:
-    """Solve with a small symmetric matrix; NaN if it is not positive definite."""
+def forward_stage(ocp: Ocp, lin: Linearization, free: bool) -> ca.Function:
+    """Build one stage of a roll-out without bounds: ``-> (s, softened rows)``, and the increment if there is an input."""
+    of = Stage(ocp, lin)
+    s = ca.SX.sym("s", of.n)
+    column, K, kappa, _ = of.gain()
+    du = -(K @ s + kappa) if free else s[of.nx :]
+    end = ca.vertcat(of.A @ s[: of.nx] + of.B @ du + of.b, du)
+    inputs, outputs = [*of.matrices, of.b, *of.softened, s], [ca.densify(end), ca.densify(of.G @ end)]
+    if free:
+        return ca.Function("rolled_free", [*inputs, column], ca.cse([*outputs, du - s[of.nx :]]))
+    return ca.Function("rolled_held", inputs, ca.cse(outputs))
+
+
+def cholesky(M: ca.SX) -> ca.SX:
+    """Return the lower Cholesky factor of a small symmetric matrix, its lower triangle dense; NaN if it is not positive definite."""
     size = M.shape[0]
-    L = ca.SX(size, size)
+    L = ca.SX(ca.Sparsity.lower(size))
     for i in range(size):
         for j in range(i + 1):
             rest = M[i, j] - ca.dot(L[i, :j], L[j, :j])
             L[i, j] = ca.sqrt(rest) if i == j else rest / L[j, j]
+    return L
+
+
+def cholesky_solve(L: ca.SX, rhs: ca.SX) -> ca.SX:
+    """Solve with a Cholesky factor."""
+    size = L.shape[0]
     rows = [rhs[i, :] for i in range(size)]
     for i in range(size):
         rows[i] = (rows[i] - sum((L[i, k] * rows[k] for k in range(i)), ca.SX(1, rhs.shape[1]))) / L[i, i]
     for i in reversed(range(size)):
         rows[i] = (rows[i] - sum((L[k, i] * rows[k] for k in range(i + 1, size)), ca.SX(1, rhs.shape[1]))) / L[i, i]
     return ca.vertcat(*rows)
-
-
-def forward(ocp: Ocp, lin: Linearization, forms: list[ca.MX], x0: ca.MX, gains: ca.MX, places: list[ca.MX], stiff: ca.MX) -> list[ca.MX]:
-    """Return what a roll-out returns."""
-    N, N_u, w = ocp.N, ocp.N_u, lin.w
-    free, held = forward_stage(ocp, lin, True), forward_stage(ocp, lin, False)
-    A, B, b, _, _, _, increment = (ca.horzsplit(form) for form in forms[:7])
-    soft = soft_stages(lin, forms, places[2], stiff)
-    x, u, gain, at, at_increment = (ca.horzsplit(e) for e in (lin.x, lin.u, gains, *places[:2]))
-    bounds = (w["lbu"], w["ubu"], w["lbdu"], w["ubdu"], stiff / lin.scale_u**2, lin.scale_u)
-    s = ca.vertcat(x0 - x[0], ca.MX.zeros(ocp.model.nu))
-    before = lin.u_prev
-    verdict = ca.MX(ca.DM([0, -INFINITY, -INFINITY]))  # changes, violation, violation relative to scale
-    states, inputs = [x0], []
-    found: tuple[list[ca.MX], ...] = ([], [], [])
-    for k in range(N):
-        stage = A[k], B[k], b[k], *soft[k], x[k + 1], s, verdict
-        if k < N_u:
-            state, s, verdict, acts, before, *now = free(*stage, gain[k], increment[k], u[k], before, at[k], at_increment[k], *bounds)
-            inputs.append(before)
-            for kind, one in zip(found, now, strict=False):
-                kind.append(one)
-        else:
-            state, s, verdict, acts = held(*stage)
-        states.append(state)
-        found[2].append(acts)
-    x_plan, u_plan = ca.horzcat(*states), ca.horzcat(*inputs)
-    finite = forms[-1] + ca.sum1(ca.vec(u_plan)) + ca.sumsqr(x_plan) ** 2  # overflows for what is no state
-    changes = ca.if_else(ca.fabs(finite) < np.inf, verdict[0], -1)
-    return [x_plan, u_plan, verdict[1:], change(lin, u_plan), changes, ca.veccat(*(ca.horzcat(*kind) for kind in found))]
-
-
-def forward_stage(ocp: Ocp, lin: Linearization, free: bool) -> ca.Function:
-    """Build one stage of the roll-out."""
-    of = Stage(ocp, lin)
-    nx, nu, n = of.nx, of.nu, of.n
-    x_next, s, verdict = ca.SX.sym("x_next", nx), ca.SX.sym("s", n), ca.SX.sym("verdict", 3)
-    gain = ca.SX.sym("gain", nu * (n + 1))
-    increment, u, before, place, pace, lbu, ubu, lbdu, ubdu = (
-        ca.SX.sym(name, nu) for name in ("increment", "u", "before", "place", "pace", "lbu", "ubu", "lbdu", "ubdu")
-    )
-    stiff, scale = ca.SX.sym("stiff", nu), ca.SX.sym("scale", nu)
-    changes, worst, share = ca.vertsplit(verdict)
-
-    K = ca.reshape(gain, nu, n + 1)
-    du = -(K[:, :n] @ s + K[:, n]) if free else s[nx:]
-    dx = of.A @ s[:nx] + of.B @ du + of.b
-    end = ca.vertcat(dx, du)
-    value = of.g + of.G @ end
-    acts = ca.SX(of.ng, 1)
-    for j in range(of.ng):
-        over, under = exceeded(value[j], of.lg[j], of.ug[j], ocp.lg[j], ocp.ug[j])
-        exceeds = ca.fmax(over, under)
-        worst, share = ca.fmax(worst, exceeds), ca.fmax(share, exceeds / of.scale[j])
-        acts[j] = belongs(of.place[j], of.stiff[j], of.scale[j], over, under, of.zg[j] / 2)
-        changes += acts[j] != of.place[j]
-    inputs = [*of.dynamics, *of.soft, x_next, s, verdict]
-    outputs = [x_next + dx, end]
-    if not free:
-        return ca.Function("coast", inputs, ca.cse([*outputs, ca.vertcat(changes, worst, share), ca.densify(acts)]))
-
-    found = []
-    for value, at, lower, upper, lb, ub in (
-        (u + du, place, lbu, ubu, ocp.lbu, ocp.ubu),
-        (increment + du - s[nx:], pace, lbdu, ubdu, ocp.lbdu, ocp.ubdu),
-    ):
-        now = [belongs(at[j], stiff[j], scale[j], *exceeded(value[j], lower[j], upper[j], lb[j], ub[j]), INFINITY) for j in range(nu)]
-        found.append(ca.densify(ca.vertcat(*now)))
-        changes += ca.sum1(found[-1] != at)
-    # Bounds are met exactly, as an actuator wants them.
-    u_plan = ca.fmax(ca.fmin(u + du, before + ubdu), before + lbdu)
-    u_plan = ca.fmax(ca.fmin(u_plan, ubu), lbu)
-    outputs += [ca.vertcat(changes, worst, share), ca.densify(acts), u_plan, *found]
-    return ca.Function("forward", [*inputs, gain, increment, u, before, place, pace, lbu, ubu, lbdu, ubdu, stiff, scale], ca.cse(outputs))
-
-
-def exceeded(value: ca.SX, lower: ca.SX, upper: ca.SX, lb: float, ub: float) -> tuple[ca.SX, ca.SX]:
-    """Return by how much a value is over its upper and under its lower bound, far from it where there is none."""
-    absent = ca.SX(-INFINITY)
-    return value - upper if np.isfinite(ub) else absent, lower - value if np.isfinite(lb) else absent
-
-
-def belongs(place: ca.SX, stiff: ca.SX, scale: ca.SX, over: ca.SX, under: ca.SX, most: ca.SX | float) -> ca.SX:
-    """Return where something belongs that exceeds its bounds by so much; `most` is the pull that brings it beyond, if they are softened."""
-    tolerance = TOLERANCE * scale
-    side = ca.sign(place)
-    by = ca.if_else(place > 0, over, under)
-    free = (over > tolerance) - (under > tolerance)
-    held = ca.if_else(stiff * by > most, 2 * side, side * (stiff * by * scale > -RELEASE))
-    beyond = ca.if_else(by < -tolerance, side, 2 * side)
-    return ca.SX(ca.if_else(place == 0, free, ca.if_else(ca.fabs(place) == 1, held, beyond)))

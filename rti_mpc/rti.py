@@ -25,13 +25,14 @@ import numpy as np
 
 from rti_mpc.active_set import ActiveSet
 from rti_mpc.array import Array
+from rti_mpc.certificate import certificate
 from rti_mpc.codegen import bind, compiled
 from rti_mpc.errors import OcpError, ShapeError
 from rti_mpc.foreign_solver import ForeignSolver, check_name
 from rti_mpc.linearization import WEIGHTS, plan_cost, shift
 from rti_mpc.ocp import Ocp
+from rti_mpc.places import places
 from rti_mpc.qp import Guess, Qp, step_size
-from rti_mpc.riccati import riccati
 from rti_mpc.scale import scale
 from rti_mpc.sequential import sequential
 from rti_mpc.simultaneous import simultaneous
@@ -43,7 +44,7 @@ from rti_mpc.turns import Turns
 FORMULATIONS = {"simultaneous": simultaneous, "sequential": sequential}
 SOLVERS = ("riccati", "osqp")  # the built-in ones; any other is one of qpsolvers
 SEQUENTIAL_UP_TO = 10  # control horizon up to which the sequential formulation is the faster one, see docs/engine.md
-SOLVED = QpStatus.SOLVED  # an enumeration looks its members up slowly
+SOLVED, INACCURATE = QpStatus.SOLVED, QpStatus.INACCURATE  # an enumeration looks its members up slowly
 ITERATIONS = 3  # a sample, at most, and
 TOLERANCE = 0.015  # the step from which there is another: what converged NMPC costs in closed loop, within 0.5 %, see docs/engine.md
 COSTS = ("delta", "lambda_", "z", "Z", "Q_e", "zh", "Zh")  # weights that carry the scale of the cost
@@ -139,10 +140,10 @@ class Rti:
         self.guess = guess
         transcribe = FORMULATIONS[formulation]
         transcriptions = [transcribe(ocp, softened=softened) for softened in (False, True)[: 2 if len(ocp.lg) else 1]]
-        recursion = riccati(ocp) if solver == "riccati" else None
+        structured = (places(ocp), certificate(ocp)) if solver == "riccati" else None
         functions = [shift(ocp), plan_cost(ocp)]
-        if recursion is not None:  # a QP solver is then so rarely asked that its QP is left to the virtual machine: it would double the build
-            functions += [recursion.linearize, recursion.advance, recursion.gains, recursion.roll_out]
+        if structured is not None:  # a QP solver is then so rarely asked that its QP is left to the virtual machine: it would double the build
+            functions += [*vars(structured[0]).values(), structured[1]]
         else:
             functions += [f for t in transcriptions for f in (t.data, t.embed, t.step)]
         made = dict(zip((f.name() for f in functions), compiled(*functions) if compile else functions, strict=True))
@@ -155,7 +156,7 @@ class Rti:
         self._cost: Array = np.zeros(1)
         self._evaluate = bind(made["cost"], (self.x, self.u, *guess.sample[2:]), (self._cost,))
         qps = [Qp(t, guess, make) for t in transcriptions]
-        self.active_set = ActiveSet(recursion, guess, make) if recursion is not None else None
+        self.active_set = ActiveSet(*structured, guess, make) if structured is not None else None
         self._roll_out()
         qps[0].fill()
         if not qps[0].sound:
@@ -316,7 +317,19 @@ class Rti:
         self.taken = 1
         if self._change[0] > self.tolerance:
             self._iterate()
+        if self.status is SOLVED and self.active_set is not None:
+            self.status = self._certified(self.active_set)
         return self.status
+
+    def _certified(self, active_set: ActiveSet) -> QpStatus:
+        """Judge the plan of the last QP; one that is neither certified nor nearly so leaves the plan of the iteration before, or the guess."""
+        if self.solver is not active_set:
+            return INACCURATE  # a plan of the QP solver, to its tolerance
+        status = active_set.certified()
+        if not status.usable:
+            self._keep()
+            active_set.forget()
+        return status
 
     def _solve(self) -> QpStatus:
         """Solve the QP, whoever can, and make the plan; without one, the guess stays."""
@@ -334,6 +347,7 @@ class Rti:
         while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
             self._relinearize()
             if not (status := self._solve()).usable:
+                self.status = INACCURATE  # the plan is that of a QP before the last, which nobody can certify any more
                 break
             self.status = status
             self.taken += 1

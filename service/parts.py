@@ -12,7 +12,7 @@ from rti_mpc.array import Array
 from rti_mpc.foreign_solver import ForeignSolver
 from rti_mpc.rti import Rti
 
-PARTS = ("copies in", "evaluation", "matrix update", "vector update", "iterations")
+PARTS = ("copies in", "evaluation", "matrix update", "vector update", "iterations", "certificate")
 
 
 class Parts:
@@ -35,6 +35,7 @@ class Parts:
             self._watch(active_set, "evaluation", "linearize", "advance")
             self._watch(active_set, "matrix update", "gain")
             self._watch(active_set, "iterations", "_roll_out")
+            self._watch(active_set, "certificate", "_certify", "_refine")
         for solver in rti.solvers:
             self._watch(solver.qp, "evaluation", "linearize", "embed", "step")
             if isinstance(solver, ForeignSolver):
