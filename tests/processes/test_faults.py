@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ def matrix(path: Path, *names: str, timeout_s: float = 180.0) -> dict[str, dict[
         ("guard_and_controller_killed",),
         ("link_cut",),
         ("state_nan",),
+        ("stop_then_controller_killed",),
     ],
     ids="-".join,
 )
@@ -53,6 +55,7 @@ def test_unknown_fault_is_one_line_that_names_all_there_are() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.skipif("CI" in os.environ, reason="the rows above are its short form")
 def test_whole_matrix_is_within_its_promises(tmp_path: Path) -> None:
     rows = matrix(tmp_path / "faults.json", timeout_s=1800.0)
     assert {name: row["broken"] for name, row in rows.items() if not row["kept"]} == {}
