@@ -93,7 +93,9 @@ def test_all_solvers_give_the_same_plan_in_either_formulation_on_200_random_prob
                 rti.reset(x0, u_prev)
                 rti.x[:] += defects  # and so another linearization at every stage
                 rti.prepare(y_ref, shift=False)
-                assert rti.feedback(x0) is QpStatus.SOLVED
+                status = rti.feedback(x0)
+                left = rti is recursion and rti.solver is not rti.active_set  # what the recursion leaves to OSQP is not certified
+                assert status is (QpStatus.INACCURATE if left else QpStatus.SOLVED)
             for which, rti in others.items():
                 for name in "xu":
                     np.testing.assert_allclose(getattr(rti, name), getattr(recursion, name), rtol=0, atol=1e-6, err_msg=str(which))

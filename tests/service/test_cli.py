@@ -93,7 +93,7 @@ def test_operator_is_told_in_one_line_that_nothing_could_be_noted_either() -> No
 def test_check_of_the_shipped_configuration_prints_both_phases_and_the_verdict() -> None:
     done = rti_mpc("check")
     assert done.returncode == 0, done.stderr
-    for words in ("preparation", "feedback", "200 samples: ", "riccati and daqp agree", "own plans are within"):
+    for words in ("preparation", "feedback", " samples: ", "riccati and daqp agree", "own plans are within"):
         assert words in done.stdout
 
 
