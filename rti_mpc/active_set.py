@@ -22,7 +22,8 @@ from rti_mpc.qp import Guess
 from rti_mpc.status import QpStatus
 
 ROLL_OUTS = 6  # at most from where the last sample left off; more places change than that only when much happens at once
-# Weights of the penalty then: soft ones are settled whatever the start, and each leads to the next. A stiffer last one gives way less, and costs digits.
+# Weights of the penalty then: soft ones are settled whatever the start, and each leads to the next. A stiffer last one gives
+# way less, and costs digits.
 PATH = (*(10.0**k for k in range(1, 10)), 3e9)
 ROLL_OUTS_EACH = 100  # at most on each step of that path
 REFINEMENTS = 2  # at most of a plan that is not certified
