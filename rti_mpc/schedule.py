@@ -25,6 +25,7 @@ STEP_NS = 10_000_000  # the ramp to rest is a staircase of such steps
 NEVER_NS = 2**63
 EVER_NS = -(2**62)
 WAITING = 64  # plans ahead of their time kept at most
+MAX_ROWS = 1000  # of a plan, the longest horizon a configuration may have: to approach a plan takes longer than in proportion to its rows
 ROUNDING = 1e-9  # of a way to rest that is a whole number of steps
 OWN = (0, 0)  # source of what no command has asked for
 
@@ -33,7 +34,7 @@ def unfit(command: Command, nu: int, robot_epoch: int) -> str:
     """Return why a command can be no plan for this life of a robot with `nu` inputs; empty if it can."""
     if command.state_epoch != robot_epoch:
         return "foreign_epoch"
-    if command.u.ndim != 2 or not len(command.u) or command.u.shape[1] != nu or command.period_ns <= 0:
+    if command.u.ndim != 2 or not 1 <= len(command.u) <= MAX_ROWS or command.u.shape[1] != nu or command.period_ns <= 0:
         return "wrong_shape"
     return "" if np.isfinite(command.u).all() else "not_finite"
 

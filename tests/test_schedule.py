@@ -9,7 +9,7 @@ import pytest
 from rti_mpc.approach import Increments
 from rti_mpc.array import Array
 from rti_mpc.message import Command
-from rti_mpc.schedule import STEP_NS, Schedule, end_ns
+from rti_mpc.schedule import STEP_NS, Schedule, end_ns, unfit
 from rti_mpc.status import Mode, QpStatus
 
 MS = 1_000_000
@@ -122,3 +122,9 @@ def test_plan_that_replaces_all_that_is_remembered_is_approached_from_what_acted
     sooner = command(np.full((4, 2), 0.5), stamp_ms=900)
     plans.add(sooner, sooner.stamp_ns, end_ns(sooner))
     np.testing.assert_array_equal(plans.at(900 * MS)[0], [0.25, 0.4])
+
+
+def test_plan_longer_than_any_horizon_is_unfit() -> None:
+    """A message has room for 65,000 rows, whose approach kept a guard from its robot for seconds."""
+    assert unfit(command(np.zeros((1000, 2))), 2, 1) == ""
+    assert unfit(command(np.zeros((1001, 2))), 2, 1) == "wrong_shape"
