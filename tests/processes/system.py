@@ -113,9 +113,10 @@ class System:
         try:
             return process.wait(PATIENCE_S)
         except subprocess.TimeoutExpired:
+            signals = signals_of(process.pid)
             process.send_signal(signal.SIGABRT)  # where every thread is, to its log
             process.wait(PATIENCE_S)
-            raise AssertionError(f"{role} does not end:\n{self.said(role)}") from None
+            raise AssertionError(f"{role} does not end:\n{signals}\n{self.said(role)}") from None
         finally:
             process.kill()
 
@@ -182,6 +183,17 @@ def anonymous_bytes(pid: int) -> int:
     """Memory of a process that no file backs, in bytes."""
     line = next(line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("RssAnon"))
     return 1024 * int(line.split()[1])
+
+
+def signals_of(pid: int) -> str:
+    """Which signals each thread of a process waits for, blocks, ignores and handles, for whoever must find out why it does not end."""
+    lines = []
+    for path in Path(f"/proc/{pid}/task").iterdir():
+        with suppress(OSError):  # a thread that has ended
+            status = dict(line.split(":", 1) for line in (path / "status").read_text().splitlines())
+            names = ("Name", "State", "SigPnd", "ShdPnd", "SigBlk", "SigIgn", "SigCgt")
+            lines.append(" ".join(f"{name} {status[name].strip()}" for name in names))
+    return "\n".join(lines)
 
 
 def listening(pid: int) -> bool:
