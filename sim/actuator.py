@@ -101,13 +101,13 @@ class Actuator:
         early = command.state_stamp_ns > arrival_ns + EARLY_NS
         arrival_ns += self._delay_ns
         reason = "switched_off" if self._off else unfit(command, len(self.u), self._robot_epoch) or ("early" if early else "")
-        if not reason:  # what could not act locks nobody out
+        start_ns = max(command.stamp_ns, arrival_ns)
+        expired = end_ns(command) <= start_ns
+        if not reason and not (expired and command.epoch != self._source.epoch):  # what could not act locks nobody out
             verdict = self._source.accept(command.epoch, command.seq, arrival_ns)
             reason = "" if verdict.accepted else verdict.value
         self.counters.lost = self._source.lost
-        start_ns = max(command.stamp_ns, arrival_ns)
-        if not reason and end_ns(command) <= start_ns:
-            reason = "expired"
+        reason = reason or ("expired" if expired else "")
         if reason:
             self.counters.expired += reason == "expired"
             self.counters.refused += reason != "expired"

@@ -190,6 +190,14 @@ def test_expired_command_is_dropped_and_counted() -> None:
     assert played(robot, 250, 500) == [(250, 0.0)]
 
 
+def test_expired_command_of_another_epoch_locks_nobody_out() -> None:
+    robot = actuator()
+    robot.accept(command(seq=1, epoch=100), 0)
+    assert robot.accept(command(seq=1, epoch=101), 250 * MS) == "expired"
+    assert robot.accept(command(seq=2, epoch=100, stamp_ms=240, first=0.2), 250 * MS) == ""
+    assert robot.counters.lost == 0
+
+
 def test_higher_epoch_takes_over_at_once_and_a_lower_one_after_silence() -> None:
     robot = actuator()
     robot.accept(command(seq=5, epoch=100), 0)
