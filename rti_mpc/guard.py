@@ -410,6 +410,7 @@ class Guard:
         self._schedule.brake(self._limits.u_rest, EVER_NS)
         self._leader = 0, -1
         self._told_ns = EVER_NS
+        self._rest_by_ns = EVER_NS  # it stands: a latch from before lets rest alone pass
         self._engaged = self._untold = self.passing = self._late = False
 
     def _jump(self, state: State, local_ns: int, where: str) -> None:

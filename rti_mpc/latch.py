@@ -17,7 +17,8 @@ from typing import Any
 
 from rti_mpc.errors import MessageError
 
-MAX_LEAP = 2**52  # of a counter above the highest known: more is no honest operator's
+MAX_COUNTER = 2**62  # above it, none is read
+MAX_LEAP = 2**20  # of a counter above the highest known: nobody misses so many changes, and forged ones take for ever to reach `MAX_COUNTER`
 MAX_REASON = 200  # characters
 WHEN = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", re.ASCII)
 
@@ -64,8 +65,8 @@ def read_latch(content: object) -> Latch:
         raise MessageError("latch must be an object")
     fields: dict[str, Any] = {name: content.get(name) for name in Latch.__slots__}
     counter, stopped, when, reason = fields.values()
-    if type(counter) is not int or counter < 0:
-        raise MessageError(f"latch.counter must be a whole number, 0 or more, got {shown(counter)}")
+    if type(counter) is not int or not 0 <= counter <= MAX_COUNTER:
+        raise MessageError(f"latch.counter must be a whole number from 0 to 2^62, got {shown(counter)}")
     if type(stopped) is not bool:
         raise MessageError(f"latch.stopped must be true or false, got {shown(stopped)}")
     if not isinstance(when, str) or (when and not WHEN.fullmatch(when)):

@@ -25,7 +25,7 @@ from rti_mpc.wire.keys import Keys
 
 VERSION = 1
 MAX_BYTES = 4096  # of a file: more is none of ours
-LOCK_S = 1.0  # to wait for another process that writes
+LOCK_S = 5.0  # to wait for others that write: each syncs a file and a folder, which a busy disk holds up
 NOWHERE = "no folder is known for it: neither --state, $STATE_DIRECTORY, $XDG_STATE_HOME nor $HOME says where"
 
 

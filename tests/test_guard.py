@@ -585,6 +585,18 @@ def test_latch_before_the_first_state_and_across_another_life_of_the_robot_holds
     assert scene.send(np.zeros(2)) is not None
 
 
+def test_guard_that_starts_latched_passes_rest_alone_from_the_time_on_that_commands_pass() -> None:
+    """Whatever is commanded by then of a way to rest has had its time, and no clock of the robot was known when it was latched."""
+    scene = Scene()
+    scene.guard.latch(REASON, scene.local_ns)
+    scene.ready().heard = False
+    scene.wait(100)
+    assert scene.state is not None
+    scene.guard.receive_state(replace(scene.state, u=0.5 * FULL, command_epoch=scene.leader, command_seq=1), scene.local_ns)
+    assert scene.send(0.5 * WAY) is None
+    assert scene.send(np.zeros(2)) is not None
+
+
 @pytest.mark.parametrize("rate", [0.5, 4.0])
 def test_simulated_time_runs_at_its_own_rate(rate: float) -> None:
     scene = Scene(rate).ready()

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rti_mpc.errors import MessageError
-from rti_mpc.latch import MAX_LEAP, MAX_REASON, Latch, merge, read_latch
+from rti_mpc.latch import MAX_COUNTER, MAX_LEAP, MAX_REASON, Latch, merge, read_latch
 
 WHEN = "2026-11-28T09:30:00Z"
 STOPPED = Latch(5, True, WHEN, "asked for by ada@lab")
@@ -43,6 +43,11 @@ def test_counter_that_leaps_is_not_believed() -> None:
     assert merge(STOPPED, Latch(6 + MAX_LEAP, False)) == STOPPED
 
 
+def test_forged_counters_never_reach_the_last_one_that_is_read() -> None:
+    years = MAX_COUNTER / MAX_LEAP / (1000 * 86_400 * 365.0)  # at a thousand messages a second, each the greatest leap
+    assert years > 100.0
+
+
 def test_latch_is_read_as_it_was_written() -> None:
     assert read_latch(CONTENT) == STOPPED
     assert read_latch(CONTENT | {"from": "a later release"}) == STOPPED
@@ -57,6 +62,7 @@ def test_latch_is_read_as_it_was_written() -> None:
         ("counter", 5.0),
         ("counter", "5"),
         ("counter", None),
+        ("counter", MAX_COUNTER + 1),
         ("stopped", 1),
         ("stopped", "yes"),
         ("when", 0),
