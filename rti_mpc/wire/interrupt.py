@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import signal
-from contextlib import suppress
 from threading import Event, Thread
 
 
@@ -16,8 +15,7 @@ def stop_on_signals() -> Event:
     Call it in the main thread. The event is set by a thread of its own: the kernel
     may hand a signal to any thread, of Zenoh's too, and a main thread that waits
     for the event would then not wake up to handle it; nor may it set the event
-    itself, whose lock it may hold. That thread is told twice, by the interpreter's
-    C handler and by ours in the main thread: either alone is enough.
+    itself, whose lock it may hold.
     """
     stop = Event()
     numbers = {signal.SIGINT, signal.SIGTERM}
@@ -32,12 +30,8 @@ def stop_on_signals() -> Event:
             if numbers & set(received):
                 stop.set()
 
-    def tell(number: int, _: object) -> None:
-        with suppress(BlockingIOError):  # full of signals that are not read yet
-            os.write(writer, bytes([number]))
-
     Thread(target=watch, name="signals", daemon=True).start()
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     for number in numbers:
-        signal.signal(number, tell)
+        signal.signal(number, lambda *_: None)
     return stop

@@ -108,15 +108,15 @@ class System:
     def interrupt(self, role: str) -> int:
         """Press Ctrl-C; return the exit status."""
         process = self.running.pop(role)
+        until(lambda: handles(process.pid, signal.SIGTERM) or process.poll() is not None, f"{role} handles signals")
         self.fault_at_ns = time.monotonic_ns()
         process.send_signal(signal.SIGINT)
         try:
             return process.wait(PATIENCE_S)
         except subprocess.TimeoutExpired:
-            signals = signals_of(process.pid)
             process.send_signal(signal.SIGABRT)  # where every thread is, to its log
             process.wait(PATIENCE_S)
-            raise AssertionError(f"{role} does not end:\n{signals}\n{self.said(role)}") from None
+            raise AssertionError(f"{role} does not end:\n{self.said(role)}") from None
         finally:
             process.kill()
 
@@ -185,15 +185,17 @@ def anonymous_bytes(pid: int) -> int:
     return 1024 * int(line.split()[1])
 
 
-def signals_of(pid: int) -> str:
-    """Which signals each thread of a process waits for, blocks, ignores and handles, for whoever must find out why it does not end."""
-    lines = []
-    for path in Path(f"/proc/{pid}/task").iterdir():
-        with suppress(OSError):  # a thread that has ended
-            status = dict(line.split(":", 1) for line in (path / "status").read_text().splitlines())
-            names = ("Name", "State", "SigPnd", "ShdPnd", "SigBlk", "SigIgn", "SigCgt")
-            lines.append(" ".join(f"{name} {status[name].strip()}" for name in names))
-    return "\n".join(lines)
+def handles(pid: int, number: signal.Signals) -> bool:
+    """
+    Whether a process handles a signal, one that Python leaves alone.
+
+    Whoever starts tests in the background has them ignore Ctrl-C, and a process that
+    does not handle it yet then loses it.
+    """
+    with suppress(FileNotFoundError):  # it has ended
+        status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+        return bool(int(status["SigCgt"], 16) >> (number - 1) & 1)
+    return False
 
 
 def listening(pid: int) -> bool:

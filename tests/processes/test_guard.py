@@ -16,13 +16,13 @@ from pathlib import Path
 
 import pytest
 
-from rti_mpc.message import Command
+from rti_mpc.message import Command, Event
 from rti_mpc.wire.cdr import decode
 from service.cli import SHIPPED
 from service.host import Host
 from tests.in_time import in_time
 from tests.processes.record import GUARDED, MS, Record, recorded, within_slew
-from tests.processes.system import CONFIG, KEYS, System, interrupted_in_time, rti_mpc, until
+from tests.processes.system import CONFIG, KEYS, System, heard, interrupted_in_time, rti_mpc, until
 
 SPEED_M_S = 0.5
 
@@ -45,7 +45,9 @@ def driven(system: System) -> System:
         system.interrupt("reference")
     x, y = system.state(lambda _: True).x[:2]
     (system.folder / "line.csv").write_text(f"x,y\n{x},{y}\n{x + 200.0},{y}\n")
+    events = system.bus.subscriber(KEYS.event("reference"), capacity=64)
     system.start("reference")
+    heard(events, Event, lambda event: event.code == "reference_published")  # the robot may still follow the last one
     system.tracking()
     system.state(lambda state: bool(state.x[3] > 0.95 * SPEED_M_S))
     return system

@@ -79,21 +79,6 @@ def test_terminal_that_hangs_up_stops_a_process_unless_it_was_started_to_outlive
             process.kill()
 
 
-UNTOLD = """
-import signal
-from rti_mpc.wire.interrupt import stop_on_signals
-
-stop = stop_on_signals()
-signal.set_wakeup_fd(-1)
-signal.raise_signal(signal.SIGINT)
-assert stop.wait(10.0)
-"""
-
-
-def test_signal_stops_the_process_where_the_interpreter_s_own_word_of_it_is_lost() -> None:
-    assert subprocess.run([sys.executable, "-c", UNTOLD], cwd=ROOT, timeout=90.0).returncode == 0
-
-
 ELSEWHERE = """
 import signal, threading, time
 from rti_mpc.wire.interrupt import stop_on_signals
