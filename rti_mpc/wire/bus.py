@@ -192,8 +192,9 @@ class Bus:
         self._config = zenoh_config(settings)
         self._over = threading.Event()
         self._session = open_session(settings, timeout_s, stop, say)
-        self._declared: list[Any] = []  # a token or queryable lives as long as its object
-        self._json: dict[str, Publisher[Any]] = {}
+        self._declared: list[Any] = []  # queryables and watches, which live as long as their objects
+        self._publishers: dict[str, Publisher[Any]] = {}  # by key: whoever changes its role and back publishes there as before
+        self._tokens: dict[str, zenoh.LivelinessToken] = {}  # by role
 
     def __enter__(self) -> Bus:
         return self
@@ -236,7 +237,7 @@ class Bus:
 
     def publisher(self, key: str, cls: type[M], *, realtime: bool = False, cached: bool = False) -> Publisher[M]:
         """
-        Publisher of one class of message.
+        Publisher of one class of message, the same one whenever a key is asked for again.
 
         Args:
             key: Where to publish.
@@ -245,7 +246,10 @@ class Bus:
             cached: Whether late joiners get the last message.
         """
         priority = zenoh.Priority.REAL_TIME if realtime else zenoh.Priority.DATA if cached else zenoh.Priority.DATA_LOW
-        return Publisher(self._publisher(key, encoding(cls), priority, express=realtime, cached=cached), realtime=realtime)
+        if key not in self._publishers:
+            publisher = self._publisher(key, encoding(cls), priority, express=realtime, cached=cached)
+            self._publishers[key] = Publisher(publisher, realtime=realtime)
+        return self._publishers[key]
 
     def subscriber(self, key: str, *, capacity: int = 1, cached: bool = False) -> Subscriber:
         """
@@ -289,13 +293,13 @@ class Bus:
 
     def publish_json(self, key: str, value: dict[str, Any]) -> None:
         """Publish a JSON object that late joiners get, too."""
-        if key not in self._json:
-            self._json[key] = Publisher(self._publisher(key, "application/json", zenoh.Priority.DATA, express=False, cached=True))
-        self._json[key].put_bytes(json.dumps(value).encode())
+        if key not in self._publishers:
+            self._publishers[key] = Publisher(self._publisher(key, "application/json", zenoh.Priority.DATA, express=False, cached=True))
+        self._publishers[key].put_bytes(json.dumps(value).encode())
 
     def withdraw_json(self, key: str) -> None:
         """Publish on a key no more, and let late joiners find nothing there."""
-        if (publisher := self._json.pop(key, None)) is not None:
+        if (publisher := self._publishers.pop(key, None)) is not None:
             publisher.undeclare()
 
     def _publisher(self, key: str, encoding: str, priority: zenoh.Priority, *, express: bool, cached: bool) -> Any:
@@ -306,17 +310,13 @@ class Bus:
             "congestion_control": zenoh.CongestionControl.DROP,
             "allowed_destination": zenoh.Locality.REMOTE,
         }
-        if cached:
-            sequence = ext.MissDetectionConfig(
-                heartbeat=HEARTBEAT_S, sporadic_heartbeat=None
-            )  # or a last message that was dropped would not be missed
-            publisher: Any = ext.declare_advanced_publisher(
-                self._session, key, cache=ext.CacheConfig(1), sample_miss_detection=sequence, publisher_detection=True, **qos
-            )
-        else:
-            publisher = self._session.declare_publisher(key, **qos)
-        self._declared.append(publisher)
-        return publisher
+        if not cached:
+            return self._session.declare_publisher(key, **qos)
+        # A last message that was dropped would not be missed without heartbeats.
+        sequence = ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None)
+        return ext.declare_advanced_publisher(
+            self._session, key, cache=ext.CacheConfig(1), sample_miss_detection=sequence, publisher_detection=True, **qos
+        )
 
     def serve(self, key: str, handler: Callable[[dict[str, Any]], dict[str, Any] | None]) -> None:
         """
@@ -363,9 +363,8 @@ class Bus:
 
     def alive(self, role: str) -> zenoh.LivelinessToken:
         """Show presence in a role until the token is undeclared, the bus closed or the process gone."""
-        token = self._session.liveliness().declare_token(self.keys.alive(role))
-        self._declared.append(token)
-        return token
+        self._tokens[role] = self._session.liveliness().declare_token(self.keys.alive(role))
+        return self._tokens[role]
 
     def is_alive(self, role: str, timeout_s: float = 0.5) -> bool:
         """Whether anybody shows presence in a role, ourselves included; just started, it may take a moment to meet the others."""

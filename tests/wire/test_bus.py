@@ -185,6 +185,23 @@ def test_late_joiners_get_the_last_event_and_info_of_every_role(join: Any) -> No
     assert {received(infos).payload, received(infos).payload} == {b'{"role": "%s", "dt_s": 0.1}' % role for role in (b"robot", b"reference")}
 
 
+def test_nothing_grows_when_a_role_is_taken_again_and_again(join: Any) -> None:
+    """A late joiner gets one last event, not one for every time; and the bus holds one publisher and one token a role."""
+    robot = join(robot=True)
+    for epoch in range(1, 6):
+        for role in ("controller", "standby"):
+            token = robot.alive(role)
+            robot.publisher(KEYS.event(role), Event, cached=True).put(replace(EVENT, epoch=epoch, source=role))
+            robot.publish_json(KEYS.info(role), {"role": role})
+            robot.withdraw_json(KEYS.info(role))
+            token.undeclare()
+    events = join().subscriber(KEYS.events, capacity=16, cached=True)
+    got = [decode(Event, received(events).payload) for _ in range(2)]
+    assert {(event.epoch, event.source) for event in got} == {(5, "controller"), (5, "standby")}
+    assert events.drain() == []
+    assert (len(robot._publishers), len(robot._tokens), len(robot._declared)) == (2, 2, 0)
+
+
 def test_late_joiners_do_not_get_what_was_withdrawn(join: Any) -> None:
     robot = join(robot=True)
     for role in ("controller", "standby"):
