@@ -14,7 +14,7 @@ import typer.main
 from rti_mpc.wire.cdr import encoding
 from rti_mpc.wire.layout import ABOUT, LAYOUTS, msg_text
 from service.cli import app
-from service.config import Config
+from service.schema import Config
 
 ROOT = Path(__file__).parents[1]
 

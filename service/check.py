@@ -29,9 +29,11 @@ from rti_mpc.ocp import Ocp
 from rti_mpc.rti import FORMULATIONS, SOLVERS, Rti
 from rti_mpc.solver import SolverSettings
 from rti_mpc.status import QpStatus
-from service.config import Config, load
+from service.build import build_rti, robot_settings
+from service.config import load
 from service.excursion import Bounds, excursions
 from service.fit import check_stop
+from service.schema import Config
 
 SAMPLES = 200
 OPINIONS = 20  # samples of these whose QP the second solver is asked about
@@ -104,7 +106,7 @@ def main(path: Path) -> int:
 
 def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> Report:
     """Solve one QP for each of the samples, and drive to the bounds."""
-    rti = config.build_rti()
+    rti = build_rti(config)
     ocp = rti.ocp
     model, N = ocp.model, ocp.N
     first, second = config.solver.name, SECOND if config.solver.name != SECOND else "osqp"
@@ -112,7 +114,7 @@ def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> Report:
     tight, judge = (twin(rti, solver, formulation) for solver, formulation in ((first, rti.formulation), (second, other)))
     bounds, scale = Bounds(rti), rti.scale[model.nx : model.nx + model.nu]
     rng = np.random.default_rng(1)
-    x = np.array(config.robot_settings()["x0"])
+    x = np.array(robot_settings(config)["x0"])
     reference = wave(ocp, x, rng)
     prepare_us, feedback_us = np.zeros(SAMPLES), np.zeros(SAMPLES)
     statuses: Counter[QpStatus] = Counter()

@@ -24,7 +24,9 @@ from typer.core import TyperGroup
 import rti_mpc
 from rti_mpc.errors import ConfigError
 from service import entry, log
-from service.config import Config, load
+from service.build import build_model, bus_settings, robot_settings, stage_parameters, with_initial_state
+from service.config import load
+from service.schema import Config
 
 if TYPE_CHECKING:
     from rti_mpc.wire.bus import BusSettings
@@ -120,7 +122,7 @@ def process(command: Callable[..., int | None], *, with_model: bool = True) -> C
             config, given["words"] = Path(file or SHIPPED), [word for word in words if word != file]
         loaded = load(config, with_model=with_model)
         overrides = options(**{name: given.pop(name) for name in shared})
-        raise typer.Exit(command(loaded, replace(loaded.bus_settings(), **overrides), **given) or 0)
+        raise typer.Exit(command(loaded, replace(bus_settings(loaded), **overrides), **given) or 0)
 
     path = inspect.Parameter("config", inspect.Parameter.POSITIONAL_OR_KEYWORD, default=SHIPPED, annotation=ConfigPath)
     run.__signature__ = inspect.Signature([path, *own, *shared.values()])  # type: ignore[attr-defined]
@@ -178,7 +180,7 @@ def sim(
     from sim.settings import RobotSettings
 
     listen = bus.listen or config.bus.listen or (bus.connect if bus.mode == "peer" and bus.config is None else ())
-    settings = RobotSettings(**config.with_initial_state(x0 or []).robot_settings())
+    settings = RobotSettings(**robot_settings(with_initial_state(config, x0 or [])))
     main(settings, replace(bus, listen=listen), config.keys(), speed=speed, log=log, duration_s=duration, guarded=config.guard.enabled)
 
 
@@ -202,9 +204,9 @@ def reference(
     trajectory = find_trajectory(scenario, waypoint_speed)
     if duration is not None:
         trajectory = trajectory.lasting(duration)
-    model = config.build_model()
+    model = build_model(config)
     parameters = {parameter.name: value for parameter, value in zip(model.parameters, model.p_nominal, strict=True)}
-    main(trajectory, bus, config.keys(), heading=heading, a=parameters.get("a", 0.0), parameters=config.stage_parameters)
+    main(trajectory, bus, config.keys(), heading=heading, a=parameters.get("a", 0.0), parameters=partial(stage_parameters, config))
 
 
 @process

@@ -39,7 +39,7 @@ from rti_mpc.wire.bus import WAITING, Bus, BusSettings, Subscriber
 from rti_mpc.wire.interrupt import stop_on_signals
 from service import realtime
 from service.announce import announce
-from service.config import Config
+from service.build import build_observer, build_rti
 from service.description import describe
 from service.fit import check_stop
 from service.latch_file import LatchFile
@@ -48,6 +48,7 @@ from service.operator_stop import OperatorStop
 from service.orders import Orders
 from service.params import Params
 from service.references import References
+from service.schema import Config
 
 TICK_S = 0.01  # between two looks for silence
 RAMP_S = 0.6  # of a controller that is being stopped, to bring the robot to rest
@@ -75,10 +76,10 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
     """
     check_stop(config)
     stop = stop or stop_on_signals()
-    rti = config.build_rti()
+    rti = build_rti(config)
     warm_up(rti)
     timing = Timing(config.delay_s, config.stale_s, config.timing.valid_s)
-    controller = Controller(rti, timing, config_hash=config.config_hash, observer=config.build_observer())
+    controller = Controller(rti, timing, config_hash=config.config_hash, observer=build_observer(config))
     lock = Condition()
     params = Params(config, controller, rti, lock)
 

@@ -34,11 +34,12 @@ from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.interrupt import stop_on_signals
 from service import machine, robot_log, toml
 from service.board import Board, print_summary
+from service.build import build_model, build_ocp, with_initial_state
 from service.children import Children
-from service.config import Config
 from service.echo import ROLE as ECHO
 from service.echo import Echo
 from service.fit import check_stop
+from service.schema import Config
 from service.summary import Outcome, summarize
 from service.witness import Witness
 
@@ -116,10 +117,10 @@ def plan(
 
 def configured(config: Config, trajectory: Trajectory, heading: Heading, guard: bool) -> Config:
     """Return the configuration of a run: on loopback, from the scenario's pose, guarded if asked for, without weight on a heading that is none."""
-    config = config.with_initial_state([f"{name}={value!r}" for name, value in zip(("x", "y", "psi"), trajectory.pose0, strict=True)])
+    config = with_initial_state(config, [f"{name}={value!r}" for name, value in zip(("x", "y", "psi"), trajectory.pose0, strict=True)])
     content = config.model_dump(by_alias=True, exclude_unset=True, exclude={"bus"})
     if heading == "none":
-        content["ocp"]["weights"]["Q"] |= {output.name: 0.0 for output in config.build_model().outputs if output.angle}
+        content["ocp"]["weights"]["Q"] |= {output.name: 0.0 for output in build_model(config).outputs if output.angle}
     if guard:
         content["guard"] = {**content.get("guard", {}), "enabled": True}
     return Config.model_validate(content)
@@ -159,7 +160,7 @@ def drive(run: Plan, console: Console, stop: Event) -> Outcome:
     Raises:
         Failed: Somebody has ended, or nobody came.
     """
-    ocp = run.config.build_ocp()
+    ocp = build_ocp(run.config)
     endpoint = free_endpoint()
     title = f"{run.trajectory.name}, heading {run.heading}, {run.speed:g} times real speed"
     logs = run.folder / "logs"

@@ -35,14 +35,16 @@ from rti_mpc.status import Mode, QpStatus
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import encode
 from service import machine, realtime
+from service.build import build_model, build_rti, robot_settings
 from service.check import wave
 from service.children import Children
-from service.config import Config, load
+from service.config import load
 from service.daemon import warm_up
 from service.demo import free_endpoint
 from service.echo import ROLE as ECHO
 from service.echo import Pinger
 from service.jitter import bare_timer
+from service.schema import Config
 from service.summary import quantiles
 
 TICK_S, TICKS = 0.001, 1000
@@ -122,7 +124,7 @@ def clock() -> dict[str, Any]:
 
 def round_trip_us(config: Config) -> Array:
     """Send a state to another process, which answers with a command's size; empty if it never came up."""
-    model, keys, endpoint = config.build_model(), config.keys(), free_endpoint()
+    model, keys, endpoint = build_model(config), config.keys(), free_endpoint()
     command = Command(0, 0, 0, 0, 0, 0, 0, 0, Mode.TRACKING, QpStatus.SOLVED, 0, np.zeros((config.ocp.N, model.nu)))
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -139,7 +141,7 @@ def round_trip_us(config: Config) -> Array:
 
 def phases_us(config: Config) -> tuple[Array, Array]:
     """Control a robot that does what the plan says, as the daemon does, each state in its time; return the times of preparation and of feedback."""
-    rti, x = config.build_rti(), np.array(config.robot_settings()["x0"])
+    rti, x = build_rti(config), np.array(robot_settings(config)["x0"])
     warm_up(rti)
     dt_ns = round(1e9 * config.ocp.dt_s)
     y = wave(rti.ocp, x, np.random.default_rng(1))(np.arange(SAMPLES + config.ocp.N + 1))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a configuration fits its model, and its solver is there: what a process that builds no problem need not know."""
+"""Checks of a configuration beyond each table's own: its keys against each other, its names against the model, and its solver."""
 
 from __future__ import annotations
 
@@ -7,15 +7,39 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from rti_mpc.errors import ConfigError, OcpError
-from rti_mpc.model import find_model
-from rti_mpc.obstacle import with_obstacles
-from service.config import ITERATIONS, Config, names
-from service.refusal import unknown_name
-from service.schema import RegulatorSection
+from service.build import build_ocp, names
+from service.refusal import quoted, unknown_name
+from service.schema import ITERATIONS, Config, RegulatorSection
 
 if TYPE_CHECKING:
     from rti_mpc.model import Model, Signal
     from rti_mpc.ocp import Ocp
+
+
+def check_tree(config: Config) -> None:
+    """
+    Check what only the whole or the file system knows.
+
+    Raises:
+        ConfigError: A key does not fit the others.
+    """
+    ocp, terminal = config.ocp, config.ocp.terminal
+    if terminal.Q is not None and terminal.lqr is not None:
+        raise ConfigError("ocp.terminal must have Q or lqr, not both")
+    if config.N_u > ocp.N:
+        raise ConfigError(f"ocp.N_u must be at most ocp.N = {ocp.N}, got {ocp.N_u}")
+    for key, values, length in (("delta", ocp.weights.delta, ocp.N), ("lambda", ocp.weights.lambda_, config.N_u)):
+        if len(values) not in (1, length):
+            raise ConfigError(f"ocp.weights.{key} must be a number or a list of {length}, one a stage, got {quoted(list(values))}")
+    if config.bus.config is not None and not config.bus.config.is_file():
+        raise ConfigError(f"bus.config must be a file, got {config.bus.config}")
+    if config.guard.enabled:
+        for name in ocp.weights.R:
+            if name not in ocp.bounds.inputs:
+                raise ConfigError(f"ocp.bounds.inputs must bound every input where a guard is enabled, {name} is missing")
+        for name, (lower, upper) in ocp.bounds.inputs.items():
+            if not lower <= (rest := config.guard.u_rest.get(name, 0.0)) <= upper:
+                raise ConfigError(f"ocp.bounds.inputs.{name} must hold the input's rest, guard.u_rest = {rest:g}, got {[lower, upper]}")
 
 
 def check_model(config: Config) -> Ocp:
@@ -26,6 +50,9 @@ def check_model(config: Config) -> Ocp:
         ConfigError: A key does not fit the model.
         OcpError: The problem is ill-posed in some other way.
     """
+    from rti_mpc.model import find_model
+    from rti_mpc.obstacle import with_obstacles
+
     try:
         model = find_model(config.model.name)
     except OcpError as error:
@@ -42,7 +69,7 @@ def check_model(config: Config) -> Ocp:
         with_obstacles(model, [(0.0, 0.0, 1.0) for _ in config.ocp.obstacles])
     except OcpError as error:
         raise ConfigError(f"ocp.obstacles: {error}") from error
-    ocp = config.build_ocp()
+    ocp = build_ocp(config)
     check_rest(ocp)
     return ocp
 
@@ -69,7 +96,7 @@ def check_stop(config: Config) -> None:
     """
     from rti_mpc.rest import motion_at_rest
 
-    if config.model.stop == "rests" and (seen := motion_at_rest(config.build_ocp())):
+    if config.model.stop == "rests" and (seen := motion_at_rest(build_ocp(config))):
         raise ConfigError(
             f"model.name: a stop must bring {config.model.name} to rest: {seen}; let its inputs command speeds, "
             f'or say that it is let go by stop = "coasts" in [model]'

@@ -29,9 +29,10 @@ from rti_mpc.wire.bus import WAITING, Bus, Received, Subscriber, unix_s
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.session import BusSettings
 from service.announce import announce
-from service.config import Config
+from service.build import guard_limits
 from service.latch_file import LatchFile
 from service.operator_stop import OperatorStop
+from service.schema import Config
 
 ROLE = "guard"
 HEARING_S = 0.5  # for which a starting guard listens for another
@@ -74,7 +75,7 @@ def main(config: Config, bus_settings: BusSettings, *, state: Path | None = None
 
 def describe(config: Config) -> dict[str, object]:
     """Describe a guard for ``info``: what it lets pass, per input; null where there is no limit."""
-    limits, bounds = config.guard_limits(), config.ocp.bounds
+    limits, bounds = guard_limits(config), config.ocp.bounds
     return {
         "role": ROLE,
         "version": rti_mpc.__version__,
@@ -93,7 +94,7 @@ class Process:
     """One life of the guard on the bus."""
 
     def __init__(self, config: Config, bus: Bus, epoch: int, file: LatchFile) -> None:
-        limits, keys = config.guard_limits(), bus.keys
+        limits, keys = guard_limits(config), bus.keys
         self._bus = bus
         self._telling = Lock()
         self._about = {**describe(config), "epoch": epoch}

@@ -23,9 +23,10 @@ from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.ocp import Ocp
 from rti_mpc.rti import Rti
 from rti_mpc.tuning import Tuning
-from service.config import Config, check_tree
-from service.fit import check_names, check_rest
+from service.build import build_rti, retuned
+from service.fit import check_names, check_rest, check_tree
 from service.refusal import entries, explain
+from service.schema import Config
 
 WEIGHTS = ("ocp.weights.Q", "ocp.weights.R", "ocp.weights.delta", "ocp.weights.lambda", "ocp.bounds.soft_weight")
 BOUNDS = ("ocp.bounds.inputs", "ocp.bounds.increments", "ocp.bounds.states")
@@ -53,7 +54,7 @@ class Params:
         self._controller = controller
         self._rti = rti
         self._lock = lock  # held while a sample is made; notified when one has been
-        self._trial = config.build_rti() if config.params.live else None
+        self._trial = build_rti(config) if config.params.live else None
 
     def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """
@@ -148,7 +149,7 @@ def changed(file: Config, ocp: Ocp, changes: Mapping[str, Any]) -> tuple[Config,
         config = Config.model_validate(document)
         check_tree(config)
         check_names(config, ocp.model)
-        ocp = config.retuned(ocp)
+        ocp = retuned(config, ocp)
         check_rest(ocp)
     except ValidationError as error:
         raise ConfigError(explain(error, Config)) from error

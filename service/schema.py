@@ -8,10 +8,14 @@ one place only.
 
 from __future__ import annotations
 
+import hashlib
+import json
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, AllowInfNan, BaseModel, BeforeValidator, ConfigDict, Field
+
+from rti_mpc.wire.keys import Keys
 
 
 def interval(value: object) -> object:
@@ -51,6 +55,9 @@ Duration = Annotated[float, Field(ge=0, le=10)]
 Period = Annotated[float, Field(ge=1e-4, le=10)]
 Endpoint = Annotated[str, Field(pattern=r"^[a-z0-9_-]+/\S+$")]
 Endpoints = Annotated[tuple[Endpoint, ...], Field(strict=False)]
+
+ITERATIONS = {"iterations", "tolerance"}  # what of the solver's section is not OSQP's
+RAMP_LEAD_S = 0.025  # from a state going stale to the end of its plan: in it the ramp is made, and reaches the robot
 
 
 class Section(BaseModel):
@@ -229,3 +236,46 @@ class SimSection(Section):
     reports_inputs: bool | None = Field(default=None, description="whether states tell which inputs act; true if left out")
     approaches: bool = Field(default=True, description="whether the robot itself approaches a command inside the slew limits, from what really acts")
     seed: int | None = Field(default=None, ge=0, description="seed of noise and dropout")
+
+
+class Config(Section):
+    """Everything physical about one robot."""
+
+    robot: str = Field(pattern=r"^[A-Za-z0-9_.-]+$", description="the robot's name in keys: letters, digits, _ . -")
+    prefix: str = Field(default="rti_mpc", pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$", description="what all keys begin with")
+    model: ModelSection = Field(description="which robot")
+    ocp: OcpSection = Field(description="the optimal control problem")
+    solver: SolverSection = Field(default=SolverSection(), description="the QP solver's settings")
+    timing: TimingSection = Field(default=TimingSection(), description="delays and timeouts")
+    observer: ObserverSection = Field(default=ObserverSection(), description="estimator of disturbances and of unmeasured states; none if left out")
+    guard: GuardSection = Field(default=GuardSection(), description="the guard between controller and robot")
+    debug: DebugSection = Field(default=DebugSection(), description="failures on request")
+    params: ParamsSection = Field(default=ParamsSection(), description="what may change while the controller runs")
+    bus: BusSection = Field(default=BusSection(), description="the Zenoh session")
+    realtime: RealtimeSection = Field(default=RealtimeSection(), description="what the controller asks of the operating system")
+    sim: SimSection = Field(default=SimSection(), description="the simulated robot")
+
+    @property
+    def N_u(self) -> int:
+        """Control horizon, in stages."""
+        return self.ocp.N_u or self.ocp.N
+
+    @property
+    def stale_s(self) -> float:
+        """Age from which a state is not used, s of the robot; early enough that the ramp is there before the last plan ends."""
+        return self.timing.stale_s or min(max(2.5 * self.ocp.dt_s, 0.05), max(self.timing.valid_s - RAMP_LEAD_S, self.ocp.dt_s))
+
+    @property
+    def delay_s(self) -> float | None:
+        """Delay from a state to the act of its command, s of the robot; None: measured."""
+        return None if self.timing.delay_s == "measured" else self.timing.delay_s
+
+    @property
+    def config_hash(self) -> int:
+        """64 bits of everything that decides a command: not of the bus, the guard, the scheduler, the simulation or failures on request."""
+        content = self.model_dump(mode="json", exclude={"bus", "debug", "guard", "realtime", "sim"})
+        return int.from_bytes(hashlib.sha256(json.dumps(content, sort_keys=True).encode()).digest()[:8], "little")
+
+    def keys(self) -> Keys:
+        """Return the keys of this robot."""
+        return Keys(self.prefix, self.robot)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rti_mpc.errors import ConfigError
 
 if TYPE_CHECKING:
-    from service.config import Config
+    from service.schema import Config
 
 MAX_DEPTH = 16  # tables and lists inside each other; a configuration has five
 

@@ -160,6 +160,16 @@ def test_wire_depends_on_messages_only() -> None:
         assert inside(path) <= BEFORE_WIRE | {"wire"}, path
 
 
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_file_imports_itself_by_way_of_others(package: str) -> None:
+    names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in files(package)}
+    imports = {name: {each.rpartition(".")[0] for each in imported(path)} | imported(path) for name, path in names.items()}
+    left = {name: {other for other in of if other in names} for name, of in imports.items()}
+    while free := {name for name, of in left.items() if not of}:
+        left = {name: of - free for name, of in left.items() if name not in free}
+    assert not left, "each of these imports another of them, or itself"
+
+
 @pytest.mark.parametrize(
     ("module", "absent"),
     [

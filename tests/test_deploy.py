@@ -14,6 +14,7 @@ import pytest
 import typer.main
 
 from rti_mpc.wire.session import BusSettings, zenoh_config
+from service.build import build_ocp
 from service.cli import app
 from service.config import load
 
@@ -27,7 +28,7 @@ SHELL = [line for block in re.findall(r"```sh\n(.*?)```", RUNBOOK, re.DOTALL) fo
 @pytest.mark.parametrize("path", sorted(DEPLOY.glob("*.toml")), ids=lambda path: path.name)
 def test_configuration_builds_its_problem(path: Path) -> None:
     config = load(path)
-    assert config.build_ocp().N == config.ocp.N
+    assert build_ocp(config).N == config.ocp.N
     assert config.keys().command.endswith(f"{config.robot}/command")
 
 

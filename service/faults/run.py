@@ -24,7 +24,8 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.guard import Limits
 from rti_mpc.trajectory import find_trajectory
 from rti_mpc.wire.interrupt import stop_on_signals
-from service.config import Config, check_tree, load
+from service.build import guard_limits
+from service.config import load
 from service.demo import Failed, configured
 from service.faults.excuse import excuses, explained
 from service.faults.measure import Incident, measure, missed_ns, positions
@@ -32,8 +33,9 @@ from service.faults.relay import ROLE as RELAY
 from service.faults.report import Report, Row, report_console
 from service.faults.system import HEADING, SCENARIO, System, Wiring
 from service.faults.table import FAULTS, Fault
-from service.fit import check_model
+from service.fit import check_model, check_tree
 from service.host import Host
+from service.schema import Config
 
 STATE_PERIOD_S = 0.01  # of the robot, and so of its record: what times are known to
 COMPANY = {
@@ -113,7 +115,7 @@ def prepared(config: Config) -> Config:
 
 def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Report, stop: Event, host: Host) -> None:
     """Inject faults until there are none left, or we are stopped."""
-    limits = config.guard_limits()
+    limits = guard_limits(config)
     system: System | None = None
     with ExitStack() as stack:
         for number, fault in enumerate(faults):

@@ -22,8 +22,8 @@ from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.session import BusSettings
 from service import robot_log, toml
+from service.build import build_model
 from service.children import Children
-from service.config import Config
 from service.demo import POLITE, Failed, free_endpoint, wait
 from service.faults.measure import positions
 from service.faults.observer import Observer
@@ -31,6 +31,7 @@ from service.faults.proxy import Proxy
 from service.faults.relay import ROLE as RELAY
 from service.info import Info, Label
 from service.robot_log import RobotLog
+from service.schema import Config
 from service.witness import Witness
 
 SCENARIO = "eight"
@@ -77,7 +78,7 @@ class System:
         self.robots = 0
         self.wiring, self._folder, self._stop = wiring, folder, stop
         self._robot_keys = Keys(f"{self.keys.prefix}/behind", self.keys.robot) if wiring in RELAYED else self.keys
-        model = config.build_model()
+        model = build_model(config)
         states, inputs = (tuple(Label(signal.name) for signal in signals) for signals in (model.states, model.inputs))
         self._info = Info("robot", states=states, inputs=inputs)
         self._suspended: set[str] = set()

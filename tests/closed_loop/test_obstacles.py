@@ -16,7 +16,9 @@ from rti_mpc.obstacle import with_obstacles
 from rti_mpc.ocp import Ocp
 from rti_mpc.pioneer_3dx import pioneer_3dx
 from rti_mpc.rti import Rti
-from service.config import Config, load
+from service.build import build_ocp, build_rti, robot_settings, stage_parameters
+from service.config import load
+from service.schema import Config
 from sim.lockstep import Lockstep
 from sim.settings import RobotSettings
 from tests.loop import drive
@@ -96,16 +98,16 @@ def along_the_axis(config: Config, seq: int = 1) -> Reference:
     """To 4 m, and 20 s there."""
     t = DT * np.arange(500)
     y = np.stack([np.minimum(SPEED * t, 4.0), 0 * t, 0 * t], axis=-1)
-    return Reference(1, seq, 0, round(1e9 * DT), End.HOLD, y, config.stage_parameters(t))
+    return Reference(1, seq, 0, round(1e9 * DT), End.HOLD, y, stage_parameters(config, t))
 
 
 @pytest.mark.parametrize("solver", ["riccati", "osqp"])
 def test_configured_discs_are_passed_and_nobody_is_told_that_the_way_is_blocked(solver: str, tmp_path: Path) -> None:
     config = configured(tmp_path / "robot.toml", PASSABLE)
     config = config.model_copy(update={"solver": config.solver.model_copy(update={"name": solver})})
-    controller = Controller(config.build_rti(), Timing())
+    controller = Controller(build_rti(config), Timing())
     controller.receive_reference(along_the_axis(config))
-    run = drive(controller, Lockstep(RobotSettings(**config.robot_settings())), 20.0)
+    run = drive(controller, Lockstep(RobotSettings(**robot_settings(config))), 20.0)
     x, t = np.array(run.x), np.array(run.t_s)
     for (px, py), r, v in (((1.0, 0.05), 0.3, 0.0), ((2.0, -0.1), 0.3, 0.0), ((3.0, 1.0), 0.3, -0.07)):
         assert np.hypot(x[:, 0] - px, x[:, 1] - py - v * t).min() > r - 1e-3
@@ -117,10 +119,10 @@ def test_configured_discs_are_passed_and_nobody_is_told_that_the_way_is_blocked(
 @pytest.mark.parametrize("noise_m", [0.0, 2e-3])
 def test_robot_whose_paths_are_all_blocked_says_so_once_and_once_that_it_is_free_again(noise_m: float, tmp_path: Path) -> None:
     config = configured(tmp_path / "robot.toml", BLOCKED)
-    controller = Controller(config.build_rti(), Timing())
+    controller = Controller(build_rti(config), Timing())
     blocked = along_the_axis(config)
     controller.receive_reference(blocked)
-    settings = RobotSettings(**config.robot_settings() | {"noise_std": [noise_m, noise_m, 0, 0, 0]})
+    settings = RobotSettings(**robot_settings(config) | {"noise_std": [noise_m, noise_m, 0, 0, 0]})
     body = Lockstep(settings)
     drive(controller, body, 20.0)
     assert body.x[0] < 1.5
@@ -128,7 +130,7 @@ def test_robot_whose_paths_are_all_blocked_says_so_once_and_once_that_it_is_free
     said = [(notice.severity, notice.code) for notice in controller.notices if notice.code != "mode"]
     assert said == [(Severity.WARNING, "blocked")]
     gone = along_the_axis(config, seq=2)
-    gone.p = np.tile(config.build_ocp().model.p_nominal, (len(gone.y), 1))
+    gone.p = np.tile(build_ocp(config).model.p_nominal, (len(gone.y), 1))
     gone.p[:, -5] = 9.0  # y of the second disc: a planner lets it go
     controller.receive_reference(gone)
     drive(controller, body, 45.0)

@@ -14,6 +14,7 @@ from rti_mpc.message import Command
 from rti_mpc.ocp import Ocp
 from rti_mpc.status import Mode
 from rti_mpc.trajectory import Heading, Trajectory, circle, eight, positioning
+from service.build import build_rti
 from service.config import load
 from service.demo import configured
 from tests.loop import Run, drive, reference, robot
@@ -29,7 +30,7 @@ SCENARIOS: dict[str, tuple[Trajectory, Heading, float]] = {
 def controller_for(trajectory: Trajectory, heading: Heading) -> tuple[Controller, Ocp]:
     """The controller that `rti-mpc demo` runs."""
     config = configured(CONFIG, trajectory, heading, guard=False)
-    rti = config.build_rti()
+    rti = build_rti(config)
     return Controller(rti, Timing(config.timing.delay_s, config.stale_s, config.timing.valid_s)), rti.ocp
 
 

@@ -21,6 +21,7 @@ from rti_mpc.status import Mode, QpStatus
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.session import BusSettings
+from service.build import guard_limits
 from service.cli import SHIPPED
 from service.config import load
 from service.host import Host
@@ -56,7 +57,7 @@ class Rig:
         self.config = folder / "robot.toml"
         self.config.write_text(SHIPPED.read_text() + "\n[guard]\nenabled = true\n")
         loaded = load(self.config)
-        limits = loaded.guard_limits()
+        limits = guard_limits(loaded)
         self.lbu, self.ubu, self.step = limits.lbu, limits.ubu, np.minimum(-limits.lbdu, limits.ubdu)
         self._slew, self._guard, self._folder = limits.slew, guard, folder
         with socket.socket() as probe:

@@ -23,6 +23,7 @@ import pytest
 from rti_mpc.epoch import NUMBER_BITS
 from rti_mpc.status import Mode
 from service import robot_log
+from service.build import guard_limits
 from service.cli import SHIPPED
 from service.config import load
 from service.faults.measure import Incident, measure
@@ -148,7 +149,7 @@ def test_links_that_are_cut_never_make_two_leaders_act_in_turn_and_the_robot_goe
     log = robot_log.read(tmp_path / "robot.csv", INFO)
     epochs = system.acted()
     assert epochs == sorted(epochs), "whoever was relieved acts no more"
-    limits = load(system.config).guard_limits()
+    limits = guard_limits(load(system.config))
     for lost, cut_ns, restored_ns, well_ns in cuts:
         incident = Incident(*map(system.robot_ns, (cut_ns, restored_ns, well_ns)))
         found = measure(log, np.zeros((len(log.stamp_ns), 2)), incident, limits)

@@ -18,8 +18,10 @@ from rti_mpc.solver import Solver
 from rti_mpc.terminal import lqr_weight
 from rti_mpc.wire.bus import BusSettings
 from service import check, daemon, demo
-from service.config import Config, load
+from service.build import build_model, build_ocp, build_rti, bus_settings, guard_limits, robot_settings, solver_settings, stage_parameters
+from service.config import load
 from service.fit import check_stop
+from service.schema import Config
 from sim.settings import RobotSettings
 
 ROOT = Path(__file__).parents[2]
@@ -121,7 +123,7 @@ def test_file_that_is_not_there_is_refused_by_name(tmp_path: Path) -> None:
 def test_configuration_becomes_the_ocp_it_describes(tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(MINIMAL)
-    ocp = load(path).build_ocp()
+    ocp = build_ocp(load(path))
     assert (ocp.N, ocp.N_u, ocp.dt, ocp.method) == (3, 3, 0.1, "euler")
     np.testing.assert_array_equal(np.diag(ocp.Q), [1, 2, 0])
     np.testing.assert_array_equal(np.diag(ocp.R), [1, 3])
@@ -134,7 +136,7 @@ def test_softened_bounds_constraints_and_obstacles_become_those_of_the_ocp(tmp_p
     path = tmp_path / "robot.toml"
     bounds = "[ocp.bounds]\nstates = { u = [-1, 1] }\nconstraints = { power = [-inf, 0.1] }\nsoft_weight = 5.0\nsoft_weight_L2 = 6.0\n"
     path.write_text(MINIMAL.replace("pioneer_3dx", "tests.service.test_config:limited") + bounds + DISC + "radius_m = 0.3\nmargin_m = 0.2\n")
-    ocp = load(path).build_ocp()
+    ocp = build_ocp(load(path))
     assert ocp.h_expr.numel() == 2, "the constraint that is bounded, and the disc"
     h = ca.Function("h", [ocp.model.x, ocp.model.u, ocp.model.p], [ocp.h_expr])
     value = np.array(h([1.0, 0.0, 0.0, 0.4, 0.0], [0.5, 0.0], ocp.model.p_nominal)).ravel()
@@ -156,11 +158,11 @@ def limited() -> Model:
 def test_terminal_weight_is_the_one_given_or_the_regulators(tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(MINIMAL + "[ocp.terminal]\nQ = { psi = 3.0, x = 1.0, y = 2.0 }\n")
-    np.testing.assert_array_equal(np.diag(load(path).build_ocp().Q_e), [1, 2, 3])
+    np.testing.assert_array_equal(np.diag(build_ocp(load(path)).Q_e), [1, 2, 3])
     path.write_text(MINIMAL)
-    assert not load(path).build_ocp().Q_e.any()
+    assert not build_ocp(load(path)).Q_e.any()
     path.write_text(MINIMAL + "[ocp.terminal.lqr]\nstates = { u = 0.25 }\ninputs = { u_c = 0.25 }\n")
-    ocp = load(path).build_ocp()
+    ocp = build_ocp(load(path))
     np.testing.assert_array_equal(ocp.Q_e, lqr_weight(ocp, np.array([0, 0, 0, 0.25, 0]), np.array([0.25, 0])))
 
 
@@ -168,10 +170,10 @@ def test_moving_obstacles_are_parameters_that_a_reference_carries_row_by_row(tmp
     path = tmp_path / "robot.toml"
     discs = DISC + "radius_m = 0.3\n" + DISC + "radius_m = 0.2\nmargin_m = 0.1\n"
     path.write_text(MINIMAL + discs)
-    assert load(path).stage_parameters(np.array([0.0, 2.0])).shape == (2, 0), "none moves: all nominal"
+    assert stage_parameters(load(path), np.array([0.0, 2.0])).shape == (2, 0), "none moves: all nominal"
     path.write_text(MINIMAL + discs + "velocity_m_s = [0.0, -0.1]\n")
     config = load(path)
-    rows, nominal = config.stage_parameters(np.array([0.0, 2.0])), config.build_ocp().model.p_nominal
+    rows, nominal = stage_parameters(config, np.array([0.0, 2.0])), build_ocp(config).model.p_nominal
     np.testing.assert_allclose(rows[0], nominal, rtol=1e-15)
     np.testing.assert_allclose(rows[1], [*nominal[:-2], 0.3, 0.3], rtol=1e-15)
 
@@ -180,13 +182,13 @@ def test_moving_obstacles_are_parameters_that_a_reference_carries_row_by_row(tmp
 def test_solver_is_chosen_by_one_word(name: str, tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(MINIMAL + f'[solver]\nname = "{name}"\n')
-    rti = load(path).build_rti()
+    rti = build_rti(load(path))
     assert (rti.active_set is None) is (name != "riccati")
     assert isinstance(rti.solvers[0], Solver if name != "daqp" else ForeignSolver)
 
 
 def test_bounds_go_to_the_signals_they_name_whatever_their_order() -> None:
-    ocp = load(SHIPPED).build_ocp()
+    ocp = build_ocp(load(SHIPPED))
     np.testing.assert_array_equal(ocp.ubu, [0.5, 0.745])
     np.testing.assert_array_equal(ocp.lbdu, [-0.25, -0.40])
     np.testing.assert_array_equal(ocp.ubx, [math.inf, math.inf, math.inf, 0.5, 0.745])
@@ -195,14 +197,14 @@ def test_bounds_go_to_the_signals_they_name_whatever_their_order() -> None:
 def test_parameters_by_name_reach_the_model(tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(MINIMAL.replace('"pioneer_3dx"', '"pioneer_3dx", parameters = { a = 0.1 }'))
-    assert load(path).build_model().p_nominal[-1] == 0.1
+    assert build_model(load(path)).p_nominal[-1] == 0.1
 
 
 def test_zenoh_file_is_found_beside_the_configuration(tmp_path: Path) -> None:
     (tmp_path / "zenoh.json5").write_text("{}")
     path = tmp_path / "robot.toml"
     path.write_text(MINIMAL + '[bus]\nconfig = "zenoh.json5"\n')
-    assert load(path).bus_settings().config == tmp_path / "zenoh.json5"
+    assert bus_settings(load(path)).config == tmp_path / "zenoh.json5"
 
 
 def test_staleness_follows_the_period_within_limits(tmp_path: Path) -> None:
@@ -242,7 +244,7 @@ def test_plant_takes_its_own_parameters_the_rest_from_the_controller(tmp_path: P
     path.write_text(
         MINIMAL + "[sim]\nx0 = { psi = 1.5 }\nparameters = { theta_1 = 0.3 }\nseed = 4\n[ocp.bounds]\nincrements = { u_c = [-0.1, 0.2] }\n"
     )
-    settings = RobotSettings(**load(path).robot_settings())
+    settings = RobotSettings(**robot_settings(load(path)))
     assert settings.model.p_nominal[0] == 0.3
     assert settings.seed == 4
     assert settings.state_period_s == 0.1
@@ -253,9 +255,9 @@ def test_plant_takes_its_own_parameters_the_rest_from_the_controller(tmp_path: P
 def test_limits_of_iterations_reach_the_controller(tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(MINIMAL + "[solver]\niterations = 7\ntolerance = 1e-3\neps = 1e-4\n")
-    rti = load(path).build_rti()
+    rti = build_rti(load(path))
     assert (rti.iterations, rti.tolerance) == (7, 1e-3)
-    assert load(path).solver_settings().eps == 1e-4
+    assert solver_settings(load(path)).eps == 1e-4
 
 
 GUARDED = SHIPPED.read_text() + "\n[guard]\nenabled = true\n"
@@ -294,7 +296,7 @@ def test_limits_of_the_guard_are_those_of_the_problem(tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(GUARDED)
     config = load(path, with_model=False)
-    limits, ocp = config.guard_limits(), config.build_ocp()
+    limits, ocp = guard_limits(config), build_ocp(config)
     for name in ("lbu", "ubu", "lbdu", "ubdu"):
         np.testing.assert_array_equal(getattr(limits, name), getattr(ocp, name))
     np.testing.assert_allclose(limits.slew, [2.5, 4.0])

@@ -16,9 +16,11 @@ from rti_mpc.ocp import VALUES
 from rti_mpc.rti import Rti
 from rti_mpc.status import QpStatus
 from rti_mpc.trajectory import circle
+from service.build import build_ocp, build_rti
 from service.cli import SHIPPED
-from service.config import Config, load
+from service.config import load
 from service.params import Params, changed, values
+from service.schema import Config
 from tests.loop import drive, reference, robot
 from tests.service.test_config import MINIMAL
 
@@ -36,7 +38,7 @@ def configuration(folder: Any, live: bool = True) -> Config:
 def running(tmp_path_factory: pytest.TempPathFactory) -> tuple[Controller, Params, Config]:
     """A controller that has driven for a second, and its parameters."""
     config = configuration(tmp_path_factory.mktemp("params"))
-    rti = config.build_rti()
+    rti = build_rti(config)
     controller = Controller(rti, Timing())
     params = Params(config, controller, rti, Condition())
     controller.receive_reference(reference(circle()))
@@ -57,7 +59,7 @@ def test_values_are_those_of_the_file_by_its_keys(running: tuple[Controller, Par
 
 def test_change_is_told_with_its_version_and_its_first_command_and_acts_from_there(tmp_path: Any) -> None:
     config = configuration(tmp_path)
-    rti = config.build_rti()
+    rti = build_rti(config)
     controller, body = Controller(rti, Timing()), robot(circle())
     params = Params(config, controller, rti, Condition())
     controller.receive_reference(reference(circle()))
@@ -127,7 +129,7 @@ def test_change_without_a_solution_on_the_present_sample_is_refused(
 
 def test_nothing_changes_unless_the_file_allows_it(tmp_path: Any) -> None:
     config = configuration(tmp_path, live=False)
-    rti = config.build_rti()
+    rti = build_rti(config)
     params = Params(config, Controller(rti, Timing()), rti, Condition())
     assert params.answer({"get": True})["live"] is False
     with pytest.raises(ConfigError, match=r"params\.live must be true"):
@@ -136,7 +138,7 @@ def test_nothing_changes_unless_the_file_allows_it(tmp_path: Any) -> None:
 
 def test_one_that_stands_by_has_what_the_leader_has(running: tuple[Controller, Params, Config]) -> None:
     controller, _, config = running
-    params = Params(config, controller, config.build_rti(), Condition())
+    params = Params(config, controller, build_rti(config), Condition())
     params.adopt(4, {"ocp.weights.Q.psi": 0.7})
     assert (params.version, params.ocp.Q[2, 2]) == (4, 0.7)
     params.adopt(0, {})  # a leader that was started anew
@@ -148,8 +150,8 @@ def test_a_bound_on_one_side_stays_on_that_side(tmp_path: Any) -> None:
     path.write_text(MINIMAL + "ocp.bounds.inputs = { u_c = [-inf, 0.5] }\nparams.live = true\n")
     config = load(path)
     with pytest.raises(ConfigError, match="be finite where it is"):
-        changed(config, config.build_ocp(), {"ocp.bounds.inputs.u_c": [-1.0, 0.5]})
-    assert changed(config, config.build_ocp(), {"ocp.bounds.inputs.u_c": [-float("inf"), 0.4]})[1].ubu[0] == 0.4
+        changed(config, build_ocp(config), {"ocp.bounds.inputs.u_c": [-1.0, 0.5]})
+    assert changed(config, build_ocp(config), {"ocp.bounds.inputs.u_c": [-float("inf"), 0.4]})[1].ubu[0] == 0.4
 
 
 FILES = {
@@ -167,10 +169,10 @@ def test_problem_after_changes_is_the_one_its_file_would_have_built(tmp_path: An
     path = tmp_path / "robot.toml"
     path.write_text(MINIMAL + file)
     config = load(path)
-    built = config.build_ocp()
+    built = build_ocp(config)
     _, before = changed(config, built, {"ocp.bounds.soft_weight": 9.0, "ocp.weights.Q.x": 5.0})
     now, ocp = changed(config, before, CHANGES)
-    wanted = now.build_ocp()
+    wanted = build_ocp(now)
     for name in VALUES:
         np.testing.assert_array_equal(getattr(ocp, name), getattr(wanted, name), err_msg=name)
     assert ocp.model is built.model
@@ -198,7 +200,7 @@ def test_change_is_tried_when_a_sample_has_just_ended(tmp_path: Any, monkeypatch
             return True
 
     config = configuration(tmp_path)
-    rti = config.build_rti()
+    rti = build_rti(config)
     params = Params(config, Controller(rti, Timing()), rti, Samples())
     monkeypatch.setattr(Rti, "feedback", lambda *_: seen.append("tries") or QpStatus.SOLVED)
     params.answer({"set": {"ocp.weights.R.u_c": 2.0}})

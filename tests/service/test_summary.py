@@ -13,6 +13,7 @@ import pytest
 from rti_mpc.message import Event, Severity, Telemetry
 from rti_mpc.status import Mode, QpStatus
 from rti_mpc.trajectory import circle, positioning
+from service.build import build_ocp
 from service.cli import SHIPPED
 from service.config import load
 from service.info import Info, Label
@@ -22,7 +23,7 @@ from service.summary import Outcome, beyond, over_share, summarize
 MS = 1_000_000
 ANCHOR_NS = 700 * MS
 CONFIG = load(SHIPPED)
-OCP = CONFIG.build_ocp()
+OCP = build_ocp(CONFIG)
 INFO = Info(
     role="controller",
     states=(Label("x", "m"), Label("y", "m"), Label("psi", "rad", True), Label("u", "m/s"), Label("omega", "rad/s")),

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from rti_mpc.errors import MessageError
+from service.build import build_ocp
 from service.config import load
 from service.daemon import describe
 from service.info import Info, Obstacle
@@ -104,7 +105,7 @@ def test_a_description_that_is_none_is_refused(wrong: Any) -> None:
 def test_a_controller_lists_what_a_planner_sends_and_where_obstacles_are_in_it(tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(MINIMAL + DISC + "radius_m = 0.3\nmargin_m = 0.1\n" + "[observer.disturbances]\nu_c = { drift = 0.1, limit = 0.2 }\n")
-    model = (ocp := load(path).build_ocp()).model
+    model = (ocp := build_ocp(load(path))).model
     document = json.loads(json.dumps({"role": "controller", **describe(ocp, model.np_ - 1)}))
     assert [parameter["name"] for parameter in document["parameters"][-4:]] == ["a", "disc_0_x", "disc_0_y", "disc_0_r"]
     assert document["p_nominal"] == list(model.p_nominal[:-1])
