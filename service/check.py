@@ -14,18 +14,16 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
 from rti_mpc.array import Array
-from rti_mpc.ocp import Ocp
 from rti_mpc.rti import FORMULATIONS, SOLVERS, Rti
 from rti_mpc.solver import SolverSettings
 from rti_mpc.status import QpStatus
@@ -33,6 +31,7 @@ from service.build import build_rti, robot_settings
 from service.config import load
 from service.excursion import Bounds, excursions
 from service.fit import check_stop
+from service.rig.wave import wave
 from service.schema import Config
 
 SAMPLES = 200
@@ -42,7 +41,6 @@ SECOND = "daqp"  # or OSQP where that is the first
 TIGHT = SolverSettings(eps=1e-9, max_iter=100_000, scaling=10)  # Ruiz scaling helps where bounds are far exceeded
 TOLERANCE = 1e-5  # what two tight answers to one QP may differ by, relative to half the range of each input
 
-WAVE_S = 40.0  # period of the reference, s
 NOISE = 0.01  # standard deviation of the disturbance, in the unit of each state
 
 
@@ -152,14 +150,6 @@ def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> Report:
             x = rti.x[1].copy()
     difference, deviation = (max(values, default=np.inf) for values in (differences, deviations))
     return Report(prepare_us, feedback_us, statuses, second, len(differences), difference, deviation, len(bounds.names), bounds.missed)
-
-
-def wave(ocp: Ocp, x: Array, rng: np.random.Generator) -> Callable[[NDArray[np.int64]], Array]:
-    """Return a reference that leaves a state, shape ``(nx,)``, in a wave of every output: stages, shape ``(M,)``, to rows, ``(M, ny)``."""
-    model = ocp.model
-    phases = rng.uniform(-np.pi, np.pi, model.ny)
-    start = np.array([x[[state.name for state in model.states].index(y.name)] if y in model.states else 0.0 for y in model.outputs])
-    return lambda k: np.asarray(start + np.sin(2 * np.pi / WAVE_S * ocp.dt * k[:, None] + phases) - np.sin(phases))
 
 
 def twin(rti: Rti, solver: str, formulation: str) -> Rti:

@@ -26,9 +26,6 @@ from pathlib import Path
 from threading import Condition, Event, Lock, Thread
 from typing import Any
 
-import numpy as np
-
-from rti_mpc.array import Array
 from rti_mpc.controller import Controller, Timing
 from rti_mpc.errors import ConfigError
 from rti_mpc.latch import Latch
@@ -49,10 +46,10 @@ from service.orders import Orders
 from service.params import Params
 from service.references import References
 from service.schema import Config
+from service.warm_up import warm_up
 
 TICK_S = 0.01  # between two looks for silence
 RAMP_S = 0.6  # of a controller that is being stopped, to bring the robot to rest
-WARM_UP = 20  # solves before the first command: the first real sample is not the first call
 
 log = logging.getLogger(LEADER)
 
@@ -113,15 +110,6 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
             level = logging.INFO if all(outcome.granted for outcome in outcomes) else logging.WARNING
             log.log(level, "real time: %s", "; ".join(map(str, outcomes)))
         return daemon.run(stop)
-
-
-def warm_up(rti: Rti) -> None:
-    """Solve a few samples at rest."""
-    x0: Array = np.zeros(rti.ocp.model.nx)
-    rti.reset(x0, rti.u_prev.copy())
-    for _ in range(WARM_UP):
-        rti.prepare(rti.y_ref.copy())
-        rti.feedback(x0)
 
 
 class Daemon:

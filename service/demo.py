@@ -11,10 +11,8 @@ been driven for long enough. Robot and controller go before everything else.
 from __future__ import annotations
 
 import json
-import socket
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 from importlib.util import find_spec
@@ -34,31 +32,27 @@ from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.interrupt import stop_on_signals
 from service import machine, robot_log, toml
 from service.board import Board, print_summary
-from service.build import build_model, build_ocp, with_initial_state
+from service.build import build_ocp
 from service.children import Children
 from service.echo import ROLE as ECHO
 from service.echo import Echo
 from service.fit import check_stop
+from service.rig.company import CLI, POLITE, Failed, check, wait
+from service.rig.endpoint import free_endpoint
+from service.rig.scenario import HEADINGS, configured
 from service.schema import Config
 from service.summary import Outcome, summarize
 from service.witness import Witness
 
-HEADINGS: dict[str, Heading] = {"circle": "none", "positioning": "none"}  # what ends nearest; "consistent" for all others
 PATIENCE_S = 60.0  # for everybody to be there: the first controller on a machine compiles
 SILENCE_S = 5.0  # of the controller, after which the robot will not be driven any further
 PATIENCE_END_S = 3.0
 LOOK_S = 0.1
 SHOW_S = 0.25
 MARGIN_S = 5.0  # of reference past the horizon of the last sample: near its last row a controller slows down
-POLITE = 10  # niceness of those who only watch
 RECORDER_S = 8.0  # to write what it has
-CLI = "service.cli"
 # The recorder first: a reference that goes on without a robot is nothing to look at.
 ENDING = (*(("recorder",) if find_spec("rerun") else ()), "controller", "guard", "robot", "reference", "echo")
-
-
-class Failed(Exception):
-    """The run cannot go on; says why."""
 
 
 @dataclass(frozen=True)
@@ -113,17 +107,6 @@ def plan(
         folder=folder or Path("runs") / f"{trajectory.name}-{datetime.now():%Y%m%d-%H%M%S}",
         viewer=viewer,
     )
-
-
-def configured(config: Config, trajectory: Trajectory, heading: Heading, guard: bool) -> Config:
-    """Return the configuration of a run: on loopback, from the scenario's pose, guarded if asked for, without weight on a heading that is none."""
-    config = with_initial_state(config, [f"{name}={value!r}" for name, value in zip(("x", "y", "psi"), trajectory.pose0, strict=True)])
-    content = config.model_dump(by_alias=True, exclude_unset=True, exclude={"bus"})
-    if heading == "none":
-        content["ocp"]["weights"]["Q"] |= {output.name: 0.0 for output in build_model(config).outputs if output.angle}
-    if guard:
-        content["guard"] = {**content.get("guard", {}), "enabled": True}
-    return Config.model_validate(content)
 
 
 def main(config: Config, scenario: str, **options: Any) -> int:
@@ -244,33 +227,6 @@ def follow(run: Plan, witness: Witness, board: Board, children: Children, stop: 
         witness.listen()
 
 
-def wait(condition: Callable[[], object], children: Children, stop: Event, patience_s: float, what: str) -> None:
-    """
-    Wait for a condition, or until stopped.
-
-    Raises:
-        Failed: It did not come true in time, or a process has ended by itself.
-    """
-    deadline_s = time.monotonic() + patience_s
-    while not condition() and not stop.is_set():
-        check(children)
-        if time.monotonic() > deadline_s:
-            raise Failed(f"waited {patience_s:g} s for {what} in vain, see {children.folder}")
-        stop.wait(0.5 * LOOK_S)
-
-
-def check(children: Children) -> None:
-    """
-    Look after everybody.
-
-    Raises:
-        Failed: A process has ended by itself.
-    """
-    if name := children.ended():
-        said = children.log(name).read_text(encoding="utf-8", errors="replace").splitlines()
-        raise Failed(f"the {name} has ended by itself, see {children.log(name)}" + (f": {said[-1]}" if said else ""))
-
-
 def conclude(run: Plan, outcome: Outcome, console: Console) -> int:
     """Write and print the sum of a run, draw it, and tell how to look at it; return the exit status."""
     summary = {**summarize(outcome), "heading": run.heading, "machine": machine.describe()}
@@ -309,10 +265,3 @@ def recorded() -> bool:
 def shown(path: Path) -> Path:
     """Return a path as it would be typed here."""
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
-
-
-def free_endpoint() -> str:
-    """Return a loopback endpoint that is free now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

@@ -36,16 +36,16 @@ from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import encode
 from service import machine, realtime
 from service.build import build_model, build_rti, robot_settings
-from service.check import wave
 from service.children import Children
 from service.config import load
-from service.daemon import warm_up
-from service.demo import free_endpoint
 from service.echo import ROLE as ECHO
 from service.echo import Pinger
 from service.jitter import bare_timer
+from service.rig.endpoint import free_endpoint
+from service.rig.wave import wave
 from service.schema import Config
 from service.summary import quantiles
+from service.warm_up import warm_up
 
 TICK_S, TICKS = 0.001, 1000
 PAUSE_S = 0.005  # between two pings, and between two samples

@@ -20,6 +20,8 @@ FORBIDDEN = {
     "sim": {"service", "osqp", "pydantic", "typer"},
 }
 EXCEPT = {"service/cli.py"}
+COMMANDS = {f"service.{name}" for name in ("bench", "check", "daemon", "demo", "doctor", "faults.run", "guard", "router", "view")}
+PARTS_OF_COMMANDS = {"service/family_bench.py"}  # of `rti-mpc bench`
 CLOCKS = {"time", "datetime", "threading", "multiprocessing", "concurrent", "random"}  # what would make two runs of one sample differ
 
 # Who alone imports a package, wherever in the file.
@@ -158,6 +160,13 @@ def test_data_flows_one_way_through_the_library() -> None:
 def test_wire_depends_on_messages_only() -> None:
     for path in files("rti_mpc/wire"):
         assert inside(path) <= BEFORE_WIRE | {"wire"}, path
+
+
+def test_commands_are_not_libraries() -> None:
+    for path in files("service"):
+        if path.relative_to(ROOT).as_posix() not in EXCEPT | PARTS_OF_COMMANDS:
+            modules = imported(path) | {name.rpartition(".")[0] for name in imported(path)}
+            assert not modules & COMMANDS, path
 
 
 @pytest.mark.parametrize("package", PACKAGES)

@@ -26,7 +26,6 @@ from rti_mpc.trajectory import find_trajectory
 from rti_mpc.wire.interrupt import stop_on_signals
 from service.build import guard_limits
 from service.config import load
-from service.demo import Failed, configured
 from service.faults.excuse import excuses, explained
 from service.faults.measure import Incident, measure, missed_ns, positions
 from service.faults.relay import ROLE as RELAY
@@ -35,6 +34,8 @@ from service.faults.system import HEADING, SCENARIO, System, Wiring
 from service.faults.table import FAULTS, Fault
 from service.fit import check_model, check_tree
 from service.host import Host
+from service.rig.company import Failed
+from service.rig.scenario import configured
 from service.schema import Config
 
 STATE_PERIOD_S = 0.01  # of the robot, and so of its record: what times are known to

@@ -24,12 +24,13 @@ from rti_mpc.wire.session import BusSettings
 from service import robot_log, toml
 from service.build import build_model
 from service.children import Children
-from service.demo import POLITE, Failed, free_endpoint, wait
 from service.faults.measure import positions
 from service.faults.observer import Observer
 from service.faults.proxy import Proxy
 from service.faults.relay import ROLE as RELAY
 from service.info import Info, Label
+from service.rig.company import CLI, POLITE, Failed, wait
+from service.rig.endpoint import free_endpoint
 from service.robot_log import RobotLog
 from service.schema import Config
 from service.witness import Witness
@@ -40,7 +41,6 @@ REFERENCE_S = 120  # 58 kB: one packet, which a busy host does not drop half of
 PATIENCE_S = 60.0  # for processes to start and the robot to be driven; the first controller on a machine compiles
 DRIVEN_M_S = 0.1
 REQUEST_S = 2.0
-CLI = "service.cli"
 
 
 class Wiring(Enum):

@@ -17,8 +17,8 @@ from service import robot_log
 from service.children import Children
 from service.cli import SHIPPED
 from service.config import load
-from service.demo import free_endpoint
 from service.info import Info, Label
+from service.rig.endpoint import free_endpoint
 from service.robot_log import RobotLog
 from tests.processes.system import until
 

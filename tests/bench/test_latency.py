@@ -30,7 +30,7 @@ from rti_mpc.wire.cdr import decode, encode
 from service import machine, robot_log
 from service.children import Children
 from service.config import load
-from service.demo import free_endpoint
+from service.rig.endpoint import free_endpoint
 from service.schema import Config
 from tests.bench.driven import INFO, quantiles, sampled
 from tests.processes.system import until

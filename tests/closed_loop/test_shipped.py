@@ -16,7 +16,7 @@ from rti_mpc.status import Mode
 from rti_mpc.trajectory import Heading, Trajectory, circle, eight, positioning
 from service.build import build_rti
 from service.config import load
-from service.demo import configured
+from service.rig.scenario import configured
 from tests.loop import Run, drive, reference, robot
 
 CONFIG = load(Path(__file__).parents[2] / "deploy" / "pioneer_3dx.toml")

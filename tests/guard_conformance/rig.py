@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-import socket
 import subprocess
 import time
 from collections.abc import Callable
@@ -25,6 +24,7 @@ from service.build import guard_limits
 from service.cli import SHIPPED
 from service.config import load
 from service.host import Host
+from service.rig.endpoint import free_endpoint
 from sim.actuator import Actuator
 from tests.in_time import in_time, on_time
 
@@ -60,9 +60,7 @@ class Rig:
         limits = guard_limits(loaded)
         self.lbu, self.ubu, self.step = limits.lbu, limits.ubu, np.minimum(-limits.lbdu, limits.ubdu)
         self._slew, self._guard, self._folder = limits.slew, guard, folder
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self._endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        self._endpoint = free_endpoint()
         self.bus = Bus(BusSettings(listen=(self._endpoint,), connect=()), loaded.keys())
         keys = self.bus.keys
         self._states = self.bus.publisher(keys.state, State, realtime=True)

@@ -7,7 +7,6 @@ import atexit
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -23,6 +22,7 @@ from rti_mpc.wire.cdr import M, decode
 from service.cli import SHIPPED
 from service.config import load
 from service.host import Host
+from service.rig.endpoint import free_endpoint
 from tests.in_time import in_time
 
 ROOT = Path(__file__).parents[2]
@@ -39,12 +39,6 @@ ARGUMENTS: dict[str, tuple[object, ...]] = {
 }
 T = TypeVar("T")
 atexit.register(shutil.rmtree, STATE, ignore_errors=True)
-
-
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def command_line(*arguments: object) -> list[str]:

@@ -23,9 +23,10 @@ import pytest
 
 from service.cli import SHIPPED
 from service.host import Host
+from service.rig.endpoint import free_endpoint
 from tests.in_time import explained
 from tests.processes.network import ip, missing, name_of
-from tests.processes.system import ROOT, command_line, environment, free_endpoint, until
+from tests.processes.system import ROOT, command_line, environment, until
 
 pytestmark = pytest.mark.slow
 

@@ -19,7 +19,8 @@ from rti_mpc.message import State
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.keys import Keys
 from service.cli import SHIPPED
-from tests.processes.system import CONFIG, free_endpoint
+from service.rig.endpoint import free_endpoint
+from tests.processes.system import CONFIG
 
 ROOT = Path(__file__).parents[2]
 KEYS = Keys(robot="test")

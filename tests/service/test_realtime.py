@@ -14,7 +14,7 @@ import pytest
 from rti_mpc.wire.bus import Bus, BusSettings
 from service.children import Children
 from service.cli import SHIPPED
-from service.demo import free_endpoint
+from service.rig.endpoint import free_endpoint
 from tests.processes.system import KEYS, until
 
 ROOT = Path(__file__).parents[2]

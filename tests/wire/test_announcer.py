@@ -14,7 +14,8 @@ from rti_mpc.wire.announcer import PERIOD_NS, Announcer
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
-from tests.processes.system import free_endpoint, until
+from service.rig.endpoint import free_endpoint
+from tests.processes.system import until
 
 FAULT = Notice(Severity.WARNING, "over_budget", "a sample was late")
 CHANGE = Notice(Severity.WARNING, "qp_failed", "tracking to fallback: the QP is failed", change=True)

@@ -14,7 +14,7 @@ from rti_mpc.message import State
 from rti_mpc.wire import reach
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.keys import Keys
-from tests.processes.system import free_endpoint
+from service.rig.endpoint import free_endpoint
 
 KEYS = Keys(robot="test")
 PATIENCE_S = 30.0
