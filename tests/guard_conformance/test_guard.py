@@ -228,6 +228,11 @@ def test_clock_that_jumps_lets_nothing_old_pass(rig: Rig, ms: int) -> None:
     rig.drive()
 
 
+def not_stored(answers: list[dict[str, Any]]) -> bool:
+    """Whether somebody has yet to store the stop, or nobody has answered."""
+    return not answers or any("not_stored" in answer for answer in answers)
+
+
 def test_stopped_guard_passes_only_ways_to_rest_and_so_does_one_that_was_restarted(rig: Rig) -> None:
     """Whatever a controller commands that has not heard of the stop."""
 
@@ -249,6 +254,8 @@ def test_stopped_guard_passes_only_ways_to_rest_and_so_does_one_that_was_restart
     times, inputs = rig.acting(stopped_ns)
     assert not inputs[times > 600.0].any(), "the last plan before ends 300 ms after its state, its ramp 200 ms later"
     rests_only()
+    while not_stored(list(rig.bus.answers(rig.bus.keys.stop, {"request": "stop"}, 5.0))):
+        assert rig.now_ns < deadline_ns, "a stop must be stored; a guard may answer before"
     rig.kill()
     rig.start()
     rests_only()
