@@ -13,6 +13,7 @@ import typer.main
 
 from rti_mpc.wire.cdr import encoding
 from rti_mpc.wire.layout import ABOUT, LAYOUTS, msg_text
+from rti_mpc.wire.streams import STREAMS, Kind, Stream
 from service.cli import app
 from service.schema import Config
 
@@ -93,8 +94,38 @@ def messages() -> Iterator[str]:
         "",
         "CDR, little-endian with its four-byte header, as the `.msg` files in `deploy/msg` define; every stamp is nanoseconds of the robot's clock.",
     )
+    yield from (
+        "",
+        "## Streams",
+        "",
+        "Keys lie below `<prefix>/<robot>/`, by default `rti_mpc/<robot>/`; `<role>` is that of the publisher.",
+        "`relay` and `echo` take part in fault injection and measurements alone.",
+    )
+    yield from (
+        "",
+        "| key | what | message | published, or answered, by | how often | quality of service | largest |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    )
+    for stream in STREAMS:
+        key = f"{stream.name}/<role>" if stream.by_role else stream.name
+        roles = ", ".join(f"`{role}`" for role in stream.publishers)
+        kind = f"[`{stream.message.__name__}`](#{stream.message.__name__.lower()})" if stream.message else FORMS[stream.kind]
+        size = f"{stream.max_bytes:,} bytes" if stream.max_bytes else ""
+        yield f"| `{key}` | {stream.about} | {kind} | {roles} | {stream.rate} | {service(stream)} | {size} |"
     for cls in LAYOUTS:
         yield from ("", f"## {cls.__name__}", "", ABOUT[cls], "", f"Encoding `{encoding(cls)}`.", "", "```text", msg_text(cls).rstrip(), "```")
+
+
+FORMS = {Kind.MESSAGE: "JSON", Kind.QUERY: "query, JSON", Kind.TOKEN: "liveliness token"}
+
+
+def service(stream: Stream[Any]) -> str:
+    """Return the quality of service of a stream in words."""
+    if stream.kind is Kind.TOKEN:
+        return ""
+    qos = stream.qos
+    words = [f"`{qos.priority}`", f"`{qos.congestion}`", *(["express"] if qos.express else []), *(["cached for late joiners"] if qos.cached else [])]
+    return ", ".join(words)
 
 
 def command_line() -> Iterator[str]:

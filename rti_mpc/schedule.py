@@ -24,7 +24,7 @@ from rti_mpc.message import Command
 STEP_NS = 10_000_000  # the ramp to rest is a staircase of such steps
 NEVER_NS = 2**63
 EVER_NS = -(2**62)
-WAITING = 64  # plans ahead of their time kept at most
+MAX_PLANS = 64  # ahead of their time, kept at most
 MAX_ROWS = 1000  # of a plan, the longest horizon a configuration may have: to approach a plan takes longer than in proportion to its rows
 ROUNDING = 1e-9  # of a way to rest that is a whole number of steps
 OWN = (0, 0)  # source of what no command has asked for
@@ -149,7 +149,7 @@ class Schedule:
         while plans and plans[-1].start_ns >= start_ns:
             plans.pop()
         plans.append(plan)
-        if len(plans) > WAITING:
+        if len(plans) > MAX_PLANS:
             del plans[1]
         return plan.u
 

@@ -29,10 +29,10 @@ from typing import Any
 from rti_mpc.controller import Controller, Timing
 from rti_mpc.errors import ConfigError
 from rti_mpc.latch import Latch
-from rti_mpc.message import Command, State, Telemetry
+from rti_mpc.message import Command, State
 from rti_mpc.rti import Rti
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import WAITING, Bus, BusSettings, Subscriber
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
 from rti_mpc.wire.interrupt import stop_on_signals
 from service import realtime
 from service.announce import announce
@@ -148,8 +148,8 @@ class Daemon:
         self._ending = False
         self._crashed = Event()
         self._announcer: Announcer | None = None
-        self._commands = bus.publisher(keys.command, Command, realtime=True)
-        self._telemetries = {role: bus.publisher(key, Telemetry) for role, key in ((LEADER, keys.telemetry), (STANDBY, keys.shadow_telemetry))}
+        self._commands = bus.publisher(keys.command)
+        self._telemetries = {role: bus.publisher(key) for role, key in ((LEADER, keys.telemetry), (STANDBY, keys.shadow_telemetry))}
         self._states_in = bus.intake(State, config.stale_s, {"x": model.nx, "u": model.nu})
         bus.expect("state", lambda: controller.heard)
         self._references = References(bus, controller, model.ny)
@@ -158,14 +158,14 @@ class Daemon:
         self._threads = [
             Thread(
                 target=self._guarded,
-                args=(act, bus.subscriber(key, capacity=WAITING, cached=cached)),
+                args=(act, bus.subscriber(key, capacity=RING_MESSAGES)),
                 name=act.__name__,
                 daemon=True,
             )
-            for act, key, cached in (
-                (self._control, keys.state, False),
-                (self._references.from_planner, keys.reference, True),
-                (self._references.from_leader, keys.anchored, True),
+            for act, key in (
+                (self._control, keys.state),
+                (self._references.from_planner, keys.reference),
+                (self._references.from_leader, keys.anchored),
             )
         ]
 

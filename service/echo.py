@@ -19,10 +19,10 @@ from rti_mpc.wire.bus import Bus, BusSettings, Publisher, Subscriber
 from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.streams import PING, PONG
 from service import entry
 
 ROLE = "echo"
-PING, PONG = "echo/ping", "echo/pong"
 
 
 class Pinger:
@@ -43,8 +43,8 @@ class Pinger:
         """
         self.round_trip_us: list[float] = []
         self._payload = encode(state)
-        self._pings = bus.publisher(bus.keys.stream(PING), State, realtime=True)
-        self._pongs = bus.subscriber(bus.keys.stream(PONG))
+        self._pings = bus.publisher(bus.keys.of(PING))
+        self._pongs = bus.subscriber(bus.keys.of(PONG))
 
     def ping(self) -> bool:
         """Ask once; return whether there was an answer before the bus was closed."""
@@ -86,7 +86,7 @@ def main(settings: BusSettings, keys: Keys, size: int) -> None:
     """Answer every ping with so many bytes, until stopped."""
     stop = stop_on_signals()
     with Bus(settings, keys) as bus:
-        pings, pongs = bus.subscriber(keys.stream(PING)), bus.publisher(keys.stream(PONG), Command, realtime=True)
+        pings, pongs = bus.subscriber(keys.of(PING)), bus.publisher(keys.of(PONG))
         bus.alive(ROLE)
         Thread(target=_answer, args=(pings, pongs, bytes(size)), daemon=True).start()
         stop.wait()

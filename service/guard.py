@@ -25,7 +25,7 @@ from rti_mpc.guard import Guard
 from rti_mpc.latch import Latch
 from rti_mpc.message import Command, State
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import WAITING, Bus, Received, Subscriber, unix_s
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received, Subscriber, unix_s
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.session import BusSettings
 from service.announce import announce
@@ -61,7 +61,7 @@ def main(config: Config, bus_settings: BusSettings, *, state: Path | None = None
         raise ConfigError("guard.enabled must be true for the robot to take what a guard passes on, got false")
     stop = stop or stop_on_signals()
     with Bus(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
-        heard, intake = bus.subscriber(bus.keys.actuation, capacity=WAITING), bus.intake(Command, HEARING_S, choosing=True)
+        heard, intake = bus.subscriber(bus.keys.actuation, capacity=RING_MESSAGES), bus.intake(Command, HEARING_S, choosing=True)
         if bus.is_alive(ROLE, HEARING_S):
             print(f"rti-mpc: {config.robot} already has a guard: stop it first, or give this robot another name", file=sys.stderr)
             return 1
@@ -103,7 +103,7 @@ class Process:
         self._lock = Lock()
         self._crashed = Event()
         self._announcer = Announcer(bus, ROLE, epoch)
-        self._actuation = bus.publisher(keys.actuation, Command, realtime=True)
+        self._actuation = bus.publisher(keys.actuation)
         self._states = bus.intake(State, config.stale_s, {"u": len(limits.u_rest)})
         bus.expect("state", lambda: self._guard.heard)
         self._commands = bus.intake(Command, config.stale_s, {"u": len(limits.u_rest)})
@@ -112,7 +112,7 @@ class Process:
         self._operator_stop.serve(bus, lambda: ROLE, self._describe)
         self._describe()
         self._threads = [
-            Thread(target=self._follow, args=(act, bus.subscriber(key, capacity=WAITING)), name=act.__name__, daemon=True)
+            Thread(target=self._follow, args=(act, bus.subscriber(key, capacity=RING_MESSAGES)), name=act.__name__, daemon=True)
             for act, key in ((self._state, keys.state), (self._command, keys.command))
         ]
 

@@ -11,11 +11,11 @@ from typing import Any
 
 from rti_mpc.errors import MessageError
 from rti_mpc.wire.document import read
-from rti_mpc.wire.keys import role_of
 from rti_mpc.wire.layout import NUMBER_LIMIT
+from rti_mpc.wire.streams import role_of
 
-LONGEST = 64  # characters of a name or a unit
-WIDEST = 512  # components of a vector, obstacles, or columns of a reference
+MAX_TEXT = 64  # characters of a name or a unit
+MAX_COMPONENTS = 512  # components of a vector, obstacles, or columns of a reference
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class Info:
         """
         info = cls.from_json(read(payload, size))
         if not info.role or info.role != role_of(key):
-            raise MessageError(f"info must be of the role that its key ends with, got {info.role[:LONGEST]!r} on {key[-LONGEST:]!r}")
+            raise MessageError(f"info must be of the role that its key ends with, got {info.role[:MAX_TEXT]!r} on {key[-MAX_TEXT:]!r}")
         return info
 
     @classmethod
@@ -168,22 +168,22 @@ BOUNDS = {"lbu": ("inputs", -1), "ubu": ("inputs", 1), "lbx": ("states", -1), "u
 
 
 def _few(values: Sequence[Any]) -> Sequence[Any]:
-    if len(values) > WIDEST:
-        raise ValueError(f"at most {WIDEST} components expected, got {len(values)}")
+    if len(values) > MAX_COMPONENTS:
+        raise ValueError(f"at most {MAX_COMPONENTS} components expected, got {len(values)}")
     return values
 
 
 def _label(signal: Mapping[str, Any]) -> Label:
     label = Label(signal["name"], signal["unit"], bool(signal["angle"]))
     for text in (label.name, label.unit):
-        if not 0 < len(text) <= LONGEST or not text.isprintable():
-            raise ValueError(f"names and units of 1 to {LONGEST} printable characters expected, got {text[:LONGEST]!r}")
+        if not 0 < len(text) <= MAX_TEXT or not text.isprintable():
+            raise ValueError(f"names and units of 1 to {MAX_TEXT} printable characters expected, got {text[:MAX_TEXT]!r}")
     return label
 
 
 def _obstacle(disc: Mapping[str, Any]) -> Obstacle:
-    if not 0 <= (at := int(disc["at"])) < WIDEST:
-        raise ValueError(f"a column below {WIDEST} expected, got {at}")
+    if not 0 <= (at := int(disc["at"])) < MAX_COMPONENTS:
+        raise ValueError(f"a column below {MAX_COMPONENTS} expected, got {at}")
     obstacle = Obstacle(at, *(float(disc[part]) for part in "xyr"))
     if not max(abs(obstacle.x), abs(obstacle.y), abs(obstacle.r)) <= NUMBER_LIMIT:
         raise ValueError(f"a place within {NUMBER_LIMIT:g} expected, got {obstacle}")

@@ -33,7 +33,7 @@ from rti_mpc.errors import MessageError
 from rti_mpc.message import Command, Notice, Severity, State
 from rti_mpc.status import Mode
 from rti_mpc.wire import document
-from rti_mpc.wire.bus import WAITING, Bus, Received, unix_s
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received, unix_s
 
 LEADER, STANDBY = "controller", "standby"  # roles
 HEARING_S = 0.5  # for which a starting controller listens for others
@@ -64,8 +64,8 @@ class Others:
 
 def hear_others(bus: Bus, stop: Event) -> Others:
     """Listen for `HEARING_S`."""
-    commands = [bus.subscriber(key, capacity=WAITING) for key in (bus.keys.command, bus.keys.actuation)]
-    infos = bus.subscriber(bus.keys.info(LEADER), capacity=WAITING, cached=True)
+    commands = [bus.subscriber(key, capacity=RING_MESSAGES) for key in (bus.keys.command, bus.keys.actuation)]
+    infos = bus.subscriber(bus.keys.info(LEADER), capacity=RING_MESSAGES)
     intake = bus.intake(Command, HEARING_S, choosing=True)
     stop.wait(HEARING_S)
     epoch = max(intake.highest_epoch(subscriber.drain()) for subscriber in commands)
@@ -117,9 +117,9 @@ class Leadership:
         self._replaced = (0, -1)  # the last command of the leader before
         self._took_over: Notice | None = None  # until the first command
         self._looked_ns = time.monotonic_ns()
-        self._infos = bus.subscriber(bus.keys.info(LEADER), capacity=WAITING, cached=True)
+        self._infos = bus.subscriber(bus.keys.info(LEADER), capacity=RING_MESSAGES)
         self._told = (0, -1)  # epoch and sequence number of the last description of a leader that was read
-        self._commands = bus.subscriber(bus.keys.command, capacity=WAITING)
+        self._commands = bus.subscriber(bus.keys.command, capacity=RING_MESSAGES)
         self._tokens: dict[str, Any] = {}
         self._company: set[int] = set()  # numbers of those who stand by
         self._accompanied = False  # whether there ever was one

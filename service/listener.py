@@ -10,9 +10,9 @@ from typing import Any
 
 from rti_mpc.errors import MessageError
 from rti_mpc.message import STAMP_ON_ARRIVAL, Command, Event, Notice, Reference, State, Telemetry
-from rti_mpc.wire.bus import WAITING, Bus, Received, Subscriber
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received, Subscriber
 from rti_mpc.wire.intake import Intake
-from rti_mpc.wire.keys import admitted, role_of
+from rti_mpc.wire.streams import admitted, role_of
 from service.info import Info
 from service.playback import Actuation
 from service.recording import Entry
@@ -45,15 +45,15 @@ class Listener:
         self._doors: dict[str, Door] = {}
         self._events: set[str] = set()  # keys of events
         self._described: set[str] = set()  # keys of descriptions
-        self._infos = bus.subscriber(keys.infos, capacity=WAITING, cached=True)
+        self._infos = bus.subscriber(keys.infos, capacity=RING_MESSAGES)
         self._streams: tuple[tuple[type[Any], Subscriber], ...] = (
             (State, bus.subscriber(keys.state, capacity=capacity)),
-            (Reference, bus.subscriber(keys.reference, capacity=WAITING, cached=True)),
-            (Reference, bus.subscriber(keys.anchored, capacity=WAITING, cached=True)),
+            (Reference, bus.subscriber(keys.reference, capacity=RING_MESSAGES)),
+            (Reference, bus.subscriber(keys.anchored, capacity=RING_MESSAGES)),
             (Command, bus.subscriber(keys.command, capacity=capacity)),
             (Command, bus.subscriber(keys.actuation, capacity=capacity)),
             (Telemetry, bus.subscriber(keys.telemetry, capacity=capacity)),
-            (Event, bus.subscriber(keys.events, capacity=capacity, cached=True)),
+            (Event, bus.subscriber(keys.events, capacity=capacity)),
         )
 
     @property

@@ -12,7 +12,7 @@ from contextlib import suppress
 from queue import Full, Queue
 from threading import Thread
 
-WAITING = 1000  # lines
+MAX_LINES = 1000  # lines
 CLOSE_S = 0.5  # to write at the end what still waits, at most
 
 
@@ -39,7 +39,7 @@ class Aside(logging.Handler):
     def __init__(self, descriptor: int) -> None:
         super().__init__()
         self._descriptor = descriptor
-        self._lines: Queue[tuple[int, str] | None] = Queue(WAITING)  # each with how many before it were dropped
+        self._lines: Queue[tuple[int, str] | None] = Queue(MAX_LINES)  # each with how many before it were dropped
         self._dropped = 0  # since the last one that was not
         self._thread = Thread(target=self._write, name="log", daemon=True)
         self._thread.start()

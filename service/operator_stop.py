@@ -20,7 +20,7 @@ from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.latch import Latch, merge, read_latch, shown
 from rti_mpc.message import Notice, Severity
 from rti_mpc.wire import document
-from rti_mpc.wire.bus import WAITING, Bus, Received
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received
 from service.latch_file import LatchFile
 
 REQUESTS = ("stop", "enable")
@@ -74,7 +74,7 @@ class OperatorStop:
 
     def listen(self, bus: Bus) -> None:
         """Take over from now on what others describe."""
-        subscriber = bus.subscriber(bus.keys.infos, capacity=WAITING, cached=True)
+        subscriber = bus.subscriber(bus.keys.infos, capacity=RING_MESSAGES)
 
         def follow() -> None:
             for received in iter(subscriber.recv, None):

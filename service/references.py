@@ -40,7 +40,7 @@ class References:
         self._planned: deque[LaidOut] = deque(maxlen=1)  # by a planner; each has one writer, the thread of its door, whose references only get newer
         self._stamped: deque[LaidOut] = deque(maxlen=1)  # by a leader
         self._last_planned = (0, 0)  # order of the last one taken from a planner
-        self._publisher = bus.publisher(bus.keys.anchored, Reference, cached=True)
+        self._publisher = bus.publisher(bus.keys.anchored)
         self._waiting: LaidOut | None = None  # for its stamp
         self._anchored: Reference | None = None
         self._leading = False

@@ -110,7 +110,7 @@ def asked_again(bus: Bus, request: dict[str, Any], timeout_s: float) -> Iterator
     latch = Latch()
     while (left_s := deadline_s - time.monotonic()) > 0.0:
         again = {"latch": asdict(latch)} if latch.counter else {}
-        for answer in bus.answers(bus.keys.stop, request | again, min(ASKED_S, left_s), urgent=True):
+        for answer in bus.answers(bus.keys.stop, request | again, min(ASKED_S, left_s)):
             yield answer
             with suppress(MessageError):
                 latch = max(latch, read_latch(answer.get("latch")))

@@ -68,7 +68,7 @@ def main(
         if rerun_spawn or rerun_connect is not None:
             outlets.append(viewer_outlet(url, keys.robot))
         bus.alive(ROLE)
-        log.info("listening to %s", keys.stream("*"))
+        log.info("listening to %s", keys.below("*"))
         pump(listener, outlets, spawned, Announcer(bus, ROLE, time.time_ns() // 1_000_000_000), stop)
     log.info("%d messages, %d lost, %d refused", listener.received, listener.lost, listener.refused)
     complete = [outlet.close() for outlet in outlets]

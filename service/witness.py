@@ -8,9 +8,9 @@ from contextlib import suppress
 
 from rti_mpc.errors import MessageError
 from rti_mpc.message import Event, Reference, Telemetry
-from rti_mpc.wire.bus import WAITING, Bus
+from rti_mpc.wire.bus import RING_MESSAGES, Bus
 from rti_mpc.wire.intake import Intake
-from rti_mpc.wire.keys import admitted
+from rti_mpc.wire.streams import admitted
 from service.info import Info
 
 CAPACITY = 4096  # samples between two looks: seconds, at any rate
@@ -37,9 +37,9 @@ class Witness:
         self.lives: set[str] = set()
         self._bus = bus
         self._samples, self._samples_in = bus.subscriber(bus.keys.telemetry, capacity=CAPACITY), bus.intake(Telemetry, STALE_S)
-        self._references, self._references_in = bus.subscriber(bus.keys.reference, capacity=WAITING, cached=True), bus.intake(Reference, STALE_S)
-        self._events, self._events_in = bus.subscriber(bus.keys.events, capacity=CAPACITY, cached=True), dict[str, Intake[Event]]()
-        self._infos = bus.subscriber(bus.keys.info("controller"), capacity=WAITING, cached=True)
+        self._references, self._references_in = bus.subscriber(bus.keys.reference, capacity=RING_MESSAGES), bus.intake(Reference, STALE_S)
+        self._events, self._events_in = bus.subscriber(bus.keys.events, capacity=CAPACITY), dict[str, Intake[Event]]()
+        self._infos = bus.subscriber(bus.keys.info("controller"), capacity=RING_MESSAGES)
         bus.watch_alive(self._notice)
 
     @property

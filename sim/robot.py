@@ -27,9 +27,9 @@ from rti_mpc.message import Command, Notice, Severity, State
 from rti_mpc.model import Model
 from rti_mpc.schedule import unfit
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import WAITING, Bus, BusSettings, Subscriber
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
 from rti_mpc.wire.interrupt import stop_on_signals
-from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.keys import Key, Keys
 from sim.actuator import STALE_NS, Counters
 from sim.clock import SLICE_S, Clock
 from sim.lockstep import Lockstep
@@ -139,11 +139,11 @@ class Robot:
         clock: Its clock.
     """
 
-    def __init__(self, settings: RobotSettings, bus: Bus, key: str, speed: float, log: Path | None) -> None:
+    def __init__(self, settings: RobotSettings, bus: Bus, key: Key[Command], speed: float, log: Path | None) -> None:
         # Milliseconds: a robot restarted within a second is another one.
         self.body = Lockstep(settings, epoch=time.time_ns() // 1_000_000)
         self._log = Log(log, settings.model)
-        self._states = bus.publisher(bus.keys.state, State, realtime=True)
+        self._states = bus.publisher(bus.keys.state)
         self._announcer = Announcer(bus, ROLE, self.body.epoch)
         self._inbox: deque[tuple[Command, int]] = deque(maxlen=64)  # with the monotonic time of arrival
         nu, epoch = settings.model.nu, self.body.epoch
@@ -152,7 +152,7 @@ class Robot:
         self._refused = 0  # by the door, so far
         self._sent = 0
         self._held_up_ns = 0
-        Thread(target=self._receive, args=(bus.subscriber(key, capacity=WAITING),), daemon=True).start()
+        Thread(target=self._receive, args=(bus.subscriber(key, capacity=RING_MESSAGES),), daemon=True).start()
         self.clock = Clock(speed)
 
     def run(self, stop: Event, until_ns: int | None = None) -> None:

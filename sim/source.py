@@ -22,7 +22,7 @@ from rti_mpc.lives import Heard, Lives
 from rti_mpc.message import Notice, Reference, Severity, State
 from rti_mpc.trajectory import Heading, Trajectory, rows
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import WAITING, Bus, BusSettings, Subscriber
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 
@@ -93,7 +93,7 @@ class Source:
         self._y, self._p = y, p
         self._period_ns = period_ns
         self._epoch = time.time_ns() // 1_000_000_000
-        self._publisher = bus.publisher(bus.keys.reference, Reference, cached=True)
+        self._publisher = bus.publisher(bus.keys.reference)
         self._announcer = Announcer(bus, ROLE, self._epoch)
         self._bus = bus
         self._states: Subscriber | None = None
@@ -114,7 +114,7 @@ class Source:
         if self._states is None:
             if now_ns < self._look_again_ns:
                 return
-            self._states = self._bus.subscriber(self._bus.keys.state, capacity=WAITING)
+            self._states = self._bus.subscriber(self._bus.keys.state, capacity=RING_MESSAGES)
         state = None
         for state in self._intake.newest_of_each(self._states.drain()):
             if self._lives.hear(state.epoch, now_ns) is Heard.BEGINS:

@@ -21,7 +21,7 @@ class Announcer:
     """
 
     def __init__(self, bus: Bus, role: str, epoch: int) -> None:
-        self._publisher = bus.publisher(bus.keys.event(role), Event, cached=True)
+        self._publisher = bus.publisher(bus.keys.event(role))
         self.role = role
         self._epoch = epoch
         self._seq = 0

@@ -28,17 +28,19 @@ from rti_mpc.errors import MessageError
 from rti_mpc.wire import document
 from rti_mpc.wire.cdr import M, encode, encoding
 from rti_mpc.wire.intake import Intake
-from rti_mpc.wire.keys import Keys, most_bytes, role_of
+from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.reach import remind
 from rti_mpc.wire.session import BusSettings as BusSettings
 from rti_mpc.wire.session import endpoints, open_session, zenoh_config
+from rti_mpc.wire.streams import MAX_REQUEST_BYTES, role_of
 
 CLOSE_TIMEOUT_S = 0.5
 HEARTBEAT_S = 1.0  # of a cached publisher, which tells the number of its last message
-MOST_BYTES = 32_768  # of a request: to parse JSON holds the interpreter's lock, for 30 ms a megabyte
-ENCODING = 256  # characters of one that are looked at
-WAITING = 1024  # samples that wait for a receiver: half a second of it being held up, at 2000 a second of anybody's
-TOKENS = 1024  # changes of presence that may wait
+MAX_ENCODING = 256  # characters of an encoding that are looked at
+RING_MESSAGES = 1024  # that wait for a receiver: half a second of it being held up, at 2000 a second of anybody's
+RING_TOKENS = 1024  # changes of presence that wait to be told
+RING_QUERIES = 16  # requests that wait to be answered
+JSON = "application/json"  # encoding of descriptions, requests and answers
 RETRY_S = 0.1  # between two looks for somebody who is not there yet
 
 
@@ -74,7 +76,7 @@ def unix_s() -> int:
 
 
 class Publisher(Generic[M]):
-    """Sends messages of one class on one key. `put` never blocks, and after `Bus.close` does nothing."""
+    """Sends the messages of a stream. `put` never blocks, and after `Bus.close` does nothing."""
 
     def __init__(self, publisher: zenoh.Publisher | ext.AdvancedPublisher, *, realtime: bool = False) -> None:
         self._publisher = publisher
@@ -111,12 +113,12 @@ class Publisher(Generic[M]):
 class Subscriber:
     """Receives from one key expression into a ring: the newest samples, oldest first. After `Bus.close`, nothing."""
 
-    def __init__(self, subscriber: zenoh.Subscriber[Any] | ext.AdvancedSubscriber[Any], key: str, capacity: int, own: str) -> None:
+    def __init__(self, subscriber: zenoh.Subscriber[Any] | ext.AdvancedSubscriber[Any], key: Key[Any], capacity: int, own: str) -> None:
         self._subscriber = subscriber
         self._capacity = capacity
         self._handler = subscriber.handler
-        self._key = "" if "*" in key else key
-        self._most = most_bytes(key)
+        self._key = "" if "*" in key else str(key)
+        self._max_bytes = key.stream.max_bytes
         self._own = own  # a cache answers its own session, too
         self._encoding: tuple[zenoh.Encoding | None, str] = None, ""  # the last one, and its text: to compare costs a fifth of making it
 
@@ -147,9 +149,9 @@ class Subscriber:
         if self._own and (info := sample.source_info) is not None and str(info.source_id.zid) == self._own:
             return None
         if sample.encoding != self._encoding[0]:
-            self._encoding = sample.encoding, str(sample.encoding)[:ENCODING]
+            self._encoding = sample.encoding, str(sample.encoding)[:MAX_ENCODING]
         key, size = self._key or str(sample.key_expr), len(sample.payload)
-        if size > self._most:
+        if size > self._max_bytes:
             return Received(b"", self._encoding[1], key, withheld=size)  # not even copied
         return Received(sample.payload.to_bytes(), self._encoding[1], key)
 
@@ -235,39 +237,31 @@ class Bus:
 
         remind(self._say, wanted, self._over)
 
-    def publisher(self, key: str, cls: type[M], *, realtime: bool = False, cached: bool = False) -> Publisher[M]:
-        """
-        Publisher of one class of message, the same one whenever a key is asked for again.
-
-        Args:
-            key: Where to publish.
-            cls: Class of the messages.
-            realtime: Whether it goes before everything else, unbatched.
-            cached: Whether late joiners get the last message.
-        """
-        priority = zenoh.Priority.REAL_TIME if realtime else zenoh.Priority.DATA if cached else zenoh.Priority.DATA_LOW
+    def publisher(self, key: Key[M]) -> Publisher[M]:
+        """Publisher of the messages of a stream, the same one whenever a key is asked for again."""
         if key not in self._publishers:
-            publisher = self._publisher(key, encoding(cls), priority, express=realtime, cached=cached)
-            self._publishers[key] = Publisher(publisher, realtime=realtime)
+            self._publishers[key] = self._publisher(key)
         return self._publishers[key]
 
-    def subscriber(self, key: str, *, capacity: int = 1, cached: bool = False) -> Subscriber:
+    def subscriber(self, key: Key[Any], *, capacity: int = 1, history: bool = True) -> Subscriber:
         """
-        Subscriber to a key expression.
+        Subscriber to a stream.
 
         Args:
             key: What to listen to; may hold wildcards.
-            capacity: Samples kept, the oldest dropped first. A receiver that wants the last message alone keeps `WAITING` all the
-                same, and takes the newest that is accepted: what anybody sends behind it must not push it out.
-            cached: Whether to ask publishers for their last message, those which come later included.
+            capacity: Messages kept, the oldest dropped first; fewer where so many of the longest would not fit into
+                `rti_mpc.wire.streams.RING_BYTES`. A receiver that wants the last message alone keeps `RING_MESSAGES` all the same, and takes
+                the newest that is accepted: what anybody sends behind it must not push it out.
+            history: Whether to ask publishers for their last message, those which come later included, where the stream is cached.
         """
+        capacity = key.stream.capacity(capacity)
         ring: Any = zenoh.handlers.RingChannel(capacity)
         origin = zenoh.Locality.REMOTE
-        if not cached:
+        if not (history and key.stream.qos.cached):
             return Subscriber(self._session.declare_subscriber(key, ring, allowed_origin=origin), key, capacity, own="")
-        history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+        request = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
         recovery = ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
-        subscriber = ext.declare_advanced_subscriber(self._session, key, ring, allowed_origin=origin, history=history, recovery=recovery)
+        subscriber = ext.declare_advanced_subscriber(self._session, key, ring, allowed_origin=origin, history=request, recovery=recovery)
         return Subscriber(subscriber, key, capacity, own=str(self._session.info.zid()))
 
     def intake(
@@ -291,47 +285,44 @@ class Bus:
         """
         return Intake(cls, stale_s, widths, unix_s=unix_s, choosing=choosing, unfit=unfit)
 
-    def publish_json(self, key: str, value: dict[str, Any]) -> None:
+    def publish_json(self, key: Key[Any], value: dict[str, Any]) -> None:
         """Publish a JSON object that late joiners get, too."""
-        if key not in self._publishers:
-            self._publishers[key] = Publisher(self._publisher(key, "application/json", zenoh.Priority.DATA, express=False, cached=True))
-        self._publishers[key].put_bytes(json.dumps(value).encode())
+        self.publisher(key).put_bytes(json.dumps(value).encode())
 
-    def withdraw_json(self, key: str) -> None:
+    def withdraw_json(self, key: Key[Any]) -> None:
         """Publish on a key no more, and let late joiners find nothing there."""
         if (publisher := self._publishers.pop(key, None)) is not None:
             publisher.undeclare()
 
-    def _publisher(self, key: str, encoding: str, priority: zenoh.Priority, *, express: bool, cached: bool) -> Any:
-        qos: Any = {
-            "encoding": encoding,
-            "priority": priority,
-            "express": express,
-            "congestion_control": zenoh.CongestionControl.DROP,
+    def _publisher(self, key: Key[M]) -> Publisher[M]:
+        message, qos = key.stream.message, key.stream.qos
+        options: Any = {
+            "encoding": JSON if message is None else encoding(message),
+            "priority": getattr(zenoh.Priority, qos.priority),
+            "express": qos.express,
+            "congestion_control": getattr(zenoh.CongestionControl, qos.congestion),
             "allowed_destination": zenoh.Locality.REMOTE,
         }
-        if not cached:
-            return self._session.declare_publisher(key, **qos)
+        if not qos.cached:
+            return Publisher(self._session.declare_publisher(key, **options), realtime=qos.express)
         # A last message that was dropped would not be missed without heartbeats.
-        sequence = ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None)
-        return ext.declare_advanced_publisher(
-            self._session, key, cache=ext.CacheConfig(1), sample_miss_detection=sequence, publisher_detection=True, **qos
-        )
+        options["sample_miss_detection"] = ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None)
+        return Publisher(ext.declare_advanced_publisher(self._session, key, cache=ext.CacheConfig(1), publisher_detection=True, **options))
 
-    def serve(self, key: str, handler: Callable[[dict[str, Any]], dict[str, Any] | None]) -> None:
+    def serve(self, key: Key[Any], handler: Callable[[dict[str, Any]], dict[str, Any] | None]) -> None:
         """
         Answer requests on a key, in a thread of its own.
 
         What the handler raises, and requests that are not a JSON object or longer
-        than `MOST_BYTES`, are answered ``{"ok": false, "error": ...}``; None is no
+        than `MAX_REQUEST_BYTES`, are answered ``{"ok": false, "error": ...}``; None is no
         answer: another gives it.
         """
-        ring: Any = zenoh.handlers.RingChannel(16)
+        ring: Any = zenoh.handlers.RingChannel(RING_QUERIES)
         queryable = self._session.declare_queryable(key, ring)
         self._declared.append(queryable)
         self._follow(queryable.handler, lambda query: _answer(key, query, handler))
 
-    def request(self, key: str, value: dict[str, Any], timeout_s: float) -> dict[str, Any]:
+    def request(self, key: Key[Any], value: dict[str, Any], timeout_s: float) -> dict[str, Any]:
         """
         Answer of whoever serves a key; where several do, a refusal before a consent.
 
@@ -345,21 +336,21 @@ class Bus:
             time.sleep(min(RETRY_S, left_s))  # nobody serves it yet
         raise TimeoutError(f"{key} must be served, got no answer within {timeout_s} s")
 
-    def answers(self, key: str, value: dict[str, Any], timeout_s: float, *, urgent: bool = False) -> Iterator[dict[str, Any]]:
-        """Yield the answers of all who serve a key, as they come; ``urgent``: the request goes before all else on its way."""
+    def answers(self, key: Key[Any], value: dict[str, Any], timeout_s: float) -> Iterator[dict[str, Any]]:
+        """Yield the answers of all who serve a key, as they come."""
         replies = self._session.get(
             key,
             timeout=timeout_s,
             payload=json.dumps(value).encode(),
-            encoding="application/json",
+            encoding=JSON,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            priority=zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.DATA,
-            express=urgent,
+            priority=getattr(zenoh.Priority, key.stream.qos.priority),
+            express=key.stream.qos.express,
         )
         for reply in replies:
             if reply.ok is not None:
-                yield _object(reply.ok.payload, document.MOST_BYTES)
+                yield _object(reply.ok.payload, document.MAX_BYTES)
 
     def alive(self, role: str) -> zenoh.LivelinessToken:
         """Show presence in a role until the token is undeclared, the bus closed or the process gone."""
@@ -380,7 +371,7 @@ class Bus:
 
     def watch_alive(self, callback: Callable[[str, bool], None]) -> None:
         """Call back, in a thread of its own, with a role and whether it is present, for those present now and at every change."""
-        ring: Any = zenoh.handlers.RingChannel(TOKENS)
+        ring: Any = zenoh.handlers.RingChannel(RING_TOKENS)
         subscriber = self._session.liveliness().declare_subscriber(self.keys.lives, ring, history=True)
         self._declared.append(subscriber)
 
@@ -413,7 +404,7 @@ def _object(payload: zenoh.ZBytes | None, most: int) -> dict[str, Any]:
 
 def _answer(key: str, query: zenoh.Query, handler: Callable[[dict[str, Any]], dict[str, Any] | None]) -> None:
     with query:
-        request = _object(query.payload, MOST_BYTES)
+        request = _object(query.payload, MAX_REQUEST_BYTES)
         try:
             answer = request if request.get("ok") is False else handler(request)
             if answer is None:
@@ -422,6 +413,6 @@ def _answer(key: str, query: zenoh.Query, handler: Callable[[dict[str, Any]], di
         except Exception as error:  # a handler's fault is the requester's to hear, not ours to die of
             text = json.dumps({"ok": False, "error": str(error)})
         try:
-            query.reply(key, text.encode(), encoding="application/json")
+            query.reply(key, text.encode(), encoding=JSON)
         except zenoh.ZError:
             return  # the requester, or the bus, is gone

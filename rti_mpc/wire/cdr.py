@@ -31,7 +31,7 @@ M = TypeVar("M", bound=Message)
 
 PACKAGE = "rti_mpc_msgs/msg"
 VERSION = 2  # major: a receiver refuses any other
-QUOTE = 40  # characters of a peer's own words in an error
+MAX_QUOTE = 40  # characters of a peer's own words in an error
 HEADER = b"\x00\x01\x00\x00"
 START = len(HEADER)  # alignment counts from here
 
@@ -267,7 +267,7 @@ def _string_reader(field: Field) -> Reader:
         except UnicodeDecodeError as error:
             raise Refused("text", f"{name} must be UTF-8, got {error.reason} at byte {error.start}") from None
         if not text.isprintable():
-            raise Refused("text", f"{name} must hold characters that can be printed, got {text[:QUOTE]!r}")
+            raise Refused("text", f"{name} must hold characters that can be printed, got {text[:MAX_QUOTE]!r}")
         values.append(text)
         return end
 

@@ -15,13 +15,13 @@ from typing import Any
 
 from rti_mpc.wire.cdr import Refused
 
-MOST_BYTES = 1 << 16  # of a description; a request has less
-DEEPEST = 16  # objects and lists inside one another
-LARGEST = 1 << 64  # magnitude that no integer reaches
-DIGITS = 20  # that such an integer has at most
+MAX_BYTES = 1 << 16  # of a description or an answer; a request has fewer
+MAX_DEPTH = 16  # objects and lists inside one another
+INTEGER_LIMIT = 1 << 64  # magnitude that no integer reaches
+MAX_DIGITS = 20  # that such an integer has at most
 
 
-def read(payload: bytes, size: int | None = None, most: int = MOST_BYTES) -> dict[str, Any]:
+def read(payload: bytes, size: int | None = None, most: int = MAX_BYTES) -> dict[str, Any]:
     """
     Return the JSON object in a payload.
 
@@ -46,20 +46,20 @@ def read(payload: bytes, size: int | None = None, most: int = MOST_BYTES) -> dic
     if not isinstance(value, dict):
         raise Refused("text", "message must be a JSON object")
     level: list[Any] = [value]
-    for _ in range(DEEPEST):
+    for _ in range(MAX_DEPTH):
         level = [inner for outer in level for inner in (outer.values() if isinstance(outer, dict) else outer) if isinstance(inner, (dict, list))]
         if not level:
             return value
-    raise Refused("value", f"message must hold at most {DEEPEST} objects and lists inside one another")
+    raise Refused("value", f"message must hold at most {MAX_DEPTH} objects and lists inside one another")
 
 
 def _integer(text: str) -> int:
-    if len(text) > 1 + DIGITS or not -LARGEST < (number := int(text)) < LARGEST:
-        raise Refused("value", f"an integer must be below 2^64, got {text[:DIGITS]}")
+    if len(text) > 1 + MAX_DIGITS or not -INTEGER_LIMIT < (number := int(text)) < INTEGER_LIMIT:
+        raise Refused("value", f"an integer must be below 2^64, got {text[:MAX_DIGITS]}")
     return number
 
 
 def _number(text: str) -> float:
     if not math.isfinite(number := float(text)):
-        raise Refused("value", f"a number must be finite, got {text[:DIGITS]}")
+        raise Refused("value", f"a number must be finite, got {text[:MAX_DIGITS]}")
     return number

@@ -10,11 +10,11 @@ from typing import Generic, Protocol
 from rti_mpc.epoch import BELIEVED, highest_believed
 from rti_mpc.message import Notice, Reference, Severity, State
 from rti_mpc.wire.cdr import VERSION, M, Refused, decode, encoding
-from rti_mpc.wire.layout import MOST_BYTES
+from rti_mpc.wire.layout import MAX_BYTES
 from rti_mpc.wire.source import Source, Verdict
 
 OPTIONAL = {(Reference, "p"), (State, "u")}  # arrays that may be left out: nominal parameters, inputs that are not reported
-QUOTE = 120  # characters of a peer's own words in a notice
+MAX_QUOTE = 120  # characters of a peer's own words in a notice
 
 
 class Payload(Protocol):
@@ -88,8 +88,8 @@ class Intake(Generic[M]):
         try:
             if received.encoding != self._encoding:
                 raise self._encoding_error(received.encoding)
-            if received.size > MOST_BYTES[self._cls]:
-                raise Refused("oversized", f"message must have at most {MOST_BYTES[self._cls]} bytes, got {received.size}")
+            if received.size > MAX_BYTES[self._cls]:
+                raise Refused("oversized", f"message must have at most {MAX_BYTES[self._cls]} bytes, got {received.size}")
             message = decode(self._cls, received.payload)
             for name, width in self._widths:
                 self._check_width(message, name, width)
@@ -191,4 +191,4 @@ class Intake(Generic[M]):
         reason = "encoding"
         if kind == expected_kind:
             reason = "version" if name == expected_schema.partition("@")[0] and version != str(VERSION) else "schema"
-        return Refused(reason, f"encoding must be {self._encoding}, got {got[:QUOTE]!r}")
+        return Refused(reason, f"encoding must be {self._encoding}, got {got[:MAX_QUOTE]!r}")

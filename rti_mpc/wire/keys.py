@@ -3,31 +3,33 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Any, Generic
 
 from rti_mpc.errors import ConfigError
 from rti_mpc.message import Command, Event, Reference, State, Telemetry
-from rti_mpc.wire import document
-from rti_mpc.wire.layout import MOST_BYTES
-
-ROLES = ("controller", "standby", "guard", "robot", "reference", "viewer", "recorder", "router", "operator", "relay")  # known to everybody
-STRANGERS = 16  # other roles of which is heard: a name costs nothing
-ROLE = re.compile(r"[a-z][a-z0-9_]{0,31}(\.[0-9]{1,7})?", re.ASCII)  # one of several is numbered, such as standby.17
-
-# Longest payload of a stream, by its first word, in bytes; of others as much as of a command.
-LONGEST: dict[str, int] = {
-    "state": MOST_BYTES[State],
-    "reference": MOST_BYTES[Reference],
-    "command": MOST_BYTES[Command],
-    "actuation": MOST_BYTES[Command],
-    "telemetry": MOST_BYTES[Telemetry],
-    "event": MOST_BYTES[Event],
-    "info": document.MOST_BYTES,
-}
+from rti_mpc.wire import streams
+from rti_mpc.wire.cdr import M
+from rti_mpc.wire.streams import Stream
 
 RESERVED = set("*$?#")  # wildcards and selectors of Zenoh
+
+
+class Key(str, Generic[M]):
+    """
+    Key of a stream, as Zenoh takes it; may hold wildcards.
+
+    Attributes:
+        stream: Row of the table in `rti_mpc.wire.streams`.
+    """
+
+    stream: Stream[M]
+
+    def __new__(cls, text: str, stream: Stream[M]) -> Key[M]:
+        """Make it of text and stream."""
+        key = super().__new__(cls, text)
+        key.stream = stream
+        return key
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,102 +51,82 @@ class Keys:
             if not all(value.split("/")) or value.startswith("@") or RESERVED & set(value):
                 raise ConfigError(f"{name} must be words joined by single slashes, without any of * $ ? # or a leading @, got {value!r}")
 
-    def stream(self, name: str) -> str:
-        """Key of a stream by its name."""
+    def below(self, name: str) -> str:
+        """Key of whatever name below this robot, such as ``"**"``."""
         return f"{self.prefix}/{self.robot}/{name}"
 
+    def of(self, stream: Stream[M], role: str = "") -> Key[M]:
+        """Key of a stream; of those by role with the role, or a wildcard for it."""
+        return Key(self.below(f"{stream.name}/{role}" if stream.by_role else stream.name), stream)
+
     @property
-    def state(self) -> str:
+    def state(self) -> Key[State]:
         """`State`, by the robot."""
-        return self.stream("state")
+        return self.of(streams.STATE)
 
     @property
-    def reference(self) -> str:
+    def reference(self) -> Key[Reference]:
         """`Reference`, by a planner."""
-        return self.stream("reference")
+        return self.of(streams.REFERENCE)
 
     @property
-    def anchored(self) -> str:
+    def anchored(self) -> Key[Reference]:
         """`Reference` with its real stamp, by the controller, for one that came to start on arrival."""
-        return self.stream("reference/anchored")
+        return self.of(streams.ANCHORED)
 
     @property
-    def command(self) -> str:
+    def command(self) -> Key[Command]:
         """`Command`, by the controller."""
-        return self.stream("command")
+        return self.of(streams.COMMAND)
 
     @property
-    def actuation(self) -> str:
+    def actuation(self) -> Key[Command]:
         """`Command`, by the guard."""
-        return self.stream("actuation")
+        return self.of(streams.ACTUATION)
 
     @property
-    def telemetry(self) -> str:
+    def telemetry(self) -> Key[Telemetry]:
         """`Telemetry`, by the controller."""
-        return self.stream("telemetry")
+        return self.of(streams.TELEMETRY)
 
     @property
-    def shadow_telemetry(self) -> str:
+    def shadow_telemetry(self) -> Key[Telemetry]:
         """`Telemetry`, by a controller that stands by."""
-        return self.stream("telemetry/standby")
+        return self.of(streams.SHADOW_TELEMETRY)
 
     @property
-    def events(self) -> str:
+    def request(self) -> Key[Any]:
+        """Queryable of the controller, JSON."""
+        return self.of(streams.REQUEST)
+
+    @property
+    def stop(self) -> Key[Any]:
+        """Queryable of controllers and guards for an operator's stop and its release, JSON."""
+        return self.of(streams.STOP)
+
+    @property
+    def events(self) -> Key[Event]:
         """All events, for subscribers."""
         return self.event("*")
 
-    def event(self, role: str) -> str:
+    def event(self, role: str) -> Key[Event]:
         """`Event`, by one role."""
-        return self.stream(f"event/{role}")
+        return self.of(streams.EVENT, role)
 
     @property
-    def infos(self) -> str:
+    def infos(self) -> Key[Any]:
         """All descriptions, for subscribers."""
         return self.info("*")
 
-    def info(self, role: str) -> str:
+    def info(self, role: str) -> Key[Any]:
         """JSON: names, units, limits, versions, by one role."""
-        return self.stream(f"info/{role}")
+        return self.of(streams.INFO, role)
 
     @property
-    def request(self) -> str:
-        """Queryable of the controller, JSON."""
-        return self.stream("request")
-
-    @property
-    def stop(self) -> str:
-        """Queryable of controllers and guards for an operator's stop and its release, JSON; what else is asked for does not delay it."""
-        return self.stream("stop")
-
-    @property
-    def lives(self) -> str:
+    def lives(self) -> Key[Any]:
         """All liveliness tokens, for watchers."""
         return self.alive("*")
 
-    def alive(self, role: str) -> str:
+    def alive(self, role: str) -> Key[Any]:
         """Liveliness token of one role."""
-        return self.stream(f"alive/{role}")
-
-
-def role_of(key: str) -> str:
-    """Return the role that a key of an event, a description or a token ends with; empty if it is no name of one."""
-    role = key.rpartition("/")[2]
-    return role if ROLE.fullmatch(role) else ""
-
-
-def admitted(key: str, known: Collection[str]) -> bool:
-    """
-    Return whether to listen to the role that a key ends with: of any in `ROLES`, and of `STRANGERS` others.
-
-    Args:
-        key: Of an event, a description or a token.
-        known: Keys of this stream that were admitted before.
-    """
-    if key in known or role_of(key) in ROLES:
-        return True
-    return bool(role_of(key)) and sum(role_of(other) not in ROLES for other in known) < STRANGERS
-
-
-def most_bytes(key: str) -> int:
-    """Return how many bytes a payload on a key may have; its wildcards may stand for roles."""
-    return next((LONGEST[word] for word in reversed(key.split("/")) if word in LONGEST), MOST_BYTES[Command])
+        return self.of(streams.ALIVE, role)

@@ -148,7 +148,7 @@ LAYOUTS: dict[type[Any], tuple[Field, ...]] = {
         Field("text", "string", "one sentence for people", high=4096),
     ),
 }
-MOST_BYTES: dict[type[Any], int] = {
+MAX_BYTES: dict[type[Any], int] = {  # of a payload
     State: 1 << 16,
     Reference: 1 << 23,  # 349,000 rows of three outputs; a session reassembles nothing longer, whatever its key
     Command: 1 << 20,

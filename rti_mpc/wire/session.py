@@ -28,7 +28,7 @@ import zenoh
 from rti_mpc.errors import ConfigError, Stopped
 from rti_mpc.message import Reference
 from rti_mpc.text_file import read_text_file
-from rti_mpc.wire.layout import MOST_BYTES
+from rti_mpc.wire.layout import MAX_BYTES
 from rti_mpc.wire.reach import remind
 
 RENDEZVOUS = "tcp/127.0.0.1:7447"
@@ -41,14 +41,14 @@ RETRY_S = 0.1  # between two looks for somebody who is not there yet
 # two to receive: a hung viewer would then cut the controller from the robot.
 THREADS = "(rx: (worker_threads: 4), tx: (worker_threads: 4))"
 
-LARGEST = MOST_BYTES[Reference] + (1 << 12)  # bytes of a message with what Zenoh adds: a longer one is dropped before it is put together
+MAX_MESSAGE_BYTES = MAX_BYTES[Reference] + (1 << 12)  # with what Zenoh adds: a longer one is dropped before it is put together
 
 # Ours, unless the user's own Zenoh configuration says otherwise.
 DEFAULTS: dict[str, Any] = {
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
     "scouting/gossip/enabled": True,
     "transport/link/tx/lease": 2000,  # a hung process is noticed after 1.5 s, not 7.5 s
-    "transport/link/rx/max_message_size": LARGEST,  # bytes: what a peer can make us put together
+    "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES,  # bytes: what a peer can make us put together
     "transport/shared_memory/enabled": False,  # gains nothing at these sizes
     "transport/link/tx/queue/congestion_control/block/wait_before_close": 500_000,  # us: what a query waits for a hung peer
     "queries_default_timeout": 1000,  # ms: a hung publisher delays a late joiner no longer

@@ -11,7 +11,7 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.message import Command, State
-from rti_mpc.wire.bus import WAITING, Bus, Subscriber
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, Subscriber
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
 
@@ -32,7 +32,7 @@ class Observer:
         self.epoch = 0
         self.answered: set[int] = set()
         self._states: deque[tuple[int, int, Array]] = deque(maxlen=4096)  # stamp, local monotonic arrival, position
-        states, commands = bus.subscriber(robot.state, capacity=WAITING), bus.subscriber(bus.keys.command, capacity=WAITING)
+        states, commands = bus.subscriber(robot.state, capacity=RING_MESSAGES), bus.subscriber(bus.keys.command, capacity=RING_MESSAGES)
         Thread(target=self._receive, args=(states, bus.intake(State, STALE_S)), daemon=True).start()
         Thread(target=self._listen, args=(commands, bus.intake(Command, STALE_S)), daemon=True).start()
 

@@ -20,12 +20,13 @@ from typing import Any
 import numpy as np
 
 from rti_mpc.message import Command, State
-from rti_mpc.wire.bus import WAITING, Bus, Publisher, Subscriber
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, Publisher, Subscriber
 from rti_mpc.wire.cdr import M
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.session import BusSettings
+from rti_mpc.wire.streams import RELAY
 
 ROLE = "relay"
 STALE_S = 0.25
@@ -80,10 +81,10 @@ class Relay:
         self._losing = False  # whether commands are lost
         self._stamp_ns = 0  # of the last state, as the robot sent it
         self._fault: tuple[str, int, deque[State]] = ("none", 0, deque())  # what, for how many states, those it holds back
-        self._states = bus.publisher(keys.state, State, realtime=True)
-        self._follow(bus.subscriber(robot.state, capacity=WAITING), bus.intake(State, STALE_S), self._change)
+        self._states = bus.publisher(keys.state)
+        self._follow(bus.subscriber(robot.state, capacity=RING_MESSAGES), bus.intake(State, STALE_S), self._change)
         for there, here in ((robot.command, keys.command), (robot.actuation, keys.actuation)):
-            commands, publisher = bus.subscriber(here, capacity=WAITING), bus.publisher(there, Command, realtime=True)
+            commands, publisher = bus.subscriber(here, capacity=RING_MESSAGES), bus.publisher(there)
             self._follow(commands, bus.intake(Command, STALE_S), partial(self._pass, publisher))
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -127,7 +128,7 @@ def main(settings: BusSettings, robot: Keys, keys: Keys) -> None:
     stop = stop_on_signals()
     with Bus(settings, keys, stop=stop) as bus:
         relay = Relay(bus, robot)
-        bus.serve(keys.stream(ROLE), relay.answer)
+        bus.serve(keys.of(RELAY), relay.answer)
         bus.alive(ROLE)
         stop.wait()
 

@@ -19,7 +19,7 @@ import numpy as np
 from rti_mpc.message import Reference
 from rti_mpc.trajectory import Heading
 from rti_mpc.wire.bus import Bus
-from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.session import BusSettings
 from service import robot_log, toml
 from service.build import build_model
@@ -95,7 +95,7 @@ class System:
             settings = client if wiring is Wiring.ROUTER else BusSettings(listen=(self._endpoint,), connect=())
             self.bus = Bus(settings, self.keys, timeout_s=PATIENCE_S, stop=stop)
             self.witness = Witness(self.bus)
-            self._references = self.bus.publisher(self.keys.reference, Reference, cached=True)
+            self._references = self.bus.publisher(self.keys.reference)
             self.observer = Observer(self.bus, self._robot_keys)
         except BaseException:
             self.children.__exit__(None, None, None)
@@ -251,7 +251,7 @@ class System:
         assert self.witness.reference is not None
         return self.witness.reference
 
-    def ask(self, key: str, **request: Any) -> dict[str, Any]:
+    def ask(self, key: Key[Any], **request: Any) -> dict[str, Any]:
         """
         Ask a process for something that it grants, and return its answer.
 

@@ -13,10 +13,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from rti_mpc.message import Command, End, Reference, State
+from rti_mpc.message import End, Reference
+from rti_mpc.wire.streams import RELAY
 from service.faults.promise import HOLDS, KEEPS_ON, PAUSES, RECOVERS, REJOINS, STAYS, STOPS, WAITS, Promise
 from service.faults.relay import LOST
-from service.faults.relay import ROLE as RELAY
 from service.faults.system import System, Wiring
 
 Act = Callable[[System], int | None]
@@ -97,7 +97,7 @@ def slow_viewer(system: System) -> None:
 def states(change: str, count: int | None = None) -> Act:
     """Change so many states, or all from now on; the fault is after the last one that passed as it was."""
     request = {"fault": change} | ({} if count is None else {"states": count})
-    return lambda system: int(system.ask(system.keys.stream(RELAY), **request)["stamp_ns"])
+    return lambda system: int(system.ask(system.keys.of(RELAY), **request)["stamp_ns"])
 
 
 def stop_and_kill(*roles: str) -> Act:
@@ -136,8 +136,7 @@ def solver_works(system: System) -> None:
 def flood(system: System) -> None:
     """Publish what is no message on every key that somebody acts on, as fast as it goes."""
     keys = system.keys
-    streams: dict[str, type[Any]] = {keys.state: State, keys.reference: Reference, keys.command: Command, keys.actuation: Command}
-    ends = [system.bus.publisher(key, cls) for key, cls in streams.items()]
+    ends: list[Any] = [system.bus.publisher(key) for key in (keys.state, keys.reference, keys.command, keys.actuation)]
     for number in range(MALFORMED):
         ends[number % len(ends)].put_bytes(GARBAGE[number // len(ends) % len(GARBAGE)])
 

@@ -44,8 +44,8 @@ class Asker:
         self._robot = robot
         self._rows = rows
         self._over = threading.Event()
-        self._planner = robot.bus.publisher(robot.bus.keys.reference, Reference)
-        planned = robot.bus.subscriber(robot.bus.keys.reference, cached=True)
+        self._planner = robot.bus.publisher(robot.bus.keys.reference)
+        planned = robot.bus.subscriber(robot.bus.keys.reference)
         self._known = decode(Reference, until(planned.try_recv, "the reference that is followed").payload)
         self._seq = itertools.count(1)
 

@@ -63,8 +63,8 @@ class Rig:
         self._endpoint = free_endpoint()
         self.bus = Bus(BusSettings(listen=(self._endpoint,), connect=()), loaded.keys())
         keys = self.bus.keys
-        self._states = self.bus.publisher(keys.state, State, realtime=True)
-        self._commands = self.bus.publisher(keys.command, Command, realtime=True)
+        self._states = self.bus.publisher(keys.state)
+        self._commands = self.bus.publisher(keys.command)
         self._actuation = self.bus.subscriber(keys.actuation, capacity=4096)
         self.epoch, self.leader, self.seq = 1000, 100, 0
         self.deaf = False  # whether the robot's states reach nobody

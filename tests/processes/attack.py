@@ -77,7 +77,7 @@ class Attack:
         self._keys = keys
         self._rng = np.random.default_rng(seed)
         self._heard: defaultdict[str, deque[tuple[float, bytes, str]]] = defaultdict(lambda: deque(maxlen=MEMORY))
-        self._memory = self._session.declare_subscriber(keys.stream("**"), zenoh.handlers.RingChannel(4096), allowed_origin=zenoh.Locality.REMOTE)
+        self._memory = self._session.declare_subscriber(keys.below("**"), zenoh.handlers.RingChannel(4096), allowed_origin=zenoh.Locality.REMOTE)
         self._tokens = [self._session.liveliness().declare_token(keys.alive(f"standby.{number}")) for number in range(100)]
         self._tokens += [self._session.liveliness().declare_token(keys.alive(name)) for name in ("standby.²", "standby.-1", "Ä", 200 * "x")]
 
@@ -120,7 +120,7 @@ class Attack:
     def listen(self) -> None:
         """Remember what others send."""
         while (sample := self._memory.try_recv()) is not None:
-            stream = str(sample.key_expr).removeprefix(self._keys.stream(""))
+            stream = str(sample.key_expr).removeprefix(self._keys.below(""))
             if len(sample.payload) < 1 << 20:
                 self._heard[stream].append((time.monotonic(), sample.payload.to_bytes(), str(sample.encoding)))
 
@@ -219,4 +219,4 @@ class Attack:
     def _put(self, stream: str, payload: bytes, kind: str, *, block: bool = False) -> None:
         self.sent += 1
         control = zenoh.CongestionControl.BLOCK if block else zenoh.CongestionControl.DROP
-        self._session.put(self._keys.stream(stream), payload, encoding=kind, congestion_control=control, express=True)
+        self._session.put(self._keys.below(stream), payload, encoding=kind, congestion_control=control, express=True)

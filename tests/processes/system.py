@@ -131,7 +131,7 @@ class System:
 
     def event(self, code: str, source: str, act: Callable[[], object] = lambda: None) -> Event:
         """Wait for an event that comes after we act, again and again."""
-        events = self.bus.subscriber(KEYS.event(source), capacity=64)
+        events = self.bus.subscriber(KEYS.event(source), capacity=64, history=False)
 
         def look() -> Event | None:
             act()

@@ -45,7 +45,7 @@ def driven(system: System) -> System:
         system.interrupt("reference")
     x, y = system.state(lambda _: True).x[:2]
     (system.folder / "line.csv").write_text(f"x,y\n{x},{y}\n{x + 200.0},{y}\n")
-    events = system.bus.subscriber(KEYS.event("reference"), capacity=64)
+    events = system.bus.subscriber(KEYS.event("reference"), capacity=64, history=False)
     system.start("reference")
     heard(events, Event, lambda event: event.code == "reference_published")  # the robot may still follow the last one
     system.tracking()
@@ -104,7 +104,7 @@ def test_nothing_stale_acts_when_somebody_was_stopped_and_goes_on(driven: System
 
 
 def test_guard_says_why_it_intervened(driven: System) -> None:
-    events = driven.bus.subscriber(KEYS.event("guard"), capacity=64)
+    events = driven.bus.subscriber(KEYS.event("guard"), capacity=64, history=False)
     driven.running["controller"].send_signal(signal.SIGSTOP)
     try:
         until(lambda: any(b"guard_braking" in received.payload for received in events.drain()), "the guard says that it brakes")

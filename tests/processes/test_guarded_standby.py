@@ -97,7 +97,7 @@ def test_commands_of_the_standby_pass_the_guard_in_time_and_none_of_the_old_lead
 
 def fence(system: Watched, epoch: int) -> None:
     """Command as an old leader that does not notice that it is one: what the new one does, in the old epoch."""
-    forger = system.bus.publisher(KEYS.command, Command, realtime=True)
+    forger = system.bus.publisher(KEYS.command)
 
     def forge() -> None:
         latest = system.listen()[-1]

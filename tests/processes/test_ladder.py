@@ -67,7 +67,7 @@ def test_other_solver_takes_over_without_anybody_noticing(driven: System, host: 
 @pytest.mark.parametrize(("failure", "samples"), [("qp", 8), pytest.param("nan_model", 8, marks=pytest.mark.slow)])
 def test_failures_lead_down_the_ladder_and_up_again(driven: System, host: Host, failure: str, samples: int) -> None:
     before, begun_ns = recovered(driven, 50), time.monotonic_ns()  # a second: no more often is one kind of fault published
-    events = driven.bus.subscriber(KEYS.event("controller"), capacity=64)
+    events = driven.bus.subscriber(KEYS.event("controller"), capacity=64, history=False)
     commands = driven.bus.subscriber(KEYS.command, capacity=4096)
     inject(driven, failure, samples)
     heard(driven.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.fallbacks >= before.fallbacks + samples)
@@ -88,7 +88,7 @@ def test_failures_lead_down_the_ladder_and_up_again(driven: System, host: Host, 
 @pytest.mark.slow
 def test_samples_over_budget_are_not_sent_and_leave_the_loop_in_phase(driven: System, host: Host) -> None:
     before, begun_ns = recovered(driven, 50), time.monotonic_ns()  # a second: no more often is one kind of fault published
-    events = driven.bus.subscriber(KEYS.event("controller"), capacity=64)
+    events = driven.bus.subscriber(KEYS.event("controller"), capacity=64, history=False)
     commands = driven.bus.subscriber(KEYS.command, capacity=4096)
     inject(driven, "over_budget", 4)
     heard(driven.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.fallbacks >= before.fallbacks + 4)
@@ -108,7 +108,7 @@ def test_samples_over_budget_are_not_sent_and_leave_the_loop_in_phase(driven: Sy
 def test_controller_that_was_stopped_acts_on_nothing_that_has_waited(driven: System, host: Host) -> None:
     """SIGSTOP, 1.5 s, SIGCONT: it notices the gap, starts cold, and re-enters softly."""
     before = recovered(driven, 50)  # a second: no more often is one kind of fault published
-    events = driven.bus.subscriber(KEYS.event("controller"), capacity=64)
+    events = driven.bus.subscriber(KEYS.event("controller"), capacity=64, history=False)
     commands = driven.bus.subscriber(KEYS.command, capacity=4096)
     process = driven.running["controller"]
     last = driven.tracking()

@@ -40,7 +40,7 @@ def test_standby_takes_over_in_time_and_the_old_leader_is_fenced(redundant: Watc
     print(f"dt = {system.dt_s} s: took over {1e3 * took_s:.1f} ms after the leader's death, {1e3 * max(3 * system.dt_s, 0.05):.0f} promised")
     in_time(host, "the takeover", 1e3 * took_s, 1e3 * max(3 * system.dt_s, 0.05), system.fault_at_ns)
     if system.dt_s == 0.1:
-        stepped_down = system.bus.subscriber(KEYS.event("standby"), capacity=64)
+        stepped_down = system.bus.subscriber(KEYS.event("standby"), capacity=64, history=False)
         system.running[leader].send_signal(signal.SIGCONT)
         until(lambda: "standby" in system.lives, "the old leader stands by")
         until(lambda: any(b"stepped_down" in received.payload for received in stepped_down.drain()), "it says so")
@@ -100,7 +100,7 @@ def test_standby_of_another_configuration_is_refused(tmp_path: Path) -> None:
     with Watched(tmp_path, 0.1) as system:
         system.start("robot", "leader")
         until(lambda: "controller" in system.lives, "a leader")
-        info = json.loads(until(system.bus.subscriber(KEYS.info("controller"), cached=True).try_recv, "its description").payload)
+        info = json.loads(until(system.bus.subscriber(KEYS.info("controller")).try_recv, "its description").payload)
         other = tmp_path / "other"
         other.mkdir()
         done = rti_mpc("run", configuration(other, 0.05), "--standby", "-e", system.endpoint)

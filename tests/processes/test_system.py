@@ -131,7 +131,7 @@ def test_of_several_planners_a_controller_that_starts_after_them_follows_the_lat
         for epoch in (latest, *range(1, latest)):
             planner = stack.enter_context(Bus(BusSettings(connect=(system.endpoint,)), keys))
             there = Reference(epoch, 1, 0, 10**9, End.HOLD, np.full((600, 3), 0.1 * epoch), np.zeros((600, 0)))
-            planner.publisher(keys.reference, Reference, cached=True).put(there)
+            planner.publisher(keys.reference).put(there)
         system.start("robot", "controller")
         samples = heard(system.bus.subscriber(keys.telemetry), Telemetry, lambda sample: sample.seq >= 5)
     assert samples.y_ref[:, :2] == pytest.approx(0.1 * latest)
@@ -144,7 +144,7 @@ def test_stop_is_latched_until_enable(driven: System) -> None:
     stood = driven.state(rests)
     driven.interrupt("reference")
     driven.start("reference")  # a new reference releases nothing
-    heard(driven.bus.subscriber(KEYS.reference, cached=True), Reference, lambda reference: True)
+    heard(driven.bus.subscriber(KEYS.reference), Reference, lambda reference: True)
     later = heard(driven.bus.subscriber(KEYS.command), Command, lambda command: command.seq > stopped.seq + 40)
     assert later.mode is Mode.STOPPED
     assert driven.state(lambda state: state.seq > stood.seq + 40).x[:2] == pytest.approx(stood.x[:2], abs=1e-3)
@@ -178,12 +178,12 @@ def malformed(message: State | Command, rows: str) -> dict[str, bytes]:
 @pytest.mark.slow
 def test_payload_of_every_malformed_kind_is_counted_and_published_while_control_goes_on(driven: System, monkeypatch: pytest.MonkeyPatch) -> None:
     """States to the controller and commands to the robot; of a flood of them each publishes one event a second."""
-    ours = driven.bus.publisher(KEYS.state, State), driven.bus.publisher(KEYS.command, Command)
+    ours = driven.bus.publisher(KEYS.state), driven.bus.publisher(KEYS.command)
     with monkeypatch.context() as later:
         later.setattr(cdr, "VERSION", cdr.VERSION + 1)
-        foreign = driven.bus.publisher(KEYS.state, State), driven.bus.publisher(KEYS.command, Command)
+        foreign = driven.bus.publisher(KEYS.state), driven.bus.publisher(KEYS.command)
     kinds = malformed(driven.state(lambda _: True), "x"), malformed(driven.tracking(), "u")
-    before, events, start_s = driven.sample(), driven.bus.subscriber(KEYS.events, capacity=1024), time.monotonic()
+    before, events, start_s = driven.sample(), driven.bus.subscriber(KEYS.events, capacity=1024, history=False), time.monotonic()
 
     def send(words: str) -> None:
         for publisher, payloads in zip(foreign if words == OTHER_VERSION else ours, kinds, strict=True):
@@ -207,7 +207,7 @@ def test_payload_of_every_malformed_kind_is_counted_and_published_while_control_
 
 def test_second_publisher_takes_nothing_over(driven: System) -> None:
     """Neither a command of an older controller, nor a state of another life of the robot: while that is heard the robot stands, and then goes on."""
-    states, commands = driven.bus.publisher(KEYS.state, State), driven.bus.publisher(KEYS.command, Command)
+    states, commands = driven.bus.publisher(KEYS.state), driven.bus.publisher(KEYS.command)
     true, command = driven.state(lambda _: True), driven.tracking()
     seqs = iter(range(10**6, 10**9))
 

@@ -58,7 +58,7 @@ def run(code: str, *arguments: str, **options: object) -> subprocess.CompletedPr
 def flooded(endpoint: str) -> Iterator[None]:
     """States without a pause."""
     with Bus(BusSettings(listen=(endpoint,), connect=()), KEYS) as bus:
-        states, over = bus.publisher(KEYS.state, State, realtime=True), threading.Event()
+        states, over = bus.publisher(KEYS.state), threading.Event()
 
         def publish() -> None:
             seq = 0

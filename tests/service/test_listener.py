@@ -15,7 +15,8 @@ from rti_mpc.message import Event, Severity
 from rti_mpc.wire.bus import Received
 from rti_mpc.wire.cdr import encode, encoding
 from rti_mpc.wire.intake import Intake
-from rti_mpc.wire.keys import ROLES, STRANGERS, Keys
+from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.streams import MAX_UNKNOWN_ROLES, ROLES
 from service.info import Info
 from service.listener import Listener
 
@@ -64,10 +65,10 @@ def test_invented_roles_take_no_place_of_those_that_everybody_knows(bus: ListBus
     invented = [f"role_{k}" for k in range(70)]
     for role in (*invented, *ROLES):
         bus.say(role)
-    assert sources(listener) == [*invented[:STRANGERS], *(role for role in ROLES if role != "viewer")]
+    assert sources(listener) == [*invented[:MAX_UNKNOWN_ROLES], *(role for role in ROLES if role != "viewer")]
     for role in (*invented[::-1], *ROLES):
         bus.say(role, seq=2)
-    assert set(sources(listener)) == {*invented[:STRANGERS], *ROLES} - {"viewer"}
+    assert set(sources(listener)) == {*invented[:MAX_UNKNOWN_ROLES], *ROLES} - {"viewer"}
 
 
 def test_events_are_of_whom_their_key_names(bus: ListBus, listener: Listener) -> None:
@@ -91,5 +92,5 @@ def test_the_last_description_of_a_role_counts_and_invented_ones_are_few(bus: Li
     for model in ("first", "last"):
         bus.describe("robot", {"role": "robot", "model": model})
     infos = [entry.message for entry in listener.drain() if isinstance(entry.message, Info)]
-    assert len(infos) == STRANGERS + 1
+    assert len(infos) == MAX_UNKNOWN_ROLES + 1
     assert (infos[-1].role, infos[-1].model) == ("robot", "last")

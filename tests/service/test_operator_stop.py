@@ -17,7 +17,7 @@ from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.latch import MAX_LEAP, Latch
 from rti_mpc.message import Notice
 from rti_mpc.wire.bus import Received
-from rti_mpc.wire.document import MOST_BYTES
+from rti_mpc.wire.document import MAX_BYTES
 from rti_mpc.wire.keys import Keys
 from service import operator_stop
 from service.latch_file import LatchFile
@@ -172,7 +172,7 @@ def test_process_takes_over_what_others_describe_and_tells_it_on(disk: Disk) -> 
 def test_nothing_that_is_heard_ends_the_thread_that_hears(disk: Disk) -> None:
     process = Process(disk)
     leap = asdict(Latch(MAX_LEAP + 1, True, WHEN, "forged"))
-    huge = {"latch": asdict(STOPPED), "more": " " * MOST_BYTES}
+    huge = {"latch": asdict(STOPPED), "more": " " * MAX_BYTES}
     nonsense: list[Any] = [
         b"",
         b"\xff",

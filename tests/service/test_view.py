@@ -53,10 +53,10 @@ label = lambda name: {"name": name, "unit": "m", "angle": False}
 info = {"role": "controller", "states": [label("x"), label("y")], "inputs": [label("f")], "outputs": [label("x"), label("y")], "dt_s": 0.01}
 with Bus(BusSettings(listen=(f"tcp/127.0.0.1:{port}",), connect=(f"tcp/127.0.0.1:{port}",)), keys) as bus:
     bus.publish_json(keys.info("controller"), info)
-    reference = bus.publisher(keys.reference, Reference, cached=True)
+    reference = bus.publisher(keys.reference)
     reference.put(Reference(epoch, 1, 0, 10**7, End.HOLD, np.zeros((2, 2)), np.zeros((2, 0))))
-    state, command = bus.publisher(keys.state, State, realtime=True), bus.publisher(keys.command, Command, realtime=True)
-    telemetry, event = bus.publisher(keys.telemetry, Telemetry), bus.publisher(keys.event("robot"), Event, cached=True)
+    state, command = bus.publisher(keys.state), bus.publisher(keys.command)
+    telemetry, event = bus.publisher(keys.telemetry), bus.publisher(keys.event("robot"))
     while not bus.is_alive("viewer"):
         pass
     event.put(Event(epoch, 1, 0, "robot", Severity.INFO, "started", f"epoch {epoch}"))
@@ -198,7 +198,7 @@ def test_a_disk_that_fills_up_ends_the_recording_but_neither_the_viewer_nor_what
     viewer = children[1]
     try:
         with Bus(BusSettings(connect=(f"tcp/127.0.0.1:{port}",)), Keys(robot="r")) as bus:
-            events = bus.subscriber(bus.keys.event("viewer"), capacity=8, cached=True)
+            events = bus.subscriber(bus.keys.event("viewer"), capacity=8)
             viewer.wait_for(f"{screen.url}: open")
             until(lambda: (tmp_path / "run.rrd").stat().st_size > 0, "it records")
             resource.prlimit(viewer.process.pid, resource.RLIMIT_FSIZE, (1, 1))  # to the writer of a file as good as a full disk
@@ -220,7 +220,7 @@ def test_a_listener_that_falls_behind_keeps_the_newest_and_counts_the_rest(port:
     endpoint = f"tcp/127.0.0.1:{port}"
     with Bus(BusSettings(listen=(endpoint,)), keys) as robot, Bus(BusSettings(connect=(endpoint,)), keys) as bus:
         listener = Listener(bus, capacity=10)
-        publisher = robot.publisher(keys.state, State)
+        publisher = robot.publisher(keys.state)
         seen = 0
         deadline = time.monotonic() + PATIENCE_S
         while not (entries := listener.drain()):
@@ -230,7 +230,7 @@ def test_a_listener_that_falls_behind_keeps_the_newest_and_counts_the_rest(port:
         last = seen + 50
         for k in range(seen + 1, last + 1):
             publisher.put(State(1, k, k, np.zeros(1)))
-        marker = robot.publisher(keys.telemetry, State)  # a refused payload on the same link, behind the states
+        marker = robot.publisher(keys.telemetry)  # a refused payload on the same link, behind the states
         marker.put(State(1, 1, 1, np.zeros(1)))
         bytes_behind = bus.subscriber(keys.telemetry, capacity=1)
         while bytes_behind.try_recv() is None:
@@ -250,8 +250,8 @@ def test_a_takeover_behind_a_guard_is_seen_in_the_recording(port: int, tmp_path:
     with Bus(BusSettings(listen=(endpoint,)), keys) as robot, Bus(BusSettings(connect=(endpoint,)), keys) as bus:
         listener = Listener(bus)
         robot.publish_json(keys.info("controller"), {"role": "controller", "states": [label], "inputs": [{**label, "name": "f"}]})
-        state, telemetry = robot.publisher(keys.state, State), robot.publisher(keys.telemetry, Telemetry)
-        command, actuation = robot.publisher(keys.command, Command), robot.publisher(keys.actuation, Command)
+        state, telemetry = robot.publisher(keys.state), robot.publisher(keys.telemetry)
+        command, actuation = robot.publisher(keys.command), robot.publisher(keys.actuation)
         heard = {"rows": 0}
 
         def hear(rows: int) -> bool:

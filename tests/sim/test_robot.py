@@ -128,8 +128,8 @@ def test_commanded_robot_moves_stops_on_silence_and_ends_on_ctrl_c_standing(endp
     log = tmp_path / "log.csv"
     with running(ROBOT, endpoint, 1.0, 0.05, log) as process, peer(endpoint) as bus:
         states = bus.subscriber(KEYS.state)
-        events = bus.subscriber(KEYS.events, capacity=16, cached=True)
-        commands = bus.publisher(KEYS.command, Command, realtime=True)
+        events = bus.subscriber(KEYS.events, capacity=16)
+        commands = bus.publisher(KEYS.command)
         seqs, begun_ns, state = itertools.count(1), time.monotonic_ns(), next_state(states)
         while state.x[3] < 0.3:
             commands.put(command(state, next(seqs), [0.4, 0.2]))
@@ -164,8 +164,8 @@ def test_what_is_no_command_is_counted_and_published_and_stops_nothing(endpoint:
     log = tmp_path / "log.csv"
     with running(ROBOT, endpoint, 1.0, 0.02, log) as process, peer(endpoint) as bus:
         states = bus.subscriber(KEYS.state)
-        events = bus.subscriber(KEYS.events, capacity=16, cached=True)
-        commands = bus.publisher(KEYS.command, Command, realtime=True)
+        events = bus.subscriber(KEYS.events, capacity=16)
+        commands = bus.publisher(KEYS.command)
         state = next_state(states)
         for payload in (b"", b"\x00\x00\x00\x00", b"\x00\x01\x00\x00" + b"\xff" * 200):
             commands.put_bytes(payload)
@@ -185,7 +185,7 @@ def test_what_is_no_command_is_counted_and_published_and_stops_nothing(endpoint:
 def test_clock_of_a_robot_whose_process_is_held_up_waits_with_it(endpoint: str, tmp_path: Path) -> None:
     with running(ROBOT, endpoint, 1.0, 0.02, tmp_path / "log.csv") as process, peer(endpoint) as bus:
         states = bus.subscriber(KEYS.state, capacity=256)
-        events = bus.subscriber(KEYS.events, capacity=16, cached=True)
+        events = bus.subscriber(KEYS.events, capacity=16)
         first = next_state(states)
         process.send_signal(signal.SIGSTOP)
         os.waitid(os.P_PID, process.pid, os.WSTOPPED)
@@ -199,7 +199,7 @@ def test_clock_of_a_robot_whose_process_is_held_up_waits_with_it(endpoint: str, 
 
 def test_source_anchors_its_reference_to_every_new_robot_and_keeps_it_for_late_joiners(endpoint: str, tmp_path: Path, host: Host) -> None:
     with running(SOURCE, endpoint) as source, peer(endpoint) as bus:
-        references = bus.subscriber(KEYS.reference, capacity=4, cached=True)
+        references = bus.subscriber(KEYS.reference, capacity=4)
         heard = []
         for life in range(2):
             with running(ROBOT, endpoint, 1.0, 0.02, tmp_path / f"{life}.csv"):

@@ -22,8 +22,8 @@ FAST = ("transport/link/tx/lease:600",)  # ms: hangs are noticed soon
 def echo(bus: Bus) -> None:
     """Answer every state with a command of its number; thousand telemetry events a second with ten states in ten milliseconds."""
     states = bus.subscriber(KEYS.state)
-    commands = bus.publisher(KEYS.command, Command, realtime=True)
-    telemetry = bus.publisher(KEYS.telemetry, Event)
+    commands = bus.publisher(KEYS.command)
+    telemetry = bus.publisher(KEYS.telemetry)
     bus.alive("controller")
     while (received := states.recv()) is not None:
         state = decode(State, received.payload)
@@ -43,21 +43,21 @@ def watch(bus: Bus) -> None:
 def plan(bus: Bus) -> None:
     """Publish one reference and stay."""
     reference = Reference(1, 1, 0, 10**8, End.HOLD, np.arange(6.0).reshape(2, 3), np.zeros((2, 0)))
-    bus.publisher(KEYS.reference, Reference, cached=True).put(reference)
+    bus.publisher(KEYS.reference).put(reference)
     threading.Event().wait()
 
 
 def farewell(bus: Bus) -> None:
     """Send a last message and leave."""
-    bus.publisher(KEYS.state, State, realtime=True).put(State(1, 1, 0, np.zeros(5)))
+    bus.publisher(KEYS.state).put(State(1, 1, 0, np.zeros(5)))
     bus.close()
 
 
 def careless(bus: Bus) -> None:
     """Leave with everything open and threads waiting."""
     threading.Thread(target=bus.subscriber(KEYS.state).recv, daemon=True).start()
-    bus.subscriber(KEYS.events, cached=True)
-    bus.publisher(KEYS.event("x"), Event, cached=True)
+    bus.subscriber(KEYS.events)
+    bus.publisher(KEYS.event("x"))
     bus.serve(KEYS.request, lambda request: request)
     bus.watch_alive(lambda role, present: None)
 

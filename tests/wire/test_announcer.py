@@ -28,7 +28,7 @@ def said(notices: list[tuple[float, Notice]], monkeypatch: pytest.MonkeyPatch) -
     """Events that a peer hears of notices, each at a time in s."""
     endpoint, heard = free_endpoint(), dict[int, Event]()
     with Bus(BusSettings(listen=(endpoint,)), Keys()) as bus, Bus(BusSettings(connect=(endpoint,)), Keys()) as peer:
-        subscriber = peer.subscriber(peer.keys.event("controller"), capacity=64, cached=True)
+        subscriber = peer.subscriber(peer.keys.event("controller"), capacity=64)
         announcer = Announcer(bus, "controller", epoch=1)
 
         def hears(code: str) -> Callable[[], bool]:

@@ -19,10 +19,12 @@ import pytest
 import zenoh
 
 from rti_mpc.message import Command, End, Event, Reference, Severity, State
-from rti_mpc.wire.bus import Bus, BusSettings, Received, Subscriber
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Received, Subscriber
 from rti_mpc.wire.cdr import decode, encoding
 from rti_mpc.wire.intake import Intake
-from rti_mpc.wire.keys import Keys, most_bytes
+from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.layout import MAX_BYTES
+from rti_mpc.wire.streams import RING_BYTES
 from service.host import Host
 from tests.in_time import MS, explained, in_time
 
@@ -93,7 +95,7 @@ def start(endpoint: str) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
 
 def echoed(bus: Bus, seq: int) -> bool:
     """Whether a state is answered by the command of its number."""
-    states, commands = bus.publisher(KEYS.state, State, realtime=True), bus.subscriber(KEYS.command)
+    states, commands = bus.publisher(KEYS.state), bus.subscriber(KEYS.command)
 
     def answered() -> bool:
         states.put(State(1, seq, 0, np.ones(5)))
@@ -120,7 +122,7 @@ def test_processes_exchange_messages_when_the_robot_starts_last_and_restarts(joi
 
 def test_those_who_met_through_the_robot_stay_linked_without_it(join: Any) -> None:
     controller, viewer = join(), join()
-    commands, seen = controller.publisher(KEYS.command, Event), viewer.subscriber(KEYS.command)
+    commands, seen = controller.publisher(KEYS.command), viewer.subscriber(KEYS.command)
 
     def passes() -> bool:
         commands.put(EVENT)
@@ -133,16 +135,16 @@ def test_those_who_met_through_the_robot_stay_linked_without_it(join: Any) -> No
     assert eventually(passes)
     controller.close()
     with join(robot=True):
-        commands = join().publisher(KEYS.command, Event)
+        commands = join().publisher(KEYS.command)
         assert eventually(passes)
 
 
 def test_a_cached_reference_reaches_a_late_joiner_in_another_process(join: Any, start: Any) -> None:
     start("plan")
     robot = join(robot=True)
-    assert decode(Reference, received(robot.subscriber(KEYS.reference, cached=True)).payload).y[1, 2] == 5.0
+    assert decode(Reference, received(robot.subscriber(KEYS.reference)).payload).y[1, 2] == 5.0
     late = join()
-    sample = received(late.subscriber(KEYS.reference, cached=True))
+    sample = received(late.subscriber(KEYS.reference))
     assert np.array_equal(decode(Reference, sample.payload).y, REFERENCE.y)
     assert sample.encoding == encoding(Reference)
 
@@ -151,8 +153,8 @@ def test_a_cached_message_that_the_link_has_dropped_arrives_all_the_same(join: A
     """As large ones are on a busy host: DROP waits for nobody."""
     dropping = f"downsampling:[{{messages:['put'],flows:['egress'],rules:[{{key_expr:'{KEYS.reference}',freq:0.001}}]}}]"
     robot, planner = join(robot=True), join(cfg=(*FAST, dropping))
-    references = robot.subscriber(KEYS.reference, capacity=8, cached=True)
-    publisher = planner.publisher(KEYS.reference, Reference, cached=True)
+    references = robot.subscriber(KEYS.reference, capacity=8)
+    publisher = planner.publisher(KEYS.reference)
     for seq in (1, 2, 3):  # all but the first that passes come too soon for the link
         publisher.put(replace(REFERENCE, seq=seq))
         assert eventually(lambda seq=seq: [decode(Reference, r.payload).seq for r in references.drain()] == [seq])
@@ -160,11 +162,11 @@ def test_a_cached_message_that_the_link_has_dropped_arrives_all_the_same(join: A
 
 def test_a_cached_message_put_before_anybody_was_there_arrives_once(join: Any) -> None:
     planner, controller = join(), join()
-    references = controller.subscriber(KEYS.reference, capacity=8, cached=True)
-    planner.publisher(KEYS.reference, Reference, cached=True).put(REFERENCE)
+    references = controller.subscriber(KEYS.reference, capacity=8)
+    planner.publisher(KEYS.reference).put(REFERENCE)
     join(robot=True)
     received(references)
-    late = join().subscriber(KEYS.reference, capacity=8, cached=True)
+    late = join().subscriber(KEYS.reference, capacity=8)
     received(late)
     assert references.drain() == late.drain() == []
 
@@ -172,13 +174,13 @@ def test_a_cached_message_put_before_anybody_was_there_arrives_once(join: Any) -
 def test_late_joiners_get_the_last_event_and_info_of_every_role(join: Any) -> None:
     robot, other = join(robot=True), join()
     for role, bus in {"robot": robot, "reference": other}.items():
-        events = bus.publisher(KEYS.event(role), Event, cached=True)
+        events = bus.publisher(KEYS.event(role))
         events.put(EVENT)
         events.put(Event(1, 2, 0, role, Severity.INFO, "last", ""))
         bus.publish_json(KEYS.info(role), {"role": role})
         bus.publish_json(KEYS.info(role), {"role": role, "dt_s": 0.1})
     late = join()
-    events, infos = late.subscriber(KEYS.events, capacity=8, cached=True), late.subscriber(KEYS.infos, capacity=8, cached=True)
+    events, infos = late.subscriber(KEYS.events, capacity=8), late.subscriber(KEYS.infos, capacity=8)
     got = [received(events), received(events)]
     assert {decode(Event, sample.payload).source for sample in got} == {"robot", "reference"}
     assert {decode(Event, sample.payload).code for sample in got} == {"last"}
@@ -191,11 +193,11 @@ def test_nothing_grows_when_a_role_is_taken_again_and_again(join: Any) -> None:
     for epoch in range(1, 6):
         for role in ("controller", "standby"):
             token = robot.alive(role)
-            robot.publisher(KEYS.event(role), Event, cached=True).put(replace(EVENT, epoch=epoch, source=role))
+            robot.publisher(KEYS.event(role)).put(replace(EVENT, epoch=epoch, source=role))
             robot.publish_json(KEYS.info(role), {"role": role})
             robot.withdraw_json(KEYS.info(role))
             token.undeclare()
-    events = join().subscriber(KEYS.events, capacity=16, cached=True)
+    events = join().subscriber(KEYS.events, capacity=16)
     got = [decode(Event, received(events).payload) for _ in range(2)]
     assert {(event.epoch, event.source) for event in got} == {(5, "controller"), (5, "standby")}
     assert events.drain() == []
@@ -207,7 +209,7 @@ def test_late_joiners_do_not_get_what_was_withdrawn(join: Any) -> None:
     for role in ("controller", "standby"):
         robot.publish_json(KEYS.info(role), {"role": role})
     robot.withdraw_json(KEYS.info("controller"))
-    infos = join().subscriber(KEYS.infos, capacity=8, cached=True)
+    infos = join().subscriber(KEYS.infos, capacity=8)
     assert received(infos).payload == b'{"role": "standby"}'
     robot.publish_json(KEYS.info("standby"), {"role": "last"})
     assert received(infos).payload == b'{"role": "last"}'
@@ -215,11 +217,11 @@ def test_late_joiners_do_not_get_what_was_withdrawn(join: Any) -> None:
 
 def test_own_messages_do_not_come_back(join: Any) -> None:
     robot, other = join(robot=True), join()
-    own = [robot.subscriber(KEYS.state), robot.subscriber(KEYS.events, cached=True)]
-    seen = other.subscriber(KEYS.events, cached=True)
-    robot.publisher(KEYS.state, State, realtime=True).put(STATE)
-    robot.publisher(KEYS.event("robot"), Event, cached=True).put(EVENT)
-    own.append(robot.subscriber(KEYS.events, cached=True))
+    own = [robot.subscriber(KEYS.state), robot.subscriber(KEYS.events)]
+    seen = other.subscriber(KEYS.events)
+    robot.publisher(KEYS.state).put(STATE)
+    robot.publisher(KEYS.event("robot")).put(EVENT)
+    own.append(robot.subscriber(KEYS.events))
     received(seen)
     assert [subscriber.try_recv() for subscriber in own] == [None, None, None]
 
@@ -227,8 +229,8 @@ def test_own_messages_do_not_come_back(join: Any) -> None:
 def test_a_ring_keeps_the_newest(join: Any) -> None:
     robot, other = join(robot=True), join()
     one, three, end = robot.subscriber(KEYS.state), robot.subscriber(KEYS.state, capacity=3), robot.subscriber(KEYS.command)
-    states = other.publisher(KEYS.state, State, realtime=True)
-    ends = other.publisher(KEYS.command, Event, realtime=True)
+    states = other.publisher(KEYS.state)
+    ends = other.publisher(KEYS.command)
     eventually(lambda: states.heard and ends.heard)
     for seq in range(10):
         states.put(State(1, seq, 0, np.zeros(1)))
@@ -238,10 +240,26 @@ def test_a_ring_keeps_the_newest(join: Any) -> None:
     assert [decode(State, sample.payload).seq for sample in three.drain()] == [7, 8, 9]
 
 
+def test_a_ring_holds_fewer_of_what_may_be_long(join: Any) -> None:
+    """Bytes, not messages, are what a host runs out of: 1024 of the longest references would be 8 GiB."""
+    robot, other = join(robot=True), join()
+    references = robot.subscriber(KEYS.reference, capacity=RING_MESSAGES)
+    marks = robot.subscriber(KEYS.event("planner"))  # of the same priority: what was sent before has come before
+    planner, marker = other.publisher(KEYS.reference), other.publisher(KEYS.event("planner"))
+    most = RING_BYTES // MAX_BYTES[Reference]
+    for seq in range(1, 2 * most):
+        planner.put(replace(REFERENCE, seq=seq))
+        marker.put(replace(EVENT, seq=seq))
+        eventually(lambda seq=seq: any(decode(Event, sample.payload).seq == seq for sample in marks.drain()))
+    got = [decode(Reference, sample.payload).seq for sample in references.drain()]
+    assert len(got) == most
+    assert got[-1] == 2 * most - 1
+
+
 def test_an_unread_subscriber_stops_nobody_and_put_never_waits(join: Any, host: Host) -> None:
     robot, other = join(robot=True), join()
     unread, commands = robot.subscriber(KEYS.telemetry), robot.subscriber(KEYS.command)
-    flood, marks = other.publisher(KEYS.telemetry, Event), other.publisher(KEYS.command, Event, realtime=True)
+    flood, marks = other.publisher(KEYS.telemetry), other.publisher(KEYS.command)
     eventually(lambda: flood.heard and marks.heard)
     load = Event(1, 1, 0, "controller", Severity.INFO, "load", 2000 * "x")
     worst = (0, 0)
@@ -265,7 +283,7 @@ def test_a_hung_viewer_does_not_cut_the_robot_from_the_controller(join: Any, sta
     assert echoed(robot, 1)
     for viewer in viewers:
         viewer.send_signal(signal.SIGSTOP)
-    states, commands = robot.publisher(KEYS.state, State, realtime=True), robot.subscriber(KEYS.command)
+    states, commands = robot.publisher(KEYS.state), robot.subscriber(KEYS.command)
     until_s, heard_ns, gap = time.monotonic() + 3.0, time.monotonic_ns(), (0, 0)  # five leases
     while time.monotonic() < until_s or ("viewer", False) not in changes:
         assert time.monotonic() < until_s + TIMEOUT_S
@@ -281,7 +299,7 @@ def test_a_hung_viewer_does_not_cut_the_robot_from_the_controller(join: Any, sta
 
 def test_close_unblocks_whoever_waits(join: Any) -> None:
     bus = join(robot=True)
-    subscribers = [bus.subscriber(KEYS.state), bus.subscriber(KEYS.events, cached=True)]
+    subscribers = [bus.subscriber(KEYS.state), bus.subscriber(KEYS.events)]
     results: list[Received | None] = []
     threads = [threading.Thread(target=lambda s=subscriber: results.append(s.recv())) for subscriber in subscribers]
     for thread in threads:
@@ -299,7 +317,7 @@ def test_close_is_bounded_while_a_peer_hangs(join: Any, start: Any, host: Host) 
     viewer = start("watch")
     eventually(lambda: bus.is_alive("viewer"))
     viewer.send_signal(signal.SIGSTOP)
-    flood = bus.publisher(KEYS.telemetry, Event)
+    flood = bus.publisher(KEYS.telemetry)
     for _ in range(2000):
         flood.put(Event(1, 1, 0, "controller", Severity.INFO, "load", 6000 * "x"))
     since_ns = time.monotonic_ns()
@@ -309,7 +327,7 @@ def test_close_is_bounded_while_a_peer_hangs(join: Any, start: Any, host: Host) 
 
 def test_after_close_put_does_nothing(join: Any) -> None:
     bus = join(robot=True)
-    publishers = [bus.publisher(KEYS.state, State, realtime=True), bus.publisher(KEYS.reference, Reference, cached=True)]
+    publishers = [bus.publisher(KEYS.state), bus.publisher(KEYS.reference)]
     bus.close()
     bus.close()
     publishers[0].put(STATE)
@@ -328,9 +346,9 @@ def test_a_process_that_forgets_to_close_exits(start: Any) -> None:
 
 def test_large_references_pass(join: Any) -> None:
     robot, other = join(robot=True), join()
-    references = robot.subscriber(KEYS.reference, cached=True)
+    references = robot.subscriber(KEYS.reference)
     large = Reference(1, 1, 0, 10**7, End.STOP, np.random.default_rng(1).normal(size=(100_000, 3)), np.zeros((100_000, 0)))
-    other.publisher(KEYS.reference, Reference, cached=True).put(large)
+    other.publisher(KEYS.reference).put(large)
     assert np.array_equal(decode(Reference, received(references).payload).y, large.y)
 
 
@@ -342,10 +360,10 @@ def test_what_is_longer_than_its_key_takes_is_withheld_and_what_no_key_takes_nev
         for key, subscriber in zip(keys, subscribers, strict=True):
             with session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK) as publisher:
                 eventually(lambda publisher=publisher: publisher.matching_status.matching)
-                for size in (1 << 24, most_bytes(key) + 1, most_bytes(key)):
+                for size in (1 << 24, key.stream.max_bytes + 1, key.stream.max_bytes):
                     publisher.put(bytes(size))
             got = [received(subscriber), received(subscriber)]
-            assert [(sample.size, len(sample.payload)) for sample in got] == [(most_bytes(key) + 1, 0), 2 * (most_bytes(key),)]
+            assert [(sample.size, len(sample.payload)) for sample in got] == [(key.stream.max_bytes + 1, 0), 2 * (key.stream.max_bytes,)]
 
 
 def test_whatever_peers_send_is_counted_and_the_next_message_passes(join: Any, endpoint: str) -> None:
@@ -362,7 +380,7 @@ def test_whatever_peers_send_is_counted_and_the_next_message_passes(join: Any, e
         samples = [received(states) for _ in range(6)]
         assert [intake.accept(sample, n) for n, sample in enumerate(samples)] == [None] * 6
     assert intake.refused == {"encoding": 2, "truncated": 1, "empty": 1, "big_endian": 1, "version": 1}
-    ours = join().publisher(KEYS.state, State, realtime=True)
+    ours = join().publisher(KEYS.state)
     eventually(lambda: ours.heard)
     ours.put(STATE)
     assert intake.accept(received(states), 7) is not None
@@ -371,7 +389,7 @@ def test_whatever_peers_send_is_counted_and_the_next_message_passes(join: Any, e
 def test_a_second_publisher_on_a_key_takes_nothing_over(join: Any) -> None:
     robot, first, second = join(robot=True), join(), join()
     states, intake = robot.subscriber(KEYS.state, capacity=64), Intake(State, stale_s=10.0)
-    ours, theirs = first.publisher(KEYS.state, State, realtime=True), second.publisher(KEYS.state, State, realtime=True)
+    ours, theirs = first.publisher(KEYS.state), second.publisher(KEYS.state)
     eventually(lambda: ours.heard and theirs.heard)
     ours.put(State(9, 0, 0, np.zeros(5)))
     assert intake.accept(received(states), 0) is not None

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from rti_mpc.errors import MessageError
-from rti_mpc.wire.document import DEEPEST, MOST_BYTES, read
+from rti_mpc.wire.document import MAX_BYTES, MAX_DEPTH, read
 
 
 def nested(depth: int) -> bytes:
@@ -24,8 +24,8 @@ def test_an_object_is_read_as_it_was_written() -> None:
         "ok": True,
     }
     assert read(json.dumps(value).encode()) == value
-    assert read(b"{}".ljust(MOST_BYTES)) == {}
-    assert read(nested(DEEPEST - 1))
+    assert read(b"{}".ljust(MAX_BYTES)) == {}
+    assert read(nested(MAX_DEPTH - 1))
 
 
 @pytest.mark.parametrize(
@@ -38,7 +38,7 @@ def test_an_object_is_read_as_it_was_written() -> None:
         (b'{"a": 1', "JSON object"),
         (b'{"a": "\\ud800"}', "JSON object"),  # cannot be printed
         (30_000 * b"[", "JSON object"),
-        (nested(DEEPEST), "inside one another"),
+        (nested(MAX_DEPTH), "inside one another"),
         (nested(10_000), "inside one another|JSON object"),
         (b'{"version": Infinity}', "finite"),
         (b'{"version": -Infinity}', "finite"),
@@ -47,7 +47,7 @@ def test_an_object_is_read_as_it_was_written() -> None:
         (b'{"version": 1' + 400 * b"0" + b"}", "2\\^64"),
         (b'{"version": -' + 5000 * b"9" + b"}", "2\\^64"),  # which Python would not even convert
         (b'{"version": 18446744073709551616}', "2\\^64"),
-        (b"{}".ljust(MOST_BYTES + 1), "at most"),
+        (b"{}".ljust(MAX_BYTES + 1), "at most"),
     ],
 )
 def test_all_else_is_refused_in_one_line(payload: bytes, wrong: str) -> None:

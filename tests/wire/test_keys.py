@@ -4,7 +4,8 @@ from __future__ import annotations
 import pytest
 
 from rti_mpc.errors import ConfigError
-from rti_mpc.wire.keys import LONGEST, ROLES, Keys, most_bytes, role_of
+from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.streams import ROLES, role_of
 
 
 def test_streams_lie_below_prefix_and_robot() -> None:
@@ -40,10 +41,9 @@ def test_other_names_are_none(name: str) -> None:
     assert role_of(f"rti_mpc/robot/alive/{name}") == ""
 
 
-def test_every_stream_has_a_longest_payload_wherever_it_lies() -> None:
+def test_a_key_knows_its_stream_wherever_it_lies() -> None:
+    """No name of a robot, and no role, makes it another: an event of the role `state` has the size of an event."""
     keys = Keys("state/fleet", "event")
-    names = {"state": "state", "anchored": "reference", "shadow_telemetry": "telemetry", "events": "event", "infos": "info", "actuation": "command"}
-    for name, stream in names.items():
-        assert most_bytes(getattr(keys, name)) == LONGEST[stream]
-    assert most_bytes(keys.info("robot")) == LONGEST["info"]
-    assert most_bytes("rti_mpc/robot/echo/ping") == LONGEST["command"]
+    longest = {"state": 1 << 16, "anchored": 1 << 23, "actuation": 1 << 20, "shadow_telemetry": 1 << 21, "events": 1 << 13, "infos": 1 << 16}
+    assert {name: getattr(keys, name).stream.max_bytes for name in longest} == longest
+    assert keys.event("state").stream.max_bytes == 1 << 13

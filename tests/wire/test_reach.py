@@ -67,7 +67,7 @@ def test_process_that_is_linked_says_what_does_not_come_until_it_has_come() -> N
         text = "no state of rti_mpc/test yet, from 1 others on the bus: is it running, and of this name?"
         while said.get(timeout=PATIENCE_S) != text:  # the link is made in its own time
             pass
-        states, seq, deadline_s = robot.publisher(KEYS.state, State, realtime=True), 0, time.monotonic() + PATIENCE_S
+        states, seq, deadline_s = robot.publisher(KEYS.state), 0, time.monotonic() + PATIENCE_S
         while not heard():
             states.put(State(1, seq := seq + 1, seq, np.zeros(5)))
             time.sleep(0.01)

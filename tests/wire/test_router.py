@@ -49,7 +49,7 @@ def router(endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
 def test_clients_wait_for_the_router_and_reach_each_other_through_it(router: subprocess.Popen[bytes], endpoint: str) -> None:
     settings = BusSettings(mode="client", connect=(endpoint,))
     with Bus(settings, KEYS) as robot, Bus(settings, KEYS) as controller:  # the router is still starting
-        states, seen = robot.publisher(KEYS.state, State, realtime=True), controller.subscriber(KEYS.state)
+        states, seen = robot.publisher(KEYS.state), controller.subscriber(KEYS.state)
         waiting = threading.Thread(target=seen.recv)
         waiting.start()
         deadline_s = time.monotonic() + TIMEOUT_S

@@ -13,7 +13,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.message import Reference
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.keys import Keys
-from rti_mpc.wire.layout import MOST_BYTES
+from rti_mpc.wire.layout import MAX_BYTES
 from rti_mpc.wire.session import RENDEZVOUS, BusSettings, zenoh_config
 
 SHIPPED = Path(__file__).parents[2] / "deploy" / "zenoh"
@@ -28,7 +28,7 @@ def value(settings: BusSettings, name: str) -> Any:
 def test_multicast_is_off_hangs_are_noticed_soon_and_no_message_is_larger_than_a_reference(settings: BusSettings) -> None:
     assert value(settings, "scouting/multicast/enabled") is False
     assert value(settings, "transport/link/tx/lease") == 2000
-    assert value(settings, "transport/link/rx/max_message_size") == MOST_BYTES[Reference] + 4096
+    assert value(settings, "transport/link/rx/max_message_size") == MAX_BYTES[Reference] + 4096
 
 
 @pytest.mark.parametrize("mode", ["peer", "client", "router"])
