@@ -457,6 +457,11 @@ class Controller:
         """Return robot time, s, from a local monotonic time to the state of the next sample."""
         return 1e-9 * (self.grid.act_ns - self.grid.delay_ns - self._states.clock.now_ns(local_ns))
 
+    @property
+    def robot_rate(self) -> float:
+        """Seconds of the robot per local second."""
+        return self._states.clock.rate
+
     def robot_now_ns(self, local_ns: int) -> int:
         """Return robot time at a local monotonic time."""
         return self._states.clock.now_ns(local_ns)

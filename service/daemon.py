@@ -29,6 +29,7 @@ from typing import Any
 from rti_mpc.controller import Controller, Timing
 from rti_mpc.errors import ConfigError
 from rti_mpc.latch import Latch
+from rti_mpc.leadership import differ
 from rti_mpc.message import Command, State
 from rti_mpc.rti import Rti
 from rti_mpc.wire.announcer import Announcer
@@ -40,7 +41,7 @@ from service.build import build_observer, build_rti
 from service.description import describe
 from service.fit import check_stop
 from service.latch_file import LatchFile
-from service.leadership import HEARING_S, LEADER, STANDBY, Leadership, differ, hear_others
+from service.leadership import HEARING_S, LEADER, STANDBY, Candidate, hear_others
 from service.operator_stop import OperatorStop
 from service.orders import Orders
 from service.params import Params
@@ -101,7 +102,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
             )
             return 1
         ocp = rti.ocp
-        leadership = Leadership(bus, controller, others, config_hash=config.config_hash, dt_s=ocp.dt, nu=ocp.model.nu, standby=standby)
+        leadership = Candidate(bus, controller, others, config_hash=config.config_hash, dt_s=ocp.dt, nu=ocp.model.nu, standby=standby)
         daemon = Daemon(config, controller, bus, leadership, params, lock, rti, outcomes, operator_stop)
         operator_stop.serve(bus, lambda: leadership.role, daemon.describe)
         bus.serve(bus.keys.request, daemon.orders.answer)
@@ -125,7 +126,7 @@ class Daemon:
         config: Config,
         controller: Controller,
         bus: Bus,
-        leadership: Leadership,
+        leadership: Candidate,
         params: Params,
         lock: Condition,
         rti: Rti,
@@ -243,6 +244,8 @@ class Daemon:
         try:
             act(subscriber)
         except Exception:
+            if self._bus.closed:
+                return  # under our hands: nothing of it was wanted any more
             log.exception("stopping after an unforeseen error")
             self._crashed.set()
 

@@ -70,7 +70,7 @@ FLOW: tuple[set[str], ...] = (
     {"polyline"},
     {"lives", "cadence", "heading", "mode", "schedule", "issued"},
     {"trajectory", "belief"},
-    {"guard", "sent"},
+    {"guard", "sent", "leadership"},
     {"model"},
     {"pioneer_3dx", "integrator", "track", "obstacle", "disturbance"},
     {"ocp"},

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who leads, decided state by state: without processes, on a bus of lists."""
+"""A controller among others, on a bus of lists: what it reads of what they send, and what it shows."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rti_mpc.wire.bus import Received, unix_s
 from rti_mpc.wire.cdr import encode, encoding
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
-from service.leadership import NUMBER_BITS, Leadership, Others, epoch_above
+from service.leadership import LOOK, LOOK_BYTES, Candidate, Others
 
 DT_S = 0.1
 DT_NS = 100_000_000
@@ -42,7 +42,7 @@ class Wire:
 
 
 class WireBus:
-    """As much of a bus as a `Leadership` uses."""
+    """As much of a bus as a `Candidate` uses."""
 
     def __init__(self, wire: Wire) -> None:
         self.keys = Keys()
@@ -81,13 +81,14 @@ class WireBus:
 
 @dataclass
 class Puppet:
-    """As much of a controller as a `Leadership` uses."""
+    """As much of a controller as a `Candidate` uses."""
 
     mode: Mode = Mode.TRACKING
     shadowing: bool = False
     epoch: int = 0
     heard: list[Command] = field(default_factory=list)
     notices: deque[Notice] = field(default_factory=deque)
+    robot_rate = 1.0
 
     def overhear(self, command: Command) -> None:
         self.heard.append(command)
@@ -102,19 +103,16 @@ class Puppet:
 class One:
     """One controller of several on a wire."""
 
-    def __init__(self, wire: Wire, *, standby: bool, number: int | None = None, dt_s: float = DT_S, config_hash: int = HASH) -> None:
+    def __init__(self, wire: Wire, *, standby: bool) -> None:
         self.bus, self.puppet, self.wire = WireBus(wire), Puppet(), wire
         bus, puppet = cast(Any, self.bus), cast(Any, self.puppet)
-        self.leadership = Leadership(bus, puppet, Others(0, None), config_hash=config_hash, dt_s=dt_s, nu=1, standby=standby)
-        if number is not None:
-            self.leadership.number = number
+        self.leadership = Candidate(bus, puppet, Others(0, None), config_hash=HASH, dt_s=DT_S, nu=1, standby=standby)
         self.leadership.declare()
         self._seq = 0
-        self._dt_ns = round(1e9 * dt_s)
 
     def see(self, k: float, late_ns: int = 0) -> bool:
         """Be shown the state of a sample; return whether it was answered."""
-        stamp_ns = round(k * self._dt_ns)
+        stamp_ns = round(k * DT_NS)
         state = State(1, round(10 * k), stamp_ns, np.zeros(1))
         self.leadership.hear(state, stamp_ns + late_ns)
         command = self.made(k)
@@ -126,9 +124,9 @@ class One:
     def made(self, k: float) -> Command:
         """A command that answers the state of a sample."""
         self._seq += 1
-        stamp_ns = round(k * self._dt_ns)
-        head = (self.puppet.epoch, self._seq, stamp_ns, 1, round(10 * k), stamp_ns, stamp_ns + self._dt_ns, HASH)
-        return Command(*head, Mode.TRACKING, QpStatus.SOLVED, self._dt_ns, np.zeros((1, 1)))
+        stamp_ns = round(k * DT_NS)
+        head = (self.puppet.epoch, self._seq, stamp_ns, 1, round(10 * k), stamp_ns, stamp_ns + DT_NS, HASH)
+        return Command(*head, Mode.TRACKING, QpStatus.SOLVED, DT_NS, np.zeros((1, 1)))
 
 
 @pytest.fixture
@@ -143,213 +141,6 @@ def pair() -> tuple[One, One]:
 
 def codes(one: One) -> list[str]:
     return [notice.code for notice in one.puppet.notices]
-
-
-def test_standby_hears_the_leader_and_leads_from_the_second_state_without_an_answer(pair: tuple[One, One]) -> None:
-    leader, standby = pair
-    assert standby.puppet.shadowing
-    assert [standby.see(k) for k in (5, 6, 7)] == [False, True, True]
-    assert [command.state_stamp_ns for command in standby.puppet.heard] == [k * DT_NS for k in range(1, 5)]
-    assert standby.leadership.epoch > leader.leadership.epoch
-    assert codes(standby) == ["took_over"]
-    assert not standby.puppet.shadowing
-
-
-def test_states_between_samples_are_no_silence(pair: tuple[One, One]) -> None:
-    """A robot that sends states five times a period: the leader answers each fifth, and has one period to do so."""
-    _, standby = pair
-    assert [standby.see(4 + k / 5) for k in range(1, 9)] == [False] * 7 + [True]
-
-
-def test_one_that_takes_over_between_samples_answers_the_next_one(pair: tuple[One, One]) -> None:
-    """With ten states a period, and somebody else who stands by: the silence it ended is none of its own."""
-    _, standby = pair
-    One(standby.wire, standby=True, number=standby.leadership.number + 1)
-    for i in range(41, 60):
-        standby.leadership.hear(State(1, i, i * DT_NS // 10, np.zeros(1)), i * DT_NS // 10)
-    assert standby.leadership.leading
-    assert standby.see(6)
-
-
-def test_leader_that_has_slept_says_nothing_until_it_has_listened(pair: tuple[One, One]) -> None:
-    leader, standby = pair
-    assert [standby.see(k) for k in (5, 6, 7)] == [False, True, True]
-    leader.bus.commands.clear()  # not here yet
-    assert not leader.see(8)
-    standby.see(8)
-    assert not leader.see(9)
-    assert leader.leadership.role == "standby"
-    assert codes(leader) == ["stepped_down"]
-    assert str(standby.leadership.epoch) in leader.puppet.notices[0].text
-
-
-def test_leader_that_nobody_has_replaced_goes_on_after_listening(pair: tuple[One, One]) -> None:
-    """No state reached anybody for a while: neither knows more than the other, and who led leads."""
-    leader, standby = pair
-    epoch = leader.leadership.epoch
-    assert [(leader.see(k), standby.see(k)) for k in (8, 9, 10)] == [(False, False), (True, False), (True, False)]
-    assert leader.leadership.epoch == leader.puppet.epoch == epoch
-    assert codes(leader) == codes(standby) == []
-
-
-def test_late_look_at_the_clock_counts_as_sleep(pair: tuple[One, One]) -> None:
-    """A process that was stopped may be shown a state of before: it is fresh by its stamp only."""
-    leader, _ = pair
-    assert not leader.see(5, late_ns=10 * DT_NS)
-    assert not leader.see(6, late_ns=9 * DT_NS + 10_000_000), "a queue of old states is no time to listen"
-    assert leader.see(7, late_ns=8 * DT_NS + 50_000_000)
-
-
-def test_state_shown_a_period_late_is_not_answered() -> None:
-    """The next one is out, and whoever stands by may have answered that."""
-    for late_ns, answered in ((DT_NS - 1, True), (DT_NS, False)):
-        leader, standby = One(wire := Wire(), standby=False), One(wire, standby=True)
-        assert leader.see(1)
-        for local_ns in range(DT_NS, 2 * DT_NS + late_ns, 10_000_000):
-            leader.leadership.listen(local_ns)  # awake all the time
-        assert leader.see(2, late_ns) == answered
-        assert not standby.leadership.leading
-
-
-@pytest.mark.parametrize("dead", [False, True])
-@pytest.mark.parametrize("shown", [{5: 30, 6: 11, 7: 0}, {7: 12}], ids=["late", "lost"])  # states, and by how many ms they come late
-def test_host_that_holds_both_up_changes_no_leader(shown: dict[int, int], dead: bool) -> None:
-    """At 50 Hz, for 50 ms: the leader listens before it goes on, and whoever stands by waits for that, but for a dead one no longer."""
-    wire = Wire()
-    leader, standby = One(wire, standby=False, dt_s=0.02), One(wire, standby=True, dt_s=0.02)
-    for k in range(1, 5):
-        assert [one.see(k) for one in (leader, standby)] == [True, False]
-    answers = []
-    for k, late_ms in (shown | dict.fromkeys(range(8, 12), 0)).items():
-        answers += [(k, one) for one in ([standby] if dead else [standby, leader]) if one.see(k, late_ns=1_000_000 * late_ms)]
-    assert {one for _, one in answers} == {standby if dead else leader}
-    assert answers[-1][0] == 11
-    assert codes(standby) == (["took_over"] if dead else [])
-
-
-def test_leader_that_answers_while_it_is_being_replaced_stays_the_leader(pair: tuple[One, One]) -> None:
-    leader, standby = pair
-    hear = standby.leadership.hear
-
-    def hear_and_compute(state: State, local_ns: int) -> None:
-        hear(state, local_ns)
-        if state.stamp_ns == 6 * DT_NS:
-            leader.wire.put(leader.bus, encode(leader.made(5)))  # comes at last
-
-    standby.leadership.hear = hear_and_compute  # type: ignore[method-assign]
-    assert [standby.see(k) for k in (5, 6, 7, 8)] == [False, False, False, True]
-    assert codes(standby) == ["took_over"]
-
-
-def test_leader_that_missed_states_says_nothing_until_it_has_listened(pair: tuple[One, One]) -> None:
-    """It was awake, and is shown the next state in time: those before were lost on the way, to it alone perhaps."""
-    leader, _ = pair
-    for local_ns in range(4 * DT_NS, 7 * DT_NS, 10_000_000):
-        leader.leadership.listen(local_ns)
-    assert not leader.see(7)
-    assert leader.see(8)
-
-
-def test_leader_that_has_just_woken_sends_no_ramp_of_its_own(pair: tuple[One, One]) -> None:
-    leader, _ = pair
-    leader.leadership.listen(30 * DT_NS)
-    assert not leader.leadership.sends(leader.made(4))
-
-
-def test_standby_that_has_slept_itself_listens_first(pair: tuple[One, One]) -> None:
-    leader, standby = pair
-    for k in range(5, 20):
-        assert leader.see(k)
-    standby.bus.commands.clear()
-    assert not standby.see(20)
-    leader.see(20)
-    assert not standby.see(21)
-
-
-def test_leader_alone_answers_whatever_it_missed() -> None:
-    leader = One(Wire(), standby=False)
-    assert [leader.see(k) for k in (1, 2, 9, 10)] == [True] * 4
-
-
-def test_of_two_that_stand_by_the_lower_number_leads_and_the_other_a_period_later_if_it_must() -> None:
-    for dead in (False, True):
-        wire = Wire()
-        leader, high, low = One(wire, standby=False), One(wire, standby=True), One(wire, standby=True)
-        for one, number in ((high, 9), (low, 5)):
-            one.leadership.number = number
-            one.leadership._tokens = {}
-            one.leadership._company = set()
-        for one in (high, low):
-            one.leadership.declare()
-        for k in range(1, 5):
-            assert [one.see(k) for one in (leader, high, low)] == [True, False, False]
-        answers = [(high.see(k), not dead and low.see(k)) for k in range(5, 9)]
-        assert answers == ([(False, False), (False, False), (True, False), (True, False)] if dead else [(False, False)] + [(False, True)] * 3)
-
-
-def test_higher_epoch_ends_a_leadership_at_once(pair: tuple[One, One]) -> None:
-    leader, standby = pair
-    standby.leadership._lead()
-    standby.leadership.declare()
-    assert standby.see(5)
-    assert not leader.see(5)
-    assert [leader.see(k) for k in (6, 7)] == [False, True], "and begins another when that falls silent"
-    assert leader.leadership.epoch > standby.leadership.epoch
-
-
-def test_robot_that_restarts_or_sets_its_clock_back_is_not_a_silent_leader(pair: tuple[One, One]) -> None:
-    _, standby = pair
-    for epoch, stamp_ns in ((2, 90 * DT_NS), (2, 91 * DT_NS), (2, 3 * DT_NS), (2, 4 * DT_NS)):
-        standby.leadership.hear(State(epoch, 1, stamp_ns, np.zeros(1)), stamp_ns)
-        assert not standby.leadership.leading
-    standby.leadership.hear(State(2, 1, 5 * DT_NS, np.zeros(1)), 5 * DT_NS)
-    assert standby.leadership.leading, "silence is counted from there"
-
-
-def test_controller_with_nothing_to_command_takes_over_nothing(pair: tuple[One, One]) -> None:
-    _, standby = pair
-    standby.puppet.mode = Mode.WAITING
-    assert [standby.see(k) for k in range(5, 12)] == [False] * 7
-    standby.puppet.mode = Mode.TRACKING
-    assert [standby.see(k) for k in (12, 13)] == [False, True]
-
-
-def test_one_that_stands_by_takes_over_from_no_leader_of_another_configuration_and_says_so_once() -> None:
-    wire = Wire()
-    leader, standby = One(wire, standby=False), One(wire, standby=True, config_hash=8)
-    for k in range(1, 6):
-        leader.see(k)
-        standby.see(k)
-    assert f"{HASH:016x}" in standby.leadership.misfit
-    assert [standby.see(k) for k in range(6, 10)] == [False] * 4
-    assert codes(standby) == ["misfit"]
-
-
-def test_a_command_of_another_configuration_ends_neither_leader_nor_standby(pair: tuple[One, One]) -> None:
-    """Those that have led this robot, or stood by for one that did, go on when it is silent."""
-    leader, standby = pair
-    forged = replace(leader.made(4), epoch=leader.leadership.epoch + 1, config_hash=666)
-    leader.bus.commands.append(Received(encode(forged), encoding(Command), ""))
-    standby.bus.commands.append(Received(encode(forged), encoding(Command), ""))
-    answered = [[one.see(k) for one in pair] for k in range(5, 12)]
-    assert answered[0] == [False, False]
-    assert sum(map(any, answered)) >= 5
-    assert all(sum(both) <= 1 for both in answered)
-    assert f"{666:016x}" in next(notice.text for notice in leader.puppet.notices if notice.code == "stepped_down")
-    assert "misfit" not in codes(leader) + codes(standby)
-
-
-def test_replayed_commands_make_no_leader_step_down_and_no_standby_believe_in_them(pair: tuple[One, One]) -> None:
-    leader, standby = pair
-    sent = [replace(leader.made(k), epoch=leader.leadership.epoch, seq=k) for k in (1, 2, 3, 4)]
-    leader._seq = 4
-    for k in range(5, 12):
-        for command in sent:
-            for one in pair:
-                one.bus.commands.append(Received(encode(command), encoding(Command), ""))
-        assert [one.see(k) for one in pair] == [True, False]
-    assert codes(leader) == codes(standby) == []
-    assert [command.state_stamp_ns for command in standby.puppet.heard] == [k * DT_NS for k in range(1, 12)]
 
 
 @pytest.mark.parametrize(
@@ -386,31 +177,6 @@ def test_a_hundred_names_keep_nobody_from_taking_over(pair: tuple[One, One]) -> 
     assert any(standby.see(k) for k in range(5, 10))
 
 
-def test_epochs_of_two_numbers_never_meet() -> None:
-    rng = np.random.default_rng(1)
-    for heard, other, number in rng.integers(0, [2**52, 2**52, 2**NUMBER_BITS], size=(500, 3)).tolist():
-        epoch = epoch_above(heard, number)
-        assert heard < epoch <= heard + 2**NUMBER_BITS
-        assert epoch % 2**NUMBER_BITS == number
-        assert epoch != epoch_above(other, (number + 1) % 2**NUMBER_BITS)
-
-
-def test_never_two_answer_a_state_and_nearly_every_state_is_answered_though_controllers_sleep() -> None:
-    """Three that hear each other; each falls asleep now and then, for up to 20 states."""
-    rng = np.random.default_rng(2)
-    answered = []
-    for _ in range(20):
-        wire = Wire()
-        ones = [One(wire, standby=k > 0) for k in range(3)]
-        asleep = np.zeros(3, dtype=int)
-        for k in range(1, 200):
-            falling = (rng.random(3) < 0.02) & (asleep == 0)
-            asleep = np.where(falling, rng.integers(1, 20, 3), np.maximum(asleep - 1, 0))
-            answered.append(sum(one.see(k) for one, rest in zip(ones, asleep, strict=True) if rest == 0))
-    assert max(answered) == 1
-    assert np.mean(answered) > 0.9
-
-
 def test_what_is_no_command_for_this_robot_unseats_nobody_and_is_counted(pair: tuple[One, One]) -> None:
     """Of a robot with more inputs, or of a version to come: it says that it leads, and it cannot be played."""
     leader, standby = pair
@@ -421,3 +187,42 @@ def test_what_is_no_command_for_this_robot_unseats_nobody_and_is_counted(pair: t
     assert leader.leadership.leading
     assert leader.leadership.commands_in.refused == {"length": 1, "version": 1}
     assert not leader.puppet.heard
+
+
+def test_what_is_decided_reaches_the_controller_and_the_bus(pair: tuple[One, One]) -> None:
+    leader, standby = pair
+    assert (standby.puppet.shadowing, standby.leadership.role, leader.leadership.relieved) == (True, "standby", True)
+    assert [standby.see(k) for k in (5, 6)] == [False, True]
+    assert (standby.puppet.shadowing, standby.puppet.epoch) == (False, standby.leadership.epoch)
+    assert standby.leadership.declare()
+    assert not standby.leadership.declare(), "once a change"
+    assert standby.leadership.role == "controller"
+    assert not leader.see(7)
+    assert (leader.puppet.shadowing, codes(leader), codes(standby)) == (True, ["stepped_down"], ["took_over"])
+    assert [command.state_stamp_ns for command in leader.puppet.heard] == [6 * DT_NS]
+
+
+@pytest.mark.parametrize(("rows", "most"), [(1, LOOK), (LOOK_BYTES // 8, 1)], ids=["many", "long"])
+def test_one_look_reads_no_more_than_it_takes_whatever_waits(pair: tuple[One, One], rows: int, most: int) -> None:
+    """Each has a higher sequence number than all before: none is left out by what was read."""
+    leader, standby = pair
+    long = np.zeros((rows, 1))
+    flood = [replace(leader.made(4), epoch=leader.leadership.epoch, state_seq=40, seq=100 + i, u=long) for i in range(3 * LOOK)]
+    waiting = [Received(encode(command), encoding(Command), "") for command in flood]
+    before = len(standby.puppet.heard)
+    standby.bus.commands.extend(waiting)
+    for looks in (1, 2, 3):
+        standby.leadership.listen(4 * DT_NS + looks)
+        assert len(standby.puppet.heard) - before == looks * most
+    assert len(standby.bus.commands) == len(flood) - 3 * most, "the rest waits on"
+
+
+def test_leader_that_slept_finds_out_within_the_time_it_listens_though_all_that_may_wait_waits(pair: tuple[One, One]) -> None:
+    """The new leader's command lies behind a full ring of an old one's, repeated."""
+    leader, standby = pair
+    old = replace(leader.made(4), epoch=leader.leadership.epoch)
+    leader.bus.commands.extend([Received(encode(old), encoding(Command), "")] * LOOK)
+    assert [standby.see(k) for k in (5, 6)] == [False, True]
+    assert not leader.see(7)
+    leader.leadership.listen(7 * DT_NS + 10_000_000)
+    assert leader.leadership.role == "standby"
