@@ -166,7 +166,7 @@ class Guard:
             if not believed:
                 return
             if self._late:
-                self._restart_clock()
+                self._clock.jump()
             if ahead_ns > max(JUMP_NS, 2.5 * self._clock.period_ns):
                 self._jump(state, local_ns, "ahead")
         self._take(state, local_ns)
@@ -382,7 +382,7 @@ class Guard:
             self.notices.append(self._cadence.notice)
         if counts and untimed != bool(self._cadence.fault):
             self._brake(state.stamp_ns, state.stamp_ns)
-            self._restart_clock()
+            self._clock.jump()
             self._take(state, local_ns)
         return counts and not (untimed or self._cadence.fault)
 
@@ -406,7 +406,7 @@ class Guard:
         else:
             self._open_ns = EVER_NS
             self._say(Severity.WARNING, "robot_restarted", "the robot was restarted: starting anew")
-        self._restart_clock()
+        self._clock.reset()
         self._schedule.brake(self._limits.u_rest, EVER_NS)
         self._leader = 0, -1
         self._told_ns = EVER_NS
@@ -420,13 +420,7 @@ class Guard:
         self._say(Severity.WARNING, "clock_jumped", text)
         self._brake(before_ns, state.stamp_ns)
         self._open_ns = EVER_NS
-        self._restart_clock()
-
-    def _restart_clock(self) -> None:
-        """Forget the robot's clock, but not how fast it runs."""
-        rate = self._clock.rate
-        self._clock.reset()
-        self._clock.rate = rate
+        self._clock.jump()
 
     def _brake(self, before_ns: int, now_ns: int) -> None:
         """Let the robot brake now from what acts at a time, which may be one of another clock."""

@@ -391,6 +391,19 @@ def test_another_life_of_the_robot_begins_at_rest_with_any_controller(scene: Sce
     assert passed.u[0].tolist() == (STEP / 2).tolist()
 
 
+@pytest.mark.parametrize("rate", [0.1, 0.5])
+def test_life_whose_clock_runs_at_another_speed_is_guarded_by_that(scene: Scene, rate: float) -> None:
+    """A simulation that is restarted slower: of the life before, nothing is kept."""
+    scene.drive(1000)
+    scene.rate = rate
+    scene.restart()
+    scene.wait(1000)
+    begun_ns = scene.guard.robot_now_ns(scene.local_ns)
+    scene.heard = False
+    scene.wait(200)
+    assert scene.guard.robot_now_ns(scene.local_ns) - begun_ns == pytest.approx(200 * MS, rel=0.01)  # of the robot, whose states are exact
+
+
 @pytest.mark.parametrize("jump_ms", [-5000, -600, 300, 5000, 10**9])
 def test_clock_that_jumps_is_answered_by_braking(scene: Scene, jump_ms: int) -> None:
     scene.wait(5000)
