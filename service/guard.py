@@ -186,5 +186,7 @@ class Process:
             for received in iter(subscriber.recv, None):
                 act(received)
         except Exception:
+            if self._bus.closed:
+                return  # under our hands: nothing of it was wanted any more
             log.exception("stopping after an unforeseen error")
             self._crashed.set()

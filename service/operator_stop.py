@@ -78,7 +78,12 @@ class OperatorStop:
 
         def follow() -> None:
             for received in iter(subscriber.recv, None):
-                self._overhear(received)
+                try:
+                    self._overhear(received)
+                except Exception:  # of whatever a change sets in motion: a bus that refuses to tell it, say
+                    if bus.closed:
+                        return
+                    log.exception("%s: what it says was obeyed, and then an unforeseen error", received.key)
 
         Thread(target=follow, name="stop_heard", daemon=True).start()
 
@@ -135,9 +140,11 @@ class OperatorStop:
                 return
             self._obey(latch)
             self.latch = latch
-            self._tell()
-        with self._storing:
-            self._storing.notify_all()
+            try:
+                self._tell()
+            finally:  # it is stored though it cannot be told
+                with self._storing:
+                    self._storing.notify_all()
 
     def _overhear(self, received: Received) -> None:
         """Look at a description of anybody's; in a thread of its own, which nothing that is heard may end."""

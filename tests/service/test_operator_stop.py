@@ -52,7 +52,8 @@ class Process:
         self.told: list[Any] = []
         self.keys = Keys()
         self.heard: queue.Queue[Received | None] = queue.Queue()
-        self.closed = threading.Event()
+        self.ended = threading.Event()
+        self.closed = False
         self.served: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {}
         self.stop = OperatorStop(file, self.obeyed.append, self.said.put)
         self.stop.listen(cast(Any, self))
@@ -60,12 +61,12 @@ class Process:
 
     def subscriber(self, key: str, **_: object) -> Any:
         assert key == self.keys.infos
-        inbox, closed = self.heard, self.closed
+        inbox, ended = self.heard, self.ended
 
         class Subscriber:
             def recv(self) -> Received | None:
                 if (received := inbox.get()) is None:
-                    closed.set()
+                    ended.set()
                 return received
 
         return Subscriber()
@@ -81,7 +82,7 @@ class Process:
         for payload in payloads:
             self.heard.put(Received(payload if isinstance(payload, bytes) else json.dumps(payload).encode(), "application/json", "info/guard"))
         self.heard.put(None)
-        assert self.closed.wait(PATIENCE_S)
+        assert self.ended.wait(PATIENCE_S)
 
 
 @pytest.fixture
@@ -219,3 +220,35 @@ def test_what_is_no_request_changes_nothing(disk: Disk, request_: dict[str, Any]
     with pytest.raises(MessageError):
         process.ask("stop", latch={"counter": -1})
     assert process.obeyed == []
+
+
+def test_bus_that_refuses_to_tell_a_change_ends_no_thread_and_the_change_is_stored(disk: Disk, caplog: pytest.LogCaptureFixture) -> None:
+    """As one does that is being closed, of which the process does not know yet."""
+    process = Process(disk)
+
+    def refuse() -> None:
+        raise RuntimeError("session closed")
+
+    process.stop._tell = refuse
+    released = Latch(6, False, WHEN, "asked for by bob@lab")
+    process.describe({"latch": asdict(STOPPED)}, {"latch": asdict(released)})
+    assert process.obeyed == [STOPPED, released]
+    assert process.stop._stored(PATIENCE_S) == ""
+    assert disk.read()[0] == released
+    assert "session closed" in caplog.text
+
+
+def test_change_that_is_heard_while_the_bus_closes_ends_its_thread_in_silence(disk: Disk, caplog: pytest.LogCaptureFixture) -> None:
+    before = set(threading.enumerate())
+    process = Process(disk)
+    (thread,) = (thread for thread in threading.enumerate() if thread not in before and thread.name == "stop_heard")
+
+    def refuse() -> None:
+        process.closed = True
+        raise RuntimeError("session closed")
+
+    process.stop._tell = refuse
+    process.heard.put(Received(json.dumps({"latch": asdict(STOPPED)}).encode(), "application/json", "info/guard"))
+    thread.join(PATIENCE_S)
+    assert not thread.is_alive()
+    assert (process.obeyed, caplog.messages) == ([STOPPED], [])
