@@ -89,7 +89,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
                 controller.enable()
 
     outcomes = realtime.attempt(**config.realtime.model_dump())  # when all is compiled, and before any thread is started, for all of them
-    with Bus(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
+    with Bus.join(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
         operator_stop = OperatorStop(LatchFile(bus.keys, state), obey, controller.notices.append)
         operator_stop.listen(bus)
         others = hear_others(bus, stop)

@@ -150,7 +150,7 @@ def drive(run: Plan, console: Console, stop: Event) -> Outcome:
     logs.mkdir(exist_ok=True)
     keys = run.config.keys()
     with (
-        Bus(BusSettings(listen=(endpoint,), connect=()), keys) as bus,
+        Bus.join(BusSettings(listen=(endpoint,), connect=()), keys) as bus,
         Children(logs) as children,
         Board(console, title, ocp.model.inputs, run.duration_s) as board,
     ):

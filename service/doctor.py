@@ -128,7 +128,7 @@ def round_trip_us(config: Config) -> Array:
     command = Command(0, 0, 0, 0, 0, 0, 0, 0, Mode.TRACKING, QpStatus.SOLVED, 0, np.zeros((config.ocp.N, model.nu)))
     with (
         tempfile.TemporaryDirectory() as folder,
-        Bus(BusSettings(listen=(endpoint,), connect=()), keys) as bus,
+        Bus.join(BusSettings(listen=(endpoint,), connect=()), keys) as bus,
         Children(Path(folder)) as children,
     ):
         pinger = Pinger(bus, State(0, 0, 0, np.zeros(model.nx)))

@@ -85,7 +85,7 @@ class Echo(Pinger):
 def main(settings: BusSettings, keys: Keys, size: int) -> None:
     """Answer every ping with so many bytes, until stopped."""
     stop = stop_on_signals()
-    with Bus(settings, keys) as bus:
+    with Bus.join(settings, keys) as bus:
         pings, pongs = bus.subscriber(keys.of(PING)), bus.publisher(keys.of(PONG))
         bus.alive(ROLE)
         Thread(target=_answer, args=(pings, pongs, bytes(size)), daemon=True).start()

@@ -60,7 +60,7 @@ def main(config: Config, bus_settings: BusSettings, *, state: Path | None = None
     if not config.guard.enabled:
         raise ConfigError("guard.enabled must be true for the robot to take what a guard passes on, got false")
     stop = stop or stop_on_signals()
-    with Bus(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
+    with Bus.join(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
         heard, intake = bus.subscriber(bus.keys.actuation, capacity=RING_MESSAGES), bus.intake(Command, HEARING_S, choosing=True)
         if bus.is_alive(ROLE, HEARING_S):
             print(f"rti-mpc: {config.robot} already has a guard: stop it first, or give this robot another name", file=sys.stderr)

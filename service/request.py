@@ -49,7 +49,7 @@ def main(bus_settings: BusSettings, keys: Keys, request: str, timeout_s: float, 
 
 def ask(bus_settings: BusSettings, keys: Keys, request: dict[str, Any], timeout_s: float) -> dict[str, Any] | None:
     """Return the answer if the request was granted; otherwise say why not, and return None."""
-    with Bus(bus_settings, keys, timeout_s=timeout_s) as bus:
+    with Bus.join(bus_settings, keys, timeout_s=timeout_s) as bus:
         try:
             answer = bus.request(keys.request, request, timeout_s)
         except TimeoutError:
@@ -81,7 +81,7 @@ def stop_or_enable(bus_settings: BusSettings, keys: Keys, what: str, timeout_s: 
     answers: dict[str, dict[str, Any]] = {}
     acting = GUARD if guarded else LEADER
     try:
-        with Bus(bus_settings, keys, timeout_s=timeout_s) as bus:
+        with Bus.join(bus_settings, keys, timeout_s=timeout_s) as bus:
             for answer in asked_again(bus, {"request": what, "by": operator()}, timeout_s):
                 answers[str(answer.get("role", "somebody"))] = answer
                 if answers.get(acting, {}).get("ok") is True:

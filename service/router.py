@@ -27,7 +27,7 @@ def main(settings: BusSettings, keys: Keys, *, stop: Event | None = None) -> Non
         ConfigError: If an endpoint is taken, or Zenoh refuses a setting.
     """
     stop = stop or stop_on_signals()
-    with Bus(replace(settings, mode="router"), keys, stop=stop, say=log.warning) as bus:
+    with Bus.join(replace(settings, mode="router"), keys, stop=stop, say=log.warning) as bus:
         bus.alive("router")
         log.info("routing")
         stop.wait()

@@ -60,7 +60,7 @@ def main(
     rerun_spawn |= rerun_connect is None and rerun_save is None
     url = viewer_url(rerun_connect or ADDRESS)
     stop = stop or stop_on_signals()
-    with Bus(bus_settings, keys, stop=stop, say=log.warning) as bus:
+    with Bus.join(bus_settings, keys, stop=stop, say=log.warning) as bus:
         listener = Listener(bus)
         bus.expect("message", lambda: listener.received)
         outlets = [file_outlet(rerun_save, keys.robot)] if rerun_save is not None else []

@@ -91,7 +91,7 @@ def main(
         ConfigError: A setting is out of range, an endpoint is taken.
     """
     stop = stop or stop_on_signals()
-    with Bus(bus_settings, keys, stop=stop, say=logger.warning) as bus:
+    with Bus.join(bus_settings, keys, stop=stop, say=logger.warning) as bus:
         wait_for_another(bus, stop)
         robot = Robot(settings, bus, keys.actuation if guarded else keys.command, speed, log)
         life = {"role": ROLE, "epoch": robot.body.epoch, "speed": speed, "state_period_s": settings.state_period_s}

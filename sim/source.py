@@ -70,7 +70,7 @@ def main(
     y = rows(trajectory, period_s, heading, a, psi0)
     p: Array = np.empty((len(y), 0)) if parameters is None else parameters(period_s * np.arange(len(y), dtype=np.float64))
     stop = stop or stop_on_signals()
-    with Bus(bus_settings, keys, stop=stop, say=logger.warning) as bus:
+    with Bus.join(bus_settings, keys, stop=stop, say=logger.warning) as bus:
         source = Source(bus, trajectory, y, p, round(1e9 * period_s))
         bus.alive(ROLE)
         logger.info("%s, heading %s, for %s", trajectory.name, heading, keys.robot)

@@ -27,7 +27,7 @@ CLOCKS = {"time", "datetime", "threading", "multiprocessing", "concurrent", "ran
 # Who alone imports a package, wherever in the file.
 ALONE = {
     "osqp": {"rti_mpc/solver.py"},
-    "zenoh": {"rti_mpc/wire/bus.py", "rti_mpc/wire/session.py"},
+    "zenoh": {"rti_mpc/wire/session.py", "rti_mpc/wire/zenoh_session.py"},
     "rerun": {"service/blueprint.py", "service/outlet.py", "service/recording.py", "service/view.py"},
     "qpsolvers": {"rti_mpc/qp.py", "rti_mpc/foreign_solver.py"},
     "casadi": {

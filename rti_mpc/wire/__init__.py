@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The wire: CDR bytes, keys, one source a key, and the bus. Leaf of the library; `bus` alone imports zenoh."""
+"""Wire: CDR bytes, keys, one source per key, and the bus. `session` and `zenoh_session` alone import zenoh."""

@@ -26,7 +26,8 @@ from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.session import BusSettings
-from rti_mpc.wire.streams import RELAY
+from rti_mpc.wire.streams import ACTUATION, COMMAND, RELAY
+from rti_mpc.wire.zenoh_session import ZenohSession
 
 ROLE = "relay"
 STALE_S = 0.25
@@ -75,16 +76,22 @@ JUMPS = {"ahead": JUMP_NS, "behind": -JUMP_NS}  # of the robot's clock
 class Relay:
     """Passes states on, and commands back."""
 
-    def __init__(self, bus: Bus, robot: Keys) -> None:
-        keys = bus.keys
+    def __init__(self, robot: Bus, bus: Bus) -> None:
+        """
+        Begin.
+
+        Args:
+            robot: Where the robot is.
+            bus: Where those are who hear of it.
+        """
         self._offset_ns = 0
         self._losing = False  # whether commands are lost
         self._stamp_ns = 0  # of the last state, as the robot sent it
         self._fault: tuple[str, int, deque[State]] = ("none", 0, deque())  # what, for how many states, those it holds back
-        self._states = bus.publisher(keys.state)
-        self._follow(bus.subscriber(robot.state, capacity=RING_MESSAGES), bus.intake(State, STALE_S), self._change)
-        for there, here in ((robot.command, keys.command), (robot.actuation, keys.actuation)):
-            commands, publisher = bus.subscriber(here, capacity=RING_MESSAGES), bus.publisher(there)
+        self._states = bus.publisher(bus.keys.state)
+        self._follow(robot.subscriber(robot.keys.state, capacity=RING_MESSAGES), bus.intake(State, STALE_S), self._change)
+        for stream in (COMMAND, ACTUATION):
+            commands, publisher = bus.subscriber(bus.keys.of(stream), capacity=RING_MESSAGES), robot.publisher(robot.keys.of(stream))
             self._follow(commands, bus.intake(Command, STALE_S), partial(self._pass, publisher))
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -126,8 +133,9 @@ class Relay:
 def main(settings: BusSettings, robot: Keys, keys: Keys) -> None:
     """Relay until stopped."""
     stop = stop_on_signals()
-    with Bus(settings, keys, stop=stop) as bus:
-        relay = Relay(bus, robot)
+    with ZenohSession(settings, stop=stop) as session:
+        bus = Bus(session, keys)
+        relay = Relay(Bus(session, robot), bus)
         bus.serve(keys.of(RELAY), relay.answer)
         bus.alive(ROLE)
         stop.wait()

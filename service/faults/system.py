@@ -93,7 +93,7 @@ class System:
                 self.start("router")
             client = BusSettings(mode="client", connect=(self._endpoint,))
             settings = client if wiring is Wiring.ROUTER else BusSettings(listen=(self._endpoint,), connect=())
-            self.bus = Bus(settings, self.keys, timeout_s=PATIENCE_S, stop=stop)
+            self.bus = Bus.join(settings, self.keys, timeout_s=PATIENCE_S, stop=stop)
             self.witness = Witness(self.bus)
             self._references = self.bus.publisher(self.keys.reference)
             self.observer = Observer(self.bus, self._robot_keys)

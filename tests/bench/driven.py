@@ -75,7 +75,7 @@ def driven(folder: Path, dt_s: float, duration_s: float, realtime: str = "") -> 
     """Drive until left, at most for so long."""
     endpoint, toml = free_endpoint(), sampled(folder, dt_s, realtime)
     keys = load(toml).keys()
-    with Bus(BusSettings(listen=(endpoint,), connect=()), keys) as bus, Children(folder) as children:
+    with Bus.join(BusSettings(listen=(endpoint,), connect=()), keys) as bus, Children(folder) as children:
         lives: set[str] = set()
         bus.watch_alive(lambda role, present: (lives.add if present else lives.discard)(role))
         meeting = ("-l", "tcp/127.0.0.1:0", "-e", endpoint)

@@ -105,7 +105,7 @@ def test_command_takes_at_most_one_and_a_half_echoes_and_the_feedback(config: Co
     nu = 2
     command = encode(Command(0, 0, 0, 0, 0, 0, 0, 0, Mode.TRACKING, QpStatus.SOLVED, 0, np.zeros((config.ocp.N, nu))))
     telemetry: list[Telemetry] = []
-    with Bus(BusSettings(listen=(endpoint,), connect=()), keys) as bus, bare_session(len(command)) as session, Children(tmp_path) as children:
+    with Bus.join(BusSettings(listen=(endpoint,), connect=()), keys) as bus, bare_session(len(command)) as session, Children(tmp_path) as children:
         lives: set[str] = set()
         bus.watch_alive(lambda role, present: (lives.add if present else lives.discard)(role))
         children.start("controller", "service.cli", "run", toml, "-e", endpoint)

@@ -61,7 +61,7 @@ class Rig:
         self.lbu, self.ubu, self.step = limits.lbu, limits.ubu, np.minimum(-limits.lbdu, limits.ubdu)
         self._slew, self._guard, self._folder = limits.slew, guard, folder
         self._endpoint = free_endpoint()
-        self.bus = Bus(BusSettings(listen=(self._endpoint,), connect=()), loaded.keys())
+        self.bus = Bus.join(BusSettings(listen=(self._endpoint,), connect=()), loaded.keys())
         keys = self.bus.keys
         self._states = self.bus.publisher(keys.state)
         self._commands = self.bus.publisher(keys.command)

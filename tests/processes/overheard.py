@@ -65,7 +65,7 @@ def write(name: str, cls: type[Any], fields: tuple[str, ...], subscriber: Subscr
 def main(endpoint: str, path: Path) -> None:
     """Write down what passes until stopped."""
     stop = stop_on_signals()
-    with Bus(BusSettings(mode="client", connect=(endpoint,)), KEYS, timeout_s=60.0, stop=stop) as bus, path.open("w", buffering=1) as file:
+    with Bus.join(BusSettings(mode="client", connect=(endpoint,)), KEYS, timeout_s=60.0, stop=stop) as bus, path.open("w", buffering=1) as file:
         for name, (key, cls, fields) in STREAMS.items():
             threading.Thread(target=write, args=(name, cls, fields, bus.subscriber(key, capacity=1024), file), daemon=True).start()
         stop.wait()

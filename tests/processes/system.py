@@ -66,7 +66,7 @@ class System:
         self.lives: set[str] = set()
         self.fault_at_ns = 0  # when the last fault began, by the monotonic clock
         self._stack = ExitStack()
-        self.bus = self._stack.enter_context(Bus(BusSettings(connect=(self.endpoint,)), KEYS))
+        self.bus = self._stack.enter_context(Bus.join(BusSettings(connect=(self.endpoint,)), KEYS))
         self.bus.watch_alive(lambda role, present: (self.lives.add if present else self.lives.discard)(role))
 
     def __enter__(self) -> System:

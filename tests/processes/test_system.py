@@ -129,7 +129,7 @@ def test_of_several_planners_a_controller_that_starts_after_them_follows_the_lat
     keys, latest = system.bus.keys, 5
     with ExitStack() as stack:
         for epoch in (latest, *range(1, latest)):
-            planner = stack.enter_context(Bus(BusSettings(connect=(system.endpoint,)), keys))
+            planner = stack.enter_context(Bus.join(BusSettings(connect=(system.endpoint,)), keys))
             there = Reference(epoch, 1, 0, 10**9, End.HOLD, np.full((600, 3), 0.1 * epoch), np.zeros((600, 0)))
             planner.publisher(keys.reference).put(there)
         system.start("robot", "controller")

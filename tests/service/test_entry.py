@@ -37,7 +37,7 @@ class Slow:
 slow = Slow()
 
 def main():
-    bus = Bus(BusSettings(connect=(sys.argv[1],)), Keys(robot="test"))
+    bus = Bus.join(BusSettings(connect=(sys.argv[1],)), Keys(robot="test"))
     heard = threading.Event()
     def follow(subscriber):
         for _ in iter(subscriber.recv, None):
@@ -57,7 +57,7 @@ def run(code: str, *arguments: str, **options: object) -> subprocess.CompletedPr
 @contextmanager
 def flooded(endpoint: str) -> Iterator[None]:
     """States without a pause."""
-    with Bus(BusSettings(listen=(endpoint,), connect=()), KEYS) as bus:
+    with Bus.join(BusSettings(listen=(endpoint,), connect=()), KEYS) as bus:
         states, over = bus.publisher(KEYS.state), threading.Event()
 
         def publish() -> None:
@@ -152,7 +152,7 @@ def test_log_that_nobody_takes_ends_nobody(output: str) -> None:
     line = f"{sys.executable} -c 'from service.cli import main; main()' router {SHIPPED} -l {endpoint} {output}; exit ${{PIPESTATUS[0]}}"
     with (
         subprocess.Popen(["bash", "-c", line], cwd=ROOT, stderr=subprocess.PIPE, process_group=0) as process,
-        Bus(BusSettings(mode="client", connect=(endpoint,)), CONFIG.keys()) as bus,
+        Bus.join(BusSettings(mode="client", connect=(endpoint,)), CONFIG.keys()) as bus,
     ):
         try:
             assert bus.is_alive("router", 20.0)

@@ -79,7 +79,7 @@ def test_a_loop_that_never_pauses_is_killed_before_it_hangs_the_machine() -> Non
 def test_controller_tells_what_it_was_granted_and_controls_all_the_same(tmp_path: Path) -> None:
     toml, endpoint = tmp_path / "robot.toml", free_endpoint()
     toml.write_text(SHIPPED.read_text() + "[realtime]\npriority = 10\ncores = [4096]\n")
-    with Bus(BusSettings(listen=(endpoint,), connect=()), KEYS) as bus, Children(tmp_path) as children:
+    with Bus.join(BusSettings(listen=(endpoint,), connect=()), KEYS) as bus, Children(tmp_path) as children:
         infos = bus.subscriber(KEYS.info("controller"))
         pid = children.start("controller", "service.cli", "run", toml, "-e", endpoint)
         info: dict[str, Any] = json.loads(until(infos.try_recv, "its description").payload)

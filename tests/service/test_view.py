@@ -51,7 +51,7 @@ port, epoch = sys.argv[1], int(sys.argv[2])
 keys = Keys(robot="r")
 label = lambda name: {"name": name, "unit": "m", "angle": False}
 info = {"role": "controller", "states": [label("x"), label("y")], "inputs": [label("f")], "outputs": [label("x"), label("y")], "dt_s": 0.01}
-with Bus(BusSettings(listen=(f"tcp/127.0.0.1:{port}",), connect=(f"tcp/127.0.0.1:{port}",)), keys) as bus:
+with Bus.join(BusSettings(listen=(f"tcp/127.0.0.1:{port}",), connect=(f"tcp/127.0.0.1:{port}",)), keys) as bus:
     bus.publish_json(keys.info("controller"), info)
     reference = bus.publisher(keys.reference)
     reference.put(Reference(epoch, 1, 0, 10**7, End.HOLD, np.zeros((2, 2)), np.zeros((2, 0))))
@@ -197,7 +197,7 @@ def test_a_disk_that_fills_up_ends_the_recording_but_neither_the_viewer_nor_what
     children += [Child(PUBLISHER, port, 1), Child(VIEWER, port, tmp_path / "run.rrd", screen.url)]
     viewer = children[1]
     try:
-        with Bus(BusSettings(connect=(f"tcp/127.0.0.1:{port}",)), Keys(robot="r")) as bus:
+        with Bus.join(BusSettings(connect=(f"tcp/127.0.0.1:{port}",)), Keys(robot="r")) as bus:
             events = bus.subscriber(bus.keys.event("viewer"), capacity=8)
             viewer.wait_for(f"{screen.url}: open")
             until(lambda: (tmp_path / "run.rrd").stat().st_size > 0, "it records")
@@ -218,7 +218,7 @@ def test_a_disk_that_fills_up_ends_the_recording_but_neither_the_viewer_nor_what
 def test_a_listener_that_falls_behind_keeps_the_newest_and_counts_the_rest(port: int) -> None:
     keys = Keys(robot="r")
     endpoint = f"tcp/127.0.0.1:{port}"
-    with Bus(BusSettings(listen=(endpoint,)), keys) as robot, Bus(BusSettings(connect=(endpoint,)), keys) as bus:
+    with Bus.join(BusSettings(listen=(endpoint,)), keys) as robot, Bus.join(BusSettings(connect=(endpoint,)), keys) as bus:
         listener = Listener(bus, capacity=10)
         publisher = robot.publisher(keys.state)
         seen = 0
@@ -247,7 +247,7 @@ def test_a_takeover_behind_a_guard_is_seen_in_the_recording(port: int, tmp_path:
     keys, endpoint, path = Keys(robot="r"), f"tcp/127.0.0.1:{port}", tmp_path / "run.rrd"
     label = {"name": "x", "unit": "m", "angle": False}
     outlet = file_outlet(path, "r")
-    with Bus(BusSettings(listen=(endpoint,)), keys) as robot, Bus(BusSettings(connect=(endpoint,)), keys) as bus:
+    with Bus.join(BusSettings(listen=(endpoint,)), keys) as robot, Bus.join(BusSettings(connect=(endpoint,)), keys) as bus:
         listener = Listener(bus)
         robot.publish_json(keys.info("controller"), {"role": "controller", "states": [label], "inputs": [{**label, "name": "f"}]})
         state, telemetry = robot.publisher(keys.state), robot.publisher(keys.telemetry)

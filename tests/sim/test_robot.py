@@ -80,7 +80,7 @@ def running(script: str, *arguments: object) -> Iterator[subprocess.Popen[bytes]
 @contextmanager
 def peer(endpoint: str) -> Iterator[Bus]:
     """Join the bus for a bounded time: every receive ends then."""
-    with Bus(BusSettings(connect=(endpoint,)), KEYS) as bus:
+    with Bus.join(BusSettings(connect=(endpoint,)), KEYS) as bus:
         timer = threading.Timer(PATIENCE_S, bus.close)
         timer.start()
         yield bus

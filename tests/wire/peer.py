@@ -65,4 +65,4 @@ def careless(bus: Bus) -> None:
 if __name__ == "__main__":
     what, endpoint, *listen = sys.argv[1:]
     settings = BusSettings(listen=(endpoint,) if listen else (), connect=(endpoint,), cfg=FAST)
-    enter(lambda: globals()[what](Bus(settings, KEYS)))  # as every process of ours: the interpreter is not finalized around threads of Zenoh
+    enter(lambda: globals()[what](Bus.join(settings, KEYS)))  # as every process of ours: the interpreter is not finalized around threads of Zenoh

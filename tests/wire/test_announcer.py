@@ -27,7 +27,7 @@ END = Notice(Severity.INFO, "end", "that is all")
 def said(notices: list[tuple[float, Notice]], monkeypatch: pytest.MonkeyPatch) -> list[Event]:
     """Events that a peer hears of notices, each at a time in s."""
     endpoint, heard = free_endpoint(), dict[int, Event]()
-    with Bus(BusSettings(listen=(endpoint,)), Keys()) as bus, Bus(BusSettings(connect=(endpoint,)), Keys()) as peer:
+    with Bus.join(BusSettings(listen=(endpoint,)), Keys()) as bus, Bus.join(BusSettings(connect=(endpoint,)), Keys()) as peer:
         subscriber = peer.subscriber(peer.keys.event("controller"), capacity=64)
         announcer = Announcer(bus, "controller", epoch=1)
 

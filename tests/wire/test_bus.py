@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -25,6 +26,7 @@ from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.layout import MAX_BYTES
 from rti_mpc.wire.streams import RING_BYTES
+from rti_mpc.wire.zenoh_session import ZenohSession
 from service.host import Host
 from tests.in_time import MS, explained, in_time
 
@@ -74,7 +76,7 @@ def join(endpoint: str) -> Iterator[Callable[..., Bus]]:
 
         def join(*, robot: bool = False, **settings: Any) -> Bus:
             settings = {"listen": (endpoint,) if robot else (), "connect": (endpoint,), "cfg": FAST, **settings}
-            return stack.enter_context(Bus(BusSettings(**settings), KEYS))
+            return stack.enter_context(Bus.join(BusSettings(**settings), KEYS))
 
         yield join
 
@@ -310,6 +312,45 @@ def test_close_unblocks_whoever_waits(join: Any) -> None:
     assert results == [None, None]
     assert subscribers[0].try_recv() is None
     assert subscribers[0].recv() is None
+
+
+def test_one_session_speaks_for_two_robots(join: Any, endpoint: str) -> None:
+    """Each is met, asked and left as if it had a process of its own."""
+    keys = Keys(robot="first"), Keys(robot="second")
+    with ZenohSession(BusSettings(listen=(endpoint,), connect=(endpoint,), cfg=FAST)) as session:
+        robots = [Bus(session, mine) for mine in keys]
+        with (
+            Bus.join(BusSettings(connect=(endpoint,), cfg=FAST), keys[0]) as first,
+            Bus.join(BusSettings(connect=(endpoint,), cfg=FAST), keys[1]) as second,
+        ):
+            controllers = first, second
+            for number, (robot, mine) in enumerate(zip(robots, keys, strict=True)):
+                robot.alive("robot")
+                robot.publish_json(mine.info("robot"), {"role": "robot", "number": number})
+                robot.serve(mine.stop, lambda request, number=number: {"ok": True, "by": number})
+            states = [controller.subscriber(controller.keys.state) for controller in controllers]
+            publishers = [robot.publisher(robot.keys.state) for robot in robots]
+            for number, (controller, publisher, subscriber) in enumerate(zip(controllers, publishers, states, strict=True)):
+                assert controller.is_alive("robot", TIMEOUT_S)
+                assert json.loads(received(controller.subscriber(controller.keys.infos)).payload)["number"] == number
+                assert controller.request(controller.keys.stop, {}, TIMEOUT_S) == {"ok": True, "by": number}
+                eventually(lambda publisher=publisher: publisher.heard)
+                publisher.put(replace(STATE, epoch=1 + number))
+                assert decode(State, received(subscriber).payload).epoch == 1 + number
+            assert [subscriber.try_recv() for subscriber in states] == [None, None], "neither hears of the other's robot"
+
+            commands = robots[0].subscriber(keys[0].command)
+            waiting = threading.Thread(target=commands.recv)
+            waiting.start()
+            robots[0].close()
+            waiting.join(TIMEOUT_S)
+            assert not waiting.is_alive(), "who waits for the robot that is left is told so"
+            publishers[0].put(STATE)
+            eventually(lambda: not first.is_alive("robot", 0.05))
+            assert second.is_alive("robot", TIMEOUT_S)
+            publishers[1].put(replace(STATE, epoch=2, seq=2))
+            assert decode(State, received(states[1]).payload).seq == 2
+            assert states[0].try_recv() is None
 
 
 def test_close_is_bounded_while_a_peer_hangs(join: Any, start: Any, host: Host) -> None:

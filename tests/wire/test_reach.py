@@ -42,7 +42,7 @@ def expecting(bus: Bus) -> Callable[[], bool]:
 @pytest.mark.parametrize("address", ["tcp/127.0.0.1:9", "tls/127.0.0.1:9", "tcp/nowhere.invalid:7447"])
 def test_process_that_reaches_nobody_says_so_again_and_again(address: str) -> None:
     said: Queue[str] = Queue()
-    with Bus(BusSettings(connect=(address,)), KEYS, say=said.put) as bus:
+    with Bus.join(BusSettings(connect=(address,)), KEYS, say=said.put) as bus:
         expecting(bus)
         for _ in range(3):
             text = said.get(timeout=PATIENCE_S)
@@ -52,7 +52,7 @@ def test_process_that_reaches_nobody_says_so_again_and_again(address: str) -> No
 
 def test_process_that_waits_to_be_reached_says_that_nobody_has_come() -> None:
     said: Queue[str] = Queue()
-    with Bus(BusSettings(listen=(free_endpoint(),), connect=()), KEYS, say=said.put) as bus:
+    with Bus.join(BusSettings(listen=(free_endpoint(),), connect=()), KEYS, say=said.put) as bus:
         expecting(bus)
         assert said.get(timeout=PATIENCE_S) == "not connected, no state yet: nobody has come to the endpoints listened on"
 
@@ -60,8 +60,8 @@ def test_process_that_waits_to_be_reached_says_that_nobody_has_come() -> None:
 def test_process_that_is_linked_says_what_does_not_come_until_it_has_come() -> None:
     endpoint, said = free_endpoint(), Queue[str]()
     with (
-        Bus(BusSettings(listen=(endpoint,), connect=()), KEYS) as robot,
-        Bus(BusSettings(connect=(endpoint,)), KEYS, say=said.put) as bus,
+        Bus.join(BusSettings(listen=(endpoint,), connect=()), KEYS) as robot,
+        Bus.join(BusSettings(connect=(endpoint,)), KEYS, say=said.put) as bus,
     ):
         heard = expecting(bus)
         text = "no state of rti_mpc/test yet, from 1 others on the bus: is it running, and of this name?"
@@ -87,5 +87,5 @@ def test_client_without_a_router_says_so_and_ends_well_when_it_is_stopped() -> N
             stop.set()
 
     with pytest.raises(Stopped, match="stopped before a router was there"):
-        Bus(BusSettings(mode="client", connect=("tcp/127.0.0.1:9",)), KEYS, stop=stop, say=say)
+        Bus.join(BusSettings(mode="client", connect=("tcp/127.0.0.1:9",)), KEYS, stop=stop, say=say)
     assert said.get() == "not connected: no router answers at tcp/127.0.0.1:9: nobody is there, or the address is wrong"

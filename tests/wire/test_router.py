@@ -48,7 +48,7 @@ def router(endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
 
 def test_clients_wait_for_the_router_and_reach_each_other_through_it(router: subprocess.Popen[bytes], endpoint: str) -> None:
     settings = BusSettings(mode="client", connect=(endpoint,))
-    with Bus(settings, KEYS) as robot, Bus(settings, KEYS) as controller:  # the router is still starting
+    with Bus.join(settings, KEYS) as robot, Bus.join(settings, KEYS) as controller:  # the router is still starting
         states, seen = robot.publisher(KEYS.state), controller.subscriber(KEYS.state)
         waiting = threading.Thread(target=seen.recv)
         waiting.start()
@@ -61,7 +61,7 @@ def test_clients_wait_for_the_router_and_reach_each_other_through_it(router: sub
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_router_ends_cleanly_within_a_second(router: subprocess.Popen[bytes], endpoint: str, host: Host, number: int) -> None:
-    with Bus(BusSettings(mode="client", connect=(endpoint,)), KEYS) as client:
+    with Bus.join(BusSettings(mode="client", connect=(endpoint,)), KEYS) as client:
         assert client.is_alive("router", TIMEOUT_S)
         since_ns = time.monotonic_ns()
         router.send_signal(number)

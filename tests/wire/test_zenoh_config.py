@@ -77,7 +77,7 @@ def test_what_zenoh_refuses_is_named(settings: BusSettings, word: str) -> None:
 @pytest.mark.parametrize("listen", ["tcp/127.0.0.1:99999", "carrier/pigeon", "tcp/192.0.2.1:7447"])
 def test_endpoints_that_cannot_be_listened_on_are_refused(listen: str) -> None:
     with pytest.raises(ConfigError, match="endpoints"):
-        Bus(BusSettings(listen=(listen,), connect=()), Keys())
+        Bus.join(BusSettings(listen=(listen,), connect=()), Keys())
 
 
 def test_an_endpoint_already_taken_is_refused() -> None:
@@ -85,7 +85,7 @@ def test_an_endpoint_already_taken_is_refused() -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         with pytest.raises(ConfigError, match="in use"):
-            Bus(BusSettings(listen=(f"tcp/127.0.0.1:{taken.getsockname()[1]}",), connect=()), Keys())
+            Bus.join(BusSettings(listen=(f"tcp/127.0.0.1:{taken.getsockname()[1]}",), connect=()), Keys())
 
 
 @pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1", "127.0.0.1:7447", "tcp/", "tls/robot.local", ""])

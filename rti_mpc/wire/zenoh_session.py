@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Zenoh session of one process, with every trap of it closed off: what a `rti_mpc.wire.bus.Bus` speaks through.
+
+* Whatever is received waits in a ring of fixed size that drops the oldest: an
+  unread subscriber stops nobody, and no Python runs in a thread of Zenoh.
+* Whatever is sent is dropped rather than waited for where a link is congested.
+* A session hears nothing of what it publishes itself.
+* `ZenohSession.close` is bounded, unblocks every `recv`, and the interpreter then exits.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+from collections.abc import Callable, Iterator
+from itertools import islice
+from typing import Any, Generic
+
+import zenoh
+from zenoh import ext
+
+from rti_mpc.wire import document
+from rti_mpc.wire.cdr import M, encode, encoding
+from rti_mpc.wire.keys import Key
+from rti_mpc.wire.received import Received
+from rti_mpc.wire.session import BusSettings, endpoints, open_session, zenoh_config
+
+CLOSE_TIMEOUT_S = 0.5
+HEARTBEAT_S = 1.0  # of a cached publisher, which tells the number of its last message
+MAX_ENCODING = 256  # characters of an encoding that are looked at
+RING_TOKENS = 1024  # changes of presence that wait to be told
+RING_QUERIES = 16  # requests that wait to be answered
+GONE = ("closed", "Undeclared")  # words of Zenoh, of a session or a publisher that is no more
+JSON = "application/json"  # encoding of descriptions, requests and answers
+
+give_way: Callable[[], None] = getattr(os, "sched_yield", lambda: None)  # not on every system
+
+
+class ZenohPublisher(Generic[M]):
+    """Sends the messages of a stream. `put` never blocks, and does nothing once it is undeclared or the session closed."""
+
+    def __init__(self, publisher: zenoh.Publisher | ext.AdvancedPublisher, *, realtime: bool = False) -> None:
+        self._publisher = publisher
+        self._realtime = realtime
+
+    @property
+    def heard(self) -> bool:
+        """Whether anybody listens now; of a cached publisher always true, since its last message waits for them."""
+        if not isinstance(self._publisher, zenoh.Publisher):
+            return True
+        status: Any = self._publisher.matching_status  # an object, always true, whatever its type hint says
+        return bool(status.matching)
+
+    def put(self, message: M) -> None:
+        """Send a message to whoever listens now, and to late joiners if the publisher is cached."""
+        self.put_bytes(encode(message))
+
+    def put_bytes(self, payload: bytes) -> None:
+        """Send bytes as they are."""
+        try:
+            self._publisher.put(payload)
+        except zenoh.ZError as error:
+            if not any(word in str(error) for word in GONE):
+                raise
+        if self._realtime:
+            give_way()  # to the thread that sends it: whoever puts goes on computing, and cores may be few
+
+    def undeclare(self) -> None:
+        """Leave the key."""
+        publisher: Any = self._publisher
+        publisher.undeclare()
+
+
+class ZenohSubscriber:
+    """Receives from one key expression into a ring: the newest samples, oldest first. After `ZenohSession.close`, nothing."""
+
+    def __init__(self, subscriber: zenoh.Subscriber[Any] | ext.AdvancedSubscriber[Any], key: Key[Any], capacity: int, own: str) -> None:
+        self._subscriber = subscriber
+        self._capacity = capacity
+        self._handler = subscriber.handler
+        self._key = "" if "*" in key else str(key)
+        self._max_bytes = key.stream.max_bytes
+        self._own = own  # a cache answers its own session, too
+        self._encoding: tuple[zenoh.Encoding | None, str] = None, ""  # the last one, and its text: to compare costs a fifth of making it
+
+    def recv(self) -> Received | None:
+        """Next sample, waiting for it; None once the session is closed."""
+        try:
+            while (received := self._received(self._handler.recv())) is None:
+                pass
+        except zenoh.ZError:
+            return None
+        return received
+
+    def try_recv(self) -> Received | None:
+        """Next sample, None if there is none now."""
+        try:
+            while (sample := self._handler.try_recv()) is not None:
+                if (received := self._received(sample)) is not None:
+                    return received
+        except zenoh.ZError:
+            return None
+        return None
+
+    def drain(self) -> list[Received]:
+        """All samples there are now, oldest first, and of those that come meanwhile no more than the ring holds."""
+        return list(islice(iter(self.try_recv, None), self._capacity))
+
+    def undeclare(self) -> None:
+        """Hear no more; whoever waits is told so."""
+        subscriber: Any = self._subscriber
+        subscriber.undeclare()
+
+    def _received(self, sample: zenoh.Sample) -> Received | None:
+        if self._own and (info := sample.source_info) is not None and str(info.source_id.zid) == self._own:
+            return None
+        if sample.encoding != self._encoding[0]:
+            self._encoding = sample.encoding, str(sample.encoding)[:MAX_ENCODING]
+        key, size = self._key or str(sample.key_expr), len(sample.payload)
+        if size > self._max_bytes:
+            return Received(b"", self._encoding[1], key, withheld=size)  # not even copied
+        return Received(sample.payload.to_bytes(), self._encoding[1], key)
+
+
+class ZenohSession:
+    """A session as `rti_mpc.wire.bus.Session` describes it."""
+
+    def __init__(
+        self,
+        settings: BusSettings,
+        *,
+        timeout_s: float = math.inf,
+        stop: threading.Event | None = None,
+        say: Callable[[str], object] = lambda _: None,
+    ) -> None:
+        """
+        Open a session.
+
+        Args:
+            settings: How.
+            timeout_s: How long a client waits for its router.
+            stop: Ends that wait when set.
+            say: Takes a line about who is not reached.
+
+        Raises:
+            ConfigError: Zenoh refuses a setting, an endpoint is taken, or no router was there in time.
+            Stopped: The wait was ended by `stop`.
+        """
+        self.connects_to = endpoints(zenoh_config(settings))
+        self._session = open_session(settings, timeout_s, stop, say)
+
+    def __enter__(self) -> ZenohSession:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close it within half a second, even where Zenoh takes longer; every `recv` returns None."""
+        closing = threading.Thread(target=self._session.close, daemon=True)
+        closing.start()
+        closing.join(CLOSE_TIMEOUT_S)
+
+    @property
+    def links(self) -> int | None:
+        """How many others this process is linked to; None once it is closed."""
+        try:
+            return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
+        except zenoh.ZError:
+            return None
+
+    def publisher(self, key: Key[M]) -> ZenohPublisher[M]:
+        """Publisher of a stream, with the quality of service that the table gives it."""
+        message, qos = key.stream.message, key.stream.qos
+        options: Any = {
+            "encoding": JSON if message is None else encoding(message),
+            "priority": getattr(zenoh.Priority, qos.priority),
+            "express": qos.express,
+            "congestion_control": getattr(zenoh.CongestionControl, qos.congestion),
+            "allowed_destination": zenoh.Locality.REMOTE,
+        }
+        if not qos.cached:
+            return ZenohPublisher(self._session.declare_publisher(key, **options), realtime=qos.express)
+        # A last message that was dropped would not be missed without heartbeats.
+        options["sample_miss_detection"] = ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None)
+        return ZenohPublisher(ext.declare_advanced_publisher(self._session, key, cache=ext.CacheConfig(1), publisher_detection=True, **options))
+
+    def subscriber(self, key: Key[Any], capacity: int, *, history: bool) -> ZenohSubscriber:
+        """Subscriber to a stream, see `rti_mpc.wire.bus.Bus.subscriber`."""
+        capacity = key.stream.capacity(capacity)
+        ring: Any = zenoh.handlers.RingChannel(capacity)
+        origin = zenoh.Locality.REMOTE
+        if not (history and key.stream.qos.cached):
+            return ZenohSubscriber(self._session.declare_subscriber(key, ring, allowed_origin=origin), key, capacity, own="")
+        request = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+        recovery = ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
+        subscriber = ext.declare_advanced_subscriber(self._session, key, ring, allowed_origin=origin, history=request, recovery=recovery)
+        return ZenohSubscriber(subscriber, key, capacity, own=str(self._session.info.zid()))
+
+    def serve(self, key: Key[Any], answer: Callable[[Received], bytes | None]) -> Any:
+        """Answer queries, in a thread of its own, until what is returned is undeclared; None is no answer."""
+        ring: Any = zenoh.handlers.RingChannel(RING_QUERIES)
+        queryable = self._session.declare_queryable(key, ring)
+
+        def act(query: zenoh.Query) -> None:
+            with query:
+                payload = answer(_withheld(query.payload, key, key.stream.max_bytes))
+                if payload is not None:
+                    query.reply(key, payload, encoding=JSON)
+
+        _follow(queryable.handler, act)
+        return queryable
+
+    def ask(self, key: Key[Any], payload: bytes, timeout_s: float) -> Iterator[Received]:
+        """Yield what all who serve a key answer, as it comes."""
+        replies = self._session.get(
+            key,
+            timeout=timeout_s,
+            payload=payload,
+            encoding=JSON,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            priority=getattr(zenoh.Priority, key.stream.qos.priority),
+            express=key.stream.qos.express,
+        )
+        for reply in replies:
+            if reply.ok is not None:
+                yield _withheld(reply.ok.payload, key, document.MAX_BYTES)
+
+    def token(self, key: Key[Any]) -> Any:
+        """Show presence until what is returned is undeclared, the session closed or the process gone."""
+        return self._session.liveliness().declare_token(key)
+
+    def present(self, key: Key[Any], timeout_s: float) -> bool:
+        """Whether anybody shows presence, ourselves included, and is heard of in time."""
+        return any(reply.ok is not None for reply in self._session.liveliness().get(key, timeout=timeout_s))
+
+    def watch(self, key: Key[Any], tell: Callable[[str, bool], None]) -> Any:
+        """Tell, in a thread of its own, the keys of those present and whether they are, now and at every change."""
+        ring: Any = zenoh.handlers.RingChannel(RING_TOKENS)
+        subscriber = self._session.liveliness().declare_subscriber(key, ring, history=True)
+        _follow(subscriber.handler, lambda sample: tell(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
+        return subscriber
+
+
+def _withheld(payload: zenoh.ZBytes | None, key: str, max_bytes: int) -> Received:
+    """Return a payload, without its bytes where those are too many."""
+    size = 0 if payload is None else len(payload)
+    return Received(b"" if payload is None or size > max_bytes else payload.to_bytes(), JSON, key, withheld=size if size > max_bytes else 0)
+
+
+def _follow(handler: Any, act: Callable[[Any], None]) -> None:
+    """Act on what comes, in a thread of its own, until the session is closed."""
+
+    def follow() -> None:
+        while True:
+            try:
+                item = handler.recv()
+            except zenoh.ZError:
+                return
+            try:
+                act(item)
+            except zenoh.ZError:  # whoever asked, or the session, is gone
+                continue
+
+    threading.Thread(target=follow, daemon=True).start()
