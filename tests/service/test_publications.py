@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The column of the table of streams that says who may publish, against each process as it runs."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+
+from rti_mpc.message import State
+from rti_mpc.trajectory import eight
+from rti_mpc.wire import bus as bus_module
+from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.streams import RELAY, STREAMS
+from service import daemon, echo, guard, request, router
+from service.build import robot_settings
+from service.config import load
+from service.faults import relay
+from sim import robot, source
+from sim.settings import RobotSettings
+from tests.wire.fake_session import FakeSession, Said
+
+CONFIG = load(Path(__file__).parents[2] / "deploy" / "pioneer_3dx.toml")
+GUARDED = CONFIG.model_copy(update={"guard": CONFIG.guard.model_copy(update={"enabled": True})})
+KEYS, SETTINGS = CONFIG.keys(), BusSettings()
+
+STOPPED = Event()  # each runs once through, from its start to its end
+STOPPED.set()
+
+
+@pytest.fixture
+def session(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeSession]:
+    session = FakeSession()
+    for module in (bus_module, relay):
+        monkeypatch.setattr(module, "ZenohSession", lambda *_, **__: session)
+    for module in (echo, relay):
+        monkeypatch.setattr(module, "stop_on_signals", lambda: STOPPED)
+    yield session
+    gc.enable()  # which a controller disables
+    gc.unfreeze()
+
+
+def may(*roles: str) -> set[Said]:
+    """What the table lets roles publish, answer and show."""
+    return {(stream.kind, stream.name, role if stream.by_role else "") for stream in STREAMS for role in roles if role in stream.publishers}
+
+
+def controllers(folder: Path) -> None:
+    for standby in (False, True):
+        daemon.main(CONFIG, SETTINGS, standby=standby, state=folder, stop=STOPPED)
+
+
+PROCESSES: dict[tuple[str, ...], Callable[[Path], object]] = {
+    ("robot",): lambda _: robot.main(RobotSettings(**robot_settings(CONFIG)), SETTINGS, KEYS, stop=STOPPED),
+    ("reference",): lambda _: source.main(eight(), SETTINGS, KEYS, stop=STOPPED),
+    ("controller", "standby"): controllers,
+    ("guard",): lambda folder: guard.main(GUARDED, SETTINGS, state=folder, stop=STOPPED),
+    ("router",): lambda _: router.main(SETTINGS, KEYS, stop=STOPPED),
+    ("relay",): lambda _: relay.main(SETTINGS, Keys("behind", KEYS.robot), KEYS),
+    ("echo",): lambda _: echo.main(SETTINGS, KEYS, 100),
+    ("operator",): lambda _: echo.Pinger(Bus.join(SETTINGS, KEYS), State(1, 1, 0, np.zeros(5))),
+}
+
+
+@pytest.mark.parametrize("roles", PROCESSES, ids="_".join)
+def test_process_publishes_what_the_table_lets_its_roles_and_nothing_else(roles: tuple[str, ...], session: FakeSession, tmp_path: Path) -> None:
+    PROCESSES[roles](tmp_path)
+    assert session.said == may(*roles)
+
+
+def test_viewer_publishes_what_the_table_lets_it(session: FakeSession, tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    from service import view
+
+    view.main(SETTINGS, KEYS, rerun_save=tmp_path / "run.rrd", stop=STOPPED)
+    assert session.said == may("viewer")
+
+
+def test_every_role_that_may_publish_has_a_process_here() -> None:
+    assert {role for stream in STREAMS for role in stream.publishers} == {"viewer", *(role for roles in PROCESSES for role in roles)}
+
+
+def test_operator_asks_whom_the_table_lets_him(session: FakeSession, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """And in fault injection the relay, too."""
+    assert request.main(SETTINGS, KEYS, "params", 0.05) == 1
+    assert request.stop_or_enable(SETTINGS, KEYS, "stop", 0.05, guarded=False, state=tmp_path) == 1
+    assert session.asked == {stream.name for stream in STREAMS if "operator" in stream.askers} - {RELAY.name}
+    assert session.said == set()
+    assert "no controller that answers" in capsys.readouterr().err
+
+
+def test_bus_declares_no_more_however_often_a_role_is_taken() -> None:
+    session = FakeSession()
+    bus = Bus(session, KEYS)
+    counts = []
+    for _ in range(3):
+        for role in ("standby", "controller"):
+            token = bus.alive(role)
+            bus.publisher(bus.keys.event(role))
+            bus.publish_json(bus.keys.info(role), {})
+            bus.withdraw_json(bus.keys.info(role))
+            token.undeclare()
+        counts.append(session.living)
+    assert counts == [2, 2, 2]
