@@ -2,9 +2,11 @@
 """
 Real-time nonlinear model predictive control: numbers in, numbers out.
 
-Data flows one way: model, integrator, ocp, transcription, codegen, qp, solver,
-rti, controller, wire. Names are imported on first use, so that a process which
-only speaks the wire contract loads neither CasADi nor OSQP.
+Data flows one way: model, ocp, linearization, riccati, active_set, rti. What the
+active set cannot solve, or another solver is asked for, takes the side branch of the
+sample's QP: transcription, qp, solver. The controller stands behind rti, the wire
+beside it. Names are imported on first use, so that a process which only speaks the
+wire contract loads neither CasADi nor OSQP.
 
 References, cited by key throughout:
 
@@ -19,6 +21,13 @@ References, cited by key throughout:
 * [Ghadimi2015] E. Ghadimi, A. Teixeira, I. Shames, M. Johansson, "Optimal parameter selection for the alternating direction method of
   multipliers (ADMM): quadratic problems", IEEE Trans. Autom. Control 60(3), 2015.
 * [Stellato2020] B. Stellato et al., "OSQP: an operator splitting solver for quadratic programs", Math. Prog. Comp. 12, 2020.
+* [FanYuan2005] J. Fan, Y. Yuan, "On the quadratic convergence of the Levenberg-Marquardt method without nonsingularity assumption", Computing 74,
+  2005.
+* [Hintermueller2003] M. Hintermüller, K. Ito, K. Kunisch, "The primal-dual active set strategy as a semismooth Newton method", SIAM J. Optim. 13(3),
+  2003.
+* [Judice1994] J. J. Júdice, F. M. Pires, "A block principal pivoting algorithm for large-scale strictly monotone linear complementarity problems",
+  Comput. Oper. Res. 21(5), 1994.
+* [Pannocchia2003] G. Pannocchia, J. B. Rawlings, "Disturbance models for offset-free model-predictive control", AIChE J. 49(2), 2003.
 """
 
 from __future__ import annotations

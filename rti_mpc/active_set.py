@@ -42,34 +42,41 @@ class ActiveSet:
         advance: Moves the last plan on by one stage to be the guess, and linearizes there.
         linearize: Does so at the guess as it is.
         gain: Computes the gains; after either of these, that is all of the preparation.
+        roll_out: Makes the plan, and finds the places; `certify` judges that plan, `refine` improves it.
         iterations: Roll-outs of the last solve.
         res_prim: Largest violation of dynamics, bounds and increments by the last plan that was certified, relative to their scales.
         res_dual: Largest amount by which the cost of that plan can be above the optimum, relative to 1 plus its cost, normalised.
     """
 
     def __init__(self, functions: Places, certificate: ca.Function, guess: Guess, make: Callable[[ca.Function], ca.Function]) -> None:
-        x, u, u_prev, *_ = guess.sample
-        weights = guess.sample[5:]
-        stages: Array = np.zeros(functions.linearize.numel_out(0))
-        gains: Array = np.zeros(functions.gains.numel_out(0))
+        stages: Array = np.zeros(functions.linearize.numel_out("stages"))
+        gains: Array = np.zeros(functions.gains.numel_out("gains"))
         # Like the guess and the plan made at it: these are found at those, and the next ones are those moved on by a stage.
-        self._places: Array = np.zeros(functions.roll_out.numel_out(5))
+        self._places: Array = np.zeros(functions.roll_out.numel_out("places_found"))
         self._found = np.zeros_like(self._places)
         changes: Array = np.zeros(1)
         self._changes = changes.data
         self._stiff = np.full(1, PATH[-1])
-        self.advance = bind(make(functions.advance), (*guess.plan[:2], *guess.sample[2:], self._found), (x, u, self._places, stages))
-        self.linearize = bind(make(functions.linearize), guess.sample, (stages,))
-        self.gain = bind(make(functions.gains), (stages, u, *weights, self._places, self._stiff), (gains,))
-        multipliers: Array = np.zeros(functions.roll_out.numel_out(6))
-        fixed = (stages, gains, *weights, self._places, self._stiff)
-        self._roll_out = bind(make(functions.roll_out), (x, u, u_prev, guess.x0, *fixed), (*guess.plan, changes, self._found, multipliers))
-        plan, slopes = guess.plan[:2], np.zeros_like(u)
-        verdict: tuple[Array, ...] = tuple(np.zeros(1) for _ in range(3))
-        self._verdict = tuple(array.data for array in verdict)
-        self._certify = bind(make(certificate), (x, u, u_prev, guess.x0, stages, *plan, multipliers, *weights), (slopes, *verdict))
-        self._refine = bind(make(functions.refine), (x, u, u_prev, *fixed, slopes, *plan, multipliers), (*plan, multipliers))
-        self._refined = (*plan, multipliers)
+        multipliers: Array = np.zeros(functions.roll_out.numel_out("multipliers"))
+        slopes = np.zeros_like(guess.plan.u)
+        verdict: dict[str, Array] = {name: np.zeros(1) for name in ("primal", "gap", "cost")}
+        self._verdict = tuple(array.data for array in verdict.values())
+
+        x, u = guess.sample["x"], guess.sample["u"]
+        moved = guess.arguments | {"x": guess.plan.x, "u": guess.plan.u, "places": self._found}
+        acting = {"places": self._places, "stiff": self._stiff}
+        fixed = {"stages": stages, "gains": gains, **guess.weights, **acting}
+        plan = {"x_plan": guess.plan.x, "u_plan": guess.plan.u, "multipliers": multipliers}
+        found = {**guess.plan.outputs(), "changes": changes, "places_found": self._found, "multipliers": multipliers}
+        self.advance = bind(make(functions.advance), moved, {"x_next": x, "u_next": u, "places_next": self._places, "stages": stages})
+        self.linearize = bind(make(functions.linearize), guess.arguments, {"stages": stages})
+        self.gain = bind(make(functions.gains), {"stages": stages, "u": u, **guess.weights, **acting}, {"gains": gains})
+        self.roll_out = bind(make(functions.roll_out), {**guess.start, "x0": guess.x0, **fixed}, found)
+        judged = {**guess.start, "x0": guess.x0, "stages": stages, **plan, **guess.weights}
+        self.certify = bind(make(certificate), judged, {"r": slopes, **verdict})
+        refined = {f"{name.removesuffix('_plan')}_refined": array for name, array in plan.items()}
+        self.refine = bind(make(functions.refine), {**guess.start, **fixed, "r": slopes, **plan}, refined)
+        self._refined = tuple(plan.values())
         self.iterations = 0
         self.res_prim = self.res_dual = 0.0
 
@@ -88,7 +95,7 @@ class ActiveSet:
             if status is SOLVED:
                 break
             gap, before = self.res_dual, [array.copy() for array in self._refined]
-            self._refine()
+            self.refine()
             status = self._judged()
             if not self.res_dual < gap:  # where places are degenerate, a step may lead away
                 for array, kept in zip(self._refined, before, strict=True):
@@ -98,7 +105,7 @@ class ActiveSet:
 
     def _judged(self) -> QpStatus:
         """Judge the plan as it is."""
-        self._certify()
+        self.certify()
         primal, gap, cost = (part[0] for part in self._verdict)
         self.res_prim, self.res_dual = primal, gap / (1.0 + cost)
         if primal <= FEASIBLE and self.res_dual <= OPTIMAL:
@@ -107,13 +114,13 @@ class ActiveSet:
 
     def solve(self) -> bool:
         """Find the places, and make the plan; tell whether they settled, and numbers are finite."""
-        self._roll_out()
+        self.roll_out()
         self.iterations = 1
         if self._changes[0] == 0.0 or self._settle(ROLL_OUTS):
             return True
         for self._stiff[0] in PATH:
             self.gain()
-            self._roll_out()
+            self.roll_out()
             self.iterations += 1
             if not self._settle(ROLL_OUTS_EACH):
                 self._stiff[0] = PATH[-1]
@@ -141,6 +148,6 @@ class ActiveSet:
                 first = int(np.argmax(self._places != self._found))
                 self._places[first] = self._found[first]
             self.gain()
-            self._roll_out()
+            self.roll_out()
             self.iterations += 1
         return self._changes[0] == 0.0

@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.codegen import bind
+from rti_mpc.codegen import bind, function
 from rti_mpc.rti import Rti
 
 NOWHERE = 0.05  # epsilon: a plan that passes an obstacle keeps above 1, a blocked one is at 0.001
@@ -39,7 +39,7 @@ class Blockage:
         self._rti = rti
         self._contrary = 0
         self._squares: Array = np.zeros(2)
-        self._measure = bind(progress(rti), (rti.x, rti.y_ref, rti.p), (self._squares,))
+        self._measure = bind(progress(rti), {"x": rti.x, "y_ref": rti.y_ref, "p": rti.p}, {"squares": self._squares})
 
     def look(self) -> bool:
         """Look at the plan of a new sample, and tell whether `blocked` has changed."""
@@ -66,4 +66,5 @@ def progress(rti: Rti) -> ca.Function:
     output = model.h()
     start, end = output(x[:, 0], p[:, -1]), output(x[:, -1], p[:, -1])  # outputs of one moment: a beacon that moves is no progress
     moved, left = end - start, y_ref[:, -1] - end
-    return ca.Function("progress", [x, y_ref, p], [ca.vertcat(ca.bilin(Q, moved, moved), ca.bilin(Q, left, left))])
+    squares = ca.vertcat(ca.bilin(Q, moved, moved), ca.bilin(Q, left, left))
+    return function("progress", {"x": x, "y_ref": y_ref, "p": p}, {"squares": squares})

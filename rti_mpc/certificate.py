@@ -23,6 +23,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from rti_mpc.codegen import function
 from rti_mpc.linearization import Linearization, divided
 from rti_mpc.ocp import Ocp
 
@@ -31,7 +32,7 @@ TINY = 1e-300  # in place of a quadratic penalty of zero
 
 def certificate(ocp: Ocp) -> ca.Function:
     """
-    Build ``(x, u, u_prev, x0, stages, x+, u+, multipliers, *WEIGHTS, scale) -> (r, primal, gap, cost)``.
+    Build ``(x, u, u_prev, x0, stages, x_plan, u_plan, multipliers, *WEIGHTS, scale) -> (r, primal, gap, cost)``.
 
     `multipliers` are those of increments, shape ``(nu, N_u)``, and of what has softened bounds, shape ``(ng, N)``, positive at an upper bound, one
     after the other. `r` is the gradient of the Lagrangian reduced to the inputs, shape ``(nu, N_u)``, those of bounds on inputs left out; `primal`
@@ -42,36 +43,38 @@ def certificate(ocp: Ocp) -> ca.Function:
     N, N_u, nx, nu, ng = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu, len(ocp.lg)
     x_plan, u_plan, x0 = ca.MX.sym("x_plan", nx, N + 1), ca.MX.sym("u_plan", nu, N_u), ca.MX.sym("x0", nx)
     stages, multipliers = ca.MX.sym("stages", lin.stages.numel()), ca.MX.sym("multipliers", nu * N_u + ng * N)
-    A, B, b, H, h, force, increments, g, g_x, g_u, damping, _, cost = divided(stages, lin.forms)
+    forms = lin.forms_in(stages)
     of_increments, of_softened = divided(multipliers, [lin.u, lin.g])
     w = lin.w
 
     dx, du = x_plan - lin.x, u_plan - lin.u
     held = ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u))
     shared = [ca.repmat(e, 1, N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg, lin.scale_x, lin.scale_g)]
-    nodes = node(ocp, lin).map(N)(A, B, b, H, h, g, g_x, g_u, dx[:, :-1], held, dx[:, 1:], of_softened, *shared)
+    data = (forms.A, forms.B, forms.b, forms.H, forms.h, forms.g, forms.g_x, forms.g_u)
+    nodes = node(ocp, lin).map(N)(*data, dx[:, :-1], held, dx[:, 1:], of_softened, *shared)
     sums, by_x, by_u = nodes[:3, :], ca.horzsplit(nodes[3 : 3 + nx, :]), nodes[3 + nx :, :]
 
     sweep = adjoint(lin)
-    columns = [ca.horzsplit(e) for e in (A, B, by_u)]
+    A_k, B_k, by_u_k = (ca.horzsplit(e) for e in (forms.A, forms.B, by_u))
     reduced: list[ca.MX] = [ca.MX.zeros(nu)] * N_u
     pi = by_x[-1]
     for k in reversed(range(N)):
-        gradient, pi = sweep(columns[0][k], columns[1][k], columns[2][k], pi, by_x[k - 1] if k else ca.MX.zeros(nx))
+        gradient, pi = sweep(A_k[k], B_k[k], by_u_k[k], pi, by_x[k - 1] if k else ca.MX.zeros(nx))
         reduced[min(k, N_u - 1)] += gradient
 
     planned = u_plan - ca.horzcat(lin.u_prev, u_plan[:, :-1])
     forces = (lin.R @ planned) * ca.repmat(w["lambda_"].T, nu, 1)
     push = forces + of_increments
-    push = push - ca.horzcat(push[:, 1:], ca.MX.zeros(nu)) + ca.repmat(damping, 1, N_u) * du
+    push = push - ca.horzcat(push[:, 1:], ca.MX.zeros(nu)) + ca.repmat(forms.damping, 1, N_u) * du
     shared = [ca.repmat(e, 1, N_u) for e in (w["lbu"], w["ubu"], w["lbdu"], w["ubdu"], lin.scale_u)]
     inputs = of_inputs(ocp).map(N_u)(ca.horzcat(*reduced) + push, u_plan, planned, of_increments, *shared)
 
     primal = ca.fmax(ca.fmax(ca.mmax(sums[0, :]), ca.mmax(inputs[0, :])), ca.mmax(ca.fabs(x_plan[:, 0] - x0) / lin.scale_x))
     gap = ca.sum2(sums[1, :]) + ca.sum2(inputs[1, :])
-    total = (cost - ca.dot(increments, force) + ca.dot(planned, forces)) / 2 + ca.sum2(sums[2, :])
-    arguments = [lin.x, lin.u, lin.u_prev, x0, stages, x_plan, u_plan, multipliers, *lin.weights]
-    return ca.Function("certificate", arguments, [inputs[2:, :], primal, gap, total])
+    total = (forms.cost - ca.dot(forms.increments, forms.force) + ca.dot(planned, forces)) / 2 + ca.sum2(sums[2, :])
+    guess = {"x": lin.x, "u": lin.u, "u_prev": lin.u_prev, "x0": x0, "stages": stages}
+    plan = {"x_plan": x_plan, "u_plan": u_plan, "multipliers": multipliers}
+    return function("certificate", {**guess, **plan, **lin.weights}, {"r": inputs[2:, :], "primal": primal, "gap": gap, "cost": total})
 
 
 def node(ocp: Ocp, lin: Linearization) -> ca.Function:

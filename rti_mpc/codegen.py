@@ -15,7 +15,7 @@ import shutil
 import subprocess
 import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -104,31 +104,37 @@ def _first_line(text: str) -> str:
     return text.strip().partition("\n")[0]
 
 
-def bind(function: ca.Function, arguments: Sequence[Array], results: Sequence[Array]) -> Callable[[], None]:
+def function(name: str, inputs: Mapping[str, Any], outputs: Mapping[str, Any]) -> ca.Function:
+    """Build a CasADi function from expressions by name; no output is called as an input is."""
+    return ca.Function(name, [*inputs.values()], [*outputs.values()], [*inputs], [*outputs])
+
+
+def bind(function: ca.Function, inputs: Mapping[str, Array], outputs: Mapping[str, Array]) -> Callable[[], None]:
     """
     Fix where a function reads and writes, and return the call.
 
     CasADi counts column by column: a C-ordered array of shape ``(N, nx)`` is
-    its ``(nx, N)``. Results are dense, or only their nonzeros are written.
+    its ``(nx, N)``. Outputs are dense, or only their nonzeros are written.
 
     Args:
         function: Compiled or not.
-        arguments: One array an input, owned by the caller, who keeps their memory in place.
-        results: One array an output, overwritten by every call.
+        inputs: One array for each input, by its name, owned by the caller, who keeps their memory in place.
+        outputs: One array for each output, by its name, overwritten by every call.
 
     Raises:
         ShapeError: An array is not C-contiguous float64 of the right size.
     """
     buffer, evaluate = cast(tuple[Any, Callable[[], None]], function.buffer())
-    for arrays, count, name, sparsity, attach in (
-        (arguments, function.n_in(), function.name_in, function.sparsity_in, buffer.set_arg),
-        (results, function.n_out(), function.name_out, function.sparsity_out, buffer.set_res),
+    for arrays, names, sparsity, attach in (
+        (inputs, function.name_in(), function.sparsity_in, buffer.set_arg),
+        (outputs, function.name_out(), function.sparsity_out, buffer.set_res),
     ):
-        assert len(arrays) == count
-        for i, array in enumerate(arrays):
+        assert set(arrays) == set(names), f"{function.name()} must be bound to {names}, got {[*arrays]}"
+        for i, name in enumerate(names):
+            array = arrays[name]
             if array.dtype != np.float64 or not array.flags.c_contiguous or array.size != sparsity(i).nnz():
-                raise ShapeError(f"{function.name()}: {name(i)}", sparsity(i).shape[::-1], array)
+                raise ShapeError(f"{function.name()}: {name}", sparsity(i).shape[::-1], array)
             attach(i, array.data)
 
-    evaluate.memory = (buffer, *arguments, *results)  # type: ignore[attr-defined] # lives as long as the call
+    evaluate.memory = (buffer, *inputs.values(), *outputs.values())  # type: ignore[attr-defined] # lives as long as the call
     return evaluate

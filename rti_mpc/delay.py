@@ -63,7 +63,9 @@ class DelayEstimator:
         self._u: Array = np.zeros(model.nu)
         self._span: Array = np.zeros(1)  # s
         phi = integrator(model, "rk4")
-        self._integrate = bind(compiled(phi)[0] if compile else phi, (self._x, self._u, np.array(model.p_nominal), self._span), (self._next,))
+        integrate = compiled(phi)[0] if compile else phi
+        inputs = {"x": self._x, "u": self._u, "p": np.array(model.p_nominal), "dt": self._span}
+        self._integrate = bind(integrate, inputs, {"x_next": self._next})
 
     def sent(self, command: Command) -> None:
         """Take note of the last command that was sent, if it is another one."""

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.codegen import bind, compiled
+from rti_mpc.codegen import bind, compiled, function
 from rti_mpc.ocp import Ocp
 
 LIMITS = ("lbu", "ubu", "lbdu", "ubdu")
@@ -35,7 +35,8 @@ class Envelope:
         self._rows: Array = np.zeros((ocp.N, nu))
         self._reach: tuple[Array, Array] = (np.zeros((2, nu)), np.zeros((2, nu)))
         fit = clipping(ocp)
-        self._fit = bind(compiled(fit)[0] if compile else fit, (self._u, *self._reach, *self.limits.values()), (self._rows,))
+        inputs = {"u": self._u, "lowest": self._reach[0], "highest": self._reach[1], **self.limits}
+        self._fit = bind(compiled(fit)[0] if compile else fit, inputs, {"rows": self._rows})
 
     def fit(self, u: Array, reach: tuple[Array, Array]) -> Array:
         """
@@ -90,4 +91,5 @@ def clipping(ocp: Ocp) -> ca.Function:
         wanted = ca.fmin(ca.fmax(u[:, k], lbu), ubu)
         rows.append(ca.fmin(ca.fmax(wanted, lower), upper))
     rows += [rows[-1]] * (ocp.N - ocp.N_u)
-    return ca.Function("clipping", [u, lowest, highest, lbu, ubu, lbdu, ubdu], [ca.densify(ca.horzcat(*rows))])
+    inputs = {"u": u, "lowest": lowest, "highest": highest, "lbu": lbu, "ubu": ubu, "lbdu": lbdu, "ubdu": ubdu}
+    return function("clipping", inputs, {"rows": ca.densify(ca.horzcat(*rows))})

@@ -43,6 +43,7 @@ class ForeignSolver:
 
     Attributes:
         qp: The problem.
+        call: Solves the problem as it is, in the form of qpsolvers.
         cold: Whether the next solve forgets the last: it does in any case.
         iterations: Iterations of the last solve; 0 of a solver that does not tell.
         res_prim: Primal residual of the last solve, infinity norm, relative to the scales.
@@ -71,7 +72,7 @@ class ForeignSolver:
             made, update = following(getattr(numbers, matrix), data, dense)
             setattr(self._problem, matrix, made)
             self._updates.append(update)
-        self._solve = partial(qpsolvers.solve_problem, self._problem, name, **TOLERANCES.get(name, {}))
+        self.call = partial(qpsolvers.solve_problem, self._problem, name, **TOLERANCES.get(name, {}))
         try:
             self._call()
         except Exception as error:  # a licence that is missing, say: better now than as a failure of every sample
@@ -114,7 +115,7 @@ class ForeignSolver:
     def _call(self) -> qpsolvers.Solution:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of a solve that failed, which the status says
-            return self._solve()
+            return self.call()
 
 
 def check_name(name: str) -> None:

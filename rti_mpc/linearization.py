@@ -23,18 +23,55 @@ damped in proportion to the cost at the guess (Levenberg-Marquardt
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
+from rti_mpc.codegen import function
 from rti_mpc.ocp import Ocp
 
 # What may change between samples without a new structure: attributes of the Ocp, read by the compiled functions in this order.
 WEIGHTS = ("Q", "R", "delta", "lambda_", "lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx", "z", "Z", "Q_e", "lh", "uh", "zh", "Zh")
 
 DAMPING = 0.005  # of the cost, for a step of half an input's range; see docs/engine.md
+
+
+class Forms(NamedTuple):
+    """
+    What a structured solver needs of a linearization, as expressions; see `Linearization` for each. Columns are stages or nodes.
+
+    Attributes:
+        A: Nonzeros of the sensitivities to the state, shape ``(nnz, N)``.
+        B: Those to the input, shape ``(nnz, N)``.
+        b: Defects, shape ``(nx, N)``.
+        H: Nonzeros of the Hessian of half the output cost, shape ``(nnz, N)``.
+        h: Its gradient, shape ``(nx, N)``.
+        force: Gradient of half the cost of the increments in themselves, shape ``(nu, N_u)``.
+        increments: Increments, shape ``(nu, N_u)``.
+        g: What has softened bounds, shape ``(ng, N)``.
+        g_x: Nonzeros of its sensitivities to the state, shape ``(nnz, N)``.
+        g_u: Those to the input, shape ``(nnz, N)``.
+        damping: Weight of half the square of a step in each input, shape ``(nu, 1)``.
+        checksum: Finite if and only if all of this is.
+        cost: The cost (4) at the guess.
+    """
+
+    A: ca.MX
+    B: ca.MX
+    b: ca.MX
+    H: ca.MX
+    h: ca.MX
+    force: ca.MX
+    increments: ca.MX
+    g: ca.MX
+    g_x: ca.MX
+    g_u: ca.MX
+    damping: ca.MX
+    checksum: ca.MX
+    cost: ca.MX
 
 
 class Linearization:
@@ -69,7 +106,8 @@ class Linearization:
         R: The increment weight, sparse.
         cost: The cost (4) at the guess.
         checksum: Finite if and only if everything above is.
-        forms: What of these a structured solver needs, in the order of `stages`, all of them in one column.
+        forms: What of these a structured solver needs.
+        stages: All forms in one column.
     """
 
     def __init__(self, ocp: Ocp) -> None:
@@ -112,24 +150,41 @@ class Linearization:
         self.damping = damping(ocp) * self.cost / self.scale_u**2
         self.checksum = ca.sum1(ca.vec(stages)) + ca.sum1(ca.vec(nodes)) + self.cost + ca.sum1(ca.vec(self.b))
         self.checksum += ca.sum1(ca.vec(bounded))
-        self.forms = [self.A, self.B, self.b, self.hessian, self.gradient, self.force, self.increments, self.g, self.g_x, self.g_u]
-        self.forms += [self.damping, self.checksum, self.cost]
+        self.forms = Forms(
+            A=self.A,
+            B=self.B,
+            b=self.b,
+            H=self.hessian,
+            h=self.gradient,
+            force=self.force,
+            increments=self.increments,
+            g=self.g,
+            g_x=self.g_x,
+            g_u=self.g_u,
+            damping=self.damping,
+            checksum=self.checksum,
+            cost=self.cost,
+        )
         self.stages = ca.veccat(*self.forms)
 
     @property
-    def arguments(self) -> list[ca.MX]:
-        """What the data of a sample depends on, in the order of all compiled functions."""
-        return [*self.sample, *self.weights]
+    def arguments(self) -> dict[str, ca.MX]:
+        """What the data of a sample depends on, by name, in the order of all compiled functions."""
+        return self.sample | self.weights
 
     @property
-    def weights(self) -> list[ca.MX]:
-        """What stays from sample to sample: weights and bounds, in the order of `WEIGHTS`, and the scale."""
-        return [*self.w.values(), self._scale]
+    def weights(self) -> dict[str, ca.MX]:
+        """What stays from sample to sample: weights and bounds, by the names in `WEIGHTS`, and the scale."""
+        return self.w | {"scale": self._scale}
 
     @property
-    def sample(self) -> list[ca.MX]:
+    def sample(self) -> dict[str, ca.MX]:
         """What changes from sample to sample: all but the weights."""
-        return [self.x, self.u, self.u_prev, self.y_ref, self.p]
+        return {"x": self.x, "u": self.u, "u_prev": self.u_prev, "y_ref": self.y_ref, "p": self.p}
+
+    def forms_in(self, stages: ca.MX) -> Forms:
+        """Return the forms that a column of them holds."""
+        return Forms(*divided(stages, self.forms))
 
     def increment_gradient(self) -> ca.MX:
         """Return the gradient of half the increment cost in the inputs, shape ``(nu, N_u)``."""
@@ -142,7 +197,7 @@ class Linearization:
         return self.R * (self.w["lambda_"][k] + following) + ca.diag(self.damping), None if last else -self.R * following
 
 
-def divided(flat: ca.MX, like: list[ca.MX]) -> list[ca.MX]:
+def divided(flat: ca.MX, like: Sequence[ca.MX]) -> list[ca.MX]:
     """Divide a column into expressions of given shapes."""
     ends = np.cumsum([0, *(one.numel() for one in like)]).tolist()
     return [ca.reshape(part, one.shape) for part, one in zip(ca.vertsplit(flat, ends), like, strict=True)]
@@ -211,11 +266,12 @@ def pattern(weight: np.ndarray[Any, Any]) -> ca.DM:
 
 
 def shift(ocp: Ocp) -> ca.Function:
-    """Build ``(x, u, p) -> (x+, u+)``: a plan moved on by one stage, its last input repeated, with the state the model predicts."""
+    """Build ``(x, u, p) -> (x_next, u_next)``: a plan moved on by one stage, its last input repeated, with the state the model predicts."""
     model, nodes = ocp.model, ocp.N + 1
     x, u, p = ca.MX.sym("x", model.nx, nodes), ca.MX.sym("u", model.nu, ocp.N_u), ca.MX.sym("p", model.np_, nodes)
     x_next = ocp.phi()(x[:, -1], u[:, -1], p[:, -1])
-    return ca.Function("shift", [x, u, p], [ca.horzcat(x[:, 1:], x_next), ca.horzcat(u[:, 1:], u[:, -1])])
+    moved = {"x_next": ca.horzcat(x[:, 1:], x_next), "u_next": ca.horzcat(u[:, 1:], u[:, -1])}
+    return function("shift", {"x": x, "u": u, "p": p}, moved)
 
 
 def change(lin: Linearization, u: Any) -> Any:
@@ -237,4 +293,4 @@ def plan_cost(ocp: Ocp) -> ca.Function:
     lin = Linearization(ocp)
     lg, ug, zg, Zg = (ca.repmat(e, 1, ocp.N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg))
     s = ca.fmax(0, ca.fmax(lin.g - ug, lg - lin.g))
-    return ca.Function("cost", lin.arguments, [lin.cost + ca.dot(zg, s) + ca.dot(Zg, s**2) / 2])
+    return function("cost", lin.arguments, {"cost": lin.cost + ca.dot(zg, s) + ca.dot(Zg, s**2) / 2})

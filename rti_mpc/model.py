@@ -128,7 +128,7 @@ class Model:
 
     def h(self) -> ca.Function:
         """Return the outputs at a node, ``h(x, p) -> y``."""
-        return ca.Function("h", [self.x, self.p], [ca.densify(self.y_expr)])
+        return ca.Function("h", [self.x, self.p], [ca.densify(self.y_expr)], ["x", "p"], ["y"])
 
     def with_parameters(self, **values: float) -> Model:
         """

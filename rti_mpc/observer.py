@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.codegen import bind, compiled
+from rti_mpc.codegen import bind, compiled, function
 from rti_mpc.disturbance import with_disturbances
 from rti_mpc.errors import OcpError
 from rti_mpc.integrator import integrator
@@ -101,8 +101,11 @@ class Observer:
         p: Array = np.array(model.p_nominal)
         functions = predict(self.model, nd, np.square(walks)), correct(nx, nd, measured, variances, self._limits)
         made = compiled(*functions) if compile else functions
-        self._predict = bind(made[0], (z, self._P, self._u, p, self._span), (z_next := np.zeros_like(z), P_next := np.zeros_like(self._P)))
-        self._correct = bind(made[1], (z_next, P_next, self._y, self._gain), (z, self._P))
+        z_next, P_next = np.zeros_like(z), np.zeros_like(self._P)
+        before = {"z": z, "P": self._P, "u": self._u, "p": p, "span": self._span}
+        self._predict = bind(made[0], before, {"z_next": z_next, "P_next": P_next})
+        measured_at = {"z": z_next, "P": P_next, "y": self._y, "gain": self._gain}
+        self._correct = bind(made[1], measured_at, {"z_corrected": z, "P_corrected": self._P})
         self._predicted = (z_next, P_next)
         self._z = z
 
@@ -127,7 +130,7 @@ class Observer:
 
 
 def predict(model: Model, nd: int, walks: Array) -> ca.Function:
-    """Build ``(z, P, u, p, span) -> (z+, P+)``: one step of the dynamics with the sensitivities of it."""
+    """Build ``(z, P, u, p, span) -> (z_next, P_next)``: one step of the dynamics with the sensitivities of it."""
     nx, n = model.nx, model.nx + nd
     z, P, span = ca.SX.sym("z", n), ca.SX.sym("P", n, n), ca.SX.sym("span")
     p = ca.SX.sym("p", model.np_ - nd)
@@ -135,14 +138,15 @@ def predict(model: Model, nd: int, walks: Array) -> ca.Function:
     z_next = ca.vertcat(x_next, z[nx:])
     A = ca.jacobian(z_next, z)
     P_next = ca.densify(A @ P @ A.T + span * ca.diag(ca.DM(walks)))
-    return ca.Function("observer_predict", [z, P, model.u, p, span], [z_next, P_next])
+    inputs = {"z": z, "P": P, "u": model.u, "p": p, "span": span}
+    return function("observer_predict", inputs, {"z_next": z_next, "P_next": P_next})
 
 
 def correct(nx: int, nd: int, measured: list[int], variances: list[float], limits: Array) -> ca.Function:
-    """Build ``(z, P, y, gain) -> (z+, P+)``; a gain of 0 freezes the disturbances, 1 does not."""
+    """Build ``(z, P, y, gain) -> (z_corrected, P_corrected)``; a gain of 0 freezes the disturbances, 1 does not."""
     z, P = ca.SX.sym("z", nx + nd), ca.SX.sym("P", nx + nd, nx + nd)
     y, gain = ca.SX.sym("y", nx), ca.SX.sym("gain")
-    inputs = [z, P, y, gain]
+    inputs = {"z": z, "P": P, "y": y, "gain": gain}
     acts = ca.vertcat(ca.SX.ones(nx), gain * ca.SX.ones(nd))
     for j, variance in zip(measured, variances, strict=True):
         column = P[:, j]
@@ -151,4 +155,4 @@ def correct(nx: int, nd: int, measured: list[int], variances: list[float], limit
         z = z + K * (y[j] - z[j])
         P = P - K @ column.T - column @ K.T + s * (K @ K.T)
     bounded = ca.fmax(ca.fmin(z[nx:], ca.DM(limits)), -ca.DM(limits))
-    return ca.Function("observer_correct", inputs, [ca.vertcat(z[:nx], bounded), ca.densify((P + P.T) / 2)])
+    return function("observer_correct", inputs, {"z_corrected": ca.vertcat(z[:nx], bounded), "P_corrected": ca.densify((P + P.T) / 2)})

@@ -18,7 +18,8 @@ Over stages of `dt` seconds, with :math:`y_i = h(x_i, p_i)`, the previous input
 
 This is the cost (4) of [Rosales]_ in full, with a terminal weight beside it.
 Bounds on states and general constraints, each with its own slacks, are softened
-by an exact penalty, so that no measurement makes the problem infeasible.
+by an exact penalty, so that no measurement makes the problem infeasible. Names of
+bounds and slack weights are those of acados [Verschueren2022]_.
 """
 
 from __future__ import annotations

@@ -13,13 +13,15 @@ a refinement, one sweep over vectors with the gains as they are, takes that away
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from rti_mpc.linearization import Linearization, change, divided, shift
+from rti_mpc.codegen import function
+from rti_mpc.linearization import Forms, Linearization, change, divided, shift
 from rti_mpc.ocp import Ocp
-from rti_mpc.riccati import Columns, Riccati, Rows, Stage, columns
+from rti_mpc.riccati import Gain, Riccati, Rows, Stage, columns, stagewise
 from rti_mpc.transcription import INFINITY
 
 TOLERANCE = 1e-9  # by which a bound may be crossed before it acts, relative to its scale: rounding must not decide
@@ -37,14 +39,16 @@ class Places:
 
     Attributes:
         linearize: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale) -> stages``.
-        advance: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale, places) -> (x+, u+, places+, stages)``: the same of a plan moved on by one stage.
+        advance: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale, places) -> (x_next, u_next, places_next, stages)``: the same of a plan moved on by one
+            stage.
         gains: ``(stages, u, *WEIGHTS, scale, places, stiff) -> gains``; `stiff` is the weight of the penalty that holds what is at its bound, for
             what is measured by its scale.
-        roll_out: ``(x, u, u_prev, x0, stages, gains, *WEIGHTS, scale, places, stiff) -> (x+, u+, violation, change, changes, places+, multipliers)``:
-            the full step, by how much it exceeds softened bounds, as it is and relative to their scale, its size, and how many places change: -1
-            if data, gains or plan are not finite.
-        refine: ``(x, u, u_prev, stages, gains, *WEIGHTS, scale, places, stiff, r, x+, u+, multipliers) -> (x+, u+, multipliers)``: what a plan and
-            its multipliers become if the gradient r that is left of the Lagrangian, see `rti_mpc.certificate`, is taken away.
+        roll_out: ``(x, u, u_prev, x0, stages, gains, *WEIGHTS, scale, places, stiff) -> (x_plan, u_plan, violation, change, changes, places_found,
+            multipliers)``: the full step, by how much it exceeds softened bounds, as it is and relative to their scale, its size, and how many
+            places change: -1 if data, gains or plan are not finite.
+        refine: ``(x, u, u_prev, stages, gains, *WEIGHTS, scale, places, stiff, r, x_plan, u_plan, multipliers) -> (x_refined, u_refined,
+            multipliers_refined)``: what a plan and its multipliers become if the gradient r that is left of the Lagrangian, see
+            `rti_mpc.certificate`, is taken away.
     """
 
     linearize: ca.Function
@@ -54,40 +58,60 @@ class Places:
     refine: ca.Function
 
 
+class Sample(NamedTuple):
+    """
+    Symbols that a roll-out and its refinement depend on.
+
+    Attributes:
+        lin: Expressions of the sample.
+        forms: Its linearization.
+        gains: Gains of all stages, shape ``(size, N_u)``.
+        place: Places of all rows.
+        stiff: Weight of the penalty that holds what is at its bound.
+    """
+
+    lin: Linearization
+    forms: Forms
+    gains: ca.MX
+    place: Rows
+    stiff: ca.MX
+
+
 def places(ocp: Ocp) -> Places:
     """Build the functions of an OCP."""
     lin = Linearization(ocp)
-    linearize = ca.Function("linearize", lin.arguments, [lin.stages])
+    linearize = function("linearize", lin.arguments, {"stages": lin.stages})
     recursion = Riccati(ocp, lin)
-    stages = ca.MX.sym("stages", linearize.numel_out(0))
-    forms = divided(stages, lin.forms)
+    stages = ca.MX.sym("stages", linearize.numel_out("stages"))
     kinds = [lin.u, lin.u, lin.g]
     flat, stiff = ca.MX.sym("places", sum(kind.numel() for kind in kinds)), ca.MX.sym("stiff")
-    at = Rows(*divided(flat, kinds))
-    x, u = shift(ocp)(lin.x, lin.u, lin.p)
-    moved = ca.veccat(*(ca.horzcat(kind[:, 1:], kind[:, -1]) for kind in (at.inputs, at.increments, at.softened)))
-    advance = ca.Function("advance", [*lin.arguments, flat], [x, u, moved, linearize(x, u, *lin.arguments[2:])])
-
-    weight, pull = penalties(ocp, lin, forms, at, stiff)
-    gains = ca.Function("gains", [stages, lin.u, *lin.weights, flat, stiff], [recursion.gains(forms, weight, pull)])
     x0, found = ca.MX.sym("x0", ocp.model.nx), ca.MX.sym("gains", recursion.size, ocp.N_u)
-    rolled = roll_out(ocp, lin, forms, x0, found, at, stiff)
-    fixed = [stages, found, *lin.weights, flat, stiff]
-    refined = [ca.MX.sym("r", *lin.u.shape), ca.MX.sym("x_plan", *lin.x.shape), ca.MX.sym("u_plan", *lin.u.shape)]
-    refined.append(ca.MX.sym("multipliers", *rolled[-1].shape))
-    better = refine(ocp, lin, recursion, forms, found, at, stiff, *refined)
+    at = Sample(lin, lin.forms_in(stages), found, Rows(*divided(flat, kinds)), stiff)
+
+    x, u = shift(ocp)(lin.x, lin.u, lin.p)
+    moved = ca.veccat(*(ca.horzcat(kind[:, 1:], kind[:, -1]) for kind in (at.place.u, at.place.du, at.place.g)))
+    linearized = linearize(**(lin.arguments | {"x": x, "u": u}))["stages"]
+    advance = {"x_next": x, "u_next": u, "places_next": moved, "stages": linearized}
+
+    acting = {"places": flat, "stiff": stiff}
+    gains = recursion.gains(at.forms, *penalties(ocp, at))
+    guess = {"x": lin.x, "u": lin.u, "u_prev": lin.u_prev}
+    fixed = {"stages": stages, "gains": found, **lin.weights, **acting}
+    rolled = roll_out(ocp, at, x0)
+    plan = {"r": lin.u, "x_plan": lin.x, "u_plan": lin.u, "multipliers": rolled["multipliers"]}
+    plan = {name: ca.MX.sym(name, *like.shape) for name, like in plan.items()}
     return Places(
         linearize,
-        advance,
-        gains,
-        ca.Function("roll_out", [lin.x, lin.u, lin.u_prev, x0, *fixed], rolled),
-        ca.Function("refine", [lin.x, lin.u, lin.u_prev, *fixed, *refined], better),
+        function("advance", {**lin.arguments, "places": flat}, advance),
+        function("gains", {"stages": stages, "u": lin.u, **lin.weights, **acting}, {"gains": gains}),
+        function("roll_out", {**guess, "x0": x0, **fixed}, rolled),
+        function("refine", {**guess, **fixed, **plan}, refine(ocp, recursion, at, **plan)),
     )
 
 
-def penalties(ocp: Ocp, lin: Linearization, forms: list[ca.MX], at: Rows, stiff: ca.MX) -> tuple[Rows, Rows]:
+def penalties(ocp: Ocp, at: Sample) -> tuple[Rows, Rows]:
     """Return weight and pull of each row, by its place."""
-    w, nu, ng = lin.w, ocp.model.nu, len(ocp.lg)
+    lin, w, nu, ng = at.lin, at.lin.w, ocp.model.nu, len(ocp.lg)
     place, value, lower, upper, weight = (ca.SX.sym(name, nu) for name in ("place", "value", "lower", "upper", "weight"))
     held = ca.Function("hold", [place, value, lower, upper, weight], [*hold(place, value, lower, upper, weight)]).map(ocp.N_u)
     place, value, lower, upper, weight, z, Z = (ca.SX.sym(name, ng) for name in ("place", "value", "lower", "upper", "weight", "z", "Z"))
@@ -99,12 +123,12 @@ def penalties(ocp: Ocp, lin: Linearization, forms: list[ca.MX], at: Rows, stiff:
     def repeated(*rows: ca.MX, times: int) -> list[ca.MX]:
         return [ca.repmat(row, 1, times) for row in rows]
 
-    of_inputs = stiff / lin.scale_u**2
-    inputs = held(at.inputs, lin.u, *repeated(w["lbu"], w["ubu"], of_inputs, times=ocp.N_u))
-    increments = held(at.increments, forms[6], *repeated(w["lbdu"], w["ubdu"], of_inputs, times=ocp.N_u))
-    limits = repeated(lin.lg, lin.ug, stiff / lin.scale_g**2, lin.zg, lin.Zg, times=ocp.N)
-    bounded = softened(at.softened, forms[7], *limits)
-    return Rows(inputs[0], increments[0], bounded[0]), Rows(inputs[1], increments[1], bounded[1])
+    stiff_u = at.stiff / lin.scale_u**2
+    weight_u, pull_u = held(at.place.u, lin.u, *repeated(w["lbu"], w["ubu"], stiff_u, times=ocp.N_u))
+    weight_du, pull_du = held(at.place.du, at.forms.increments, *repeated(w["lbdu"], w["ubdu"], stiff_u, times=ocp.N_u))
+    limits = repeated(lin.lg, lin.ug, at.stiff / lin.scale_g**2, lin.zg, lin.Zg, times=ocp.N)
+    weight_g, pull_g = softened(at.place.g, at.forms.g, *limits)
+    return Rows(weight_u, weight_du, weight_g), Rows(pull_u, pull_du, pull_g)
 
 
 def hold(place: ca.SX, value: ca.SX, lower: ca.SX, upper: ca.SX, weight: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -113,84 +137,131 @@ def hold(place: ca.SX, value: ca.SX, lower: ca.SX, upper: ca.SX, weight: ca.SX) 
     return ca.densify(weight), ca.densify(weight * (value - ca.if_else(place > 0, upper, lower)))
 
 
-def roll_out(ocp: Ocp, lin: Linearization, forms: list[ca.MX], x0: ca.MX, gains: ca.MX, at: Rows, stiff: ca.MX) -> list[ca.MX]:
-    """Return what a roll-out returns."""
-    N, N_u, w = ocp.N, ocp.N_u, lin.w
-    free, held = roll_stage(ocp, lin, True), roll_stage(ocp, lin, False)
-    A, B, b, _, _, _, increment, g, g_x, g_u = (columns(form) for form in forms[:10])
-    x, u, gain = columns(lin.x), columns(lin.u), columns(gains)
-    place, pace, of_softened = at.columns()
-    limits = (lin.lg, lin.ug, lin.zg, lin.Zg, stiff / lin.scale_g**2, lin.scale_g)
-    bounds = (w["lbu"], w["ubu"], w["lbdu"], w["ubdu"], stiff / lin.scale_u**2, lin.scale_u)
-    s, slip = ca.vertcat(x0 - x[0], ca.MX.zeros(ocp.model.nu)), ca.MX.zeros(ocp.model.nx + ocp.model.nu)
+def roll_out(ocp: Ocp, at: Sample, x0: ca.MX) -> dict[str, ca.MX]:
+    """Return what a roll-out returns, by name."""
+    lin, forms, w, N_u = at.lin, at.forms, at.lin.w, ocp.N_u
+    free, held = roll_free(ocp, lin), roll_held(ocp, lin)
+    x_k = columns(lin.x)
+    stages = stagewise(A=forms.A, B=forms.B, b=forms.b, g_x=forms.g_x, g_u=forms.g_u, g=forms.g, place_g=at.place.g)
+    inputs = stagewise(u=lin.u, increment=forms.increments, gain=at.gains, place_u=at.place.u, place_du=at.place.du)
+    limits = {"lg": lin.lg, "ug": lin.ug, "zg": lin.zg, "Zg": lin.Zg, "stiff_g": at.stiff / lin.scale_g**2, "scale_g": lin.scale_g}
+    bounds = {name: w[name] for name in ("lbu", "ubu", "lbdu", "ubdu")} | {"stiff_u": at.stiff / lin.scale_u**2, "scale_u": lin.scale_u}
+    s, slip = ca.vertcat(x0 - x_k[0], ca.MX.zeros(ocp.model.nu)), ca.MX.zeros(ocp.model.nx + ocp.model.nu)
     before = lin.u_prev
     verdict = ca.MX(ca.DM([0, -INFINITY, -INFINITY]))  # changes, violation, violation relative to scale
-    states, inputs = [x0], []
-    found: tuple[Columns, ...] = ([], [], [], [], [])
-    for k in range(N):
-        stage = A[k], B[k], b[k], g_x[k], g_u[k], g[k], of_softened[k], *limits, x[k + 1], s, slip, verdict
-        if k < N_u:
-            state, s, slip, verdict, acts, paid, before, *now = free(*stage, gain[k], increment[k], u[k], before, place[k], pace[k], *bounds)
-            inputs.append(before)
-            for kind, one in zip(found, now, strict=False):
-                kind.append(one)
-        else:
-            state, s, slip, verdict, acts, paid = held(*stage)
-        states.append(state)
-        found[3].append(acts)
-        found[4].append(paid)
-    x_plan, u_plan = ca.horzcat(*states), ca.horzcat(*inputs)
-    finite = forms[11] + ca.sum1(ca.vec(u_plan)) + ca.sumsqr(x_plan) ** 2  # overflows for what is no state
-    changes = ca.if_else(ca.fabs(finite) < np.inf, verdict[0], -1)
-    of_inputs, of_increments, forces, of_softened_rows, paid_rows = (ca.horzcat(*kind) for kind in found)
-    now_at = ca.veccat(of_inputs, of_increments, of_softened_rows)
-    return [x_plan, u_plan, verdict[1:], change(lin, u_plan), changes, now_at, ca.veccat(forces, paid_rows)]
+    states, rolled = [x0], []
+    for k in range(ocp.N):
+        stage = {**stages[k], **limits, "x_next": x_k[k + 1], "s": s, "slip": slip, "verdict": verdict}
+        after = free(**stage, **inputs[k], before=before, **bounds) if k < N_u else held(**stage)
+        s, slip, verdict = after["s_after"], after["slip_after"], after["verdict_after"]
+        before = after.get("u_plan", before)
+        states.append(after["x_plan"])
+        rolled.append(after)
+
+    def along(name: str, count: int = ocp.N) -> ca.MX:
+        return ca.MX(ca.horzcat(*(after[name] for after in rolled[:count])))
+
+    x_plan, u_plan = ca.horzcat(*states), along("u_plan", N_u)
+    finite = forms.checksum + ca.sum1(ca.vec(u_plan)) + ca.sumsqr(x_plan) ** 2  # overflows for what is no state
+    return {
+        "x_plan": x_plan,
+        "u_plan": u_plan,
+        "violation": verdict[1:],
+        "change": change(lin, u_plan),
+        "changes": ca.if_else(ca.fabs(finite) < np.inf, verdict[0], -1),
+        "places_found": ca.veccat(along("place_u_found", N_u), along("place_du_found", N_u), along("place_g_found")),
+        "multipliers": ca.veccat(along("force", N_u), along("paid")),
+    }
 
 
-def roll_stage(ocp: Ocp, lin: Linearization, free: bool) -> ca.Function:
-    """Build one stage of the roll-out."""
-    of = Stage(ocp, lin)
-    nx, nu = of.nx, of.nu
-    x_next, s, slip, verdict = ca.SX.sym("x_next", nx), ca.SX.sym("s", of.n), ca.SX.sym("slip", of.n), ca.SX.sym("verdict", 3)
-    g, at_g, lg, ug, zg, Zg, stiff_g, scale_g = softened = [ca.SX.sym(f"softened_{i}", of.ng) for i in range(8)]
-    increment, u, before, place, pace, lbu, ubu, lbdu, ubdu, stiff, scale = bounded = [ca.SX.sym(f"bounded_{i}", nu) for i in range(11)]
-    column, K, kappa, _ = of.gain()
+class Softened(NamedTuple):
+    """
+    A stage of the roll-out as far as it is the same with an input and without.
+
+    Attributes:
+        symbols: What it depends on, by name.
+        outputs: What it returns, by name, but for the verdict.
+        verdict: How many places have changed so far, by how much a softened bound is exceeded at most, and by what share of its scale.
+    """
+
+    symbols: dict[str, ca.SX]
+    outputs: dict[str, ca.SX]
+    verdict: list[ca.SX]
+
+
+def softened_rows(ocp: Ocp, of: Stage, s: ca.SX, slip: ca.SX, du: ca.SX, slipped: ca.SX) -> Softened:
+    """
+    Return the end of a stage, and the places of what has softened bounds there.
+
+    Args:
+        ocp: The problem.
+        of: Symbols of the stage.
+        s: Symbol of the deviation that it begins with, shape ``(nx + nu,)``.
+        slip: Symbol of what meeting bounds to the last bit has changed of s so far.
+        du: Deviation of its input.
+        slipped: By how much the input that meets its bounds differs from that.
+    """
+    nx = of.nx
+    x_next, verdict = ca.SX.sym("x_next", nx), ca.SX.sym("verdict", 3)
+    names = ("g", "place_g", "lg", "ug", "zg", "Zg", "stiff_g", "scale_g")
+    g, place_g, lg, ug, zg, Zg, stiff_g, scale_g = own = [ca.SX.sym(name, of.ng) for name in names]
     changes, worst, share = ca.vertsplit(verdict)
-
-    du = -(K @ s + kappa) if free else s[nx:]
-    # By so little the penalty gives way. States are to know what the actuator will do, places are not: degenerate ones would go in circles.
-    u_plan = met(u + du, before, lbu, ubu, lbdu, ubdu) if free else u
-    slipped = u_plan - u - du if free else slip[nx:]
     drift = of.A @ slip[:nx] + of.B @ slipped
     dx = of.A @ s[:nx] + of.B @ du + of.b
     end = ca.vertcat(dx, du)
     value = g + of.G @ end
     planned = value + of.G @ ca.vertcat(drift, slipped)
-    acts, paid = ca.SX(of.ng, 1), ca.SX(of.ng, 1)
+    found, paid = ca.SX(of.ng, 1), ca.SX(of.ng, 1)
     for j in range(of.ng):
         over, under = exceeded(value[j], lg[j], ug[j], ocp.lg[j], ocp.ug[j])
         exceeds = ca.fmax(*exceeded(planned[j], lg[j], ug[j], ocp.lg[j], ocp.ug[j]))
         worst, share = ca.fmax(worst, exceeds), ca.fmax(share, exceeds / scale_g[j])
-        acts[j] = belongs(at_g[j], stiff_g[j], scale_g[j], over, under, zg[j] / 2)
-        changes += acts[j] != at_g[j]
-        by = ca.if_else(at_g[j] > 0, over, under)
-        paid[j] = ca.sign(at_g[j]) * ca.if_else(ca.fabs(at_g[j]) == 2, (zg[j] + Zg[j] * by) / 2, stiff_g[j] * by)
-    inputs = [*of.matrices, of.b, *of.softened, *softened, x_next, s, slip, verdict]
-    outputs = [x_next + dx + drift, end, ca.vertcat(drift, slipped)]
-    if not free:
-        return ca.Function("coast", inputs, ca.cse([*outputs, ca.vertcat(changes, worst, share), ca.densify(acts), ca.densify(paid)]))
+        found[j] = belongs(place_g[j], stiff_g[j], scale_g[j], over, under, zg[j] / 2)
+        changes += found[j] != place_g[j]
+        by = ca.if_else(place_g[j] > 0, over, under)
+        paid[j] = ca.sign(place_g[j]) * ca.if_else(ca.fabs(place_g[j]) == 2, (zg[j] + Zg[j] * by) / 2, stiff_g[j] * by)
+    symbols = {**of.dynamics, **of.defect, **of.softened, **dict(zip(names, own, strict=True))}
+    symbols |= {"x_next": x_next, "s": s, "slip": slip, "verdict": verdict}
+    outputs = {"x_plan": x_next + dx + drift, "s_after": end, "slip_after": ca.vertcat(drift, slipped)}
+    return Softened(symbols, outputs | {"place_g_found": ca.densify(found), "paid": ca.densify(paid)}, [changes, worst, share])
 
-    found = []
-    for values, at, lower, upper, lb, ub in (
-        (u + du, place, lbu, ubu, ocp.lbu, ocp.ubu),
-        (increment + du - s[nx:], pace, lbdu, ubdu, ocp.lbdu, ocp.ubdu),
-    ):
-        now = [belongs(at[j], stiff[j], scale[j], *exceeded(values[j], lower[j], upper[j], lb[j], ub[j]), INFINITY) for j in range(nu)]
-        found.append(ca.densify(ca.vertcat(*now)))
-        changes += ca.sum1(found[-1] != at)
-    force = stiff * (ca.fabs(pace) == 1) * (increment + du - s[nx:] - ca.if_else(pace > 0, ubdu, lbdu))
-    outputs += [ca.vertcat(changes, worst, share), ca.densify(acts), ca.densify(paid), u_plan, *found]
-    return ca.Function("forward", [*inputs, column, *bounded], ca.cse([*outputs, ca.densify(force)]))
+
+def simplified(name: str, inputs: dict[str, ca.SX], outputs: dict[str, ca.SX]) -> ca.Function:
+    """Build a function whose common subexpressions are computed once."""
+    return function(name, inputs, dict(zip(outputs, ca.cse([*outputs.values()]), strict=True)))
+
+
+def roll_held(ocp: Ocp, lin: Linearization) -> ca.Function:
+    """Build a stage of the roll-out whose input is that of the stage before."""
+    of = Stage(ocp, lin)
+    s, slip = ca.SX.sym("s", of.n), ca.SX.sym("slip", of.n)
+    symbols, outputs, verdict = softened_rows(ocp, of, s, slip, s[of.nx :], slip[of.nx :])
+    return simplified("coast", symbols, {**outputs, "verdict_after": ca.vertcat(*verdict)})
+
+
+def roll_free(ocp: Ocp, lin: Linearization) -> ca.Function:
+    """Build a stage of the roll-out with an input."""
+    of, nu = Stage(ocp, lin), ocp.model.nu
+    s, slip, gain = ca.SX.sym("s", of.n), ca.SX.sym("slip", of.n), Gain(of)
+    names = ("increment", "u", "before", "place_u", "place_du", "lbu", "ubu", "lbdu", "ubdu", "stiff_u", "scale_u")
+    increment, u, before, place_u, place_du, lbu, ubu, lbdu, ubdu, stiff, scale = own = [ca.SX.sym(name, nu) for name in names]
+    du = -(gain.K @ s + gain.kappa)
+    # By so little the penalty gives way. States are to know what the actuator will do, places are not: degenerate ones would go in circles.
+    u_plan = met(u + du, before, lbu, ubu, lbdu, ubdu)
+    symbols, outputs, verdict = softened_rows(ocp, of, s, slip, du, u_plan - u - du)
+
+    def placed(value: ca.SX, place: ca.SX, lower: ca.SX, upper: ca.SX, lb: Any, ub: Any) -> ca.SX:
+        now = [belongs(place[j], stiff[j], scale[j], *exceeded(value[j], lower[j], upper[j], lb[j], ub[j]), INFINITY) for j in range(nu)]
+        return ca.densify(ca.vertcat(*now))
+
+    planned = increment + du - s[of.nx :]
+    outputs["place_u_found"] = placed(u + du, place_u, lbu, ubu, ocp.lbu, ocp.ubu)
+    outputs["place_du_found"] = placed(planned, place_du, lbdu, ubdu, ocp.lbdu, ocp.ubdu)
+    verdict[0] += ca.sum1(outputs["place_u_found"] != place_u)
+    verdict[0] += ca.sum1(outputs["place_du_found"] != place_du)
+    outputs["force"] = ca.densify(stiff * (ca.fabs(place_du) == 1) * (planned - ca.if_else(place_du > 0, ubdu, lbdu)))
+    inputs = {**symbols, "gain": gain.column, **dict(zip(names, own, strict=True))}
+    return simplified("forward", inputs, {**outputs, "u_plan": u_plan, "verdict_after": ca.vertcat(*verdict)})
 
 
 def met(u: ca.SX, before: ca.SX, lbu: ca.SX, ubu: ca.SX, lbdu: ca.SX, ubdu: ca.SX) -> ca.SX:
@@ -216,50 +287,40 @@ def belongs(place: ca.SX, stiff: ca.SX, scale: ca.SX, over: ca.SX, under: ca.SX,
     return ca.SX(ca.if_else(place == 0, free, ca.if_else(ca.fabs(place) == 1, held, beyond)))
 
 
-def refine(
-    ocp: Ocp,
-    lin: Linearization,
-    recursion: Riccati,
-    forms: list[ca.MX],
-    gains: ca.MX,
-    at: Rows,
-    stiff: ca.MX,
-    r: ca.MX,
-    x_plan: ca.MX,
-    u_plan: ca.MX,
-    multipliers: ca.MX,
-) -> list[ca.MX]:
+def refine(ocp: Ocp, recursion: Riccati, at: Sample, *, r: ca.MX, x_plan: ca.MX, u_plan: ca.MX, multipliers: ca.MX) -> dict[str, ca.MX]:
     """Return what a refinement returns: one Newton step on the optimality conditions, softened rows that are held brought to their bounds."""
+    lin, forms, place, stiff = at.lin, at.forms, at.place, at.stiff
     N, N_u, nu, w = ocp.N, ocp.N_u, ocp.model.nu, lin.w
     of_increments, of_softened = divided(multipliers, [lin.u, lin.g])
     du = u_plan - lin.u
     held = ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u))
     of = Stage(ocp, lin)
     dx_i, du_i, g_i = ca.SX.sym("dx", of.nx), ca.SX.sym("du", nu), ca.SX.sym("g", of.ng)
-    value = ca.Function("softened_value", [g_i, *of.softened, dx_i, du_i], [ca.densify(g_i + of.G @ ca.vertcat(dx_i, du_i))])
-    values = value.map(N)(forms[7], forms[8], forms[9], x_plan[:, 1:] - lin.x[:, 1:], held)
-    weight = ca.repmat(stiff / lin.scale_g**2, 1, N) * (ca.fabs(at.softened) == 1)
+    symbols = [g_i, *of.softened.values(), dx_i, du_i]
+    value = ca.Function("softened_value", symbols, [ca.densify(g_i + of.G @ ca.vertcat(dx_i, du_i))])
+    values = value.map(N)(forms.g, forms.g_x, forms.g_u, x_plan[:, 1:] - lin.x[:, 1:], held)
+    weight = ca.repmat(stiff / lin.scale_g**2, 1, N) * (ca.fabs(place.g) == 1)
     lower, upper = (ca.repmat(e, 1, N) for e in (lin.lg, lin.ug))
-    excess = values - ca.if_else(at.softened > 0, upper, lower)
+    excess = values - ca.if_else(place.g > 0, upper, lower)
     zero = ca.MX.zeros(nu, N_u)
-    corrected = recursion.corrected(forms, gains, Rows(r * (at.inputs == 0), zero, weight * excess))
+    corrected = recursion.corrected(forms, at.gains, Rows(r * (place.u == 0), zero, weight * excess))
     start = ca.MX.zeros(of.n)
     _, step, rows = recursion.rolled(forms, corrected, start, defects=False)
-    side = ca.sign(at.softened)
-    by = side * (excess + rows.softened)
+    side = ca.sign(place.g)
+    by = side * (excess + rows.g)
     beyond = side * (ca.repmat(lin.zg, 1, N) + ca.repmat(lin.Zg, 1, N) * by) / 2
-    paid = ca.if_else(ca.fabs(at.softened) == 2, beyond, (of_softened + weight * (excess + rows.softened)) * (ca.fabs(at.softened) == 1))
-    force = of_increments + ca.repmat(stiff / lin.scale_u**2, 1, N_u) * (ca.fabs(at.increments) == 1) * rows.increments
+    paid = ca.if_else(ca.fabs(place.g) == 2, beyond, (of_softened + weight * (excess + rows.g)) * (ca.fabs(place.g) == 1))
+    force = of_increments + ca.repmat(stiff / lin.scale_u**2, 1, N_u) * (ca.fabs(place.du) == 1) * rows.du
     clip, follow = met_function(nu), follow_function(lin)
     last, change_k, inputs, states = lin.u_prev, ca.MX.zeros(of.nx), [], [x_plan[:, 0]]
-    planned, A, B = columns(u_plan), columns(forms[0]), columns(forms[1])
+    planned, A, B = columns(u_plan), columns(forms.A), columns(forms.B)
     for k in range(N):
         if k < N_u:
             last = clip(planned[k] + step[:, k], last, w["lbu"], w["ubu"], w["lbdu"], w["ubdu"])
             inputs.append(last)
         change_k = follow(A[k], B[k], change_k, last - planned[min(k, N_u - 1)])
         states.append(x_plan[:, k + 1] + change_k)
-    return [ca.horzcat(*states), ca.horzcat(*inputs), ca.veccat(force, paid)]
+    return {"x_refined": ca.horzcat(*states), "u_refined": ca.horzcat(*inputs), "multipliers_refined": ca.veccat(force, paid)}
 
 
 def follow_function(lin: Linearization) -> ca.Function:

@@ -29,7 +29,8 @@ class Prediction:
         self._start: Array = np.zeros(model.nx)
         self._input: Array = np.zeros(model.nu)
         phi = integrator(model, "rk4")
-        self._integrate = bind(compiled(phi)[0] if compile else phi, (self._start, self._input, self.p, self._span), (self.x,))
+        integrate = compiled(phi)[0] if compile else phi
+        self._integrate = bind(integrate, {"x": self._start, "u": self._input, "p": self.p, "dt": self._span}, {"x_next": self.x})
 
     def predict(self, x: Array, from_ns: int, to_ns: int) -> Array:
         """

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -23,21 +23,53 @@ if TYPE_CHECKING:
     import qpsolvers
 
 
+class Plan(NamedTuple):
+    """
+    What a full step leads to.
+
+    Attributes:
+        x: States, shape ``(N + 1, nx)``.
+        u: Inputs, shape ``(N_u, nu)``.
+        violation: By how much softened bounds are exceeded at most, as it is and relative to their scale, shape ``(2,)``.
+        change: Size of the step, see `rti_mpc.linearization.change`, shape ``(1,)``.
+    """
+
+    x: Array
+    u: Array
+    violation: Array
+    change: Array
+
+    def outputs(self) -> dict[str, Array]:
+        """Return these by the names of the functions that make them."""
+        return {"x_plan": self.x, "u_plan": self.u, "violation": self.violation, "change": self.change}
+
+
 @dataclass(frozen=True, eq=False)
 class Guess:
     """
     Where the QPs of an OCP are made, and what comes out: arrays that all of them share.
 
     Attributes:
-        sample: x, u, u_prev, y_ref, p, the weights, and the scale, in the order of `Linearization.arguments`.
+        sample: x, u, u_prev, y_ref and p, by these names.
+        weights: Weights and bounds, by the names in `rti_mpc.linearization.WEIGHTS`, and the scale.
         x0: State embedded at node 0, shape ``(nx,)``.
-        plan: States and inputs after the full step, shapes as the guess; by how much softened bounds are exceeded, as it is and relative to their
-            scale, shape ``(2,)``; the size of the step, see `rti_mpc.linearization.change`, shape ``(1,)``.
+        plan: What the full step from there leads to.
     """
 
-    sample: tuple[Array, ...]
+    sample: dict[str, Array]
+    weights: dict[str, Array]
     x0: Array
-    plan: tuple[Array, Array, Array, Array]
+    plan: Plan
+
+    @property
+    def arguments(self) -> dict[str, Array]:
+        """What the data of a sample depends on, by name."""
+        return self.sample | self.weights
+
+    @property
+    def start(self) -> dict[str, Array]:
+        """What a step begins with: x, u and u_prev."""
+        return {name: self.sample[name] for name in ("x", "u", "u_prev")}
 
 
 class QpData:
@@ -116,21 +148,21 @@ class Qp(QpData):
         self.z: Array = np.zeros(n)
         self.cost: Array = np.zeros(1)
         self.checksum: Array = np.zeros(1)
-        memory: Array = np.zeros(transcription.everything.numel_out(5))
+        memory: Array = np.zeros(transcription.everything.numel_out("memory"))
         self._eliminable = transcription.eliminable
 
-        self._scale, self._columns, self._rows = guess.sample[-1], transcription.columns, transcription.rows
+        self._scale, self._columns, self._rows = guess.weights["scale"], transcription.columns, transcription.rows
         self.watched = transcription.watched
-        self.varies_P, self.varies_A = 1 in transcription.varying, 2 in transcription.varying
+        self.varies_P, self.varies_A = "P_data" in transcription.varying, "A_data" in transcription.varying
 
-        outputs = (self.q, self.P.data, self.A.data, self.l, self.u, memory, self.cost, self.checksum)
-        self.fill = bind(transcription.everything, guess.sample, outputs)
-        self.linearize = bind(make(transcription.data), guess.sample, [outputs[i] for i in transcription.varying])
-        x, u, u_prev, *_ = guess.sample
-        weights = guess.sample[5:]
-        targets = [getattr(self, name)[place] for name, place in transcription.embedded]
-        self.embed = bind(make(transcription.embed), (guess.x0, x, memory), targets)
-        self.step = bind(make(transcription.step), (x, u, u_prev, self.z, guess.x0, memory, *weights), guess.plan)
+        vectors = {"q": self.q, "lower": self.l, "upper": self.u}
+        outputs = {**vectors, "P_data": self.P.data, "A_data": self.A.data, "memory": memory, "cost": self.cost, "checksum": self.checksum}
+        self.fill = bind(transcription.everything, guess.arguments, outputs)
+        self.linearize = bind(make(transcription.data), guess.arguments, {name: outputs[name] for name in transcription.varying})
+        embedded = {f"{name}_embedded": vectors[name][place] for name, place in transcription.embedded}
+        self.embed = bind(make(transcription.embed), {"x0": guess.x0, "x": guess.sample["x"], "memory": memory}, embedded)
+        step = {**guess.start, "solution": self.z, "x0": guess.x0, "memory": memory, **guess.weights}
+        self.step = bind(make(transcription.step), step, guess.plan.outputs())
 
     @property
     def sound(self) -> bool:

@@ -31,14 +31,14 @@ from rti_mpc.errors import OcpError, ShapeError
 from rti_mpc.foreign_solver import ForeignSolver, check_name
 from rti_mpc.linearization import WEIGHTS, plan_cost, shift
 from rti_mpc.ocp import Ocp
-from rti_mpc.places import places
-from rti_mpc.qp import Guess, Qp, step_size
+from rti_mpc.places import Places, places
+from rti_mpc.qp import Guess, Plan, Qp, step_size
 from rti_mpc.scale import scale
 from rti_mpc.sequential import sequential
 from rti_mpc.simultaneous import simultaneous
 from rti_mpc.solver import Solver, SolverSettings
 from rti_mpc.status import QpStatus
-from rti_mpc.transcription import INFINITY
+from rti_mpc.transcription import INFINITY, Transcription
 from rti_mpc.turns import Turns
 
 FORMULATIONS = {"simultaneous": simultaneous, "sequential": sequential}
@@ -69,12 +69,16 @@ class Rti:
         u_prev: Input before the plan, shape ``(nu,)``: what increments are counted from.
         y_ref: Reference rows of the current sample, shape ``(N, ny)``.
         p: Stage parameters of the current sample, shape ``(N + 1, np)``.
+        x0: Initial state of the current sample, shape ``(nx,)``, its angles in the turn of the plan.
         scale: What states, inputs and softened bounds are measured by inside, see `rti_mpc.scale`; shape ``(nx + nu + ng,)``.
+        cost_scale: What costs are multiplied by inside.
         guess: Where the current sample is linearized, and what the solvers read and write.
         active_set: What is tried first; None if the solver is another.
         solvers: The QP solvers, each with its QP: without softened bounds and, if there are any, with them.
         solver: What solved the current sample, or is about to.
         status: Outcome of the last feedback.
+        advance: Native call: moves the plan on by one stage, to be the guess.
+        evaluate: Native call: the cost of the plan.
 
     Args:
         ocp: The problem.
@@ -102,19 +106,10 @@ class Rti:
         tolerance: float = TOLERANCE,
         compile: bool = True,
     ) -> None:
+        check_options(solver, settings, iterations, tolerance)
         model, N, N_u = ocp.model, ocp.N, ocp.N_u
-        if formulation == "auto":
-            formulation = "sequential" if N_u <= SEQUENTIAL_UP_TO else "simultaneous"
-        if formulation not in FORMULATIONS:
-            raise OcpError(f"formulation must be auto, {' or '.join(FORMULATIONS)}, got {formulation!r}")
-        if solver not in SOLVERS:
-            check_name(solver)
-            if settings is not None:
-                raise OcpError(f"settings are OSQP's, they must be left out for another solver, got {settings} for {solver!r}")
-        if not (iterations >= 1 and tolerance >= 0.0):
-            raise OcpError(f"iterations must be at least 1 and tolerance not negative, got {iterations} and {tolerance}")
         self.ocp = ocp
-        self.formulation = formulation
+        self.formulation = formulation_of(ocp, formulation)
         self.iterations, self.tolerance, self.taken = iterations, tolerance, 0
         # A step leads from a guess to a plan; the next guess is that plan, moved on by a stage. No memory is both.
         self.x: Array = np.zeros((N + 1, model.nx))
@@ -125,56 +120,58 @@ class Rti:
         self.u_prev: Array = np.array(model.u_rest, dtype=np.float64)
         self.y_ref: Array = np.zeros((N, model.ny))
         self.p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
+        self.x0: Array = np.zeros(model.nx)
         self.status = QpStatus.NONE
         self._rows = self.y_ref.shape
         self._pending = False  # whether a sample was prepared and has had no feedback
-        self._x0: Array = np.zeros(model.nx)
         self._violation: Array = np.zeros(2)  # of softened bounds, as it is and relative to their scales
         change: Array = np.zeros(1)
         self._change = change.data
         # OSQP has its own infinity, and reads no other.
-        weights = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS}
+        self._weights = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS}
         self.scale: Array = np.ones(model.nx + model.nu + len(ocp.lg))
-        guess = Guess((x, u, self.u_prev, self.y_ref, self.p, *weights.values(), self.scale), self._x0, (self.x, self.u, self._violation, change))
+        self.guess = Guess(
+            sample={"x": x, "u": u, "u_prev": self.u_prev, "y_ref": self.y_ref, "p": self.p},
+            weights=self._weights | {"scale": self.scale},
+            x0=self.x0,
+            plan=Plan(self.x, self.u, self._violation, change),
+        )
 
-        self.guess = guess
-        transcribe = FORMULATIONS[formulation]
-        transcriptions = [transcribe(ocp, softened=softened) for softened in (False, True)[: 2 if len(ocp.lg) else 1]]
+        transcriptions = [FORMULATIONS[self.formulation](ocp, softened=softened) for softened in (False, True)[: 2 if len(ocp.lg) else 1]]
         structured = (places(ocp), certificate(ocp)) if solver == "riccati" else None
-        functions = [shift(ocp), plan_cost(ocp)]
-        if structured is not None:  # a QP solver is then so rarely asked that its QP is left to the virtual machine: it would double the build
-            functions += [*vars(structured[0]).values(), structured[1]]
-        else:
-            functions += [f for t in transcriptions for f in (t.data, t.embed, t.step)]
-        made = dict(zip((f.name() for f in functions), compiled(*functions) if compile else functions, strict=True))
+        moves, cost = shift(ocp), plan_cost(ocp)
+        native = [moves, cost, *natives(transcriptions, structured)]
+        made = dict(zip((f.name() for f in native), compiled(*native) if compile else native, strict=True))
 
         def make(function: Any) -> Any:
             return made.get(function.name(), function)
 
-        self._shift = bind(made["shift"], (self.x, self.u, self.p), (x, u))
-        self._turns = Turns(ocp, x, self._x0, self.y_ref, self.p, (weights["lbx"], weights["ubx"]))
+        self.advance = bind(make(moves), {"x": self.x, "u": self.u, "p": self.p}, {"x_next": x, "u_next": u})
+        self._turns = Turns(ocp, x, self.x0, self.y_ref, self.p, (self._weights["lbx"], self._weights["ubx"]))
         self._cost: Array = np.zeros(1)
-        self._evaluate = bind(made["cost"], (self.x, self.u, *guess.sample[2:]), (self._cost,))
-        qps = [Qp(t, guess, make) for t in transcriptions]
-        self.active_set = ActiveSet(*structured, guess, make) if structured is not None else None
-        self._roll_out()
-        qps[0].fill()
-        if not qps[0].sound:
-            raise OcpError(f"model {model.name} must be finite and differentiable around the zero state")
-        self.scale[:] = scale(ocp, self.x, self.u, self.y_ref, self.p)
-        # The cost normalised, so that one step size of ADMM, and one tolerance, fit every problem.
-        self._cost_scale = 1.0 / step_size(qps[0])
-        for name in COSTS:
-            weights[name] *= self._cost_scale
-        self.y_ref[:] = 0.0
-        self._weights = weights
-        for qp in qps:
-            qp.fill()
+        self.evaluate = bind(make(cost), self.guess.arguments | {"x": self.x, "u": self.u}, {"cost": self._cost})
+        qps = [Qp(transcription, self.guess, make) for transcription in transcriptions]
+        self.active_set = None if structured is None else ActiveSet(*structured, self.guess, make)
+        self._normalise(qps)
         if solver in SOLVERS:
             self.solvers = [Solver(qp, settings or SolverSettings()) for qp in qps]
         else:
             self.solvers = [ForeignSolver(qp, solver) for qp in qps]
         self.reset(np.zeros(model.nx), np.array(model.u_rest))
+
+    def _normalise(self, qps: Sequence[Qp]) -> None:
+        """Find what variables are measured by, and normalise the cost, so that one step size of ADMM, and one tolerance, fit every problem."""
+        self._roll_out()
+        qps[0].fill()
+        if not qps[0].sound:
+            raise OcpError(f"model {self.ocp.model.name} must be finite and differentiable around the zero state")
+        self.scale[:] = scale(self.ocp, self.x, self.u, self.y_ref, self.p)
+        self.cost_scale = 1.0 / step_size(qps[0])
+        for name in COSTS:
+            self._weights[name] *= self.cost_scale
+        self.y_ref[:] = 0.0
+        for qp in qps:
+            qp.fill()
 
     @property
     def qp(self) -> Qp:
@@ -197,6 +194,10 @@ class Rti:
             self.solver = self.active_set
             self.active_set.forget()
 
+    def use_whole_qp(self) -> None:
+        """Let the QP solver, where it is asked next, solve the QP with its softened bounds."""
+        self._backup, self._loaded = self.solvers[-1], False
+
     def retune(self, values: Mapping[str, Array]) -> None:
         """
         Take other weights and bounds from the next `prepare` on; `ocp` keeps those it was built with.
@@ -207,7 +208,7 @@ class Rti:
         for name, value in values.items():
             self._weights[name][:] = np.clip(value, -INFINITY, INFINITY)
             if name in COSTS:
-                self._weights[name] *= self._cost_scale
+                self._weights[name] *= self.cost_scale
         for solver in self.solvers:
             solver.refill()
 
@@ -231,7 +232,7 @@ class Rti:
                 raise ShapeError("p", self.p.shape, p)
             self.p[...] = p
         if self._pending:
-            self._keep()
+            self.keep_guess()
         self.y_ref[...] = y_ref
         self._turns.take_reference()
         if u_prev is not None:
@@ -247,7 +248,7 @@ class Rti:
             self.active_set.advance()
             self.active_set.gain()
         else:
-            self._shift()
+            self.advance()
         if self.solver is not self.active_set:  # so that a sample like the last is prepared in full
             self._load()
 
@@ -271,7 +272,7 @@ class Rti:
         self._backup.load()
         self._loaded = True
 
-    def _keep(self) -> None:
+    def keep_guess(self) -> None:
         """Let the guess be the plan: for want of a better one."""
         for guess, plan in self._pairs:
             plan[:] = guess
@@ -291,13 +292,13 @@ class Rti:
     def shift(self) -> None:
         """Move the plan on by one stage: its first input becomes the previous one, its last is repeated, with the state the model predicts."""
         if self._pending:
-            self._keep()
+            self.keep_guess()
         self.u_prev[...] = self.u[0]
         if self.active_set is None:
-            self._shift()
+            self.advance()
         else:
             self.active_set.advance()
-        self._keep()
+        self.keep_guess()
 
     def feedback(self, x0: Array) -> QpStatus:
         """
@@ -309,11 +310,11 @@ class Rti:
         Args:
             x0: State at node 0, shape ``(nx,)``; angles may wrap: those of the plan continue the last one's.
         """
-        self._x0[...] = x0
+        self.x0[...] = x0
         self._pending = False
         if self._turns.settle():
             self._linearize()
-        self.status = self._solve()
+        self.status = self.solve()
         self.taken = 1
         if self._change[0] > self.tolerance:
             self._iterate()
@@ -327,35 +328,35 @@ class Rti:
             return INACCURATE  # a plan of the QP solver, to its tolerance
         status = active_set.certified()
         if not status.usable:
-            self._keep()
+            self.keep_guess()
             active_set.forget()
         return status
 
-    def _solve(self) -> QpStatus:
+    def solve(self) -> QpStatus:
         """Solve the QP, whoever can, and make the plan; without one, the guess stays."""
         active_set = self.active_set
         if active_set is not None and active_set.solve():
             self.solver = active_set
             return SOLVED
-        status = self._solve_qp()
+        status = self.solve_qp()
         if not status.usable:
-            self._keep()
+            self.keep_guess()
         return status
 
     def _iterate(self) -> None:
         """Iterate at the plan while the step is large; an iteration that fails leaves the plan of the one before."""
         while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
             self._relinearize()
-            if not (status := self._solve()).usable:
+            if not (status := self.solve()).usable:
                 self.status = INACCURATE  # the plan is that of a QP before the last, which nobody can certify any more
                 break
             self.status = status
             self.taken += 1
 
-    def _solve_qp(self) -> QpStatus:
+    def solve_qp(self) -> QpStatus:
         """Solve with the QP solver."""
         self.solver = self._backup
-        if not (np.abs(self._x0) < INFINITY).all():  # nor NaN
+        if not (np.abs(self.x0) < INFINITY).all():  # nor NaN
             return QpStatus.FAILED
         violation = self._violation
         if not self._loaded:
@@ -366,7 +367,7 @@ class Rti:
             self._backup.load()
             status = self._backup.solve()
         if status.usable:
-            self._evaluate()
+            self.evaluate()
             if not isfinite(self._cost[0]):  # numbers of such a size that they overflowed inside the solver
                 self.solver.cold = True
                 return QpStatus.FAILED
@@ -377,8 +378,8 @@ class Rti:
     @property
     def cost(self) -> float:
         """The cost (4) of the plan, with the penalties for what it exceeds; ask before the next `prepare`, which overwrites what it depends on."""
-        self._evaluate()
-        return float(self._cost[0]) / self._cost_scale
+        self.evaluate()
+        return float(self._cost[0]) / self.cost_scale
 
     @property
     def violation(self) -> float:
@@ -389,3 +390,34 @@ class Rti:
     def touches(self) -> bool:
         """Whether the last plan is at a softened bound, or beyond it."""
         return bool(self._violation[1] > -TOUCHING)
+
+
+def check_options(solver: str, settings: SolverSettings | None, iterations: int, tolerance: float) -> None:
+    """Refuse options of an `Rti` that make no sense; see there."""
+    if solver not in SOLVERS:
+        check_name(solver)
+        if settings is not None:
+            raise OcpError(f"settings are OSQP's, they must be left out for another solver, got {settings} for {solver!r}")
+    if not (iterations >= 1 and tolerance >= 0.0):
+        raise OcpError(f"iterations must be at least 1 and tolerance not negative, got {iterations} and {tolerance}")
+
+
+def formulation_of(ocp: Ocp, formulation: str) -> str:
+    """Return which formulation is meant."""
+    if formulation == "auto":
+        return "sequential" if ocp.N_u <= SEQUENTIAL_UP_TO else "simultaneous"
+    if formulation not in FORMULATIONS:
+        raise OcpError(f"formulation must be auto, {' or '.join(FORMULATIONS)}, got {formulation!r}")
+    return formulation
+
+
+def natives(transcriptions: Sequence[Transcription], structured: tuple[Places, Any] | None) -> list[Any]:
+    """
+    Return the functions of a problem's solver that are worth compiling.
+
+    A QP solver behind the active set is so rarely asked that its QP is left to the
+    virtual machine: it would double the build.
+    """
+    if structured is not None:
+        return [*vars(structured[0]).values(), structured[1]]
+    return [function for transcription in transcriptions for function in (transcription.data, transcription.embed, transcription.step)]

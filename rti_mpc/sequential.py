@@ -24,6 +24,7 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
+from rti_mpc.codegen import function
 from rti_mpc.linearization import Linearization, change
 from rti_mpc.ocp import Ocp
 from rti_mpc.transcription import (
@@ -178,7 +179,9 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
     A_pattern, A_data = A.finish(rows.count, n)
     P_pattern, P_data = P.finish(n, n)
     checksum = lin.checksum + ca.sum1(memory) + ca.sum1(P_data)
-    everything, varying, data = data_functions(lin, [q, P_data, A_data, lower, upper_bounds, memory, lin.cost, checksum], kind)
+    outputs = {"q": q, "P_data": P_data, "A_data": A_data, "lower": lower, "upper": upper_bounds}
+    outputs |= {"memory": memory, "cost": lin.cost, "checksum": checksum}
+    everything, varying, data = data_functions(lin, outputs, kind)
     return Transcription(
         P=P_pattern,
         A=A_pattern,
@@ -186,7 +189,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
         varying=varying,
         data=data,
         embed=embed(ocp, kind, memory.numel(), sum(e.numel() for e in known), end_soft - first_soft),
-        embedded=(("q", slice(0, to_s)), *((name, slice(first_soft, end_soft)) for name in ("l", "u") if ng)),
+        embedded=(("q", slice(0, to_s)), *((name, slice(first_soft, end_soft)) for name in ("lower", "upper") if ng)),
         step=full_step(ocp, kind, lin, n, memory.numel()),
         columns=np.concatenate([np.tile(by_input, N_u), np.tile(by_bound[:ng], N)]),
         rows=np.array(rows.scales),
@@ -204,11 +207,11 @@ def embed(ocp: Ocp, kind: str, remembered: int, start: int, soft_rows: int) -> c
     deviation = x0 - x[:, 0]
     lengths = (inputs, inputs * nx, soft_rows * nx, soft_rows, soft_rows)
     q, M, Phi, lower, upper = ca.vertsplit(memory[start:], np.cumsum([0, *lengths]).tolist())
-    outputs = [q + ca.reshape(M, inputs, nx) @ deviation]
+    outputs = {"q_embedded": q + ca.reshape(M, inputs, nx) @ deviation}
     if soft_rows:
         response = ca.reshape(Phi, soft_rows, nx) @ deviation
-        outputs += [lower - response, upper - response]
-    return ca.Function(f"embed_{kind}", [x0, x, memory], outputs)
+        outputs |= {"lower_embedded": lower - response, "upper_embedded": upper - response}
+    return function(f"embed_{kind}", {"x0": x0, "x": x, "memory": memory}, outputs)
 
 
 def full_step(ocp: Ocp, kind: str, lin: Linearization, n: int, remembered: int) -> ca.Function:
@@ -232,5 +235,6 @@ def full_step(ocp: Ocp, kind: str, lin: Linearization, n: int, remembered: int) 
     deviation = x0 - x[:, 0]
     dx = ca.horzcat(deviation, advance(deviation, A, B, ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u)), b))
     u_plan = clipped(u + du, u_prev, w)
-    plan = [x + dx, u_plan, known.violation(dx, du, w), change(lin, u_plan)]
-    return ca.Function(f"step_{kind}", [x, u, u_prev, z, x0, known.memory, *lin.weights], plan)
+    start = {"x": x, "u": u, "u_prev": u_prev, "solution": z, "x0": x0, "memory": known.memory}
+    plan = {"x_plan": x + dx, "u_plan": u_plan, "violation": known.violation(dx, du, w), "change": change(lin, u_plan)}
+    return function(f"step_{kind}", {**start, **lin.weights}, plan)

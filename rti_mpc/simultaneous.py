@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
+from rti_mpc.codegen import function
 from rti_mpc.linearization import Linearization, change, nonzeros
 from rti_mpc.ocp import Ocp
 from rti_mpc.transcription import (
@@ -104,7 +105,8 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
     A_pattern, A_data = A.finish(rows.count, n)
     P_pattern, P_data = P.finish(n, n)
     memory = ca.veccat(*head(lin))
-    outputs = [q, P_data, A_data, ca.vertcat(*rows.lower), ca.vertcat(*rows.upper), memory, lin.cost, lin.checksum]
+    outputs = {"q": q, "P_data": P_data, "A_data": A_data, "lower": ca.vertcat(*rows.lower), "upper": ca.vertcat(*rows.upper)}
+    outputs |= {"memory": memory, "cost": lin.cost, "checksum": lin.checksum}
     everything, varying, data = data_functions(lin, outputs, kind)
     return Transcription(
         P=P_pattern,
@@ -113,7 +115,7 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
         varying=varying,
         data=data,
         embed=embed(ocp, kind, memory.numel()),
-        embedded=(("l", slice(0, nx)), ("u", slice(0, nx))),
+        embedded=(("lower", slice(0, nx)), ("upper", slice(0, nx))),
         step=full_step(ocp, kind, lin, n, memory.numel()),
         columns=np.concatenate([np.tile(by_state, N + 1), np.tile(by_input, N_u), np.tile(by_bound[:ng], N)]),
         rows=np.array(rows.scales),
@@ -127,7 +129,8 @@ def embed(ocp: Ocp, kind: str, remembered: int) -> ca.Function:
     x0 = ca.SX.sym("x0", ocp.model.nx)
     x = ca.SX.sym("x", ocp.model.nx, ocp.N + 1)
     deviation = x0 - x[:, 0]
-    return ca.Function(f"embed_{kind}", [x0, x, ca.SX.sym("memory", remembered)], [deviation, deviation])
+    memory = ca.SX.sym("memory", remembered)
+    return function(f"embed_{kind}", {"x0": x0, "x": x, "memory": memory}, {"lower_embedded": deviation, "upper_embedded": deviation})
 
 
 def full_step(ocp: Ocp, kind: str, lin: Linearization, n: int, remembered: int) -> ca.Function:
@@ -139,5 +142,6 @@ def full_step(ocp: Ocp, kind: str, lin: Linearization, n: int, remembered: int) 
     to_du, to_s = x.numel(), x.numel() + u.numel()
     dx, du = ca.reshape(z[:to_du], x.shape), ca.reshape(z[to_du:to_s], u.shape)
     u_plan = clipped(u + du, u_prev, w)
-    plan = [x + dx, u_plan, known.violation(dx, du, w), change(lin, u_plan)]
-    return ca.Function(f"step_{kind}", [x, u, u_prev, z, x0, known.memory, *lin.weights], plan)
+    start = {"x": x, "u": u, "u_prev": u_prev, "solution": z, "x0": x0, "memory": known.memory}
+    plan = {"x_plan": x + dx, "u_plan": u_plan, "violation": known.violation(dx, du, w), "change": change(lin, u_plan)}
+    return function(f"step_{kind}", {**start, **lin.weights}, plan)

@@ -65,6 +65,7 @@ class Solver:
 
     Attributes:
         qp: The problem.
+        workspace: OSQP's own, held for good and updated in place.
         cold: Whether the next `load` forgets the last solution.
     """
 
@@ -93,10 +94,10 @@ class Solver:
             warm_starting=True,
             polishing=False,
         )
-        self._osqp = public._solver
-        self._info = self._osqp.info
-        self._solution = self._osqp.solution
-        refused = self._osqp.update_data_mat(P_x=scaled.P.data, P_i=None, A_x=scaled.A.data, A_i=None)
+        self.workspace = public._solver
+        self._info = self.workspace.info
+        self._solution = self.workspace.solution
+        refused = self.workspace.update_data_mat(P_x=scaled.P.data, P_i=None, A_x=scaled.A.data, A_i=None)
         assert not refused, "OSQP must have kept the patterns it was given"
         self._P_x = scaled.P.data if qp.varies_P else None
         # The softened rows, the last of all, are weighed by whether they act; OSQP sees what comes of that.
@@ -119,9 +120,9 @@ class Solver:
             changed |= self._weigh()
             np.multiply(scaled.A.data, self._scale[qp.A.indices], out=self._A_x)
         if changed:
-            self._sound = not self._osqp.update_data_mat(P_x=self._P_x, P_i=None, A_x=self._A_x, A_i=None)  # refused: no factorization
+            self._sound = not self.workspace.update_data_mat(P_x=self._P_x, P_i=None, A_x=self._A_x, A_i=None)  # refused: no factorization
         if self.cold:
-            self._osqp.warm_start(*self._zero)
+            self.workspace.warm_start(*self._zero)
             self.cold = False
 
     def refill(self) -> None:
@@ -144,7 +145,7 @@ class Solver:
             return False
         self._active = active
         self._scale[self._soft] = np.where(active, ACTING_SCALE, 1.0)
-        self._osqp.warm_start(self._solution.x, y / self._scale)
+        self.workspace.warm_start(self._solution.x, y / self._scale)
         return True
 
     def solve(self) -> QpStatus:
@@ -152,7 +153,7 @@ class Solver:
         if not self._sound:
             self.cold = True
             return QpStatus.FAILED
-        scaled, workspace = self._scaled, self._osqp
+        scaled, workspace = self._scaled, self.workspace
         self.qp.embed()
         scaled.vectors()
         if self._l is not scaled.l:

@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
+from rti_mpc.codegen import function
 from rti_mpc.linearization import Linearization
 from rti_mpc.ocp import Ocp
 
@@ -32,14 +33,14 @@ class Transcription:
     Attributes:
         P: Pattern of the upper triangle of the Hessian, shape ``(n, n)``.
         A: Pattern of the constraint matrix, shape ``(m, n)``.
-        everything: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale) -> (q, P_data, A_data, l, u, memory, cost, checksum)``; `memory` is what `embed` and
-            `step` want to know, and `checksum` is finite if and only if all the others are.
-        varying: Which of these eight change from sample to sample.
+        everything: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale) -> (q, P_data, A_data, lower, upper, memory, cost, checksum)``; `memory` is what
+            `embed` and `step` want to know, and `checksum` is finite if and only if all the others are.
+        varying: Which of these eight change from sample to sample, by name.
         data: As `everything`, but returns only what varies.
-        embed: ``(x0, x, memory) -> `` what of the QP depends on the initial state.
-        embedded: Where that goes: attribute of the QP, and place in it.
-        step: ``(x, u, u_prev, z, x0, memory, *WEIGHTS, scale) -> (x+, u+, violation, change)``: the full step, by how much it exceeds softened
-            bounds, as it is and relative to their scale, and its size.
+        embed: ``(x0, x, memory) -> `` what of the QP depends on the initial state, named as what it is a part of, with ``_embedded``.
+        embedded: Where that goes: q, lower or upper, and place in it.
+        step: ``(x, u, u_prev, solution, x0, memory, *WEIGHTS, scale) -> (x_plan, u_plan, violation, change)``: the full step, by how much it
+            exceeds softened bounds, as it is and relative to their scale, and its size.
         columns: Which entry of the scale each variable is measured by, see `rti_mpc.scale`; shape ``(n,)``.
         rows: Which entry each row is measured by; shape ``(m,)``.
         eliminable: States in z, which as many first rows determine.
@@ -50,7 +51,7 @@ class Transcription:
     P: sp.csc_array[Any]
     A: sp.csc_array[Any]
     everything: ca.Function
-    varying: tuple[int, ...]
+    varying: tuple[str, ...]
     data: ca.Function
     embed: ca.Function
     embedded: tuple[tuple[str, slice], ...]
@@ -243,12 +244,13 @@ def each(column: ca.MX, times: int) -> ca.MX:
     return ca.repmat(column, 1, times)
 
 
-def data_functions(lin: Linearization, outputs: list[ca.MX], kind: str) -> tuple[ca.Function, tuple[int, ...], ca.Function]:
+def data_functions(lin: Linearization, outputs: dict[str, ca.MX], kind: str) -> tuple[ca.Function, tuple[str, ...], ca.Function]:
     """Return the function of all outputs, which of them vary with the sample, and the function of these."""
-    outputs = [ca.densify(output) for output in outputs]
-    varying = tuple(i for i, output in enumerate(outputs) if output.numel() and ca.depends_on(output, ca.veccat(*lin.sample)))
+    outputs = {name: ca.densify(output) for name, output in outputs.items()}
+    sample = ca.veccat(*lin.sample.values())
+    varying = tuple(name for name, output in outputs.items() if output.numel() and ca.depends_on(output, sample))
     return (
-        ca.Function("everything", lin.arguments, outputs),
+        function("everything", lin.arguments, outputs),
         varying,
-        ca.Function(f"data_{kind}", lin.arguments, [outputs[i] for i in varying]),
+        function(f"data_{kind}", lin.arguments, {name: outputs[name] for name in varying}),
     )

@@ -47,7 +47,7 @@ class Turns:
         self._lbx, self._ubx = bounds
         views: list[Any] = [array.data for array in (x0, x[0], y, y_ref[0])]  # read faster than arrays are
         self._x0, self._guess, self._y, self._y_first = views
-        self._output = bind(model.h(), (x0, p[0]), (y,))
+        self._output = bind(model.h(), {"x": x0, "p": p[0]}, {"y": y})
         self._states = [j for j, signal in enumerate(model.states) if signal.angle]
         self._outputs = [j for j, signal in enumerate(model.outputs) if signal.angle]
         self._bounded = [j for j in self._states if ocp.ubx[j] - ocp.lbx[j] <= math.tau]

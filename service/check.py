@@ -124,7 +124,7 @@ def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> Report:
         began_ns = time.perf_counter_ns()
         rti.prepare(y_ref)
         prepared_ns = time.perf_counter_ns()
-        guess = *(array.copy() for array in rti.guess.sample[:2]), rti.u_prev.copy()
+        guess = tuple(array.copy() for array in rti.guess.start.values())
         fed_ns = time.perf_counter_ns()
         status = rti.feedback(x)
         done_ns = time.perf_counter_ns()

@@ -65,14 +65,15 @@ class FaultyRti(Rti):
             time.sleep(PERIODS * self.ocp.dt)
         return super().feedback(x0)
 
-    def _solve(self) -> QpStatus:
+    def solve(self) -> QpStatus:
+        """As `Rti.solve`."""
         if self._failing not in ("solver", "qp"):
-            return super()._solve()
+            return super().solve()
         if self.active_set is None:
-            self._backup, self._loaded = self.solvers[-1], False
-        status = self._solve_qp() if self._failing == "solver" else QpStatus.INFEASIBLE
+            self.use_whole_qp()
+        status = self.solve_qp() if self._failing == "solver" else QpStatus.INFEASIBLE
         if not status.usable:
-            self._keep()
+            self.keep_guess()
         return status
 
 

@@ -27,24 +27,24 @@ class Parts:
         self.timed = False
         self._times: dict[str, int] = {}
         self._swaps: list[tuple[Any, str, Any, Any]] = []  # object, attribute, as it is, timed
-        for name in ("y_ref", "p", "u_prev", "_x0"):
+        for name in ("y_ref", "p", "u_prev", "x0"):
             array = getattr(rti, name)
             self._swaps.append((rti, name, array, Memory(array, self._timing("copies in", array.__setitem__))))
-        self._watch(rti, "evaluation", "_shift", "_evaluate")
+        self._watch(rti, "evaluation", "advance", "evaluate")
         if (active_set := getattr(rti, "active_set", None)) is not None:
             self._watch(active_set, "evaluation", "linearize", "advance")
             self._watch(active_set, "matrix update", "gain")
-            self._watch(active_set, "iterations", "_roll_out")
-            self._watch(active_set, "certificate", "_certify", "_refine")
+            self._watch(active_set, "iterations", "roll_out")
+            self._watch(active_set, "certificate", "certify", "refine")
         for solver in rti.solvers:
             self._watch(solver.qp, "evaluation", "linearize", "embed", "step")
             if isinstance(solver, ForeignSolver):
-                self._watch(solver, "iterations", "_solve")
+                self._watch(solver, "iterations", "call")
                 continue
-            workspace = solver._osqp
+            workspace = solver.workspace
             calls = {"update_data_mat": "matrix update", "update_data_vec": "vector update", "solve": "iterations"}
             proxy = Workspace(workspace, {name: self._timing(part, getattr(workspace, name)) for name, part in calls.items()})
-            self._swaps.append((solver, "_osqp", workspace, proxy))
+            self._swaps.append((solver, "workspace", workspace, proxy))
 
     def _watch(self, owner: Any, part: str, *names: str) -> None:
         """Time some calls of an object as one part."""

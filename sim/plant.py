@@ -57,7 +57,7 @@ class Plant:
         self.x = self._state[: model.nx]
         self.u = self._state[model.nx :] if lag_s > 0.0 else self._input
         phi = integrator(lagging(model, lag_s) if lag_s > 0.0 else model, "rk4", substeps)
-        self._evaluate = bind(phi, (self._state, self._input, self._p, self._dt), (self._next,))
+        self._evaluate = bind(phi, {"x": self._state, "u": self._input, "p": self._p, "dt": self._dt}, {"x_next": self._next})
 
     def advance(self, u: Array, duration_s: float) -> None:
         """Integrate over an interval in which the input, shape ``(nu,)``, is held."""

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -71,6 +72,7 @@ FLOW: tuple[set[str], ...] = (
     {"lives", "cadence", "heading", "mode", "schedule", "issued"},
     {"trajectory", "belief"},
     {"guard", "sent", "leadership"},
+    {"codegen"},
     {"model"},
     {"pioneer_3dx", "integrator", "track", "obstacle", "disturbance"},
     {"ocp"},
@@ -78,7 +80,6 @@ FLOW: tuple[set[str], ...] = (
     {"transcription", "scale"},
     {"simultaneous", "sequential", "riccati", "certificate"},
     {"places"},
-    {"codegen"},
     {"qp", "prediction", "observer", "envelope", "delay", "turns"},
     {"scaled", "active_set", "state_stream"},
     {"solver", "foreign_solver"},
@@ -201,3 +202,10 @@ def test_import_loads_only_what_it_needs(module: str, absent: set[str]) -> None:
 def test_file_names_its_licence_first(package: str) -> None:
     for path in files(package):
         assert path.read_text().startswith("# SPDX-License-Identifier: Apache-2.0\n"), path
+
+
+def test_every_cited_reference_is_defined_and_every_defined_one_cited() -> None:
+    sources = [path.read_text(encoding="utf-8") for package in PACKAGES for path in files(package)]
+    cited = {key for source in sources for key in re.findall(r"\[(\w+)\]_", source)}
+    defined = re.findall(r"^\* \[(\w+)\] ", (ROOT / "rti_mpc/__init__.py").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(cited) == sorted(defined)

@@ -47,7 +47,7 @@ def test_gap_is_at_least_what_a_worse_plan_costs_more(by: float) -> None:
     rti.u[:] = inside
     for k in range(ocp.N):
         rti.x[k + 1] = np.array(phi(rti.x[k], rti.u[k], [])).ravel()
-    more = 0.5 * rti._cost_scale * (rti.cost - least)  # the QP is half the cost, normalised
+    more = 0.5 * rti.cost_scale * (rti.cost - least)  # the QP is half the cost, normalised
     one = active(rti)
     one._judged()
     assert one._verdict[1][0] >= more > 0.0

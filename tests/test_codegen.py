@@ -48,7 +48,7 @@ def test_compiled_function_is_machine_code_and_gives_the_same_numbers(cache: Pat
     (fast,) = compiled(product())
     assert fast.class_name() == "External"
     A, b, c, s = arrays()
-    bind(fast, (A, b), (c, s))()
+    bind(fast, {"A": A, "b": b}, {"c": c, "s": s})()
     np.testing.assert_allclose(c, A.T @ b, rtol=1e-15)
     np.testing.assert_allclose(s, np.sin(A.T @ b), rtol=1e-15)
 
@@ -110,7 +110,7 @@ def test_file_in_the_cache_that_is_not_whole_and_ours_is_built_anew_and_never_lo
     harm(library)
     (fast,) = compiled(product())
     A, b, c, s = arrays()
-    bind(fast, (A, b), (c, s))()
+    bind(fast, {"A": A, "b": b}, {"c": c, "s": s})()
     np.testing.assert_allclose(c, A.T @ b, rtol=1e-15)
     assert (library.read_bytes(), library.is_symlink(), library.stat().st_mode & 0o777) == (content, False, 0o600)
     assert library.stat().st_uid == os.geteuid()
@@ -203,7 +203,7 @@ def test_cache_that_cannot_be_written_is_no_error(tmp_path: Path, monkeypatch: p
 @pytest.mark.parametrize("make", [compiled, lambda function: [function]], ids=["compiled", "interpreted"])
 def test_bound_function_follows_its_arrays_and_writes_in_place(make: Any) -> None:
     A, b, c, s = arrays()
-    call = bind(make(product())[0], (A, b), (c, s))
+    call = bind(make(product())[0], {"A": A, "b": b}, {"c": c, "s": s})
     for _ in range(3):
         A += 1.0
         b *= -0.5
@@ -225,13 +225,13 @@ def test_bound_function_follows_its_arrays_and_writes_in_place(make: Any) -> Non
 def test_array_that_casadi_would_misread_is_refused_by_name(change: Any, message: str) -> None:
     A, b, c, s = change(*arrays())
     with pytest.raises(ShapeError, match=message):
-        bind(product(), (A, b), (c, s))
+        bind(product(), {"A": A, "b": b}, {"c": c, "s": s})
 
 
 def test_arrays_stay_alive_as_long_as_the_call() -> None:
     def make() -> tuple[Any, Array]:
         A, b, c, s = arrays()
-        return bind(product(), (A, b), (c, s)), c
+        return bind(product(), {"A": A, "b": b}, {"c": c, "s": s}), c
 
     call, c = make()
     garbage = [np.full(6, 1e9) for _ in range(1000)]

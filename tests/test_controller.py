@@ -491,7 +491,7 @@ def failing(rti: Rti, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Let the next QPs fail."""
     left = 0
     assert rti.active_set is not None
-    solve, solve_qp = rti.active_set.solve, rti._solve_qp
+    solve, solve_qp = rti.active_set.solve, rti.solve_qp
 
     def gives_up() -> bool:
         return left == 0 and solve()
@@ -508,7 +508,7 @@ def failing(rti: Rti, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
         left = times
 
     monkeypatch.setattr(rti.active_set, "solve", gives_up)
-    monkeypatch.setattr(rti, "_solve_qp", fails)
+    monkeypatch.setattr(rti, "solve_qp", fails)
     return fail
 
 

@@ -86,7 +86,7 @@ def test_nan_never_reaches_the_solver_and_the_next_sample_is_solved(name: str, m
     solve(one, 1)
     plan = one.u.copy()
     solver, asked = one.solver, []
-    monkeypatch.setattr(solver, "_solve", lambda inner=solver._solve: asked.append(1) or inner())
+    monkeypatch.setattr(solver, "call", lambda inner=solver.call: asked.append(1) or inner())
     y_ref, x0 = np.zeros((10, 2)), np.zeros(2)
     one.prepare(y_ref * np.nan, shift=False)
     assert one.feedback(x0) is QpStatus.FAILED
@@ -121,7 +121,7 @@ def test_whatever_a_solver_raises_is_a_failed_sample(monkeypatch: pytest.MonkeyP
     def fail() -> None:
         raise ValueError("not for me")
 
-    monkeypatch.setattr(one.solver, "_solve", fail)
+    monkeypatch.setattr(one.solver, "call", fail)
     assert solve(one, 2) is QpStatus.FAILED
     monkeypatch.undo()
     assert solve(one, 2) is QpStatus.SOLVED

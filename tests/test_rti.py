@@ -214,7 +214,7 @@ def test_iteration_that_fails_leaves_the_plan_of_the_one_before(monkeypatch: pyt
     assert rti.active_set is not None
     solve, solved = rti.active_set.solve, iter((True, False))
     monkeypatch.setattr(rti.active_set, "solve", lambda: next(solved) and solve())
-    monkeypatch.setattr(rti, "_solve_qp", lambda: QpStatus.FAILED)
+    monkeypatch.setattr(rti, "solve_qp", lambda: QpStatus.FAILED)
     for one in (rti, plain):
         one.reset(x0, u_prev)
         one.prepare(y_ref, shift=False)

@@ -33,7 +33,7 @@ def solve(one: Rti, seed: int) -> QpStatus:
 def test_inner_object_of_osqp_offers_what_is_driven() -> None:
     """It is not public: another minor version may move it, and this is where that shows."""
     assert osqp.__version__.startswith("1.1.")
-    inner = rti().solver._osqp
+    inner = rti().solver.workspace
     for name in ("update_data_vec", "update_data_mat", "solve", "warm_start"):
         assert callable(getattr(inner, name))
     codes = {"SOLVED": 1, "SOLVED_INACCURATE": 2, "PRIMAL_INFEASIBLE": 3, "DUAL_INFEASIBLE": 5, "MAX_ITER_REACHED": 7, "TIME_LIMIT_REACHED": 8}
@@ -60,9 +60,9 @@ def test_osqp_writes_into_none_of_our_arrays(scaling: int) -> None:
     qp = one.qp
     arrays = (qp.P.data, qp.q, qp.A.data, qp.l, qp.u)
     before = [array.copy() for array in arrays]
-    one.solver._osqp.solve()
-    one.solver._osqp.update_data_mat(P_x=qp.P.data, P_i=None, A_x=qp.A.data, A_i=None)
-    one.solver._osqp.solve()
+    one.solver.workspace.solve()
+    one.solver.workspace.update_data_mat(P_x=qp.P.data, P_i=None, A_x=qp.A.data, A_i=None)
+    one.solver.workspace.solve()
     for now, then in zip(arrays, before, strict=True):
         np.testing.assert_array_equal(now, then)
 
@@ -92,7 +92,7 @@ def test_nan_never_reaches_osqp() -> None:
 
             return call
 
-    inner, one.solver._osqp = one.solver._osqp, Spy()
+    inner, one.solver.workspace = one.solver.workspace, Spy()
     y_ref, x0 = np.zeros((10, 2)), np.zeros(2)
     one.prepare(y_ref * np.nan, shift=False)
     assert one.feedback(x0) is QpStatus.FAILED
@@ -115,7 +115,7 @@ def test_infeasible_problem_is_told_by_its_status_and_its_iterate_not_taken() ->
     qp = one.qp
     first = np.flatnonzero(qp.l == qp.u)[-1]  # the last stage of the dynamics, twice
     qp.A.data[:] = np.where(qp.A.indices == first, 0.0, qp.A.data)
-    one.solver._osqp.update_data_mat(P_x=None, P_i=None, A_x=qp.A.data, A_i=None)
+    one.solver.workspace.update_data_mat(P_x=None, P_i=None, A_x=qp.A.data, A_i=None)
     qp.l[first] = qp.u[first] = 1.0
     assert one.feedback(np.zeros(2)) is QpStatus.INFEASIBLE
     np.testing.assert_array_equal(one.x, plan[0])

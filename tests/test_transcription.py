@@ -82,7 +82,7 @@ class ByHand:
         outputs = [np.sqrt(d) * root_Q @ e_i for d, e_i in zip(ocp.delta, e, strict=True)]
         if ocp.Q_e.any():
             outputs.append(np.linalg.cholesky(ocp.Q_e).T @ e[-1])
-        return np.sqrt(rti._cost_scale) * np.concatenate([*outputs, (np.sqrt(ocp.lambda_)[:, None] * (du @ root_R.T)).ravel()])
+        return np.sqrt(rti.cost_scale) * np.concatenate([*outputs, (np.sqrt(ocp.lambda_)[:, None] * (du @ root_R.T)).ravel()])
 
     def rows(self, v: Array) -> Array:
         """Left-hand sides of all constraints, in the order the transcription documents."""
@@ -158,7 +158,7 @@ def test_gradient_is_half_that_of_the_cost(name: str) -> None:
     ocp, problem = rti.ocp, ByHand(rti)
     difference = jacobian(lambda v: np.atleast_1d(0.5 * (problem.residuals(v) ** 2).sum()), problem.guess)[0]
     slacks = ocp.N * len(ocp.lg)
-    difference[len(difference) - slacks :] = 0.5 * rti._cost_scale * SLACK_UNIT * np.tile([*ocp.z[list(ocp.soft)], *ocp.zh], ocp.N)
+    difference[len(difference) - slacks :] = 0.5 * rti.cost_scale * SLACK_UNIT * np.tile([*ocp.z[list(ocp.soft)], *ocp.zh], ocp.N)
     np.testing.assert_allclose(whole(rti).q, difference, rtol=1e-7, atol=1e-6)  # costs of 1e3 over h
 
 
@@ -175,7 +175,7 @@ def test_hessian_is_the_gauss_newton_approximation_and_the_damping(name: str) ->
         steps = range(slacks - rti.u.size, slacks)
         residuals = problem.residuals(problem.guess)
         expected[steps, steps] += np.tile(damping(ocp) / rti.scale[nx : nx + nu] ** 2, ocp.N_u) * (residuals @ residuals)
-        expected[slacks:, slacks:] = np.diag(0.5 * rti._cost_scale * SLACK_UNIT**2 * np.tile([*ocp.Z[list(ocp.soft)], *ocp.Zh], ocp.N))
+        expected[slacks:, slacks:] = np.diag(0.5 * rti.cost_scale * SLACK_UNIT**2 * np.tile([*ocp.Z[list(ocp.soft)], *ocp.Zh], ocp.N))
         np.testing.assert_allclose(hessian(whole(rti)), expected, rtol=1e-7, atol=1e-6)
 
 
@@ -202,10 +202,10 @@ def test_sequential_qp_is_the_simultaneous_one_with_the_states_eliminated(name: 
     sparse, dense = (at_random(name, seed=9, formulation=formulation) for formulation in ("simultaneous", "sequential"))
     x0 = np.random.default_rng(9).normal(size=sparse.ocp.model.nx)
     for rti in (sparse, dense):
-        rti._x0[:] = x0
+        rti.x0[:] = x0
         whole(rti).embed()
     full, reduced = whole(sparse), whole(dense)
-    scale = dense._cost_scale / sparse._cost_scale
+    scale = dense.cost_scale / sparse.cost_scale
     k = sparse.x.size
     A, P = full.A.toarray(), hessian(full)
     offset = np.linalg.solve(A[:k, :k], full.l[:k])  # states where the inputs do not change

@@ -49,7 +49,8 @@ class Loop:
         self._acting, self._p = np.zeros((looks, model.nu)), np.tile(model.p_nominal, (looks, 1))
         self._start, self._path = np.zeros(model.nx), np.zeros((looks, model.nx))
         step = integrator(model, "euler" if euler else "rk4").mapaccum("plant", looks)
-        self._advance = bind(step, (self._start, self._acting, self._p, np.full(looks, experiment.T0 / looks)), (self._path,))
+        inputs = {"x": self._start, "u": self._acting, "p": self._p, "dt": np.full(looks, experiment.T0 / looks)}
+        self._advance = bind(step, inputs, {"x_next": self._path})
         self._offsets = experiment.T0 * np.arange(1, looks + 1) / looks
         for _ in range(WARM_UP):
             contender.reset(experiment.x0)

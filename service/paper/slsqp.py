@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import Bounds, minimize
 
 from rti_mpc.array import Array
-from rti_mpc.codegen import bind
+from rti_mpc.codegen import bind, function
 from rti_mpc.ocp import Ocp
 from service.yardstick import shifted
 
@@ -63,7 +63,12 @@ class Slsqp:
         def evaluator(expr: ca.SX, shape: tuple[int, ...]) -> Any:
             """Return a function of the variables, at the present sample."""
             out = np.zeros(shape)
-            evaluate = bind(ca.Function("f", [z, x0, u_prev, y_ref], [ca.densify(expr)]), (self._variables, *self._sample), (out,))
+            symbols = {"z": z, "x0": x0, "u_prev": u_prev, "y_ref": y_ref}
+            evaluate = bind(
+                function("f", symbols, {"value": ca.densify(expr)}),
+                dict(zip(symbols, (self._variables, *self._sample), strict=True)),
+                {"value": out},
+            )
 
             def value(variables: Array) -> Array:
                 self._variables[:] = variables
