@@ -126,12 +126,17 @@ class Timer:
 
 
 class Threads:
-    """All threads of a process and its descendants, but for our own, and how long each has waited for a core."""
+    """
+    All threads of a process and its descendants, but for our own, and how long each has waited for a core.
+
+    The kernel adds a wait up when it is over. One that lasts is told meanwhile, as is
+    the last one of a thread that then ends: the thread is runnable, and does not run.
+    """
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
-        self._open: dict[str, int] = {}  # descriptor by path
-        self._waited_ns: dict[str, int] = {}
+        self._open: dict[str, Waits] = {}  # by folder in proc
+        self._looked_ns = time.monotonic_ns()
         self.look()
         self.waited_ns()
 
@@ -143,23 +148,52 @@ class Threads:
                 for thread in os.listdir(f"/proc/{pid}/task"):
                     with open(f"/proc/{pid}/task/{thread}/children") as children:
                         pids += [child for child in children.read().split() if int(child) != os.getpid()]
-                    path = f"/proc/{pid}/task/{thread}/schedstat"
-                    if path not in self._open:
-                        self._open[path] = os.open(path, os.O_RDONLY)
+                    folder = f"/proc/{pid}/task/{thread}"
+                    if folder not in self._open:
+                        self._open[folder] = Waits(folder)
 
     def waited_ns(self) -> int:
         """Return what they have waited since the last call, ns."""
-        total_ns = 0
-        for path, descriptor in list(self._open.items()):
+        total_ns, now_ns = 0, time.monotonic_ns()
+        for folder, waits in list(self._open.items()):
             try:
-                waited_ns = int(os.pread(descriptor, 128, 0).split()[1])
+                total_ns += waits.since(now_ns - self._looked_ns)
             except OSError:  # it has ended
-                os.close(self._open.pop(path))
-                self._waited_ns.pop(path, None)
-                continue
-            total_ns += waited_ns - self._waited_ns.get(path, 0)
-            self._waited_ns[path] = waited_ns
+                waits.close()
+                del self._open[folder]
+        self._looked_ns = now_ns
         return total_ns
+
+
+class Waits:
+    """How long one thread has waited for a core."""
+
+    def __init__(self, folder: str) -> None:
+        self._stat = f"{folder}/stat"
+        self._descriptor = os.open(f"{folder}/schedstat", os.O_RDONLY)
+        self._ran_ns = self._waited_ns = 0
+        self._told_ns = 0  # of a wait that lasts
+
+    def since(self, elapsed_ns: int) -> int:
+        """
+        Return what it has waited since the last call, so many ns ago.
+
+        Raises:
+            OSError: It has ended.
+        """
+        ran_ns, waited_ns, _ = map(int, os.pread(self._descriptor, 128, 0).split())
+        if (ran_ns, waited_ns) == (self._ran_ns, self._waited_ns):
+            with open(self._stat, "rb") as stat:
+                runnable = stat.read().rpartition(b") ")[2][:1] == b"R"
+            self._told_ns += elapsed_ns * runnable
+            return elapsed_ns * runnable
+        more_ns = max(0, waited_ns - self._waited_ns - self._told_ns)
+        self._ran_ns, self._waited_ns, self._told_ns = ran_ns, waited_ns, 0
+        return more_ns
+
+    def close(self) -> None:
+        """Let it go."""
+        os.close(self._descriptor)
 
 
 def main(path: str, core: int, pid: int) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from service.host import Host
+from service.host import Host, Waits
 from service.realtime import available
 from tests.processes.system import until
 
@@ -59,6 +59,27 @@ def test_grandchildren_are_seen_too(host: Host) -> None:
     begin_ns = time.monotonic_ns()
     subprocess.run(["sh", "-c", shell, "sh", GREEDY], stdout=subprocess.DEVNULL, check=True)
     assert host.held_up_ms(begin_ns, time.monotonic_ns()) > 0.5 * 1e3 * COMPUTED_S
+
+
+def test_wait_that_lasts_is_told_before_the_kernel_adds_it_up_and_only_once(tmp_path: Path) -> None:
+    """A thread that ends right after a wait would else take it along."""
+
+    def tell(ran: int, waited: int, state: str) -> None:
+        (tmp_path / "schedstat").write_text(f"{ran} {waited} 7\n")
+        (tmp_path / "stat").write_text(f"12 (a) b) {state} 1 12\n")
+
+    tell(0, 0, "R")
+    waits = Waits(str(tmp_path))
+    assert [waits.since(10), waits.since(10)] == [10, 10]
+    tell(1, 25, "S")
+    assert waits.since(10) == 5
+    assert waits.since(10) == 0, "it sleeps"
+    tell(2, 26, "R")
+    assert waits.since(10) == 1, "it ran"
+    (tmp_path / "stat").unlink()
+    with pytest.raises(OSError, match="stat"):
+        waits.since(10)
+    waits.close()
 
 
 def test_its_timers_end_with_it_and_with_whoever_started_it(host: Host) -> None:
