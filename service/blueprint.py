@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 
 from rti_mpc.array import Array
 from rti_mpc.status import Mode, QpStatus
-from service.info import Info
+from rti_mpc.wire.info import Info
 from service.outline import outline
 
 TIMELINE = "robot_time"

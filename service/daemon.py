@@ -261,8 +261,8 @@ class Daemon:
                 self._send(command)
         if self._leadership.declare():
             self._introduce()
-        if (info := self._leadership.leader()) is not None:
-            self.orders.adopt(info)
+        if (leader := self._leadership.leader()) is not None:
+            self.orders.adopt(leader)
         self._announce()
 
     def _introduce(self) -> None:

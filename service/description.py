@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-from math import isfinite
 from typing import Any
 
 import rti_mpc
 from rti_mpc.obstacle import discs_of
 from rti_mpc.ocp import Ocp
+from rti_mpc.wire import info
 
 
 def describe(ocp: Ocp, np_: int) -> dict[str, Any]:
@@ -20,10 +20,10 @@ def describe(ocp: Ocp, np_: int) -> dict[str, Any]:
     return {
         "version": rti_mpc.__version__,
         "model": ocp.model.name,
-        **{name: [{"name": s.name, "unit": s.unit, "angle": s.angle} for s in signals] for name, signals in vectors.items()},
-        **{name: [value if isfinite(value) else None for value in getattr(ocp, name).tolist()] for name in limits},
+        **info.labels(**vectors),
+        **info.bounds(**{name: getattr(ocp, name).tolist() for name in limits}),
         "p_nominal": list(model.p_nominal[:np_]),
-        "obstacles": [{"at": at, "x": x, "y": y, "r": r} for at, x, y, r in discs_of(model)],
+        **info.obstacles(discs_of(model)),
         "N": ocp.N,
         "N_u": ocp.N_u,
         "dt_s": ocp.dt,

@@ -24,6 +24,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.guard import Guard
 from rti_mpc.latch import Latch
 from rti_mpc.message import Command, State
+from rti_mpc.wire import info
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received, Subscriber, unix_s
 from rti_mpc.wire.interrupt import stop_on_signals
@@ -79,11 +80,8 @@ def describe(config: Config) -> dict[str, object]:
     return {
         "role": ROLE,
         "version": rti_mpc.__version__,
-        "inputs": [{"name": name, "unit": "1", "angle": False} for name in bounds.inputs],
-        **{
-            name: [value if abs(value) < float("inf") else None for value in getattr(limits, name).tolist()]
-            for name in ("u_rest", "lbu", "ubu", "lbdu", "ubdu")
-        },
+        **info.labels(inputs=[info.Label(name) for name in bounds.inputs]),
+        **info.bounds(**{name: getattr(limits, name).tolist() for name in ("u_rest", "lbu", "ubu", "lbdu", "ubdu")}),
         "dt_s": limits.dt_s,
         "tick_s": config.guard.tick_s,
         "config_hash": config.config_hash,

@@ -10,19 +10,18 @@ from __future__ import annotations
 import re
 import secrets
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from threading import Event
 from typing import Any
 
 from rti_mpc.controller import Controller
 from rti_mpc.epoch import NUMBER_BITS, highest_believed
-from rti_mpc.errors import MessageError
 from rti_mpc.leadership import SILENCE_S, Leadership
 from rti_mpc.message import Command, State
 from rti_mpc.status import Mode
-from rti_mpc.wire import document
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received, Subscriber, unix_s
+from rti_mpc.wire.info import Leader
 
 LEADER, STANDBY = "controller", "standby"  # roles
 HEARING_S = 0.5  # for which a starting controller listens for others
@@ -54,19 +53,9 @@ def hear_others(bus: Bus, stop: Event) -> Others:
     stop.wait(HEARING_S)
     epoch = max(intake.highest_epoch(subscriber.drain()) for subscriber in commands)
     highest = highest_believed(unix_s(), epoch, choosing=True)
-    leaders = [info for received in infos.drain() if (info := leader_info(received, highest)) is not None]
-    leader = max(leaders, key=lambda info: (info["epoch"], info["seq"]), default=None)
-    return Others(epoch, None) if leader is None else Others(max(epoch, leader["epoch"]), leader["config_hash"])
-
-
-def leader_info(received: Received, highest: int) -> dict[str, Any] | None:
-    """Return a leader's description of itself, if it is one; its epoch is at most `highest`."""
-    try:
-        info = document.read(received.payload, received.size)
-    except MessageError:
-        return None
-    whole = all(type(number := info.get(name)) is int and number >= 0 for name in ("epoch", "seq", "config_hash"))
-    return info if whole and info["epoch"] <= highest else None
+    leaders = [leader for received in infos.drain() if (leader := Leader.from_received(received, highest)) is not None]
+    leader = max(leaders, key=lambda leader: (leader.epoch, leader.seq), default=None)
+    return Others(epoch, None) if leader is None else Others(max(epoch, leader.epoch), leader.config_hash)
 
 
 class Candidate:
@@ -143,7 +132,7 @@ class Candidate:
         self._decision.look(local_ns, self._controller.robot_rate)
         self._follow(self._decision.known)
 
-    def leader(self) -> Mapping[str, Any] | None:
+    def leader(self) -> Leader | None:
         """Return what the leader has last said of itself, once; None while this one leads."""
         waiting = self._look(self._infos)
         if self.leading:
@@ -153,11 +142,11 @@ class Candidate:
         known = self._decision.known
         news, highest = None, highest_believed(unix_s(), known, choosing=True)
         for received in waiting:
-            info = leader_info(received, highest)
-            if info is not None and info["epoch"] >= known and (info["epoch"], info["seq"]) > self._told:
-                news, self._told = info, (info["epoch"], info["seq"])
+            leader = Leader.from_received(received, highest)
+            if leader is not None and leader.epoch >= known and (leader.epoch, leader.seq) > self._told:
+                news, self._told = leader, (leader.epoch, leader.seq)
         if news is not None:
-            self._decision.fit(news["config_hash"])
+            self._decision.fit(news.config_hash)
         return news
 
     def declare(self) -> bool:

@@ -11,9 +11,9 @@ from typing import Any
 from rti_mpc.errors import MessageError
 from rti_mpc.message import STAMP_ON_ARRIVAL, Command, Event, Notice, Reference, State, Telemetry
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received, Subscriber
+from rti_mpc.wire.info import Info
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.streams import admitted, role_of
-from service.info import Info
 from service.playback import Actuation
 from service.recording import Entry
 from service.timeline import Timeline
@@ -87,7 +87,7 @@ class Listener:
         infos: dict[str, Info] = {}
         for received in self._infos.drain():
             try:
-                info = Info.from_payload(received.payload, received.size, received.key)
+                info = Info.from_received(received)
             except MessageError:
                 self._bad_infos += 1
                 continue

@@ -19,7 +19,7 @@ from typing import Any
 from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.latch import Latch, merge, read_latch, shown
 from rti_mpc.message import Notice, Severity
-from rti_mpc.wire import document
+from rti_mpc.wire import info
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received
 from service.latch_file import LatchFile
 
@@ -70,7 +70,7 @@ class OperatorStop:
 
     def describe(self) -> dict[str, Any]:
         """Return the latch as a part of the description of this process."""
-        return {"latch": asdict(self.latch)}
+        return info.latch(asdict(self.latch))
 
     def listen(self, bus: Bus) -> None:
         """Take over from now on what others describe."""
@@ -149,12 +149,12 @@ class OperatorStop:
     def _overhear(self, received: Received) -> None:
         """Look at a description of anybody's; in a thread of its own, which nothing that is heard may end."""
         try:
-            info = document.read(received.payload, received.size)
+            told = info.latches(received)
         except MessageError:
             return  # others say so, who want more of it
         try:
-            if "latch" in info:
-                self.hear(read_latch(info["latch"]))
+            for latch in told:
+                self.hear(read_latch(latch))
         except MessageError as error:
             self._say(Notice(Severity.WARNING, "latch_refused", f"{received.key}: {error}"))
 

@@ -9,7 +9,7 @@ description, from which those that stand by take it over.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from threading import Condition
 from typing import Any
 
@@ -17,6 +17,8 @@ from rti_mpc.controller import Controller
 from rti_mpc.errors import ConfigError, RtiMpcError
 from rti_mpc.message import Notice, Severity
 from rti_mpc.rti import Rti
+from rti_mpc.wire import info
+from rti_mpc.wire.info import Leader
 from service import injection
 from service.operator_stop import REQUESTS, OperatorStop
 from service.params import Params
@@ -45,7 +47,7 @@ class Orders:
 
     def describe(self) -> dict[str, Any]:
         """Return them as a part of the description."""
-        return {**self._stop.describe(), "parameters": {"version": self._params.version, "changes": self._params.changes}}
+        return {**self._stop.describe(), **info.parameters(self._params.version, self._params.changes)}
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any] | None:
         """
@@ -71,11 +73,11 @@ class Orders:
         self._tell()
         return {"ok": True, "request": what, **answer}
 
-    def adopt(self, info: Mapping[str, Any]) -> None:
+    def adopt(self, leader: Leader) -> None:
         """Take over what a leader's description says."""
         try:
             version = self._params.version
-            self._params.adopt(info["parameters"]["version"], dict(info["parameters"]["changes"]))
+            self._params.adopt(leader.parameters["version"], dict(leader.parameters["changes"]))
             if self._params.version != version:
                 self._say("parameters_changed", f"parameters of version {self._params.version}, as the leader has them")
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RtiMpcError) as error:

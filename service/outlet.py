@@ -17,7 +17,7 @@ import rerun as rr
 
 from rti_mpc.errors import ConfigError
 from rti_mpc.message import Notice, Reference, Severity
-from service.info import Info
+from rti_mpc.wire.info import Info
 from service.recording import Entry, Recording
 
 APPLICATION = "rti_mpc"

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from rti_mpc.array import Array
 from rti_mpc.message import Command, Event, Reference, Severity, State, Telemetry
+from rti_mpc.wire.info import Info, Label, Obstacle
 from service.blueprint import RUNGS, STRIPS, TIMELINE, Frame, blueprint, legend, lifted, looks
-from service.info import Info, Label, Obstacle
 from service.playback import Actuation, Playback, Row
 from service.tracking_error import tracking_error
 

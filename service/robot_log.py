@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rti_mpc.array import Array
-from service.info import Info
+from rti_mpc.wire.info import Info
 
 COUNTERS = ("lost", "late", "expired", "refused", "starved")
 

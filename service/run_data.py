@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rti_mpc.array import Array
-from service.info import Info
+from rti_mpc.wire.info import Info
 
 
 @dataclass(frozen=True, eq=False)

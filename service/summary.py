@@ -20,7 +20,7 @@ from rti_mpc.message import Event, Severity, Telemetry
 from rti_mpc.ocp import Ocp
 from rti_mpc.status import Mode
 from rti_mpc.trajectory import Trajectory
-from service.info import Info
+from rti_mpc.wire.info import Info
 from service.robot_log import RobotLog
 from service.run_data import Run
 

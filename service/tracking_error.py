@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rti_mpc.array import Array
 from rti_mpc.message import Reference
-from service.info import Info
+from rti_mpc.wire.info import Info
 
 
 def tracking_error(info: Info, reference: Reference, stamps: NDArray[np.int64], x: Array) -> dict[str, Array]:

@@ -9,9 +9,9 @@ from contextlib import suppress
 from rti_mpc.errors import MessageError
 from rti_mpc.message import Event, Reference, Telemetry
 from rti_mpc.wire.bus import RING_MESSAGES, Bus
+from rti_mpc.wire.info import Info
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.streams import admitted
-from service.info import Info
 
 CAPACITY = 4096  # samples between two looks: seconds, at any rate
 STALE_S = 60.0  # one life of each process is a run
@@ -65,7 +65,7 @@ class Witness:
         self.reference = self._references_in.newest(self._references.drain(), now_ns) or self.reference
         for received in self._infos.drain():
             with suppress(MessageError):
-                self.info = Info.from_payload(received.payload, received.size, received.key)
+                self.info = Info.from_received(received)
         for received in self._events.drain():
             if not admitted(received.key, self._events_in):
                 continue

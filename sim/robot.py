@@ -28,6 +28,7 @@ from rti_mpc.model import Model
 from rti_mpc.schedule import unfit
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
+from rti_mpc.wire.info import labels
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Key, Keys
 from sim.actuator import STALE_NS, Counters
@@ -121,11 +122,10 @@ def wait_for_another(bus: Bus, stop: Event) -> None:
 
 def describe(model: Model) -> dict[str, Any]:
     """Describe a model for ``info``."""
-    vectors = {"states": model.states, "inputs": model.inputs, "outputs": model.outputs}
     return {
         "version": rti_mpc.__version__,
         "model": model.name,
-        **{name: [{"name": s.name, "unit": s.unit, "angle": s.angle} for s in signals] for name, signals in vectors.items()},
+        **labels(states=model.states, inputs=model.inputs, outputs=model.outputs),
         "parameters": {s.name: value for s, value in zip(model.parameters, model.p_nominal, strict=True)},
     }
 

@@ -19,6 +19,7 @@ import numpy as np
 from rti_mpc.message import Reference
 from rti_mpc.trajectory import Heading
 from rti_mpc.wire.bus import Bus
+from rti_mpc.wire.info import Info, Label
 from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.session import BusSettings
 from service import robot_log, toml
@@ -28,7 +29,6 @@ from service.faults.measure import positions
 from service.faults.observer import Observer
 from service.faults.proxy import Proxy
 from service.faults.relay import ROLE as RELAY
-from service.info import Info, Label
 from service.rig.company import CLI, POLITE, Failed, wait
 from service.rig.endpoint import free_endpoint
 from service.robot_log import RobotLog

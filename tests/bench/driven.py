@@ -13,11 +13,11 @@ import numpy as np
 from rti_mpc.message import Telemetry
 from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import decode
+from rti_mpc.wire.info import Info, Label
 from service import robot_log
 from service.children import Children
 from service.cli import SHIPPED
 from service.config import load
-from service.info import Info, Label
 from service.rig.endpoint import free_endpoint
 from service.robot_log import RobotLog
 from tests.processes.system import until

@@ -12,8 +12,8 @@ pytest.importorskip("matplotlib")
 import matplotlib as mpl
 from matplotlib.image import imread
 
+from rti_mpc.wire.info import Info, Label
 from service.figure import figure
-from service.info import Info, Label
 from service.run_data import Run
 
 SECOND = 1_000_000_000

@@ -14,10 +14,10 @@ pytest.importorskip("rerun")
 from rti_mpc.message import Event, Severity
 from rti_mpc.wire.bus import Received
 from rti_mpc.wire.cdr import encode, encoding
+from rti_mpc.wire.info import Info
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.streams import MAX_UNKNOWN_ROLES, ROLES
-from service.info import Info
 from service.listener import Listener
 
 

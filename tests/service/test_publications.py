@@ -14,7 +14,8 @@ import pytest
 from rti_mpc.message import State
 from rti_mpc.trajectory import eight
 from rti_mpc.wire import bus as bus_module
-from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.bus import Bus, BusSettings, Received
+from rti_mpc.wire.info import Info, Leader, latches
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.streams import RELAY, STREAMS
 from service import daemon, echo, guard, request, router
@@ -28,6 +29,8 @@ from tests.wire.fake_session import FakeSession, Said
 CONFIG = load(Path(__file__).parents[2] / "deploy" / "pioneer_3dx.toml")
 GUARDED = CONFIG.model_copy(update={"guard": CONFIG.guard.model_copy(update={"enabled": True})})
 KEYS, SETTINGS = CONFIG.keys(), BusSettings()
+
+UNITS = dict.fromkeys(("robot", "controller", "standby"), ("m/s", "rad/s")) | {"guard": ("1", "1")}  # a guard knows no model
 
 STOPPED = Event()  # each runs once through, from its start to its end
 STOPPED.set()
@@ -79,6 +82,20 @@ def test_viewer_publishes_what_the_table_lets_it(session: FakeSession, tmp_path:
 
     view.main(SETTINGS, KEYS, rerun_save=tmp_path / "run.rrd", stop=STOPPED)
     assert session.said == may("viewer")
+
+
+@pytest.mark.parametrize("roles", [("robot",), ("guard",), ("controller", "standby")], ids="_".join)
+def test_description_of_a_process_can_be_read(roles: tuple[str, ...], session: FakeSession, tmp_path: Path) -> None:
+    PROCESSES[roles](tmp_path)
+    infos = {key: payload for key, payload in session.put.items() if key in [KEYS.info(role) for role in roles]}
+    assert len(infos) == len(roles)
+    for key, payload in infos.items():
+        received = Received(payload, "application/json", key)
+        info = Info.from_received(received)
+        assert [(label.name, label.unit) for label in info.inputs] == [("u_c", UNITS[info.role][0]), ("omega_c", UNITS[info.role][1])]
+        assert len(latches(received)) == (info.role != "robot")
+        leader = Leader.from_received(received, 2**63)
+        assert (leader is not None and leader.parameters == {"version": 0, "changes": {}}) == (info.role in ("controller", "standby"))
 
 
 def test_every_role_that_may_publish_has_a_process_here() -> None:

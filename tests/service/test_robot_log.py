@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from rti_mpc.wire.info import Info, Label
 from service import robot_log
-from service.info import Info, Label
 
 INFO = Info(role="controller", states=(Label("x", "m"), Label("v", "m/s")), inputs=(Label("a", "m/s^2"),))
 TEXT = """stamp_ns,seq,x,v,a,command_seq,latency_us,lost,late,expired,refused,starved

@@ -13,10 +13,10 @@ import pytest
 from rti_mpc.message import Event, Severity, Telemetry
 from rti_mpc.status import Mode, QpStatus
 from rti_mpc.trajectory import circle, positioning
+from rti_mpc.wire.info import Info, Label
 from service.build import build_ocp
 from service.cli import SHIPPED
 from service.config import load
-from service.info import Info, Label
 from service.robot_log import COUNTERS, RobotLog
 from service.summary import Outcome, beyond, over_share, summarize
 

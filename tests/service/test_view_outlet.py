@@ -21,8 +21,8 @@ from rerun_bindings import check_for_rrd_footer
 
 from rti_mpc.errors import ConfigError
 from rti_mpc.message import State
+from rti_mpc.wire.info import Info
 from service.host import Host
-from service.info import Info
 from service.outlet import Outlet, file_outlet, viewer_outlet
 from service.recording import Entry
 from tests.in_time import MS, in_time

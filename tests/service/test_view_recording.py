@@ -16,7 +16,7 @@ from rerun.chunk import RrdReader
 
 from rti_mpc.message import Command, End, Event, Reference, Severity, State, Telemetry
 from rti_mpc.status import Mode, QpStatus
-from service.info import Info
+from rti_mpc.wire.info import Info
 from service.playback import Actuation
 from service.recording import Entry, Recording
 

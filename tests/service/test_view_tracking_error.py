@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rti_mpc.message import End, Reference
-from service.info import Info, Label
+from rti_mpc.wire.info import Info, Label
 from service.tracking_error import tracking_error
 
 UNIX_NS = 1_800_000_000_000_000_000  # as a float, good to 256 ns only

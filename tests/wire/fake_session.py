@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from rti_mpc.wire.bus import Declared, Received
+from rti_mpc.wire.cdr import Message, encode
 from rti_mpc.wire.keys import Key
 from rti_mpc.wire.streams import Kind, role_of
 
@@ -20,6 +21,7 @@ class FakeSession:
 
     Attributes:
         said: Everything that was ever declared to be published, answered or shown.
+        put: What was put on each key last.
         living: How many of those are declared now.
         asked: Names of the streams on which somebody was asked.
         links: As of a session.
@@ -28,6 +30,7 @@ class FakeSession:
 
     def __init__(self) -> None:
         self.said: set[Said] = set()
+        self.put: dict[str, bytes] = {}
         self.living = 0
         self.asked: set[str] = set()
         self.links: int | None = None
@@ -68,22 +71,23 @@ class FakeSession:
     def _say(self, key: Key[Any]) -> FakePublisher:
         self.said.add((key.stream.kind, key.stream.name, role_of(key).partition(".")[0] if key.stream.by_role else ""))
         self.living += 1
-        return FakePublisher(self)
+        return FakePublisher(self, key)
 
 
 class FakePublisher:
-    """Whatever is declared; what is put goes nowhere."""
+    """Whatever is declared."""
 
     heard = False
 
-    def __init__(self, session: FakeSession) -> None:
+    def __init__(self, session: FakeSession, key: Key[Any]) -> None:
         self._session = session
+        self._key = key
 
-    def put(self, message: object) -> None:
-        pass
+    def put(self, message: Message) -> None:
+        self.put_bytes(encode(message))
 
     def put_bytes(self, payload: bytes) -> None:
-        pass
+        self._session.put[self._key] = payload
 
     def undeclare(self) -> None:
         self._session.living -= 1

@@ -1,17 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``info/<role>`` says: names, units and limits, which viewers and figures take their labels from."""
+"""
+Descriptions on ``info/<role>``, JSON that late joiners get: how their parts are written, and how they are read.
+
+Viewers and figures take names, units and limits from them, those who stand by
+what the leader has been told, and everybody an operator's stop that was missed.
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 from rti_mpc.errors import MessageError
 from rti_mpc.wire.document import read
 from rti_mpc.wire.layout import NUMBER_LIMIT
+from rti_mpc.wire.received import Received
 from rti_mpc.wire.streams import role_of
 
 MAX_TEXT = 64  # characters of a name or a unit
@@ -113,19 +119,14 @@ class Info:
             raise MessageError(f"info must be JSON of role, states, inputs, outputs, bounds as documented, got a fault at {error}") from error
 
     @classmethod
-    def from_payload(cls, payload: bytes, size: int, key: str) -> Info:
+    def from_received(cls, received: Received) -> Info:
         """
-        Read a description as it came.
-
-        Args:
-            payload: Its bytes.
-            size: How many were sent.
-            key: Where it was published, which ends with the role that it describes.
+        Read a description as it came, on a key that ends with the role that it describes.
 
         Raises:
             MessageError: It is none.
         """
-        info = cls.from_json(read(payload, size))
+        info, key = cls.from_json(read(received.payload, received.size)), received.key
         if not info.role or info.role != role_of(key):
             raise MessageError(f"info must be of the role that its key ends with, got {info.role[:MAX_TEXT]!r} on {key[-MAX_TEXT:]!r}")
         return info
@@ -165,6 +166,89 @@ class Info:
 
 VECTORS = ("states", "inputs", "outputs", "disturbances")
 BOUNDS = {"lbu": ("inputs", -1), "ubu": ("inputs", 1), "lbx": ("states", -1), "ubx": ("states", 1)}
+
+
+class Signal(Protocol):
+    """Component of a vector, `rti_mpc.model.Signal` or `Label`."""
+
+    @property
+    def name(self) -> str:
+        """Unique within its vector."""
+
+    @property
+    def unit(self) -> str:
+        """SI unit, ``"1"`` if none."""
+
+    @property
+    def angle(self) -> bool:
+        """Whether it wraps."""
+
+
+def labels(**vectors: Iterable[Signal]) -> dict[str, Any]:
+    """Write the components of vectors, such as ``states``, as a part of a description."""
+    return {name: [{"name": s.name, "unit": s.unit, "angle": s.angle} for s in signals] for name, signals in vectors.items()}
+
+
+def bounds(**vectors: Iterable[float]) -> dict[str, Any]:
+    """Write bounds, such as ``lbu``, as a part of a description: null where there is none."""
+    return {name: [value if math.isfinite(value) else None for value in values] for name, values in vectors.items()}
+
+
+def obstacles(discs: Iterable[tuple[int, float, float, float]]) -> dict[str, Any]:
+    """Write obstacles, each as `Obstacle` has it, as a part of a description."""
+    return {"obstacles": [{"at": at, "x": x, "y": y, "r": r} for at, x, y, r in discs]}
+
+
+def parameters(version: int, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Write a controller's parameters, by their version and what was changed, as a part of a description."""
+    return {"parameters": {"version": version, "changes": changes}}
+
+
+def latch(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Write an operator's stop, the fields of a `rti_mpc.latch.Latch`, as a part of a description."""
+    return {"latch": values}
+
+
+def latches(received: Received) -> tuple[Any, ...]:
+    """
+    Read what a description says of an operator's stop, to be judged by `rti_mpc.latch.read_latch`; empty where it says nothing.
+
+    Raises:
+        MessageError: It is no JSON object.
+    """
+    document = read(received.payload, received.size)
+    return (document["latch"],) if "latch" in document else ()
+
+
+@dataclass(frozen=True)
+class Leader:
+    """
+    A controller that leads, by its own description.
+
+    Attributes:
+        epoch: Of its commands.
+        seq: Of the description.
+        config_hash: Of its configuration.
+        parameters: Version and changes of its parameters as they came, see `parameters`; None where they are not told.
+    """
+
+    epoch: int
+    seq: int
+    config_hash: int
+    parameters: Any = None
+
+    @classmethod
+    def from_received(cls, received: Received, highest: int) -> Leader | None:
+        """Read the description of a leader, whose epoch is at most `highest`; None if it is none."""
+        try:
+            document = read(received.payload, received.size)
+        except MessageError:
+            return None
+        numbers: list[Any] = [document.get(name) for name in ("epoch", "seq", "config_hash")]
+        if not all(type(number) is int and number >= 0 for number in numbers):
+            return None
+        epoch, seq, config_hash = numbers
+        return cls(epoch, seq, config_hash, document.get("parameters")) if epoch <= highest else None
 
 
 def _few(values: Sequence[Any]) -> Sequence[Any]:

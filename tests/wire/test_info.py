@@ -9,10 +9,11 @@ from typing import Any
 import pytest
 
 from rti_mpc.errors import MessageError
+from rti_mpc.wire.info import Info, Label, Leader, Obstacle, bounds, labels, obstacles, parameters
+from rti_mpc.wire.received import Received
 from service.build import build_ocp
 from service.config import load
 from service.daemon import describe
-from service.info import Info, Obstacle
 from tests.service.test_config import DISC, MINIMAL
 
 PIONEER: dict[str, Any] = {
@@ -63,6 +64,24 @@ def test_a_command_is_shown_beside_the_one_state_it_is_about(states: Any, inputs
     vectors = {name: [{"name": n, "unit": u, "angle": False} for n, u in pairs] for name, pairs in (("states", states), ("inputs", inputs))}
     info = Info.from_json({"role": "controller", **vectors})
     assert [info.measured(i) for i in range(len(inputs))] == expected
+
+
+def test_what_is_written_of_vectors_bounds_and_obstacles_is_read_as_it_was() -> None:
+    states, disc = (Label("x", "m"), Label("psi", "rad", angle=True)), (3, 1.0, 0.5, 0.4)
+    written = {**labels(states=states), **bounds(lbx=[-1.0, -math.inf], ubx=[math.inf, 2.0]), **obstacles([disc])}
+    info = Info.from_json(json.loads(json.dumps({"role": "robot", **written})))
+    assert (info.states, info.lbx, info.ubx, info.obstacles) == (states, (-1.0, -math.inf), (math.inf, 2.0), (Obstacle(*disc),))
+
+
+@pytest.mark.parametrize("wrong", [{"epoch": -1}, {"seq": True}, {"config_hash": "1"}, {"epoch": 11}, {"epoch": None}])
+def test_leader_says_who_it_is_in_whole_numbers(wrong: dict[str, Any]) -> None:
+    said = {"epoch": 10, "seq": 2, "config_hash": 7, **parameters(3, {"ocp.N": 5})}
+
+    def read(document: dict[str, Any]) -> Leader | None:
+        return Leader.from_received(Received(json.dumps(document).encode(), "application/json", "r/info/controller"), 10)
+
+    assert read(said) == Leader(10, 2, 7, {"version": 3, "changes": {"ocp.N": 5}})
+    assert read({**said, **wrong}) is None
 
 
 def test_infos_that_label_alike_are_equal() -> None:
