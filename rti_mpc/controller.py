@@ -16,10 +16,13 @@ What follows a gap starts cold, and acts late enough to be there in time.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.blockage import Blockage
+from rti_mpc.call import Call, told
 from rti_mpc.delay import DelayEstimator
 from rti_mpc.envelope import Envelope
 from rti_mpc.errors import OcpError
@@ -28,20 +31,20 @@ from rti_mpc.grid import Timing as Timing
 from rti_mpc.guard import Limits
 from rti_mpc.issued import Issued
 from rti_mpc.ladder import Ladder
-from rti_mpc.message import STAMP_ON_ARRIVAL, Command, End, Reference, Severity, State, Telemetry
+from rti_mpc.message import STAMP_ON_ARRIVAL, Command, End, Notice, Reference, Severity, State, Telemetry
 from rti_mpc.mode import ModeMachine
 from rti_mpc.observer import Observer
 from rti_mpc.ocp import Ocp, restless
 from rti_mpc.prediction import Prediction
 from rti_mpc.record import Record
 from rti_mpc.rti import Rti
+from rti_mpc.schedule import EVER_NS
 from rti_mpc.sent import Sent
 from rti_mpc.state_stream import Arrival, StateStream
 from rti_mpc.status import Mode, QpStatus
 from rti_mpc.track import Track
 from rti_mpc.tuning import Tuning
 
-BUDGET = 0.75  # of a period, after the time at which a command acts, in which it may leave; the rest is for messages on their way
 UNREPORTED = "the robot does not report which inputs act: commands are believed to act, and only the robot itself or a guard can cover their loss"
 ITERATIONS_COLD = 3  # iterations of a first sample, whose guess is one state and one input
 
@@ -50,12 +53,16 @@ class Controller:
     """
     The controller of one robot.
 
-    The caller hands in each message as it comes, publishes what is returned,
-    and calls `prepare` after each sample, off the path from state to command.
+    The caller hands in each message as it comes. What is returned is a proposal:
+    `in_time` judges it, the caller publishes it and calls `commit`, and what was
+    not committed was never sent. After each sample it calls `prepare`, off the
+    path from state to command.
+
+    What commands depend on changes by the calls marked `told` alone, each of which
+    `on_call` is told of: repeated on a controller built alike, they give the same commands.
 
     Attributes:
-        notices: Mode changes and faults since the caller last emptied it.
-        shadowing: Whether another controller's commands act, those handed to `overhear`, and not what is made here.
+        on_call: Takes each call that may change a command, before it is made; None: nobody does.
         skipped: Samples skipped since start.
         ladder: Samples without a plan of their own, by what replaced it.
         np_: Parameters a row of a reference may carry: the model's, without the disturbances an observer estimates.
@@ -77,9 +84,9 @@ class Controller:
         self._valid_ns = round(1e9 * timing.valid_s)
         self._u_rest: Array = np.array(model.u_rest)
 
-        self.shadowing = False
+        self.on_call: Callable[[Call], object] | None = None
+        self._shadowing = False
         self._modes = ModeMachine()
-        self.notices = self._modes.notices
         self.skipped = 0
         self.ladder = Ladder()
         self.envelope = Envelope(ocp, compile=compile)
@@ -108,6 +115,19 @@ class Controller:
         """What the controller is doing."""
         return self._modes.mode
 
+    def say(self, notice: Notice) -> None:
+        """Have something said beside what the controller says itself; in any thread."""
+        self._modes.notices.append(notice)
+
+    def notices(self) -> list[Notice]:
+        """Take what is to be said: mode changes and faults since the last call; in any thread."""
+        return self._modes.take()
+
+    @property
+    def shadowing(self) -> bool:
+        """Whether another controller's commands act, those handed to `overhear`, and not what is made here."""
+        return self._shadowing
+
     # What comes in.
 
     @property
@@ -123,6 +143,7 @@ class Controller:
         """Whether a state goes on from the last one, by life and number."""
         return self.follows(state) and self._states.cadence.counts(state.seq)
 
+    @told
     def receive_state(self, state: State, arrival_ns: int) -> Command | None:
         """
         Act on a state, if its sample is due.
@@ -132,11 +153,11 @@ class Controller:
             arrival_ns: Local monotonic time.
 
         Returns:
-            The command to publish at once, or None: then the state is only kept as the freshest.
+            The command to publish at once, a proposal, or None: then the state is only kept as the freshest.
         """
         arrival = self._states.receive(state, arrival_ns)
         if (notice := self._states.notice) is not None:
-            self.notices.append(notice)
+            self.say(notice)
         if arrival is not Arrival.FRESH:
             if arrival in (Arrival.REPEATED, Arrival.REFUSED, Arrival.FOREIGN, Arrival.OLD):
                 return None
@@ -166,6 +187,7 @@ class Controller:
         """Do of `receive_reference` what may be done in any thread, and takes longer the more rows there are; None if it will be refused."""
         return None if self._track.misfit(reference, self.np_) else self._track.lay_out(reference)
 
+    @told
     def receive_reference(self, reference: Reference, rows: Array | None = None) -> Reference | None:
         """
         Follow a reference from the next sample on.
@@ -185,12 +207,14 @@ class Controller:
         anchored = None if self._states.last is None else self._anchor(self._states.last)
         return anchored if reference.stamp_ns == STAMP_ON_ARRIVAL else None
 
+    @told
     def stop(self, reason: str) -> None:
         """Ramp to rest and stay there until `enable`."""
         if not self._stopped:
             self._stopped = reason
             self._modes.say(Severity.INFO, "stop", f"stop: {reason}")
 
+    @told
     def enable(self) -> None:
         """Release a `stop`: start cold, from the input that acts."""
         if self._stopped:
@@ -200,6 +224,7 @@ class Controller:
                 self.grid.running = False
                 self._modes.enter(Mode.WAITING, "enabled")
 
+    @told
     def retune(self, ocp: Ocp, version: int) -> int:
         """
         Plan with other weights and bounds, from the next sample on that is not prepared yet; a stop keeps the slew limits it was built with.
@@ -213,21 +238,29 @@ class Controller:
         self._tuning.change(ocp, version)
         return self._issued.seq + 1 + self._loaded
 
+    @told
     def overhear(self, command: Command) -> None:
         """Take note of a command of the controller that this one shadows."""
         self._sent.append(command)
         if self._delay is not None:
             self._delay.sent(command)
 
+    @told
+    def shadow(self) -> None:
+        """Let what is made here not act, but what is handed to `overhear`."""
+        self._shadowing = True
+
+    @told
     def lead(self, epoch: int) -> None:
         """Let what is made here act from the next command on; it goes on from what has acted so far."""
-        self._issued.epoch, self.shadowing = epoch, False
+        self._issued.epoch, self._shadowing = epoch, False
         if self._loaded:
             self._load(shift=False)
 
+    @told
     def tick(self, local_ns: int) -> Command | None:
         """
-        Notice silence: return a ramp to rest, once, when the last state has become stale.
+        Notice silence: propose a ramp to rest, once, when the last state has become stale.
 
         Args:
             local_ns: Local monotonic time.
@@ -244,9 +277,14 @@ class Controller:
         self._modes.enter(mode, f"no state for {1e-9 * age_ns:.3f} s", Severity.ERROR, "state_stale")
         return self._brake(state, now_ns + self.grid.delay_ns, QpStatus.NONE)
 
+    @told
     def in_time(self, command: Command, local_ns: int) -> Command | None:
         """
         Hold a sample to its budget: its command must be there before its first row is over.
+
+        Args:
+            command: What was proposed for it.
+            local_ns: Local monotonic time.
 
         Returns:
             What to publish: the command; nothing if it is too late and the previous plan plays on in the robot's hands; or a ramp.
@@ -254,16 +292,11 @@ class Controller:
         if self._states.cadence.fault:
             return command  # nobody knows how late it is, and none follows
         now_ns = self._states.clock.latest_ns(local_ns)
-        if now_ns < command.stamp_ns + BUDGET * self.grid.dt_ns:
+        if not self.grid.too_late(now_ns - command.stamp_ns):
             if self._overran:
                 self._overran = False
                 self._modes.enter(command.mode, "samples are in time again")
-            if not self.shadowing:
-                self._sent.leave(now_ns)
             return command
-        if not self.shadowing:
-            self._sent.withdraw(command)
-        self._issued.withdraw()
         self._overran = True
         failure = f"a sample was {1e-9 * (now_ns - command.stamp_ns):.3f} s late"
         if self._plays_on(now_ns, counted=command.mode is Mode.FALLBACK):
@@ -272,18 +305,31 @@ class Controller:
         if not self._stopped:
             self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "over_budget")
         assert self._states.last is not None
-        if not self.shadowing:
-            self._sent.leave(now_ns)
         counted = command.mode in (Mode.BRAKING, Mode.STOPPED)
         return self._brake(self._states.last, now_ns + self.grid.delay_ns, command.status, wanted=counted)
 
+    @told
+    def commit(self, command: Command, left_ns: int | None = None) -> None:
+        """
+        Record a proposal as sent, now that it has left; of a shadow, as one that would have been.
+
+        Args:
+            command: The last proposal.
+            left_ns: Local monotonic time at which it left at the earliest; None if it answers no state, and robot time is a guess.
+        """
+        self._issued.commit(command)
+        if self._shadowing:
+            return
+        clock = self._states.clock
+        self._sent.append(command, EVER_NS if left_ns is None or self._states.cadence.fault else clock.latest_ns(left_ns))
+
     # The two phases.
 
+    @told
     def prepare(self) -> None:
         """Prepare the next sample: fix `t_k`, look the reference up, shift, linearize and load the QP."""
         self._record.keep(self._issued.seq)
         self._look_ahead()
-        self._sent.settle()
         state = self._states.last
         if not self.grid.running or state is None:
             return
@@ -302,7 +348,7 @@ class Controller:
         """Learn from the state of the last sample, and let the grid follow."""
         estimator.hear(self._sent.confirmed)
         estimator.observe(self._states.x, stamp_ns)
-        if self._issued.last is not None and not self.shadowing:
+        if self._issued.last is not None and not self._shadowing:
             estimator.sent(self._issued.last)
         self._sent.delay_ns = estimator.delay_ns
         self.grid.adapt(estimator.delay_ns)
@@ -344,7 +390,7 @@ class Controller:
         self._issued.plan = None
         self.ladder.failed = 0
         clock = self._states.clock
-        if clock.late_ns + clock.doubt_ns < BUDGET * self.grid.dt_ns:
+        if not self.grid.too_late(clock.late_ns + clock.doubt_ns):
             self.grid.start(stamp_ns)
         else:  # it may have waited on its way for too long to be answered: the next one will tell
             self.grid.running = False
@@ -367,8 +413,7 @@ class Controller:
         if not self._overran:
             self._modes.enter(mode, reason)
         valid_until_ns = min(act_ns + self._rti.ocp.N * self.grid.dt_ns, state.stamp_ns + self.grid.delay_ns + self._valid_ns)
-        self._issued.plan = command = self._issue(state, act_ns, valid_until_ns, mode, status, self.envelope.fit(self._rti.u, self._reach))
-        return command
+        return self._issued.propose(state, act_ns, valid_until_ns, mode, status, self.envelope.fit(self._rti.u, self._reach), plan=True)
 
     def _feedback_cold(self) -> QpStatus:
         """Solve a first sample: the guess stays where the robot is, and is iterated on."""
@@ -394,13 +439,13 @@ class Controller:
         if self._plays_on(act_ns) and plan is not None:
             self._modes.enter(Mode.FALLBACK, f"{failure}: playing the previous plan", Severity.WARNING, "qp_failed")
             rows = self.envelope.refit(plan.u, round((act_ns - plan.stamp_ns) / plan.period_ns), self._reach)
-            return self._issue(state, act_ns, plan.valid_until_ns, Mode.FALLBACK, status, rows)
+            return self._issued.propose(state, act_ns, plan.valid_until_ns, Mode.FALLBACK, status, rows)
         self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "no_plan")
         return self._brake(state, act_ns, status)
 
     def _brake(self, state: State, act_ns: int, status: QpStatus, *, wanted: bool = False) -> Command:
         """
-        Issue the brake law, because a stop is `wanted` or for want of a plan.
+        Propose the brake law, because a stop is `wanted` or for want of a plan.
 
         It is valid from its own time on, not from its state's: made of past commands
         and never further from rest than they, it is as right without a state.
@@ -410,7 +455,7 @@ class Controller:
             self.ladder.brake(at_rest=bool((rows[0] == self._u_rest).all()))
         self._issued.plan = None
         self._loaded = False
-        return self._issue(state, act_ns, act_ns + self._valid_ns, self.mode, status, rows)
+        return self._issued.propose(state, act_ns, act_ns + self._valid_ns, self.mode, status, rows)
 
     def _give_up(self, state: State) -> Command | None:
         """
@@ -425,14 +470,15 @@ class Controller:
             self._modes.enter(Mode.STOPPED if self._stopped else Mode.BRAKING, self._states.cadence.fault)
             rows = self.envelope.ramp(self._sent.reach(act_ns))
             valid_ns = max(1, round(self._valid_ns * min(1.0, self._states.cadence.rate)))  # as long as it should act, in the unit of the stamps
-            command = self._issue(state, act_ns, act_ns + valid_ns, self.mode, QpStatus.NONE, np.tile(rows[0], (len(rows), 1)))
+            command = self._issued.propose(state, act_ns, act_ns + valid_ns, self.mode, QpStatus.NONE, np.tile(rows[0], (len(rows), 1)))
         self._issued.plan = None
         self._overran = self._loaded = self.grid.running = False
         self._modes.enter(Mode.IDLE, self._states.cadence.fault)
         return command
 
+    @told
     def standstill(self, local_ns: int) -> Command | None:
-        """Return the last command of a life: to rest as fast as the slew limits allow; None if nothing was ever commanded, or its clock is none."""
+        """Propose the last command of a life: to rest as fast as the slew limits allow; None if nothing was ever commanded, or its clock is none."""
         state = self._states.last
         if self._issued.last is None or state is None or self._states.cadence.fault:
             return None
@@ -440,16 +486,9 @@ class Controller:
 
     # What goes out.
 
-    def _issue(self, state: State, act_ns: int, valid_until_ns: int, mode: Mode, status: QpStatus, u: Array) -> Command:
-        """Make a command of a plan, shape ``(N, nu)``."""
-        command = self._issued.make(state, act_ns, valid_until_ns, mode, status, u)
-        if not self.shadowing:
-            self._sent.append(command)
-        return command
-
     @property
     def at_rest(self) -> bool:
-        """Whether the last command is rest from its first row on, or there never was one."""
+        """Whether the last command that has left is rest from its first row on, or there never was one."""
         last = self._issued.last
         return last is None or np.array_equal(last.u[0], self._u_rest)
 

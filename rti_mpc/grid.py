@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+BUDGET = 0.75  # of a period, after the time at which a command acts, in which it may leave; the rest is for messages on their way
 MOST = 3  # periods that a measured delay may have
 MARGIN = 8  # part of a period that is added to a measured delay
 SETTLING = 40  # samples in which a measured delay may change by a period
@@ -55,6 +56,10 @@ class Grid:
     def early(self, stamp_ns: int, period_ns: float) -> bool:
         """Whether a state comes before the next sample's; `period_ns` is that of the states."""
         return self.running and self.act_ns - self.delay_ns - stamp_ns > period_ns / 2
+
+    def too_late(self, late_ns: int) -> bool:
+        """Whether a command that leaves by so much after its time is not there before its first row is over."""
+        return late_ns >= BUDGET * self.dt_ns
 
     def behind(self, stamp_ns: int) -> int:
         """Samples that a state shows to have been missed."""

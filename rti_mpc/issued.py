@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands that a controller has made, numbered without a gap."""
+"""The commands of a controller, numbered without a gap: proposed, and issued once they have left."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class Issued:
 
     Attributes:
         epoch: Of the next one.
-        seq: Number of the last one.
-        last: The last one; None before the first.
-        plan: The last one with a plan of its own, as long as that may be gone on with; else None.
+        seq: Number of the last one that has left.
+        last: The last one that has left; None before the first.
+        plan: The last of them with a plan of its own, as long as that may be gone on with; else None.
     """
 
     def __init__(self, epoch: int, config_hash: int, period_ns: int) -> None:
@@ -26,15 +26,24 @@ class Issued:
         self.plan: Command | None = None
         self._config_hash = config_hash
         self._period_ns = period_ns
-        self._before: tuple[Command | None, Command | None] = (None, None)  # `last` and `plan` before the last one
+        self._planned: Command | None = None  # the last one proposed, if it has a plan of its own
 
-    def make(self, state: State, act_ns: int, valid_until_ns: int, mode: Mode, status: QpStatus, u: Array) -> Command:
-        """Make the next one: rows, shape ``(N, nu)``, that answer a state and act from `act_ns` on."""
-        self.seq += 1
-        self._before = self.last, self.plan
-        self.last = Command(
+    def propose(self, state: State, act_ns: int, valid_until_ns: int, mode: Mode, status: QpStatus, u: Array, *, plan: bool = False) -> Command:
+        """
+        Make what may be the next one; until it is committed, nothing has happened.
+
+        Args:
+            state: The state it answers.
+            act_ns: When its first row acts, robot time.
+            valid_until_ns: When it ends, robot time.
+            mode: What the controller is doing.
+            status: Of the QP.
+            u: Rows, shape ``(N, nu)``.
+            plan: Whether that is a plan of its own.
+        """
+        command = Command(
             epoch=self.epoch,
-            seq=self.seq,
+            seq=self.seq + 1,
             stamp_ns=act_ns,
             state_epoch=state.epoch,
             state_seq=state.seq,
@@ -46,9 +55,11 @@ class Issued:
             period_ns=self._period_ns,
             u=u,
         )
-        return self.last
+        self._planned = command if plan else None
+        return command
 
-    def withdraw(self) -> None:
-        """Take the last one back: it is not sent, and the next one has its number."""
-        self.seq -= 1
-        self.last, self.plan = self._before
+    def commit(self, command: Command) -> None:
+        """Take a proposal for the last one: the next one has the next number."""
+        self.seq, self.last = command.seq, command
+        if command is self._planned:
+            self.plan = command

@@ -35,6 +35,15 @@ class ModeMachine:
         self.mode = Mode.IDLE
         self.notices: deque[Notice] = deque(maxlen=64)
 
+    def take(self) -> list[Notice]:
+        """Take all notices, oldest first; in any thread."""
+        taken: list[Notice] = []
+        try:
+            while True:
+                taken.append(self.notices.popleft())
+        except IndexError:  # there is none left, or another thread took it
+            return taken
+
     def enter(self, mode: Mode, reason: str, severity: Severity = Severity.INFO, code: str = "mode") -> None:
         """Change the mode, and say why; nothing happens if it is the mode already."""
         if mode is self.mode:

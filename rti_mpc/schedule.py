@@ -157,11 +157,6 @@ class Schedule:
         """Hold the same plans as another one."""
         self._plans = deque(replace(plan) for plan in other._plans)
 
-    def withdraw(self, command: Command) -> None:
-        """Take the last plan back, if it is this command's: it will not act."""
-        if len(self._plans) > 1 and self._plans[-1].stamp_ns == command.stamp_ns:
-            self._plans.pop()
-
     def forget(self, t_ns: int) -> None:
         """Drop what is over before a time, and counts against no limit any more."""
         t_ns -= self._increments.dt_ns if self._increments is not None else 0

@@ -33,7 +33,6 @@ class Sent:
     def __init__(self, u_rest: Array, lbdu: Array, ubdu: Array, dt_ns: int) -> None:
         self.delay_ns = 0
         self._left_ns = EVER_NS  # when the last command left at the earliest
-        self._unsettled: Command | None = None  # the last one, until it is known when it left
         self._alone: tuple[int, Array] = (EVER_NS, u_rest)  # when the robot last stopped braking on its own, and from which input
         self._slew = (lbdu, ubdu)  # per dt
         self._dt_ns = dt_ns
@@ -43,21 +42,15 @@ class Sent:
         self._schedule = Belief(u_rest, slew, increments)
         self._slowest = Schedule(u_rest, slew, increments)  # if each command was on its way for as long as it may be
 
-    def append(self, command: Command) -> None:
-        """Remember a command, unless it has expired before its time: the robot refuses it."""
-        self.settle()
-        self._left_ns += 1  # commands leave one after the other, whatever our idea of the robot's clock
-        self._unsettled = command
+    def append(self, command: Command, left_ns: int = EVER_NS) -> None:
+        """
+        Remember a command that has left, unless it has expired before its time: the robot refuses it.
 
-    def leave(self, now_ns: int) -> None:
-        """Take note of when the last command leaves: what was sent before acts at least until then."""
-        self._left_ns = max(self._left_ns, now_ns)
-
-    def settle(self) -> None:
-        """Remember what `leave` has noted."""
-        command, self._unsettled = self._unsettled, None
-        if command is None:
-            return
+        Args:
+            command: The command.
+            left_ns: When it left at the earliest, robot time, if that is known: what was sent before acts at least until then.
+        """
+        self._left_ns = max(self._left_ns + 1, left_ns)  # commands leave one after the other, whatever our idea of the robot's clock
         start_ns = max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, self._left_ns)
         if start_ns < end_ns(command):
             before, _, braking = self._schedule.at(start_ns - 1)
@@ -70,20 +63,11 @@ class Sent:
 
     def correct(self, t_ns: int, u: Array, source: tuple[int, int]) -> bool:
         """Take note of what the robot reports to act, as `Belief.correct`; return whether that was not known."""
-        self.settle()
         changed = self._schedule.correct(t_ns, u, source)
         if changed:
             self._slowest.copy(self._schedule)
             self._alone = EVER_NS, self._schedule.u_rest
         return changed
-
-    def withdraw(self, command: Command) -> None:
-        """Forget the last command: it was not sent after all."""
-        if self._unsettled is not None:
-            self._unsettled = None if self._unsettled is command else self._unsettled
-            return
-        for schedule in (self._schedule, self._slowest):
-            schedule.withdraw(command)
 
     @property
     def confirmed(self) -> int:
@@ -92,20 +76,18 @@ class Sent:
 
     def brake(self, before_ns: int, now_ns: int) -> None:
         """Assume that the robot, whose clock has jumped from one time to another, brakes from what acted."""
-        self.settle()
-        self._left_ns, self._unsettled = EVER_NS, None
+        self._left_ns = EVER_NS
         for schedule in (self._schedule, self._slowest):
             schedule.cut(before_ns, now_ns)
 
     def clear(self) -> None:
         """Forget everything: the robot was restarted, and stands."""
-        self._left_ns, self._unsettled = EVER_NS, None
+        self._left_ns = EVER_NS
         for schedule in (self._schedule, self._slowest):
             schedule.brake(schedule.u_rest, EVER_NS)
 
     def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Array, float]]:
         """Yield the inputs that act between two times, shape ``(nu,)``, each with for how long, s; backward, the one that acts at the end."""
-        self.settle()
         if to_ns < from_ns:
             yield self.at(to_ns)[0], 1e-9 * (to_ns - from_ns)
         while from_ns < to_ns:
@@ -116,7 +98,6 @@ class Sent:
 
     def at(self, t_ns: int) -> tuple[Array, int]:
         """Return the input that acts at a time, shape ``(nu,)``, and when it next changes."""
-        self.settle()
         u, change_ns, _ = self._schedule.at(t_ns)
         return u, change_ns
 
@@ -132,7 +113,6 @@ class Sent:
         Where the robot brakes on its own, that leaves it the speed it has; a plan
         that has ended this may be late, too, and the robot have braked on.
         """
-        self.settle()
         acting = self.at(t_ns)[0]
         second = self._near(self._schedule, acting + self._slew[0], acting + self._slew[1], t_ns, t_ns + self._dt_ns - 1)
         ended_ns, u = self._alone

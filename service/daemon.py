@@ -90,7 +90,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
 
     outcomes = realtime.attempt(**config.realtime.model_dump())  # when all is compiled, and before any thread is started, for all of them
     with Bus.join(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
-        operator_stop = OperatorStop(LatchFile(bus.keys, state), obey, controller.notices.append)
+        operator_stop = OperatorStop(LatchFile(bus.keys, state), obey, controller.say)
         operator_stop.listen(bus)
         others = hear_others(bus, stop)
         if standby and others.config_hash not in (None, config.config_hash):
@@ -191,6 +191,7 @@ class Daemon:
             # Whatever happened above, the last thing the robot hears is to come to rest, and stay there.
             if not relieved and (command := self._controller.standstill(time.monotonic_ns())) is not None:
                 self._commands.put(command)
+                self._controller.commit(command)
         self._announce()
         self._operator_stop.close()
         log.info("stopped")
@@ -217,7 +218,7 @@ class Daemon:
             if command is not None:
                 command = controller.in_time(command, acted_ns)
                 if command is not None:
-                    self._send(command)
+                    self._send(command, acted_ns)
                 sent_ns = time.monotonic_ns()
                 controller.prepare()
                 prepared_ns = time.monotonic_ns()
@@ -234,10 +235,11 @@ class Daemon:
             )
             self._prepare_us = 1e-3 * (prepared_ns - sent_ns)
 
-    def _send(self, command: Command) -> None:
-        """Send a command, if it is ours to send."""
+    def _send(self, command: Command, left_ns: int | None = None) -> None:
+        """Send a command, if it is ours to send, and record it."""
         if self._leadership.sends(command):
             self._commands.put(command)
+        self._controller.commit(command, left_ns)
 
     def _guarded(self, act: Any, subscriber: Subscriber) -> None:
         """Run a loop; what nobody foresaw ends in a standstill and a non-zero exit, for the supervisor to restart."""
@@ -287,11 +289,7 @@ class Daemon:
         announcer, now_ns = self._announcer, time.monotonic_ns()
         if announcer is None or announcer.role != self._leadership.role:
             return  # the next tick introduces us
-        while self._controller.notices:
-            try:
-                notice = self._controller.notices.popleft()
-            except IndexError:
-                return  # the other thread took it
+        for notice in self._controller.notices():
             announce(log, announcer, notice, self._controller.robot_now_ns(now_ns))
         for intake in (self._states_in, self._references.planners, self._references.leaders, self._leadership.commands_in):
             for refusal in intake.notices(now_ns):

@@ -159,8 +159,9 @@ def phases_us(config: Config) -> tuple[Array, Array]:
         seq += 1
         return controller.receive_state(State(1, seq, seq * dt_ns, x), seq * dt_ns)
 
-    while answer() is None:
+    while (command := answer()) is None:
         pass
+    controller.commit(command)
     controller.prepare()
     for k in paced(SAMPLES):
         arrival_ns = time.monotonic_ns()
@@ -168,6 +169,7 @@ def phases_us(config: Config) -> tuple[Array, Array]:
         assert command is not None
         encode(command)
         commanded_ns = time.monotonic_ns()
+        controller.commit(command, commanded_ns)
         controller.prepare()
         prepare_us[k], feedback_us[k] = 1e-3 * (time.monotonic_ns() - commanded_ns), 1e-3 * (commanded_ns - arrival_ns)
         x = rti.x[1].copy()

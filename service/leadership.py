@@ -70,7 +70,7 @@ class Candidate:
         self.commands_in = bus.intake(Command, SILENCE_S, {"u": nu}, choosing=True)
         number, epoch = secrets.randbits(NUMBER_BITS), max(others.epoch, unix_s() << NUMBER_BITS) + 1
         self._decision = Leadership(
-            number, epoch, config_hash=config_hash, dt_s=dt_s, standby=standby, say=controller.notices.append, local_ns=time.monotonic_ns()
+            number, epoch, config_hash=config_hash, dt_s=dt_s, standby=standby, say=controller.say, local_ns=time.monotonic_ns()
         )
         self._bus = bus
         self._controller = controller
@@ -79,7 +79,7 @@ class Candidate:
         self._told = (0, -1)  # epoch and sequence number of the last description of a leader that was read
         self._commands = bus.subscriber(bus.keys.command, capacity=RING_MESSAGES)
         self._tokens: dict[str, Any] = {}
-        controller.shadowing = True
+        controller.shadow()
         self._apply()
         bus.watch_alive(self._meet)
 
@@ -183,7 +183,7 @@ class Candidate:
             return
         self._acting = acting
         if acting is None:
-            self._controller.shadowing = True
+            self._controller.shadow()
         else:
             self._controller.lead(acting)
 

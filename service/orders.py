@@ -84,4 +84,4 @@ class Orders:
             self._say("leader_not_understood", f"the leader's description must hold its orders, got a fault at {error}", Severity.WARNING)
 
     def _say(self, code: str, text: str, severity: Severity = Severity.INFO) -> None:
-        self._controller.notices.append(Notice(severity, code, text))
+        self._controller.say(Notice(severity, code, text))

@@ -84,5 +84,6 @@ def drive(
             run.commands.append(command)
             if reason := body.accept(command, body.now_ns + round(1e9 * latency_s)):
                 run.refused.append(reason)
+            controller.commit(command)
             controller.prepare()
     return run

@@ -66,7 +66,7 @@ LOCAL = {"rti_mpc/wire/session.py"}  # reads JSON that is not a peer's: Zenoh's 
 
 # Inside the library, a file imports only from groups before its own.
 FLOW: tuple[set[str], ...] = (
-    {"errors", "array", "status", "robot_clock", "ladder", "grid", "epoch", "cache", "angle"},
+    {"errors", "array", "status", "robot_clock", "ladder", "grid", "epoch", "cache", "angle", "call"},
     {"message", "approach", "text_file", "latch"},
     {"polyline"},
     {"lives", "cadence", "heading", "mode", "schedule", "issued"},

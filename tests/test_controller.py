@@ -49,7 +49,7 @@ def on_the_circle(controller: Controller) -> tuple[Controller, Lockstep]:
 
 
 def codes(controller: Controller) -> list[str]:
-    return [notice.code for notice in controller.notices]
+    return [notice.code for notice in controller.notices()]
 
 
 def modes(run: Run) -> list[Mode]:
@@ -97,6 +97,7 @@ def test_order_of_state_and_reference_does_not_matter(rti: Rti) -> None:
             controller.prepare()
             command = controller.receive_state(dataclasses.replace(state, seq=2, stamp_ns=DT), DT)
         assert command is not None
+        controller.commit(command)
         plans.append(controller.telemetry(prepare_us=0, feedback_us=0, latency_us=0, slack_s=0).y_ref[0, 2])
     assert plans == [pytest.approx(2 * np.pi - 3)] * 2
 
@@ -135,6 +136,7 @@ def test_telemetry_describes_the_sample_of_its_command(on_the_circle: tuple[Cont
     state = body.tick()
     command = controller.receive_state(state, body.now_ns)
     assert command is not None
+    controller.commit(command)
     before = controller.telemetry(prepare_us=1.0, feedback_us=2.0, latency_us=3.0, slack_s=0.05)
     controller.prepare()
     after = controller.telemetry(prepare_us=1.0, feedback_us=2.0, latency_us=3.0, slack_s=0.05)
@@ -179,6 +181,7 @@ def test_jitter_of_the_robots_clock_neither_skips_nor_doubles_a_sample(controlle
         command = controller.receive_state(State(1, i + 1, stamp_ns, body.x), stamp_ns)
         if command is not None:
             stamps.append(command.stamp_ns)
+            controller.commit(command)
             controller.prepare()
     gaps = np.diff(stamps) / DT
     assert controller.skipped == 0
@@ -204,13 +207,13 @@ def test_plan_starts_where_the_robot_is_when_it_acts(rti: Rti, delay_s: float, l
     predicted: dict[int, Array] = {}
     controller = Controller(rti, Timing(delay_s=delay_s), compile=False)
     controller.receive_reference(reference(eight()))
-    issue = controller._issue
+    propose = controller._issued.propose
 
-    def noted(*args: Any) -> Any:
+    def noted(*args: Any, **kwargs: Any) -> Any:
         predicted[controller.grid.act_ns] = controller._x0.copy()
-        return issue(*args)
+        return propose(*args, **kwargs)
 
-    controller._issue = noted  # type: ignore[method-assign]
+    controller._issued.propose = noted  # type: ignore[method-assign]
     run = drive(controller, robot(eight(), state_period_s=0.01), 6.0, latency_s=latency_s)
     assert not run.refused
     true = {round(1e9 * t): x for t, x in zip(run.t_s, run.x, strict=True)}
@@ -279,8 +282,9 @@ def test_gap_in_which_the_plan_has_run_out_is_followed_by_a_cold_start(
     state = body.tick()
     command = controller.receive_state(state, body.now_ns)
     assert command is not None
-    assert controller.notices[-1].code == "gap"
-    assert f"no sample for {missed} periods" in controller.notices[-1].text
+    notice = controller.notices()[-1]
+    assert notice.code == "gap"
+    assert f"no sample for {missed} periods" in notice.text
     assert controller.skipped == missed
     assert command.stamp_ns == state.stamp_ns
     assert np.all(np.abs(command.u[0] - body.actuator.u) <= STEP)
@@ -293,7 +297,7 @@ def test_first_state_after_a_long_gap_is_not_answered_for_it_may_have_waited(on_
     for _ in range(missed):
         body.tick()
     assert controller.receive_state(body.tick(), body.now_ns) is None
-    assert controller.notices[-1].code == "gap"
+    assert controller.notices()[-1].code == "gap"
     state = body.tick()
     command = controller.receive_state(state, body.now_ns)
     assert command is not None
@@ -317,7 +321,9 @@ def test_outage_recovers_within_three_samples(on_the_circle: tuple[Controller, L
 def test_states_that_go_back_a_little_are_not_used(on_the_circle: tuple[Controller, Lockstep]) -> None:
     controller, body = on_the_circle
     state = body.tick()
-    assert controller.receive_state(state, body.now_ns) is not None
+    command = controller.receive_state(state, body.now_ns)
+    assert command is not None
+    controller.commit(command)
     controller.prepare()
     for back_ms in (0, 100, 220):
         assert controller.receive_state(dataclasses.replace(state, seq=state.seq + 1, stamp_ns=state.stamp_ns - back_ms * MS), body.now_ns) is None
@@ -330,7 +336,7 @@ def test_states_that_go_back_a_little_are_not_used(on_the_circle: tuple[Controll
 def test_robot_that_is_restarted_is_another_robot(on_the_circle: tuple[Controller, Lockstep]) -> None:
     """Its clock begins anew: the reference on the old one's time is not followed."""
     controller, _ = on_the_circle
-    controller.notices.clear()
+    controller.notices()
     again = Restarted(epoch=2)
     assert again.drive(controller, 0.6).commands == []
     assert controller.mode is Mode.WAITING
@@ -398,7 +404,7 @@ def test_reference_that_does_not_fit_is_refused_with_what_would_be_right(
 ) -> None:
     controller, body = on_the_circle
     assert controller.receive_reference(dataclasses.replace(to_go((0.0, 0.0, 0.0)), **change)) is None
-    notice = controller.notices[-1]
+    notice = controller.notices()[-1]
     assert notice.code == "reference_refused"
     assert text in notice.text
     assert "rows of 3 outputs and of 0 or 7 parameters" in notice.text
@@ -411,7 +417,7 @@ def test_reference_that_ends_with_hold_is_held(controller: Controller) -> None:
     run = drive(controller, body, 25.0)
     assert modes(run)[:10] == [Mode.TRACKING] * 10
     assert modes(run)[-1] is Mode.HOLDING
-    assert controller.notices[-1].text == "tracking to holding: the reference has ended"
+    assert controller.notices()[-1].text == "tracking to holding: the reference has ended"
     assert np.abs(run.x[-1][3:]).max() < 1e-3
 
 
@@ -523,7 +529,7 @@ def test_failed_qps_play_the_shifted_plan_and_then_brake(on_the_circle: tuple[Co
         np.testing.assert_array_equal(command.u[-1], good.u[-1])
         assert command.valid_until_ns == good.valid_until_ns  # never renewed
         assert command.status is QpStatus.INFEASIBLE
-    assert [n.code for n in controller.notices if n.code != "mode"] == ["qp_failed", "no_plan"]
+    assert [n.code for n in controller.notices() if n.code != "mode"] == ["qp_failed", "no_plan"]
     assert controller.ladder.fallbacks == 9
     ramp = run.commands[2]
     assert_inside_slew(run, excess=0.1)  # the robot brakes in steps of 10 ms
@@ -611,7 +617,7 @@ def test_stale_state_is_answered_by_one_ramp(controller: Controller, rti: Rti) -
     assert np.all(np.abs(command.u[0] - last.u[1]) <= STEP)
     assert_inside_slew(Run(commands=[command]))
     np.testing.assert_array_equal(command.u[-1], 0.0)
-    notice = controller.notices[-1]
+    notice = controller.notices()[-1]
     assert (notice.code, notice.severity.name) == ("state_stale", "ERROR")
     assert "no state for 0.12" in notice.text
 
@@ -634,7 +640,7 @@ def test_ramps_are_built_from_commands_never_from_measured_speeds(on_the_circle:
 
 def test_stop_is_latched_until_enable(on_the_circle: tuple[Controller, Lockstep]) -> None:
     controller, body = on_the_circle
-    controller.notices.clear()
+    controller.notices()
     controller.stop("by hand")
     controller.stop("by hand again")
     run = drive(controller, body, 19.0)
@@ -649,7 +655,8 @@ def test_stop_is_latched_until_enable(on_the_circle: tuple[Controller, Lockstep]
     assert set(modes(run)) == {Mode.TRACKING}
     assert_inside_slew(run)
     assert run.error_mm(circle())[-10:].max() < 0.5
-    assert codes(controller).count("stop") == codes(controller).count("enable") == 1
+    said = codes(controller)
+    assert said.count("stop") == said.count("enable") == 1
 
 
 def test_stop_outlasts_a_restart_of_the_robot(on_the_circle: tuple[Controller, Lockstep]) -> None:
@@ -669,7 +676,7 @@ def test_last_command_of_a_life_is_a_standstill(on_the_circle: tuple[Controller,
     command = controller.standstill(body.now_ns)
     assert command is not None
     np.testing.assert_array_equal(command.u, 0.0)
-    assert command.seq == controller._issued.seq
+    assert command.seq == controller._issued.seq + 1
     assert body.accept(command) == ""
 
 

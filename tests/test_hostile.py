@@ -101,10 +101,12 @@ def test_controller_answers_absurd_states_and_references_or_not_and_then_an_hone
             sent = controller.in_time(command, local_ns + MS) or command
             encode(sent)
             assert (np.abs(sent.u) <= 0.75).all()
+            controller.commit(sent, local_ns + MS)
             controller.prepare()
             encode(controller.telemetry(prepare_us=0.0, feedback_us=0.0, latency_us=0.0, slack_s=controller.slack_s(local_ns)))
         if (silent := controller.tick(local_ns + 20 * MS)) is not None:
             encode(silent)
+            controller.commit(silent)
     assert answered > 10
     errors = []
     for one in (controller, fresh):

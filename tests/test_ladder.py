@@ -32,7 +32,7 @@ def driving(rti: FaultyRti) -> tuple[Controller, Lockstep]:
     controller, body = Controller(rti, Timing(), compile=False), robot(circle())
     controller.receive_reference(reference(circle()))
     drive(controller, body, 5.0)
-    controller.notices.clear()
+    controller.notices()
     return controller, body
 
 
@@ -41,7 +41,7 @@ def fail(rti: FaultyRti, failure: str, samples: int) -> None:
 
 
 def codes(controller: Controller) -> list[str]:
-    return [notice.code for notice in controller.notices]
+    return [notice.code for notice in controller.notices()]
 
 
 def sample(controller: Controller, body: Lockstep, took_ms: float = 0.0) -> Command | None:
@@ -51,6 +51,7 @@ def sample(controller: Controller, body: Lockstep, took_ms: float = 0.0) -> Comm
     command = controller.in_time(command, body.now_ns + round(took_ms * MS))
     if command is not None:
         assert body.accept(command, body.now_ns) == ""
+        controller.commit(command, body.now_ns + round(took_ms * MS))
     controller.prepare()
     return command
 
@@ -109,8 +110,9 @@ def test_sample_over_its_budget_is_not_sent_and_the_previous_plan_plays_on(drivi
     assert good is not None
     assert sample(controller, body, took_ms=105) is None
     assert controller.mode is Mode.FALLBACK
-    assert codes(controller) == ["over_budget"]
-    assert "0.105 s late" in controller.notices[-1].text
+    (notice,) = controller.notices()
+    assert notice.code == "over_budget"
+    assert "0.105 s late" in notice.text
     assert (controller.ladder.shifted, controller.ladder.failed) == (1, 1)
     after = sample(controller, body)
     assert after is not None
@@ -170,6 +172,7 @@ def test_sample_right_after_a_restart_is_held_to_its_budget_though_the_speed_of_
         assert (command is not None) == (k >= 2), "the first two show how fast the clock runs, roughly"
         if command is not None:
             assert controller.in_time(command, arrival_ns + 1 * MS) is command
+            controller.commit(command, arrival_ns + 1 * MS)
             controller.prepare()
     arrival_ns = (state := body.tick()).stamp_ns // speed
     command = controller.receive_state(state, arrival_ns)
@@ -182,7 +185,7 @@ def test_first_state_of_a_life_is_left_unanswered_without_a_word(rti: FaultyRti)
     controller, body = Controller(rti, Timing(), compile=False), robot(circle())
     controller.receive_reference(reference(circle()))
     assert controller.receive_state(body.tick(), body.now_ns) is None
-    controller.notices.clear()
+    controller.notices()
     second = sample(controller, body, took_ms=10)
     assert second is not None
     assert (second.seq, codes(controller), controller.ladder) == (1, ["mode"], Ladder())

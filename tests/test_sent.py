@@ -102,9 +102,8 @@ def test_reach_keeps_to_all_inputs_of_the_period_before_and_after() -> None:
 def test_reach_keeps_to_a_row_that_acts_while_the_next_command_is_on_its_way() -> None:
     """Sent a millisecond before the row begins, it may arrive ten after; what comes right after it must not be far from either."""
     ramp = command(2, 99, np.tile([0.2, 0.0], (3, 1)))
-    memory = sent(command(1, 0, np.array([[0.2, 0.0], [0.3, 0.3], [0.3, 0.3]])), ramp)
-    memory.leave(99 * MS)
-    memory.settle()
+    memory = sent(command(1, 0, np.array([[0.2, 0.0], [0.3, 0.3], [0.3, 0.3]])))
+    memory.append(ramp, 99 * MS)
     lowest, highest = memory.reach(DT)
     np.testing.assert_allclose(lowest[0], [0.3 - 0.2, 0.3 - 0.3])
     np.testing.assert_allclose(highest[0], [0.2 + 0.2, 0.0 + 0.3])
@@ -121,14 +120,6 @@ def test_robot_that_brakes_on_its_own_is_taken_over_at_the_speed_it_has() -> Non
 def test_nothing_sent_lets_an_input_leave_rest_within_the_slew_limits() -> None:
     lowest, highest = sent().reach(0)
     np.testing.assert_array_equal([lowest, highest], [[-SLEW, -SLEW], [SLEW, SLEW]])
-
-
-def test_command_that_was_not_sent_after_all_is_forgotten() -> None:
-    first, second = command(1, 0, plan(0.1)), command(2, 100, plan(0.2))
-    memory = sent(first, second)
-    memory.withdraw(first)  # not the last one
-    memory.withdraw(second)
-    np.testing.assert_array_equal(memory.at(150 * MS)[0], plan(0.1)[1])
 
 
 @pytest.mark.parametrize(("delay_ms", "value"), [(0, 0.2), (40, 0.2), (60, 0.11)])

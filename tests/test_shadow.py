@@ -50,7 +50,7 @@ def take_over(
     last one perhaps only after one more, and leads from the second state on that the leader does not answer.
     """
     leader, shadow = controller("leader", delay_s), controller("shadow", delay_s)
-    shadow.shadowing = True
+    shadow.shadow()
     body = robot(eight(), reports_inputs=reports)
     applied, taken = [], []
     for k in range(samples):
@@ -61,8 +61,11 @@ def take_over(
             shadow.lead(2)
         own = shadow.receive_state(state, body.now_ns)
         assert (own is None) == (k == 0), "the second state tells how fast the robot's clock runs"
+        if own is not None:
+            shadow.commit(own)
         shadow.prepare()
         if command is not None:
+            leader.commit(command)
             leader.prepare()
             assert not body.accept(command, body.now_ns)
             if hears and not (late and k == dies_at - 1):
@@ -121,6 +124,7 @@ def test_change_acts_from_the_sample_told_and_is_told_in_telemetry() -> None:
         state = body.tick()
         command = one.receive_state(state, body.now_ns)
         assert command is not None
+        one.commit(command)
         one.prepare()
         versions[command.seq] = one.telemetry(prepare_us=0, feedback_us=0, latency_us=0, slack_s=0).parameter_version
         if command.seq >= seq:

@@ -158,7 +158,7 @@ class Fuzz:
         state = self._states.accept(received, local_ns)
         if state is None:
             self.seen["refused at the door"] += 1
-            self._publish(controller.tick(local_ns), arrival_ns)
+            self._publish(self._silent(local_ns), arrival_ns)
             return
         command = controller.receive_state(state, local_ns)
         if command is None:
@@ -168,10 +168,18 @@ class Fuzz:
         command = controller.in_time(command, self.local_ns(self._busy_ns))
         if command is None:
             self.seen["over budget"] += 1
+        else:
+            controller.commit(command, self.local_ns(self._busy_ns))
         self._publish(command, self._busy_ns + self._latency_ns())
         controller.prepare()
         if rng.random() < 0.05 and controller._issued.last is not None:
             encode(controller.telemetry(prepare_us=1.0, feedback_us=1.0, latency_us=1.0, slack_s=0.1))
+
+    def _silent(self, local_ns: int) -> Command | None:
+        """Let the controller look for silence."""
+        if (command := self.controller.tick(local_ns)) is not None:
+            self.controller.commit(command)
+        return command
 
     def _publish(self, command: Command | None, arrival_ns: int) -> None:
         """Check a command as it goes over the wire, and send it on its way."""
@@ -250,8 +258,8 @@ class Fuzz:
             failure = str(self.rng.choice(FAULTS))
             self.rti.inject({"failure": failure, "samples": int(self.rng.integers(1, 12))})
             self.seen[failure] += 1
-        while self.controller.notices:
-            self.seen[self.controller.notices.popleft().code] += 1
+        for notice in self.controller.notices():
+            self.seen[notice.code] += 1
 
     def _silence(self, duration_ns: int) -> None:
         """Let no state come for a while: the controller looks at the clock."""
@@ -260,7 +268,7 @@ class Fuzz:
         self._play(max(self._busy_ns, self._now_ns))
         for _ in range(duration_ns // (10 * MS)):
             self._play(self._now_ns + 10 * MS)
-            self._publish(self.controller.tick(self.local_ns(self._now_ns)), self._now_ns + self._latency_ns())
+            self._publish(self._silent(self.local_ns(self._now_ns)), self._now_ns + self._latency_ns())
 
     def _stall(self, duration_ns: int) -> None:
         """Stop the controller for a while: then it sees some of the states that have waited, all at once."""

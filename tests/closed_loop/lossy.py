@@ -42,7 +42,7 @@ class Lossy(Fuzz):
         self._ticked_ns = 0
         super().__init__(seed, compile=compile)
         self._standby = Controller(Rti(pioneer(N=6, N_u=4), compile=compile), Timing(), epoch=8, compile=compile)
-        self._standby.shadowing = True
+        self._standby.shadow()
 
     def _begin(self, now_ns: int) -> None:
         super()._begin(now_ns)
@@ -96,9 +96,10 @@ class Lossy(Fuzz):
         if isinstance(message, Command):
             standby.overhear(message)
         elif (command := standby.receive_state(message, local_ns := self.local_ns(self._now_ns))) is not None:
-            standby.in_time(command, local_ns + MS)
+            if (command := standby.in_time(command, local_ns + MS)) is not None:
+                standby.commit(command, local_ns + MS)
             standby.prepare()
-        standby.notices.clear()
+        standby.notices()
 
     def _advance(self, to_ns: int) -> None:
         played = self._played
@@ -145,7 +146,7 @@ class Lossy(Fuzz):
         self._guard.notices.clear()
         if self.rng.random() < 0.003:
             self.controller, self._standby = self._standby, self.controller
-            self._standby.shadowing = True
+            self._standby.shadow()
             epoch = self._standby._issued.epoch + 1
             self.controller.lead(epoch)
             self._command_seq = self.controller._issued.seq

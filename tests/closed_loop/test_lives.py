@@ -72,6 +72,8 @@ class Scene:
         command = self.controller.receive_state(state, self.local_ns)
         if command is not None:
             command = self.controller.in_time(command, self.local_ns)
+            if command is not None:
+                self.controller.commit(command, self.local_ns)
             self.controller.prepare()
         self.answered += command is not None
         self.send(command)
@@ -105,10 +107,13 @@ class Scene:
                 self.hear(self.state())
             if self.guard is not None:
                 self.tell(self.guard.tick(self.local_ns))
-            self.send(self.controller.tick(self.local_ns))
-            for notices in (self.controller.notices, *([] if self.guard is None else [self.guard.notices])):
-                self.said += notices
-                notices.clear()
+            if (ramp := self.controller.tick(self.local_ns)) is not None:
+                self.controller.commit(ramp)
+            self.send(ramp)
+            self.said += self.controller.notices()
+            if self.guard is not None:
+                self.said += self.guard.notices
+                self.guard.notices.clear()
 
     def told(self, code: str) -> list[str]:
         return [notice.text for notice in self.said if notice.code == code]

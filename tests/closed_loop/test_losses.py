@@ -61,6 +61,7 @@ class Scene:
                 self.guard.receive_state(state, body.now_ns)
             command = self.controller.receive_state(state, body.now_ns)
             if command is not None:
+                self.controller.commit(command)
                 self.controller.prepare()
                 self.send(command)
             if self.guard is not None:
@@ -116,7 +117,7 @@ def test_robot_that_does_not_report_is_told_of_once() -> None:
     for reports in (True, False):
         scene = Scene(guarded=False, at="none", reports=reports)
         scene.drive(3.0)
-        said[reports] = [notice.code for notice in scene.controller.notices]
+        said[reports] = [notice.code for notice in scene.controller.notices()]
     assert said[False].count("inputs_unreported") == 1
     assert "inputs_unreported" not in said[True]
 

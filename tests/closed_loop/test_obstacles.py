@@ -112,7 +112,7 @@ def test_configured_discs_are_passed_and_nobody_is_told_that_the_way_is_blocked(
     for (px, py), r, v in (((1.0, 0.05), 0.3, 0.0), ((2.0, -0.1), 0.3, 0.0), ((3.0, 1.0), 0.3, -0.07)):
         assert np.hypot(x[:, 0] - px, x[:, 1] - py - v * t).min() > r - 1e-3
     np.testing.assert_allclose(x[-1, :2], [4.0, 0.0], rtol=0, atol=2e-3)
-    assert not [notice.code for notice in controller.notices if notice.code in ("blocked", "free")]
+    assert not [notice.code for notice in controller.notices() if notice.code in ("blocked", "free")]
     assert controller.ladder.fallbacks == 0
 
 
@@ -127,7 +127,7 @@ def test_robot_whose_paths_are_all_blocked_says_so_once_and_once_that_it_is_free
     drive(controller, body, 20.0)
     assert body.x[0] < 1.5
     assert noise_m > 0.0 or abs(body.x[3]) < 1e-3  # m/s: it stands, where noise lets it
-    said = [(notice.severity, notice.code) for notice in controller.notices if notice.code != "mode"]
+    said = [(notice.severity, notice.code) for notice in controller.notices() if notice.code != "mode"]
     assert said == [(Severity.WARNING, "blocked")]
     gone = along_the_axis(config, seq=2)
     gone.p = np.tile(build_ocp(config).model.p_nominal, (len(gone.y), 1))
@@ -135,5 +135,5 @@ def test_robot_whose_paths_are_all_blocked_says_so_once_and_once_that_it_is_free
     controller.receive_reference(gone)
     drive(controller, body, 45.0)
     np.testing.assert_allclose(body.x[:2], [4.0, 0.0], rtol=0, atol=2e-3 + 5 * noise_m)
-    said = [(notice.severity, notice.code) for notice in controller.notices if notice.code != "mode"]
+    said += [(notice.severity, notice.code) for notice in controller.notices() if notice.code != "mode"]
     assert said == [(Severity.WARNING, "blocked"), (Severity.INFO, "free")]

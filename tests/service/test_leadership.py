@@ -87,8 +87,14 @@ class Puppet:
     shadowing: bool = False
     epoch: int = 0
     heard: list[Command] = field(default_factory=list)
-    notices: deque[Notice] = field(default_factory=deque)
+    said: list[Notice] = field(default_factory=list)
     robot_rate = 1.0
+
+    def say(self, notice: Notice) -> None:
+        self.said.append(notice)
+
+    def shadow(self) -> None:
+        self.shadowing = True
 
     def overhear(self, command: Command) -> None:
         self.heard.append(command)
@@ -140,7 +146,7 @@ def pair() -> tuple[One, One]:
 
 
 def codes(one: One) -> list[str]:
-    return [notice.code for notice in one.puppet.notices]
+    return [notice.code for notice in one.puppet.said]
 
 
 @pytest.mark.parametrize(
