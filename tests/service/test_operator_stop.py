@@ -140,6 +140,7 @@ def test_process_that_starts_is_stopped_by_its_file_until_it_is_released(disk: D
     assert process.ask("stop")["latch"] == asdict(STOPPED), "it stands since the first stop"
     assert process.ask("enable")["ok"] is True
     assert [latch.counter for latch in process.obeyed] == [5, 6]
+    assert process.stop._stored(PATIENCE_S) == ""
     assert Process(disk).obeyed == []
 
 
@@ -157,6 +158,7 @@ def test_file_that_cannot_be_understood_is_a_stop_that_enable_releases_for_good(
     assert caplog.messages[0] == f"{disk.path}: message must be a JSON object: taken as a stop"
     assert "`rti-mpc enable` releases it" in caplog.messages[1]
     assert process.ask("enable")["ok"] is True
+    assert process.stop._stored(PATIENCE_S) == ""
     assert Process(disk).obeyed == []
 
 
