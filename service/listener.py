@@ -9,11 +9,12 @@ from functools import partial
 from typing import Any
 
 from rti_mpc.errors import MessageError
-from rti_mpc.message import STAMP_ON_ARRIVAL, Command, Event, Notice, Reference, State, Telemetry
-from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received, Subscriber
+from rti_mpc.message import STAMP_ON_ARRIVAL, Event, Notice, State
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received
 from rti_mpc.wire.info import Info
 from rti_mpc.wire.intake import Intake
-from rti_mpc.wire.streams import admitted, role_of
+from rti_mpc.wire.keys import Key
+from rti_mpc.wire.streams import Stream, admitted, role_of
 from service.playback import Actuation
 from service.recording import Entry
 from service.timeline import Timeline
@@ -46,15 +47,8 @@ class Listener:
         self._events: set[str] = set()  # keys of events
         self._described: set[str] = set()  # keys of descriptions
         self._infos = bus.subscriber(keys.infos, capacity=RING_MESSAGES)
-        self._streams: tuple[tuple[type[Any], Subscriber], ...] = (
-            (State, bus.subscriber(keys.state, capacity=capacity)),
-            (Reference, bus.subscriber(keys.reference, capacity=RING_MESSAGES)),
-            (Reference, bus.subscriber(keys.anchored, capacity=RING_MESSAGES)),
-            (Command, bus.subscriber(keys.command, capacity=capacity)),
-            (Command, bus.subscriber(keys.actuation, capacity=capacity)),
-            (Telemetry, bus.subscriber(keys.telemetry, capacity=capacity)),
-            (Event, bus.subscriber(keys.events, capacity=capacity)),
-        )
+        heard: tuple[Key[Any], ...] = (keys.state, keys.reference, keys.anchored, keys.command, keys.actuation, keys.telemetry, keys.events)
+        self._streams = [(key.stream, bus.subscriber(key, capacity=capacity)) for key in heard]
 
     @property
     def lost(self) -> int:
@@ -98,9 +92,9 @@ class Listener:
             yield Entry(self._timeline.now_ns, info)
 
     def _messages(self, now_ns: int) -> Iterator[Entry]:
-        for cls, subscriber in self._streams:
+        for stream, subscriber in self._streams:
             for received in subscriber.drain():
-                door = self._door(cls, received)
+                door = self._door(stream, received)
                 message = None if door is None else door.accept(received, now_ns)
                 if message is None:
                     continue
@@ -111,12 +105,12 @@ class Listener:
                 elif message.stamp_ns != STAMP_ON_ARRIVAL:  # such a reference follows with its real stamp
                     yield Entry(self._timeline.place(message.stamp_ns), message)
 
-    def _door(self, cls: type[Any], received: Received) -> Door | None:
+    def _door(self, stream: Stream[Any], received: Received) -> Door | None:
         """Return the door of a key; None for one role too many of those that send events."""
-        key = received.key
-        if key not in self._doors and (cls is not Event or admitted(key, self._events)):
+        key, cls = received.key, stream.message
+        if cls is not None and key not in self._doors and (not stream.by_role or admitted(key, self._events)):
             self._doors[key] = self._bus.intake(cls, STALE_S, unfit=partial(_foreign, role_of(key)))
-            if cls is Event:
+            if stream.by_role:
                 self._events.add(key)
         return self._doors.get(key)
 
