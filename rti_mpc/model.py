@@ -19,22 +19,8 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 from rti_mpc.errors import OcpError
-
-
-@dataclass(frozen=True)
-class Signal:
-    r"""
-    One component of a state, input, output or parameter vector.
-
-    Attributes:
-        name: Unique within its vector; what configuration and viewers call it.
-        unit: SI unit, ``"1"`` if none.
-        angle: Whether it is an angle in rad of which whole turns mean nothing: it may wrap at :math:`\pm\pi`, and the dynamics repeat with each turn.
-    """
-
-    name: str
-    unit: str
-    angle: bool = False
+from rti_mpc.signals import VECTORS, misplaced
+from rti_mpc.signals import Signal as Signal
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,10 +79,13 @@ class Model:
         ):
             if expr.numel() != length or (length and expr.shape != (length, 1)):
                 raise OcpError(f"model {self.name}: {label} must have {expr.numel()} entries, in a column, got {length} for shape {expr.shape}")
-        for signals in (self.states, self.inputs, self.outputs, self.parameters, self.constraints):
+        for vector in VECTORS:
+            signals: tuple[Signal, ...] = getattr(self, vector)
             names = [signal.name for signal in signals]
             if len(set(names)) < len(names):
                 raise OcpError(f"model {self.name}: names must be unique within a vector, got {names}")
+            if wrong := misplaced(vector, signals, self.states):
+                raise OcpError(f"model {self.name}: {wrong}")
         for label, expr, known in (
             ("f_expl_expr", self.f_expl_expr, (self.x, self.u, self.p)),
             ("y_expr", self.y_expr, (self.x, self.p)),
@@ -129,6 +118,15 @@ class Model:
     def h(self) -> ca.Function:
         """Return the outputs at a node, ``h(x, p) -> y``."""
         return ca.Function("h", [self.x, self.p], [ca.densify(self.y_expr)], ["x", "p"], ["y"])
+
+    def counterparts(self) -> dict[str, list[str]]:
+        """Return the names of the states that ``inputs`` command, and that ``outputs`` are; of each component, empty where there is none."""
+        x, y = ca.vertsplit(self.x), ca.vertsplit(ca.densify(self.y_expr))
+        named = [(state.name, x_j) for state, x_j in zip(self.states, x, strict=True)]
+        return {
+            "inputs": [signal.commands for signal in self.inputs],
+            "outputs": [next((name for name, x_j in named if ca.is_equal(y_i, x_j)), "") for y_i in y],
+        }
 
     def with_parameters(self, **values: float) -> Model:
         """

@@ -8,16 +8,16 @@ Discs to keep out of, as stage parameters: one that moves is one whose parameter
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 
 import casadi as ca
 
 from rti_mpc.errors import OcpError
-from rti_mpc.model import Model, Signal
+from rti_mpc.model import Model
+from rti_mpc.signals import Role, Signal, plane
 
-PARTS = ("x", "y", "r")
+PARTS: dict[str, Role] = {"x": "disc_x", "y": "disc_y", "r": "disc_radius"}  # of a disc: ends of the names of its parameters, and their roles
 TINY = 1e-9  # m^2: a distance of zero has no derivative
 
 
@@ -29,7 +29,7 @@ def with_obstacles(model: Model, discs: Sequence[tuple[float, float, float]]) ->
     may cut short between two nodes, :math:`(v \, dt)^2 / 8 r`.
 
     Args:
-        model: A model whose first two outputs are a position, in m.
+        model: A model with outputs of the roles x and y.
         discs: x, y and radius of each, in m; a reference may carry others, row by row.
 
     Returns:
@@ -40,17 +40,17 @@ def with_obstacles(model: Model, discs: Sequence[tuple[float, float, float]]) ->
     """
     if not discs:
         return model
-    if [signal.unit for signal in model.outputs[:2]] != ["m", "m"]:
-        raise OcpError(f"model {model.name}: the first two outputs must be a position in m, got {[s.name for s in model.outputs[:2]]}")
+    if (position := plane(model.outputs)) is None:
+        raise OcpError(f"model {model.name}: two outputs must be a position, with role x and role y, got {[s.name for s in model.outputs]}")
     if any(radius <= 0 for _, _, radius in discs):
         raise OcpError(f"the radius of a disc must be positive, got {list(discs)}")
     p = ca.SX.sym("disc", 3, len(discs))
-    away = p[:2, :] - ca.repmat(model.y_expr[:2], 1, len(discs))
+    away = p[:2, :] - ca.repmat(model.y_expr[list(position), 0], 1, len(discs))
     clearance = ca.sqrt(ca.sum1(away**2) + TINY).T - p[2, :].T
     return replace(
         model,
         p=ca.vertcat(model.p, ca.vec(p)),
-        parameters=(*model.parameters, *(Signal(f"disc_{i}_{part}", "m") for i in range(len(discs)) for part in PARTS)),
+        parameters=(*model.parameters, *(Signal(f"disc_{i}_{part}", "m", role=role) for i in range(len(discs)) for part, role in PARTS.items())),
         p_nominal=(*model.p_nominal, *(float(value) for disc in discs for value in disc)),
         h_expr=ca.vertcat(model.h_expr, clearance),
         constraints=(*model.constraints, *(Signal(f"disc_{i}", "m") for i in range(len(discs)))),
@@ -60,4 +60,4 @@ def with_obstacles(model: Model, discs: Sequence[tuple[float, float, float]]) ->
 def discs_of(model: Model) -> list[tuple[int, float, float, float]]:
     """Return the discs among the parameters of a model: the place of the first of its three, and nominal x, y and radius, in m."""
     p = model.p_nominal
-    return [(i, p[i], p[i + 1], p[i + 2]) for i, signal in enumerate(model.parameters) if re.fullmatch(r"disc_\d+_x", signal.name)]
+    return [(i, p[i], p[i + 1], p[i + 2]) for i, signal in enumerate(model.parameters) if signal.role == "disc_x"]

@@ -28,6 +28,7 @@ NOMINAL = {
     "theta_6": 1.0915,
     "a": 0.2,  # [m], not printed in the paper: the value its robot's authors use
 }
+POSE = (Signal("x", "m", role="x"), Signal("y", "m", role="y"), Signal("psi", "rad", angle=True, role="heading"))
 
 
 def pioneer_3dx() -> Model:
@@ -51,9 +52,9 @@ def pioneer_3dx() -> Model:
             -theta_5 / theta_2 * u * omega - theta_6 / theta_2 * omega + omega_c / theta_2,
         ),
         y_expr=x[:3],
-        states=(Signal("x", "m"), Signal("y", "m"), Signal("psi", "rad", angle=True), Signal("u", "m/s"), Signal("omega", "rad/s")),
-        inputs=(Signal("u_c", "m/s"), Signal("omega_c", "rad/s")),
-        outputs=(Signal("x", "m"), Signal("y", "m"), Signal("psi", "rad", angle=True)),
+        states=(*POSE, Signal("u", "m/s"), Signal("omega", "rad/s")),
+        inputs=(Signal("u_c", "m/s", commands="u"), Signal("omega_c", "rad/s", commands="omega")),
+        outputs=POSE,
         parameters=(
             Signal("theta_1", "s"),
             Signal("theta_2", "s"),
@@ -61,7 +62,7 @@ def pioneer_3dx() -> Model:
             Signal("theta_4", "1"),
             Signal("theta_5", "s/m"),
             Signal("theta_6", "1"),
-            Signal("a", "m"),
+            Signal("a", "m", role="axle_offset"),
         ),
         p_nominal=tuple(NOMINAL.values()),
     )

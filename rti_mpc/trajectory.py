@@ -9,6 +9,7 @@ curve: that is a circle. Both are here, each under its own name.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -20,6 +21,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.heading import Curve, consistent, periodic, tangent
 from rti_mpc.message import End
 from rti_mpc.polyline import polyline, read_csv
+from rti_mpc.signals import POSE, Role, Signal
 
 Heading = Literal["tangent", "consistent", "none"]
 HEADINGS: tuple[Heading, ...] = get_args(Heading)
@@ -163,7 +165,14 @@ def find_trajectory(scenario: str, speed_m_s: float = 0.25, corner_m: float = 0.
         raise ConfigError(f"{path}: {error}") from error
 
 
-def rows(trajectory: Trajectory, period_s: float, heading: Heading = "consistent", a: float = 0.2, psi0: float | None = None) -> Array:
+def rows(
+    trajectory: Trajectory,
+    period_s: float,
+    heading: Heading = "consistent",
+    a: float | None = 0.2,
+    psi0: float | None = None,
+    roles: Sequence[Role] = POSE,
+) -> Array:
     """
     Sample a trajectory into reference rows.
 
@@ -172,12 +181,13 @@ def rows(trajectory: Trajectory, period_s: float, heading: Heading = "consistent
         period_s: Time between rows.
         heading: ``"tangent"``, or ``"consistent"`` for a point ahead of the axle; ``"none"`` is for controllers without weight on the heading,
             its rows carry the tangent for viewers.
-        a: Distance of the reference point ahead of the axle, in m.
+        a: Distance of the reference point ahead of the axle, in m; None: it is on the axle, where the consistent heading is the tangent.
         psi0: Initial consistent heading of an open path, in rad: its tangent by default. Closed paths have the heading that repeats.
+        roles: What the columns are, in their order: those of `rti_mpc.signals.POSE`.
 
     Returns:
-        Rows ``x, y, psi``, shape ``(M, 3)``, from time 0 to the first at or after the duration, so that an open path ends at its last point; psi is
-        unwrapped.
+        Rows, shape ``(M, len(roles))``, from time 0 to the first at or after the duration, so that an open path ends at its last point; the
+        heading is unwrapped.
 
     Raises:
         ConfigError: The period, the heading or `a` is out of range.
@@ -187,14 +197,41 @@ def rows(trajectory: Trajectory, period_s: float, heading: Heading = "consistent
         raise ConfigError(f"heading must be one of {', '.join(HEADINGS)}, got {heading!r}")
     periods = math.ceil(trajectory.duration_s / _positive("period_s", period_s) - 1e-9)  # all of the last one, where it is not a whole one
     t: Array = np.arange(periods + 1) * np.float64(period_s)
+    columns = dict(zip(("x", "y"), trajectory.position(t).T, strict=True))
+    if "heading" in roles:
+        columns["heading"] = headings(trajectory, t, heading, a, psi0)
+    return np.ascontiguousarray(np.column_stack([columns[role] for role in roles]))
+
+
+def headings(trajectory: Trajectory, t: Array, heading: Heading, a: float | None, psi0: float | None) -> Array:
+    """Return the heading at times, both of shape ``(M,)``, as `rows` describes it."""
     psi = tangent(trajectory.velocity, t)
-    if heading == "consistent":
-        _positive("a", a)
-        start = float(psi[0]) if psi0 is None else psi0
-        if trajectory.lap_s is not None:
-            start = periodic(trajectory.velocity, trajectory.lap_s, a, start)
-        psi = consistent(trajectory.velocity, t, a, start)
-    return np.ascontiguousarray(np.column_stack([trajectory.position(t), psi]))
+    if heading != "consistent" or a is None:
+        return psi
+    _positive("a", a)
+    start = float(psi[0]) if psi0 is None else psi0
+    if trajectory.lap_s is not None:
+        start = periodic(trajectory.velocity, trajectory.lap_s, a, start)
+    return consistent(trajectory.velocity, t, a, start)
+
+
+def followed_roles(model: str, outputs: Sequence[Signal]) -> tuple[Role, ...]:
+    """
+    Return the roles of a model's outputs, which the columns of its reference take.
+
+    Args:
+        model: Its name.
+        outputs: Its outputs.
+
+    Raises:
+        ConfigError: A path says nothing of an output.
+    """
+    if unfilled := [output.name for output in outputs if output.role not in POSE]:
+        raise ConfigError(
+            f"model {model}: a path in the plane fills outputs whose role is {', '.join(POSE)}, not {', '.join(unfilled)}: "
+            "give each its role, or publish rows of your own"
+        )
+    return tuple(output.role for output in outputs)
 
 
 def _positive(name: str, value: float) -> float:

@@ -149,7 +149,7 @@ def _commands(info: Info, i: int) -> rrb.TimeSeriesView:
 
 
 def _errors(info: Info) -> rrb.TimeSeriesView:
-    if info.position is not None:
+    if info.tracked_position is not None:
         return _series("Tracking error [mm]", ["error/position"])
     return _series("Tracking error", [f"error/{info.outputs[i].name}" for i, _ in info.tracked])
 

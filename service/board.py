@@ -39,7 +39,7 @@ class Board(Redrawn):
         else:
             self.console.print(text)
 
-    def show(self, time_s: float, error_mm: float, telemetry: Sequence[Telemetry], events: Sequence[Event]) -> None:
+    def show(self, time_s: float, error_mm: float | None, telemetry: Sequence[Telemetry], events: Sequence[Event]) -> None:
         """Show where the robot is and how the controller fares; at least one sample is there."""
         rows = self._rows(error_mm, telemetry)
         if self.live:
@@ -57,12 +57,12 @@ class Board(Redrawn):
                 f"{time_s:5.0f} of {self._duration_s:.0f} s: " + ", ".join(f"{name} {text}" for name, text in rows.items()), soft_wrap=True
             )
 
-    def _rows(self, error_mm: float, telemetry: Sequence[Telemetry]) -> dict[str, str]:
+    def _rows(self, error_mm: float | None, telemetry: Sequence[Telemetry]) -> dict[str, str]:
         last, recent = telemetry[-1], telemetry[-RECENT:]
         medians = {name: np.median([getattr(sample, name) for sample in recent]) for name in ("prepare_us", "feedback_us")}
         return {
             "mode": last.mode.name.lower(),
-            "error": f"{error_mm:.2f} mm",
+            **({} if error_mm is None else {"error": f"{error_mm:.2f} mm"}),
             "command": "  ".join(f"{signal.name} {value:+.3f} {signal.unit}" for signal, value in zip(self._inputs, last.u[0], strict=True)),
             "preparation": f"{medians['prepare_us']:.0f} us",
             "feedback": f"{medians['feedback_us']:.0f} us",

@@ -198,15 +198,18 @@ def reference(
     waypoint_speed: Annotated[float, typer.Option(metavar="M/S", min=0.001, help="Speed along waypoints.")] = 0.25,
 ) -> None:
     """Publish a reference from the robot's present state on, and again when the robot restarts."""
-    from rti_mpc.trajectory import find_trajectory
+    from rti_mpc.signals import place
+    from rti_mpc.trajectory import find_trajectory, followed_roles
     from sim.source import main
 
     trajectory = find_trajectory(scenario, waypoint_speed)
     if duration is not None:
         trajectory = trajectory.lasting(duration)
     model = build_model(config)
-    parameters = {parameter.name: value for parameter, value in zip(model.parameters, model.p_nominal, strict=True)}
-    main(trajectory, bus, config.keys(), heading=heading, a=parameters.get("a", 0.0), parameters=partial(stage_parameters, config))
+    offset = place(model.parameters, "axle_offset")
+    a = None if offset is None else model.p_nominal[offset]
+    roles = followed_roles(model.name, model.outputs)
+    main(trajectory, bus, config.keys(), heading=heading, a=a, roles=roles, parameters=partial(stage_parameters, config))
 
 
 @process

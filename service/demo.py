@@ -24,11 +24,12 @@ import numpy as np
 from rich.console import Console
 
 from rti_mpc.errors import ConfigError
-from rti_mpc.message import Command, State
+from rti_mpc.message import Command, Reference, State, Telemetry
 from rti_mpc.status import Mode, QpStatus
 from rti_mpc.trajectory import Heading, Trajectory, find_trajectory
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import encode
+from rti_mpc.wire.info import Info
 from rti_mpc.wire.interrupt import stop_on_signals
 from service import machine, robot_log, toml
 from service.board import Board, print_summary
@@ -93,7 +94,7 @@ def plan(
     Fill in what the scenario decides.
 
     Raises:
-        ConfigError: There is no such scenario, or the model has no pose to start it from.
+        ConfigError: There is no such scenario, or the model has outputs that no path fills.
     """
     trajectory = find_trajectory(scenario)
     heading = heading or HEADINGS.get(scenario, "consistent")
@@ -219,12 +220,18 @@ def follow(run: Plan, witness: Witness, board: Board, children: Children, stop: 
             return
         if now_s - shown_s > SHOW_S:
             shown_s = now_s
-            at_s = np.array(1e-9 * (last.stamp_ns - witness.reference.stamp_ns))
-            error_mm = 1e3 * float(np.hypot(*(last.x0[:2] - run.trajectory.position(at_s))))
-            board.show(time_s, error_mm, witness.telemetry, witness.events)
+            board.show(time_s, error_mm(run, witness.info, last, witness.reference), witness.telemetry, witness.events)
         check(children)
         stop.wait(LOOK_S)
         witness.listen()
+
+
+def error_mm(run: Plan, info: Info | None, sample: Telemetry, reference: Reference) -> float | None:
+    """Return how far from the path the robot is in a sample; None: the model has no position."""
+    if info is None or info.position is None:
+        return None
+    at_s = np.array(1e-9 * (sample.stamp_ns - reference.stamp_ns))
+    return 1e3 * float(np.hypot(*(sample.x0[list(info.position)] - run.trajectory.position(at_s))))
 
 
 def conclude(run: Plan, outcome: Outcome, console: Console) -> int:

@@ -20,7 +20,7 @@ def describe(ocp: Ocp, np_: int) -> dict[str, Any]:
     return {
         "version": rti_mpc.__version__,
         "model": ocp.model.name,
-        **info.labels(**vectors),
+        **info.labels(model.counterparts(), **vectors),
         **info.bounds(**{name: getattr(ocp, name).tolist() for name in limits}),
         "p_nominal": list(model.p_nominal[:np_]),
         **info.obstacles(discs_of(model)),

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +46,7 @@ LOOK: Any = {
 
 def figure(run: Run, path: Path) -> None:
     """
-    Draw a run.
+    Draw a run; without path and error where the model has no position.
 
     Args:
         run: At least one state and one sample.
@@ -54,18 +56,22 @@ def figure(run: Run, path: Path) -> None:
     with mpl.rc_context(LOOK):
         page = Figure(figsize=(13.0, 7.6), layout="constrained")
         FigureCanvasAgg(page)
-        grid = page.add_gridspec(2 + nu, 2, width_ratios=[1.0, 1.15], height_ratios=[1.3, *[1.0] * nu, 1.3])
-        _path(page.add_subplot(grid[:, 0]), run)
-        error = page.add_subplot(grid[0, 1])
-        _error(error, run)
-        below = [page.add_subplot(grid[1 + k, 1], sharex=error) for k in range(nu + 1)]
-        for i, axes in enumerate(below[:-1]):
-            _command(axes, run, i)
-        _phases(below[-1], run)
-        for axes in (error, *below[:-1]):
-            axes.tick_params(labelbottom=False)
-        below[-1].set_xlabel("robot time [s]")
-        below[-1].set_xlim(0.0, run.time_s[-1])
+        panels: list[Callable[[Axes, Run], None]] = [*(partial(_command, i=i) for i in range(nu)), _phases]
+        if run.info.position is None:
+            grid = page.add_gridspec(1 + nu, 1, height_ratios=[*[1.0] * nu, 1.3])
+            places = [grid[k, 0] for k in range(1 + nu)]
+        else:
+            grid = page.add_gridspec(2 + nu, 2, width_ratios=[1.0, 1.15], height_ratios=[1.3, *[1.0] * nu, 1.3])
+            _path(page.add_subplot(grid[:, 0]), run)
+            panels, places = [_error, *panels], [grid[k, 1] for k in range(2 + nu)]
+        first: Axes | None = None
+        for draw, place in zip(panels, places, strict=True):
+            axes = page.add_subplot(place, sharex=first)
+            first = first or axes
+            draw(axes, run)
+            axes.tick_params(labelbottom=draw is _phases)
+        axes.set_xlabel("robot time [s]")
+        axes.set_xlim(0.0, run.time_s[-1])
         page.savefig(path, dpi=130)
 
 

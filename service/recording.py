@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rti_mpc.array import Array
 from rti_mpc.message import Command, Event, Reference, Severity, State, Telemetry
+from rti_mpc.signals import plane
 from rti_mpc.wire.info import Info, Label, Obstacle
 from service.blueprint import RUNGS, STRIPS, TIMELINE, Frame, blueprint, legend, lifted, looks
 from service.playback import Actuation, Playback, Row
@@ -136,7 +137,7 @@ class Recording:
     def _references(self, times: Times, references: list[Reference]) -> None:
         assert self.info is not None
         self._reference = references[-1]
-        pair = _positions(self.info.outputs)
+        pair = plane(self.info.outputs)
         if pair is not None and self.info.position is not None:
             frame = Frame.around(references[-1].y[:, pair])
             if frame != self._frame:
@@ -247,11 +248,6 @@ def located(obstacle: Obstacle, reference: Reference | None, stamps: NDArray[np.
         row = (stamps - reference.stamp_ns) / reference.period_ns
         x, y, r = (np.interp(row, np.arange(len(reference.p)), reference.p[:, obstacle.at + part]) for part in range(3))
     return x, y, r
-
-
-def _positions(outputs: Sequence[Label]) -> tuple[int, int] | None:
-    names = [label.name for label in outputs]
-    return (names.index("x"), names.index("y")) if {"x", "y"} <= set(names) else None
 
 
 def _widths(message: Message) -> dict[str, int]:

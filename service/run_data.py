@@ -57,13 +57,12 @@ class Run:
 
     @property
     def position(self) -> Array:
-        """True positions in m, shape ``(M, 2)``."""
-        assert self.info.position is not None
-        return self.x[:, self.info.position]
+        """True positions in m, shape ``(M, 2)``; NaN where the model has none."""
+        return np.full((len(self.x), 2), np.nan) if self.info.position is None else self.x[:, self.info.position]
 
     @property
     def error_mm(self) -> Array:
-        """Distance of the true position from the reference at the same stamp, shape ``(M,)``."""
+        """Distance of the true position from the reference at the same stamp, shape ``(M,)``; NaN where the model has no position."""
         dx, dy = (self.position - self.reference).T
         return np.asarray(1e3 * np.hypot(dx, dy))
 

@@ -26,6 +26,7 @@ from service.run_data import Run
 
 TRANSIENT_S = 20.0
 DRIVING = (Mode.TRACKING, Mode.HOLDING)
+ERRORS = ("max_error_mm", "rms_error_mm", "last_lap_max_error_mm", "final_error_mm", "final_speed_mm_s")
 ROUNDING = 1e-9  # of a difference of two inputs; bounds themselves are compared exactly
 
 
@@ -147,17 +148,20 @@ def summarize(outcome: Outcome) -> dict[str, Any]:
 
 
 def errors(run: Run, lap_s: float | None) -> dict[str, float | None]:
-    """Sum up the distance from the reference, and the speed in the end; null where the run did not get so far."""
+    """Sum up the distance from the reference, and the speed in the end; null where the run did not get so far, or the model has no position."""
+    if run.info.position is None:
+        return dict.fromkeys(ERRORS)
     settled = run.error_mm[run.settled]
     last_lap = run.error_mm[run.time_s >= run.time_s[-1] - lap_s] if lap_s and run.time_s[-1] - lap_s >= run.transient_s else settled[:0]
     steps_mm, steps_s = 1e3 * np.hypot(*np.diff(run.position, axis=0).T), np.diff(run.time_s)
-    return {
-        "max_error_mm": float(settled.max()) if settled.size else None,
-        "rms_error_mm": float(np.sqrt((settled**2).mean())) if settled.size else None,
-        "last_lap_max_error_mm": float(last_lap.max()) if last_lap.size else None,
-        "final_error_mm": float(run.error_mm[-1]),
-        "final_speed_mm_s": float(steps_mm[-1] / steps_s[-1]) if steps_s.size else None,
-    }
+    numbers = (
+        float(settled.max()) if settled.size else None,
+        float(np.sqrt((settled**2).mean())) if settled.size else None,
+        float(last_lap.max()) if last_lap.size else None,
+        float(run.error_mm[-1]),
+        float(steps_mm[-1] / steps_s[-1]) if steps_s.size else None,
+    )
+    return dict(zip(ERRORS, numbers, strict=True))
 
 
 def limits(outcome: Outcome, samples: Sequence[Telemetry]) -> dict[str, Any]:

@@ -26,11 +26,11 @@ def tracking_error(info: Info, reference: Reference, stamps: NDArray[np.int64], 
         distance in the plane, in mm, where there is one. Shape ``(n,)``; NaN before row 0, against the last row after it.
     """
     row = (stamps - reference.stamp_ns) / reference.period_ns
-    error = {}
+    error, position = {}, info.tracked_position
     for i, k in info.tracked:
         label, y = info.outputs[i], reference.y[:, i]
         deviation = x[:, k] - np.interp(row, np.arange(len(y)), np.unwrap(y) if label.angle else y)
         error[label.name] = np.remainder(deviation + np.pi, 2 * np.pi) - np.pi if label.angle else deviation
-    if {"x", "y"} <= error.keys():
-        error["position"] = 1e3 * np.hypot(error["x"], error["y"])
+    if position is not None:
+        error["position"] = 1e3 * np.hypot(*(error[info.outputs[i].name] for i in position))
     return {name: np.where(row < 0.0, np.nan, values) for name, values in error.items()}

@@ -125,7 +125,7 @@ def describe(model: Model) -> dict[str, Any]:
     return {
         "version": rti_mpc.__version__,
         "model": model.name,
-        **labels(states=model.states, inputs=model.inputs, outputs=model.outputs),
+        **labels(model.counterparts(), states=model.states, inputs=model.inputs, outputs=model.outputs),
         "parameters": {s.name: value for s, value in zip(model.parameters, model.p_nominal, strict=True)},
     }
 

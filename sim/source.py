@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from threading import Event
 
 import numpy as np
@@ -20,6 +20,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.lives import Heard, Lives
 from rti_mpc.message import Notice, Reference, Severity, State
+from rti_mpc.signals import POSE, Role
 from rti_mpc.trajectory import Heading, Trajectory, rows
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
@@ -40,8 +41,9 @@ def main(
     keys: Keys,
     *,
     heading: Heading = "consistent",
-    a: float = 0.2,
+    a: float | None = 0.2,
     psi0: float | None = None,
+    roles: Sequence[Role] = POSE,
     period_s: float = 0.05,
     parameters: Callable[[Array], Array] | None = None,
     stop: Event | None = None,
@@ -54,8 +56,9 @@ def main(
         bus_settings: How to join the bus.
         keys: Where its streams are.
         heading: ``"tangent"``, ``"consistent"``, or ``"none"`` for a controller without weight on it.
-        a: Distance of the reference point ahead of the axle, in m.
+        a: Distance of the reference point ahead of the axle, in m; None: on it.
         psi0: Initial consistent heading of an open path, in rad.
+        roles: Of the model's outputs, in their order.
         period_s: Time between rows; the receiver interpolates, on the eight within 0.02 mm.
         parameters: Stage parameters at times since the start, in s: of shape ``(M,)`` to ``(M, np)``; the model's nominal ones if left out.
         stop: Stops the source when set; SIGINT and SIGTERM if there is none.
@@ -67,7 +70,7 @@ def main(
         ConfigError: The heading or a number is out of range.
         OcpError: No consistent heading repeats on this closed path.
     """
-    y = rows(trajectory, period_s, heading, a, psi0)
+    y = rows(trajectory, period_s, heading, a, psi0, roles)
     p: Array = np.empty((len(y), 0)) if parameters is None else parameters(period_s * np.arange(len(y), dtype=np.float64))
     stop = stop or stop_on_signals()
     with Bus.join(bus_settings, keys, stop=stop, say=logger.warning) as bus:

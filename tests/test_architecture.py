@@ -66,7 +66,7 @@ LOCAL = {"rti_mpc/wire/session.py"}  # reads JSON that is not a peer's: Zenoh's 
 
 # Inside the library, a file imports only from groups before its own.
 FLOW: tuple[set[str], ...] = (
-    {"errors", "array", "status", "robot_clock", "ladder", "grid", "epoch", "cache", "angle", "call"},
+    {"errors", "array", "status", "robot_clock", "ladder", "grid", "epoch", "cache", "angle", "call", "signals"},
     {"message", "approach", "text_file", "latch"},
     {"polyline"},
     {"lives", "cadence", "heading", "mode", "schedule", "issued"},
@@ -88,7 +88,7 @@ FLOW: tuple[set[str], ...] = (
     {"record", "blockage"},
     {"controller"},
 )
-BEFORE_WIRE = {"errors", "array", "status", "message", "epoch", "text_file"}
+BEFORE_WIRE = {"errors", "array", "signals", "status", "message", "epoch", "text_file"}
 
 
 def imported(path: Path) -> set[str]:

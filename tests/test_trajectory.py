@@ -15,7 +15,8 @@ from rti_mpc.array import Array
 from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.heading import consistent, periodic
 from rti_mpc.message import End
-from rti_mpc.trajectory import HEADINGS, SCENARIOS, Heading, Trajectory, circle, eight, find_trajectory, positioning, rows, waypoints
+from rti_mpc.signals import Signal
+from rti_mpc.trajectory import HEADINGS, SCENARIOS, Heading, Trajectory, circle, eight, find_trajectory, followed_roles, positioning, rows, waypoints
 
 SQUARE = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0], [0.0, 0.0]])
 ZIGZAG = np.array([[0.0, 0.0], [1.5, 0.0], [2.0, 1.0], [3.5, 1.0]])
@@ -280,3 +281,19 @@ def test_periods_durations_and_speeds_must_be_positive(value: float) -> None:
     for call in (lambda: rows(eight(), value), lambda: eight().lasting(value), lambda: waypoints(ZIGZAG, value), lambda: rows(eight(), 0.1, a=value)):
         with pytest.raises(ConfigError, match="above 0"):
             call()
+
+
+def test_rows_have_a_column_a_role_in_its_order() -> None:
+    whole, turned = rows(eight(), 0.1), rows(eight(), 0.1, roles=("heading", "x", "y"))
+    np.testing.assert_array_equal(turned, whole[:, [2, 0, 1]])
+    np.testing.assert_array_equal(rows(eight(), 0.1, roles=("x", "y")), whole[:, :2])
+
+
+def test_consistent_heading_of_a_point_on_the_axle_is_the_tangent() -> None:
+    np.testing.assert_array_equal(rows(eight(), 0.1, "consistent", None), rows(eight(), 0.1, "tangent"))
+
+
+def test_outputs_that_no_path_fills_are_refused_by_name() -> None:
+    outputs = (Signal("x", "m", role="x"), Signal("v", "m/s"), Signal("elbow", "rad", angle=True))
+    with pytest.raises(ConfigError, match=r"model crane: .* not v, elbow: give each its role"):
+        followed_roles("crane", outputs)

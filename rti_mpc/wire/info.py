@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from rti_mpc.errors import MessageError
+from rti_mpc.signals import place, plane
 from rti_mpc.wire.document import read
 from rti_mpc.wire.layout import NUMBER_LIMIT
 from rti_mpc.wire.received import Received
@@ -33,11 +34,15 @@ class Label:
         name: Unique within its vector.
         unit: SI unit, ``"1"`` if none.
         angle: Whether it wraps at ``+-pi``.
+        role: As in `rti_mpc.signals.Signal`; empty if none is said.
+        state: Name of the state that an input commands, or that an output is; empty if there is none.
     """
 
     name: str
     unit: str = "1"
     angle: bool = False
+    role: str = ""
+    state: str = ""
 
     def __str__(self) -> str:
         return self.name if self.unit == "1" else f"{self.name} [{self.unit}]"
@@ -141,27 +146,30 @@ class Info:
     @property
     def position(self) -> tuple[int, int] | None:
         """Indices of the states that are the position in the plane; None: the model has none."""
-        names = [label.name for label in self.states]
-        return (names.index("x"), names.index("y")) if {"x", "y"} <= set(names) else None
+        return plane(self.states)
 
     @property
     def heading(self) -> int | None:
-        """Index of the first state that is an angle; None: the model has none."""
-        return next((i for i, label in enumerate(self.states) if label.angle), None)
+        """Index of the state that is the heading in the plane; None: the model has none."""
+        return place(self.states, "heading")
 
     @property
     def tracked(self) -> list[tuple[int, int]]:
-        """Pairs of an output and the state of the same name, by index."""
-        names = [label.name for label in self.states]
-        return [(i, names.index(label.name)) for i, label in enumerate(self.outputs) if label.name in names]
+        """Pairs of an output and the state that it is, by index."""
+        return [(i, k) for i, label in enumerate(self.outputs) if (k := self._state(label)) is not None]
+
+    @property
+    def tracked_position(self) -> tuple[int, int] | None:
+        """Indices of the outputs that are the position in the plane; None: there are none, or they are no states."""
+        position, tracked = plane(self.outputs), [i for i, _ in self.tracked]
+        return position if position is not None and set(position) <= set(tracked) else None
 
     def measured(self, i: int) -> int | None:
-        """Index of the state that input `i` commands: of its unit, and if several are, of a name it begins with."""
-        command = self.inputs[i]
-        same_unit = [k for k, label in enumerate(self.states) if label.unit == command.unit != "1"]
-        same_name = [k for k in same_unit if command.name.startswith(self.states[k].name)]
-        found = same_unit if len(same_unit) == 1 else same_name
-        return found[0] if len(found) == 1 else None
+        """Index of the state that input `i` commands; None: there is none."""
+        return self._state(self.inputs[i])
+
+    def _state(self, label: Label) -> int | None:
+        return next((k for k, state in enumerate(self.states) if state.name == label.state), None)
 
 
 VECTORS = ("states", "inputs", "outputs", "disturbances")
@@ -183,10 +191,26 @@ class Signal(Protocol):
     def angle(self) -> bool:
         """Whether it wraps."""
 
+    @property
+    def role(self) -> str:
+        """What it is to others; empty if nothing."""
 
-def labels(**vectors: Iterable[Signal]) -> dict[str, Any]:
-    """Write the components of vectors, such as ``states``, as a part of a description."""
-    return {name: [{"name": s.name, "unit": s.unit, "angle": s.angle} for s in signals] for name, signals in vectors.items()}
+
+def labels(counterparts: Mapping[str, Sequence[str]] | None = None, /, **vectors: Sequence[Signal]) -> dict[str, Any]:
+    """
+    Write the components of vectors, such as ``states``, as a part of a description.
+
+    Args:
+        counterparts: By name of a vector, what `Label` calls the state of each of its components; empty if left out.
+        vectors: By name, their components.
+    """
+    return {
+        vector: [
+            {"name": signal.name, "unit": signal.unit, "angle": signal.angle, "role": signal.role, "state": state}
+            for signal, state in zip(signals, (counterparts or {}).get(vector, [""] * len(signals)), strict=True)
+        ]
+        for vector, signals in vectors.items()
+    }
 
 
 def bounds(**vectors: Iterable[float]) -> dict[str, Any]:
@@ -258,7 +282,8 @@ def _few(values: Sequence[Any]) -> Sequence[Any]:
 
 
 def _label(signal: Mapping[str, Any]) -> Label:
-    label = Label(signal["name"], signal["unit"], bool(signal["angle"]))
+    role, state = (str(signal.get(name, ""))[:MAX_TEXT] for name in ("role", "state"))
+    label = Label(signal["name"], signal["unit"], bool(signal["angle"]), role, state)
     for text in (label.name, label.unit):
         if not 0 < len(text) <= MAX_TEXT or not text.isprintable():
             raise ValueError(f"names and units of 1 to {MAX_TEXT} printable characters expected, got {text[:MAX_TEXT]!r}")

@@ -85,12 +85,13 @@ class Measured:
     final_error_m: float
 
 
-def measure(log: RobotLog, reference: Array, incident: Incident, limits: Limits) -> Measured:
+def measure(log: RobotLog, place: tuple[int, int], reference: Array, incident: Incident, limits: Limits) -> Measured:
     """
     Measure one incident.
 
     Args:
-        log: The robot's record; its first two states are the position, in m. It has a row between fault and mending.
+        log: The robot's record. It has a row between fault and mending.
+        place: Indices of the states that are the position, in m.
         reference: Where the robot was to be at each stamp, shape ``(M, 2)``, in m.
         incident: When it happened.
         limits: What inputs may do.
@@ -99,9 +100,10 @@ def measure(log: RobotLog, reference: Array, incident: Incident, limits: Limits)
     broken = (t >= incident.fault_ns) & (t <= incident.mend_ns)
     seen = (t >= incident.fault_ns) & (t <= incident.end_ns)
     moving: Mask = np.abs(log.u - limits.u_rest).max(axis=1) > AT_REST
-    way = np.hypot(*np.diff(log.x[:, :2], axis=0, prepend=log.x[:1, :2]).T)
+    position = log.x[:, list(place)]
+    way = np.hypot(*np.diff(position, axis=0, prepend=position[:1]).T)
     speed: Array = way / (1e-9 * np.diff(t, prepend=t[0] - 1))
-    error = np.hypot(*(log.x[:, :2] - reference).T)[broken]
+    error = np.hypot(*(position - reference).T)[broken]
 
     zero = settled(~moving, broken)
     brake = None if zero is None or zero == np.argmax(broken) else braking(log, limits, int(np.argmax(broken)), zero)
@@ -127,12 +129,12 @@ def measure(log: RobotLog, reference: Array, incident: Incident, limits: Limits)
     )
 
 
-def positions(reference: Reference | None, stamp_ns: NDArray[np.int64]) -> Array:
-    """Return where a reference wants the robot at stamps, shape ``(..., 2)``, m: at its ends beyond them; NaN without one."""
+def positions(reference: Reference | None, columns: tuple[int, int], stamp_ns: NDArray[np.int64]) -> Array:
+    """Return where a reference wants the robot at stamps, of its columns x and y, shape ``(..., 2)``, m: at its ends beyond them; NaN without one."""
     if reference is None:
         return np.full((*stamp_ns.shape, 2), np.nan)
     rows = (stamp_ns - reference.stamp_ns) / reference.period_ns
-    return np.stack([np.interp(rows, np.arange(len(reference.y)), reference.y[:, j]) for j in (0, 1)], axis=-1)
+    return np.stack([np.interp(rows, np.arange(len(reference.y)), reference.y[:, j]) for j in columns], axis=-1)
 
 
 def step(limits: Limits) -> Array:

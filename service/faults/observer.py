@@ -23,12 +23,18 @@ class Observer:
     """
     Follows the states of a robot at speed 1, and the commands for them.
 
+    Args:
+        bus: Ours.
+        robot: Where the robot's streams are.
+        place: Indices of the states that are its position.
+
     Attributes:
         epoch: Of the robot's present life, 0 before the first state.
         answered: Sequence numbers of states of that life that a controller has answered.
     """
 
-    def __init__(self, bus: Bus, robot: Keys) -> None:
+    def __init__(self, bus: Bus, robot: Keys, place: tuple[int, int]) -> None:
+        self._place = list(place)
         self.epoch = 0
         self.answered: set[int] = set()
         self._states: deque[tuple[int, int, Array]] = deque(maxlen=4096)  # stamp, local monotonic arrival, position
@@ -76,7 +82,7 @@ class Observer:
             if (state := intake.read(received)) is None:
                 continue
             self.epoch = state.epoch
-            self._states.append((state.stamp_ns, arrival_ns, state.x[:2]))
+            self._states.append((state.stamp_ns, arrival_ns, state.x[self._place]))
 
     def _listen(self, subscriber: Subscriber, intake: Intake[Command]) -> None:
         """Note which states were answered; a thread of its own."""

@@ -24,13 +24,13 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.guard import Limits
 from rti_mpc.trajectory import find_trajectory
 from rti_mpc.wire.interrupt import stop_on_signals
-from service.build import guard_limits
+from service.build import build_model, guard_limits
 from service.config import load
 from service.faults.excuse import excuses, explained
 from service.faults.measure import Incident, measure, missed_ns, positions
 from service.faults.relay import ROLE as RELAY
 from service.faults.report import Report, Row, report_console
-from service.faults.system import HEADING, SCENARIO, System, Wiring
+from service.faults.system import HEADING, SCENARIO, System, Wiring, measured_places
 from service.faults.table import FAULTS, Fault
 from service.fit import check_model, check_tree
 from service.host import Host
@@ -105,6 +105,7 @@ def chosen(only: Sequence[str]) -> list[Fault]:
 def prepared(config: Config) -> Config:
     """Return the configuration of a run: from the scenario's pose, guarded, with states that come fast enough to measure by."""
     config = configured(config, find_trajectory(SCENARIO), HEADING, guard=True)
+    measured_places(build_model(config))
     content = config.model_dump(by_alias=True, exclude_unset=True)
     content["debug"] = {"inject": True}
     content["sim"] = {**content.get("sim", {}), "state_period_s": min(STATE_PERIOD_S, config.ocp.dt_s)}
@@ -181,7 +182,10 @@ def suffer(system: System, fault: Fault, limits: Limits, report: Report, host: H
     if system.stopped:
         raise Failed("stopped")
     log, incident = system.log(), Incident(fault_ns, mend_ns, end_ns)
-    measured, missed = measure(log, positions(reference, log.stamp_ns), incident, limits), missed_ns(log, incident, limits.dt_s)
+    measured, missed = (
+        measure(log, system.place, positions(reference, system.columns, log.stamp_ns), incident, limits),
+        missed_ns(log, incident, limits.dt_s),
+    )
 
     def held_up_ms(from_ns: int, to_ns: int) -> float:
         return host.held_up_ms(system.observer.arrival_ns(from_ns), system.observer.arrival_ns(to_ns))

@@ -12,11 +12,13 @@ from enum import Enum
 from pathlib import Path
 from threading import Event
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rti_mpc.errors import ConfigError
 from rti_mpc.message import Reference
+from rti_mpc.signals import plane
 from rti_mpc.trajectory import Heading
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.info import Info, Label
@@ -35,12 +37,28 @@ from service.robot_log import RobotLog
 from service.schema import Config
 from service.witness import Witness
 
+if TYPE_CHECKING:
+    from rti_mpc.model import Model
+
 SCENARIO = "eight"
 HEADING: Heading = "consistent"
 REFERENCE_S = 120  # 58 kB: one packet, which a busy host does not drop half of
 PATIENCE_S = 60.0  # for processes to start and the robot to be driven; the first controller on a machine compiles
 DRIVEN_M_S = 0.1
 REQUEST_S = 2.0
+
+
+def measured_places(model: Model) -> tuple[tuple[int, int], tuple[int, int]]:
+    """
+    Return the indices of the states, and of the outputs, that are the position in the plane.
+
+    Raises:
+        ConfigError: The model has none, and what a robot does after a fault is measured by its way.
+    """
+    states, outputs = plane(model.states), plane(model.outputs)
+    if states is None or outputs is None:
+        raise ConfigError(f"model {model.name}: faults are measured by the robot's way, so states and outputs must have the roles x and y")
+    return states, outputs
 
 
 class Wiring(Enum):
@@ -69,6 +87,8 @@ class System:
         observer: Hears the robot.
         link: Between controller and router, with that wiring.
         robots: How many robots were started.
+        place: Indices of the states that are the position.
+        columns: Indices of the outputs that are.
     """
 
     def __init__(self, config: Config, wiring: Wiring, folder: Path, stop: Event) -> None:
@@ -79,6 +99,7 @@ class System:
         self.wiring, self._folder, self._stop = wiring, folder, stop
         self._robot_keys = Keys(f"{self.keys.prefix}/behind", self.keys.robot) if wiring in RELAYED else self.keys
         model = build_model(config)
+        self.place, self.columns = measured_places(model)
         states, inputs = (tuple(Label(signal.name) for signal in signals) for signals in (model.states, model.inputs))
         self._info = Info("robot", states=states, inputs=inputs)
         self._suspended: set[str] = set()
@@ -96,7 +117,7 @@ class System:
             self.bus = Bus.join(settings, self.keys, timeout_s=PATIENCE_S, stop=stop)
             self.witness = Witness(self.bus)
             self._references = self.bus.publisher(self.keys.reference)
-            self.observer = Observer(self.bus, self._robot_keys)
+            self.observer = Observer(self.bus, self._robot_keys, self.place)
         except BaseException:
             self.children.__exit__(None, None, None)
             raise
@@ -201,7 +222,7 @@ class System:
 
     def error_m(self) -> float:
         """Return the distance from the reference now."""
-        return float(np.hypot(*(self.observer.position - positions(self.witness.reference, np.array(self.observer.stamp_ns)))))
+        return float(np.hypot(*(self.observer.position - positions(self.witness.reference, self.columns, np.array(self.observer.stamp_ns)))))
 
     def reference_left_s(self) -> float:
         """Return how long the reference still lasts."""

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from rti_mpc.trajectory import Heading, Trajectory
+from rti_mpc.signals import POSE
+from rti_mpc.trajectory import Heading, Trajectory, followed_roles
 from service.build import build_model, with_initial_state
 from service.schema import Config
 
@@ -11,11 +12,19 @@ HEADINGS: dict[str, Heading] = {"circle": "none", "positioning": "none"}  # what
 
 
 def configured(config: Config, trajectory: Trajectory, heading: Heading, guard: bool) -> Config:
-    """Return the configuration of a run: on loopback, from the scenario's pose, guarded if asked for, without weight on a heading that is none."""
-    config = with_initial_state(config, [f"{name}={value!r}" for name, value in zip(("x", "y", "psi"), trajectory.pose0, strict=True)])
+    """
+    Return the configuration of a run: on loopback, from the scenario's pose, guarded if asked for, without weight on a heading that is none.
+
+    Raises:
+        ConfigError: The model has outputs that no path fills.
+    """
+    model = build_model(config)
+    followed_roles(model.name, model.outputs)
+    pose = dict(zip(POSE, trajectory.pose0, strict=True))
+    config = with_initial_state(config, [f"{state.name}={pose[state.role]!r}" for state in model.states if state.role in pose])
     content = config.model_dump(by_alias=True, exclude_unset=True, exclude={"bus"})
     if heading == "none":
-        content["ocp"]["weights"]["Q"] |= {output.name: 0.0 for output in build_model(config).outputs if output.angle}
+        content["ocp"]["weights"]["Q"] |= {output.name: 0.0 for output in model.outputs if output.role == "heading"}
     if guard:
         content["guard"] = {**content.get("guard", {}), "enabled": True}
     return Config.model_validate(content)

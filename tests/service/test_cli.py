@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 import tomllib
 from importlib import metadata
 from pathlib import Path
@@ -14,6 +15,9 @@ import typer.main
 from typer.testing import CliRunner
 
 from service.cli import SHIPPED, app
+from service.host import Host
+from tests.in_time import in_time
+from tests.robots import toml
 
 ROOT = Path(__file__).parents[2]
 ZENOH = ("--mode", "--connect", "--listen", "--config", "--cfg", "--no-multicast-scouting")
@@ -50,6 +54,19 @@ def test_bad_configuration_is_one_line_and_exit_status_2(command: str, tmp_path:
     assert done.stdout == ""
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith(f"rti-mpc: {path}: ocp.dt_ms is unknown, perhaps ocp.dt_s is meant")
+
+
+@pytest.mark.parametrize(("command", "rest"), [("reference", ()), ("demo", ()), ("faults", ("--only", "controller_killed"))])
+def test_outputs_that_no_path_fills_are_refused_by_name_in_the_terminal(command: str, rest: tuple[str, ...], tmp_path: Path, host: Host) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(toml("arm"))
+    rti_mpc("reference", "--help")  # what is compiled to bytecode once
+    began_ns = time.monotonic_ns()
+    done = rti_mpc(command, str(path), *rest)
+    in_time(host, "the refusal", 1e-6 * (time.monotonic_ns() - began_ns), 5000.0, began_ns)
+    assert (done.returncode, done.stdout) == (2, "")
+    said = "rti-mpc: model arm: a path in the plane fills outputs whose role is x, y, heading, not x, elbow: "
+    assert done.stderr == f"{said}give each its role, or publish rows of your own\n"
 
 
 def test_bad_option_is_exit_status_2() -> None:

@@ -20,8 +20,8 @@ SECOND = 1_000_000_000
 PIONEER = Info(
     role="controller",
     model="pioneer_3dx",
-    states=(Label("x", "m"), Label("y", "m"), Label("psi", "rad", True), Label("u", "m/s"), Label("omega", "rad/s")),
-    inputs=(Label("u_c", "m/s"), Label("omega_c", "rad/s")),
+    states=(Label("x", "m", role="x"), Label("y", "m", role="y"), Label("psi", "rad", True, "heading"), Label("u", "m/s"), Label("omega", "rad/s")),
+    inputs=(Label("u_c", "m/s", state="u"), Label("omega_c", "rad/s", state="omega")),
     dt_s=0.1,
     lbu=(-0.2, -np.inf),
     ubu=(0.5, np.inf),
@@ -98,9 +98,27 @@ def test_a_run_shorter_than_its_transient_and_without_error_is_drawn(run: Run, t
 
 
 def test_a_model_with_one_input_and_no_heading_is_drawn(run: Run, tmp_path: Path) -> None:
-    info = Info(role="controller", states=(Label("x", "m"), Label("y", "m")), inputs=(Label("f", "N"),), dt_s=0.1, lbu=(-np.inf,), ubu=(np.inf,))
+    info = Info(
+        role="controller",
+        states=(Label("x", "m", role="x"), Label("y", "m", role="y")),
+        inputs=(Label("f", "N"),),
+        dt_s=0.1,
+        lbu=(-np.inf,),
+        ubu=(np.inf,),
+    )
     figure(replace(run, info=info, x=run.position, u_applied=run.u_applied[:, :1]), tmp_path / "run.png")
     assert (tmp_path / "run.png").stat().st_size > 0
+
+
+def test_a_model_without_position_is_drawn_without_path_and_error(run: Run, tmp_path: Path) -> None:
+    arm = replace(run.info, states=tuple(replace(label, role="") for label in run.info.states))
+    with mpl.rc_context({"svg.fonttype": "none"}):
+        figure(replace(run, info=arm), tmp_path / "run.svg")
+    shown = words(tmp_path / "run.svg")
+    assert "Command u_c" in shown
+    assert "Command omega_c" in shown
+    assert "Path: circle" not in shown
+    assert "Tracking error" not in shown
 
 
 def test_drawing_leaves_the_callers_settings_alone(run: Run, tmp_path: Path) -> None:

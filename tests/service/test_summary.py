@@ -26,8 +26,8 @@ CONFIG = load(SHIPPED)
 OCP = build_ocp(CONFIG)
 INFO = Info(
     role="controller",
-    states=(Label("x", "m"), Label("y", "m"), Label("psi", "rad", True), Label("u", "m/s"), Label("omega", "rad/s")),
-    inputs=(Label("u_c", "m/s"), Label("omega_c", "rad/s")),
+    states=(Label("x", "m", role="x"), Label("y", "m", role="y"), Label("psi", "rad", True, "heading"), Label("u", "m/s"), Label("omega", "rad/s")),
+    inputs=(Label("u_c", "m/s", state="u"), Label("omega_c", "rad/s", state="omega")),
     dt_s=0.1,
     lbu=(-0.5, -0.745),
     ubu=(0.5, 0.745),

@@ -49,7 +49,7 @@ from rti_mpc.wire.keys import Keys
 
 port, epoch = sys.argv[1], int(sys.argv[2])
 keys = Keys(robot="r")
-label = lambda name: {"name": name, "unit": "m", "angle": False}
+label = lambda name: {"name": name, "unit": "m", "angle": False, "role": name if name in "xy" else "", "state": name}
 info = {"role": "controller", "states": [label("x"), label("y")], "inputs": [label("f")], "outputs": [label("x"), label("y")], "dt_s": 0.01}
 with Bus.join(BusSettings(listen=(f"tcp/127.0.0.1:{port}",), connect=(f"tcp/127.0.0.1:{port}",)), keys) as bus:
     bus.publish_json(keys.info("controller"), info)

@@ -23,12 +23,17 @@ from service.recording import Entry, Recording
 SECOND = 1_000_000_000
 STATES = [("x", "m"), ("y", "m"), ("psi", "rad"), ("u", "m/s"), ("omega", "rad/s")]
 INPUTS = [("u_c", "m/s"), ("omega_c", "rad/s")]
+ROLES = {"x": "x", "y": "y", "psi": "heading"}
 LIMITS = {"lbu": [-0.2, -1.2], "ubu": [0.5, None]}
 
 
 def described(role: str, states: list[tuple[str, str]], inputs: list[tuple[str, str]], outputs: list[tuple[str, str]], **rest: Any) -> Info:
     vectors = {"states": states, "inputs": inputs, "outputs": outputs}
-    labels = {k: [{"name": name, "unit": unit, "angle": unit == "rad"} for name, unit in v] for k, v in vectors.items()}
+    commanded = {"u_c": "u", "omega_c": "omega"}
+    labels = {
+        k: [{"name": name, "unit": unit, "angle": unit == "rad", "role": ROLES.get(name, ""), "state": commanded.get(name, name)} for name, unit in v]
+        for k, v in vectors.items()
+    }
     return Info.from_json({"role": role, "model": "pioneer_3dx", "dt_s": 0.1, **labels, **rest})
 
 

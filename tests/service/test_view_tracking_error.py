@@ -9,8 +9,8 @@ from rti_mpc.wire.info import Info, Label
 from service.tracking_error import tracking_error
 
 UNIX_NS = 1_800_000_000_000_000_000  # as a float, good to 256 ns only
-PLANE = (Label("x", "m"), Label("y", "m"), Label("psi", "rad", True))
-INFO = Info(role="controller", states=(*PLANE, Label("u", "m/s")), outputs=(Label("psi", "rad", True), *PLANE[:2]))
+PLANE = (Label("x", "m", role="x", state="x"), Label("y", "m", role="y", state="y"), Label("psi", "rad", True, "heading", "psi"))
+INFO = Info(role="controller", states=(*PLANE, Label("u", "m/s")), outputs=(PLANE[2], *PLANE[:2]))
 
 
 def reference(y: list[list[float]]) -> Reference:

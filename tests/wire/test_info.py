@@ -19,9 +19,12 @@ from tests.service.test_config import DISC, MINIMAL
 PIONEER: dict[str, Any] = {
     "role": "controller",
     "model": "pioneer_3dx",
-    "states": [{"name": n, "unit": u, "angle": n == "psi"} for n, u in [("x", "m"), ("y", "m"), ("psi", "rad"), ("u", "m/s"), ("omega", "rad/s")]],
+    "states": [
+        {"name": n, "unit": u, "angle": u == "rad", "role": role}
+        for n, u, role in [("east", "m", "x"), ("y", "m", "y"), ("turn", "rad", ""), ("psi", "rad", "heading"), ("omega", "rad/s", "")]
+    ],
     "inputs": [{"name": "u_c", "unit": "m/s", "angle": False}, {"name": "omega_c", "unit": "rad/s", "angle": False}],
-    "outputs": [{"name": "psi", "unit": "rad", "angle": True}, {"name": "z", "unit": "1", "angle": False}],
+    "outputs": [{"name": "yaw", "unit": "rad", "angle": True, "role": "heading", "state": "psi"}, {"name": "y", "unit": "1", "angle": False}],
     "dt_s": 0.1,
     "lbu": [-0.2, None],
     "ubu": [0.5, None],
@@ -43,32 +46,42 @@ def test_bounds_that_are_not_said_are_infinite() -> None:
     assert math.isnan(info.dt_s)
 
 
-def test_position_heading_and_tracked_states_are_found_by_name_and_mark() -> None:
+def test_position_heading_and_tracked_states_are_found_by_role_whatever_their_names() -> None:
     info = Info.from_json(PIONEER)
     assert info.position == (0, 1)
-    assert info.heading == 2
-    assert info.tracked == [(0, 2)]
+    assert info.heading == 3
+    assert info.tracked == [(0, 3)]
+    assert info.tracked_position is None
+
+
+def test_a_description_without_roles_has_neither_position_nor_heading() -> None:
+    states = [{"name": name, "unit": "m", "angle": name == "psi"} for name in ("x", "y", "psi")]
+    info = Info.from_json({"role": "controller", "states": states, "outputs": states})
+    assert (info.position, info.heading, info.tracked) == (None, None, [])
 
 
 @pytest.mark.parametrize(
-    ("states", "inputs", "expected"),
+    ("states", "commands", "expected"),
     [
-        ([("u", "m/s"), ("omega", "rad/s")], [("u_c", "m/s"), ("omega_c", "rad/s")], [0, 1]),
-        ([("vx", "m/s"), ("vy", "m/s")], [("vy_c", "m/s")], [1]),
-        ([("vx", "m/s"), ("vy", "m/s")], [("speed", "m/s")], [None]),
-        ([("q", "1")], [("duty", "1")], [None]),
-        ([("x", "m")], [("force", "N")], [None]),
+        (["u", "omega"], ["u", "omega"], [0, 1]),
+        (["vx", "vy"], ["vy"], [1]),
+        (["vx", "vy"], [""], [None]),
+        (["v"], ["gone"], [None]),
     ],
 )
-def test_a_command_is_shown_beside_the_one_state_it_is_about(states: Any, inputs: Any, expected: list[int | None]) -> None:
-    vectors = {name: [{"name": n, "unit": u, "angle": False} for n, u in pairs] for name, pairs in (("states", states), ("inputs", inputs))}
-    info = Info.from_json({"role": "controller", **vectors})
-    assert [info.measured(i) for i in range(len(inputs))] == expected
+def test_a_command_is_shown_beside_the_state_that_follows_it(states: list[str], commands: list[str], expected: list[int | None]) -> None:
+    document = {
+        "role": "controller",
+        "states": [{"name": name, "unit": "m/s", "angle": False} for name in states],
+        "inputs": [{"name": f"input_{k}", "unit": "m/s", "angle": False, "state": state} for k, state in enumerate(commands)],
+    }
+    info = Info.from_json(document)
+    assert [info.measured(i) for i in range(len(commands))] == expected
 
 
 def test_what_is_written_of_vectors_bounds_and_obstacles_is_read_as_it_was() -> None:
-    states, disc = (Label("x", "m"), Label("psi", "rad", angle=True)), (3, 1.0, 0.5, 0.4)
-    written = {**labels(states=states), **bounds(lbx=[-1.0, -math.inf], ubx=[math.inf, 2.0]), **obstacles([disc])}
+    states, disc = (Label("x", "m", role="x", state="x"), Label("psi", "rad", angle=True)), (3, 1.0, 0.5, 0.4)
+    written = {**labels({"states": ["x", ""]}, states=states), **bounds(lbx=[-1.0, -math.inf], ubx=[math.inf, 2.0]), **obstacles([disc])}
     info = Info.from_json(json.loads(json.dumps({"role": "robot", **written})))
     assert (info.states, info.lbx, info.ubx, info.obstacles) == (states, (-1.0, -math.inf), (math.inf, 2.0), (Obstacle(*disc),))
 

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Signals, the named components of a model's vectors, and their roles.
+
+A role says what a signal is to others than the optimal control problem: a path fills
+outputs by their roles, obstacles are kept from the position, viewers draw it. Names
+mean nothing but to people, and nothing is inferred from them, from units or from places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+Role = Literal["", "x", "y", "heading", "axle_offset", "disc_x", "disc_y", "disc_radius"]
+
+POSE: tuple[Role, ...] = ("x", "y", "heading")  # what a path in the plane tells of a robot
+UNITS: dict[Role, str] = {"x": "m", "y": "m", "heading": "rad", "axle_offset": "m", "disc_x": "m", "disc_y": "m", "disc_radius": "m"}
+VECTORS: dict[str, tuple[Role, ...]] = {
+    "states": POSE,
+    "outputs": POSE,
+    "inputs": (),
+    "parameters": ("axle_offset", "disc_x", "disc_y", "disc_radius"),
+    "constraints": (),
+}  # the roles that signals of each vector may have
+SEVERAL: tuple[Role, ...] = ("", "disc_x", "disc_y", "disc_radius")  # roles that more than one signal of a vector may have
+
+
+@dataclass(frozen=True)
+class Signal:
+    r"""
+    One component of a state, input, output or parameter vector.
+
+    Attributes:
+        name: Unique within its vector; what configuration and viewers call it.
+        unit: SI unit, ``"1"`` if none.
+        angle: Whether it is an angle in rad of which whole turns mean nothing: it may wrap at :math:`\pm\pi`, and the dynamics repeat with each turn.
+        role: Of states and outputs ``"x"``, ``"y"`` (position in the plane, m) and ``"heading"`` (an angle, from the x axis to the left); of a
+            parameter ``"axle_offset"``: distance in m from the axle ahead to the point whose position this is. Empty: none of these.
+        commands: Of an input, the name of the state that follows it, a speed; empty: none.
+    """
+
+    name: str
+    unit: str
+    angle: bool = False
+    role: Role = ""
+    commands: str = ""
+
+
+class HasRole(Protocol):
+    """A signal, or its label on the bus."""
+
+    @property
+    def role(self) -> str:
+        """Its role; empty if it has none."""
+
+
+def place(signals: Sequence[HasRole], role: Role) -> int | None:
+    """Return the index of the signal of a role; None if there is none."""
+    return next((i for i, signal in enumerate(signals) if signal.role == role), None)
+
+
+def plane(signals: Sequence[HasRole]) -> tuple[int, int] | None:
+    """Return the indices of x and y; None if not both are there."""
+    x, y = place(signals, "x"), place(signals, "y")
+    return None if x is None or y is None else (x, y)
+
+
+def misplaced(vector: str, signals: Sequence[Signal], states: Sequence[Signal]) -> str:
+    """Return what is wrong with roles in a vector, empty if nothing is."""
+    roles = [signal.role for signal in signals if signal.role not in SEVERAL]
+    for signal in signals:
+        if signal.role and signal.role not in VECTORS[vector]:
+            return f"the role of {vector} must be {' or '.join(VECTORS[vector]) or 'left out'}, got {signal.role} for {signal.name}"
+        if signal.role and signal.unit != UNITS[signal.role]:
+            return f"the role {signal.role} must be in {UNITS[signal.role]}, got {signal.name} in {signal.unit}"
+        if signal.role == "heading" and not signal.angle:
+            return f"the role heading must be an angle, got {signal.name} without angle=True"
+        if roles.count(signal.role) > 1:
+            return f"the role {signal.role} must be one signal's of {vector}, got {[s.name for s in signals if s.role == signal.role]}"
+        if signal.commands and (vector != "inputs" or signal.commands not in [state.name for state in states]):
+            return f"commands must be an input's, and name a state, got {signal.commands} for {signal.name} of {vector}"
+    return ""

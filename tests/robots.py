@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Robots that keep no convention: other orders, other names, and what others call something else; `tests.robots:NAME` in a configuration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+
+from rti_mpc.model import Model, Signal
+from rti_mpc.pioneer_3dx import pioneer_3dx
+
+OUTPUTS = (2, 0, 1)  # psi, x, y
+SHIPPED = Path(__file__).parents[1] / "deploy" / "pioneer_3dx.toml"
+STATES = (3, 2, 4, 0, 1)  # u, psi, omega, x, y
+
+
+def shuffled() -> Model:
+    """The paper's robot with its outputs and its states in another order."""
+    model = pioneer_3dx()
+    x = ca.SX.sym("z", 5)
+    places = [STATES.index(j) for j in range(5)]
+    f, y = (ca.substitute(expr, model.x, x[places]) for expr in (model.f_expl_expr[list(STATES)], model.y_expr[list(OUTPUTS)]))
+    return replace(
+        model,
+        name="shuffled",
+        x=x,
+        f_expl_expr=f,
+        y_expr=y,
+        states=tuple(model.states[j] for j in STATES),
+        outputs=tuple(model.outputs[i] for i in OUTPUTS),
+    )
+
+
+def glider() -> Model:
+    """A point that is moved by its velocity: no heading; names that mean something else to others, and a parameter `a` that is no axle's offset."""
+    x, u, p = ca.SX.sym("x", 2), ca.SX.sym("u", 2), ca.SX.sym("a")
+    return Model(
+        name="glider",
+        x=x,
+        u=u,
+        p=p,
+        f_expl_expr=p * u,
+        y_expr=x,
+        states=(Signal("psi", "m", role="x"), Signal("x", "m", role="y")),
+        inputs=(Signal("u", "m/s"), Signal("v", "m/s")),
+        outputs=(Signal("psi", "m", role="x"), Signal("x", "m", role="y")),
+        parameters=(Signal("a", "1"),),
+        p_nominal=(-1.0,),
+    )
+
+
+def rover() -> Model:
+    """A unicycle, its position on the axle: a heading, and no offset."""
+    x, u = ca.SX.sym("x", 3), ca.SX.sym("u", 2)
+    pose = (Signal("x", "m", role="x"), Signal("y", "m", role="y"), Signal("psi", "rad", angle=True, role="heading"))
+    return Model(
+        name="rover",
+        x=x,
+        u=u,
+        f_expl_expr=ca.vertcat(u[0] * ca.cos(x[2]), u[0] * ca.sin(x[2]), u[1]),
+        y_expr=x,
+        states=pose,
+        inputs=(Signal("v", "m/s"), Signal("w", "rad/s")),
+        outputs=pose,
+    )
+
+
+def arm() -> Model:
+    """Two joints, one of them named as if it were a position."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)
+    joints = (Signal("x", "rad", angle=True), Signal("elbow", "rad", angle=True))
+    return Model(
+        name="arm", x=x, u=u, f_expl_expr=u, y_expr=x, states=joints, inputs=(Signal("w_1", "rad/s"), Signal("w_2", "rad/s")), outputs=joints
+    )
+
+
+def toml(name: str) -> str:
+    """A configuration of one of these; that of the shipped robot where it is the same one."""
+    if name == "shuffled":
+        return SHIPPED.read_text().replace('name = "pioneer_3dx"', 'name = "tests.robots:shuffled"')
+    model: Model = globals()[name]()
+    Q = ", ".join(f"{signal.name} = {0.05 if signal.angle else 1.0}" for signal in model.outputs)
+    R = ", ".join(f"{signal.name} = 1.0" for signal in model.inputs)
+    limits, steps = (", ".join(f"{signal.name} = [-{most}, {most}]" for signal in model.inputs) for most in (1.0, 0.2))
+    return f"""
+robot = "{name}"
+model = {{ name = "tests.robots:{name}" }}
+[ocp]
+N = 20
+dt_s = 0.1
+weights = {{ Q = {{ {Q} }}, R = {{ {R} }}, lambda = 0.01 }}
+bounds = {{ inputs = {{ {limits} }}, increments = {{ {steps} }} }}
+"""
