@@ -84,6 +84,16 @@ def test_checks_that_the_contract_of_a_guard_names_exist() -> None:
     assert set(re.findall(r"def (test_\w+)", suite)) == {check for check in re.findall(r"def (test_\w+)", suite) if check.startswith(tuple(named))}
 
 
+def test_the_runbook_begins_with_what_to_do_when_the_robot_stands() -> None:
+    assert re.findall(r"^## (.*)", RUNBOOK, re.MULTILINE)[0] == "When the robot stands"
+
+
+@pytest.mark.parametrize("page", sorted(DEPLOY.glob("*.md")), ids=lambda path: path.name)
+def test_every_link_of_a_page_leads_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#h][^)#]*)", page.read_text()):
+        assert (page.parent / target).exists(), target
+
+
 def test_files_in_the_runbook_exist() -> None:
     named = {word for line in SHELL for word in line.split() if word.startswith("deploy/")} | set(
         re.findall(r"^\| `([^`]+)` \|", RUNBOOK, re.MULTILINE)

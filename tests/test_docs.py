@@ -3,12 +3,10 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import re
 import subprocess
 import sys
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -50,31 +48,6 @@ def test_every_page_of_the_site_exists_and_is_reached() -> None:
 def test_every_link_of_a_page_leads_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#h][^)#]*)", page.read_text()):
         assert target in GENERATED or (page.parent / target).exists(), target
-
-
-def event_codes() -> set[str]:
-    """Every code of an event that the source spells out: a word right behind a severity, or given to what makes a notice of it."""
-    codes = set()
-    for package in ("rti_mpc", "service", "sim"):
-        for path in (ROOT / package).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                if isinstance(node, ast.Call):
-                    told = isinstance(node.func, ast.Attribute) and node.func.attr in ("_note", "_tell")
-                    behind = [after for before, after in pairwise(node.args) if ast.unparse(before).startswith("Severity.")]
-                    found = behind + (node.args[:1] if told else [])
-                elif isinstance(node, ast.Tuple) and ast.unparse(node).startswith("(Arrival."):
-                    found = node.elts[1:2]
-                else:
-                    continue
-                codes |= {str(code.value) for code in found if isinstance(code, ast.Constant) and code.value}
-    return codes
-
-
-def test_every_event_is_documented() -> None:
-    documented = set(re.findall(r"`([a-z_]+)`", (DOCS / "events.md").read_text(encoding="utf-8")))
-    codes = event_codes()
-    assert len(codes) > 30
-    assert codes <= documented
 
 
 def commands() -> list[str]:
