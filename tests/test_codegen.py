@@ -228,6 +228,31 @@ def test_array_that_casadi_would_misread_is_refused_by_name(change: Any, message
         bind(product(), {"A": A, "b": b}, {"c": c, "s": s})
 
 
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "names"),
+    [
+        (("A",), ("c", "s"), r"\['A', 'b'\], got \['A'\]"),
+        (("A", "b", "x"), ("c", "s"), r"\['A', 'b'\], got \['A', 'b', 'x'\]"),
+        (("A", "b"), ("c", "S"), r"\['c', 's'\], got \['c', 'S'\]"),
+    ],
+)
+def test_names_that_are_not_those_of_a_function_are_refused(inputs: tuple[str, ...], outputs: tuple[str, ...], names: str) -> None:
+    A, b, c, s = arrays()
+    known = {"A": A, "b": b, "x": b, "c": c, "s": s, "S": s}
+    with pytest.raises(AssertionError, match=f"product must be bound to {names}"):
+        bind(product(), {name: known[name] for name in inputs}, {name: known[name] for name in outputs})
+
+
+def test_order_in_which_arrays_are_named_does_not_matter() -> None:
+    A, b, c, s = arrays()
+    bind(product(), {"A": A, "b": b}, {"c": c, "s": s})()
+    expected = c.copy(), s.copy()
+    c[:], s[:] = 0.0, 0.0
+    bind(product(), {"b": b, "A": A}, {"s": s, "c": c})()
+    np.testing.assert_array_equal(c, expected[0])
+    np.testing.assert_array_equal(s, expected[1])
+
+
 def test_arrays_stay_alive_as_long_as_the_call() -> None:
     def make() -> tuple[Any, Array]:
         A, b, c, s = arrays()

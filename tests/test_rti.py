@@ -16,11 +16,14 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
+from rti_mpc.certificate import certificate
 from rti_mpc.errors import OcpError, ShapeError
 from rti_mpc.integrator import integrator
 from rti_mpc.model import Model, Signal
 from rti_mpc.ocp import Ocp
-from rti_mpc.rti import FORMULATIONS, Rti
+from rti_mpc.places import places
+from rti_mpc.rti import FORMULATIONS, Rti, natives
+from rti_mpc.simultaneous import simultaneous
 from rti_mpc.solver import SolverSettings
 from rti_mpc.status import QpStatus
 from tests.oracle import nlp
@@ -640,6 +643,37 @@ def test_resident_memory_stays_flat(solver: str, samples: int) -> None:
         if i == 2_000:
             before = resident()
     assert resident() - before < 1 << 20
+
+
+@pytest.mark.parametrize("solver", ["riccati", "osqp"])
+def test_kept_guess_becomes_the_plan(solver: str) -> None:
+    rti = Rti(pioneer(N=5), solver=solver, compile=False)
+    rti.prepare(np.tile([1.0, 0.5, 0.0], (5, 1)), shift=False)
+    assert rti.feedback(np.zeros(5)).usable
+    guess = {name: rti.guess.sample[name].copy() for name in ("x", "u")}
+    assert np.abs(rti.u - guess["u"]).max() > 1e-3, "the plan is another one"
+    rti.keep_guess()
+    np.testing.assert_array_equal(rti.x, guess["x"])
+    np.testing.assert_array_equal(rti.u, guess["u"])
+
+
+def test_whole_qp_is_the_one_with_softened_bounds_until_the_next_start() -> None:
+    rti = Rti(pioneer(N=5, lbx=[-INF, -INF, -INF, -0.2, -INF], ubx=[INF, INF, INF, 0.2, INF]), solver="osqp", compile=False)
+    assert len(rti.solvers) == 2
+    rti.use_whole_qp()
+    rti.prepare(np.zeros((5, 3)), shift=False)
+    assert rti.solve_qp().usable
+    assert rti.qp is rti.solvers[1].qp
+    rti.reset(np.zeros(5), np.zeros(2))
+    assert rti.qp is rti.solvers[0].qp
+
+
+def test_list_of_what_is_compiled_leaves_the_qp_behind_an_active_set_out() -> None:
+    ocp = pioneer(N=5)
+    transcription = simultaneous(ocp, softened=False)
+    assert natives([transcription], None) == [transcription.data, transcription.embed, transcription.step]
+    listed = [function.name() for function in natives([transcription], (places(ocp), certificate(ocp)))]
+    assert listed == ["linearize", "advance", "gains", "roll_out", "refine", "certificate"]
 
 
 def resident() -> int:
