@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import sys
@@ -50,4 +51,27 @@ def test_a_misspelt_key_is_answered_by_the_line_shown(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("target", re.findall(r"\]\(([^)h][^)]*)\)", README))
 def test_every_link_into_the_repository_leads_somewhere(target: str) -> None:
-    assert (ROOT / target).exists()
+    path, _, anchor = target.partition("#")
+    assert (ROOT / path).exists()
+    headings = re.findall(r"^#+ (.*)", (ROOT / path).read_text(encoding="utf-8"), re.MULTILINE) if anchor else []
+    assert not anchor or anchor in {re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in headings}
+
+
+def test_every_function_named_with_its_file_is_there() -> None:
+    named = re.findall(r"`(\w+)\.(\w+)` in\s+\[`[^`]+`\]\(([^)]+)\)", README)
+    assert {"prepare", "feedback", "solve"} <= {method for _, method, _ in named}
+    for owner, method, path in named:
+        classes = [node for node in ast.parse((ROOT / path).read_text()).body if isinstance(node, ast.ClassDef) and node.name == owner]
+        assert any(isinstance(node, ast.FunctionDef) and node.name == method for found in classes for node in found.body), (
+            f"{owner}.{method} in {path}"
+        )
+
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "deploy").glob("*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_file_named_in_a_page_exists(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"`((?:rti_mpc|service|sim|tests|deploy|docs)/[\w./@-]+\.[a-z0-9]+)`", text) + re.findall(r"tests/[\w/]+\.py", text):
+        assert (ROOT / name).exists(), name
