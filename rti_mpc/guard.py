@@ -111,6 +111,7 @@ class Guard:
         self._state: State | None = None  # the last one that came in time
         self._heard = (0, 0)  # stamp of the last state, and local time of its arrival
         self._late = False  # whether that one had waited on the way
+        self._paced = 0  # such states in a row that came at the robot's own pace
         self._awake_ns = 0  # local time of the last call
         self._open_ns = EVER_NS  # robot time from which commands pass
         self._leader = (0, -1)  # epoch and sequence number of the last command that was in order
@@ -161,11 +162,11 @@ class Guard:
             ahead_ns = state.stamp_ns - self._clock.now_ns(local_ns)
             late = ahead_ns < -LATE_NS * self._clock.rate
             paced = 2 * (local_ns - heard_local_ns) * self._clock.rate >= state.stamp_ns - heard_ns
-            believed = not late or (self._late and paced)  # late twice, and at the robot's own pace: its clock has waited
+            self._paced = self._paced + 1 if late and self._late and paced else 0
             self._heard, self._late = (state.stamp_ns, local_ns), late
-            if not believed:
+            if late and self._paced < self._clock.patience:
                 return
-            if self._late:
+            if late:  # for long, and each at the robot's own pace: its clock has waited
                 self._clock.jump()
             if ahead_ns > max(JUMP_NS, 2.5 * self._clock.period_ns):
                 self._jump(state, local_ns, "ahead")

@@ -11,6 +11,8 @@ LEAP_NS = 250_000_000  # robot time by which a clock that has jumped is ahead
 DRIFT = 0.1  # share by which the rate may be wrong, where states come late now and then
 RECENT = 2  # states, by the least late of which lateness is told: more, and a clock that has waited looked late for as long
 SETTLING = 20  # states after which the rate is known well enough for that
+PACED_NS = 80_000_000  # local time in which late states must each have taken their time before the robot's clock is believed to have waited
+MAX_PACED = 8  # states, from which that is believed in any case
 FASTEST = 10.0  # rate of a robot whose second state is still to come, at most
 
 
@@ -52,6 +54,7 @@ class RobotClock:
         self._seq = 0
         self._anchor: tuple[int, int] | None = None
         self._old: tuple[int, int] | None = None  # stamp and arrival of the last state, if that was not fresh
+        self._paced = 0  # such states in a row that have each taken their time
         self._measured = False  # whether the rate is
         self._recent: deque[tuple[int, int]] = deque(maxlen=RECENT)  # stamps and arrivals
         self._in_a_row = 0  # states that came late by a quarter of a period and more
@@ -71,8 +74,9 @@ class RobotClock:
 
         One that comes much later than the others did has waited on its way, in
         the queues of a process that was stopped for instance: more like it
-        follow at once. If the next one takes its time, it is the robot's clock
-        that has waited, as a simulation's may, and goes on from here.
+        follow at once, or in clumps where this process gets few turns. If the next
+        ones take their time, each of them, it is the robot's clock that has
+        waited, as a simulation's may, and goes on from here.
         """
         ahead_ns = stamp_ns - self.now_ns(arrival_ns)
         since_ns = self.arrival_ns or arrival_ns
@@ -82,7 +86,10 @@ class RobotClock:
             self._recent.clear()
         elif -ahead_ns > self._most_ns:
             old, self._old = self._old, (stamp_ns, arrival_ns)
+            self._paced += 1
             if old is None or 2 * self.rate * (arrival_ns - old[1]) < stamp_ns - old[0]:
+                self._paced = 0
+            if old is None or self._paced < self.patience:
                 return False
             self._recent.clear()
             since_ns = old[1]
@@ -124,6 +131,11 @@ class RobotClock:
 
     def _rate(self, robot_ns: int, local_ns: int) -> float:
         return min(max(robot_ns / local_ns, 1e-3), 1e3)
+
+    @property
+    def patience(self) -> int:
+        """Late states in a row, each of which has taken its time, from which the robot's clock is believed to have waited."""
+        return min(max(1, int(PACED_NS * self.rate / self.period_ns)), MAX_PACED) if self.period_ns else 1
 
     def latest_ns(self, local_ns: int) -> int:
         """Return what robot time is at a local time at most, for a state that came as late as the last one did."""

@@ -353,6 +353,30 @@ def test_states_that_waited_on_the_way_make_no_old_command_young(scene: Scene) -
         assert scene.guard.receive_command(command, scene.local_ns) is None
 
 
+def test_states_that_waited_and_come_in_clumps_make_no_old_command_young() -> None:
+    """As they do in a guard that was stopped and then gets few turns on a busy host: the first of each clump has taken its time."""
+    guard = Guard(LIMITS)
+    scene = Scene().ready()
+
+    def command(state: State) -> Command:
+        return replace(
+            scene.command(), state_epoch=1, state_seq=state.seq, stamp_ns=state.stamp_ns, state_stamp_ns=state.stamp_ns, valid_until_ns=2**60
+        )
+
+    def state(k: int) -> State:
+        return State(1, k, k * 10 * MS, np.zeros(5))
+
+    local_ns = LOCAL_NS
+    for k in range(1, 201):
+        guard.receive_state(state(k), local_ns := LOCAL_NS + k * 10 * MS)
+    assert guard.receive_command(command(state(200)), local_ns) is not None
+    local_ns += 1500 * MS  # stopped
+    for k in range(201, 260):
+        local_ns += (90 if k % 5 == 0 else 1) * MS
+        guard.receive_state(state(k), local_ns)
+        assert guard.receive_command(command(state(k)), local_ns) is None, k
+
+
 def test_clock_of_a_simulation_that_was_held_up_is_believed_again(scene: Scene) -> None:
     """Its clock waits with it: ours is ahead until its pace has shown that."""
     scene.drive(1000)

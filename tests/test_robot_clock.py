@@ -134,3 +134,14 @@ def test_stamp_that_stands_still_changes_nothing() -> None:
     rate, period_ns = clock.rate, clock.period_ns
     clock.observe(31, clock.stamp_ns, clock.arrival_ns + 5 * MS)
     assert (clock.rate, clock.period_ns) == (rate, period_ns)
+
+
+def test_states_that_waited_and_come_in_clumps_are_not_fresh() -> None:
+    """A process that was stopped and then gets few turns drains its queue so: the first of each clump has taken its time."""
+    clock = RobotClock()
+    for k in range(200):
+        assert clock.observe(k, k * 10 * MS, k * 10 * MS)
+    arrival_ns = 1990 * MS + 1500 * MS
+    for k in range(200, 260):
+        arrival_ns += (90 if k % 5 == 0 else 1) * MS
+        assert not clock.observe(k, k * 10 * MS, arrival_ns), k
