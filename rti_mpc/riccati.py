@@ -139,8 +139,8 @@ class Stage:
         A: Sensitivities to the state; `B`, to the input; `b`, the defect.
         H: Hessian of the outputs at the end; `h`, their gradient.
         G: Sensitivities of what has softened bounds to s at the end, shape ``(ng, nx + nu)``.
-        dynamics: Symbols of A and B, by the names in `rti_mpc.linearization.Forms`; `defect`, that of b; `cost`, those of H and h; `softened`, those
-            of G.
+        dynamics: Symbols of A and B, by the names in `rti_mpc.linearization.Forms`.
+        defect: That of b; `cost`, those of H and h; `softened`, those of G.
     """
 
     def __init__(self, ocp: Ocp, lin: Linearization) -> None:
