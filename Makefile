@@ -70,14 +70,14 @@ clean:
 	rm -rf .venv site .mypy_cache .pytest_cache .ruff_cache dist
 
 ifdef UV
-$(READY): constraints.txt
+$(READY): constraints.txt pyproject.toml
 	@echo "setting up .venv with uv"
 	@rm -rf .venv && uv venv --quiet --python '$(or $(PYTHON),>=3.11,<3.15)' .venv
 	@uv pip install --quiet --python $(BIN)/python --require-hashes --requirement constraints.txt
 	@uv pip install --quiet --python $(BIN)/python --no-build-isolation --no-deps --editable .
 	@touch $@
 else
-$(READY): constraints.txt
+$(READY): constraints.txt pyproject.toml
 	@test -n "$(PYTHON)" || { echo "make needs Python 3.11 to 3.14: apt-get install python3 python3-venv" >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { echo "make needs venv: apt-get install $$(basename $(PYTHON))-venv" >&2; exit 1; }
 	@echo "setting up .venv with pip and $$($(PYTHON) --version), about a minute"

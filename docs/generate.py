@@ -14,8 +14,8 @@ import typer.main
 from rti_mpc.wire.cdr import encoding
 from rti_mpc.wire.layout import ABOUT, LAYOUTS, msg_text
 from rti_mpc.wire.streams import STREAMS, Kind, Stream
-from service.cli import app
-from service.schema import Config
+from rti_mpc_service.cli import app
+from rti_mpc_service.config.schema import Config
 
 ROOT = Path(__file__).parents[1]
 

@@ -36,20 +36,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rti_mpc.controller import Controller as Controller
-    from rti_mpc.model import Model as Model
-    from rti_mpc.model import Signal as Signal
-    from rti_mpc.model import find_model as find_model
-    from rti_mpc.ocp import Ocp as Ocp
-    from rti_mpc.rti import Rti as Rti
+    from rti_mpc.control.controller import Controller as Controller
+    from rti_mpc.model.model import Model as Model
+    from rti_mpc.model.model import Signal as Signal
+    from rti_mpc.model.model import find_model as find_model
+    from rti_mpc.rti.ocp import Ocp as Ocp
+    from rti_mpc.rti.rti import Rti as Rti
 
 HOME = {
-    "Controller": "rti_mpc.controller",
-    "Model": "rti_mpc.model",
-    "Ocp": "rti_mpc.ocp",
-    "Rti": "rti_mpc.rti",
-    "Signal": "rti_mpc.model",
-    "find_model": "rti_mpc.model",
+    "Controller": "rti_mpc.control.controller",
+    "Model": "rti_mpc.model.model",
+    "Ocp": "rti_mpc.rti.ocp",
+    "Rti": "rti_mpc.rti.rti",
+    "Signal": "rti_mpc.model.model",
+    "find_model": "rti_mpc.model.model",
 }
 
 __version__ = "0.1.0"

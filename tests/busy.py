@@ -26,7 +26,7 @@ while os.getppid() == int(sys.argv[1]):  # at ordinary priority, for as long as 
 # What a test imports that starts processes, talks over a bus or reads a clock.
 TELLING = (
     *("subprocess", "threading", "time", "socket", "zenoh"),
-    *("service.children", "service.host", "rti_mpc.wire.bus", "tests.processes", "tests.guard_conformance"),
+    *("rti_mpc_service.rig.children", "rti_mpc_service.host.hold_up", "rti_mpc.wire.bus", "tests.processes", "tests.guard_conformance"),
 )
 
 

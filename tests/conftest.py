@@ -12,7 +12,7 @@ import pytest
 if "PYTEST_XDIST_WORKER" in os.environ:  # before NumPy is loaded: workers share the cores, and threads of their algebra would fight for them
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
-from service.host import Host
+from rti_mpc_service.host.hold_up import Host
 
 PROCESSES = Path(__file__).parent / "processes"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 
-from service.host import Host
+from rti_mpc_service.host.hold_up import Host
 
 MS = 1_000_000
 BEFORE_NS = 50 * MS  # what has just been sent when something begins may be held up already

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.controller import Controller
-from rti_mpc.message import Command, Reference, State
-from rti_mpc.pioneer_3dx import pioneer_3dx
-from rti_mpc.trajectory import Heading, Trajectory, rows
-from sim.lockstep import Lockstep
-from sim.settings import RobotSettings
+from rti_mpc.contract.message import Command, Reference, State
+from rti_mpc.control.controller import Controller
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc.reference.trajectory import Heading, Trajectory, rows
+from rti_mpc_sim.lockstep import Lockstep
+from rti_mpc_sim.settings import RobotSettings
 
 MS = 1_000_000
 SLEW = np.array([2.5, 4.0])  # 1/s: the controller's increments per 0.1 s

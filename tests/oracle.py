@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.ocp import Ocp
+from rti_mpc.rti.ocp import Ocp
 
 # Bounds are not relaxed and the tolerances are tight: at a weakly active bound an interior point method stays sqrt(mu) away, and IPOPT's own
 # error would be what a test of 1e-5 sees.
@@ -26,7 +26,7 @@ IPOPT = {
 
 def nlp(ocp: Ocp) -> Callable[[Array, Array, Array, Array, Array], tuple[Array, Array, float]]:
     """
-    Build the nonlinear program of `rti_mpc.ocp`, by multiple shooting.
+    Build the nonlinear program of `rti_mpc.rti.ocp`, by multiple shooting.
 
     Returns:
         ``solve(x0, u_prev, y_ref, x, u) -> (x, u, cost)`` from the guess ``x, u``; it fails where IPOPT does not converge.

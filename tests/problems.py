@@ -9,9 +9,9 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.model import Model, Signal
-from rti_mpc.ocp import Ocp
-from rti_mpc.pioneer_3dx import pioneer_3dx
+from rti_mpc.model.model import Model, Signal
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc.rti.ocp import Ocp
 
 INF = np.inf
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import casadi as ca
 
-from rti_mpc.model import Model, Signal
-from rti_mpc.pioneer_3dx import pioneer_3dx
+from rti_mpc.model.model import Model, Signal
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 
 OUTPUTS = (2, 0, 1)  # psi, x, y
 SHIPPED = Path(__file__).parents[1] / "deploy" / "pioneer_3dx.toml"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layers of the system, held by what each file imports."""
+"""The rules of the folders, held by what each file imports."""
 
 from __future__ import annotations
 
@@ -7,92 +7,71 @@ import ast
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("rti_mpc", "service", "sim")
+PACKAGES = {"rti_mpc": ROOT / "rti_mpc", "rti_mpc_service": ROOT / "service/rti_mpc_service", "rti_mpc_sim": ROOT / "sim/rti_mpc_sim"}
 
-# What no file of a layer imports; the command line alone may start a simulation, lazily.
-FORBIDDEN = {
-    "rti_mpc": {"service", "sim", "asyncio", "logging", "pydantic", "typer", "rich"},
-    "service": {"sim"},
-    "sim": {"service", "osqp", "pydantic", "typer"},
+# What the files of a folder may import of the library, beside their own folder and the files beside the folders.
+LIBRARY = {
+    "rti_mpc": set(),
+    "rti_mpc.model": set(),
+    "rti_mpc.model.robots": {"rti_mpc.model"},
+    "rti_mpc.contract": set(),
+    "rti_mpc.reference": {"rti_mpc.contract"},
+    "rti_mpc.rti": {"rti_mpc.model", "rti_mpc.contract", "rti_mpc.rti.qp"},
+    "rti_mpc.rti.qp": {"rti_mpc.contract", "rti_mpc.rti"},
+    "rti_mpc.control": {"rti_mpc.model", "rti_mpc.contract", "rti_mpc.rti"},
+    "rti_mpc.wire": {"rti_mpc.contract"},
 }
-EXCEPT = {"service/cli.py"}
-COMMANDS = {f"service.{name}" for name in ("bench", "check", "daemon", "demo", "doctor", "faults.run", "guard", "router", "view")}
-PARTS_OF_COMMANDS = {"service/family_bench.py"}  # of `rti-mpc bench`
+
+# The commands of the service: none is a library of another. What they share is beside them, or in `config`, `host` and `rig`.
+COMMANDS = {f"rti_mpc_service.{name}" for name in ("bench", "check", "controller", "demo", "doctor", "faults", "paper", "view")}
+BORROWED = {"rti_mpc_service.paper": {"rti_mpc_service.bench"}}  # command: what it takes of another all the same
+
+# What no file of a package imports; the command line alone may start a simulation, lazily.
+FORBIDDEN = {
+    "rti_mpc": {"rti_mpc_service", "rti_mpc_sim", "asyncio", "logging", "pydantic", "typer", "rich"},
+    "rti_mpc_service": {"rti_mpc_sim"},
+    "rti_mpc_sim": {"rti_mpc_service", "osqp", "pydantic", "typer"},
+}
+COMMAND_LINE = "service/rti_mpc_service/cli.py"
 CLOCKS = {"time", "datetime", "threading", "multiprocessing", "concurrent", "random"}  # what would make two runs of one sample differ
 
-# Who alone imports a package, wherever in the file.
+# The one place of a foreign package: files, or all files of a folder.
 ALONE = {
-    "osqp": {"rti_mpc/solver.py"},
-    "zenoh": {"rti_mpc/wire/session.py", "rti_mpc/wire/zenoh_session.py"},
-    "rerun": {"service/blueprint.py", "service/outlet.py", "service/recording.py", "service/view.py"},
-    "qpsolvers": {"rti_mpc/qp.py", "rti_mpc/foreign_solver.py"},
+    "osqp": {"rti_mpc/rti/qp/osqp.py"},
+    "qpsolvers": {"rti_mpc/rti/qp"},
+    "zenoh": {"rti_mpc/wire"},
+    "rerun": {"service/rti_mpc_service/view"},
     "casadi": {
-        "rti_mpc/rest.py",
-        *(f"rti_mpc/{name}.py" for name in ("simultaneous", "sequential", "terminal", "obstacle", "blockage", "disturbance", "observer")),
-        *(
-            f"rti_mpc/{name}.py"
-            for name in (
-                "model",
-                "pioneer_3dx",
-                "integrator",
-                "ocp",
-                "linearization",
-                "transcription",
-                "riccati",
-                "places",
-                "certificate",
-                "codegen",
-                "qp",
-                "active_set",
-                "track",
-                "envelope",
-                "scale",
-            )
-        ),
-        "sim/plant.py",
-        "service/excursion.py",
-        "service/yardstick.py",
-        "service/families.py",
-        "service/paper/slsqp.py",
+        *("rti_mpc/codegen.py", "rti_mpc/model", "rti_mpc/rti", "rti_mpc/control", "sim/rti_mpc_sim/plant.py"),
+        *(f"service/rti_mpc_service/{name}" for name in ("bench", "check", "paper")),
     },
 }
 
-LOCAL = {"rti_mpc/wire/session.py"}  # reads JSON that is not a peer's: Zenoh's own configuration
+# Who reads what peers send. Zenoh's own configuration is no peer's.
+DOORS = {"decode": {"rti_mpc/wire/intake.py"}, "json.loads": {"rti_mpc/wire/document.py", "rti_mpc/wire/session.py"}}
 
-# Inside the library, a file imports only from groups before its own.
-FLOW: tuple[set[str], ...] = (
-    {"errors", "array", "status", "robot_clock", "ladder", "grid", "epoch", "cache", "angle", "call", "signals"},
-    {"message", "approach", "text_file", "latch"},
-    {"polyline"},
-    {"lives", "cadence", "heading", "mode", "schedule", "issued"},
-    {"trajectory", "belief"},
-    {"guard", "sent", "leadership"},
-    {"codegen"},
-    {"model"},
-    {"pioneer_3dx", "integrator", "track", "obstacle", "disturbance"},
-    {"ocp"},
-    {"linearization", "terminal", "rest"},
-    {"transcription", "scale"},
-    {"simultaneous", "sequential", "riccati", "certificate"},
-    {"places"},
-    {"qp", "prediction", "observer", "envelope", "delay", "turns"},
-    {"scaled", "active_set", "state_stream"},
-    {"solver", "foreign_solver"},
-    {"rti"},
-    {"tuning"},
-    {"record", "blockage"},
-    {"controller"},
-)
-BEFORE_WIRE = {"errors", "array", "signals", "status", "message", "epoch", "text_file"}
+
+def relative(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def files(package: str) -> list[Path]:
+    return sorted(PACKAGES[package].rglob("*.py"))
+
+
+def every_file() -> Iterator[Path]:
+    for package in PACKAGES:
+        yield from files(package)
 
 
 def imported(path: Path) -> set[str]:
-    """Full names of all modules a file imports, in functions too."""
+    """Full names of all that a file imports, in functions too."""
     names = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -107,33 +86,77 @@ def roots(path: Path) -> set[str]:
     return {name.partition(".")[0] for name in imported(path)}
 
 
-def files(package: str) -> list[Path]:
-    return sorted((ROOT / package).rglob("*.py"))
+def folder_of(name: str) -> str:
+    """Import package of the folder that a full name lies in, as ``rti_mpc.rti.qp``."""
+    top, *rest = name.split(".")
+    folder, path = [top], PACKAGES[top]
+    for part in rest:
+        path /= part
+        if not path.is_dir():
+            break
+        folder.append(part)
+    return ".".join(folder)
 
 
-def inside(path: Path) -> set[str]:
-    """Modules of the library that a file of the library imports, by their first name."""
-    return {name.split(".")[1] for name in imported(path) if name.startswith("rti_mpc.")}
+def folder_of_file(path: Path) -> str:
+    package = next(name for name, root in PACKAGES.items() if root in path.parents)
+    return ".".join([package, *path.parent.relative_to(PACKAGES[package]).parts])
 
 
-@pytest.mark.parametrize("layer", FORBIDDEN)
-def test_layer_does_not_import_upwards(layer: str) -> None:
-    assert files(layer)
-    for path in files(layer):
-        if path.relative_to(ROOT).as_posix() not in EXCEPT:
-            assert not roots(path) & FORBIDDEN[layer], path
+def folders_imported(path: Path) -> set[str]:
+    """Folders of ours that a file imports from, but for its own."""
+    return {folder_of(name) for name in imported(path) if name.partition(".")[0] in PACKAGES} - {folder_of_file(path)}
+
+
+@pytest.mark.parametrize("package", FORBIDDEN)
+def test_package_does_not_import_upwards(package: str) -> None:
+    assert files(package)
+    for path in files(package):
+        if relative(path) != COMMAND_LINE:
+            assert not roots(path) & FORBIDDEN[package], path
+
+
+@pytest.mark.parametrize("folder", LIBRARY)
+def test_folder_of_the_library_imports_only_from_folders_before_it(folder: str) -> None:
+    paths = [path for path in files("rti_mpc") if folder_of_file(path) == folder and path != ROOT / "rti_mpc/__init__.py"]
+    assert paths
+    for path in paths:
+        assert folders_imported(path) <= LIBRARY[folder] | {"rti_mpc"}, path
+
+
+def test_every_folder_of_the_library_has_its_place() -> None:
+    assert {folder_of_file(path) for path in files("rti_mpc")} == set(LIBRARY)
+
+
+def test_command_is_no_library_of_another() -> None:
+    for path in files("rti_mpc_service"):
+        folder = folder_of_file(path)
+        if folder in COMMANDS or folder != "rti_mpc_service":
+            assert folders_imported(path) & COMMANDS <= BORROWED.get(folder, set()), path
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_file_imports_itself_by_way_of_others(package: str) -> None:
+    names = {".".join([package, *path.relative_to(PACKAGES[package]).with_suffix("").parts]): path for path in files(package)}
+    imports = {name: {each.rpartition(".")[0] for each in imported(path)} | imported(path) for name, path in names.items()}
+    left = {name: {other for other in of if other in names} for name, of in imports.items()}
+    while free := {name for name, of in left.items() if not of}:
+        left = {name: of - free for name, of in left.items() if name not in free}
+    assert not left, "each of these imports another of them, or itself"
 
 
 def test_library_has_no_clock_and_no_thread_but_on_the_wire() -> None:
     for path in files("rti_mpc"):
-        if path.parent.name != "wire":
+        if folder_of_file(path) != "rti_mpc.wire":
             assert not roots(path) & CLOCKS, path
 
 
 @pytest.mark.parametrize("package", ALONE)
-def test_foreign_package_is_behind_its_own_files(package: str) -> None:
-    importers = {path.relative_to(ROOT).as_posix() for layer in PACKAGES for path in files(layer) if package in roots(path)}
-    assert importers <= ALONE[package]
+def test_foreign_package_has_one_place(package: str) -> None:
+    importers = [path for path in every_file() if package in roots(path)]
+    assert importers
+    for path in importers:
+        assert {relative(path), *map(relative, path.parents[: len(path.relative_to(ROOT).parts) - 1])} & ALONE[package], path
 
 
 def called(path: Path) -> set[str]:
@@ -143,52 +166,21 @@ def called(path: Path) -> set[str]:
     return names | {f"{func.value.id}.{func.attr}" for func in calls if isinstance(func, ast.Attribute) and isinstance(func.value, ast.Name)}
 
 
-@pytest.mark.parametrize(("name", "doors"), [("decode", {"rti_mpc/wire/intake.py"}), ("json.loads", {"rti_mpc/wire/document.py"})])
-def test_what_peers_send_is_read_in_one_place(name: str, doors: set[str]) -> None:
-    callers = {path.relative_to(ROOT).as_posix() for layer in PACKAGES for path in files(layer) if name in called(path)}
-    assert callers - LOCAL == doors
-
-
-def test_data_flows_one_way_through_the_library() -> None:
-    before: set[str] = set()
-    for group in FLOW:
-        for name in group:
-            assert inside(ROOT / "rti_mpc" / f"{name}.py") <= before, name
-        before |= group
-    assert {path.stem for path in (ROOT / "rti_mpc").glob("*.py")} == before | {"__init__"}, "every file has its place"
-
-
-def test_wire_depends_on_messages_only() -> None:
-    for path in files("rti_mpc/wire"):
-        assert inside(path) <= BEFORE_WIRE | {"wire"}, path
-
-
-def test_commands_are_not_libraries() -> None:
-    for path in files("service"):
-        if path.relative_to(ROOT).as_posix() not in EXCEPT | PARTS_OF_COMMANDS:
-            modules = imported(path) | {name.rpartition(".")[0] for name in imported(path)}
-            assert not modules & COMMANDS, path
-
-
-@pytest.mark.parametrize("package", PACKAGES)
-def test_no_file_imports_itself_by_way_of_others(package: str) -> None:
-    names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in files(package)}
-    imports = {name: {each.rpartition(".")[0] for each in imported(path)} | imported(path) for name, path in names.items()}
-    left = {name: {other for other in of if other in names} for name, of in imports.items()}
-    while free := {name for name, of in left.items() if not of}:
-        left = {name: of - free for name, of in left.items() if name not in free}
-    assert not left, "each of these imports another of them, or itself"
+@pytest.mark.parametrize("name", DOORS)
+def test_what_peers_send_is_read_in_one_place(name: str) -> None:
+    assert {relative(path) for path in every_file() if name in called(path)} == DOORS[name]
 
 
 @pytest.mark.parametrize(
     ("module", "absent"),
     [
         ("rti_mpc.wire.bus", {"casadi", "osqp", "scipy", "pydantic", "rerun"}),
-        ("rti_mpc.trajectory", {"casadi", "osqp", "scipy", "zenoh"}),
-        ("rti_mpc.rti", {"zenoh", "rerun", "qpsolvers", "pydantic"}),
-        ("service.config", {"casadi", "osqp", "scipy", "zenoh", "rerun"}),
-        ("service.guard", {"casadi", "osqp", "scipy", "rerun", "qpsolvers"}),
-        ("service.cli", {"casadi", "osqp", "scipy", "zenoh", "rerun", "sim"}),
+        ("rti_mpc.reference.trajectory", {"casadi", "osqp", "scipy", "zenoh"}),
+        ("rti_mpc.contract.guard", {"casadi", "osqp", "scipy", "zenoh"}),
+        ("rti_mpc.rti.rti", {"zenoh", "rerun", "qpsolvers", "pydantic"}),
+        ("rti_mpc_service.config.config", {"casadi", "osqp", "scipy", "zenoh", "rerun"}),
+        ("rti_mpc_service.guard", {"casadi", "osqp", "scipy", "rerun", "qpsolvers"}),
+        ("rti_mpc_service.cli", {"casadi", "osqp", "scipy", "zenoh", "rerun", "rti_mpc_sim"}),
     ],
 )
 def test_import_loads_only_what_it_needs(module: str, absent: set[str]) -> None:
@@ -198,14 +190,12 @@ def test_import_loads_only_what_it_needs(module: str, absent: set[str]) -> None:
     assert not loaded & absent
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_file_names_its_licence_first(package: str) -> None:
-    for path in files(package):
+def test_file_names_its_licence_first() -> None:
+    for path in every_file():
         assert path.read_text().startswith("# SPDX-License-Identifier: Apache-2.0\n"), path
 
 
 def test_every_cited_reference_is_defined_and_every_defined_one_cited() -> None:
-    sources = [path.read_text(encoding="utf-8") for package in PACKAGES for path in files(package)]
-    cited = {key for source in sources for key in re.findall(r"\[(\w+)\]_", source)}
+    cited = {key for path in every_file() for key in re.findall(r"\[(\w+)\]_", path.read_text(encoding="utf-8"))}
     defined = re.findall(r"^\* \[(\w+)\] ", (ROOT / "rti_mpc/__init__.py").read_text(encoding="utf-8"), re.MULTILINE)
     assert sorted(cited) == sorted(defined)

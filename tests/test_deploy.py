@@ -14,9 +14,9 @@ import pytest
 import typer.main
 
 from rti_mpc.wire.session import BusSettings, zenoh_config
-from service.build import build_ocp
-from service.cli import app
-from service.config import load
+from rti_mpc_service.cli import app
+from rti_mpc_service.config.build import build_ocp
+from rti_mpc_service.config.config import load
 
 ROOT = Path(__file__).parents[1]
 DEPLOY = ROOT / "deploy"

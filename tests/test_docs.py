@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from service.cli import app
+from rti_mpc_service.cli import app
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -35,7 +35,7 @@ def test_tutorial_of_your_robot_runs_word_by_word(tmp_path: Path) -> None:
         return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True, timeout=120).stdout
 
     assert run("script.py") == "off by 0.0 mm after 10 s\n"
-    assert "solved" in run("-c", "from service.cli import main; main()", "check", "car.toml")
+    assert "solved" in run("-c", "from rti_mpc_service.cli import main; main()", "check", "car.toml")
 
 
 def test_every_page_of_the_site_exists_and_is_reached() -> None:

@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.controller import Controller, Timing
-from rti_mpc.guard import Guard, Limits
-from rti_mpc.message import STAMP_ON_ARRIVAL, Command, End, Reference, State
-from rti_mpc.pioneer_3dx import pioneer_3dx
-from rti_mpc.rti import Rti
-from rti_mpc.status import Mode, QpStatus
-from rti_mpc.trajectory import circle
+from rti_mpc.contract.guard import Guard, Limits
+from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Reference, State
+from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc.reference.trajectory import circle
+from rti_mpc.rti.rti import Rti
 from rti_mpc.wire.bus import Received
 from rti_mpc.wire.cdr import M, encode, encoding
 from rti_mpc.wire.intake import Intake
-from sim.lockstep import Lockstep
-from sim.settings import RobotSettings
+from rti_mpc_sim.lockstep import Lockstep
+from rti_mpc_sim.settings import RobotSettings
 from tests.loop import MS, SLEW, drive, reference
 from tests.problems import pioneer
 

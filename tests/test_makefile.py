@@ -24,7 +24,7 @@ def make(tmp_path: Path, pythons: Mapping[str, str]) -> subprocess.CompletedProc
     clone, bin_ = tmp_path / "clone", tmp_path / "bin"
     clone.mkdir()
     bin_.mkdir()
-    for name in ("Makefile", "constraints.txt"):
+    for name in ("Makefile", "constraints.txt", "pyproject.toml"):
         shutil.copy(ROOT / name, clone)
     for tool in TOOLS:
         (bin_ / tool).symlink_to(str(shutil.which(tool)))

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from service.cli import app
+from rti_mpc_service.cli import app
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -44,7 +44,7 @@ def test_a_misspelt_key_is_answered_by_the_line_shown(tmp_path: Path) -> None:
     (shown,) = (block.strip() for block in blocks("") if block.startswith("rti-mpc: robot.toml"))
     shipped = (ROOT / "deploy" / "pioneer_3dx.toml").read_text()
     (tmp_path / "robot.toml").write_text(shipped.replace("\ndt_s = ", "\ndt_ms = "))
-    command = [sys.executable, "-m", "service.cli", "check", "robot.toml"]
+    command = [sys.executable, "-m", "rti_mpc_service.cli", "check", "robot.toml"]
     done = subprocess.run(command, cwd=tmp_path, env={"PYTHONPATH": str(ROOT), "PATH": ""}, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr.strip()) == (2, shown)
 

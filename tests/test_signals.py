@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from rti_mpc.errors import OcpError
-from rti_mpc.model import Model, Signal
-from rti_mpc.obstacle import discs_of, with_obstacles
-from rti_mpc.pioneer_3dx import pioneer_3dx
+from rti_mpc.model.model import Model, Signal
+from rti_mpc.model.obstacle import discs_of, with_obstacles
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.signals import place, plane
 from tests.robots import arm, glider, shuffled
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 
-from rti_mpc.message import Event, Notice, Severity
+from rti_mpc.contract.message import Event, Notice, Severity
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.layout import STAMP_LIMIT_NS
 

@@ -22,8 +22,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.contract.message import Command, Event, Reference, State, Telemetry
 from rti_mpc.errors import MessageError
-from rti_mpc.message import Command, Event, Reference, State, Telemetry
 from rti_mpc.wire.layout import LAYOUTS, NUMBER_LIMIT, SHORTEST_NS, Field
 
 Message = State | Reference | Command | Telemetry | Event

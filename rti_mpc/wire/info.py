@@ -177,7 +177,7 @@ BOUNDS = {"lbu": ("inputs", -1), "ubu": ("inputs", 1), "lbx": ("states", -1), "u
 
 
 class Signal(Protocol):
-    """Component of a vector, `rti_mpc.model.Signal` or `Label`."""
+    """Component of a vector, `rti_mpc.model.model.Signal` or `Label`."""
 
     @property
     def name(self) -> str:
@@ -229,13 +229,13 @@ def parameters(version: int, changes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def latch(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Write an operator's stop, the fields of a `rti_mpc.latch.Latch`, as a part of a description."""
+    """Write an operator's stop, the fields of a `rti_mpc.contract.latch.Latch`, as a part of a description."""
     return {"latch": values}
 
 
 def latches(received: Received) -> tuple[Any, ...]:
     """
-    Read what a description says of an operator's stop, to be judged by `rti_mpc.latch.read_latch`; empty where it says nothing.
+    Read what a description says of an operator's stop, to be judged by `rti_mpc.contract.latch.read_latch`; empty where it says nothing.
 
     Raises:
         MessageError: It is no JSON object.

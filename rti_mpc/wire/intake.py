@@ -7,8 +7,8 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from typing import Generic, Protocol
 
-from rti_mpc.epoch import BELIEVED, highest_believed
-from rti_mpc.message import Notice, Reference, Severity, State
+from rti_mpc.contract.epoch import BELIEVED, highest_believed
+from rti_mpc.contract.message import Notice, Reference, Severity, State
 from rti_mpc.wire.cdr import VERSION, M, Refused, decode, encoding
 from rti_mpc.wire.layout import MAX_BYTES
 from rti_mpc.wire.source import Source, Verdict
@@ -60,7 +60,7 @@ class Intake(Generic[M]):
             stale_s: Time without an accepted message after which another source may take over.
             widths: Numbers a row must have, by array, such as ``{"x": 5}``; those of `OPTIONAL` may be left out.
             quiet_s: Shortest time between two notices of one code.
-            unix_s: Tells the Unix time, s, which limits epochs, see `rti_mpc.epoch.highest_believed`.
+            unix_s: Tells the Unix time, s, which limits epochs, see `rti_mpc.contract.epoch.highest_believed`.
             choosing: Whether an epoch is chosen above those heard.
             unfit: Why a message cannot be for us, as a code such as ``foreign_epoch``; empty if it can. Its source is then not judged at all.
         """

@@ -6,8 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Generic
 
+from rti_mpc.contract.message import Command, Event, Reference, State, Telemetry
 from rti_mpc.errors import ConfigError
-from rti_mpc.message import Command, Event, Reference, State, Telemetry
 from rti_mpc.wire import streams
 from rti_mpc.wire.cdr import M
 from rti_mpc.wire.streams import Stream

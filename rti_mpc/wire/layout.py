@@ -3,7 +3,7 @@
 Field table of every message: the one source of the CDR codec and of the ``.msg`` files in `deploy/msg`.
 
 Fields stand in the order of the wire, which is that of the dataclasses in
-`rti_mpc.message`. A matrix is flat on the wire; its row width is a ``uint32``
+`rti_mpc.contract.message`. A matrix is flat on the wire; its row width is a ``uint32``
 in front of the first matrix that has this width.
 """
 
@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-from rti_mpc.message import STAMP_ON_ARRIVAL, Command, End, Event, Reference, Severity, State, Telemetry
-from rti_mpc.status import Mode, QpStatus
+from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Event, Reference, Severity, State, Telemetry
+from rti_mpc.contract.status import Mode, QpStatus
 
 STAMP_LIMIT_NS = 2**62  # magnitude that no time reaches: sums of two stamps, or of a stamp and a duration, fit an int64
 PERIOD_LIMIT_NS = 3_600_000_000_000  # longest time between rows: one hour

@@ -25,8 +25,8 @@ from typing import Any
 
 import zenoh
 
+from rti_mpc.contract.message import Reference
 from rti_mpc.errors import ConfigError, Stopped
-from rti_mpc.message import Reference
 from rti_mpc.text_file import read_text_file
 from rti_mpc.wire.layout import MAX_BYTES
 from rti_mpc.wire.reach import remind

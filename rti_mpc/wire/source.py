@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from rti_mpc.epoch import SEQ_AHEAD
+from rti_mpc.contract.epoch import SEQ_AHEAD
 
 
 class Verdict(Enum):

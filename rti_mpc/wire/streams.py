@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Generic, Literal
 
-from rti_mpc.message import Command, Event, Reference, State, Telemetry
+from rti_mpc.contract.message import Command, Event, Reference, State, Telemetry
 from rti_mpc.wire import document
 from rti_mpc.wire.cdr import M
 from rti_mpc.wire.layout import MAX_BYTES

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from rti_mpc.message import Reference
+from rti_mpc.contract.message import Reference
 from rti_mpc.wire.cdr import decode
 from tests.bench.driven import Driven
 from tests.processes.system import until

@@ -10,16 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from rti_mpc.message import Telemetry
+from rti_mpc.contract.message import Telemetry
 from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.info import Info, Label
-from service import robot_log
-from service.children import Children
-from service.cli import SHIPPED
-from service.config import load
-from service.rig.endpoint import free_endpoint
-from service.robot_log import RobotLog
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.config.config import load
+from rti_mpc_service.rig import robot_log
+from rti_mpc_service.rig.children import Children
+from rti_mpc_service.rig.endpoint import free_endpoint
+from rti_mpc_service.rig.robot_log import RobotLog
 from tests.processes.system import until
 
 INFO = Info("controller", states=tuple(map(Label, ("x", "y", "psi", "u", "omega"))), inputs=tuple(map(Label, ("u_c", "omega_c"))))
@@ -80,12 +80,12 @@ def driven(folder: Path, dt_s: float, duration_s: float, realtime: str = "") -> 
         bus.watch_alive(lambda role, present: (lives.add if present else lives.discard)(role))
         meeting = ("-l", "tcp/127.0.0.1:0", "-e", endpoint)
         pids = {
-            "controller": children.start("controller", "service.cli", "run", toml, "-e", endpoint),
-            "reference": children.start("reference", "service.cli", "reference", toml, "-e", endpoint, "--duration", duration_s),
+            "controller": children.start("controller", "rti_mpc_service.cli", "run", toml, "-e", endpoint),
+            "reference": children.start("reference", "rti_mpc_service.cli", "reference", toml, "-e", endpoint, "--duration", duration_s),
         }
         until(lambda: pids.keys() <= lives, "controller and reference", patience_s=60.0)
         robot = Driven(folder, endpoint, bus, children, lives, bus.subscriber(keys.telemetry, capacity=8192), pids)
-        pids["robot"] = children.start("robot", "service.cli", "sim", toml, *meeting, "--log", folder / "robot.csv")
+        pids["robot"] = children.start("robot", "rti_mpc_service.cli", "sim", toml, *meeting, "--log", folder / "robot.csv")
         until(lambda: robot.listen() > 1, "the first samples", patience_s=30.0)
         yield robot
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.bench import ENTRIES, main, measure
+from rti_mpc_service.bench.bench import ENTRIES, main, measure
 
 SHORT = "CI" in os.environ  # to see that all of it runs: figures need a quiet machine, and `make bench`
 KEYS = {"N", "formulation", "solver", "compiled", "step_us", "prepare_us", "feedback_us", "ipopt_us", "speedup"}

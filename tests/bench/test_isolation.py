@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rti_mpc.message import Telemetry
-from service import machine
+from rti_mpc.contract.message import Telemetry
+from rti_mpc_service.host import machine
 from tests.bench.driven import Driven, driven, quantiles
 from tests.processes.system import until
 
@@ -53,7 +53,7 @@ def block(robot: Driven, name: str) -> list[Telemetry]:
         return robot.samples(BLOCK)
     recording = robot.folder / "run.rrd"
     recording.unlink(missing_ok=True)
-    pid = robot.children.start("viewer", "service.cli", "view", robot.toml, "-e", robot.endpoint, "--rerun-save", recording, nice=10)
+    pid = robot.children.start("viewer", "rti_mpc_service.cli", "view", robot.toml, "-e", robot.endpoint, "--rerun-save", recording, nice=10)
     until(lambda: "viewer" in robot.lives and recording.exists() and recording.stat().st_size, "the viewer records", patience_s=30.0)
     robot.listen()
     TROUBLES[name](pid)

@@ -23,15 +23,16 @@ import numpy as np
 import pytest
 import zenoh
 
-from rti_mpc.message import Command, State, Telemetry
-from rti_mpc.status import Mode, QpStatus
+from rti_mpc.contract.message import Command, State, Telemetry
+from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import decode, encode
-from service import machine, robot_log
-from service.children import Children
-from service.config import load
-from service.rig.endpoint import free_endpoint
-from service.schema import Config
+from rti_mpc_service.config.config import load
+from rti_mpc_service.config.schema import Config
+from rti_mpc_service.host import machine
+from rti_mpc_service.rig import robot_log
+from rti_mpc_service.rig.children import Children
+from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.bench.driven import INFO, quantiles, sampled
 from tests.processes.system import until
 
@@ -108,13 +109,13 @@ def test_command_takes_at_most_one_and_a_half_echoes_and_the_feedback(config: Co
     with Bus.join(BusSettings(listen=(endpoint,), connect=()), keys) as bus, bare_session(len(command)) as session, Children(tmp_path) as children:
         lives: set[str] = set()
         bus.watch_alive(lambda role, present: (lives.add if present else lives.discard)(role))
-        children.start("controller", "service.cli", "run", toml, "-e", endpoint)
-        children.start("reference", "service.cli", "reference", toml, "-e", endpoint, "--duration", 120)
+        children.start("controller", "rti_mpc_service.cli", "run", toml, "-e", endpoint)
+        children.start("reference", "rti_mpc_service.cli", "reference", toml, "-e", endpoint, "--duration", 120)
         until(lambda: {"controller", "reference"} <= lives, "controller and reference", patience_s=60.0)
         samples = bus.subscriber(keys.telemetry, capacity=4096)
         pings = Pings(bus, session, encode(State(0, 0, 0, np.zeros(5))))
         pings.start()
-        children.start("robot", "service.cli", "sim", toml, "-l", "tcp/127.0.0.1:0", "-e", endpoint, "--log", tmp_path / "robot.csv")
+        children.start("robot", "rti_mpc_service.cli", "sim", toml, "-l", "tcp/127.0.0.1:0", "-e", endpoint, "--log", tmp_path / "robot.csv")
 
         def enough() -> bool:
             telemetry.extend(decode(Telemetry, received.payload) for received in samples.drain())

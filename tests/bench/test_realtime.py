@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service import machine, realtime
+from rti_mpc_service.host import machine, realtime
 from tests.bench.driven import driven, quantiles
 
 pytestmark = pytest.mark.benchmark

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rti_mpc.message import Telemetry
-from service import machine
+from rti_mpc.contract.message import Telemetry
+from rti_mpc_service.host import machine
 from tests.bench.asker import KINDS, Asker
 from tests.bench.driven import Driven, driven, quantiles
 

@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from rti_mpc.approach import Increments
-from rti_mpc.controller import Controller, Timing
-from rti_mpc.guard import Guard, Limits
-from rti_mpc.message import Command, State
-from rti_mpc.rti import Rti
+from rti_mpc.contract.approach import Increments
+from rti_mpc.contract.guard import Guard, Limits
+from rti_mpc.contract.message import Command, State
+from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.rti.rti import Rti
 from rti_mpc.wire.cdr import decode, encode
-from sim.actuator import Actuator
+from rti_mpc_sim.actuator import Actuator
 from tests.closed_loop.fuzz import BOUND, DT, MS, ROUNDING, STEP, WINDOW_NS, Fuzz, Payload
 from tests.problems import pioneer
 

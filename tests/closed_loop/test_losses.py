@@ -8,13 +8,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rti_mpc.approach import Increments
 from rti_mpc.array import Array
-from rti_mpc.controller import Controller, Timing
-from rti_mpc.guard import Guard, Limits
-from rti_mpc.message import Command
-from rti_mpc.rti import Rti
-from rti_mpc.trajectory import eight
+from rti_mpc.contract.approach import Increments
+from rti_mpc.contract.guard import Guard, Limits
+from rti_mpc.contract.message import Command
+from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.reference.trajectory import eight
+from rti_mpc.rti.rti import Rti
 from tests.loop import MS, reference, robot
 from tests.problems import pioneer
 

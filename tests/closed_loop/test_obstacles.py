@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.controller import Controller, Timing
-from rti_mpc.integrator import integrator
-from rti_mpc.message import End, Reference, Severity
-from rti_mpc.obstacle import with_obstacles
-from rti_mpc.ocp import Ocp
-from rti_mpc.pioneer_3dx import pioneer_3dx
-from rti_mpc.rti import Rti
-from service.build import build_ocp, build_rti, robot_settings, stage_parameters
-from service.config import load
-from service.schema import Config
-from sim.lockstep import Lockstep
-from sim.settings import RobotSettings
+from rti_mpc.contract.message import End, Reference, Severity
+from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.model.integrator import integrator
+from rti_mpc.model.obstacle import with_obstacles
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.rti import Rti
+from rti_mpc_service.config.build import build_ocp, build_rti, robot_settings, stage_parameters
+from rti_mpc_service.config.config import load
+from rti_mpc_service.config.schema import Config
+from rti_mpc_sim.lockstep import Lockstep
+from rti_mpc_sim.settings import RobotSettings
 from tests.loop import drive
 
 INF = np.inf

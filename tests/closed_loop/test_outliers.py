@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.controller import Controller, Timing
-from rti_mpc.message import Reference, State
-from rti_mpc.observer import Disturbance, Observer, ObserverSettings
-from rti_mpc.ocp import Ocp
-from rti_mpc.pioneer_3dx import pioneer_3dx
-from rti_mpc.rti import Rti
-from rti_mpc.status import Mode
-from rti_mpc.trajectory import Heading, Trajectory, circle, eight
+from rti_mpc.contract.message import Reference, State
+from rti_mpc.contract.status import Mode
+from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.control.observer import Disturbance, Observer, ObserverSettings
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc.reference.trajectory import Heading, Trajectory, circle, eight
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.rti import Rti
 from tests.loop import drive, reference, robot
 from tests.problems import PAPER, SLEW, pioneer
 

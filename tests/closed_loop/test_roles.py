@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rti_mpc.controller import Controller, Timing
-from rti_mpc.message import Reference
+from rti_mpc.contract.message import Reference
+from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.reference.trajectory import eight, followed_roles, rows
 from rti_mpc.signals import place, plane
-from rti_mpc.trajectory import eight, followed_roles, rows
-from service.build import build_rti, robot_settings
-from service.config import load
-from service.rig.scenario import configured
-from sim.lockstep import Lockstep
-from sim.settings import RobotSettings
+from rti_mpc_service.config.build import build_rti, robot_settings
+from rti_mpc_service.config.config import load
+from rti_mpc_service.rig.scenario import configured
+from rti_mpc_sim.lockstep import Lockstep
+from rti_mpc_sim.settings import RobotSettings
 from tests.loop import MS, drive
 from tests.robots import toml
 

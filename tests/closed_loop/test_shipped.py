@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rti_mpc.controller import Controller, Timing
-from rti_mpc.message import Command
-from rti_mpc.ocp import Ocp
-from rti_mpc.status import Mode
-from rti_mpc.trajectory import Heading, Trajectory, circle, eight, positioning
-from service.build import build_rti
-from service.config import load
-from service.rig.scenario import configured
+from rti_mpc.contract.message import Command
+from rti_mpc.contract.status import Mode
+from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.reference.trajectory import Heading, Trajectory, circle, eight, positioning
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc_service.config.build import build_rti
+from rti_mpc_service.config.config import load
+from rti_mpc_service.rig.scenario import configured
 from tests.loop import Run, drive, reference, robot
 
 CONFIG = load(Path(__file__).parents[2] / "deploy" / "pioneer_3dx.toml")

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import pytest
 
-from rti_mpc.rti import FORMULATIONS, Rti
-from rti_mpc.solver import SolverSettings
-from service.bench import closed_loop_cost, paper_ocp
+from rti_mpc.rti.qp.osqp import SolverSettings
+from rti_mpc.rti.rti import FORMULATIONS, Rti
+from rti_mpc_service.bench.bench import closed_loop_cost, paper_ocp
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

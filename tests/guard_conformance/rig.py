@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.message import Command, State
-from rti_mpc.schedule import Schedule
-from rti_mpc.status import Mode, QpStatus
+from rti_mpc.contract.message import Command, State
+from rti_mpc.contract.schedule import Schedule
+from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.session import BusSettings
-from service.build import guard_limits
-from service.cli import SHIPPED
-from service.config import load
-from service.host import Host
-from service.rig.endpoint import free_endpoint
-from sim.actuator import Actuator
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.config.build import guard_limits
+from rti_mpc_service.config.config import load
+from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.rig.endpoint import free_endpoint
+from rti_mpc_sim.actuator import Actuator
 from tests.in_time import in_time, on_time
 
 ROOT = Path(__file__).parents[2]

@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rti_mpc.message import Command
+from rti_mpc.contract.message import Command
 from rti_mpc.wire.cdr import encode
-from service.host import Host
+from rti_mpc_service.host.hold_up import Host
 from tests.guard_conformance.rig import MS, PATIENCE_S, Rig
 
-OURS = f"{shlex.quote(sys.executable)} -c 'from service.cli import main; main()' guard"
+OURS = f"{shlex.quote(sys.executable)} -c 'from rti_mpc_service.cli import main; main()' guard"
 
 
 @pytest.fixture(scope="module")

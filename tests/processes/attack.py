@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from rti_mpc.contract.message import Command, Event, Reference, Severity, State, Telemetry
 from rti_mpc.errors import MessageError
-from rti_mpc.message import Command, Event, Reference, Severity, State, Telemetry
 from rti_mpc.wire.cdr import decode, encode, encoding
 from rti_mpc.wire.keys import Keys
 

@@ -80,7 +80,7 @@ class Network:
 
     def start(self, name: str, host: str, module: str, *arguments: object, folder: Path) -> None:
         """Start a module of ours on a host, as `python -m` does; it ends with us, however we end."""
-        leash = [sys.executable, "-m", "service.leash", str(os.getpid())]
+        leash = [sys.executable, "-m", "rti_mpc_service.rig.leash", str(os.getpid())]
         command = ["ip", "netns", "exec", name_of(host), *leash, module, *map(str, arguments)]
         with (folder / f"{name}.log").open("wb") as log:
             process = subprocess.Popen(command, cwd=ROOT, env=environment(), stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT)

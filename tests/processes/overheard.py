@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
-from rti_mpc.message import Command, State, Telemetry
+from rti_mpc.contract.message import Command, State, Telemetry
 from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.interrupt import stop_on_signals

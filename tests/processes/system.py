@@ -16,13 +16,13 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TypeVar
 
-from rti_mpc.message import Command, Event, State, Telemetry
+from rti_mpc.contract.message import Command, Event, State, Telemetry
 from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import M, decode
-from service.cli import SHIPPED
-from service.config import load
-from service.host import Host
-from service.rig.endpoint import free_endpoint
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.config.config import load
+from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.in_time import in_time
 
 ROOT = Path(__file__).parents[2]
@@ -42,7 +42,7 @@ atexit.register(shutil.rmtree, STATE, ignore_errors=True)
 
 
 def command_line(*arguments: object) -> list[str]:
-    return [sys.executable, "-c", "from service.cli import main; main()", *map(str, arguments)]
+    return [sys.executable, "-c", "from rti_mpc_service.cli import main; main()", *map(str, arguments)]
 
 
 def rti_mpc(*arguments: object, timeout_s: float = 120.0) -> subprocess.CompletedProcess[str]:

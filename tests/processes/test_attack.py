@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rti_mpc.epoch import highest_believed
-from rti_mpc.message import Command
+from rti_mpc.contract.epoch import highest_believed
+from rti_mpc.contract.message import Command
 from rti_mpc.wire.bus import unix_s
-from service.cli import SHIPPED
-from service.host import Host
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.host.hold_up import Host
 from tests.in_time import on_time
 from tests.processes.attack import RATE_HZ, Attack
 from tests.processes.system import KEYS, System, until

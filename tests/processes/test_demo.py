@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 
-from service.cli import SHIPPED
-from service.config import load
-from service.host import Host
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.config.config import load
+from rti_mpc_service.host.hold_up import Host
 from tests.in_time import explained
 from tests.processes.system import PATIENCE_S, ROOT, command_line, environment, rti_mpc, until
 

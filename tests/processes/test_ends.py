@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.cli import SHIPPED
-from service.host import Host
-from service.rig.endpoint import free_endpoint
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.in_time import explained
 from tests.processes.network import ip, missing, name_of
 from tests.processes.system import ROOT, command_line, environment, until

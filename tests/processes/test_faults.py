@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from service.faults.promise import BRAKES
-from service.faults.table import FAULTS
+from rti_mpc_service.faults.promise import BRAKES
+from rti_mpc_service.faults.table import FAULTS
 from tests.processes.system import rti_mpc
 
 

@@ -16,10 +16,10 @@ from pathlib import Path
 
 import pytest
 
-from rti_mpc.message import Command, Event
+from rti_mpc.contract.message import Command, Event
 from rti_mpc.wire.cdr import decode
-from service.cli import SHIPPED
-from service.host import Host
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.host.hold_up import Host
 from tests.in_time import in_time
 from tests.processes.record import GUARDED, MS, Record, recorded, within_slew
 from tests.processes.system import CONFIG, KEYS, System, heard, interrupted_in_time, rti_mpc, until

@@ -16,9 +16,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from rti_mpc.message import Command
-from rti_mpc.status import Mode
-from service.host import Host
+from rti_mpc.contract.message import Command
+from rti_mpc.contract.status import Mode
+from rti_mpc_service.host.hold_up import Host
 from tests.in_time import in_time
 from tests.processes.record import GUARDED, MS, STANDING, recorded, within_slew
 from tests.processes.system import KEYS, until

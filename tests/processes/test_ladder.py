@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rti_mpc.message import Command, Event, Telemetry
-from rti_mpc.status import Mode
+from rti_mpc.contract.message import Command, Event, Telemetry
+from rti_mpc.contract.status import Mode
 from rti_mpc.wire.bus import Subscriber
 from rti_mpc.wire.cdr import decode
-from service.cli import SHIPPED
-from service.host import Host
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.host.hold_up import Host
 from tests.in_time import on_time
 from tests.processes.system import CONFIG, KEYS, SPEED, System, heard
 

@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rti_mpc.epoch import NUMBER_BITS
-from rti_mpc.status import Mode
-from service import robot_log
-from service.build import guard_limits
-from service.cli import SHIPPED
-from service.config import load
-from service.faults.measure import Incident, measure
-from service.host import Host
+from rti_mpc.contract.epoch import NUMBER_BITS
+from rti_mpc.contract.status import Mode
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.config.build import guard_limits
+from rti_mpc_service.config.config import load
+from rti_mpc_service.faults.measure import Incident, measure
+from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.rig import robot_log
 from tests.bench.driven import INFO
 from tests.in_time import MS, in_time
 from tests.processes.network import MIDDLE, MIDDLE_ADDRESS, Network, missing
@@ -75,7 +75,7 @@ class Partitioned:
         self._start("standby", "standby", "run", "--standby")
 
     def _start(self, name: str, host: str, command: str, *arguments: object, meeting: tuple[object, ...] = MEETING) -> None:
-        self.network.start(name, host, "service.cli", command, self.config, *meeting, *arguments, folder=self.folder)
+        self.network.start(name, host, "rti_mpc_service.cli", command, self.config, *meeting, *arguments, folder=self.folder)
 
     def said(self, name: str) -> str:
         return (self.folder / f"{name}.log").read_text()

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from service.cli import SHIPPED
-from service.host import Host
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.host.hold_up import Host
 from tests.in_time import MS, in_time
 from tests.processes.system import ROOT, command_line, environment, until
 

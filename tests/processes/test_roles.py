@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rti_mpc.message import Reference
+from rti_mpc.contract.message import Reference
+from rti_mpc.reference.trajectory import eight, rows
 from rti_mpc.signals import Role
-from rti_mpc.trajectory import eight, rows
 from rti_mpc.wire.bus import Bus, BusSettings
-from service.config import load
+from rti_mpc_service.config.config import load
 from tests.processes.system import System, heard
 from tests.robots import toml
 

@@ -26,11 +26,11 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from rti_mpc.message import Command, Telemetry
+from rti_mpc.contract.message import Command, Telemetry
 from rti_mpc.wire.cdr import decode
-from service import machine, realtime
-from service.host import Host
-from service.robot_log import RobotLog
+from rti_mpc_service.host import machine, realtime
+from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.rig.robot_log import RobotLog
 from tests.bench.driven import Driven, driven, quantiles
 from tests.processes.system import ROOT, anonymous_bytes, environment, until
 
@@ -53,7 +53,7 @@ TIMER = """
 import os, signal, sys
 from contextlib import suppress
 import numpy as np
-from service.jitter import bare_timer
+from rti_mpc_service.host.jitter import bare_timer
 os.sched_setaffinity(0, {int(sys.argv[1])})
 with suppress(PermissionError):
     if priority := int(sys.argv[4]):

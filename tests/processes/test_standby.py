@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rti_mpc.message import Telemetry
-from rti_mpc.status import Mode
+from rti_mpc.contract.message import Telemetry
+from rti_mpc.contract.status import Mode
 from rti_mpc.wire.cdr import decode
-from service.host import Host
+from rti_mpc_service.host.hold_up import Host
 from tests.in_time import in_time
 from tests.processes.system import KEYS, heard, rti_mpc, until
 from tests.processes.watched import Watched, configuration, within_limits

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 import zenoh
 
-from rti_mpc.message import Command, State
-from rti_mpc.status import Mode
-from service.cli import SHIPPED
+from rti_mpc.contract.message import Command, State
+from rti_mpc.contract.status import Mode
+from rti_mpc_service.cli import SHIPPED
 from tests.processes.record import GUARDED
 from tests.processes.system import KEYS, System, heard, rti_mpc, until
 

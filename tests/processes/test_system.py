@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rti_mpc.message import Command, End, Event, Reference, State, Telemetry
-from rti_mpc.status import Mode
+from rti_mpc.contract.message import Command, End, Event, Reference, State, Telemetry
+from rti_mpc.contract.status import Mode
 from rti_mpc.wire import cdr
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.cdr import decode, encode
 from rti_mpc.wire.session import BusSettings
-from service.cli import SHIPPED
-from service.host import Host
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.host.hold_up import Host
 from tests.in_time import MS, in_time
 from tests.processes.system import CONFIG, KEYS, SPEED, System, heard, interrupted_in_time, rti_mpc, until
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rti_mpc.epoch import NUMBER_BITS
-from rti_mpc.message import Command, Telemetry
-from rti_mpc.status import Mode
+from rti_mpc.contract.epoch import NUMBER_BITS
+from rti_mpc.contract.message import Command, Telemetry
+from rti_mpc.contract.status import Mode
 from rti_mpc.wire.cdr import decode
-from service.cli import SHIPPED
+from rti_mpc_service.cli import SHIPPED
 from tests.processes.system import KEYS, System, heard, until
 
 ARGUMENTS: dict[str, tuple[object, ...]] = {

@@ -14,8 +14,8 @@ import pytest
 import typer.main
 from typer.testing import CliRunner
 
-from service.cli import SHIPPED, app
-from service.host import Host
+from rti_mpc_service.cli import SHIPPED, app
+from rti_mpc_service.host.hold_up import Host
 from tests.in_time import in_time
 from tests.robots import toml
 
@@ -26,7 +26,7 @@ COMMANDS = sorted(typer.main.get_group(app).commands)
 
 def rti_mpc(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run the command line as a process, as a shell would."""
-    command = [sys.executable, "-c", "from service.cli import main; main()", *arguments]
+    command = [sys.executable, "-c", "from rti_mpc_service.cli import main; main()", *arguments]
     return subprocess.run(command, cwd=ROOT, env={**os.environ, "COLUMNS": "200", **environment}, capture_output=True, text=True, timeout=60)
 
 
@@ -125,7 +125,7 @@ def test_news_of_matplotlib_is_not_ours_to_tell() -> None:
     """It tells of fonts it has found, once on a machine: in the middle of a newcomer's first demo."""
     say = """
 import logging
-from service import log
+from rti_mpc_service import log
 log.start()
 for name in ("matplotlib.font_manager", "controller"):
     logging.getLogger(name).info("news")

@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rti_mpc.message import State
+from rti_mpc.contract.message import State
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.keys import Keys
-from service.cli import SHIPPED
-from service.rig.endpoint import free_endpoint
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.processes.system import CONFIG
 
 ROOT = Path(__file__).parents[2]
@@ -28,7 +28,7 @@ LISTENER = """
 import sys, threading, time
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.keys import Keys
-from service.entry import enter
+from rti_mpc_service.entry import enter
 
 class Slow:
     def __del__(self):
@@ -98,13 +98,13 @@ def test_process_ends_well_while_its_threads_are_inside_zenoh() -> None:
     ],
 )
 def test_process_ends_with_the_status_of_what_it_did_and_says_it_in_one_line(step: str, status: int, said: str) -> None:
-    code = "import atexit, os, sys, threading, time\nfrom rti_mpc.errors import *\nfrom service.entry import enter\ndef main():\n  "
+    code = "import atexit, os, sys, threading, time\nfrom rti_mpc.errors import *\nfrom rti_mpc_service.entry import enter\ndef main():\n  "
     done = run(f"{code}{step}\nenter(main)", stdout=subprocess.PIPE)
     assert (done.returncode, done.stderr.decode()) == (status, said)
 
 
 def test_fault_of_our_own_keeps_its_traceback() -> None:
-    done = run("from service.entry import enter\nenter(lambda: 1 / 0)")
+    done = run("from rti_mpc_service.entry import enter\nenter(lambda: 1 / 0)")
     assert done.returncode == 1
     assert b"Traceback" in done.stderr
     assert b"ZeroDivisionError" in done.stderr
@@ -112,7 +112,7 @@ def test_fault_of_our_own_keeps_its_traceback() -> None:
 
 def shell(command: str, *arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
     """A command of ours, as `$run`, in a shell, with the environment of a terminal that knows ASCII only."""
-    line = f"{sys.executable} -c 'from service.cli import main; main()'"
+    line = f"{sys.executable} -c 'from rti_mpc_service.cli import main; main()'"
     ascii_only = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "PYTHONPATH": str(ROOT)}
     return subprocess.run(
         ["bash", "-c", command.replace("$run", line), "bash", *map(str, arguments)],
@@ -149,7 +149,7 @@ def test_output_that_is_closed_full_or_not_read_to_its_end_is_one_line_at_most(c
 @pytest.mark.parametrize("output", ["> /dev/full", ">&-", "| true"])
 def test_log_that_nobody_takes_ends_nobody(output: str) -> None:
     endpoint = free_endpoint()
-    line = f"{sys.executable} -c 'from service.cli import main; main()' router {SHIPPED} -l {endpoint} {output}; exit ${{PIPESTATUS[0]}}"
+    line = f"{sys.executable} -c 'from rti_mpc_service.cli import main; main()' router {SHIPPED} -l {endpoint} {output}; exit ${{PIPESTATUS[0]}}"
     with (
         subprocess.Popen(["bash", "-c", line], cwd=ROOT, stderr=subprocess.PIPE, process_group=0) as process,
         Bus.join(BusSettings(mode="client", connect=(endpoint,)), CONFIG.keys()) as bus,
@@ -177,7 +177,7 @@ def test_path_with_an_umlaut_is_printed_as_it_is_where_only_ascii_is_known(tmp_p
 
 
 def test_warning_of_the_library_is_one_line_of_the_log() -> None:
-    code = "import warnings\nfrom service import entry, log\nentry.enter(log.start, lambda: warnings.warn('slow', stacklevel=1))"
+    code = "import warnings\nfrom rti_mpc_service import entry, log\nentry.enter(log.start, lambda: warnings.warn('slow', stacklevel=1))"
     done = run(code, stdout=subprocess.PIPE)
     assert json.loads(done.stdout) == {"level": "WARNING", "logger": "rti_mpc", "text": "slow"}
     assert done.stderr == b""

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import pytest
 
-from rti_mpc.latch import Latch
+from rti_mpc.contract.latch import Latch
 from rti_mpc.wire.keys import Keys
-from service import latch_file
-from service.latch_file import MAX_BYTES, LatchFile, state_folder
+from rti_mpc_service import latch_file
+from rti_mpc_service.latch_file import MAX_BYTES, LatchFile, state_folder
 
 WHEN = "2026-11-28T09:30:00Z"
 STOPPED = Latch(5, True, WHEN, "asked for by ada@lab")
@@ -88,9 +88,9 @@ def test_process_that_is_killed_while_it_writes_leaves_the_latch_before_or_after
     script = f"""
 import os, pathlib, signal
 from pathlib import Path
-from rti_mpc.latch import Latch
+from rti_mpc.contract.latch import Latch
 from rti_mpc.wire.keys import Keys
-from service.latch_file import LatchFile
+from rti_mpc_service.latch_file import LatchFile
 
 def die(*_, **__):
     os.kill(os.getpid(), signal.SIGKILL)

@@ -12,7 +12,7 @@ from threading import Timer
 
 import pytest
 
-from service.log import MAX_LINES, Aside
+from rti_mpc_service.log import MAX_LINES, Aside
 from tests.processes.system import PATIENCE_S, ROOT, environment
 
 PIPE_BYTES = 4096
@@ -20,7 +20,7 @@ TAKEN = PIPE_BYTES // 60  # lines that the pipe takes before anybody reads it, o
 LINES = 10 * MAX_LINES
 TALK = f"""
 import logging, sys
-from service import log
+from rti_mpc_service import log
 log.start()
 news = logging.getLogger("controller")
 for k in range({LINES}):

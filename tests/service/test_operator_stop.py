@@ -13,15 +13,15 @@ from typing import Any, cast
 
 import pytest
 
+from rti_mpc.contract.latch import MAX_LEAP, Latch
+from rti_mpc.contract.message import Notice
 from rti_mpc.errors import ConfigError, MessageError
-from rti_mpc.latch import MAX_LEAP, Latch
-from rti_mpc.message import Notice
 from rti_mpc.wire.bus import Received
 from rti_mpc.wire.document import MAX_BYTES
 from rti_mpc.wire.keys import Keys
-from service import operator_stop
-from service.latch_file import LatchFile
-from service.operator_stop import OperatorStop
+from rti_mpc_service import operator_stop
+from rti_mpc_service.latch_file import LatchFile
+from rti_mpc_service.operator_stop import OperatorStop
 
 WHEN = "2026-11-28T09:30:00Z"
 STOPPED = Latch(5, True, WHEN, "asked for by ada@lab")

@@ -11,19 +11,22 @@ from threading import Event
 import numpy as np
 import pytest
 
-from rti_mpc.message import State
-from rti_mpc.trajectory import eight
+from rti_mpc.contract.message import State
+from rti_mpc.reference.trajectory import eight
 from rti_mpc.wire import bus as bus_module
 from rti_mpc.wire.bus import Bus, BusSettings, Received
 from rti_mpc.wire.info import Info, Leader, latches
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.streams import RELAY, STREAMS
-from service import daemon, echo, guard, request, router
-from service.build import robot_settings
-from service.config import load
-from service.faults import relay
-from sim import robot, source
-from sim.settings import RobotSettings
+from rti_mpc_service import guard, request, router
+from rti_mpc_service import reference as source
+from rti_mpc_service.config.build import robot_settings
+from rti_mpc_service.config.config import load
+from rti_mpc_service.controller import daemon
+from rti_mpc_service.faults import relay
+from rti_mpc_service.host import echo
+from rti_mpc_sim import robot
+from rti_mpc_sim.settings import RobotSettings
 from tests.wire.fake_session import FakeSession, Said
 
 CONFIG = load(Path(__file__).parents[2] / "deploy" / "pioneer_3dx.toml")
@@ -78,7 +81,7 @@ def test_process_publishes_what_the_table_lets_its_roles_and_nothing_else(roles:
 
 def test_viewer_publishes_what_the_table_lets_it(session: FakeSession, tmp_path: Path) -> None:
     pytest.importorskip("rerun")
-    from service import view
+    from rti_mpc_service.view import view
 
     view.main(SETTINGS, KEYS, rerun_save=tmp_path / "run.rrd", stop=STOPPED)
     assert session.said == may("viewer")

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.message import Command
-from rti_mpc.schedule import STEP_NS
-from rti_mpc.status import Mode, QpStatus
-from sim.actuator import Actuator
+from rti_mpc.contract.message import Command
+from rti_mpc.contract.schedule import STEP_NS
+from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc_sim.actuator import Actuator
 
 MS = 1_000_000
 SLEW = np.array([1.0, 2.0])

@@ -9,7 +9,7 @@ from threading import Event
 import pytest
 
 from rti_mpc.errors import ConfigError
-from sim.clock import Clock
+from rti_mpc_sim.clock import Clock
 
 HALF = 20  # of the waits
 BUSY_MS = 2.0  # after each

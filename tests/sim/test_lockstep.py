@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rti_mpc.contract.message import Command
+from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.errors import ConfigError
-from rti_mpc.message import Command
-from rti_mpc.pioneer_3dx import pioneer_3dx
-from rti_mpc.status import Mode, QpStatus
-from sim.lockstep import Lockstep
-from sim.plant import Plant
-from sim.settings import RobotSettings
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc_sim.lockstep import Lockstep
+from rti_mpc_sim.plant import Plant
+from rti_mpc_sim.settings import RobotSettings
 
 MS = 1_000_000
 X0 = np.array([0.5, 0.0, 3.0, 0.0, 0.0])

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from rti_mpc.errors import ConfigError
-from rti_mpc.pioneer_3dx import pioneer_3dx
-from sim.actuator import Counters
-from sim.log import PATIENCE_NS, Log
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc_sim.actuator import Counters
+from rti_mpc_sim.log import PATIENCE_NS, Log
 
 X = np.array([1.0, 2.0, 0.1 + 0.2, 0.0, 0.0])
 U = np.zeros(2)

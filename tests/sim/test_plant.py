@@ -11,8 +11,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from rti_mpc.array import Array
-from rti_mpc.pioneer_3dx import pioneer_3dx
-from sim.plant import Plant, lagging
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc_sim.plant import Plant, lagging
 
 MODEL = pioneer_3dx().with_parameters(theta_1=0.3, a=0.15)
 X0 = np.array([0.5, -0.2, 0.3, 0.1, -0.4])

@@ -20,13 +20,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rti_mpc.message import Command, End, Event, Reference, State
-from rti_mpc.status import Mode, QpStatus
-from rti_mpc.trajectory import eight, rows
+from rti_mpc.contract.message import Command, End, Event, Reference, State
+from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.reference.trajectory import eight, rows
 from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
-from service.host import Host
+from rti_mpc_service.host.hold_up import Host
 from tests.in_time import MS, explained, in_time
 
 ROOT = Path(__file__).parents[2]
@@ -37,11 +37,11 @@ ROBOT = """
 import sys
 from pathlib import Path
 import numpy as np
-from rti_mpc.pioneer_3dx import pioneer_3dx
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.wire.bus import BusSettings
 from rti_mpc.wire.keys import Keys
-from sim import robot
-from sim.settings import RobotSettings
+from rti_mpc_sim import robot
+from rti_mpc_sim.settings import RobotSettings
 
 _, endpoint, speed, period_s, log = sys.argv
 settings = RobotSettings(pioneer_3dx(), np.array([0.5, 0.0, 0.0, 0.0, 0.0]), slew=np.array([1.0, 2.0]), state_period_s=float(period_s))
@@ -50,10 +50,10 @@ robot.main(settings, BusSettings(listen=(endpoint,), connect=()), Keys("test", "
 
 SOURCE = """
 import sys
-from rti_mpc.trajectory import eight
+from rti_mpc.reference.trajectory import eight
 from rti_mpc.wire.bus import BusSettings
 from rti_mpc.wire.keys import Keys
-from sim import source
+from rti_mpc_service import reference as source
 
 source.main(eight(), BusSettings(connect=(sys.argv[1],)), Keys("test", "sim"), period_s=0.1)
 """

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from rti_mpc.array import Array
-from sim.sensor import Sensor
+from rti_mpc_sim.sensor import Sensor
 
 STD = np.array([0.01, 0.0])
 

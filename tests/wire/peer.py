@@ -8,12 +8,12 @@ import threading
 
 import numpy as np
 
-from rti_mpc.message import Command, End, Event, Reference, Severity, State
-from rti_mpc.status import Mode, QpStatus
+from rti_mpc.contract.message import Command, End, Event, Reference, Severity, State
+from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
-from service.entry import enter
+from rti_mpc_service.entry import enter
 
 KEYS = Keys(robot="test")
 FAST = ("transport/link/tx/lease:600",)  # ms: hangs are noticed soon

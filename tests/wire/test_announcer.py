@@ -8,13 +8,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from rti_mpc.message import Event, Notice, Severity
+from rti_mpc.contract.message import Event, Notice, Severity
 from rti_mpc.wire import announcer as announcer_module
 from rti_mpc.wire.announcer import PERIOD_NS, Announcer
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
-from service.rig.endpoint import free_endpoint
+from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.processes.system import until
 
 FAULT = Notice(Severity.WARNING, "over_budget", "a sample was late")

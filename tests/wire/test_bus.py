@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from rti_mpc.message import Command, End, Event, Reference, Severity, State
+from rti_mpc.contract.message import Command, End, Event, Reference, Severity, State
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Received, Subscriber
 from rti_mpc.wire.cdr import decode, encoding
 from rti_mpc.wire.intake import Intake
@@ -27,7 +27,7 @@ from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.layout import MAX_BYTES
 from rti_mpc.wire.streams import RING_BYTES
 from rti_mpc.wire.zenoh_session import ZenohSession
-from service.host import Host
+from rti_mpc_service.host.hold_up import Host
 from tests.in_time import MS, explained, in_time
 
 ROOT = Path(__file__).parents[2]

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Event, Reference, Severity, State, Telemetry
+from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.errors import MessageError
-from rti_mpc.message import STAMP_ON_ARRIVAL, Command, End, Event, Reference, Severity, State, Telemetry
-from rti_mpc.status import Mode, QpStatus
 from rti_mpc.wire.cdr import PACKAGE, REASONS, Message, Refused, decode, encode, encoding, schema
 from rti_mpc.wire.layout import LAYOUTS, msg_text
 

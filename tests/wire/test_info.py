@@ -11,10 +11,10 @@ import pytest
 from rti_mpc.errors import MessageError
 from rti_mpc.wire.info import Info, Label, Leader, Obstacle, bounds, labels, obstacles, parameters
 from rti_mpc.wire.received import Received
-from service.build import build_ocp
-from service.config import load
-from service.daemon import describe
-from tests.service.test_config import DISC, MINIMAL
+from rti_mpc_service.config.build import build_ocp
+from rti_mpc_service.config.config import load
+from rti_mpc_service.controller.daemon import describe
+from tests.service.config.test_config import DISC, MINIMAL
 
 PIONEER: dict[str, Any] = {
     "role": "controller",

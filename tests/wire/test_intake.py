@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rti_mpc.epoch import epoch_above, highest_believed
-from rti_mpc.message import Command, End, Reference, Severity, State
-from rti_mpc.status import Mode, QpStatus
+from rti_mpc.contract.epoch import epoch_above, highest_believed
+from rti_mpc.contract.message import Command, End, Reference, Severity, State
+from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.wire.bus import Received
 from rti_mpc.wire.cdr import Message, encode, encoding
 from rti_mpc.wire.intake import Intake

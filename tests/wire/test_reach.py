@@ -9,12 +9,12 @@ from queue import Queue
 import numpy as np
 import pytest
 
+from rti_mpc.contract.message import State
 from rti_mpc.errors import Stopped
-from rti_mpc.message import State
 from rti_mpc.wire import reach
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.keys import Keys
-from service.rig.endpoint import free_endpoint
+from rti_mpc_service.rig.endpoint import free_endpoint
 
 KEYS = Keys(robot="test")
 PATIENCE_S = 30.0

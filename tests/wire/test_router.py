@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rti_mpc.message import State
+from rti_mpc.contract.message import State
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.keys import Keys
-from service.host import Host
+from rti_mpc_service.host.hold_up import Host
 from tests.in_time import MS, in_time
 
 ROOT = Path(__file__).parents[2]
@@ -26,7 +26,7 @@ TIMEOUT_S = 60.0
 ROUTER = """
 from rti_mpc.wire.bus import BusSettings
 from rti_mpc.wire.keys import Keys
-from service.router import main
+from rti_mpc_service.router import main
 main(BusSettings(listen=({!r},)), Keys(robot="test"))
 """
 

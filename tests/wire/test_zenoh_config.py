@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from rti_mpc.contract.message import Reference
 from rti_mpc.errors import ConfigError
-from rti_mpc.message import Reference
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.layout import MAX_BYTES

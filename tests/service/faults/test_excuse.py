@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.faults.excuse import excuses, explained
-from service.faults.measure import Incident, Measured
-from service.faults.promise import KEEPS_ON, STOPS
+from rti_mpc_service.faults.excuse import excuses, explained
+from rti_mpc_service.faults.measure import Incident, Measured
+from rti_mpc_service.faults.promise import KEEPS_ON, STOPS
 
 S = 1_000_000_000
 PERIOD_NS = S // 10

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.guard import Limits
-from service.faults.measure import Incident, Measured, measure
-from service.faults.promise import KEEPS_ON, STOPS
-from service.robot_log import RobotLog
+from rti_mpc.contract.guard import Limits
+from rti_mpc_service.faults.measure import Incident, Measured, measure
+from rti_mpc_service.faults.promise import KEEPS_ON, STOPS
+from rti_mpc_service.rig.robot_log import RobotLog
 
 ROW_S = 0.01
 LAG_S = 0.24

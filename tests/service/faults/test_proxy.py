@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from service.faults.proxy import Proxy
+from rti_mpc_service.faults.proxy import Proxy
 
 SOON_S, QUIET_S = 5.0, 0.1
 

@@ -7,8 +7,8 @@ from dataclasses import astuple
 import numpy as np
 import pytest
 
-from rti_mpc.message import State
-from service.faults.relay import CHANGES
+from rti_mpc.contract.message import State
+from rti_mpc_service.faults.relay import CHANGES
 
 PERIOD_NS = 10_000_000
 SENT = [State(7, seq, seq * PERIOD_NS, np.array([0.1 * seq, 1.0, 2.0])) for seq in range(1, 81)]

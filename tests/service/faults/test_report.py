@@ -9,10 +9,10 @@ import pytest
 from rich.console import Console
 
 from rti_mpc.errors import ConfigError
-from service.faults import run
-from service.faults.measure import Measured
-from service.faults.report import WIDTH, Report, Row
-from service.faults.table import FAULTS
+from rti_mpc_service.faults import run
+from rti_mpc_service.faults.measure import Measured
+from rti_mpc_service.faults.report import WIDTH, Report, Row
+from rti_mpc_service.faults.table import FAULTS
 
 BY_NAME = {fault.name: fault for fault in FAULTS}
 STOPPED = Measured(0.2, 0.21, 0.4, 1.8, 0.25, 0, 1.0, 2.5, 30, 0.5, 0.5)

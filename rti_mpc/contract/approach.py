@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Slew limits of what is really applied: the rows of a plan, approached from the inputs that acted before.
+
+A controller that has not heard of a loss begins where it believes the robot to be.
+Whoever plays its rows, or passes them on, brings them inside the limits of what
+acted: no two inputs within three quarters of a period differ by more than one
+increment. The last quarter is left to messages on their way, as in `rti_mpc.control.sent`:
+limits over a whole period would clip healthy plans by the milliseconds in which
+commands come sooner or later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from rti_mpc.array import Array
+
+WINDOW = 0.75  # of a period: inputs within it differ by no more than an increment
+ROUNDING = 1e-9  # of an input, in its unit: less is no approach
+
+
+@dataclass(frozen=True, eq=False)
+class Increments:
+    """
+    By how much inputs may change in a period.
+
+    Attributes:
+        lbdu: Lower bound of an input's change over `dt_ns`, shape ``(nu,)``, at most 0.
+        ubdu: Upper bound of an input's change, at least 0.
+        dt_ns: The period.
+    """
+
+    lbdu: Array
+    ubdu: Array
+    dt_ns: int
+
+
+def segments(at: Callable[[int], tuple[Array, int, bool]], from_ns: int, to_ns: int) -> list[tuple[int, Array]]:
+    """Return until when, and the input that acted until then, for all inputs of an interval, the oldest first; `at` is that of a `Schedule`."""
+    acted = []
+    while from_ns < to_ns:
+        u, change_ns, _ = at(from_ns)
+        from_ns = min(change_ns, to_ns)
+        acted.append((from_ns, u))
+    return acted
+
+
+def approach(u: Array, stamp_ns: int, period_ns: int, start_ns: int, acted: list[tuple[int, Array]], limits: Increments) -> Array:
+    """
+    Bring the rows of a plan inside the slew limits of what acted before it.
+
+    Args:
+        u: Rows, shape ``(n, nu)``; row ``i`` acts from ``stamp_ns + i * period_ns``.
+        stamp_ns: When row 0 would act.
+        period_ns: Time between rows.
+        start_ns: When the plan begins to act, with the row of that time.
+        acted: What acted in the period before `start_ns`, as `segments` returns it.
+        limits: The slew limits.
+
+    Returns:
+        The rows, shape ``(n, nu)``: `u` itself if it is inside.
+    """
+    window_ns = round(WINDOW * limits.dt_ns)
+    share = min(1.0, period_ns / limits.dt_ns)
+    lowest, highest = share * limits.lbdu, share * limits.ubdu
+    change = np.diff(u, axis=0)
+    even = period_ns >= window_ns and bool((change >= lowest - ROUNDING).all() and (change <= highest + ROUNDING).all())
+    first = max(0, (start_ns - stamp_ns) // period_ns)
+    begins_ns = stamp_ns + (first + 1) * period_ns  # when a plan that comes late by less than a row begins
+    rows, near, limited = u, acted, False
+    for k in range(first, len(u)):
+        row_ns = max(start_ns, stamp_ns + k * period_ns)
+        if even and k > first and not limited and row_ns - window_ns >= start_ns:
+            break
+        row = within(u[k], near, row_ns - window_ns, limits)
+        was_limited, limited = limited, bool((np.abs(row - u[k]) > ROUNDING).any())
+        if limited or was_limited:
+            if rows is u:
+                rows = u.copy()
+                near = [(begins_ns, before) for _, before in near]  # should it come late, the robot begins with the second row
+            row = within(u[k], near, row_ns - limits.dt_ns, limits)
+            if k > first:
+                row = np.minimum(np.maximum(row, rows[k - 1] + lowest), rows[k - 1] + highest)
+            limited = bool((np.abs(row - u[k]) > ROUNDING).any())
+            rows[k] = row
+        near = [*near, (row_ns + period_ns, rows[k])]
+    return rows
+
+
+def within(row: Array, acted: list[tuple[int, Array]], after_ns: int, limits: Increments) -> Array:
+    """Return what is nearest to a row and within the limits of all that has acted after a time; where nothing is, between them and the last."""
+    now = acted[-1][1]
+    near = np.array([u for until_ns, u in acted if until_ns > after_ns] or [now])
+    lower = np.minimum(near.max(axis=0) + limits.lbdu, now)
+    upper = np.maximum(near.min(axis=0) + limits.ubdu, now)
+    clipped: Array = np.minimum(np.maximum(row, lower), upper)
+    return clipped

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The cadence of a robot's states: whether they count, and whether their stamps advance as nanoseconds do.
+
+A stamp in another unit looks like a clock that runs a thousand times too slowly, or
+more: whatever is commanded by it acts for a thousand times too long. So nothing is
+commanded before the rate was seen to be one that a simulation may have, nor when it no longer is.
+"""
+
+from __future__ import annotations
+
+import math
+
+from rti_mpc.contract.epoch import SEQ_AHEAD
+from rti_mpc.contract.message import Notice, Severity
+
+RATES = (0.005, 200.0)  # robot seconds per local second that stamps in nanoseconds may show
+SLACK = 1.1  # factor by which a measured rate may be beyond these: arrivals jitter
+WINDOW_NS = 50_000_000  # local time, at least, over which a rate is measured
+STANDING_NS = 1_000_000_000  # local time for which stamps or numbers may stand still before that is told
+STANDING_STATES = 2  # states that must have shown it
+UNITS = {-9: "s (seconds)", -6: "ms (milliseconds)", -3: "us (microseconds)", 3: "ps (picoseconds)"}  # by the power of ten that such stamps show
+
+
+class Cadence:
+    """
+    Judges one life of a robot.
+
+    Attributes:
+        known: Whether stamps were seen to advance at a rate that is possible, and still do.
+        fault: What is wrong with that rate and what would be right; empty if nothing was seen to be.
+        rate: The last one measured, ns of the stamps per local ns; 0 before the first.
+        notice: What the last state has shown that people must know, None as a rule.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: another life of the robot."""
+        self.known = False
+        self.fault = ""
+        self.notice: Notice | None = None
+        self._seq: int | None = None
+        self._counted_ns = 0  # local time of the last state whose number counted
+        self._uncounted = 0  # states since then with a stamp of their own
+        self._told = False  # whether it was told that stamps or numbers stand still
+        self.jump()
+
+    def jump(self) -> None:
+        """Begin to measure anew: the robot's clock has gone back."""
+        self.rate = 0.0
+        self._side = 0  # of the range, on which the last window was: below -1, above 1, inside 0
+        self._mark: tuple[int, int] | None = None  # stamp and local time of the state that began the window
+        self._moved: tuple[int, int] | None = None  # those of the last state whose stamp was another than before
+        self._standing = 0  # states since then
+
+    def counts(self, seq: int) -> bool:
+        """Whether a sequence number goes on from the last one."""
+        return self._seq is None or self._seq < seq <= self._seq + SEQ_AHEAD
+
+    def observe(self, seq: int, stamp_ns: int, local_ns: int) -> bool:
+        """
+        Take note of a state, and tell whether its number counts: it is above the last one.
+
+        Args:
+            seq: Sequence number of the state.
+            stamp_ns: Its stamp.
+            local_ns: Local monotonic time.
+        """
+        self.notice = None
+        if not self._count(seq, stamp_ns, local_ns):
+            return False
+        self._advance(stamp_ns, local_ns)
+        return True
+
+    def _count(self, seq: int, stamp_ns: int, local_ns: int) -> bool:
+        last, silent_ns = self._seq, local_ns - self._counted_ns
+        if self.counts(seq) or (seq != last and silent_ns > STANDING_NS):
+            self._seq, self._counted_ns, self._uncounted = seq, local_ns, 0
+            return True
+        self._uncounted += self._moved is not None and stamp_ns > self._moved[0]  # what is sent twice has no stamp of its own
+        if self._uncounted >= STANDING_STATES and silent_ns >= STANDING_NS:
+            text = f"seq must be above the one before in every state, got {seq} after {last} for {1e-9 * silent_ns:.1f} s: nothing is commanded"
+            self._tell("seq_stands_still", text)
+        return False
+
+    def _advance(self, stamp_ns: int, local_ns: int) -> None:
+        if self._moved is not None and stamp_ns <= self._moved[0]:
+            self._standing += 1
+            still_ns = local_ns - self._moved[1]
+            if self._standing >= STANDING_STATES and still_ns >= STANDING_NS:
+                got = f"{self._standing + 1} states of {self._moved[0]} in {1e-9 * still_ns:.1f} s"
+                text = f"stamps must advance as nanoseconds do, got {got}: nothing is commanded"
+                self._tell("stamps_stand_still", text)
+            return
+        self._moved, self._standing = (stamp_ns, local_ns), 0
+        if self._mark is None:
+            self._mark = stamp_ns, local_ns
+        elif local_ns - self._mark[1] >= WINDOW_NS:
+            self._measure((stamp_ns - self._mark[0]) / (local_ns - self._mark[1]))
+            self._mark = stamp_ns, local_ns
+
+    def _measure(self, rate: float) -> None:
+        """Judge the rate of a window, and that of the one before with it: whatever is between may be held up once."""
+        side, self.rate = (rate > RATES[1] * SLACK) - (rate < RATES[0] / SLACK), rate
+        if side == 0:
+            self.known, self.fault, self._told = True, "", False
+        elif side == self._side and not self.fault:
+            unit = UNITS.get(3 * round(math.log10(rate) / 3))
+            looks = f"they look like {unit}, nanoseconds are expected" if unit else f"{RATES[0]:g} to {RATES[1]:g} are expected"
+            self.known, self.fault = False, f"the robot's stamps advance {rate:.3g} ns per ns: {looks}"
+            self.notice = Notice(Severity.ERROR, "stamps_not_ns", f"{self.fault}; nothing is commanded")
+        self._side = side
+
+    def _tell(self, code: str, text: str) -> None:
+        if not self._told:
+            self._told = True
+            self.notice = Notice(Severity.ERROR, code, text)

@@ -1,0 +1,434 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The guard of one robot: what a controller commands passes only if it is fresh, its own and inside every limit.
+
+No clock inside: every time is a stamp of the robot, or local monotonic time
+handed in. A healthy command passes at once and whole, so that the robot plays
+the rest of the plan if nothing follows, even if it is the guard that has died.
+Before the last plan ends the guard tells the robot the ramp to rest, in short
+commands, and then to stand, until a controller commands again.
+
+It trusts nobody: not a controller that was stopped and goes on where it was, nor
+an old leader, nor messages that have waited somewhere, nor a clock that jumps.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.contract.approach import Increments
+from rti_mpc.contract.belief import Belief
+from rti_mpc.contract.cadence import Cadence
+from rti_mpc.contract.epoch import SEQ_AHEAD, epoch_above
+from rti_mpc.contract.lives import Heard, Lives
+from rti_mpc.contract.message import Command, Notice, Severity, State
+from rti_mpc.contract.robot_clock import RobotClock
+from rti_mpc.contract.schedule import EVER_NS, STEP_NS, end_ns, unfit
+from rti_mpc.contract.status import Mode, QpStatus
+
+VALID_NS = 300_000_000  # after its state, and the delay, in which a command may act at most, whatever it says itself
+EARLY_NS = 50_000_000  # local time by which a state that a command answers may be ahead of our idea of the robot's clock
+LATE_NS = 50_000_000  # local time by which a state is late if it has waited on the way, and says nothing of the time now
+JUMP_NS = 250_000_000  # by which a clock has jumped
+LEFT_NS = 250_000_000  # robot time without a command in order after which the leader may count anew
+HELD_UP_NS = 250_000_000  # local time without a tick after which this process was held up
+LEAD_NS = 30_000_000  # local time by which the robot is told of the ramp before it is due
+TOLD = 10  # steps of the ramp in a command of our own
+ROUNDING = 1e-6  # of an input, in its unit: above any rounding, single precision included, and below what an actuator resolves
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """
+    What a robot may be commanded.
+
+    Attributes:
+        u_rest: Input at which it stands still, shape ``(nu,)``.
+        lbu: Lower bound of the inputs, shape ``(nu,)``.
+        ubu: Upper bound of the inputs.
+        lbdu: Lower bound of an input's change over `dt_s`, shape ``(nu,)``, below 0.
+        ubdu: Upper bound of an input's change, above 0.
+        dt_s: Period of the controller, s.
+        delay_s: Delay from a state to the act of its command, s.
+        stale_s: Age from which neither a state nor what answers it is used, s of the robot.
+    """
+
+    u_rest: Array
+    lbu: Array
+    ubu: Array
+    lbdu: Array
+    ubdu: Array
+    dt_s: float
+    delay_s: float = 0.0
+    stale_s: float = 0.25
+
+    @property
+    def slew(self) -> Array:
+        """Rate of the ramp to rest, shape ``(nu,)``, per s."""
+        return np.minimum(-self.lbdu, self.ubdu) / self.dt_s
+
+    @property
+    def settling_s(self) -> float:
+        """How long after its state a command of anybody may still move the inputs: to its end, and down the ramp."""
+        way = np.maximum(np.abs(self.lbu - self.u_rest), np.abs(self.ubu - self.u_rest))
+        limited = np.isfinite(self.slew)
+        ramp = np.where(limited, way / np.where(limited, self.slew, 1.0), 0.0)
+        return self.delay_s + 1e-9 * VALID_NS + float(np.minimum(ramp, 10.0).max(initial=0.0))
+
+
+class Guard:
+    """
+    One life of the guard.
+
+    The caller hands in each message as it comes, and the time now and then, and
+    publishes what is returned.
+
+    Attributes:
+        epoch: Epoch of what it publishes: never below the highest of a controller, so that one which starts hears what to exceed.
+        notices: What it did and why, since the caller last emptied it.
+        passing: Whether a controller's plan acts.
+    """
+
+    def __init__(self, limits: Limits, *, epoch: int = 1, config_hash: int = 0) -> None:
+        self.epoch = epoch
+        self.notices: deque[Notice] = deque(maxlen=64)
+        self.passing = False
+        self._limits = limits
+        self._config_hash = config_hash
+        self._dt_ns = round(1e9 * limits.dt_s)
+        self._delay_ns = round(1e9 * limits.delay_s)
+        self._stale_ns = round(1e9 * limits.stale_s)
+        self._seq = 0
+        self._lives = Lives(limits.stale_s, limits.settling_s)
+        self._cadence = Cadence()
+        self._clock = RobotClock()
+        increments = Increments(limits.lbdu, limits.ubdu, self._dt_ns)
+        self._schedule = Belief(limits.u_rest, limits.slew, increments)  # what the robot was told by controllers, and its ramp after that
+        self._state: State | None = None  # the last one that came in time
+        self._heard = (0, 0)  # stamp of the last state, and local time of its arrival
+        self._late = False  # whether that one had waited on the way
+        self._paced = 0  # such states in a row that came at the robot's own pace
+        self._awake_ns = 0  # local time of the last call
+        self._open_ns = EVER_NS  # robot time from which commands pass
+        self._leader = (0, -1)  # epoch and sequence number of the last command that was in order
+        self._led_ns = EVER_NS  # robot time of it
+        self._told_ns = EVER_NS  # until when the robot knows what to do
+        self._engaged = False  # whether this robot was ever told anything
+        self._untold = False  # whether it is still to be told to brake
+        self._stopped = False
+        self._latched = ""  # why an operator's stop is latched
+        self._rest_by_ns = EVER_NS  # robot time from which a latched guard passes rest only, and no way there any more
+        self._waiting = False  # whether it was said that commands wait for `_open_ns`
+
+    def robot_now_ns(self, local_ns: int) -> int:
+        """Return robot time at a local monotonic time, 0 before the first state."""
+        return 0 if self._state is None else self._clock.now_ns(local_ns)
+
+    @property
+    def heard(self) -> bool:
+        """Whether a state of the robot has come."""
+        return self._state is not None
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the robot was told to stand, or never to move."""
+        return not self._engaged or bool(np.array_equal(self._schedule.at(self._told_ns - 1)[0], self._limits.u_rest))
+
+    # What comes in.
+
+    def receive_state(self, state: State, local_ns: int) -> None:
+        """Take the robot's clock, and the beginning of another of its lives, from a state."""
+        self._wake(local_ns)
+        whose = self._lives.hear(state.epoch, local_ns, self._clock.rate)
+        if self._lives.notice is not None:
+            self.notices.append(self._lives.notice)
+            begin_ns = self._clock.now_ns(local_ns) + round(LEAD_NS * self._clock.rate)  # the robot is told before it is due
+            self._brake(begin_ns, begin_ns)
+        if whose is Heard.OTHER or not self._counts(state, local_ns, begins=whose is Heard.BEGINS):
+            return
+        heard_ns, heard_local_ns = self._heard
+        if whose is Heard.BEGINS:
+            self._begin(state)
+        elif state.stamp_ns <= heard_ns:
+            if heard_ns - state.stamp_ns <= JUMP_NS:
+                return
+            self._jump(state, local_ns, "back")
+            self._cadence.jump()
+        else:
+            ahead_ns = state.stamp_ns - self._clock.now_ns(local_ns)
+            late = ahead_ns < -LATE_NS * self._clock.rate
+            paced = 2 * (local_ns - heard_local_ns) * self._clock.rate >= state.stamp_ns - heard_ns
+            self._paced = self._paced + 1 if late and self._late and paced else 0
+            self._heard, self._late = (state.stamp_ns, local_ns), late
+            if late and self._paced < self._clock.patience:
+                return
+            if late:  # for long, and each at the robot's own pace: its clock has waited
+                self._clock.jump()
+            if ahead_ns > max(JUMP_NS, 2.5 * self._clock.period_ns):
+                self._jump(state, local_ns, "ahead")
+        self._take(state, local_ns)
+        if len(state.u) == len(self._limits.u_rest):
+            self._schedule.correct(state.stamp_ns, np.clip(state.u, self._limits.lbu, self._limits.ubu), (state.command_epoch, state.command_seq))
+
+    def receive_command(self, command: Command, local_ns: int) -> Command | None:
+        """
+        Judge a command.
+
+        Returns:
+            What to publish at once, None if it is refused.
+        """
+        self._wake(local_ns)
+        now_ns = self._clock.now_ns(local_ns)
+        until_ns = min(end_ns(command), command.state_stamp_ns + self._delay_ns + VALID_NS)
+        reason = self._objection(command, now_ns, until_ns)
+        if not reason:
+            self._follow(command)
+            self._led_ns = now_ns
+            if now_ns < self._open_ns:
+                if not self._waiting:
+                    self._say(Severity.INFO, "guard_starting", "commands wait until what an earlier guard may have told the robot has run out")
+                self._waiting = True
+                return None
+        if reason:
+            code, _, why = reason.partition(": ")
+            text = f"command {command.seq} of epoch {command.epoch} was refused: {why or code.replace('_', ' ')}"
+            self._say(Severity.WARNING, f"command_{code}", text)
+            return None
+        start_ns = max(command.stamp_ns, now_ns)
+        u = np.clip(command.u, self._limits.lbu, self._limits.ubu)
+        passed = self._numbered(replace(command, valid_until_ns=min(command.valid_until_ns, until_ns), u=u))
+        passed.u = self._schedule.add(passed, start_ns, until_ns)
+        if (np.abs(passed.u - u) > ROUNDING).any():
+            text = f"command {command.seq} of epoch {command.epoch} begins too far from what acts: approached inside the slew limits"
+            self._say(Severity.WARNING, "slew_limited", text)
+        if not self.passing:
+            self.passing = True
+            self._say(Severity.INFO, "guard_passing", f"commands of epoch {command.epoch} pass", change=True)
+        self._engaged, self._told_ns = True, until_ns
+        return passed
+
+    def tick(self, local_ns: int) -> Command | None:
+        """
+        Look after the time.
+
+        Returns:
+            The next piece of the ramp to rest, or of standing, if the robot must soon know it, for the caller to publish.
+        """
+        self._wake(local_ns)
+        if self._state is None or not self._engaged:
+            return None
+        if self._cadence.fault:
+            return self._last_step(self._state) if self._untold else None
+        now_ns = self._clock.now_ns(local_ns)
+        self._schedule.forget(now_ns - 2 * self._dt_ns)
+        if self.passing:
+            self._watch(now_ns)
+        if self._told_ns - now_ns > LEAD_NS * self._clock.rate:
+            return None
+        start_ns = max(self._told_ns, now_ns)
+        u = np.array([self._schedule.at(start_ns + i * STEP_NS)[0] for i in range(TOLD)])
+        period_ns = STEP_NS
+        if not (u - self._limits.u_rest).any():
+            if now_ns - self._state.stamp_ns > 10 * self._stale_ns:
+                return None  # nobody is there to be told to stand
+            u, period_ns = u[:1], TOLD * STEP_NS
+        return self._tell(start_ns, TOLD * STEP_NS, period_ns, u, self._state)
+
+    def _last_step(self, state: State) -> Command:
+        """Return the last command to a robot whose clock is none: each row is the next step to rest, whichever acts and for however long."""
+        t_ns = state.stamp_ns
+        u = np.tile(self._schedule.nearest(self._limits.u_rest, t_ns), (TOLD, 1))
+        valid_ns = max(1, round(VALID_NS * min(1.0, self._cadence.rate)))  # as long as it should act, in the unit of the stamps
+        return self._tell(t_ns, valid_ns, STEP_NS, u, state)
+
+    def _tell(self, start_ns: int, valid_ns: int, period_ns: int, u: Array, state: State) -> Command:
+        """Return a command of our own, which the robot is then told of."""
+        self._told_ns, self._untold = start_ns + valid_ns, False
+        return self._numbered(
+            Command(
+                epoch=0,
+                seq=0,
+                stamp_ns=start_ns,
+                state_epoch=state.epoch,
+                state_seq=state.seq,
+                state_stamp_ns=state.stamp_ns,
+                valid_until_ns=self._told_ns,
+                config_hash=self._config_hash,
+                mode=Mode.BRAKING,
+                status=QpStatus.NONE,
+                period_ns=period_ns,
+                u=u,
+            )
+        )
+
+    def _watch(self, now_ns: int) -> None:
+        """Brake where the last plan ends, or goes on for longer than a latched stop lets it."""
+        u, _, ended = self._schedule.at(now_ns)
+        moving = not np.array_equal(u, self._limits.u_rest)
+        if ended:
+            self.passing = False
+            text = f"the last plan has ended: {'braking to rest' if moving else 'standing'}"
+            self._say(Severity.ERROR if moving else Severity.WARNING, "guard_braking", text, change=True)
+        elif moving and self._latched and now_ns >= self._rest_by_ns:
+            self._brake(now_ns, now_ns)
+            self._say(Severity.ERROR, "guard_braking", "the robot was to stand by now: braking to rest", change=True)
+
+    def stop(self, local_ns: int) -> None:
+        """Take no command any more: from now on the robot is told to ramp to rest, and to stand."""
+        self._stopped = True
+        if not self._cadence.fault:
+            self._brake(self._clock.now_ns(local_ns), self._clock.now_ns(local_ns))
+
+    def latch(self, reason: str, local_ns: int) -> None:
+        """
+        Pass only ways to rest until `enable`, and rest alone once there was time to get there.
+
+        The last plan plays on meanwhile, up to its end: it is the controller's to
+        ramp down, and the guard's if the controller does not.
+        """
+        if not self._latched:
+            self._latched = reason
+            self._rest_by_ns = self._clock.now_ns(local_ns) + round(1e9 * self._limits.settling_s)
+            self._say(Severity.INFO, "stop", f"stop: {reason}", change=True)
+
+    def enable(self) -> None:
+        """Release a `latch`."""
+        if self._latched:
+            self._latched = ""
+            self._say(Severity.INFO, "enable", "released by an operator", change=True)
+
+    # Commands.
+
+    def _objection(self, command: Command, now_ns: int, until_ns: int) -> str:
+        """Return what is wrong with a command, as a code and perhaps a reason; empty if nothing is."""
+        limits, epoch, seq = self._limits, *self._leader
+        if self._state is None:
+            return "no_state: no state of the robot was heard yet"
+        if self._stopped:
+            return "stopped: the guard is being stopped"
+        if self._lives.disputed:
+            return "two_robots: it is not known which robot it is for"
+        if not self._cadence.known:
+            return f"untimed: {self._cadence.fault or 'two states must have shown how fast the clock of the robot runs'}"
+        if self._untold:
+            return "held: the robot is told to brake first"
+        if command.epoch < epoch:
+            return f"fenced: epoch {epoch} has taken over"
+        if command.epoch == epoch and command.seq == seq:
+            return "repeated"
+        if command.epoch == epoch and now_ns - self._led_ns <= LEFT_NS and not seq < command.seq <= seq + SEQ_AHEAD:
+            return f"old: {seq} has passed" if command.seq < seq else f"ahead: the last one was {seq}"
+        if reason := unfit(command, len(limits.u_rest), self._state.epoch):
+            return reason
+        if now_ns - self._clock.stamp_ns > max(self._stale_ns, 2.5 * self._clock.period_ns):
+            return f"blind: no state for {1e-9 * (now_ns - self._clock.stamp_ns):.3f} s"
+        age_ns = now_ns - command.state_stamp_ns
+        if age_ns > self._delay_ns + self._stale_ns or age_ns < -EARLY_NS * self._clock.rate:
+            return f"{'stale' if age_ns > 0 else 'early'}: it answers a state of {1e-9 * age_ns:.3f} s ago"
+        if until_ns <= max(command.stamp_ns, now_ns):
+            return "expired"
+        u = command.u
+        if (u < limits.lbu - ROUNDING).any() or (u > limits.ubu + ROUNDING).any():
+            return f"out_of_bounds: inputs reach from {u.min(axis=0).tolist()} to {u.max(axis=0).tolist()}"
+        change, share = np.diff(u, axis=0), self._share(command)
+        if (change < share * limits.lbdu - ROUNDING).any() or (change > share * limits.ubdu + ROUNDING).any():
+            return f"out_of_slew: rows change by up to {np.abs(change).max(axis=0).tolist()}"
+        if self._latched and not self._comes_to_rest(command, now_ns):
+            return f"stopped: {self._latched}; only ways to rest pass"
+        return ""
+
+    def _comes_to_rest(self, command: Command, now_ns: int) -> bool:
+        """Whether the rows that would act only approach rest, from what acts now, and stay there; long after a `latch`, whether they are rest."""
+        start_ns = max(command.stamp_ns, now_ns)
+        first = (start_ns - command.stamp_ns) // command.period_ns
+        before = self._limits.u_rest if now_ns >= self._rest_by_ns else self._schedule.at(start_ns - 1)[0]
+        way = np.vstack([before, self._approach(command, start_ns)[first:]]) - self._limits.u_rest
+        lower, upper = np.minimum(way[:-1], 0.0) - ROUNDING, np.maximum(way[:-1], 0.0) + ROUNDING
+        return bool((np.abs(way[-1]) <= ROUNDING).all() and ((way[1:] >= lower) & (way[1:] <= upper)).all())
+
+    def _follow(self, command: Command) -> None:
+        """Take the source of a command in order for the leader: no lower epoch will pass again in this life of the robot."""
+        if self._leader[0] and command.epoch != self._leader[0]:
+            self._say(Severity.WARNING, "source_changed", f"epoch {command.epoch} took over from {self._leader[0]}")
+        self._leader = command.epoch, command.seq
+        if command.epoch > self.epoch:
+            self.epoch = epoch_above(command.epoch, self.epoch)  # with our own number: never that of another guard, whose numbering is not ours
+
+    def _approach(self, command: Command, start_ns: int) -> Array:
+        """Return the rows of a command as they would act from a time on."""
+        return self._schedule.approached(replace(command, u=np.clip(command.u, self._limits.lbu, self._limits.ubu)), start_ns)
+
+    def _share(self, command: Command) -> float:
+        """Return how much of the slew limits over `dt` a row may use."""
+        return min(1.0, command.period_ns / self._dt_ns)
+
+    def _numbered(self, command: Command) -> Command:
+        """Return a command as one of ours."""
+        self._seq += 1
+        return replace(command, epoch=self.epoch, seq=self._seq)
+
+    # Times and lives.
+
+    def _counts(self, state: State, local_ns: int, *, begins: bool) -> bool:
+        """Whether a state is another than before, of a clock that is one; where it no longer is, the robot is told one more step to rest."""
+        if begins:
+            self._cadence.reset()
+        untimed = bool(self._cadence.fault)
+        counts = self._cadence.observe(state.seq, state.stamp_ns, local_ns)
+        if self._cadence.notice is not None:
+            self.notices.append(self._cadence.notice)
+        if counts and untimed != bool(self._cadence.fault):
+            self._brake(state.stamp_ns, state.stamp_ns)
+            self._clock.jump()
+            self._take(state, local_ns)
+        return counts and not (untimed or self._cadence.fault)
+
+    def _take(self, state: State, local_ns: int) -> None:
+        """Go by the clock and the life of a state."""
+        self._heard = state.stamp_ns, local_ns
+        self._clock.observe(state.seq, state.stamp_ns, local_ns)
+        self._state = state
+
+    def _wake(self, local_ns: int) -> None:
+        """Note if this process was held up: what has waited meanwhile is judged by its age, after a state that came in time."""
+        held_up_ns = local_ns - self._awake_ns
+        if self._awake_ns and held_up_ns > HELD_UP_NS:
+            self._say(Severity.WARNING, "guard_held_up", f"the guard was held up for {1e-9 * held_up_ns:.3f} s")
+        self._awake_ns = local_ns
+
+    def _begin(self, state: State) -> None:
+        """Begin with a robot, or with another life of it: then it stands, and any controller may be the first."""
+        if self._state is None:
+            self._open_ns = state.stamp_ns + round(1e9 * self._limits.settling_s)
+        else:
+            self._open_ns = EVER_NS
+            self._say(Severity.WARNING, "robot_restarted", "the robot was restarted: starting anew")
+        self._clock.reset()
+        self._schedule.brake(self._limits.u_rest, EVER_NS)
+        self._leader = 0, -1
+        self._told_ns = EVER_NS
+        self._rest_by_ns = EVER_NS  # it stands: a latch from before lets rest alone pass
+        self._engaged = self._untold = self.passing = self._late = False
+
+    def _jump(self, state: State, local_ns: int, where: str) -> None:
+        """Go on from a clock that has jumped: the robot brakes from what acts."""
+        before_ns = self._clock.now_ns(local_ns)
+        text = f"the robot's clock jumped {where} by {1e-9 * abs(state.stamp_ns - before_ns):.3f} s: braking"
+        self._say(Severity.WARNING, "clock_jumped", text)
+        self._brake(before_ns, state.stamp_ns)
+        self._open_ns = EVER_NS
+        self._clock.jump()
+
+    def _brake(self, before_ns: int, now_ns: int) -> None:
+        """Let the robot brake now from what acts at a time, which may be one of another clock."""
+        self._schedule.cut(before_ns, now_ns)
+        self._told_ns, self._untold = now_ns, self._engaged
+        self._rest_by_ns = EVER_NS  # of another clock, perhaps
+        self.passing = False
+
+    def _say(self, severity: Severity, code: str, text: str, *, change: bool = False) -> None:
+        self.notices.append(Notice(severity, code, text, change))

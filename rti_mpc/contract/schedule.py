@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Which input acts when: the command contract as a function of time.
+
+Row ``i`` of the newest plan whose time has come acts from ``stamp_ns + i * period_ns``,
+never before it arrived; a plan ahead of its time waits while the previous one plays on.
+A plan that begins elsewhere than the inputs are is approached inside the slew limits
+(`rti_mpc.contract.approach`). Nothing acts from the plan's end on: then the inputs ramp to rest
+inside the slew limits, and stay there. Whoever knows the plans knows what acts: the robot
+plays them, guard and controller tell from them what the robot does.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.contract.approach import Increments, approach, segments, within
+from rti_mpc.contract.message import Command
+
+STEP_NS = 10_000_000  # the ramp to rest is a staircase of such steps
+NEVER_NS = 2**63
+EVER_NS = -(2**62)
+MAX_PLANS = 64  # ahead of their time, kept at most
+MAX_ROWS = 1000  # of a plan, the longest horizon a configuration may have: to approach a plan takes longer than in proportion to its rows
+ROUNDING = 1e-9  # of a way to rest that is a whole number of steps
+OWN = (0, 0)  # source of what no command has asked for
+
+
+def unfit(command: Command, nu: int, robot_epoch: int) -> str:
+    """Return why a command can be no plan for this life of a robot with `nu` inputs; empty if it can."""
+    if command.state_epoch != robot_epoch:
+        return "foreign_epoch"
+    if command.u.ndim != 2 or not 1 <= len(command.u) <= MAX_ROWS or command.u.shape[1] != nu or command.period_ns <= 0:
+        return "wrong_shape"
+    return "" if np.isfinite(command.u).all() else "not_finite"
+
+
+def end_ns(command: Command) -> int:
+    """Return when the last row of a command ends, or its validity if that is earlier."""
+    return min(command.valid_until_ns, command.stamp_ns + len(command.u) * command.period_ns)
+
+
+@dataclass(slots=True)
+class Plan:
+    """
+    What acts from `start_ns` until `end_ns`.
+
+    Attributes:
+        stamp_ns: When row 0 would act.
+        period_ns: Time between rows.
+        asked: Rows as they were commanded, shape ``(n, nu)``.
+        u: Rows as they act, shape ``(n, nu)``.
+        before: Input that acted before it, shape ``(nu,)``.
+        source: Epoch and sequence number of the command it comes from; zeros: the robot's own.
+        pause_ns: After its end, until the ramp to rest begins, shape ``(nu,)``; None until somebody asks.
+    """
+
+    start_ns: int
+    end_ns: int
+    stamp_ns: int
+    period_ns: int
+    asked: Array
+    u: Array
+    before: Array
+    source: tuple[int, int] = OWN
+    pause_ns: Array | None = None
+
+    def row(self, t_ns: int) -> int:
+        """Return the row of a time."""
+        return max(0, min((t_ns - self.stamp_ns) // self.period_ns, len(self.u) - 1))
+
+
+class Schedule:
+    """
+    The plans of one robot.
+
+    The ramp to rest goes at the rate of the slew limits, less what the last rows have
+    just used up of them: over any duration the change stays inside.
+    """
+
+    def __init__(self, u_rest: Array, slew: Array, increments: Increments | None = None) -> None:
+        """
+        Begin at rest.
+
+        Args:
+            u_rest: Input at rest, shape ``(nu,)``.
+            slew: Largest rate of the ramp to rest, shape ``(nu,)``, in the input's unit per s; infinite where there is no limit.
+            increments: Slew limits inside which plans are approached; None: their rows act as they are.
+        """
+        self.u_rest: Array = np.array(u_rest, dtype=np.float64)
+        self._slew = 1e-9 * np.asarray(slew, dtype=np.float64)  # per ns
+        self._increments = increments
+        self._plans: deque[Plan] = deque()  # by start; those of the past as far as `forget` has left them
+        self.brake(self.u_rest, EVER_NS)
+
+    def __len__(self) -> int:
+        """Return how many plans are kept."""
+        return len(self._plans)
+
+    def brake(self, u: Array, t_ns: int) -> None:
+        """Drop every plan: the inputs ramp to rest from `u`, shape ``(nu,)``, beginning at a time."""
+        self._plans.clear()
+        u = np.array(u, dtype=np.float64)
+        self._plans.append(Plan(t_ns, t_ns, t_ns, 1, u[None], u[None], u))
+
+    def cut(self, t_ns: int, now_ns: int) -> None:
+        """Let what acts at a time end there, and drop what would follow; the clock has jumped since, and shows another time."""
+        plans, shift_ns = self._plans, now_ns - t_ns
+        while plans and plans[-1].start_ns > t_ns:
+            before = plans.pop().before
+        if not plans:  # a time that is forgotten
+            self.brake(before, now_ns)
+            return
+        plans[-1].end_ns, plans[-1].pause_ns = min(plans[-1].end_ns, t_ns), None
+        for plan in plans:
+            plan.start_ns += shift_ns
+            plan.end_ns += shift_ns
+            plan.stamp_ns += shift_ns
+
+    def add(self, command: Command, start_ns: int, end_ns: int, *, approached: bool = True) -> Array:
+        """
+        Put a command in line; those that would start after it never act.
+
+        Args:
+            command: The command.
+            start_ns: When it begins to act.
+            end_ns: When it ends.
+            approached: Whether its rows are brought inside the slew limits of what acts before, if this schedule has any.
+
+        Returns:
+            Its rows as they will act, shape ``(n, nu)``.
+        """
+        u = command.u.copy()
+        plan = Plan(start_ns, end_ns, command.stamp_ns, command.period_ns, u, u, u[0], (command.epoch, command.seq))
+        return self._put(plan, self._increments if approached else None)
+
+    def _put(self, plan: Plan, limits: Increments | None) -> Array:
+        """Put a plan in line, approached inside limits from what acts before it."""
+        plans, start_ns = self._plans, plan.start_ns
+        plan.u, plan.pause_ns = plan.asked, None
+        if limits is not None:
+            acted = segments(self.at, start_ns - limits.dt_ns, start_ns)
+            plan.u = approach(plan.asked, plan.stamp_ns, plan.period_ns, start_ns, acted, limits)
+        plan.before = self.at(start_ns - 1)[0].copy()
+        while plans and plans[-1].start_ns >= start_ns:
+            plans.pop()
+        plans.append(plan)
+        if len(plans) > MAX_PLANS:
+            del plans[1]
+        return plan.u
+
+    def copy(self, other: Schedule) -> None:
+        """Hold the same plans as another one."""
+        self._plans = deque(replace(plan) for plan in other._plans)
+
+    def forget(self, t_ns: int) -> None:
+        """Drop what is over before a time, and counts against no limit any more."""
+        t_ns -= self._increments.dt_ns if self._increments is not None else 0
+        while len(self._plans) > 1 and self._plans[1].start_ns <= t_ns:
+            self._plans.popleft()
+
+    def approached(self, command: Command, start_ns: int) -> Array:
+        """Return the rows of a command, shape ``(n, nu)``, as they would act from a time on."""
+        limits, u = self._increments, command.u
+        if limits is None:
+            return u
+        return approach(u, command.stamp_ns, command.period_ns, start_ns, segments(self.at, start_ns - limits.dt_ns, start_ns), limits)
+
+    def nearest(self, u: Array, t_ns: int) -> Array:
+        """Return what is nearest to an input, shape ``(nu,)``, of those that may begin to act at a time, inside the slew limits."""
+        limits = self._increments
+        return u if limits is None else within(u, segments(self.at, t_ns - limits.dt_ns, t_ns), t_ns - limits.dt_ns, limits)
+
+    def source(self, t_ns: int) -> tuple[int, int]:
+        """Return epoch and sequence number of the command whose plan acts at a time; zeros where none does."""
+        plan = next((plan for plan in reversed(self._plans) if plan.start_ns <= t_ns), None)
+        return OWN if plan is None or t_ns >= plan.end_ns else plan.source
+
+    def at(self, t_ns: int) -> tuple[Array, int, bool]:
+        """Return the input that acts at a time, shape ``(nu,)``, until when it does, and whether no plan acts."""
+        change_ns = NEVER_NS
+        for plan in reversed(self._plans):
+            if plan.start_ns <= t_ns:
+                break
+            change_ns = plan.start_ns
+        else:
+            return plan.before, change_ns, True  # a time that is forgotten
+        if t_ns < plan.end_ns:
+            row = plan.row(t_ns)
+            row_end_ns = plan.stamp_ns + (row + 1) * plan.period_ns if row < len(plan.u) - 1 else plan.end_ns
+            return plan.u[row], min(change_ns, row_end_ns, plan.end_ns), False
+        u, step_ns = self._ramp(plan, t_ns)
+        return u, min(change_ns, step_ns), True
+
+    def _ramp(self, plan: Plan, t_ns: int) -> tuple[Array, int]:
+        """Return the input at a time after the end of a plan, and when the ramp steps next."""
+        last = plan.u[plan.row(plan.end_ns - 1)]
+        way = self.u_rest - last
+        if plan.pause_ns is None:
+            plan.pause_ns = self._pause_ns(plan, last, way)
+        steps = np.floor((t_ns - plan.end_ns - plan.pause_ns) / STEP_NS) + 1.0
+        with np.errstate(invalid="ignore"):  # no slew limit, no step: 0 * inf is no way at all
+            reach = np.where(steps > 0.0, steps * (STEP_NS * self._slew), 0.0)
+        rests = np.abs(way) <= reach * (1.0 + ROUNDING)
+        if rests.all():
+            return self.u_rest, NEVER_NS
+        next_ns = plan.pause_ns + STEP_NS * np.maximum(steps, 0.0)
+        return np.where(rests, self.u_rest, last + np.clip(way, -reach, reach)), plan.end_ns + int(np.ceil(next_ns[~rests].min()))
+
+    def _pause_ns(self, plan: Plan, last: Array, way: Array) -> Array:
+        """
+        Return how long after its end the ramp waits until earlier jumps to the same side are paid for, shape ``(nu,)``.
+
+        An input that acted until some time goes on counting until the ramp, had it begun then, would be at the last row.
+        """
+        window_ns = plan.period_ns if self._increments is None else self._increments.dt_ns
+        pause_ns: Array = np.zeros(len(last))
+        for until_ns, u in segments(self.at, plan.end_ns - window_ns, plan.end_ns):
+            jump = last - u
+            with np.errstate(invalid="ignore"):
+                paid_ns = np.where(jump * way > 0.0, np.minimum(np.abs(jump) / self._slew, window_ns), -np.inf)
+            pause_ns = np.maximum(pause_ns, until_ns + STEP_NS - plan.end_ns + paid_ns)
+        return np.ceil(pause_ns)  # whole ns: where a step begins, it has begun

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What became of a QP, and what the controller is doing: the two small enumerations that travel on the wire."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class QpStatus(IntEnum):
+    """Outcome of one QP. Mapped from the solver's own codes in `rti_mpc.rti.qp.osqp` only."""
+
+    SOLVED = 0
+    INACCURATE = 1
+    MAX_ITER = 2
+    TIME_LIMIT = 3
+    INFEASIBLE = 4
+    FAILED = 5
+    NONE = 6  # no QP was solved for this command
+
+    @property
+    def usable(self) -> bool:
+        """Whether the iterate may be commanded and may seed the next sample."""
+        return self <= QpStatus.MAX_ITER
+
+
+class Mode(IntEnum):
+    """What the controller is doing, one lane in the viewer."""
+
+    IDLE = 0  # started, has heard no state yet
+    WAITING = 1  # a state, but no reference yet
+    TRACKING = 2  # solving along the reference
+    HOLDING = 3  # the reference ended with HOLD: solving around its last row
+    FALLBACK = 4  # the QP gave nothing usable: playing the shifted previous plan
+    BRAKING = 5  # ramping to standstill inside the slew limits
+    STOPPED = 6  # latched by an operator: only `enable` resumes

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+Whether the way is blocked: obstacles or other softened bounds hold the robot, and there is no way round that it sees.
+
+A plan is blocked if it touches a softened bound and gets nowhere over the whole
+horizon, measured against what is left to the reference at its end,
+
+.. math::
+
+    \|y_N - y_0\|_Q < \epsilon \, \|y_{ref,N} - y_N\|_Q .
+
+The weight of the cost makes that a ratio without unit. One such plan is a
+robot that hesitates; as many as the horizon has stages are a blocked one, and
+as many others a free one.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.codegen import bind, function
+from rti_mpc.rti.rti import Rti
+
+NOWHERE = 0.05  # epsilon: a plan that passes an obstacle keeps above 1, a blocked one is at 0.001
+
+
+class Blockage:
+    """
+    Looks at one plan after the other.
+
+    Attributes:
+        blocked: What so many plans in a row have said.
+    """
+
+    def __init__(self, rti: Rti) -> None:
+        self.blocked = False
+        self._rti = rti
+        self._contrary = 0
+        self._squares: Array = np.zeros(2)
+        self._measure = bind(progress(rti), {"x": rti.x, "y_ref": rti.y_ref, "p": rti.p}, {"squares": self._squares})
+
+    def look(self) -> bool:
+        """Look at the plan of a new sample, and tell whether `blocked` has changed."""
+        self._measure()
+        moved, left = self._squares
+        standing = self._rti.touches and bool(moved < NOWHERE**2 * left)
+        self._contrary = self._contrary + 1 if standing is not self.blocked else 0
+        if self._contrary < self._rti.ocp.N:
+            return False
+        self.blocked = standing
+        self._contrary = 0
+        return True
+
+    def clear(self) -> None:
+        """Forget everything: another life of the robot."""
+        self.blocked = False
+        self._contrary = 0
+
+
+def progress(rti: Rti) -> ca.Function:
+    """Build ``(x, y_ref, p) -> [|y_N - y_0|^2, |y_ref,N - y_N|^2]``, both weighted by Q."""
+    model, N, Q = rti.ocp.model, rti.ocp.N, ca.DM(rti.ocp.Q)
+    x, y_ref, p = ca.MX.sym("x", model.nx, N + 1), ca.MX.sym("y_ref", model.ny, N), ca.MX.sym("p", model.np_, N + 1)
+    output = model.h()
+    start, end = output(x[:, 0], p[:, -1]), output(x[:, -1], p[:, -1])  # outputs of one moment: a beacon that moves is no progress
+    moved, left = end - start, y_ref[:, -1] - end
+    squares = ca.vertcat(ca.bilin(Q, moved, moved), ca.bilin(Q, left, left))
+    return function("progress", {"x": x, "y_ref": y_ref, "p": p}, {"squares": squares})

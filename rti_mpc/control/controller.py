@@ -1,0 +1,548 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+State and reference in, command out: the real-time iteration on the robot's time grid.
+
+No clock inside: every time is a stamp of the robot, or local monotonic time
+handed in. Samples lie on a grid that follows the robot (`rti_mpc.control.grid`).
+Preparation fixes the time :math:`t_k` at which the next command acts, looks the
+reference up from there on, shifts and linearizes. Feedback starts with the
+state that is due; it integrates that state to :math:`t_k` with the inputs already
+sent, embeds it and solves. Reference, plan and command all start at :math:`t_k`.
+
+A plan that cannot be made, or comes too late, is replaced rung by rung
+(`rti_mpc.control.ladder`). Whatever goes out has passed the `rti_mpc.control.envelope.Envelope`.
+What follows a gap starts cold, and acts late enough to be there in time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.contract.guard import Limits
+from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Notice, Reference, Severity, State, Telemetry
+from rti_mpc.contract.schedule import EVER_NS
+from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.control.blockage import Blockage
+from rti_mpc.control.call import Call, told
+from rti_mpc.control.delay import DelayEstimator
+from rti_mpc.control.envelope import Envelope
+from rti_mpc.control.grid import Grid
+from rti_mpc.control.grid import Timing as Timing
+from rti_mpc.control.issued import Issued
+from rti_mpc.control.ladder import Ladder
+from rti_mpc.control.mode import ModeMachine
+from rti_mpc.control.observer import Observer
+from rti_mpc.control.prediction import Prediction
+from rti_mpc.control.record import Record
+from rti_mpc.control.sent import Sent
+from rti_mpc.control.state_stream import Arrival, StateStream
+from rti_mpc.control.track import Track
+from rti_mpc.control.tuning import Tuning
+from rti_mpc.errors import OcpError
+from rti_mpc.rti.ocp import Ocp, restless
+from rti_mpc.rti.rti import Rti
+
+UNREPORTED = "the robot does not report which inputs act: commands are believed to act, and only the robot itself or a guard can cover their loss"
+ITERATIONS_COLD = 3  # iterations of a first sample, whose guess is one state and one input
+
+
+class Controller:
+    """
+    The controller of one robot.
+
+    The caller hands in each message as it comes. What is returned is a proposal:
+    `in_time` judges it, the caller publishes it and calls `commit`, and what was
+    not committed was never sent. After each sample it calls `prepare`, off the
+    path from state to command.
+
+    What commands depend on changes by the calls marked `told` alone, each of which
+    `on_call` is told of: repeated on a controller built alike, they give the same commands.
+
+    Attributes:
+        on_call: Takes each call that may change a command, before it is made; None: nobody does.
+        skipped: Samples skipped since start.
+        ladder: Samples without a plan of their own, by what replaced it.
+        np_: Parameters a row of a reference may carry: the model's, without the disturbances an observer estimates.
+        envelope: What inputs may be.
+        grid: When commands act.
+
+    Raises:
+        OcpError: Bounds leave out the input at which the robot rests.
+    """
+
+    def __init__(
+        self, rti: Rti, timing: Timing, *, epoch: int = 1, config_hash: int = 0, observer: Observer | None = None, compile: bool = True
+    ) -> None:
+        ocp, model = rti.ocp, rti.ocp.model
+        if wrong := restless(ocp):
+            raise OcpError(wrong)
+        self._rti = rti
+        self._stale_ns = round(1e9 * timing.stale_s)
+        self._valid_ns = round(1e9 * timing.valid_s)
+        self._u_rest: Array = np.array(model.u_rest)
+
+        self.on_call: Callable[[Call], object] | None = None
+        self._shadowing = False
+        self._modes = ModeMachine()
+        self.skipped = 0
+        self.ladder = Ladder()
+        self.envelope = Envelope(ocp, compile=compile)
+        self._tuning = Tuning(rti, self.envelope.limits)
+        self.grid = Grid(ocp.dt, timing)
+        limits = Limits(self._u_rest, ocp.lbu, ocp.ubu, ocp.lbdu, ocp.ubdu, ocp.dt, 1e-9 * self.grid.most_ns)
+        self._states = StateStream(model, self._stale_ns, self.grid.dt_ns, limits.settling_s, observer)
+        self.np_ = model.np_ - len(self._states.d)
+        self._track = Track(model, ocp.N, self.grid.dt_ns)
+        self._sent = Sent(self._u_rest, ocp.lbdu, ocp.ubdu, self.grid.dt_ns)
+        self._prediction = Prediction(model, self._sent, compile=compile)
+        self._x0 = self._prediction.x
+        self._loaded = False  # whether the QP of t_k is prepared
+        self._reach: tuple[Array, Array] = (np.zeros((2, model.nu)), np.zeros((2, model.nu)))  # what the first rows at t_k may be
+        self._overran = False  # whether the last sample was over its budget
+        self._unreported = False  # whether it was said that the robot does not report its inputs
+        self._for_rival: tuple[int | None, tuple[Reference, Array] | None] = (None, None)  # the last reference, and which life might have begun then
+        self._stopped = ""  # why an operator's stop is latched
+        self._issued = Issued(epoch, config_hash, self.grid.dt_ns)
+        self._record = Record(rti, self._tuning)
+        self._blockage = Blockage(rti)
+        self._delay = DelayEstimator(model, self.grid.dt_ns, self.grid.most_ns, compile=compile) if timing.delay_s is None else None
+
+    @property
+    def mode(self) -> Mode:
+        """What the controller is doing."""
+        return self._modes.mode
+
+    def say(self, notice: Notice) -> None:
+        """Have something said beside what the controller says itself; in any thread."""
+        self._modes.notices.append(notice)
+
+    def notices(self) -> list[Notice]:
+        """Take what is to be said: mode changes and faults since the last call; in any thread."""
+        return self._modes.take()
+
+    @property
+    def shadowing(self) -> bool:
+        """Whether another controller's commands act, those handed to `overhear`, and not what is made here."""
+        return self._shadowing
+
+    # What comes in.
+
+    @property
+    def heard(self) -> bool:
+        """Whether a state of the robot has come."""
+        return self._states.last is not None
+
+    def follows(self, state: State) -> bool:
+        """Whether a state is of the life that is followed, or may be the first one."""
+        return self._states.last is None or state.epoch == self._states.last.epoch
+
+    def awaits(self, state: State) -> bool:
+        """Whether a state goes on from the last one, by life and number."""
+        return self.follows(state) and self._states.cadence.counts(state.seq)
+
+    @told
+    def receive_state(self, state: State, arrival_ns: int) -> Command | None:
+        """
+        Act on a state, if its sample is due.
+
+        Args:
+            state: Of the model's `nx`, finite.
+            arrival_ns: Local monotonic time.
+
+        Returns:
+            The command to publish at once, a proposal, or None: then the state is only kept as the freshest.
+        """
+        arrival = self._states.receive(state, arrival_ns)
+        if (notice := self._states.notice) is not None:
+            self.say(notice)
+        if arrival is not Arrival.FRESH:
+            if arrival in (Arrival.REPEATED, Arrival.REFUSED, Arrival.FOREIGN, Arrival.OLD):
+                return None
+            if arrival is Arrival.UNTIMED:
+                return self._give_up(state)
+            self._forget(arrival, state)
+        surprised = self._hear(state)
+        self._states.estimate(self._sent, known=self.mode in (Mode.TRACKING, Mode.HOLDING) and not surprised)
+        self._prediction.p[self.np_ :] = self._states.d
+        if surprised and self._loaded and self.grid.running:
+            self._load(shift=False)
+        if self.mode is Mode.IDLE:
+            self._modes.enter(Mode.WAITING, "first state")
+            if not len(state.u) and not self._unreported:
+                self._unreported = True
+                self._modes.say(Severity.WARNING, "inputs_unreported", UNREPORTED)
+        if self._track.arriving:
+            self._anchor(state)
+        grid, period_ns = self.grid, self._states.clock.period_ns
+        if not (self._track.loaded or self._stopped) or not self._states.cadence.known or grid.early(state.stamp_ns, period_ns):
+            return None
+        if (behind := grid.behind(state.stamp_ns)) or not grid.running:
+            self._rejoin(state.stamp_ns, behind)
+        return self._act(state) if grid.running else None
+
+    def lay_out(self, reference: Reference) -> Array | None:
+        """Do of `receive_reference` what may be done in any thread, and takes longer the more rows there are; None if it will be refused."""
+        return None if self._track.misfit(reference, self.np_) else self._track.lay_out(reference)
+
+    @told
+    def receive_reference(self, reference: Reference, rows: Array | None = None) -> Reference | None:
+        """
+        Follow a reference from the next sample on.
+
+        Args:
+            reference: It.
+            rows: What `lay_out` has made of it; done here if None.
+
+        Returns:
+            The reference with its real stamp, to be published, if it was to start on arrival and a state is there to start at.
+        """
+        if misfit := self._track.misfit(reference, self.np_):
+            self._modes.say(Severity.WARNING, "reference_refused", misfit)
+            return None
+        self._track.arriving = reference, self._track.lay_out(reference) if rows is None else rows
+        self._for_rival = self._states.lives.rival, self._track.arriving
+        anchored = None if self._states.last is None else self._anchor(self._states.last)
+        return anchored if reference.stamp_ns == STAMP_ON_ARRIVAL else None
+
+    @told
+    def stop(self, reason: str) -> None:
+        """Ramp to rest and stay there until `enable`."""
+        if not self._stopped:
+            self._stopped = reason
+            self._modes.say(Severity.INFO, "stop", f"stop: {reason}")
+
+    @told
+    def enable(self) -> None:
+        """Release a `stop`: start cold, from the input that acts."""
+        if self._stopped:
+            self._stopped = ""
+            self._modes.say(Severity.INFO, "enable", "released by an operator")
+            if self.mode is Mode.STOPPED:
+                self.grid.running = False
+                self._modes.enter(Mode.WAITING, "enabled")
+
+    @told
+    def retune(self, ocp: Ocp, version: int) -> int:
+        """
+        Plan with other weights and bounds, from the next sample on that is not prepared yet; a stop keeps the slew limits it was built with.
+
+        Returns:
+            Sequence number of its command.
+
+        Raises:
+            OcpError: The problem differs in more than these.
+        """
+        self._tuning.change(ocp, version)
+        return self._issued.seq + 1 + self._loaded
+
+    @told
+    def overhear(self, command: Command) -> None:
+        """Take note of a command of the controller that this one shadows."""
+        self._sent.append(command)
+        if self._delay is not None:
+            self._delay.sent(command)
+
+    @told
+    def shadow(self) -> None:
+        """Let what is made here not act, but what is handed to `overhear`."""
+        self._shadowing = True
+
+    @told
+    def lead(self, epoch: int) -> None:
+        """Let what is made here act from the next command on; it goes on from what has acted so far."""
+        self._issued.epoch, self._shadowing = epoch, False
+        if self._loaded:
+            self._load(shift=False)
+
+    @told
+    def tick(self, local_ns: int) -> Command | None:
+        """
+        Notice silence: propose a ramp to rest, once, when the last state has become stale.
+
+        Args:
+            local_ns: Local monotonic time.
+        """
+        state = self._states.last
+        if state is None or not self.grid.running:
+            return None
+        now_ns = self._states.clock.now_ns(local_ns)
+        age_ns = now_ns - state.stamp_ns
+        if age_ns <= self._stale_ns:
+            return None
+        self.grid.running = False
+        mode = Mode.STOPPED if self._stopped else Mode.BRAKING
+        self._modes.enter(mode, f"no state for {1e-9 * age_ns:.3f} s", Severity.ERROR, "state_stale")
+        return self._brake(state, now_ns + self.grid.delay_ns, QpStatus.NONE)
+
+    @told
+    def in_time(self, command: Command, local_ns: int) -> Command | None:
+        """
+        Hold a sample to its budget: its command must be there before its first row is over.
+
+        Args:
+            command: What was proposed for it.
+            local_ns: Local monotonic time.
+
+        Returns:
+            What to publish: the command; nothing if it is too late and the previous plan plays on in the robot's hands; or a ramp.
+        """
+        if self._states.cadence.fault:
+            return command  # nobody knows how late it is, and none follows
+        now_ns = self._states.clock.latest_ns(local_ns)
+        if not self.grid.too_late(now_ns - command.stamp_ns):
+            if self._overran:
+                self._overran = False
+                self._modes.enter(command.mode, "samples are in time again")
+            return command
+        self._overran = True
+        failure = f"a sample was {1e-9 * (now_ns - command.stamp_ns):.3f} s late"
+        if self._plays_on(now_ns, counted=command.mode is Mode.FALLBACK):
+            self._modes.enter(Mode.FALLBACK, f"{failure}: the previous plan plays on", Severity.WARNING, "over_budget")
+            return None
+        if not self._stopped:
+            self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "over_budget")
+        assert self._states.last is not None
+        counted = command.mode in (Mode.BRAKING, Mode.STOPPED)
+        return self._brake(self._states.last, now_ns + self.grid.delay_ns, command.status, wanted=counted)
+
+    @told
+    def commit(self, command: Command, left_ns: int | None = None) -> None:
+        """
+        Record a proposal as sent, now that it has left; of a shadow, as one that would have been.
+
+        Args:
+            command: The last proposal.
+            left_ns: Local monotonic time at which it left at the earliest; None if it answers no state, and robot time is a guess.
+        """
+        self._issued.commit(command)
+        if self._shadowing:
+            return
+        clock = self._states.clock
+        self._sent.append(command, EVER_NS if left_ns is None or self._states.cadence.fault else clock.latest_ns(left_ns))
+
+    # The two phases.
+
+    @told
+    def prepare(self) -> None:
+        """Prepare the next sample: fix `t_k`, look the reference up, shift, linearize and load the QP."""
+        self._record.keep(self._issued.seq)
+        self._look_ahead()
+        state = self._states.last
+        if not self.grid.running or state is None:
+            return
+        if self._delay is not None:
+            self._measure_delay(self._delay, state.stamp_ns)
+        self.grid.advance(state.stamp_ns, self._states.clock.period_ns)
+        self._loaded = False
+        if self.mode in (Mode.TRACKING, Mode.HOLDING):
+            self.ladder.failed = 0
+        elif self.mode is not Mode.FALLBACK or not np.isfinite(self._rti.x).all():
+            return  # the next sample starts cold
+        self._tuning.begin()
+        self._load(shift=True)
+
+    def _measure_delay(self, estimator: DelayEstimator, stamp_ns: int) -> None:
+        """Learn from the state of the last sample, and let the grid follow."""
+        estimator.hear(self._sent.confirmed)
+        estimator.observe(self._states.x, stamp_ns)
+        if self._issued.last is not None and not self._shadowing:
+            estimator.sent(self._issued.last)
+        self._sent.delay_ns = estimator.delay_ns
+        self.grid.adapt(estimator.delay_ns)
+
+    def _look_ahead(self) -> None:
+        """Say that the way is blocked, or free again."""
+        if self.mode not in (Mode.TRACKING, Mode.HOLDING) or not self._blockage.look():
+            return
+        if self._blockage.blocked:
+            self._modes.say(Severity.WARNING, "blocked", "the way is blocked: the plan stands still at a softened bound, short of the reference")
+        else:
+            self._modes.say(Severity.INFO, "free", "the way is free again")
+
+    def _load(self, *, shift: bool) -> None:
+        """Load the QP of `t_k`."""
+        act_ns = self.grid.act_ns
+        self._track.look_up(act_ns)
+        self._track.p[:, self.np_ :] = self._states.d
+        self._reach = self._sent.reach(act_ns)
+        u_prev = self._sent.at(act_ns - 1)[0]
+        self._tuning.follow(u_prev)
+        self._rti.prepare(self._track.y_ref, self._track.p, shift=shift, u_prev=u_prev)
+        self._loaded = True
+
+    def _rejoin(self, stamp_ns: int, behind: int) -> None:
+        """Bring plan and grid to a state that the grid has not expected: one that comes late, or the first after a gap."""
+        self.skipped += behind
+        last = self._issued.last
+        if behind and last is not None and stamp_ns + self.grid.delay_ns < last.valid_until_ns:  # what was sent still acts
+            self.grid.catch_up(behind, stamp_ns)
+            if self._loaded:
+                for _ in range(behind - 1):
+                    self._rti.shift()
+                self._load(shift=True)
+            return
+        if behind:
+            self._modes.say(Severity.WARNING, "gap", f"no sample for {behind} periods: starting cold")
+        self._loaded = False
+        self._issued.plan = None
+        self.ladder.failed = 0
+        clock = self._states.clock
+        if not self.grid.too_late(clock.late_ns + clock.doubt_ns):
+            self.grid.start(stamp_ns)
+        else:  # it may have waited on its way for too long to be answered: the next one will tell
+            self.grid.running = False
+
+    def _act(self, state: State) -> Command:
+        """Feedback: from a due state to the command that acts at `t_k`."""
+        act_ns = self.grid.act_ns
+        ending = self._track.ended(act_ns)
+        disputed = self._states.lives.disputed
+        if self._stopped or disputed or ending is End.STOP:
+            why = "two robots use this name" if disputed else "the reference ended with STOP"
+            self._modes.enter(*((Mode.STOPPED, self._stopped) if self._stopped else (Mode.BRAKING, why)))
+            return self._brake(state, act_ns, QpStatus.NONE, wanted=True)
+        self._prediction.predict(self._states.x, state.stamp_ns, act_ns)
+        status = self._rti.feedback(self._x0) if self._loaded else self._feedback_cold()
+        if not (status.usable and np.isfinite(self._rti.u).all()):
+            return self._fall_back(state, status)
+        self.ladder.softened += self._rti.solver is not (self._rti.active_set or self._rti.solvers[0])
+        mode, reason = (Mode.TRACKING, "following the reference") if ending is None else (Mode.HOLDING, "the reference has ended")
+        if not self._overran:
+            self._modes.enter(mode, reason)
+        valid_until_ns = min(act_ns + self._rti.ocp.N * self.grid.dt_ns, state.stamp_ns + self.grid.delay_ns + self._valid_ns)
+        return self._issued.propose(state, act_ns, valid_until_ns, mode, status, self.envelope.fit(self._rti.u, self._reach), plan=True)
+
+    def _feedback_cold(self) -> QpStatus:
+        """Solve a first sample: the guess stays where the robot is, and is iterated on."""
+        self._rti.reset(self._x0, self._sent.at(self.grid.act_ns - 1)[0])
+        self._tuning.begin()
+        status = QpStatus.FAILED
+        for _ in range(ITERATIONS_COLD):
+            self._load(shift=False)
+            status = self._rti.feedback(self._x0)
+        return status
+
+    # What replaces a plan.
+
+    def _plays_on(self, now_ns: int, *, counted: bool = False) -> bool:
+        """Whether the previous plan may serve a sample that has none of its own."""
+        plan = self._issued.plan
+        left = plan is not None and now_ns < plan.valid_until_ns
+        return left if counted else self.ladder.fall(plan_left=left)
+
+    def _fall_back(self, state: State, status: QpStatus) -> Command:
+        """Replace a plan that could not be made."""
+        act_ns, plan, failure = self.grid.act_ns, self._issued.plan, f"the QP is {status.name.lower()}"
+        if self._plays_on(act_ns) and plan is not None:
+            self._modes.enter(Mode.FALLBACK, f"{failure}: playing the previous plan", Severity.WARNING, "qp_failed")
+            rows = self.envelope.refit(plan.u, round((act_ns - plan.stamp_ns) / plan.period_ns), self._reach)
+            return self._issued.propose(state, act_ns, plan.valid_until_ns, Mode.FALLBACK, status, rows)
+        self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "no_plan")
+        return self._brake(state, act_ns, status)
+
+    def _brake(self, state: State, act_ns: int, status: QpStatus, *, wanted: bool = False) -> Command:
+        """
+        Propose the brake law, because a stop is `wanted` or for want of a plan.
+
+        It is valid from its own time on, not from its state's: made of past commands
+        and never further from rest than they, it is as right without a state.
+        """
+        rows = self.envelope.ramp(self._sent.reach(act_ns))
+        if not wanted:
+            self.ladder.brake(at_rest=bool((rows[0] == self._u_rest).all()))
+        self._issued.plan = None
+        self._loaded = False
+        return self._issued.propose(state, act_ns, act_ns + self._valid_ns, self.mode, status, rows)
+
+    def _give_up(self, state: State) -> Command | None:
+        """
+        End what is commanded to a robot whose clock is none: one command, each of whose rows is the next step to rest, and nothing after it.
+
+        Whichever row acts there, and for however long, it is inside the slew limits.
+        """
+        if self.mode is Mode.IDLE:
+            return None
+        act_ns, command = state.stamp_ns + self.grid.delay_ns, None
+        if self._issued.last is not None and (self._sent.at(state.stamp_ns)[0] != self._u_rest).any():
+            self._modes.enter(Mode.STOPPED if self._stopped else Mode.BRAKING, self._states.cadence.fault)
+            rows = self.envelope.ramp(self._sent.reach(act_ns))
+            valid_ns = max(1, round(self._valid_ns * min(1.0, self._states.cadence.rate)))  # as long as it should act, in the unit of the stamps
+            command = self._issued.propose(state, act_ns, act_ns + valid_ns, self.mode, QpStatus.NONE, np.tile(rows[0], (len(rows), 1)))
+        self._issued.plan = None
+        self._overran = self._loaded = self.grid.running = False
+        self._modes.enter(Mode.IDLE, self._states.cadence.fault)
+        return command
+
+    @told
+    def standstill(self, local_ns: int) -> Command | None:
+        """Propose the last command of a life: to rest as fast as the slew limits allow; None if nothing was ever commanded, or its clock is none."""
+        state = self._states.last
+        if self._issued.last is None or state is None or self._states.cadence.fault:
+            return None
+        return self._brake(state, self.robot_now_ns(local_ns) + self.grid.delay_ns, QpStatus.NONE, wanted=True)
+
+    # What goes out.
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the last command that has left is rest from its first row on, or there never was one."""
+        last = self._issued.last
+        return last is None or np.array_equal(last.u[0], self._u_rest)
+
+    def slack_s(self, local_ns: int) -> float:
+        """Return robot time, s, from a local monotonic time to the state of the next sample."""
+        return 1e-9 * (self.grid.act_ns - self.grid.delay_ns - self._states.clock.now_ns(local_ns))
+
+    @property
+    def robot_rate(self) -> float:
+        """Seconds of the robot per local second."""
+        return self._states.clock.rate
+
+    def robot_now_ns(self, local_ns: int) -> int:
+        """Return robot time at a local monotonic time."""
+        return self._states.clock.now_ns(local_ns)
+
+    def telemetry(self, *, prepare_us: float, feedback_us: float, latency_us: float, slack_s: float) -> Telemetry:
+        """Describe the last sample; the times are the caller's, who has a clock."""
+        assert self._issued.last is not None
+        times = prepare_us, feedback_us, latency_us, slack_s
+        return self._record.telemetry(
+            self._issued.last, self._x0, self._states.d, times, delay_s=1e-9 * self.grid.delay_ns, skipped=self.skipped, ladder=self.ladder
+        )
+
+    # Small parts.
+
+    def _hear(self, state: State) -> bool:
+        """Learn which input acts from a robot that reports it; return whether that was not known."""
+        if not len(state.u):
+            return False
+        limits, believed = self.envelope.limits, self._sent.at(state.stamp_ns - 1)[0]  # which is outside after bounds were tightened
+        u = np.minimum(np.maximum(state.u, np.minimum(limits["lbu"], believed)), np.maximum(limits["ubu"], believed))
+        return self._sent.correct(state.stamp_ns, u, (state.command_epoch, state.command_seq))
+
+    def _anchor(self, state: State) -> Reference:
+        """Follow the reference that has arrived, from the last state on if it is to start on arrival."""
+        anchored = self._track.anchor(state.stamp_ns)
+        if self._loaded and self.grid.running:
+            self._load(shift=False)
+        return anchored
+
+    def _forget(self, arrival: Arrival, state: State) -> None:
+        """Keep nothing of the robot's last life, or of the time before its clock jumped but that it brakes since then."""
+        if arrival is Arrival.NEW_LIFE:
+            self._sent.clear()
+        else:
+            self._sent.brake(self._states.before_ns, state.stamp_ns)
+        if arrival is not Arrival.JUMPED_AHEAD:
+            self._modes.enter(Mode.IDLE, "another life of the robot, or of its clock")
+            self._track.clear()
+            self._blockage.clear()
+        if arrival is Arrival.NEW_LIFE and self._for_rival[0] == state.epoch:
+            self._track.arriving = self._for_rival[1]  # it came when the new life was heard, but not sure yet
+        if self._delay is not None:
+            self._delay.clear()
+        self._issued.plan = None
+        self._overran = self._loaded = self.grid.running = False

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+The delay from a state to the act of its command, measured from how the robot responds.
+
+Each candidate :math:`d_j` says when every command sent would have begun to act: at
+its stamp, or :math:`d_j` after the state that it answers if that is later. The
+step from one state to the next is predicted for all of them, and the squared
+errors are summed and forgotten,
+
+.. math::
+
+    J_j \leftarrow \gamma J_j + \sum_i \left( \frac{x_i - \phi(x^-, u(\cdot; d_j))_i}{\sigma_i} \right)^2,
+
+with :math:`\sigma_i^2` the mean squared error of state `i` under the best candidate
+of each step: noise, and the model's. Where the inputs do not change all errors are the same, and nothing
+is forgotten: such a step says nothing. The estimate is the least of a parabola
+through the best candidate and its neighbours.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.codegen import bind, compiled
+from rti_mpc.contract.message import Command
+from rti_mpc.contract.schedule import end_ns
+from rti_mpc.model.integrator import integrator
+from rti_mpc.model.model import Model
+
+EACH = 4  # candidates a period
+FORGETTING = 0.98  # in a step that says something: the last fifty count
+TELLING = 0.1  # in normalised squared errors, by which the candidates must differ for a step to say something
+BELIEVED = 20.0  # in normalised squared errors, by which another candidate must be better: noise alone is 4.5 sigma away from it
+WILD = 1e6  # error of a state, in its unit, from which on it says nothing
+STEADY = 10  # reports in a row after which what was learnt is right
+FINEST = 1e-4  # error of a state, in its unit, below which none is told from another
+
+
+class DelayEstimator:
+    """
+    Compares candidate delays over recent commands and states.
+
+    Attributes:
+        delay_ns: The estimate, ns.
+    """
+
+    def __init__(self, model: Model, dt_ns: int, most_ns: int, *, compile: bool = True) -> None:
+        self.delay_ns = 0
+        self._dt_ns = dt_ns
+        self._candidates = [round(j * dt_ns / EACH) for j in range(EACH * most_ns // dt_ns + 1)]  # ns
+        self._costs: Array = np.zeros(len(self._candidates))
+        self._variance: Array = np.zeros(model.nx)
+        self._u_rest: Array = np.array(model.u_rest)
+        self._commands: deque[Command] = deque(maxlen=5 + most_ns // dt_ns)
+        self._last: tuple[Array, int] | None = None  # state and its stamp
+        self._kept: tuple[Array, Array, int] | None = None  # costs, variances and estimate while commands acted as believed
+        self._interrupted = False  # whether they do not any more
+        self._x: Array = np.zeros(model.nx)
+        self._next: Array = np.zeros(model.nx)
+        self._u: Array = np.zeros(model.nu)
+        self._span: Array = np.zeros(1)  # s
+        phi = integrator(model, "rk4")
+        integrate = compiled(phi)[0] if compile else phi
+        inputs = {"x": self._x, "u": self._u, "p": np.array(model.p_nominal), "dt": self._span}
+        self._integrate = bind(integrate, inputs, {"x_next": self._next})
+
+    def sent(self, command: Command) -> None:
+        """Take note of the last command that was sent, if it is another one."""
+        if not self._commands or self._commands[-1] is not command:
+            self._commands.append(command)
+
+    def clear(self) -> None:
+        """Forget states and commands, of another life of the robot. What was learnt is kept."""
+        self._commands.clear()
+        self._last = None
+
+    def hear(self, confirmed: int) -> None:
+        """
+        Take back what was learnt from responses to commands that were lost.
+
+        Args:
+            confirmed: Reports of the robot in a row that have named the command which was to act; 0 where it does not report.
+        """
+        if confirmed >= STEADY:
+            self._kept = self._costs.copy(), self._variance.copy(), self.delay_ns
+        elif self._kept is None:
+            return
+        elif not confirmed:
+            self._interrupted = True
+        elif self._interrupted:
+            self._costs[:], self._variance[:], self.delay_ns = self._kept
+            self._kept, self._interrupted = None, False
+            self.clear()
+
+    def observe(self, x: Array, stamp_ns: int) -> None:
+        """
+        Take note of a state, and improve the estimate.
+
+        Args:
+            x: State, shape ``(nx,)``, its angles next to those of the last one.
+            stamp_ns: Its stamp.
+        """
+        last, self._last = self._last, (x.copy(), stamp_ns)
+        if last is None or not 0 < stamp_ns - last[1] <= 2 * self._dt_ns:
+            return
+        errors = self._errors(*last, x, stamp_ns)
+        squared = np.where(np.abs(errors) < WILD, errors, np.nan) ** 2
+        played = np.flatnonzero(np.isfinite(squared.sum(axis=1)))
+        if not len(played):
+            return
+        squared = np.where(np.isfinite(squared), squared, squared[played].max(axis=0))  # the robot would have had to brake: it is no such delay
+        self._variance += (1.0 - FORGETTING if self._variance.any() else 1.0) * (squared.min(axis=0) - self._variance)
+        step = (squared / np.maximum(self._variance, FINEST**2)).sum(axis=1)
+        if np.ptp(step) <= TELLING:
+            return
+        self._costs *= FORGETTING
+        self._costs += step
+        self._estimate()
+
+    def _errors(self, x: Array, from_ns: int, x_next: Array, to_ns: int) -> Array:
+        """Return what each candidate misses a step by, shape ``(candidates, nx)``; NaN where no plan would have acted all the time."""
+        known: dict[tuple[int, ...], Array] = {}
+        errors = []
+        for delay_ns in self._candidates:
+            starts = tuple(max(command.stamp_ns, command.state_stamp_ns + delay_ns) for command in self._commands)
+            if starts not in known:
+                known[starts] = x_next - self._x if self._play(starts, x, from_ns, to_ns) else np.full_like(x, np.nan)
+            errors.append(known[starts])
+        return np.array(errors)
+
+    def _play(self, starts: tuple[int, ...], x: Array, t_ns: int, to_ns: int) -> bool:
+        """Predict with commands that begin to act at these times; tell whether one did all the time."""
+        self._x[:] = x
+        while t_ns < to_ns:
+            newest = next((i for i in range(len(starts) - 1, -1, -1) if starts[i] <= t_ns), -1)
+            until_ns = min((to_ns, *starts[newest + 1 :]))
+            if newest >= 0:
+                command = self._commands[newest]
+                if t_ns >= end_ns(command):
+                    return False
+                row = (t_ns - command.stamp_ns) // command.period_ns
+                until_ns = min(until_ns, command.stamp_ns + (row + 1) * command.period_ns, end_ns(command))
+                self._u[:] = command.u[row]
+            elif len(starts) == self._commands.maxlen:
+                return False
+            else:
+                self._u[:] = self._u_rest  # the first of them are still on their way
+            self._span[0] = 1e-9 * (until_ns - t_ns)
+            self._integrate()
+            self._x[:] = self._next
+            t_ns = until_ns
+        return True
+
+    def _estimate(self) -> None:
+        """Move to the best candidate, if it is better by enough."""
+        costs, step_ns = self._costs, self._dt_ns / EACH
+        best, now = int(costs.argmin()), min(round(self.delay_ns / step_ns), len(costs) - 1)
+        if best != now and costs[now] - costs[best] < BELIEVED:
+            return
+        offset = 0.0
+        if 0 < best < len(costs) - 1:
+            before, least, after = costs[best - 1 : best + 2]
+            if (bend := before - 2.0 * least + after) > 0.0:
+                offset = 0.5 * (before - after) / bend
+        self.delay_ns = round(step_ns * (best + offset))

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What inputs may be: the last gate of every plan, whatever made it.
+
+Bounds hold for each row, slew limits from row to row; the first two are held to
+what `rti_mpc.control.sent.Sent.reach` allows. No solver is asked, and a plan that keeps
+all of it already passes unchanged.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.codegen import bind, compiled, function
+from rti_mpc.rti.ocp import Ocp
+
+LIMITS = ("lbu", "ubu", "lbdu", "ubdu")
+
+
+class Envelope:
+    """
+    Bounds and slew limits of the inputs.
+
+    Attributes:
+        limits: Those of the OCP by name, each of shape ``(nu,)``; owned, and obeyed as they are when a plan passes.
+    """
+
+    def __init__(self, ocp: Ocp, *, compile: bool = True) -> None:
+        nu = ocp.model.nu
+        self.limits = {name: np.array(getattr(ocp, name)) for name in LIMITS}
+        self._u_rest: Array = np.array(ocp.model.u_rest)
+        self._u: Array = np.zeros((ocp.N_u, nu))
+        self._rows: Array = np.zeros((ocp.N, nu))
+        self._reach: tuple[Array, Array] = (np.zeros((2, nu)), np.zeros((2, nu)))
+        fit = clipping(ocp)
+        inputs = {"u": self._u, "lowest": self._reach[0], "highest": self._reach[1], **self.limits}
+        self._fit = bind(compiled(fit)[0] if compile else fit, inputs, {"rows": self._rows})
+
+    def fit(self, u: Array, reach: tuple[Array, Array]) -> Array:
+        """
+        Bring a finite plan inside, each row as near to what it was as the rows before it allow.
+
+        Args:
+            u: Inputs, shape ``(N_u, nu)``.
+            reach: Lowest and highest first two rows, each of shape ``(2, nu)``.
+
+        Returns:
+            All `N` rows, inputs held after `N_u` expanded, shape ``(N, nu)``.
+        """
+        self._u[:] = u
+        self._reach[0][:], self._reach[1][:] = reach
+        self._fit()
+        return self._rows.copy()
+
+    def refit(self, rows: Array, elapsed: int, reach: tuple[Array, Array]) -> Array:
+        """
+        Bring an earlier plan inside once more, shifted by the rows that are over.
+
+        Args:
+            rows: Inputs of all stages, shape ``(N, nu)``; the last is repeated.
+            elapsed: Rows to leave out.
+            reach: Lowest and highest first two rows, each of shape ``(2, nu)``.
+        """
+        shifted = rows[np.minimum(np.arange(len(rows)) + elapsed, len(rows) - 1)]
+        lower, upper = reach[0][0], reach[1][0]
+        for k, row in enumerate(shifted):
+            row[:] = np.clip(row, lower, upper)
+            lower, upper = row + self.limits["lbdu"], row + self.limits["ubdu"]
+            if k == 0:
+                lower, upper = np.maximum(lower, reach[0][1]), np.minimum(upper, reach[1][1])
+        return shifted
+
+    def ramp(self, reach: tuple[Array, Array]) -> Array:
+        """Return the brake law, shape ``(N, nu)``: from the inputs sent, never from a measured speed, to rest as fast as the slew limits allow."""
+        return self.refit(np.tile(self._u_rest, (len(self._rows), 1)), 0, reach)
+
+
+def clipping(ocp: Ocp) -> ca.Function:
+    """Build ``(u, lowest, highest, *LIMITS) -> rows``, columns being stages."""
+    nu = ocp.model.nu
+    u = ca.SX.sym("u", nu, ocp.N_u)
+    lowest, highest = ca.SX.sym("lowest", nu, 2), ca.SX.sym("highest", nu, 2)
+    lbu, ubu, lbdu, ubdu = (ca.SX.sym(name, nu) for name in LIMITS)
+    rows: list[ca.SX] = []
+    for k in range(ocp.N_u):
+        lower, upper = (rows[-1] + lbdu, rows[-1] + ubdu) if k else (lowest[:, 0], highest[:, 0])
+        if k == 1:
+            lower, upper = ca.fmax(lower, lowest[:, 1]), ca.fmin(upper, highest[:, 1])
+        wanted = ca.fmin(ca.fmax(u[:, k], lbu), ubu)
+        rows.append(ca.fmin(ca.fmax(wanted, lower), upper))
+    rows += [rows[-1]] * (ocp.N - ocp.N_u)
+    inputs = {"u": u, "lowest": lowest, "highest": highest, "lbu": lbu, "ubu": ubu, "lbdu": lbdu, "ubdu": ubdu}
+    return function("clipping", inputs, {"rows": ca.densify(ca.horzcat(*rows))})

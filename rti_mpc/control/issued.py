@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands of a controller, numbered without a gap: proposed, and issued once they have left."""
+
+from __future__ import annotations
+
+from rti_mpc.array import Array
+from rti_mpc.contract.message import Command, State
+from rti_mpc.contract.status import Mode, QpStatus
+
+
+class Issued:
+    """
+    The commands of one controller.
+
+    Attributes:
+        epoch: Of the next one.
+        seq: Number of the last one that has left.
+        last: The last one that has left; None before the first.
+        plan: The last of them with a plan of its own, as long as that may be gone on with; else None.
+    """
+
+    def __init__(self, epoch: int, config_hash: int, period_ns: int) -> None:
+        self.epoch = epoch
+        self.seq = 0
+        self.last: Command | None = None
+        self.plan: Command | None = None
+        self._config_hash = config_hash
+        self._period_ns = period_ns
+        self._planned: Command | None = None  # the last one proposed, if it has a plan of its own
+
+    def propose(self, state: State, act_ns: int, valid_until_ns: int, mode: Mode, status: QpStatus, u: Array, *, plan: bool = False) -> Command:
+        """
+        Make what may be the next one; until it is committed, nothing has happened.
+
+        Args:
+            state: The state it answers.
+            act_ns: When its first row acts, robot time.
+            valid_until_ns: When it ends, robot time.
+            mode: What the controller is doing.
+            status: Of the QP.
+            u: Rows, shape ``(N, nu)``.
+            plan: Whether that is a plan of its own.
+        """
+        command = Command(
+            epoch=self.epoch,
+            seq=self.seq + 1,
+            stamp_ns=act_ns,
+            state_epoch=state.epoch,
+            state_seq=state.seq,
+            state_stamp_ns=state.stamp_ns,
+            valid_until_ns=valid_until_ns,
+            config_hash=self._config_hash,
+            mode=mode,
+            status=status,
+            period_ns=self._period_ns,
+            u=u,
+        )
+        self._planned = command if plan else None
+        return command
+
+    def commit(self, command: Command) -> None:
+        """Take a proposal for the last one: the next one has the next number."""
+        self.seq, self.last = command.seq, command
+        if command is self._planned:
+            self.plan = command

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+State and disturbances of a robot, estimated together by an extended Kalman filter.
+
+The state is augmented by disturbances that walk at random, :math:`z = (x, d)`,
+:math:`\dot x = f(x, u, p, d)`, :math:`\dot d = w`. A controller that predicts with
+the estimate tracks without offset although its model is wrong
+[Pannocchia2003]_. The measured states are taken in one by one, in the
+form of Joseph, which holds for any gain: the disturbances' is set to zero where they
+are frozen, and they are kept inside limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.codegen import bind, compiled, function
+from rti_mpc.errors import OcpError
+from rti_mpc.model.disturbance import with_disturbances
+from rti_mpc.model.integrator import integrator
+from rti_mpc.model.model import Model
+
+NOISE = 1e-3  # standard deviation of a measured state, in its unit
+PROCESS = 1e-3  # random walk of a state beside its model, in its unit / sqrt(s)
+
+
+@dataclass(frozen=True, slots=True)
+class Disturbance:
+    """
+    What is known of one disturbance, in the unit it has in `with_disturbances`.
+
+    Attributes:
+        drift: Standard deviation of its random walk, in its unit / sqrt(s): the larger, the faster it is followed, and the noisier.
+        limit: Largest magnitude the estimate may take.
+    """
+
+    drift: float
+    limit: float
+
+
+@dataclass(frozen=True)
+class ObserverSettings:
+    """
+    What the filter assumes.
+
+    Attributes:
+        disturbances: By the name of an input or a state.
+        measured: Names of the states that are measured; all of them if there are none.
+        noise: Standard deviation of measured states by name, in the state's unit; `NOISE` if left out.
+        process: Random walk of states beside their model by name, in the state's unit / sqrt(s); `PROCESS` if left out.
+    """
+
+    disturbances: Mapping[str, Disturbance] = field(default_factory=dict)
+    measured: tuple[str, ...] = ()
+    noise: Mapping[str, float] = field(default_factory=dict)
+    process: Mapping[str, float] = field(default_factory=dict)
+
+
+class Observer:
+    """
+    The filter of one robot.
+
+    Attributes:
+        model: The model with its disturbances; what a controller must predict with.
+        x: Estimated state, shape ``(nx,)``.
+        d: Estimated disturbances, shape ``(nd,)``: the last parameters of `model`.
+        frozen: Whether disturbances keep their values: where it is not known which inputs act.
+
+    Raises:
+        OcpError: A name is unknown, or a number not positive.
+    """
+
+    def __init__(self, model: Model, settings: ObserverSettings, *, compile: bool = True) -> None:
+        states = [signal.name for signal in model.states]
+        for what, names in (("measured", settings.measured), ("noise", settings.noise), ("process", settings.process)):
+            if unknown := [name for name in names if name not in states]:
+                raise OcpError(f"{what} must be of states ({', '.join(states)}), got {', '.join(unknown)}")
+        for name, of in settings.disturbances.items():
+            if not (of.drift > 0.0 and of.limit > 0.0):
+                raise OcpError(f"drift and limit of the disturbance of {name} must be positive, got {of.drift} and {of.limit}")
+        self.model = with_disturbances(model, settings.disturbances)
+        nx, nd = model.nx, len(settings.disturbances)
+        self._limits: Array = np.array([of.limit for of in settings.disturbances.values()])
+        measured = [j for j, name in enumerate(states) if not settings.measured or name in settings.measured]
+        variances = [settings.noise.get(states[j], NOISE) ** 2 for j in measured]
+        if min(variances, default=1.0) <= 0.0:
+            raise OcpError(f"the noise of a measured state must be positive, got {dict(settings.noise)}")
+        walks = [settings.process.get(name, PROCESS) for name in states] + [of.drift for of in settings.disturbances.values()]
+        self._initial: Array = np.diag([*(variances[measured.index(j)] if j in measured else 1.0 for j in range(nx)), *self._limits**2])
+
+        z: Array = np.zeros(nx + nd)
+        self.x, self.d = z[:nx], z[nx:]
+        self.frozen = False
+        self._P: Array = self._initial.copy()
+        self._u, self._span, self._y, self._gain = np.zeros(model.nu), np.zeros(1), np.zeros(nx), np.ones(1)
+        p: Array = np.array(model.p_nominal)
+        functions = predict(self.model, nd, np.square(walks)), correct(nx, nd, measured, variances, self._limits)
+        made = compiled(*functions) if compile else functions
+        z_next, P_next = np.zeros_like(z), np.zeros_like(self._P)
+        before = {"z": z, "P": self._P, "u": self._u, "p": p, "span": self._span}
+        self._predict = bind(made[0], before, {"z_next": z_next, "P_next": P_next})
+        measured_at = {"z": z_next, "P": P_next, "y": self._y, "gain": self._gain}
+        self._correct = bind(made[1], measured_at, {"z_corrected": z, "P_corrected": self._P})
+        self._predicted = (z_next, P_next)
+        self._z = z
+
+    def reset(self, x: Array) -> None:
+        """Start from a measured state, what is not measured of it at its value; the disturbances are kept, what is known of them is not."""
+        self.x[:] = x
+        self._P[:] = self._initial
+
+    def predict(self, u: Array, span_s: float) -> None:
+        """Go on with an input, shape ``(nu,)``, for some time, s."""
+        self._u[:] = u
+        self._span[0] = span_s
+        self._predict()
+        self._z[:], self._P[:] = self._predicted
+
+    def correct(self, y: Array) -> None:
+        """Take a measured state in, shape ``(nx,)``, its angles next to those of `x`; what is not measured of it is not looked at."""
+        self._predicted[0][:], self._predicted[1][:] = self._z, self._P
+        self._y[:] = y
+        self._gain[0] = not self.frozen
+        self._correct()
+
+
+def predict(model: Model, nd: int, walks: Array) -> ca.Function:
+    """Build ``(z, P, u, p, span) -> (z_next, P_next)``: one step of the dynamics with the sensitivities of it."""
+    nx, n = model.nx, model.nx + nd
+    z, P, span = ca.SX.sym("z", n), ca.SX.sym("P", n, n), ca.SX.sym("span")
+    p = ca.SX.sym("p", model.np_ - nd)
+    x_next = integrator(model)(z[:nx], model.u, ca.vertcat(p, z[nx:]), span)
+    z_next = ca.vertcat(x_next, z[nx:])
+    A = ca.jacobian(z_next, z)
+    P_next = ca.densify(A @ P @ A.T + span * ca.diag(ca.DM(walks)))
+    inputs = {"z": z, "P": P, "u": model.u, "p": p, "span": span}
+    return function("observer_predict", inputs, {"z_next": z_next, "P_next": P_next})
+
+
+def correct(nx: int, nd: int, measured: list[int], variances: list[float], limits: Array) -> ca.Function:
+    """Build ``(z, P, y, gain) -> (z_corrected, P_corrected)``; a gain of 0 freezes the disturbances, 1 does not."""
+    z, P = ca.SX.sym("z", nx + nd), ca.SX.sym("P", nx + nd, nx + nd)
+    y, gain = ca.SX.sym("y", nx), ca.SX.sym("gain")
+    inputs = {"z": z, "P": P, "y": y, "gain": gain}
+    acts = ca.vertcat(ca.SX.ones(nx), gain * ca.SX.ones(nd))
+    for j, variance in zip(measured, variances, strict=True):
+        column = P[:, j]
+        s = P[j, j] + variance
+        K = acts * column / s
+        z = z + K * (y[j] - z[j])
+        P = P - K @ column.T - column @ K.T + s * (K @ K.T)
+    bounded = ca.fmax(ca.fmin(z[nx:], ca.DM(limits)), -ca.DM(limits))
+    return function("observer_correct", inputs, {"z_corrected": ca.vertcat(z[:nx], bounded), "P_corrected": ca.densify((P + P.T) / 2)})

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the robot will be when the next command acts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.codegen import bind, compiled
+from rti_mpc.control.sent import Sent
+from rti_mpc.model.integrator import integrator
+from rti_mpc.model.model import Model
+
+
+class Prediction:
+    """
+    Integrates a state over the inputs already sent: its whole vector, speeds as well as pose.
+
+    Attributes:
+        x: The state predicted last, shape ``(nx,)``. Overwritten by the next one.
+        p: Parameters it predicts with, shape ``(np,)``; the model's nominal ones unless set.
+    """
+
+    def __init__(self, model: Model, sent: Sent, *, compile: bool = True) -> None:
+        self.x: Array = np.zeros(model.nx)
+        self.p: Array = np.array(model.p_nominal)
+        self._sent = sent
+        self._span: Array = np.zeros(1)  # s
+        self._start: Array = np.zeros(model.nx)
+        self._input: Array = np.zeros(model.nu)
+        phi = integrator(model, "rk4")
+        integrate = compiled(phi)[0] if compile else phi
+        self._integrate = bind(integrate, {"x": self._start, "u": self._input, "p": self.p, "dt": self._span}, {"x_next": self.x})
+
+    def predict(self, x: Array, from_ns: int, to_ns: int) -> Array:
+        """
+        Integrate from one time to another, one RK4 step over each input; a little backward, if need be.
+
+        Args:
+            x: State at `from_ns`, shape ``(nx,)``.
+            from_ns: Robot time.
+            to_ns: Robot time.
+        """
+        self.x[:] = x
+        for u, span_s in self._sent.spans(from_ns, to_ns):
+            self._start[:] = self.x
+            self._input[:] = u
+            self._span[0] = span_s
+            self._integrate()
+        return self.x

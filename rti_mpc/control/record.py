@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is to be said of a sample, after its command has gone out."""
+
+from __future__ import annotations
+
+from rti_mpc.array import Array
+from rti_mpc.contract.message import Command, Telemetry
+from rti_mpc.control.ladder import Ladder
+from rti_mpc.control.tuning import Tuning
+from rti_mpc.rti.rti import Rti
+
+
+class Record:
+    """The plan behind the last command, kept before preparation overwrites it."""
+
+    def __init__(self, rti: Rti, tuning: Tuning) -> None:
+        self._rti = rti
+        self._tuning = tuning
+        self._seq = 0  # of the command whose plan is kept
+        self._plan = (rti.x.copy(), rti.y_ref.copy(), 0.0)  # states, reference, cost
+        self._version = 0  # of the parameters
+
+    def keep(self, seq: int) -> None:
+        """Keep the plan of a command, by its number, if it is not kept already."""
+        if self._seq != seq:
+            self._plan = (self._rti.x.copy(), self._rti.y_ref.copy(), self._rti.cost)
+            self._seq, self._version = seq, self._tuning.version
+
+    def telemetry(
+        self, command: Command, x0: Array, d: Array, times: tuple[float, float, float, float], *, delay_s: float, skipped: int, ladder: Ladder
+    ) -> Telemetry:
+        """
+        Describe the sample of the last command.
+
+        Args:
+            command: It.
+            x0: State embedded at stage 0, shape ``(nx,)``.
+            d: Estimated disturbances, shape ``(nd,)``.
+            times: Preparation, feedback and latency, us, and slack, s.
+            delay_s: From a state to the act of its command, s.
+            skipped: Samples skipped since start.
+            ladder: Samples without a plan of their own.
+        """
+        self.keep(command.seq)
+        solver = self._rti.solver
+        prepare_us, feedback_us, latency_us, slack_s = times
+        return Telemetry(
+            epoch=command.epoch,
+            seq=command.seq,
+            stamp_ns=command.stamp_ns,
+            state_seq=command.state_seq,
+            state_stamp_ns=command.state_stamp_ns,
+            mode=command.mode,
+            status=command.status,
+            iterations=solver.iterations,
+            res_prim=solver.res_prim,
+            res_dual=solver.res_dual,
+            cost=self._plan[2],
+            violation=self._rti.violation,
+            prepare_us=prepare_us,
+            feedback_us=feedback_us,
+            latency_us=latency_us,
+            state_age_s=1e-9 * (command.stamp_ns - command.state_stamp_ns),
+            slack_s=slack_s,
+            skipped=skipped,
+            fallbacks=ladder.fallbacks,
+            parameter_version=self._version,
+            x0=x0.copy(),
+            x=self._plan[0],
+            u=command.u,
+            y_ref=self._plan[1],
+            d=d.copy(),
+            delay_s=delay_s,
+            softened=ladder.softened,
+            shifted=ladder.shifted,
+            braked=ladder.braked,
+            rested=ladder.rested,
+        )

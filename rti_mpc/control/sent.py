@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The inputs already sent: what the robot does until the next command acts.
+
+Commands are believed to act as soon as they can, until a robot that reports what acts
+tells otherwise (`rti_mpc.contract.belief`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.contract.approach import Increments
+from rti_mpc.contract.belief import Belief
+from rti_mpc.contract.message import Command
+from rti_mpc.contract.schedule import EVER_NS, Schedule, end_ns
+
+TRANSIT = 0.1  # of a period, that a command may be on its way: the plan before acts until then
+WINDOW = 0.75  # of a period, before which what acted for that long does not count: or no plan could turn round
+
+
+class Sent:
+    """
+    The last commands, as the robot plays them if none is later than expected.
+
+    Attributes:
+        delay_ns: How long after the state that it answers a command can act, though its time have come before.
+    """
+
+    def __init__(self, u_rest: Array, lbdu: Array, ubdu: Array, dt_ns: int) -> None:
+        self.delay_ns = 0
+        self._left_ns = EVER_NS  # when the last command left at the earliest
+        self._alone: tuple[int, Array] = (EVER_NS, u_rest)  # when the robot last stopped braking on its own, and from which input
+        self._slew = (lbdu, ubdu)  # per dt
+        self._dt_ns = dt_ns
+        self._transit_ns, self._window_ns = round(TRANSIT * dt_ns), round(WINDOW * dt_ns)
+        slew = 1e9 * np.minimum(-lbdu, ubdu) / dt_ns
+        increments = Increments(lbdu, ubdu, dt_ns)
+        self._schedule = Belief(u_rest, slew, increments)
+        self._slowest = Schedule(u_rest, slew, increments)  # if each command was on its way for as long as it may be
+
+    def append(self, command: Command, left_ns: int = EVER_NS) -> None:
+        """
+        Remember a command that has left, unless it has expired before its time: the robot refuses it.
+
+        Args:
+            command: The command.
+            left_ns: When it left at the earliest, robot time, if that is known: what was sent before acts at least until then.
+        """
+        self._left_ns = max(self._left_ns + 1, left_ns)  # commands leave one after the other, whatever our idea of the robot's clock
+        start_ns = max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, self._left_ns)
+        if start_ns < end_ns(command):
+            before, _, braking = self._schedule.at(start_ns - 1)
+            if braking:
+                self._alone = start_ns, before.copy()
+            self._schedule.add(command, start_ns, end_ns(command), approached=False)
+        start_ns = max(start_ns, self._left_ns + self._transit_ns)
+        if start_ns < end_ns(command):
+            self._slowest.add(command, start_ns, end_ns(command), approached=False)
+
+    def correct(self, t_ns: int, u: Array, source: tuple[int, int]) -> bool:
+        """Take note of what the robot reports to act, as `Belief.correct`; return whether that was not known."""
+        changed = self._schedule.correct(t_ns, u, source)
+        if changed:
+            self._slowest.copy(self._schedule)
+            self._alone = EVER_NS, self._schedule.u_rest
+        return changed
+
+    @property
+    def confirmed(self) -> int:
+        """Reports of the robot in a row that have named the command which was to act."""
+        return self._schedule.confirmed
+
+    def brake(self, before_ns: int, now_ns: int) -> None:
+        """Assume that the robot, whose clock has jumped from one time to another, brakes from what acted."""
+        self._left_ns = EVER_NS
+        for schedule in (self._schedule, self._slowest):
+            schedule.cut(before_ns, now_ns)
+
+    def clear(self) -> None:
+        """Forget everything: the robot was restarted, and stands."""
+        self._left_ns = EVER_NS
+        for schedule in (self._schedule, self._slowest):
+            schedule.brake(schedule.u_rest, EVER_NS)
+
+    def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Array, float]]:
+        """Yield the inputs that act between two times, shape ``(nu,)``, each with for how long, s; backward, the one that acts at the end."""
+        if to_ns < from_ns:
+            yield self.at(to_ns)[0], 1e-9 * (to_ns - from_ns)
+        while from_ns < to_ns:
+            u, change_ns = self.at(from_ns)
+            until_ns = min(change_ns, to_ns)
+            yield u, 1e-9 * (until_ns - from_ns)
+            from_ns = until_ns
+
+    def at(self, t_ns: int) -> tuple[Array, int]:
+        """Return the input that acts at a time, shape ``(nu,)``, and when it next changes."""
+        u, change_ns, _ = self._schedule.at(t_ns)
+        return u, change_ns
+
+    def reach(self, t_ns: int) -> tuple[Array, Array]:
+        """
+        Return what the first two rows of a plan may be at least and at most, each of shape ``(2, nu)``.
+
+        Row 0 takes over at a time, or late by up to a period. It is to be within
+        the slew limits of every input that acts in the period before, and of those
+        that act until it arrives; so is row 1 of the latter. Then the inputs change
+        by no more than the limits within any period, whenever the plan arrives, and
+        within three quarters of one, however long commands are on their way.
+        Where the robot brakes on its own, that leaves it the speed it has; a plan
+        that has ended this may be late, too, and the robot have braked on.
+        """
+        acting = self.at(t_ns)[0]
+        second = self._near(self._schedule, acting + self._slew[0], acting + self._slew[1], t_ns, t_ns + self._dt_ns - 1)
+        ended_ns, u = self._alone
+        if abs(t_ns - ended_ns) < self._dt_ns:
+            way, share = self._schedule.u_rest - u, (t_ns + self._dt_ns - ended_ns) / self._dt_ns
+            second = self._within(*second, u + np.clip(way, share * self._slew[0], share * self._slew[1]))
+        first = self._near(self._schedule, *second, t_ns - self._dt_ns + 1, t_ns)
+        first = self._near(self._slowest, *first, t_ns - self._window_ns, t_ns + self._transit_ns)
+        return np.array([first[0], second[0]]), np.array([first[1], second[1]])
+
+    def _near(self, schedule: Schedule, lowest: Array, highest: Array, at_ns: int, last_ns: int) -> tuple[Array, Array]:
+        """Narrow an interval to what is within the slew limits of all inputs from one time to another; if nothing is, to what comes nearest."""
+        while at_ns <= last_ns:
+            u, change_ns, _ = schedule.at(at_ns)
+            lowest, highest = self._within(lowest, highest, u)
+            at_ns = change_ns if at_ns == last_ns else min(change_ns, last_ns)
+        return lowest, highest
+
+    def _within(self, lowest: Array, highest: Array, u: Array) -> tuple[Array, Array]:
+        """Narrow an interval to what is within the slew limits of an input."""
+        narrowed = np.minimum(np.maximum(lowest, u + self._slew[0]), highest)
+        return narrowed, np.maximum(np.minimum(highest, u + self._slew[1]), narrowed)

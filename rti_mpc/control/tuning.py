@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Other weights and bounds for a controller that runs, without a bump.
+
+Weights change from one sample to the next: what a plan may do with an input is
+bounded all the same. A bound that the input is beyond is approached as fast as
+the slew limits allow: until then it stays just so far out that a plan can keep
+it. The first increment keeps the old slew limits and the new ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.errors import OcpError
+from rti_mpc.rti.linearization import WEIGHTS
+from rti_mpc.rti.ocp import Ocp, restless
+from rti_mpc.rti.rti import Rti
+
+BOUNDS = ("lbu", "ubu", "lbdu", "ubdu")
+STRUCTURE = ("N", "N_u", "dt", "method")
+PRESENCE = (*BOUNDS, "lbx", "ubx", "lh", "uh")
+
+
+class Tuning:
+    """
+    What an `Rti` is to be tuned to.
+
+    Attributes:
+        version: Of the weights and bounds that act; 0 for those it was built with.
+    """
+
+    def __init__(self, rti: Rti, limits: Mapping[str, Array] | None = None) -> None:
+        """
+        Begin with what an `Rti` was built with.
+
+        Args:
+            rti: It.
+            limits: Where else the bounds that act are to be written, by name: ``lbu`` and ``ubu``, each of shape ``(nu,)``.
+        """
+        self.version = 0
+        self._rti = rti
+        self._limits = {} if limits is None else {name: limits[name] for name in ("lbu", "ubu")}
+        self._changed = False
+        self._wanted = rti.ocp
+        self._wanted_version = 0
+        self._slew = rti.ocp.lbdu, rti.ocp.ubdu  # of this sample
+        self._acting = {name: getattr(rti.ocp, name) for name in BOUNDS}
+        self._written = 0  # version of the weights that act
+
+    def change(self, ocp: Ocp, version: int) -> None:
+        """
+        Tune to the weights and bounds of an OCP, from the next `begin` on.
+
+        Raises:
+            OcpError: Something else of it differs, such as which bounds there are, or its bounds leave out rest.
+        """
+        built = self._rti.ocp
+        for name in STRUCTURE:
+            if getattr(ocp, name) != getattr(built, name):
+                raise OcpError(f"{name} must stay {getattr(built, name)}, got {getattr(ocp, name)}: it is compiled in")
+        for name in PRESENCE:
+            if not np.array_equal(np.isfinite(getattr(ocp, name)), np.isfinite(getattr(built, name))):
+                raise OcpError(f"{name} must be finite where it was built so, and only there, got {getattr(ocp, name)}: it is compiled in")
+        if wrong := restless(ocp):
+            raise OcpError(wrong)
+        self._wanted, self._wanted_version = ocp, version
+        self._changed = True
+
+    def begin(self) -> None:
+        """Begin the preparation of another sample."""
+        lbdu, ubdu = self._wanted.lbdu, self._wanted.ubdu
+        if self.version != self._wanted_version:
+            self.version = self._wanted_version
+            lbdu, ubdu = np.maximum(lbdu, self._acting["lbdu"]), np.minimum(ubdu, self._acting["ubdu"])
+        self._slew = lbdu, ubdu
+
+    def follow(self, u_prev: Array) -> None:
+        """
+        Go there, as far as the input allows; before each preparation.
+
+        Args:
+            u_prev: Input before the plan, shape ``(nu,)``.
+        """
+        if not self._changed:
+            return
+        wanted, (lbdu, ubdu) = self._wanted, self._slew
+        bounds = dict(zip(BOUNDS, (np.minimum(wanted.lbu, u_prev + ubdu), np.maximum(wanted.ubu, u_prev + lbdu), lbdu, ubdu), strict=True))
+        fresh = self.version != self._written
+        if fresh or any(not np.array_equal(bounds[name], self._acting[name]) for name in BOUNDS):
+            self._rti.retune({**{name: getattr(wanted, name) for name in WEIGHTS if fresh}, **bounds})
+            for name, limit in self._limits.items():
+                limit[:] = bounds[name]
+        self._acting, self._written = bounds, self.version

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Robots as CasADi expressions: names, units, bounds, integrators, obstacles and disturbances."""

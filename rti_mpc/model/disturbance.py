@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+What a model leaves out, as parameters of it: :math:`\dot x = f(x, u + d_u, p) + d_x`.
+
+A disturbance of an input stands for wrong gains and friction, one of a state
+for slip and wind. They are parameters like others, so whatever predicts with the
+model predicts with them [Pannocchia2003]_.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import casadi as ca
+
+from rti_mpc.errors import OcpError
+from rti_mpc.model.model import Model, Signal
+
+PREFIX = "d_"
+
+
+def with_disturbances(model: Model, names: Iterable[str]) -> Model:
+    """
+    Append disturbances to the parameters of a model.
+
+    Args:
+        model: The undisturbed one.
+        names: Inputs, which they are added to, in the input's unit; or states, to whose derivative they are added, in the state's unit / s.
+
+    Returns:
+        The model with parameters ``d_<name>`` at the end, nominally zero.
+
+    Raises:
+        OcpError: A name is neither an input nor a state.
+    """
+    names = tuple(names)
+    if not names:
+        return model
+    inputs, states = [s.name for s in model.inputs], [s.name for s in model.states]
+    if unknown := [name for name in names if name not in (*inputs, *states)]:
+        raise OcpError(f"a disturbance must be of an input ({', '.join(inputs)}) or of a state ({', '.join(states)}), got {', '.join(unknown)}")
+    d = ca.SX.sym("d", len(names))
+    by_name = dict(zip(names, ca.vertsplit(d), strict=True))
+    zero = ca.SX(0)
+    u = model.u + ca.vertcat(*(by_name.get(name, zero) for name in inputs))
+    f = ca.substitute(model.f_expl_expr, model.u, u) + ca.vertcat(*(by_name.get(name, zero) if name not in inputs else zero for name in states))
+    units = {s.name: f"{s.unit}/s" for s in model.states} | {s.name: s.unit for s in model.inputs}
+    return replace(
+        model,
+        p=ca.vertcat(model.p, d),
+        f_expl_expr=f,
+        parameters=(*model.parameters, *(Signal(PREFIX + name, units[name]) for name in names)),
+        p_nominal=(*model.p_nominal, *(0.0 for _ in names)),
+    )

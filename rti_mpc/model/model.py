@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+A robot as CasADi expressions: :math:`\dot x = f(x, u, p)`, outputs, and what else is to be kept inside bounds, with names and units.
+
+The names are those of acados (`f_expl_expr`), so that a model written for it
+can be brought along.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+import sysconfig
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import casadi as ca
+
+from rti_mpc.errors import OcpError
+from rti_mpc.signals import VECTORS, misplaced
+from rti_mpc.signals import Signal as Signal
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """
+    A continuous-time model.
+
+    Attributes:
+        name: Name, as in the configuration.
+        x: State symbol, shape ``(nx, 1)``.
+        u: Input symbol, shape ``(nu, 1)``.
+        p: Parameter symbol, shape ``(np, 1)``.
+        f_expl_expr: Right-hand side f(x, u, p), shape ``(nx, 1)``.
+        y_expr: Output h(x, p), shape ``(ny, 1)``.
+        states: Names and units of `x`.
+        inputs: Names and units of `u`.
+        outputs: Names and units of `y_expr`.
+        parameters: Names and units of `p`.
+        h_expr: What else than inputs and states may be bounded, h(x, u, p), shape ``(nh, 1)``; nothing by default.
+        constraints: Names and units of `h_expr`.
+        p_nominal: Values of `p` unless a reference carries others.
+        u_rest: Input at which the robot stands still; zeros by default.
+
+    Raises:
+        OcpError: A dimension, a name or a free symbol does not fit.
+    """
+
+    name: str
+    x: ca.SX
+    u: ca.SX
+    f_expl_expr: ca.SX
+    y_expr: ca.SX
+    states: tuple[Signal, ...]
+    inputs: tuple[Signal, ...]
+    outputs: tuple[Signal, ...]
+    p: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
+    parameters: tuple[Signal, ...] = ()
+    p_nominal: tuple[float, ...] = ()
+    h_expr: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
+    constraints: tuple[Signal, ...] = ()
+    u_rest: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check that names, dimensions and symbols fit together."""
+        if not self.u_rest:
+            object.__setattr__(self, "u_rest", (0.0,) * len(self.inputs))
+        for label, expr, length in (
+            ("states", self.x, len(self.states)),
+            ("f_expl_expr", self.f_expl_expr, len(self.states)),
+            ("inputs", self.u, len(self.inputs)),
+            ("outputs", self.y_expr, len(self.outputs)),
+            ("parameters", self.p, len(self.parameters)),
+            ("constraints", self.h_expr, len(self.constraints)),
+            ("p_nominal", self.p, len(self.p_nominal)),
+            ("u_rest", self.u, len(self.u_rest)),
+        ):
+            if expr.numel() != length or (length and expr.shape != (length, 1)):
+                raise OcpError(f"model {self.name}: {label} must have {expr.numel()} entries, in a column, got {length} for shape {expr.shape}")
+        for vector in VECTORS:
+            signals: tuple[Signal, ...] = getattr(self, vector)
+            names = [signal.name for signal in signals]
+            if len(set(names)) < len(names):
+                raise OcpError(f"model {self.name}: names must be unique within a vector, got {names}")
+            if wrong := misplaced(vector, signals, self.states):
+                raise OcpError(f"model {self.name}: {wrong}")
+        for label, expr, known in (
+            ("f_expl_expr", self.f_expl_expr, (self.x, self.u, self.p)),
+            ("y_expr", self.y_expr, (self.x, self.p)),
+            ("h_expr", self.h_expr, (self.x, self.u, self.p)),
+        ):
+            free = [str(s) for s in ca.symvar(expr) if not any(ca.depends_on(k, s) for k in known)]
+            if free:
+                raise OcpError(f"model {self.name}: {label} must depend only on x, {'' if label[0] == 'y' else 'u, '}p, also has {', '.join(free)}")
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def ny(self) -> int:
+        """Number of outputs."""
+        return len(self.outputs)
+
+    @property
+    def np_(self) -> int:
+        """Number of parameters."""
+        return len(self.parameters)
+
+    def h(self) -> ca.Function:
+        """Return the outputs at a node, ``h(x, p) -> y``."""
+        return ca.Function("h", [self.x, self.p], [ca.densify(self.y_expr)], ["x", "p"], ["y"])
+
+    def counterparts(self) -> dict[str, list[str]]:
+        """Return the names of the states that ``inputs`` command, and that ``outputs`` are; of each component, empty where there is none."""
+        x, y = ca.vertsplit(self.x), ca.vertsplit(ca.densify(self.y_expr))
+        named = [(state.name, x_j) for state, x_j in zip(self.states, x, strict=True)]
+        return {
+            "inputs": [signal.commands for signal in self.inputs],
+            "outputs": [next((name for name, x_j in named if ca.is_equal(y_i, x_j)), "") for y_i in y],
+        }
+
+    def with_parameters(self, **values: float) -> Model:
+        """
+        Return this model with other nominal parameters.
+
+        Raises:
+            OcpError: A name is not a parameter of this model.
+        """
+        names = [signal.name for signal in self.parameters]
+        for name in values:
+            if name not in names:
+                raise OcpError(f"model {self.name} has parameters {', '.join(names) or 'none'}, got {name}")
+        return replace(self, p_nominal=tuple(values.get(n, v) for n, v in zip(names, self.p_nominal, strict=True)))
+
+
+MODEL_NAME = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")  # package.module:function
+SHIPPED = {"pioneer_3dx": "rti_mpc.model.robots.pioneer_3dx:pioneer_3dx"}
+
+
+def find_model(name: str) -> Model:
+    """
+    Find a model by the name of a shipped one, or by ``package.module:function``.
+
+    Raises:
+        OcpError: There is no such model, its module cannot be imported, or the function does not return one. One line, with the user's file and line.
+    """
+    path = SHIPPED.get(name, name)
+    wanted = f"a model must be one of {', '.join(SHIPPED)} or an importable package.module:function of your own, got {name!r}"
+    if not MODEL_NAME.fullmatch(path):
+        raise OcpError(wanted)
+    module_name, _, function_name = path.partition(":")
+    package = module_name.partition(".")[0]
+    if package in sys.stdlib_module_names:
+        raise OcpError(f"{wanted} ({package} is Python's own)")
+    try:
+        module = importlib.import_module(module_name)
+    except (Exception, SystemExit) as error:
+        if isinstance(error, ModuleNotFoundError) and f"{module_name}.".startswith(f"{error.name}."):
+            raise OcpError(f"{wanted} ({error})") from None
+        raise OcpError(f"{module_name} must be importable, {raised(error)}") from error
+    build: Callable[[], Model] | None = getattr(module, function_name, None)
+    if not callable(build):
+        raise OcpError(f"{wanted} ({module_name} has no function {function_name})")
+    try:
+        model = build()
+    except (Exception, SystemExit) as error:  # whatever a user's function raises, named as theirs
+        raise OcpError(f"{name} must return a model, {raised(error)}") from error
+    if not isinstance(model, Model):
+        raise OcpError(f"{name} must return a rti_mpc.model.model.Model, got {type(model).__name__}")
+    return model
+
+
+def raised(error: BaseException) -> str:
+    """Say in one line what a user's code raised, and where."""
+    if isinstance(error, SyntaxError):
+        return f"it raised {type(error).__name__} in {error.filename}, line {error.lineno}: {error.msg}"
+    foreign = (__file__, "<", sysconfig.get_paths()["purelib"])  # the user's own line, not one of a library called there
+    theirs = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(foreign)]
+    where = f" in {theirs[-1].filename}, line {theirs[-1].lineno}" if theirs else ""
+    return f"it raised {type(error).__name__}{where}: {' '.join(str(error).split()) or 'nothing said'}"

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+Discs to keep out of, as stage parameters: one that moves is one whose parameters do.
+
+    model = with_obstacles(pioneer_3dx(), [(1.0, 0.5, 0.3)])
+    ocp = Ocp(model, ..., lh=0.0)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import casadi as ca
+
+from rti_mpc.errors import OcpError
+from rti_mpc.model.model import Model
+from rti_mpc.signals import Role, Signal, plane
+
+PARTS: dict[str, Role] = {"x": "disc_x", "y": "disc_y", "r": "disc_radius"}  # of a disc: ends of the names of its parameters, and their roles
+TINY = 1e-9  # m^2: a distance of zero has no derivative
+
+
+def with_obstacles(model: Model, discs: Sequence[tuple[float, float, float]]) -> Model:
+    r"""
+    Add discs to the parameters of a model, and the clearance from each to its constraints.
+
+    The robot is a point: a disc's radius includes the robot's own, and what it
+    may cut short between two nodes, :math:`(v \, dt)^2 / 8 r`.
+
+    Args:
+        model: A model with outputs of the roles x and y.
+        discs: x, y and radius of each, in m; a reference may carry others, row by row.
+
+    Returns:
+        The model with parameters ``disc_i_x, disc_i_y, disc_i_r`` appended, and constraints ``disc_i``, in m: distance less radius, negative inside.
+
+    Raises:
+        OcpError: The model has no position, or a radius is not positive.
+    """
+    if not discs:
+        return model
+    if (position := plane(model.outputs)) is None:
+        raise OcpError(f"model {model.name}: two outputs must be a position, with role x and role y, got {[s.name for s in model.outputs]}")
+    if any(radius <= 0 for _, _, radius in discs):
+        raise OcpError(f"the radius of a disc must be positive, got {list(discs)}")
+    p = ca.SX.sym("disc", 3, len(discs))
+    away = p[:2, :] - ca.repmat(model.y_expr[list(position), 0], 1, len(discs))
+    clearance = ca.sqrt(ca.sum1(away**2) + TINY).T - p[2, :].T
+    return replace(
+        model,
+        p=ca.vertcat(model.p, ca.vec(p)),
+        parameters=(*model.parameters, *(Signal(f"disc_{i}_{part}", "m", role=role) for i in range(len(discs)) for part, role in PARTS.items())),
+        p_nominal=(*model.p_nominal, *(float(value) for disc in discs for value in disc)),
+        h_expr=ca.vertcat(model.h_expr, clearance),
+        constraints=(*model.constraints, *(Signal(f"disc_{i}", "m") for i in range(len(discs)))),
+    )
+
+
+def discs_of(model: Model) -> list[tuple[int, float, float, float]]:
+    """Return the discs among the parameters of a model: the place of the first of its three, and nominal x, y and radius, in m."""
+    p = model.p_nominal
+    return [(i, p[i], p[i + 1], p[i + 2]) for i, signal in enumerate(model.parameters) if signal.role == "disc_x"]

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+Certificate of the QP of a sample: how far a plan can be from the optimum, from the problem's own data.
+
+Nothing of the recursion is used, multipliers of increments and softened bounds
+apart, which may come from any solver: wrong ones make the certificate worse, never
+better. With the gradient of the Lagrangian reduced to the inputs by one adjoint
+sweep, r, convexity bounds the cost of every plan from below, so that a plan costs
+at most
+
+.. math::
+
+    \sum_i \max_{lbu_i \le v \le ubu_i} r_i (u_i - v)
+    + \sum_j \mu_j \, (\text{distance to its bound})
+    + \sum_j \left( p_j(s_j) - \mu_j s_j - \min_{s \ge 0} (p_j(s) - \mu_j s) \right)
+
+more than the optimum: the duality gap. p is the penalty on a slack. Multipliers of
+bounds on inputs are r where it pushes against them, and need not be known.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from rti_mpc.codegen import function
+from rti_mpc.rti.linearization import Linearization, divided
+from rti_mpc.rti.ocp import Ocp
+
+TINY = 1e-300  # in place of a quadratic penalty of zero
+
+
+def certificate(ocp: Ocp) -> ca.Function:
+    """
+    Build ``(x, u, u_prev, x0, stages, x_plan, u_plan, multipliers, *WEIGHTS, scale) -> (r, primal, gap, cost)``.
+
+    `multipliers` are those of increments, shape ``(nu, N_u)``, and of what has softened bounds, shape ``(ng, N)``, positive at an upper bound, one
+    after the other. `r` is the gradient of the Lagrangian reduced to the inputs, shape ``(nu, N_u)``, those of bounds on inputs left out; `primal`
+    the largest violation of dynamics, bounds and increments relative to their scales; `gap` a bound on the cost above the optimum, and `cost` that of
+    the plan, penalties included, both normalised.
+    """
+    lin = Linearization(ocp)
+    N, N_u, nx, nu, ng = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu, len(ocp.lg)
+    x_plan, u_plan, x0 = ca.MX.sym("x_plan", nx, N + 1), ca.MX.sym("u_plan", nu, N_u), ca.MX.sym("x0", nx)
+    stages, multipliers = ca.MX.sym("stages", lin.stages.numel()), ca.MX.sym("multipliers", nu * N_u + ng * N)
+    forms = lin.forms_in(stages)
+    of_increments, of_softened = divided(multipliers, [lin.u, lin.g])
+    w = lin.w
+
+    dx, du = x_plan - lin.x, u_plan - lin.u
+    held = ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u))
+    shared = [ca.repmat(e, 1, N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg, lin.scale_x, lin.scale_g)]
+    data = (forms.A, forms.B, forms.b, forms.H, forms.h, forms.g, forms.g_x, forms.g_u)
+    nodes = node(ocp, lin).map(N)(*data, dx[:, :-1], held, dx[:, 1:], of_softened, *shared)
+    sums, by_x, by_u = nodes[:3, :], ca.horzsplit(nodes[3 : 3 + nx, :]), nodes[3 + nx :, :]
+
+    sweep = adjoint(lin)
+    A_k, B_k, by_u_k = (ca.horzsplit(e) for e in (forms.A, forms.B, by_u))
+    reduced: list[ca.MX] = [ca.MX.zeros(nu)] * N_u
+    pi = by_x[-1]
+    for k in reversed(range(N)):
+        gradient, pi = sweep(A_k[k], B_k[k], by_u_k[k], pi, by_x[k - 1] if k else ca.MX.zeros(nx))
+        reduced[min(k, N_u - 1)] += gradient
+
+    planned = u_plan - ca.horzcat(lin.u_prev, u_plan[:, :-1])
+    forces = (lin.R @ planned) * ca.repmat(w["lambda_"].T, nu, 1)
+    push = forces + of_increments
+    push = push - ca.horzcat(push[:, 1:], ca.MX.zeros(nu)) + ca.repmat(forms.damping, 1, N_u) * du
+    shared = [ca.repmat(e, 1, N_u) for e in (w["lbu"], w["ubu"], w["lbdu"], w["ubdu"], lin.scale_u)]
+    inputs = of_inputs(ocp).map(N_u)(ca.horzcat(*reduced) + push, u_plan, planned, of_increments, *shared)
+
+    primal = ca.fmax(ca.fmax(ca.mmax(sums[0, :]), ca.mmax(inputs[0, :])), ca.mmax(ca.fabs(x_plan[:, 0] - x0) / lin.scale_x))
+    gap = ca.sum2(sums[1, :]) + ca.sum2(inputs[1, :])
+    total = (forms.cost - ca.dot(forms.increments, forms.force) + ca.dot(planned, forces)) / 2 + ca.sum2(sums[2, :])
+    guess = {"x": lin.x, "u": lin.u, "u_prev": lin.u_prev, "x0": x0, "stages": stages}
+    plan = {"x_plan": x_plan, "u_plan": u_plan, "multipliers": multipliers}
+    return function("certificate", {**guess, **plan, **lin.weights}, {"r": inputs[2:, :], "primal": primal, "gap": gap, "cost": total})
+
+
+def node(ocp: Ocp, lin: Linearization) -> ca.Function:
+    """Build the terms of one stage and the node at its end: ``-> [violation of the dynamics; gap; cost; gradients in dx and du]``."""
+    nx, nu, ng = ocp.model.nx, ocp.model.nu, len(ocp.lg)
+    nz = [ca.SX.sym(name, pattern.nnz()) for name, pattern in zip("ABHXU", (lin.A_k, lin.B_k, lin.H_i, lin.G_x, lin.G_u), strict=True)]
+    A, B, H, G_x, G_u = (ca.SX(pattern, values) for pattern, values in zip((lin.A_k, lin.B_k, lin.H_i, lin.G_x, lin.G_u), nz, strict=True))
+    b, h, before, after, scale_x = (ca.SX.sym(name, nx) for name in ("b", "h", "before", "after", "scale_x"))
+    du = ca.SX.sym("du", nu)
+    g, mu, lg, ug, zg, Zg, scale_g = (ca.SX.sym(name, ng) for name in ("g", "mu", "lg", "ug", "zg", "Zg", "scale_g"))
+    violation = ca.mmax(ca.fabs(A @ before + B @ du + b - after) / scale_x)
+    value = g + G_x @ after + G_u @ du
+    gap = ca.SX(0)
+    cost = ca.dot(h, after) + ca.dot(after, H @ after) / 2
+    taken = ca.SX(ng, 1)
+    for j in range(ng):
+        for sign, bound, there in ((1, ug[j], np.isfinite(ocp.ug[j])), (-1, -lg[j], np.isfinite(ocp.lg[j]))):
+            if there:
+                beyond = sign * value[j] - bound
+                s = ca.fmax(0, beyond)
+                penalty = (zg[j] * s + Zg[j] * s**2 / 2) / 2
+                most = (zg[j] + Zg[j] * s) / 2  # what the slack pays for: no multiplier is larger
+                multiplier = ca.fmax(0, ca.fmin(sign * mu[j], most))
+                gap += penalty - multiplier * beyond + ca.fmax(0, multiplier - zg[j] / 2) ** 2 / ca.fmax(Zg[j], TINY)
+                cost += penalty
+                taken[j] += sign * multiplier
+    by_x, by_u = H @ after + h + G_x.T @ taken, G_u.T @ taken
+    inputs = [nz[0], nz[1], b, nz[2], h, g, nz[3], nz[4], before, du, after, mu, lg, ug, zg, Zg, scale_x, scale_g]
+    return ca.Function("certify_node", inputs, [ca.cse(ca.densify(ca.vertcat(violation, gap, cost, by_x, by_u)))])
+
+
+def adjoint(lin: Linearization) -> ca.Function:
+    """Build one stage of the adjoint sweep: ``(A, B, by_u, pi, by_x) -> (B' pi + by_u, A' pi + by_x)``."""
+    a, b = ca.SX.sym("a", lin.A_k.nnz()), ca.SX.sym("b", lin.B_k.nnz())
+    A, B = ca.SX(lin.A_k, a), ca.SX(lin.B_k, b)
+    by_u, pi, by_x = ca.SX.sym("by_u", B.shape[1]), ca.SX.sym("pi", A.shape[0]), ca.SX.sym("by_x", A.shape[0])
+    return ca.Function("certify_back", [a, b, by_u, pi, by_x], [ca.densify(B.T @ pi + by_u), ca.densify(A.T @ pi + by_x)])
+
+
+def of_inputs(ocp: Ocp) -> ca.Function:
+    """Build the terms of one input: ``-> [violation of its bounds; gap; reduced gradient]``."""
+    nu = ocp.model.nu
+    names = ("r", "u", "increment", "mu", "lbu", "ubu", "lbdu", "ubdu", "scale")
+    r, u, increment, mu, lbu, ubu, lbdu, ubdu, scale = symbols = [ca.SX.sym(name, nu) for name in names]
+    violation, gap = ca.SX(0), ca.SX(0)
+    for j in range(nu):
+        for sign, bounds, limits, at, pace in ((1, ocp.ubu, ocp.ubdu, ubu[j], ubdu[j]), (-1, ocp.lbu, ocp.lbdu, -lbu[j], -lbdu[j])):
+            room = at - sign * u[j] if np.isfinite(bounds[j]) else scale[j]
+            gap += ca.fmax(0, -sign * r[j]) * ca.fmax(0, room)
+            if np.isfinite(bounds[j]):
+                violation = ca.fmax(violation, -room / scale[j])
+            if np.isfinite(limits[j]):
+                left = pace - sign * increment[j]
+                violation = ca.fmax(violation, -left / scale[j])
+                gap += ca.fmax(0, sign * mu[j]) * ca.fmax(0, left)
+            else:
+                gap += ca.fmax(0, sign * mu[j]) / TINY
+    return ca.Function("certify_input", symbols, [ca.cse(ca.densify(ca.vertcat(violation, gap, r)))])

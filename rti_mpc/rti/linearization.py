@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+The linear-quadratic approximation of the OCP at a guess, stage by stage: what both formulations are made of.
+
+At a guess :math:`(x, u)`, in the deviations
+:math:`\Delta x_k = x_k^+ - x_k`, :math:`\Delta u_k = u_k^+ - u_k`, the
+dynamics and outputs of `rti_mpc.rti.ocp` become
+
+.. math::
+
+    \Delta x_0 &= \bar x_0 - x_0 \\
+    \Delta x_{k+1} &= A_k \Delta x_k + B_k \Delta u_k + b_k, \qquad b_k = \phi(x_k, u_k, p_k) - x_{k+1} \\
+    y_i &\approx h(x_i, p_i) + C_i \Delta x_i
+
+and the cost its Gauss-Newton approximation. It is halved, to read
+:math:`\tfrac12 z^T P z + q^T z` as a QP solver wants it.
+
+Far from the reference the curvature that Gauss-Newton leaves out, residual times
+second derivative, is the larger part, and full steps go to and fro. So steps are
+damped in proportion to the cost at the guess (Levenberg-Marquardt
+[FanYuan2005]_): where the reference is met, not at all; the optimum stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+import scipy.sparse as sp
+
+from rti_mpc.codegen import function
+from rti_mpc.rti.ocp import Ocp
+
+# What may change between samples without a new structure: attributes of the Ocp, read by the compiled functions in this order.
+WEIGHTS = ("Q", "R", "delta", "lambda_", "lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx", "z", "Z", "Q_e", "lh", "uh", "zh", "Zh")
+
+DAMPING = 0.005  # of the cost, for a step of half an input's range; see docs/engine.md
+
+
+class Forms(NamedTuple):
+    """
+    What a structured solver needs of a linearization, as expressions; see `Linearization` for each. Columns are stages or nodes.
+
+    Attributes:
+        A: Nonzeros of the sensitivities to the state, shape ``(nnz, N)``.
+        B: Those to the input, shape ``(nnz, N)``.
+        b: Defects, shape ``(nx, N)``.
+        H: Nonzeros of the Hessian of half the output cost, shape ``(nnz, N)``.
+        h: Its gradient, shape ``(nx, N)``.
+        force: Gradient of half the cost of the increments in themselves, shape ``(nu, N_u)``.
+        increments: Increments, shape ``(nu, N_u)``.
+        g: What has softened bounds, shape ``(ng, N)``.
+        g_x: Nonzeros of its sensitivities to the state, shape ``(nnz, N)``.
+        g_u: Those to the input, shape ``(nnz, N)``.
+        damping: Weight of half the square of a step in each input, shape ``(nu, 1)``.
+        checksum: Finite if and only if all of this is.
+        cost: The cost (4) at the guess.
+    """
+
+    A: ca.MX
+    B: ca.MX
+    b: ca.MX
+    H: ca.MX
+    h: ca.MX
+    force: ca.MX
+    increments: ca.MX
+    g: ca.MX
+    g_x: ca.MX
+    g_u: ca.MX
+    damping: ca.MX
+    checksum: ca.MX
+    cost: ca.MX
+
+
+class Linearization:
+    """
+    Expressions of one sample. Columns are stages or nodes.
+
+    Attributes:
+        x: State guess, shape ``(nx, N + 1)``.
+        u: Input guess, shape ``(nu, N_u)``.
+        u_prev: Input before the plan, shape ``(nu, 1)``.
+        y_ref: Reference, shape ``(ny, N)``.
+        p: Stage parameters, shape ``(np, N + 1)``.
+        w: The weights and bounds, by the names in `WEIGHTS`.
+        scale_x: What states are measured by inside the solvers, shape ``(nx, 1)``; `scale_u`, inputs; `scale_g`, what has softened bounds.
+        A: Sensitivities to the state, nonzeros of `A_k` column by column, shape ``(nnz, N)``.
+        B: Sensitivities to the input, nonzeros of `B_k`, shape ``(nnz, N)``.
+        A_k: Pattern of one A, shape ``(nx, nx)``.
+        B_k: Pattern of one B, shape ``(nx, nu)``.
+        b: Defects, shape ``(nx, N)``.
+        gradient: Gradient of half the output cost in the states at nodes 1 to N, shape ``(nx, N)``.
+        hessian: Its Gauss-Newton Hessian, nonzeros of `H_i`, shape ``(nnz, N)``.
+        H_i: Pattern of one Hessian, symmetric, shape ``(nx, nx)``.
+        g: What has softened bounds, at nodes 1 to N: states, then general constraints; shape ``(ng, N)``.
+        g_x: Its sensitivities to the state of the node, nonzeros of `G_x`, shape ``(nnz, N)``.
+        g_u: Its sensitivities to the input that led there, nonzeros of `G_u`, shape ``(nnz, N)``.
+        G_x: Pattern of one, shape ``(ng, nx)``.
+        G_u: Pattern of one, shape ``(ng, nu)``.
+        lg: Lower bounds on g, shape ``(ng, 1)``; `ug`, upper bounds; `zg` and `Zg`, weights of the slacks.
+        increments: ``u_k - u_{k-1}``, shape ``(nu, N_u)``.
+        force: ``lambda_k R (u_k - u_{k-1})``, shape ``(nu, N_u)``.
+        damping: Weight of half the square of a step in each input, shape ``(nu, 1)``; zero for a linear model.
+        R: The increment weight, sparse.
+        cost: The cost (4) at the guess.
+        checksum: Finite if and only if everything above is.
+        forms: What of these a structured solver needs.
+        stages: All forms in one column.
+    """
+
+    def __init__(self, ocp: Ocp) -> None:
+        model, N, N_u = ocp.model, ocp.N, ocp.N_u
+        nx, nu = model.nx, model.nu
+        self.x = ca.MX.sym("x", nx, N + 1)
+        self.u = ca.MX.sym("u", nu, N_u)
+        self.u_prev = ca.MX.sym("u_prev", nu)
+        self.y_ref = ca.MX.sym("y_ref", model.ny, N)
+        self.p = ca.MX.sym("p", model.np_, N + 1)
+        self.w = {name: ca.MX.sym(name, *np.shape(getattr(ocp, name))) for name in WEIGHTS}
+        self._scale = ca.MX.sym("scale", nx + nu + len(ocp.lg))
+        self.scale_x, self.scale_u, self.scale_g = self._scale[:nx], self._scale[nx : nx + nu], self._scale[nx + nu :]
+
+        stage, self.A_k, self.B_k = linearize(ocp)
+        held = ca.horzcat(self.u, ca.repmat(self.u[:, -1], 1, N - N_u))
+        stages = stage.map(N)(self.x[:, :-1], held, self.p[:, :-1])
+        to_B = nx + self.A_k.nnz()
+        self.A, self.B = stages[nx:to_B, :], stages[to_B:, :]
+        self.b = stages[:nx, :] - self.x[:, 1:]
+
+        node, self.H_i = gauss_newton(ocp)
+        W = ca.kron(self.w["delta"].T, self.w["Q"])
+        W = ca.horzcat(W[:, : -model.ny], W[:, -model.ny :] + self.w["Q_e"])
+        nodes = node.map(N)(self.x[:, 1:], self.p[:, 1:], self.y_ref, W)
+        self.gradient, self.hessian = nodes[:nx, :], nodes[nx + 1 :, :]
+
+        soft, w = list(ocp.soft), self.w
+        constraint, self.G_x, self.G_u = constraints(ocp)
+        bounded = constraint.map(N)(self.x[:, 1:], held, self.p[:, 1:])
+        to_x, to_u = len(ocp.lg), len(ocp.lg) + self.G_x.nnz()
+        self.g, self.g_x, self.g_u = bounded[:to_x, :], bounded[to_x:to_u, :], bounded[to_u:, :]
+        self.lg, self.ug = ca.vertcat(w["lbx"][soft, 0], w["lh"]), ca.vertcat(w["ubx"][soft, 0], w["uh"])
+        self.zg, self.Zg = ca.vertcat(w["z"][soft, 0], w["zh"]), ca.vertcat(w["Z"][soft, 0], w["Zh"])
+
+        self.increments = self.u - ca.horzcat(self.u_prev, self.u[:, :-1])
+        self.R = self.w["R"] * pattern(ocp.R)
+        self.force = (self.R @ self.increments) * ca.repmat(self.w["lambda_"].T, nu, 1)
+        self.cost = ca.sum2(nodes[nx, :]) + ca.dot(self.increments, self.force)
+        self.damping = damping(ocp) * self.cost / self.scale_u**2
+        self.checksum = ca.sum1(ca.vec(stages)) + ca.sum1(ca.vec(nodes)) + self.cost + ca.sum1(ca.vec(self.b))
+        self.checksum += ca.sum1(ca.vec(bounded))
+        self.forms = Forms(
+            A=self.A,
+            B=self.B,
+            b=self.b,
+            H=self.hessian,
+            h=self.gradient,
+            force=self.force,
+            increments=self.increments,
+            g=self.g,
+            g_x=self.g_x,
+            g_u=self.g_u,
+            damping=self.damping,
+            checksum=self.checksum,
+            cost=self.cost,
+        )
+        self.stages = ca.veccat(*self.forms)
+
+    @property
+    def arguments(self) -> dict[str, ca.MX]:
+        """What the data of a sample depends on, by name, in the order of all compiled functions."""
+        return self.sample | self.weights
+
+    @property
+    def weights(self) -> dict[str, ca.MX]:
+        """What stays from sample to sample: weights and bounds, by the names in `WEIGHTS`, and the scale."""
+        return self.w | {"scale": self._scale}
+
+    @property
+    def sample(self) -> dict[str, ca.MX]:
+        """What changes from sample to sample: all but the weights."""
+        return {"x": self.x, "u": self.u, "u_prev": self.u_prev, "y_ref": self.y_ref, "p": self.p}
+
+    def forms_in(self, stages: ca.MX) -> Forms:
+        """Return the forms that a column of them holds."""
+        return Forms(*divided(stages, self.forms))
+
+    def increment_gradient(self) -> ca.MX:
+        """Return the gradient of half the increment cost in the inputs, shape ``(nu, N_u)``."""
+        return ca.MX(self.force - ca.horzcat(self.force[:, 1:], ca.MX.zeros(self.u_prev.numel())))
+
+    def increment_hessian(self, k: int) -> tuple[ca.MX, ca.MX | None]:
+        """Return the blocks ``(k, k)`` and ``(k, k + 1)`` of the Hessian of half the increment cost and the damping; None after the last stage."""
+        last = k == self.u.shape[1] - 1
+        following = 0 if last else self.w["lambda_"][k + 1]
+        return self.R * (self.w["lambda_"][k] + following) + ca.diag(self.damping), None if last else -self.R * following
+
+
+def divided(flat: ca.MX, like: Sequence[ca.MX]) -> list[ca.MX]:
+    """Divide a column into expressions of given shapes."""
+    ends = np.cumsum([0, *(one.numel() for one in like)]).tolist()
+    return [ca.reshape(part, one.shape) for part, one in zip(ca.vertsplit(flat, ends), like, strict=True)]
+
+
+def linearize(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
+    """
+    Linearize the dynamics over one stage.
+
+    Returns:
+        ``stage(x, u, p) -> [phi; nonzeros of A; nonzeros of B]``, with the patterns of A, shape ``(nx, nx)``, and of B, shape ``(nx, nu)``.
+    """
+    model = ocp.model
+    x_next = ocp.phi()(model.x, model.u, model.p)
+    A = ca.jacobian(x_next, model.x)
+    B = ca.jacobian(x_next, model.u)
+    out = ca.cse(ca.densify(ca.vertcat(x_next, nonzeros(A), nonzeros(B))))
+    return ca.Function("stage", [model.x, model.u, model.p], [out]), A.sparsity(), B.sparsity()
+
+
+def gauss_newton(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity]:
+    r"""
+    Build the terms of :math:`\tfrac12 \|h(x, p) - y_{ref}\|_W^2` at one node.
+
+    Returns:
+        ``node(x, p, y_ref, W) -> [gradient in x; twice the term itself; nonzeros of C' W C]``, and the pattern of the last.
+    """
+    model = ocp.model
+    y_ref = ca.SX.sym("y_ref", model.ny)
+    weight = ca.SX.sym("W", model.ny, model.ny)
+    W = weight * output_pattern(ocp)
+    C = ca.jacobian(model.y_expr, model.x)
+    e = model.y_expr - y_ref
+    H = C.T @ W @ C
+    out = ca.cse(ca.densify(ca.vertcat(C.T @ (W @ e), e.T @ (W @ e), nonzeros(H))))
+    return ca.Function("node", [model.x, model.p, y_ref, weight], [out]), H.sparsity()
+
+
+def constraints(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
+    """
+    Linearize what has softened bounds: the bounded states, then the general constraints.
+
+    Returns:
+        ``constraint(x, u, p) -> [g; nonzeros of G_x; nonzeros of G_u]``, with their patterns.
+    """
+    model = ocp.model
+    g = ca.vertcat(model.x[list(ocp.soft), 0], ocp.h_expr)
+    G_x, G_u = ca.jacobian(g, model.x), ca.jacobian(g, model.u)
+    out = ca.cse(ca.densify(ca.vertcat(g, nonzeros(G_x), nonzeros(G_u))))
+    return ca.Function("constraint", [model.x, model.u, model.p], [out]), G_x.sparsity(), G_u.sparsity()
+
+
+def nonzeros(matrix: Any) -> Any:
+    """Return the nonzeros of a matrix, column by column, as a column: CasADi's own `nz` is a row for a matrix of one row."""
+    return ca.vec(matrix.nz[:])
+
+
+def output_pattern(ocp: Ocp) -> ca.DM:
+    """Return ones where the weight on outputs may become nonzero."""
+    return pattern((ocp.Q != 0) | (ocp.Q_e != 0))
+
+
+def pattern(weight: np.ndarray[Any, Any]) -> ca.DM:
+    """Return ones where a weight matrix may become nonzero: its diagonal, and what is nonzero now."""
+    return ca.DM(sp.csc_matrix(((weight != 0) | np.eye(len(weight), dtype=bool)).astype(float)))
+
+
+def shift(ocp: Ocp) -> ca.Function:
+    """Build ``(x, u, p) -> (x_next, u_next)``: a plan moved on by one stage, its last input repeated, with the state the model predicts."""
+    model, nodes = ocp.model, ocp.N + 1
+    x, u, p = ca.MX.sym("x", model.nx, nodes), ca.MX.sym("u", model.nu, ocp.N_u), ca.MX.sym("p", model.np_, nodes)
+    x_next = ocp.phi()(x[:, -1], u[:, -1], p[:, -1])
+    moved = {"x_next": ca.horzcat(x[:, 1:], x_next), "u_next": ca.horzcat(u[:, 1:], u[:, -1])}
+    return function("shift", {"x": x, "u": u, "p": p}, moved)
+
+
+def change(lin: Linearization, u: Any) -> Any:
+    """Return the size of a step from the guess to inputs `u` as an expression: what an input changes by at most, relative to its scale."""
+    return ca.mmax(ca.fabs(u - lin.u) / ca.repmat(lin.scale_u, 1, u.shape[1]))
+
+
+def damping(ocp: Ocp) -> float:
+    """Return the damping of a step of the scale of an input, relative to the cost: none for a linear model, whose full step is exact."""
+    model = ocp.model
+    variables = ca.vertcat(model.x, model.u)
+    first = ca.jacobian(ca.vertcat(model.f_expl_expr, model.y_expr), variables)
+    linear = ca.jacobian(ca.vec(first), variables).nnz() == 0
+    return 0.0 if linear else DAMPING
+
+
+def plan_cost(ocp: Ocp) -> ca.Function:
+    """Build ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale) -> cost``: the cost (4) of a plan and its penalties, nothing of it linearized."""
+    lin = Linearization(ocp)
+    lg, ug, zg, Zg = (ca.repmat(e, 1, ocp.N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg))
+    s = ca.fmax(0, ca.fmax(lin.g - ug, lg - lin.g))
+    return function("cost", lin.arguments, {"cost": lin.cost + ca.dot(zg, s) + ca.dot(Zg, s**2) / 2})

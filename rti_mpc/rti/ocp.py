@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+The optimal control problem of one sample, frozen and validated.
+
+Over stages of `dt` seconds, with :math:`y_i = h(x_i, p_i)`, the previous input
+:math:`u_{-1}`, and inputs held after the control horizon,
+
+.. math::
+
+    \min \; & \sum_{i=1}^{N} \delta_i \|y_i - y_{ref,i}\|_Q^2
+            + \sum_{i=1}^{N_u} \lambda_i \|u_{i-1} - u_{i-2}\|_R^2
+            + \|y_N - y_{ref,N}\|_{Q_e}^2
+            + \sum_{i=1}^{N} \left( z^T s_i + \tfrac12 s_i^T Z s_i \right) \\
+    \text{s.t.} \; & x_{k+1} = \phi(x_k, u_k, p_k), \quad x_0 \text{ given}, \\
+    & lbu \le u_k \le ubu, \quad lbdu \le u_k - u_{k-1} \le ubdu, \\
+    & lbx - s_i \le x_i \le ubx + s_i, \quad
+      lh - s_i \le h(x_i, u_{i-1}, p_i) \le uh + s_i, \quad s_i \ge 0 .
+
+This is the cost (4) of [Rosales]_ in full, with a terminal weight beside it.
+Bounds on states and general constraints, each with its own slacks, are softened
+by an exact penalty, so that no measurement makes the problem infeasible. Names of
+bounds and slack weights are those of acados [Verschueren2022]_.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from copy import copy
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rti_mpc.array import Array
+from rti_mpc.errors import OcpError
+from rti_mpc.model.integrator import integrator
+from rti_mpc.model.model import Model
+
+SOFT_WEIGHT = 1e3  # L1 and L2, of slacks that are given none
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Ocp:
+    r"""
+    An optimal control problem. Everything is checked, and every array owned and read-only.
+
+    Attributes:
+        model: Dynamics and outputs.
+        N: Horizon, in stages.
+        N_u: Control horizon, ``1 <= N_u <= N``; `N` by default.
+        dt: Duration of a stage, s.
+        method: Integrator of a stage, ``"rk4"`` or ``"euler"``.
+        Q: Output weight, shape ``(ny, ny)``, given so or by its diagonal; cost / unit of the outputs squared.
+        R: Increment weight, shape ``(nu, nu)``, given so or by its diagonal; cost / unit of the inputs squared.
+        delta: Penalty sequence on outputs, shape ``(N,)``, given so or as a constant.
+        lambda_: Penalty sequence on increments, shape ``(N_u,)``, given so or as a constant.
+        lbu: Lower bound on inputs, shape ``(nu,)``; none by default, as for the following.
+        ubu: Upper bound on inputs, shape ``(nu,)``.
+        lbdu: Lower bound on the increment of inputs from stage to stage, shape ``(nu,)``.
+        ubdu: Upper bound on the increment of inputs, shape ``(nu,)``.
+        lbx: Softened lower bound on states at nodes 1 to N, shape ``(nx,)``.
+        ubx: Softened upper bound on states, shape ``(nx,)``.
+        z: L1 weight of the slacks, shape ``(nx,)``, given so or as a constant; cost / unit of the state.
+        Z: L2 weight of the slacks, shape ``(nx,)``, given so or as a constant; cost / unit of the state squared.
+        Q_e: Terminal weight beside ``delta_N Q``, shape ``(ny, ny)``, given so or by its diagonal; none by default.
+        h_expr: General constraints h(x, u, p) in the model's symbols, shape ``(nh, 1)``; the model's by default.
+        lh: Softened lower bound on them, shape ``(nh,)``.
+        uh: Softened upper bound on them, shape ``(nh,)``.
+        zh: L1 weight of their slacks, shape ``(nh,)``, given so or as a constant.
+        Zh: L2 weight of their slacks, shape ``(nh,)``, given so or as a constant.
+
+    Raises:
+        OcpError: An argument does not fit; the message names it, and what it must be. A rest input that is declared, and not zero, must fit, too.
+    """
+
+    model: Model
+    N: int
+    N_u: int
+    dt: float
+    method: str
+    Q: Array
+    R: Array
+    delta: Array
+    lambda_: Array
+    lbu: Array
+    ubu: Array
+    lbdu: Array
+    ubdu: Array
+    lbx: Array
+    ubx: Array
+    z: Array
+    Z: Array
+    Q_e: Array
+    h_expr: ca.SX
+    lh: Array
+    uh: Array
+    zh: Array
+    Zh: Array
+
+    def __init__(
+        self,
+        model: Model,
+        *,
+        N: int,
+        dt: float,
+        Q: ArrayLike,
+        R: ArrayLike,
+        N_u: int | None = None,
+        method: str = "rk4",
+        delta: ArrayLike = 1.0,
+        lambda_: ArrayLike = 1.0,
+        lbu: ArrayLike = -np.inf,
+        ubu: ArrayLike = np.inf,
+        lbdu: ArrayLike = -np.inf,
+        ubdu: ArrayLike = np.inf,
+        lbx: ArrayLike = -np.inf,
+        ubx: ArrayLike = np.inf,
+        z: ArrayLike = SOFT_WEIGHT,
+        Z: ArrayLike = SOFT_WEIGHT,
+        Q_e: ArrayLike | None = None,
+        h_expr: ca.SX | None = None,
+        lh: ArrayLike = -np.inf,
+        uh: ArrayLike = np.inf,
+        zh: ArrayLike = SOFT_WEIGHT,
+        Zh: ArrayLike = SOFT_WEIGHT,
+    ) -> None:
+        if N_u is None:
+            N_u = N
+        if not 1 <= N_u <= N:
+            raise OcpError(f"N_u and N must satisfy 1 <= N_u <= N, got N_u = {N_u}, N = {N}")
+        if not (np.isfinite(dt) and dt > 0):
+            raise OcpError(f"dt must be a positive number of seconds, got {dt}")
+        integrator(model, method)  # raises for an unknown method
+        h_expr = model.h_expr if h_expr is None else h_expr
+        nh = h_expr.numel()
+        free = [s for s in ca.symvar(h_expr) if not ca.depends_on(ca.vertcat(model.x, model.u, model.p), s)]
+        if free or (nh and h_expr.shape != (nh, 1)):
+            raise OcpError(f"h_expr must be a column of the model's x, u, p, got shape {h_expr.shape} and {free or 'nothing'} besides")
+        fields: dict[str, Any] = {"model": model, "N": N, "N_u": N_u, "dt": float(dt), "method": method, "h_expr": h_expr}
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+        values = {"Q": Q, "R": R, "delta": delta, "lambda_": lambda_, "lbu": lbu, "ubu": ubu, "lbdu": lbdu, "ubdu": ubdu, "lbx": lbx, "ubx": ubx}
+        values |= {"z": z, "Z": Z, "Q_e": np.zeros(model.ny) if Q_e is None else Q_e, "lh": lh, "uh": uh, "zh": zh, "Zh": Zh}
+        self._take(values)
+
+    def retuned(self, **values: ArrayLike) -> Ocp:
+        """
+        Return this problem with other weights and bounds, by their names; no expression is built.
+
+        Raises:
+            OcpError: As at construction.
+        """
+        other = copy(self)
+        other._take(values)
+        return other
+
+    def _take(self, values: Mapping[str, ArrayLike]) -> None:
+        """Check and own weights and bounds; for what has no reader yet."""
+        sizes = {"nx": self.model.nx, "nu": self.model.nu, "ny": self.model.ny, "nh": self.h_expr.numel(), "N": self.N, "N_u": self.N_u}
+        for name, value in values.items():
+            check, size = VALUES[name]
+            array = check(name, value, sizes[size])
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        for lower, upper in (("lbu", "ubu"), ("lbx", "ubx"), ("lh", "uh")):
+            if not np.all(getattr(self, lower) < getattr(self, upper)):
+                raise OcpError(f"{lower} must lie below {upper}, got {getattr(self, lower)} and {getattr(self, upper)}")
+        if any(self.model.u_rest) and (wrong := restless(self)):
+            raise OcpError(wrong)
+        if np.any(self.lbdu > 0) or np.any(self.ubdu < 0):
+            raise OcpError(f"lbdu <= 0 <= ubdu must hold, or no input could be kept, got {self.lbdu} and {self.ubdu}")
+
+    @property
+    def soft(self) -> tuple[int, ...]:
+        """Indices of the states with a bound, each with one slack a node."""
+        return tuple(int(j) for j in np.flatnonzero(np.isfinite(self.lbx) | np.isfinite(self.ubx)))
+
+    @property
+    def lg(self) -> Array:
+        """Lower bounds of everything softened: of the states in `soft`, then of `h_expr`."""
+        return np.concatenate([self.lbx[list(self.soft)], self.lh])
+
+    @property
+    def ug(self) -> Array:
+        """Upper bounds of everything softened."""
+        return np.concatenate([self.ubx[list(self.soft)], self.uh])
+
+    def phi(self) -> ca.Function:
+        """One stage of the dynamics, ``phi(x, u, p) -> x_next``."""
+        model = self.model
+        x_next = integrator(model, self.method)(model.x, model.u, model.p, self.dt)
+        return ca.Function("phi", [model.x, model.u, model.p], [x_next], ["x", "u", "p"], ["x_next"])
+
+
+def restless(ocp: Ocp) -> str:
+    """
+    Return why a robot could not be brought to its rest input inside the bounds, empty if it can.
+
+    A problem whose model declares no rest other than zero may leave it out; whoever is to stop a robot may not.
+    """
+    for signal, rest, *limits in zip(ocp.model.inputs, ocp.model.u_rest, ocp.lbu, ocp.ubu, ocp.lbdu, ocp.ubdu, strict=True):
+        lower, upper, falling, rising = map(float, limits)
+        if not lower <= rest <= upper:
+            return f"the bounds of input {signal.name} must hold its rest, {rest:g} {signal.unit}, or it could not be stopped, got {[lower, upper]}"
+        if not falling < 0.0 < rising:
+            return f"the increments of input {signal.name} must hold lower < 0 < upper, or it could not be stopped, got {[falling, rising]}"
+    return ""
+
+
+def weights(name: str, value: ArrayLike, length: int) -> Array:
+    """Return finite weights >= 0 of shape ``(length,)`` from these or a constant."""
+    array = vector(name, value, length)
+    if not np.all(np.isfinite(array)) or np.any(array < 0):
+        raise OcpError(f"{name} must be finite and not negative, got {array.tolist()}")
+    return array
+
+
+def weight_matrix(name: str, value: ArrayLike, size: int) -> Array:
+    """Return a finite symmetric positive semidefinite matrix from itself or its diagonal."""
+    array = np.array(value, dtype=np.float64)
+    if array.shape == (size,):
+        array = np.diag(array)
+    if array.shape != (size, size):
+        raise OcpError(f"{name} must have shape ({size}, {size}) or be its diagonal ({size},), got shape {array.shape}")
+    if (
+        not np.all(np.isfinite(array))
+        or not np.array_equal(array, array.T)
+        or np.linalg.eigvalsh(array).min(initial=0.0) < -1e-12 * np.abs(array).max()
+    ):
+        raise OcpError(f"{name} must be finite, symmetric and positive semidefinite, got {array.tolist()}")
+    return array
+
+
+def bound(name: str, value: ArrayLike, length: int) -> Array:
+    """Return bounds of shape ``(length,)`` from these or a constant; infinite where there is none."""
+    array = vector(name, value, length)
+    if np.any(np.isnan(array)):
+        raise OcpError(f"{name} must not be NaN, got {array.tolist()}")
+    return array
+
+
+def vector(name: str, value: ArrayLike, length: int) -> Array:
+    """Return an owned array of shape ``(length,)`` from one or from a constant."""
+    array = np.array(value, dtype=np.float64)
+    if array.shape not in ((), (length,)):
+        raise OcpError(f"{name} must be a number or have shape ({length},), got shape {array.shape}")
+    return np.array(np.broadcast_to(array, (length,)))
+
+
+# What checks and owns each weight and bound, and its size.
+VALUES: dict[str, tuple[Callable[[str, ArrayLike, int], Array], str]] = {
+    "Q": (weight_matrix, "ny"),
+    "R": (weight_matrix, "nu"),
+    "delta": (weights, "N"),
+    "lambda_": (weights, "N_u"),
+    "lbu": (bound, "nu"),
+    "ubu": (bound, "nu"),
+    "lbdu": (bound, "nu"),
+    "ubdu": (bound, "nu"),
+    "lbx": (bound, "nx"),
+    "ubx": (bound, "nx"),
+    "z": (weights, "nx"),
+    "Z": (weights, "nx"),
+    "Q_e": (weight_matrix, "ny"),
+    "lh": (bound, "nh"),
+    "uh": (bound, "nh"),
+    "zh": (weights, "nh"),
+    "Zh": (weights, "nh"),
+}

@@ -1,0 +1,336 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+Functions of the active-set method: bounds enter the Riccati recursion by the *place* of what they bound.
+
+At a bound it is held by a penalty too stiff to give way noticeably; beyond a
+softened one it pays for it; elsewhere it is free. Rolled out from the initial
+state, whatever crosses a bound is placed there, and a bound whose multiplier has
+changed its sign is released: a primal-dual active set method [Hintermueller2003]_.
+A roll-out that changes no place is the solution, up to what the penalty gives way;
+a refinement, one sweep over vectors with the gains as they are, takes that away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from rti_mpc.codegen import function
+from rti_mpc.rti.linearization import Forms, Linearization, change, divided, shift
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.qp.transcription import INFINITY
+from rti_mpc.rti.riccati import Gain, Riccati, Rows, Stage, columns, stagewise
+
+TOLERANCE = 1e-9  # by which a bound may be crossed before it acts, relative to its scale: rounding must not decide
+RELEASE = 1e-6  # multiplier of the wrong sign, times the scale, in units of the normalised cost, from which a bound is released
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """
+    The functions of the two phases.
+
+    The places are 0 for what is free, -1 and 1 at the lower and the upper bound, -2 and 2 beyond a softened one: of inputs and of increments, shapes
+    ``(nu, N_u)``, and of what has softened bounds, shape ``(ng, N)``, one after the other. Multipliers, of increments and of what has softened
+    bounds, are positive at an upper bound.
+
+    Attributes:
+        linearize: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale) -> stages``.
+        advance: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale, places) -> (x_next, u_next, places_next, stages)``: the same of a plan moved on by one
+            stage.
+        gains: ``(stages, u, *WEIGHTS, scale, places, stiff) -> gains``; `stiff` is the weight of the penalty that holds what is at its bound, for
+            what is measured by its scale.
+        roll_out: ``(x, u, u_prev, x0, stages, gains, *WEIGHTS, scale, places, stiff) -> (x_plan, u_plan, violation, change, changes, places_found,
+            multipliers)``: the full step, by how much it exceeds softened bounds, as it is and relative to their scale, its size, and how many
+            places change: -1 if data, gains or plan are not finite.
+        refine: ``(x, u, u_prev, stages, gains, *WEIGHTS, scale, places, stiff, r, x_plan, u_plan, multipliers) -> (x_refined, u_refined,
+            multipliers_refined)``: what a plan and its multipliers become if the gradient r that is left of the Lagrangian, see
+            `rti_mpc.rti.certificate`, is taken away.
+    """
+
+    linearize: ca.Function
+    advance: ca.Function
+    gains: ca.Function
+    roll_out: ca.Function
+    refine: ca.Function
+
+
+class Sample(NamedTuple):
+    """
+    Symbols that a roll-out and its refinement depend on.
+
+    Attributes:
+        lin: Expressions of the sample.
+        forms: Its linearization.
+        gains: Gains of all stages, shape ``(size, N_u)``.
+        place: Places of all rows.
+        stiff: Weight of the penalty that holds what is at its bound.
+    """
+
+    lin: Linearization
+    forms: Forms
+    gains: ca.MX
+    place: Rows
+    stiff: ca.MX
+
+
+def places(ocp: Ocp) -> Places:
+    """Build the functions of an OCP."""
+    lin = Linearization(ocp)
+    linearize = function("linearize", lin.arguments, {"stages": lin.stages})
+    recursion = Riccati(ocp, lin)
+    stages = ca.MX.sym("stages", linearize.numel_out("stages"))
+    kinds = [lin.u, lin.u, lin.g]
+    flat, stiff = ca.MX.sym("places", sum(kind.numel() for kind in kinds)), ca.MX.sym("stiff")
+    x0, found = ca.MX.sym("x0", ocp.model.nx), ca.MX.sym("gains", recursion.size, ocp.N_u)
+    at = Sample(lin, lin.forms_in(stages), found, Rows(*divided(flat, kinds)), stiff)
+
+    x, u = shift(ocp)(lin.x, lin.u, lin.p)
+    moved = ca.veccat(*(ca.horzcat(kind[:, 1:], kind[:, -1]) for kind in (at.place.u, at.place.du, at.place.g)))
+    linearized = linearize(**(lin.arguments | {"x": x, "u": u}))["stages"]
+    advance = {"x_next": x, "u_next": u, "places_next": moved, "stages": linearized}
+
+    acting = {"places": flat, "stiff": stiff}
+    gains = recursion.gains(at.forms, *penalties(ocp, at))
+    guess = {"x": lin.x, "u": lin.u, "u_prev": lin.u_prev}
+    fixed = {"stages": stages, "gains": found, **lin.weights, **acting}
+    rolled = roll_out(ocp, at, x0)
+    plan = {"r": lin.u, "x_plan": lin.x, "u_plan": lin.u, "multipliers": rolled["multipliers"]}
+    plan = {name: ca.MX.sym(name, *like.shape) for name, like in plan.items()}
+    return Places(
+        linearize,
+        function("advance", {**lin.arguments, "places": flat}, advance),
+        function("gains", {"stages": stages, "u": lin.u, **lin.weights, **acting}, {"gains": gains}),
+        function("roll_out", {**guess, "x0": x0, **fixed}, rolled),
+        function("refine", {**guess, **fixed, **plan}, refine(ocp, recursion, at, **plan)),
+    )
+
+
+def penalties(ocp: Ocp, at: Sample) -> tuple[Rows, Rows]:
+    """Return weight and pull of each row, by its place."""
+    lin, w, nu, ng = at.lin, at.lin.w, ocp.model.nu, len(ocp.lg)
+    place, value, lower, upper, weight = (ca.SX.sym(name, nu) for name in ("place", "value", "lower", "upper", "weight"))
+    held = ca.Function("hold", [place, value, lower, upper, weight], [*hold(place, value, lower, upper, weight)]).map(ocp.N_u)
+    place, value, lower, upper, weight, z, Z = (ca.SX.sym(name, ng) for name in ("place", "value", "lower", "upper", "weight", "z", "Z"))
+    weighs, pulls = hold(place, value, lower, upper, weight)
+    beyond = ca.fabs(place) == 2
+    pulls += beyond / 2 * (Z * (value - ca.if_else(place > 0, upper, lower)) + ca.sign(place) * z)
+    softened = ca.Function("hold_softened", [place, value, lower, upper, weight, z, Z], [weighs + beyond * Z / 2, pulls]).map(ocp.N)
+
+    def repeated(*rows: ca.MX, times: int) -> list[ca.MX]:
+        return [ca.repmat(row, 1, times) for row in rows]
+
+    stiff_u = at.stiff / lin.scale_u**2
+    weight_u, pull_u = held(at.place.u, lin.u, *repeated(w["lbu"], w["ubu"], stiff_u, times=ocp.N_u))
+    weight_du, pull_du = held(at.place.du, at.forms.increments, *repeated(w["lbdu"], w["ubdu"], stiff_u, times=ocp.N_u))
+    limits = repeated(lin.lg, lin.ug, at.stiff / lin.scale_g**2, lin.zg, lin.Zg, times=ocp.N)
+    weight_g, pull_g = softened(at.place.g, at.forms.g, *limits)
+    return Rows(weight_u, weight_du, weight_g), Rows(pull_u, pull_du, pull_g)
+
+
+def hold(place: ca.SX, value: ca.SX, lower: ca.SX, upper: ca.SX, weight: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return weight and gradient of the penalty on values that are placed at their bounds."""
+    weight = weight * (ca.fabs(place) == 1)
+    return ca.densify(weight), ca.densify(weight * (value - ca.if_else(place > 0, upper, lower)))
+
+
+def roll_out(ocp: Ocp, at: Sample, x0: ca.MX) -> dict[str, ca.MX]:
+    """Return what a roll-out returns, by name."""
+    lin, forms, w, N_u = at.lin, at.forms, at.lin.w, ocp.N_u
+    free, held = roll_free(ocp, lin), roll_held(ocp, lin)
+    x_k = columns(lin.x)
+    stages = stagewise(A=forms.A, B=forms.B, b=forms.b, g_x=forms.g_x, g_u=forms.g_u, g=forms.g, place_g=at.place.g)
+    inputs = stagewise(u=lin.u, increment=forms.increments, gain=at.gains, place_u=at.place.u, place_du=at.place.du)
+    limits = {"lg": lin.lg, "ug": lin.ug, "zg": lin.zg, "Zg": lin.Zg, "stiff_g": at.stiff / lin.scale_g**2, "scale_g": lin.scale_g}
+    bounds = {name: w[name] for name in ("lbu", "ubu", "lbdu", "ubdu")} | {"stiff_u": at.stiff / lin.scale_u**2, "scale_u": lin.scale_u}
+    s, slip = ca.vertcat(x0 - x_k[0], ca.MX.zeros(ocp.model.nu)), ca.MX.zeros(ocp.model.nx + ocp.model.nu)
+    before = lin.u_prev
+    verdict = ca.MX(ca.DM([0, -INFINITY, -INFINITY]))  # changes, violation, violation relative to scale
+    states, rolled = [x0], []
+    for k in range(ocp.N):
+        stage = {**stages[k], **limits, "x_next": x_k[k + 1], "s": s, "slip": slip, "verdict": verdict}
+        after = free(**stage, **inputs[k], before=before, **bounds) if k < N_u else held(**stage)
+        s, slip, verdict = after["s_after"], after["slip_after"], after["verdict_after"]
+        before = after.get("u_plan", before)
+        states.append(after["x_plan"])
+        rolled.append(after)
+
+    def along(name: str, count: int = ocp.N) -> ca.MX:
+        return ca.MX(ca.horzcat(*(after[name] for after in rolled[:count])))
+
+    x_plan, u_plan = ca.horzcat(*states), along("u_plan", N_u)
+    finite = forms.checksum + ca.sum1(ca.vec(u_plan)) + ca.sumsqr(x_plan) ** 2  # overflows for what is no state
+    return {
+        "x_plan": x_plan,
+        "u_plan": u_plan,
+        "violation": verdict[1:],
+        "change": change(lin, u_plan),
+        "changes": ca.if_else(ca.fabs(finite) < np.inf, verdict[0], -1),
+        "places_found": ca.veccat(along("place_u_found", N_u), along("place_du_found", N_u), along("place_g_found")),
+        "multipliers": ca.veccat(along("force", N_u), along("paid")),
+    }
+
+
+class Softened(NamedTuple):
+    """
+    A stage of the roll-out as far as it is the same with an input and without.
+
+    Attributes:
+        symbols: What it depends on, by name.
+        outputs: What it returns, by name, but for the verdict.
+        verdict: How many places have changed so far, by how much a softened bound is exceeded at most, and by what share of its scale.
+    """
+
+    symbols: dict[str, ca.SX]
+    outputs: dict[str, ca.SX]
+    verdict: list[ca.SX]
+
+
+def softened_rows(ocp: Ocp, of: Stage, s: ca.SX, slip: ca.SX, du: ca.SX, slipped: ca.SX) -> Softened:
+    """
+    Return the end of a stage, and the places of what has softened bounds there.
+
+    Args:
+        ocp: The problem.
+        of: Symbols of the stage.
+        s: Symbol of the deviation that it begins with, shape ``(nx + nu,)``.
+        slip: Symbol of what meeting bounds to the last bit has changed of s so far.
+        du: Deviation of its input.
+        slipped: By how much the input that meets its bounds differs from that.
+    """
+    nx = of.nx
+    x_next, verdict = ca.SX.sym("x_next", nx), ca.SX.sym("verdict", 3)
+    names = ("g", "place_g", "lg", "ug", "zg", "Zg", "stiff_g", "scale_g")
+    g, place_g, lg, ug, zg, Zg, stiff_g, scale_g = own = [ca.SX.sym(name, of.ng) for name in names]
+    changes, worst, share = ca.vertsplit(verdict)
+    drift = of.A @ slip[:nx] + of.B @ slipped
+    dx = of.A @ s[:nx] + of.B @ du + of.b
+    end = ca.vertcat(dx, du)
+    value = g + of.G @ end
+    planned = value + of.G @ ca.vertcat(drift, slipped)
+    found, paid = ca.SX(of.ng, 1), ca.SX(of.ng, 1)
+    for j in range(of.ng):
+        over, under = exceeded(value[j], lg[j], ug[j], ocp.lg[j], ocp.ug[j])
+        exceeds = ca.fmax(*exceeded(planned[j], lg[j], ug[j], ocp.lg[j], ocp.ug[j]))
+        worst, share = ca.fmax(worst, exceeds), ca.fmax(share, exceeds / scale_g[j])
+        found[j] = belongs(place_g[j], stiff_g[j], scale_g[j], over, under, zg[j] / 2)
+        changes += found[j] != place_g[j]
+        by = ca.if_else(place_g[j] > 0, over, under)
+        paid[j] = ca.sign(place_g[j]) * ca.if_else(ca.fabs(place_g[j]) == 2, (zg[j] + Zg[j] * by) / 2, stiff_g[j] * by)
+    symbols = {**of.dynamics, **of.defect, **of.softened, **dict(zip(names, own, strict=True))}
+    symbols |= {"x_next": x_next, "s": s, "slip": slip, "verdict": verdict}
+    outputs = {"x_plan": x_next + dx + drift, "s_after": end, "slip_after": ca.vertcat(drift, slipped)}
+    return Softened(symbols, outputs | {"place_g_found": ca.densify(found), "paid": ca.densify(paid)}, [changes, worst, share])
+
+
+def simplified(name: str, inputs: dict[str, ca.SX], outputs: dict[str, ca.SX]) -> ca.Function:
+    """Build a function whose common subexpressions are computed once."""
+    return function(name, inputs, dict(zip(outputs, ca.cse([*outputs.values()]), strict=True)))
+
+
+def roll_held(ocp: Ocp, lin: Linearization) -> ca.Function:
+    """Build a stage of the roll-out whose input is that of the stage before."""
+    of = Stage(ocp, lin)
+    s, slip = ca.SX.sym("s", of.n), ca.SX.sym("slip", of.n)
+    symbols, outputs, verdict = softened_rows(ocp, of, s, slip, s[of.nx :], slip[of.nx :])
+    return simplified("coast", symbols, {**outputs, "verdict_after": ca.vertcat(*verdict)})
+
+
+def roll_free(ocp: Ocp, lin: Linearization) -> ca.Function:
+    """Build a stage of the roll-out with an input."""
+    of, nu = Stage(ocp, lin), ocp.model.nu
+    s, slip, gain = ca.SX.sym("s", of.n), ca.SX.sym("slip", of.n), Gain(of)
+    names = ("increment", "u", "before", "place_u", "place_du", "lbu", "ubu", "lbdu", "ubdu", "stiff_u", "scale_u")
+    increment, u, before, place_u, place_du, lbu, ubu, lbdu, ubdu, stiff, scale = own = [ca.SX.sym(name, nu) for name in names]
+    du = -(gain.K @ s + gain.kappa)
+    # By so little the penalty gives way. States are to know what the actuator will do, places are not: degenerate ones would go in circles.
+    u_plan = met(u + du, before, lbu, ubu, lbdu, ubdu)
+    symbols, outputs, verdict = softened_rows(ocp, of, s, slip, du, u_plan - u - du)
+
+    def placed(value: ca.SX, place: ca.SX, lower: ca.SX, upper: ca.SX, lb: Any, ub: Any) -> ca.SX:
+        now = [belongs(place[j], stiff[j], scale[j], *exceeded(value[j], lower[j], upper[j], lb[j], ub[j]), INFINITY) for j in range(nu)]
+        return ca.densify(ca.vertcat(*now))
+
+    planned = increment + du - s[of.nx :]
+    outputs["place_u_found"] = placed(u + du, place_u, lbu, ubu, ocp.lbu, ocp.ubu)
+    outputs["place_du_found"] = placed(planned, place_du, lbdu, ubdu, ocp.lbdu, ocp.ubdu)
+    verdict[0] += ca.sum1(outputs["place_u_found"] != place_u)
+    verdict[0] += ca.sum1(outputs["place_du_found"] != place_du)
+    outputs["force"] = ca.densify(stiff * (ca.fabs(place_du) == 1) * (planned - ca.if_else(place_du > 0, ubdu, lbdu)))
+    inputs = {**symbols, "gain": gain.column, **dict(zip(names, own, strict=True))}
+    return simplified("forward", inputs, {**outputs, "u_plan": u_plan, "verdict_after": ca.vertcat(*verdict)})
+
+
+def met(u: ca.SX, before: ca.SX, lbu: ca.SX, ubu: ca.SX, lbdu: ca.SX, ubdu: ca.SX) -> ca.SX:
+    """Return an input that meets its bounds to the last bit, as an actuator wants it."""
+    paced = ca.fmax(ca.fmin(u, before + ubdu), before + lbdu)
+    return ca.fmax(ca.fmin(paced, ubu), lbu)
+
+
+def exceeded(value: ca.SX, lower: ca.SX, upper: ca.SX, lb: float, ub: float) -> tuple[ca.SX, ca.SX]:
+    """Return by how much a value is over its upper and under its lower bound, far from it where there is none."""
+    absent = ca.SX(-INFINITY)
+    return value - upper if np.isfinite(ub) else absent, lower - value if np.isfinite(lb) else absent
+
+
+def belongs(place: ca.SX, stiff: ca.SX, scale: ca.SX, over: ca.SX, under: ca.SX, most: ca.SX | float) -> ca.SX:
+    """Return where something belongs that exceeds its bounds by so much; `most` is the pull that brings it beyond, if they are softened."""
+    tolerance = TOLERANCE * scale
+    side = ca.sign(place)
+    by = ca.if_else(place > 0, over, under)
+    free = (over > tolerance) - (under > tolerance)
+    held = ca.if_else(stiff * by > most, 2 * side, side * (stiff * by * scale > -RELEASE))
+    beyond = ca.if_else(by < -tolerance, side, 2 * side)
+    return ca.SX(ca.if_else(place == 0, free, ca.if_else(ca.fabs(place) == 1, held, beyond)))
+
+
+def refine(ocp: Ocp, recursion: Riccati, at: Sample, *, r: ca.MX, x_plan: ca.MX, u_plan: ca.MX, multipliers: ca.MX) -> dict[str, ca.MX]:
+    """Return what a refinement returns: one Newton step on the optimality conditions, softened rows that are held brought to their bounds."""
+    lin, forms, place, stiff = at.lin, at.forms, at.place, at.stiff
+    N, N_u, nu, w = ocp.N, ocp.N_u, ocp.model.nu, lin.w
+    of_increments, of_softened = divided(multipliers, [lin.u, lin.g])
+    du = u_plan - lin.u
+    held = ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u))
+    of = Stage(ocp, lin)
+    dx_i, du_i, g_i = ca.SX.sym("dx", of.nx), ca.SX.sym("du", nu), ca.SX.sym("g", of.ng)
+    symbols = [g_i, *of.softened.values(), dx_i, du_i]
+    value = ca.Function("softened_value", symbols, [ca.densify(g_i + of.G @ ca.vertcat(dx_i, du_i))])
+    values = value.map(N)(forms.g, forms.g_x, forms.g_u, x_plan[:, 1:] - lin.x[:, 1:], held)
+    weight = ca.repmat(stiff / lin.scale_g**2, 1, N) * (ca.fabs(place.g) == 1)
+    lower, upper = (ca.repmat(e, 1, N) for e in (lin.lg, lin.ug))
+    excess = values - ca.if_else(place.g > 0, upper, lower)
+    zero = ca.MX.zeros(nu, N_u)
+    corrected = recursion.corrected(forms, at.gains, Rows(r * (place.u == 0), zero, weight * excess))
+    start = ca.MX.zeros(of.n)
+    _, step, rows = recursion.rolled(forms, corrected, start, defects=False)
+    side = ca.sign(place.g)
+    by = side * (excess + rows.g)
+    beyond = side * (ca.repmat(lin.zg, 1, N) + ca.repmat(lin.Zg, 1, N) * by) / 2
+    paid = ca.if_else(ca.fabs(place.g) == 2, beyond, (of_softened + weight * (excess + rows.g)) * (ca.fabs(place.g) == 1))
+    force = of_increments + ca.repmat(stiff / lin.scale_u**2, 1, N_u) * (ca.fabs(place.du) == 1) * rows.du
+    clip, follow = met_function(nu), follow_function(lin)
+    last, change_k, inputs, states = lin.u_prev, ca.MX.zeros(of.nx), [], [x_plan[:, 0]]
+    planned, A, B = columns(u_plan), columns(forms.A), columns(forms.B)
+    for k in range(N):
+        if k < N_u:
+            last = clip(planned[k] + step[:, k], last, w["lbu"], w["ubu"], w["lbdu"], w["ubdu"])
+            inputs.append(last)
+        change_k = follow(A[k], B[k], change_k, last - planned[min(k, N_u - 1)])
+        states.append(x_plan[:, k + 1] + change_k)
+    return {"x_refined": ca.horzcat(*states), "u_refined": ca.horzcat(*inputs), "multipliers_refined": ca.veccat(force, paid)}
+
+
+def follow_function(lin: Linearization) -> ca.Function:
+    """Return ``(A, B, dx, du) -> dx`` at the end of a stage: what states become of inputs as they were clipped."""
+    a, b = ca.SX.sym("a", lin.A_k.nnz()), ca.SX.sym("b", lin.B_k.nnz())
+    dx, du = ca.SX.sym("dx", lin.A_k.size1()), ca.SX.sym("du", lin.B_k.size2())
+    return ca.Function("follow", [a, b, dx, du], [ca.densify(ca.SX(lin.A_k, a) @ dx + ca.SX(lin.B_k, b) @ du)])
+
+
+def met_function(nu: int) -> ca.Function:
+    """Return `met` as a function."""
+    symbols = [ca.SX.sym(name, nu) for name in ("u", "before", "lbu", "ubu", "lbdu", "ubdu")]
+    return ca.Function("met", symbols, [met(*symbols)])

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+One OSQP workspace, held for the life of the controller and updated in place.
+
+OSQP checks nothing of what it is given [Stellato2020]_: a NaN poisons every
+later solve, a short array is read past its end, and an infeasible problem
+fills the solution with a finite number. So only the owned arrays of a `Qp`
+reach it, `Rti` shows it finite numbers only, and a solution is judged by its
+status alone. Its inner object is driven directly: the public one copies and
+builds namespaces at every call, which costs more than the solve.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import osqp
+
+from rti_mpc.contract.status import QpStatus
+from rti_mpc.rti.qp.qp import Qp
+from rti_mpc.rti.scaled import Scaled
+
+# OSQP's codes, https://osqp.org/docs/interfaces/status_values.html, in its version 1.1.
+STATUS = {
+    1: QpStatus.SOLVED,
+    2: QpStatus.INACCURATE,
+    3: QpStatus.INFEASIBLE,
+    4: QpStatus.INFEASIBLE,
+    5: QpStatus.INFEASIBLE,
+    6: QpStatus.INFEASIBLE,
+    7: QpStatus.MAX_ITER,
+    8: QpStatus.TIME_LIMIT,
+}
+
+ACTING = 1e-6  # multiplier from which a bound acts: the others are zero exactly
+ACTING_SCALE = 30.0  # of such a row: its step size is that of an equation, about 1000 times the others'
+
+
+@dataclass(frozen=True)
+class SolverSettings:
+    """
+    Settings of OSQP, as its documentation names them, for a problem whose cost is normalised.
+
+    Attributes:
+        eps: Absolute and relative tolerance on the residuals; ten times tighter changes the closed-loop cost by less than 0.01 %.
+        max_iter: Iterations at most; the iterate is then taken as it is.
+        rho: Step size of ADMM, relative to the one that `rti_mpc.rti.qp.qp.step_size` holds best.
+        check_termination: Iterations between two looks at the residuals.
+        scaling: Sweeps of Ruiz scaling; none by default: they break the symmetry of the problem, and cost a sample more than they save.
+        alpha: Over-relaxation, between 0 and 2.
+    """
+
+    eps: float = 1e-4
+    max_iter: int = 100
+    rho: float = 0.7
+    check_termination: int = 5
+    scaling: int = 0
+    alpha: float = 1.6
+
+
+class Solver:
+    """
+    An OSQP workspace for one `Qp`.
+
+    Attributes:
+        qp: The problem.
+        workspace: OSQP's own, held for good and updated in place.
+        cold: Whether the next `load` forgets the last solution.
+    """
+
+    def __init__(self, qp: Qp, settings: SolverSettings) -> None:
+        self.qp = qp
+        self.cold = False
+        self._sound = True
+        self._scaled = scaled = Scaled(qp)
+        self._zero = (np.zeros_like(qp.q), np.zeros_like(qp.l))
+        public = osqp.OSQP(algebra="builtin")
+        public.setup(
+            scaled.P.copy(),  # OSQP keeps what it is given, and writes into it
+            scaled.q,
+            scaled.A.copy(),
+            scaled.l,
+            scaled.u,
+            verbose=False,
+            eps_abs=settings.eps,
+            eps_rel=settings.eps,
+            max_iter=settings.max_iter,
+            rho=settings.rho,
+            adaptive_rho=0,
+            check_termination=settings.check_termination,
+            scaling=settings.scaling,
+            alpha=settings.alpha,
+            warm_starting=True,
+            polishing=False,
+        )
+        self.workspace = public._solver
+        self._info = self.workspace.info
+        self._solution = self.workspace.solution
+        refused = self.workspace.update_data_mat(P_x=scaled.P.data, P_i=None, A_x=scaled.A.data, A_i=None)
+        assert not refused, "OSQP must have kept the patterns it was given"
+        self._P_x = scaled.P.data if qp.varies_P else None
+        # The softened rows, the last of all, are weighed by whether they act; OSQP sees what comes of that.
+        self._soft = slice(len(qp.l) - len(qp.watched), None)
+        self._active = np.zeros(len(qp.watched), dtype=bool)
+        self._scale = np.ones_like(qp.l)
+        weighed = len(qp.watched) > 0
+        self._A_x, self._l, self._u = (array.copy() if weighed else array for array in (scaled.A.data, scaled.l, scaled.u))
+
+    def load(self) -> None:
+        """Linearize at the guess, and take over the new matrices, factorization included; off the path from state to command."""
+        qp, scaled = self.qp, self._scaled
+        qp.linearize()
+        self._sound = qp.sound
+        if not self._sound:  # or OSQP would never recover
+            return
+        scaled.matrices()
+        changed = qp.varies_A or self._P_x is not None
+        if self._A_x is not scaled.A.data:
+            changed |= self._weigh()
+            np.multiply(scaled.A.data, self._scale[qp.A.indices], out=self._A_x)
+        if changed:
+            self._sound = not self.workspace.update_data_mat(P_x=self._P_x, P_i=None, A_x=self._A_x, A_i=None)  # refused: no factorization
+        if self.cold:
+            self.workspace.warm_start(*self._zero)
+            self.cold = False
+
+    def refill(self) -> None:
+        """Take over, with the next `load`, what no sample changes, too: after a change of weights."""
+        self.qp.fill()
+        self._P_x = self._scaled.P.data
+
+    def _weigh(self) -> bool:
+        """
+        Give softened rows that act the step size of equations, and tell whether anything changed.
+
+        One step size does not fit both: where such a bound acts, its multiplier
+        must travel far; where it does not, it must not hold the solution back.
+        Which act is seen from the last multipliers, a stage earlier.
+        """
+        y = self._solution.y * self._scale
+        acts = np.abs(y[self._soft]) > ACTING
+        active = np.zeros_like(acts) if self.cold else acts[self.qp.watched].any(axis=1)
+        if np.array_equal(active, self._active):
+            return False
+        self._active = active
+        self._scale[self._soft] = np.where(active, ACTING_SCALE, 1.0)
+        self.workspace.warm_start(self._solution.x, y / self._scale)
+        return True
+
+    def solve(self) -> QpStatus:
+        """Embed the initial state, solve from the last solution, and make the plan."""
+        if not self._sound:
+            self.cold = True
+            return QpStatus.FAILED
+        scaled, workspace = self._scaled, self.workspace
+        self.qp.embed()
+        scaled.vectors()
+        if self._l is not scaled.l:
+            np.multiply(scaled.l, self._scale, out=self._l)
+            np.multiply(scaled.u, self._scale, out=self._u)
+        if workspace.update_data_vec(q=scaled.q, l=self._l, u=self._u):  # refused: what it holds is another problem
+            self.cold = True
+            return QpStatus.FAILED
+        workspace.solve()
+        status = STATUS.get(self._info.status_val, QpStatus.FAILED)
+        if status.usable:
+            scaled.plan(self._solution.x)
+        else:
+            self.cold = True  # a failed solve never seeds the next
+        return status
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of the last solve."""
+        return int(self._info.iter)
+
+    @property
+    def res_prim(self) -> float:
+        """Primal residual of the last solve, infinity norm, relative to the scales."""
+        return float(self._info.prim_res)
+
+    @property
+    def res_dual(self) -> float:
+        """Dual residual of the last solve, infinity norm, relative to the scales."""
+        return float(self._info.dual_res)
+
+    @property
+    def objective(self) -> float:
+        """Objective of the last solve."""
+        return float(self._info.obj_val)

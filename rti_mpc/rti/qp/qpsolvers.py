@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Any other QP solver, by its name in qpsolvers: set up anew for every sample, without memory of the last.
+
+It sees the QP as qpsolvers writes one, in matrices that are made once and
+updated in place: dense ones for a solver that knows no others. What it warns
+of or raises is a failed solve, and nothing of that outlives the sample.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import partial
+from importlib.metadata import metadata
+from math import isfinite
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from rti_mpc.array import Array
+from rti_mpc.contract.status import QpStatus
+from rti_mpc.errors import OcpError
+from rti_mpc.rti.qp.qp import Qp, QpData
+from rti_mpc.rti.scaled import Scaled
+
+if TYPE_CHECKING:
+    import qpsolvers
+
+# Their own names for how exact to be, where their defaults are not: near the solution the last digits cost an iteration or two.
+TOLERANCES: dict[str, dict[str, Any]] = {
+    "clarabel": {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11},
+    "daqp": {"primal_tol": 1e-10, "dual_tol": 1e-12},
+    "piqp": {"eps_abs": 1e-12, "eps_rel": 1e-13, "eps_duality_gap_abs": 1e-12, "eps_duality_gap_rel": 1e-13},
+    "proxqp": {"eps_abs": 1e-10, "eps_rel": 0.0},
+}
+
+
+class ForeignSolver:
+    """
+    A solver of qpsolvers for one `Qp`.
+
+    Attributes:
+        qp: The problem.
+        call: Solves the problem as it is, in the form of qpsolvers.
+        cold: Whether the next solve forgets the last: it does in any case.
+        iterations: Iterations of the last solve; 0 of a solver that does not tell.
+        res_prim: Primal residual of the last solve, infinity norm, relative to the scales.
+        res_dual: Dual residual of the last solve, infinity norm, relative to the scales.
+
+    Raises:
+        OcpError: There is no such solver here, or it cannot solve.
+    """
+
+    def __init__(self, qp: Qp, name: str) -> None:
+        check_name(name)
+        import qpsolvers  # loads every solver that is installed: only where one of them is wanted
+
+        self.qp = qp
+        self.cold = False
+        self.iterations = 0
+        self.res_prim = self.res_dual = 0.0
+        self._sound = True
+        dense = name not in qpsolvers.sparse_solvers
+        self._scaled = scaled = Scaled(qp)
+        self._equal, self._above, self._below = scaled.sides()
+        self._problem: Any = scaled.to_problem()
+        numbers = numbered(scaled)
+        self._updates: list[Callable[[], None]] = []
+        for matrix, data in (("P", scaled.P.data), ("G", scaled.A.data), ("A", scaled.A.data)):
+            made, update = following(getattr(numbers, matrix), data, dense)
+            setattr(self._problem, matrix, made)
+            self._updates.append(update)
+        self.call = partial(qpsolvers.solve_problem, self._problem, name, **TOLERANCES.get(name, {}))
+        try:
+            self._call()
+        except Exception as error:  # a licence that is missing, say: better now than as a failure of every sample
+            raise OcpError(f"solver {name} must be able to solve, it raised {type(error).__name__}: {str(error).partition(chr(10))[0]}") from error
+
+    def load(self) -> None:
+        """Linearize at the guess, and take over the new matrices; off the path from state to command."""
+        self.qp.linearize()
+        self._sound = self.qp.sound
+        if self._sound:
+            self._scaled.matrices()
+            for update in self._updates:
+                update()
+
+    def refill(self) -> None:
+        """Take over, with the next `load`, what no sample changes, too: after a change of weights."""
+        self.qp.fill()
+
+    def solve(self) -> QpStatus:
+        """Embed the initial state, solve, and make the plan."""
+        if not self._sound:
+            return QpStatus.FAILED
+        qp, problem = self._scaled, self._problem
+        self.qp.embed()
+        qp.vectors()
+        problem.q[:] = qp.q
+        np.concatenate((qp.u[self._above], -qp.l[self._below]), out=problem.h)
+        problem.b[:] = qp.u[self._equal]
+        try:
+            solution = self._call()
+        except Exception:  # whatever a foreign solver raises; the controller knows what to do without a plan
+            return QpStatus.FAILED
+        status = outcome(solution)
+        self.iterations = iterations(solution)
+        if status.usable:
+            self.res_prim, self.res_dual = residuals(problem, solution)
+            qp.plan(np.asarray(solution.x))
+        return status
+
+    def _call(self) -> qpsolvers.Solution:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a solve that failed, which the status says
+            return self.call()
+
+
+def check_name(name: str) -> None:
+    """
+    Refuse a solver that is not installed.
+
+    Raises:
+        OcpError: It is not; the message says which are, and how to install others.
+    """
+    import qpsolvers
+
+    here = sorted(set(qpsolvers.available_solvers) - {"osqp"})
+    if name not in here:
+        others = sorted(set(metadata("qpsolvers").get_all("Provides-Extra") or ()) - {*here, "osqp", "open-source-solvers", "wheels-only"})
+        raise OcpError(
+            f"solver must be riccati, osqp, or one that is installed, {', '.join(here)}, got {name!r}; "
+            f"pip install 'qpsolvers[NAME]' brings {', '.join(others)}"
+        )
+
+
+def outcome(solution: qpsolvers.Solution) -> QpStatus:
+    """Map what a solver says: an iterate that is not the solution is none to be commanded."""
+    if solution.found and solution.x is not None and isfinite(solution.x.sum()):
+        return QpStatus.SOLVED
+    info = solution.extras.get("info")
+    said = str(solution.extras.get("status", getattr(info, "status", "")))
+    return QpStatus.INFEASIBLE if "infeasible" in said.lower() else QpStatus.FAILED
+
+
+def iterations(solution: qpsolvers.Solution) -> int:
+    """Return the iterations of a solver that tells them, 0 of another."""
+    extras = solution.extras
+    return int(next((extras[key] for key in ("iterations", "iter") if key in extras), getattr(extras.get("info"), "iter", 0)))
+
+
+def residuals(problem: Any, solution: qpsolvers.Solution) -> tuple[float, float]:
+    """Return the primal and the dual residual of a solution, NaN if it has no multipliers; qpsolvers' own want rows of every kind."""
+    x = solution.x
+    primal = max(np.max(problem.G @ x - problem.h, initial=0.0), np.max(np.abs(problem.A @ x - problem.b), initial=0.0))
+    if solution.y is None or solution.z is None:
+        return float(primal), float("nan")
+    return float(primal), float(np.max(np.abs(problem.P @ x + problem.q + problem.G.T @ solution.z + problem.A.T @ solution.y)))
+
+
+def numbered(qp: QpData) -> qpsolvers.Problem:
+    """Return the problem with numbers in its matrices: which nonzero of the QP's an entry is, counted from 1, negative where its sign changes."""
+    kept = [(matrix, matrix.data.copy()) for matrix in (qp.P, qp.A)]
+    for matrix, _ in kept:
+        matrix.data[:] = np.arange(1, matrix.nnz + 1)
+    problem = qp.to_problem()
+    for matrix, data in kept:
+        matrix.data[:] = data
+    return problem
+
+
+def following(numbers: sp.csc_matrix[Any], data: Array, dense: bool) -> tuple[Any, Callable[[], None]]:
+    """Return a matrix of a numbered pattern, dense or sparse, and what updates it in place from the data numbered."""
+    matrix: Any = numbers.toarray(order="C") if dense else numbers.copy()
+    values: Array = matrix.reshape(-1) if dense else matrix.data
+    places = np.flatnonzero(values)
+    sources, signs = np.abs(values[places]).astype(np.intp) - 1, np.sign(values[places])
+
+    def update() -> None:
+        values[places] = signs * data[sources]
+
+    update()
+    return matrix, update

@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+Riccati recursion for the QP of a sample, its bounds as quadratic terms: what the active set and the interior point are made of.
+
+The increments couple an input to the one before, so the recursion is in
+:math:`s_k = (\Delta x_k, \Delta u_{k-1})`. From the cost-to-go
+:math:`\tfrac12 s^T P s + p^T s` behind stage k follow the terms of its input,
+
+.. math::
+
+    \tfrac12 \Delta u_k^T Q_{uu} \Delta u_k + \Delta u_k^T (Q_{us} s_k + q_u) ,
+
+and from these the gains. Each bounded *row* d, an input, an increment or what has
+softened bounds, adds :math:`\tfrac12 W d^2 + v d` in its deviation from the guess;
+weight W and pull v are the solver's. With the gains known, other pulls cost a sweep
+over vectors alone.
+
+Stages are functions of their own, called by name: *free* ones, whose input is a
+variable, and those after the control horizon, where the input before is *held*.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import casadi as ca
+
+from rti_mpc.codegen import function
+from rti_mpc.rti.linearization import Forms, Linearization, nonzeros
+from rti_mpc.rti.ocp import Ocp
+
+Columns = list[ca.MX]  # one expression per stage
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """
+    A number for each bounded row.
+
+    Attributes:
+        u: Of the inputs, shape ``(nu, N_u)``.
+        du: Of the increments, shape ``(nu, N_u)``.
+        g: Of what has softened bounds, shape ``(ng, N)``.
+    """
+
+    u: ca.MX
+    du: ca.MX
+    g: ca.MX
+
+
+def columns(matrix: ca.MX) -> Columns:
+    """Return a matrix column by column, one without rows as well."""
+    return list(ca.horzsplit(matrix)) if matrix.size1() else [ca.MX(0, 1)] * matrix.size2()
+
+
+def stagewise(**matrices: ca.MX) -> list[dict[str, ca.MX]]:
+    """Return the columns of matrices of the same width stage by stage, by name."""
+    split = {name: columns(matrix) for name, matrix in matrices.items()}
+    return [dict(zip(split, column, strict=True)) for column in zip(*split.values(), strict=True)]
+
+
+class Riccati:
+    """
+    The recursion of an OCP, in expressions.
+
+    Attributes:
+        size: Entries of the gains of one stage: K and kappa of ``du = -K s - kappa``, and the Cholesky factor of ``Q_uu``.
+    """
+
+    def __init__(self, ocp: Ocp, lin: Linearization) -> None:
+        self._ocp, self._lin = ocp, lin
+        nx, nu = ocp.model.nx, ocp.model.nu
+        self._n = n = nx + nu
+        self._ends = (nu * n, nu * (n + 1))
+        self.size = nu * (n + 1) + nu * (nu + 1) // 2
+        self._backward_free, self._backward_held = backward_free(ocp, lin), backward_held(ocp, lin)
+        self._sweep_free, self._sweep_held = sweep_free(ocp, lin), sweep_held(ocp, lin)
+        self._forward_free, self._forward_held = forward_free(ocp, lin), forward_held(ocp, lin)
+
+    def gains(self, forms: Forms, weight: Rows, pull: Rows) -> ca.MX:
+        """Return the gains of all stages with an input, one a column, shape ``(size, N_u)``."""
+        n = self._n
+        stages = stagewise(A=forms.A, B=forms.B, b=forms.b, H=forms.H, h=forms.h, g_x=forms.g_x, g_u=forms.g_u, weight_g=weight.g, pull_g=pull.g)
+        inputs = stagewise(force=forms.force, weight_u=weight.u, pull_u=pull.u, weight_du=weight.du, pull_du=pull.du)
+        lambda_ = ca.vertsplit(self._lin.w["lambda_"])
+        shared = {"R": nonzeros(self._lin.R), "damping": forms.damping}
+        P, p = ca.MX.zeros(n * (n + 1) // 2), ca.MX.zeros(n)
+        found: Columns = []
+        for k in reversed(range(self._ocp.N)):
+            if k < self._ocp.N_u:
+                before = self._backward_free(**stages[k], P=P, p=p, **inputs[k], lambda_k=lambda_[k], **shared)
+                found.append(before["gain"])
+            else:
+                before = self._backward_held(**stages[k], P=P, p=p)
+            P, p = before["P_before"], before["p_before"]
+        return ca.horzcat(*reversed(found))
+
+    def corrected(self, forms: Forms, gains: ca.MX, pull: Rows) -> ca.MX:
+        """Return gains whose kappa is that of pulls alone: rolled out from s = 0 without defects they make the change that these pulls make."""
+        stages = stagewise(A=forms.A, B=forms.B, g_x=forms.g_x, g_u=forms.g_u, pull_g=pull.g)
+        inputs = stagewise(gain=gains, pull_u=pull.u, pull_du=pull.du)
+        p = ca.MX.zeros(self._n)
+        kappas = []
+        for k in reversed(range(self._ocp.N)):
+            if k < self._ocp.N_u:
+                before = self._sweep_free(**stages[k], p=p, **inputs[k])
+                kappas.append(before["kappa"])
+            else:
+                before = self._sweep_held(**stages[k], p=p)
+            p = before["p_before"]
+        K, _, L = ca.vertsplit(gains, [0, *self._ends, self.size])
+        return ca.vertcat(K, ca.horzcat(*reversed(kappas)), L)
+
+    def rolled(self, forms: Forms, gains: ca.MX, s: ca.MX, *, defects: bool) -> tuple[ca.MX, ca.MX, Rows]:
+        """Return the steps in states, shape ``(nx, N + 1)``, and in inputs, shape ``(nu, N_u)``, and the rows, all in deviations, from s on."""
+        nx, b = self._ocp.model.nx, forms.b if defects else ca.MX.zeros(forms.b.shape)
+        stages, gain = stagewise(A=forms.A, B=forms.B, b=b, g_x=forms.g_x, g_u=forms.g_u), columns(gains)
+        states, inputs, increments, softened = [s[:nx]], [], [], []
+        for k in range(self._ocp.N):
+            if k < self._ocp.N_u:
+                after = self._forward_free(**stages[k], s=s, gain=gain[k])
+                increments.append(after["increment"])
+                inputs.append(after["s_after"][nx:])
+            else:
+                after = self._forward_held(**stages[k], s=s)
+            s = after["s_after"]
+            states.append(s[:nx])
+            softened.append(after["g"])
+        du = ca.horzcat(*inputs)
+        return ca.horzcat(*states), du, Rows(du, ca.horzcat(*increments), ca.horzcat(*softened))
+
+
+class Stage:
+    """
+    Symbols of one stage, and the linear forms made of them from nonzeros, every structural zero left out.
+
+    Attributes:
+        A: Sensitivities to the state; `B`, to the input; `b`, the defect.
+        H: Hessian of the outputs at the end; `h`, their gradient.
+        G: Sensitivities of what has softened bounds to s at the end, shape ``(ng, nx + nu)``.
+        dynamics: Symbols of A and B, by the names in `rti_mpc.rti.linearization.Forms`.
+        defect: That of b; `cost`, those of H and h; `softened`, those of G.
+    """
+
+    def __init__(self, ocp: Ocp, lin: Linearization) -> None:
+        nx, nu = ocp.model.nx, ocp.model.nu
+        self.nx, self.nu, self.n, self.ng = nx, nu, nx + nu, len(ocp.lg)
+        patterns = {"A": lin.A_k, "B": lin.B_k, "H": lin.H_i, "g_x": lin.G_x, "g_u": lin.G_u}
+        nz = {name: ca.SX.sym(name, pattern.nnz()) for name, pattern in patterns.items()}
+        self.A, self.B, self.H, G_x, G_u = (ca.SX(pattern, nz[name]) for name, pattern in patterns.items())
+        self.G = ca.horzcat(G_x, G_u)
+        self.b, self.h = ca.SX.sym("b", nx), ca.SX.sym("h", nx)
+        self.dynamics = {"A": nz["A"], "B": nz["B"]}
+        self.defect = {"b": self.b}
+        self.cost = {"H": nz["H"], "h": self.h}
+        self.softened = {"g_x": nz["g_x"], "g_u": nz["g_u"]}
+
+
+class Gain:
+    """
+    Symbol of the gains of one stage, all in a column, and its parts.
+
+    Attributes:
+        column: The symbol.
+        K: Feedback of ``du = -K s - kappa``, shape ``(nu, nx + nu)``; `kappa`, the rest of it, shape ``(nu, 1)``.
+        L: Lower Cholesky factor of ``Q_uu``, shape ``(nu, nu)``.
+    """
+
+    def __init__(self, of: Stage) -> None:
+        lower = ca.Sparsity.lower(of.nu)
+        self.column = ca.SX.sym("gain", of.nu * (of.n + 1) + lower.nnz())
+        K, self.kappa, L = ca.vertsplit(self.column, [0, of.nu * of.n, of.nu * (of.n + 1), self.column.numel()])
+        self.K, self.L = ca.reshape(K, of.nu, of.n), ca.SX(lower, L)
+
+
+class Behind(NamedTuple):
+    """Cost-to-go of a stage in its state and its input, before that is eliminated, and the symbols it depends on."""
+
+    Qxx: ca.SX
+    Qux: ca.SX
+    Quu: ca.SX
+    qx: ca.SX
+    qu: ca.SX
+    symbols: dict[str, ca.SX]
+
+
+def behind(of: Stage) -> Behind:
+    """Return the cost-to-go of a stage from that behind it."""
+    nx, upper = of.nx, ca.Sparsity.upper(of.n)
+    P_nz, p = ca.SX.sym("P", upper.nnz()), ca.SX.sym("p", of.n)
+    weight, pull = ca.SX.sym("weight_g", of.ng), ca.SX.sym("pull_g", of.ng)
+    P = ca.triu2symm(ca.SX(upper, P_nz)) + of.G.T @ ca.diag(weight) @ of.G
+    p_end = p + of.G.T @ pull
+
+    A, B = of.A, of.B
+    Pxx, Pxu, Puu = P[:nx, :nx] + of.H, P[:nx, nx:], P[nx:, nx:]
+    PB = Pxx @ B + Pxu
+    Qxx, Qux, Quu = A.T @ Pxx @ A, PB.T @ A, B.T @ PB + Pxu.T @ B + Puu
+    px = p_end[:nx] + of.h + Pxx @ of.b
+    qx, qu = A.T @ px, B.T @ px + p_end[nx:] + Pxu.T @ of.b
+    symbols = {**of.dynamics, **of.defect, **of.cost, **of.softened, "weight_g": weight, "pull_g": pull, "P": P_nz, "p": p}
+    return Behind(Qxx, Qux, Quu, qx, qu, symbols)
+
+
+def backward_held(ocp: Ocp, lin: Linearization) -> ca.Function:
+    """Build a stage of the recursion whose input is that of the stage before: ``-> (P_before, p_before)``."""
+    of = Stage(ocp, lin)
+    Qxx, Qux, Quu, qx, qu, symbols = behind(of)
+    Qss, qs = ca.blockcat([[Qxx, Qux.T], [Qux, Quu]]), ca.vertcat(qx, qu)
+    P_before, p_before = ca.cse([nonzeros(ca.densify(Qss)[ca.Sparsity.upper(of.n)]), ca.densify(qs)])
+    return function("held", symbols, {"P_before": P_before, "p_before": p_before})
+
+
+def backward_free(ocp: Ocp, lin: Linearization) -> ca.Function:
+    """Build a stage of the recursion with an input: ``-> (P_before, p_before, gain)``."""
+    of = Stage(ocp, lin)
+    n, nu = of.n, of.nu
+    Qxx, Qux, Quu, qx, qu, symbols = behind(of)
+    R_nz, lambda_ = ca.SX.sym("R", lin.R.sparsity().nnz()), ca.SX.sym("lambda_k")
+    names = ("damping", "force", "weight_u", "pull_u", "weight_du", "pull_du")
+    damping, force, weight_u, pull_u, weight_du, pull_du = own = [ca.SX.sym(name, nu) for name in names]
+    R = ca.SX(lin.R.sparsity(), R_nz) * lambda_ + ca.diag(weight_du)
+    force = force + pull_du
+    Quu, qu = Quu + R + ca.diag(weight_u + damping), qu + force + pull_u
+    Qus = ca.horzcat(Qux, -R)
+    L = cholesky(Quu)
+    gain = cholesky_solve(L, ca.horzcat(Qus, qu))
+    # The cost with du = -K s - kappa in it.
+    P_before = ca.diagcat(Qxx, R) - Qus.T @ gain[:, :n]
+    p_before = ca.vertcat(qx, -force) - Qus.T @ gain[:, n]
+    found = ca.vertcat(ca.vec(ca.densify(gain)), nonzeros(L))
+    P_before, p_before, found = ca.cse([nonzeros(ca.densify(P_before)[ca.Sparsity.upper(n)]), ca.densify(p_before), found])
+    inputs = {**symbols, "R": R_nz, "lambda_k": lambda_, **dict(zip(names, own, strict=True))}
+    return function("free", inputs, {"P_before": P_before, "p_before": p_before, "gain": found})
+
+
+def swept(of: Stage) -> tuple[ca.SX, ca.SX, dict[str, ca.SX]]:
+    """Return the gradient of the cost-to-go of a stage in its state and its input, from pulls alone, and the symbols it depends on."""
+    p, pull = ca.SX.sym("p", of.n), ca.SX.sym("pull_g", of.ng)
+    p_end = p + of.G.T @ pull
+    qx, qu = of.A.T @ p_end[: of.nx], of.B.T @ p_end[: of.nx] + p_end[of.nx :]
+    return qx, qu, {**of.dynamics, **of.softened, "pull_g": pull, "p": p}
+
+
+def sweep_held(ocp: Ocp, lin: Linearization) -> ca.Function:
+    """Build a stage of the sweep for the pulls alone, the matrices known, whose input is that of the stage before: ``-> p_before``."""
+    qx, qu, symbols = swept(Stage(ocp, lin))
+    (p_before,) = ca.cse([ca.densify(ca.vertcat(qx, qu))])
+    return function("sweep_held", symbols, {"p_before": p_before})
+
+
+def sweep_free(ocp: Ocp, lin: Linearization) -> ca.Function:
+    """Build a stage of that sweep with an input: ``-> (p_before, kappa)``."""
+    of = Stage(ocp, lin)
+    qx, qu, symbols = swept(of)
+    gain = Gain(of)
+    pull_u, pull_du = ca.SX.sym("pull_u", of.nu), ca.SX.sym("pull_du", of.nu)
+    qu = qu + pull_u + pull_du
+    p_before = ca.vertcat(qx, -pull_du) - gain.K.T @ qu
+    p_before, kappa = ca.cse([ca.densify(p_before), ca.densify(cholesky_solve(gain.L, qu))])
+    inputs = {**symbols, "gain": gain.column, "pull_u": pull_u, "pull_du": pull_du}
+    return function("sweep_free", inputs, {"p_before": p_before, "kappa": kappa})
+
+
+def forward_held(ocp: Ocp, lin: Linearization) -> ca.Function:
+    """Build a stage of a roll-out without bounds whose input is that of the stage before: ``-> (s_after, g)``."""
+    of = Stage(ocp, lin)
+    s = ca.SX.sym("s", of.n)
+    du = s[of.nx :]
+    end = ca.vertcat(of.A @ s[: of.nx] + of.B @ du + of.b, du)
+    after, g = ca.cse([ca.densify(end), ca.densify(of.G @ end)])
+    return function("rolled_held", {**of.dynamics, **of.defect, **of.softened, "s": s}, {"s_after": after, "g": g})
+
+
+def forward_free(ocp: Ocp, lin: Linearization) -> ca.Function:
+    """Build a stage of a roll-out without bounds, with an input: ``-> (s_after, g, increment)``."""
+    of = Stage(ocp, lin)
+    s, gain = ca.SX.sym("s", of.n), Gain(of)
+    du = -(gain.K @ s + gain.kappa)
+    end = ca.vertcat(of.A @ s[: of.nx] + of.B @ du + of.b, du)
+    after, g, increment = ca.cse([ca.densify(end), ca.densify(of.G @ end), du - s[of.nx :]])
+    inputs = {**of.dynamics, **of.defect, **of.softened, "s": s, "gain": gain.column}
+    return function("rolled_free", inputs, {"s_after": after, "g": g, "increment": increment})
+
+
+def cholesky(M: ca.SX) -> ca.SX:
+    """Return the lower Cholesky factor of a small symmetric matrix, its lower triangle dense; NaN if it is not positive definite."""
+    size = M.shape[0]
+    L = ca.SX(ca.Sparsity.lower(size))
+    for i in range(size):
+        for j in range(i + 1):
+            rest = M[i, j] - ca.dot(L[i, :j], L[j, :j])
+            L[i, j] = ca.sqrt(rest) if i == j else rest / L[j, j]
+    return L
+
+
+def cholesky_solve(L: ca.SX, rhs: ca.SX) -> ca.SX:
+    """Solve with a Cholesky factor."""
+    size = L.shape[0]
+    rows = [rhs[i, :] for i in range(size)]
+    for i in range(size):
+        rows[i] = (rows[i] - sum((L[i, k] * rows[k] for k in range(i)), ca.SX(1, rhs.shape[1]))) / L[i, i]
+    for i in reversed(range(size)):
+        rows[i] = (rows[i] - sum((L[k, i] * rows[k] for k in range(i + 1, size)), ca.SX(1, rhs.shape[1]))) / L[i, i]
+    return ca.vertcat(*rows)

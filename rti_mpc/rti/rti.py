@@ -1,0 +1,423 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The real-time iteration: one Newton-type step of the OCP a sample, in two phases.
+
+Preparation needs no state: it shifts the guess, linearizes there and prepares the
+solver, factorization included. Feedback embeds the initial state, solves and takes
+the full step. Only feedback is on the path from sensor to actuator
+[Diehl2005]_ [Gros2020]_. Where that step is large, one linearization was not
+enough: feedback then iterates, a few times at most. One iteration at most is the
+plain scheme; many, and a small tolerance, are sequential quadratic programming.
+
+Nearly always the QP is solved by `ActiveSet`; a QP solver is there for when that
+finds no way. Softened bounds rarely act: the QP without them is solved first; a
+plan that keeps them all the same is the solution of the whole QP too. If it does
+not, the whole QP is solved, and is the one prepared until its plan has left them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.codegen import bind, compiled
+from rti_mpc.contract.status import QpStatus
+from rti_mpc.errors import OcpError, ShapeError
+from rti_mpc.rti.active_set import ActiveSet
+from rti_mpc.rti.certificate import certificate
+from rti_mpc.rti.linearization import WEIGHTS, plan_cost, shift
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.places import Places, places
+from rti_mpc.rti.qp.osqp import Solver, SolverSettings
+from rti_mpc.rti.qp.qp import Guess, Plan, Qp, step_size
+from rti_mpc.rti.qp.qpsolvers import ForeignSolver, check_name
+from rti_mpc.rti.qp.sequential import sequential
+from rti_mpc.rti.qp.simultaneous import simultaneous
+from rti_mpc.rti.qp.transcription import INFINITY, Transcription
+from rti_mpc.rti.scale import scale
+from rti_mpc.rti.turns import Turns
+
+FORMULATIONS = {"simultaneous": simultaneous, "sequential": sequential}
+SOLVERS = ("riccati", "osqp")  # the built-in ones; any other is one of qpsolvers
+SEQUENTIAL_UP_TO = 10  # control horizon up to which the sequential formulation is the faster one, see docs/engine.md
+SOLVED, INACCURATE = QpStatus.SOLVED, QpStatus.INACCURATE  # an enumeration looks its members up slowly
+ITERATIONS = 3  # a sample, at most, and
+TOLERANCE = 0.015  # the step from which there is another: what converged NMPC costs in closed loop, within 0.5 %, see docs/engine.md
+COSTS = ("delta", "lambda_", "z", "Z", "Q_e", "zh", "Zh")  # weights that carry the scale of the cost
+TOUCHING = 2e-3  # distance from a softened bound, relative to its scale, from which on a plan counts as having left it
+
+
+class Rti:
+    """
+    Real-time iteration on a fixed OCP.
+
+    Between samples it remembers the guess, the previous input, and what its
+    solvers start from; nothing else.
+
+    Attributes:
+        ocp: The problem.
+        formulation: ``"simultaneous"`` or ``"sequential"``.
+        iterations: QPs a sample, at most: 1 is the plain real-time iteration, many with a small tolerance converged SQP.
+        tolerance: Change of the inputs by one iteration, relative to their scale, half their range, from which on another follows.
+        taken: Iterations of the last feedback.
+        x: States of the plan, shape ``(N + 1, nx)``: of the last feedback, and the next guess.
+        u: Inputs of the plan, shape ``(N_u, nu)``. Row 0 is the command.
+        u_prev: Input before the plan, shape ``(nu,)``: what increments are counted from.
+        y_ref: Reference rows of the current sample, shape ``(N, ny)``.
+        p: Stage parameters of the current sample, shape ``(N + 1, np)``.
+        x0: Initial state of the current sample, shape ``(nx,)``, its angles in the turn of the plan.
+        scale: What states, inputs and softened bounds are measured by inside, see `rti_mpc.rti.scale`; shape ``(nx + nu + ng,)``.
+        cost_scale: What costs are multiplied by inside.
+        guess: Where the current sample is linearized, and what the solvers read and write.
+        active_set: What is tried first; None if the solver is another.
+        solvers: The QP solvers, each with its QP: without softened bounds and, if there are any, with them.
+        solver: What solved the current sample, or is about to.
+        status: Outcome of the last feedback.
+        advance: Native call: moves the plan on by one stage, to be the guess.
+        evaluate: Native call: the cost of the plan.
+
+    Args:
+        ocp: The problem.
+        settings: OSQP's, as a solver or as what is there for when `riccati` finds no way.
+        formulation: ``"simultaneous"``, ``"sequential"``, or ``"auto"`` for the faster one.
+        solver: ``"riccati"``, ``"osqp"``, or another one's name in qpsolvers.
+        compile: Whether to compile the model.
+
+    Raises:
+        OcpError: The formulation or the solver is unknown, the settings are not the solver's, a number of iterations or a tolerance makes no sense,
+            or the model is not finite where the robot rests.
+    """
+
+    solver: ActiveSet | Solver | ForeignSolver
+    solvers: Sequence[Solver | ForeignSolver]
+
+    def __init__(
+        self,
+        ocp: Ocp,
+        settings: SolverSettings | None = None,
+        *,
+        formulation: str = "auto",
+        solver: str = "riccati",
+        iterations: int = ITERATIONS,
+        tolerance: float = TOLERANCE,
+        compile: bool = True,
+    ) -> None:
+        check_options(solver, settings, iterations, tolerance)
+        model, N, N_u = ocp.model, ocp.N, ocp.N_u
+        self.ocp = ocp
+        self.formulation = formulation_of(ocp, formulation)
+        self.iterations, self.tolerance, self.taken = iterations, tolerance, 0
+        # A step leads from a guess to a plan; the next guess is that plan, moved on by a stage. No memory is both.
+        self.x: Array = np.zeros((N + 1, model.nx))
+        self.u: Array = np.zeros((N_u, model.nu))
+        x, u = np.zeros_like(self.x), np.zeros_like(self.u)
+        # Moved through views of bytes laid out before: numpy decides anew each time how to copy, which takes longer than to do it.
+        self._pairs = tuple((guess.reshape(-1).data, plan.reshape(-1).data) for guess, plan in ((x, self.x), (u, self.u)))
+        self.u_prev: Array = np.array(model.u_rest, dtype=np.float64)
+        self.y_ref: Array = np.zeros((N, model.ny))
+        self.p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
+        self.x0: Array = np.zeros(model.nx)
+        self.status = QpStatus.NONE
+        self._rows = self.y_ref.shape
+        self._pending = False  # whether a sample was prepared and has had no feedback
+        self._violation: Array = np.zeros(2)  # of softened bounds, as it is and relative to their scales
+        change: Array = np.zeros(1)
+        self._change = change.data
+        # OSQP has its own infinity, and reads no other.
+        self._weights = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS}
+        self.scale: Array = np.ones(model.nx + model.nu + len(ocp.lg))
+        self.guess = Guess(
+            sample={"x": x, "u": u, "u_prev": self.u_prev, "y_ref": self.y_ref, "p": self.p},
+            weights=self._weights | {"scale": self.scale},
+            x0=self.x0,
+            plan=Plan(self.x, self.u, self._violation, change),
+        )
+
+        transcriptions = [FORMULATIONS[self.formulation](ocp, softened=softened) for softened in (False, True)[: 2 if len(ocp.lg) else 1]]
+        structured = (places(ocp), certificate(ocp)) if solver == "riccati" else None
+        moves, cost = shift(ocp), plan_cost(ocp)
+        native = [moves, cost, *natives(transcriptions, structured)]
+        made = dict(zip((f.name() for f in native), compiled(*native) if compile else native, strict=True))
+
+        def make(function: Any) -> Any:
+            return made.get(function.name(), function)
+
+        self.advance = bind(make(moves), {"x": self.x, "u": self.u, "p": self.p}, {"x_next": x, "u_next": u})
+        self._turns = Turns(ocp, x, self.x0, self.y_ref, self.p, (self._weights["lbx"], self._weights["ubx"]))
+        self._cost: Array = np.zeros(1)
+        self.evaluate = bind(make(cost), self.guess.arguments | {"x": self.x, "u": self.u}, {"cost": self._cost})
+        qps = [Qp(transcription, self.guess, make) for transcription in transcriptions]
+        self.active_set = None if structured is None else ActiveSet(*structured, self.guess, make)
+        self._normalise(qps)
+        if solver in SOLVERS:
+            self.solvers = [Solver(qp, settings or SolverSettings()) for qp in qps]
+        else:
+            self.solvers = [ForeignSolver(qp, solver) for qp in qps]
+        self.reset(np.zeros(model.nx), np.array(model.u_rest))
+
+    def _normalise(self, qps: Sequence[Qp]) -> None:
+        """Find what variables are measured by, and normalise the cost, so that one step size of ADMM, and one tolerance, fit every problem."""
+        self._roll_out()
+        qps[0].fill()
+        if not qps[0].sound:
+            raise OcpError(f"model {self.ocp.model.name} must be finite and differentiable around the zero state")
+        self.scale[:] = scale(self.ocp, self.x, self.u, self.y_ref, self.p)
+        self.cost_scale = 1.0 / step_size(qps[0])
+        for name in COSTS:
+            self._weights[name] *= self.cost_scale
+        self.y_ref[:] = 0.0
+        for qp in qps:
+            qp.fill()
+
+    @property
+    def qp(self) -> Qp:
+        """The QP of the current sample; filled if its solver is a QP solver."""
+        return self._backup.qp if isinstance(self.solver, ActiveSet) else self.solver.qp
+
+    def reset(self, x0: Array, u_prev: Array) -> None:
+        """Start cold: the guess stays at one state and one input, and no earlier solution seeds the next."""
+        self.u_prev[:] = u_prev
+        self.u[:] = np.clip(u_prev, self.ocp.lbu, self.ocp.ubu)
+        self.x[:] = x0
+        self._pending = False
+        self._turns.forget()
+        self._backup = self.solvers[0]
+        self._loaded = False
+        self.solver = self._backup
+        for solver in self.solvers:
+            solver.cold = True
+        if self.active_set is not None:
+            self.solver = self.active_set
+            self.active_set.forget()
+
+    def use_whole_qp(self) -> None:
+        """Let the QP solver, where it is asked next, solve the QP with its softened bounds."""
+        self._backup, self._loaded = self.solvers[-1], False
+
+    def retune(self, values: Mapping[str, Array]) -> None:
+        """
+        Take other weights and bounds from the next `prepare` on; `ocp` keeps those it was built with.
+
+        Args:
+            values: By the names in `WEIGHTS`, shapes as in `Ocp`. Finite where the problem's are: which bounds there are is compiled in.
+        """
+        for name, value in values.items():
+            self._weights[name][:] = np.clip(value, -INFINITY, INFINITY)
+            if name in COSTS:
+                self._weights[name] *= self.cost_scale
+        for solver in self.solvers:
+            solver.refill()
+
+    def prepare(self, y_ref: Array, p: Array | None = None, *, shift: bool = True, u_prev: Array | None = None) -> None:
+        """
+        Shift the guess by one stage, linearize there and load the QP.
+
+        Args:
+            y_ref: Reference at nodes 1 to N, shape ``(N, ny)``; angles may wrap.
+            p: Stage parameters at nodes 0 to N, shape ``(N + 1, np)``; those of the last sample if none are given.
+            shift: Whether time goes on. Without, the same sample is iterated on.
+            u_prev: Input that acts before the plan, shape ``(nu,)``, where it is not the first input of the last plan.
+
+        Raises:
+            ShapeError: A shape does not fit.
+        """
+        if y_ref.shape != self._rows:
+            raise ShapeError("y_ref", self._rows, y_ref)
+        if p is not None:
+            if p.shape != self.p.shape:
+                raise ShapeError("p", self.p.shape, p)
+            self.p[...] = p
+        if self._pending:
+            self.keep_guess()
+        self.y_ref[...] = y_ref
+        self._turns.take_reference()
+        if u_prev is not None:
+            self.u_prev[...] = u_prev
+        elif shift:
+            self.u_prev[...] = self.u[0]
+        self._pending = True
+        if not shift:
+            self._relinearize()
+            return
+        self._loaded = False
+        if self.active_set is not None:
+            self.active_set.advance()
+            self.active_set.gain()
+        else:
+            self.advance()
+        if self.solver is not self.active_set:  # so that a sample like the last is prepared in full
+            self._load()
+
+    def _relinearize(self) -> None:
+        """Linearize at the plan itself, and prepare the solver."""
+        for guess, plan in self._pairs:
+            guess[:] = plan
+        self._linearize()
+
+    def _linearize(self) -> None:
+        """Linearize at the guess as it is, and prepare the solver."""
+        self._loaded = False
+        if self.active_set is not None:
+            self.active_set.linearize()
+            self.active_set.gain()
+        if self.solver is not self.active_set:
+            self._load()
+
+    def _load(self) -> None:
+        """Prepare the QP solver at the guess."""
+        self._backup.load()
+        self._loaded = True
+
+    def keep_guess(self) -> None:
+        """Let the guess be the plan: for want of a better one."""
+        for guess, plan in self._pairs:
+            plan[:] = guess
+        if self.active_set is not None:
+            self.active_set.keep()
+
+    def _roll_out(self) -> None:
+        """Make a guess in motion, half way to the upper bounds of the inputs, on its reference: there the problem shows its scale, undamped."""
+        ubu = self.ocp.ubu
+        self.u[:] = np.where(np.isfinite(ubu), 0.5 * (np.clip(ubu, -INFINITY, INFINITY) + self.u_prev), self.u_prev)
+        self.x[:] = 0.0
+        for _ in range(self.ocp.N):
+            self.shift()
+        self.u_prev[:] = self.u[0]
+        self.y_ref[:] = np.array(self.ocp.model.h().map(self.ocp.N)(self.x[1:].T, self.p[1:].T)).T
+
+    def shift(self) -> None:
+        """Move the plan on by one stage: its first input becomes the previous one, its last is repeated, with the state the model predicts."""
+        if self._pending:
+            self.keep_guess()
+        self.u_prev[...] = self.u[0]
+        if self.active_set is None:
+            self.advance()
+        else:
+            self.active_set.advance()
+        self.keep_guess()
+
+    def feedback(self, x0: Array) -> QpStatus:
+        """
+        Embed the initial state, solve the QP and take the full step; iterate while that was large.
+
+        A status that is not `usable` leaves the guess for a plan, and the next
+        solve starts cold: a failure never seeds what follows.
+
+        Args:
+            x0: State at node 0, shape ``(nx,)``; angles may wrap: those of the plan continue the last one's.
+        """
+        self.x0[...] = x0
+        self._pending = False
+        if self._turns.settle():
+            self._linearize()
+        self.status = self.solve()
+        self.taken = 1
+        if self._change[0] > self.tolerance:
+            self._iterate()
+        if self.status is SOLVED and self.active_set is not None:
+            self.status = self._certified(self.active_set)
+        return self.status
+
+    def _certified(self, active_set: ActiveSet) -> QpStatus:
+        """Judge the plan of the last QP; one that is neither certified nor nearly so leaves the plan of the iteration before, or the guess."""
+        if self.solver is not active_set:
+            return INACCURATE  # a plan of the QP solver, to its tolerance
+        status = active_set.certified()
+        if not status.usable:
+            self.keep_guess()
+            active_set.forget()
+        return status
+
+    def solve(self) -> QpStatus:
+        """Solve the QP, whoever can, and make the plan; without one, the guess stays."""
+        active_set = self.active_set
+        if active_set is not None and active_set.solve():
+            self.solver = active_set
+            return SOLVED
+        status = self.solve_qp()
+        if not status.usable:
+            self.keep_guess()
+        return status
+
+    def _iterate(self) -> None:
+        """Iterate at the plan while the step is large; an iteration that fails leaves the plan of the one before."""
+        while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
+            self._relinearize()
+            if not (status := self.solve()).usable:
+                self.status = INACCURATE  # the plan is that of a QP before the last, which nobody can certify any more
+                break
+            self.status = status
+            self.taken += 1
+
+    def solve_qp(self) -> QpStatus:
+        """Solve with the QP solver."""
+        self.solver = self._backup
+        if not (np.abs(self.x0) < INFINITY).all():  # nor NaN
+            return QpStatus.FAILED
+        violation = self._violation
+        if not self._loaded:
+            self._load()
+        status = self._backup.solve()
+        if status.usable and self._backup is not self.solvers[-1] and violation[0] > 0.0:
+            self._backup = self.solver = self.solvers[-1]
+            self._backup.load()
+            status = self._backup.solve()
+        if status.usable:
+            self.evaluate()
+            if not isfinite(self._cost[0]):  # numbers of such a size that they overflowed inside the solver
+                self.solver.cold = True
+                return QpStatus.FAILED
+            if violation[1] < -TOUCHING:
+                self._backup = self.solvers[0]
+        return status
+
+    @property
+    def cost(self) -> float:
+        """The cost (4) of the plan, with the penalties for what it exceeds; ask before the next `prepare`, which overwrites what it depends on."""
+        self.evaluate()
+        return float(self._cost[0]) / self.cost_scale
+
+    @property
+    def violation(self) -> float:
+        """By how much the plan exceeds a softened bound at most, in the unit of what is bounded; 0 if it exceeds none."""
+        return max(0.0, float(self._violation[0]))
+
+    @property
+    def touches(self) -> bool:
+        """Whether the last plan is at a softened bound, or beyond it."""
+        return bool(self._violation[1] > -TOUCHING)
+
+
+def check_options(solver: str, settings: SolverSettings | None, iterations: int, tolerance: float) -> None:
+    """Refuse options of an `Rti` that make no sense; see there."""
+    if solver not in SOLVERS:
+        check_name(solver)
+        if settings is not None:
+            raise OcpError(f"settings are OSQP's, they must be left out for another solver, got {settings} for {solver!r}")
+    if not (iterations >= 1 and tolerance >= 0.0):
+        raise OcpError(f"iterations must be at least 1 and tolerance not negative, got {iterations} and {tolerance}")
+
+
+def formulation_of(ocp: Ocp, formulation: str) -> str:
+    """Return which formulation is meant."""
+    if formulation == "auto":
+        return "sequential" if ocp.N_u <= SEQUENTIAL_UP_TO else "simultaneous"
+    if formulation not in FORMULATIONS:
+        raise OcpError(f"formulation must be auto, {' or '.join(FORMULATIONS)}, got {formulation!r}")
+    return formulation
+
+
+def natives(transcriptions: Sequence[Transcription], structured: tuple[Places, Any] | None) -> list[Any]:
+    """
+    Return the functions of a problem's solver that are worth compiling.
+
+    A QP solver behind the active set is so rarely asked that its QP is left to the
+    virtual machine: it would double the build.
+    """
+    if structured is not None:
+        return [*vars(structured[0]).values(), structured[1]]
+    return [function for transcription in transcriptions for function in (transcription.data, transcription.embed, transcription.step)]

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+Scale of each variable: what one unit of it is inside the solvers, so that the units of a model mean nothing.
+
+An input is measured by half the range between its bounds, by what its increments
+add up to over the control horizon, or by the curvature of the cost. A state is
+measured by half the range between its bounds, or by how far the inputs can move
+it over the horizon, its reach; what has general constraints likewise. Every
+tolerance is a share of these.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.rti.linearization import constraints, gauss_newton, linearize
+from rti_mpc.rti.ocp import Ocp
+
+
+def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
+    """
+    Return the scales of states, inputs and what has softened bounds, one after the other, shape ``(nx + nu + ng,)``, all positive.
+
+    Args:
+        ocp: The problem.
+        x: States of a plan at which reach and curvature are computed, shape ``(N + 1, nx)``.
+        u: Its inputs, shape ``(N_u, nu)``.
+        y_ref: Reference of that plan, shape ``(N, ny)``.
+        p: Stage parameters, shape ``(N + 1, np)``.
+    """
+    model, N = ocp.model, ocp.N
+    held = u[np.minimum(np.arange(N), ocp.N_u - 1)]
+    stage, A_k, B_k = linearize(ocp)
+    columns = np.array(stage.map(N)(x[:-1].T, held.T, p[:-1].T))[model.nx :]
+    A, B = dense(A_k, columns[: A_k.nnz()]), dense(B_k, columns[A_k.nnz() :])
+    response = np.zeros((N + 1, model.nx, model.nu))  # of the states to a step of each input
+    for k in range(N):
+        response[k + 1] = A[k] @ response[k] + B[k]
+    response = response[1:]
+
+    node, H_i = gauss_newton(ocp)
+    W = np.hstack([ocp.delta[k] * ocp.Q + (ocp.Q_e if k == N - 1 else 0.0) for k in range(N)])
+    H = dense(H_i, np.array(node.map(N)(x[1:].T, p[1:].T, y_ref.T, W))[model.nx + 1 :])
+    curvature = np.einsum("kai,kab,kbi->i", response, H, response) + ocp.lambda_.sum() * np.diag(ocp.R)
+
+    reach_u = first(
+        half(ocp.lbu, ocp.ubu),
+        half(ocp.lbdu, ocp.ubdu) * ocp.N_u,
+        beyond(ocp.lbu, ocp.ubu, np.array(model.u_rest)),
+        1.0 / np.sqrt(curvature),
+    )
+    reach = shared(np.abs(response * reach_u).sum(axis=2).max(axis=0), [state.unit for state in model.states])
+    scale_x = first(half(ocp.lbx, ocp.ubx), reach, beyond(ocp.lbx, ocp.ubx, np.zeros(model.nx)))
+
+    constraint, G_x, G_u = constraints(ocp)
+    ng = len(ocp.lg)
+    columns = np.array(constraint.map(N)(x[1:].T, held.T, p[1:].T)).reshape(-1, N)[ng:]
+    by_x, by_u = dense(G_x, columns[: G_x.nnz()]), dense(G_u, columns[G_x.nnz() :])
+    reach_g = np.abs((by_x @ response + by_u) * reach_u).sum(axis=2).max(axis=0, initial=0.0)
+    scale_g = first(half(ocp.lg, ocp.ug), reach_g, beyond(ocp.lg, ocp.ug, np.zeros(ng)))
+    scale_g[: len(ocp.soft)] = scale_x[list(ocp.soft)]
+    return np.concatenate([scale_x, reach_u, scale_g])
+
+
+def shared(reach: Array, units: list[str]) -> Array:
+    """Return the largest reach of all states of the same unit for each: x and y of a position are measured alike, whichever way the robot faces."""
+    alike = np.array([[a == b and a not in ("", "1") for b in units] for a in units]) | np.eye(len(units), dtype=bool)
+    return np.asarray(np.where(alike, reach, 0.0).max(axis=1))
+
+
+def half(lower: Array, upper: Array) -> Array:
+    """Return half the range between bounds; infinite where one is absent."""
+    return np.asarray(0.5 * (upper - lower))
+
+
+def beyond(lower: Array, upper: Array, origin: Array) -> Array:
+    """Return the distance from an origin to the nearest bound that is there."""
+    return np.asarray(np.minimum(np.abs(upper - origin), np.abs(lower - origin)))
+
+
+def first(*candidates: Array) -> Array:
+    """Return for each component the first candidate that can be a scale, finite and positive, or 1."""
+    chosen = np.ones_like(candidates[0])
+    for candidate in reversed(candidates):
+        chosen = np.where(np.isfinite(candidate) & (candidate > 0.0), candidate, chosen)
+    return chosen
+
+
+def dense(pattern: ca.Sparsity, nonzeros: Array) -> Array:
+    """Return dense matrices of a pattern from their nonzeros, a matrix per column; shape ``(columns, rows of the pattern, its columns)``."""
+    rows, cols = pattern.get_triplet()
+    matrices = np.zeros((nonzeros.shape[1], *pattern.shape))
+    matrices[:, rows, cols] = nonzeros.T
+    return matrices

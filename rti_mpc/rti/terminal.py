@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+A terminal weight from the linear-quadratic regulator: what the horizon does not see any more, as if it went on for ever.
+
+Around a point of motion the dynamics are :math:`x^+ = A x + B u`, outputs
+:math:`y = C x`. With the previous input as a state, so that increments
+:math:`v` are the inputs,
+
+.. math::
+
+    \begin{bmatrix} x \\ u \end{bmatrix}^+ =
+    \begin{bmatrix} A & B \\ 0 & I \end{bmatrix} \begin{bmatrix} x \\ u \end{bmatrix} + \begin{bmatrix} B \\ I \end{bmatrix} v ,
+
+the cost to go is :math:`\xi^T S \xi`, S from the Riccati equation. A reference
+says nothing of the states that are no outputs: they are taken at their best,
+which leaves the Schur complement of S in the outputs.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+from scipy.linalg import LinAlgError, solve_discrete_are
+
+from rti_mpc.array import Array
+from rti_mpc.errors import OcpError
+from rti_mpc.rti.ocp import Ocp
+
+
+def lqr_weight(ocp: Ocp, x: Array, u: Array) -> Array:
+    """
+    Return the terminal weight `Q_e` that continues a horizon for ever.
+
+    Args:
+        ocp: Its dynamics, `Q`, `R` and the last of `delta` and `lambda_`.
+        x: State to linearize at, shape ``(nx,)``; a wheeled robot must be in motion, or it cannot be stabilized.
+        u: Input there, shape ``(nu,)``.
+
+    Returns:
+        The weight, shape ``(ny, ny)``, symmetric, without the last stage's own ``delta_N Q``.
+
+    Raises:
+        OcpError: The linearization cannot be stabilized.
+    """
+    model = ocp.model
+    phi, p = ocp.phi(), np.array(model.p_nominal)
+    sensitivities = ca.Function(
+        "sensitivities",
+        [model.x, model.u, model.p],
+        [*(ca.jacobian(phi(model.x, model.u, model.p), z) for z in (model.x, model.u)), ca.jacobian(model.y_expr, model.x)],
+    )
+    A, B, C = (np.array(M) for M in sensitivities(x, u, p))
+    nx, nu = B.shape
+    F = np.block([[A, B], [np.zeros((nu, nx)), np.eye(nu)]])
+    G = np.vstack([B, np.eye(nu)])
+    C = np.hstack([C, np.zeros((len(C), nu))])
+    try:
+        S = solve_discrete_are(F, G, ocp.delta[-1] * C.T @ ocp.Q @ C, ocp.lambda_[-1] * ocp.R)
+    except (LinAlgError, ValueError) as error:
+        raise OcpError(f"model {model.name} must be stabilizable where a terminal weight is wanted, at x = {x}, u = {u}: {error}") from error
+    # The least of xi' S xi over all xi of one output y is y' (C S^-1 C')^-1 y.
+    weight = np.linalg.inv(C @ np.linalg.pinv(S) @ C.T) - ocp.delta[-1] * ocp.Q
+    return np.asarray((weight + weight.T) / 2)

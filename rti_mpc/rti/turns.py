@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+Whole turns of angles: which of :math:`\psi + 2 \pi k` is meant.
+
+Measurements and references wrap, plans do not. One wrong heading may leave the two
+a turn apart, and a robot would then turn once round itself to follow its reference.
+So the state continues the plan, and the error of each angle continues the error of
+the sample before, until it exceeds half a turn by `HYSTERESIS_RAD`: then the nearer
+way round is taken. Noise at half a turn therefore changes the way at most once.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from rti_mpc.angle import whole_turns
+from rti_mpc.array import Array
+from rti_mpc.codegen import bind
+from rti_mpc.rti.ocp import Ocp
+
+HYSTERESIS_RAD = 0.3  # beyond half a turn, before the other way round is taken
+FARTHEST_RAD = math.pi + HYSTERESIS_RAD
+
+
+class Turns:
+    """
+    The angles of one problem, kept in the same turn: of the state, of the plan, and of the reference.
+
+    A state with bounds no more than a turn apart stays in the turn of its bounds.
+
+    Args:
+        ocp: The problem; it repeats with each turn of a state that is an angle.
+        x: State guess, shape ``(N + 1, nx)``.
+        x0: Initial state, shape ``(nx,)``.
+        y_ref: Reference rows, shape ``(N, ny)``.
+        p: Stage parameters, shape ``(N + 1, np)``.
+        bounds: Lower and upper bounds on states that act, each of shape ``(nx,)``; infinite or huge where there are none.
+    """
+
+    def __init__(self, ocp: Ocp, x: Array, x0: Array, y_ref: Array, p: Array, bounds: tuple[Array, Array]) -> None:
+        model = ocp.model
+        y: Array = np.zeros(model.ny)
+        self._x, self._y_ref = x, y_ref
+        self._lbx, self._ubx = bounds
+        views: list[Any] = [array.data for array in (x0, x[0], y, y_ref[0])]  # read faster than arrays are
+        self._x0, self._guess, self._y, self._y_first = views
+        self._output = bind(model.h(), {"x": x0, "p": p[0]}, {"y": y})
+        self._states = [j for j, signal in enumerate(model.states) if signal.angle]
+        self._outputs = [j for j, signal in enumerate(model.outputs) if signal.angle]
+        self._bounded = [j for j in self._states if ocp.ubx[j] - ocp.lbx[j] <= math.tau]
+        self._steps = [(y_ref[1:, j], y_ref[:-1, j]) for j in self._outputs]
+        self._step: Array = np.zeros(ocp.N - 1)
+        self._added: Array = np.zeros(model.ny)  # to reference rows as they are given
+        self._errors = [0.0] * model.ny
+
+    def forget(self) -> None:
+        """Start cold: the nearest way round is taken again."""
+        self._errors = [0.0] * len(self._errors)
+
+    def take_reference(self) -> None:
+        """Unwrap reference rows as they were given, and add the turns of the sample before."""
+        for j, (later, earlier) in zip(self._outputs, self._steps, strict=True):
+            np.subtract(later, earlier, out=self._step)
+            if np.dot(self._step, self._step) >= math.pi**2:  # one of them may be half a turn
+                self._y_ref[:, j] = np.unwrap(self._y_ref[:, j])
+            if self._added[j]:
+                self._y_ref[:, j] += self._added[j]
+
+    def settle(self) -> bool:
+        """Bring a new initial state, the guess and the reference into the same turn; tell whether guess or reference have changed."""
+        changed = False
+        for j in self._states:
+            self._x0[j] -= whole_turns(self._x0[j] - self._guess[j])
+        for j in self._bounded:
+            beyond = self._x0[j] - 0.5 * float(self._lbx[j] + self._ubx[j])
+            if abs(beyond) > FARTHEST_RAD:
+                turns = whole_turns(beyond)
+                self._x0[j] -= turns
+                self._x[:, j] -= turns
+                changed = True
+        if self._outputs:
+            self._output()
+        for j in self._outputs:
+            error = self._y[j] - self._y_first[j]
+            turns = whole_turns(error - self._errors[j])
+            if abs(error - turns) > FARTHEST_RAD:
+                turns = whole_turns(error)
+            if turns:
+                self._y_ref[:, j] += turns
+                self._added[j] += turns
+                changed = True
+            self._errors[j] = error - turns
+        return changed

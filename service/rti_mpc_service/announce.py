@@ -1,0 +1,17 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a process has to say: an event on the bus, and a line of its log."""
+
+from __future__ import annotations
+
+import logging
+
+from rti_mpc.contract.message import Notice, Severity
+from rti_mpc.wire.announcer import Announcer
+
+LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
+
+
+def announce(log: logging.Logger, announcer: Announcer, notice: Notice, stamp_ns: int) -> None:
+    """Publish and log a notice, with a time of the robot; neither, where it is a fault that just was."""
+    if announcer.say(notice, stamp_ns):
+        log.log(LEVELS[notice.severity], "%s", notice.text)

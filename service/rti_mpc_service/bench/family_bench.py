@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Benchmark over problem families: CPU time of a sample, who solved it, and closed-loop cost over converged NMPC.
+
+Each solver drives a closed loop of its own. Five equal copies solve every
+sample in turn; its time is the least of the five, so that what the machine does
+beside them does not count. Times are CPU times of this thread.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import resource
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from difflib import get_close_matches
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from rti_mpc.array import Array
+from rti_mpc.contract.status import QpStatus
+from rti_mpc.errors import ConfigError
+from rti_mpc.rti.rti import Rti
+from rti_mpc_service.bench.bench import spread
+from rti_mpc_service.bench.families import FAMILIES, Family
+from rti_mpc_service.bench.yardstick import Ipopt
+from rti_mpc_service.console import table_console
+from rti_mpc_service.host import machine
+
+COPIES = 5  # that solve each sample; its time is their least
+SOLVERS = ("riccati", "osqp")  # unless others are asked for
+QUICK = 40  # samples of a first look
+
+
+def drive(family: Family, solver: str, samples: int, tick: Callable[[], None]) -> dict[str, Any]:
+    """Drive one closed loop by one solver; return times, us, counts and the cost."""
+    ocp = family.ocp
+    copies = [Rti(ocp, solver=solver, formulation="simultaneous") for _ in range(COPIES)]
+    step: Array = np.zeros((samples, COPIES))
+    feedback: Array = np.zeros((samples, COPIES))
+    unsolved, iterations, cost = 0, [], 0.0
+    x, u = np.zeros(ocp.model.nx), family.u0
+    gc.collect()
+    gc.disable()
+    try:
+        for k in range(samples):
+            if (start := family.start(k)) is not None:
+                x, u = start, family.u0
+                for rti in copies:
+                    rti.reset(x, u)
+            y_ref, p = family.at(k)
+            for c, rti in enumerate(copies):
+                began_ns = time.thread_time_ns()
+                rti.prepare(y_ref, p, shift=start is None, u_prev=u)
+                prepared_ns = time.thread_time_ns()
+                status = rti.feedback(x)
+                done_ns = time.thread_time_ns()
+                step[k, c], feedback[k, c] = 1e-3 * (done_ns - began_ns), 1e-3 * (done_ns - prepared_ns)
+            unsolved += status is not QpStatus.SOLVED
+            iterations.append(rti.solver.iterations)
+            x, u, cost = advance(family, x, u, rti.u[0].copy(), y_ref, p, cost)
+            tick()
+    finally:
+        gc.enable()
+    return {
+        "cpu_us": spread(step.min(axis=1)),
+        "feedback_us": spread(feedback.min(axis=1)),
+        "unsolved": unsolved,
+        "iterations": {"p50": int(np.median(iterations)), "max": max(iterations)},
+        "cost": cost,
+    }
+
+
+def converge(family: Family, samples: int, tick: Callable[[], None]) -> dict[str, Any]:
+    """Drive one closed loop by IPOPT, with softened bounds as the problem has them; return its times, us, and the cost."""
+    ipopt = Ipopt(family.ocp, softened=True)
+    times_us, cost = [], 0.0
+    x, u = np.zeros(family.ocp.model.nx), family.u0
+    for k in range(samples):
+        if (start := family.start(k)) is not None:
+            x, u = start, family.u0
+            ipopt.reset(x, u)
+        y_ref, p = family.at(k)
+        began_ns = time.thread_time_ns()
+        command = ipopt.solve(x, u, y_ref, p)
+        times_us.append(1e-3 * (time.thread_time_ns() - began_ns))
+        x, u, cost = advance(family, x, u, command, y_ref, p, cost)
+        tick()
+    return {"ipopt_us": spread(times_us), "cost": cost}
+
+
+def advance(family: Family, x: Array, u_prev: Array, u: Array, y_ref: Array, p: Array | None, cost: float) -> tuple[Array, Array, float]:
+    """Return the plant's next state, the input that led there, and the cost with that of the period."""
+    x = family.plant(x, u)
+    return x, u, cost + family.cost(x, u, u_prev, y_ref[0], None if p is None else p[1])
+
+
+def build(name: str, N: int, solver: str) -> tuple[float, float]:
+    """Build a problem with an empty cache; return the time, s, and the peak memory of this process or its compiler, MiB."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["XDG_CACHE_HOME"] = folder
+        began_s = time.monotonic()
+        Rti(FAMILIES[name][0](N).ocp, solver=solver, formulation="simultaneous")
+        took_s = time.monotonic() - began_s
+    peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return took_s, peak / 1024
+
+
+def build_alone(name: str, N: int, solver: str) -> tuple[float, float]:
+    """Do so in a process of its own."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(build, name, N, solver).result()
+
+
+def main(names: Sequence[str], horizons: Sequence[int], solvers: Sequence[str], *, quick: bool, path: Path | None) -> int:
+    """
+    Measure families, print a table, and write the rows to a file if asked to.
+
+    Args:
+        names: Families, or ``all``.
+        horizons: Stages; those of each family if none are given.
+        solvers: Solvers by name.
+        quick: Only the first samples of each.
+        path: JSON file to write.
+
+    Raises:
+        ConfigError: A family is unknown.
+    """
+    for name in names:
+        if name not in FAMILIES and name != "all":
+            near = "".join(f"perhaps {other} is meant, " for other in get_close_matches(name, FAMILIES, 1))
+            raise ConfigError(f"--problem must be all or one of {', '.join(FAMILIES)}; {near}got {name!r}")
+    chosen = list(FAMILIES) if "all" in names else list(dict.fromkeys(names))
+    console = table_console()
+    console.print(", ".join(f"{key} {value}" for key, value in machine.describe().items()), soft_wrap=True)
+    rows: list[dict[str, Any]] = []
+    with Progress(console=console, transient=True) as progress:
+        for name in chosen:
+            make, usual = FAMILIES[name]
+            for N in horizons or usual:
+                family = make(N)
+                samples = min(QUICK, family.samples) if quick else family.samples
+                task = progress.add_task(f"{name}, N = {N}", total=samples * (1 + len(solvers)))
+                tick = lambda t=task: progress.advance(t)  # noqa: E731
+                converged = converge(family, samples, tick)
+                for solver in solvers:
+                    compile_s, compile_mib = build_alone(name, N, solver)
+                    row = drive(family, solver, samples, tick)
+                    row |= {"cost_over_converged": row["cost"] / converged["cost"] - 1.0, "ipopt_us": converged["ipopt_us"], "samples": samples}
+                    row |= {"compile_s": round(compile_s, 2), "compile_mib": round(compile_mib)}
+                    rows.append({"problem": name, "N": N, "solver": solver, **row})
+    show(console, rows)
+    if path is not None:
+        path.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+def show(console: Console, rows: list[dict[str, Any]]) -> None:
+    """Print the rows."""
+    table = Table(title="CPU time of a sample, us: median / p99 / most")
+    for heading in ("problem", "N", "solver", "step", "feedback", "IPOPT", "unsolved", "iterations", "cost", "compile"):
+        table.add_column(heading, justify="left" if heading in ("problem", "solver") else "right", no_wrap=True)
+    for row in rows:
+        times = ["{p50:.0f} / {p99:.0f} / {max:.0f}".format(**row[key]) for key in ("cpu_us", "feedback_us", "ipopt_us")]
+        table.add_row(
+            row["problem"],
+            str(row["N"]),
+            row["solver"],
+            *times,
+            f"{row['unsolved']} of {row['samples']}",
+            "{p50} / {max}".format(**row["iterations"]),
+            f"{row['cost_over_converged']:+.2%}",
+            f"{row['compile_s']:.1f} s, {row['compile_mib']} MiB",
+        )
+    console.print(table)

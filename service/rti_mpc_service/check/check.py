@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A dry run of one configuration: does it load, how long does a sample take here, is its QP solver right?
+
+The plan's own prediction, disturbed, is the next state: 200 samples of closed
+loop around a wave in every output, seeded, then excursions to each bound that
+there is. Every tenth QP, and those of the excursions, are solved again, by the
+same solver as tightly as it can, and by another one in the other way of writing
+the problem. That those two agree says that the QP is solved right; how far the
+controller's own plan is from theirs, what its tolerance costs.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from rti_mpc.array import Array
+from rti_mpc.contract.status import QpStatus
+from rti_mpc.rti.qp.osqp import SolverSettings
+from rti_mpc.rti.rti import FORMULATIONS, SOLVERS, Rti
+from rti_mpc_service.check.excursion import Bounds, excursions
+from rti_mpc_service.config.build import build_rti, robot_settings
+from rti_mpc_service.config.config import load
+from rti_mpc_service.config.fit import check_stop
+from rti_mpc_service.config.schema import Config
+from rti_mpc_service.rig.wave import wave
+
+SAMPLES = 200
+OPINIONS = 20  # samples of these whose QP the second solver is asked about
+EACH = 4  # samples of an excursion to a bound; the second solver is asked about the first and the last
+SECOND = "daqp"  # or OSQP where that is the first
+TIGHT = SolverSettings(eps=1e-9, max_iter=100_000, scaling=10)  # Ruiz scaling helps where bounds are far exceeded
+TOLERANCE = 1e-5  # what two tight answers to one QP may differ by, relative to half the range of each input
+
+NOISE = 0.01  # standard deviation of the disturbance, in the unit of each state
+
+
+@dataclass(frozen=True)
+class Report:
+    """
+    Outcome of a dry run.
+
+    Attributes:
+        prepare_us: Time of each preparation, shape ``(SAMPLES,)``.
+        feedback_us: Time of each feedback, shape ``(SAMPLES,)``.
+        statuses: How often each status came out.
+        second: The other solver.
+        opinions: How many QPs both have solved.
+        difference: Largest difference of its inputs from those of the first, solved tightly, relative to half the range of each.
+        deviation: Largest difference of the controller's own inputs from them.
+        bounds: How many bounds there are.
+        missed: Names of those that no plan has been at.
+    """
+
+    prepare_us: Array
+    feedback_us: Array
+    statuses: Counter[QpStatus]
+    second: str
+    opinions: int
+    difference: float
+    deviation: float
+    bounds: int
+    missed: list[str]
+
+    @property
+    def agree(self) -> bool:
+        """Whether the other solver confirms the first."""
+        return self.opinions > 0 and self.difference <= TOLERANCE
+
+
+def main(path: Path) -> int:
+    """Check a configuration, print what was found, and return the exit status: 0 if every sample was usable and both solvers agree."""
+    config = load(path)
+    check_stop(config)
+    console = Console()
+    report = check(config, track(range(SAMPLES), "solving", console=console, transient=True, disable=not console.is_terminal))
+    table = Table("phase, us", "p50", "p99", "max")
+    for phase, times in (("preparation", report.prepare_us), ("feedback", report.feedback_us)):
+        table.add_row(phase, *(f"{np.percentile(times, share):.0f}" for share in (50, 99, 100)))
+    console.print(
+        f"{path}: N = {config.ocp.N}, N_u = {config.N_u}, dt = {config.ocp.dt_s} s, configuration {config.config_hash:016x}", soft_wrap=True
+    )
+    console.print(table)
+    console.print(
+        f"{sum(report.statuses.values())} samples: " + ", ".join(f"{count} {status.name}" for status, count in sorted(report.statuses.items()))
+    )
+    verdict = "agree" if report.agree else "DISAGREE"
+    difference = f"solved tightly they differ by at most {report.difference:.1e}, {TOLERANCE:.0e} allowed"
+    console.print(f"{config.solver.name} and {report.second} {verdict}: on {report.opinions} QPs {difference}", soft_wrap=True)
+    console.print(f"the controller's own plans are within {report.deviation:.1e} of them, relative to half the range of each input", soft_wrap=True)
+    reached = f"driven to {report.bounds - len(report.missed)} of {report.bounds} bounds"
+    console.print(reached + (f", not to the {', the '.join(report.missed)}" if report.missed else ""), soft_wrap=True)
+    return 0 if report.agree and all(status.usable for status in report.statuses) else 1
+
+
+def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> Report:
+    """Solve one QP for each of the samples, and drive to the bounds."""
+    rti = build_rti(config)
+    ocp = rti.ocp
+    model, N = ocp.model, ocp.N
+    first, second = config.solver.name, SECOND if config.solver.name != SECOND else "osqp"
+    other = next(name for name in FORMULATIONS if name != rti.formulation)
+    tight, judge = (twin(rti, solver, formulation) for solver, formulation in ((first, rti.formulation), (second, other)))
+    bounds, scale = Bounds(rti), rti.scale[model.nx : model.nx + model.nu]
+    rng = np.random.default_rng(1)
+    x = np.array(robot_settings(config)["x0"])
+    reference = wave(ocp, x, rng)
+    prepare_us, feedback_us = np.zeros(SAMPLES), np.zeros(SAMPLES)
+    statuses: Counter[QpStatus] = Counter()
+    differences: list[float] = []
+    deviations: list[float] = []
+
+    def sample(x: Array, y_ref: Array, *, asked: bool) -> tuple[float, float]:
+        """Solve one sample, and have its QP solved again; return the times of both phases, us."""
+        began_ns = time.perf_counter_ns()
+        rti.prepare(y_ref)
+        prepared_ns = time.perf_counter_ns()
+        guess = tuple(array.copy() for array in rti.guess.start.values())
+        fed_ns = time.perf_counter_ns()
+        status = rti.feedback(x)
+        done_ns = time.perf_counter_ns()
+        statuses[status] += 1
+        bounds.look()
+        if asked and status.usable:
+            mine, theirs = (answer(one, guess, y_ref, x) for one in (tight, judge))
+            if mine is not None and theirs is not None:
+                differences.append(float(np.max(np.abs(mine - theirs) / scale)))
+                deviations.append(float(np.max(np.abs(rti.u - theirs) / scale)))
+        return 1e-3 * (prepared_ns - began_ns), 1e-3 * (done_ns - fed_ns)
+
+    start = x
+    rti.reset(x, np.array(model.u_rest))
+    for k in samples:
+        prepare_us[k], feedback_us[k] = sample(x, reference(k + 1 + np.arange(N)), asked=k % (SAMPLES // OPINIONS) == 0)
+        x = rti.x[1] + NOISE * rng.standard_normal(model.nx)
+    for excursion in excursions(rti, start):
+        x = excursion.x0
+        rti.reset(x, np.array(model.u_rest))
+        for k in range(EACH):
+            sample(x, excursion.y_ref, asked=k in (0, EACH - 1))
+            x = rti.x[1].copy()
+    difference, deviation = (max(values, default=np.inf) for values in (differences, deviations))
+    return Report(prepare_us, feedback_us, statuses, second, len(differences), difference, deviation, len(bounds.names), bounds.missed)
+
+
+def twin(rti: Rti, solver: str, formulation: str) -> Rti:
+    """Return a controller's like whose solver is tight; those of qpsolvers are in any case."""
+    settings = TIGHT if solver in SOLVERS else None
+    return Rti(rti.ocp, settings, formulation=formulation, solver=solver, iterations=rti.iterations, tolerance=rti.tolerance, compile=False)
+
+
+def answer(one: Rti, guess: tuple[Array, ...], y_ref: Array, x0: Array) -> Array | None:
+    """Return the inputs that an iteration makes of a sample, from a guess of x, u and u_prev; shape ``(N_u, nu)``, None if it makes none."""
+    one.x[:], one.u[:], one.u_prev[:] = guess
+    one.prepare(y_ref, shift=False)
+    return one.u.copy() if one.feedback(x0) is QpStatus.SOLVED else None

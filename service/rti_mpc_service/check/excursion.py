@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Excursions: starts and references that drive a controller to each of its bounds.
+
+A wave of moderate size touches few of them, and a solver that is wrong at a
+bound would go unnoticed. Inputs and increments are driven by a reference that
+lies ten times as far as they reach, softened bounds by a start beyond them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.rti import Rti
+
+FAR = 10.0  # times what an input reaches within the horizon lies the reference that drives it to its bounds
+BEYOND = 1.0  # of its scale by which the start exceeds a softened bound
+STEPS = 8  # Newton steps to such a start; what is linear takes one
+AT = 1e-3  # of its scale within which a plan counts as being at a bound
+
+
+@dataclass(frozen=True)
+class Excursion:
+    """Where it starts, shape ``(nx,)``, and the reference rows that it follows, shape ``(N, ny)``."""
+
+    x0: Array
+    y_ref: Array
+
+
+class Bounds:
+    """
+    The bounds of a problem, and which of them a controller has been at.
+
+    Attributes:
+        names: What each is called; upper and lower are two.
+        reached: Which of them plans have been at so far, shape ``(len(names),)``.
+    """
+
+    def __init__(self, rti: Rti) -> None:
+        self._rti, ocp = rti, rti.ocp
+        model = ocp.model
+        self._scale_u, self._scale_g = rti.scale[model.nx : model.nx + model.nu], rti.scale[model.nx + model.nu :]
+        inputs = [signal.name for signal in model.inputs]
+        softened = [model.states[j].name for j in ocp.soft] + [signal.name for signal in model.constraints[: ocp.h_expr.numel()]]
+        softened += [f"constraint {j}" for j in range(len(softened) - len(ocp.soft), ocp.h_expr.numel())]
+        kinds = (("", inputs, ocp.lbu, ocp.ubu), ("increment of ", inputs, ocp.lbdu, ocp.ubdu), ("", softened, ocp.lg, ocp.ug))
+        self._there = np.concatenate([np.isfinite(bounds) for _, _, lower, upper in kinds for bounds in (lower, upper)])
+        every = [f"{side} bound of {kind}{name}" for kind, names, _, _ in kinds for side in ("lower", "upper") for name in names]
+        self.names = [name for name, there in zip(every, self._there, strict=True) if there]
+        self.reached = np.zeros(len(self.names), dtype=bool)
+        self._softened = ca.Function("softened", [model.x, model.u, model.p], [ca.vertcat(model.x[list(ocp.soft), 0], ocp.h_expr)]).map(ocp.N)
+
+    def look(self) -> None:
+        """Note which bounds the last plan is at."""
+        rti, ocp = self._rti, self._rti.ocp
+        held = rti.u[np.minimum(np.arange(ocp.N), ocp.N_u - 1)]
+        increments = np.diff(rti.u, axis=0, prepend=rti.u_prev[None])
+        softened = np.array(self._softened(rti.x[1:].T, held.T, rti.p[1:].T)).reshape(-1, ocp.N).T
+        found = []
+        for values, lower, upper, scale in (
+            (rti.u, ocp.lbu, ocp.ubu, self._scale_u),
+            (increments, ocp.lbdu, ocp.ubdu, self._scale_u),
+            (softened, ocp.lg, ocp.ug, self._scale_g),
+        ):
+            found += [(values <= lower + AT * scale).any(axis=0), (values >= upper - AT * scale).any(axis=0)]
+        self.reached |= np.concatenate(found)[self._there]
+
+    @property
+    def missed(self) -> list[str]:
+        """Names of the bounds that no plan has been at."""
+        return [name for name, reached in zip(self.names, self.reached, strict=True) if not reached]
+
+
+def excursions(rti: Rti, x0: Array) -> Iterator[Excursion]:
+    """Yield an excursion to each bound, from around a state of shape ``(nx,)``."""
+    ocp = rti.ocp
+    rest = np.array(ocp.model.u_rest)
+    nominal = outputs(ocp, x0, rest)
+    for lower, upper, reach in ((ocp.lbu, ocp.ubu, 1), (ocp.lbdu + rest, ocp.ubdu + rest, ocp.N_u)):
+        for bounds in (lower, upper):
+            for j in np.flatnonzero(np.isfinite(bounds)):
+                u = rest.copy()
+                u[j] += reach * (bounds[j] - rest[j])
+                yield Excursion(x0, nominal + FAR * (outputs(ocp, x0, u) - nominal))
+    scale_g = rti.scale[ocp.model.nx + ocp.model.nu :]
+    for bounds, outward in ((ocp.lg, -BEYOND), (ocp.ug, BEYOND)):
+        for j in np.flatnonzero(np.isfinite(bounds)):
+            yield Excursion(start_at(rti, x0, int(j), bounds[j] + outward * scale_g[j]), nominal)
+
+
+def outputs(ocp: Ocp, x: Array, u: Array) -> Array:
+    """Return the outputs at nodes 1 to N if an input is held, shape ``(N, ny)``."""
+    phi, h, p = ocp.phi(), ocp.model.h(), np.array(ocp.model.p_nominal)
+    rows = []
+    for _ in range(ocp.N):
+        x = np.array(phi(x, u, p)).ravel()
+        rows.append(np.array(h(x, p)).ravel())
+    return np.array(rows)
+
+
+def start_at(rti: Rti, x0: Array, j: int, wanted: float) -> Array:
+    """Return the state near `x0`, by its scale, at which the j-th of what has softened bounds has a value; as near as Newton's method comes."""
+    ocp = rti.ocp
+    model = ocp.model
+    g = ca.vertcat(model.x[list(ocp.soft), 0], ocp.h_expr)[j]
+    value = ca.Function("value", [model.x, model.u, model.p], [g, ca.densify(ca.gradient(g, model.x))])
+    squares = rti.scale[: model.nx] ** 2
+    x = x0.copy()
+    for _ in range(STEPS):
+        now, slope = (np.array(part).ravel() for part in value(x, model.u_rest, model.p_nominal))
+        curvature = float(squares @ slope**2)
+        if curvature <= 0.0 or not np.isfinite(curvature):
+            return x0
+        x = x + squares * slope * (wanted - float(now[0])) / curvature
+    return x

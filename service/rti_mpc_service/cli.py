@@ -1,0 +1,378 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The command line: options in, one call out. Everything physical is in the configuration.
+
+Each command imports what it runs when it runs: `rti-mpc --help` loads no solver,
+no bus and no viewer, and this file alone knows both `service` and `sim`.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import platform
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial, wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+
+import typer
+from typer.core import TyperGroup
+
+import rti_mpc
+from rti_mpc.errors import ConfigError
+from rti_mpc_service import entry, log
+from rti_mpc_service.config.build import build_model, bus_settings, robot_settings, stage_parameters, with_initial_state
+from rti_mpc_service.config.config import load
+from rti_mpc_service.config.schema import Config
+
+if TYPE_CHECKING:
+    from rti_mpc.wire.bus import BusSettings
+
+HERE = Path(__file__).parent
+SHIPPED = (HERE / "deploy" if (HERE / "deploy").is_dir() else HERE.parents[1] / "deploy") / "pioneer_3dx.toml"  # in the wheel, in a clone
+
+
+class Commands(TyperGroup):
+    """Group whose list of commands holds whole sentences, wrapped where the terminal is narrow; Click cuts them off."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the list of commands."""
+        rows = [(name, self.commands[name].get_short_help_str(limit=sys.maxsize)) for name in self.list_commands(ctx)]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
+
+
+app = typer.Typer(
+    cls=Commands,
+    help="Real-time nonlinear model predictive control as a service, over Zenoh.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def print_version(wanted: bool) -> None:
+    """Print the versions that decide what a command does."""
+    if wanted:
+        from rti_mpc.wire import cdr
+        from rti_mpc_service.host import machine
+
+        packages = ", ".join(f"{name} {version}" for name, version in machine.packages().items())
+        typer.echo(f"rti-mpc {rti_mpc.__version__}, messages of version {cdr.VERSION}, Python {platform.python_version()}, {packages}")
+        raise typer.Exit
+
+
+@app.callback()
+def top(
+    version: Annotated[
+        bool, typer.Option("--version", callback=print_version, is_eager=True, help="Print the version, and those it builds on.")
+    ] = False,
+) -> None:
+    """Real-time nonlinear model predictive control as a service, over Zenoh."""
+
+
+def claimed(path: Path | None) -> Path | None:
+    """Make sure that a file can be written, before minutes are spent on what it is to hold."""
+    try:
+        if path is not None:
+            path.touch()
+    except OSError as error:
+        raise ConfigError(f"--json must be a file that can be written, got {path}: {error.strerror}") from error
+    return path
+
+
+ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="The robot's TOML file.", show_default="the shipped pioneer_3dx.toml")]
+JsonPath = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write it as JSON, too.", callback=claimed)]
+
+
+def options(
+    mode: Annotated[Literal["peer", "client"] | None, typer.Option("--mode", "-m", help="Mode of the Zenoh session.")] = None,
+    connect: Annotated[list[str] | None, typer.Option("--connect", "-e", metavar="ENDPOINT", help="Endpoint to connect to; repeatable.")] = None,
+    listen: Annotated[list[str] | None, typer.Option("--listen", "-l", metavar="ENDPOINT", help="Endpoint to listen on; repeatable.")] = None,
+    zenoh: Annotated[Path | None, typer.Option("--config", "-c", metavar="FILE", help="Zenoh's own configuration, JSON5.")] = None,
+    cfg: Annotated[list[str] | None, typer.Option("--cfg", metavar="KEY:VALUE", help="One setting of Zenoh, applied last; repeatable.")] = None,
+    multicast: Annotated[bool | None, typer.Option("--multicast-scouting/--no-multicast-scouting", help="Look for others by multicast; off.")] = None,
+) -> dict[str, Any]:
+    """Collect Zenoh's options, named as in Zenoh's own programs."""
+    given = {"mode": mode, "connect": connect, "listen": listen, "config": zenoh, "cfg": cfg, "multicast": multicast}
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in given.items() if value is not None}
+
+
+def process(command: Callable[..., int | None], *, with_model: bool = True) -> Callable[..., None]:
+    """
+    Register a process of a robot: a command with CONFIG and Zenoh's options besides its own.
+
+    Args:
+        command: Takes the configuration, how to join the bus, and its own options; returns an exit status, None for 0. CONFIG is the
+            first TOML file among its `words`, if it takes any.
+        with_model: Whether the configuration is checked against the model.
+    """
+    shared = inspect.signature(options, eval_str=True).parameters
+    own = list(inspect.signature(command, eval_str=True, locals={"BusSettings": Any}).parameters.values())[2:]
+
+    @wraps(command)
+    def run(config: Path = SHIPPED, **given: Any) -> None:
+        if "words" in given:
+            words = [str(config), *(given["words"] or [])]
+            file = next((word for word in words if word.endswith(".toml")), "")
+            config, given["words"] = Path(file or SHIPPED), [word for word in words if word != file]
+        loaded = load(config, with_model=with_model)
+        overrides = options(**{name: given.pop(name) for name in shared})
+        raise typer.Exit(command(loaded, replace(bus_settings(loaded), **overrides), **given) or 0)
+
+    path = inspect.Parameter("config", inspect.Parameter.POSITIONAL_OR_KEYWORD, default=SHIPPED, annotation=ConfigPath)
+    run.__signature__ = inspect.Signature([path, *own, *shared.values()])  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in (path, *own, *shared.values())}
+    del run.__wrapped__  # or its signature would be read instead
+    return app.command()(run)
+
+
+Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", min=0.1, help="How long to wait for an answer.")]
+
+
+StatePath = Annotated[
+    Path | None,
+    typer.Option(
+        "--state",
+        metavar="DIR",
+        help="Folder that remembers an operator's stop.",
+        show_default="$STATE_DIRECTORY, $XDG_STATE_HOME/rti_mpc or ~/.local/state/rti_mpc",
+    ),
+]
+
+
+@process
+def run(
+    config: Config,
+    bus: BusSettings,
+    standby: Annotated[bool, typer.Option("--standby", help="Stand by while another controller leads, and take over when it falls silent.")] = False,
+    state: StatePath = None,
+) -> int:
+    """Control the robot: wait for its states and a reference, answer each with a command."""
+    from rti_mpc_service.controller.daemon import main
+
+    return main(config, bus, standby=standby, state=state)
+
+
+@partial(process, with_model=False)
+def guard(config: Config, bus: BusSettings, state: StatePath = None) -> int:
+    """Stand between controller and robot: pass on what is fresh and inside the limits, brake when nothing is."""
+    from rti_mpc_service.guard import main
+
+    return main(config, bus, state=state)
+
+
+@process
+def sim(
+    config: Config,
+    bus: BusSettings,
+    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Seconds of the robot per second.")] = 1.0,
+    x0: Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE", help="Initial state, before the configuration's; repeatable.")] = None,
+    duration: Annotated[float | None, typer.Option(metavar="SECONDS", min=0.0, help="Stop after this long, in the robot's time.")] = None,
+    log: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Write every state, input and answer time.")] = None,
+) -> None:
+    """Play the robot: a plant of its own model, that stops without valid commands."""
+    from rti_mpc_sim.robot import main
+    from rti_mpc_sim.settings import RobotSettings
+
+    listen = bus.listen or config.bus.listen or (bus.connect if bus.mode == "peer" and bus.config is None else ())
+    settings = RobotSettings(**robot_settings(with_initial_state(config, x0 or [])))
+    main(settings, replace(bus, listen=listen), config.keys(), speed=speed, log=log, duration_s=duration, guarded=config.guard.enabled)
+
+
+@process
+def reference(
+    config: Config,
+    bus: BusSettings,
+    scenario: Annotated[str, typer.Option(metavar="circle|eight|positioning|FILE.csv", help="What to follow; a file holds waypoints.")] = "eight",
+    heading: Annotated[
+        Literal["tangent", "consistent", "none"], typer.Option(help="Of the path; what the point ahead of the axle can follow; 0.")
+    ] = "consistent",
+    duration: Annotated[
+        float | None, typer.Option(metavar="SECONDS", min=0.1, help="How long, in the robot's time; the scenario's own if not given.")
+    ] = None,
+    waypoint_speed: Annotated[float, typer.Option(metavar="M/S", min=0.001, help="Speed along waypoints.")] = 0.25,
+) -> None:
+    """Publish a reference from the robot's present state on, and again when the robot restarts."""
+    from rti_mpc.reference.trajectory import find_trajectory, followed_roles
+    from rti_mpc.signals import place
+    from rti_mpc_service.reference import main
+
+    trajectory = find_trajectory(scenario, waypoint_speed)
+    if duration is not None:
+        trajectory = trajectory.lasting(duration)
+    model = build_model(config)
+    offset = place(model.parameters, "axle_offset")
+    a = None if offset is None else model.p_nominal[offset]
+    roles = followed_roles(model.name, model.outputs)
+    main(trajectory, bus, config.keys(), heading=heading, a=a, roles=roles, parameters=partial(stage_parameters, config))
+
+
+@process
+def view(
+    config: Config,
+    bus: BusSettings,
+    rerun_spawn: Annotated[bool, typer.Option("--rerun-spawn", help="Start a Rerun viewer on this machine.")] = False,
+    rerun_connect: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Draw in a Rerun viewer that is there, or will be.")] = None,
+    rerun_save: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Record to a file.")] = None,
+    rerun_memory_limit: Annotated[str, typer.Option(metavar="SIZE", help="Memory a spawned viewer may fill before it forgets.")] = "25%",
+) -> int:
+    """Draw the robot live in Rerun, or record it."""
+    from rti_mpc_service.view.view import main
+
+    return main(
+        bus,
+        config.keys(),
+        rerun_spawn=rerun_spawn,
+        rerun_connect=rerun_connect,
+        rerun_save=rerun_save,
+        rerun_memory_limit=rerun_memory_limit,
+    )
+
+
+@process
+def router(config: Config, bus: BusSettings) -> None:
+    """Run a Zenoh router, for clients on several hosts or behind access control."""
+    from rti_mpc_service.router import main
+
+    main(bus, config.keys())
+
+
+@partial(process, with_model=False)
+def stop(config: Config, bus: BusSettings, timeout: Timeout = 2.0, state: StatePath = None) -> int:
+    """Bring the robot to a standstill, across every restart; only `enable` releases it."""
+    from rti_mpc_service.request import stop_or_enable
+
+    return stop_or_enable(bus, config.keys(), "stop", timeout, guarded=config.guard.enabled, state=state)
+
+
+@partial(process, with_model=False)
+def enable(config: Config, bus: BusSettings, timeout: Timeout = 2.0, state: StatePath = None) -> int:
+    """Release a robot that was stopped."""
+    from rti_mpc_service.request import stop_or_enable
+
+    return stop_or_enable(bus, config.keys(), "enable", timeout, guarded=config.guard.enabled, state=state)
+
+
+@partial(process, with_model=False)
+def params(
+    config: Config,
+    bus: BusSettings,
+    words: Annotated[list[str] | None, typer.Argument(metavar="get [KEY]... | set KEY=VALUE...", help="Keys and values as in the file.")] = None,
+    timeout: Timeout = 2.0,
+) -> int:
+    """Print parameters of a controller that runs, or change them, all or none, between two samples."""
+    from rti_mpc_service.request import params
+
+    return params(bus, config.keys(), words or ["get"], timeout)
+
+
+@app.command()
+def demo(
+    config: ConfigPath = SHIPPED,
+    scenario: Annotated[str, typer.Option(metavar="circle|eight|positioning|FILE.csv", help="What to follow; a file holds waypoints.")] = "eight",
+    heading: Annotated[
+        Literal["tangent", "consistent", "none"] | None,
+        typer.Option(help="Of the path; what the point ahead of the axle can follow; without weight on it.", show_default="the scenario's best"),
+    ] = None,
+    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Seconds of the robot per second.")] = 4.0,
+    duration: Annotated[
+        float | None, typer.Option(metavar="SECONDS", min=1.0, help="How long, in the robot's time.", show_default="the scenario's own")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder to leave everything in.", show_default="runs/SCENARIO-TIME")] = None,
+    viewer: Annotated[bool, typer.Option("--viewer", help="Watch live in Rerun.")] = False,
+    guard: Annotated[bool, typer.Option("--guard", help="With a guard between controller and robot.")] = False,
+) -> None:
+    """Run the whole system on this machine, and sum up how well the robot was driven."""
+    from rti_mpc_service.demo.demo import main
+
+    raise typer.Exit(main(load(config), scenario, heading=heading, speed=speed, duration_s=duration, folder=out, viewer=viewer, guard=guard))
+
+
+@app.command()
+def faults(
+    config: ConfigPath = SHIPPED,
+    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="One fault of the matrix; repeatable.", show_default="all")] = None,
+    path: JsonPath = None,
+) -> None:
+    """Break every part of a running system in turn, and print what the robot did: the fault matrix."""
+    from rti_mpc_service.faults.run import main
+
+    raise typer.Exit(main(config, tuple(only or ()), path))
+
+
+@app.command()
+def bench(
+    horizon: Annotated[
+        list[int] | None, typer.Option("--horizon", "-n", min=2, help="Stages; repeatable.", show_default="7, 20, 50, 100, 200")
+    ] = None,
+    solver: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Another QP solver of qpsolvers, such as daqp; repeatable.")] = None,
+    problem: Annotated[
+        list[str] | None, typer.Option(metavar="FAMILY", help="Measure a problem family instead, such as slalom, or all of them; repeatable.")
+    ] = None,
+    interpreted: Annotated[bool, typer.Option("--interpreted", help="Also without a compiler.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="A first look: eight seconds of driving.")] = False,
+    costs: Annotated[bool, typer.Option("--costs", help="Also closed-loop costs against exact QPs and converged NMPC.")] = False,
+    path: JsonPath = None,
+) -> None:
+    """Measure what a sample costs, by horizon and formulation, beside IPOPT on the same states."""
+    if problem:
+        from rti_mpc_service.bench import family_bench
+
+        raise typer.Exit(family_bench.main(problem, horizon or (), solver or family_bench.SOLVERS, quick=quick, path=path))
+    from rti_mpc_service.bench.bench import HORIZONS, main
+
+    raise typer.Exit(main(tuple(horizon or HORIZONS), solvers=tuple(solver or ()), interpreted=interpreted, quick=quick, costs=costs, path=path))
+
+
+@app.command()
+def paper(
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for paper.md and its folder of figures and run.json.", show_default="runs/paper-TIME")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="A first look: three seconds of every experiment, few of each sweep.")] = False,
+) -> None:
+    """Do the paper's study again, and beyond: its algorithms beside this one's, what it leaves open, what each setting gains."""
+    from rti_mpc_service.paper.study import main
+
+    raise typer.Exit(main(out, quick=quick))
+
+
+@app.command()
+def check(config: ConfigPath = SHIPPED) -> None:
+    """Load a configuration, solve 200 times, print both phases and the verdict of a second solver."""
+    from rti_mpc_service.check.check import main
+
+    raise typer.Exit(main(config))
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of a robot's TOML file, by which editors complete and check it."""
+    typer.echo(
+        json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "rti-mpc robot", **Config.model_json_schema()}, indent=1)
+    )
+
+
+@app.command()
+def doctor(
+    config: ConfigPath = SHIPPED,
+    path: JsonPath = None,
+) -> None:
+    """Examine this host: scheduler, clock, timers, bus, compiler, and which period the loop can keep here."""
+    from rti_mpc_service.doctor.doctor import main
+
+    raise typer.Exit(main(config, path))
+
+
+def main() -> NoReturn:
+    """Run the command line; what it refuses is one line, with exit status 2."""
+    entry.enter(log.start, app)
+
+
+if __name__ == "__main__":
+    main()

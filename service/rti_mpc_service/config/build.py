@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The parts of a robot's processes, each built of its configuration.
+
+Each function imports what it builds when it is called, so that a guard or a viewer
+loads neither CasADi nor a solver.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rti_mpc.errors import ConfigError
+from rti_mpc_service.config.refusal import unknown_name
+from rti_mpc_service.config.schema import ITERATIONS, Config
+
+if TYPE_CHECKING:
+    from rti_mpc.array import Array
+    from rti_mpc.contract.guard import Limits
+    from rti_mpc.control.observer import Observer
+    from rti_mpc.model.model import Model, Signal
+    from rti_mpc.rti.ocp import Ocp
+    from rti_mpc.rti.qp.osqp import SolverSettings
+    from rti_mpc.rti.rti import Rti
+    from rti_mpc.wire.bus import BusSettings
+
+
+def build_model(config: Config) -> Model:
+    """Return the controller's model."""
+    from rti_mpc.model.model import find_model
+
+    return find_model(config.model.name).with_parameters(**config.model.parameters)
+
+
+def build_ocp(config: Config) -> Ocp:
+    """Return the optimal control problem; its model has the obstacles and, last, the disturbances among its parameters."""
+    from rti_mpc.model.disturbance import with_disturbances
+    from rti_mpc.model.obstacle import with_obstacles
+    from rti_mpc.rti.ocp import Ocp
+
+    own = build_model(config)
+    discs = [(*obstacle.centre_m, obstacle.radius_m + obstacle.margin_m) for obstacle in config.ocp.obstacles]
+    model = with_disturbances(with_obstacles(own, discs), config.observer.disturbances)
+    limits, terminal = config.ocp.bounds, config.ocp.terminal
+    outside = {signal.name: (0.0, math.inf) for signal in model.constraints[len(own.constraints) :]}
+    bounded = [i for i, signal in enumerate(model.constraints) if signal.name in (limits.constraints | outside)]
+    lh, uh = bounds(limits.constraints | outside, names(model.constraints[i] for i in bounded))
+    problem = Ocp(
+        model,
+        N=config.ocp.N,
+        N_u=config.N_u,
+        dt=config.ocp.dt_s,
+        method=config.ocp.integrator,
+        Q_e=None if terminal.Q is None else [terminal.Q[output.name] for output in model.outputs],
+        h_expr=model.h_expr[bounded, 0],
+        lh=lh,
+        uh=uh,
+        **weights_and_bounds(config, model),
+    )
+    return problem if terminal.lqr is None else problem.retuned(Q_e=regulator_weight(config, problem))
+
+
+def retuned(config: Config, problem: Ocp) -> Ocp:
+    """Return a problem, built of another configuration, with the weights and bounds of this one; all else is kept, not built again."""
+    other = problem.retuned(**weights_and_bounds(config, problem.model))
+    return other if config.ocp.terminal.lqr is None else other.retuned(Q_e=regulator_weight(config, other))
+
+
+def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
+    """Return those of the problem that may change while it is solved, as `Ocp` names them."""
+    from rti_mpc.rti.ocp import SOFT_WEIGHT
+
+    weights, limits = config.ocp.weights, config.ocp.bounds
+    z, Z = (SOFT_WEIGHT if weight is None else weight for weight in (limits.soft_weight, limits.soft_weight_L2))
+    lbu, ubu = bounds(limits.inputs, names(model.inputs))
+    lbdu, ubdu = bounds(limits.increments, names(model.inputs))
+    lbx, ubx = bounds(limits.states, names(model.states))
+    return {
+        "Q": [weights.Q[output.name] for output in model.outputs],
+        "R": [weights.R[input.name] for input in model.inputs],
+        "delta": spread(weights.delta, config.ocp.N),
+        "lambda_": spread(weights.lambda_, config.N_u),
+        "lbu": lbu,
+        "ubu": ubu,
+        "lbdu": lbdu,
+        "ubdu": ubdu,
+        "lbx": lbx,
+        "ubx": ubx,
+        "z": z,
+        "Z": Z,
+        "zh": z,
+        "Zh": Z,
+    }
+
+
+def regulator_weight(config: Config, problem: Ocp) -> Array:
+    """Return the terminal weight that the problem's own weights lead to, in the motion that `ocp.terminal.lqr` says."""
+    from rti_mpc.rti.terminal import lqr_weight
+
+    model, motion = problem.model, config.ocp.terminal.lqr
+    assert motion is not None
+    x = [motion.states.get(state.name, 0.0) for state in model.states]
+    u = [motion.inputs.get(input.name, rest) for input, rest in zip(model.inputs, model.u_rest, strict=True)]
+    return lqr_weight(problem, np.array(x), np.array(u))
+
+
+def stage_parameters(config: Config, t_s: Array) -> Array:
+    """
+    Return what a reference carries of moving obstacles.
+
+    Args:
+        config: The robot's configuration, with its obstacles.
+        t_s: Times of its rows from its start on, shape ``(M,)``, in s.
+
+    Returns:
+        Rows, shape ``(M, np)``: the model's own parameters, then x, y and radius of each obstacle; ``(M, 0)``, all nominal, if none moves.
+    """
+    if not any(any(obstacle.velocity_m_s) for obstacle in config.ocp.obstacles):
+        return np.empty((len(t_s), 0))
+    columns = [np.full(len(t_s), value) for value in build_model(config).p_nominal]
+    for obstacle in config.ocp.obstacles:
+        columns += [centre + speed * t_s for centre, speed in zip(obstacle.centre_m, obstacle.velocity_m_s, strict=True)]
+        columns.append(np.full(len(t_s), obstacle.radius_m + obstacle.margin_m))
+    return np.column_stack(columns)
+
+
+def build_rti(config: Config) -> Rti:
+    """Return the real-time iteration, compiled."""
+    from rti_mpc.rti.rti import Rti
+    from rti_mpc_service.injection import FaultyRti
+
+    cls = FaultyRti if config.debug.inject else Rti
+    settings = solver_settings(config)
+    return cls(build_ocp(config), settings, formulation=config.ocp.formulation, solver=config.solver.name, **iterations(config))
+
+
+def build_observer(config: Config) -> Observer | None:
+    """Return the observer, compiled, if there is anything to estimate."""
+    from rti_mpc.control.observer import Disturbance, Observer, ObserverSettings
+
+    if not (config.observer.disturbances or config.observer.measured):
+        return None
+    disturbances = {name: Disturbance(of.drift, of.limit) for name, of in config.observer.disturbances.items()}
+    settings = ObserverSettings(disturbances, config.observer.measured, config.observer.noise, config.observer.process)
+    return Observer(build_model(config), settings)
+
+
+def robot_settings(config: Config) -> dict[str, Any]:
+    """Return what `rti_mpc_sim.settings.RobotSettings` is made from; the slew limits are those of the increments."""
+    from rti_mpc.contract.approach import Increments
+
+    model, sim = build_model(config).with_parameters(**config.sim.parameters), config.sim
+    lbdu, ubdu = bounds(config.ocp.bounds.increments, names(model.inputs))
+    increments = Increments(np.array(lbdu), np.array(ubdu), round(1e9 * config.ocp.dt_s))
+    lbu, ubu = bounds(config.ocp.bounds.inputs, names(model.inputs))
+    return {
+        "state_period_s": config.ocp.dt_s,
+        **sim.model_dump(exclude_none=True, exclude={"parameters", "approaches"}),
+        "model": model,
+        "x0": [sim.x0.get(state.name, 0.0) for state in model.states],
+        "noise_std": [sim.noise_std.get(state.name, 0.0) for state in model.states],
+        "lbu": lbu,
+        "ubu": ubu,
+        "slew": [min(-lower, upper) / config.ocp.dt_s for lower, upper in zip(lbdu, ubdu, strict=True)],
+        "increments": increments if sim.approaches else None,
+    }
+
+
+def guard_limits(config: Config) -> Limits:
+    """Return what the guard lets pass; its configuration is enough, no model is loaded."""
+    from rti_mpc.contract.guard import Limits
+    from rti_mpc.control.grid import MOST
+
+    inputs = tuple(config.ocp.bounds.inputs)
+    lbu, ubu = bounds(config.ocp.bounds.inputs, inputs)
+    lbdu, ubdu = bounds(config.ocp.bounds.increments, inputs)
+    return Limits(
+        u_rest=np.array([config.guard.u_rest.get(name, 0.0) for name in inputs]),
+        lbu=np.array(lbu),
+        ubu=np.array(ubu),
+        lbdu=np.array(lbdu),
+        ubdu=np.array(ubdu),
+        dt_s=config.ocp.dt_s,
+        delay_s=MOST * config.ocp.dt_s if config.delay_s is None else config.delay_s,
+        stale_s=config.timing.valid_s,  # of commands, too: a ramp answers a state that is stale
+    )
+
+
+def with_initial_state(config: Config, assignments: Sequence[str]) -> Config:
+    """
+    Return a configuration with other initial states of the simulated robot.
+
+    Args:
+        config: The robot's configuration.
+        assignments: Each ``name=value``, in the state's unit.
+
+    Raises:
+        ConfigError: An assignment is none, or the model has no such state.
+    """
+    try:
+        given = {name: float(value) for name, _, value in (assignment.partition("=") for assignment in assignments)}
+    except ValueError as error:
+        raise ConfigError(f"--x0 must be NAME=VALUE, got {' '.join(assignments)}") from error
+    if wrong := unknown_name("sim.x0", given, "state", build_model(config).states, complete=False):
+        raise ConfigError(wrong)
+    return config.model_copy(update={"sim": config.sim.model_copy(update={"x0": {**config.sim.x0, **given}})})
+
+
+def solver_settings(config: Config) -> SolverSettings | None:
+    """Return the settings of OSQP, None if none are given."""
+    from rti_mpc.rti.qp.osqp import SolverSettings
+
+    given = config.solver.model_dump(exclude_none=True, exclude=ITERATIONS | {"name"})
+    return SolverSettings(**given) if given else None
+
+
+def iterations(config: Config) -> dict[str, Any]:
+    """Return the limits of the iterations a sample, as `Rti` names them, that are given."""
+    return config.solver.model_dump(exclude_none=True, include=ITERATIONS)
+
+
+def bus_settings(config: Config) -> BusSettings:
+    """Return how a process other than the robot joins the bus: it connects, and listens on a free port."""
+    from rti_mpc.wire.bus import BusSettings
+
+    return BusSettings(**config.bus.model_dump(exclude_none=True, exclude={"listen"}))
+
+
+def spread(values: tuple[float, ...], length: int) -> tuple[float, ...]:
+    """Return a sequence, or the constant that a single value stands for."""
+    return values if len(values) == length else values * length
+
+
+def bounds(table: Mapping[str, tuple[float, float]], names: Iterable[str]) -> tuple[list[float], list[float]]:
+    """Return lower and upper bounds in the order of the names."""
+    pairs = [table.get(name, (-math.inf, math.inf)) for name in names]
+    return [lower for lower, _ in pairs], [upper for _, upper in pairs]
+
+
+def names(signals: Iterable[Signal]) -> list[str]:
+    """Return the names of signals."""
+    return [signal.name for signal in signals]

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Loading of a robot's configuration: a TOML file, read once into a frozen tree.
+
+Everything is checked here, so that nothing behind this door checks again: the
+tree by itself (`rti_mpc_service.config.schema`), then its keys against each other and its names
+against the model (`rti_mpc_service.config.fit`), which ends with building the `Ocp`
+(`rti_mpc_service.config.build`). Each refusal is one line (`rti_mpc_service.config.refusal`).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from rti_mpc.errors import ConfigError, OcpError
+from rti_mpc.text_file import read_text_file
+from rti_mpc_service.config import toml
+from rti_mpc_service.config.fit import check_model, check_tree
+from rti_mpc_service.config.refusal import explain
+from rti_mpc_service.config.schema import Config
+
+
+def load(path: Path, *, with_model: bool = True) -> Config:
+    """
+    Read, check and freeze a robot's configuration.
+
+    Args:
+        path: TOML file.
+        with_model: Whether to check it against the model, too, which loads CasADi.
+
+    Raises:
+        ConfigError: One line: the file, the key, what must hold, what was got.
+    """
+    content = read_text_file(path, "TOML")
+    try:
+        config = Config.model_validate(toml.read(content))
+        if config.bus.config is not None:
+            config = config.model_copy(update={"bus": config.bus.model_copy(update={"config": path.parent / config.bus.config})})
+        check_tree(config)
+        if with_model:
+            check_model(config)
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {explain(error, Config)}") from error
+    except (ConfigError, OcpError) as error:
+        raise ConfigError(f"{path}: {error}") from error
+    return config

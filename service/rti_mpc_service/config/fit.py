@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks of a configuration beyond each table's own: its keys against each other, its names against the model, and its solver."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from rti_mpc.errors import ConfigError, OcpError
+from rti_mpc_service.config.build import build_ocp, names
+from rti_mpc_service.config.refusal import quoted, unknown_name
+from rti_mpc_service.config.schema import ITERATIONS, Config, RegulatorSection
+
+if TYPE_CHECKING:
+    from rti_mpc.model.model import Model, Signal
+    from rti_mpc.rti.ocp import Ocp
+
+
+def check_tree(config: Config) -> None:
+    """
+    Check what only the whole or the file system knows.
+
+    Raises:
+        ConfigError: A key does not fit the others.
+    """
+    ocp, terminal = config.ocp, config.ocp.terminal
+    if terminal.Q is not None and terminal.lqr is not None:
+        raise ConfigError("ocp.terminal must have Q or lqr, not both")
+    if config.N_u > ocp.N:
+        raise ConfigError(f"ocp.N_u must be at most ocp.N = {ocp.N}, got {ocp.N_u}")
+    for key, values, length in (("delta", ocp.weights.delta, ocp.N), ("lambda", ocp.weights.lambda_, config.N_u)):
+        if len(values) not in (1, length):
+            raise ConfigError(f"ocp.weights.{key} must be a number or a list of {length}, one a stage, got {quoted(list(values))}")
+    if config.bus.config is not None and not config.bus.config.is_file():
+        raise ConfigError(f"bus.config must be a file, got {config.bus.config}")
+    if config.guard.enabled:
+        for name in ocp.weights.R:
+            if name not in ocp.bounds.inputs:
+                raise ConfigError(f"ocp.bounds.inputs must bound every input where a guard is enabled, {name} is missing")
+        for name, (lower, upper) in ocp.bounds.inputs.items():
+            if not lower <= (rest := config.guard.u_rest.get(name, 0.0)) <= upper:
+                raise ConfigError(f"ocp.bounds.inputs.{name} must hold the input's rest, guard.u_rest = {rest:g}, got {[lower, upper]}")
+
+
+def check_model(config: Config) -> Ocp:
+    """
+    Check what only the model knows, and return the problem.
+
+    Raises:
+        ConfigError: A key does not fit the model.
+        OcpError: The problem is ill-posed in some other way.
+    """
+    from rti_mpc.model.model import find_model
+    from rti_mpc.model.obstacle import with_obstacles
+
+    try:
+        model = find_model(config.model.name)
+    except OcpError as error:
+        raise ConfigError(f"model.name: {error}") from error
+    check_names(config, model)
+    if config.guard.enabled:
+        inputs, given = names(model.inputs), list(config.ocp.bounds.inputs)
+        if given != inputs:
+            raise ConfigError(f"ocp.bounds.inputs must be in the model's order {inputs} where a guard is enabled, got {given}")
+        if tuple(config.guard.u_rest.get(name, 0.0) for name in inputs) != model.u_rest:
+            raise ConfigError(f"guard.u_rest must be the model's {dict(zip(inputs, model.u_rest, strict=True))}, got {config.guard.u_rest}")
+    check_solver(config)
+    try:
+        with_obstacles(model, [(0.0, 0.0, 1.0) for _ in config.ocp.obstacles])
+    except OcpError as error:
+        raise ConfigError(f"ocp.obstacles: {error}") from error
+    ocp = build_ocp(config)
+    check_rest(ocp)
+    return ocp
+
+
+def check_rest(ocp: Ocp) -> None:
+    """
+    Check that every input can be brought to its rest.
+
+    Raises:
+        ConfigError: Its bounds leave that out.
+    """
+    from rti_mpc.rti.ocp import restless
+
+    if wrong := restless(ocp):
+        raise ConfigError(f"ocp.bounds: {wrong}")
+
+
+def check_stop(config: Config) -> None:
+    """
+    Check that a stop brings the robot to rest, unless its file says that it does not.
+
+    Raises:
+        ConfigError: It coasts, or falls; what was seen of it is said.
+    """
+    from rti_mpc.rti.rest import motion_at_rest
+
+    if config.model.stop == "rests" and (seen := motion_at_rest(build_ocp(config))):
+        raise ConfigError(
+            f"model.name: a stop must bring {config.model.name} to rest: {seen}; let its inputs command speeds, "
+            f'or say that it is let go by stop = "coasts" in [model]'
+        )
+
+
+def check_names(config: Config, model: Model) -> None:
+    """
+    Check that names are those of the model.
+
+    Raises:
+        ConfigError: One is not, or one is missing.
+    """
+    ocp, sim, observer, terminal = config.ocp, config.sim, config.observer, config.ocp.terminal
+    regulator = terminal.lqr or RegulatorSection()
+    tables: tuple[tuple[str, Mapping[str, object], str, tuple[Signal, ...]], ...] = (
+        ("model.parameters", config.model.parameters, "parameter", model.parameters),
+        ("ocp.weights.Q", ocp.weights.Q, "output", model.outputs),
+        ("ocp.weights.R", ocp.weights.R, "input", model.inputs),
+        ("ocp.bounds.inputs", ocp.bounds.inputs, "input", model.inputs),
+        ("ocp.bounds.increments", ocp.bounds.increments, "input", model.inputs),
+        ("ocp.bounds.states", ocp.bounds.states, "state", model.states),
+        ("ocp.bounds.constraints", ocp.bounds.constraints, "constraint", model.constraints),
+        *((("ocp.terminal.Q", terminal.Q, "output", model.outputs),) if terminal.Q is not None else ()),
+        ("ocp.terminal.lqr.states", regulator.states, "state", model.states),
+        ("ocp.terminal.lqr.inputs", regulator.inputs, "input", model.inputs),
+        ("observer.disturbances", observer.disturbances, "input or state", (*model.inputs, *model.states)),
+        ("observer.measured", dict.fromkeys(observer.measured), "state", model.states),
+        ("observer.noise", observer.noise, "state", model.states),
+        ("observer.process", observer.process, "state", model.states),
+        ("guard.u_rest", config.guard.u_rest, "input", model.inputs),
+        ("sim.x0", sim.x0, "state", model.states),
+        ("sim.noise_std", sim.noise_std, "state", model.states),
+        ("sim.parameters", sim.parameters, "parameter", model.parameters),
+    )
+    for key, table, kind, signals in tables:
+        if wrong := unknown_name(key, table, kind, signals, complete=key.startswith("ocp.weights") or key == "ocp.terminal.Q"):
+            raise ConfigError(wrong)
+
+
+def check_solver(config: Config) -> None:
+    """
+    Check that the QP solver is there, and the settings are its own.
+
+    Raises:
+        ConfigError: They are not.
+    """
+    if "name" not in config.solver.model_fields_set:
+        return
+    from rti_mpc.rti.qp.qpsolvers import check_name  # a robot or a viewer has no use for solvers
+    from rti_mpc.rti.rti import SOLVERS
+
+    if config.solver.name in SOLVERS:
+        return
+    try:
+        check_name(config.solver.name)
+    except OcpError as error:
+        raise ConfigError(f"solver.name: {error}") from error
+    if foreign := config.solver.model_dump(exclude_none=True, exclude=ITERATIONS | {"name"}):
+        key, got = next(iter(foreign.items()))
+        raise ConfigError(f"solver.{key} is a setting of osqp, it must be left out for solver.name = {config.solver.name!r}, got {got}")

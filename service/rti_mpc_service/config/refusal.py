@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Why a configuration is refused, in one line: the key, what must hold, what was got, and what was probably meant."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, get_args
+
+from pydantic import BaseModel, ValidationError
+
+if TYPE_CHECKING:
+    from rti_mpc.model.model import Signal
+
+QUOTE = 200  # characters of a value in a refusal
+
+# Pydantic's words, in those of a TOML file.
+WORDS = (
+    (r"^Value error, ", ""),
+    (r"^(Input|String) should ", "must "),
+    (r"be a valid dictionary.*", "be a table"),
+    (r"be a valid tuple", "be a list"),
+    (r"be a valid string", "be text"),
+    (r"be a valid integer", "be a whole number"),
+    (r"be a valid number", "be a number"),
+    (r"greater than or equal to", "at least"),
+    (r"less than or equal to", "at most"),
+)
+
+
+def explain(error: ValidationError, tree: type[BaseModel]) -> str:
+    """Word one complaint; an unknown key comes first, for it is often why another is missing."""
+    complaint = min(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden")
+    loc, got, keys = complaint["loc"], complaint["input"], dict(entries(tree))
+    key, what = dotted(loc), describe(loc, keys)
+    if complaint["type"] == "extra_forbidden":
+        return f"{key} is unknown, {meant(described(loc), keys)}, got {quoted(got)}"
+    if complaint["type"] == "missing":
+        return f"{key} is missing: {what}"
+    must = complaint["msg"]
+    for pattern, words in WORDS:
+        must = re.sub(pattern, words, must)
+    return f"{key} ({what}) {must}, got {quoted(got)}"
+
+
+def quoted(value: object) -> str:
+    """Return a value as text of bounded length."""
+    text = repr(value)
+    return text if len(text) <= QUOTE else f"{text[:QUOTE]}..."
+
+
+def unknown_name(key: str, table: Mapping[str, object], kind: str, signals: Sequence[Signal], *, complete: bool) -> str | None:
+    """
+    Say what is wrong with the names of a table, if anything.
+
+    Args:
+        key: The table's key.
+        table: Values by name.
+        kind: What the names stand for, such as ``"state"``.
+        signals: What the model has.
+        complete: Whether the table must name each of them.
+    """
+    units = {signal.name: f"{signal.name} [{signal.unit}]" for signal in signals}
+    for name, got in table.items():
+        if name not in units:
+            near = [units[n] for n in get_close_matches(name, units, 1)]
+            meaning = f"perhaps {near[0]} is meant" if near else known(units.values())
+            return f"{key}.{name} is no {kind} of the model, {meaning}, got {quoted(got)}"
+    missing = [unit for name, unit in units.items() if complete and name not in table]
+    return f"{key} must name every {kind} of the model, {missing[0]} is missing, got {quoted(dict(table))}" if missing else None
+
+
+def entries(tree: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield every key of a tree with its description, depth first."""
+    for name, field in tree.model_fields.items():
+        key = prefix + (field.alias or name)
+        yield key, field.description or ""
+        for inside in (field.annotation, *get_args(field.annotation)):  # a table, one that may be left out, or a list of tables
+            if isinstance(inside, type) and issubclass(inside, BaseModel):
+                yield from entries(inside, key + ".")
+
+
+def dotted(loc: Sequence[int | str]) -> str:
+    """Write a location as the file's reader would: ``bus.listen[0]``."""
+    return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in loc).removeprefix(".")
+
+
+def described(loc: Sequence[int | str]) -> str:
+    """Write a location as the tree does, whichever table of a list it is in."""
+    return ".".join(step for step in loc if isinstance(step, str))
+
+
+def describe(loc: Sequence[int | str], tree: dict[str, str]) -> str:
+    """Return the description of the innermost key that has one."""
+    return next((tree[key] for n in range(len(loc), 0, -1) if (key := described(loc[:n])) in tree), "")
+
+
+def meant(key: str, tree: dict[str, str]) -> str:
+    """Return the same key elsewhere, or the nearest beside this one, or all that are beside it."""
+    section, _, name = key.rpartition(".")
+    beside = {other.rpartition(".")[2]: other for other in tree if other.rpartition(".")[0] == section}
+    near = [other for other in tree if other.rpartition(".")[2] == name]
+    near += [other for n, other in beside.items() if n.lower() == name.lower()] + [beside[n] for n in get_close_matches(name, beside, 1)]
+    return f"perhaps {near[0]} is meant ({tree[near[0]]})" if near else known(beside)
+
+
+def known(names: Iterable[str]) -> str:
+    """List what there is."""
+    return f"known: {', '.join(names) or 'none'}"

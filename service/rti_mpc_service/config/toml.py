@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""TOML: read with a bound on its depth, and a configuration written again, so that a run leaves behind exactly what it was run with."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from rti_mpc.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rti_mpc_service.config.schema import Config
+
+MAX_DEPTH = 16  # tables and lists inside each other; a configuration has five
+
+
+def read(text: str) -> dict[str, Any]:
+    """
+    Return the content of TOML.
+
+    Raises:
+        ConfigError: It is none, or nested deeper than `MAX_DEPTH`.
+    """
+    try:
+        content = tomllib.loads(text)
+    except ValueError as error:  # of a number with thousands of digits, too
+        raise ConfigError(f"must be TOML, got {error}") from None
+    except RecursionError:
+        content = None
+    if content is None or too_deep(content):
+        raise ConfigError(f"must be TOML of at most {MAX_DEPTH} tables and lists inside each other")
+    return content
+
+
+def too_deep(content: dict[str, Any]) -> bool:
+    """Whether more than `MAX_DEPTH` tables and lists are inside each other."""
+    level: list[Any] = [content]
+    for _ in range(MAX_DEPTH):
+        tables = [value for value in level if isinstance(value, dict | list)]
+        level = [inner for table in tables for inner in (table.values() if isinstance(table, dict) else table)]
+    return any(isinstance(value, dict | list) for value in level)
+
+
+def write(config: Config) -> str:
+    """Return the text of a file that loads as this configuration; what was left out stays out."""
+    return "\n".join(_table("", config.model_dump(mode="python", by_alias=True, exclude_unset=True, exclude_none=True))).strip() + "\n"
+
+
+def _table(path: str, values: Mapping[str, Any]) -> list[str]:
+    """Return the lines of a table: its own keys, then the tables below it."""
+    below = {name: value for name, value in values.items() if isinstance(value, dict)}
+    own = [f"{_key(name)} = {text(value)}" for name, value in values.items() if name not in below]
+    lines = ["", f"[{path}]", *own] if path and (own or not below) else own
+    for name, value in below.items():
+        lines += _table(f"{path}.{_key(name)}" if path else _key(name), value)
+    return lines
+
+
+def _key(name: str) -> str:
+    """Return a bare key where TOML allows it."""
+    return name if name.isascii() and name.replace("_", "").replace("-", "").isalnum() else json.dumps(name)
+
+
+def text(value: Any) -> str:
+    """Return a value; JSON's text is TOML's but for infinities and what JSON lacks."""
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{_key(name)} = {text(inner)}' for name, inner in value.items())} }}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(text, value))}]"
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return json.dumps(value if isinstance(value, bool | int | float) else str(value))

@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The controller as a process: waits for the state, acts, prepares the next sample in the slack.
+
+One thread waits for states and does all of the control, so that nothing stands
+between a state and its command but `Controller.receive_state` and one `put`. The
+others only hand things over: references through an inbox that is emptied in the
+slack, requests and the watch for silence through a lock that is held for
+microseconds.
+
+All of them share the interpreter's lock with the thread that controls, so none may
+compute for long: references are laid out where they are received, of a change of
+parameters nothing is built, and it is tried when a sample has just ended. A switch
+interval below the interpreter's 5 ms does not help, as measured: a sample then
+loses the lock as often as it takes it, and preparations take twice as long.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from threading import Condition, Event, Lock, Thread
+from typing import Any
+
+from rti_mpc.contract.latch import Latch
+from rti_mpc.contract.leadership import differ
+from rti_mpc.contract.message import Command, State
+from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.errors import ConfigError
+from rti_mpc.rti.rti import Rti
+from rti_mpc.wire.announcer import Announcer
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
+from rti_mpc.wire.interrupt import stop_on_signals
+from rti_mpc_service.announce import announce
+from rti_mpc_service.config.build import build_observer, build_rti
+from rti_mpc_service.config.fit import check_stop
+from rti_mpc_service.config.schema import Config
+from rti_mpc_service.controller.description import describe
+from rti_mpc_service.controller.leadership import HEARING_S, LEADER, STANDBY, Candidate, hear_others
+from rti_mpc_service.controller.orders import Orders
+from rti_mpc_service.controller.params import Params
+from rti_mpc_service.controller.references import References
+from rti_mpc_service.host import realtime
+from rti_mpc_service.latch_file import LatchFile
+from rti_mpc_service.operator_stop import OperatorStop
+from rti_mpc_service.warm_up import warm_up
+
+TICK_S = 0.01  # between two looks for silence
+RAMP_S = 0.6  # of a controller that is being stopped, to bring the robot to rest
+
+log = logging.getLogger(LEADER)
+
+
+def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, state: Path | None = None, stop: Event | None = None) -> int:
+    """
+    Control one robot until stopped.
+
+    Args:
+        config: The robot.
+        bus_settings: How to join the bus.
+        standby: Whether to stand by while another controller leads.
+        state: Folder that remembers an operator's stop; None: the user's, or the service's.
+        stop: Stops the controller when set; SIGINT and SIGTERM if there is none.
+
+    Returns:
+        Exit status: 0 when stopped, 1 when another controller is there or an unforeseen error ended this one.
+
+    Raises:
+        ConfigError: A stop would not bring the robot to rest, or the leader has another configuration than its standby.
+    """
+    check_stop(config)
+    stop = stop or stop_on_signals()
+    rti = build_rti(config)
+    warm_up(rti)
+    timing = Timing(config.delay_s, config.stale_s, config.timing.valid_s)
+    controller = Controller(rti, timing, config_hash=config.config_hash, observer=build_observer(config))
+    lock = Condition()
+    params = Params(config, controller, rti, lock)
+
+    def obey(latch: Latch) -> None:
+        with lock:
+            if latch.stopped:
+                controller.stop(latch.reason)
+            else:
+                controller.enable()
+
+    outcomes = realtime.attempt(**config.realtime.model_dump())  # when all is compiled, and before any thread is started, for all of them
+    with Bus.join(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
+        operator_stop = OperatorStop(LatchFile(bus.keys, state), obey, controller.say)
+        operator_stop.listen(bus)
+        others = hear_others(bus, stop)
+        if standby and others.config_hash not in (None, config.config_hash):
+            raise ConfigError(differ(others.config_hash, config.config_hash))
+        if not standby and bus.is_alive(LEADER, HEARING_S):
+            print(
+                f"rti-mpc: {config.robot} already has a controller: stop it first, run this one with --standby, or give this robot another name",
+                file=sys.stderr,
+            )
+            return 1
+        ocp = rti.ocp
+        leadership = Candidate(bus, controller, others, config_hash=config.config_hash, dt_s=ocp.dt, nu=ocp.model.nu, standby=standby)
+        daemon = Daemon(config, controller, bus, leadership, params, lock, rti, outcomes, operator_stop)
+        operator_stop.serve(bus, lambda: leadership.role, daemon.describe)
+        bus.serve(bus.keys.request, daemon.orders.answer)
+        log.info("epoch %d controls %s every %g s" if leadership.leading else "%d stands by %s, every %g s", leadership.epoch, config.robot, ocp.dt)
+        if outcomes:
+            level = logging.INFO if all(outcome.granted for outcome in outcomes) else logging.WARNING
+            log.log(level, "real time: %s", "; ".join(map(str, outcomes)))
+        return daemon.run(stop)
+
+
+class Daemon:
+    """
+    One life of a controller on the bus.
+
+    Attributes:
+        orders: What answers requests.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        controller: Controller,
+        bus: Bus,
+        leadership: Candidate,
+        params: Params,
+        lock: Condition,
+        rti: Rti,
+        outcomes: Sequence[realtime.Outcome],
+        operator_stop: OperatorStop,
+    ) -> None:
+        keys, model = bus.keys, rti.ocp.model
+        self._config = config
+        self._granted = {outcome.what: outcome.text for outcome in outcomes}
+        self._formulation = rti.formulation
+        self._controller = controller
+        self._bus = bus
+        self._leadership = leadership
+        self._params = params
+        self.orders = Orders(controller, rti, params, lock, operator_stop, lambda: leadership.leading, self.describe)
+        self._operator_stop = operator_stop
+        self._lock = lock
+        self._telling = Lock()
+        self._told = 0  # descriptions published
+        self._ending = False
+        self._crashed = Event()
+        self._announcer: Announcer | None = None
+        self._commands = bus.publisher(keys.command)
+        self._telemetries = {role: bus.publisher(key) for role, key in ((LEADER, keys.telemetry), (STANDBY, keys.shadow_telemetry))}
+        self._states_in = bus.intake(State, config.stale_s, {"x": model.nx, "u": model.nu})
+        bus.expect("state", lambda: controller.heard)
+        self._references = References(bus, controller, model.ny)
+        self._prepare_us = 0.0
+        self._ticked_ns = 0
+        self._threads = [
+            Thread(
+                target=self._guarded,
+                args=(act, bus.subscriber(key, capacity=RING_MESSAGES)),
+                name=act.__name__,
+                daemon=True,
+            )
+            for act, key in (
+                (self._control, keys.state),
+                (self._references.from_planner, keys.reference),
+                (self._references.from_leader, keys.anchored),
+            )
+        ]
+
+    def run(self, stop: Event) -> int:
+        """Control until stopped; then bring the robot to rest, and make rest the last command, unless another takes over."""
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        self._tick()
+        for thread in self._threads:
+            thread.start()
+        while not stop.wait(TICK_S) and not self._crashed.is_set():
+            self._tick()
+        with self._lock:
+            relieved = self._ending = self._leadership.relieved
+            self._controller.stop("the controller is being stopped")
+        deadline_s = time.monotonic() + RAMP_S
+        while not (relieved or self._crashed.is_set() or self._controller.at_rest) and time.monotonic() < deadline_s:
+            time.sleep(TICK_S)
+        with self._lock:
+            self._ending = True
+            # Whatever happened above, the last thing the robot hears is to come to rest, and stay there.
+            if not relieved and (command := self._controller.standstill(time.monotonic_ns())) is not None:
+                self._commands.put(command)
+                self._controller.commit(command)
+        self._announce()
+        self._operator_stop.close()
+        log.info("stopped")
+        return int(self._crashed.is_set())
+
+    def _control(self, subscriber: Subscriber) -> None:
+        """Act on states as they come: the loop that counts."""
+        for received in iter(subscriber.recv, None):
+            arrival_ns = time.monotonic_ns()
+            for state in self._states_in.newest_of_each((received, *subscriber.drain()), self._controller.awaits):
+                self._sample(state, arrival_ns)
+            self._announce()
+
+    def _sample(self, state: State, arrival_ns: int) -> None:
+        """Act on one state."""
+        controller = self._controller
+        with self._lock:
+            if self._ending:
+                return
+            if controller.awaits(state):  # not for one that is replayed
+                self._leadership.hear(state, arrival_ns)
+            command = controller.receive_state(state, arrival_ns)
+            acted_ns = time.monotonic_ns()
+            if command is not None:
+                command = controller.in_time(command, acted_ns)
+                if command is not None:
+                    self._send(command, acted_ns)
+                sent_ns = time.monotonic_ns()
+                controller.prepare()
+                prepared_ns = time.monotonic_ns()
+                self._lock.notify_all()
+            self._references.hand_over(self._leadership.leading)
+        if command is not None:
+            self._telemetries[self._leadership.role].put(
+                controller.telemetry(
+                    prepare_us=self._prepare_us,
+                    feedback_us=1e-3 * (acted_ns - arrival_ns),
+                    latency_us=1e-3 * (sent_ns - arrival_ns),
+                    slack_s=controller.slack_s(prepared_ns),
+                )
+            )
+            self._prepare_us = 1e-3 * (prepared_ns - sent_ns)
+
+    def _send(self, command: Command, left_ns: int | None = None) -> None:
+        """Send a command, if it is ours to send, and record it."""
+        if self._leadership.sends(command):
+            self._commands.put(command)
+        self._controller.commit(command, left_ns)
+
+    def _guarded(self, act: Any, subscriber: Subscriber) -> None:
+        """Run a loop; what nobody foresaw ends in a standstill and a non-zero exit, for the supervisor to restart."""
+        try:
+            act(subscriber)
+        except Exception:
+            if self._bus.closed:
+                return  # under our hands: nothing of it was wanted any more
+            log.exception("stopping after an unforeseen error")
+            self._crashed.set()
+
+    def _tick(self) -> None:
+        """Look for silence, and say what there is to say when no state does."""
+        now_ns = time.monotonic_ns()
+        held_up = now_ns - self._ticked_ns > 3e9 * TICK_S  # then states may have come that nobody has looked at yet
+        self._ticked_ns = now_ns
+        with self._lock:
+            self._leadership.listen(now_ns)
+            command = None if held_up else self._controller.tick(now_ns)
+            if command is not None:
+                self._send(command)
+        if self._leadership.declare():
+            self._introduce()
+        if (leader := self._leadership.leader()) is not None:
+            self.orders.adopt(leader)
+        self._announce()
+
+    def _introduce(self) -> None:
+        """Speak in the role that is played now."""
+        role = self._leadership.role
+        self.describe()
+        self._bus.withdraw_json(self._bus.keys.info(STANDBY if role == LEADER else LEADER))
+        self._announcer = Announcer(self._bus, role, self._leadership.epoch)
+
+    def describe(self) -> None:
+        """Publish what this controller is."""
+        with self._telling:
+            role, config = self._leadership.role, self._config
+            self._told += 1
+            life = {"role": role, "epoch": self._leadership.epoch, "seq": self._told}
+            about = {**life, "config_hash": config.config_hash, "stale_s": config.stale_s}
+            model = {**describe(self._params.ocp, self._controller.np_), "formulation": self._formulation, "realtime": self._granted}
+            self._bus.publish_json(self._bus.keys.info(role), {**model, **about, **self.orders.describe()})
+
+    def _announce(self) -> None:
+        """Publish and log mode changes and faults."""
+        announcer, now_ns = self._announcer, time.monotonic_ns()
+        if announcer is None or announcer.role != self._leadership.role:
+            return  # the next tick introduces us
+        for notice in self._controller.notices():
+            announce(log, announcer, notice, self._controller.robot_now_ns(now_ns))
+        for intake in (self._states_in, self._references.planners, self._references.leaders, self._leadership.commands_in):
+            for refusal in intake.notices(now_ns):
+                announce(log, announcer, refusal, self._controller.robot_now_ns(now_ns))

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a controller says of itself in ``info``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import rti_mpc
+from rti_mpc.model.obstacle import discs_of
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.wire import info
+
+
+def describe(ocp: Ocp, np_: int) -> dict[str, Any]:
+    """Describe a controller: names, units, limits; null where there is none. Parameters from `np_` on are disturbances."""
+    model = ocp.model
+    vectors = {"states": model.states, "inputs": model.inputs, "outputs": model.outputs}
+    vectors |= {"parameters": model.parameters[:np_], "disturbances": model.parameters[np_:]}
+    limits = ("lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx")
+    return {
+        "version": rti_mpc.__version__,
+        "model": ocp.model.name,
+        **info.labels(model.counterparts(), **vectors),
+        **info.bounds(**{name: getattr(ocp, name).tolist() for name in limits}),
+        "p_nominal": list(model.p_nominal[:np_]),
+        **info.obstacles(discs_of(model)),
+        "N": ocp.N,
+        "N_u": ocp.N_u,
+        "dt_s": ocp.dt,
+        "integrator": ocp.method,
+    }

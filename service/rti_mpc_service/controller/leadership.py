@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Leadership of one process: what it hears of other controllers, and what follows for its own.
+
+Who leads is decided by `rti_mpc.contract.leadership`. Here are the bus, the clock and the controller.
+"""
+
+from __future__ import annotations
+
+import re
+import secrets
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from threading import Event
+from typing import Any
+
+from rti_mpc.contract.epoch import NUMBER_BITS, highest_believed
+from rti_mpc.contract.leadership import SILENCE_S, Leadership
+from rti_mpc.contract.message import Command, State
+from rti_mpc.contract.status import Mode
+from rti_mpc.control.controller import Controller
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received, Subscriber, unix_s
+from rti_mpc.wire.info import Leader
+
+LEADER, STANDBY = "controller", "standby"  # roles
+HEARING_S = 0.5  # for which a starting controller listens for others
+LOOK = 64  # messages that are read at one look: of 100 looks a second, three times what waits at 2000 a second of anybody's
+LOOK_BYTES = 65_536  # after which a look ends; 64 commands of 60 rows
+NUMBERED = re.compile(rf"{STANDBY}\.([0-9]{{1,7}})")  # role of one who stands by
+UNREADY = (Mode.IDLE, Mode.WAITING)  # with nothing to command
+
+
+@dataclass(frozen=True)
+class Others:
+    """
+    What a starting controller hears of others.
+
+    Attributes:
+        epoch: Highest epoch of a controller or a guard, 0 if there is none.
+        config_hash: Of the controller that leads, None if there is none.
+    """
+
+    epoch: int
+    config_hash: int | None
+
+
+def hear_others(bus: Bus, stop: Event) -> Others:
+    """Listen for `HEARING_S`."""
+    commands = [bus.subscriber(key, capacity=RING_MESSAGES) for key in (bus.keys.command, bus.keys.actuation)]
+    infos = bus.subscriber(bus.keys.info(LEADER), capacity=RING_MESSAGES)
+    intake = bus.intake(Command, HEARING_S, choosing=True)
+    stop.wait(HEARING_S)
+    epoch = max(intake.highest_epoch(subscriber.drain()) for subscriber in commands)
+    highest = highest_believed(unix_s(), epoch, choosing=True)
+    leaders = [leader for received in infos.drain() if (leader := Leader.from_received(received, highest)) is not None]
+    leader = max(leaders, key=lambda leader: (leader.epoch, leader.seq), default=None)
+    return Others(epoch, None) if leader is None else Others(max(epoch, leader.epoch), leader.config_hash)
+
+
+class Candidate:
+    """
+    One controller among others on the bus.
+
+    Attributes:
+        commands_in: Door of what other controllers send.
+    """
+
+    def __init__(self, bus: Bus, controller: Controller, others: Others, *, config_hash: int, dt_s: float, nu: int, standby: bool) -> None:
+        self.commands_in = bus.intake(Command, SILENCE_S, {"u": nu}, choosing=True)
+        number, epoch = secrets.randbits(NUMBER_BITS), max(others.epoch, unix_s() << NUMBER_BITS) + 1
+        self._decision = Leadership(
+            number, epoch, config_hash=config_hash, dt_s=dt_s, standby=standby, say=controller.say, local_ns=time.monotonic_ns()
+        )
+        self._bus = bus
+        self._controller = controller
+        self._acting: int | None = None  # epoch of commands that act, as the controller knows it
+        self._infos = bus.subscriber(bus.keys.info(LEADER), capacity=RING_MESSAGES)
+        self._told = (0, -1)  # epoch and sequence number of the last description of a leader that was read
+        self._commands = bus.subscriber(bus.keys.command, capacity=RING_MESSAGES)
+        self._tokens: dict[str, Any] = {}
+        controller.shadow()
+        self._apply()
+        bus.watch_alive(self._meet)
+
+    @property
+    def leading(self) -> bool:
+        """Whether this one leads."""
+        return self._decision.leading
+
+    @property
+    def epoch(self) -> int:
+        """Epoch of its commands; those of the robot's first leader are the Unix seconds at its start, times ``2 ** NUMBER_BITS``, or above."""
+        return self._decision.epoch
+
+    @property
+    def role(self) -> str:
+        """Role it plays."""
+        return LEADER if self.leading else STANDBY
+
+    @property
+    def relieved(self) -> bool:
+        """Whether another one takes over when this one ends."""
+        return self._decision.relieved
+
+    def hear(self, state: State, local_ns: int) -> None:
+        """
+        Decide who answers a state; before the controller does.
+
+        Args:
+            state: The state.
+            local_ns: Local monotonic time.
+        """
+        self.listen(local_ns)
+        late_ns = self._controller.robot_now_ns(local_ns) - state.stamp_ns
+        self._decision.hear(state, local_ns, late_ns=late_ns, ready=self._controller.mode not in UNREADY)
+        self._apply()
+
+    def sends(self, command: Command) -> bool:
+        """Whether a command is ours to send; it then counts as sent. The first one is not if the one that was replaced has answered after all."""
+        if (replaced := self._decision.replaced) is not None:
+            self._follow(replaced, late=True)
+        return self._decision.sends(command)
+
+    def listen(self, local_ns: int) -> None:
+        """
+        Take in what others command, and stand by if one of them leads.
+
+        Args:
+            local_ns: Local monotonic time.
+        """
+        self._decision.look(local_ns, self._controller.robot_rate)
+        self._follow(self._decision.known)
+
+    def leader(self) -> Leader | None:
+        """Return what the leader has last said of itself, once; None while this one leads."""
+        waiting = self._look(self._infos)
+        if self.leading:
+            for _ in waiting:
+                pass
+            return None
+        known = self._decision.known
+        news, highest = None, highest_believed(unix_s(), known, choosing=True)
+        for received in waiting:
+            leader = Leader.from_received(received, highest)
+            if leader is not None and leader.epoch >= known and (leader.epoch, leader.seq) > self._told:
+                news, self._told = leader, (leader.epoch, leader.seq)
+        if news is not None:
+            self._decision.fit(news.config_hash)
+        return news
+
+    def declare(self) -> bool:
+        """Show on the bus which role is played, if that has changed, and tell whether it has; off the path from state to command."""
+        roles = (LEADER,) if self.leading else (STANDBY, f"{STANDBY}.{self._decision.number}")
+        if tuple(self._tokens) == roles:
+            return False
+        before, self._tokens = self._tokens, {role: self._bus.alive(role) for role in roles}
+        for token in before.values():
+            token.undeclare()
+        return True
+
+    def _follow(self, known: int, *, late: bool = False) -> None:
+        """Let act what others have commanded and acts."""
+        for received in self._look(self._commands):
+            command = self.commands_in.read(received, known=known)
+            if command is not None and self._decision.follow(command, late=late):
+                known = command.epoch
+                self._controller.overhear(command)
+        self._apply()
+
+    def _look(self, subscriber: Subscriber) -> Iterator[Received]:
+        """Yield what waits, oldest first: no more than a look takes; the rest waits on."""
+        size = 0
+        for _ in range(LOOK):
+            if size >= LOOK_BYTES or (received := subscriber.try_recv()) is None:
+                return
+            size += len(received.payload)
+            yield received
+
+    def _apply(self) -> None:
+        """Let the controller's commands act, or not, as was decided."""
+        if (acting := self._decision.acting) == self._acting:
+            return
+        self._acting = acting
+        if acting is None:
+            self._controller.shadow()
+        else:
+            self._controller.lead(acting)
+
+    def _meet(self, role: str, present: bool) -> None:
+        """Count who stands by; in a thread of the bus."""
+        if (numbered := NUMBERED.fullmatch(role)) is not None:
+            self._decision.meet(int(numbered[1]), present=present)

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Standing orders: an operator's stop, and parameters. They hold whoever leads.
+
+A stop reaches every controller, and each obeys (`rti_mpc_service.operator_stop`). A
+change of parameters is the leader's to grant. It stands in the leader's
+description, from which those that stand by take it over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from threading import Condition
+from typing import Any
+
+from rti_mpc.contract.message import Notice, Severity
+from rti_mpc.control.controller import Controller
+from rti_mpc.errors import ConfigError, RtiMpcError
+from rti_mpc.rti.rti import Rti
+from rti_mpc.wire import info
+from rti_mpc.wire.info import Leader
+from rti_mpc_service import injection
+from rti_mpc_service.controller.params import Params
+from rti_mpc_service.operator_stop import REQUESTS, OperatorStop
+
+
+class Orders:
+    """The orders one controller has."""
+
+    def __init__(
+        self,
+        controller: Controller,
+        rti: Rti,
+        params: Params,
+        lock: Condition,
+        stop: OperatorStop,
+        leading: Callable[[], bool],
+        tell: Callable[[], None],
+    ) -> None:
+        self._rti = rti
+        self._controller = controller
+        self._params = params
+        self._lock = lock
+        self._stop = stop
+        self._leading = leading
+        self._tell = tell  # publishes the description
+
+    def describe(self) -> dict[str, Any]:
+        """Return them as a part of the description."""
+        return {**self._stop.describe(), **info.parameters(self._params.version, self._params.changes)}
+
+    def answer(self, request: dict[str, Any]) -> dict[str, Any] | None:
+        """
+        Grant a request of an operator; None if that is for another to do.
+
+        Raises:
+            ConfigError: It is refused, and why.
+        """
+        what = request.get("request")
+        if what in REQUESTS:  # also here, for those who know no key of its own
+            return self._stop.answer(request)
+        if what not in ("params", "inject"):
+            raise ConfigError(f"request must be stop, enable, params or inject, got {what!r}")
+        if not self._leading():
+            return None
+        if what == "inject":
+            with self._lock:
+                return injection.answer(self._rti, request)
+        answer = self._params.answer(request)
+        if "from_seq" in answer:
+            text = ", ".join(f"{key} = {value}" for key, value in request["set"].items())
+            self._say("parameters_changed", f"parameters of version {self._params.version}, from command {answer['from_seq']} on: {text}")
+        self._tell()
+        return {"ok": True, "request": what, **answer}
+
+    def adopt(self, leader: Leader) -> None:
+        """Take over what a leader's description says."""
+        try:
+            version = self._params.version
+            self._params.adopt(leader.parameters["version"], dict(leader.parameters["changes"]))
+            if self._params.version != version:
+                self._say("parameters_changed", f"parameters of version {self._params.version}, as the leader has them")
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RtiMpcError) as error:
+            self._say("leader_not_understood", f"the leader's description must hold its orders, got a fault at {error}", Severity.WARNING)
+
+    def _say(self, code: str, text: str, severity: Severity = Severity.INFO) -> None:
+        self._controller.say(Notice(severity, code, text))

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Parameters of a running controller: weights, and bounds inside those of its file.
+
+A change is a transaction. It is checked as the file is, tried on a copy of the
+present sample, and then taken over between two samples, all of it or nothing.
+Keys are those of the file. What is compiled in, such as the horizon and which
+bounds there are, is refused, and so is every bound wider than the file's: the
+guard and the robot hold to their own files.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from threading import Condition
+from typing import Any
+
+from pydantic import ValidationError
+
+from rti_mpc.control.controller import Controller
+from rti_mpc.control.tuning import Tuning
+from rti_mpc.errors import ConfigError, OcpError
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.rti import Rti
+from rti_mpc_service.config.build import build_rti, retuned
+from rti_mpc_service.config.fit import check_names, check_rest, check_tree
+from rti_mpc_service.config.refusal import entries, explain
+from rti_mpc_service.config.schema import Config
+
+WEIGHTS = ("ocp.weights.Q", "ocp.weights.R", "ocp.weights.delta", "ocp.weights.lambda", "ocp.bounds.soft_weight")
+BOUNDS = ("ocp.bounds.inputs", "ocp.bounds.increments", "ocp.bounds.states")
+VERSIONS = 2**32  # as many as telemetry can tell
+PATIENCE = 2  # periods, for a sample
+SAMPLE = ("x", "u", "u_prev", "y_ref", "p")  # of an `Rti`
+
+
+class Params:
+    """
+    The parameters of one controller.
+
+    Attributes:
+        ocp: The problem with what was asked for last.
+        version: Counts changes; 0 for the file's values.
+        changes: What differs from the file, by key.
+    """
+
+    def __init__(self, config: Config, controller: Controller, rti: Rti, lock: Condition) -> None:
+        self.ocp: Ocp = rti.ocp
+        self.version = 0
+        self.changes: dict[str, Any] = {}
+        self._file = config
+        self._values = values(config)
+        self._controller = controller
+        self._rti = rti
+        self._lock = lock  # held while a sample is made; notified when one has been
+        self._trial = build_rti(config) if config.params.live else None
+
+    def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """
+        Answer a request, ``{"get": true}`` or ``{"set": {key: value, ...}}``.
+
+        Raises:
+            ConfigError: One line: the key, what must hold, what was got.
+        """
+        if request.get("get") is True:
+            return {"version": self.version, "live": self._trial is not None, "values": self._values}
+        given = request.get("set")
+        if not isinstance(given, dict) or not given:
+            raise ConfigError(f'params must be asked for with "get": true or "set": {{key: value}}, got {dict(request)!r}')
+        if self._trial is None:
+            raise ConfigError("params.live must be true in the controller's file for a change while it runs, got false")
+        config, ocp = changed(self._file, self.ocp, {**self.changes, **given})
+        self._try(self._trial, ocp)
+        seq = self._take(config, ocp, self.version + 1, {**self.changes, **given})
+        return {"version": self.version, "from_seq": seq}
+
+    def adopt(self, version: int, changes: Mapping[str, Any]) -> None:
+        """
+        Take over what the leader has been told.
+
+        Raises:
+            ConfigError: It does not fit.
+        """
+        if type(version) is not int or not 0 <= version < VERSIONS:
+            raise ConfigError(f"version of parameters must be an integer from 0 to {VERSIONS - 1}, got {version!r}")
+        if version != self.version:
+            self._take(*changed(self._file, self.ocp, changes), version, dict(changes))
+
+    def _take(self, config: Config, ocp: Ocp, version: int, changes: dict[str, Any]) -> int:
+        with self._lock:
+            seq = self._controller.retune(ocp, version)
+        self.ocp, self.version, self.changes, self._values = ocp, version, changes, values(config)
+        return seq
+
+    def _try(self, trial: Rti, ocp: Ocp) -> None:
+        """Solve the QP that is prepared now with other weights and bounds, on a copy."""
+        with self._lock:
+            self._lock.wait(PATIENCE * self.ocp.dt)  # for a sample to end: what follows then falls into the slack before the next
+            sample = {name: getattr(self._rti, name).copy() for name in SAMPLE}
+        trial.reset(sample["x"][0], sample["u_prev"])
+        for name, value in sample.items():
+            getattr(trial, name)[:] = value
+        tuning = Tuning(trial)
+        tuning.change(ocp, 1)
+        tuning.begin()
+        tuning.follow(sample["u_prev"])
+        trial.prepare(sample["y_ref"], sample["p"], shift=False)
+        status = trial.feedback(sample["x"][0])
+        if not status.usable:
+            raise ConfigError(f"the present sample must have a solution with the new values, its QP is {status.name.lower()}")
+
+
+def values(config: Config) -> dict[str, Any]:
+    """Return what may be changed, by key."""
+    document = config.model_dump(by_alias=True)
+    tables = {key: branch(document, key) for key in (*WEIGHTS, *BOUNDS)}
+    return {
+        f"{key}.{name}" if isinstance(table, dict) else key: value
+        for key, table in tables.items()
+        for name, value in (table.items() if isinstance(table, dict) else [("", table)])
+    }
+
+
+def branch(document: Mapping[str, Any], key: str) -> Any:
+    """Return what a dotted key leads to."""
+    for step in key.split("."):
+        document = document[step]
+    return document
+
+
+def changed(file: Config, ocp: Ocp, changes: Mapping[str, Any]) -> tuple[Config, Ocp]:
+    """
+    Return a configuration with other values, and its problem, made of one that was built of the file.
+
+    No expression is built, which would take ten times as long: whatever is done
+    here, the interpreter's lock is shared with the thread that controls.
+
+    Raises:
+        ConfigError: A key may not change, a value does not fit.
+    """
+    document = file.model_dump(by_alias=True)
+    for key, value in changes.items():
+        table, _, name = key.rpartition(".")
+        if key not in WEIGHTS and table not in (*WEIGHTS[:2], *BOUNDS):
+            raise ConfigError(f"{key} {refused(key)}, got {value!r}")
+        branch(document, table)[name] = value
+    try:
+        config = Config.model_validate(document)
+        check_tree(config)
+        check_names(config, ocp.model)
+        ocp = retuned(config, ocp)
+        check_rest(ocp)
+    except ValidationError as error:
+        raise ConfigError(explain(error, Config)) from error
+    except OcpError as error:
+        raise ConfigError(str(error)) from error
+    for wrong in wider(file, config, changes):
+        raise ConfigError(wrong)
+    return config, ocp
+
+
+def refused(key: str) -> str:
+    """Say why a key is none that may change."""
+    known = dict(entries(Config))
+    table = key.rpartition(".")[0]
+    named = known.get(table, "") if not any(other.startswith(f"{table}.") for other in known) else ""  # a table of names
+    what = known.get(key, named)
+    return f"({what}) is fixed while the controller runs: change its file, and restart it" if what else f"is none of {', '.join((*WEIGHTS, *BOUNDS))}"
+
+
+def wider(file: Config, config: Config, changes: Mapping[str, Any]) -> Iterator[str]:
+    """Say which bounds are new, gone, or wider than the file's."""
+    now, before = values(config), values(file)
+    for key in changes:
+        if key.rpartition(".")[0] not in BOUNDS:
+            continue
+        if key not in before:
+            yield f"{key} is not in the controller's file, and which bounds there are is fixed while it runs, got {list(now[key])}"
+            return
+        (lower, upper), (least, most) = now[key], before[key]
+        if lower < least or upper > most or math.isinf(lower) != math.isinf(least) or math.isinf(upper) != math.isinf(most):
+            yield f"{key} must lie inside the file's {[least, most]}, to which guard and robot hold, and be finite where it is, got {[lower, upper]}"

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run looks like on a terminal: a table that lives, lines where there is no terminal, and the sum at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from rich.console import Console, Group
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from rti_mpc.contract.message import Event, Severity, Telemetry
+from rti_mpc.model.model import Signal
+from rti_mpc_service.redrawn import Redrawn
+
+RECENT = 200  # samples the medians are of
+EVENTS = 3  # shown
+LINES = 10  # of progress, without a terminal
+MISSING = "none"
+
+
+class Board(Redrawn):
+    """Shows the progress of a run."""
+
+    def __init__(self, console: Console, title: str, inputs: Sequence[Signal], duration_s: float) -> None:
+        super().__init__(console)
+        self._title = title
+        self._inputs = inputs
+        self._duration_s = duration_s
+        self._said = 0
+
+    def wait(self, text: str) -> None:
+        """Tell what is waited for."""
+        if self.live:
+            self.draw(Text(f"{self._title}: {text}"))
+        else:
+            self.console.print(text)
+
+    def show(self, time_s: float, error_mm: float | None, telemetry: Sequence[Telemetry], events: Sequence[Event]) -> None:
+        """Show where the robot is and how the controller fares; at least one sample is there."""
+        rows = self._rows(error_mm, telemetry)
+        if self.live:
+            table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+            for row in rows.items():
+                table.add_row(*row)
+            bar = ProgressBar(total=self._duration_s, completed=min(time_s, self._duration_s), width=48)
+            news = [Text(event.text, "red" if event.severity is Severity.ERROR else "yellow") for event in events if event.severity]
+            head = Table.grid(padding=(0, 2))
+            head.add_row(self._title, bar, f"{max(time_s, 0.0):.0f} of {self._duration_s:.0f} s")
+            self.draw(Group(head, table, *news[-EVENTS:]))
+        elif time_s >= self._said * self._duration_s / LINES:
+            self._said = int(time_s * LINES / self._duration_s) + 1
+            self.console.print(
+                f"{time_s:5.0f} of {self._duration_s:.0f} s: " + ", ".join(f"{name} {text}" for name, text in rows.items()), soft_wrap=True
+            )
+
+    def _rows(self, error_mm: float | None, telemetry: Sequence[Telemetry]) -> dict[str, str]:
+        last, recent = telemetry[-1], telemetry[-RECENT:]
+        medians = {name: np.median([getattr(sample, name) for sample in recent]) for name in ("prepare_us", "feedback_us")}
+        return {
+            "mode": last.mode.name.lower(),
+            **({} if error_mm is None else {"error": f"{error_mm:.2f} mm"}),
+            "command": "  ".join(f"{signal.name} {value:+.3f} {signal.unit}" for signal, value in zip(self._inputs, last.u[0], strict=True)),
+            "preparation": f"{medians['prepare_us']:.0f} us",
+            "feedback": f"{medians['feedback_us']:.0f} us",
+            "in period": f"{np.mean([sample.slack_s >= 0.0 for sample in telemetry]):.2%}",
+            "fallbacks": str(last.fallbacks),
+        }
+
+
+def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
+    """Print the sum of a run."""
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    rows = [
+        (f"error after {summary['transient_s']:g} s", "max {} mm, rms {} mm".format(*said(summary, "max_error_mm", "rms_error_mm"))),
+        ("error of the last lap", "max {} mm".format(*said(summary, "last_lap_max_error_mm"))),
+        ("at the end", "{} mm from the reference, at {} mm/s".format(*said(summary, "final_error_mm", "final_speed_mm_s"))),
+    ]
+    rows = [row for row in rows if MISSING not in row[1]]
+    rows += [
+        ("samples in period", f"{summary['in_period_share']:.2%} of {summary['samples']}, {summary['skipped']} skipped"),
+        ("inputs in bounds", "always" if inputs_in_bounds(summary) else "NOT ALWAYS"),
+        ("states over bounds", f"at most {summary['states_over_share']:.2%}"),
+        ("fallbacks", str(summary["fallbacks"])),
+        ("commands", f"{summary['lost']} lost, {summary['late']} late, {summary['expired']} expired, {summary['refused']} refused"),
+    ]
+    names = {"prepare_us": "preparation", "feedback_us": "feedback", "latency_us": "state out to command in", "echo_us": "bare echo"}
+    rows += [(name, "p50 {p50}, p99 {p99}, max {max} us".format(**summary[key])) for key, name in names.items()]
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
+    for miss in summary["misses"]:
+        console.print(
+            "missed its period: the sample at {at_s:.1f} s, by {late:.1f} ms of the robot; "
+            "preparation {prepare_us:.0f}, feedback {feedback_us:.0f} us".format(late=-1e3 * miss["slack_s"], **miss),
+            soft_wrap=True,
+        )
+    for fault in summary["events"]:
+        console.print("{severity} of the {source} at {at_s:.1f} s: {text}".format(**fault), soft_wrap=True, markup=False)
+
+
+def said(summary: Mapping[str, Any], *names: str) -> list[str]:
+    """Return numbers in words, `MISSING` for what the run was too short for."""
+    return [MISSING if summary[name] is None else f"{summary[name]:.3g}" for name in names]
+
+
+def inputs_in_bounds(summary: Mapping[str, Any]) -> bool:
+    """Whether inputs and their increments were inside their bounds."""
+    return all(summary[f"{name}_in_bounds"] for name in ("commanded_inputs", "commanded_increments", "applied_inputs"))

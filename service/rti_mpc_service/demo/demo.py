@@ -1,0 +1,276 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The whole system on this machine: robot, controller, reference and recorder, each its own process, judged at the end.
+
+The demo is one more peer. It listens on a free loopback port where all the
+others meet, so that several demos run side by side; it starts the robot when all
+who are to follow it are there, listens, and stops everybody when the robot has
+been driven for long enough. Robot and controller go before everything else.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import dataclass
+from datetime import datetime
+from importlib.util import find_spec
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from rti_mpc.contract.message import Command, Reference, State, Telemetry
+from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.errors import ConfigError
+from rti_mpc.reference.trajectory import Heading, Trajectory, find_trajectory
+from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.cdr import encode
+from rti_mpc.wire.info import Info
+from rti_mpc.wire.interrupt import stop_on_signals
+from rti_mpc_service.config import toml
+from rti_mpc_service.config.build import build_ocp
+from rti_mpc_service.config.fit import check_stop
+from rti_mpc_service.config.schema import Config
+from rti_mpc_service.demo.board import Board, print_summary
+from rti_mpc_service.host import machine
+from rti_mpc_service.host.echo import ROLE as ECHO
+from rti_mpc_service.host.echo import Echo
+from rti_mpc_service.rig import robot_log
+from rti_mpc_service.rig.children import Children
+from rti_mpc_service.rig.company import CLI, POLITE, Failed, check, wait
+from rti_mpc_service.rig.endpoint import free_endpoint
+from rti_mpc_service.rig.scenario import HEADINGS, configured
+from rti_mpc_service.rig.summary import Outcome, summarize
+from rti_mpc_service.rig.witness import Witness
+
+PATIENCE_S = 60.0  # for everybody to be there: the first controller on a machine compiles
+SILENCE_S = 5.0  # of the controller, after which the robot will not be driven any further
+PATIENCE_END_S = 3.0
+LOOK_S = 0.1
+SHOW_S = 0.25
+MARGIN_S = 5.0  # of reference past the horizon of the last sample: near its last row a controller slows down
+RECORDER_S = 8.0  # to write what it has
+# The recorder first: a reference that goes on without a robot is nothing to look at.
+ENDING = (*(("recorder",) if find_spec("rerun") else ()), "controller", "guard", "robot", "reference", "echo")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """
+    What is to be run.
+
+    Attributes:
+        config: The robot, as its processes load it.
+        scenario: As on the command line.
+        heading: What the reference says of it.
+        trajectory: What to follow.
+        duration_s: For how long, robot time.
+        speed: Robot seconds in a second.
+        folder: Where everything goes.
+        viewer: Whether to watch live.
+    """
+
+    config: Config
+    scenario: str
+    heading: Heading
+    trajectory: Trajectory
+    duration_s: float
+    speed: float
+    folder: Path
+    viewer: bool
+
+    @property
+    def reference_s(self) -> float:
+        """How long the reference lasts."""
+        return self.duration_s + self.config.ocp.N * self.config.ocp.dt_s + MARGIN_S
+
+
+def plan(
+    config: Config, scenario: str, *, heading: Heading | None, speed: float, duration_s: float | None, folder: Path | None, viewer: bool, guard: bool
+) -> Plan:
+    """
+    Fill in what the scenario decides.
+
+    Raises:
+        ConfigError: There is no such scenario, or the model has outputs that no path fills.
+    """
+    trajectory = find_trajectory(scenario)
+    heading = heading or HEADINGS.get(scenario, "consistent")
+    return Plan(
+        config=configured(config, trajectory, heading, guard),
+        scenario=scenario,
+        heading=heading,
+        trajectory=trajectory,
+        duration_s=duration_s or trajectory.duration_s,
+        speed=speed,
+        folder=folder or Path("runs") / f"{trajectory.name}-{datetime.now():%Y%m%d-%H%M%S}",
+        viewer=viewer,
+    )
+
+
+def main(config: Config, scenario: str, **options: Any) -> int:
+    """
+    Run a demo, leave its folder, print its sum.
+
+    Returns:
+        Exit status: 0 if the robot was driven to the end.
+
+    Raises:
+        ConfigError: A stop would not bring the robot to rest, the scenario is none, or does not fit the robot, or the folder cannot be written.
+    """
+    check_stop(config)
+    console = Console()
+    run = plan(config, scenario, **options)
+    try:
+        run.folder.mkdir(parents=True, exist_ok=True)
+        (run.folder / "config.toml").write_text(toml.write(run.config), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"--out must be a folder that can be written, got {run.folder}: {error.strerror}") from error
+    stop = stop_on_signals()
+    try:
+        outcome = drive(run, console, stop)
+    except Failed as error:
+        console.print(f"rti-mpc: {error}", soft_wrap=True, markup=False)
+        return 1
+    return conclude(run, outcome, console)
+
+
+def drive(run: Plan, console: Console, stop: Event) -> Outcome:
+    """
+    Start everybody, listen until the end, stop everybody.
+
+    Raises:
+        Failed: Somebody has ended, or nobody came.
+    """
+    ocp = build_ocp(run.config)
+    endpoint = free_endpoint()
+    title = f"{run.trajectory.name}, heading {run.heading}, {run.speed:g} times real speed"
+    logs = run.folder / "logs"
+    logs.mkdir(exist_ok=True)
+    keys = run.config.keys()
+    with (
+        Bus.join(BusSettings(listen=(endpoint,), connect=()), keys) as bus,
+        Children(logs) as children,
+        Board(console, title, ocp.model.inputs, run.duration_s) as board,
+    ):
+        witness = Witness(bus)
+        command = Command(0, 0, 0, 0, 0, 0, 0, 0, Mode.TRACKING, QpStatus.SOLVED, 0, np.zeros((ocp.N, ocp.model.nu)))
+        start(run, children, endpoint, len(encode(command)))
+        company = {"controller", "reference", ECHO, *(["viewer"] if recorded() else []), *guards(run)}
+        board.wait(f"starting {', '.join(sorted(company))}")
+        wait(lambda: witness.listen().met(company), children, stop, PATIENCE_S, "all processes")
+        echo = Echo(bus, State(0, 0, 0, np.zeros(ocp.model.nx)), 0.5 * ocp.dt / run.speed)
+        meeting = ("-l", "tcp/127.0.0.1:0", "-e", endpoint)
+        children.start("robot", CLI, "sim", run.folder / "config.toml", *meeting, "--speed", run.speed, "--log", run.folder / "robot.csv")
+        board.wait("starting the robot")
+        follow(run, witness, board, children, stop)
+        board.wait("stopping all processes")
+        for name in (name for name in ENDING if name != "guard" or guards(run)):
+            if children.end(name, RECORDER_S if name == "recorder" else PATIENCE_END_S):
+                board.console.print(f"{name} did not end well, see {children.log(name)}", soft_wrap=True, markup=False)
+        witness.listen()
+    if witness.info is None or witness.reference is None:
+        raise Failed("stopped before the robot had a reference")
+    return Outcome(
+        trajectory=run.trajectory,
+        anchor_ns=witness.reference.stamp_ns,
+        duration_s=run.duration_s,
+        speed=run.speed,
+        ocp=ocp,
+        info=witness.info,
+        log=robot_log.read(run.folder / "robot.csv", witness.info),
+        telemetry=witness.telemetry,
+        unheard=witness.lost,
+        events=witness.events,
+        echo_us=echo.round_trip_us,
+    )
+
+
+def start(run: Plan, children: Children, endpoint: str, size: int) -> None:
+    """Start everybody but the robot."""
+    keys, config = run.config.keys(), run.folder / "config.toml"
+    scenario = ("--scenario", run.scenario, "--heading", run.heading, "--duration", run.reference_s)
+    children.start("controller", CLI, "run", config, "-e", endpoint)
+    for name in guards(run):
+        children.start(name, CLI, "guard", config, "-e", endpoint)
+    children.start("reference", CLI, "reference", config, "-e", endpoint, *scenario, nice=POLITE)
+    children.start("echo", "rti_mpc_service.host.echo", endpoint, keys.prefix, keys.robot, size)
+    if recorded():
+        live = ("--rerun-spawn",) if run.viewer else ()
+        children.start("recorder", CLI, "view", config, "-e", endpoint, "--rerun-save", run.folder / "run.rrd", *live, nice=POLITE)
+
+
+def follow(run: Plan, witness: Witness, board: Board, children: Children, stop: Event) -> None:
+    """
+    Listen until the robot was driven for long enough, the controller fell silent, or we are stopped.
+
+    Raises:
+        Failed: A process has ended by itself, or nothing was ever driven.
+    """
+    wait(lambda: witness.listen().begun, children, stop, PATIENCE_S, "the first sample")
+    heard, heard_s, shown_s = 0, time.monotonic(), 0.0
+    while not stop.is_set() and witness.reference is not None:
+        now_s, last = time.monotonic(), witness.telemetry[-1]
+        time_s = 1e-9 * (last.state_stamp_ns - witness.reference.stamp_ns)
+        if len(witness.telemetry) > heard:
+            heard, heard_s = len(witness.telemetry), now_s
+        if time_s >= run.duration_s or now_s - heard_s > SILENCE_S:
+            return
+        if now_s - shown_s > SHOW_S:
+            shown_s = now_s
+            board.show(time_s, error_mm(run, witness.info, last, witness.reference), witness.telemetry, witness.events)
+        check(children)
+        stop.wait(LOOK_S)
+        witness.listen()
+
+
+def error_mm(run: Plan, info: Info | None, sample: Telemetry, reference: Reference) -> float | None:
+    """Return how far from the path the robot is in a sample; None: the model has no position."""
+    if info is None or info.position is None:
+        return None
+    at_s = np.array(1e-9 * (sample.stamp_ns - reference.stamp_ns))
+    return 1e3 * float(np.hypot(*(sample.x0[list(info.position)] - run.trajectory.position(at_s))))
+
+
+def conclude(run: Plan, outcome: Outcome, console: Console) -> int:
+    """Write and print the sum of a run, draw it, and tell how to look at it; return the exit status."""
+    summary = {**summarize(outcome), "heading": run.heading, "machine": machine.describe()}
+    (run.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    if not summary["samples"]:
+        console.print(f"rti-mpc: nothing was driven, see {run.folder / 'logs'}", soft_wrap=True, markup=False)
+        return 1
+    console.print(
+        f"{run.trajectory.name}, heading {run.heading}, {run.duration_s:.0f} s of the robot at {run.speed:g} times real speed", highlight=False
+    )
+    print_summary(console, summary)
+    if find_spec("matplotlib") is not None:
+        from rti_mpc_service.rig.figure import figure
+
+        figure(outcome.run(), run.folder / "run.png")
+        console.print(f"figure     {run.folder / 'run.png'}", soft_wrap=True, markup=False)
+    if recorded():
+        rerun = Path(sys.executable).with_name("rerun")
+        console.print(f"recording  {shown(rerun) if rerun.exists() else 'rerun'} {run.folder / 'run.rrd'}", soft_wrap=True, markup=False)
+    console.print(f"all of it  {run.folder}", soft_wrap=True, markup=False)
+    if not summary["driven"]:
+        console.print("rti-mpc: the robot was not driven to the end", markup=False)
+    return 0 if summary["driven"] else 1
+
+
+def guards(run: Plan) -> tuple[str, ...]:
+    """Return the guard's role, if there is one."""
+    return ("guard",) if run.config.guard.enabled else ()
+
+
+def recorded() -> bool:
+    """Whether Rerun is there to record with."""
+    return find_spec("rerun") is not None
+
+
+def shown(path: Path) -> Path:
+    """Return a path as it would be typed here."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

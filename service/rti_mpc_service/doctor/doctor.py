@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What this host gives to a control loop, and what the loop can promise on it.
+
+Each part is measured alone, for a second: how late a bare timer wakes, how long a
+message takes to another process and back, how long preparation and feedback of
+this configuration take after a pause, with caches as cold as in a service.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from rti_mpc.array import Array
+from rti_mpc.cache import cache_dir, own
+from rti_mpc.contract.message import Command, End, Reference, State
+from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.cdr import encode
+from rti_mpc_service.config.build import build_model, build_rti, robot_settings
+from rti_mpc_service.config.config import load
+from rti_mpc_service.config.schema import Config
+from rti_mpc_service.host import machine, realtime
+from rti_mpc_service.host.echo import ROLE as ECHO
+from rti_mpc_service.host.echo import Pinger
+from rti_mpc_service.host.jitter import bare_timer
+from rti_mpc_service.rig.children import Children
+from rti_mpc_service.rig.endpoint import free_endpoint
+from rti_mpc_service.rig.summary import quantiles
+from rti_mpc_service.rig.wave import wave
+from rti_mpc_service.warm_up import warm_up
+
+TICK_S, TICKS = 0.001, 1000
+PAUSE_S = 0.005  # between two pings, and between two samples
+PINGS, SAMPLES = 200, 200
+PATIENCE_S = 10.0  # for the process that echoes
+PRIORITY = 20  # tried where the configuration asks for none
+MARGIN = 1.5  # on the sum of all p99, for the shortest period
+CLOCK_SOURCE = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+TIMER_SLACK = Path("/proc/self/timerslack_ns")
+EXTRAS = {"rerun-sdk": "view", "matplotlib": "figure"}
+
+
+def main(path: Path, json_path: Path | None = None) -> int:
+    """Examine this host, print what was found, and return the exit status: 0 if the configuration's period can be kept."""
+    config = load(path)
+    console = Console()
+    with console.status("measuring"):
+        report = examine(config)
+    if json_path is not None:
+        json_path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    table = Table("what", "here", "which means", box=None, padding=(0, 2, 0, 0))
+    for row in rows(report):
+        table.add_row(*row)
+    console.print(table)
+    loop = report["loop"]
+    fits = "can be kept here" if loop["fits"] else "CANNOT be kept here"
+    console.print(f"{path}: a period of {1e3 * config.ocp.dt_s:g} ms {fits}, the shortest is {shortest(loop)}", soft_wrap=True, markup=False)
+    return 0 if loop["fits"] else 1
+
+
+def examine(config: Config) -> dict[str, Any]:
+    """Measure everything, one after the other, in JSON; times in the unit of the name."""
+    ticks = count()
+    report: dict[str, Any] = {
+        "machine": machine.describe(),
+        "realtime": permissions(config),
+        "clock": clock(),
+        "timer_us": quantiles(np.array(1e-3) * bare_timer(TICK_S, lambda: next(ticks) < TICKS)[:, 1]),
+        "round_trip_us": quantiles(round_trip_us(config)),
+        "compiler": compiler(),
+        "cache": cache(),
+        "extras": {name: installed(name) for name in EXTRAS},
+    }
+    prepare_us, feedback_us = phases_us(config)
+    report |= {"prepare_us": quantiles(prepare_us), "feedback_us": quantiles(feedback_us)}
+    return report | {"loop": promise(report, config.ocp.dt_s)}
+
+
+def promise(report: dict[str, Any], dt_s: float) -> dict[str, Any]:
+    """Say which period can be kept: all that happens between two states, each at its p99, and half as much again; none if a part is unknown."""
+    parts = [report[part]["p99"] for part in ("prepare_us", "feedback_us", "timer_us", "round_trip_us")]
+    shortest_us = None if None in parts else MARGIN * sum(parts)
+    return {"margin": MARGIN, "shortest_period_us": shortest_us, "fits": shortest_us is not None and shortest_us <= 1e6 * dt_s}
+
+
+def permissions(config: Config) -> dict[str, dict[str, Any]]:
+    """Attempt what a controller may ask for, in a thread that then ends."""
+    wanted = config.realtime
+    with ThreadPoolExecutor(1) as pool:
+        outcomes = pool.submit(realtime.attempt, wanted.priority or PRIORITY, wanted.cores or realtime.available(), lock_memory=True).result()
+    return {outcome.what: asdict(outcome) for outcome in outcomes}
+
+
+def clock() -> dict[str, Any]:
+    """Describe the monotonic clock and the timers."""
+    began_ns = time.perf_counter_ns()
+    readings = [time.monotonic_ns() for _ in range(10_000)]
+    took_ns = time.perf_counter_ns() - began_ns
+    return {
+        "source": CLOCK_SOURCE.read_text().strip() if CLOCK_SOURCE.is_file() else "unknown",
+        "resolution_ns": 1e9 * time.get_clock_info("monotonic").resolution,
+        "reading_ns": took_ns / len(readings),
+        "timer_slack_us": 1e-3 * int(TIMER_SLACK.read_text()) if TIMER_SLACK.is_file() else None,
+    }
+
+
+def round_trip_us(config: Config) -> Array:
+    """Send a state to another process, which answers with a command's size; empty if it never came up."""
+    model, keys, endpoint = build_model(config), config.keys(), free_endpoint()
+    command = Command(0, 0, 0, 0, 0, 0, 0, 0, Mode.TRACKING, QpStatus.SOLVED, 0, np.zeros((config.ocp.N, model.nu)))
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Bus.join(BusSettings(listen=(endpoint,), connect=()), keys) as bus,
+        Children(Path(folder)) as children,
+    ):
+        pinger = Pinger(bus, State(0, 0, 0, np.zeros(model.nx)))
+        children.start("echo", "rti_mpc_service.host.echo", endpoint, keys.prefix, keys.robot, len(encode(command)))
+        if bus.is_alive(ECHO, PATIENCE_S):
+            for _ in paced(PINGS):
+                pinger.ping()
+    return np.array(pinger.round_trip_us)
+
+
+def phases_us(config: Config) -> tuple[Array, Array]:
+    """Control a robot that does what the plan says, as the daemon does, each state in its time; return the times of preparation and of feedback."""
+    rti, x = build_rti(config), np.array(robot_settings(config)["x0"])
+    warm_up(rti)
+    dt_ns = round(1e9 * config.ocp.dt_s)
+    y = wave(rti.ocp, x, np.random.default_rng(1))(np.arange(SAMPLES + config.ocp.N + 1))
+    controller = Controller(rti, Timing())
+    controller.receive_reference(Reference(1, 1, 0, dt_ns, End.HOLD, y, np.empty((len(y), 0))))
+    prepare_us, feedback_us = np.zeros(SAMPLES), np.zeros(SAMPLES)
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    seq = 0
+
+    def answer() -> Command | None:
+        """Answer the next state; None while the rate of the robot's clock is not known."""
+        nonlocal seq
+        seq += 1
+        return controller.receive_state(State(1, seq, seq * dt_ns, x), seq * dt_ns)
+
+    while (command := answer()) is None:
+        pass
+    controller.commit(command)
+    controller.prepare()
+    for k in paced(SAMPLES):
+        arrival_ns = time.monotonic_ns()
+        command = answer()
+        assert command is not None
+        encode(command)
+        commanded_ns = time.monotonic_ns()
+        controller.commit(command, commanded_ns)
+        controller.prepare()
+        prepare_us[k], feedback_us[k] = 1e-3 * (time.monotonic_ns() - commanded_ns), 1e-3 * (commanded_ns - arrival_ns)
+        x = rti.x[1].copy()
+    gc.enable()
+    return prepare_us, feedback_us
+
+
+def paced(number: int) -> Iterator[int]:
+    """Count, with a pause before each."""
+    for k in range(number):
+        time.sleep(PAUSE_S)
+        yield k
+
+
+def compiler() -> str | None:
+    """Return the first line of what the C compiler says of itself, None if there is none."""
+    path = shutil.which("cc")
+    return subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout.partition("\n")[0] if path else None
+
+
+def cache() -> dict[str, Any]:
+    """Say where compiled code is kept, and what keeps it from being kept there, if anything does."""
+    try:
+        folder = cache_dir()
+        own(folder)
+    except OSError as error:
+        return {"path": None, "error": str(error)}
+    return {"path": str(folder), "error": None}
+
+
+def installed(name: str) -> str | None:
+    """Return the version of a package, None if it is not installed."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def rows(report: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """Say each finding and what it means, in a line."""
+    host, clock, loop, cache = report["machine"], report["clock"], report["loop"], report["cache"]
+    slack = "unknown" if clock["timer_slack_us"] is None else f"{clock['timer_slack_us']:g} us"
+    yield "processor", f"{host['processor']}, {host['cores']} cores, load {host['load']}", "robot and controller want a core each"
+    yield "governor", host["governor"], "performance keeps times even"
+    for what, outcome in report["realtime"].items():
+        yield what.replace("_", " "), outcome["text"], f"realtime.{what} {'would be granted' if outcome['granted'] else 'would be refused'}"
+    yield "clock", f"{clock['source']}, {clock['resolution_ns']:g} ns, {clock['reading_ns']:.0f} ns a reading", ""
+    yield "timer slack", slack, "what the kernel may add to a sleep"
+    yield "bare timer loop", said(report["timer_us"]), f"how late it wakes, every {1e3 * TICK_S:g} ms"
+    yield "Zenoh round trip", said(report["round_trip_us"]), "a state out, a command in, nothing between"
+    yield "compiler", report["compiler"] or "none", "what it compiled is cached" if report["compiler"] else "preparation takes several times longer"
+    yield "cache", cache["path"] or "none", "is kept" if cache["error"] is None else f"compiles at EVERY start: {cache['error']}"
+    for name, found in report["extras"].items():
+        yield name, found or "not installed", f"pip install 'rti-mpc[{EXTRAS[name]}]'" if found is None else ""
+    yield "versions", ", ".join(f"{name} {found}" for name, found in {"python": host["python"], **host["packages"]}.items()), host["system"]
+    yield "preparation", said(report["prepare_us"]), f"of {SAMPLES} samples, {1e3 * PAUSE_S:g} ms apart"
+    yield "feedback", said(report["feedback_us"]), ""
+    yield "shortest period", shortest(loop), f"{loop['margin']:g} times preparation, feedback, timer and round trip at p99"
+
+
+def shortest(loop: dict[str, Any]) -> str:
+    """Return the shortest period in words."""
+    return "unknown" if loop["shortest_period_us"] is None else f"{1e-3 * loop['shortest_period_us']:.1f} ms"
+
+
+def said(times: dict[str, float]) -> str:
+    """Return quantiles in words."""
+    return "not measured" if times["p50"] is None else f"p50 {times['p50']:.0f}, p99 {times['p99']:.0f}, max {times['max']:.0f} us"

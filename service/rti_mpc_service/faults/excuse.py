@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the host alone explains of an incident, by its witness.
+
+A time may be longer by what the processes were held up for meanwhile. A sample
+that was missed is explained where they were held up, about when it was due, for a
+share of a period that a host which is on time never takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rti_mpc_service.faults.measure import Incident, Measured
+from rti_mpc_service.faults.promise import Promise
+
+SHARE = 0.25  # of a period: a sample takes a fiftieth of one, and is missed when it takes a whole one
+TIMES = {"brake_s": "fault_ns", "zero_s": "fault_ns", "still_s": "fault_ns", "recovery_s": "mend_ns"}  # and where each begins
+
+HeldUp = Callable[[int, int], float]
+
+
+def excuses(measured: Measured, missed_ns: NDArray[np.int64], incident: Incident, period_ns: int, held_up_ms: HeldUp) -> dict[str, float]:
+    """
+    Return by how much the host excuses each number that it may have made larger.
+
+    Args:
+        measured: What the robot did.
+        missed_ns: When the samples were due that were missed, shape ``(n,)``.
+        incident: When it happened.
+        period_ns: Of the controller.
+        held_up_ms: For how long the host held the processes up between two instants, ms. All instants are in robot time.
+    """
+    excused = {"missed": float(sum(held_up_ms(at - period_ns, at + period_ns) > 1e-6 * SHARE * period_ns for at in missed_ns.tolist()))}
+    for name, begin in TIMES.items():
+        if (took_s := getattr(measured, name)) is not None:
+            excused[name] = 1e-3 * held_up_ms(getattr(incident, begin), getattr(incident, begin) + round(1e9 * took_s))
+    return excused
+
+
+def explained(promise: Promise, measured: Measured, excused: Mapping[str, float]) -> list[str]:
+    """Return what would not be within a promise without the excuses, in words; nothing of what is not within it with them."""
+    broken = promise.broken(measured, excused)
+    return [f"{words}, of which the host explains {excused[words.split()[0]]:.3g}" for words in promise.broken(measured) if words not in broken]

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+What a robot did after a fault, from its own record alone.
+
+Inputs come as they acted and positions as they truly were, both in robot time. A
+ramp to rest that begins at :math:`t_0` inside the slew limits :math:`\dot u_{max}`
+ends at
+
+.. math::
+
+    t_z = t_0 + \max_i |u_i(t_0)| / \dot u_{max, i} ,
+
+so braking begins with the first step towards rest from which rest is reached about
+when the slew limits allow: slowing down along a path comes before that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rti_mpc.array import Array
+from rti_mpc.contract.guard import Limits
+from rti_mpc.contract.message import Reference
+from rti_mpc.contract.schedule import STEP_NS
+from rti_mpc_service.rig.robot_log import RobotLog
+
+STANDING_M_S = 1e-3
+AT_REST = 1e-9  # of an input, in its unit
+LATE_S = 0.02  # by which a ramp may be behind one that began in time: two steps of ten milliseconds
+SLOWER = 1.5  # times as long as the slew limits need may a ramp take that is put together of several
+RAMP_STEP = 0.09  # share of a period's change with which a ramp begins at least: a step of ten milliseconds
+FRESH_S = 0.25  # age up to which a state may be answered
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Incident:
+    """
+    When something was broken, mended and no longer looked at, in robot time.
+
+    Attributes:
+        fault_ns: Just before it was broken.
+        mend_ns: Just before it was mended.
+        end_ns: Where the look at it ends.
+    """
+
+    fault_ns: int
+    mend_ns: int
+    end_ns: int
+
+
+@dataclass(frozen=True)
+class Measured:
+    """
+    What a robot did; None for what it did not.
+
+    Attributes:
+        speed_m_s: Speed at the fault.
+        brake_s: From the fault to the first braking command.
+        zero_s: From the fault to the command that is zero, and stays so until mended.
+        still_s: From the fault to a true speed below 1 mm/s, that stays so until mended.
+        distance_m: Way from the fault to the standstill, or until mended.
+        stale: Instants at which an input acted, once at rest, that answers no state fresh when mended.
+        step_share: Largest step of an input, as a share of what it may change in a period; while braking, in any period.
+        recovery_s: From mended to the first input other than rest, or motion, whichever had ended; else to the first state that is answered.
+        missed: Samples of the controller that the robot had no command for, until mended.
+        error_m: Largest distance from the reference until mended.
+        final_error_m: Distance from the reference when mended.
+    """
+
+    speed_m_s: float
+    brake_s: float | None
+    zero_s: float | None
+    still_s: float | None
+    distance_m: float
+    stale: int
+    step_share: float
+    recovery_s: float | None
+    missed: int
+    error_m: float
+    final_error_m: float
+
+
+def measure(log: RobotLog, place: tuple[int, int], reference: Array, incident: Incident, limits: Limits) -> Measured:
+    """
+    Measure one incident.
+
+    Args:
+        log: The robot's record. It has a row between fault and mending.
+        place: Indices of the states that are the position, in m.
+        reference: Where the robot was to be at each stamp, shape ``(M, 2)``, in m.
+        incident: When it happened.
+        limits: What inputs may do.
+    """
+    t = log.stamp_ns
+    broken = (t >= incident.fault_ns) & (t <= incident.mend_ns)
+    seen = (t >= incident.fault_ns) & (t <= incident.end_ns)
+    moving: Mask = np.abs(log.u - limits.u_rest).max(axis=1) > AT_REST
+    position = log.x[:, list(place)]
+    way = np.hypot(*np.diff(position, axis=0, prepend=position[:1]).T)
+    speed: Array = way / (1e-9 * np.diff(t, prepend=t[0] - 1))
+    error = np.hypot(*(position - reference).T)[broken]
+
+    zero = settled(~moving, broken)
+    brake = None if zero is None or zero == np.argmax(broken) else braking(log, limits, int(np.argmax(broken)), zero)
+    still = settled(speed < STANDING_M_S, broken)
+    again = moving if zero is not None else speed > STANDING_M_S if still is not None else np.isfinite(log.latency_us)
+    driven = np.flatnonzero(again & seen & (t > incident.mend_ns))
+
+    def after(instant_ns: int, row: int | None) -> float | None:
+        return None if row is None else 1e-9 * float(t[row] - instant_ns)
+
+    return Measured(
+        speed_m_s=float(speed[broken][0]),
+        brake_s=after(incident.fault_ns, brake),
+        zero_s=after(incident.fault_ns, zero),
+        still_s=after(incident.fault_ns, still),
+        distance_m=float(way[broken & (still is None or t <= t[still])].sum()),
+        stale=0 if zero is None else int((moving & (t > t[zero]) & (t < fresh_ns(log, incident))).sum()),
+        step_share=max(step_share(log.u[seen], limits), 0.0 if zero is None or brake is None else ramp_share(log, limits, brake, zero)),
+        recovery_s=after(incident.mend_ns, int(driven[0])) if driven.size else None,
+        missed=len(missed_ns(log, incident, limits.dt_s)),
+        error_m=float(error.max()),
+        final_error_m=float(error[-1]),
+    )
+
+
+def positions(reference: Reference | None, columns: tuple[int, int], stamp_ns: NDArray[np.int64]) -> Array:
+    """Return where a reference wants the robot at stamps, of its columns x and y, shape ``(..., 2)``, m: at its ends beyond them; NaN without one."""
+    if reference is None:
+        return np.full((*stamp_ns.shape, 2), np.nan)
+    rows = (stamp_ns - reference.stamp_ns) / reference.period_ns
+    return np.stack([np.interp(rows, np.arange(len(reference.y)), reference.y[:, j]) for j in columns], axis=-1)
+
+
+def step(limits: Limits) -> Array:
+    """Return the largest change of each input in a period, shape ``(nu,)``."""
+    return limits.slew * limits.dt_s
+
+
+def settled(condition: Mask, window: Mask) -> int | None:
+    """Return the row from which a condition holds up to the end of a window; None if it does not hold there."""
+    rows = np.flatnonzero(window)
+    broken = np.flatnonzero(~condition[rows])
+    if not broken.size:
+        return int(rows[0])
+    return None if broken[-1] == len(rows) - 1 else int(rows[broken[-1] + 1])
+
+
+def braking(log: RobotLog, limits: Limits, first: int, zero: int) -> int:
+    """Return the row at which the ramp to rest, which ends at row `zero`, has begun; see above."""
+    t_s = 1e-9 * (log.stamp_ns - log.stamp_ns[zero])
+    left_s = (np.abs(log.u - limits.u_rest) / step(limits)).max(axis=1) * limits.dt_s
+    way = np.abs(log.u - limits.u_rest)
+    for row in range(max(first, 1), zero):
+        share = float(((way[row - 1] - way[row]) / step(limits)).max())
+        if share >= RAMP_STEP and -t_s[row - 1] <= SLOWER * left_s[row - 1] + LATE_S:
+            return row
+    return zero
+
+
+def fresh_ns(log: RobotLog, incident: Incident) -> int:
+    """Return the first stamp, of states fresh when mended, that was answered after that; the end if none was."""
+    arrival_ns = log.stamp_ns + 1e3 * log.latency_us
+    answered = log.stamp_ns[(log.stamp_ns >= incident.mend_ns - round(1e9 * FRESH_S)) & (arrival_ns >= incident.mend_ns)]
+    return int(answered[0]) if answered.size else incident.end_ns
+
+
+def step_share(u: Array, limits: Limits) -> float:
+    """Return the largest change from row to row, as a share of what it may be."""
+    return float((np.abs(np.diff(u, axis=0)) / step(limits)).max()) if len(u) > 1 else 0.0
+
+
+def ramp_share(log: RobotLog, limits: Limits, brake: int, zero: int) -> float:
+    """
+    Return the largest change in any period of a ramp to rest, as a share of what it may be.
+
+    One step less than a period, for a ramp that is told over a bus begins with the step that was due meanwhile.
+    """
+    t, share = log.stamp_ns[: zero + 1], 0.0
+    for row in range(max(brake - 1, 0), zero):
+        last = int(np.searchsorted(t, t[row] + 1e9 * limits.dt_s - STEP_NS, side="right")) - 1
+        share = max(share, float((np.abs(log.u[last] - log.u[row]) / step(limits)).max()))
+    return share
+
+
+def missed_ns(log: RobotLog, incident: Incident, dt_s: float) -> NDArray[np.int64]:
+    """Return when the samples were due that were left out between states that were answered, in robot time, shape ``(n,)``."""
+    period_ns = 1e9 * dt_s
+    near = (log.stamp_ns >= incident.fault_ns - 2 * period_ns) & (log.stamp_ns <= incident.mend_ns)
+    stamps = log.stamp_ns[near & np.isfinite(log.latency_us)]
+    silent_ns = incident.mend_ns - (stamps[-1] if stamps.size else incident.fault_ns)  # the last sample need not be over
+    gaps = np.append(np.round(np.diff(stamps) / period_ns), silent_ns // period_ns)
+    before = stamps if stamps.size else [incident.fault_ns]
+    return np.concatenate([stamp + period_ns * np.arange(1, gap) for stamp, gap in zip(before, gaps, strict=True)]).astype(np.int64)

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What time it is for the robot, how it moves, and what its controller has answered."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from threading import Thread
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.contract.message import Command, State
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, Subscriber
+from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.keys import Keys
+
+STALE_S = 0.25  # without a message after which another life is looked at
+LOOK_BACK_NS = 200_000_000  # over which speed is measured
+
+
+class Observer:
+    """
+    Follows the states of a robot at speed 1, and the commands for them.
+
+    Args:
+        bus: Ours.
+        robot: Where the robot's streams are.
+        place: Indices of the states that are its position.
+
+    Attributes:
+        epoch: Of the robot's present life, 0 before the first state.
+        answered: Sequence numbers of states of that life that a controller has answered.
+    """
+
+    def __init__(self, bus: Bus, robot: Keys, place: tuple[int, int]) -> None:
+        self._place = list(place)
+        self.epoch = 0
+        self.answered: set[int] = set()
+        self._states: deque[tuple[int, int, Array]] = deque(maxlen=4096)  # stamp, local monotonic arrival, position
+        states, commands = bus.subscriber(robot.state, capacity=RING_MESSAGES), bus.subscriber(bus.keys.command, capacity=RING_MESSAGES)
+        Thread(target=self._receive, args=(states, bus.intake(State, STALE_S)), daemon=True).start()
+        Thread(target=self._listen, args=(commands, bus.intake(Command, STALE_S)), daemon=True).start()
+
+    def forget(self) -> None:
+        """Wait for another life of the robot."""
+        self.epoch = 0
+        self._states.clear()
+        self.answered.clear()
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the last state."""
+        return self._states[-1][0]
+
+    @property
+    def position(self) -> Array:
+        """Position in the last state, shape ``(2,)``."""
+        return self._states[-1][2]
+
+    def now_ns(self) -> int:
+        """Robot time now, whether its states still come or not."""
+        stamp_ns, arrival_ns, _ = self._states[-1]
+        return stamp_ns + time.monotonic_ns() - arrival_ns
+
+    def arrival_ns(self, stamp_ns: int) -> int:
+        """Return when, by the monotonic clock, the first state of a time or later has come; if none has, when the last one has."""
+        return next((arrival_ns for stamp, arrival_ns, _ in self._states.copy() if stamp >= stamp_ns), self._states[-1][1])
+
+    def speed_m_s(self) -> float:
+        """Speed over the last states; 0 if they do not come."""
+        states = list(self._states)
+        if not states or self.now_ns() - states[-1][0] > LOOK_BACK_NS:
+            return 0.0
+        first = next(state for state in states if states[-1][0] - state[0] <= LOOK_BACK_NS)
+        return float(np.hypot(*(states[-1][2] - first[2]))) / max(1e-9 * (states[-1][0] - first[0]), 1e-3)
+
+    def _receive(self, subscriber: Subscriber, intake: Intake[State]) -> None:
+        """Note every state with the time of its arrival; a thread of its own."""
+        for received in iter(subscriber.recv, None):
+            arrival_ns = time.monotonic_ns()
+            if (state := intake.read(received)) is None:
+                continue
+            self.epoch = state.epoch
+            self._states.append((state.stamp_ns, arrival_ns, state.x[self._place]))
+
+    def _listen(self, subscriber: Subscriber, intake: Intake[Command]) -> None:
+        """Note which states were answered; a thread of its own."""
+        for received in iter(subscriber.recv, None):
+            command = intake.read(received)
+            if command is not None and command.state_epoch == self.epoch:
+                self.answered.add(command.state_seq)

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fault matrix as it grows on a terminal, and as a whole at the end."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from rich.console import Console, Group
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from rti_mpc_service.faults.measure import Measured
+from rti_mpc_service.faults.table import Fault
+from rti_mpc_service.host import machine
+from rti_mpc_service.redrawn import Redrawn
+
+COLUMNS = ("fault", "the robot", "speed\nm/s", "braking\nms", "zero\nms", "standstill\ns", "way\nm", "step\n%", "error\nmm", "recovery\ns", "kept")
+NONE = "-"
+WIDTH = 130
+
+
+@dataclass(frozen=True)
+class Row:
+    """
+    One fault and what came of it.
+
+    Attributes:
+        fault: What was done.
+        measured: What the robot did; None if nothing could be measured.
+        broken: What is not within the promise.
+        excused: What is not, either, but the host alone explains it.
+    """
+
+    fault: Fault
+    measured: Measured | None
+    broken: list[str]
+    excused: list[str] = field(default_factory=list)
+
+    @property
+    def did(self) -> str:
+        """What the robot did, in words."""
+        if (measured := self.measured) is None:
+            return "unknown"
+        if measured.zero_s is None and measured.still_s is None:
+            return "drove on"
+        words = [
+            word
+            for word, done in (("braked", measured.brake_s), ("stood", measured.still_s), ("drove again", measured.recovery_s))
+            if done is not None
+        ]
+        return ", ".join(words)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything, in JSON."""
+        return {
+            "name": self.fault.name,
+            "fault": self.fault.text,
+            "wiring": self.fault.wiring.value,
+            "promise": self.fault.promise.text,
+            "kept": not self.broken,
+            "broken": self.broken,
+            "excused": self.excused,
+            "robot": self.did,
+            **({} if self.measured is None else asdict(self.measured)),
+        }
+
+    def cells(self) -> tuple[str, ...]:
+        """Return the cells of the table."""
+        promised = self.fault.promise.at_most
+        measured, verdict = self.measured, "NO" if self.broken else "host" if self.excused else "yes"
+        if measured is None:
+            return (self.fault.name, self.did, *[NONE] * (len(COLUMNS) - 3), verdict)
+        return (
+            self.fault.name,
+            self.did,
+            f"{measured.speed_m_s:.2f}",
+            shown(measured.brake_s, 1e3, 0),
+            shown(measured.zero_s, 1e3, 0),
+            shown(measured.still_s, 1.0, 2),
+            f"{measured.distance_m:.3f}",
+            f"{100 * measured.step_share:.0f}",
+            shown(next((getattr(measured, name) for name in ("error_m", "final_error_m") if name in promised), None), 1e3, 1),
+            shown(measured.recovery_s if "recovery_s" in promised else None, 1.0, 2),
+            verdict,
+        )
+
+
+def shown(value: float | None, factor: float, digits: int) -> str:
+    """Return a number as it is shown."""
+    return NONE if value is None else f"{factor * value:.{digits}f}"
+
+
+def report_console() -> Console:
+    """Return a console, wide enough for the matrix where there is no terminal."""
+    console = Console()
+    return console if console.is_terminal else Console(width=WIDTH)
+
+
+class Report(Redrawn):
+    """
+    Shows the matrix while it grows.
+
+    Attributes:
+        rows: So far.
+    """
+
+    def __init__(self, console: Console, count: int) -> None:
+        super().__init__(console)
+        self.rows: list[Row] = []
+        self._count = count
+
+    @property
+    def kept(self) -> bool:
+        """Whether every promise was kept so far."""
+        return not any(row.broken for row in self.rows)
+
+    def say(self, fault: Fault, text: str) -> None:
+        """Tell what is going on."""
+        if self.live:
+            head = Table.grid(padding=(0, 2))
+            head.add_row(f"{len(self.rows)} of {self._count}", ProgressBar(total=self._count, completed=len(self.rows), width=32), fault.name, text)
+            self.draw(Group(self._table(), head) if self.rows else head)
+
+    def add(self, row: Row) -> None:
+        """Add a row; without a terminal, as a line."""
+        self.rows.append(row)
+        if not self.live:
+            said = "; ".join([*row.broken, *row.excused]) or "kept"
+            self.console.print(f"{len(self.rows)} of {self._count}: {row.fault.name}, the robot {row.did}: {said}", soft_wrap=True, markup=False)
+
+    def conclude(self) -> None:
+        """Print the whole, and what was not kept, or is excused."""
+        self.console.print(self._table())
+        for row in self.rows:
+            if words := [*row.broken, *row.excused]:
+                self.console.print(f"{row.fault.name}: {row.fault.promise.text}: {'; '.join(words)}", soft_wrap=True, markup=False)
+        kept = sum(not row.broken for row in self.rows)
+        about = machine.describe()
+        self.console.print(
+            f"{kept} of {len(self.rows)} within their promise; robot time at speed 1, {about['processor']}, {about['cores']} cores", soft_wrap=True
+        )
+
+    def _table(self) -> Table:
+        table = Table(box=None, padding=(0, 1))
+        for name in COLUMNS:
+            table.add_column(name, justify="left" if name in COLUMNS[:2] else "right", no_wrap=True)
+        for row in self.rows:
+            table.add_row(*(Text(cell, "red" if row.broken else "") for cell in row.cells()))
+        return table

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Injects faults into real processes, one after another, and holds what the robot did against what is promised.
+
+Systems start as `demo` starts them, at real speed. Faults of one wiring follow one
+another in one system, each once the robot is driven again; a system that breaks a
+promise ends with it.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from importlib.util import find_spec
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+
+from rti_mpc.contract.guard import Limits
+from rti_mpc.errors import ConfigError
+from rti_mpc.reference.trajectory import find_trajectory
+from rti_mpc.wire.interrupt import stop_on_signals
+from rti_mpc_service.config.build import build_model, guard_limits
+from rti_mpc_service.config.config import load
+from rti_mpc_service.config.fit import check_model, check_tree
+from rti_mpc_service.config.schema import Config
+from rti_mpc_service.faults.excuse import excuses, explained
+from rti_mpc_service.faults.measure import Incident, measure, missed_ns, positions
+from rti_mpc_service.faults.relay import ROLE as RELAY
+from rti_mpc_service.faults.report import Report, Row, report_console
+from rti_mpc_service.faults.system import HEADING, SCENARIO, System, Wiring, measured_places
+from rti_mpc_service.faults.table import FAULTS, Fault
+from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.rig.company import Failed
+from rti_mpc_service.rig.scenario import configured
+
+STATE_PERIOD_S = 0.01  # of the robot, and so of its record: what times are known to
+COMPANY = {
+    Wiring.PEERS: ("controller", "guard", "reference", "robot"),
+    Wiring.ROUTER: ("router", "controller", "guard", "reference", "robot"),
+    Wiring.LINK: (RELAY, "controller", "guard", "reference", "robot"),
+    Wiring.SENSOR: (RELAY, "controller", "guard", "reference", "robot"),
+}
+SETTLED_M = 0.001
+RECOVERY_S = 20.0
+LEFT_S = 40.0  # of reference, that a fault may take
+A_MOMENT_S = 0.3  # more, to see what comes of it
+FLUSH_S = 5.0  # for the robot to write what it knows; a line waits a second for an answer
+
+
+def main(config_path: Path, only: Sequence[str], path: Path | None) -> int:
+    """
+    Inject faults, print the matrix, and write it to a file if asked to.
+
+    Args:
+        config_path: The robot's TOML file.
+        only: Names of faults; none: all.
+        path: JSON file to write.
+
+    Returns:
+        Exit status: 0 if every promise was kept.
+
+    Raises:
+        ConfigError: A name is none, or the robot cannot be guarded or has no pose to start from.
+    """
+    faults = chosen(only)
+    config = prepared(load(config_path))
+    stop = stop_on_signals()
+    folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
+    with Host() as host, Report(console := report_console(), len(faults)) as report:
+        inject(config, faults, folder, report, stop, host)
+    report.conclude()
+    if report.kept:
+        shutil.rmtree(folder)
+    else:
+        console.print(f"what the processes said and the robot recorded: {folder}", soft_wrap=True, markup=False)
+    if path is not None:
+        path.write_text(json.dumps([row.to_json() for row in report.rows], indent=1) + "\n", encoding="utf-8")
+    return 0 if report.kept and not stop.is_set() else 1
+
+
+def chosen(only: Sequence[str]) -> list[Fault]:
+    """
+    Return faults by their names, in the order of the table.
+
+    Raises:
+        ConfigError: There is no fault of a name.
+        ModuleNotFoundError: It wants a viewer, and there is none; of all faults, those are left out.
+    """
+    names = [fault.name for fault in FAULTS]
+    if unknown := [name for name in only if name not in names]:
+        raise ConfigError(f"--only must be one of {', '.join(names)}, got {unknown[0]!r}")
+    faults = [fault for fault in FAULTS if fault.name in only or not only]
+    if find_spec("rerun") is not None:
+        return faults
+    if only and any(fault.viewer for fault in faults):
+        raise ModuleNotFoundError(name="rerun")
+    return [fault for fault in faults if not fault.viewer]
+
+
+def prepared(config: Config) -> Config:
+    """Return the configuration of a run: from the scenario's pose, guarded, with states that come fast enough to measure by."""
+    config = configured(config, find_trajectory(SCENARIO), HEADING, guard=True)
+    measured_places(build_model(config))
+    content = config.model_dump(by_alias=True, exclude_unset=True)
+    content["debug"] = {"inject": True}
+    content["sim"] = {**content.get("sim", {}), "state_period_s": min(STATE_PERIOD_S, config.ocp.dt_s)}
+    config = Config.model_validate(content)
+    check_tree(config)
+    check_model(config)
+    return config
+
+
+def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Report, stop: Event, host: Host) -> None:
+    """Inject faults until there are none left, or we are stopped."""
+    limits = guard_limits(config)
+    system: System | None = None
+    with ExitStack() as stack:
+        for number, fault in enumerate(faults):
+            if stop.is_set():
+                return
+            try:
+                if system is None or system.wiring is not fault.wiring:
+                    stack.close()
+                    report.say(fault, f"starting {fault.wiring.value}")
+                    system = stack.enter_context(System(config, fault.wiring, folder / f"{number}", stop))
+                make_ready(system, fault, report)
+                row = suffer(system, fault, limits, report, host)
+            except (Failed, ConfigError) as error:
+                row = Row(fault, None, [str(error)])
+            if stop.is_set():
+                return
+            report.add(row)
+            if row.broken:
+                stack.close()
+                system = None
+
+
+def make_ready(system: System, fault: Fault, report: Report) -> None:
+    """
+    Wait until the robot is driven, as well as the fault wants it.
+
+    Raises:
+        Failed: It is not.
+    """
+    report.say(fault, "waiting for the robot to be driven")
+    system.ensure(*COMPANY[fault.wiring], *(("viewer",) if fault.viewer else ()))
+    if system.witness.begun and system.reference_left_s() < LEFT_S:
+        system.restart("reference")
+        system.wait(lambda: system.witness.listen() and system.reference_left_s() > LEFT_S, "another reference")
+    error_m = SETTLED_M if fault.promise.on_path else np.inf
+    system.wait(lambda: system.driven(error_m), "the robot to be driven")
+
+
+def suffer(system: System, fault: Fault, limits: Limits, report: Report, host: Host) -> Row:
+    """
+    Break, wait, mend, wait, measure, and ask the host's witness.
+
+    Raises:
+        Failed: Nothing can be measured.
+    """
+    report.say(fault, fault.text)
+    before_ns = system.now_ns()
+    injected_ns = fault.inject(system)
+    fault_ns = before_ns if injected_ns is None else injected_ns
+    system.pause(fault.hold_s)
+    mend_ns, robots = max(system.now_ns(), fault_ns + round(2e9 * STATE_PERIOD_S)), system.robots
+    reference = system.witness.reference
+    report.say(fault, "waiting for the robot to recover")
+    fault.mend(system)
+    if system.robots != robots:  # another life: nothing of the last one counts
+        system.wait(lambda: system.observer.epoch, "the robot's first state")
+        fault_ns = mend_ns = 0
+    recovered(system, mend_ns)
+    system.pause(A_MOMENT_S)
+    end_ns = system.now_ns()
+    system.wait(lambda: system.logged_ns() >= end_ns, "the robot's record", FLUSH_S)
+    if system.stopped:
+        raise Failed("stopped")
+    log, incident = system.log(), Incident(fault_ns, mend_ns, end_ns)
+    measured, missed = (
+        measure(log, system.place, positions(reference, system.columns, log.stamp_ns), incident, limits),
+        missed_ns(log, incident, limits.dt_s),
+    )
+
+    def held_up_ms(from_ns: int, to_ns: int) -> float:
+        return host.held_up_ms(system.observer.arrival_ns(from_ns), system.observer.arrival_ns(to_ns))
+
+    excused = excuses(measured, missed, incident, system.period_ns, held_up_ms)
+    return Row(fault, measured, fault.promise.broken(measured, excused), explained(fault.promise, measured, excused))
+
+
+def recovered(system: System, mend_ns: int) -> None:
+    """Wait until the robot is driven by answers to its present states; if it is not, the measurement says so."""
+    try:
+        system.wait(lambda: system.driven() and system.last_sample_ns() > mend_ns, "the robot to be driven", RECOVERY_S)
+    except Failed:
+        return

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot and everybody around it, as the processes a user runs, with what it takes to break them and to see what comes of it."""
+
+from __future__ import annotations
+
+import resource
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from enum import Enum
+from pathlib import Path
+from threading import Event
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rti_mpc.contract.message import Reference
+from rti_mpc.errors import ConfigError
+from rti_mpc.reference.trajectory import Heading
+from rti_mpc.signals import plane
+from rti_mpc.wire.bus import Bus
+from rti_mpc.wire.info import Info, Label
+from rti_mpc.wire.keys import Key, Keys
+from rti_mpc.wire.session import BusSettings
+from rti_mpc_service.config import toml
+from rti_mpc_service.config.build import build_model
+from rti_mpc_service.config.schema import Config
+from rti_mpc_service.faults.measure import positions
+from rti_mpc_service.faults.observer import Observer
+from rti_mpc_service.faults.proxy import Proxy
+from rti_mpc_service.faults.relay import ROLE as RELAY
+from rti_mpc_service.rig import robot_log
+from rti_mpc_service.rig.children import Children
+from rti_mpc_service.rig.company import CLI, POLITE, Failed, wait
+from rti_mpc_service.rig.endpoint import free_endpoint
+from rti_mpc_service.rig.robot_log import RobotLog
+from rti_mpc_service.rig.witness import Witness
+
+if TYPE_CHECKING:
+    from rti_mpc.model.model import Model
+
+SCENARIO = "eight"
+HEADING: Heading = "consistent"
+REFERENCE_S = 120  # 58 kB: one packet, which a busy host does not drop half of
+PATIENCE_S = 60.0  # for processes to start and the robot to be driven; the first controller on a machine compiles
+DRIVEN_M_S = 0.1
+REQUEST_S = 2.0
+
+
+def measured_places(model: Model) -> tuple[tuple[int, int], tuple[int, int]]:
+    """
+    Return the indices of the states, and of the outputs, that are the position in the plane.
+
+    Raises:
+        ConfigError: The model has none, and what a robot does after a fault is measured by its way.
+    """
+    states, outputs = plane(model.states), plane(model.outputs)
+    if states is None or outputs is None:
+        raise ConfigError(f"model {model.name}: faults are measured by the robot's way, so states and outputs must have the roles x and y")
+    return states, outputs
+
+
+class Wiring(Enum):
+    """How the processes are linked."""
+
+    PEERS = "peers"  # each directly with each
+    ROUTER = "router"  # clients of a router, the controller through a link that can be cut
+    LINK = "link"  # peers, what the controller hears of the robot through a process that can change it
+    SENSOR = "sensor"  # the same for everybody, the guard, too
+
+
+RELAYED = (Wiring.LINK, Wiring.SENSOR)
+
+
+class System:
+    """
+    The processes of one robot, being driven.
+
+    Attributes:
+        wiring: How they are linked.
+        keys: Where everybody's streams are.
+        period_ns: Of the controller.
+        children: The processes.
+        bus: Ours, a peer among them.
+        witness: Hears the controller.
+        observer: Hears the robot.
+        link: Between controller and router, with that wiring.
+        robots: How many robots were started.
+        place: Indices of the states that are the position.
+        columns: Indices of the outputs that are.
+    """
+
+    def __init__(self, config: Config, wiring: Wiring, folder: Path, stop: Event) -> None:
+        folder.mkdir(parents=True)
+        self.keys = config.keys()
+        self.period_ns = round(1e9 * config.ocp.dt_s)
+        self.robots = 0
+        self.wiring, self._folder, self._stop = wiring, folder, stop
+        self._robot_keys = Keys(f"{self.keys.prefix}/behind", self.keys.robot) if wiring in RELAYED else self.keys
+        model = build_model(config)
+        self.place, self.columns = measured_places(model)
+        states, inputs = (tuple(Label(signal.name) for signal in signals) for signals in (model.states, model.inputs))
+        self._info = Info("robot", states=states, inputs=inputs)
+        self._suspended: set[str] = set()
+        (folder / "config.toml").write_text(toml.write(config), encoding="utf-8")
+        behind = config.model_copy(update={"prefix": self._robot_keys.prefix})
+        (folder / "robot.toml").write_text(toml.write(behind), encoding="utf-8")
+        self._endpoint = free_endpoint()
+        self.children = Children(folder)
+        try:
+            self.link = Proxy(self._endpoint)
+            if wiring is Wiring.ROUTER:
+                self.start("router")
+            client = BusSettings(mode="client", connect=(self._endpoint,))
+            settings = client if wiring is Wiring.ROUTER else BusSettings(listen=(self._endpoint,), connect=())
+            self.bus = Bus.join(settings, self.keys, timeout_s=PATIENCE_S, stop=stop)
+            self.witness = Witness(self.bus)
+            self._references = self.bus.publisher(self.keys.reference)
+            self.observer = Observer(self.bus, self._robot_keys, self.place)
+        except BaseException:
+            self.children.__exit__(None, None, None)
+            raise
+
+    def __enter__(self) -> System:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        self.resume(*self._suspended)
+        self.link.restore()
+        self.children.__exit__(kind, error, traceback)
+        self.link.close()
+        self.bus.close()
+
+    # Processes.
+
+    def start(self, *roles: str) -> None:
+        """Start processes; a robot has a new life, with a record of its own."""
+        for role in roles:
+            if role == "robot":
+                self.robots += 1
+                self.observer.forget()
+            module, *arguments = self._command(role)
+            self.children.start(role, str(module), *arguments, nice=POLITE if role == "viewer" else 0)
+
+    def kill(self, *roles: str) -> None:
+        """SIGKILL."""
+        for role in roles:
+            self.children.kill(role)
+
+    def suspend(self, *roles: str) -> None:
+        """SIGSTOP."""
+        for role in roles:
+            self.children.signal(role, signal.SIGSTOP)
+            self._suspended.add(role)
+
+    def resume(self, *roles: str) -> None:
+        """SIGCONT."""
+        for role in roles:
+            self._suspended.discard(role)
+            self.children.signal(role, signal.SIGCONT)
+
+    def restart(self, *roles: str) -> None:
+        """End processes as Ctrl-C does, and start them again."""
+        for role in roles:
+            self.children.end(role)
+            self.start(role)
+
+    def limit_files(self, size: int | None, *roles: str) -> None:
+        """Let processes write files up to a size only, in bytes, None for no limit: Python ignores the signal, and sees the write fail."""
+        for role in roles:
+            if (pid := self.children.pid(role)) is not None:
+                _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+                resource.prlimit(pid, resource.RLIMIT_FSIZE, (hard if size is None else size, hard))
+
+    def _keys_of(self, role: str) -> Keys:
+        """Return where the streams of a process are: before or behind the relay, if there is one."""
+        return self._robot_keys if role == "robot" or (role == "guard" and self.wiring is Wiring.LINK) else self.keys
+
+    def _command(self, role: str) -> tuple[object, ...]:
+        """Return module and arguments of a process."""
+        here = self._folder / ("config.toml" if self._keys_of(role) is self.keys else "robot.toml")
+        through = self.link.endpoint if self.wiring is Wiring.ROUTER and role == "controller" else self._endpoint
+        meeting: tuple[object, ...] = (here, *(("-m", "client") if self.wiring is Wiring.ROUTER else ()), "-e", through)
+        scenario = ("--scenario", SCENARIO, "--heading", HEADING, "--duration", REFERENCE_S)
+        commands: dict[str, tuple[object, ...]] = {
+            "controller": (CLI, "run", *meeting),
+            "guard": (CLI, "guard", *meeting),
+            "reference": (CLI, "reference", *meeting, *scenario),
+            "robot": (CLI, "sim", *meeting, *(() if "-m" in meeting else ("-l", "tcp/127.0.0.1:0")), "--log", self.log_path),
+            "viewer": (CLI, "view", *meeting, "--rerun-save", self._folder / "run.rrd"),
+            "router": (CLI, "router", here, "-l", self._endpoint),
+            RELAY: ("rti_mpc_service.faults.relay", self._endpoint, self._robot_keys.prefix, self.keys.prefix, self.keys.robot),
+        }
+        return commands[role]
+
+    # What is seen.
+
+    @property
+    def log_path(self) -> Path:
+        """Record of the robot's present life."""
+        return self._folder / f"robot-{self.robots}.csv"
+
+    def log(self) -> RobotLog:
+        """Return the record of the robot's present life, as far as it is written; a guard's own commands are no answers."""
+        log = robot_log.read(self.log_path, self._info)
+        return replace(log, latency_us=np.where(np.isin(log.seq, list(self.observer.answered)), log.latency_us, np.nan))
+
+    def logged_ns(self) -> int:
+        """Return the stamp of the last whole line of that record, -1 if there is none."""
+        lines = self.log_path.read_bytes().splitlines(keepends=True)[1:] if self.log_path.exists() else []
+        return next((int(line.partition(b",")[0]) for line in reversed(lines) if line.endswith(b"\n")), -1)
+
+    def now_ns(self) -> int:
+        """Robot time; a robot that is suspended or dead has none but that of its last state."""
+        alive = self.children.pid("robot") is not None and "robot" not in self._suspended
+        return self.observer.now_ns() if alive else self.observer.stamp_ns
+
+    def last_sample_ns(self) -> int:
+        """Return the stamp of the last state that the controller has answered, as far as it has told us."""
+        return self.witness.listen().telemetry[-1].state_stamp_ns
+
+    def error_m(self) -> float:
+        """Return the distance from the reference now."""
+        return float(np.hypot(*(self.observer.position - positions(self.witness.reference, self.columns, np.array(self.observer.stamp_ns)))))
+
+    def reference_left_s(self) -> float:
+        """Return how long the reference still lasts."""
+        reference = self.reference
+        return 1e-9 * (reference.stamp_ns + (len(reference.y) - 1) * reference.period_ns - self.now_ns())
+
+    def driven(self, error_m: float = np.inf) -> bool:
+        """Whether the robot is driven, and as near to its reference as told."""
+        self.witness.listen()
+        return self.witness.begun and self.observer.speed_m_s() > DRIVEN_M_S and self.error_m() < error_m
+
+    def wait(self, condition: Callable[[], object], what: str, patience_s: float = PATIENCE_S) -> None:
+        """
+        Wait for a condition, or until stopped.
+
+        Raises:
+            Failed: It did not come true in time, or a process has ended by itself.
+        """
+        wait(condition, self.children, self._stop, patience_s, what)
+
+    @property
+    def stopped(self) -> bool:
+        """Whether we are to stop."""
+        return self._stop.is_set()
+
+    def pause(self, duration_s: float) -> None:
+        """Wait for so long, or until stopped."""
+        self._stop.wait(duration_s)
+
+    def ensure(self, *roles: str) -> None:
+        """Start those that are not there, and wait until all are present."""
+        self.start(*(role for role in roles if self.children.pid(role) is None))
+        others = [role for role in roles if self._keys_of(role) is self.keys]  # a relay passes no presence on, and the robot's states tell
+        self.wait(lambda: self.witness.listen().met(set(others)), f"{', '.join(others)} to be there")
+
+    # What is said.
+
+    def refer(self, reference: Reference) -> None:
+        """Publish a reference, as another planner that takes over."""
+        reference = replace(reference, epoch=max(time.time_ns() // 1_000_000_000, self.reference.epoch + 1), seq=1)
+        self._references.put(reference)
+        self.witness.reference = reference
+
+    @property
+    def reference(self) -> Reference:
+        """The reference that is followed."""
+        assert self.witness.reference is not None
+        return self.witness.reference
+
+    def ask(self, key: Key[Any], **request: Any) -> dict[str, Any]:
+        """
+        Ask a process for something that it grants, and return its answer.
+
+        Raises:
+            Failed: It refuses, or does not answer.
+        """
+        try:
+            answer = self.bus.request(key, request, timeout_s=REQUEST_S)
+        except TimeoutError:
+            answer = {"error": f"no answer within {REQUEST_S:g} s"}
+        if answer.get("ok") is not True:
+            raise Failed(f"{key} was asked for {request}: {answer.get('error')}")
+        return answer

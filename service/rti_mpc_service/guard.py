@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The guard as a process: no model, no solver, nothing of CasADi, OSQP or SciPy.
+
+One thread waits for commands and passes them on, one waits for states, the main
+one ticks. Each holds a lock for microseconds. What the guard decides is
+`rti_mpc.contract.guard`'s.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import secrets
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from threading import Event, Lock, Thread
+
+import rti_mpc
+from rti_mpc.contract.epoch import NUMBER_BITS, epoch_above
+from rti_mpc.contract.guard import Guard
+from rti_mpc.contract.latch import Latch
+from rti_mpc.contract.message import Command, State
+from rti_mpc.errors import ConfigError
+from rti_mpc.wire import info
+from rti_mpc.wire.announcer import Announcer
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received, Subscriber, unix_s
+from rti_mpc.wire.interrupt import stop_on_signals
+from rti_mpc.wire.session import BusSettings
+from rti_mpc_service.announce import announce
+from rti_mpc_service.config.build import guard_limits
+from rti_mpc_service.config.schema import Config
+from rti_mpc_service.latch_file import LatchFile
+from rti_mpc_service.operator_stop import OperatorStop
+
+ROLE = "guard"
+HEARING_S = 0.5  # for which a starting guard listens for another
+RAMP_S = 3.0  # of a guard that is being stopped, to bring the robot to rest, at most
+
+log = logging.getLogger(ROLE)
+
+
+def main(config: Config, bus_settings: BusSettings, *, state: Path | None = None, stop: Event | None = None) -> int:
+    """
+    Guard one robot until stopped.
+
+    Args:
+        config: The robot, of whose model no more is known than its inputs' bounds.
+        bus_settings: How to join the bus.
+        state: Folder that remembers an operator's stop; None: the user's, or the service's.
+        stop: Stops the guard when set; SIGINT and SIGTERM if there is none.
+
+    Returns:
+        Exit status: 0 when stopped, 1 when another guard is there or an unforeseen error ended this one.
+
+    Raises:
+        ConfigError: The configuration has no guard, or an endpoint cannot be had.
+    """
+    if not config.guard.enabled:
+        raise ConfigError("guard.enabled must be true for the robot to take what a guard passes on, got false")
+    stop = stop or stop_on_signals()
+    with Bus.join(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
+        heard, intake = bus.subscriber(bus.keys.actuation, capacity=RING_MESSAGES), bus.intake(Command, HEARING_S, choosing=True)
+        if bus.is_alive(ROLE, HEARING_S):
+            print(f"rti-mpc: {config.robot} already has a guard: stop it first, or give this robot another name", file=sys.stderr)
+            return 1
+        known = max(unix_s() << NUMBER_BITS, intake.highest_epoch(heard.drain()))
+        epoch = epoch_above(known, secrets.randbits(NUMBER_BITS))
+        process = Process(config, bus, epoch, LatchFile(bus.keys, state))
+        bus.alive(ROLE)
+        log.info("epoch %d guards %s", epoch, config.robot)
+        return process.run(stop)
+
+
+def describe(config: Config) -> dict[str, object]:
+    """Describe a guard for ``info``: what it lets pass, per input; null where there is no limit."""
+    limits, bounds = guard_limits(config), config.ocp.bounds
+    return {
+        "role": ROLE,
+        "version": rti_mpc.__version__,
+        **info.labels(inputs=[info.Label(name) for name in bounds.inputs]),
+        **info.bounds(**{name: getattr(limits, name).tolist() for name in ("u_rest", "lbu", "ubu", "lbdu", "ubdu")}),
+        "dt_s": limits.dt_s,
+        "tick_s": config.guard.tick_s,
+        "config_hash": config.config_hash,
+    }
+
+
+class Process:
+    """One life of the guard on the bus."""
+
+    def __init__(self, config: Config, bus: Bus, epoch: int, file: LatchFile) -> None:
+        limits, keys = guard_limits(config), bus.keys
+        self._bus = bus
+        self._telling = Lock()
+        self._about = {**describe(config), "epoch": epoch}
+        self._guard = Guard(limits, epoch=epoch, config_hash=config.config_hash)
+        self._tick_s = config.guard.tick_s
+        self._lock = Lock()
+        self._crashed = Event()
+        self._announcer = Announcer(bus, ROLE, epoch)
+        self._actuation = bus.publisher(keys.actuation)
+        self._states = bus.intake(State, config.stale_s, {"u": len(limits.u_rest)})
+        bus.expect("state", lambda: self._guard.heard)
+        self._commands = bus.intake(Command, config.stale_s, {"u": len(limits.u_rest)})
+        self._operator_stop = OperatorStop(file, self._obey, self._guard.notices.append)
+        self._operator_stop.listen(bus)
+        self._operator_stop.serve(bus, lambda: ROLE, self._describe)
+        self._describe()
+        self._threads = [
+            Thread(target=self._follow, args=(act, bus.subscriber(key, capacity=RING_MESSAGES)), name=act.__name__, daemon=True)
+            for act, key in ((self._state, keys.state), (self._command, keys.command))
+        ]
+
+    def run(self, stop: Event) -> int:
+        """Guard until stopped; then tell the robot to ramp to rest, and to stand."""
+        gc.collect()
+        gc.freeze()
+        for thread in self._threads:
+            thread.start()
+        while not stop.wait(self._tick_s) and not self._crashed.is_set():
+            self._tick()
+        with self._lock:
+            self._guard.stop(time.monotonic_ns())
+        deadline_s = time.monotonic() + RAMP_S
+        while not self._guard.at_rest and time.monotonic() < deadline_s:
+            self._tick()
+            time.sleep(self._tick_s)
+        self._tick()
+        self._operator_stop.close()
+        log.info("stopped")
+        return int(self._crashed.is_set())
+
+    def _obey(self, latch: Latch) -> None:
+        """Do what an operator has asked for last."""
+        with self._lock:
+            if latch.stopped:
+                self._guard.latch(latch.reason, time.monotonic_ns())
+            else:
+                self._guard.enable()
+
+    def _describe(self) -> None:
+        """Publish what this guard is."""
+        with self._telling:
+            self._bus.publish_json(self._bus.keys.info(ROLE), {**self._about, **self._operator_stop.describe()})
+
+    def _state(self, received: Received) -> None:
+        """Take a state in."""
+        with self._lock:
+            local_ns = time.monotonic_ns()
+            if (state := self._states.read(received)) is not None:
+                self._guard.receive_state(state, local_ns)
+
+    def _command(self, received: Received) -> None:
+        """Pass a command on at once, if it is in order."""
+        command = self._commands.read(received, known=self._guard.epoch)
+        if command is None:
+            return
+        with self._lock:
+            passed = self._guard.receive_command(command, time.monotonic_ns())
+            if passed is not None:
+                self._actuation.put(passed)
+
+    def _tick(self) -> None:
+        """Look after the time, and say what there is to say."""
+        with self._lock:
+            local_ns = time.monotonic_ns()
+            told = self._guard.tick(local_ns)
+            if told is not None:
+                self._actuation.put(told)
+        stamp_ns = self._guard.robot_now_ns(local_ns)
+        while self._guard.notices:
+            notice = self._guard.notices.popleft()
+            announce(log, self._announcer, notice, stamp_ns)
+        for intake in (self._states, self._commands):
+            for refusal in intake.notices(local_ns):
+                announce(log, self._announcer, refusal, stamp_ns)
+
+    def _follow(self, act: Callable[[Received], None], subscriber: Subscriber) -> None:
+        """Run a loop; what nobody foresaw ends in a ramp to rest and a non-zero exit, for the supervisor to restart."""
+        try:
+            for received in iter(subscriber.recv, None):
+                act(received)
+        except Exception:
+            if self._bus.closed:
+                return  # under our hands: nothing of it was wanted any more
+            log.exception("stopping after an unforeseen error")
+            self._crashed.set()

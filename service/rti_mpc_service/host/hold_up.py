@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A witness of the host: how long it kept its cores from a process and all that it has started.
+
+On each core a bare timer, which computes nothing, tells when that core stood still.
+One of them adds up how long each thread of the watched processes was ready to run
+and had no core (`schedstat` in `proc(5)`). What one process waits for the next,
+so the sum over all of them bounds what a chain of them may be late by.
+
+`python -m rti_mpc_service.host.hold_up FILE CORE PID` is one such timer; a PID of 0 watches nobody.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+from rti_mpc_service.host.realtime import available
+
+TICK_NS = 2_000_000
+LATE_NS = 500_000  # from which on a tick is late: a core that sleeps deeply needs less to wake
+TICKS = 5  # a row: 10 ms
+ROWS = 10  # between two looks for new threads: 0.1 s
+LAYOUT = struct.Struct("<4q")
+PATIENCE_S = 10.0  # for the timers to have seen what is asked for
+
+
+class Row(NamedTuple):
+    """What one timer saw, ns: between two instants of the monotonic clock, by how much its ticks were late and for how long threads waited."""
+
+    since_ns: int
+    until_ns: int
+    late_ns: int
+    waited_ns: int
+
+    @property
+    def held_up_ns(self) -> int:
+        """Both."""
+        return self.late_ns + self.waited_ns
+
+
+class Host:
+    """Watches this process and all its descendants, from when it is entered until it is left."""
+
+    def __enter__(self) -> Host:
+        with ExitStack() as stack:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rti-mpc-host-")))
+            self._timers = [Timer(folder, core, os.getpid() if core == available()[0] else 0, stack) for core in available()]
+            self.held_up_ms(time.monotonic_ns(), time.monotonic_ns())
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        self._stack.close()
+
+    def held_up_ms(self, from_ns: int, to_ns: int) -> float:
+        """
+        Return for how long the host held the watched processes up in a time that has passed, all cores and threads added up, ms.
+
+        Args:
+            from_ns: From when on, by the monotonic clock.
+            to_ns: To when.
+
+        Raises:
+            TimeoutError: A timer has not come to its end within ten seconds.
+        """
+        return 1e-6 * sum(row.held_up_ns for timer in self._timers for row in timer.rows(from_ns, to_ns))
+
+    def worst_ms(self, from_ns: int, to_ns: int, within_ns: int) -> float:
+        """
+        Return for how long the host held the watched processes up at worst within some time, ms.
+
+        Args:
+            from_ns: From when on, by the monotonic clock.
+            to_ns: To when.
+            within_ns: How much time.
+
+        Raises:
+            TimeoutError: A timer has not come to its end within ten seconds.
+        """
+        rows = sorted(row for timer in self._timers for row in timer.rows(from_ns, to_ns))
+        recent, held_up_ns, worst_ns = deque[Row](), 0, 0
+        for row in rows:
+            recent.append(row)
+            held_up_ns += row.held_up_ns
+            while row.since_ns - recent[0].since_ns > within_ns:
+                held_up_ns -= recent.popleft().held_up_ns
+            worst_ns = max(worst_ns, held_up_ns)
+        return 1e-6 * worst_ns
+
+
+class Timer:
+    """A bare timer in a process of its own, and what it has written so far."""
+
+    def __init__(self, folder: Path, core: int, watched: int, stack: ExitStack) -> None:
+        self._file = stack.enter_context((folder / str(core)).open("w+b", buffering=0))
+        self._rows: list[Row] = []
+        command = [sys.executable, "-m", "rti_mpc_service.host.hold_up", str(folder / str(core)), str(core), str(watched)]
+        self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, process_group=0)
+        stack.callback(self.process.wait)
+        stack.callback(self.process.kill)
+
+    def rows(self, from_ns: int, to_ns: int) -> Iterator[Row]:
+        """Wait until it has seen a time whole, and return what it saw then, the last first."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not self._rows or self._rows[-1].until_ns < to_ns:
+            if time.monotonic() > deadline_s:
+                raise TimeoutError(f"the host's witness must tell every {1e-6 * TICKS * TICK_NS:g} ms, and was silent for {PATIENCE_S:g} s")
+            time.sleep(1e-9 * TICK_NS)
+            self._rows += map(Row._make, LAYOUT.iter_unpack(self._file.read()))  # a row is written at once
+        for row in reversed(self._rows):
+            if row.until_ns < from_ns:
+                return
+            if row.since_ns <= to_ns:
+                yield row
+
+
+class Threads:
+    """
+    All threads of a process and its descendants, but for our own, and how long each has waited for a core.
+
+    The kernel adds a wait up when it is over. One that lasts is told meanwhile, as is
+    the last one of a thread that then ends: the thread is runnable, and does not run.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._open: dict[str, Waits] = {}  # by folder in proc
+        self._looked_ns = time.monotonic_ns()
+        self.look()
+        self.waited_ns()
+
+    def look(self) -> None:
+        """Find the threads there are now."""
+        pids = [str(self._pid)] if self._pid else []
+        for pid in pids:
+            with suppress(OSError):  # it ends meanwhile
+                for thread in os.listdir(f"/proc/{pid}/task"):
+                    with open(f"/proc/{pid}/task/{thread}/children") as children:
+                        pids += [child for child in children.read().split() if int(child) != os.getpid()]
+                    folder = f"/proc/{pid}/task/{thread}"
+                    if folder not in self._open:
+                        self._open[folder] = Waits(folder)
+
+    def waited_ns(self) -> int:
+        """Return what they have waited since the last call, ns."""
+        total_ns, now_ns = 0, time.monotonic_ns()
+        for folder, waits in list(self._open.items()):
+            try:
+                total_ns += waits.since(now_ns - self._looked_ns)
+            except OSError:  # it has ended
+                waits.close()
+                del self._open[folder]
+        self._looked_ns = now_ns
+        return total_ns
+
+
+class Waits:
+    """How long one thread has waited for a core."""
+
+    def __init__(self, folder: str) -> None:
+        self._stat = f"{folder}/stat"
+        self._descriptor = os.open(f"{folder}/schedstat", os.O_RDONLY)
+        self._ran_ns = self._waited_ns = 0
+        self._told_ns = 0  # of a wait that lasts
+
+    def since(self, elapsed_ns: int) -> int:
+        """
+        Return what it has waited since the last call, so many ns ago.
+
+        Raises:
+            OSError: It has ended.
+        """
+        ran_ns, waited_ns, _ = map(int, os.pread(self._descriptor, 128, 0).split())
+        if (ran_ns, waited_ns) == (self._ran_ns, self._waited_ns):
+            with open(self._stat, "rb") as stat:
+                runnable = stat.read().rpartition(b") ")[2][:1] == b"R"
+            self._told_ns += elapsed_ns * runnable
+            return elapsed_ns * runnable
+        more_ns = max(0, waited_ns - self._waited_ns - self._told_ns)
+        self._ran_ns, self._waited_ns, self._told_ns = ran_ns, waited_ns, 0
+        return more_ns
+
+    def close(self) -> None:
+        """Let it go."""
+        os.close(self._descriptor)
+
+
+def main(path: str, core: int, pid: int) -> None:
+    """Write a row every ten milliseconds for as long as our parent lives."""
+    os.sched_setaffinity(0, {core})
+    parent, threads, number = os.getppid(), Threads(pid), 0
+    since_ns = due_ns = time.monotonic_ns()
+    with Path(path).open("ab", buffering=0) as file:
+        while os.getppid() == parent:
+            late_ns = 0
+            for _ in range(TICKS):
+                due_ns += TICK_NS
+                due_ns += max(0, time.monotonic_ns() - due_ns) // TICK_NS * TICK_NS  # those that were slept through are not made up for
+                time.sleep(max(0.0, 1e-9 * (due_ns - time.monotonic_ns())))
+                if (lateness_ns := time.monotonic_ns() - due_ns) > LATE_NS:
+                    late_ns += lateness_ns
+            if (number := number + 1) % ROWS == 0:
+                threads.look()
+            waited_ns, now_ns = threads.waited_ns(), time.monotonic_ns()
+            file.write(LAYOUT.pack(since_ns, now_ns, late_ns, waited_ns))
+            since_ns = now_ns
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))

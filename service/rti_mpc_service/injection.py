@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Failures on request, so that each rung of the ladder can be seen at work: ``debug.inject`` of the configuration.
+
+They happen where real ones do, inside the real-time iteration; the controller knows nothing of them.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.contract.status import QpStatus
+from rti_mpc.rti.rti import Rti
+
+FAILURES = {
+    "solver": "the first solver finds nothing: another one must, with softened bounds",
+    "qp": "no solver finds anything",
+    "nan_model": "the model gives NaN",
+    "over_budget": "a sample takes one and a half periods, of wall time",
+}
+PERIODS = 1.5  # that a sample over its budget takes
+MOST = 10_000  # samples of one request
+
+
+class FaultyRti(Rti):
+    """A real-time iteration that fails when it is told to."""
+
+    _failure = ""
+    _left = 0  # samples that are still to fail
+    _failing = ""  # how the present sample does
+
+    def inject(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Let the next samples fail, as a request says; answer it."""
+        failure, samples = request.get("failure"), request.get("samples", 1)
+        if failure not in FAILURES:
+            return {"ok": False, "error": f"failure must be one of {', '.join(FAILURES)}, got {failure!r}"}
+        if type(samples) is not int or not 1 <= samples <= MOST:
+            return {"ok": False, "error": f"samples must be a whole number from 1 to {MOST}, got {samples!r}"}
+        self._failure, self._left = failure, samples
+        return {"ok": True, "request": "inject", "failure": failure, "samples": samples}
+
+    def _begin(self) -> None:
+        """Begin a sample."""
+        self._failing = self._failure if self._left else ""
+        self._left = max(0, self._left - 1)
+
+    def reset(self, x0: Array, u_prev: Array) -> None:
+        """As `Rti.reset`."""
+        self._begin()
+        super().reset(x0, u_prev)
+
+    def prepare(self, y_ref: Array, p: Array | None = None, *, shift: bool = True, u_prev: Array | None = None) -> None:
+        """As `Rti.prepare`."""
+        if shift:
+            self._begin()
+        super().prepare(y_ref, np.full_like(self.p, np.nan) if self._failing == "nan_model" else p, shift=shift, u_prev=u_prev)
+
+    def feedback(self, x0: Array) -> QpStatus:
+        """As `Rti.feedback`."""
+        if self._failing == "over_budget":
+            time.sleep(PERIODS * self.ocp.dt)
+        return super().feedback(x0)
+
+    def solve(self) -> QpStatus:
+        """As `Rti.solve`."""
+        if self._failing not in ("solver", "qp"):
+            return super().solve()
+        if self.active_set is None:
+            self.use_whole_qp()
+        status = self.solve_qp() if self._failing == "solver" else QpStatus.INFEASIBLE
+        if not status.usable:
+            self.keep_guess()
+        return status
+
+
+def answer(rti: Rti, request: dict[str, Any]) -> dict[str, Any]:
+    """Answer a request for failures, whether they are enabled or not."""
+    if isinstance(rti, FaultyRti):
+        return rti.inject(request)
+    return {"ok": False, "error": "inject must be enabled in the configuration, with debug.inject = true, got false"}

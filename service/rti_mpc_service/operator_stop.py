@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+An operator's stop in one process: obeyed, told, stored, and answered on a key of its own.
+
+Controllers, those that stand by, and guards each have one. It takes requests,
+hears in the descriptions of the others what it has missed, and obeys at once;
+a thread of its own stores each change, since a disk may be slow or full.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import asdict
+from datetime import UTC, datetime
+from threading import Condition, Lock, Thread
+from typing import Any
+
+from rti_mpc.contract.latch import Latch, merge, read_latch, shown
+from rti_mpc.contract.message import Notice, Severity
+from rti_mpc.errors import ConfigError, MessageError
+from rti_mpc.wire import info
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received
+from rti_mpc_service.latch_file import LatchFile
+
+REQUESTS = ("stop", "enable")
+OPERATOR = "an operator"
+MAX_NAME = 100  # characters of who asks
+STORING_S = 0.5  # that an answer waits for the disk
+RETRY_S = 10.0  # between two attempts to store
+
+log = logging.getLogger("stop")
+
+
+class OperatorStop:
+    """
+    The latch of one process.
+
+    Attributes:
+        latch: What holds now.
+    """
+
+    def __init__(self, file: LatchFile, obey: Callable[[Latch], None], say: Callable[[Notice], None]) -> None:
+        """
+        Read the file, obey, and say what it says.
+
+        Args:
+            file: Where the latch outlives the process.
+            obey: Stops or releases; must not block.
+            say: Publishes a notice.
+        """
+        self._file = file
+        self._obey = obey
+        self._say = say
+        self._role: Callable[[], str] = lambda: ""
+        self._tell: Callable[[], None] = lambda: None
+        self._changing = Lock()
+        self._storing = Condition()
+        self._attempted, self._fault = Latch(), ""  # the last latch that was to be stored, and why it could not be
+        self.latch, complaint = file.read()
+        if complaint:
+            log.warning("%s: taken as a stop", complaint)
+        if self.latch.stopped:
+            log.warning("%s; `rti-mpc enable` releases it", self.latch)
+            obey(self.latch)
+        if obstacle := file.obstacle():
+            say(Notice(Severity.WARNING, "stop_not_stored", f"a stop will be forgotten with the last process of this robot: {obstacle}"))
+        self._attempted = self.latch
+        Thread(target=self._store, name="stop_stored", daemon=True).start()
+
+    def describe(self) -> dict[str, Any]:
+        """Return the latch as a part of the description of this process."""
+        return info.latch(asdict(self.latch))
+
+    def listen(self, bus: Bus) -> None:
+        """Take over from now on what others describe."""
+        subscriber = bus.subscriber(bus.keys.infos, capacity=RING_MESSAGES)
+
+        def follow() -> None:
+            for received in iter(subscriber.recv, None):
+                try:
+                    self._overhear(received)
+                except Exception:  # of whatever a change sets in motion: a bus that refuses to tell it, say
+                    if bus.closed:
+                        return
+                    log.exception("%s: what it says was obeyed, and then an unforeseen error", received.key)
+
+        Thread(target=follow, name="stop_heard", daemon=True).start()
+
+    def serve(self, bus: Bus, role: Callable[[], str], tell: Callable[[], None]) -> None:
+        """
+        Answer on the bus from now on.
+
+        Args:
+            bus: The bus.
+            role: Returns which role this process plays.
+            tell: Publishes the description of this process.
+        """
+        self._role, self._tell = role, tell
+        bus.serve(bus.keys.stop, self.answer)
+
+    def answer(self, request: dict[str, Any]) -> dict[str, Any]:
+        """
+        Stop or release the robot, or hear that somebody else has been asked to; then store it, as far as that does not take long.
+
+        Raises:
+            ConfigError: It is no such request.
+            MessageError: Its latch is none.
+        """
+        what = request.get("request")
+        if what not in REQUESTS:
+            raise ConfigError(f"request must be stop or enable, got {shown(what)}")
+        if "latch" in request:
+            self.hear(read_latch(request["latch"]))
+        else:
+            by = request.get("by", OPERATOR)
+            if not (isinstance(by, str) and 0 < len(by) <= MAX_NAME and by.isprintable()):
+                raise ConfigError(f"by must be printable, of at most {MAX_NAME} characters, got {shown(by)}")
+            self._take(lambda known: known.change(stopped=what == "stop", reason=f"asked for by {by}", when=now()))
+        fault = self._stored(STORING_S)
+        latch = self.latch
+        answer = {"ok": latch.stopped == (what == "stop"), "request": what, "role": self._role(), "latch": asdict(latch)}
+        if not answer["ok"]:
+            answer["error"] = f"not any more: {latch}"
+        return answer | ({"not_stored": fault} if fault else {})
+
+    def hear(self, heard: Latch) -> None:
+        """Take over another's latch, if it is greater."""
+        self._take(lambda known: merge(known, heard))
+
+    def close(self) -> None:
+        """Give the disk the time it needs, up to a limit."""
+        self._stored(STORING_S)
+
+    def _take(self, change: Callable[[Latch], Latch]) -> None:
+        """Obey a change, then tell it, then have it stored."""
+        with self._changing:
+            latch = change(self.latch)
+            if latch == self.latch:
+                return
+            self._obey(latch)
+            self.latch = latch
+            try:
+                self._tell()
+            finally:  # it is stored though it cannot be told
+                with self._storing:
+                    self._storing.notify_all()
+
+    def _overhear(self, received: Received) -> None:
+        """Look at a description of anybody's; in a thread of its own, which nothing that is heard may end."""
+        try:
+            told = info.latches(received)
+        except MessageError:
+            return  # others say so, who want more of it
+        try:
+            for latch in told:
+                self.hear(read_latch(latch))
+        except MessageError as error:
+            self._say(Notice(Severity.WARNING, "latch_refused", f"{received.key}: {error}"))
+
+    def _stored(self, patience_s: float) -> str:
+        """Wait until the latch was to be stored, and return why it could not be; empty if it was."""
+        with self._storing:
+            if not self._storing.wait_for(lambda: self._attempted >= self.latch, patience_s):
+                return f"it was not yet after {patience_s:g} s"
+            return self._fault
+
+    def _store(self) -> None:
+        """Store what changes, and try again what could not be."""
+        while True:
+            with self._storing:
+                self._storing.wait_for(lambda: self._attempted < self.latch, RETRY_S if self._fault else None)
+            latch, before, fault = self.latch, self._fault, ""
+            try:
+                self._file.write(latch)
+            except OSError as error:
+                fault = f"{self._file.path}: {error.strerror}" if self._file.path else str(error.strerror)
+            with self._storing:
+                self._attempted, self._fault = latch, fault
+                self._storing.notify_all()
+            if fault and fault != before:
+                self._say(Notice(Severity.WARNING, "stop_not_stored", f"{latch} could not be stored: {fault}"))
+            elif before and not fault:
+                self._say(Notice(Severity.INFO, "stop_stored", f"{latch} is stored now, in {self._file.path}"))
+
+
+def now() -> str:
+    """Return UTC time as a latch holds it."""
+    return f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"

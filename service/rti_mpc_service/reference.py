@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+A reference source as a process: one trajectory, anchored to the robot's clock.
+
+It waits for a state, publishes the whole reference from that state's stamp on,
+and again for every robot that starts anew. Whoever joins late gets the last
+one, for as long as the source lives. A second robot of the name, or a forged
+state, gets none while the first one lives.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from threading import Event
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.contract.lives import Heard, Lives
+from rti_mpc.contract.message import Notice, Reference, Severity, State
+from rti_mpc.reference.trajectory import Heading, Trajectory, rows
+from rti_mpc.signals import POSE, Role
+from rti_mpc.wire.announcer import Announcer
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
+from rti_mpc.wire.interrupt import stop_on_signals
+from rti_mpc.wire.keys import Keys
+
+ROLE = "reference"
+LOOK_S = 0.02  # between two looks at the robot: waking for every state would take a core from those who control
+LOOK_AGAIN_NS = 500_000_000  # after which it is looked whether the robot was restarted
+STALE_S = 1.0  # silence of the robot, and time for which another one is heard alone, after which the reference is anchored to that one
+
+logger = logging.getLogger(ROLE)
+
+
+def main(
+    trajectory: Trajectory,
+    bus_settings: BusSettings,
+    keys: Keys,
+    *,
+    heading: Heading = "consistent",
+    a: float | None = 0.2,
+    psi0: float | None = None,
+    roles: Sequence[Role] = POSE,
+    period_s: float = 0.05,
+    parameters: Callable[[Array], Array] | None = None,
+    stop: Event | None = None,
+) -> int:
+    """
+    Publish a reference until stopped.
+
+    Args:
+        trajectory: What to follow, see `rti_mpc.reference.trajectory.find_trajectory`.
+        bus_settings: How to join the bus.
+        keys: Where its streams are.
+        heading: ``"tangent"``, ``"consistent"``, or ``"none"`` for a controller without weight on it.
+        a: Distance of the reference point ahead of the axle, in m; None: on it.
+        psi0: Initial consistent heading of an open path, in rad.
+        roles: Of the model's outputs, in their order.
+        period_s: Time between rows; the receiver interpolates, on the eight within 0.02 mm.
+        parameters: Stage parameters at times since the start, in s: of shape ``(M,)`` to ``(M, np)``; the model's nominal ones if left out.
+        stop: Stops the source when set; SIGINT and SIGTERM if there is none.
+
+    Returns:
+        How many robots the reference was anchored to.
+
+    Raises:
+        ConfigError: The heading or a number is out of range.
+        OcpError: No consistent heading repeats on this closed path.
+    """
+    y = rows(trajectory, period_s, heading, a, psi0, roles)
+    p: Array = np.empty((len(y), 0)) if parameters is None else parameters(period_s * np.arange(len(y), dtype=np.float64))
+    stop = stop or stop_on_signals()
+    with Bus.join(bus_settings, keys, stop=stop, say=logger.warning) as bus:
+        source = Source(bus, trajectory, y, p, round(1e9 * period_s))
+        bus.alive(ROLE)
+        logger.info("%s, heading %s, for %s", trajectory.name, heading, keys.robot)
+        while not stop.wait(LOOK_S):
+            source.look()
+    return source.anchored
+
+
+class Source:
+    """
+    Anchors rows to every new life of the robot.
+
+    Attributes:
+        anchored: How many robots the reference was anchored to.
+    """
+
+    def __init__(self, bus: Bus, trajectory: Trajectory, y: Array, p: Array, period_ns: int) -> None:
+        self.anchored = 0
+        self._trajectory = trajectory
+        self._y, self._p = y, p
+        self._period_ns = period_ns
+        self._epoch = time.time_ns() // 1_000_000_000
+        self._publisher = bus.publisher(bus.keys.reference)
+        self._announcer = Announcer(bus, ROLE, self._epoch)
+        self._bus = bus
+        self._states: Subscriber | None = None
+        self._look_again_ns = 0
+        self._intake = bus.intake(State, STALE_S)
+        self._lives = Lives(STALE_S, STALE_S)
+        bus.expect("state", lambda: self.anchored)
+
+    def look(self) -> None:
+        """
+        Publish if a robot has started since the last look.
+
+        One state now and then tells, and more where there may be more than one
+        robot. A subscription in between would wake this process at every state,
+        while robot and controller want the processor.
+        """
+        now_ns = time.monotonic_ns()
+        if self._states is None:
+            if now_ns < self._look_again_ns:
+                return
+            self._states = self._bus.subscriber(self._bus.keys.state, capacity=RING_MESSAGES)
+        state = None
+        for state in self._intake.newest_of_each(self._states.drain()):
+            if self._lives.hear(state.epoch, now_ns) is Heard.BEGINS:
+                self._anchor(state.stamp_ns)
+        if state is not None and self._lives.rival is None:
+            self._states = None
+            self._look_again_ns = now_ns + LOOK_AGAIN_NS
+        for notice in self._intake.notices(now_ns):
+            self._announcer.say(notice, 0 if state is None else state.stamp_ns)
+
+    def _anchor(self, stamp_ns: int) -> None:
+        """Publish the reference from a time on."""
+        self.anchored += 1
+        self._publisher.put(Reference(self._epoch, self.anchored, stamp_ns, self._period_ns, self._trajectory.end, self._y, self._p))
+        text = f"{self._trajectory.name} for {self._trajectory.duration_s:.1f} s from {1e-9 * stamp_ns:.3f} s of the robot on"
+        self._announcer.say(Notice(Severity.INFO, "reference_published", text), stamp_ns)
+        logger.info("%s", text)

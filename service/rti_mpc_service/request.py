@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An operator's request to the processes of one robot, the answer printed."""
+
+from __future__ import annotations
+
+import getpass
+import json
+import os
+import socket
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rti_mpc.contract.latch import Latch, read_latch
+from rti_mpc.errors import ConfigError, MessageError
+from rti_mpc.wire.bus import RETRY_S, Bus, BusSettings
+from rti_mpc.wire.keys import Keys
+from rti_mpc_service.config import toml
+from rti_mpc_service.latch_file import LatchFile
+from rti_mpc_service.operator_stop import MAX_NAME, now
+
+ASKED_S = 0.7  # until a stop is asked for again: who acts may hang, and another take over
+GUARD, LEADER = "guard", "controller"  # roles of those who may act
+
+
+def main(bus_settings: BusSettings, keys: Keys, request: str, timeout_s: float, **details: Any) -> int:
+    """
+    Ask, and print the acknowledgement.
+
+    Args:
+        bus_settings: How to join the bus.
+        keys: Which robot.
+        request: What is asked for, such as ``"params"``.
+        timeout_s: How long to wait for an answer.
+        details: The rest of the request.
+
+    Returns:
+        Exit status: 0 if it was granted, 1 if it was refused or nobody answered.
+    """
+    answer = ask(bus_settings, keys, {"request": request, **details}, timeout_s)
+    if answer is not None:
+        print(json.dumps(answer))
+    return int(answer is None)
+
+
+def ask(bus_settings: BusSettings, keys: Keys, request: dict[str, Any], timeout_s: float) -> dict[str, Any] | None:
+    """Return the answer if the request was granted; otherwise say why not, and return None."""
+    with Bus.join(bus_settings, keys, timeout_s=timeout_s) as bus:
+        try:
+            answer = bus.request(keys.request, request, timeout_s)
+        except TimeoutError:
+            answer = {"error": f"{keys.robot} has no controller that answers within {timeout_s} s: nothing was changed"}
+    if answer.get("ok") is True:
+        return answer
+    print(f"rti-mpc: {answer.get('error', 'refused without a reason')}", file=sys.stderr)
+    return None
+
+
+def stop_or_enable(bus_settings: BusSettings, keys: Keys, what: str, timeout_s: float, *, guarded: bool, state: Path | None) -> int:
+    """
+    Stop or release a robot, and print the answer of whoever acts: the guard of one that is guarded, else the controller that leads.
+
+    Args:
+        bus_settings: How to join the bus.
+        keys: Which robot.
+        what: ``"stop"`` or ``"enable"``.
+        timeout_s: How long to wait for that answer.
+        guarded: Whether the robot takes what a guard passes on.
+        state: Folder in which it is noted where nobody answers; None: the user's.
+
+    Returns:
+        Exit status: 0 if whoever acts has confirmed, else 1.
+
+    Raises:
+        ConfigError: The bus cannot be joined.
+    """
+    answers: dict[str, dict[str, Any]] = {}
+    acting = GUARD if guarded else LEADER
+    try:
+        with Bus.join(bus_settings, keys, timeout_s=timeout_s) as bus:
+            for answer in asked_again(bus, {"request": what, "by": operator()}, timeout_s):
+                answers[str(answer.get("role", "somebody"))] = answer
+                if answers.get(acting, {}).get("ok") is True:
+                    break
+    except ConfigError as error:  # no router, for one
+        raise ConfigError(f"{error}; nobody was asked to {what}; {noted(LatchFile(keys, state), what)}") from error
+    confirmed = [role for role, answer in answers.items() if answer.get("ok") is True]
+    if acting in confirmed:
+        print(json.dumps(answers[acting]))
+        if fault := answers[acting].get("not_stored"):
+            print(f"rti-mpc: the {acting} obeys, but will have forgotten it after a restart: {fault}", file=sys.stderr)
+        return 0
+    print(
+        f"rti-mpc: {keys.robot}: the {acting} has not confirmed {what} within {timeout_s:g} s; {' and '.join(confirmed) or 'nobody'} has",
+        *(f"{role}: {answer['error']}" for role, answer in answers.items() if "error" in answer),
+        *([] if answers else [noted(LatchFile(keys, state), what)]),
+        sep="; ",
+        file=sys.stderr,
+    )
+    return 1
+
+
+def asked_again(bus: Bus, request: dict[str, Any], timeout_s: float) -> Iterator[dict[str, Any]]:
+    """Yield answers to one request, which is asked again until the time is over; those who know of it by then are not to do it twice."""
+    deadline_s = time.monotonic() + timeout_s
+    latch = Latch()
+    while (left_s := deadline_s - time.monotonic()) > 0.0:
+        again = {"latch": asdict(latch)} if latch.counter else {}
+        for answer in bus.answers(bus.keys.stop, request | again, min(ASKED_S, left_s)):
+            yield answer
+            with suppress(MessageError):
+                latch = max(latch, read_latch(answer.get("latch")))
+        time.sleep(min(RETRY_S, left_s))
+
+
+def noted(file: LatchFile, what: str) -> str:
+    """Note what nobody has confirmed for those who are started later, and say so."""
+    latch, _ = file.read()
+    changed = latch.change(stopped=what == "stop", reason=f"asked for by {operator()}", when=now())
+    try:
+        if changed != latch or file.path is None:
+            file.write(changed)
+    except OSError as error:
+        return f"it could not be noted either: {error.strerror}"
+    return f"what is started later with {file.path} is {changed}"
+
+
+def operator() -> str:
+    """Return who asks."""
+    try:
+        name = getpass.getuser()
+    except (KeyError, OSError):  # no name for this user
+        name = str(os.getuid())
+    return f"{name}@{socket.gethostname()}"[:MAX_NAME]
+
+
+def params(bus_settings: BusSettings, keys: Keys, words: Sequence[str], timeout_s: float) -> int:
+    """
+    Print parameters as lines of TOML, or change them.
+
+    Args:
+        bus_settings: How to join the bus.
+        keys: Which robot.
+        words: ``get`` and keys, or what they begin with, all if there are none; or ``set`` and ``KEY=VALUE`` each.
+        timeout_s: How long to wait for an answer.
+
+    Returns:
+        Exit status: 0 if it was granted, 1 if it was refused or nobody answered.
+
+    Raises:
+        ConfigError: The words are none of these.
+    """
+    action, *wanted = words
+    if action == "set":
+        return main(bus_settings, keys, "params", timeout_s, set=assigned(wanted))
+    if action != "get":
+        raise ConfigError(f"params must be followed by get or set, got {action}")
+    answer = ask(bus_settings, keys, {"request": "params", "get": True}, timeout_s)
+    if answer is None:
+        return 1
+    values = {key: value for key, value in answer["values"].items() if not wanted or any(f"{key}.".startswith(f"{want}.") for want in wanted)}
+    if not values:
+        print(f"rti-mpc: {' '.join(wanted)} must be among {', '.join(answer['values'])}", file=sys.stderr)
+        return 1
+    print(f"# version {answer['version']}{'' if answer['live'] else ', fixed: params.live is false'}")
+    for key, value in values.items():
+        print(f"{key} = {toml.text(value)}" if value is not None else f"# {key} is left to its default")
+    return 0
+
+
+def assigned(assignments: Sequence[str]) -> dict[str, Any]:
+    """
+    Read ``KEY=VALUE`` as a line of TOML each.
+
+    Raises:
+        ConfigError: One is none.
+    """
+    values = {}
+    for assignment in assignments:
+        key, _, value = assignment.partition("=")
+        try:
+            (values[key.strip()],) = toml.read(f"value = {value}").values()
+        except (ConfigError, ValueError):
+            raise ConfigError(f"params must be set by KEY=VALUE, the value as in the file, got {assignment}") from None
+    return values

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Supervision of the processes of a run: waiting for them, and noticing that one has ended by itself."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from threading import Event
+
+from rti_mpc_service.rig.children import Children
+
+CLI = "rti_mpc_service.cli"  # module of the command line, as children are started with it
+POLITE = 10  # niceness of those who only watch
+LOOK_S = 0.05  # between two looks at a condition
+
+
+class Failed(Exception):
+    """The run cannot go on; says why."""
+
+
+def wait(condition: Callable[[], object], children: Children, stop: Event, patience_s: float, what: str) -> None:
+    """
+    Wait for a condition, or until stopped.
+
+    Raises:
+        Failed: It did not come true in time, or a process has ended by itself.
+    """
+    deadline_s = time.monotonic() + patience_s
+    while not condition() and not stop.is_set():
+        check(children)
+        if time.monotonic() > deadline_s:
+            raise Failed(f"waited {patience_s:g} s for {what} in vain, see {children.folder}")
+        stop.wait(LOOK_S)
+
+
+def check(children: Children) -> None:
+    """
+    Look after everybody.
+
+    Raises:
+        Failed: A process has ended by itself.
+    """
+    if name := children.ended():
+        said = children.log(name).read_text(encoding="utf-8", errors="replace").splitlines()
+        raise Failed(f"the {name} has ended by itself, see {children.log(name)}" + (f": {said[-1]}" if said else ""))

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run on one page: path, tracking error, commands against their limits, phase times against the period."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from rti_mpc_service.outline import outline, placed
+from rti_mpc_service.rig.run_data import Run
+
+INK, GRID, SHADE = "#2b303b", "#dfe3ea", "#e6eaf2"
+REFERENCE, MEASURED, COMMAND, LIMIT, ERROR = "#9aa3b2", "#2f6fd0", "#e08a1e", "#c8404a", "#b8377e"
+PHASES = {"prepare": "#4c9f6b", "feedback": "#e08a1e", "latency": "#7a5cc9"}
+FLOOR_MM = 1e-4  # drawn for anything closer: a logarithm has no zero
+LOOK: Any = {
+    "font.size": 9.5,
+    "font.family": "DejaVu Sans",
+    "axes.edgecolor": "#b4bac6",
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": GRID,
+    "grid.linewidth": 0.7,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "lines.linewidth": 1.5,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+}
+
+
+def figure(run: Run, path: Path) -> None:
+    """
+    Draw a run; without path and error where the model has no position.
+
+    Args:
+        run: At least one state and one sample.
+        path: Image to write; its suffix is the format.
+    """
+    nu = len(run.info.inputs)
+    with mpl.rc_context(LOOK):
+        page = Figure(figsize=(13.0, 7.6), layout="constrained")
+        FigureCanvasAgg(page)
+        panels: list[Callable[[Axes, Run], None]] = [*(partial(_command, i=i) for i in range(nu)), _phases]
+        if run.info.position is None:
+            grid = page.add_gridspec(1 + nu, 1, height_ratios=[*[1.0] * nu, 1.3])
+            places = [grid[k, 0] for k in range(1 + nu)]
+        else:
+            grid = page.add_gridspec(2 + nu, 2, width_ratios=[1.0, 1.15], height_ratios=[1.3, *[1.0] * nu, 1.3])
+            _path(page.add_subplot(grid[:, 0]), run)
+            panels, places = [_error, *panels], [grid[k, 1] for k in range(2 + nu)]
+        first: Axes | None = None
+        for draw, place in zip(panels, places, strict=True):
+            axes = page.add_subplot(place, sharex=first)
+            first = first or axes
+            draw(axes, run)
+            axes.tick_params(labelbottom=draw is _phases)
+        axes.set_xlabel("robot time [s]")
+        axes.set_xlim(0.0, run.time_s[-1])
+        page.savefig(path, dpi=130)
+
+
+def _path(axes: Axes, run: Run) -> None:
+    """Draw the plane, equal axes, with the robot where it started and where it ended."""
+    axes.plot(*run.reference.T, color=REFERENCE, linewidth=5.0, alpha=0.55, solid_capstyle="round", label="reference")
+    axes.plot(*run.position.T, color=MEASURED, label="robot, true position")
+    if run.info.heading is not None:
+        for row, alpha in ((0, 0.5), (-1, 1.0)):
+            pose = (*run.position[row], run.x[row, run.info.heading])
+            for polygon in outline(run.info.model):
+                axes.fill(*placed(polygon, *pose).T, facecolor=SHADE, edgecolor=INK, linewidth=1.0, alpha=alpha, zorder=1)
+    axes.plot(*run.position[0], "o", color=MEASURED, markerfacecolor="white", zorder=4, label="start")
+    axes.plot(*run.position[-1], "o", color=MEASURED, zorder=4, label="end")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.08)
+    axes.set(title=f"Path: {run.scenario}", xlabel="x [m]", ylabel="y [m]")
+    axes.legend(loc="upper center", ncols=4, bbox_to_anchor=(0.5, -0.07))
+
+
+def _error(axes: Axes, run: Run) -> None:
+    """Draw the error on a logarithmic scale, which shows transient and steady tracking alike."""
+    axes.axvspan(0.0, min(run.transient_s, run.time_s[-1]), color=SHADE, label="transient")
+    axes.semilogy(run.time_s, np.maximum(run.error_mm, FLOOR_MM), color=ERROR, linewidth=1.2)
+    settled = run.error_mm[run.settled]
+    if settled.size:
+        label = f"after the transient: max {settled.max():.3g} mm, rms {np.sqrt((settled**2).mean()):.3g} mm"
+        axes.axhline(settled.max(), color=ERROR, linewidth=0.9, linestyle="--", label=label)
+    axes.set(title="Tracking error", ylabel="distance [mm]")
+    _legend_above(axes)
+
+
+def _command(axes: Axes, run: Run, i: int) -> None:
+    """Draw an input as the steps it is, between its limits, and the speed it is about."""
+    label, measured = run.info.inputs[i], run.info.measured(i)
+    for bound in (run.info.lbu[i], run.info.ubu[i]):
+        if np.isfinite(bound):
+            axes.axhline(bound, color=LIMIT, linewidth=1.0, linestyle="--")
+    axes.step(run.time_s, run.u_applied[:, i], where="post", color=COMMAND, label=f"{label.name}, applied")
+    if measured is not None:
+        axes.plot(run.time_s, run.x[:, measured], color=MEASURED, linewidth=1.2, label=f"{run.info.states[measured].name}, true")
+    axes.plot([], [], color=LIMIT, linewidth=1.0, linestyle="--", label="limits")
+    axes.margins(y=0.12)
+    axes.set(title=f"Command {label.name}", ylabel=f"[{label.unit}]")
+    _legend_above(axes)
+
+
+def _phases(axes: Axes, run: Run) -> None:
+    """Draw phase times on a logarithmic scale, for the period is far away."""
+    for name, color in PHASES.items():
+        values = getattr(run, f"{name}_us")
+        median, p99 = np.percentile(values, [50, 99])
+        label = f"{name}: median {median:.0f}, p99 {p99:.0f} us"
+        axes.semilogy(run.sample_time_s, values, ".", color=color, markersize=2.2, alpha=0.6)
+        axes.plot([], [], "o", color=color, markersize=4, label=label)
+        axes.axhline(median, color=color, linewidth=0.9)
+        axes.axhline(p99, color=color, linewidth=0.9, linestyle=":")
+    axes.axhline(run.period_us, color=LIMIT, linewidth=1.2, linestyle="--", label=f"period at speed {run.speed:g}: {run.period_us:.0f} us")
+    axes.set(title="Phase times (lines: median, dotted p99)", ylabel="[us]", ylim=(None, 30 * run.period_us))
+    axes.legend(loc="upper right", ncols=2)
+
+
+def _legend_above(axes: Axes) -> None:
+    """Put the legend beside the title, where it covers nothing."""
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=3, borderaxespad=0.0, borderpad=0.2)

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The record a simulated robot keeps of itself, as arrays: the truth a controller is judged by."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rti_mpc.array import Array
+from rti_mpc.wire.info import Info
+
+COUNTERS = ("lost", "late", "expired", "refused", "starved")
+
+
+@dataclass(frozen=True, eq=False)
+class RobotLog:
+    """
+    One row a state of the robot.
+
+    Attributes:
+        stamp_ns: Stamps, robot time, shape ``(M,)``.
+        seq: Sequence numbers, shape ``(M,)``.
+        x: True states, shape ``(M, nx)``.
+        u: Inputs that acted up to the stamps, shape ``(M, nu)``.
+        latency_us: From a state sent to the first command answering it received, NaN where none came, shape ``(M,)``.
+        counters: What became of commands, at the last row.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    seq: NDArray[np.int64]
+    x: Array
+    u: Array
+    latency_us: Array
+    counters: dict[str, int]
+
+    def part(self, rows: NDArray[np.bool_]) -> RobotLog:
+        """Return some of the rows, with the counters of the whole."""
+        return RobotLog(self.stamp_ns[rows], self.seq[rows], self.x[rows], self.u[rows], self.latency_us[rows], self.counters)
+
+
+def read(path: Path, info: Info) -> RobotLog:
+    """
+    Read the record of a robot.
+
+    Args:
+        path: CSV file, see `rti_mpc_sim.log`.
+        info: Names of states and inputs.
+    """
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+
+    def numbers(names: Sequence[str]) -> Array:
+        return np.array([[float(row[name] or "nan") for name in names] for row in rows]).reshape(len(rows), len(names))
+
+    return RobotLog(
+        stamp_ns=np.array([int(row["stamp_ns"]) for row in rows], dtype=np.int64),
+        seq=np.array([int(row["seq"]) for row in rows], dtype=np.int64),
+        x=numbers([label.name for label in info.states]),
+        u=numbers([label.name for label in info.inputs]),
+        latency_us=numbers(["latency_us"])[:, 0],
+        counters={name: int(rows[-1][name]) if rows else 0 for name in COUNTERS},
+    )

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a run was worth, in numbers, and whether it kept its promises.
+
+Errors are distances of the plant's true position from the analytic trajectory at
+the same stamp, at every state after the transient. Bounds are compared here, with
+what was commanded and what acted, by code that shares nothing with the solver.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.contract.message import Event, Severity, Telemetry
+from rti_mpc.contract.status import Mode
+from rti_mpc.reference.trajectory import Trajectory
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.wire.info import Info
+from rti_mpc_service.rig.robot_log import RobotLog
+from rti_mpc_service.rig.run_data import Run
+
+TRANSIENT_S = 20.0
+DRIVING = (Mode.TRACKING, Mode.HOLDING)
+ERRORS = ("max_error_mm", "rms_error_mm", "last_lap_max_error_mm", "final_error_mm", "final_speed_mm_s")
+ROUNDING = 1e-9  # of a difference of two inputs; bounds themselves are compared exactly
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """
+    All that is known of a run.
+
+    Attributes:
+        trajectory: What was to be followed.
+        anchor_ns: When it began, robot time.
+        duration_s: How long it was to be followed.
+        speed: Robot seconds in a second.
+        ocp: The controller's problem, with its bounds.
+        info: Names of its vectors.
+        log: The robot's record.
+        telemetry: One a sample.
+        unheard: Samples whose telemetry was lost.
+        events: What went wrong, and mode changes.
+        echo_us: Round trips of the bare echo.
+    """
+
+    trajectory: Trajectory
+    anchor_ns: int
+    duration_s: float
+    speed: float
+    ocp: Ocp
+    info: Info
+    log: RobotLog
+    telemetry: Sequence[Telemetry]
+    unheard: int
+    events: Sequence[Event]
+    echo_us: Sequence[float]
+
+    @property
+    def end_ns(self) -> int:
+        """When it was to end, robot time."""
+        return self.anchor_ns + round(1e9 * self.duration_s)
+
+    @property
+    def samples(self) -> list[Telemetry]:
+        """The samples whose states lie between anchor and end."""
+        return [sample for sample in self.telemetry if self.anchor_ns <= sample.state_stamp_ns <= self.end_ns]
+
+    @property
+    def driven(self) -> bool:
+        """Whether the robot was driven to the end: it got there, and a plan for the reference was acting."""
+        reached = self.log.stamp_ns.size > 0 and self.log.stamp_ns[-1] >= self.end_ns
+        return bool(reached and self.samples and self.samples[-1].mode in DRIVING and self._until_the_end())
+
+    def _until_the_end(self) -> bool:
+        """Whether the last sample is about the end."""
+        return self.end_ns - self.samples[-1].state_stamp_ns < 2.5e9 * self.ocp.dt
+
+    def run(self) -> Run:
+        """Return the part between anchor and end, as figures are drawn from; samples whose command never arrived are left out."""
+        log = self.log.part((self.anchor_ns <= self.log.stamp_ns) & (self.log.stamp_ns <= self.end_ns))
+        latency_us = dict(zip(log.seq.tolist(), log.latency_us.tolist(), strict=True))
+        answered = [sample for sample in self.samples if np.isfinite(latency_us.get(sample.state_seq, np.nan))]
+        return Run(
+            info=self.info,
+            scenario=self.trajectory.name,
+            stamp_ns=log.stamp_ns,
+            x=log.x,
+            u_applied=log.u,
+            reference=self.trajectory.position(np.asarray(1e-9 * (log.stamp_ns - self.anchor_ns))),
+            sample_stamp_ns=np.array([sample.stamp_ns for sample in answered], dtype=np.int64),
+            prepare_us=np.array([sample.prepare_us for sample in answered]),
+            feedback_us=np.array([sample.feedback_us for sample in answered]),
+            latency_us=np.array([latency_us[sample.state_seq] for sample in answered]),
+            speed=self.speed,
+            transient_s=min(TRANSIENT_S, self.duration_s / 2),
+        )
+
+
+def summarize(outcome: Outcome) -> dict[str, Any]:
+    """
+    Sum a run up, in JSON.
+
+    Lengths in mm, times in the unit of the name. Of a share of the period, the
+    samples the controller skipped are part.
+    """
+    run, samples, counters = outcome.run(), outcome.samples, outcome.log.counters
+    if not run.stamp_ns.size or not samples:
+        return {"scenario": run.scenario, "driven": False, "samples": 0, "events": faults(outcome.events)}
+    skipped = samples[-1].skipped - samples[0].skipped
+    misses = [sample for sample in samples if sample.slack_s < 0.0]
+    return {
+        "scenario": run.scenario,
+        "driven": outcome.driven,
+        "duration_s": outcome.duration_s,
+        "transient_s": run.transient_s,
+        "speed": outcome.speed,
+        "states": len(run.stamp_ns),
+        "samples": len(samples),
+        **errors(run, outcome.trajectory.lap_s),
+        "in_period_share": (len(samples) - len(misses)) / (len(samples) + skipped),
+        "misses": [
+            {
+                "at_s": 1e-9 * (sample.state_stamp_ns - outcome.anchor_ns),
+                "slack_s": sample.slack_s,
+                "prepare_us": sample.prepare_us,
+                "feedback_us": sample.feedback_us,
+                "latency_us": sample.latency_us,
+            }
+            for sample in misses
+        ],
+        "skipped": skipped,
+        "fallbacks": samples[-1].fallbacks,
+        **{name: counters[name] for name in ("lost", "late", "expired", "refused", "starved")},
+        "unheard": outcome.unheard,
+        **limits(outcome, samples),
+        "prepare_us": quantiles(run.prepare_us),
+        "feedback_us": quantiles(run.feedback_us),
+        "latency_us": quantiles(run.latency_us),
+        "echo_us": quantiles(np.array(outcome.echo_us)),
+        "events": faults(outcome.events),
+    }
+
+
+def errors(run: Run, lap_s: float | None) -> dict[str, float | None]:
+    """Sum up the distance from the reference, and the speed in the end; null where the run did not get so far, or the model has no position."""
+    if run.info.position is None:
+        return dict.fromkeys(ERRORS)
+    settled = run.error_mm[run.settled]
+    last_lap = run.error_mm[run.time_s >= run.time_s[-1] - lap_s] if lap_s and run.time_s[-1] - lap_s >= run.transient_s else settled[:0]
+    steps_mm, steps_s = 1e3 * np.hypot(*np.diff(run.position, axis=0).T), np.diff(run.time_s)
+    numbers = (
+        float(settled.max()) if settled.size else None,
+        float(np.sqrt((settled**2).mean())) if settled.size else None,
+        float(last_lap.max()) if last_lap.size else None,
+        float(run.error_mm[-1]),
+        float(steps_mm[-1] / steps_s[-1]) if steps_s.size else None,
+    )
+    return dict(zip(ERRORS, numbers, strict=True))
+
+
+def limits(outcome: Outcome, samples: Sequence[Telemetry]) -> dict[str, Any]:
+    """Compare every row commanded, the steps between them, every input that acted and every true state with the bounds."""
+    ocp, log = outcome.ocp, outcome.log
+    commanded = np.vstack([sample.u for sample in samples])
+    steps = np.vstack([np.diff(sample.u, axis=0) for sample in samples])
+    return {
+        "commanded_inputs_in_bounds": not beyond(commanded, ocp.lbu, ocp.ubu).any(),
+        "commanded_increments_in_bounds": not (beyond(steps, ocp.lbdu, ocp.ubdu) > ROUNDING).any(),
+        "applied_inputs_in_bounds": not beyond(log.u, ocp.lbu, ocp.ubu).any(),
+        "states_over_share": float(over_share(log.x, ocp.lbx, ocp.ubx).max()),
+    }
+
+
+def beyond(values: Array, lower: Array, upper: Array) -> Array:
+    """Return by how much values, shape ``(M, n)``, are outside their bounds, shape ``(n,)``; 0 inside, exactly."""
+    return np.asarray(np.maximum(np.maximum(values - upper, lower - values), 0.0))
+
+
+def over_share(values: Array, lower: Array, upper: Array) -> Array:
+    """Return the same as a share of the bound that is broken; of the other one where that is 0."""
+    above, below = np.maximum(values - upper, 0.0), np.maximum(lower - values, 0.0)
+    size = np.where(above > 0.0, np.abs(upper), np.abs(lower))
+    other = np.where(above > 0.0, np.abs(lower), np.abs(upper))
+    outside: Array = above + below
+    return np.asarray(np.divide(outside, np.where(size > 0.0, size, other), out=np.zeros_like(outside), where=outside > 0.0))
+
+
+def quantiles(values: Array) -> dict[str, float | None]:
+    """Return median, 99th percentile and maximum; null where there is nothing."""
+    if not values.size:
+        return {"p50": None, "p99": None, "max": None}
+    return {name: round(float(np.percentile(values, share)), 1) for name, share in (("p50", 50), ("p99", 99), ("max", 100))}
+
+
+def faults(events: Sequence[Event]) -> list[dict[str, Any]]:
+    """Return the events that are not news only."""
+    return [
+        {"at_s": 1e-9 * event.stamp_ns, "source": event.source, "severity": event.severity.name, "code": event.code, "text": event.text}
+        for event in events
+        if event.severity is not Severity.INFO
+    ]

@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A reference for any model: a wave in every output, from the outputs of a state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rti_mpc.array import Array
+from rti_mpc.rti.ocp import Ocp
+
+WAVE_S = 40.0  # period of the reference, s
+
+
+def wave(ocp: Ocp, x: Array, rng: np.random.Generator) -> Callable[[NDArray[np.int64]], Array]:
+    """Return a reference that leaves a state, shape ``(nx,)``, in a wave of every output: stages, shape ``(M,)``, to rows, ``(M, ny)``."""
+    model = ocp.model
+    phases = rng.uniform(-np.pi, np.pi, model.ny)
+    start = np.array([x[[state.name for state in model.states].index(y.name)] if y in model.states else 0.0 for y in model.outputs])
+    return lambda k: np.asarray(start + np.sin(2 * np.pi / WAVE_S * ocp.dt * k[:, None] + phases) - np.sin(phases))

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Somebody who listens to a run and remembers it: what was said about every sample, and what went wrong."""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+
+from rti_mpc.contract.message import Event, Reference, Telemetry
+from rti_mpc.errors import MessageError
+from rti_mpc.wire.bus import RING_MESSAGES, Bus
+from rti_mpc.wire.info import Info
+from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.streams import admitted
+
+CAPACITY = 4096  # samples between two looks: seconds, at any rate
+STALE_S = 60.0  # one life of each process is a run
+
+
+class Witness:
+    """
+    Collects telemetry, events and the reference.
+
+    Attributes:
+        telemetry: One a sample.
+        events: In the order they came.
+        reference: The last one, with its real stamp.
+        info: The controller's description of itself.
+        lives: Roles that are present now.
+    """
+
+    def __init__(self, bus: Bus) -> None:
+        self.telemetry: list[Telemetry] = []
+        self.events: list[Event] = []
+        self.reference: Reference | None = None
+        self.info: Info | None = None
+        self.lives: set[str] = set()
+        self._bus = bus
+        self._samples, self._samples_in = bus.subscriber(bus.keys.telemetry, capacity=CAPACITY), bus.intake(Telemetry, STALE_S)
+        self._references, self._references_in = bus.subscriber(bus.keys.reference, capacity=RING_MESSAGES), bus.intake(Reference, STALE_S)
+        self._events, self._events_in = bus.subscriber(bus.keys.events, capacity=CAPACITY), dict[str, Intake[Event]]()
+        self._infos = bus.subscriber(bus.keys.info("controller"), capacity=RING_MESSAGES)
+        bus.watch_alive(self._notice)
+
+    @property
+    def lost(self) -> int:
+        """Samples nobody told us about."""
+        return self._samples_in.source.lost
+
+    @property
+    def begun(self) -> bool:
+        """Whether the robot is being driven."""
+        return bool(self.telemetry) and self.reference is not None
+
+    def met(self, roles: set[str]) -> bool:
+        """Whether these are present, and the controller has told who it is."""
+        return roles <= self.lives and self.info is not None
+
+    def listen(self) -> Witness:
+        """Take in what has come since the last call."""
+        now_ns = time.monotonic_ns()
+        for received in self._samples.drain():
+            if (sample := self._samples_in.accept(received, now_ns)) is not None:
+                self.telemetry.append(sample)
+        self.reference = self._references_in.newest(self._references.drain(), now_ns) or self.reference
+        for received in self._infos.drain():
+            with suppress(MessageError):
+                self.info = Info.from_received(received)
+        for received in self._events.drain():
+            if not admitted(received.key, self._events_in):
+                continue
+            if received.key not in self._events_in:
+                self._events_in[received.key] = self._bus.intake(Event, STALE_S)
+            if (event := self._events_in[received.key].accept(received, now_ns)) is not None:
+                self.events.append(event)
+        return self
+
+    def _notice(self, role: str, present: bool) -> None:
+        """Note who comes and goes; called in a thread of the bus."""
+        if admitted(role, self.lives):
+            (self.lives.add if present else self.lives.discard)(role)

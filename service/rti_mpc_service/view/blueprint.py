@@ -1,0 +1,270 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the viewer shows where, and what each entity looks like."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from rti_mpc.array import Array
+from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.wire.info import Info
+from rti_mpc_service.outline import outline
+
+TIMELINE = "robot_time"
+TRAIL_S = 90.0
+WINDOW_S = (-60.0, 15.0)  # around now; the legend lies on what is yet to come
+HALF_FIELD = 0.52  # tangent of half the viewer's vertical field of view
+GRID_M = 0.5
+MARGIN_M = 0.35  # a robot around a reference
+
+COLORS = {
+    "reference": (150, 156, 168),
+    "measured": (86, 160, 255),
+    "command": (255, 176, 59),
+    "actuation": (38, 128, 118),
+    "limit": (226, 86, 86),
+    "error": (240, 110, 170),
+    "prepare": (124, 200, 124),
+    "feedback": (255, 176, 59),
+    "latency": (170, 140, 245),
+    "body": (70, 78, 96),
+    "obstacle": (74, 40, 44),
+    "wheel": (112, 120, 138),
+    "edge": (200, 206, 218),
+    "idle": (110, 116, 128),
+    "good": (72, 160, 96),
+    "warning": (222, 160, 40),
+    "bad": (214, 70, 70),
+}
+PHASES = ("prepare", "feedback", "latency")
+RUNGS = {"softened": "measured", "shifted": "warning", "braked": "bad", "rested": "latency"}  # of the ladder of fallbacks, as telemetry counts them
+MODES = dict(zip(Mode, ("idle", "idle", "good", "good", "warning", "warning", "bad"), strict=True))
+STATUSES = dict(zip(QpStatus, ("good", "warning", "warning", "warning", "bad", "bad", "idle"), strict=True))
+LANES: dict[str, dict[Any, str]] = {"guard": MODES, "mode": MODES, "status": STATUSES}  # a leader is any epoch
+
+
+@dataclass(frozen=True)
+class Frame:
+    """
+    What is seen of the plane.
+
+    Attributes:
+        center: In m.
+        half: Half of its sides, in m.
+    """
+
+    center: tuple[float, float] = (0.0, 0.0)
+    half: tuple[float, float] = (1.0, 1.0)
+
+    @classmethod
+    def around(cls, xy: Array) -> Frame:
+        """Frame points, shape ``(M, 2)``, to a tenth of a metre, so that it does not follow every change of them."""
+        low, high = xy.min(axis=0), xy.max(axis=0)
+        (x, y), (w, h) = (0.5 * (low + high)).round(1).tolist(), (0.5 * (high - low)).round(1).tolist()
+        return cls((x, y), (w, h))
+
+    @property
+    def eye_height(self) -> float:
+        """How far above the plane to look from, in m, for a view wider than high."""
+        return (max(self.half[1], self.half[0] / 1.3) + MARGIN_M) / HALF_FIELD
+
+
+def blueprint(info: Info, frame: Frame | None = None) -> rrb.Blueprint:
+    """
+    Lay the views out.
+
+    Args:
+        info: Names: which state belongs beside which command, whether there is a plane to look at.
+        frame: What to see of the plane.
+    """
+    series: list[rrb.View | rrb.Container] = [
+        *(_commands(info, i) for i in range(len(info.inputs))),
+        _errors(info),
+        _times(info),
+    ]
+    states = _series("States", ["state/**"])
+    estimated = [_series("Disturbances", ["disturbance/**"])] if info.disturbances else []
+    tabs: list[rrb.View | rrb.Container] = [states, *estimated, _troubles()]
+    left = rrb.Vertical(*tabs) if info.position is None else rrb.Tabs(_world(frame or Frame()), *tabs)
+    lanes = rrb.StateTimelineView(origin="/lane", name="Modes, QP status and who leads", time_view=_time_axis())
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(left, rrb.Vertical(*series, row_shares=[4] * len(info.inputs) + [3, 3]), column_shares=[1, 1]),
+            rrb.Horizontal(lanes, _events(), column_shares=[1, 2]),
+            row_shares=[8, 3],
+        ),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def _world(frame: Frame) -> rrb.Spatial3DView:
+    """Look from above, y up: a plain 2D view would draw y down."""
+    x, y = frame.center
+    start = rrb.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S)
+    trail = rrb.VisibleTimeRanges([rrb.VisibleTimeRange(TIMELINE, start=start, end=rrb.TimeRangeBoundary.cursor_relative())])
+    return rrb.Spatial3DView(
+        origin="/world",
+        name=f"From above, y up, grid {GRID_M:g} m",
+        background=(16, 18, 22),
+        line_grid=rrb.LineGrid3D(visible=True, spacing=GRID_M, stroke_width=0.5, color=(255, 255, 255, 28)),
+        eye_controls=rrb.EyeControls3D(position=(x, y - 0.01, frame.eye_height), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)),
+        overrides={"world/trail": [trail]},
+    )
+
+
+def _time_axis() -> rrb.TimeAxis:
+    boundaries = (rrb.TimeRangeBoundary.cursor_relative(seconds=seconds) for seconds in WINDOW_S)
+    return rrb.TimeAxis(view_range=rr.TimeRange(*boundaries))
+
+
+def _series(
+    name: str, contents: list[str], axis_y: rrb.ScalarAxis | None = None, overrides: Mapping[Any, rr.SeriesLines] | None = None
+) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=[f"+ /{path}" for path in contents],
+        name=name,
+        axis_x=_time_axis(),
+        axis_y=axis_y,
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightBottom),
+        overrides=overrides,
+    )
+
+
+def _commands(info: Info, i: int) -> rrb.TimeSeriesView:
+    """Show a command between its limits, what a guard let through, and the measured state it is about."""
+    name, k = info.inputs[i].name, info.measured(i)
+    measured = {} if k is None else {f"state/{info.states[k].name}": _line("measured", "measured")}
+    return _series(f"Command {info.inputs[i]}", [f"actuation/{name}", f"command/{name}/**", *measured], overrides=measured)
+
+
+def _errors(info: Info) -> rrb.TimeSeriesView:
+    if info.tracked_position is not None:
+        return _series("Tracking error [mm]", ["error/position"])
+    return _series("Tracking error", [f"error/{info.outputs[i].name}" for i, _ in info.tracked])
+
+
+def _times(info: Info) -> rrb.Container:
+    """Show what a sample costs, and what it leaves of the period."""
+    period_ms = 1e3 * info.dt_s
+    axis = rrb.ScalarAxis(range=(-0.1 * period_ms, 1.2 * period_ms)) if period_ms > 0 else None
+    return rrb.Horizontal(
+        _series("Phase times [us]", [f"telemetry/{name}_us" for name in PHASES]),
+        _series(f"Left of the {period_ms:g} ms period [ms]" if axis else "Left of the period [ms]", ["slack/**"], axis),
+    )
+
+
+def _troubles() -> rrb.Container:
+    """Show what was sent instead of a plan, and how long a state takes to act."""
+    return rrb.Vertical(
+        _series("Samples since start, softened or without a plan of their own", [f"telemetry/{rung}" for rung in RUNGS]),
+        _series("From a state to the act of its command [s]", ["telemetry/delay_s", "telemetry/state_age_s"]),
+        name="Fallbacks and delay",
+    )
+
+
+def _events() -> rrb.TextLogView:
+    kinds = rrb.encodings.TextLogColumnKind
+    columns = [rrb.encodings.TextLogColumn(kind, visible=kind is not kinds.EntityPath) for kind in kinds]
+    return rrb.TextLogView(origin="/event", name="Events", columns=rrb.TextLogColumns(text_log_columns=columns))
+
+
+class Strip(NamedTuple):
+    """How a polyline in the plane looks; heights, in m, say what lies on top of what."""
+
+    color: str
+    width: float
+    z: float
+
+
+STRIPS = {
+    "world/reference": Strip("reference", 5.0, 0.0),
+    "world/trail": Strip("measured", 2.0, 0.004),
+    "world/horizon": Strip("command", 4.0, 0.02),
+}
+LEGEND = {"reference": "reference", "driven": "measured", "planned": "command"}
+OBSTACLE_Z = -0.004  # [m], below everything
+FARTHEST = 1e38  # m, within single precision, in which Rerun draws
+CIRCLE: Array = np.column_stack([np.cos(angles := np.linspace(0, 2 * np.pi, 48, endpoint=False)), np.sin(angles)])
+ROBOT_Z = 0.008  # [m], between trail and horizon
+
+
+def looks(info: Info) -> dict[str, rr.AsComponents]:
+    """Return what does not change about a recording, by entity."""
+    return _series_looks(info) | _lane_looks() | ({} if info.position is None else _world_looks(info))
+
+
+def legend(frame: Frame) -> rr.Points3D:
+    """Return what tells the lines in the plane apart, at the bottom of what is seen."""
+    (x, y), reach = frame.center, HALF_FIELD * frame.eye_height
+    xy = np.array([(x + shift * reach, y - 0.88 * reach) for shift in (-0.6, 0.0, 0.6)])
+    return rr.Points3D(
+        lifted(xy, 0.0), labels=list(LEGEND), show_labels=True, colors=[COLORS[color] for color in LEGEND.values()], radii=rr.Radius.ui_points(4.0)
+    )
+
+
+def lifted(xy: Array, z: float) -> Array:
+    """Return points in the plane, shape ``(..., 2)``, at a height, shape ``(..., 3)``; those beyond single precision where that ends."""
+    return np.concatenate([np.clip(xy, -FARTHEST, FARTHEST), np.full((*xy.shape[:-1], 1), z)], axis=-1)
+
+
+def _series_looks(info: Info) -> dict[str, rr.AsComponents]:
+    looks: dict[str, rr.AsComponents] = {f"state/{label.name}": _line(str(label), "measured") for label in info.states}
+    looks |= {f"disturbance/{label.name}": _line(str(label), "error") for label in info.disturbances}
+    for label, low, high in zip(info.inputs, info.lbu, info.ubu, strict=True):
+        looks[f"actuation/{label.name}"] = _line("let through", "actuation", 6.0, rr.components.InterpolationMode.StepAfter)
+        looks[f"command/{label.name}"] = _line("command", "command", interpolation=rr.components.InterpolationMode.StepAfter)
+        said = f"±{high:g}" if low == -high else f"{low:g} to {high:g}"
+        limits = _line(f"limits {said}", "limit", 1.0)  # of one name: one entry of the legend, and the scale of a plot too low for ticks
+        looks |= {f"command/{label.name}/{side}": limits for side in ("min", "max")}
+    looks |= {f"error/{info.outputs[i].name}": _line(str(info.outputs[i]), "error") for i, _ in info.tracked}
+    looks |= {f"telemetry/{phase}_us": _line(phase, phase) for phase in PHASES}
+    looks |= {f"telemetry/{rung}": _line(rung, color) for rung, color in RUNGS.items()}
+    looks |= {"telemetry/delay_s": _line("delay", "measured"), "telemetry/state_age_s": _line("age of the state", "idle")}
+    looks |= {"error/position": _line("position [mm]", "error"), "slack": _line("left", "feedback"), "slack/period": _line("period", "limit", 1.0)}
+    return looks
+
+
+def _lane_looks() -> dict[str, rr.AsComponents]:
+    looks: dict[str, rr.AsComponents] = {}
+    for lane, values in LANES.items():
+        names, colors = [value.name for value in values], [COLORS[color] for color in values.values()]
+        looks[f"lane/{lane}"] = rr.StateConfiguration(values=names, labels=names, colors=colors)
+    return looks
+
+
+def _world_looks(info: Info) -> dict[str, rr.AsComponents]:
+    looks: dict[str, rr.AsComponents] = {"world": rr.ViewCoordinates.RIGHT_HAND_Z_UP}
+    for path, strip in STRIPS.items():
+        looks[path] = rr.LineStrips3D.from_fields(colors=COLORS[strip.color], radii=rr.Radius.ui_points(strip.width / 2))
+    for k, polygon in enumerate(outline(info.model) if info.heading is not None else []):
+        edge = lifted(np.vstack([polygon, polygon[:1]]), ROBOT_Z + 0.002)
+        looks[f"world/robot/part_{k}"] = _filled(polygon, ROBOT_Z - 0.001 * (k > 0), COLORS["wheel" if k else "body"])
+        looks[f"world/robot/part_{k}/edge"] = rr.LineStrips3D([edge], colors=COLORS["edge"], radii=rr.Radius.ui_points(0.75))
+    for i in range(len(info.obstacles)):  # of radius 1 m: where each is, and its radius, come with the samples
+        looks[f"world/obstacle_{i}/disc"] = _filled(CIRCLE, OBSTACLE_Z, COLORS["obstacle"])
+        looks[f"world/obstacle_{i}/edge"] = rr.LineStrips3D(
+            [lifted(np.vstack([CIRCLE, CIRCLE[:1]]), OBSTACLE_Z)], colors=COLORS["limit"], radii=rr.Radius.ui_points(0.75)
+        )
+    looks["world/robot/point"] = rr.Points3D([[0.0, 0.0, 0.02]], colors=COLORS["measured"], radii=rr.Radius.ui_points(3.0))
+    return looks
+
+
+def _line(name: str, color: str, width: float = 1.5, interpolation: rr.components.InterpolationMode | None = None) -> rr.SeriesLines:
+    return rr.SeriesLines(names=name, colors=COLORS[color], widths=width, interpolation_mode=interpolation)
+
+
+def _filled(polygon: Array, z: float, color: tuple[int, int, int]) -> rr.Mesh3D:
+    """Return a polygon that its first corner sees whole as a fan of triangles."""
+    fan = [(0, k, k + 1) for k in range(1, len(polygon) - 1)]
+    return rr.Mesh3D(vertex_positions=lifted(polygon, z), triangle_indices=fan, vertex_colors=[color] * len(polygon))

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All streams of one robot, drained together and placed on its timeline."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Event, Notice, State
+from rti_mpc.errors import MessageError
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received
+from rti_mpc.wire.info import Info
+from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.keys import Key
+from rti_mpc.wire.streams import Stream, admitted, role_of
+from rti_mpc_service.view.playback import Actuation
+from rti_mpc_service.view.recording import Entry
+from rti_mpc_service.view.timeline import Timeline
+
+CAPACITY = 2048  # messages a stream may be ahead of us: 2 s at 1 kHz
+STALE_S = 2.0
+
+Door = Intake[Any]
+
+
+class Listener:
+    """
+    Subscriptions to everything a viewer draws.
+
+    What waits to be drained waits in rings that drop the oldest; the holes this
+    leaves in the sequence numbers are counted. Nothing a peer sends raises.
+
+    Attributes:
+        received: Messages accepted.
+    """
+
+    def __init__(self, bus: Bus, capacity: int = CAPACITY) -> None:
+        keys = bus.keys
+        self._actuation = keys.actuation
+        self.received = 0
+        self._bad_infos = 0
+        self._timeline = Timeline()
+        self._bus = bus
+        self._doors: dict[str, Door] = {}
+        self._events: set[str] = set()  # keys of events
+        self._described: set[str] = set()  # keys of descriptions
+        self._infos = bus.subscriber(keys.infos, capacity=RING_MESSAGES)
+        heard: tuple[Key[Any], ...] = (keys.state, keys.reference, keys.anchored, keys.command, keys.actuation, keys.telemetry, keys.events)
+        self._streams = [(key.stream, bus.subscriber(key, capacity=capacity)) for key in heard]
+
+    @property
+    def lost(self) -> int:
+        """Messages that never came, or that our rings dropped."""
+        return sum(door.source.lost for door in self._doors.values())
+
+    @property
+    def refused(self) -> int:
+        """Payloads that were no message of ours."""
+        return self._bad_infos + sum(door.refused.total() for door in self._doors.values())
+
+    @property
+    def now_ns(self) -> int:
+        """Where the newest state lies on the robot's timeline."""
+        return self._timeline.now_ns
+
+    def own(self, notice: Notice) -> Entry:
+        """Return an event of our own, as of now."""
+        return Entry(self.now_ns, Event(0, 0, self.now_ns, "viewer", notice.severity, notice.code, notice.text))
+
+    def drain(self) -> list[Entry]:
+        """Everything received since the last call, states first, for they move the timeline."""
+        now_ns = time.monotonic_ns()
+        entries = [*self._descriptions(), *self._messages(now_ns)]
+        self.received += len(entries)
+        return [*entries, *self._notices(now_ns)]
+
+    def _descriptions(self) -> Iterator[Entry]:
+        """Yield the last one of every role."""
+        infos: dict[str, Info] = {}
+        for received in self._infos.drain():
+            try:
+                info = Info.from_received(received)
+            except MessageError:
+                self._bad_infos += 1
+                continue
+            if admitted(received.key, self._described):
+                self._described.add(received.key)
+                infos[received.key] = info
+        for info in infos.values():
+            yield Entry(self._timeline.now_ns, info)
+
+    def _messages(self, now_ns: int) -> Iterator[Entry]:
+        for stream, subscriber in self._streams:
+            for received in subscriber.drain():
+                door = self._door(stream, received)
+                message = None if door is None else door.accept(received, now_ns)
+                if message is None:
+                    continue
+                if isinstance(message, State):
+                    yield Entry(self._timeline.place_state(message.epoch, message.stamp_ns), message)
+                elif received.key == self._actuation:
+                    yield Entry(self._timeline.place(message.stamp_ns), Actuation(message))
+                elif message.stamp_ns != STAMP_ON_ARRIVAL:  # such a reference follows with its real stamp
+                    yield Entry(self._timeline.place(message.stamp_ns), message)
+
+    def _door(self, stream: Stream[Any], received: Received) -> Door | None:
+        """Return the door of a key; None for one role too many of those that send events."""
+        key, cls = received.key, stream.message
+        if cls is not None and key not in self._doors and (not stream.by_role or admitted(key, self._events)):
+            self._doors[key] = self._bus.intake(cls, STALE_S, unfit=partial(_foreign, role_of(key)))
+            if stream.by_role:
+                self._events.add(key)
+        return self._doors.get(key)
+
+    def _notices(self, now_ns: int) -> Iterator[Entry]:
+        """Show what the doors have to say as events of our own."""
+        for door in self._doors.values():
+            for notice in door.notices(now_ns):
+                yield self.own(notice)
+
+
+def _foreign(role: str, message: Any) -> str:
+    """Say that an event tells another source than its key does."""
+    return "foreign_source" if isinstance(message, Event) and message.source != role else ""

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where entries leave the viewer process: a file or a viewer, each with a queue and a thread of its own, so that a hung one delays nobody."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import socket
+import threading
+import uuid
+from collections import deque
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import rerun as rr
+
+from rti_mpc.contract.message import Notice, Reference, Severity
+from rti_mpc.errors import ConfigError
+from rti_mpc.wire.info import Info
+from rti_mpc_service.view.recording import Entry, Recording
+
+APPLICATION = "rti_mpc"
+CAPACITY = 8192  # entries; some 50 MB of long horizons
+FILE_PERIOD_S = 1.0  # fewer, larger chunks: a recording that opens fast
+VIEWER_PERIOD_S = 1 / 15
+FILE_FLUSH_S = 10.0
+FILE_CLOSE_S = 5.0  # a recording is worth waiting for; milliseconds where the disk works
+VIEWER_FLUSH_S = 2.0
+VIEWER_CLOSE_S = 0.5
+PROBE_S = 0.2  # Rerun itself waits 5 s for a viewer that is not there
+
+log = logging.getLogger(__name__)
+
+
+class Unavailable(Exception):
+    """There is nobody to connect to, for now."""
+
+
+class Outlet:
+    """
+    Drop-oldest queue in front of one Rerun stream, and the thread that empties it.
+
+    A stream that fails is given up and opened again; the new one is told the
+    present info and reference first, then what the queue still holds.
+
+    Attributes:
+        name: For the log.
+        dropped: Entries the queue had no room for.
+        failures: Streams given up.
+        notices: What went wrong since the owner last emptied it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        open_stream: Callable[[], rr.RecordingStream],
+        *,
+        period_s: float = VIEWER_PERIOD_S,
+        flush_s: float = VIEWER_FLUSH_S,
+        close_s: float = VIEWER_CLOSE_S,
+        capacity: int = CAPACITY,
+        epitaph: Callable[[], str] = lambda: "given up, what it had not taken is lost",
+    ) -> None:
+        self.name = name
+        self.dropped = 0
+        self.failures = 0
+        self.notices: deque[Notice] = deque(maxlen=16)
+        self._open_stream = open_stream
+        self._period_s = period_s
+        self._flush_s = flush_s
+        self._close_s = close_s
+        self._epitaph = epitaph  # of a stream that failed
+        self._queue: deque[Entry] = deque(maxlen=capacity)
+        self._context: dict[str, Entry] = {}
+        self._missed = 0
+        self._lock = threading.Lock()
+        self._recording: Recording | None = None
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"outlet {name}", daemon=True)
+        self._thread.start()
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a stream."""
+        return self._recording is not None
+
+    def offer(self, entries: Iterable[Entry]) -> None:
+        """Queue entries, at the expense of the oldest. Never waits for the stream."""
+        with self._lock:
+            missed = self._missed
+            for entry in entries:
+                if isinstance(entry.message, Info | Reference):
+                    self._context[entry.message.role if isinstance(entry.message, Info) else ""] = entry
+                self._missed += len(self._queue) == self._queue.maxlen
+                self._queue.append(entry)
+            self.dropped += self._missed - missed
+
+    def close(self) -> bool:
+        """Write what is queued and end the stream, within a bounded time; return whether nothing was lost on the way."""
+        self._closing.set()
+        self._thread.join(min(self._close_s, VIEWER_CLOSE_S) if self.failures else self._close_s)
+        return not (self._thread.is_alive() or self._queue or self.dropped or self.failures)
+
+    def _run(self) -> None:
+        while not self._closing.wait(self._period_s):
+            self._pump()
+        self._pump()
+        if self._recording is not None:
+            self._recording.finish()
+            self._recording.stream.disconnect()
+
+    def _pump(self) -> None:
+        """Send what is queued, through a new stream if the last one failed."""
+        try:
+            new = self._recording is None
+            if self._recording is None:
+                self._recording = Recording(self._open_stream())
+                log.info("%s: open", self.name)
+            self._recording.send(self._take(new))
+            self._recording.stream.flush(timeout_sec=self._flush_s)
+        except Unavailable:
+            return
+        except RuntimeError as error:
+            self.failures += 1
+            self._note("outlet_failed", f"{self._epitaph()}: {error}")
+            self._give_up()
+
+    def _take(self, new: bool) -> list[Entry]:
+        """Empty the queue, behind the context where this is news to the stream or was dropped."""
+        with self._lock:
+            entries, missed = list(self._queue), self._missed
+            self._queue.clear()
+            self._missed = 0
+            queued = {id(entry) for entry in entries}
+            context = [entry for entry in self._context.values() if id(entry) not in queued] if new or missed else []
+        if missed:
+            self._note("outlet_slow", f"too slow, {missed} entries dropped")
+        return context + entries
+
+    def _note(self, code: str, text: str) -> None:
+        self.notices.append(Notice(Severity.ERROR, code, f"{self.name}: {text}"))
+
+    def _give_up(self) -> None:
+        """Leave a stream; waits for as long as its receiver hangs, in which there is nobody to connect to anyway."""
+        recording, self._recording = self._recording, None
+        if recording is not None:
+            recording.stream.disconnect()
+
+
+def file_outlet(path: Path, name: str) -> Outlet:
+    """
+    Record to a file, overwriting it. A recording that fails, on a full disk say, ends there.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
+    stream = _stream(name)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"")
+        stream.save(path, write_footer=False)  # or Rerun keeps the particulars of every chunk until the end
+    except (OSError, RuntimeError) as error:
+        raise ConfigError(f"rerun-save must be a file that can be written, got {str(path)!r} ({error})") from error
+    once = iter([stream])
+
+    def open_stream() -> rr.RecordingStream:
+        for stream in once:
+            return stream
+        raise Unavailable
+
+    def epitaph() -> str:
+        return f"the recording ends here, with {1e-6 * shutil.disk_usage(path.parent).free:.1f} MB free on its disk"
+
+    return Outlet(str(path), open_stream, period_s=FILE_PERIOD_S, flush_s=FILE_FLUSH_S, close_s=FILE_CLOSE_S, epitaph=epitaph)
+
+
+def viewer_outlet(url: str, name: str) -> Outlet:
+    """Show in the viewer that listens at a URL, whenever one does."""
+    address = urlsplit(url)
+    where = (address.hostname or "127.0.0.1", address.port or 9876)
+    recording_id = uuid.uuid4()  # one, so that a viewer which only hung goes on with the recording it has
+
+    def open_stream() -> rr.RecordingStream:
+        try:
+            socket.create_connection(where, PROBE_S).close()
+        except OSError as error:
+            raise Unavailable from error
+        stream = _stream(name, recording_id)
+        stream.connect_grpc(url)
+        return stream
+
+    return Outlet(url, open_stream)
+
+
+def _stream(name: str, recording_id: uuid.UUID | None = None) -> rr.RecordingStream:
+    rr.unregister_shutdown()  # at exit it would wait without limit for a viewer that hangs; `Outlet.close` is bounded
+    stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+    stream.send_recording_name(name)
+    return stream

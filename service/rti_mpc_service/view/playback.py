@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a robot was told, row by row, from the plans that its guard passed on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+from rti_mpc.array import Array
+from rti_mpc.contract.message import Command
+from rti_mpc.contract.status import Mode
+from rti_mpc_service.view.timeline import AHEAD_NS
+
+
+@dataclass(frozen=True, slots=True)
+class Actuation:
+    """
+    What a guard tells the robot: a plan it let through, or a piece of its own ramp to rest.
+
+    Attributes:
+        command: As on the wire, numbered by the guard.
+    """
+
+    command: Command
+
+    @property
+    def u(self) -> Array:
+        """Inputs, shape ``(N, nu)``."""
+        return self.command.u
+
+
+class Row(NamedTuple):
+    """
+    An input that the robot was told.
+
+    Attributes:
+        time_ns: When it begins to act, on the robot's timeline.
+        u: Inputs, shape ``(nu,)``.
+        mode: Of the plan it is from.
+    """
+
+    time_ns: int
+    u: Array
+    mode: Mode
+
+
+class Playback:
+    """
+    Plays plans as the robot does: each until the next one begins, or until it has expired.
+
+    So each is known to its end only when the next one is there, and a ramp that
+    was told in time but not needed leaves no row.
+    """
+
+    def __init__(self) -> None:
+        self._last: list[tuple[int, Command]] = []  # where it lies, and the plan; none before the first
+        self._played_ns = -1  # where the last row lies
+
+    def add(self, times: Sequence[int], actuations: Sequence[Actuation]) -> list[Row]:
+        """Take plans, and return what was played before the last of them begins."""
+        plans = [*self._last, *zip(times, (actuation.command for actuation in actuations), strict=True)]
+        self._last = plans[-1:]
+        return [row for (time_ns, command), (end_ns, _) in pairwise(plans) for row in self._play(time_ns, command, end_ns)]
+
+    def end(self) -> list[Row]:
+        """Return what is played of the last plan if no other one follows."""
+        return [row for time_ns, command in self._last for row in self._play(time_ns, command, time_ns + AHEAD_NS)]
+
+    def _play(self, time_ns: int, command: Command, end_ns: int) -> list[Row]:
+        rows = []
+        end_ns = min(end_ns, time_ns + command.valid_until_ns - command.stamp_ns)
+        for begin_ns, u in zip(range(time_ns, end_ns, command.period_ns), command.u, strict=False):
+            if min(begin_ns + command.period_ns, end_ns) > self._played_ns:  # not over before the plan came
+                self._played_ns = max(begin_ns, self._played_ns + 1)
+                rows.append(Row(self._played_ns, u, command.mode))
+        return rows

@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages as columns of a Rerun recording."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from rti_mpc.array import Array
+from rti_mpc.contract.message import Command, Event, Reference, Severity, State, Telemetry
+from rti_mpc.signals import plane
+from rti_mpc.wire.info import Info, Label, Obstacle
+from rti_mpc_service.view.blueprint import RUNGS, STRIPS, TIMELINE, Frame, blueprint, legend, lifted, looks
+from rti_mpc_service.view.playback import Actuation, Playback, Row
+from rti_mpc_service.view.tracking_error import tracking_error
+
+Message = Info | Reference | State | Command | Actuation | Telemetry | Event
+Columns = Iterable[rr.ComponentColumn]
+Times = NDArray[np.int64]
+
+VECTORS = {"x": "states", "u": "inputs", "y": "outputs", "y_ref": "outputs"}  # of messages, and whose labels they take
+HELD = 10_000  # entries kept until an info tells their names
+SCALARS = (
+    *("prepare_us", "feedback_us", "latency_us"),
+    *("iterations", "res_prim", "res_dual", "cost", "violation"),
+    *("state_age_s", "slack_s", "delay_s", "skipped", "fallbacks", *RUNGS, "parameter_version"),
+)
+LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
+MS = 1_000_000  # [ns], to which events lie: the column of times is not wider
+ROWS = 5000  # of a reference, drawn
+
+
+@dataclass(slots=True, eq=False)
+class Entry:
+    """
+    A message and where it lies on the robot's timeline.
+
+    Attributes:
+        time_ns: From `rti_mpc_service.view.timeline.Timeline`.
+        message: What was received.
+    """
+
+    time_ns: int
+    message: Message
+
+
+class Recording:
+    """
+    One Rerun stream being written: a file, or a viewer that is connected.
+
+    Names and limits come from an `Info`. What arrives before any is held, and
+    written once there is one, or under numbers when the recording ends without.
+    """
+
+    def __init__(self, stream: rr.RecordingStream) -> None:
+        self.stream = stream
+        self.info: Info | None = None
+        self._reference: Reference | None = None
+        self._frame: Frame | None = None
+        self._held: deque[Entry] = deque(maxlen=HELD)
+        self._last: State | None = None
+        self._playback = Playback()
+        self._lanes: dict[str, tuple[str, int]] = {}  # the last change of each: to what, and where it lies
+        self._writers: dict[type, Callable[[Times, list[Any]], None]] = {
+            Reference: self._references,
+            State: self._states,
+            Command: self._commands,
+            Actuation: self._actuations,
+            Telemetry: self._telemetry,
+            Event: self._events,
+        }
+
+    def send(self, entries: Iterable[Entry]) -> None:
+        """Write entries; one column an entity, whatever their number."""
+        groups: defaultdict[type, list[Any]] = defaultdict(list)
+        for entry in entries:
+            groups[type(entry.message)].append(entry)
+        for entry in groups.pop(Info, ()):
+            self._info(entry.message)
+        for cls, write in self._writers.items():
+            if self.info is None and cls is not Event:
+                self._held.extend(groups[cls])
+                continue
+            fitting = [entry for entry in groups[cls] if self._fits(entry.message)]
+            if fitting:
+                write(np.array([entry.time_ns for entry in fitting], np.int64), [entry.message for entry in fitting])
+
+    def finish(self) -> None:
+        """Write what was held for want of an info, or of what comes next."""
+        if self.info is None and self._held:
+            widths = {name: width for entry in self._held for name, width in _widths(entry.message).items()}
+            self._name(Info.unnamed(widths.get("x", 0), widths.get("u", 0), widths.get("y", widths.get("y_ref", 0))))
+        self._told(self._playback.end())
+
+    def _info(self, info: Info) -> None:
+        """Keep a description; take names from it, a controller's before a robot's."""
+        self.stream.log(f"info/{info.role}", rr.TextDocument(info.document, media_type="text/plain"), static=True)
+        if info.states and info != self.info and (self.info is None or info.role == "controller"):
+            self._name(info)
+
+    def _name(self, info: Info) -> None:
+        """Take names from a description, and write what was held for want of them."""
+        if self.info is not None and _vectors(info) != _vectors(self.info):
+            self._reference, self._last, self._playback = None, None, Playback()
+        self.info = info
+        for path, archetype in looks(info).items():
+            self.stream.log(path, archetype, static=True)
+        self.stream.send_blueprint(blueprint(info, self._frame))
+        held, self._held = list(self._held), deque(maxlen=HELD)
+        self.send(held)
+
+    def _fits(self, message: Message) -> bool:
+        """Whether the vectors of a message are as long as the info says: it may be about another model."""
+        return self.info is None or all(width == len(getattr(self.info, VECTORS[name])) for name, width in _widths(message).items())
+
+    def _columns(self, path: str, times: Times, *columns: Columns) -> None:
+        index = rr.TimeColumn(TIMELINE, duration=times.astype("timedelta64[ns]"))
+        self.stream.send_columns(path, [index], [column for group in columns for column in group])
+
+    def _strips(self, path: str, times: Times, lines: Iterable[Array]) -> None:
+        """Write one polyline a row, each of shape ``(M, 2)``, at the height of what it is."""
+        strips = [lifted(line, STRIPS[path].z) for line in lines]
+        self._columns(path, times, rr.LineStrips3D.columns(strips=strips))
+
+    def _scalars(self, path: str, times: Times, values: Array) -> None:
+        """Write values, shape ``(n,)``; infinities and NaN are left out."""
+        said = np.isfinite(values)
+        if said.any():
+            self._columns(path, times[said], rr.Scalars.columns(scalars=values[said]))
+
+    def _references(self, times: Times, references: list[Reference]) -> None:
+        assert self.info is not None
+        self._reference = references[-1]
+        pair = plane(self.info.outputs)
+        if pair is not None and self.info.position is not None:
+            frame = Frame.around(references[-1].y[:, pair])
+            if frame != self._frame:
+                self._frame = frame
+                self.stream.log("world/legend", legend(frame), static=True)
+                self.stream.send_blueprint(blueprint(self.info, frame))
+            self._strips("world/reference", times, [r.y[:: 1 + len(r.y) // ROWS, pair] for r in references])
+
+    def _states(self, times: Times, states: list[State]) -> None:
+        assert self.info is not None
+        x = np.array([state.x for state in states])
+        for i, label in enumerate(self.info.states):
+            self._scalars(f"state/{label.name}", times, x[:, i])
+        if self.info.position is not None:
+            self._motion(times, states, x)
+        if self._reference is not None:
+            stamps = np.array([state.stamp_ns for state in states], np.int64)
+            for name, values in tracking_error(self.info, self._reference, stamps, x).items():
+                self._scalars(f"error/{name}", times, values)
+        self._last = states[-1]
+
+    def _motion(self, times: Times, states: list[State], x: Array) -> None:
+        """Write pose and trail: a segment a state, none across two lives of the robot."""
+        assert self.info is not None
+        assert self.info.position is not None
+        xy = x[:, self.info.position]
+        psi = np.zeros(len(x)) if self.info.heading is None else x[:, self.info.heading]
+        rotation = np.column_stack([0 * psi, 0 * psi, np.sin(psi / 2), np.cos(psi / 2)])
+        self._columns("world/robot", times, rr.Transform3D.columns(translation=lifted(xy, 0.0), quaternion=rotation))
+        before = [self._last if self._last is not None else states[0], *states[:-1]]
+        joined = np.array([a.epoch == b.epoch for a, b in zip(before, states, strict=True)])
+        start = np.where(joined[:, None], [state.x[list(self.info.position)] for state in before], xy)
+        self._strips("world/trail", times, np.stack([start, xy], axis=1))
+
+    def _commands(self, times: Times, commands: list[Command]) -> None:
+        assert self.info is not None
+        u = np.array([command.u[0] for command in commands])
+        self._inputs("command", times, u)
+        for i, label in enumerate(self.info.inputs):
+            for side, bounds in (("min", self.info.lbu), ("max", self.info.ubu)):
+                self._scalars(f"command/{label.name}/{side}", times, np.full(len(u), bounds[i]))
+
+    def _actuations(self, times: Times, actuations: list[Actuation]) -> None:
+        self._told(self._playback.add(times.tolist(), actuations))
+
+    def _told(self, rows: list[Row]) -> None:
+        """Write what a guard told the robot."""
+        if rows:
+            times = np.array([row.time_ns for row in rows], np.int64)
+            self._inputs("actuation", times, np.array([row.u for row in rows]))
+            self._lane("guard", times, [row.mode.name for row in rows])
+
+    def _inputs(self, stream: str, times: Times, u: Array) -> None:
+        """Write inputs, shape ``(n, nu)``."""
+        assert self.info is not None
+        for i, label in enumerate(self.info.inputs):
+            self._scalars(f"{stream}/{label.name}", times, u[:, i])
+
+    def _telemetry(self, times: Times, samples: list[Telemetry]) -> None:
+        assert self.info is not None
+        for name in SCALARS:
+            self._scalars(f"telemetry/{name}", times, np.array([getattr(sample, name) for sample in samples], float))
+        for i, label in enumerate(self.info.disturbances):
+            self._scalars(f"disturbance/{label.name}", times, np.array([sample.d[i] if i < len(sample.d) else np.nan for sample in samples]))
+        self._scalars("slack", times, np.array([1e3 * sample.slack_s for sample in samples]))
+        self._scalars("slack/period", times, np.full(len(times), 1e3 * self.info.dt_s))
+        self._lane("mode", times, [sample.mode.name for sample in samples])
+        self._lane("status", times, [sample.status.name for sample in samples])
+        self._lane("leader", times, [f"epoch {sample.epoch}" for sample in samples])
+        if self.info.position is not None:
+            self._obstacles(times, np.array([sample.stamp_ns for sample in samples], np.int64))
+            self._strips("world/horizon", times, [sample.x[:, self.info.position] for sample in samples])
+
+    def _obstacles(self, times: Times, stamps: NDArray[np.int64]) -> None:
+        """Write where obstacles are: where the reference says, or where they are by themselves."""
+        assert self.info is not None
+        for i, obstacle in enumerate(self.info.obstacles):
+            x, y, r = located(obstacle, self._reference, stamps)
+            scale = np.column_stack([r, r, np.ones_like(r)])
+            self._columns(f"world/obstacle_{i}", times, rr.Transform3D.columns(translation=np.column_stack([x, y, 0 * x]), scale=scale))
+
+    def _lane(self, lane: str, times: Times, values: Sequence[str]) -> None:
+        """Write where a lane changes, in the order it was told: a sample that braked ahead of time may lie behind the next one."""
+        value, since_ns = self._lanes.get(lane, ("", -1))
+        changes = []
+        for time_ns, new in zip(times.tolist(), values, strict=True):
+            if new != value:
+                value, since_ns = new, max(time_ns, since_ns + 1)
+                changes.append((since_ns, value))
+        self._lanes[lane] = value, since_ns
+        if changes:
+            begins, states = zip(*changes, strict=True)
+            self._columns(f"lane/{lane}", np.array(begins, np.int64), rr.StateChange.columns(state=states))
+
+    def _events(self, times: Times, events: list[Event]) -> None:
+        for source in sorted({event.source for event in events}):
+            mine = [k for k, event in enumerate(events) if event.source == source]
+            text = [f"{source}: {events[k].text} ({events[k].code})" for k in mine]
+            columns = rr.TextLog.columns(text=text, level=[LEVELS[events[k].severity] for k in mine])
+            self._columns(f"event/{rr.escape_entity_path_part(source)}", times[mine] // MS * MS, columns)
+
+
+def located(obstacle: Obstacle, reference: Reference | None, stamps: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+    """Return x, y and radius of an obstacle at stamps, each of shape ``(n,)``, in m; held before and after the reference, as a controller does."""
+    if reference is None or reference.p.shape[1] < obstacle.at + 3:
+        x, y, r = (np.full(len(stamps), value) for value in (obstacle.x, obstacle.y, obstacle.r))
+    else:
+        row = (stamps - reference.stamp_ns) / reference.period_ns
+        x, y, r = (np.interp(row, np.arange(len(reference.p)), reference.p[:, obstacle.at + part]) for part in range(3))
+    return x, y, r
+
+
+def _widths(message: Message) -> dict[str, int]:
+    """Return how many numbers the vectors of a message have, or the rows of its matrices; inputs that a state does not report are left out."""
+    arrays = {name: getattr(message, name) for name in VECTORS if hasattr(message, name)}
+    return {name: array.shape[-1] for name, array in arrays.items() if array.ndim > 1 or array.size}
+
+
+def _vectors(info: Info) -> tuple[tuple[Label, ...], ...]:
+    return info.states, info.inputs, info.outputs

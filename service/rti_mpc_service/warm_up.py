@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Warm-up of a real-time iteration: caches and branch predictors are filled before the first sample counts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.rti.rti import Rti
+
+WARM_UP = 20  # solves before the first command: the first real sample is not the first call
+
+
+def warm_up(rti: Rti) -> None:
+    """Solve a few samples at rest."""
+    x0: Array = np.zeros(rti.ocp.model.nx)
+    rti.reset(x0, rti.u_prev.copy())
+    for _ in range(WARM_UP):
+        rti.prepare(rti.y_ref.copy())
+        rti.feedback(x0)

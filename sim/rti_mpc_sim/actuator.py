@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The robot's side of the command contract: what is taken, what is refused, and what became of it.
+
+What was taken acts as `rti_mpc.contract.schedule` says, approached inside the slew limits
+from what really acts, whatever was lost before. No clock: time is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.contract.approach import Increments
+from rti_mpc.contract.message import Command
+from rti_mpc.contract.schedule import OWN, Schedule, end_ns, unfit
+from rti_mpc.wire.source import Source
+
+EARLY_NS = 250_000_000  # by which a state that is answered may be ahead of the robot's clock: a guard knows that clock no better
+STALE_NS = 250_000_000  # silence after which another controller may take over, even one of a lower epoch
+
+
+@dataclass(slots=True)
+class Counters:
+    """
+    What became of commands since start.
+
+    Attributes:
+        lost: Missing sequence numbers.
+        late: Arrived when their first row was already over; the remaining rows act.
+        expired: Arrived when nothing of them could act any more.
+        refused: Malformed, repeated, from another source, for another life of the robot or a state still to come, or no finite plan.
+        starved: How often a plan ran out in motion and the robot braked on its own.
+    """
+
+    lost: int = 0
+    late: int = 0
+    expired: int = 0
+    refused: int = 0
+    starved: int = 0
+
+
+class Actuator:
+    """
+    Plays plans.
+
+    Attributes:
+        u: Input demanded now, shape ``(nu,)``.
+        source: Epoch and sequence number of the command it comes from; zeros: the ramp of the robot itself.
+        counters: What became of commands.
+        braking: Whether no plan acts.
+    """
+
+    def __init__(
+        self,
+        u_rest: Array,
+        slew: Array,
+        epoch: int,
+        delay_ns: int = 0,
+        bounds: tuple[float | Array, float | Array] = (-np.inf, np.inf),
+        increments: Increments | None = None,
+    ) -> None:
+        """
+        Begin at rest.
+
+        Args:
+            u_rest: Input at rest, shape ``(nu,)``.
+            slew: Largest rate of the ramp to rest, shape ``(nu,)``, in the input's unit per s.
+            epoch: Life of the robot that commands must be for.
+            delay_ns: Time from the arrival of a command to the instant from which it can act.
+            bounds: Of the inputs, shape ``(nu,)``: a drive does no more, whatever it is told.
+            increments: Slew limits inside which plans are approached; None: their rows are played as they come.
+        """
+        self.u = np.array(u_rest, dtype=np.float64)
+        self.source = OWN
+        self.counters = Counters()
+        self.braking = True
+        self._schedule = Schedule(u_rest, slew, increments)
+        self._now_ns = 0
+        self._robot_epoch = epoch
+        self._delay_ns = delay_ns
+        self._source = Source(STALE_NS)
+        self._bounds = bounds  # of the inputs, shape (nu,): a drive does no more, whatever it is told
+        self._off = False
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the inputs have come to rest."""
+        return self.braking and bool(np.array_equal(self.u, self._schedule.u_rest))
+
+    def accept(self, command: Command, arrival_ns: int) -> str:
+        """
+        Take a command, or refuse it. It can act from its arrival on, plus the delay of the actuators.
+
+        Returns:
+            The reason for refusing it, empty if it was taken.
+        """
+        early = command.state_stamp_ns > arrival_ns + EARLY_NS
+        arrival_ns += self._delay_ns
+        reason = "switched_off" if self._off else unfit(command, len(self.u), self._robot_epoch) or ("early" if early else "")
+        start_ns = max(command.stamp_ns, arrival_ns)
+        expired = end_ns(command) <= start_ns
+        if not reason and not (expired and command.epoch != self._source.epoch):  # what could not act locks nobody out
+            verdict = self._source.accept(command.epoch, command.seq, arrival_ns)
+            reason = "" if verdict.accepted else verdict.value
+        self.counters.lost = self._source.lost
+        reason = reason or ("expired" if expired else "")
+        if reason:
+            self.counters.expired += reason == "expired"
+            self.counters.refused += reason != "expired"
+            return reason
+        self.counters.late += arrival_ns >= command.stamp_ns + command.period_ns
+        self._schedule.add(replace(command, u=np.clip(command.u, *self._bounds)), start_ns, end_ns(command))
+        return ""
+
+    def play(self, from_ns: int, to_ns: int) -> Iterator[tuple[int, Array]]:
+        """
+        Tell which inputs act in an interval; intervals must follow one another.
+
+        Yields:
+            Until when, in ns, and the input held until then, shape ``(nu,)``: valid until the next one.
+        """
+        t = from_ns
+        while t < to_ns:
+            self._schedule.forget(t)
+            u, change_ns, braking = self._schedule.at(t)
+            begins, self.braking = braking and not self.braking, braking
+            self.counters.starved += begins and not (self._off or self.at_rest)
+            self.u[:], self.source = u, self._schedule.source(t)
+            t = self._now_ns = min(change_ns, to_ns)
+            yield t, self.u
+
+    def switch_off(self) -> None:
+        """Drop every plan and take no other: the inputs ramp to rest."""
+        self._off = True
+        self._schedule.brake(self.u, self._now_ns)

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The robot without clock and network: plant, actuators and sensors, advanced when told.
+
+Closed loops are tested with it step by step; the process `rti_mpc_sim.robot` is this
+robot with a clock and the bus::
+
+    robot = Lockstep(settings)
+    while robot.now_ns < duration_ns:
+        state = robot.tick()              # what the robot sends at this instant
+        command = controller(state)       # any controller
+        robot.accept(command)             # arrives at once, or when told
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.contract.message import Command, State
+from rti_mpc_sim.actuator import Actuator, Counters
+from rti_mpc_sim.plant import Plant
+from rti_mpc_sim.sensor import NOTHING, Sensor
+from rti_mpc_sim.settings import RobotSettings
+
+
+class Lockstep:
+    """
+    One robot, from time 0.
+
+    Attributes:
+        now_ns: Robot time.
+        epoch: Epoch of its states.
+        x: True state, shape ``(nx,)``; angles do not wrap. Overwritten as time advances.
+        u: Input that has acted up to now, after the lag, shape ``(nu,)``. Overwritten as time advances.
+        actuator: Its actuators.
+        sensor: Its sensors.
+    """
+
+    def __init__(self, settings: RobotSettings, epoch: int = 1) -> None:
+        model = settings.model
+        angles = tuple(i for i, signal in enumerate(model.states) if signal.angle)
+        self.now_ns = 0
+        self.epoch = epoch
+        self.period_ns = settings.state_period_ns
+        self.actuator = Actuator(
+            np.array(model.u_rest),
+            settings.slew,
+            epoch,
+            round(1e9 * settings.actuator_delay_s),
+            (settings.lbu, settings.ubu),
+            settings.increments,
+        )
+        self.sensor = Sensor(epoch, settings.noise_std, angles, round(1e9 * settings.sensor_delay_s), settings.dropout, settings.seed)
+        self._plant = Plant(model, settings.x0, settings.state_period_s, settings.substeps, settings.actuator_lag_s)
+        self.x: Array = self._plant.x
+        self.u: Array = self._plant.u
+        self._reports_inputs = settings.reports_inputs
+        self._next_ns = 0
+
+    @property
+    def counters(self) -> Counters:
+        """What became of commands."""
+        return self.actuator.counters
+
+    @property
+    def due_ns(self) -> int:
+        """When the robot next measures or sends a state."""
+        return min(self._next_ns, self.sensor.due_ns)
+
+    def accept(self, command: Command, arrival_ns: int | None = None) -> str:
+        """Receive a command, now unless told otherwise; return the reason if it is refused."""
+        return self.actuator.accept(command, self.now_ns if arrival_ns is None else arrival_ns)
+
+    def advance(self, to_ns: int) -> None:
+        """Integrate up to a time, exactly over the intervals in which each input acts."""
+        for until_ns, u in self.actuator.play(self.now_ns, to_ns):
+            self._plant.advance(u, 1e-9 * (until_ns - self.now_ns))
+            self.now_ns = until_ns
+
+    def measure(self) -> int | None:
+        """Measure the state if it is time to, and return its sequence number; times that were missed are skipped."""
+        if self.now_ns < self._next_ns:
+            return None
+        self._next_ns = (self.now_ns // self.period_ns + 1) * self.period_ns
+        actuator = self.actuator
+        acting = (actuator.u, *actuator.source) if self._reports_inputs else NOTHING
+        return self.sensor.measure(self.x, self.now_ns, *acting)
+
+    def tick(self) -> State:
+        """Advance to the next state that is not lost, and return it."""
+        while True:
+            self.advance(max(self.now_ns, self.due_ns))
+            self.measure()
+            if (state := self.sensor.take(self.now_ns)) is not None:
+                return state

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+What the robot really does: its own model, integrated finer than the controller's.
+
+A first-order lag of the actuators, :math:`T \dot v = u - v`, is part of the
+plant: `v` joins its state, so that inputs that lag are integrated as exactly as
+the rest.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.codegen import bind
+from rti_mpc.model.integrator import integrator
+from rti_mpc.model.model import Model, Signal
+
+
+def lagging(model: Model, lag_s: float) -> Model:
+    """Return a model whose inputs follow with a first-order lag, as further states."""
+    v = ca.SX.sym("v", model.nu)
+    f = ca.Function("f", [model.x, model.u, model.p], [model.f_expl_expr])
+    return replace(
+        model,
+        x=ca.vertcat(model.x, v),
+        f_expl_expr=ca.vertcat(f(model.x, v, model.p), (model.u - v) / lag_s),
+        states=(*model.states, *(Signal(f"{s.name}_applied", s.unit) for s in model.inputs)),
+    )
+
+
+class Plant:
+    """
+    The continuous plant, advanced over any interval of constant input.
+
+    One call into CasADi covers up to `max_step_s`, cut into equal RK4 steps;
+    nothing is allocated.
+
+    Attributes:
+        x: True state, shape ``(nx,)``; angles do not wrap.
+        u: Input acting on the plant now, after the lag, shape ``(nu,)``.
+    """
+
+    def __init__(self, model: Model, x0: Array, max_step_s: float, substeps: int, lag_s: float = 0.0) -> None:
+        if lag_s > 0.0:
+            substeps = max(substeps, math.ceil(2.0 * max_step_s / lag_s))
+        self._max_step_s = max_step_s
+        self._state = np.concatenate([x0, model.u_rest]) if lag_s > 0.0 else np.array(x0)  # (nx,) or (nx + nu,)
+        self._next = np.zeros_like(self._state)
+        self._input = np.array(model.u_rest, dtype=np.float64)  # (nu,)
+        self._p = np.array(model.p_nominal, dtype=np.float64)  # (np,)
+        self._dt = np.zeros(1)
+        self.x = self._state[: model.nx]
+        self.u = self._state[model.nx :] if lag_s > 0.0 else self._input
+        phi = integrator(lagging(model, lag_s) if lag_s > 0.0 else model, "rk4", substeps)
+        self._evaluate = bind(phi, {"x": self._state, "u": self._input, "p": self._p, "dt": self._dt}, {"x_next": self._next})
+
+    def advance(self, u: Array, duration_s: float) -> None:
+        """Integrate over an interval in which the input, shape ``(nu,)``, is held."""
+        self._input[:] = u
+        calls = max(1, math.ceil(duration_s / self._max_step_s - 1e-9))
+        self._dt[0] = duration_s / calls
+        for _ in range(calls):
+            self._evaluate()
+            self._state[:] = self._next

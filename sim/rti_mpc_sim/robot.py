@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+The simulated robot as a process: the lockstep robot with a clock, on the bus.
+
+It measures and sends states on an absolute grid of wall time over speed, and
+advances over exactly the intervals in which each received row acted. Where this
+process itself is held up for a whole period, the robot's clock waits with it: a
+busy machine is no fault of the robot. When it is stopped its inputs ramp to
+rest, and the last state it sends is the one in which it stands.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import time
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+import numpy as np
+
+import rti_mpc
+from rti_mpc.contract.message import Command, Notice, Severity, State
+from rti_mpc.contract.schedule import unfit
+from rti_mpc.model.model import Model
+from rti_mpc.wire.announcer import Announcer
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
+from rti_mpc.wire.info import labels
+from rti_mpc.wire.interrupt import stop_on_signals
+from rti_mpc.wire.keys import Key, Keys
+from rti_mpc_sim.actuator import STALE_NS, Counters
+from rti_mpc_sim.clock import SLICE_S, Clock
+from rti_mpc_sim.lockstep import Lockstep
+from rti_mpc_sim.log import Log
+from rti_mpc_sim.settings import RobotSettings
+
+ROLE = "robot"
+STANDING = 1e-6  # change of the state in a period, in any unit, below which the robot stands
+COAST_NS = 10_000_000_000  # robot time after which it is taken to stand anyway
+HEARING_S = 0.5  # for which a starting robot listens for another one of its name
+LEASE_S = 2.0  # after which the presence of a process that was killed, or hangs, has ended
+
+logger = logging.getLogger(ROLE)
+
+
+@dataclass(frozen=True)
+class RobotSummary:
+    """
+    What a robot did in its life.
+
+    Attributes:
+        states: States sent.
+        held_up_s: Wall time for which the robot's clock waited for this process.
+        counters: What became of commands.
+    """
+
+    states: int
+    held_up_s: float
+    counters: Counters
+
+
+def main(
+    settings: RobotSettings,
+    bus_settings: BusSettings,
+    keys: Keys,
+    *,
+    speed: float = 1.0,
+    log: Path | None = None,
+    duration_s: float | None = None,
+    guarded: bool = False,
+    info: dict[str, Any] | None = None,
+    stop: Event | None = None,
+) -> RobotSummary:
+    """
+    Play the robot until it is stopped.
+
+    Args:
+        settings: Plant, actuators and sensors.
+        bus_settings: How to join the bus; the robot listens on the rendezvous endpoint.
+        keys: Where its streams are.
+        speed: Seconds of robot time per second.
+        log: CSV file to write, see `rti_mpc_sim.log`.
+        duration_s: Robot time after which it stops by itself.
+        guarded: Whether it takes `actuation`, a guard's, and no `command`.
+        info: Further entries of its description.
+        stop: Stops the robot when set; SIGINT and SIGTERM if there is none.
+
+    Raises:
+        ConfigError: A setting is out of range, an endpoint is taken.
+    """
+    stop = stop or stop_on_signals()
+    with Bus.join(bus_settings, keys, stop=stop, say=logger.warning) as bus:
+        wait_for_another(bus, stop)
+        robot = Robot(settings, bus, keys.actuation if guarded else keys.command, speed, log)
+        life = {"role": ROLE, "epoch": robot.body.epoch, "speed": speed, "state_period_s": settings.state_period_s}
+        life |= {"reports_inputs": settings.reports_inputs, "approaches": settings.increments is not None}
+        bus.publish_json(keys.info(ROLE), {**describe(settings.model), **(info or {}), **life})
+        bus.alive(ROLE)
+        logger.info("epoch %d of %s, %s, at %g times real speed", robot.body.epoch, keys.robot, settings.model.name, speed)
+        gc.collect()
+        gc.freeze()
+        robot.run(stop, None if duration_s is None else round(1e9 * duration_s))
+        return robot.finish()
+
+
+def wait_for_another(bus: Bus, stop: Event) -> None:
+    """Wait until no other robot of this name is present, for one lease at most: either it was killed and is about to vanish, or it lives."""
+    if not bus.is_alive(ROLE, HEARING_S):
+        return
+    logger.warning("another robot is present as %s: waiting for at most %g s until it is gone", bus.keys.robot, LEASE_S)
+    deadline_s = time.monotonic() + LEASE_S
+    while not stop.is_set() and time.monotonic() < deadline_s:
+        if not bus.is_alive(ROLE, SLICE_S):
+            logger.info("the other robot is gone")
+            return
+        stop.wait(SLICE_S)
+    logger.warning("two robots use the name %s: stop one of them, or give it another name", bus.keys.robot)
+
+
+def describe(model: Model) -> dict[str, Any]:
+    """Describe a model for ``info``."""
+    return {
+        "version": rti_mpc.__version__,
+        "model": model.name,
+        **labels(model.counterparts(), states=model.states, inputs=model.inputs, outputs=model.outputs),
+        "parameters": {s.name: value for s, value in zip(model.parameters, model.p_nominal, strict=True)},
+    }
+
+
+class Robot:
+    """
+    One life of the robot on the bus.
+
+    Attributes:
+        body: The robot itself.
+        clock: Its clock.
+    """
+
+    def __init__(self, settings: RobotSettings, bus: Bus, key: Key[Command], speed: float, log: Path | None) -> None:
+        # Milliseconds: a robot restarted within a second is another one.
+        self.body = Lockstep(settings, epoch=time.time_ns() // 1_000_000)
+        self._log = Log(log, settings.model)
+        self._states = bus.publisher(bus.keys.state)
+        self._announcer = Announcer(bus, ROLE, self.body.epoch)
+        self._inbox: deque[tuple[Command, int]] = deque(maxlen=64)  # with the monotonic time of arrival
+        nu, epoch = settings.model.nu, self.body.epoch
+        self._intake = bus.intake(Command, 1e-9 * STALE_NS / speed, {"u": nu}, unfit=lambda command: unfit(command, nu, epoch))
+        bus.expect("command", lambda: self._intake.source.epoch is not None)
+        self._refused = 0  # by the door, so far
+        self._sent = 0
+        self._held_up_ns = 0
+        Thread(target=self._receive, args=(bus.subscriber(key, capacity=RING_MESSAGES),), daemon=True).start()
+        self.clock = Clock(speed)
+
+    def run(self, stop: Event, until_ns: int | None = None) -> None:
+        """Live until stopped."""
+        body = self.body
+        self.clock.set_back(body.now_ns)  # what came before was birth
+        while not stop.is_set() and (until_ns is None or body.now_ns < until_ns):
+            due_ns = body.due_ns
+            self.clock.wait(due_ns - body.period_ns // 2, stop)  # after a state the cores are for those who answer it
+            self._log.write(time.monotonic_ns())
+            self.clock.wait(due_ns, stop)
+            if self.clock.now_ns() - due_ns >= body.period_ns:
+                self._hold(due_ns)
+            self._live(due_ns)
+
+    def finish(self) -> RobotSummary:
+        """Ramp to rest, coast until the robot stands, send that state, and sum up."""
+        body = self.body
+        body.actuator.switch_off()
+        deadline_ns, x = body.now_ns + COAST_NS, np.full_like(body.x, np.inf)
+        last = None
+        while body.now_ns < deadline_ns and not (body.actuator.at_rest and np.abs(body.x - x).max() < STANDING):
+            x[:] = body.x
+            self._advance(body.due_ns)
+            last = body.sensor.take(body.now_ns) or last
+        if last is not None:
+            self._send(last)
+        self._announcer.say(Notice(Severity.INFO, "robot_stopped", "the robot was stopped and stands"), body.now_ns)
+        logger.info("stopped, and stands")
+        self._log.close()
+        return RobotSummary(self._sent, 1e-9 * self._held_up_ns, body.counters)
+
+    def _receive(self, subscriber: Subscriber) -> None:
+        """Note every command from our source with the time of its arrival; a thread of its own. What is not for us takes nobody's place."""
+        for received in iter(subscriber.recv, None):
+            arrival_ns = time.monotonic_ns()
+            if (command := self._intake.accept(received, arrival_ns)) is not None:
+                self._inbox.append((command, arrival_ns))
+
+    def _hold(self, due_ns: int) -> None:
+        """Set the clock back to a time that this process missed."""
+        late_ns = self.clock.set_back(due_ns)
+        self._held_up_ns += late_ns
+        text = f"the simulation was held up for {1e-6 * late_ns:.1f} ms, {1e-6 * self._held_up_ns:.1f} ms in all: the robot's clock waited"
+        self._announcer.say(Notice(Severity.WARNING, "simulation_held_up", text), due_ns)
+
+    def _live(self, to_ns: int) -> None:
+        """Advance to a time with the commands that arrived by then, measure, send."""
+        while self._inbox and self.clock.at_ns(self._inbox[0][1]) <= to_ns:
+            self._take(*self._inbox.popleft())
+        for notice in self._intake.notices(time.monotonic_ns()):
+            self._announcer.say(notice, to_ns)
+        refused = self._intake.refused.total() + self._intake.source.dropped
+        self.body.counters.refused += refused - self._refused
+        self._refused = refused
+        starved = self.body.counters.starved
+        self._advance(to_ns)
+        if self.body.counters.starved > starved:
+            ran_out = Notice(Severity.ERROR, "command_ran_out", "no valid command is left: the robot brakes to rest on its own")
+            self._announcer.say(ran_out, to_ns)
+        while (state := self.body.sensor.take(to_ns)) is not None:
+            self._send(state)
+
+    def _take(self, command: Command, monotonic_ns: int) -> None:
+        """Hand a command to the actuators."""
+        arrival_ns = max(self.body.now_ns, self.clock.at_ns(monotonic_ns))
+        reason = self.body.accept(command, arrival_ns)
+        if reason:
+            text = f"command {command.seq} of epoch {command.epoch} was refused: {reason.replace('_', ' ')}"
+            self._announcer.say(Notice(Severity.WARNING, f"command_{reason}", text), arrival_ns)
+        else:
+            self._log.answered(command.state_seq, command.seq, monotonic_ns)
+
+    def _advance(self, to_ns: int) -> None:
+        """Advance, and measure if it is time to."""
+        body = self.body
+        body.advance(to_ns)
+        if (seq := body.measure()) is not None:
+            self._log.measured(seq, body.now_ns, body.x, body.u, body.counters, time.monotonic_ns())
+
+    def _send(self, state: State) -> None:
+        """Send a state."""
+        self._log.sent(state.seq, time.monotonic_ns())
+        self._states.put(state)
+        self._sent += 1

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the robot sees itself: noise, delay and dropout, all from one seed."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.contract.message import State
+
+NOTHING: tuple[Array, int, int] = (np.zeros(0), 0, 0)  # told of what acts
+
+
+class Sensor:
+    """
+    Measures states and hands them out when they are due.
+
+    A state that drops out uses up its sequence number, as one lost on a real
+    link would. Angles wrap to (-pi, pi], as a real robot's do.
+    """
+
+    def __init__(self, epoch: int, noise_std: Array, angles: tuple[int, ...], delay_ns: int = 0, dropout: float = 0.0, seed: int = 1) -> None:
+        """
+        Prepare to measure.
+
+        Args:
+            epoch: Epoch of the states.
+            noise_std: Standard deviations, shape ``(nx,)``.
+            angles: Indices of the states that wrap.
+            delay_ns: Time from measuring to handing out.
+            dropout: Share of states that are lost.
+            seed: Seed of noise and dropout.
+        """
+        self._epoch = epoch
+        self._noise_std = noise_std
+        self._angles = list(angles)
+        self._delay_ns = delay_ns
+        self._dropout = dropout
+        self._random = np.random.default_rng(seed)
+        self._seq = 0
+        self._on_the_way: deque[State] = deque()
+
+    @property
+    def due_ns(self) -> int:
+        """When the next state on the way is due; far in the future if there is none."""
+        return self._on_the_way[0].stamp_ns + self._delay_ns if self._on_the_way else 2**63
+
+    def measure(self, x: Array, stamp_ns: int, u: Array = NOTHING[0], command_epoch: int = 0, command_seq: int = 0) -> int:
+        """
+        Measure.
+
+        Args:
+            x: True state, shape ``(nx,)``.
+            stamp_ns: The time now.
+            u: Input that the actuators are asked for, before any lag of theirs, shape ``(nu,)``; empty: not to be told.
+            command_epoch: Epoch of the command it comes from.
+            command_seq: Its sequence number; 0: the ramp of the robot itself.
+
+        Returns:
+            The sequence number of the state.
+        """
+        self._seq += 1
+        measured = x + self._noise_std * self._random.standard_normal(len(x))
+        measured[self._angles] = np.pi - np.remainder(np.pi - measured[self._angles], 2 * np.pi)
+        if self._random.random() >= self._dropout:
+            self._on_the_way.append(State(self._epoch, self._seq, stamp_ns, measured, u.copy(), command_epoch, command_seq))
+        return self._seq
+
+    def take(self, now_ns: int) -> State | None:
+        """Hand out the oldest state that is due, if any."""
+        return self._on_the_way.popleft() if self.due_ns <= now_ns else None

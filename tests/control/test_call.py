@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calls written down, and made again: what is told decides every command, to the last bit."""
+
+from __future__ import annotations
+
+import ast
+import copy
+import inspect
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, State
+from rti_mpc.contract.status import Mode
+from rti_mpc.control.call import Call
+from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.reference.trajectory import circle, eight
+from rti_mpc.rti.rti import Rti
+from rti_mpc.wire.cdr import encode
+from tests.loop import MS, reference, robot
+from tests.problems import pioneer
+
+TOLD = {
+    *("commit", "enable", "in_time", "lead", "overhear", "prepare", "receive_reference"),
+    *("receive_state", "retune", "shadow", "standstill", "stop", "tick"),
+}
+READS = {  # change nothing that a command depends on
+    *("at_rest", "awaits", "follows", "heard", "lay_out", "mode", "notices", "robot_now_ns", "robot_rate"),
+    *("say", "shadowing", "slack_s", "telemetry"),
+}
+
+
+def made() -> Controller:
+    return Controller(Rti(pioneer(N=6, N_u=4), compile=False), Timing(), compile=False)
+
+
+def test_every_public_method_of_a_controller_is_told_or_reads() -> None:
+    public = {name: member for name, member in vars(Controller).items() if not name.startswith("_")}
+    assert {name for name, member in public.items() if hasattr(member, "__wrapped__")} == TOLD
+    assert set(public) == TOLD | READS
+
+
+def test_no_call_that_is_told_makes_another_one() -> None:
+    """Or that would happen twice, when both are made again."""
+    calls = [node.func for node in ast.walk(ast.parse(inspect.getsource(Controller))) if isinstance(node, ast.Call)]
+    own = {func.attr for func in calls if isinstance(func, ast.Attribute) and isinstance(func.value, ast.Name) and func.value.id == "self"}
+    assert own
+    assert not own & TOLD
+
+
+def life(controller: Controller) -> tuple[list[Call], list[bytes]]:
+    """Let a controller live through all that can happen; return its calls, with the arguments as they were, and its commands as sent."""
+    calls: list[Call] = []
+    controller.on_call = lambda call: calls.append(copy.deepcopy(call, {id(problem): problem}))
+    problem = replace(pioneer(N=6, N_u=4), R=np.array([0.3, 0.2]))
+    body, rng, sent = robot(circle()), np.random.default_rng(1), []
+    leader = made()  # of another's commands
+    controller.receive_reference(reference(circle(), stamp_ns=STAMP_ON_ARRIVAL))
+    leader.receive_reference(reference(circle()))
+
+    def send(command: Command, left_ns: int | None = None) -> None:
+        assert body.accept(command, body.now_ns) in ("", "expired")
+        controller.commit(command, left_ns)
+        sent.append(encode(command))
+
+    for k in range(160):
+        state = body.tick()
+        local_ns = body.now_ns + int(rng.integers(0, 3 * MS))
+        if 60 <= k < 75:
+            if k == 60:
+                controller.shadow()
+            if (theirs := answer(leader, state, local_ns)) is not None:
+                controller.overhear(theirs)
+        elif k == 75:
+            controller.lead(9)
+        if k == 40:
+            controller.retune(problem, 1)
+        if k == 90:
+            controller.stop("asked for")
+        if k == 110:
+            controller.enable()
+        if k == 115:
+            controller.receive_reference(reference(eight(), stamp_ns=body.now_ns, epoch=2))
+        if 120 <= k < 126:  # lost
+            if (ramp := controller.tick(local_ns)) is not None:
+                send(ramp)
+            continue
+        command = controller.receive_state(state, local_ns)
+        if command is None:
+            continue
+        command = controller.in_time(command, left_ns := local_ns + (90 * MS if k in (30, 50, 51) else MS))
+        if command is not None:
+            if controller.shadowing:
+                controller.commit(command, left_ns)
+            else:
+                send(command, left_ns)
+        controller.prepare()
+    last = controller.standstill(body.now_ns)
+    assert last is not None
+    send(last)
+    assert controller.ladder.shifted == 2, "of three that were late; no plan was left for the third"
+    return calls, sent
+
+
+def answer(leader: Controller, state: State, local_ns: int) -> Command | None:
+    if (command := leader.receive_state(state, local_ns)) is not None:
+        leader.commit(command)
+        leader.prepare()
+    return command
+
+
+def test_controller_that_is_told_the_same_calls_sends_the_same_commands_bit_for_bit() -> None:
+    """Late samples, a loss, a shadow that takes over, a stop, other weights and references: all is in the calls."""
+    calls, sent = life(made())
+    assert {call.name for call in calls} >= {"lead", "overhear", "retune", "shadow", "standstill", "stop", "tick"}
+    again, repeated = made(), []
+    proposal: Any = None
+    for call in calls:
+        if call.name == "commit":
+            assert encode(proposal) == encode(call.args[0])
+            if not again.shadowing:
+                repeated.append(encode(proposal))
+            call = call._replace(args=(proposal, *call.args[1:]))
+        result = call.repeat(again)
+        if call.name in ("receive_state", "in_time", "tick", "standstill"):
+            proposal = result
+    assert repeated == sent
+    assert len(sent) > 100
+    assert again.mode is not Mode.IDLE
+
+
+def test_proposal_that_is_not_committed_was_never_sent() -> None:
+    """Nor is there a gap in the numbers; whoever plans on plans from what has left."""
+    one, other, body = made(), made(), robot(circle())
+    for controller in (one, other):
+        controller.receive_reference(reference(circle()))
+    commands = []
+    for k in range(30):
+        state = body.tick()
+        both = [controller.receive_state(state, body.now_ns) for controller in (one, other)]
+        if k == 20:
+            assert both[0] is not None
+            assert one._issued.last is not both[0]
+            np.testing.assert_array_equal(one._sent.at(body.now_ns)[0], commands[-1].u[1])  # what was sent before plays on
+            assert one.receive_state(replace(state, seq=state.seq), body.now_ns) is None, "and once is enough for a state"
+        for controller, command in zip((one, other), both, strict=True):
+            if command is not None:
+                if k != 20 or controller is other:
+                    controller.commit(command)
+                controller.prepare()
+        if both[0] is not None and k != 20:
+            commands.append(both[0])
+            body.accept(both[0])
+    assert [command.seq for command in commands] == list(range(1, len(commands) + 1))

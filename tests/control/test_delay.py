@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The delay, measured and compensated: against a robot whose delay is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rti_mpc.contract.message import Command
+from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.control.delay import DelayEstimator
+from rti_mpc.control.grid import MARGIN, MOST, SETTLING, Grid
+from rti_mpc.reference.trajectory import eight
+from rti_mpc.rti.rti import Rti
+from rti_mpc_sim.actuator import Actuator
+from tests.loop import MS, SLEW, Run, drive, reference, robot
+from tests.problems import double_integrator, pioneer
+
+DT = 100 * MS
+NOISE = np.array([1e-3, 1e-3, 2e-3, 5e-3, 5e-3])
+
+
+@pytest.fixture(scope="module")
+def rti() -> Rti:
+    return Rti(pioneer(N=12, Q=[1.0, 1.0, 0.0]), compile=False)
+
+
+def driven(rti: Rti, delay_s: float | None, actuator_delay_s: float, noise: float = 0.0, duration_s: float = 40.0) -> tuple[Controller, Run]:
+    controller = Controller(rti, Timing(delay_s=delay_s), compile=False)
+    body = robot(eight(), actuator_delay_s=actuator_delay_s, noise_std=noise * NOISE, seed=3)
+    controller.receive_reference(reference(eight().lasting(duration_s + 5.0)))
+    return controller, drive(controller, body, duration_s)
+
+
+def error_mm(run: Run) -> float:
+    return float(run.error_mm(eight())[np.array(run.t_s) > 20.0].max())
+
+
+@pytest.mark.parametrize(("delay_s", "noise"), [(0.2, 0.0), (None, 0.0), (None, 1.0)], ids=["configured", "measured", "measured with noise"])
+def test_delay_of_two_periods_costs_less_than_twice_the_error_without_delay(rti: Rti, delay_s: float | None, noise: float) -> None:
+    undelayed = error_mm(driven(rti, 0.0, 0.0, noise)[1])
+    assert error_mm(driven(rti, delay_s, 0.2, noise)[1]) <= 2.0 * undelayed
+    if not noise:
+        assert error_mm(driven(rti, 0.0, 0.2)[1]) > 10.0 * undelayed  # what it is without compensation
+
+
+@pytest.mark.parametrize("actuator_delay_s", [0.0, 0.05, 0.13, 0.2])
+def test_delay_is_found_from_the_response(rti: Rti, actuator_delay_s: float) -> None:
+    """Within half a candidate's step, in ten seconds; what is added to it covers that."""
+    controller, _ = driven(rti, None, actuator_delay_s, duration_s=10.0)
+    assert controller._delay is not None
+    assert 1e-9 * controller._delay.delay_ns == pytest.approx(actuator_delay_s, abs=0.0126)
+    telemetry = controller.telemetry(prepare_us=0, feedback_us=0, latency_us=0, slack_s=0)
+    assert telemetry.delay_s == pytest.approx(1e-9 * controller._delay.delay_ns + 0.1 / MARGIN, abs=1e-6)
+
+
+def test_noise_alone_is_no_delay(rti: Rti) -> None:
+    controller, _ = driven(rti, None, 0.0, noise=1.0)
+    assert controller.grid.delay_ns < 40 * MS
+
+
+def test_delay_longer_than_can_be_measured_is_taken_for_the_longest(rti: Rti) -> None:
+    controller, run = driven(rti, None, 0.29, duration_s=20.0)
+    assert controller.grid.delay_ns == MOST * DT
+    assert not run.refused[20:]
+
+
+def test_measured_delay_never_makes_the_grid_jump(rti: Rti) -> None:
+    _, run = driven(rti, None, 0.2, duration_s=20.0)
+    steps = np.diff([command.stamp_ns for command in run.commands])
+    assert np.all(np.abs(steps - DT) <= 2 * DT // SETTLING)  # the first one catches up with its own
+    for one, other in zip(run.commands, run.commands[1:], strict=False):
+        assert np.all(np.abs(other.u[0] - one.u[0]) <= 1.000001 * 0.1 * SLEW * (1 + 1 / SETTLING))
+
+
+@pytest.mark.parametrize("delay_ns", [-(10**9), 0, 10**12])
+def test_delay_stays_between_nothing_and_three_periods(delay_ns: int) -> None:
+    grid = Grid(0.1, Timing(delay_s=None))
+    for _ in range(1000):
+        grid.adapt(delay_ns)
+        assert 0 <= grid.delay_ns <= MOST * DT
+
+
+def played(actuator: Actuator, x: np.ndarray, from_ns: int, to_ns: int) -> np.ndarray:
+    """A mass on a line, exactly."""
+    for until_ns, (a,) in actuator.play(from_ns, to_ns):
+        t = 1e-9 * (until_ns - from_ns)
+        x = np.array([x[0] + t * x[1] + t * t * a / 2, x[1] + t * a])
+        from_ns = until_ns
+    return x
+
+
+@pytest.mark.parametrize("delay_ms", [0, 30, 75, 140])
+@pytest.mark.parametrize("noise", [0.0, 2e-3])
+def test_estimator_by_itself_finds_the_delay_of_random_inputs(delay_ms: int, noise: float) -> None:
+    rng = np.random.default_rng(delay_ms)
+    estimator = DelayEstimator(double_integrator().model, DT, MOST * DT, compile=False)
+    actuator = Actuator(np.zeros(1), np.full(1, np.inf), epoch=1, delay_ns=delay_ms * MS)
+    x = np.zeros(2)
+    for k in range(100):
+        now_ns = k * DT
+        estimator.observe(x + noise * rng.standard_normal(2), now_ns)
+        command = Command(1, k + 1, now_ns, 1, k, now_ns, now_ns + 250 * MS, 0, Mode.TRACKING, QpStatus.SOLVED, DT, rng.uniform(-1, 1, (6, 1)))
+        estimator.sent(command)
+        actuator.accept(command, now_ns)
+        x = played(actuator, x, now_ns, now_ns + DT)
+    assert 1e-6 * estimator.delay_ns == pytest.approx(delay_ms, abs=10.0)
+
+
+def test_inputs_that_do_not_change_say_nothing() -> None:
+    estimator = DelayEstimator(double_integrator().model, DT, MOST * DT, compile=False)
+    for k in range(100):
+        estimator.observe(np.array([0.01 * k, 0.1]), k * DT)
+        estimator.sent(Command(1, k + 1, k * DT, 1, k, k * DT, k * DT + 250 * MS, 0, Mode.TRACKING, QpStatus.SOLVED, DT, np.zeros((6, 1))))
+    assert not estimator._costs.any()
+
+
+def test_another_life_of_the_robot_keeps_what_was_learnt() -> None:
+    estimator = DelayEstimator(double_integrator().model, DT, MOST * DT, compile=False)
+    estimator.delay_ns = 75 * MS
+    estimator.observe(np.zeros(2), 10**12)
+    estimator.clear()
+    estimator.observe(np.zeros(2), 0)
+    estimator.observe(np.zeros(2), DT)
+    assert estimator.delay_ns == 75 * MS

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The last gate of every plan."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rti_mpc.array import Array
+from rti_mpc.control.envelope import Envelope
+from tests.problems import pioneer
+
+STEP = np.array([0.25, 0.4])
+BOUND = np.array([0.5, 0.745])
+
+
+@pytest.fixture(scope="module")
+def envelope() -> Envelope:
+    return Envelope(pioneer(N=8, N_u=6), compile=False)
+
+
+def around(u: Array) -> tuple[Array, Array]:
+    """Where the first two rows may lie if an input acts before and until they do."""
+    return np.tile(u - STEP, (2, 1)), np.tile(u + STEP, (2, 1))
+
+
+def test_plan_that_is_inside_passes_unchanged_and_its_held_inputs_are_expanded(envelope: Envelope) -> None:
+    plan = np.cumsum(np.full((6, 2), 0.05), axis=0)
+    rows = envelope.fit(plan, around(np.zeros(2)))
+    np.testing.assert_array_equal(rows, plan[[0, 1, 2, 3, 4, 5, 5, 5]])
+
+
+def test_any_plan_comes_out_inside(envelope: Envelope) -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(2000):
+        acting = rng.uniform(-BOUND, BOUND)
+        plan = rng.choice([0.0, 1.0, 1e300]) * rng.standard_normal((6, 2))
+        for rows in (
+            envelope.fit(plan, around(acting)),
+            envelope.refit(envelope.fit(plan, around(acting)), 3, around(acting)),
+            envelope.ramp(around(acting)),
+        ):
+            assert rows.shape == (8, 2)
+            assert np.all(np.abs(rows) <= BOUND)
+            assert np.all(np.abs(np.diff(np.vstack([acting, rows]), axis=0)) <= (1 + 1e-14) * STEP)  # rounding
+            assert np.all(np.abs(rows[1] - acting) <= (1 + 1e-14) * STEP)
+
+
+def test_ramp_goes_to_rest_as_fast_as_it_may(envelope: Envelope) -> None:
+    rows = envelope.ramp(around(np.array([0.5, -0.3])))
+    np.testing.assert_allclose(rows[:, 0], [0.25, 0.25, 0, 0, 0, 0, 0, 0])  # the second row not before the first has surely arrived
+    np.testing.assert_array_equal(rows[:, 1], 0.0)
+
+
+def test_earlier_plan_is_shifted_and_its_last_row_repeated(envelope: Envelope) -> None:
+    plan = np.cumsum(np.full((8, 2), 0.05), axis=0)
+    np.testing.assert_array_equal(envelope.refit(plan, 2, around(plan[2])), plan[[2, 3, 4, 5, 6, 7, 7, 7]])
+
+
+def test_limits_are_obeyed_as_they_are(envelope: Envelope) -> None:
+    envelope = Envelope(pioneer(N=8), compile=False)
+    envelope.limits["ubu"][:] = 0.1
+    rows = envelope.fit(np.full((8, 2), 0.3), around(np.array([0.5, 0.0])))
+    np.testing.assert_allclose(rows[:, 0], [0.25, 0.25, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1])  # slew limits before bounds
+    np.testing.assert_allclose(rows[:, 1], 0.1)

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The observer: by itself against a plant whose disturbances are known, then in closed loop with models that are wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from rti_mpc.array import Array
+from rti_mpc.contract.message import State
+from rti_mpc.contract.status import Mode
+from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.control.observer import Disturbance, Observer, ObserverSettings
+from rti_mpc.errors import OcpError
+from rti_mpc.model.integrator import integrator
+from rti_mpc.model.model import Model
+from rti_mpc.model.robots.pioneer_3dx import NOMINAL, pioneer_3dx
+from rti_mpc.reference.trajectory import circle
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.rti import Rti
+from rti_mpc_sim.lockstep import Lockstep
+from rti_mpc_sim.settings import RobotSettings
+from tests.loop import SLEW, drive, reference
+from tests.problems import PAPER
+from tests.problems import SLEW as INCREMENTS
+
+POSE = ("x", "y", "psi")
+INPUTS = {"u_c": Disturbance(drift=0.1, limit=0.3), "omega_c": Disturbance(drift=0.1, limit=0.3)}
+SLIP = {"x": Disturbance(drift=0.02, limit=0.1), "y": Disturbance(drift=0.02, limit=0.1)}
+DT = 0.1
+
+
+def wrong_parameters() -> Model:
+    """The robot with every theta 20 % off, up and down in turn."""
+    return pioneer_3dx().with_parameters(**{name: NOMINAL[name] * (1.2 if i % 2 else 0.8) for i, name in enumerate(NOMINAL) if name != "a"})
+
+
+def slipping() -> Model:
+    """The robot, sliding to its left at 2 cm/s."""
+    model = pioneer_3dx()
+    psi = model.x[2]
+    return replace(model, f_expl_expr=model.f_expl_expr + 0.02 * ca.vertcat(-ca.sin(psi), ca.cos(psi), 0, 0, 0))
+
+
+def observed(observer: Observer, plant: Model, x: Array, d: Array, steps: int, measures: slice = slice(None)) -> Array:
+    """Let a plant go and be observed; return its last state."""
+    rng = np.random.default_rng(1)
+    phi = integrator(plant, "rk4", 20)
+    observer.reset(np.where(np.arange(5) < 3, x, 0.0))
+    for _ in range(steps):
+        u = rng.uniform([-0.5, -0.7], [0.5, 0.7])
+        x = np.array(phi(x, u + d, plant.p_nominal, DT)).ravel()
+        observer.predict(u, DT)
+        seen = np.full(5, 1e6)  # what is not measured must not be looked at
+        seen[measures] = x[measures]
+        observer.correct(seen)
+    return x
+
+
+def test_input_disturbances_and_unmeasured_speeds_are_found_from_the_pose_alone() -> None:
+    observer = Observer(pioneer_3dx(), ObserverSettings(INPUTS, POSE), compile=False)
+    d = np.array([0.05, -0.1])
+    x = observed(observer, pioneer_3dx(), np.array([1.0, 2.0, 0.5, 0.3, 0.2]), d, 100, slice(3))
+    np.testing.assert_allclose(observer.d, d, rtol=0, atol=1e-3)  # the filter allows for a drift; the plant has finer steps
+    np.testing.assert_allclose(observer.x, x, rtol=0, atol=1e-3)
+
+
+def test_disturbances_stay_inside_their_limits() -> None:
+    observer = Observer(pioneer_3dx(), ObserverSettings(INPUTS), compile=False)
+    observed(observer, pioneer_3dx(), np.zeros(5), np.array([0.9, -0.9]), 50)
+    np.testing.assert_array_equal(observer.d, [0.3, -0.3])
+
+
+def test_frozen_disturbances_keep_their_values_while_the_state_is_followed() -> None:
+    observer = Observer(pioneer_3dx(), ObserverSettings(INPUTS), compile=False)
+    observed(observer, pioneer_3dx(), np.zeros(5), np.array([0.05, 0.05]), 50)
+    before = observer.d.copy()
+    observer.frozen = True
+    x = observed(observer, pioneer_3dx(), np.zeros(5), np.array([-0.2, 0.2]), 50)
+    np.testing.assert_array_equal(observer.d, before)
+    np.testing.assert_allclose(observer.x, x, rtol=0, atol=0.05)  # a wrong disturbance acts on the prediction; the measurement corrects it
+
+
+def test_compiled_observer_is_the_interpreted_one() -> None:
+    results = []
+    for compile in (False, True):
+        observer = Observer(pioneer_3dx(), ObserverSettings(INPUTS | SLIP, POSE), compile=compile)
+        observed(observer, wrong_parameters(), np.zeros(5), np.zeros(2), 20, slice(3))
+        results.append(np.concatenate([observer.x, observer.d]))
+    np.testing.assert_allclose(*results, rtol=0, atol=1e-12)  # equal to rounding
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (ObserverSettings(measured=("x", "v")), r"measured must be of states \(x, y, psi, u, omega\), got v"),
+        (ObserverSettings({"u_c": Disturbance(0.0, 1.0)}), r"disturbance of u_c must be positive, got 0.0 and 1.0"),
+        (ObserverSettings(noise={"x": 0.0}), r"noise of a measured state must be positive"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(settings: ObserverSettings, words: str) -> None:
+    with pytest.raises(OcpError, match=words):
+        Observer(pioneer_3dx(), settings, compile=False)
+
+
+# In closed loop: the circle, after 20 s.
+
+
+def steady_error_mm(plant: Model, settings: ObserverSettings | None, hides: tuple[int, ...] = ()) -> float:
+    observer = None if settings is None else Observer(pioneer_3dx(), settings, compile=False)
+    model = pioneer_3dx() if observer is None else observer.model
+    rti = Rti(Ocp(model, **(PAPER | INCREMENTS | {"N": 20, "Q": [1.0, 1.0, 0.0]})), compile=False)
+    controller = Controller(rti, Timing(), observer=observer, compile=False)
+    body = Lockstep(RobotSettings(plant, np.array([*circle().pose0, 0.0, 0.0]), SLEW))
+    controller.receive_reference(reference(circle()))
+
+    def hidden(state: State) -> State:
+        x = state.x.copy()
+        x[list(hides)] = 0.0
+        return replace(state, x=x)
+
+    run = drive(controller, body, 40.0, sees=hidden)
+    assert {command.mode for command in run.commands} == {Mode.TRACKING}
+    assert not run.refused
+    return float(run.error_mm(circle())[np.array(run.t_s) > 20.0].max())
+
+
+@pytest.mark.parametrize("plant", [wrong_parameters, slipping])
+def test_wrong_model_is_tracked_without_offset_by_its_observer(plant: Callable[[], Model]) -> None:
+    """The promise is 1 mm; without the observer it is millimetres."""
+    without, with_ = steady_error_mm(plant(), None), steady_error_mm(plant(), ObserverSettings(INPUTS | SLIP))
+    print(f"{plant.__name__}: {without:.2f} mm without, {with_:.3f} mm with the observer")
+    assert with_ < 1.0 < without
+
+
+def test_pose_alone_is_enough_to_drive() -> None:
+    assert steady_error_mm(wrong_parameters(), ObserverSettings(INPUTS, POSE), hides=(3, 4)) < 1.0

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A reference on the controller's stages: interpolated, unwrapped, never extrapolated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rti_mpc.array import Array
+from rti_mpc.contract.message import End, Reference
+from rti_mpc.control.track import Track
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from tests.problems import beacon
+
+MS = 1_000_000
+N = 5
+
+
+def reference(y: Array, p: Array | None = None, stamp_ms: int = 0, period_ms: int = 20, end: End = End.HOLD) -> Reference:
+    return Reference(1, 1, stamp_ms * MS, period_ms * MS, end, y, np.zeros((len(y), 0)) if p is None else p)
+
+
+def turning(rows: int, wrapped: bool) -> Array:
+    """A heading that goes from 2.5 through pi on to 4, and positions that say the time."""
+    psi = np.linspace(2.5, 4.0, rows)
+    y = np.column_stack([np.arange(rows), -np.arange(rows), psi])
+    if wrapped:
+        y[:, 2] = np.pi - np.remainder(np.pi - psi, 2 * np.pi)
+    return y
+
+
+def follow(track: Track, message: Reference, stamp_ns: int = 0) -> None:
+    track.arriving = message, track.lay_out(message)
+    track.anchor(stamp_ns)
+
+
+def looked_up(y: Array, t_ms: float, **options: int) -> Array:
+    track = Track(pioneer_3dx(), N, 100 * MS)
+    follow(track, reference(y, **options))
+    track.look_up(round(t_ms * MS))
+    return track.y_ref.copy()
+
+
+def test_nothing_is_followed_before_a_reference_and_after_it_is_cleared() -> None:
+    track = Track(pioneer_3dx(), N, 100 * MS)
+    assert not track.loaded
+    assert track.ended(0) is None
+    follow(track, reference(turning(3, wrapped=False)))
+    assert track.loaded
+    track.clear()
+    assert not track.loaded
+
+
+def test_rows_are_those_of_nodes_1_to_N() -> None:
+    np.testing.assert_allclose(looked_up(turning(100, wrapped=False), t_ms=40)[:, 0], [7, 12, 17, 22, 27])
+
+
+def test_time_between_rows_is_interpolated() -> None:
+    np.testing.assert_allclose(looked_up(turning(100, wrapped=False), t_ms=45)[:, 0], [7.25, 12.25, 17.25, 22.25, 27.25])
+
+
+def test_slow_reference_is_interpolated_too() -> None:
+    np.testing.assert_allclose(looked_up(turning(10, wrapped=False), t_ms=0, period_ms=400)[:, 1], [-0.25, -0.5, -0.75, -1.0, -1.25])
+
+
+@pytest.mark.parametrize(("t_ms", "row"), [(-5000, 0), (10_000, 9)])
+def test_reference_is_held_before_its_first_and_after_its_last_row(t_ms: float, row: int) -> None:
+    y = turning(10, wrapped=False)
+    rows = looked_up(y, t_ms)
+    np.testing.assert_allclose(rows[:, 0], np.full(N, row))
+    np.testing.assert_allclose(np.ptp(rows, axis=0), 0.0)
+
+
+def test_heading_that_wraps_is_the_same_as_one_that_does_not() -> None:
+    for t_ms in (0, 333, 690):
+        np.testing.assert_allclose(looked_up(turning(60, wrapped=True), t_ms), looked_up(turning(60, wrapped=False), t_ms), atol=1e-12)
+
+
+def test_reference_ends_with_its_last_row_and_says_what_then() -> None:
+    track = Track(pioneer_3dx(), N, 100 * MS)
+    follow(track, reference(turning(11, wrapped=False), stamp_ms=1000, end=End.STOP))
+    assert track.ended(1200 * MS) is None
+    assert track.ended(1200 * MS + 1) is End.STOP
+
+
+def test_parameters_are_looked_up_for_all_nodes_and_nominal_where_there_are_none() -> None:
+    model = beacon().model
+    track = Track(model, N, 100 * MS)
+    y = np.zeros((20, 2))
+    p = np.column_stack([np.arange(20.0), np.full(20, 3.0)])
+    follow(track, reference(y, p, period_ms=100))
+    track.look_up(250 * MS)
+    np.testing.assert_allclose(track.p[:, 0], 2.5 + np.arange(6))
+    follow(track, reference(y))
+    track.look_up(250 * MS)
+    np.testing.assert_allclose(track.p, np.tile(model.p_nominal, (6, 1)))
+
+
+def test_single_row_is_a_point_to_go_to() -> None:
+    np.testing.assert_allclose(looked_up(np.array([[1.0, 2.0, 0.3]]), 777), np.tile([1.0, 2.0, 0.3], (N, 1)))
+
+
+def test_message_is_not_changed_and_may_change_later() -> None:
+    y = turning(60, wrapped=True)
+    before = y.copy()
+    message = reference(y)
+    track = Track(pioneer_3dx(), N, 100 * MS)
+    follow(track, message)
+    np.testing.assert_array_equal(message.y, before)
+    track.look_up(0)
+    first = track.y_ref.copy()
+    y[:] = 9.0
+    track.look_up(0)
+    np.testing.assert_array_equal(track.y_ref, first)

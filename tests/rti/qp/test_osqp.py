@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The OSQP workspaces: updated in place, judged by status, recoverable from anything."""
+
+from __future__ import annotations
+
+import numpy as np
+import osqp
+import pytest
+
+from rti_mpc.array import Array
+from rti_mpc.contract.status import QpStatus
+from rti_mpc.rti.qp.osqp import STATUS, SolverSettings
+from rti_mpc.rti.rti import FORMULATIONS, Rti
+from tests.problems import beacon, double_integrator
+
+TIGHT = SolverSettings(eps=1e-9, max_iter=100_000)
+
+
+def rti(settings: SolverSettings = TIGHT, formulation: str = "simultaneous") -> Rti:
+    return Rti(double_integrator(lbu=-1.0, ubu=1.0), settings, formulation=formulation, solver="osqp", iterations=1, compile=False)
+
+
+def solve(one: Rti, seed: int) -> QpStatus:
+    """Solve at a guess that depends on nothing but the seed."""
+    rng = np.random.default_rng(seed)
+    one.x[:] = rng.normal(size=one.x.shape)
+    one.u[:] = 0.1 * rng.normal(size=one.u.shape)
+    one.u_prev[:] = 0.0
+    one.prepare(rng.normal(size=one.y_ref.shape), shift=False)
+    return one.feedback(rng.normal(size=one.ocp.model.nx))
+
+
+def test_inner_object_of_osqp_offers_what_is_driven() -> None:
+    """It is not public: another minor version may move it, and this is where that shows."""
+    assert osqp.__version__.startswith("1.1.")
+    inner = rti().solver.workspace
+    for name in ("update_data_vec", "update_data_mat", "solve", "warm_start"):
+        assert callable(getattr(inner, name))
+    codes = {"SOLVED": 1, "SOLVED_INACCURATE": 2, "PRIMAL_INFEASIBLE": 3, "DUAL_INFEASIBLE": 5, "MAX_ITER_REACHED": 7, "TIME_LIMIT_REACHED": 8}
+    assert {name: int(osqp.SolverStatus[f"OSQP_{name}"]) for name in codes} == codes
+    assert set(codes.values()) <= set(STATUS)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("build", [double_integrator, beacon])
+def test_updated_workspace_solves_the_new_problem(build: type, formulation: str) -> None:
+    """Vectors, constraint matrix and, where outputs are not linear, the Hessian: as a workspace set up anew does."""
+    used = Rti(build(), TIGHT, formulation=formulation, solver="osqp", compile=False)
+    for seed in (1, 2, 3):
+        assert solve(used, seed) is QpStatus.SOLVED
+        new = Rti(build(), TIGHT, formulation=formulation, solver="osqp", compile=False)
+        assert solve(new, seed) is QpStatus.SOLVED
+        np.testing.assert_allclose(used.u, new.u, atol=1e-6)
+
+
+@pytest.mark.parametrize("scaling", [0, 10])
+def test_osqp_writes_into_none_of_our_arrays(scaling: int) -> None:
+    one = rti(SolverSettings(scaling=scaling))
+    solve(one, 1)
+    qp = one.qp
+    arrays = (qp.P.data, qp.q, qp.A.data, qp.l, qp.u)
+    before = [array.copy() for array in arrays]
+    one.solver.workspace.solve()
+    one.solver.workspace.update_data_mat(P_x=qp.P.data, P_i=None, A_x=qp.A.data, A_i=None)
+    one.solver.workspace.solve()
+    for now, then in zip(arrays, before, strict=True):
+        np.testing.assert_array_equal(now, then)
+
+
+def test_second_solve_starts_from_the_first_and_a_cold_one_does_not() -> None:
+    one = rti()
+    solve(one, 1)
+    first = one.solver.iterations
+    solve(one, 1)
+    assert one.solver.iterations < first / 2
+    one.solver.cold = True
+    solve(one, 1)
+    assert one.solver.iterations == first
+
+
+def test_nan_never_reaches_osqp() -> None:
+    """One would poison every later solve, and raise nothing."""
+    one = rti()
+    solve(one, 1)
+    seen: list[Array] = []
+
+    class Spy:
+        def __getattr__(self, name: str) -> object:
+            def call(*args: Array, **arrays: Array | None) -> object:
+                seen.extend(array.copy() for array in (*args, *arrays.values()) if array is not None)
+                return getattr(inner, name)(*args, **arrays)
+
+            return call
+
+    inner, one.solver.workspace = one.solver.workspace, Spy()
+    y_ref, x0 = np.zeros((10, 2)), np.zeros(2)
+    one.prepare(y_ref * np.nan, shift=False)
+    assert one.feedback(x0) is QpStatus.FAILED
+    one.prepare(y_ref, shift=False)
+    assert one.feedback(x0 * np.nan) is QpStatus.FAILED
+    one.prepare(y_ref, shift=False, u_prev=np.array([np.nan]))
+    assert one.feedback(x0) is QpStatus.FAILED
+    one.prepare(y_ref, shift=False, u_prev=np.array([0.1]))
+    assert one.feedback(x0) is QpStatus.SOLVED
+    assert seen
+    assert all(np.isfinite(array).all() for array in seen)
+
+
+def test_infeasible_problem_is_told_by_its_status_and_its_iterate_not_taken() -> None:
+    """OSQP fills the solution with 2143289344.0 then, which is finite."""
+    one = rti()
+    solve(one, 1)
+    plan = one.x.copy(), one.u.copy()
+    one.prepare(np.zeros((10, 2)), shift=False)
+    qp = one.qp
+    first = np.flatnonzero(qp.l == qp.u)[-1]  # the last stage of the dynamics, twice
+    qp.A.data[:] = np.where(qp.A.indices == first, 0.0, qp.A.data)
+    one.solver.workspace.update_data_mat(P_x=None, P_i=None, A_x=qp.A.data, A_i=None)
+    qp.l[first] = qp.u[first] = 1.0
+    assert one.feedback(np.zeros(2)) is QpStatus.INFEASIBLE
+    np.testing.assert_array_equal(one.x, plan[0])
+    np.testing.assert_array_equal(one.u, plan[1])
+
+
+def test_data_that_osqp_refuses_is_a_failure_not_a_solve_of_what_it_held_before() -> None:
+    """It returns a code then, raises nothing, and solves the old problem when asked to."""
+    one = rti()
+    solve(one, 1)
+    one.prepare(np.zeros((10, 2)), shift=False)
+    row = np.flatnonzero(one.qp.l < one.qp.u)[0]
+    one.qp.l[row] = one.qp.u[row] + 1.0
+    assert one.feedback(np.zeros(2)) is QpStatus.FAILED
+    one.prepare(np.zeros((10, 2)), shift=False)
+    assert one.feedback(np.zeros(2)) is QpStatus.SOLVED
+
+
+def test_iteration_limit_is_a_usable_status() -> None:
+    one = rti(SolverSettings(eps=1e-12, max_iter=5))
+    assert solve(one, 1) is QpStatus.MAX_ITER
+    assert one.status.usable
+    assert one.solver.iterations == 5
+    assert np.isfinite(one.u).all()
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_residuals_and_objective_are_those_of_the_solution(formulation: str) -> None:
+    one = rti(formulation=formulation)
+    solve(one, 1)
+    qp, z = one.qp, one.qp.z
+    P = qp.P.toarray()
+    P += np.triu(P, k=1).T
+    Az = qp.A @ z
+    assert one.solver.objective == pytest.approx(0.5 * z @ P @ z + qp.q @ z, rel=1e-9)
+    assert np.maximum(qp.l - Az, Az - qp.u).max() <= 2 * one.solver.res_prim + 1e-12
+    assert one.solver.res_prim < 1e-7
+    assert one.solver.res_dual < 1e-7
+
+
+def test_only_usable_statuses_may_be_commanded() -> None:
+    assert [status.name for status in QpStatus if status.usable] == ["SOLVED", "INACCURATE", "MAX_ITER"]

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The optimal control problem: what its arguments become, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.errors import OcpError
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc.rti.ocp import Ocp, restless
+from rti_mpc.rti.rti import Rti
+from tests.problems import INF, PAPER, double_integrator, pioneer
+
+
+def test_diagonals_constants_and_defaults_become_arrays() -> None:
+    ocp = double_integrator(N=4, N_u=2, delta=[1, 2, 3, 4], lambda_=0.5)
+    np.testing.assert_array_equal(ocp.Q, [[1.0, 0.0], [0.0, 0.1]])
+    np.testing.assert_array_equal(ocp.R, [[0.05]])
+    np.testing.assert_array_equal(ocp.delta, [1.0, 2.0, 3.0, 4.0])
+    np.testing.assert_array_equal(ocp.lambda_, [0.5, 0.5])
+    np.testing.assert_array_equal(ocp.ubu, [INF])
+    np.testing.assert_array_equal(ocp.lbx, [-INF, -INF])
+    assert ocp.soft == ()
+    assert double_integrator(N=4).N_u == 4
+
+
+def test_states_with_a_bound_on_either_side_are_soft() -> None:
+    assert pioneer(ubx=[1.0, INF, INF, 0.5, INF], lbx=[-INF, -INF, -INF, -0.5, -1.0]).soft == (0, 3, 4)
+
+
+def test_arrays_are_owned_and_read_only() -> None:
+    Q = np.eye(2)
+    ocp = double_integrator(Q=Q)
+    Q[0, 0] = 9.0
+    assert ocp.Q[0, 0] == 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        ocp.Q[0, 0] = 9.0
+    with pytest.raises(AttributeError):
+        ocp.N = 3  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"N_u": 0}, "1 <= N_u <= N, got N_u = 0, N = 7"),
+        ({"N_u": 8}, "1 <= N_u <= N, got N_u = 8, N = 7"),
+        ({"N": 0}, "1 <= N_u <= N"),
+        ({"dt": 0.0}, "dt must be a positive number of seconds, got 0.0"),
+        ({"dt": INF}, "dt must be a positive"),
+        ({"method": "heun"}, "integrator must be one of euler, rk4, got 'heun'"),
+        ({"Q": [1.0, 1.0]}, r"Q must have shape \(3, 3\) or be its diagonal \(3,\), got shape \(2,\)"),
+        ({"Q": [1.0, 1.0, -0.05]}, "Q must be finite, symmetric and positive semidefinite"),
+        ({"R": [[1.0, 0.1], [0.2, 1.0]]}, "R must be finite, symmetric and positive semidefinite"),
+        ({"R": [1.0, np.nan]}, "R must be finite"),
+        ({"delta": [1.0] * 6}, r"delta must be a number or have shape \(7,\), got shape \(6,\)"),
+        ({"N_u": 3, "lambda_": [1.0] * 7}, r"lambda_ must be a number or have shape \(3,\)"),
+        ({"lambda_": -1.0}, "lambda_ must be finite and not negative"),
+        ({"z": INF}, "z must be finite and not negative"),
+        ({"lbu": [0.5, -0.745]}, "lbu must lie below ubu"),
+        ({"ubx": [INF, INF, INF, -0.5, 0.745]}, "lbx must lie below ubx"),
+        ({"ubu": [np.nan, 1.0]}, "ubu must not be NaN"),
+        ({"lbdu": 0.1}, "lbdu <= 0 <= ubdu must hold, or no input could be kept"),
+        ({"lbx": [0.0, 0.0]}, r"lbx must be a number or have shape \(5,\)"),
+    ],
+)
+def test_argument_that_does_not_fit_is_refused_by_name(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(OcpError, match=message):
+        pioneer(**changes)
+
+
+def test_bounds_that_leave_out_a_declared_rest_are_refused_with_the_input_and_its_rest() -> None:
+    model = replace(pioneer_3dx(), u_rest=(0.1, 0.0))
+    limits = {name: value for name, value in PAPER.items() if name not in ("lbu", "ubu")}
+    assert Ocp(model, **limits, lbu=[0.1, 0.0], ubu=[0.3, 0.5])
+    with pytest.raises(OcpError, match=r"bounds of input u_c must hold its rest, 0.1 m/s, or it could not be stopped, got \[0.2, 0.3\]"):
+        Ocp(model, **limits, lbu=[0.2, -0.5], ubu=[0.3, 0.5])
+    with pytest.raises(OcpError, match="bounds of input omega_c must hold its rest, 0 rad/s"):
+        Ocp(model, **limits, lbu=[0.0, 0.1], ubu=[0.3, 0.5])
+
+
+def test_bounds_without_zero_are_a_problem_but_none_to_stop_a_robot_in() -> None:
+    """The library may solve it; who stops robots refuses it."""
+    ocp = pioneer(lbu=[0.2, -0.745])
+    assert "bounds of input u_c must hold its rest, 0 m/s" in restless(ocp)
+    assert "increments of input omega_c must hold lower < 0 < upper" in restless(pioneer(lbdu=[-0.25, 0.0]))
+    assert restless(pioneer()) == restless(pioneer(lbdu=-INF, ubdu=INF, lbu=-INF, ubu=INF)) == ""
+    with pytest.raises(OcpError, match="u_c must hold its rest"):
+        Controller(Rti(ocp, compile=False), Timing(), compile=False)
+
+
+def test_papers_problem_is_accepted_without_increment_bounds() -> None:
+    ocp = pioneer(lbdu=-INF, ubdu=INF, method="euler")
+    assert (ocp.N, ocp.N_u, ocp.dt) == (PAPER["N"], PAPER["N"], 0.1)
+    assert ocp.soft == (3, 4)
+
+
+def test_retuned_problem_is_checked_alike_and_leaves_the_first_as_it_was() -> None:
+    ocp = pioneer()
+    Q, other = ocp.Q, ocp.retuned(Q=[1.0, 2.0, 3.0], ubu=[0.4, 0.7])
+    assert (other.Q.diagonal().tolist(), other.ubu.tolist()) == ([1.0, 2.0, 3.0], [0.4, 0.7])
+    assert ocp.Q is Q
+    assert not other.Q.flags.writeable
+    with pytest.raises(OcpError, match="Q must be finite, symmetric and positive semidefinite"):
+        ocp.retuned(Q=[1.0, 2.0, -3.0])
+    with pytest.raises(OcpError, match="lbu must lie below ubu"):
+        ocp.retuned(ubu=[-0.6, 0.7])

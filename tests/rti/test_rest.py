@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Robots that come to rest when their inputs do, and those that coast or fall."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from rti_mpc.model.model import Model, Signal
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.rest import motion_at_rest
+from tests.problems import INF, PAPER, beacon, double_integrator, pioneer
+
+
+def robot(names: str, units: str, f: Any, nu: int, **options: Any) -> Ocp:
+    """A robot of derivatives f(x, u), whose outputs are its states."""
+    states = tuple(Signal(name, unit, angle=unit == "rad") for name, unit in zip(names.split(), units.split(), strict=True))
+    x, u = ca.SX.sym("x", len(states)), ca.SX.sym("u", nu)
+    model = Model(
+        name="robot",
+        x=x,
+        u=u,
+        f_expl_expr=ca.vertcat(*f(x, u)),
+        y_expr=x,
+        states=states,
+        inputs=tuple(Signal(f"u_{k}", "1") for k in range(nu)),
+        outputs=states,
+        u_rest=options.pop("u_rest", ()),
+    )
+    return Ocp(model, **({"N": 5, "dt": 0.05, "Q": np.ones(len(states)), "R": np.ones(nu), "lbu": -2.0, "ubu": 2.0} | options))
+
+
+def car(x: Any, u: Any) -> tuple[Any, ...]:
+    """README's: acceleration and curvature."""
+    return x[3] * ca.cos(x[2]), x[3] * ca.sin(x[2]), x[3] * u[1], u[0]
+
+
+def holonomic(x: Any, u: Any) -> tuple[Any, ...]:
+    """A base on three wheels that move in any direction, its speeds a moment behind their commands."""
+    c, s = ca.cos(x[2]), ca.sin(x[2])
+    return x[3] * c - x[4] * s, x[3] * s + x[4] * c, x[5], (u[0] - x[3]) / 0.2, (u[1] - x[4]) / 0.2, (u[2] - x[5]) / 0.1
+
+
+def drone(x: Any, u: Any) -> tuple[Any, ...]:
+    """In the plane: it hovers if its attitude is level, and leaves if not."""
+    return x[2], x[3], -u[0] * ca.sin(x[4]) - 0.5 * x[2], u[0] * ca.cos(x[4]) - 9.81 - 0.5 * x[3], u[1]
+
+
+RESTING = {
+    "pioneer": pioneer(),
+    "pioneer without bounds on states": pioneer(lbx=-INF, ubx=INF),
+    "unicycle": beacon(),
+    "holonomic base": robot("x y psi v_x v_y omega", "m m rad m/s m/s rad/s", holonomic, 3),
+    "stiff drive": robot("x v", "m m/s", lambda x, u: (x[1], 1e5 * (u - x[1])), 1),
+    "forward only": robot("x v", "m m/s", lambda x, u: (x[1], u - x[1]), 1, lbu=0.0, lbx=[-INF, 0.0], ubx=[INF, 2.0]),
+    "slow drive": robot("x v", "m m/s", lambda x, u: (x[1], (u - x[1]) / 1.5), 1),
+    "joints driven by speeds": robot("q_1 q_2", "rad rad", lambda x, u: (u[0], u[1]), 2),
+    "conveyor with an offset": robot("s", "m", lambda x, u: (u - 0.3,), 1, u_rest=(0.3,)),
+}
+MOVING = {
+    "car": (robot("x y psi v", "m m rad m/s", car, 2, lbx=[-INF] * 3 + [0], ubx=[INF] * 3 + [3]), "s after its inputs have come to rest"),
+    "mass": (double_integrator(), "r changes by"),
+    "frictionless arm": (robot("q w", "rad rad/s", lambda x, u: (x[1], u - 9.81 * ca.sin(x[0])), 1), "changes by"),
+    "arm with friction": (robot("q w", "rad rad/s", lambda x, u: (x[1], u - 9.81 * ca.sin(x[0]) - 5 * x[1]), 1), "where it stands at q ="),
+    "arm that lies": (robot("q w", "rad rad/s", lambda x, u: (x[1], u), 1), "q changes by"),
+    "cart that rolls": (robot("x v", "m m/s", lambda x, u: (x[1], u - 0.05 * x[1]), 1), "x changes by"),
+    "drone": (robot("x z v_x v_z theta", "m m m/s m/s rad", drone, 2, u_rest=(9.81, 0.0), lbu=[0, -2], ubu=[20, 2]), "changes by"),
+    "conveyor": (robot("s", "m", lambda x, u: (u - 0.3,), 1), "s changes by -0.3 m per second"),
+    "unstable": (robot("x v", "m m/s", lambda x, u: (x[1], u + x[1] ** 3), 1), "x changes by"),
+}
+
+
+@pytest.mark.parametrize("name", RESTING)
+def test_robot_that_comes_to_rest_with_its_inputs_passes(name: str) -> None:
+    assert motion_at_rest(RESTING[name]) == ""
+
+
+@pytest.mark.parametrize("name", MOVING)
+def test_robot_that_coasts_or_falls_is_found_and_what_was_seen_is_said(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    ocp, words = MOVING[name]
+    seen = motion_at_rest(ocp)
+    assert words in seen
+    assert seen == motion_at_rest(ocp), "and the same each time"
+    assert capfd.readouterr() == ("", "")
+
+
+def test_bounds_say_what_operation_is() -> None:
+    """At 0.5 m/s at most the paper's robot is as still after a second as one of 50 m/s is after two."""
+    assert motion_at_rest(Ocp(pioneer().model, **(PAPER | {"ubu": [50.0, 0.7]}))) == ""

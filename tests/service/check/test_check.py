@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`rti-mpc check`: what it compares, and what it lets pass."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rti_mpc.contract.status import QpStatus
+from rti_mpc_service.check import check
+from rti_mpc_service.config.config import load
+from tests.service.config.test_config import MINIMAL
+
+
+@pytest.mark.parametrize(("first", "second"), [("riccati", "daqp"), ("osqp", "daqp"), ("daqp", "osqp")])
+def test_two_solvers_are_compared_tightly_whatever_the_controllers_tolerance(first: str, second: str, tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    loose = "eps = 0.01\n" if first != "daqp" else ""
+    path.write_text(MINIMAL + f"[ocp.bounds]\ninputs = {{ u_c = [-0.2, 0.2] }}\n[solver]\nname = '{first}'\n{loose}")
+    report = check.check(load(path))
+    assert report.second == second
+    assert report.opinions > check.OPINIONS, "those at the bounds are asked about, too"
+    assert report.agree
+    assert report.difference < 1e-6
+    assert (report.deviation > 1e-4) is (first == "osqp"), "what the tolerance costs is told apart from whether the QP is right"
+
+
+def test_a_qp_that_is_not_the_other_formulations_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + "[ocp.bounds]\ninputs = { u_c = [-1, 1], omega_c = [-1, 1] }\n")
+    right = check.answer
+    monkeypatch.setattr(check, "answer", lambda one, *sample: right(one, *sample) + (1e-4 if one.formulation == "simultaneous" else 0.0))
+    report = check.check(load(path))
+    assert not report.agree
+    np.testing.assert_allclose(report.difference, 1e-4, rtol=0.01)
+
+
+CART = """
+robot = "cart"
+model = { name = "tests.problems:cart" }
+ocp.N = 20
+ocp.dt_s = 0.1
+ocp.integrator = "rk4"
+ocp.weights = { Q = { r = 1 }, R = { F = 1e-7 }, delta = 1, lambda = 1 }
+[ocp.bounds]
+inputs = { F = [-5000, 5000] }
+increments = { F = [-2000, 2000] }
+states = { v = [-3, 3] }
+"""
+
+
+def test_every_bound_is_driven_to(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(CART)
+    report = check.check(load(path))
+    assert (report.bounds, report.missed) == (6, [])
+    assert report.agree
+
+
+def test_a_bound_that_gives_way_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The penalty that holds what is at its bound, too soft by far: the reference in a wave never touches one."""
+    path = tmp_path / "robot.toml"
+    path.write_text(CART)
+    monkeypatch.setattr("rti_mpc.rti.active_set.PATH", (10.0,))
+    report = check.check(load(path))
+    assert not report.agree or sum(report.statuses.values()) > report.statuses[QpStatus.SOLVED]

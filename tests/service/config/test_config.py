@@ -1,0 +1,336 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from rti_mpc.errors import ConfigError
+from rti_mpc.model.model import Model, Signal
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc.rti.qp.osqp import Solver
+from rti_mpc.rti.qp.qpsolvers import ForeignSolver
+from rti_mpc.rti.terminal import lqr_weight
+from rti_mpc.wire.bus import BusSettings
+from rti_mpc_service.check import check
+from rti_mpc_service.config.build import (
+    build_model,
+    build_ocp,
+    build_rti,
+    bus_settings,
+    guard_limits,
+    robot_settings,
+    solver_settings,
+    stage_parameters,
+)
+from rti_mpc_service.config.config import load
+from rti_mpc_service.config.fit import check_stop
+from rti_mpc_service.config.schema import Config
+from rti_mpc_service.controller import daemon
+from rti_mpc_service.demo import demo
+from rti_mpc_sim.settings import RobotSettings
+
+ROOT = Path(__file__).parents[3]
+SHIPPED = ROOT / "deploy" / "pioneer_3dx.toml"
+MINIMAL = """
+robot = "r"
+model = { name = "pioneer_3dx" }
+ocp.N = 3
+ocp.dt_s = 0.1
+ocp.integrator = "euler"
+ocp.weights = { Q = { x = 1, y = 2, psi = 0 }, R = { u_c = 1, omega_c = 3 }, delta = [1, 2, 3], lambda = 0.5 }
+"""
+
+DISC = "[[ocp.obstacles]]\ncentre_m = [1.0, 0.5]\n"
+
+# What a user may write into the shipped file, and what the one line must tell them.
+WRONG = [
+    ("[ocp]", "[solver]\niterations = 0\n[ocp]", ["solver.iterations", "at least 1", "0"]),
+    ("dt_s = 0.1", "dt_ms = 100", ["ocp.dt_ms", "dt_s", "in seconds", "100"]),
+    ("dt_s = 0.1", "dt_s = 100.0", ["ocp.dt_s", "in seconds", "at most 10", "100.0"]),
+    ("dt_s = 0.1", 'dt_s = "0.1"', ["ocp.dt_s", "must be a number", "'0.1'"]),
+    ("dt_s = 0.1", "dt_s = nan", ["ocp.dt_s", "finite", "nan"]),
+    ("dt_s = 0.1", "", ["ocp.dt_s", "missing", "in seconds"]),
+    ("N = 20", "N = 20.5", ["ocp.N", "whole number", "20.5"]),
+    ("N = 20", "N = true", ["ocp.N", "whole number", "True"]),
+    ("N = 20", "N = 20\nN_u = 21", ["ocp.N_u", "at most ocp.N = 20", "21"]),
+    ("N = 20", "N = 20\nstale_s = 0.1", ["ocp.stale_s", "timing.stale_s"]),
+    ("N = 20", "N = 20\nhorizon = 7", ["ocp.horizon", "N, N_u, dt_s"]),
+    ("N = 20", "n = 20", ["ocp.n is unknown", "perhaps ocp.N is meant", "in stages", "20"]),
+    ('integrator = "rk4"', 'integrator = "rk5"', ["ocp.integrator", "'rk4' or 'euler'", "'rk5'"]),
+    ("psi = 0.05", "psi = -0.05", ["ocp.weights.Q.psi", "at least 0", "-0.05"]),
+    ("psi = 0.05", "phi = 0.05", ["ocp.weights.Q.phi", "no output", "psi [rad]"]),
+    (", psi = 0.05", "", ["ocp.weights.Q", "psi [rad]", "missing"]),
+    ("delta = 28.0", "delta = [28.0, 28.0]", ["ocp.weights.delta", "20", "[28.0, 28.0]"]),
+    ("delta = 28.0", "delta = [28.0, -1.0]", ["ocp.weights.delta[1]", "at least 0", "-1.0"]),
+    ("lambda = 0.8", "lamda = 0.8", ["ocp.weights.lamda", "ocp.weights.lambda", "0.8"]),
+    ("u_c = [-0.5, 0.5]", "u_c = 0.5", ["ocp.bounds.inputs.u_c", "[lower, upper]", "0.5"]),
+    ("u_c = [-0.5, 0.5]", "u_c = [0.5, -0.5]", ["ocp.bounds.inputs.u_c", "lower < upper", "[0.5, -0.5]"]),
+    ("u_c = [-0.5, 0.5]", "u_c = [nan, 0.5]", ["ocp.bounds.inputs.u_c", "nan"]),
+    ("u_c = [-0.25, 0.25]", "u_c = [0.1, 0.25]", ["ocp.bounds.increments.u_c", "lower < 0 < upper", "0.1"]),
+    ("u_c = [-0.25, 0.25]", "u_c = [0.0, 0.25]", ["ocp.bounds.increments.u_c", "lower < 0 < upper", "brought to rest"]),
+    ("u_c = [-0.5, 0.5]", "u_c = [0.2, 0.3]", ["ocp.bounds", "bounds of input u_c must hold its rest, 0 m/s", "[0.2, 0.3]"]),
+    ("omega_c = [-0.745, 0.745]", "omega_c = [-inf, -0.1]", ["input omega_c must hold its rest, 0 rad/s", "[-inf, -0.1]"]),
+    ("u_c = [-0.5, 0.5]", "u_c = [inf, inf]", ["ocp.bounds.inputs.u_c", "lower < upper"]),
+    ('name = "pioneer_3dx"', 'name = "pioneer_4dx"', ["model.name", "pioneer_4dx", "pioneer_3dx"]),
+    ('robot = "pioneer"', 'robot = "two words"', ["robot", "letters, digits", "'two words'"]),
+    ('robot = "pioneer"', "robot = 3", ["robot", "must be text", "3"]),
+    ("[ocp]", "[bus]\nconnect = ['127.0.0.1:7447']\n[ocp]", ["bus.connect[0]", "tcp/127.0.0.1:7447", "'127.0.0.1:7447'"]),
+    ("[ocp]", "[bus]\nconfig = 'none.json5'\n[ocp]", ["bus.config", "file", "none.json5"]),
+    ("[ocp]", "[sim]\nx0 = { z = 1.0 }\n[ocp]", ["sim.x0.z", "no state", "x [m]"]),
+    ("[ocp]", "[sim]\nparameters = { theta_7 = 1.0 }\n[ocp]", ["sim.parameters.theta_7", "no parameter", "theta_6"]),
+    ("[ocp]", "[observer.disturbances]\nv = { drift = 0.1, limit = 0.2 }\n[ocp]", ["observer.disturbances.v", "no input or state", "u_c [m/s]"]),
+    ("[ocp]", "[observer.disturbances]\nu_c = { drift = 0.0, limit = 0.2 }\n[ocp]", ["observer.disturbances.u_c.drift", "greater than 0", "0.0"]),
+    ("[ocp]", "[observer.disturbances]\nu_c = { drift = 0.1 }\n[ocp]", ["observer.disturbances.u_c.limit", "missing"]),
+    ("[ocp]", "[observer]\nmeasured = ['x', 'z']\n[ocp]", ["observer.measured.z", "no state", "x [m]"]),
+    ("[ocp]", "[guard]\ntick_s = 0.1\n[ocp]", ["guard.tick_s", "at most 0.01", "0.1"]),
+    ("[ocp]", "[guard]\nu_rest = { v = 1.0 }\n[ocp]", ["guard.u_rest.v", "no input", "u_c [m/s]"]),
+    ("[ocp]", "[guard]\nenabled = true\nu_rest = { u_c = 0.1 }\n[ocp]", ["guard.u_rest", "must be the model's", "'u_c': 0.0"]),
+    ("[ocp]", "[solver]\nname = 'dapq'\n[ocp]", ["solver.name", "'dapq'", "riccati, osqp", "daqp", "pip install 'qpsolvers[NAME]'"]),
+    ("[ocp]", "[solver]\nname = 'daqp'\nrho = 2.0\n[ocp]", ["solver.rho", "osqp", "'daqp'", "2.0"]),
+    ("soft_weight = 1e3", "soft_weight = -1.0", ["ocp.bounds.soft_weight", "L1", "at least 0", "-1.0"]),
+    ("soft_weight = 1e3", "soft_weight_l2 = 1.0", ["ocp.bounds.soft_weight_l2", "soft_weight_L2"]),
+    ("soft_weight = 1e3", "constraints = { power = [0, 1] }", ["ocp.bounds.constraints.power", "no constraint", "none"]),
+    ("[ocp.bounds]", "[ocp.terminal]\nQ = { x = 1.0, y = 1.0 }\n[ocp.bounds]", ["ocp.terminal.Q", "psi [rad]", "missing"]),
+    ("[ocp.bounds]", "[ocp.terminal]\nQ = { x = 1.0, y = -1.0 }\n[ocp.bounds]", ["ocp.terminal.Q.y", "at least 0", "-1.0"]),
+    ("[ocp.bounds]", "[ocp.terminal]\nlqr.states = { v = 0.2 }\n[ocp.bounds]", ["ocp.terminal.lqr.states.v", "no state", "u [m/s]"]),
+    ("[ocp.bounds]", "[ocp.terminal]\nlqr = {}\n[ocp.bounds]", ["stabilizable", "terminal weight"]),
+    ("[ocp.bounds]", "[ocp.terminal]\nlqr = {}\nQ = { x = 1, y = 1, psi = 0 }\n[ocp.bounds]", ["ocp.terminal", "Q or lqr, not both"]),
+    ("[model]", DISC + "radius_m = -0.3\n[model]", ["ocp.obstacles[0].radius_m", "in m", "greater than 0", "-0.3"]),
+    ("[model]", DISC + "[model]", ["ocp.obstacles[0].radius_m", "missing", "in m"]),
+    ("[model]", DISC + "radius = 0.3\n[model]", ["ocp.obstacles[0].radius", "ocp.obstacles.radius_m", "in m"]),
+    ("[model]", DISC + "radius_m = 0.3\nvelocity_m_s = 0.1\n[model]", ["ocp.obstacles[0].velocity_m_s", "[x, y]", "m/s", "0.1"]),
+    ("[model]", DISC + "radius_m = 0.3\nmargin_m = -0.1\n[model]", ["ocp.obstacles[0].margin_m", "in m", "at least 0", "-0.1"]),
+    ("[model]", "[modle]", ["modle", "model"]),
+    ("[model]", "[model", ["TOML", "line"]),
+]
+
+
+@pytest.mark.parametrize(("right", "wrong", "told"), WRONG, ids=[wrong.replace("\n", " ") or f"no {right}" for right, wrong, _ in WRONG])
+def test_wrong_value_is_refused_in_one_line_that_says_what_would_be_right(right: str, wrong: str, told: list[str], tmp_path: Path) -> None:
+    text = SHIPPED.read_text()
+    assert right in text
+    path = tmp_path / "robot.toml"
+    path.write_text(text.replace(right, wrong, 1))
+    with pytest.raises(ConfigError) as refusal:
+        load(path)
+    line = str(refusal.value)
+    assert "\n" not in line
+    assert line.startswith(f"{path}: ")
+    for words in told:
+        assert words in line, line
+
+
+def test_file_that_is_not_there_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=re.escape(str(tmp_path / "none.toml"))):
+        load(tmp_path / "none.toml")
+
+
+def test_configuration_becomes_the_ocp_it_describes(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL)
+    ocp = build_ocp(load(path))
+    assert (ocp.N, ocp.N_u, ocp.dt, ocp.method) == (3, 3, 0.1, "euler")
+    np.testing.assert_array_equal(np.diag(ocp.Q), [1, 2, 0])
+    np.testing.assert_array_equal(np.diag(ocp.R), [1, 3])
+    np.testing.assert_array_equal(ocp.delta, [1, 2, 3])
+    np.testing.assert_array_equal(ocp.lambda_, [0.5, 0.5, 0.5])
+    assert np.all(np.isinf(ocp.ubu)), "a bound left out is no bound"
+
+
+def test_softened_bounds_constraints_and_obstacles_become_those_of_the_ocp(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    bounds = "[ocp.bounds]\nstates = { u = [-1, 1] }\nconstraints = { power = [-inf, 0.1] }\nsoft_weight = 5.0\nsoft_weight_L2 = 6.0\n"
+    path.write_text(MINIMAL.replace("pioneer_3dx", "tests.service.config.test_config:limited") + bounds + DISC + "radius_m = 0.3\nmargin_m = 0.2\n")
+    ocp = build_ocp(load(path))
+    assert ocp.h_expr.numel() == 2, "the constraint that is bounded, and the disc"
+    h = ca.Function("h", [ocp.model.x, ocp.model.u, ocp.model.p], [ocp.h_expr])
+    value = np.array(h([1.0, 0.0, 0.0, 0.4, 0.0], [0.5, 0.0], ocp.model.p_nominal)).ravel()
+    np.testing.assert_allclose(value, [0.2, 0.0], rtol=0, atol=1e-8)  # 0.4 * 0.5; half a metre from the centre is where the disc begins
+    np.testing.assert_array_equal(ocp.lh, [-math.inf, 0.0])
+    np.testing.assert_array_equal(ocp.uh, [0.1, math.inf])
+    for l1, l2 in ((ocp.z, ocp.Z), (ocp.zh, ocp.Zh)):
+        assert set(l1) == {5.0}
+        assert set(l2) == {6.0}
+
+
+def limited() -> Model:
+    """The paper's robot, which says how much power it takes."""
+    model = pioneer_3dx()
+    power, other = model.x[3] * model.u[0], model.x[4]
+    return replace(model, h_expr=ca.vertcat(other, power), constraints=(Signal("other", "rad/s"), Signal("power", "m^2/s^2")))
+
+
+def test_terminal_weight_is_the_one_given_or_the_regulators(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + "[ocp.terminal]\nQ = { psi = 3.0, x = 1.0, y = 2.0 }\n")
+    np.testing.assert_array_equal(np.diag(build_ocp(load(path)).Q_e), [1, 2, 3])
+    path.write_text(MINIMAL)
+    assert not build_ocp(load(path)).Q_e.any()
+    path.write_text(MINIMAL + "[ocp.terminal.lqr]\nstates = { u = 0.25 }\ninputs = { u_c = 0.25 }\n")
+    ocp = build_ocp(load(path))
+    np.testing.assert_array_equal(ocp.Q_e, lqr_weight(ocp, np.array([0, 0, 0, 0.25, 0]), np.array([0.25, 0])))
+
+
+def test_moving_obstacles_are_parameters_that_a_reference_carries_row_by_row(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    discs = DISC + "radius_m = 0.3\n" + DISC + "radius_m = 0.2\nmargin_m = 0.1\n"
+    path.write_text(MINIMAL + discs)
+    assert stage_parameters(load(path), np.array([0.0, 2.0])).shape == (2, 0), "none moves: all nominal"
+    path.write_text(MINIMAL + discs + "velocity_m_s = [0.0, -0.1]\n")
+    config = load(path)
+    rows, nominal = stage_parameters(config, np.array([0.0, 2.0])), build_ocp(config).model.p_nominal
+    np.testing.assert_allclose(rows[0], nominal, rtol=1e-15)
+    np.testing.assert_allclose(rows[1], [*nominal[:-2], 0.3, 0.3], rtol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["riccati", "osqp", "daqp"])
+def test_solver_is_chosen_by_one_word(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + f'[solver]\nname = "{name}"\n')
+    rti = build_rti(load(path))
+    assert (rti.active_set is None) is (name != "riccati")
+    assert isinstance(rti.solvers[0], Solver if name != "daqp" else ForeignSolver)
+
+
+def test_bounds_go_to_the_signals_they_name_whatever_their_order() -> None:
+    ocp = build_ocp(load(SHIPPED))
+    np.testing.assert_array_equal(ocp.ubu, [0.5, 0.745])
+    np.testing.assert_array_equal(ocp.lbdu, [-0.25, -0.40])
+    np.testing.assert_array_equal(ocp.ubx, [math.inf, math.inf, math.inf, 0.5, 0.745])
+
+
+def test_parameters_by_name_reach_the_model(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL.replace('"pioneer_3dx"', '"pioneer_3dx", parameters = { a = 0.1 }'))
+    assert build_model(load(path)).p_nominal[-1] == 0.1
+
+
+def test_zenoh_file_is_found_beside_the_configuration(tmp_path: Path) -> None:
+    (tmp_path / "zenoh.json5").write_text("{}")
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + '[bus]\nconfig = "zenoh.json5"\n')
+    assert bus_settings(load(path)).config == tmp_path / "zenoh.json5"
+
+
+def test_staleness_follows_the_period_within_limits(tmp_path: Path) -> None:
+    stale_s = []
+    for dt_s in (0.01, 0.04, 0.2):
+        path = tmp_path / "robot.toml"
+        path.write_text(MINIMAL.replace("dt_s = 0.1", f"dt_s = {dt_s}"))
+        stale_s.append(load(path).stale_s)
+    assert stale_s == [0.05, 0.1, 0.225]
+
+
+def test_hash_follows_what_decides_a_command_and_nothing_else(tmp_path: Path) -> None:
+    def config_hash(text: str) -> int:
+        path = tmp_path / "robot.toml"
+        path.write_text(text)
+        return load(path).config_hash
+
+    reference = config_hash(MINIMAL)
+    assert 0 <= reference < 2**64
+    assert config_hash("# a comment\n" + MINIMAL.replace("x = 1, y = 2", "y = 2.0, x = 1.0")) == reference
+    assert config_hash(MINIMAL + "[sim]\nseed = 2\n[bus]\nlisten = ['tcp/127.0.0.1:7448']\n[realtime]\npriority = 1\n") == reference
+    assert config_hash(MINIMAL.replace("lambda = 0.5", "lambda = 0.6")) != reference
+
+
+def test_every_field_says_what_it_is() -> None:
+    def fields(schema: dict[str, object]) -> list[str]:
+        found = []
+        for section in (schema, *schema["$defs"].values()):  # type: ignore[attr-defined]
+            found += [name for name, field in section["properties"].items() if "description" not in field]
+        return found
+
+    assert fields(Config.model_json_schema()) == []
+
+
+def test_plant_takes_its_own_parameters_the_rest_from_the_controller(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(
+        MINIMAL + "[sim]\nx0 = { psi = 1.5 }\nparameters = { theta_1 = 0.3 }\nseed = 4\n[ocp.bounds]\nincrements = { u_c = [-0.1, 0.2] }\n"
+    )
+    settings = RobotSettings(**robot_settings(load(path)))
+    assert settings.model.p_nominal[0] == 0.3
+    assert settings.seed == 4
+    assert settings.state_period_s == 0.1
+    np.testing.assert_array_equal(settings.x0, [0, 0, 1.5, 0, 0])
+    np.testing.assert_allclose(settings.slew, [1.0, math.inf], rtol=1e-15)
+
+
+def test_limits_of_iterations_reach_the_controller(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + "[solver]\niterations = 7\ntolerance = 1e-3\neps = 1e-4\n")
+    rti = build_rti(load(path))
+    assert (rti.iterations, rti.tolerance) == (7, 1e-3)
+    assert solver_settings(load(path)).eps == 1e-4
+
+
+GUARDED = SHIPPED.read_text() + "\n[guard]\nenabled = true\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "instead", "words"),
+    [
+        (", omega_c = [-0.745, 0.745] }", " }", ["ocp.bounds.inputs", "bound every input", "omega_c"]),
+        (
+            "inputs = { u_c = [-0.5, 0.5], omega_c = [-0.745, 0.745] }",
+            "inputs = { omega_c = [-1, 1], u_c = [-1, 1] }",
+            ["the model's order ['u_c', 'omega_c']"],
+        ),
+    ],
+)
+def test_guard_must_know_every_limit_in_the_order_of_the_wire(tmp_path: Path, text: str, instead: str, words: list[str]) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(GUARDED.replace(text, instead))
+    with pytest.raises(ConfigError) as refusal:
+        load(path)
+    assert all(word in str(refusal.value) for word in words), refusal.value
+    path.write_text(SHIPPED.read_text().replace(text, instead))
+    load(path)  # nobody else minds
+
+
+def test_guard_that_loads_no_model_knows_that_bounds_leave_out_rest(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    for rest, instead in (("", "u_c = [0.2, 0.3]"), ("u_rest = { u_c = 0.6 }\n", "u_c = [-0.5, 0.5]")):
+        path.write_text(GUARDED.replace("u_c = [-0.5, 0.5]", instead) + rest)
+        with pytest.raises(ConfigError, match=r"ocp\.bounds\.inputs\.u_c must hold the input's rest, guard\.u_rest = 0"):
+            load(path, with_model=False)
+
+
+def test_limits_of_the_guard_are_those_of_the_problem(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(GUARDED)
+    config = load(path, with_model=False)
+    limits, ocp = guard_limits(config), build_ocp(config)
+    for name in ("lbu", "ubu", "lbdu", "ubdu"):
+        np.testing.assert_array_equal(getattr(limits, name), getattr(ocp, name))
+    np.testing.assert_allclose(limits.slew, [2.5, 4.0])
+    assert limits.settling_s == pytest.approx(0.3 + 0.2)
+    assert config.config_hash == load(SHIPPED).config_hash
+
+
+def coasting() -> Model:
+    """The robot, its forward speed kept up by nothing but its input's acceleration."""
+    model = pioneer_3dx()
+    rates = ca.vertsplit(model.f_expl_expr)
+    return replace(model, f_expl_expr=ca.vertcat(*rates[:3], model.u[0], rates[4]))
+
+
+def test_robot_that_a_stop_does_not_bring_to_rest_is_refused_unless_its_file_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    check_stop(load(SHIPPED))
+    path.write_text(SHIPPED.read_text().replace('"pioneer_3dx"', '"tests.service.config.test_config:coasting"'))
+    for refuse in (lambda: check.main(path), lambda: daemon.main(load(path), BusSettings()), lambda: demo.main(load(path), "eight")):
+        with pytest.raises(ConfigError) as refusal:
+            refuse()
+        assert "\n" not in str(refusal.value)
+        for words in ("tests.service.config.test_config:coasting", "10 s after its inputs have come to rest", "m per second", 'stop = "coasts"'):
+            assert words in str(refusal.value)
+    path.write_text(path.read_text().replace("[model]", '[model]\nstop = "coasts"'))
+    check_stop(load(path))

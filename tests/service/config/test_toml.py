@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.config import toml
+from rti_mpc_service.config.config import load
+from tests.service.config.test_config import MINIMAL
+
+ODD = """
+[solver]
+eps = 1e-7
+[bus]
+listen = ['tcp/[::1]:7448']
+[sim.parameters]
+theta_1 = 0.25
+"""
+
+TABLES = """
+[ocp.terminal.lqr]
+states = { u = 0.25 }
+inputs = { u_c = 0.25 }
+[[ocp.obstacles]]
+centre_m = [1, -2.5]
+radius_m = 0.3
+[[ocp.obstacles]]
+centre_m = [-1.0, 0.0]
+radius_m = 0.2
+velocity_m_s = [0.0, 0.1]
+"""
+
+
+@pytest.mark.parametrize("text", [SHIPPED.read_text(), MINIMAL, MINIMAL + ODD, MINIMAL + TABLES])
+def test_configuration_written_is_the_one_that_was_read(tmp_path: Path, text: str) -> None:
+    path, again = tmp_path / "robot.toml", tmp_path / "again.toml"
+    path.write_text(text)
+    config = load(path)
+    again.write_text(toml.write(config))
+    assert load(again) == config
+    assert toml.write(load(again)) == toml.write(config)
+
+
+def test_what_was_left_out_stays_out(tmp_path: Path) -> None:
+    written = toml.write(load(SHIPPED))
+    assert "[ocp.weights" in written
+    for name in ("[sim", "[bus", "prefix"):
+        assert name not in written
+
+
+def test_infinite_bounds_and_a_zenoh_file_are_kept(tmp_path: Path) -> None:
+    path, again = tmp_path / "robot.toml", tmp_path / "again.toml"
+    (tmp_path / "peer.json5").write_text("{}")
+    path.write_text(SHIPPED.read_text().replace("u_c = [-0.5, 0.5]", "u_c = [-inf, 0.5]") + "[bus]\nconfig = 'peer.json5'\n")
+    config = load(path)
+    again.write_text(toml.write(config))
+    assert load(again) == config

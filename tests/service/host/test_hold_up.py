@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the witness of the host sees. Whatever else the machine does, it can only see more."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rti_mpc_service.host.hold_up import Host, Waits
+from rti_mpc_service.host.realtime import available
+from tests.processes.system import until
+
+ROOT = Path(__file__).parents[3]
+pytestmark = pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="this kernel does not tell how long threads wait for a core")
+
+GREEDY = """
+import os, sys, time
+os.sched_setaffinity(0, {int(sys.argv[1])})
+until_s = time.process_time() + float(sys.argv[2])
+print("ready", flush=True)
+while time.process_time() < until_s:
+    pass
+"""
+OWNER = """
+import threading
+from rti_mpc_service.host.hold_up import Host
+with Host() as host:
+    print(*[timer.process.pid for timer in host._timers], flush=True)
+    threading.Event().wait(60)
+"""
+COMPUTED_S = 0.3  # by each of two on one core: each waits for the other for as long, but for the last slice of time
+
+
+@pytest.fixture
+def host() -> Iterator[Host]:
+    with Host() as host:
+        yield host
+
+
+def greedy(core: int) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, "-c", GREEDY, str(core), str(COMPUTED_S)], stdout=subprocess.DEVNULL)
+
+
+def test_processes_that_share_a_core_hold_each_other_up(host: Host) -> None:
+    begin_ns = time.monotonic_ns()
+    for process in [greedy(available()[0]) for _ in range(2)]:
+        assert process.wait() == 0
+    assert host.held_up_ms(begin_ns, time.monotonic_ns()) > 0.5 * 1e3 * COMPUTED_S
+
+
+def test_grandchildren_are_seen_too(host: Host) -> None:
+    shell = f"'{sys.executable}' -c \"$1\" {available()[0]} {COMPUTED_S} & '{sys.executable}' -c \"$1\" {available()[0]} {COMPUTED_S} & wait"
+    begin_ns = time.monotonic_ns()
+    subprocess.run(["sh", "-c", shell, "sh", GREEDY], stdout=subprocess.DEVNULL, check=True)
+    assert host.held_up_ms(begin_ns, time.monotonic_ns()) > 0.5 * 1e3 * COMPUTED_S
+
+
+def test_wait_that_lasts_is_told_before_the_kernel_adds_it_up_and_only_once(tmp_path: Path) -> None:
+    """A thread that ends right after a wait would else take it along."""
+
+    def tell(ran: int, waited: int, state: str) -> None:
+        (tmp_path / "schedstat").write_text(f"{ran} {waited} 7\n")
+        (tmp_path / "stat").write_text(f"12 (a) b) {state} 1 12\n")
+
+    tell(0, 0, "R")
+    waits = Waits(str(tmp_path))
+    assert [waits.since(10), waits.since(10)] == [10, 10]
+    tell(1, 25, "S")
+    assert waits.since(10) == 5
+    assert waits.since(10) == 0, "it sleeps"
+    tell(2, 26, "R")
+    assert waits.since(10) == 1, "it ran"
+    (tmp_path / "stat").unlink()
+    with pytest.raises(OSError, match="stat"):
+        waits.since(10)
+    waits.close()
+
+
+def test_its_timers_end_with_it_and_with_whoever_started_it(host: Host) -> None:
+    pids = [timer.process.pid for timer in host._timers]
+    host.__exit__(None, None, None)
+    assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
+    with subprocess.Popen([sys.executable, "-c", OWNER], cwd=ROOT, stdout=subprocess.PIPE, text=True) as owner:
+        assert owner.stdout is not None
+        pids = [int(word) for word in owner.stdout.readline().split()]
+        owner.send_signal(signal.SIGKILL)
+    until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids), "its timers have ended")

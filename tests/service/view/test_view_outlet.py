@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rerun")
+import rerun as rr
+import rerun_cli
+from rerun.chunk import RrdReader
+from rerun_bindings import check_for_rrd_footer
+
+from rti_mpc.contract.message import State
+from rti_mpc.errors import ConfigError
+from rti_mpc.wire.info import Info
+from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.view.outlet import Outlet, file_outlet, viewer_outlet
+from rti_mpc_service.view.recording import Entry
+from tests.in_time import MS, in_time
+
+BINARY = Path(rerun_cli.__file__).with_name("rerun")  # the script of that name is a wrapper whose child a signal would orphan
+INFO = Info.from_json({"role": "controller", "states": [{"name": "q", "unit": "m", "angle": False}]})
+PATIENCE_S = 60.0
+
+
+def state(k: int, width: int = 1) -> Entry:
+    return Entry(k, State(1, k, k, np.full(width, float(k))))
+
+
+def values(path: Path) -> list[float]:
+    """What a recording holds of q."""
+    chunks = [chunk for chunk in RrdReader(path).stream().to_chunks() if chunk.entity_path == "/state/q" and not chunk.is_static]
+    return sorted(value[0] for chunk in chunks for value in chunk.to_record_batch().column("Scalars:scalars").to_pylist())
+
+
+def await_(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+class Viewer:
+    """Stands in for a viewer, without a screen: Rerun's own server, which saves what it is shown."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = probe.getsockname()[1]
+        self.lives = 0
+
+    @property
+    def url(self) -> str:
+        return f"rerun+http://127.0.0.1:{self.port}/proxy"
+
+    @property
+    def path(self) -> Path:
+        return self.folder / f"viewer-{self.lives}.rrd"
+
+    def start(self) -> None:
+        self.lives += 1
+        options = ["--save", self.path, "--bind", "127.0.0.1", "--port", str(self.port)]
+        self.process = subprocess.Popen([BINARY, *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    @property
+    def shown(self) -> int:
+        """Bytes saved so far."""
+        return self.path.stat().st_size if self.path.exists() else 0
+
+    def shows(self) -> list[float]:
+        """What it holds of q so far; nothing while a chunk is half written."""
+        try:
+            return values(self.path) if self.shown else []
+        except RuntimeError:
+            return []
+
+
+@pytest.fixture
+def viewer(tmp_path: Path) -> Iterator[Viewer]:
+    viewer = Viewer(tmp_path)
+    viewer.start()
+    yield viewer
+    viewer.kill()
+
+
+def test_a_closed_file_holds_everything_offered(tmp_path: Path) -> None:
+    outlet = file_outlet(tmp_path / "folder" / "run.rrd", "robot")
+    outlet.offer([Entry(0, INFO)])
+    for k in range(1000):
+        outlet.offer([state(k)])
+    assert outlet.close()
+    assert values(tmp_path / "folder" / "run.rrd") == list(range(1000))
+
+
+def test_a_recording_has_no_footer_for_which_to_remember_every_chunk(tmp_path: Path) -> None:
+    """Rerun would keep the particulars of each in memory until the end: hundreds of MiB an hour."""
+    outlet = file_outlet(tmp_path / "run.rrd", "robot")
+    outlet.offer([Entry(0, INFO), state(0)])
+    assert outlet.close()
+    assert not check_for_rrd_footer(str(tmp_path / "run.rrd"))
+
+
+def test_a_recording_replaces_an_older_one(tmp_path: Path) -> None:
+    for k in range(2):
+        outlet = file_outlet(tmp_path / "run.rrd", "robot")
+        outlet.offer([Entry(0, INFO), state(k)])
+        assert outlet.close()
+    assert values(tmp_path / "run.rrd") == [1.0]
+
+
+def test_a_full_queue_drops_the_oldest_counts_them_and_keeps_the_description(tmp_path: Path) -> None:
+    ready = Event()
+
+    def open_slowly() -> rr.RecordingStream:
+        assert ready.wait(PATIENCE_S)
+        stream = rr.RecordingStream("test")
+        stream.save(tmp_path / "run.rrd")
+        return stream
+
+    outlet = Outlet("slow", open_slowly, capacity=100, close_s=PATIENCE_S)
+    outlet.offer([Entry(0, INFO)])
+    outlet.offer(state(k) for k in range(250))
+    assert outlet.dropped == 151
+    ready.set()
+    assert not outlet.close()
+    assert values(tmp_path / "run.rrd") == list(range(150, 250))
+    assert [(notice.code, notice.text) for notice in outlet.notices] == [("outlet_slow", "slow: too slow, 151 entries dropped")]
+
+
+def test_a_file_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="rerun-save must be a file"):
+        file_outlet(tmp_path, "robot")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_is_refused() -> None:
+    with pytest.raises(ConfigError, match="No space left"):
+        file_outlet(Path("/dev/full"), "robot")
+
+
+def test_without_a_viewer_closing_does_not_wait(viewer: Viewer, host: Host) -> None:
+    viewer.kill()
+    outlet = viewer_outlet(viewer.url, "robot")
+    outlet.offer([Entry(0, INFO)])
+    since_ns = time.monotonic_ns()
+    assert not outlet.close()
+    in_time(host, "closing", (time.monotonic_ns() - since_ns) / MS, 1000.0, since_ns)
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # it is still being written
+def test_a_viewer_killed_and_started_again_is_shown_the_robot_again(viewer: Viewer) -> None:
+    outlet = viewer_outlet(viewer.url, "robot")
+    outlet.offer([Entry(0, INFO), state(0)])
+    await_(lambda: outlet.connected and viewer.shown > 0)
+    viewer.kill()
+    await_(lambda: outlet.failures == 1)
+    outlet.offer([state(1)])
+    viewer.start()
+    await_(lambda: outlet.connected)
+    outlet.offer([state(2)])
+    outlet.close()
+    await_(lambda: viewer.shows() == [1.0, 2.0])
+
+
+def test_a_hung_viewer_delays_neither_offers_nor_closing(viewer: Viewer, host: Host) -> None:
+    outlet = viewer_outlet(viewer.url, "robot")
+    outlet.offer([Entry(0, INFO)])
+    await_(lambda: outlet.connected)
+    os.kill(viewer.process.pid, signal.SIGSTOP)
+    worst = (0, 0)
+    deadline = time.monotonic() + 3.0
+    while time.monotonic() < deadline:
+        since_ns = time.monotonic_ns()
+        outlet.offer([state(k) for k in range(200)])
+        worst = max(worst, (time.monotonic_ns() - since_ns, since_ns))
+        Event().wait(0.005)
+    since_ns = time.monotonic_ns()
+    outlet.close()
+    in_time(host, "closing", (time.monotonic_ns() - since_ns) / MS, 1000.0, since_ns)
+    in_time(host, "an offer", worst[0] / MS, 500.0, worst[1])
+    os.kill(viewer.process.pid, signal.SIGCONT)

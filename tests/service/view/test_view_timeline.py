@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from rti_mpc.contract.message import STAMP_ON_ARRIVAL
+from rti_mpc_service.view.timeline import AHEAD_NS, GAP_NS, Timeline
+
+SECOND = 1_000_000_000
+
+
+def test_the_axis_is_the_robots_clock() -> None:
+    timeline = Timeline()
+    assert timeline.place_state(3, 17 * SECOND) == 17 * SECOND
+    assert timeline.place(17 * SECOND + 5) == 17 * SECOND + 5
+
+
+def test_a_clock_that_begins_again_is_appended() -> None:
+    timeline = Timeline()
+    timeline.place_state(3, 20 * SECOND)
+    assert timeline.place_state(4, 0) == 20 * SECOND + GAP_NS
+    assert timeline.place(SECOND // 2) == 20 * SECOND + GAP_NS + SECOND // 2
+    assert timeline.place_state(4, 2 * SECOND) == 22 * SECOND + GAP_NS
+    assert timeline.place_state(5, 0) == 22 * SECOND + 2 * GAP_NS
+
+
+def test_a_clock_that_goes_on_through_a_restart_stays_as_it_is() -> None:
+    timeline = Timeline()
+    timeline.place_state(3, 20 * SECOND)
+    assert timeline.place_state(4, 30 * SECOND) == 30 * SECOND
+
+
+def test_stamps_of_a_former_life_do_not_run_ahead_of_the_present_one() -> None:
+    timeline = Timeline()
+    timeline.place_state(3, 900 * SECOND)
+    now = timeline.place_state(4, 0)
+    assert timeline.place(900 * SECOND) == now + AHEAD_NS
+
+
+def test_what_comes_before_any_state_is_placed_where_a_clock_can_be() -> None:
+    assert Timeline().place(STAMP_ON_ARRIVAL) == 0
+    assert Timeline().place(12) == 12
+
+
+def test_the_axis_stays_within_int64_whatever_lives_of_a_robot_say() -> None:
+    timeline = Timeline()
+    for epoch, stamp_ns in enumerate(20 * [2**62 - 1, 1 - 2**62, 0, 2**62 - 1, 5]):
+        for placed in (timeline.place_state(epoch, stamp_ns), timeline.place(2**62 - 1), timeline.place(1 - 2**62), timeline.now_ns):
+            assert abs(placed) < 2**63

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rti_mpc.contract.message import End, Reference
+from rti_mpc.wire.info import Info, Label
+from rti_mpc_service.view.tracking_error import tracking_error
+
+UNIX_NS = 1_800_000_000_000_000_000  # as a float, good to 256 ns only
+PLANE = (Label("x", "m", role="x", state="x"), Label("y", "m", role="y", state="y"), Label("psi", "rad", True, "heading", "psi"))
+INFO = Info(role="controller", states=(*PLANE, Label("u", "m/s")), outputs=(PLANE[2], *PLANE[:2]))
+
+
+def reference(y: list[list[float]]) -> Reference:
+    return Reference(1, 1, UNIX_NS, 1000, End.HOLD, np.array(y), np.zeros((len(y), 0)))
+
+
+def error(y: list[list[float]], offset_ns: int, x: list[float]) -> dict[str, float]:
+    errors = tracking_error(INFO, reference(y), np.array([UNIX_NS + offset_ns]), np.array([x]))
+    return {name: float(values[0]) for name, values in errors.items()}
+
+
+def test_between_rows_the_reference_is_interpolated_at_any_epoch_of_the_clock() -> None:
+    result = error([[0.0, 0.0, 0.0], [0.0, 1.0, 2.0]], 250, [0.25, 0.5, 0.0, 9.0])
+    assert result == pytest.approx({"x": 0.0, "y": 0.0, "psi": 0.0, "position": 0.0}, abs=1e-12)
+
+
+def test_after_the_last_row_the_reference_is_held() -> None:
+    assert error([[0.0, 0.0, 0.0], [0.0, 1.0, 2.0]], 9000, [1.003, 2.004, 0.0, 0.0])["position"] == pytest.approx(5.0)
+
+
+def test_before_the_first_row_there_is_no_error() -> None:
+    assert np.isnan(error([[0.0, 0.0, 0.0]], -1, [0.0] * 4)["position"])
+
+
+@pytest.mark.parametrize("turns", [-3, 0, 2])
+def test_heading_error_is_the_short_way_round(turns: int) -> None:
+    assert error([[3.1, 0.0, 0.0]], 0, [0.0, 0.0, -3.1 + 2 * np.pi * turns, 0.0])["psi"] == pytest.approx(2 * np.pi - 6.2)
+
+
+def test_a_reference_that_crosses_pi_is_interpolated_the_short_way() -> None:
+    assert error([[3.1, 0.0, 0.0], [-3.1, 0.0, 0.0]], 500, [0.0, 0.0, np.pi, 0.0])["psi"] == pytest.approx(0.0, abs=1e-12)
