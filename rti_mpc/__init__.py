@@ -8,6 +8,20 @@ sample's QP: transcription, qp, solver. The controller stands behind rti, the wi
 beside it. Names are imported on first use, so that a process which only speaks the
 wire contract loads neither CasADi nor OSQP.
 
+Public names: `Model` and `Signal` describe a robot, `find_model` finds one that ships,
+`Ocp` is the problem, `Rti` solves one sample of it, `Controller` does so on a robot's
+time with everything that may go wrong.
+
+Example:
+    >>> from rti_mpc import Ocp, Rti, find_model
+    >>> ocp = Ocp(find_model("pioneer_3dx"), N=20, dt=0.1, Q=[1, 1, 0.05], R=[1, 1], lbu=-0.5, ubu=0.5)
+    >>> rti = Rti(ocp, compile=False)
+    >>> rti.prepare(y_ref=rti.y_ref + [1.0, 0.0, 0.0])  # before the state is there: shift, linearize, factorize
+    >>> rti.feedback(x0=rti.x[0])  # once it is: embed the state, solve
+    <QpStatus.SOLVED: 0>
+    >>> rti.u[0].shape  # the command
+    (2,)
+
 References, cited by key throughout:
 
 * [Rosales] A. Rosales Acosta, "Dynamic nonlinear model based predictive control for mobile robots".
@@ -53,6 +67,7 @@ HOME = {
 }
 
 __version__ = "0.1.0"
+__all__ = ["Controller", "Model", "Ocp", "Rti", "Signal", "__version__", "find_model"]
 
 
 def __getattr__(name: str) -> Any:
@@ -60,3 +75,8 @@ def __getattr__(name: str) -> Any:
     if name not in HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    """Return the public names, those that are not imported yet included."""
+    return __all__
