@@ -17,7 +17,7 @@ import pytest
 from rti_mpc.contract.message import Command, End, Event, Reference, State, Telemetry
 from rti_mpc.contract.status import Mode
 from rti_mpc.wire import cdr
-from rti_mpc.wire.bus import Bus
+from rti_mpc.wire.bus import Bus, Publisher
 from rti_mpc.wire.cdr import decode, encode
 from rti_mpc.wire.session import BusSettings
 from rti_mpc_service.cli import SHIPPED
@@ -179,9 +179,15 @@ def malformed(message: State | Command, rows: str) -> dict[str, bytes]:
 def test_payload_of_every_malformed_kind_is_counted_and_published_while_control_goes_on(driven: System, monkeypatch: pytest.MonkeyPatch) -> None:
     """States to the controller and commands to the robot; of a flood of them each publishes one event a second."""
     ours = driven.bus.publisher(KEYS.state), driven.bus.publisher(KEYS.command)
-    with monkeypatch.context() as later:
-        later.setattr(cdr, "VERSION", cdr.VERSION + 1)
-        foreign = driven.bus.publisher(KEYS.state), driven.bus.publisher(KEYS.command)
+    with Bus.join(BusSettings(connect=(driven.endpoint,)), KEYS) as another:
+        with monkeypatch.context() as later:
+            later.setattr(cdr, "VERSION", cdr.VERSION + 1)
+            foreign = another.publisher(KEYS.state), another.publisher(KEYS.command)
+        refuse_malformed(driven, ours, foreign)
+
+
+def refuse_malformed(driven: System, ours: tuple[Publisher[State], Publisher[Command]], foreign: tuple[Publisher[State], Publisher[Command]]) -> None:
+    """Send every malformed kind, by publishers of our version of the messages and of another, and look at what is published of it."""
     kinds = malformed(driven.state(lambda _: True), "x"), malformed(driven.tracking(), "u")
     before, events, start_s = driven.sample(), driven.bus.subscriber(KEYS.events, capacity=1024, history=False), time.monotonic()
 

@@ -97,11 +97,12 @@ class Watched(System):
             return [row for row in csv.DictReader(file) if None not in row.values()]
 
     def answered_ns(self, command: Command) -> int:
-        """When the robot took a command, by its own log."""
+        """When the robot had taken a command at the latest, by its own log. It tells of the first answer to a state, a guard's ramp perhaps."""
 
         def look() -> int | None:
-            rows = (row for row in self.log() if int(row["seq"]) == command.state_seq and row["command_seq"] == str(command.seq))
-            return next((int(row["stamp_ns"]) + round(1e3 * float(row["latency_us"])) for row in rows), None)
+            answered = [row for row in self.log() if int(row["seq"]) >= command.state_seq and row["command_seq"]]
+            times = [int(row["stamp_ns"]) + round(1e3 * float(row["latency_us"])) for row in answered if int(row["command_seq"]) >= command.seq]
+            return min(times, default=None)
 
         return until(look, "the robot's log tells of the command", pause_s=0.05)
 
