@@ -199,3 +199,9 @@ def test_every_cited_reference_is_defined_and_every_defined_one_cited() -> None:
     cited = {key for path in every_file() for key in re.findall(r"\[(\w+)\]_", path.read_text(encoding="utf-8"))}
     defined = re.findall(r"^\* \[(\w+)\] ", (ROOT / "rti_mpc/__init__.py").read_text(encoding="utf-8"), re.MULTILINE)
     assert sorted(cited) == sorted(defined)
+
+
+def test_module_opens_with_what_it_is_and_not_with_a_question() -> None:
+    for path in every_file():
+        first = (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").partition(" ")[0]
+        assert first not in {"", "What", "Who", "Whose", "Whether", "How", "Where", "Which", "When", "Why", "That"}, path

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Which input acts when, as its sender believes it: corrected by what the robot reports.
+Schedule of inputs as the sender of commands believes it, corrected by what the robot reports.
 
 A state of a robot that reports tells which input acts at its stamp, and the command
 that it comes from. Commands that should have acted by then and do not are believed to

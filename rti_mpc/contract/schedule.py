@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Which input acts when: the command contract as a function of time.
+Schedule of inputs: the command contract as a function of time.
 
 Row ``i`` of the newest plan whose time has come acts from ``stamp_ns + i * period_ns``,
 never before it arrived; a plan ahead of its time waits while the previous one plays on.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What became of a QP, and what the controller is doing: the two small enumerations that travel on the wire."""
+"""Status of a QP and mode of the controller: the two small enumerations that travel on the wire."""
 
 from __future__ import annotations
 

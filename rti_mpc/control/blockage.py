@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Whether the way is blocked: obstacles or other softened bounds hold the robot, and there is no way round that it sees.
+Blockage: obstacles or other softened bounds hold the robot, and its plans find no way round.
 
 A plan is blocked if it touches a softened bound and gets nowhere over the whole
 horizon, measured against what is left to the reference at its end,

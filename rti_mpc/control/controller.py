@@ -193,7 +193,7 @@ class Controller:
         Follow a reference from the next sample on.
 
         Args:
-            reference: It.
+            reference: Message of a planner.
             rows: What `lay_out` has made of it; done here if None.
 
         Returns:

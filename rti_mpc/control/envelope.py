@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What inputs may be: the last gate of every plan, whatever made it.
+Envelope of the inputs: the last check of every plan, whatever made it.
 
 Bounds hold for each row, slew limits from row to row; the first two are held to
 what `rti_mpc.control.sent.Sent.reach` allows. No solver is asked, and a plan that keeps

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What replaces a plan that cannot be made, rung by rung, each counted.
+Ladder of fallbacks for a plan that cannot be made, each rung counted.
 
 1. The plan of the second solver, with softened bounds: made inside `Rti`.
 2. The previous plan, shifted: at most `FALLBACKS` samples in a row, and never past its validity.

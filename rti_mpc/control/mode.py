@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the controller is doing: a small state machine, each of whose transitions says why."""
+"""Mode of the controller: a small state machine, each of whose transitions has a reason."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the robot will be when the next command acts."""
+"""Prediction of the state at which the next command acts."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is to be said of a sample, after its command has gone out."""
+"""Record of a sample for telemetry, made after its command has gone out."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Record:
         Describe the sample of the last command.
 
         Args:
-            command: It.
+            command: Command of the sample, as it was sent.
             x0: State embedded at stage 0, shape ``(nx,)``.
             d: Estimated disturbances, shape ``(nd,)``.
             times: Preparation, feedback and latency, us, and slack, s.

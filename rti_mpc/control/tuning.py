@@ -38,7 +38,7 @@ class Tuning:
         Begin with what an `Rti` was built with.
 
         Args:
-            rti: It.
+            rti: Real-time iteration to be tuned.
             limits: Where else the bounds that act are to be written, by name: ``lbu`` and ``ubu``, each of shape ``(nu,)``.
         """
         self.version = 0

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-What a model leaves out, as parameters of it: :math:`\dot x = f(x, u + d_u, p) + d_x`.
+Disturbances, the part of the dynamics that a model leaves out, as parameters of it: :math:`\dot x = f(x, u + d_u, p) + d_x`.
 
 A disturbance of an input stands for wrong gains and friction, one of a state
 for slip and wind. They are parameters like others, so whatever predicts with the

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Whether a robot comes to rest when its inputs do.
+Rest of a robot: a check that it comes to rest when its inputs do.
 
 A stop commands the inputs at rest. That stops a robot that is driven by speeds. One
 that is driven by accelerations coasts on, one that is driven by torques falls.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where each stream lives: ``<prefix>/<robot>/<stream>``."""
+"""Keys of the streams: ``<prefix>/<robot>/<stream>``."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-How a process joins the bus: settings, and the Zenoh session made of them.
+Settings of a session, with which a process joins the bus, and the Zenoh session made of them.
 
 Peers find each other by gossip. One, the robot, listens on the rendezvous
 endpoint, the others on a free loopback port; those connect to the robot, again and

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a process has to say: an event on the bus, and a line of its log."""
+"""Announcements of a process: each an event on the bus and a line of its log."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a process says on standard output: for people on a terminal, one JSON object a line otherwise."""
+"""Log of a process on standard output: for people on a terminal, otherwise one JSON object per line."""
 
 from __future__ import annotations
 

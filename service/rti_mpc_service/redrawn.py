@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a terminal shows and redraws in place, while something goes on."""
+"""Terminal output that is redrawn in place while something goes on."""
 
 from __future__ import annotations
 

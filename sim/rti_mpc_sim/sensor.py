@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the robot sees itself: noise, delay and dropout, all from one seed."""
+"""Sensor of the simulated robot: noise, delay and dropout, all from one seed."""
 
 from __future__ import annotations
 

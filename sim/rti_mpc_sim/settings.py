@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a simulated robot is made of, as plain values."""
+"""Settings of a simulated robot, as plain values."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What a sample costs, by horizon, solver and formulation, and of what parts: beside IPOPT, interleaved on the same states.
+Benchmark of a sample by horizon, solver and formulation, and of its parts: beside IPOPT, interleaved on the same states.
 
 The problem is the paper's (Euler, bounds on inputs and on speeds), in closed
 loop with its robot on the eight and on positioning; every sample counts. The

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a step is made of: the native calls in it, timed where they are made."""
+"""Parts of a step: its native calls, timed where they are made."""
 
 from __future__ import annotations
 

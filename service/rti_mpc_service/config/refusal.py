@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Why a configuration is refused, in one line: the key, what must hold, what was got, and what was probably meant."""
+"""Refusals of a configuration, one line each: the key, what must hold, what was got, and what was probably meant."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a controller says of itself in ``info``."""
+"""Description of a controller, as it publishes it on ``info``."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run looks like on a terminal: a table that lives, lines where there is no terminal, and the sum at the end."""
+"""Terminal output of a run: a live table, lines where there is no terminal, and the summary at the end."""
 
 from __future__ import annotations
 

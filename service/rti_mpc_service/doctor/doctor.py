@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What this host gives to a control loop, and what the loop can promise on it.
+Doctor: measurements of what this host gives to a control loop, and the period that the loop can keep on it.
 
 Each part is measured alone, for a second: how late a bare timer wakes, how long a
 message takes to another process and back, how long preparation and feedback of

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What the host alone explains of an incident, by its witness.
+Excuses: the part of an incident that the host alone explains, by its witness.
 
 A time may be longer by what the processes were held up for meanwhile. A sample
 that was missed is explained where they were held up, about when it was due, for a

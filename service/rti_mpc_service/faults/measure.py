@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-What a robot did after a fault, from its own record alone.
+Measurement of a robot's reaction to a fault, from its own record alone.
 
 Inputs come as they acted and positions as they truly were, both in robot time. A
 ramp to rest that begins at :math:`t_0` inside the slew limits :math:`\dot u_{max}`

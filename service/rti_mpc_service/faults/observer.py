@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What time it is for the robot, how it moves, and what its controller has answered."""
+"""Observer of a run: the robot's time, its motion, and what its controller has answered."""
 
 from __future__ import annotations
 

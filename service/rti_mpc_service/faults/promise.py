@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What must hold under a fault: limits on what is measured, and what is said where one is broken."""
+"""Promises under a fault: limits on what is measured, and the words where one is broken."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the host does to a loop that does nothing: how late a bare timer wakes."""
+"""Jitter of the host: how late a bare timer wakes."""
 
 from __future__ import annotations
 

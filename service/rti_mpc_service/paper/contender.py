@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who drives: the paper's algorithms, converged NMPC, and the real-time iteration, behind the same two calls."""
+"""Contenders of the study: the paper's algorithms, converged NMPC, and the real-time iteration, behind the same two calls."""
 
 from __future__ import annotations
 

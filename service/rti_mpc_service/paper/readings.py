@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the paper leaves open: which curve, which heading, `a` and plant give its 3 mm; how fast its references are; where the second one ends."""
+"""
+Readings of what the paper leaves open.
+
+Which curve, heading, `a` and plant give its 3 mm, how fast its references are, and where the second one ends.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What a run was worth, in numbers, and whether it kept its promises.
+Summary of a run in numbers, and whether it kept its promises.
 
 Errors are distances of the plant's true position from the analytic trajectory at
 the same stamp, at every state after the transient. Bounds are compared here, with

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the viewer shows where, and what each entity looks like."""
+"""Blueprint of the viewer: its panels, and the look of each entity."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where entries leave the viewer process: a file or a viewer, each with a queue and a thread of its own, so that a hung one delays nobody."""
+"""Outlets of the viewer process: a file or a viewer, each with a queue and a thread of its own, so that a hung one delays nobody."""
 
 from __future__ import annotations
 

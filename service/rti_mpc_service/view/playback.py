@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a robot was told, row by row, from the plans that its guard passed on."""
+"""Playback of the commands that a robot was given, row by row, from the plans that its guard passed on."""
 
 from __future__ import annotations
 

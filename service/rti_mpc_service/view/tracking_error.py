@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far a robot is from its reference, from the messages alone."""
+"""Tracking error of a robot, from the messages alone."""
 
 from __future__ import annotations
 
