@@ -76,8 +76,9 @@ class Asker:
 
     def _flood(self) -> None:
         """Send what is no request, and wait for no answer."""
+        session: Any = self._robot.bus._session
         for _ in range(FLOOD):
-            self._robot.bus._session.get(self._robot.bus.keys.request, lambda _: None, payload=b"{" * 1000, timeout=1.0)
+            session._session.get(self._robot.bus.keys.request, lambda _: None, payload=b"{" * 1000, timeout=1.0)
         self.answers["nonsense", False] += FLOOD
 
     def _plan(self, now_ns: int) -> None:
