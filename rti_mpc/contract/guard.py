@@ -26,7 +26,7 @@ from rti_mpc.contract.cadence import Cadence
 from rti_mpc.contract.epoch import SEQ_AHEAD, epoch_above
 from rti_mpc.contract.lives import Heard, Lives
 from rti_mpc.contract.message import Command, Notice, Severity, State
-from rti_mpc.contract.robot_clock import RobotClock
+from rti_mpc.contract.robot_clock import Backlog, RobotClock
 from rti_mpc.contract.schedule import EVER_NS, STEP_NS, end_ns, unfit
 from rti_mpc.contract.status import Mode, QpStatus
 
@@ -109,9 +109,8 @@ class Guard:
         increments = Increments(limits.lbdu, limits.ubdu, self._dt_ns)
         self._schedule = Belief(limits.u_rest, limits.slew, increments)  # what the robot was told by controllers, and its ramp after that
         self._state: State | None = None  # the last one that came in time
-        self._heard = (0, 0)  # stamp of the last state, and local time of its arrival
-        self._late = False  # whether that one had waited on the way
-        self._paced = 0  # such states in a row that came at the robot's own pace
+        self._heard_ns = 0  # stamp of the last state
+        self._late = Backlog()
         self._awake_ns = 0  # local time of the last call
         self._open_ns = EVER_NS  # robot time from which commands pass
         self._leader = (0, -1)  # epoch and sequence number of the last command that was in order
@@ -150,7 +149,7 @@ class Guard:
             self._brake(begin_ns, begin_ns)
         if whose is Heard.OTHER or not self._counts(state, local_ns, begins=whose is Heard.BEGINS):
             return
-        heard_ns, heard_local_ns = self._heard
+        heard_ns = self._heard_ns
         if whose is Heard.BEGINS:
             self._begin(state)
         elif state.stamp_ns <= heard_ns:
@@ -161,12 +160,12 @@ class Guard:
         else:
             ahead_ns = state.stamp_ns - self._clock.now_ns(local_ns)
             late = ahead_ns < -LATE_NS * self._clock.rate
-            paced = 2 * (local_ns - heard_local_ns) * self._clock.rate >= state.stamp_ns - heard_ns
-            self._paced = self._paced + 1 if late and self._late and paced else 0
-            self._heard, self._late = (state.stamp_ns, local_ns), late
-            if late and self._paced < self._clock.patience:
+            self._heard_ns = state.stamp_ns
+            if not late:
+                self._late.clear()
+            elif not self._late.believed(state.stamp_ns, local_ns, self._clock):
                 return
-            if late:  # for long, and each at the robot's own pace: its clock has waited
+            else:
                 self._clock.jump()
             if ahead_ns > max(JUMP_NS, 2.5 * self._clock.period_ns):
                 self._jump(state, local_ns, "ahead")
@@ -389,7 +388,7 @@ class Guard:
 
     def _take(self, state: State, local_ns: int) -> None:
         """Go by the clock and the life of a state."""
-        self._heard = state.stamp_ns, local_ns
+        self._heard_ns = state.stamp_ns
         self._clock.observe(state.seq, state.stamp_ns, local_ns)
         self._state = state
 
@@ -412,7 +411,8 @@ class Guard:
         self._leader = 0, -1
         self._told_ns = EVER_NS
         self._rest_by_ns = EVER_NS  # it stands: a latch from before lets rest alone pass
-        self._engaged = self._untold = self.passing = self._late = False
+        self._engaged = self._untold = self.passing = False
+        self._late.clear()
 
     def _jump(self, state: State, local_ns: int, where: str) -> None:
         """Go on from a clock that has jumped: the robot brakes from what acts."""

@@ -16,6 +16,34 @@ MAX_PACED = 8  # states, from which that is believed in any case
 FASTEST = 10.0  # rate of a robot whose second state is still to come, at most
 
 
+class Backlog:
+    """
+    Late states in a row: those that have waited on their way come at once, or in clumps where this process gets few turns.
+
+    If each of the next ones takes its time, it is the robot's clock that has waited,
+    as a simulation's may, and goes on from here.
+
+    Attributes:
+        last: Stamp and arrival of the last state, if that was late.
+    """
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Take note of a state that came in time, or forget everything."""
+        self.last: tuple[int, int] | None = None
+        self._paced = 0  # such states in a row that have each taken their time
+
+    def believed(self, stamp_ns: int, arrival_ns: int, clock: RobotClock) -> bool:
+        """Take note of a late state, and tell whether it is the clock that has waited."""
+        last, self.last = self.last, (stamp_ns, arrival_ns)
+        paced = last is not None and 2 * clock.rate * (arrival_ns - last[1]) >= stamp_ns - last[0]
+        self._paced = self._paced + 1 if paced else 0
+        patience = min(max(1, int(PACED_NS * clock.rate / clock.period_ns)), MAX_PACED) if clock.period_ns else 1
+        return self._paced >= patience
+
+
 class RobotClock:
     """
     Robot time from stamps and local monotonic arrival times.
@@ -53,8 +81,7 @@ class RobotClock:
         self.period_ns = 0.0
         self._seq = 0
         self._anchor: tuple[int, int] | None = None
-        self._old: tuple[int, int] | None = None  # stamp and arrival of the last state, if that was not fresh
-        self._paced = 0  # such states in a row that have each taken their time
+        self._late = Backlog()
         self._measured = False  # whether the rate is
         self._recent: deque[tuple[int, int]] = deque(maxlen=RECENT)  # stamps and arrivals
         self._in_a_row = 0  # states that came late by a quarter of a period and more
@@ -73,10 +100,8 @@ class RobotClock:
         Take note of a state's stamp and arrival, and tell whether it is fresh.
 
         One that comes much later than the others did has waited on its way, in
-        the queues of a process that was stopped for instance: more like it
-        follow at once, or in clumps where this process gets few turns. If the next
-        ones take their time, each of them, it is the robot's clock that has
-        waited, as a simulation's may, and goes on from here.
+        the queues of a process that was stopped for instance; or it is the
+        robot's clock that has waited, as a `Backlog` tells.
         """
         ahead_ns = stamp_ns - self.now_ns(arrival_ns)
         since_ns = self.arrival_ns or arrival_ns
@@ -85,15 +110,12 @@ class RobotClock:
             self._anchor = (stamp_ns, arrival_ns)
             self._recent.clear()
         elif -ahead_ns > self._most_ns:
-            old, self._old = self._old, (stamp_ns, arrival_ns)
-            self._paced += 1
-            if old is None or 2 * self.rate * (arrival_ns - old[1]) < stamp_ns - old[0]:
-                self._paced = 0
-            if old is None or self._paced < self.patience:
+            before = self._late.last
+            if not self._late.believed(stamp_ns, arrival_ns, self) or before is None:
                 return False
             self._recent.clear()
-            since_ns = old[1]
-            rate = self._rate(stamp_ns - old[0], arrival_ns - old[1])
+            since_ns = before[1]
+            rate = self._rate(stamp_ns - before[0], arrival_ns - before[1])
             self.rate = min(self.rate, rate) if self._measured else rate  # what was held up together comes at once, though no clock runs faster
             self.rate_most = max(self.rate_most, self.rate)
             self._anchor = (stamp_ns, arrival_ns)
@@ -101,7 +123,8 @@ class RobotClock:
             period_ns = (stamp_ns - self.stamp_ns) / max(1, seq - self._seq)
             self.period_ns += (min(period_ns, 2.0 * self.period_ns) - self.period_ns) * 0.1 if self.period_ns else period_ns
             self._measure(stamp_ns, arrival_ns, *self._anchor)
-        self._old, self.leapt = None, leaps
+        self._late.clear()
+        self.leapt = leaps
         self.late_ns = self._late_ns(stamp_ns, arrival_ns)
         self.doubt_ns = round(DRIFT * self.rate * (arrival_ns - since_ns))
         if self._settling:
@@ -131,11 +154,6 @@ class RobotClock:
 
     def _rate(self, robot_ns: int, local_ns: int) -> float:
         return min(max(robot_ns / local_ns, 1e-3), 1e3)
-
-    @property
-    def patience(self) -> int:
-        """Late states in a row, each of which has taken its time, from which the robot's clock is believed to have waited."""
-        return min(max(1, int(PACED_NS * self.rate / self.period_ns)), MAX_PACED) if self.period_ns else 1
 
     def latest_ns(self, local_ns: int) -> int:
         """Return what robot time is at a local time at most, for a state that came as late as the last one did."""
