@@ -175,7 +175,7 @@ def find_model(name: str) -> Model:
     except (Exception, SystemExit) as error:  # whatever a user's function raises, named as theirs
         raise OcpError(f"{name} must return a model, {raised(error)}") from error
     if not isinstance(model, Model):
-        raise OcpError(f"{name} must return a rti_mpc.model.model.Model, got {type(model).__name__}")
+        raise OcpError(f"{name} must return a rti_mpc.Model, got {type(model).__name__}")
     return model
 
 

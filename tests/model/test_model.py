@@ -119,7 +119,7 @@ def test_model_of_ones_own_is_found_by_module_and_function() -> None:
         ("rti_mpc.nowhere:model", "No module named"),
         ("rti_mpc.model.model:nothing", "has no function nothing"),
         ("numpy:zeros_like", r"numpy:zeros_like must return a model, it raised TypeError: "),
-        ("numpy:errstate", "numpy:errstate must return a rti_mpc.model.model.Model, got errstate"),
+        ("numpy:errstate", "numpy:errstate must return a rti_mpc.Model, got errstate"),
         ("numpy:__version__", "has no function __version__"),
         *(
             (name, "package.module:function of your own, got")
@@ -144,7 +144,7 @@ def test_model_that_does_not_exist_is_refused_with_what_would_be_right(name: str
         ("import numpy\ndef model():\n    numpy.zeros(-1)", "{module}:model must return a model, it raised ValueError in {file}, line 3: "),
         ("def model():\n    return model()", "{module}:model must return a model, it raised RecursionError in {file}, line 2: "),
         ("def model(x):\n    pass", "{module}:model must return a model, it raised TypeError: "),
-        ("def model():\n    pass", "{module}:model must return a rti_mpc.model.model.Model, got NoneType"),
+        ("def model():\n    pass", "{module}:model must return a rti_mpc.Model, got NoneType"),
         ("model = 1", "of your own, got '{module}:model' ({module} has no function model)"),
         ("\0", "{module} must be importable, it raised "),
     ],
