@@ -12,10 +12,10 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 from rti_mpc.errors import MessageError
-from rti_mpc.signals import place, plane
+from rti_mpc.signals import Signal, place, plane
 from rti_mpc.wire.document import read
 from rti_mpc.wire.layout import NUMBER_LIMIT
 from rti_mpc.wire.received import Received
@@ -176,27 +176,7 @@ VECTORS = ("states", "inputs", "outputs", "disturbances")
 BOUNDS = {"lbu": ("inputs", -1), "ubu": ("inputs", 1), "lbx": ("states", -1), "ubx": ("states", 1)}
 
 
-class Signal(Protocol):
-    """Component of a vector, `rti_mpc.model.model.Signal` or `Label`."""
-
-    @property
-    def name(self) -> str:
-        """Unique within its vector."""
-
-    @property
-    def unit(self) -> str:
-        """SI unit, ``"1"`` if none."""
-
-    @property
-    def angle(self) -> bool:
-        """Whether it wraps."""
-
-    @property
-    def role(self) -> str:
-        """What it is to others; empty if nothing."""
-
-
-def labels(counterparts: Mapping[str, Sequence[str]] | None = None, /, **vectors: Sequence[Signal]) -> dict[str, Any]:
+def labels(counterparts: Mapping[str, Sequence[str]] | None = None, /, **vectors: Sequence[Signal | Label]) -> dict[str, Any]:
     """
     Write the components of vectors, such as ``states``, as a part of a description.
 
