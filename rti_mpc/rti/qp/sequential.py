@@ -179,9 +179,9 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
     A_pattern, A_data = A.finish(rows.count, n)
     P_pattern, P_data = P.finish(n, n)
     checksum = lin.checksum + ca.sum1(memory) + ca.sum1(P_data)
-    outputs = {"q": q, "P_data": P_data, "A_data": A_data, "lower": lower, "upper": upper_bounds}
-    outputs |= {"memory": memory, "cost": lin.cost, "checksum": checksum}
-    everything, varying, data = data_functions(lin, outputs, kind)
+    everything, varying, data = data_functions(
+        lin, kind, q=q, P_data=P_data, A_data=A_data, lower=lower, upper=upper_bounds, memory=memory, checksum=checksum
+    )
     return Transcription(
         P=P_pattern,
         A=A_pattern,

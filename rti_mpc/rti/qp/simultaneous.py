@@ -105,9 +105,10 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
     A_pattern, A_data = A.finish(rows.count, n)
     P_pattern, P_data = P.finish(n, n)
     memory = ca.veccat(*head(lin))
-    outputs = {"q": q, "P_data": P_data, "A_data": A_data, "lower": ca.vertcat(*rows.lower), "upper": ca.vertcat(*rows.upper)}
-    outputs |= {"memory": memory, "cost": lin.cost, "checksum": lin.checksum}
-    everything, varying, data = data_functions(lin, outputs, kind)
+    lower, upper = ca.vertcat(*rows.lower), ca.vertcat(*rows.upper)
+    everything, varying, data = data_functions(
+        lin, kind, q=q, P_data=P_data, A_data=A_data, lower=lower, upper=upper, memory=memory, checksum=lin.checksum
+    )
     return Transcription(
         P=P_pattern,
         A=A_pattern,

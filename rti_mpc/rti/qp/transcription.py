@@ -33,7 +33,7 @@ class Transcription:
     Attributes:
         P: Pattern of the upper triangle of the Hessian, shape ``(n, n)``.
         A: Pattern of the constraint matrix, shape ``(m, n)``.
-        everything: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale) -> (q, P_data, A_data, lower, upper, memory, cost, checksum)``; `memory` is what
+        everything: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale) -> (q, P_data, A_data, lower, upper, memory, checksum, cost)``; `memory` is what
             `embed` and `step` want to know, and `checksum` is finite if and only if all the others are.
         varying: Which of these eight change from sample to sample, by name.
         data: As `everything`, but returns only what varies.
@@ -244,9 +244,9 @@ def each(column: ca.MX, times: int) -> ca.MX:
     return ca.repmat(column, 1, times)
 
 
-def data_functions(lin: Linearization, outputs: dict[str, ca.MX], kind: str) -> tuple[ca.Function, tuple[str, ...], ca.Function]:
-    """Return the function of all outputs, which of them vary with the sample, and the function of these."""
-    outputs = {name: ca.densify(output) for name, output in outputs.items()}
+def data_functions(lin: Linearization, kind: str, **data: ca.MX) -> tuple[ca.Function, tuple[str, ...], ca.Function]:
+    """Return the function of all data of a QP, the cost among them, which of them vary with the sample, and the function of these."""
+    outputs = {name: ca.densify(output) for name, output in (data | {"cost": lin.cost}).items()}
     sample = ca.veccat(*lin.sample.values())
     varying = tuple(name for name, output in outputs.items() if output.numel() and ca.depends_on(output, sample))
     return (
