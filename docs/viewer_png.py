@@ -20,6 +20,8 @@ import rerun_cli
 from matplotlib.image import imread, imsave
 from rerun.experimental import ViewerClient
 
+from rti_mpc_service.rig.endpoint import free_port
+
 START_S = 20.0
 SETTLE_S = 12.0  # until the recording is drawn and the notices have faded
 TOP_BAR = 36  # pixels, without anything of ours
@@ -27,9 +29,7 @@ TOP_BAR = 36  # pixels, without anything of ours
 
 def main(recording: Path, image: Path) -> None:
     """Show a recording in a headless viewer and save what it shows."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     binary = Path(rerun_cli.__file__).with_name("rerun")  # the script of that name is a wrapper whose child would be left over
     viewer = subprocess.Popen([binary, "--headless", "--window-size", "1600x900", "--bind", "127.0.0.1", "--port", str(port), recording])
     try:

@@ -7,7 +7,6 @@ import csv
 import itertools
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -27,6 +26,7 @@ from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.in_time import MS, explained, in_time
 
 ROOT = Path(__file__).parents[2]
@@ -61,9 +61,7 @@ source.main(eight(), BusSettings(connect=(sys.argv[1],)), Keys("test", "sim"), p
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_endpoint()
 
 
 @contextmanager

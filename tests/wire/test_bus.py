@@ -4,7 +4,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -28,6 +27,7 @@ from rti_mpc.wire.layout import MAX_BYTES
 from rti_mpc.wire.streams import RING_BYTES
 from rti_mpc.wire.zenoh_session import ZenohSession
 from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.in_time import MS, explained, in_time
 
 ROOT = Path(__file__).parents[2]
@@ -64,9 +64,7 @@ def stranger(endpoint: str) -> zenoh.Session:
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_endpoint()
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -18,6 +17,7 @@ from rti_mpc.contract.message import State
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.in_time import MS, in_time
 
 ROOT = Path(__file__).parents[2]
@@ -33,9 +33,7 @@ main(BusSettings(listen=({!r},)), Keys(robot="test"))
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_endpoint()
 
 
 @pytest.fixture

@@ -6,8 +6,13 @@ from __future__ import annotations
 import socket
 
 
-def free_endpoint() -> str:
-    """Return a loopback endpoint that is free now."""
+def free_port() -> int:
+    """Return a TCP port of the loopback interface that is free now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        return int(probe.getsockname()[1])
+
+
+def free_endpoint() -> str:
+    """Return a loopback endpoint that is free now."""
+    return f"tcp/127.0.0.1:{free_port()}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 import re
 import resource
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -17,6 +16,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from rti_mpc_service.rig.endpoint import free_port
 
 pytest.importorskip("rerun")
 from rerun.chunk import RrdReader
@@ -86,9 +87,7 @@ sys.exit(main(bus, Keys(robot="r"), rerun_save=Path(sys.argv[2]), rerun_connect=
 
 @pytest.fixture
 def port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    return free_port()
 
 
 class Child:
@@ -297,10 +296,7 @@ def test_a_spawned_viewer_that_has_ended_is_told_of(port: int, children: list[Ch
     """Its own words are lost among others; Rerun ends at once where there is no screen."""
     no_screen = "import os\nos.environ.pop('DISPLAY', None)\nos.environ.pop('WAYLAND_DISPLAY', None)\n"
     source = no_screen + VIEWER.replace("rerun_connect=live", "rerun_connect=live, rerun_spawn=True")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        live = f"127.0.0.1:{probe.getsockname()[1]}"
-    children.append(Child(source, port, tmp_path / "run.rrd", live))
+    children.append(Child(source, port, tmp_path / "run.rrd", f"127.0.0.1:{free_port()}"))
     children[0].wait_for("the Rerun viewer has ended")
 
 

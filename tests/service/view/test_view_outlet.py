@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -23,6 +22,7 @@ from rti_mpc.contract.message import State
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.info import Info
 from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.rig.endpoint import free_port
 from rti_mpc_service.view.outlet import Outlet, file_outlet, viewer_outlet
 from rti_mpc_service.view.recording import Entry
 from tests.in_time import MS, in_time
@@ -54,9 +54,7 @@ class Viewer:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port = probe.getsockname()[1]
+        self.port = free_port()
         self.lives = 0
 
     @property
