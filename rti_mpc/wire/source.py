@@ -24,7 +24,7 @@ class Verdict(Enum):
     NEXT = "next"  # accepted
     REPEATED = "repeated"  # refused: the last accepted message once more, as caches send it
     OLD = "old"  # refused: a later sequence number was accepted before
-    AHEAD = "too far ahead"  # refused: so many messages are not lost between two
+    AHEAD = "ahead"  # refused: so many messages are not lost between two
     FOREIGN = "foreign"  # refused: somebody else's, while our source is alive
 
     @property

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -70,3 +72,8 @@ def test_foreign_messages_do_not_keep_a_source_alive_nor_disturb_it(source: Sour
     assert source.accept(5, 11, 61) is Verdict.NEXT
     assert source.accept(4, 2, 61 + STALE_NS) is Verdict.FOREIGN
     assert source.accept(4, 3, 62 + STALE_NS) is Verdict.NEW
+
+
+def test_every_verdict_is_a_word_that_an_event_s_code_can_end_with() -> None:
+    """As those of the robot do: a number far ahead was told as one with spaces."""
+    assert [verdict for verdict in Verdict if not re.fullmatch(r"[a-z]+(_[a-z]+)*", verdict.value)] == []
