@@ -9,9 +9,11 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.contract.status import QpStatus
 from rti_mpc.model.model import Model, Signal
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.rti import Rti
 
 INF = np.inf
 
@@ -109,3 +111,13 @@ def cart(newtons: float = 1.0) -> Model:
         inputs=(Signal("F", "N"),),
         outputs=(Signal("r", "m"),),
     )
+
+
+def solve(one: Rti, seed: int) -> QpStatus:
+    """Solve at a guess that depends on nothing but the seed."""
+    rng = np.random.default_rng(seed)
+    one.x[:] = rng.normal(size=one.x.shape)
+    one.u[:] = 0.1 * rng.normal(size=one.u.shape)
+    one.u_prev[:] = 0.0
+    one.prepare(rng.normal(size=one.y_ref.shape), shift=False)
+    return one.feedback(rng.normal(size=one.ocp.model.nx))

@@ -11,23 +11,13 @@ from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.rti.qp.osqp import STATUS, SolverSettings
 from rti_mpc.rti.rti import FORMULATIONS, Rti
-from tests.problems import beacon, double_integrator
+from tests.problems import beacon, double_integrator, solve
 
 TIGHT = SolverSettings(eps=1e-9, max_iter=100_000)
 
 
 def rti(settings: SolverSettings = TIGHT, formulation: str = "simultaneous") -> Rti:
     return Rti(double_integrator(lbu=-1.0, ubu=1.0), settings, formulation=formulation, solver="osqp", iterations=1, compile=False)
-
-
-def solve(one: Rti, seed: int) -> QpStatus:
-    """Solve at a guess that depends on nothing but the seed."""
-    rng = np.random.default_rng(seed)
-    one.x[:] = rng.normal(size=one.x.shape)
-    one.u[:] = 0.1 * rng.normal(size=one.u.shape)
-    one.u_prev[:] = 0.0
-    one.prepare(rng.normal(size=one.y_ref.shape), shift=False)
-    return one.feedback(rng.normal(size=one.ocp.model.nx))
 
 
 def test_inner_object_of_osqp_offers_what_is_driven() -> None:

@@ -14,23 +14,13 @@ from rti_mpc.errors import OcpError
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.qp.qpsolvers import numbered
 from rti_mpc.rti.rti import FORMULATIONS, Rti
-from tests.problems import INF, beacon, double_integrator, fenced
+from tests.problems import INF, beacon, double_integrator, fenced, solve
 
 NAMES = ("clarabel", "daqp", "piqp")
 
 
 def rti(name: str = "daqp", formulation: str = "simultaneous", **changes: Any) -> Rti:
     return Rti(double_integrator(lbu=-1.0, ubu=1.0, **changes), formulation=formulation, solver=name, iterations=1, compile=False)
-
-
-def solve(one: Rti, seed: int) -> QpStatus:
-    """Solve at a guess that depends on nothing but the seed."""
-    rng = np.random.default_rng(seed)
-    one.x[:] = rng.normal(size=one.x.shape)
-    one.u[:] = 0.1 * rng.normal(size=one.u.shape)
-    one.u_prev[:] = 0.0
-    one.prepare(rng.normal(size=one.y_ref.shape), shift=False)
-    return one.feedback(rng.normal(size=one.ocp.model.nx))
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
