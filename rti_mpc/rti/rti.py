@@ -33,7 +33,7 @@ from rti_mpc.rti.linearization import WEIGHTS, plan_cost, shift
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.places import Places, places
 from rti_mpc.rti.qp.osqp import Solver, SolverSettings
-from rti_mpc.rti.qp.qp import Guess, Plan, Qp, step_size
+from rti_mpc.rti.qp.qp import Guess, Qp, Step, step_size
 from rti_mpc.rti.qp.qpsolvers import ForeignSolver, check_name
 from rti_mpc.rti.qp.sequential import sequential
 from rti_mpc.rti.qp.simultaneous import simultaneous
@@ -134,7 +134,7 @@ class Rti:
             sample={"x": x, "u": u, "u_prev": self.u_prev, "y_ref": self.y_ref, "p": self.p},
             weights=self._weights | {"scale": self.scale},
             x0=self.x0,
-            plan=Plan(self.x, self.u, self._violation, change),
+            plan=Step(self.x, self.u, self._violation, change),
         )
 
         transcriptions = [FORMULATIONS[self.formulation](ocp, softened=softened) for softened in (False, True)[: 2 if len(ocp.lg) else 1]]

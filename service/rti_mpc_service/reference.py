@@ -74,7 +74,7 @@ def main(
     p: Array = np.empty((len(y), 0)) if parameters is None else parameters(period_s * np.arange(len(y), dtype=np.float64))
     stop = stop or stop_on_signals()
     with Bus.join(bus_settings, keys, stop=stop, say=logger.warning) as bus:
-        source = Source(bus, trajectory, y, p, round(1e9 * period_s))
+        source = ReferenceSource(bus, trajectory, y, p, round(1e9 * period_s))
         bus.alive(ROLE)
         logger.info("%s, heading %s, for %s", trajectory.name, heading, keys.robot)
         while not stop.wait(LOOK_S):
@@ -82,7 +82,7 @@ def main(
     return source.anchored
 
 
-class Source:
+class ReferenceSource:
     """
     Anchors rows to every new life of the robot.
 

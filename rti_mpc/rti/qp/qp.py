@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import qpsolvers
 
 
-class Plan(NamedTuple):
+class Step(NamedTuple):
     """
     What a full step leads to.
 
@@ -59,7 +59,7 @@ class Guess:
     sample: dict[str, Array]
     weights: dict[str, Array]
     x0: Array
-    plan: Plan
+    plan: Step
 
     @property
     def arguments(self) -> dict[str, Array]:

@@ -31,8 +31,8 @@ from rti_mpc.rti.qp.transcription import (
     KINDS,
     SLACK_UNIT,
     Blocks,
+    BoundRows,
     Remembered,
-    Rows,
     Transcription,
     clipped,
     data_functions,
@@ -127,7 +127,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
     to_s = N_u * nu
     n = to_s + N * ng
 
-    A, rows = Blocks(), Rows()
+    A, rows = Blocks(), BoundRows()
     _, by_input, by_bound = measured_by(ocp)
     input_rows(ocp, lin, rows, A, 0)
     first_soft = rows.count

@@ -24,8 +24,8 @@ from rti_mpc.rti.qp.transcription import (
     KINDS,
     SLACK_UNIT,
     Blocks,
+    BoundRows,
     Remembered,
-    Rows,
     Transcription,
     clipped,
     data_functions,
@@ -53,7 +53,7 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
     to_du, to_s = (N + 1) * nx, (N + 1) * nx + N_u * nu
     n = to_s + N * ng
 
-    A, rows = Blocks(), Rows()
+    A, rows = Blocks(), BoundRows()
     by_state, by_input, by_bound = measured_by(ocp)
     zero = ca.MX.zeros(nx)
     A.place(rows.add(zero, zero, zero, by_state), 0, sp.eye_array(nx))

@@ -100,7 +100,7 @@ class Blocks:
         return ones, ca.vertcat(*self._pool)[(numbers.data - 1).tolist()]
 
 
-class Rows:
+class BoundRows:
     """Bounds of the rows of a QP under assembly, in deviations from a guess."""
 
     def __init__(self) -> None:
@@ -142,7 +142,7 @@ class Rows:
             self.watched[row] = [seen for bound in watched for seen in self.watched[bound][:2]] * (2 if len(watched) == 1 else 1)
 
 
-def input_rows(ocp: Ocp, lin: Linearization, rows: Rows, A: Blocks, to_du: int) -> None:
+def input_rows(ocp: Ocp, lin: Linearization, rows: BoundRows, A: Blocks, to_du: int) -> None:
     """Append the bounds on inputs and on increments."""
     N_u, nu = ocp.N_u, ocp.model.nu
     difference = sp.eye_array(N_u) - sp.eye_array(N_u, k=-1)

@@ -45,7 +45,7 @@ NOISE = 0.01  # standard deviation of the disturbance, in the unit of each state
 
 
 @dataclass(frozen=True)
-class Report:
+class CheckReport:
     """
     Outcome of a dry run.
 
@@ -102,7 +102,7 @@ def main(path: Path) -> int:
     return 0 if report.agree and all(status.usable for status in report.statuses) else 1
 
 
-def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> Report:
+def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> CheckReport:
     """Solve one QP for each of the samples, and drive to the bounds."""
     rti = build_rti(config)
     ocp = rti.ocp
@@ -149,7 +149,7 @@ def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> Report:
             sample(x, excursion.y_ref, asked=k in (0, EACH - 1))
             x = rti.x[1].copy()
     difference, deviation = (max(values, default=np.inf) for values in (differences, deviations))
-    return Report(prepare_us, feedback_us, statuses, second, len(differences), difference, deviation, len(bounds.names), bounds.missed)
+    return CheckReport(prepare_us, feedback_us, statuses, second, len(differences), difference, deviation, len(bounds.names), bounds.missed)
 
 
 def twin(rti: Rti, solver: str, formulation: str) -> Rti:

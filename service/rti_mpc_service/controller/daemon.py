@@ -130,7 +130,7 @@ class Daemon:
         params: Params,
         lock: Condition,
         rti: Rti,
-        outcomes: Sequence[realtime.Outcome],
+        outcomes: Sequence[realtime.RealtimeOutcome],
         operator_stop: OperatorStop,
     ) -> None:
         keys, model = bus.keys, rti.ocp.model

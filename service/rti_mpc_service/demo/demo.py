@@ -59,7 +59,7 @@ ENDING = (*(("recorder",) if find_spec("rerun") else ()), "controller", "guard",
 
 
 @dataclass(frozen=True)
-class Plan:
+class DemoPlan:
     """
     What is to be run.
 
@@ -91,7 +91,7 @@ class Plan:
 
 def plan(
     config: Config, scenario: str, *, heading: Heading | None, speed: float, duration_s: float | None, folder: Path | None, viewer: bool, guard: bool
-) -> Plan:
+) -> DemoPlan:
     """
     Fill in what the scenario decides.
 
@@ -100,7 +100,7 @@ def plan(
     """
     trajectory = find_trajectory(scenario)
     heading = heading or HEADINGS.get(scenario, "consistent")
-    return Plan(
+    return DemoPlan(
         config=configured(config, trajectory, heading, guard),
         scenario=scenario,
         heading=heading,
@@ -139,7 +139,7 @@ def main(config: Config, scenario: str, **options: Any) -> int:
     return conclude(run, outcome, console)
 
 
-def drive(run: Plan, console: Console, stop: Event) -> Outcome:
+def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:
     """
     Start everybody, listen until the end, stop everybody.
 
@@ -190,7 +190,7 @@ def drive(run: Plan, console: Console, stop: Event) -> Outcome:
     )
 
 
-def start(run: Plan, children: Children, endpoint: str, size: int) -> None:
+def start(run: DemoPlan, children: Children, endpoint: str, size: int) -> None:
     """Start everybody but the robot."""
     keys, config = run.config.keys(), run.folder / "config.toml"
     scenario = ("--scenario", run.scenario, "--heading", run.heading, "--duration", run.reference_s)
@@ -204,7 +204,7 @@ def start(run: Plan, children: Children, endpoint: str, size: int) -> None:
         children.start("recorder", CLI, "view", config, "-e", endpoint, "--rerun-save", run.folder / "run.rrd", *live, nice=POLITE)
 
 
-def follow(run: Plan, witness: Witness, board: Board, children: Children, stop: Event) -> None:
+def follow(run: DemoPlan, witness: Witness, board: Board, children: Children, stop: Event) -> None:
     """
     Listen until the robot was driven for long enough, the controller fell silent, or we are stopped.
 
@@ -228,7 +228,7 @@ def follow(run: Plan, witness: Witness, board: Board, children: Children, stop: 
         witness.listen()
 
 
-def error_mm(run: Plan, info: Info | None, sample: Telemetry, reference: Reference) -> float | None:
+def error_mm(run: DemoPlan, info: Info | None, sample: Telemetry, reference: Reference) -> float | None:
     """Return how far from the path the robot is in a sample; None: the model has no position."""
     if info is None or info.position is None:
         return None
@@ -236,7 +236,7 @@ def error_mm(run: Plan, info: Info | None, sample: Telemetry, reference: Referen
     return 1e3 * float(np.hypot(*(sample.x0[list(info.position)] - run.trajectory.position(at_s))))
 
 
-def conclude(run: Plan, outcome: Outcome, console: Console) -> int:
+def conclude(run: DemoPlan, outcome: Outcome, console: Console) -> int:
     """Write and print the sum of a run, draw it, and tell how to look at it; return the exit status."""
     summary = {**summarize(outcome), "heading": run.heading, "machine": machine.describe()}
     (run.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
@@ -261,7 +261,7 @@ def conclude(run: Plan, outcome: Outcome, console: Console) -> int:
     return 0 if summary["driven"] else 1
 
 
-def guards(run: Plan) -> tuple[str, ...]:
+def guards(run: DemoPlan) -> tuple[str, ...]:
     """Return the guard's role, if there is one."""
     return ("guard",) if run.config.guard.enabled else ()
 

@@ -19,7 +19,7 @@ STALE_S = 0.25  # without a message after which another life is looked at
 LOOK_BACK_NS = 200_000_000  # over which speed is measured
 
 
-class Observer:
+class RunObserver:
     """
     Follows the states of a robot at speed 1, and the commands for them.
 

@@ -22,7 +22,7 @@ WIDTH = 130
 
 
 @dataclass(frozen=True)
-class Row:
+class MatrixRow:
     """
     One fault and what came of it.
 
@@ -98,7 +98,7 @@ def report_console() -> Console:
     return console if console.is_terminal else Console(width=WIDTH)
 
 
-class Report(Redrawn):
+class MatrixReport(Redrawn):
     """
     Shows the matrix while it grows.
 
@@ -108,7 +108,7 @@ class Report(Redrawn):
 
     def __init__(self, console: Console, count: int) -> None:
         super().__init__(console)
-        self.rows: list[Row] = []
+        self.rows: list[MatrixRow] = []
         self._count = count
 
     @property
@@ -123,7 +123,7 @@ class Report(Redrawn):
             head.add_row(f"{len(self.rows)} of {self._count}", ProgressBar(total=self._count, completed=len(self.rows), width=32), fault.name, text)
             self.draw(Group(self._table(), head) if self.rows else head)
 
-    def add(self, row: Row) -> None:
+    def add(self, row: MatrixRow) -> None:
         """Add a row; without a terminal, as a line."""
         self.rows.append(row)
         if not self.live:

@@ -31,7 +31,7 @@ from rti_mpc_service.config.schema import Config
 from rti_mpc_service.faults.excuse import excuses, explained
 from rti_mpc_service.faults.measure import Incident, measure, missed_ns, positions
 from rti_mpc_service.faults.relay import ROLE as RELAY
-from rti_mpc_service.faults.report import Report, Row, report_console
+from rti_mpc_service.faults.report import MatrixReport, MatrixRow, report_console
 from rti_mpc_service.faults.system import HEADING, SCENARIO, System, Wiring, measured_places
 from rti_mpc_service.faults.table import FAULTS, Fault
 from rti_mpc_service.host.hold_up import Host
@@ -71,7 +71,7 @@ def main(config_path: Path, only: Sequence[str], path: Path | None) -> int:
     config = prepared(load(config_path))
     stop = stop_on_signals()
     folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
-    with Host() as host, Report(console := report_console(), len(faults)) as report:
+    with Host() as host, MatrixReport(console := report_console(), len(faults)) as report:
         inject(config, faults, folder, report, stop, host)
     report.conclude()
     if report.kept:
@@ -115,7 +115,7 @@ def prepared(config: Config) -> Config:
     return config
 
 
-def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Report, stop: Event, host: Host) -> None:
+def inject(config: Config, faults: Sequence[Fault], folder: Path, report: MatrixReport, stop: Event, host: Host) -> None:
     """Inject faults until there are none left, or we are stopped."""
     limits = guard_limits(config)
     system: System | None = None
@@ -131,7 +131,7 @@ def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Report
                 make_ready(system, fault, report)
                 row = suffer(system, fault, limits, report, host)
             except (Failed, ConfigError) as error:
-                row = Row(fault, None, [str(error)])
+                row = MatrixRow(fault, None, [str(error)])
             if stop.is_set():
                 return
             report.add(row)
@@ -140,7 +140,7 @@ def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Report
                 system = None
 
 
-def make_ready(system: System, fault: Fault, report: Report) -> None:
+def make_ready(system: System, fault: Fault, report: MatrixReport) -> None:
     """
     Wait until the robot is driven, as well as the fault wants it.
 
@@ -156,7 +156,7 @@ def make_ready(system: System, fault: Fault, report: Report) -> None:
     system.wait(lambda: system.driven(error_m), "the robot to be driven")
 
 
-def suffer(system: System, fault: Fault, limits: Limits, report: Report, host: Host) -> Row:
+def suffer(system: System, fault: Fault, limits: Limits, report: MatrixReport, host: Host) -> MatrixRow:
     """
     Break, wait, mend, wait, measure, and ask the host's witness.
 
@@ -191,7 +191,7 @@ def suffer(system: System, fault: Fault, limits: Limits, report: Report, host: H
         return host.held_up_ms(system.observer.arrival_ns(from_ns), system.observer.arrival_ns(to_ns))
 
     excused = excuses(measured, missed, incident, system.period_ns, held_up_ms)
-    return Row(fault, measured, fault.promise.broken(measured, excused), explained(fault.promise, measured, excused))
+    return MatrixRow(fault, measured, fault.promise.broken(measured, excused), explained(fault.promise, measured, excused))
 
 
 def recovered(system: System, mend_ns: int) -> None:

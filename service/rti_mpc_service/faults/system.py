@@ -28,7 +28,7 @@ from rti_mpc_service.config import toml
 from rti_mpc_service.config.build import build_model
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.faults.measure import positions
-from rti_mpc_service.faults.observer import Observer
+from rti_mpc_service.faults.observer import RunObserver
 from rti_mpc_service.faults.proxy import Proxy
 from rti_mpc_service.faults.relay import ROLE as RELAY
 from rti_mpc_service.rig import robot_log
@@ -118,7 +118,7 @@ class System:
             self.bus = Bus.join(settings, self.keys, timeout_s=PATIENCE_S, stop=stop)
             self.witness = Witness(self.bus)
             self._references = self.bus.publisher(self.keys.reference)
-            self.observer = Observer(self.bus, self._robot_keys, self.place)
+            self.observer = RunObserver(self.bus, self._robot_keys, self.place)
         except BaseException:
             self.children.__exit__(None, None, None)
             raise

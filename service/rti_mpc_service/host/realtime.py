@@ -27,7 +27,7 @@ MCL_CURRENT, MCL_ONFAULT = 1, 4  # of mlockall(2)
 
 
 @dataclass(frozen=True)
-class Outcome:
+class RealtimeOutcome:
     """What became of one attempt."""
 
     what: str
@@ -38,7 +38,7 @@ class Outcome:
         return f"{self.what} {self.text}"
 
 
-def attempt(priority: int | None = None, cores: Sequence[int] = (), *, lock_memory: bool = False) -> list[Outcome]:
+def attempt(priority: int | None = None, cores: Sequence[int] = (), *, lock_memory: bool = False) -> list[RealtimeOutcome]:
     """
     Ask the operating system for what is configured.
 
@@ -69,13 +69,13 @@ def available() -> Sequence[int]:
     return sorted(os.sched_getaffinity(0))
 
 
-def _outcome(what: str, act: Callable[[], str], why_not: Callable[[], str]) -> Outcome:
+def _outcome(what: str, act: Callable[[], str], why_not: Callable[[], str]) -> RealtimeOutcome:
     try:
-        return Outcome(what, True, act())
+        return RealtimeOutcome(what, True, act())
     except OSError as error:
-        return Outcome(what, False, f"refused: {error.strerror}, {why_not()}")
+        return RealtimeOutcome(what, False, f"refused: {error.strerror}, {why_not()}")
     except AttributeError:
-        return Outcome(what, False, "refused: this system has no such thing")
+        return RealtimeOutcome(what, False, "refused: this system has no such thing")
 
 
 def _schedule(priority: int) -> str:

@@ -31,7 +31,7 @@ class Actuation:
         return self.command.u
 
 
-class Row(NamedTuple):
+class PlayedRow(NamedTuple):
     """
     An input that the robot was told.
 
@@ -58,21 +58,21 @@ class Playback:
         self._last: list[tuple[int, Command]] = []  # where it lies, and the plan; none before the first
         self._played_ns = -1  # where the last row lies
 
-    def add(self, times: Sequence[int], actuations: Sequence[Actuation]) -> list[Row]:
+    def add(self, times: Sequence[int], actuations: Sequence[Actuation]) -> list[PlayedRow]:
         """Take plans, and return what was played before the last of them begins."""
         plans = [*self._last, *zip(times, (actuation.command for actuation in actuations), strict=True)]
         self._last = plans[-1:]
         return [row for (time_ns, command), (end_ns, _) in pairwise(plans) for row in self._play(time_ns, command, end_ns)]
 
-    def end(self) -> list[Row]:
+    def end(self) -> list[PlayedRow]:
         """Return what is played of the last plan if no other one follows."""
         return [row for time_ns, command in self._last for row in self._play(time_ns, command, time_ns + AHEAD_NS)]
 
-    def _play(self, time_ns: int, command: Command, end_ns: int) -> list[Row]:
+    def _play(self, time_ns: int, command: Command, end_ns: int) -> list[PlayedRow]:
         rows = []
         end_ns = min(end_ns, time_ns + command.valid_until_ns - command.stamp_ns)
         for begin_ns, u in zip(range(time_ns, end_ns, command.period_ns), command.u, strict=False):
             if min(begin_ns + command.period_ns, end_ns) > self._played_ns:  # not over before the plan came
                 self._played_ns = max(begin_ns, self._played_ns + 1)
-                rows.append(Row(self._played_ns, u, command.mode))
+                rows.append(PlayedRow(self._played_ns, u, command.mode))
         return rows

@@ -17,7 +17,7 @@ from rti_mpc.contract.message import Command, Event, Reference, Severity, State,
 from rti_mpc.signals import plane
 from rti_mpc.wire.info import Info, Label, Obstacle
 from rti_mpc_service.view.blueprint import RUNGS, STRIPS, TIMELINE, Frame, blueprint, legend, lifted, looks
-from rti_mpc_service.view.playback import Actuation, Playback, Row
+from rti_mpc_service.view.playback import Actuation, Playback, PlayedRow
 from rti_mpc_service.view.tracking_error import tracking_error
 
 Message = Info | Reference | State | Command | Actuation | Telemetry | Event
@@ -183,7 +183,7 @@ class Recording:
     def _actuations(self, times: Times, actuations: list[Actuation]) -> None:
         self._told(self._playback.add(times.tolist(), actuations))
 
-    def _told(self, rows: list[Row]) -> None:
+    def _told(self, rows: list[PlayedRow]) -> None:
         """Write what a guard told the robot."""
         if rows:
             times = np.array([row.time_ns for row in rows], np.int64)

@@ -11,7 +11,7 @@ from rich.console import Console
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.faults import run
 from rti_mpc_service.faults.measure import Measured
-from rti_mpc_service.faults.report import WIDTH, Report, Row
+from rti_mpc_service.faults.report import WIDTH, MatrixReport, MatrixRow
 from rti_mpc_service.faults.table import FAULTS
 
 BY_NAME = {fault.name: fault for fault in FAULTS}
@@ -19,9 +19,9 @@ STOPPED = Measured(0.2, 0.21, 0.4, 1.8, 0.25, 0, 1.0, 2.5, 30, 0.5, 0.5)
 DRIVING = replace(STOPPED, brake_s=None, zero_s=None, still_s=None, missed=0, error_m=0.002, recovery_s=0.01)
 
 
-def row(name: str, measured: Measured | None) -> Row:
+def row(name: str, measured: Measured | None) -> MatrixRow:
     fault = BY_NAME[name]
-    return Row(fault, measured, ["it was not there"] if measured is None else fault.promise.broken(measured))
+    return MatrixRow(fault, measured, ["it was not there"] if measured is None else fault.promise.broken(measured))
 
 
 def test_row_says_what_the_robot_did() -> None:
@@ -43,7 +43,7 @@ def test_row_holds_every_number_in_json_and_those_that_were_promised_in_the_tabl
 
 def test_matrix_is_printed_with_what_was_not_kept() -> None:
     console = Console(file=io.StringIO(), width=WIDTH)
-    with Report(console, 2) as report:
+    with MatrixReport(console, 2) as report:
         report.add(row("controller_killed", replace(STOPPED, brake_s=0.31)))
         report.add(row("viewer_killed", DRIVING))
     report.conclude()
