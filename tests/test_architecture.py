@@ -205,3 +205,8 @@ def test_module_opens_with_what_it_is_and_not_with_a_question() -> None:
     for path in every_file():
         first = (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").partition(" ")[0]
         assert first not in {"", "What", "Who", "Whose", "Whether", "How", "Where", "Which", "When", "Why", "That"}, path
+
+
+def test_no_two_classes_share_a_name() -> None:
+    names = [node.name for path in every_file() for node in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(node, ast.ClassDef)]
+    assert sorted(name for name in set(names) if names.count(name) > 1) == []
