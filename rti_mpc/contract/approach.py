@@ -19,8 +19,8 @@ import numpy as np
 
 from rti_mpc.array import Array
 
-WINDOW = 0.75  # of a period: inputs within it differ by no more than an increment
-ROUNDING = 1e-9  # of an input, in its unit: less is no approach
+SLEW_WINDOW_PERIODS = 0.75  # inputs within this time differ by no more than one increment
+INPUT_ROUNDING = 1e-9  # in the unit of the input: a row that differs by less has not been changed
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +64,11 @@ def approach(u: Array, stamp_ns: int, period_ns: int, start_ns: int, acted: list
     Returns:
         The rows, shape ``(n, nu)``: `u` itself if it is inside.
     """
-    window_ns = round(WINDOW * limits.dt_ns)
+    window_ns = round(SLEW_WINDOW_PERIODS * limits.dt_ns)
     share = min(1.0, period_ns / limits.dt_ns)
     lowest, highest = share * limits.lbdu, share * limits.ubdu
     change = np.diff(u, axis=0)
-    even = period_ns >= window_ns and bool((change >= lowest - ROUNDING).all() and (change <= highest + ROUNDING).all())
+    even = period_ns >= window_ns and bool((change >= lowest - INPUT_ROUNDING).all() and (change <= highest + INPUT_ROUNDING).all())
     first = max(0, (start_ns - stamp_ns) // period_ns)
     begins_ns = stamp_ns + (first + 1) * period_ns  # when a plan that comes late by less than a row begins
     rows, near, limited = u, acted, False
@@ -77,7 +77,7 @@ def approach(u: Array, stamp_ns: int, period_ns: int, start_ns: int, acted: list
         if even and k > first and not limited and row_ns - window_ns >= start_ns:
             break
         row = within(u[k], near, row_ns - window_ns, limits)
-        was_limited, limited = limited, bool((np.abs(row - u[k]) > ROUNDING).any())
+        was_limited, limited = limited, bool((np.abs(row - u[k]) > INPUT_ROUNDING).any())
         if limited or was_limited:
             if rows is u:
                 rows = u.copy()
@@ -85,7 +85,7 @@ def approach(u: Array, stamp_ns: int, period_ns: int, start_ns: int, acted: list
             row = within(u[k], near, row_ns - limits.dt_ns, limits)
             if k > first:
                 row = np.minimum(np.maximum(row, rows[k - 1] + lowest), rows[k - 1] + highest)
-            limited = bool((np.abs(row - u[k]) > ROUNDING).any())
+            limited = bool((np.abs(row - u[k]) > INPUT_ROUNDING).any())
             rows[k] = row
         near = [*near, (row_ns + period_ns, rows[k])]
     return rows

@@ -19,12 +19,12 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
-from rti_mpc.contract.schedule import EVER_NS, Plan, Schedule
+from rti_mpc.contract.schedule import BEFORE_ALL_NS, Plan, Schedule
 
-TOLERANCE = 0.1  # of a period, by which a command may act sooner or later than believed
-OVERDUE = 1.0  # periods after which a command that does not act is missing; until then it is about to come
-SAME = 1e-6  # of an input, in its unit and relative: above the rounding of single precision
-MISSING = 8  # plans taken out that are remembered: any of them may still come
+START_TOLERANCE_PERIODS = 0.1  # a command may begin to act this much sooner or later than believed
+OVERDUE_PERIODS = 1.0  # a command that does not act this long after its time is missing; until then it is still expected
+INPUT_TOLERANCE = 1e-6  # in the unit of the input, and relative to it: above the rounding of single precision
+MAX_MISSING_PLANS = 8  # missing plans that are remembered, since each may still arrive
 
 
 class Belief(Schedule):
@@ -37,25 +37,25 @@ class Belief(Schedule):
 
     def __init__(self, u_rest: Array, slew: Array, increments: Increments) -> None:
         """Begin at rest; the arguments are those of `Schedule`."""
-        self._missing: deque[Plan] = deque(maxlen=MISSING)
+        self._missing: deque[Plan] = deque(maxlen=MAX_MISSING_PLANS)
         self.confirmed = 0
-        self._reported_ns = EVER_NS  # stamp of the last report
+        self._reported_ns = BEFORE_ALL_NS  # stamp of the last report
         self._period_ns = increments.dt_ns
-        self._overdue_ns = round(OVERDUE * increments.dt_ns)
-        self._tolerance_ns = round(TOLERANCE * increments.dt_ns)
+        self._overdue_ns = round(OVERDUE_PERIODS * increments.dt_ns)
+        self._tolerance_ns = round(START_TOLERANCE_PERIODS * increments.dt_ns)
         super().__init__(u_rest, slew, increments)
 
     def brake(self, u: Array, t_ns: int) -> None:
         """Drop every plan: the inputs ramp to rest from `u`, shape ``(nu,)``, beginning at a time."""
         super().brake(u, t_ns)
         self._missing.clear()
-        self._reported_ns = EVER_NS
+        self._reported_ns = BEFORE_ALL_NS
 
     def cut(self, t_ns: int, now_ns: int) -> None:
         """Let what acts at a time end there, and drop what would follow; the clock has jumped since, and shows another time."""
         super().cut(t_ns, now_ns)
         self._missing.clear()
-        self._reported_ns = EVER_NS
+        self._reported_ns = BEFORE_ALL_NS
 
     def correct(self, t_ns: int, u: Array, source: tuple[int, int]) -> bool:
         """
@@ -100,7 +100,7 @@ class Belief(Schedule):
 
     def _plays(self, u: Array, t_ns: int, *, or_after: bool = True) -> bool:
         """Whether an input is believed to act at a time, or nearly then; shortly before it only, unless `or_after`."""
-        most = SAME * (1.0 + np.abs(u))
+        most = INPUT_TOLERANCE * (1.0 + np.abs(u))
         times = (t_ns - 1, t_ns, t_ns - self._tolerance_ns, t_ns + self._tolerance_ns) if or_after else (t_ns - 1, t_ns - self._tolerance_ns)
         return any((np.abs(self.at(t)[0] - u) <= most).all() for t in times)
 

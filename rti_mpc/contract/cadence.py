@@ -11,15 +11,15 @@ from __future__ import annotations
 
 import math
 
-from rti_mpc.contract.epoch import SEQ_AHEAD
+from rti_mpc.contract.epoch import MAX_SEQ_GAP
 from rti_mpc.contract.message import Notice, Severity
 
-RATES = (0.005, 200.0)  # robot seconds per local second that stamps in nanoseconds may show
-SLACK = 1.1  # factor by which a measured rate may be beyond these: arrivals jitter
-WINDOW_NS = 50_000_000  # local time, at least, over which a rate is measured
-STANDING_NS = 1_000_000_000  # local time for which stamps or numbers may stand still before that is told
-STANDING_STATES = 2  # states that must have shown it
-UNITS = {-9: "s (seconds)", -6: "ms (milliseconds)", -3: "us (microseconds)", 3: "ps (picoseconds)"}  # by the power of ten that such stamps show
+RATE_RANGE = (0.005, 200.0)  # robot seconds per local second: the range that stamps in nanoseconds may show
+RATE_TOLERANCE_FACTOR = 1.1  # a measured rate may be outside the range by this factor, since arrivals jitter
+RATE_WINDOW_NS = 50_000_000  # local time: a rate is measured over at least this long
+STANDSTILL_NS = 1_000_000_000  # local time: stamps or numbers that stand still for this long are reported
+STANDSTILL_STATES = 2  # at least this many states must have shown it
+UNIT_BY_EXPONENT = {-9: "s (seconds)", -6: "ms (milliseconds)", -3: "us (microseconds)", 3: "ps (picoseconds)"}  # key: log10 of the measured rate
 
 
 class Cadence:
@@ -57,7 +57,7 @@ class Cadence:
 
     def counts(self, seq: int) -> bool:
         """Whether a sequence number goes on from the last one."""
-        return self._seq is None or self._seq < seq <= self._seq + SEQ_AHEAD
+        return self._seq is None or self._seq < seq <= self._seq + MAX_SEQ_GAP
 
     def observe(self, seq: int, stamp_ns: int, local_ns: int) -> bool:
         """
@@ -76,11 +76,11 @@ class Cadence:
 
     def _count(self, seq: int, stamp_ns: int, local_ns: int) -> bool:
         last, silent_ns = self._seq, local_ns - self._counted_ns
-        if self.counts(seq) or (seq != last and silent_ns > STANDING_NS):
+        if self.counts(seq) or (seq != last and silent_ns > STANDSTILL_NS):
             self._seq, self._counted_ns, self._uncounted = seq, local_ns, 0
             return True
         self._uncounted += self._moved is not None and stamp_ns > self._moved[0]  # what is sent twice has no stamp of its own
-        if self._uncounted >= STANDING_STATES and silent_ns >= STANDING_NS:
+        if self._uncounted >= STANDSTILL_STATES and silent_ns >= STANDSTILL_NS:
             text = f"seq must be above the one before in every state, got {seq} after {last} for {1e-9 * silent_ns:.1f} s: nothing is commanded"
             self._tell("seq_stands_still", text)
         return False
@@ -89,7 +89,7 @@ class Cadence:
         if self._moved is not None and stamp_ns <= self._moved[0]:
             self._standing += 1
             still_ns = local_ns - self._moved[1]
-            if self._standing >= STANDING_STATES and still_ns >= STANDING_NS:
+            if self._standing >= STANDSTILL_STATES and still_ns >= STANDSTILL_NS:
                 got = f"{self._standing + 1} states of {self._moved[0]} in {1e-9 * still_ns:.1f} s"
                 text = f"stamps must advance as nanoseconds do, got {got}: nothing is commanded"
                 self._tell("stamps_stand_still", text)
@@ -97,18 +97,18 @@ class Cadence:
         self._moved, self._standing = (stamp_ns, local_ns), 0
         if self._mark is None:
             self._mark = stamp_ns, local_ns
-        elif local_ns - self._mark[1] >= WINDOW_NS:
+        elif local_ns - self._mark[1] >= RATE_WINDOW_NS:
             self._measure((stamp_ns - self._mark[0]) / (local_ns - self._mark[1]))
             self._mark = stamp_ns, local_ns
 
     def _measure(self, rate: float) -> None:
         """Judge the rate of a window, and that of the one before with it: whatever is between may be held up once."""
-        side, self.rate = (rate > RATES[1] * SLACK) - (rate < RATES[0] / SLACK), rate
+        side, self.rate = (rate > RATE_RANGE[1] * RATE_TOLERANCE_FACTOR) - (rate < RATE_RANGE[0] / RATE_TOLERANCE_FACTOR), rate
         if side == 0:
             self.known, self.fault, self._told = True, "", False
         elif side == self._side and not self.fault:
-            unit = UNITS.get(3 * round(math.log10(rate) / 3))
-            looks = f"they look like {unit}, nanoseconds are expected" if unit else f"{RATES[0]:g} to {RATES[1]:g} are expected"
+            unit = UNIT_BY_EXPONENT.get(3 * round(math.log10(rate) / 3))
+            looks = f"they look like {unit}, nanoseconds are expected" if unit else f"{RATE_RANGE[0]:g} to {RATE_RANGE[1]:g} are expected"
             self.known, self.fault = False, f"the robot's stamps advance {rate:.3g} ns per ns: {looks}"
             self.notice = Notice(Severity.ERROR, "stamps_not_ns", f"{self.fault}; nothing is commanded")
         self._side = side

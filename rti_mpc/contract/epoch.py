@@ -16,11 +16,11 @@ take it, so that it does not miss what they follow where clocks differ.
 
 from __future__ import annotations
 
-NUMBER_BITS = 20
-BELIEVED = 1 << 52  # above the Unix seconds times 2 ** NUMBER_BITS: whose clock stands at 1970 still believes the epochs of 2105
-SKEW = 1 << 26  # more, for whoever chooses an epoch above those it believes: clocks may differ by a minute
-SUCCESSION = 1 << 22  # above the highest one followed: room for four more owners
-SEQ_AHEAD = 1_000_000  # messages of one epoch that may be missing between two; more is no loss but another's counting
+NUMBER_BITS = 20  # low bits of an epoch that hold the number of its owner
+EPOCH_LEAD = 1 << 52  # epochs this far above the present second are believed: a host whose clock stands at 1970 believes those of 2105
+EPOCH_SKEW = 1 << 26  # added where an epoch is to be chosen above those believed: clocks of hosts may differ by a minute
+EPOCH_SUCCESSION = 1 << 22  # epochs this far above the highest one followed are believed: room for four more owners
+MAX_SEQ_GAP = 1_000_000  # messages of one epoch that may be lost in a row; a larger gap is another sender's numbering
 
 
 def epoch_above(epoch: int, number: int) -> int:
@@ -37,4 +37,4 @@ def highest_believed(unix_s: int, known: int = 0, *, choosing: bool = False) -> 
         known: Highest epoch followed so far, 0 if there is none.
         choosing: Whether an epoch is to be chosen above all that are believed.
     """
-    return max(BELIEVED + SKEW * choosing + (unix_s << NUMBER_BITS), known + SUCCESSION)
+    return max(EPOCH_LEAD + EPOCH_SKEW * choosing + (unix_s << NUMBER_BITS), known + EPOCH_SUCCESSION)

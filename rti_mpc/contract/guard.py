@@ -23,22 +23,22 @@ from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.belief import Belief
 from rti_mpc.contract.cadence import Cadence
-from rti_mpc.contract.epoch import SEQ_AHEAD, epoch_above
+from rti_mpc.contract.epoch import MAX_SEQ_GAP, epoch_above
 from rti_mpc.contract.lives import Heard, Lives
 from rti_mpc.contract.message import Command, Notice, Severity, State
 from rti_mpc.contract.robot_clock import Backlog, RobotClock
-from rti_mpc.contract.schedule import EVER_NS, STEP_NS, end_ns, unfit
+from rti_mpc.contract.schedule import BEFORE_ALL_NS, RAMP_STEP_NS, end_ns, unfit
 from rti_mpc.contract.status import Mode, QpStatus
 
-VALID_NS = 300_000_000  # after its state, and the delay, in which a command may act at most, whatever it says itself
-EARLY_NS = 50_000_000  # local time by which a state that a command answers may be ahead of our idea of the robot's clock
-LATE_NS = 50_000_000  # local time by which a state is late if it has waited on the way, and says nothing of the time now
-JUMP_NS = 250_000_000  # by which a clock has jumped
-LEFT_NS = 250_000_000  # robot time without a command in order after which the leader may count anew
-HELD_UP_NS = 250_000_000  # local time without a tick after which this process was held up
-LEAD_NS = 30_000_000  # local time by which the robot is told of the ramp before it is due
-TOLD = 10  # steps of the ramp in a command of our own
-ROUNDING = 1e-6  # of an input, in its unit: above any rounding, single precision included, and below what an actuator resolves
+MAX_VALID_NS = 300_000_000  # robot time: a command ends at the latest this long after its state and the delay, whatever its own validity
+MAX_STATE_AHEAD_NS = 50_000_000  # local time: the state that a command answers may be this far ahead of our idea of the robot's clock
+MAX_STATE_LATE_NS = 50_000_000  # local time: a state that is later than this has waited on its way, and does not show the robot's clock
+CLOCK_JUMP_NS = 250_000_000  # robot time: a larger difference from the time expected is a jump of the robot's clock
+LEADER_SILENCE_NS = 250_000_000  # robot time: after this long without a command in order the leader's numbers may begin anywhere
+HELD_UP_NS = 250_000_000  # local time: a longer pause between two calls means that this process was held up
+RAMP_LEAD_NS = 30_000_000  # local time: the ramp to rest is sent this long before it is due
+RAMP_STEPS_PER_COMMAND = 10  # steps of the ramp in one command of the guard
+INPUT_ROUNDING = 1e-6  # in the unit of the input: above any rounding, single precision included, and below what an actuator resolves
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class Limits:
         way = np.maximum(np.abs(self.lbu - self.u_rest), np.abs(self.ubu - self.u_rest))
         limited = np.isfinite(self.slew)
         ramp = np.where(limited, way / np.where(limited, self.slew, 1.0), 0.0)
-        return self.delay_s + 1e-9 * VALID_NS + float(np.minimum(ramp, 10.0).max(initial=0.0))
+        return self.delay_s + 1e-9 * MAX_VALID_NS + float(np.minimum(ramp, 10.0).max(initial=0.0))
 
 
 class Guard:
@@ -112,15 +112,15 @@ class Guard:
         self._heard_ns = 0  # stamp of the last state
         self._late = Backlog()
         self._awake_ns = 0  # local time of the last call
-        self._open_ns = EVER_NS  # robot time from which commands pass
+        self._open_ns = BEFORE_ALL_NS  # robot time from which commands pass
         self._leader = (0, -1)  # epoch and sequence number of the last command that was in order
-        self._led_ns = EVER_NS  # robot time of it
-        self._told_ns = EVER_NS  # until when the robot knows what to do
+        self._led_ns = BEFORE_ALL_NS  # robot time of it
+        self._told_ns = BEFORE_ALL_NS  # until when the robot knows what to do
         self._engaged = False  # whether this robot was ever told anything
         self._untold = False  # whether it is still to be told to brake
         self._stopped = False
         self._latched = ""  # why an operator's stop is latched
-        self._rest_by_ns = EVER_NS  # robot time from which a latched guard passes rest only, and no way there any more
+        self._rest_by_ns = BEFORE_ALL_NS  # robot time from which a latched guard passes rest only, and no way there any more
         self._waiting = False  # whether it was said that commands wait for `_open_ns`
 
     def robot_now_ns(self, local_ns: int) -> int:
@@ -145,7 +145,7 @@ class Guard:
         whose = self._lives.hear(state.epoch, local_ns, self._clock.rate)
         if self._lives.notice is not None:
             self.notices.append(self._lives.notice)
-            begin_ns = self._clock.now_ns(local_ns) + round(LEAD_NS * self._clock.rate)  # the robot is told before it is due
+            begin_ns = self._clock.now_ns(local_ns) + round(RAMP_LEAD_NS * self._clock.rate)  # the robot is told before it is due
             self._brake(begin_ns, begin_ns)
         if whose is Heard.OTHER or not self._counts(state, local_ns, begins=whose is Heard.BEGINS):
             return
@@ -153,13 +153,13 @@ class Guard:
         if whose is Heard.BEGINS:
             self._begin(state)
         elif state.stamp_ns <= heard_ns:
-            if heard_ns - state.stamp_ns <= JUMP_NS:
+            if heard_ns - state.stamp_ns <= CLOCK_JUMP_NS:
                 return
             self._jump(state, local_ns, "back")
             self._cadence.jump()
         else:
             ahead_ns = state.stamp_ns - self._clock.now_ns(local_ns)
-            late = ahead_ns < -LATE_NS * self._clock.rate
+            late = ahead_ns < -MAX_STATE_LATE_NS * self._clock.rate
             self._heard_ns = state.stamp_ns
             if not late:
                 self._late.clear()
@@ -167,7 +167,7 @@ class Guard:
                 return
             else:
                 self._clock.jump()
-            if ahead_ns > max(JUMP_NS, 2.5 * self._clock.period_ns):
+            if ahead_ns > max(CLOCK_JUMP_NS, 2.5 * self._clock.period_ns):
                 self._jump(state, local_ns, "ahead")
         self._take(state, local_ns)
         if len(state.u) == len(self._limits.u_rest):
@@ -182,7 +182,7 @@ class Guard:
         """
         self._wake(local_ns)
         now_ns = self._clock.now_ns(local_ns)
-        until_ns = min(end_ns(command), command.state_stamp_ns + self._delay_ns + VALID_NS)
+        until_ns = min(end_ns(command), command.state_stamp_ns + self._delay_ns + MAX_VALID_NS)
         reason = self._objection(command, now_ns, until_ns)
         if not reason:
             self._follow(command)
@@ -201,7 +201,7 @@ class Guard:
         u = np.clip(command.u, self._limits.lbu, self._limits.ubu)
         passed = self._numbered(replace(command, valid_until_ns=min(command.valid_until_ns, until_ns), u=u))
         passed.u = self._schedule.add(passed, start_ns, until_ns)
-        if (np.abs(passed.u - u) > ROUNDING).any():
+        if (np.abs(passed.u - u) > INPUT_ROUNDING).any():
             text = f"command {command.seq} of epoch {command.epoch} begins too far from what acts: approached inside the slew limits"
             self._say(Severity.WARNING, "slew_limited", text)
         if not self.passing:
@@ -226,23 +226,23 @@ class Guard:
         self._schedule.forget(now_ns - 2 * self._dt_ns)
         if self.passing:
             self._watch(now_ns)
-        if self._told_ns - now_ns > LEAD_NS * self._clock.rate:
+        if self._told_ns - now_ns > RAMP_LEAD_NS * self._clock.rate:
             return None
         start_ns = max(self._told_ns, now_ns)
-        u = np.array([self._schedule.at(start_ns + i * STEP_NS)[0] for i in range(TOLD)])
-        period_ns = STEP_NS
+        u = np.array([self._schedule.at(start_ns + i * RAMP_STEP_NS)[0] for i in range(RAMP_STEPS_PER_COMMAND)])
+        period_ns = RAMP_STEP_NS
         if not (u - self._limits.u_rest).any():
             if now_ns - self._state.stamp_ns > 10 * self._stale_ns:
                 return None  # nobody is there to be told to stand
-            u, period_ns = u[:1], TOLD * STEP_NS
-        return self._tell(start_ns, TOLD * STEP_NS, period_ns, u, self._state)
+            u, period_ns = u[:1], RAMP_STEPS_PER_COMMAND * RAMP_STEP_NS
+        return self._tell(start_ns, RAMP_STEPS_PER_COMMAND * RAMP_STEP_NS, period_ns, u, self._state)
 
     def _last_step(self, state: State) -> Command:
         """Return the last command to a robot whose clock is none: each row is the next step to rest, whichever acts and for however long."""
         t_ns = state.stamp_ns
-        u = np.tile(self._schedule.nearest(self._limits.u_rest, t_ns), (TOLD, 1))
-        valid_ns = max(1, round(VALID_NS * min(1.0, self._cadence.rate)))  # as long as it should act, in the unit of the stamps
-        return self._tell(t_ns, valid_ns, STEP_NS, u, state)
+        u = np.tile(self._schedule.nearest(self._limits.u_rest, t_ns), (RAMP_STEPS_PER_COMMAND, 1))
+        valid_ns = max(1, round(MAX_VALID_NS * min(1.0, self._cadence.rate)))  # as long as it should act, in the unit of the stamps
+        return self._tell(t_ns, valid_ns, RAMP_STEP_NS, u, state)
 
     def _tell(self, start_ns: int, valid_ns: int, period_ns: int, u: Array, state: State) -> Command:
         """Return a command of our own, which the robot is then told of."""
@@ -319,22 +319,22 @@ class Guard:
             return f"fenced: epoch {epoch} has taken over"
         if command.epoch == epoch and command.seq == seq:
             return "repeated"
-        if command.epoch == epoch and now_ns - self._led_ns <= LEFT_NS and not seq < command.seq <= seq + SEQ_AHEAD:
+        if command.epoch == epoch and now_ns - self._led_ns <= LEADER_SILENCE_NS and not seq < command.seq <= seq + MAX_SEQ_GAP:
             return f"old: {seq} has passed" if command.seq < seq else f"ahead: the last one was {seq}"
         if reason := unfit(command, len(limits.u_rest), self._state.epoch):
             return reason
         if now_ns - self._clock.stamp_ns > max(self._stale_ns, 2.5 * self._clock.period_ns):
             return f"blind: no state for {1e-9 * (now_ns - self._clock.stamp_ns):.3f} s"
         age_ns = now_ns - command.state_stamp_ns
-        if age_ns > self._delay_ns + self._stale_ns or age_ns < -EARLY_NS * self._clock.rate:
+        if age_ns > self._delay_ns + self._stale_ns or age_ns < -MAX_STATE_AHEAD_NS * self._clock.rate:
             return f"{'stale' if age_ns > 0 else 'early'}: it answers a state of {1e-9 * age_ns:.3f} s ago"
         if until_ns <= max(command.stamp_ns, now_ns):
             return "expired"
         u = command.u
-        if (u < limits.lbu - ROUNDING).any() or (u > limits.ubu + ROUNDING).any():
+        if (u < limits.lbu - INPUT_ROUNDING).any() or (u > limits.ubu + INPUT_ROUNDING).any():
             return f"out_of_bounds: inputs reach from {u.min(axis=0).tolist()} to {u.max(axis=0).tolist()}"
         change, share = np.diff(u, axis=0), self._share(command)
-        if (change < share * limits.lbdu - ROUNDING).any() or (change > share * limits.ubdu + ROUNDING).any():
+        if (change < share * limits.lbdu - INPUT_ROUNDING).any() or (change > share * limits.ubdu + INPUT_ROUNDING).any():
             return f"out_of_slew: rows change by up to {np.abs(change).max(axis=0).tolist()}"
         if self._latched and not self._comes_to_rest(command, now_ns):
             return f"stopped: {self._latched}; only ways to rest pass"
@@ -346,8 +346,8 @@ class Guard:
         first = (start_ns - command.stamp_ns) // command.period_ns
         before = self._limits.u_rest if now_ns >= self._rest_by_ns else self._schedule.at(start_ns - 1)[0]
         way = np.vstack([before, self._approach(command, start_ns)[first:]]) - self._limits.u_rest
-        lower, upper = np.minimum(way[:-1], 0.0) - ROUNDING, np.maximum(way[:-1], 0.0) + ROUNDING
-        return bool((np.abs(way[-1]) <= ROUNDING).all() and ((way[1:] >= lower) & (way[1:] <= upper)).all())
+        lower, upper = np.minimum(way[:-1], 0.0) - INPUT_ROUNDING, np.maximum(way[:-1], 0.0) + INPUT_ROUNDING
+        return bool((np.abs(way[-1]) <= INPUT_ROUNDING).all() and ((way[1:] >= lower) & (way[1:] <= upper)).all())
 
     def _follow(self, command: Command) -> None:
         """Take the source of a command in order for the leader: no lower epoch will pass again in this life of the robot."""
@@ -404,13 +404,13 @@ class Guard:
         if self._state is None:
             self._open_ns = state.stamp_ns + round(1e9 * self._limits.settling_s)
         else:
-            self._open_ns = EVER_NS
+            self._open_ns = BEFORE_ALL_NS
             self._say(Severity.WARNING, "robot_restarted", "the robot was restarted: starting anew")
         self._clock.reset()
-        self._schedule.brake(self._limits.u_rest, EVER_NS)
+        self._schedule.brake(self._limits.u_rest, BEFORE_ALL_NS)
         self._leader = 0, -1
-        self._told_ns = EVER_NS
-        self._rest_by_ns = EVER_NS  # it stands: a latch from before lets rest alone pass
+        self._told_ns = BEFORE_ALL_NS
+        self._rest_by_ns = BEFORE_ALL_NS  # it stands: a latch from before lets rest alone pass
         self._engaged = self._untold = self.passing = False
         self._late.clear()
 
@@ -420,14 +420,14 @@ class Guard:
         text = f"the robot's clock jumped {where} by {1e-9 * abs(state.stamp_ns - before_ns):.3f} s: braking"
         self._say(Severity.WARNING, "clock_jumped", text)
         self._brake(before_ns, state.stamp_ns)
-        self._open_ns = EVER_NS
+        self._open_ns = BEFORE_ALL_NS
         self._clock.jump()
 
     def _brake(self, before_ns: int, now_ns: int) -> None:
         """Let the robot brake now from what acts at a time, which may be one of another clock."""
         self._schedule.cut(before_ns, now_ns)
         self._told_ns, self._untold = now_ns, self._engaged
-        self._rest_by_ns = EVER_NS  # of another clock, perhaps
+        self._rest_by_ns = BEFORE_ALL_NS  # of another clock, perhaps
         self.passing = False
 
     def _say(self, severity: Severity, code: str, text: str, *, change: bool = False) -> None:

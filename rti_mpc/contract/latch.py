@@ -17,10 +17,10 @@ from typing import Any
 
 from rti_mpc.errors import MessageError
 
-MAX_COUNTER = 2**62  # above it, none is read
-MAX_LEAP = 2**20  # of a counter above the highest known: nobody misses so many changes, and forged ones take for ever to reach `MAX_COUNTER`
-MAX_REASON = 200  # characters
-WHEN = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", re.ASCII)
+MAX_COUNTER = 2**62  # a latch with a higher counter is refused
+MAX_COUNTER_LEAP = 2**20  # steps above the highest counter known: nobody misses so many changes, and forged latches take years to reach `MAX_COUNTER`
+MAX_REASON_CHARS = 200
+UTC_TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", re.ASCII)
 
 
 @dataclass(frozen=True, order=True, slots=True)
@@ -51,7 +51,7 @@ class Latch:
 
 def merge(known: Latch, heard: Latch) -> Latch:
     """Return which of two latches holds; one whose counter leaps is not believed."""
-    return max(known, heard) if heard.counter - known.counter <= MAX_LEAP else known
+    return max(known, heard) if heard.counter - known.counter <= MAX_COUNTER_LEAP else known
 
 
 def read_latch(content: object) -> Latch:
@@ -69,10 +69,10 @@ def read_latch(content: object) -> Latch:
         raise MessageError(f"latch.counter must be a whole number from 0 to 2^62, got {shown(counter)}")
     if type(stopped) is not bool:
         raise MessageError(f"latch.stopped must be true or false, got {shown(stopped)}")
-    if not isinstance(when, str) or (when and not WHEN.fullmatch(when)):
+    if not isinstance(when, str) or (when and not UTC_TIME.fullmatch(when)):
         raise MessageError(f"latch.when must be a UTC time such as 2026-11-28T09:30:00Z, got {shown(when)}")
-    if not isinstance(reason, str) or len(reason) > MAX_REASON or not reason.isprintable():
-        raise MessageError(f"latch.reason must be printable, of at most {MAX_REASON} characters, got {shown(reason)}")
+    if not isinstance(reason, str) or len(reason) > MAX_REASON_CHARS or not reason.isprintable():
+        raise MessageError(f"latch.reason must be printable, of at most {MAX_REASON_CHARS} characters, got {shown(reason)}")
     return Latch(**fields)
 
 

@@ -22,16 +22,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rti_mpc.contract.epoch import SEQ_AHEAD, epoch_above
+from rti_mpc.contract.epoch import MAX_SEQ_GAP, epoch_above
 from rti_mpc.contract.message import Command, Notice, Severity, State
 
-SILENCE_PERIODS = 1.5  # of the leader, by the states it did not answer, after which another leads
-SILENCE_S = 0.03  # at least, robot time
-ASLEEP_S = 0.03  # without a look at the clock, at least: less is a busy machine
-DOUBT_S = 0.03  # for which a leader in doubt listens, local time
-COMPANY = 16  # others standing by of whom is known: a name costs nothing
-RANKS = 3  # periods that one who stands by leaves to those of a lower number, at most
-OWN = 2**64  # above every sequence number: nobody else's command of our epoch counts
+SILENCE_PERIODS = 1.5  # another controller leads when the leader has left the states of this long unanswered
+MIN_SILENCE_S = 0.03  # robot time: the silence that is waited for is never shorter
+MIN_SLEEP_S = 0.03  # local time: a shorter pause between two looks at the clock is a busy machine, not a sleep
+LISTENING_S = 0.03  # local time for which a leader in doubt listens before it commands again
+MAX_STANDBYS = 16  # standby controllers that are remembered: anybody can announce a name
+MAX_RANK = 3  # periods that a standby waits at most for those of a lower number
+ABOVE_EVERY_SEQ = 2**64  # larger than every sequence number: no command of our own epoch counts if it comes from elsewhere
 
 
 class Leadership:
@@ -70,9 +70,11 @@ class Leadership:
         self._config_hash = config_hash
         self._say = say
         self._dt_ns = round(1e9 * dt_s)
-        self._silence_ns = round(1e9 * max(SILENCE_PERIODS * dt_s, SILENCE_S))
+        self._silence_ns = round(1e9 * max(SILENCE_PERIODS * dt_s, MIN_SILENCE_S))
         self._late_ns = -((self._dt_ns - self._silence_ns) // self._dt_ns) * self._dt_ns  # age of a state not answered at which another leads
-        self._last = (0, -1) if standby else (self.epoch, OWN)  # the last command of the highest epoch, ours included; a guard counts its own
+        self._last = (
+            (0, -1) if standby else (self.epoch, ABOVE_EVERY_SEQ)
+        )  # the last command of the highest epoch, ours included; a guard counts its own
         self._belongs = not standby  # whether a controller of this configuration has ever led this robot
         self._robot_epoch = 0
         self._seen_ns = 0  # stamp of the last state
@@ -110,7 +112,7 @@ class Leadership:
             return
         if not present:
             self._company = self._company - {number}
-        elif len(self._company) < COMPANY:
+        elif len(self._company) < MAX_STANDBYS:
             self._company = self._company | {number}
         self._accompanied = True
 
@@ -123,7 +125,7 @@ class Leadership:
             rate: Seconds of the robot per local second.
         """
         slept_ns, self._looked_ns = local_ns - self._looked_ns, local_ns
-        if slept_ns > 1e9 * ASLEEP_S and rate * slept_ns > self._silence_ns:
+        if slept_ns > 1e9 * MIN_SLEEP_S and rate * slept_ns > self._silence_ns:
             self._doubt(local_ns)
 
     def follow(self, command: Command, *, late: bool = False) -> bool:
@@ -140,7 +142,7 @@ class Leadership:
         last = self._replaced if late and self._took_over is not None else self._last
         if self._robot_epoch and command.state_epoch != self._robot_epoch:
             return False
-        if not (command.epoch > last[0] or (command.epoch == last[0] and last[1] < command.seq <= last[1] + SEQ_AHEAD)):
+        if not (command.epoch > last[0] or (command.epoch == last[0] and last[1] < command.seq <= last[1] + MAX_SEQ_GAP)):
             return False
         if late and self._took_over is not None:
             self._took_over = None
@@ -171,17 +173,17 @@ class Leadership:
             self._robot_epoch, self._quiet_ns = state.epoch, state.stamp_ns
         elif not self.leading and (elapsed_ns >= self._silence_ns or late_ns >= self._late_ns):
             # Held up, as the leader may be, which listens first; a clock of the robot that has waited looks late by more than any state.
-            self._quiet_ns = state.stamp_ns + max(0, min(late_ns, self._late_ns)) + round(1e9 * DOUBT_S)
+            self._quiet_ns = state.stamp_ns + max(0, min(late_ns, self._late_ns)) + round(1e9 * LISTENING_S)
         silent_ns = state.stamp_ns - self._quiet_ns
         if not self.leading:
-            rank = min(RANKS, sum(number < self.number for number in self._company))
+            rank = min(MAX_RANK, sum(number < self.number for number in self._company))
             if silent_ns >= self._silence_ns + rank * self._dt_ns and not self.misfit:
                 self._take_over(silent_ns)
                 self._quiet_ns = state.stamp_ns  # the silence was another's, and our first sample may be states away
         elif self._doubt_ns is None:
             if silent_ns >= self._silence_ns or late_ns >= self._late_ns:
                 self._doubt(local_ns)
-        elif local_ns - self._doubt_ns >= 1e9 * DOUBT_S:
+        elif local_ns - self._doubt_ns >= 1e9 * LISTENING_S:
             self._doubt_ns = None
 
     def sends(self, command: Command) -> bool:
@@ -205,7 +207,7 @@ class Leadership:
     def _take_over(self, silent_ns: int) -> None:
         self._replaced = self._last
         self.epoch = epoch_above(max(self.epoch - 1, self._last[0]), self.number)
-        self._last = self.epoch, OWN
+        self._last = self.epoch, ABOVE_EVERY_SEQ
         self.leading = self._belongs = True
         text = f"leads from now on, with epoch {self.epoch}: nobody has answered a state for {1e-9 * silent_ns:.3f} s"
         self._took_over = Notice(Severity.WARNING, "took_over", text)

@@ -5,15 +5,15 @@ from __future__ import annotations
 
 from collections import deque
 
-WINDOW_NS = 1_000_000_000  # local time over which the rate is measured
-EACH_STATE = 1.05  # factor by which one state may change the rate
-LEAP_NS = 250_000_000  # robot time by which a clock that has jumped is ahead
-DRIFT = 0.1  # share by which the rate may be wrong, where states come late now and then
-RECENT = 2  # states, by the least late of which lateness is told: more, and a clock that has waited looked late for as long
-SETTLING = 20  # states after which the rate is known well enough for that
-PACED_NS = 80_000_000  # local time in which late states must each have taken their time before the robot's clock is believed to have waited
-MAX_PACED = 8  # states, from which that is believed in any case
-FASTEST = 10.0  # rate of a robot whose second state is still to come, at most
+RATE_WINDOW_NS = 1_000_000_000  # local time over which the rate is measured
+RATE_FACTOR_PER_STATE = 1.05  # one state may change the rate by this factor at most
+CLOCK_LEAP_NS = 250_000_000  # robot time: a stamp further ahead than this is a jump of the robot's clock
+RATE_UNCERTAINTY = 0.1  # share by which the rate may be wrong, where states come late now and then
+RECENT_STATES = 2  # lateness is measured against the least late of these: with more of them a clock that has waited would look late for longer
+SETTLING_STATES = 20  # states after which the rate is known well enough for that
+PACED_NS = 80_000_000  # local time: late states must come at their own pace for this long before the robot's clock is believed to have waited
+MAX_PACED_STATES = 8  # with this many such states in a row that is believed in any case
+MAX_INITIAL_RATE = 10.0  # robot seconds per local second that are assumed at most until the second state has come
 
 
 class Backlog:
@@ -40,7 +40,7 @@ class Backlog:
         last, self.last = self.last, (stamp_ns, arrival_ns)
         paced = last is not None and 2 * clock.rate * (arrival_ns - last[1]) >= stamp_ns - last[0]
         self._paced = self._paced + 1 if paced else 0
-        patience = min(max(1, int(PACED_NS * clock.rate / clock.period_ns)), MAX_PACED) if clock.period_ns else 1
+        patience = min(max(1, int(PACED_NS * clock.rate / clock.period_ns)), MAX_PACED_STATES) if clock.period_ns else 1
         return self._paced >= patience
 
 
@@ -77,15 +77,15 @@ class RobotClock:
         self.stamp_ns = 0
         self.arrival_ns = 0
         self.rate = 0.1
-        self.rate_most = FASTEST
+        self.rate_most = MAX_INITIAL_RATE
         self.period_ns = 0.0
         self._seq = 0
         self._anchor: tuple[int, int] | None = None
         self._late = Backlog()
         self._measured = False  # whether the rate is
-        self._recent: deque[tuple[int, int]] = deque(maxlen=RECENT)  # stamps and arrivals
+        self._recent: deque[tuple[int, int]] = deque(maxlen=RECENT_STATES)  # stamps and arrivals
         self._in_a_row = 0  # states that came late by a quarter of a period and more
-        self._settling = SETTLING  # states still to come
+        self._settling = SETTLING_STATES  # states still to come
         self.late_ns = self.doubt_ns = 0
         self.leapt = False
 
@@ -105,7 +105,7 @@ class RobotClock:
         """
         ahead_ns = stamp_ns - self.now_ns(arrival_ns)
         since_ns = self.arrival_ns or arrival_ns
-        leaps = self._measured and ahead_ns > max(self._most_ns, LEAP_NS) and not self.leapt
+        leaps = self._measured and ahead_ns > max(self._most_ns, CLOCK_LEAP_NS) and not self.leapt
         if self._anchor is None or leaps:
             self._anchor = (stamp_ns, arrival_ns)
             self._recent.clear()
@@ -126,7 +126,7 @@ class RobotClock:
         self._late.clear()
         self.leapt = leaps
         self.late_ns = self._late_ns(stamp_ns, arrival_ns)
-        self.doubt_ns = round(DRIFT * self.rate * (arrival_ns - since_ns))
+        self.doubt_ns = round(RATE_UNCERTAINTY * self.rate * (arrival_ns - since_ns))
         if self._settling:
             self._recent.clear()
         self._recent.append((stamp_ns, arrival_ns))
@@ -140,12 +140,12 @@ class RobotClock:
         if not self._measured:
             self.rate_most = rate
         self._in_a_row = self._in_a_row + 1 if self._late_ns(stamp_ns, arrival_ns) > self.period_ns / 4 else 0
-        if (0 < self._in_a_row < RECENT and not self._settling) or elapsed_ns < WINDOW_NS // 4:
+        if (0 < self._in_a_row < RECENT_STATES and not self._settling) or elapsed_ns < RATE_WINDOW_NS // 4:
             return
         self._settling = max(0, self._settling - 1)
-        self.rate = min(max(rate, self.rate / EACH_STATE), self.rate * EACH_STATE) if self._measured else rate
+        self.rate = min(max(rate, self.rate / RATE_FACTOR_PER_STATE), self.rate * RATE_FACTOR_PER_STATE) if self._measured else rate
         self.rate_most, self._measured = self.rate, True
-        if elapsed_ns >= WINDOW_NS:
+        if elapsed_ns >= RATE_WINDOW_NS:
             self._anchor = (stamp_ns, arrival_ns)
 
     def _late_ns(self, stamp_ns: int, arrival_ns: int) -> int:

@@ -21,13 +21,13 @@ from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments, approach, segments, within
 from rti_mpc.contract.message import Command
 
-STEP_NS = 10_000_000  # the ramp to rest is a staircase of such steps
-NEVER_NS = 2**63
-EVER_NS = -(2**62)
-MAX_PLANS = 64  # ahead of their time, kept at most
-MAX_ROWS = 1000  # of a plan, the longest horizon a configuration may have: to approach a plan takes longer than in proportion to its rows
-ROUNDING = 1e-9  # of a way to rest that is a whole number of steps
-OWN = (0, 0)  # source of what no command has asked for
+RAMP_STEP_NS = 10_000_000  # the ramp to rest is a staircase of steps of this duration
+NEVER_NS = 2**63  # later than every time
+BEFORE_ALL_NS = -(2**62)  # earlier than every time
+MAX_PLANS = 64  # plans that are kept, those ahead of their time included
+MAX_ROWS = 1000  # rows of a plan, the longest horizon a configuration may have: the cost of `approach` grows faster than the rows
+WAY_ROUNDING = 1e-9  # relative: so that a way to rest of a whole number of steps takes no further one
+NO_COMMAND = (0, 0)  # epoch and sequence number of inputs that come from no command
 
 
 def unfit(command: Command, nu: int, robot_epoch: int) -> str:
@@ -66,7 +66,7 @@ class Plan:
     asked: Array
     u: Array
     before: Array
-    source: tuple[int, int] = OWN
+    source: tuple[int, int] = NO_COMMAND
     pause_ns: Array | None = None
 
     def row(self, t_ns: int) -> int:
@@ -95,7 +95,7 @@ class Schedule:
         self._slew = 1e-9 * np.asarray(slew, dtype=np.float64)  # per ns
         self._increments = increments
         self._plans: deque[Plan] = deque()  # by start; those of the past as far as `forget` has left them
-        self.brake(self.u_rest, EVER_NS)
+        self.brake(self.u_rest, BEFORE_ALL_NS)
 
     def __len__(self) -> int:
         """Return how many plans are kept."""
@@ -178,7 +178,7 @@ class Schedule:
     def source(self, t_ns: int) -> tuple[int, int]:
         """Return epoch and sequence number of the command whose plan acts at a time; zeros where none does."""
         plan = next((plan for plan in reversed(self._plans) if plan.start_ns <= t_ns), None)
-        return OWN if plan is None or t_ns >= plan.end_ns else plan.source
+        return NO_COMMAND if plan is None or t_ns >= plan.end_ns else plan.source
 
     def at(self, t_ns: int) -> tuple[Array, int, bool]:
         """Return the input that acts at a time, shape ``(nu,)``, until when it does, and whether no plan acts."""
@@ -202,13 +202,13 @@ class Schedule:
         way = self.u_rest - last
         if plan.pause_ns is None:
             plan.pause_ns = self._pause_ns(plan, last, way)
-        steps = np.floor((t_ns - plan.end_ns - plan.pause_ns) / STEP_NS) + 1.0
+        steps = np.floor((t_ns - plan.end_ns - plan.pause_ns) / RAMP_STEP_NS) + 1.0
         with np.errstate(invalid="ignore"):  # no slew limit, no step: 0 * inf is no way at all
-            reach = np.where(steps > 0.0, steps * (STEP_NS * self._slew), 0.0)
-        rests = np.abs(way) <= reach * (1.0 + ROUNDING)
+            reach = np.where(steps > 0.0, steps * (RAMP_STEP_NS * self._slew), 0.0)
+        rests = np.abs(way) <= reach * (1.0 + WAY_ROUNDING)
         if rests.all():
             return self.u_rest, NEVER_NS
-        next_ns = plan.pause_ns + STEP_NS * np.maximum(steps, 0.0)
+        next_ns = plan.pause_ns + RAMP_STEP_NS * np.maximum(steps, 0.0)
         return np.where(rests, self.u_rest, last + np.clip(way, -reach, reach)), plan.end_ns + int(np.ceil(next_ns[~rests].min()))
 
     def _pause_ns(self, plan: Plan, last: Array, way: Array) -> Array:
@@ -223,5 +223,5 @@ class Schedule:
             jump = last - u
             with np.errstate(invalid="ignore"):
                 paid_ns = np.where(jump * way > 0.0, np.minimum(np.abs(jump) / self._slew, window_ns), -np.inf)
-            pause_ns = np.maximum(pause_ns, until_ns + STEP_NS - plan.end_ns + paid_ns)
+            pause_ns = np.maximum(pause_ns, until_ns + RAMP_STEP_NS - plan.end_ns + paid_ns)
         return np.ceil(pause_ns)  # whole ns: where a step begins, it has begun

@@ -23,7 +23,7 @@ from rti_mpc.array import Array
 from rti_mpc.codegen import bind, function
 from rti_mpc.rti.rti import Rti
 
-NOWHERE = 0.05  # epsilon: a plan that passes an obstacle keeps above 1, a blocked one is at 0.001
+MIN_PROGRESS_RATIO = 0.05  # epsilon, without a unit: a plan that passes an obstacle stays above 1, a blocked one is near 0.001
 
 
 class Blockage:
@@ -45,7 +45,7 @@ class Blockage:
         """Look at the plan of a new sample, and tell whether `blocked` has changed."""
         self._measure()
         moved, left = self._squares
-        standing = self._rti.touches and bool(moved < NOWHERE**2 * left)
+        standing = self._rti.touches and bool(moved < MIN_PROGRESS_RATIO**2 * left)
         self._contrary = self._contrary + 1 if standing is not self.blocked else 0
         if self._contrary < self._rti.ocp.N:
             return False

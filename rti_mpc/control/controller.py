@@ -23,7 +23,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.guard import Limits
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Notice, Reference, Severity, State, Telemetry
-from rti_mpc.contract.schedule import EVER_NS
+from rti_mpc.contract.schedule import BEFORE_ALL_NS
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.blockage import Blockage
 from rti_mpc.control.call import Call, told
@@ -45,8 +45,10 @@ from rti_mpc.errors import OcpError
 from rti_mpc.rti.ocp import Ocp, restless
 from rti_mpc.rti.rti import Rti
 
-UNREPORTED = "the robot does not report which inputs act: commands are believed to act, and only the robot itself or a guard can cover their loss"
-ITERATIONS_COLD = 3  # iterations of a first sample, whose guess is one state and one input
+INPUTS_UNREPORTED = (
+    "the robot does not report which inputs act: commands are believed to act, and only the robot itself or a guard can cover their loss"
+)
+ITERATIONS_COLD = 3  # iterations of the first sample, whose guess is one state and one input at all stages
 
 
 class Controller:
@@ -173,7 +175,7 @@ class Controller:
             self._modes.enter(Mode.WAITING, "first state")
             if not len(state.u) and not self._unreported:
                 self._unreported = True
-                self._modes.say(Severity.WARNING, "inputs_unreported", UNREPORTED)
+                self._modes.say(Severity.WARNING, "inputs_unreported", INPUTS_UNREPORTED)
         if self._track.arriving:
             self._anchor(state)
         grid, period_ns = self.grid, self._states.clock.period_ns
@@ -321,7 +323,7 @@ class Controller:
         if self._shadowing:
             return
         clock = self._states.clock
-        self._sent.append(command, EVER_NS if left_ns is None or self._states.cadence.fault else clock.latest_ns(left_ns))
+        self._sent.append(command, BEFORE_ALL_NS if left_ns is None or self._states.cadence.fault else clock.latest_ns(left_ns))
 
     # The two phases.
 

@@ -30,13 +30,13 @@ from rti_mpc.contract.schedule import end_ns
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model
 
-EACH = 4  # candidates a period
-FORGETTING = 0.98  # in a step that says something: the last fifty count
-TELLING = 0.1  # in normalised squared errors, by which the candidates must differ for a step to say something
-BELIEVED = 20.0  # in normalised squared errors, by which another candidate must be better: noise alone is 4.5 sigma away from it
-WILD = 1e6  # error of a state, in its unit, from which on it says nothing
-STEADY = 10  # reports in a row after which what was learnt is right
-FINEST = 1e-4  # error of a state, in its unit, below which none is told from another
+CANDIDATES_PER_PERIOD = 4
+FORGETTING_FACTOR = 0.98  # gamma, applied at each informative step: about the last fifty of them count
+MIN_ERROR_SPREAD = 0.1  # a step is informative if the normalised squared errors of the candidates differ by more than this
+MIN_COST_ADVANTAGE = 20.0  # another candidate is taken if its cost J is lower by this much: noise alone would have to be 4.5 sigma
+MAX_STATE_ERROR = 1e6  # in the unit of the state: a prediction error this large is not used
+CONFIRMED_REPORTS = 10  # after this many confirmed reports in a row the estimate is kept as a good one
+MIN_STATE_DEVIATION = 1e-4  # lower limit of sigma_i, in the unit of the state: smaller errors do not tell candidates apart
 
 
 class DelayEstimator:
@@ -50,7 +50,7 @@ class DelayEstimator:
     def __init__(self, model: Model, dt_ns: int, most_ns: int, *, compile: bool = True) -> None:
         self.delay_ns = 0
         self._dt_ns = dt_ns
-        self._candidates = [round(j * dt_ns / EACH) for j in range(EACH * most_ns // dt_ns + 1)]  # ns
+        self._candidates = [round(j * dt_ns / CANDIDATES_PER_PERIOD) for j in range(CANDIDATES_PER_PERIOD * most_ns // dt_ns + 1)]  # ns
         self._costs: Array = np.zeros(len(self._candidates))
         self._variance: Array = np.zeros(model.nx)
         self._u_rest: Array = np.array(model.u_rest)
@@ -84,7 +84,7 @@ class DelayEstimator:
         Args:
             confirmed: Reports of the robot in a row that have named the command which was to act; 0 where it does not report.
         """
-        if confirmed >= STEADY:
+        if confirmed >= CONFIRMED_REPORTS:
             self._kept = self._costs.copy(), self._variance.copy(), self.delay_ns
         elif self._kept is None:
             return
@@ -107,16 +107,16 @@ class DelayEstimator:
         if last is None or not 0 < stamp_ns - last[1] <= 2 * self._dt_ns:
             return
         errors = self._errors(*last, x, stamp_ns)
-        squared = np.where(np.abs(errors) < WILD, errors, np.nan) ** 2
+        squared = np.where(np.abs(errors) < MAX_STATE_ERROR, errors, np.nan) ** 2
         played = np.flatnonzero(np.isfinite(squared.sum(axis=1)))
         if not len(played):
             return
         squared = np.where(np.isfinite(squared), squared, squared[played].max(axis=0))  # the robot would have had to brake: it is no such delay
-        self._variance += (1.0 - FORGETTING if self._variance.any() else 1.0) * (squared.min(axis=0) - self._variance)
-        step = (squared / np.maximum(self._variance, FINEST**2)).sum(axis=1)
-        if np.ptp(step) <= TELLING:
+        self._variance += (1.0 - FORGETTING_FACTOR if self._variance.any() else 1.0) * (squared.min(axis=0) - self._variance)
+        step = (squared / np.maximum(self._variance, MIN_STATE_DEVIATION**2)).sum(axis=1)
+        if np.ptp(step) <= MIN_ERROR_SPREAD:
             return
-        self._costs *= FORGETTING
+        self._costs *= FORGETTING_FACTOR
         self._costs += step
         self._estimate()
 
@@ -156,9 +156,9 @@ class DelayEstimator:
 
     def _estimate(self) -> None:
         """Move to the best candidate, if it is better by enough."""
-        costs, step_ns = self._costs, self._dt_ns / EACH
+        costs, step_ns = self._costs, self._dt_ns / CANDIDATES_PER_PERIOD
         best, now = int(costs.argmin()), min(round(self.delay_ns / step_ns), len(costs) - 1)
-        if best != now and costs[now] - costs[best] < BELIEVED:
+        if best != now and costs[now] - costs[best] < MIN_COST_ADVANTAGE:
             return
         offset = 0.0
         if 0 < best < len(costs) - 1:

@@ -16,7 +16,7 @@ from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled, function
 from rti_mpc.rti.ocp import Ocp
 
-LIMITS = ("lbu", "ubu", "lbdu", "ubdu")
+INPUT_BOUNDS = ("lbu", "ubu", "lbdu", "ubdu")  # attributes of the Ocp
 
 
 class Envelope:
@@ -29,7 +29,7 @@ class Envelope:
 
     def __init__(self, ocp: Ocp, *, compile: bool = True) -> None:
         nu = ocp.model.nu
-        self.limits = {name: np.array(getattr(ocp, name)) for name in LIMITS}
+        self.limits = {name: np.array(getattr(ocp, name)) for name in INPUT_BOUNDS}
         self._u_rest: Array = np.array(ocp.model.u_rest)
         self._u: Array = np.zeros((ocp.N_u, nu))
         self._rows: Array = np.zeros((ocp.N, nu))
@@ -78,11 +78,11 @@ class Envelope:
 
 
 def clipping(ocp: Ocp) -> ca.Function:
-    """Build ``(u, lowest, highest, *LIMITS) -> rows``, columns being stages."""
+    """Build ``(u, lowest, highest, *INPUT_BOUNDS) -> rows``, columns being stages."""
     nu = ocp.model.nu
     u = ca.SX.sym("u", nu, ocp.N_u)
     lowest, highest = ca.SX.sym("lowest", nu, 2), ca.SX.sym("highest", nu, 2)
-    lbu, ubu, lbdu, ubdu = (ca.SX.sym(name, nu) for name in LIMITS)
+    lbu, ubu, lbdu, ubdu = (ca.SX.sym(name, nu) for name in INPUT_BOUNDS)
     rows: list[ca.SX] = []
     for k in range(ocp.N_u):
         lower, upper = (rows[-1] + lbdu, rows[-1] + ubdu) if k else (lowest[:, 0], highest[:, 0])

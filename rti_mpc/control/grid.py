@@ -12,10 +12,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-BUDGET = 0.75  # of a period, after the time at which a command acts, in which it may leave; the rest is for messages on their way
-MOST = 3  # periods that a measured delay may have
-MARGIN = 8  # part of a period that is added to a measured delay
-SETTLING = 40  # samples in which a measured delay may change by a period
+MAX_LATENESS_PERIODS = 0.75  # a command may leave this long after the time at which it acts; the rest of the period is left to its transport
+MAX_DELAY_PERIODS = 3  # the largest delay that is measured
+DELAY_MARGIN_PERIODS = 1 / 8  # added to a measured delay
+DELAY_SLEW_SAMPLES = 40  # samples that the delay takes to change by one period
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Grid:
     def __init__(self, dt_s: float, timing: Timing) -> None:
         self.dt_ns = round(1e9 * dt_s)
         self.delay_ns = round(1e9 * (timing.delay_s or 0.0))
-        self.most_ns = self.delay_ns if timing.delay_s is not None else MOST * self.dt_ns
+        self.most_ns = self.delay_ns if timing.delay_s is not None else MAX_DELAY_PERIODS * self.dt_ns
         self.act_ns = 0
         self.running = False
 
@@ -59,7 +59,7 @@ class Grid:
 
     def too_late(self, late_ns: int) -> bool:
         """Whether a command that leaves by so much after its time is not there before its first row is over."""
-        return late_ns >= BUDGET * self.dt_ns
+        return late_ns >= MAX_LATENESS_PERIODS * self.dt_ns
 
     def behind(self, stamp_ns: int) -> int:
         """Samples that a state shows to have been missed."""
@@ -81,5 +81,5 @@ class Grid:
 
     def adapt(self, delay_ns: int) -> None:
         """Let the delay come nearer to a measured one, by little enough that nothing jumps; a command rather waits a little than comes too late."""
-        change_ns, wanted_ns = self.dt_ns // SETTLING, min(max(delay_ns, 0) + self.dt_ns // MARGIN, self.most_ns)
+        change_ns, wanted_ns = self.dt_ns // DELAY_SLEW_SAMPLES, min(max(delay_ns, 0) + int(DELAY_MARGIN_PERIODS * self.dt_ns), self.most_ns)
         self.delay_ns += min(max(wanted_ns - self.delay_ns, -change_ns), change_ns)

@@ -3,7 +3,7 @@
 Ladder of fallbacks for a plan that cannot be made, each rung counted.
 
 1. The plan of the second solver, with softened bounds: made inside `Rti`.
-2. The previous plan, shifted: at most `FALLBACKS` samples in a row, and never past its validity.
+2. The previous plan, shifted: at most `MAX_FALLBACK_SAMPLES` samples in a row, and never past its validity.
 3. The brake law: a ramp to rest inside the slew limits, from past commands alone.
 4. Standstill.
 """
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-FALLBACKS = 3  # samples in a row that the shifted previous plan may serve
+MAX_FALLBACK_SAMPLES = 3  # consecutive samples that the shifted previous plan may serve
 
 
 @dataclass(slots=True)
@@ -37,7 +37,7 @@ class Ladder:
     def fall(self, *, plan_left: bool) -> bool:
         """Note a sample without a plan of its own, and tell whether the previous one may play on."""
         self.failed += 1
-        plays_on = plan_left and self.failed <= FALLBACKS
+        plays_on = plan_left and self.failed <= MAX_FALLBACK_SAMPLES
         self.shifted += plays_on
         return plays_on
 

@@ -8,16 +8,16 @@ from collections import deque
 from rti_mpc.contract.message import Notice, Severity
 from rti_mpc.contract.status import Mode
 
-ANSWERS = {Mode.TRACKING, Mode.HOLDING, Mode.BRAKING, Mode.STOPPED}  # to a state, whatever came before
+ANSWERING_MODES = {Mode.TRACKING, Mode.HOLDING, Mode.BRAKING, Mode.STOPPED}  # modes that may follow any other but IDLE and STOPPED
 
 # From each mode the ones that may follow; idle follows all, when the robot begins another life.
 TRANSITIONS: dict[Mode, set[Mode]] = {
     Mode.IDLE: {Mode.WAITING},
-    Mode.WAITING: ANSWERS | {Mode.IDLE},
-    Mode.TRACKING: ANSWERS | {Mode.FALLBACK, Mode.IDLE},
-    Mode.HOLDING: ANSWERS | {Mode.FALLBACK, Mode.IDLE},
-    Mode.FALLBACK: ANSWERS | {Mode.IDLE},
-    Mode.BRAKING: ANSWERS | {Mode.IDLE},
+    Mode.WAITING: ANSWERING_MODES | {Mode.IDLE},
+    Mode.TRACKING: ANSWERING_MODES | {Mode.FALLBACK, Mode.IDLE},
+    Mode.HOLDING: ANSWERING_MODES | {Mode.FALLBACK, Mode.IDLE},
+    Mode.FALLBACK: ANSWERING_MODES | {Mode.IDLE},
+    Mode.BRAKING: ANSWERING_MODES | {Mode.IDLE},
     Mode.STOPPED: {Mode.WAITING, Mode.IDLE},
 }
 

@@ -25,8 +25,8 @@ from rti_mpc.model.disturbance import with_disturbances
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model
 
-NOISE = 1e-3  # standard deviation of a measured state, in its unit
-PROCESS = 1e-3  # random walk of a state beside its model, in its unit / sqrt(s)
+DEFAULT_NOISE = 1e-3  # standard deviation of a measured state, in its unit
+DEFAULT_PROCESS_NOISE = 1e-3  # standard deviation of the random walk that is added to a state, in its unit / sqrt(s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +51,8 @@ class ObserverSettings:
     Attributes:
         disturbances: By the name of an input or a state.
         measured: Names of the states that are measured; all of them if there are none.
-        noise: Standard deviation of measured states by name, in the state's unit; `NOISE` if left out.
-        process: Random walk of states beside their model by name, in the state's unit / sqrt(s); `PROCESS` if left out.
+        noise: Standard deviation of measured states by name, in the state's unit; `DEFAULT_NOISE` if left out.
+        process: Random walk of states beside their model by name, in the state's unit / sqrt(s); `DEFAULT_PROCESS_NOISE` if left out.
     """
 
     disturbances: Mapping[str, Disturbance] = field(default_factory=dict)
@@ -87,10 +87,10 @@ class Observer:
         nx, nd = model.nx, len(settings.disturbances)
         self._limits: Array = np.array([of.limit for of in settings.disturbances.values()])
         measured = [j for j, name in enumerate(states) if not settings.measured or name in settings.measured]
-        variances = [settings.noise.get(states[j], NOISE) ** 2 for j in measured]
+        variances = [settings.noise.get(states[j], DEFAULT_NOISE) ** 2 for j in measured]
         if min(variances, default=1.0) <= 0.0:
             raise OcpError(f"the noise of a measured state must be positive, got {dict(settings.noise)}")
-        walks = [settings.process.get(name, PROCESS) for name in states] + [of.drift for of in settings.disturbances.values()]
+        walks = [settings.process.get(name, DEFAULT_PROCESS_NOISE) for name in states] + [of.drift for of in settings.disturbances.values()]
         self._initial: Array = np.diag([*(variances[measured.index(j)] if j in measured else 1.0 for j in range(nx)), *self._limits**2])
 
         z: Array = np.zeros(nx + nd)

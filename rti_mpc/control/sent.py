@@ -16,10 +16,10 @@ from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.belief import Belief
 from rti_mpc.contract.message import Command
-from rti_mpc.contract.schedule import EVER_NS, Schedule, end_ns
+from rti_mpc.contract.schedule import BEFORE_ALL_NS, Schedule, end_ns
 
-TRANSIT = 0.1  # of a period, that a command may be on its way: the plan before acts until then
-WINDOW = 0.75  # of a period, before which what acted for that long does not count: or no plan could turn round
+TRANSIT_PERIODS = 0.1  # a command may take this long to arrive; the plan before it acts until then
+SLEW_WINDOW_PERIODS = 0.75  # a late command is held to the slew limits over this time: over a whole period no plan could reverse its direction
 
 
 class Sent:
@@ -32,17 +32,17 @@ class Sent:
 
     def __init__(self, u_rest: Array, lbdu: Array, ubdu: Array, dt_ns: int) -> None:
         self.delay_ns = 0
-        self._left_ns = EVER_NS  # when the last command left at the earliest
-        self._alone: tuple[int, Array] = (EVER_NS, u_rest)  # when the robot last stopped braking on its own, and from which input
+        self._left_ns = BEFORE_ALL_NS  # when the last command left at the earliest
+        self._alone: tuple[int, Array] = (BEFORE_ALL_NS, u_rest)  # when the robot last stopped braking on its own, and from which input
         self._slew = (lbdu, ubdu)  # per dt
         self._dt_ns = dt_ns
-        self._transit_ns, self._window_ns = round(TRANSIT * dt_ns), round(WINDOW * dt_ns)
+        self._transit_ns, self._window_ns = round(TRANSIT_PERIODS * dt_ns), round(SLEW_WINDOW_PERIODS * dt_ns)
         slew = 1e9 * np.minimum(-lbdu, ubdu) / dt_ns
         increments = Increments(lbdu, ubdu, dt_ns)
         self._schedule = Belief(u_rest, slew, increments)
         self._slowest = Schedule(u_rest, slew, increments)  # if each command was on its way for as long as it may be
 
-    def append(self, command: Command, left_ns: int = EVER_NS) -> None:
+    def append(self, command: Command, left_ns: int = BEFORE_ALL_NS) -> None:
         """
         Remember a command that has left, unless it has expired before its time: the robot refuses it.
 
@@ -66,7 +66,7 @@ class Sent:
         changed = self._schedule.correct(t_ns, u, source)
         if changed:
             self._slowest.copy(self._schedule)
-            self._alone = EVER_NS, self._schedule.u_rest
+            self._alone = BEFORE_ALL_NS, self._schedule.u_rest
         return changed
 
     @property
@@ -76,15 +76,15 @@ class Sent:
 
     def brake(self, before_ns: int, now_ns: int) -> None:
         """Assume that the robot, whose clock has jumped from one time to another, brakes from what acted."""
-        self._left_ns = EVER_NS
+        self._left_ns = BEFORE_ALL_NS
         for schedule in (self._schedule, self._slowest):
             schedule.cut(before_ns, now_ns)
 
     def clear(self) -> None:
         """Forget everything: the robot was restarted, and stands."""
-        self._left_ns = EVER_NS
+        self._left_ns = BEFORE_ALL_NS
         for schedule in (self._schedule, self._slowest):
-            schedule.brake(schedule.u_rest, EVER_NS)
+            schedule.brake(schedule.u_rest, BEFORE_ALL_NS)
 
     def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Array, float]]:
         """Yield the inputs that act between two times, shape ``(nu,)``, each with for how long, s; backward, the one that acts at the end."""

@@ -17,7 +17,7 @@ from rti_mpc.control.observer import Observer
 from rti_mpc.control.sent import Sent
 from rti_mpc.model.model import Model
 
-IN_RANGE = 1e9  # magnitude, in any unit, beyond which a number is no state
+MAX_STATE_MAGNITUDE = 1e9  # in any unit; a state with a larger number is refused
 
 
 class Arrival(Enum):
@@ -123,8 +123,8 @@ class StateStream:
 
     def _judge(self, state: State, arrival_ns: int) -> tuple[Arrival, str, str]:
         """Judge a state, with the code and the text of what is to be said of it."""
-        if not abs(state.x).max() <= IN_RANGE:
-            return Arrival.REFUSED, "state_refused", f"a state must be finite and at most {IN_RANGE:g}, got {state.x.tolist()}"
+        if not abs(state.x).max() <= MAX_STATE_MAGNITUDE:
+            return Arrival.REFUSED, "state_refused", f"a state must be finite and at most {MAX_STATE_MAGNITUDE:g}, got {state.x.tolist()}"
         heard = self.lives.hear(state.epoch, arrival_ns, self.clock.rate)
         self.notice = self.lives.notice
         if heard is Heard.OTHER:

@@ -21,7 +21,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, End, Reference
 from rti_mpc.model.model import Model
 
-FAR_NS = 2**62  # before or after a whole reference
+MAX_OFFSET_NS = 2**62  # limit of the time since the start of a reference: longer than any reference
 
 
 class Track:
@@ -106,7 +106,7 @@ class Track:
         """Write the reference from `t_ns` on, node 0 included for `p`, into `y_ref` and `p`."""
         assert self._reference is not None
         rows = self._rows
-        since_ns = min(max(t_ns - self._reference.stamp_ns, -FAR_NS), FAR_NS)  # of two stamps that differ by more than an int64 holds
+        since_ns = min(max(t_ns - self._reference.stamp_ns, -MAX_OFFSET_NS), MAX_OFFSET_NS)  # of two stamps that differ by more than an int64 holds
         at = np.clip((self._nodes_ns + since_ns) / self._reference.period_ns, 0, len(rows) - 1)
         below = np.minimum(at.astype(np.intp), max(len(rows) - 2, 0))
         fraction = (at - below)[:, np.newaxis]

@@ -15,14 +15,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.control.envelope import INPUT_BOUNDS
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.linearization import WEIGHTS
 from rti_mpc.rti.ocp import Ocp, restless
 from rti_mpc.rti.rti import Rti
 
-BOUNDS = ("lbu", "ubu", "lbdu", "ubdu")
-STRUCTURE = ("N", "N_u", "dt", "method")
-PRESENCE = (*BOUNDS, "lbx", "ubx", "lh", "uh")
+COMPILED_FIELDS = ("N", "N_u", "dt", "method")  # attributes of the Ocp that are compiled in
+COMPILED_BOUNDS = (*INPUT_BOUNDS, "lbx", "ubx", "lh", "uh")  # bounds of the Ocp: which of them are finite is compiled in
 
 
 class Tuning:
@@ -48,7 +48,7 @@ class Tuning:
         self._wanted = rti.ocp
         self._wanted_version = 0
         self._slew = rti.ocp.lbdu, rti.ocp.ubdu  # of this sample
-        self._acting = {name: getattr(rti.ocp, name) for name in BOUNDS}
+        self._acting = {name: getattr(rti.ocp, name) for name in INPUT_BOUNDS}
         self._written = 0  # version of the weights that act
 
     def change(self, ocp: Ocp, version: int) -> None:
@@ -59,10 +59,10 @@ class Tuning:
             OcpError: Something else of it differs, such as which bounds there are, or its bounds leave out rest.
         """
         built = self._rti.ocp
-        for name in STRUCTURE:
+        for name in COMPILED_FIELDS:
             if getattr(ocp, name) != getattr(built, name):
                 raise OcpError(f"{name} must stay {getattr(built, name)}, got {getattr(ocp, name)}: it is compiled in")
-        for name in PRESENCE:
+        for name in COMPILED_BOUNDS:
             if not np.array_equal(np.isfinite(getattr(ocp, name)), np.isfinite(getattr(built, name))):
                 raise OcpError(f"{name} must be finite where it was built so, and only there, got {getattr(ocp, name)}: it is compiled in")
         if wrong := restless(ocp):
@@ -88,9 +88,9 @@ class Tuning:
         if not self._changed:
             return
         wanted, (lbdu, ubdu) = self._wanted, self._slew
-        bounds = dict(zip(BOUNDS, (np.minimum(wanted.lbu, u_prev + ubdu), np.maximum(wanted.ubu, u_prev + lbdu), lbdu, ubdu), strict=True))
+        bounds = dict(zip(INPUT_BOUNDS, (np.minimum(wanted.lbu, u_prev + ubdu), np.maximum(wanted.ubu, u_prev + lbdu), lbdu, ubdu), strict=True))
         fresh = self.version != self._written
-        if fresh or any(not np.array_equal(bounds[name], self._acting[name]) for name in BOUNDS):
+        if fresh or any(not np.array_equal(bounds[name], self._acting[name]) for name in INPUT_BOUNDS):
             self._rti.retune({**{name: getattr(wanted, name) for name in WEIGHTS if fresh}, **bounds})
             for name, limit in self._limits.items():
                 limit[:] = bounds[name]

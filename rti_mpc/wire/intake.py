@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from typing import Generic, Protocol
 
-from rti_mpc.contract.epoch import BELIEVED, highest_believed
+from rti_mpc.contract.epoch import EPOCH_LEAD, highest_believed
 from rti_mpc.contract.message import Notice, Reference, Severity, State
 from rti_mpc.wire.cdr import VERSION, M, Refused, decode, encoding
 from rti_mpc.wire.layout import MAX_BYTES
@@ -93,7 +93,7 @@ class Intake(Generic[M]):
             message = decode(self._cls, received.payload)
             for name, width in self._widths:
                 self._check_width(message, name, width)
-            if message.epoch > BELIEVED:  # above all that honest clocks make: only then is there a clock to be read
+            if message.epoch > EPOCH_LEAD:  # above all that honest clocks make: only then is there a clock to be read
                 self._check_epoch(message.epoch, max(known, self.source.epoch or 0))
         except Refused as error:
             self.refused[error.reason] += 1

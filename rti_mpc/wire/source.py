@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from rti_mpc.contract.epoch import SEQ_AHEAD
+from rti_mpc.contract.epoch import MAX_SEQ_GAP
 
 
 class Verdict(Enum):
@@ -75,12 +75,12 @@ class Source:
     def _judge(self, epoch: int, seq: int, now_ns: int) -> Verdict:
         if epoch == self.epoch and seq == self.seq:
             return Verdict.REPEATED
-        if epoch == self.epoch and self.seq < seq <= self.seq + SEQ_AHEAD:
+        if epoch == self.epoch and self.seq < seq <= self.seq + MAX_SEQ_GAP:
             return Verdict.NEXT
         since_ns = self._accepted_ns
         if epoch == self.epoch:
             last, begun_ns = self._other_count
-            begun_ns = begun_ns if last < seq <= last + SEQ_AHEAD else now_ns
+            begun_ns = begun_ns if last < seq <= last + MAX_SEQ_GAP else now_ns
             self._other_count, since_ns = (seq, begun_ns), max(since_ns, begun_ns)
         if self.epoch is None or epoch > self.epoch or now_ns - since_ns > self.stale_ns:
             return Verdict.NEW

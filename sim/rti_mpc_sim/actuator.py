@@ -16,7 +16,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.message import Command
-from rti_mpc.contract.schedule import OWN, Schedule, end_ns, unfit
+from rti_mpc.contract.schedule import NO_COMMAND, Schedule, end_ns, unfit
 from rti_mpc.wire.source import Source
 
 EARLY_NS = 250_000_000  # by which a state that is answered may be ahead of the robot's clock: a guard knows that clock no better
@@ -75,7 +75,7 @@ class Actuator:
             increments: Slew limits inside which plans are approached; None: their rows are played as they come.
         """
         self.u = np.array(u_rest, dtype=np.float64)
-        self.source = OWN
+        self.source = NO_COMMAND
         self.counters = Counters()
         self.braking = True
         self._schedule = Schedule(u_rest, slew, increments)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.contract.approach import WINDOW, Increments, approach, segments
+from rti_mpc.contract.approach import SLEW_WINDOW_PERIODS, Increments, approach, segments
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.schedule import Schedule, end_ns
 from rti_mpc.contract.status import Mode, QpStatus
@@ -80,5 +80,5 @@ def test_whatever_plans_come_whenever_no_two_inputs_within_three_quarters_of_a_p
     ends, u = np.array([until_ns for until_ns, _ in acted]), np.array([value for _, value in acted])
     assert np.abs(u).max() > 0.3
     for i in range(len(u)):
-        near = ends[:i] > begins[i] - WINDOW * DT
+        near = ends[:i] > begins[i] - SLEW_WINDOW_PERIODS * DT
         assert (np.abs(u[:i][near] - u[i]) <= STEP + 1e-9).all(), begins[i] / MS

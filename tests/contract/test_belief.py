@@ -12,7 +12,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.belief import Belief
 from rti_mpc.contract.message import Command
-from rti_mpc.contract.schedule import OWN, end_ns
+from rti_mpc.contract.schedule import NO_COMMAND, end_ns
 from rti_mpc.contract.status import Mode, QpStatus
 
 MS = 1_000_000
@@ -61,14 +61,14 @@ def test_robots_own_ramp_takes_out_all_that_should_have_acted(belief: Belief) ->
     robot = Belief(np.zeros(2), STEP / 0.1, Increments(-STEP, STEP, 100 * MS))
     for seq in (1, 2):
         add(robot, command(seq, 100 * seq, plan(seq)))
-    assert belief.correct(500 * MS, robot.at(500 * MS - 1)[0], OWN)
+    assert belief.correct(500 * MS, robot.at(500 * MS - 1)[0], NO_COMMAND)
     for t_ms in range(420, 500):
         np.testing.assert_allclose(belief.at(t_ms * MS)[0], robot.at(t_ms * MS)[0], atol=1e-12)
 
 
 def test_ramp_of_another_shape_is_taken_as_it_is(belief: Belief) -> None:
     u = np.array([0.01, 0.3])
-    assert belief.correct(900 * MS, u, OWN)
+    assert belief.correct(900 * MS, u, NO_COMMAND)
     np.testing.assert_array_equal(belief.at(900 * MS - 1)[0], u)
     now, _, braking = belief.at(910 * MS)
     assert braking
@@ -127,7 +127,7 @@ def test_whatever_is_reported_nothing_is_raised_and_what_is_reported_is_believed
         if rng.random() < 0.02:
             made.cut(t_ms * MS, t_ms * MS)
         u = rng.uniform(-1, 1, 2) if rng.random() < 0.5 else made.at(t_ms * MS)[0].copy()
-        source = [OWN, (OURS, max(1, seq - int(rng.integers(0, 12)))), (99, 1)][int(rng.integers(0, 3))]
+        source = [NO_COMMAND, (OURS, max(1, seq - int(rng.integers(0, 12)))), (99, 1)][int(rng.integers(0, 3))]
         made.correct(t_ms * MS, u, source)
         assert made._plays(u, t_ms * MS)
         assert 0 < len(made) <= 64

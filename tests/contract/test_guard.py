@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.contract.guard import VALID_NS, Guard, Limits
+from rti_mpc.contract.guard import MAX_VALID_NS, Guard, Limits
 from rti_mpc.contract.message import Command, Severity, State
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc_sim.actuator import Actuator
@@ -276,7 +276,7 @@ def test_rounding_is_forgiven_and_never_passed_on(scene: Scene) -> None:
 def test_nothing_acts_longer_than_promised_whatever_a_command_says(scene: Scene) -> None:
     passed = scene.send(valid_until_ns=2**62)
     assert passed is not None
-    assert passed.valid_until_ns == passed.state_stamp_ns + VALID_NS
+    assert passed.valid_until_ns == passed.state_stamp_ns + MAX_VALID_NS
 
 
 def test_higher_epoch_takes_over_and_the_old_leader_never_passes_again(scene: Scene) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rti_mpc.contract.latch import MAX_COUNTER, MAX_LEAP, MAX_REASON, Latch, merge, read_latch
+from rti_mpc.contract.latch import MAX_COUNTER, MAX_COUNTER_LEAP, MAX_REASON_CHARS, Latch, merge, read_latch
 from rti_mpc.errors import MessageError
 
 WHEN = "2026-11-28T09:30:00Z"
@@ -39,12 +39,12 @@ def test_change_exceeds_what_is_known_and_a_word_that_holds_already_changes_noth
 
 
 def test_counter_that_leaps_is_not_believed() -> None:
-    assert merge(STOPPED, Latch(5 + MAX_LEAP, False)).counter == 5 + MAX_LEAP
-    assert merge(STOPPED, Latch(6 + MAX_LEAP, False)) == STOPPED
+    assert merge(STOPPED, Latch(5 + MAX_COUNTER_LEAP, False)).counter == 5 + MAX_COUNTER_LEAP
+    assert merge(STOPPED, Latch(6 + MAX_COUNTER_LEAP, False)) == STOPPED
 
 
 def test_forged_counters_never_reach_the_last_one_that_is_read() -> None:
-    years = MAX_COUNTER / MAX_LEAP / (1000 * 86_400 * 365.0)  # at a thousand messages a second, each the greatest leap
+    years = MAX_COUNTER / MAX_COUNTER_LEAP / (1000 * 86_400 * 365.0)  # at a thousand messages a second, each the greatest leap
     assert years > 100.0
 
 
@@ -70,7 +70,7 @@ def test_latch_is_read_as_it_was_written() -> None:
         ("when", f"{WHEN}\n"),
         ("reason", None),
         ("reason", "a\x1b[2Jb"),
-        ("reason", "a" * (MAX_REASON + 1)),
+        ("reason", "a" * (MAX_REASON_CHARS + 1)),
     ],
 )
 def test_what_is_no_latch_is_refused_in_a_line_that_names_the_field(field: str, value: Any) -> None:

@@ -9,7 +9,7 @@ import pytest
 from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.message import Command
-from rti_mpc.contract.schedule import STEP_NS, Schedule, end_ns, unfit
+from rti_mpc.contract.schedule import RAMP_STEP_NS, Schedule, end_ns, unfit
 from rti_mpc.contract.status import Mode, QpStatus
 
 MS = 1_000_000
@@ -83,7 +83,7 @@ def test_braking_from_an_input_begins_at_once_and_ends_at_rest() -> None:
     plans.brake(np.array([0.25, 0.4]), 40 * MS)
     u, change_ns, braking = plans.at(40 * MS)
     np.testing.assert_allclose(u, [0.225, 0.36])
-    assert (change_ns, braking) == (40 * MS + STEP_NS, True)
+    assert (change_ns, braking) == (40 * MS + RAMP_STEP_NS, True)
     assert not plans.at(140 * MS)[0].any()
 
 

@@ -15,7 +15,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, End, Reference, State
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.controller import Controller, Timing
-from rti_mpc.control.ladder import FALLBACKS
+from rti_mpc.control.ladder import MAX_FALLBACK_SAMPLES
 from rti_mpc.reference.trajectory import circle, eight, positioning, waypoints
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import Rti
@@ -544,7 +544,7 @@ def test_shifted_plan_serves_three_samples_at_most(failing: Callable[[int], None
     drive(controller, body, 5.0)
     failing(100)
     run = drive(controller, body, 6.6)
-    assert FALLBACKS == 3
+    assert MAX_FALLBACK_SAMPLES == 3
     assert modes(run) == [Mode.FALLBACK] * 3 + [Mode.BRAKING] * 13
     assert_inside_slew(run)
     ladder = controller.ladder
@@ -573,7 +573,7 @@ def test_after_failures_one_good_qp_is_enough(on_the_circle: tuple[Controller, L
     run = drive(controller, body, 20.0)
     first = next(i for i, command in enumerate(run.commands) if command.mode is Mode.TRACKING)
     assert all(mode is Mode.TRACKING for mode in modes(run)[first:])
-    assert first <= (failures if failures <= FALLBACKS else FALLBACKS + -(-(failures - FALLBACKS) // 3))
+    assert first <= (failures if failures <= MAX_FALLBACK_SAMPLES else MAX_FALLBACK_SAMPLES + -(-(failures - MAX_FALLBACK_SAMPLES) // 3))
     assert_inside_slew(run, excess=0.1)
     later = drive(controller, body, 30.0)
     assert later.error_mm(circle())[-10:].max() < 0.5

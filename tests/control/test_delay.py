@@ -10,7 +10,7 @@ from rti_mpc.contract.message import Command
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.control.delay import DelayEstimator
-from rti_mpc.control.grid import MARGIN, MOST, SETTLING, Grid
+from rti_mpc.control.grid import DELAY_MARGIN_PERIODS, DELAY_SLEW_SAMPLES, MAX_DELAY_PERIODS, Grid
 from rti_mpc.reference.trajectory import eight
 from rti_mpc.rti.rti import Rti
 from rti_mpc_sim.actuator import Actuator
@@ -52,7 +52,7 @@ def test_delay_is_found_from_the_response(rti: Rti, actuator_delay_s: float) -> 
     assert controller._delay is not None
     assert 1e-9 * controller._delay.delay_ns == pytest.approx(actuator_delay_s, abs=0.0126)
     telemetry = controller.telemetry(prepare_us=0, feedback_us=0, latency_us=0, slack_s=0)
-    assert telemetry.delay_s == pytest.approx(1e-9 * controller._delay.delay_ns + 0.1 / MARGIN, abs=1e-6)
+    assert telemetry.delay_s == pytest.approx(1e-9 * controller._delay.delay_ns + 0.1 * DELAY_MARGIN_PERIODS, abs=1e-6)
 
 
 def test_noise_alone_is_no_delay(rti: Rti) -> None:
@@ -62,16 +62,16 @@ def test_noise_alone_is_no_delay(rti: Rti) -> None:
 
 def test_delay_longer_than_can_be_measured_is_taken_for_the_longest(rti: Rti) -> None:
     controller, run = driven(rti, None, 0.29, duration_s=20.0)
-    assert controller.grid.delay_ns == MOST * DT
+    assert controller.grid.delay_ns == MAX_DELAY_PERIODS * DT
     assert not run.refused[20:]
 
 
 def test_measured_delay_never_makes_the_grid_jump(rti: Rti) -> None:
     _, run = driven(rti, None, 0.2, duration_s=20.0)
     steps = np.diff([command.stamp_ns for command in run.commands])
-    assert np.all(np.abs(steps - DT) <= 2 * DT // SETTLING)  # the first one catches up with its own
+    assert np.all(np.abs(steps - DT) <= 2 * DT // DELAY_SLEW_SAMPLES)  # the first one catches up with its own
     for one, other in zip(run.commands, run.commands[1:], strict=False):
-        assert np.all(np.abs(other.u[0] - one.u[0]) <= 1.000001 * 0.1 * SLEW * (1 + 1 / SETTLING))
+        assert np.all(np.abs(other.u[0] - one.u[0]) <= 1.000001 * 0.1 * SLEW * (1 + 1 / DELAY_SLEW_SAMPLES))
 
 
 @pytest.mark.parametrize("delay_ns", [-(10**9), 0, 10**12])
@@ -79,7 +79,7 @@ def test_delay_stays_between_nothing_and_three_periods(delay_ns: int) -> None:
     grid = Grid(0.1, Timing(delay_s=None))
     for _ in range(1000):
         grid.adapt(delay_ns)
-        assert 0 <= grid.delay_ns <= MOST * DT
+        assert 0 <= grid.delay_ns <= MAX_DELAY_PERIODS * DT
 
 
 def played(actuator: Actuator, x: np.ndarray, from_ns: int, to_ns: int) -> np.ndarray:
@@ -95,7 +95,7 @@ def played(actuator: Actuator, x: np.ndarray, from_ns: int, to_ns: int) -> np.nd
 @pytest.mark.parametrize("noise", [0.0, 2e-3])
 def test_estimator_by_itself_finds_the_delay_of_random_inputs(delay_ms: int, noise: float) -> None:
     rng = np.random.default_rng(delay_ms)
-    estimator = DelayEstimator(double_integrator().model, DT, MOST * DT, compile=False)
+    estimator = DelayEstimator(double_integrator().model, DT, MAX_DELAY_PERIODS * DT, compile=False)
     actuator = Actuator(np.zeros(1), np.full(1, np.inf), epoch=1, delay_ns=delay_ms * MS)
     x = np.zeros(2)
     for k in range(100):
@@ -109,7 +109,7 @@ def test_estimator_by_itself_finds_the_delay_of_random_inputs(delay_ms: int, noi
 
 
 def test_inputs_that_do_not_change_say_nothing() -> None:
-    estimator = DelayEstimator(double_integrator().model, DT, MOST * DT, compile=False)
+    estimator = DelayEstimator(double_integrator().model, DT, MAX_DELAY_PERIODS * DT, compile=False)
     for k in range(100):
         estimator.observe(np.array([0.01 * k, 0.1]), k * DT)
         estimator.sent(Command(1, k + 1, k * DT, 1, k, k * DT, k * DT + 250 * MS, 0, Mode.TRACKING, QpStatus.SOLVED, DT, np.zeros((6, 1))))
@@ -117,7 +117,7 @@ def test_inputs_that_do_not_change_say_nothing() -> None:
 
 
 def test_another_life_of_the_robot_keeps_what_was_learnt() -> None:
-    estimator = DelayEstimator(double_integrator().model, DT, MOST * DT, compile=False)
+    estimator = DelayEstimator(double_integrator().model, DT, MAX_DELAY_PERIODS * DT, compile=False)
     estimator.delay_ns = 75 * MS
     estimator.observe(np.zeros(2), 10**12)
     estimator.clear()

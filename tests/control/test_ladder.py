@@ -9,7 +9,7 @@ import pytest
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.controller import Controller, Timing
-from rti_mpc.control.ladder import FALLBACKS, Ladder
+from rti_mpc.control.ladder import MAX_FALLBACK_SAMPLES, Ladder
 from rti_mpc.reference.trajectory import circle
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc_service.injection import FAILURES, MOST, FaultyRti, answer
@@ -84,7 +84,7 @@ def test_each_rung_is_counted(driving: tuple[Controller, Lockstep], rti: FaultyR
 @pytest.mark.parametrize("failed", [1, 2, 3, 4, 7])
 def test_ladder_lets_the_previous_plan_play_three_times_at_most(failed: int) -> None:
     ladder = Ladder()
-    assert [ladder.fall(plan_left=True) for _ in range(failed)] == [i < FALLBACKS for i in range(failed)]
+    assert [ladder.fall(plan_left=True) for _ in range(failed)] == [i < MAX_FALLBACK_SAMPLES for i in range(failed)]
     assert not Ladder().fall(plan_left=False)
 
 

@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import pytest
 
-from rti_mpc.contract.latch import MAX_LEAP, Latch
+from rti_mpc.contract.latch import MAX_COUNTER_LEAP, Latch
 from rti_mpc.contract.message import Notice
 from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.wire.bus import Received
@@ -174,7 +174,7 @@ def test_process_takes_over_what_others_describe_and_tells_it_on(disk: Disk) -> 
 
 def test_nothing_that_is_heard_ends_the_thread_that_hears(disk: Disk) -> None:
     process = Process(disk)
-    leap = asdict(Latch(MAX_LEAP + 1, True, WHEN, "forged"))
+    leap = asdict(Latch(MAX_COUNTER_LEAP + 1, True, WHEN, "forged"))
     huge = {"latch": asdict(STOPPED), "more": " " * MAX_BYTES}
     nonsense: list[Any] = [
         b"",

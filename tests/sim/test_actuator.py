@@ -10,7 +10,7 @@ import pytest
 
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Command
-from rti_mpc.contract.schedule import STEP_NS
+from rti_mpc.contract.schedule import RAMP_STEP_NS
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc_sim.actuator import Actuator
 
@@ -240,4 +240,4 @@ def test_switched_off_robot_ramps_to_rest_and_takes_no_command() -> None:
 
 
 def test_brake_steps_are_short_against_any_sample() -> None:
-    assert STEP_NS <= 10 * MS
+    assert RAMP_STEP_NS <= 10 * MS

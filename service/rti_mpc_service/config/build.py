@@ -173,7 +173,7 @@ def robot_settings(config: Config) -> dict[str, Any]:
 def guard_limits(config: Config) -> Limits:
     """Return what the guard lets pass; its configuration is enough, no model is loaded."""
     from rti_mpc.contract.guard import Limits
-    from rti_mpc.control.grid import MOST
+    from rti_mpc.control.grid import MAX_DELAY_PERIODS
 
     inputs = tuple(config.ocp.bounds.inputs)
     lbu, ubu = bounds(config.ocp.bounds.inputs, inputs)
@@ -185,7 +185,7 @@ def guard_limits(config: Config) -> Limits:
         lbdu=np.array(lbdu),
         ubdu=np.array(ubdu),
         dt_s=config.ocp.dt_s,
-        delay_s=MOST * config.ocp.dt_s if config.delay_s is None else config.delay_s,
+        delay_s=MAX_DELAY_PERIODS * config.ocp.dt_s if config.delay_s is None else config.delay_s,
         stale_s=config.timing.valid_s,  # of commands, too: a ramp answers a state that is stale
     )
 

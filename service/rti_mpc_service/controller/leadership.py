@@ -16,7 +16,7 @@ from threading import Event
 from typing import Any
 
 from rti_mpc.contract.epoch import NUMBER_BITS, highest_believed
-from rti_mpc.contract.leadership import SILENCE_S, Leadership
+from rti_mpc.contract.leadership import MIN_SILENCE_S, Leadership
 from rti_mpc.contract.message import Command, State
 from rti_mpc.contract.status import Mode
 from rti_mpc.control.controller import Controller
@@ -67,7 +67,7 @@ class Candidate:
     """
 
     def __init__(self, bus: Bus, controller: Controller, others: Others, *, config_hash: int, dt_s: float, nu: int, standby: bool) -> None:
-        self.commands_in = bus.intake(Command, SILENCE_S, {"u": nu}, choosing=True)
+        self.commands_in = bus.intake(Command, MIN_SILENCE_S, {"u": nu}, choosing=True)
         number, epoch = secrets.randbits(NUMBER_BITS), max(others.epoch, unix_s() << NUMBER_BITS) + 1
         self._decision = Leadership(
             number, epoch, config_hash=config_hash, dt_s=dt_s, standby=standby, say=controller.say, local_ns=time.monotonic_ns()

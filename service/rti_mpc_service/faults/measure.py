@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from rti_mpc.array import Array
 from rti_mpc.contract.guard import Limits
 from rti_mpc.contract.message import Reference
-from rti_mpc.contract.schedule import STEP_NS
+from rti_mpc.contract.schedule import RAMP_STEP_NS
 from rti_mpc_service.rig.robot_log import RobotLog
 
 STANDING_M_S = 1e-3
@@ -183,7 +183,7 @@ def ramp_share(log: RobotLog, limits: Limits, brake: int, zero: int) -> float:
     """
     t, share = log.stamp_ns[: zero + 1], 0.0
     for row in range(max(brake - 1, 0), zero):
-        last = int(np.searchsorted(t, t[row] + 1e9 * limits.dt_s - STEP_NS, side="right")) - 1
+        last = int(np.searchsorted(t, t[row] + 1e9 * limits.dt_s - RAMP_STEP_NS, side="right")) - 1
         share = max(share, float((np.abs(log.u[last] - log.u[row]) / step(limits)).max()))
     return share
 
