@@ -38,6 +38,7 @@ from tests.service.view.test_view_outlet import Viewer as Screen
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 60.0
+PERIOD_NS = 10**7  # of the publisher's stamps
 
 # A robot and its controller in one: epoch in x, sequence number in y; a line for each tenth sample once a viewer is there.
 PUBLISHER = """
@@ -146,6 +147,12 @@ def rows(path: Path, entity: str, column: str = "Scalars:scalars") -> list[tuple
     return pairs
 
 
+def missing(path: Path, *entities: str) -> int:
+    """Count the samples between the first and the last of each entity that a finished recording does not hold."""
+    times = [[time_ns for time_ns, _ in rows(path, entity)] for entity in entities]
+    return sum((each[-1] - each[0]) // PERIOD_NS + 1 - len(each) for each in times)
+
+
 def changes(path: Path, lane: str) -> list[tuple[int, str]]:
     """What a finished recording holds of a lane: robot time in ns, value from then on."""
     return rows(path, lane, "StateChange:state")
@@ -164,9 +171,10 @@ def test_a_stopped_viewer_leaves_everything_received_in_the_recording(
     samples = {entity: len(rows(tmp_path / "run.rrd", entity)) for entity in ("state/y", "command/f", "telemetry/cost")}
     assert min(samples.values()) >= 80
     assert received == sum(samples.values()) + len(["info", "reference", "event"])
-    assert (lost, refused) == (0, 0)
+    assert refused == 0
     numbers = [value for _, value in rows(tmp_path / "run.rrd", "state/y")]
-    assert numbers == list(np.arange(numbers[0], numbers[-1] + 1))
+    assert numbers == sorted(set(numbers))
+    assert lost == missing(tmp_path / "run.rrd", "state/y", "command/f", "telemetry/cost")  # on its way, where the host holds up a link
     assert all(
         value == pytest.approx(1e3 * np.hypot(1.0, k)) for (_, value), k in zip(rows(tmp_path / "run.rrd", "error/position"), numbers, strict=True)
     )
