@@ -9,19 +9,13 @@ UV := $(shell command -v uv)
 FITS := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 PYTHON = $(shell for python in python3 python3.13 python3.12 python3.11 python3.14; do $$python -c '$(FITS)' 2>/dev/null && echo $$python && break; done)
 
-# What runs beside other tests, in as many processes as there are cores, and what has the machine to itself: `serial`.
-PARALLEL = $(BIN)/pytest -n auto --dist loadfile -m "not serial and not slow and not benchmark"
-SERIAL = $(BIN)/pytest -m "serial and not slow and not benchmark"
-NONE_IS_FINE = || [ $$? -eq 5 ]
-
 .PHONY: demo test test-busy test-slow soak attack ends bench lint format types docs msg lock clean
 
 demo: $(READY)
 	$(BIN)/rti-mpc demo $(ARGS)
 
 test: $(READY)
-	$(PARALLEL) $(ARGS) $(NONE_IS_FINE)
-	$(SERIAL) $(ARGS) $(NONE_IS_FINE)
+	$(BIN)/pytest -n auto --dist loadfile $(ARGS)
 
 test-busy: $(READY)
 	$(BIN)/python tests/busy.py $(ARGS)

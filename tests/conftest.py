@@ -5,7 +5,6 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -13,8 +12,6 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # before NumPy is loaded: workers share
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 from rti_mpc_service.host.hold_up import Host
-
-PROCESSES = Path(__file__).parent / "processes"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -30,11 +27,8 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ["STATE_DIRECTORY"] = state
 
 
-@pytest.hookimpl(tryfirst=True)  # before marks choose
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        if PROCESSES in item.path.parents:
-            item.add_marker(pytest.mark.serial)
+def pytest_xdist_auto_num_workers() -> int:
+    return 2 * (os.cpu_count() or 1)  # tests of processes mostly wait; what they hold to times, they hold on a busy host
 
 
 @pytest.fixture(scope="session")

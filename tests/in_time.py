@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import subprocess
 import time
+from contextlib import suppress
+from pathlib import Path
 
 from rti_mpc_service.host.hold_up import Host
 
@@ -30,3 +33,14 @@ def explained(host: Host, what: str, by_ms: float, from_ns: int, to_ns: int) -> 
     held_up_ms = host.held_up_ms(from_ns - BEFORE_NS, to_ns)
     print(f"\n{what}, while the host held processes up for {held_up_ms:.0f} ms, where {by_ms:.0f} would explain it")
     return held_up_ms >= by_ms
+
+
+def awake_ms(process: subprocess.Popen[str]) -> float:
+    """Wait for a process to end; return the time this took, without what its main thread stood in the queue for a core."""
+    since_ns, queued_ns = time.monotonic_ns(), 0
+    while process.poll() is None:
+        with suppress(FileNotFoundError, ProcessLookupError):  # it has just ended
+            queued_ns = int(Path(f"/proc/{process.pid}/schedstat").read_text().split()[1])
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(0.01)
+    return (time.monotonic_ns() - since_ns - queued_ns) / MS

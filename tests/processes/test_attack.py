@@ -37,7 +37,13 @@ def system(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[System]:
     """Robot, controller, standby, reference and viewer, and a guard or none."""
     guarded = request.param == "guarded"
     (tmp_path / "robot.toml").write_text(SHIPPED.read_text() + ("\n[guard]\nenabled = true\n" if guarded else ""))
-    roles = {"robot": ("sim", "--x0", "x=0.5"), "standby": ("run", "--standby"), "viewer": ("view", "--rerun-save", tmp_path / "run.rrd")}
+    reference = ("reference", "--scenario", "eight", "--duration", 3600)  # longer than the longest attack
+    roles = {
+        "robot": ("sim", "--x0", "x=0.5"),
+        "reference": reference,
+        "standby": ("run", "--standby"),
+        "viewer": ("view", "--rerun-save", tmp_path / "run.rrd"),
+    }
     with System(tmp_path, tmp_path / "robot.toml", **roles) as system:
         system.start("robot")
         system.opened("robot")
