@@ -12,7 +12,7 @@ import mkdocs_gen_files
 import typer.main
 
 from rti_mpc.wire.cdr import encoding
-from rti_mpc.wire.layout import ABOUT, LAYOUTS, msg_text
+from rti_mpc.wire.layout import LAYOUTS, MESSAGE_DESCRIPTIONS, msg_text
 from rti_mpc.wire.streams import STREAMS, Kind, Stream
 from rti_mpc_service.cli import app
 from rti_mpc_service.config.schema import Config
@@ -113,7 +113,8 @@ def messages() -> Iterator[str]:
         size = f"{stream.max_bytes:,} bytes" if stream.max_bytes else ""
         yield f"| `{key}` | {stream.about} | {kind} | {roles} | {stream.rate} | {service(stream)} | {size} |"
     for cls in LAYOUTS:
-        yield from ("", f"## {cls.__name__}", "", ABOUT[cls], "", f"Encoding `{encoding(cls)}`.", "", "```text", msg_text(cls).rstrip(), "```")
+        yield from ("", f"## {cls.__name__}", "", MESSAGE_DESCRIPTIONS[cls], "", f"Encoding `{encoding(cls)}`.", "")
+        yield from ("```text", msg_text(cls).rstrip(), "```")
 
 
 FORMS = {Kind.MESSAGE: "JSON", Kind.QUERY: "query, JSON", Kind.TOKEN: "liveliness token"}

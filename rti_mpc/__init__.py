@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from rti_mpc.rti.ocp import Ocp as Ocp
     from rti_mpc.rti.rti import Rti as Rti
 
-HOME = {
+MODULE_OF_NAME = {
     "Controller": "rti_mpc.control.controller",
     "Model": "rti_mpc.model.model",
     "Ocp": "rti_mpc.rti.ocp",
@@ -72,9 +72,9 @@ __all__ = ["Controller", "Model", "Ocp", "Rti", "Signal", "__version__", "find_m
 
 def __getattr__(name: str) -> Any:
     """Import a public name from its module on first use (PEP 562)."""
-    if name not in HOME:
+    if name not in MODULE_OF_NAME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(HOME[name]), name)
+    return getattr(import_module(MODULE_OF_NAME[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -17,7 +17,7 @@ import stat
 from pathlib import Path
 
 SEAL_BYTES = hashlib.sha256().digest_size
-OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+WRITABLE_BY_OTHERS = stat.S_IWGRP | stat.S_IWOTH  # bits of a file mode
 
 
 def cache_dir() -> Path:
@@ -90,7 +90,7 @@ def keep(path: Path, key: str, content: bytes) -> None:
 
 def _ours(state: os.stat_result) -> bool:
     """Whether something belongs to this user and nobody else may write it."""
-    return state.st_uid == os.geteuid() and not state.st_mode & OTHERS_WRITE
+    return state.st_uid == os.geteuid() and not state.st_mode & WRITABLE_BY_OTHERS
 
 
 def _seal(key: str, content: bytes) -> bytes:

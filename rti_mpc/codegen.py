@@ -27,7 +27,7 @@ from rti_mpc.cache import cache_dir, keep, own, sealed
 from rti_mpc.errors import ShapeError
 
 # No contraction into fused operations and no fast-math: a machine with a compiler and one without agree to rounding.
-FLAGS = ("-O3", "-std=gnu89", "-fno-semantic-interposition", "-ffp-contract=off", "-shared", "-fPIC", "-w")
+COMPILER_FLAGS = ("-O3", "-std=gnu89", "-fno-semantic-interposition", "-ffp-contract=off", "-shared", "-fPIC", "-w")
 
 
 def compiled(*functions: ca.Function) -> list[ca.Function]:
@@ -49,7 +49,7 @@ def compiled(*functions: ca.Function) -> list[ca.Function]:
     for function in functions:
         generator.add(function)
     source = generator.dump()
-    key = hashlib.sha256("\0".join((source, compiler, *FLAGS, os.uname().machine)).encode()).hexdigest()[:32]
+    key = hashlib.sha256("\0".join((source, compiler, *COMPILER_FLAGS, os.uname().machine)).encode()).hexdigest()[:32]
     name = f"{functions[0].name()}-{key}.so"
     try:
         try:
@@ -90,7 +90,7 @@ def build(compiler: str, source: str) -> bytes:
         code.write_text(source, encoding="utf-8")
         made = code.with_suffix(".so")
         environment = {"PATH": os.defpath, **os.environ}  # where the compiler was looked for, for its linker
-        subprocess.run([compiler, *FLAGS, "-o", str(made), str(code), "-lm"], check=True, capture_output=True, env=environment)
+        subprocess.run([compiler, *COMPILER_FLAGS, "-o", str(made), str(code), "-lm"], check=True, capture_output=True, env=environment)
         return made.read_bytes()
 
 

@@ -15,16 +15,16 @@ from typing import Literal, Protocol
 
 Role = Literal["", "x", "y", "heading", "axle_offset", "disc_x", "disc_y", "disc_radius"]
 
-POSE: tuple[Role, ...] = ("x", "y", "heading")  # what a path in the plane tells of a robot
-UNITS: dict[Role, str] = {"x": "m", "y": "m", "heading": "rad", "axle_offset": "m", "disc_x": "m", "disc_y": "m", "disc_radius": "m"}
-VECTORS: dict[str, tuple[Role, ...]] = {
-    "states": POSE,
-    "outputs": POSE,
+POSE_ROLES: tuple[Role, ...] = ("x", "y", "heading")  # roles that a path in the plane gives values for
+UNIT_OF_ROLE: dict[Role, str] = {"x": "m", "y": "m", "heading": "rad", "axle_offset": "m", "disc_x": "m", "disc_y": "m", "disc_radius": "m"}
+ROLES_OF_VECTOR: dict[str, tuple[Role, ...]] = {
+    "states": POSE_ROLES,
+    "outputs": POSE_ROLES,
     "inputs": (),
     "parameters": ("axle_offset", "disc_x", "disc_y", "disc_radius"),
     "constraints": (),
-}  # the roles that signals of each vector may have
-SEVERAL: tuple[Role, ...] = ("", "disc_x", "disc_y", "disc_radius")  # roles that more than one signal of a vector may have
+}  # roles that the signals of each vector may have
+REPEATABLE_ROLES: tuple[Role, ...] = ("", "disc_x", "disc_y", "disc_radius")  # roles that several signals of one vector may have
 
 
 @dataclass(frozen=True)
@@ -69,12 +69,12 @@ def plane(signals: Sequence[HasRole]) -> tuple[int, int] | None:
 
 def misplaced(vector: str, signals: Sequence[Signal], states: Sequence[Signal]) -> str:
     """Return what is wrong with roles in a vector, empty if nothing is."""
-    roles = [signal.role for signal in signals if signal.role not in SEVERAL]
+    roles = [signal.role for signal in signals if signal.role not in REPEATABLE_ROLES]
     for signal in signals:
-        if signal.role and signal.role not in VECTORS[vector]:
-            return f"the role of {vector} must be {' or '.join(VECTORS[vector]) or 'left out'}, got {signal.role} for {signal.name}"
-        if signal.role and signal.unit != UNITS[signal.role]:
-            return f"the role {signal.role} must be in {UNITS[signal.role]}, got {signal.name} in {signal.unit}"
+        if signal.role and signal.role not in ROLES_OF_VECTOR[vector]:
+            return f"the role of {vector} must be {' or '.join(ROLES_OF_VECTOR[vector]) or 'left out'}, got {signal.role} for {signal.name}"
+        if signal.role and signal.unit != UNIT_OF_ROLE[signal.role]:
+            return f"the role {signal.role} must be in {UNIT_OF_ROLE[signal.role]}, got {signal.name} in {signal.unit}"
         if signal.role == "heading" and not signal.angle:
             return f"the role heading must be an angle, got {signal.name} without angle=True"
         if roles.count(signal.role) > 1:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from rti_mpc.errors import ConfigError
 
-MAX_BYTES = 1 << 17  # a robot with a weight for each of a thousand stages needs a tenth
+MAX_FILE_BYTES = 1 << 17  # ten times what a configuration with a weight for each of a thousand stages needs
 
 
-def read_text_file(path: Path, kind: str = "text", max_bytes: int = MAX_BYTES) -> str:
+def read_text_file(path: Path, kind: str = "text", max_bytes: int = MAX_FILE_BYTES) -> str:
     """
     Read a whole file; never waits, as for a pipe, and takes no more memory than is right.
 

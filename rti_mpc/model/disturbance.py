@@ -17,7 +17,7 @@ import casadi as ca
 from rti_mpc.errors import OcpError
 from rti_mpc.model.model import Model, Signal
 
-PREFIX = "d_"
+DISTURBANCE_PREFIX = "d_"
 
 
 def with_disturbances(model: Model, names: Iterable[str]) -> Model:
@@ -50,6 +50,6 @@ def with_disturbances(model: Model, names: Iterable[str]) -> Model:
         model,
         p=ca.vertcat(model.p, d),
         f_expl_expr=f,
-        parameters=(*model.parameters, *(Signal(PREFIX + name, units[name]) for name in names)),
+        parameters=(*model.parameters, *(Signal(DISTURBANCE_PREFIX + name, units[name]) for name in names)),
         p_nominal=(*model.p_nominal, *(0.0 for _ in names)),
     )

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 from rti_mpc.errors import OcpError
-from rti_mpc.signals import VECTORS, misplaced
+from rti_mpc.signals import ROLES_OF_VECTOR, misplaced
 from rti_mpc.signals import Signal as Signal
 
 
@@ -79,7 +79,7 @@ class Model:
         ):
             if expr.numel() != length or (length and expr.shape != (length, 1)):
                 raise OcpError(f"model {self.name}: {label} must have {expr.numel()} entries, in a column, got {length} for shape {expr.shape}")
-        for vector in VECTORS:
+        for vector in ROLES_OF_VECTOR:
             signals: tuple[Signal, ...] = getattr(self, vector)
             names = [signal.name for signal in signals]
             if len(set(names)) < len(names):
@@ -142,8 +142,8 @@ class Model:
         return replace(self, p_nominal=tuple(values.get(n, v) for n, v in zip(names, self.p_nominal, strict=True)))
 
 
-MODEL_NAME = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")  # package.module:function
-SHIPPED = {"pioneer_3dx": "rti_mpc.model.robots.pioneer_3dx:pioneer_3dx"}
+MODEL_NAME_PATTERN = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")  # package.module:function
+SHIPPED_MODELS = {"pioneer_3dx": "rti_mpc.model.robots.pioneer_3dx:pioneer_3dx"}
 
 
 def find_model(name: str) -> Model:
@@ -153,9 +153,9 @@ def find_model(name: str) -> Model:
     Raises:
         OcpError: There is no such model, its module cannot be imported, or the function does not return one. One line, with the user's file and line.
     """
-    path = SHIPPED.get(name, name)
-    wanted = f"a model must be one of {', '.join(SHIPPED)} or an importable package.module:function of your own, got {name!r}"
-    if not MODEL_NAME.fullmatch(path):
+    path = SHIPPED_MODELS.get(name, name)
+    wanted = f"a model must be one of {', '.join(SHIPPED_MODELS)} or an importable package.module:function of your own, got {name!r}"
+    if not MODEL_NAME_PATTERN.fullmatch(path):
         raise OcpError(wanted)
     module_name, _, function_name = path.partition(":")
     package = module_name.partition(".")[0]

@@ -17,8 +17,8 @@ from rti_mpc.errors import OcpError
 from rti_mpc.model.model import Model
 from rti_mpc.signals import Role, Signal, plane
 
-PARTS: dict[str, Role] = {"x": "disc_x", "y": "disc_y", "r": "disc_radius"}  # of a disc: ends of the names of its parameters, and their roles
-TINY = 1e-9  # m^2: a distance of zero has no derivative
+DISC_ROLES: dict[str, Role] = {"x": "disc_x", "y": "disc_y", "r": "disc_radius"}  # key: last part of a parameter's name, disc_0_x
+SMOOTHING_M2 = 1e-9  # added to a squared distance in m^2, since a distance of zero has no derivative
 
 
 def with_obstacles(model: Model, discs: Sequence[tuple[float, float, float]]) -> Model:
@@ -46,11 +46,11 @@ def with_obstacles(model: Model, discs: Sequence[tuple[float, float, float]]) ->
         raise OcpError(f"the radius of a disc must be positive, got {list(discs)}")
     p = ca.SX.sym("disc", 3, len(discs))
     away = p[:2, :] - ca.repmat(model.y_expr[list(position), 0], 1, len(discs))
-    clearance = ca.sqrt(ca.sum1(away**2) + TINY).T - p[2, :].T
+    clearance = ca.sqrt(ca.sum1(away**2) + SMOOTHING_M2).T - p[2, :].T
     return replace(
         model,
         p=ca.vertcat(model.p, ca.vec(p)),
-        parameters=(*model.parameters, *(Signal(f"disc_{i}_{part}", "m", role=role) for i in range(len(discs)) for part, role in PARTS.items())),
+        parameters=(*model.parameters, *(Signal(f"disc_{i}_{part}", "m", role=role) for i in range(len(discs)) for part, role in DISC_ROLES.items())),
         p_nominal=(*model.p_nominal, *(float(value) for disc in discs for value in disc)),
         h_expr=ca.vertcat(model.h_expr, clearance),
         constraints=(*model.constraints, *(Signal(f"disc_{i}", "m") for i in range(len(discs)))),

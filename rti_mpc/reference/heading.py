@@ -24,8 +24,8 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
 
-STEP_S = 0.005  # RK4 steps of the consistent heading: its rates are below a few 1/s
-REST_M_S = 1e-9  # slower than this has no direction
+RK4_STEP_S = 0.005  # of the consistent heading, whose rates are below a few 1/s
+MIN_SPEED_M_S = 1e-9  # a slower motion has no direction
 
 Curve = Callable[[Array], Array]
 
@@ -42,7 +42,7 @@ def tangent(velocity: Curve, t: Array) -> Array:
         Headings, shape ``(M,)``, in rad; zeros if nothing moves.
     """
     v = velocity(t)
-    moving = np.hypot(v[:, 0], v[:, 1]) > REST_M_S
+    moving = np.hypot(v[:, 0], v[:, 1]) > MIN_SPEED_M_S
     if not moving.any():
         return np.zeros(len(t))
     last = np.maximum.accumulate(np.where(moving, np.arange(len(t)), np.argmax(moving)))
@@ -64,7 +64,7 @@ def consistent(velocity: Curve, t: Array, a: float, psi0: float) -> Array:
     """
     if len(t) < 2:
         return np.full(len(t), psi0)
-    n = max(1, math.ceil(float(np.max(np.diff(t))) / STEP_S))
+    n = max(1, math.ceil(float(np.max(np.diff(t))) / RK4_STEP_S))
     h = np.repeat(np.diff(t) / n, n)
     start = (t[:-1, None] + np.diff(t)[:, None] * (np.arange(n) / n)).ravel()
     v = np.stack([velocity(start), velocity(start + 0.5 * h), velocity(start + h)], axis=1).reshape(-1, 6) / a
@@ -93,7 +93,7 @@ def periodic(velocity: Curve, lap_s: float, a: float, psi0: float, laps: int = 5
     Raises:
         OcpError: No heading repeats: the path is too tight for a point so far ahead of the axle.
     """
-    t = np.linspace(0.0, lap_s, max(2, math.ceil(lap_s / STEP_S) + 1))
+    t = np.linspace(0.0, lap_s, max(2, math.ceil(lap_s / RK4_STEP_S) + 1))
     for _ in range(laps):
         end = float(consistent(velocity, t, a, psi0)[-1])
         change = math.remainder(end - psi0, math.tau)

@@ -16,7 +16,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.text_file import read_text_file
 
 MAX_CSV_BYTES = 1 << 26
-REVERSAL_RAD = 3.1  # turning more than this is driving back: such a corner has no arc
+REVERSAL_RAD = 3.1  # a corner that turns by more than this is a reversal, and has no arc
 
 
 @dataclass(frozen=True)

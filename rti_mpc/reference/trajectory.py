@@ -21,7 +21,7 @@ from rti_mpc.contract.message import End
 from rti_mpc.errors import ConfigError
 from rti_mpc.reference.heading import Curve, consistent, periodic, tangent
 from rti_mpc.reference.polyline import polyline, read_csv
-from rti_mpc.signals import POSE, Role, Signal
+from rti_mpc.signals import POSE_ROLES, Role, Signal
 
 Heading = Literal["tangent", "consistent", "none"]
 HEADINGS: tuple[Heading, ...] = get_args(Heading)
@@ -171,7 +171,7 @@ def rows(
     heading: Heading = "consistent",
     a: float | None = 0.2,
     psi0: float | None = None,
-    roles: Sequence[Role] = POSE,
+    roles: Sequence[Role] = POSE_ROLES,
 ) -> Array:
     """
     Sample a trajectory into reference rows.
@@ -183,7 +183,7 @@ def rows(
             its rows carry the tangent for viewers.
         a: Distance of the reference point ahead of the axle, in m; None: it is on the axle, where the consistent heading is the tangent.
         psi0: Initial consistent heading of an open path, in rad: its tangent by default. Closed paths have the heading that repeats.
-        roles: What the columns are, in their order: those of `rti_mpc.signals.POSE`.
+        roles: What the columns are, in their order: those of `rti_mpc.signals.POSE_ROLES`.
 
     Returns:
         Rows, shape ``(M, len(roles))``, from time 0 to the first at or after the duration, so that an open path ends at its last point; the
@@ -226,9 +226,9 @@ def followed_roles(model: str, outputs: Sequence[Signal]) -> tuple[Role, ...]:
     Raises:
         ConfigError: A path says nothing of an output.
     """
-    if unfilled := [output.name for output in outputs if output.role not in POSE]:
+    if unfilled := [output.name for output in outputs if output.role not in POSE_ROLES]:
         raise ConfigError(
-            f"model {model}: a path in the plane fills outputs whose role is {', '.join(POSE)}, not {', '.join(unfilled)}: "
+            f"model {model}: a path in the plane fills outputs whose role is {', '.join(POSE_ROLES)}, not {', '.join(unfilled)}: "
             "give each its role, or publish rows of your own"
         )
     return tuple(output.role for output in outputs)

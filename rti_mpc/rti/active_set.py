@@ -21,17 +21,17 @@ from rti_mpc.contract.status import QpStatus
 from rti_mpc.rti.places import Places
 from rti_mpc.rti.qp.qp import Guess
 
-ROLL_OUTS = 6  # at most from where the last sample left off; more places change than that only when much happens at once
-# Weights of the penalty then: soft ones are settled whatever the start, and each leads to the next. A stiffer last one gives
-# way less, and costs digits.
-PATH = (*(10.0**k for k in range(1, 10)), 3e9)
-ROLL_OUTS_EACH = 100  # at most on each step of that path
-REFINEMENTS = 2  # at most of a plan that is not certified
-FEASIBLE = 1e-9  # violation of dynamics, bounds and increments, relative to their scales, up to which a plan is certified
-OPTIMAL = 1e-6  # share of 1 plus its cost, normalised, by which a certified plan may cost more than the optimum
-NEARLY_FEASIBLE, NEARLY_OPTIMAL = 1e-6, 1e-2  # the same of a plan that may be commanded, as inaccurate
-SOLVED, INACCURATE, FAILED = QpStatus.SOLVED, QpStatus.INACCURATE, QpStatus.FAILED  # an enumeration looks its members up slowly
-PATIENCE = 3  # roll-outs in which the changes may become no fewer, before places change one at a time
+MAX_ROLL_OUTS = 6  # from the places of the last sample; more are needed only when many places change at once
+# Weights of the penalty when that was not enough. With a soft penalty the places settle from any start, and those found are the
+# start for the next, stiffer one. A last weight above 3e9 would yield less at the bounds, and lose digits.
+PENALTY_PATH = (*(10.0**k for k in range(1, 10)), 3e9)
+MAX_ROLL_OUTS_PER_PENALTY = 100
+MAX_REFINEMENTS = 2  # of a plan that is not certified yet
+MAX_VIOLATION = 1e-9  # of dynamics, bounds and increments by a certified plan, relative to their scales
+MAX_GAP = 1e-6  # by which a certified plan may cost more than the optimum, relative to 1 plus its normalised cost
+MAX_VIOLATION_INACCURATE, MAX_GAP_INACCURATE = 1e-6, 1e-2  # the same limits of a plan that may be commanded as inaccurate
+SOLVED, INACCURATE, FAILED = QpStatus.SOLVED, QpStatus.INACCURATE, QpStatus.FAILED  # read faster than a member of the enumeration
+MAX_STALLED_ROLL_OUTS = 3  # roll-outs without fewer changes before places change one at a time
 
 
 class ActiveSet:
@@ -56,7 +56,7 @@ class ActiveSet:
         self._found = np.zeros_like(self._places)
         changes: Array = np.zeros(1)
         self._changes = changes.data
-        self._stiff = np.full(1, PATH[-1])
+        self._stiff = np.full(1, PENALTY_PATH[-1])
         multipliers: Array = np.zeros(functions.roll_out.numel_out("multipliers"))
         slopes = np.zeros_like(guess.plan.u)
         verdict: dict[str, Array] = {name: np.zeros(1) for name in ("primal", "gap", "cost")}
@@ -91,7 +91,7 @@ class ActiveSet:
     def certified(self) -> QpStatus:
         """Return what the last plan is for its QP, from the problem's own data; it is refined where it is not yet the solution."""
         status = self._judged()
-        for _ in range(REFINEMENTS):
+        for _ in range(MAX_REFINEMENTS):
             if status is SOLVED:
                 break
             gap, before = self.res_dual, [array.copy() for array in self._refined]
@@ -108,22 +108,22 @@ class ActiveSet:
         self.certify()
         primal, gap, cost = (part[0] for part in self._verdict)
         self.res_prim, self.res_dual = primal, gap / (1.0 + cost)
-        if primal <= FEASIBLE and self.res_dual <= OPTIMAL:
+        if primal <= MAX_VIOLATION and self.res_dual <= MAX_GAP:
             return SOLVED
-        return INACCURATE if primal <= NEARLY_FEASIBLE and self.res_dual <= NEARLY_OPTIMAL else FAILED
+        return INACCURATE if primal <= MAX_VIOLATION_INACCURATE and self.res_dual <= MAX_GAP_INACCURATE else FAILED
 
     def solve(self) -> bool:
         """Find the places, and make the plan; tell whether they settled, and numbers are finite."""
         self.roll_out()
         self.iterations = 1
-        if self._changes[0] == 0.0 or self._settle(ROLL_OUTS):
+        if self._changes[0] == 0.0 or self._settle(MAX_ROLL_OUTS):
             return True
-        for self._stiff[0] in PATH:
+        for self._stiff[0] in PENALTY_PATH:
             self.gain()
             self.roll_out()
             self.iterations += 1
-            if not self._settle(ROLL_OUTS_EACH):
-                self._stiff[0] = PATH[-1]
+            if not self._settle(MAX_ROLL_OUTS_PER_PENALTY):
+                self._stiff[0] = PENALTY_PATH[-1]
                 self.forget()
                 return False
         return True
@@ -135,12 +135,12 @@ class ActiveSet:
         All places change at once as long as there are fewer and fewer that
         do; then the first alone, which cannot go round in circles [Judice1994]_.
         """
-        fewest, patience = np.inf, PATIENCE
+        fewest, patience = np.inf, MAX_STALLED_ROLL_OUTS
         for _ in range(most - 1):
             changes = self._changes[0]
             if changes <= 0.0:
                 break
-            patience = PATIENCE if changes < fewest else patience - 1
+            patience = MAX_STALLED_ROLL_OUTS if changes < fewest else patience - 1
             fewest = min(fewest, changes)
             if patience >= 0:
                 self._places[:] = self._found

@@ -27,7 +27,7 @@ from rti_mpc.codegen import function
 from rti_mpc.rti.linearization import Linearization, divided
 from rti_mpc.rti.ocp import Ocp
 
-TINY = 1e-300  # in place of a quadratic penalty of zero
+SMALLEST_DIVISOR = 1e-300  # replaces a quadratic penalty of zero
 
 
 def certificate(ocp: Ocp) -> ca.Function:
@@ -98,7 +98,7 @@ def node(ocp: Ocp, lin: Linearization) -> ca.Function:
                 penalty = (zg[j] * s + Zg[j] * s**2 / 2) / 2
                 most = (zg[j] + Zg[j] * s) / 2  # what the slack pays for: no multiplier is larger
                 multiplier = ca.fmax(0, ca.fmin(sign * mu[j], most))
-                gap += penalty - multiplier * beyond + ca.fmax(0, multiplier - zg[j] / 2) ** 2 / ca.fmax(Zg[j], TINY)
+                gap += penalty - multiplier * beyond + ca.fmax(0, multiplier - zg[j] / 2) ** 2 / ca.fmax(Zg[j], SMALLEST_DIVISOR)
                 cost += penalty
                 taken[j] += sign * multiplier
     by_x, by_u = H @ after + h + G_x.T @ taken, G_u.T @ taken
@@ -131,5 +131,5 @@ def of_inputs(ocp: Ocp) -> ca.Function:
                 violation = ca.fmax(violation, -left / scale[j])
                 gap += ca.fmax(0, sign * mu[j]) * ca.fmax(0, left)
             else:
-                gap += ca.fmax(0, sign * mu[j]) / TINY
+                gap += ca.fmax(0, sign * mu[j]) / SMALLEST_DIVISOR
     return ca.Function("certify_input", symbols, [ca.cse(ca.densify(ca.vertcat(violation, gap, r)))])

@@ -33,10 +33,10 @@ import scipy.sparse as sp
 from rti_mpc.codegen import function
 from rti_mpc.rti.ocp import Ocp
 
-# What may change between samples without a new structure: attributes of the Ocp, read by the compiled functions in this order.
+# Weights and bounds, by the attributes of the Ocp. They may change between samples; the compiled functions read them in this order.
 WEIGHTS = ("Q", "R", "delta", "lambda_", "lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx", "z", "Z", "Q_e", "lh", "uh", "zh", "Zh")
 
-DAMPING = 0.005  # of the cost, for a step of half an input's range; see docs/engine.md
+DAMPING_PER_COST = 0.005  # weight of half the square of a step, in half ranges of an input, per cost at the guess; see docs/engine.md
 
 
 class Forms(NamedTuple):
@@ -285,7 +285,7 @@ def damping(ocp: Ocp) -> float:
     variables = ca.vertcat(model.x, model.u)
     first = ca.jacobian(ca.vertcat(model.f_expl_expr, model.y_expr), variables)
     linear = ca.jacobian(ca.vec(first), variables).nnz() == 0
-    return 0.0 if linear else DAMPING
+    return 0.0 if linear else DAMPING_PER_COST
 
 
 def plan_cost(ocp: Ocp) -> ca.Function:

@@ -38,7 +38,7 @@ from rti_mpc.errors import OcpError
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model
 
-SOFT_WEIGHT = 1e3  # L1 and L2, of slacks that are given none
+DEFAULT_SLACK_WEIGHT = 1e3  # L1 weight, in cost per unit of the state, and L2 weight, in cost per unit squared
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -117,14 +117,14 @@ class Ocp:
         ubdu: ArrayLike = np.inf,
         lbx: ArrayLike = -np.inf,
         ubx: ArrayLike = np.inf,
-        z: ArrayLike = SOFT_WEIGHT,
-        Z: ArrayLike = SOFT_WEIGHT,
+        z: ArrayLike = DEFAULT_SLACK_WEIGHT,
+        Z: ArrayLike = DEFAULT_SLACK_WEIGHT,
         Q_e: ArrayLike | None = None,
         h_expr: ca.SX | None = None,
         lh: ArrayLike = -np.inf,
         uh: ArrayLike = np.inf,
-        zh: ArrayLike = SOFT_WEIGHT,
-        Zh: ArrayLike = SOFT_WEIGHT,
+        zh: ArrayLike = DEFAULT_SLACK_WEIGHT,
+        Zh: ArrayLike = DEFAULT_SLACK_WEIGHT,
     ) -> None:
         if N_u is None:
             N_u = N
@@ -160,7 +160,7 @@ class Ocp:
         """Check and own weights and bounds; for what has no reader yet."""
         sizes = {"nx": self.model.nx, "nu": self.model.nu, "ny": self.model.ny, "nh": self.h_expr.numel(), "N": self.N, "N_u": self.N_u}
         for name, value in values.items():
-            check, size = VALUES[name]
+            check, size = WEIGHTS_AND_BOUNDS[name]
             array = check(name, value, sizes[size])
             array.setflags(write=False)
             object.__setattr__(self, name, array)
@@ -249,8 +249,8 @@ def vector(name: str, value: ArrayLike, length: int) -> Array:
     return np.array(np.broadcast_to(array, (length,)))
 
 
-# What checks and owns each weight and bound, and its size.
-VALUES: dict[str, tuple[Callable[[str, ArrayLike, int], Array], str]] = {
+# The function that checks and copies each weight or bound, and the name of its length.
+WEIGHTS_AND_BOUNDS: dict[str, tuple[Callable[[str, ArrayLike, int], Array], str]] = {
     "Q": (weight_matrix, "ny"),
     "R": (weight_matrix, "nu"),
     "delta": (weights, "N"),

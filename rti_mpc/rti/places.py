@@ -24,8 +24,8 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.riccati import Gain, Riccati, Rows, Stage, columns, stagewise
 
-TOLERANCE = 1e-9  # by which a bound may be crossed before it acts, relative to its scale: rounding must not decide
-RELEASE = 1e-6  # multiplier of the wrong sign, times the scale, in units of the normalised cost, from which a bound is released
+BOUND_TOLERANCE = 1e-9  # a bound acts when it is exceeded by more than this, relative to its scale, so that rounding does not decide
+RELEASE_MULTIPLIER = 1e-6  # a bound is released when its multiplier has the wrong sign and is larger, in normalised cost per scale of what is bounded
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,11 +278,11 @@ def exceeded(value: ca.SX, lower: ca.SX, upper: ca.SX, lb: float, ub: float) -> 
 
 def belongs(place: ca.SX, stiff: ca.SX, scale: ca.SX, over: ca.SX, under: ca.SX, most: ca.SX | float) -> ca.SX:
     """Return where something belongs that exceeds its bounds by so much; `most` is the pull that brings it beyond, if they are softened."""
-    tolerance = TOLERANCE * scale
+    tolerance = BOUND_TOLERANCE * scale
     side = ca.sign(place)
     by = ca.if_else(place > 0, over, under)
     free = (over > tolerance) - (under > tolerance)
-    held = ca.if_else(stiff * by > most, 2 * side, side * (stiff * by * scale > -RELEASE))
+    held = ca.if_else(stiff * by > most, 2 * side, side * (stiff * by * scale > -RELEASE_MULTIPLIER))
     beyond = ca.if_else(by < -tolerance, side, 2 * side)
     return ca.SX(ca.if_else(place == 0, free, ca.if_else(ca.fabs(place) == 1, held, beyond)))
 

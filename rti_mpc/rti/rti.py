@@ -42,13 +42,13 @@ from rti_mpc.rti.scale import scale
 from rti_mpc.rti.turns import Turns
 
 FORMULATIONS = {"simultaneous": simultaneous, "sequential": sequential}
-SOLVERS = ("riccati", "osqp")  # the built-in ones; any other is one of qpsolvers
-SEQUENTIAL_UP_TO = 10  # control horizon up to which the sequential formulation is the faster one, see docs/engine.md
-SOLVED, INACCURATE = QpStatus.SOLVED, QpStatus.INACCURATE  # an enumeration looks its members up slowly
-ITERATIONS = 3  # a sample, at most, and
-TOLERANCE = 0.015  # the step from which there is another: what converged NMPC costs in closed loop, within 0.5 %, see docs/engine.md
-COSTS = ("delta", "lambda_", "z", "Z", "Q_e", "zh", "Zh")  # weights that carry the scale of the cost
-TOUCHING = 2e-3  # distance from a softened bound, relative to its scale, from which on a plan counts as having left it
+BUILT_IN_SOLVERS = ("riccati", "osqp")  # any other solver is one of qpsolvers
+MAX_SEQUENTIAL_N_U = 10  # control horizon up to which the sequential formulation is the faster one, see docs/engine.md
+SOLVED, INACCURATE = QpStatus.SOLVED, QpStatus.INACCURATE  # read faster than a member of the enumeration
+MAX_ITERATIONS = 3  # per sample
+STEP_TOLERANCE = 0.015  # a larger step is followed by another iteration: closed-loop costs within 0.5 % of converged NMPC, see docs/engine.md
+COST_WEIGHTS = ("delta", "lambda_", "z", "Z", "Q_e", "zh", "Zh")  # weights that are multiplied by the scale of the cost
+TOUCHING_DISTANCE = 2e-3  # relative to the scale of a softened bound: a plan further away than this has left the bound
 
 
 class Rti:
@@ -102,8 +102,8 @@ class Rti:
         *,
         formulation: str = "auto",
         solver: str = "riccati",
-        iterations: int = ITERATIONS,
-        tolerance: float = TOLERANCE,
+        iterations: int = MAX_ITERATIONS,
+        tolerance: float = STEP_TOLERANCE,
         compile: bool = True,
     ) -> None:
         check_options(solver, settings, iterations, tolerance)
@@ -153,7 +153,7 @@ class Rti:
         qps = [Qp(transcription, self.guess, make) for transcription in transcriptions]
         self.active_set = None if structured is None else ActiveSet(*structured, self.guess, make)
         self._normalise(qps)
-        if solver in SOLVERS:
+        if solver in BUILT_IN_SOLVERS:
             self.solvers = [Solver(qp, settings or SolverSettings()) for qp in qps]
         else:
             self.solvers = [ForeignSolver(qp, solver) for qp in qps]
@@ -167,7 +167,7 @@ class Rti:
             raise OcpError(f"model {self.ocp.model.name} must be finite and differentiable around the zero state")
         self.scale[:] = scale(self.ocp, self.x, self.u, self.y_ref, self.p)
         self.cost_scale = 1.0 / step_size(qps[0])
-        for name in COSTS:
+        for name in COST_WEIGHTS:
             self._weights[name] *= self.cost_scale
         self.y_ref[:] = 0.0
         for qp in qps:
@@ -207,7 +207,7 @@ class Rti:
         """
         for name, value in values.items():
             self._weights[name][:] = np.clip(value, -INFINITY, INFINITY)
-            if name in COSTS:
+            if name in COST_WEIGHTS:
                 self._weights[name] *= self.cost_scale
         for solver in self.solvers:
             solver.refill()
@@ -371,7 +371,7 @@ class Rti:
             if not isfinite(self._cost[0]):  # numbers of such a size that they overflowed inside the solver
                 self.solver.cold = True
                 return QpStatus.FAILED
-            if violation[1] < -TOUCHING:
+            if violation[1] < -TOUCHING_DISTANCE:
                 self._backup = self.solvers[0]
         return status
 
@@ -389,12 +389,12 @@ class Rti:
     @property
     def touches(self) -> bool:
         """Whether the last plan is at a softened bound, or beyond it."""
-        return bool(self._violation[1] > -TOUCHING)
+        return bool(self._violation[1] > -TOUCHING_DISTANCE)
 
 
 def check_options(solver: str, settings: SolverSettings | None, iterations: int, tolerance: float) -> None:
     """Refuse options of an `Rti` that make no sense; see there."""
-    if solver not in SOLVERS:
+    if solver not in BUILT_IN_SOLVERS:
         check_name(solver)
         if settings is not None:
             raise OcpError(f"settings are OSQP's, they must be left out for another solver, got {settings} for {solver!r}")
@@ -405,7 +405,7 @@ def check_options(solver: str, settings: SolverSettings | None, iterations: int,
 def formulation_of(ocp: Ocp, formulation: str) -> str:
     """Return which formulation is meant."""
     if formulation == "auto":
-        return "sequential" if ocp.N_u <= SEQUENTIAL_UP_TO else "simultaneous"
+        return "sequential" if ocp.N_u <= MAX_SEQUENTIAL_N_U else "simultaneous"
     if formulation not in FORMULATIONS:
         raise OcpError(f"formulation must be auto, {' or '.join(FORMULATIONS)}, got {formulation!r}")
     return formulation

@@ -21,8 +21,8 @@ from rti_mpc.array import Array
 from rti_mpc.codegen import bind
 from rti_mpc.rti.ocp import Ocp
 
-HYSTERESIS_RAD = 0.3  # beyond half a turn, before the other way round is taken
-FARTHEST_RAD = math.pi + HYSTERESIS_RAD
+HYSTERESIS_RAD = 0.3  # an error must exceed half a turn by this much before the other way round is taken
+MAX_ERROR_RAD = math.pi + HYSTERESIS_RAD
 
 
 class Turns:
@@ -76,7 +76,7 @@ class Turns:
             self._x0[j] -= whole_turns(self._x0[j] - self._guess[j])
         for j in self._bounded:
             beyond = self._x0[j] - 0.5 * float(self._lbx[j] + self._ubx[j])
-            if abs(beyond) > FARTHEST_RAD:
+            if abs(beyond) > MAX_ERROR_RAD:
                 turns = whole_turns(beyond)
                 self._x0[j] -= turns
                 self._x[:, j] -= turns
@@ -86,7 +86,7 @@ class Turns:
         for j in self._outputs:
             error = self._y[j] - self._y_first[j]
             turns = whole_turns(error - self._errors[j])
-            if abs(error - turns) > FARTHEST_RAD:
+            if abs(error - turns) > MAX_ERROR_RAD:
                 turns = whole_turns(error)
             if turns:
                 self._y_ref[:, j] += turns

@@ -9,7 +9,7 @@ from rti_mpc.contract.message import Event, Notice, Severity
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.layout import STAMP_LIMIT_NS
 
-PERIOD_NS = 1_000_000_000  # monotonic, between two events of one code
+MIN_INTERVAL_NS = 1_000_000_000  # local time between two faults of one code
 
 
 class Announcer:
@@ -31,7 +31,7 @@ class Announcer:
         """Publish a notice; a fault not, if one of its code just was. Return whether it was published."""
         now_ns, code = time.monotonic_ns(), notice.code
         each = notice.change or notice.severity is Severity.INFO
-        due = each or now_ns - self._last_ns.get(code, -PERIOD_NS) >= PERIOD_NS
+        due = each or now_ns - self._last_ns.get(code, -MIN_INTERVAL_NS) >= MIN_INTERVAL_NS
         if due:
             self._last_ns[code] = now_ns
             self._seq += 1

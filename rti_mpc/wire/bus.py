@@ -22,8 +22,8 @@ from rti_mpc.wire.session import BusSettings as BusSettings
 from rti_mpc.wire.streams import MAX_REQUEST_BYTES, role_of
 from rti_mpc.wire.zenoh_session import CLOSE_TIMEOUT_S, ZenohSession
 
-RING_MESSAGES = 1024  # that wait for a receiver: half a second of it being held up, at 2000 a second of anybody's
-RETRY_S = 0.1  # between two looks for somebody who is not there yet
+RING_MESSAGES = 1024  # messages that wait for a receiver: those of half a second at 2000 per second
+RETRY_INTERVAL_S = 0.1  # between two attempts to reach a process that is not there yet
 
 Sent = TypeVar("Sent", bound=Message, contravariant=True)
 
@@ -225,7 +225,7 @@ class Bus:
         Args:
             key: What to listen to; may hold wildcards.
             capacity: Messages kept, the oldest dropped first; fewer where so many of the longest would not fit into
-                `rti_mpc.wire.streams.RING_BYTES`. A receiver that wants the last message alone keeps `RING_MESSAGES` all the same, and takes
+                `rti_mpc.wire.streams.MAX_RING_BYTES`. A receiver that wants the last message alone keeps `RING_MESSAGES` all the same, and takes
                 the newest that is accepted: what anybody sends behind it must not push it out.
             history: Whether to ask publishers for their last message, those which come later included, where the stream is cached.
         """
@@ -293,13 +293,13 @@ class Bus:
         while (left_s := deadline_s - time.monotonic()) > 0.0:
             if answers := list(self.answers(key, value, left_s)):
                 return min(answers, key=lambda answer: answer.get("ok") is True)
-            time.sleep(min(RETRY_S, left_s))  # nobody serves it yet
+            time.sleep(min(RETRY_INTERVAL_S, left_s))  # nobody serves it yet
         raise TimeoutError(f"{key} must be served, got no answer within {timeout_s} s")
 
     def answers(self, key: Key[Any], value: dict[str, Any], timeout_s: float) -> Iterator[dict[str, Any]]:
         """Yield the answers of all who serve a key, as they come."""
         for received in self._session.ask(key, json.dumps(value).encode(), timeout_s):
-            yield _object(received, document.MAX_BYTES)
+            yield _object(received, document.MAX_DOCUMENT_BYTES)
 
     def alive(self, role: str) -> Declared:
         """Show presence in a role until the token is undeclared, the bus closed or the process gone."""
@@ -315,7 +315,7 @@ class Bus:
                 return True
             if left_s <= 0.0:
                 return False
-            time.sleep(min(RETRY_S, left_s))
+            time.sleep(min(RETRY_INTERVAL_S, left_s))
 
     def watch_alive(self, callback: Callable[[str, bool], None]) -> None:
         """Call back, in a thread of its own, with a role and whether it is present, for those present now and at every change."""

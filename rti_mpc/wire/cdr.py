@@ -24,20 +24,20 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, Event, Reference, State, Telemetry
 from rti_mpc.errors import MessageError
-from rti_mpc.wire.layout import LAYOUTS, NUMBER_LIMIT, SHORTEST_NS, Field
+from rti_mpc.wire.layout import LAYOUTS, MIN_PERIOD_NS, NUMBER_LIMIT, Field
 
 Message = State | Reference | Command | Telemetry | Event
 M = TypeVar("M", bound=Message)
 
-PACKAGE = "rti_mpc_msgs/msg"
-VERSION = 2  # major: a receiver refuses any other
-MAX_QUOTE = 40  # characters of a peer's own words in an error
+MESSAGE_PACKAGE = "rti_mpc_msgs/msg"
+MESSAGE_VERSION = 2  # a receiver refuses messages of any other version
+MAX_QUOTED_CHARS = 40  # of a text that an error quotes
 HEADER = b"\x00\x01\x00\x00"
-START = len(HEADER)  # alignment counts from here
+HEADER_BYTES = len(HEADER)  # alignment is counted from the end of the header
 
-FORMATS = {"uint8": "B", "uint32": "I", "uint64": "Q", "int64": "q", "float64": "d"}  # of scalars, by their type in .msg files
-WORD = Struct("<I")
-WORD_PADDED = Struct("<I4x")
+STRUCT_FORMATS = {"uint8": "B", "uint32": "I", "uint64": "Q", "int64": "q", "float64": "d"}  # key: type of a scalar in .msg files
+UINT32 = Struct("<I")
+UINT32_PADDED = Struct("<I4x")  # followed by four bytes that align a float64
 
 # Both continue at an offset from the end of the header. A writer returns the bytes of its fields; a reader appends their
 # values to a list and returns the offset after them.
@@ -50,7 +50,7 @@ class Refused(MessageError):
     A payload is not the message expected.
 
     Attributes:
-        reason: One of `REASONS`, for counters.
+        reason: One of `REFUSAL_REASONS`, for counters.
     """
 
     def __init__(self, reason: str, text: str) -> None:
@@ -58,7 +58,7 @@ class Refused(MessageError):
         super().__init__(text)
 
 
-REASONS = (
+REFUSAL_REASONS = (
     *("empty", "truncated", "oversized", "big_endian", "header", "length", "not_finite", "value", "text"),
     *("encoding", "version", "schema", "epoch"),
 )
@@ -66,7 +66,7 @@ REASONS = (
 
 def schema(cls: type[Any]) -> str:
     """Schema of a message class, such as ``rti_mpc_msgs/msg/State@2``."""
-    return f"{PACKAGE}/{cls.__name__}@{VERSION}"
+    return f"{MESSAGE_PACKAGE}/{cls.__name__}@{MESSAGE_VERSION}"
 
 
 def encoding(cls: type[Any]) -> str:
@@ -89,27 +89,27 @@ def decode(cls: type[M], payload: bytes) -> M:
     Message in a payload; its arrays are owned, C-contiguous float64.
 
     Raises:
-        MessageError: If the bytes are not exactly one such message; `reason` is one of `REASONS`.
+        MessageError: If the bytes are not exactly one such message; `reason` is one of `REFUSAL_REASONS`.
     """
-    if payload[:START] != HEADER:
+    if payload[:HEADER_BYTES] != HEADER:
         raise _header_error(payload)
     values: list[Any] = []
     offset = 0
     for read in READERS[cls]:
         offset = read(payload, offset, values)
-    if len(payload) != START + offset:
-        raise Refused("oversized", f"message must end after {START + offset} bytes, got {len(payload)}")
+    if len(payload) != HEADER_BYTES + offset:
+        raise Refused("oversized", f"message must end after {HEADER_BYTES + offset} bytes, got {len(payload)}")
     message: M = cls(*values)
-    if (check := RELATIONS.get(cls)) is not None:
+    if (check := FIELD_RELATIONS.get(cls)) is not None:
         check(message)
     return message
 
 
 def _header_error(payload: bytes) -> Refused:
-    got = payload[:START].hex(" ")
+    got = payload[:HEADER_BYTES].hex(" ")
     if not payload:
         return Refused("empty", "payload must hold a CDR message, got no bytes")
-    if len(payload) < START:
+    if len(payload) < HEADER_BYTES:
         return Refused("truncated", f"payload must begin with the CDR header {HEADER.hex(' ')}, got {got}")
     if payload[:2] == b"\x00\x00":
         return Refused("big_endian", f"payload must be little-endian CDR, header {HEADER.hex(' ')}, got the big-endian header {got}")
@@ -125,8 +125,8 @@ def _layouts(fields: Sequence[Field]) -> tuple[Struct, ...]:
     for start in range(8):
         text, offset = "<", start
         for field in fields:
-            size = Struct("<" + FORMATS[field.kind]).size
-            text += f"{-offset % size}x{FORMATS[field.kind]}"
+            size = Struct("<" + STRUCT_FORMATS[field.kind]).size
+            text += f"{-offset % size}x{STRUCT_FORMATS[field.kind]}"
             offset += -offset % size + size
         layouts.append(Struct(text))
     return tuple(layouts)
@@ -149,10 +149,10 @@ def _scalar_reader(fields: Sequence[Field]) -> Reader:
     def read(payload: bytes, offset: int, values: list[Any]) -> int:
         layout = layouts[offset % 8]
         end = offset + layout.size
-        if len(payload) < START + end:
-            raise Refused("truncated", f"message must hold at least {START + end} bytes, got {len(payload)}")
+        if len(payload) < HEADER_BYTES + end:
+            raise Refused("truncated", f"message must hold at least {HEADER_BYTES + end} bytes, got {len(payload)}")
         first = len(values)
-        values += layout.unpack_from(payload, START + offset)
+        values += layout.unpack_from(payload, HEADER_BYTES + offset)
         for i, name, known in members:
             value = values[first + i]
             if value not in known:
@@ -177,12 +177,12 @@ def _array_writer(field: Field, *, with_width: bool) -> Writer:
         array: Array = getattr(message, name)
         head = b""
         if with_width:
-            head = bytes(-offset % 4) + WORD.pack(array.shape[1])
+            head = bytes(-offset % 4) + UINT32.pack(array.shape[1])
             offset += len(head)
         padding = -offset % 4
         offset += padding
         size = array.size
-        length = (WORD_PADDED if size and offset % 8 == 0 else WORD).pack(size)
+        length = (UINT32_PADDED if size and offset % 8 == 0 else UINT32).pack(size)
         return head + bytes(padding) + length + array.astype("<f8", copy=False).tobytes()
 
     return write
@@ -208,9 +208,9 @@ def _array_reader(field: Field, *, width_at: int | None) -> Reader:
         if size:
             offset += -offset % 8
         end = offset + 8 * size
-        if START + end > len(payload):
-            raise Refused("truncated", f"{name} must hold the {size} numbers it declares, got {max(0, len(payload) - START - offset) // 8}")
-        array = np.frombuffer(payload, "<f8", size, START + offset).astype(np.float64)
+        if HEADER_BYTES + end > len(payload):
+            raise Refused("truncated", f"{name} must hold the {size} numbers it declares, got {max(0, len(payload) - HEADER_BYTES - offset) // 8}")
+        array = np.frombuffer(payload, "<f8", size, HEADER_BYTES + offset).astype(np.float64)
         if field.filled and not size:
             raise Refused("length", f"{name} must hold at least one row, got none")
         if field.finite and not (fits := np.abs(array) <= NUMBER_LIMIT).all():
@@ -223,9 +223,9 @@ def _array_reader(field: Field, *, width_at: int | None) -> Reader:
 
 def _word(payload: bytes, offset: int, name: str) -> tuple[int, int]:
     offset += -offset % 4
-    if len(payload) < START + offset + 4:
-        raise Refused("truncated", f"{name} must begin at byte {START + offset}, got {len(payload)} bytes")
-    value: int = WORD.unpack_from(payload, START + offset)[0]
+    if len(payload) < HEADER_BYTES + offset + 4:
+        raise Refused("truncated", f"{name} must begin at byte {HEADER_BYTES + offset}, got {len(payload)} bytes")
+    value: int = UINT32.unpack_from(payload, HEADER_BYTES + offset)[0]
     return value, offset + 4
 
 
@@ -244,7 +244,7 @@ def _string_writer(field: Field) -> Writer:
         if not text.isprintable():  # such as a line break in somebody else's words
             text = "".join(c if c.isprintable() else " " for c in text)
         encoded = text.encode("utf-8", "replace")[: field.high and field.high - 1].decode("utf-8", "ignore").encode() + b"\x00"
-        return bytes(-offset % 4) + WORD.pack(len(encoded)) + encoded
+        return bytes(-offset % 4) + UINT32.pack(len(encoded)) + encoded
 
     return write
 
@@ -255,11 +255,11 @@ def _string_reader(field: Field) -> Reader:
     def read(payload: bytes, offset: int, values: list[Any]) -> int:
         size, offset = _word(payload, offset, name)
         end = offset + size
-        if START + end > len(payload):
-            raise Refused("truncated", f"{name} must hold the {size} bytes it declares, got {len(payload) - START - offset}")
+        if HEADER_BYTES + end > len(payload):
+            raise Refused("truncated", f"{name} must hold the {size} bytes it declares, got {len(payload) - HEADER_BYTES - offset}")
         if field.high is not None and size > field.high:
             raise Refused("text", f"{name} must have at most {field.high} bytes, got {size}")
-        encoded = payload[START + offset : START + end]
+        encoded = payload[HEADER_BYTES + offset : HEADER_BYTES + end]
         if encoded[-1:] != b"\x00":
             raise Refused("text", f"{name} must end with a zero byte")
         try:
@@ -267,7 +267,7 @@ def _string_reader(field: Field) -> Reader:
         except UnicodeDecodeError as error:
             raise Refused("text", f"{name} must be UTF-8, got {error.reason} at byte {error.start}") from None
         if not text.isprintable():
-            raise Refused("text", f"{name} must hold characters that can be printed, got {text[:MAX_QUOTE]!r}")
+            raise Refused("text", f"{name} must hold characters that can be printed, got {text[:MAX_QUOTED_CHARS]!r}")
         values.append(text)
         return end
 
@@ -287,8 +287,8 @@ def _check_reference(message: Reference) -> None:
 
 def _check_command(message: Command) -> None:
     rows, states, gain = len(message.u_rest), len(message.x_rest), message.K.shape
-    if rows and message.rest_period_ns < SHORTEST_NS:
-        raise Refused("value", f"rest_period_ns must be at least {SHORTEST_NS} for a way to rest of {rows} rows, got {message.rest_period_ns}")
+    if rows and message.rest_period_ns < MIN_PERIOD_NS:
+        raise Refused("value", f"rest_period_ns must be at least {MIN_PERIOD_NS} for a way to rest of {rows} rows, got {message.rest_period_ns}")
     if states not in (0, rows):
         raise Refused("length", f"x_rest must hold {rows} rows, as many as u_rest, or none, got {states}")
     if gain[0] not in (0, message.u.shape[1]):
@@ -301,7 +301,7 @@ def _check_telemetry(message: Telemetry) -> None:
         raise Refused("length", f"x0 must hold {width} numbers, got {message.x0.size}")
 
 
-RELATIONS: dict[type[Any], Callable[[Any], None]] = {Reference: _check_reference, Command: _check_command, Telemetry: _check_telemetry}
+FIELD_RELATIONS: dict[type[Any], Callable[[Any], None]] = {Reference: _check_reference, Command: _check_command, Telemetry: _check_telemetry}
 
 
 def _codec(fields: Sequence[Field]) -> tuple[tuple[Writer, ...], tuple[Reader, ...]]:
@@ -310,7 +310,7 @@ def _codec(fields: Sequence[Field]) -> tuple[tuple[Writer, ...], tuple[Reader, .
     readers: list[Reader] = []
     first: dict[str, int] = {}  # position of the first array of a row width
     position = 0
-    for scalar, run in groupby(fields, key=lambda field: field.kind in FORMATS):
+    for scalar, run in groupby(fields, key=lambda field: field.kind in STRUCT_FORMATS):
         group = list(run)
         if scalar:
             writers.append(_scalar_writer(group))

@@ -15,13 +15,13 @@ from typing import Any
 
 from rti_mpc.wire.cdr import Refused
 
-MAX_BYTES = 1 << 16  # of a description or an answer; a request has fewer
-MAX_DEPTH = 16  # objects and lists inside one another
-INTEGER_LIMIT = 1 << 64  # magnitude that no integer reaches
-MAX_DIGITS = 20  # that such an integer has at most
+MAX_DOCUMENT_BYTES = 1 << 16  # of a description or an answer; requests are shorter
+MAX_DEPTH = 16  # of objects and lists inside one another
+INTEGER_LIMIT = 1 << 64  # every integer is smaller in magnitude
+MAX_DIGITS = 20  # of such an integer
 
 
-def read(payload: bytes, size: int | None = None, most: int = MAX_BYTES) -> dict[str, Any]:
+def read(payload: bytes, size: int | None = None, most: int = MAX_DOCUMENT_BYTES) -> dict[str, Any]:
     """
     Return the JSON object in a payload.
 

@@ -21,8 +21,8 @@ from rti_mpc.wire.layout import NUMBER_LIMIT
 from rti_mpc.wire.received import Received
 from rti_mpc.wire.streams import role_of
 
-MAX_TEXT = 64  # characters of a name or a unit
-MAX_COMPONENTS = 512  # components of a vector, obstacles, or columns of a reference
+MAX_TEXT_CHARS = 64  # of a name or a unit
+MAX_COMPONENTS = 512  # of a vector; also the most obstacles, and the most columns of a reference
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,8 @@ class Info:
             MessageError: It is not one.
         """
         try:
-            vectors: dict[str, Any] = {name: tuple(_label(signal) for signal in _few(document.get(name, ()))) for name in VECTORS}
-            bounds: dict[str, Any] = {name: _bounds(document.get(name), sign, len(vectors[vector])) for name, (vector, sign) in BOUNDS.items()}
+            vectors: dict[str, Any] = {name: tuple(_label(signal) for signal in _few(document.get(name, ()))) for name in INFO_VECTORS}
+            bounds: dict[str, Any] = {name: _bounds(document.get(name), sign, len(vectors[vector])) for name, (vector, sign) in INFO_BOUNDS.items()}
             return cls(
                 role=str(document["role"]),
                 document=json.dumps(document, indent=2),
@@ -133,14 +133,15 @@ class Info:
         """
         info, key = cls.from_json(read(received.payload, received.size)), received.key
         if not info.role or info.role != role_of(key):
-            raise MessageError(f"info must be of the role that its key ends with, got {info.role[:MAX_TEXT]!r} on {key[-MAX_TEXT:]!r}")
+            raise MessageError(f"info must be of the role that its key ends with, got {info.role[:MAX_TEXT_CHARS]!r} on {key[-MAX_TEXT_CHARS:]!r}")
         return info
 
     @classmethod
     def unnamed(cls, nx: int, nu: int, ny: int) -> Info:
         """Number the components of a robot whose description was never heard."""
-        vectors: dict[str, Any] = {name: tuple(Label(f"{name[:-1]}_{i}") for i in range(n)) for name, n in zip(VECTORS, (nx, nu, ny, 0), strict=True)}
-        bounds: dict[str, Any] = {name: _bounds(None, sign, len(vectors[vector])) for name, (vector, sign) in BOUNDS.items()}
+        sizes = zip(INFO_VECTORS, (nx, nu, ny, 0), strict=True)
+        vectors: dict[str, Any] = {name: tuple(Label(f"{name[:-1]}_{i}") for i in range(n)) for name, n in sizes}
+        bounds: dict[str, Any] = {name: _bounds(None, sign, len(vectors[vector])) for name, (vector, sign) in INFO_BOUNDS.items()}
         return cls(role="unknown", **vectors, **bounds)
 
     @property
@@ -172,8 +173,9 @@ class Info:
         return next((k for k, state in enumerate(self.states) if state.name == label.state), None)
 
 
-VECTORS = ("states", "inputs", "outputs", "disturbances")
-BOUNDS = {"lbu": ("inputs", -1), "ubu": ("inputs", 1), "lbx": ("states", -1), "ubx": ("states", 1)}
+INFO_VECTORS = ("states", "inputs", "outputs", "disturbances")
+# Bounds, each with its vector and the sign of the infinity that stands for none.
+INFO_BOUNDS = {"lbu": ("inputs", -1), "ubu": ("inputs", 1), "lbx": ("states", -1), "ubx": ("states", 1)}
 
 
 def labels(counterparts: Mapping[str, Sequence[str]] | None = None, /, **vectors: Sequence[Signal | Label]) -> dict[str, Any]:
@@ -262,11 +264,11 @@ def _few(values: Sequence[Any]) -> Sequence[Any]:
 
 
 def _label(signal: Mapping[str, Any]) -> Label:
-    role, state = (str(signal.get(name, ""))[:MAX_TEXT] for name in ("role", "state"))
+    role, state = (str(signal.get(name, ""))[:MAX_TEXT_CHARS] for name in ("role", "state"))
     label = Label(signal["name"], signal["unit"], bool(signal["angle"]), role, state)
     for text in (label.name, label.unit):
-        if not 0 < len(text) <= MAX_TEXT or not text.isprintable():
-            raise ValueError(f"names and units of 1 to {MAX_TEXT} printable characters expected, got {text[:MAX_TEXT]!r}")
+        if not 0 < len(text) <= MAX_TEXT_CHARS or not text.isprintable():
+            raise ValueError(f"names and units of 1 to {MAX_TEXT_CHARS} printable characters expected, got {text[:MAX_TEXT_CHARS]!r}")
     return label
 
 

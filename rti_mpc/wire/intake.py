@@ -9,12 +9,12 @@ from typing import Generic, Protocol
 
 from rti_mpc.contract.epoch import EPOCH_LEAD, highest_believed
 from rti_mpc.contract.message import Notice, Reference, Severity, State
-from rti_mpc.wire.cdr import VERSION, M, Refused, decode, encoding
-from rti_mpc.wire.layout import MAX_BYTES
+from rti_mpc.wire.cdr import MESSAGE_VERSION, M, Refused, decode, encoding
+from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
 from rti_mpc.wire.source import Source, Verdict
 
-OPTIONAL = {(Reference, "p"), (State, "u")}  # arrays that may be left out: nominal parameters, inputs that are not reported
-MAX_QUOTE = 120  # characters of a peer's own words in a notice
+OPTIONAL_ARRAYS = {(Reference, "p"), (State, "u")}  # arrays that may be left out: nominal parameters, inputs that are not reported
+MAX_QUOTED_CHARS = 120  # of an encoding that a notice quotes
 
 
 class Payload(Protocol):
@@ -39,7 +39,7 @@ class Intake(Generic[M]):
 
     Attributes:
         source: The source it is locked to, with its counts of lost and dropped messages.
-        refused: Payloads that were no message, or none for us, by reason: one of `rti_mpc.wire.cdr.REASONS`, or of `unfit`.
+        refused: Payloads that were no message, or none for us, by reason: one of `rti_mpc.wire.cdr.REFUSAL_REASONS`, or of `unfit`.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Intake(Generic[M]):
         Args:
             cls: Class of the messages.
             stale_s: Time without an accepted message after which another source may take over.
-            widths: Numbers a row must have, by array, such as ``{"x": 5}``; those of `OPTIONAL` may be left out.
+            widths: Numbers a row must have, by array, such as ``{"x": 5}``; those of `OPTIONAL_ARRAYS` may be left out.
             quiet_s: Shortest time between two notices of one code.
             unix_s: Tells the Unix time, s, which limits epochs, see `rti_mpc.contract.epoch.highest_believed`.
             choosing: Whether an epoch is chosen above those heard.
@@ -88,8 +88,8 @@ class Intake(Generic[M]):
         try:
             if received.encoding != self._encoding:
                 raise self._encoding_error(received.encoding)
-            if received.size > MAX_BYTES[self._cls]:
-                raise Refused("oversized", f"message must have at most {MAX_BYTES[self._cls]} bytes, got {received.size}")
+            if received.size > MAX_PAYLOAD_BYTES[self._cls]:
+                raise Refused("oversized", f"message must have at most {MAX_PAYLOAD_BYTES[self._cls]} bytes, got {received.size}")
             message = decode(self._cls, received.payload)
             for name, width in self._widths:
                 self._check_width(message, name, width)
@@ -176,7 +176,7 @@ class Intake(Generic[M]):
 
     def _check_width(self, message: M, name: str, width: int) -> None:
         got = getattr(message, name).shape[-1]
-        if got != width and not (got == 0 and (self._cls, name) in OPTIONAL):
+        if got != width and not (got == 0 and (self._cls, name) in OPTIONAL_ARRAYS):
             raise Refused("length", f"{name} must hold {width} numbers a row, got {got}")
 
     def _check_epoch(self, epoch: int, known: int) -> None:
@@ -190,5 +190,5 @@ class Intake(Generic[M]):
         name, _, version = schema.partition("@")
         reason = "encoding"
         if kind == expected_kind:
-            reason = "version" if name == expected_schema.partition("@")[0] and version != str(VERSION) else "schema"
-        return Refused(reason, f"encoding must be {self._encoding}, got {got[:MAX_QUOTE]!r}")
+            reason = "version" if name == expected_schema.partition("@")[0] and version != str(MESSAGE_VERSION) else "schema"
+        return Refused(reason, f"encoding must be {self._encoding}, got {got[:MAX_QUOTED_CHARS]!r}")

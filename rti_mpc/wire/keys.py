@@ -12,7 +12,7 @@ from rti_mpc.wire import streams
 from rti_mpc.wire.cdr import M
 from rti_mpc.wire.streams import Stream
 
-RESERVED = set("*$?#")  # wildcards and selectors of Zenoh
+RESERVED_CHARS = set("*$?#")  # Zenoh's wildcards and selectors
 
 
 class Key(str, Generic[M]):
@@ -48,7 +48,7 @@ class Keys:
     def __post_init__(self) -> None:
         for name in ("prefix", "robot"):
             value = getattr(self, name)
-            if not all(value.split("/")) or value.startswith("@") or RESERVED & set(value):
+            if not all(value.split("/")) or value.startswith("@") or RESERVED_CHARS & set(value):
                 raise ConfigError(f"{name} must be words joined by single slashes, without any of * $ ? # or a leading @, got {value!r}")
 
     def below(self, name: str) -> str:

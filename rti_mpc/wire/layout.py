@@ -16,10 +16,10 @@ from typing import Any
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Event, Reference, Severity, State, Telemetry
 from rti_mpc.contract.status import Mode, QpStatus
 
-STAMP_LIMIT_NS = 2**62  # magnitude that no time reaches: sums of two stamps, or of a stamp and a duration, fit an int64
-PERIOD_LIMIT_NS = 3_600_000_000_000  # longest time between rows: one hour
-SHORTEST_NS = 100_000  # between rows that a robot plays, as the shortest period of a controller: each costs time to play
-NUMBER_LIMIT = 1e18  # magnitude of a state, an input, a reference, in any unit: sums and products of such are finite
+STAMP_LIMIT_NS = 2**62  # every time is smaller in magnitude: sums of two stamps, or of a stamp and a duration, fit an int64
+MAX_PERIOD_NS = 3_600_000_000_000  # longest time between rows: one hour
+MIN_PERIOD_NS = 100_000  # shortest time between rows of a command, and shortest period of a controller: each row costs the robot time
+NUMBER_LIMIT = 1e18  # largest magnitude of a state, an input or a reference, in any unit: sums and products of them are finite
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ LAYOUTS: dict[type[Any], tuple[Field, ...]] = {
     ),
     Reference: (
         *_head("time of row 0, ns of the robot's clock; STAMP_ON_ARRIVAL: the state current on arrival", STAMP_ON_ARRIVAL),
-        Field("period_ns", "int64", "ns between rows", low=1, high=PERIOD_LIMIT_NS),
+        Field("period_ns", "int64", "ns between rows", low=1, high=MAX_PERIOD_NS),
         Field("end", "uint8", "after the last row: HOLD it, or STOP", member_of=End),
         Field(
             "y",
@@ -101,9 +101,9 @@ LAYOUTS: dict[type[Any], tuple[Field, ...]] = {
         Field("config_hash", "uint64", "configuration of the controller, as in info"),
         Field("mode", "uint8", "what the controller was doing: IDLE ... STOPPED", member_of=Mode),
         Field("status", "uint8", "outcome of the QP behind this command: SOLVED ... NONE", member_of=QpStatus),
-        Field("period_ns", "int64", "ns between rows", low=SHORTEST_NS, high=PERIOD_LIMIT_NS),
+        Field("period_ns", "int64", "ns between rows", low=MIN_PERIOD_NS, high=MAX_PERIOD_NS),
         Field("u", "float64[]", "rows of nu, SI units in the order of the model's inputs", width="nu", finite=True, filled=True),
-        Field("rest_period_ns", "int64", "ns between rows of the way to rest; 0 where there are none", low=0, high=PERIOD_LIMIT_NS),
+        Field("rest_period_ns", "int64", "ns between rows of the way to rest; 0 where there are none", low=0, high=MAX_PERIOD_NS),
         Field(
             "u_rest", "float64[]", "way to rest from valid_until_ns on, rows of nu; empty: inside the slew limits to rest", width="nu", finite=True
         ),
@@ -148,35 +148,35 @@ LAYOUTS: dict[type[Any], tuple[Field, ...]] = {
         Field("text", "string", "one sentence for people", high=4096),
     ),
 }
-MAX_BYTES: dict[type[Any], int] = {  # of a payload
+MAX_PAYLOAD_BYTES: dict[type[Any], int] = {
     State: 1 << 16,
-    Reference: 1 << 23,  # 349,000 rows of three outputs; a session reassembles nothing longer, whatever its key
+    Reference: 1 << 23,  # 349,000 rows of three outputs; a session reassembles no longer message on any key
     Command: 1 << 20,
     Telemetry: 1 << 21,
     Event: 1 << 13,
 }
-ABOUT: dict[type[Any], str] = {
+MESSAGE_DESCRIPTIONS: dict[type[Any], str] = {
     State: "The robot's state, published by the robot.",
     Reference: "Output reference on a regular time grid. It ends with its last row: no heartbeat.",
     Command: "A plan of inputs: row i acts from stamp_ns + i * period_ns on, nothing acts from valid_until_ns on but the way to rest.",
     Telemetry: "Everything an engineer plots of one sample of the controller. Numbers may be NaN where nothing was computed.",
     Event: "A mode change or a fault.",
 }
-WIDTHS: dict[str, str] = {"nx": "states per row", "nu": "inputs per row", "ny": "outputs per row", "np": "stage parameters per row"}
+WIDTH_DESCRIPTIONS: dict[str, str] = {"nx": "states per row", "nu": "inputs per row", "ny": "outputs per row", "np": "stage parameters per row"}
 
 
 def msg_text(cls: type[Any]) -> str:
     """Text of the ``.msg`` file of a message class."""
     constants, lines, widths = [], [], set()
     for field in LAYOUTS[cls]:
-        if field.member_of is not None and ABOUT[cls] != ABOUT[Telemetry]:  # whose modes are those of Command
+        if field.member_of is not None and MESSAGE_DESCRIPTIONS[cls] != MESSAGE_DESCRIPTIONS[Telemetry]:  # whose modes are those of Command
             constants += ["", *(f"uint8 {member.name}={int(member)}" for member in field.member_of)]
         if field.also is not None:
             constants += ["", f"{field.kind} STAMP_ON_ARRIVAL={field.also}"]
         if field.width and field.width not in widths:
             widths.add(field.width)
-            lines.append(("uint32 " + field.width, WIDTHS[field.width]))
+            lines.append(("uint32 " + field.width, WIDTH_DESCRIPTIONS[field.width]))
         lines.append((f"{field.kind} {field.name}", field.about))
     column = max(len(declaration) for declaration, _ in lines)
     body = [f"{declaration:<{column}}  # {about}" for declaration, about in lines]
-    return "\n".join([f"# {ABOUT[cls]}", *constants, "", *body]) + "\n"
+    return "\n".join([f"# {MESSAGE_DESCRIPTIONS[cls]}", *constants, "", *body]) + "\n"

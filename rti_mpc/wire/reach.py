@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from threading import Event, Thread
 
-FIRST_S = 2.0  # to meet others who are there; with what a start takes, an operator is told within 5 s
-AGAIN_S = 60.0
+FIRST_REMINDER_S = 2.0  # enough to meet the other processes; with the time of a start the operator is told within 5 s
+REMINDER_INTERVAL_S = 60.0  # between later reminders
 
 
 def remind(say: Callable[[str], object], wanted: Callable[[], str], over: Event) -> None:
@@ -21,9 +21,9 @@ def remind(say: Callable[[str], object], wanted: Callable[[], str], over: Event)
     """
 
     def watch() -> None:
-        pause_s = FIRST_S
+        pause_s = FIRST_REMINDER_S
         while not over.wait(pause_s) and (text := wanted()):
             say(text)
-            pause_s = AGAIN_S
+            pause_s = REMINDER_INTERVAL_S
 
     Thread(target=watch, name="reach", daemon=True).start()

@@ -28,23 +28,24 @@ import zenoh
 from rti_mpc.contract.message import Reference
 from rti_mpc.errors import ConfigError, Stopped
 from rti_mpc.text_file import read_text_file
-from rti_mpc.wire.layout import MAX_BYTES
+from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
 from rti_mpc.wire.reach import remind
 
-RENDEZVOUS = "tcp/127.0.0.1:7447"
-ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws)/.+:\d+([?#].*)?$|(?!(tcp|tls|udp|quic|ws)/)[a-z_-]+/.+")  # those without a port are Zenoh's to judge
-CLIENT_TIMEOUT_MS = 500  # one attempt to reach a router
-MAX_CONFIG_BYTES = 1 << 16  # of Zenoh's configuration: its parser goes down with every bracket
-RETRY_S = 0.1  # between two looks for somebody who is not there yet
+RENDEZVOUS_ENDPOINT = "tcp/127.0.0.1:7447"
+# Protocols that need a port; whether an endpoint of another protocol is valid is left to Zenoh.
+ENDPOINT_PATTERN = re.compile(r"(tcp|tls|udp|quic|ws)/.+:\d+([?#].*)?$|(?!(tcp|tls|udp|quic|ws)/)[a-z_-]+/.+")
+CLIENT_TIMEOUT_MS = 500  # of one attempt to reach a router
+MAX_CONFIG_BYTES = 1 << 16  # of Zenoh's configuration file: its parser recurses at every bracket
+RETRY_INTERVAL_S = 0.1  # between two attempts to reach a router
 
 # Closing the link of a hung peer occupies a thread of Zenoh for its linger time, 10 s. By default there is one to send and
 # two to receive: a hung viewer would then cut the controller from the robot.
-THREADS = "(rx: (worker_threads: 4), tx: (worker_threads: 4))"
+ZENOH_THREADS = "(rx: (worker_threads: 4), tx: (worker_threads: 4))"
 
-MAX_MESSAGE_BYTES = MAX_BYTES[Reference] + (1 << 12)  # with what Zenoh adds: a longer one is dropped before it is put together
+MAX_MESSAGE_BYTES = MAX_PAYLOAD_BYTES[Reference] + (1 << 12)  # payload and Zenoh's own bytes: a longer message is dropped before it is reassembled
 
-# Ours, unless the user's own Zenoh configuration says otherwise.
-DEFAULTS: dict[str, Any] = {
+# Settings of this package, unless the user's own Zenoh configuration says otherwise.
+ZENOH_DEFAULTS: dict[str, Any] = {
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
     "scouting/gossip/enabled": True,
     "transport/link/tx/lease": 2000,  # a hung process is noticed after 1.5 s, not 7.5 s
@@ -71,7 +72,7 @@ class BusSettings:
 
     mode: str = "peer"
     listen: tuple[str, ...] = ()
-    connect: tuple[str, ...] = (RENDEZVOUS,)
+    connect: tuple[str, ...] = (RENDEZVOUS_ENDPOINT,)
     config: Path | None = None
     multicast: bool = False
     cfg: tuple[str, ...] = ()
@@ -85,8 +86,8 @@ def zenoh_config(settings: BusSettings) -> zenoh.Config:
         ConfigError: An endpoint is none, Zenoh refuses a value, or cannot read the file.
     """
     for endpoint in (*settings.listen, *settings.connect):
-        if not ENDPOINT.match(endpoint):
-            raise ConfigError(f"bus: an endpoint must be a protocol, an address and a port, such as {RENDEZVOUS}, got {endpoint!r}")
+        if not ENDPOINT_PATTERN.match(endpoint):
+            raise ConfigError(f"bus: an endpoint must be a protocol, an address and a port, such as {RENDEZVOUS_ENDPOINT}, got {endpoint!r}")
     name = str(settings.config)
     if settings.config is not None:
         read_text_file(settings.config, "Zenoh's configuration", MAX_CONFIG_BYTES)
@@ -109,13 +110,13 @@ def zenoh_config(settings: BusSettings) -> zenoh.Config:
 
 def _by_name(settings: BusSettings, mode: str) -> dict[str, Any]:
     """Settings by their names in Zenoh. Nobody connects to himself, and a router to nobody unless told."""
-    others = () if mode == "router" and settings.connect == (RENDEZVOUS,) else settings.connect
+    others = () if mode == "router" and settings.connect == (RENDEZVOUS_ENDPOINT,) else settings.connect
     return {
-        "listen/endpoints": settings.listen or {"client": [], "peer": ["tcp/127.0.0.1:0"], "router": [RENDEZVOUS]}.get(mode, []),
+        "listen/endpoints": settings.listen or {"client": [], "peer": ["tcp/127.0.0.1:0"], "router": [RENDEZVOUS_ENDPOINT]}.get(mode, []),
         "connect/endpoints": [endpoint for endpoint in others if endpoint not in settings.listen],
         "connect/timeout_ms": CLIENT_TIMEOUT_MS if mode == "client" else -1,
         "scouting/multicast/enabled": settings.multicast,
-        **DEFAULTS,
+        **ZENOH_DEFAULTS,
     }
 
 
@@ -144,7 +145,7 @@ def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event 
         Stopped: The wait was ended.
     """
     deadline_s = time.monotonic() + timeout_s
-    os.environ.setdefault("ZENOH_RUNTIME", THREADS)
+    os.environ.setdefault("ZENOH_RUNTIME", ZENOH_THREADS)
     config, opened, told = zenoh_config(settings), threading.Event(), False
     try:
         while True:
@@ -160,6 +161,6 @@ def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event 
                 if not told:
                     told = True
                     remind(say, lambda: f"not connected: no router answers at {endpoints(config)}", opened)
-                time.sleep(RETRY_S)
+                time.sleep(RETRY_INTERVAL_S)
     finally:
         opened.set()

@@ -18,14 +18,14 @@ from typing import Any, Generic, Literal
 from rti_mpc.contract.message import Command, Event, Reference, State, Telemetry
 from rti_mpc.wire import document
 from rti_mpc.wire.cdr import M
-from rti_mpc.wire.layout import MAX_BYTES
+from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
 
-ROLES = ("controller", "standby", "guard", "robot", "reference", "viewer", "recorder", "router", "operator", "relay", "echo")  # known to everybody
-ROLE = re.compile(r"[a-z][a-z0-9_]{0,31}(\.[0-9]{1,7})?", re.ASCII)  # one of several is numbered, such as standby.17
-MAX_UNKNOWN_ROLES = 16  # other roles of which is heard: a name costs nothing
+KNOWN_ROLES = ("controller", "standby", "guard", "robot", "reference", "viewer", "recorder", "router", "operator", "relay", "echo")
+ROLE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}(\.[0-9]{1,7})?", re.ASCII)  # where several processes share a role they are numbered: standby.17
+MAX_UNKNOWN_ROLES = 16  # other roles that are listened to: anybody can invent one
 
-MAX_REQUEST_BYTES = 32_768  # to parse JSON holds the interpreter's lock, for 30 ms a megabyte
-RING_BYTES = 1 << 30  # in one ring of a receiver, at most, where peers send nothing but the longest payloads
+MAX_REQUEST_BYTES = 32_768  # parsing JSON holds the interpreter's lock for 30 ms per megabyte
+MAX_RING_BYTES = 1 << 30  # of one receiver's ring if peers send nothing but the longest payloads
 
 
 class Kind(Enum):
@@ -54,11 +54,11 @@ class Qos:
     congestion: Literal["DROP", "BLOCK"] = "DROP"
 
 
-FAST = Qos("REAL_TIME", express=True)  # before all else on its way
-LAST = Qos(cached=True)
-LOW = Qos("DATA_LOW")
-ASKED = Qos(congestion="BLOCK")
-ASKED_FAST = Qos("REAL_TIME", express=True, congestion="BLOCK")
+QOS_FAST = Qos("REAL_TIME", express=True)  # overtakes all other messages
+QOS_CACHED = Qos(cached=True)
+QOS_LOW = Qos("DATA_LOW")
+QOS_QUERY = Qos(congestion="BLOCK")
+QOS_FAST_QUERY = Qos("REAL_TIME", express=True, congestion="BLOCK")
 
 
 @dataclass(frozen=True)
@@ -93,31 +93,31 @@ class Stream(Generic[M]):
         """Largest payload, in bytes."""
         if self.kind is not Kind.MESSAGE:
             return MAX_REQUEST_BYTES if self.kind is Kind.QUERY else 0
-        return document.MAX_BYTES if self.message is None else MAX_BYTES[self.message]
+        return document.MAX_DOCUMENT_BYTES if self.message is None else MAX_PAYLOAD_BYTES[self.message]
 
     def capacity(self, messages: int) -> int:
-        """Return how many messages a ring may hold, of those that a receiver wants, within `RING_BYTES`."""
-        return min(messages, RING_BYTES // self.max_bytes)
+        """Return how many messages a ring may hold, of those that a receiver wants, within `MAX_RING_BYTES`."""
+        return min(messages, MAX_RING_BYTES // self.max_bytes)
 
 
 def _query(name: str, servers: tuple[str, ...], qos: Qos, about: str) -> Stream[Any]:
     return Stream(name, None, servers, qos, "as asked", about, kind=Kind.QUERY, askers=("operator",))
 
 
-CONTROLLERS = ("controller", "standby")  # one program, which changes its role
+CONTROLLER_ROLES = ("controller", "standby")  # of one program, which changes its role
 
-STATE = Stream("state", State, ("robot", "relay"), FAST, "as the robot measures, up to 1 kHz", "state of the robot")
-REFERENCE = Stream("reference", Reference, ("reference",), LAST, "now and then", "what to follow")
-ANCHORED = Stream("reference/anchored", Reference, ("controller",), LAST, "as such come", "a reference that starts on arrival, with its stamp")
-COMMAND = Stream("command", Command, ("controller", "relay"), FAST, "each sample", "plan of inputs")
-ACTUATION = Stream("actuation", Command, ("guard", "relay"), FAST, "each command", "what the guard lets pass, or its own ramp to rest")
-TELEMETRY = Stream("telemetry", Telemetry, ("controller",), LOW, "each sample", "everything of one sample")
-SHADOW_TELEMETRY = Stream("telemetry/standby", Telemetry, ("standby",), LOW, "each sample", "the same of a controller that stands by")
+STATE = Stream("state", State, ("robot", "relay"), QOS_FAST, "as the robot measures, up to 1 kHz", "state of the robot")
+REFERENCE = Stream("reference", Reference, ("reference",), QOS_CACHED, "now and then", "what to follow")
+ANCHORED = Stream("reference/anchored", Reference, ("controller",), QOS_CACHED, "as such come", "a reference that starts on arrival, with its stamp")
+COMMAND = Stream("command", Command, ("controller", "relay"), QOS_FAST, "each sample", "plan of inputs")
+ACTUATION = Stream("actuation", Command, ("guard", "relay"), QOS_FAST, "each command", "what the guard lets pass, or its own ramp to rest")
+TELEMETRY = Stream("telemetry", Telemetry, ("controller",), QOS_LOW, "each sample", "everything of one sample")
+SHADOW_TELEMETRY = Stream("telemetry/standby", Telemetry, ("standby",), QOS_LOW, "each sample", "the same of a controller that stands by")
 EVENT = Stream(
     "event",
     Event,
-    (*CONTROLLERS, "guard", "robot", "reference", "viewer"),
-    LAST,
+    (*CONTROLLER_ROLES, "guard", "robot", "reference", "viewer"),
+    QOS_CACHED,
     "each mode change, each fault at most once a second",
     "mode changes and faults",
     by_role=True,
@@ -125,28 +125,28 @@ EVENT = Stream(
 INFO: Stream[Any] = Stream(
     "info",
     None,
-    (*CONTROLLERS, "guard", "robot"),
-    LAST,
+    (*CONTROLLER_ROLES, "guard", "robot"),
+    QOS_CACHED,
     "at the start, and as it changes",
     "description in JSON: names, units, limits, versions",
     by_role=True,
 )
-REQUEST = _query("request", CONTROLLERS, ASKED, "parameters, and failures on request")
-STOP = _query("stop", (*CONTROLLERS, "guard"), ASKED_FAST, "an operator's stop and its release; what else is asked for does not delay it")
+REQUEST = _query("request", CONTROLLER_ROLES, QOS_QUERY, "parameters, and failures on request")
+STOP = _query("stop", (*CONTROLLER_ROLES, "guard"), QOS_FAST_QUERY, "an operator's stop and its release; what else is asked for does not delay it")
 ALIVE: Stream[Any] = Stream(
     "alive",
     None,
-    (*CONTROLLERS, "guard", "robot", "reference", "viewer", "router", "relay", "echo"),
+    (*CONTROLLER_ROLES, "guard", "robot", "reference", "viewer", "router", "relay", "echo"),
     Qos(),
     "while it lives",
     "presence, for people and fleets; never a safety signal",
     kind=Kind.TOKEN,
     by_role=True,
 )
-# Of fault injection and of measurements, alone.
-RELAY = _query("relay", ("relay",), ASKED, "faults of a link or a sensor")
-PING = Stream("echo/ping", State, ("operator",), FAST, "each sample", "of a state's size, to measure the bus")
-PONG = Stream("echo/pong", Command, ("echo",), FAST, "each ping", "its answer, of a command's size")
+# Streams of fault injection and of measurements only.
+RELAY = _query("relay", ("relay",), QOS_QUERY, "faults of a link or a sensor")
+PING = Stream("echo/ping", State, ("operator",), QOS_FAST, "each sample", "of a state's size, to measure the bus")
+PONG = Stream("echo/pong", Command, ("echo",), QOS_FAST, "each ping", "its answer, of a command's size")
 
 STREAMS: tuple[Stream[Any], ...] = (
     *(STATE, REFERENCE, ANCHORED, COMMAND, ACTUATION, TELEMETRY, SHADOW_TELEMETRY),
@@ -157,17 +157,17 @@ STREAMS: tuple[Stream[Any], ...] = (
 def role_of(key: str) -> str:
     """Return the role that a key of an event, a description or a token ends with; empty if it is no name of one."""
     role = key.rpartition("/")[2]
-    return role if ROLE.fullmatch(role) else ""
+    return role if ROLE_PATTERN.fullmatch(role) else ""
 
 
 def admitted(key: str, known: Collection[str]) -> bool:
     """
-    Return whether to listen to the role that a key ends with: of any in `ROLES`, and of `MAX_UNKNOWN_ROLES` others.
+    Return whether to listen to the role that a key ends with: of any in `KNOWN_ROLES`, and of `MAX_UNKNOWN_ROLES` others.
 
     Args:
         key: Of an event, a description or a token.
         known: Keys of this stream that were admitted before.
     """
-    if key in known or role_of(key) in ROLES:
+    if key in known or role_of(key) in KNOWN_ROLES:
         return True
-    return bool(role_of(key)) and sum(role_of(other) not in ROLES for other in known) < MAX_UNKNOWN_ROLES
+    return bool(role_of(key)) and sum(role_of(other) not in KNOWN_ROLES for other in known) < MAX_UNKNOWN_ROLES

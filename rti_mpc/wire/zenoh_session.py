@@ -28,12 +28,12 @@ from rti_mpc.wire.received import Received
 from rti_mpc.wire.session import BusSettings, endpoints, open_session, zenoh_config
 
 CLOSE_TIMEOUT_S = 0.5
-HEARTBEAT_S = 1.0  # of a cached publisher, which tells the number of its last message
-MAX_ENCODING = 256  # characters of an encoding that are looked at
-RING_TOKENS = 1024  # changes of presence that wait to be told
-RING_QUERIES = 16  # requests that wait to be answered
-GONE = ("closed", "Undeclared")  # words of Zenoh, of a session or a publisher that is no more
-JSON = "application/json"  # encoding of descriptions, requests and answers
+HEARTBEAT_S = 1.0  # period at which a cached publisher sends the number of its last message
+MAX_ENCODING_CHARS = 256  # of an encoding that are read
+RING_TOKENS = 1024  # changes of presence that wait for their receiver
+RING_QUERIES = 16  # requests that wait for their answer
+CLOSED_WORDS = ("closed", "Undeclared")  # in Zenoh's errors about a session that is closed or a publisher that is undeclared
+JSON_ENCODING = "application/json"  # of descriptions, requests and answers
 
 give_way: Callable[[], None] = getattr(os, "sched_yield", lambda: None)  # not on every system
 
@@ -62,7 +62,7 @@ class ZenohPublisher(Generic[M]):
         try:
             self._publisher.put(payload)
         except zenoh.ZError as error:
-            if not any(word in str(error) for word in GONE):
+            if not any(word in str(error) for word in CLOSED_WORDS):
                 raise
         if self._realtime:
             give_way()  # to the thread that sends it: whoever puts goes on computing, and cores may be few
@@ -117,7 +117,7 @@ class ZenohSubscriber:
         if self._own and (info := sample.source_info) is not None and str(info.source_id.zid) == self._own:
             return None
         if sample.encoding != self._encoding[0]:
-            self._encoding = sample.encoding, str(sample.encoding)[:MAX_ENCODING]
+            self._encoding = sample.encoding, str(sample.encoding)[:MAX_ENCODING_CHARS]
         key, size = self._key or str(sample.key_expr), len(sample.payload)
         if size > self._max_bytes:
             return Received(b"", self._encoding[1], key, withheld=size)  # not even copied
@@ -175,7 +175,7 @@ class ZenohSession:
         """Publisher of a stream, with the quality of service that the table gives it."""
         message, qos = key.stream.message, key.stream.qos
         options: Any = {
-            "encoding": JSON if message is None else encoding(message),
+            "encoding": JSON_ENCODING if message is None else encoding(message),
             "priority": getattr(zenoh.Priority, qos.priority),
             "express": qos.express,
             "congestion_control": getattr(zenoh.CongestionControl, qos.congestion),
@@ -208,7 +208,7 @@ class ZenohSession:
             with query:
                 payload = answer(_withheld(query.payload, key, key.stream.max_bytes))
                 if payload is not None:
-                    query.reply(key, payload, encoding=JSON)
+                    query.reply(key, payload, encoding=JSON_ENCODING)
 
         _follow(queryable.handler, act)
         return queryable
@@ -219,7 +219,7 @@ class ZenohSession:
             key,
             timeout=timeout_s,
             payload=payload,
-            encoding=JSON,
+            encoding=JSON_ENCODING,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             priority=getattr(zenoh.Priority, key.stream.qos.priority),
@@ -227,7 +227,7 @@ class ZenohSession:
         )
         for reply in replies:
             if reply.ok is not None:
-                yield _withheld(reply.ok.payload, key, document.MAX_BYTES)
+                yield _withheld(reply.ok.payload, key, document.MAX_DOCUMENT_BYTES)
 
     def token(self, key: Key[Any]) -> Any:
         """Show presence until what is returned is undeclared, the session closed or the process gone."""
@@ -248,7 +248,7 @@ class ZenohSession:
 def _withheld(payload: zenoh.ZBytes | None, key: str, max_bytes: int) -> Received:
     """Return a payload, without its bytes where those are too many."""
     size = 0 if payload is None else len(payload)
-    return Received(b"" if payload is None or size > max_bytes else payload.to_bytes(), JSON, key, withheld=size if size > max_bytes else 0)
+    return Received(b"" if payload is None or size > max_bytes else payload.to_bytes(), JSON_ENCODING, key, withheld=size if size > max_bytes else 0)
 
 
 def _follow(handler: Any, act: Callable[[Any], None]) -> None:

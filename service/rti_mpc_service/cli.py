@@ -62,7 +62,7 @@ def print_version(wanted: bool) -> None:
         from rti_mpc_service.host import machine
 
         packages = ", ".join(f"{name} {version}" for name, version in machine.packages().items())
-        typer.echo(f"rti-mpc {rti_mpc.__version__}, messages of version {cdr.VERSION}, Python {platform.python_version()}, {packages}")
+        typer.echo(f"rti-mpc {rti_mpc.__version__}, messages of version {cdr.MESSAGE_VERSION}, Python {platform.python_version()}, {packages}")
         raise typer.Exit
 
 

@@ -21,7 +21,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.lives import Heard, Lives
 from rti_mpc.contract.message import Notice, Reference, Severity, State
 from rti_mpc.reference.trajectory import Heading, Trajectory, rows
-from rti_mpc.signals import POSE, Role
+from rti_mpc.signals import POSE_ROLES, Role
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
 from rti_mpc.wire.interrupt import stop_on_signals
@@ -43,7 +43,7 @@ def main(
     heading: Heading = "consistent",
     a: float | None = 0.2,
     psi0: float | None = None,
-    roles: Sequence[Role] = POSE,
+    roles: Sequence[Role] = POSE_ROLES,
     period_s: float = 0.05,
     parameters: Callable[[Array], Array] | None = None,
     stop: Event | None = None,

@@ -17,7 +17,7 @@ from typing import Any
 
 from rti_mpc.contract.latch import Latch, read_latch
 from rti_mpc.errors import ConfigError, MessageError
-from rti_mpc.wire.bus import RETRY_S, Bus, BusSettings
+from rti_mpc.wire.bus import RETRY_INTERVAL_S, Bus, BusSettings
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.config import toml
 from rti_mpc_service.latch_file import LatchFile
@@ -114,7 +114,7 @@ def asked_again(bus: Bus, request: dict[str, Any], timeout_s: float) -> Iterator
             yield answer
             with suppress(MessageError):
                 latch = max(latch, read_latch(answer.get("latch")))
-        time.sleep(min(RETRY_S, left_s))
+        time.sleep(min(RETRY_INTERVAL_S, left_s))
 
 
 def noted(file: LatchFile, what: str) -> str:

@@ -18,7 +18,7 @@ from rti_mpc.control.observer import Disturbance, Observer, ObserverSettings
 from rti_mpc.errors import OcpError
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model
-from rti_mpc.model.robots.pioneer_3dx import NOMINAL, pioneer_3dx
+from rti_mpc.model.robots.pioneer_3dx import NOMINAL_PARAMETERS, pioneer_3dx
 from rti_mpc.reference.trajectory import circle
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
@@ -36,7 +36,8 @@ DT = 0.1
 
 def wrong_parameters() -> Model:
     """The robot with every theta 20 % off, up and down in turn."""
-    return pioneer_3dx().with_parameters(**{name: NOMINAL[name] * (1.2 if i % 2 else 0.8) for i, name in enumerate(NOMINAL) if name != "a"})
+    scaled = {name: value * (1.2 if i % 2 else 0.8) for i, (name, value) in enumerate(NOMINAL_PARAMETERS.items()) if name != "a"}
+    return pioneer_3dx().with_parameters(**scaled)
 
 
 def slipping() -> Model:

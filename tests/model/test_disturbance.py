@@ -8,7 +8,7 @@ import pytest
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
 from rti_mpc.model.disturbance import with_disturbances
-from rti_mpc.model.robots.pioneer_3dx import NOMINAL, pioneer_3dx
+from rti_mpc.model.robots.pioneer_3dx import NOMINAL_PARAMETERS, pioneer_3dx
 
 X = np.array([0.1, -0.2, 0.7, 0.3, -0.4])
 U = np.array([0.2, 0.5])
@@ -17,7 +17,7 @@ U = np.array([0.2, 0.5])
 def slope(names: tuple[str, ...], u: Array, d: Array) -> Array:
     model = with_disturbances(pioneer_3dx(), names)
     f = ca.Function("f", [model.x, model.u, model.p], [model.f_expl_expr])
-    return np.array(f(X, u, [*NOMINAL.values(), *d])).ravel()
+    return np.array(f(X, u, [*NOMINAL_PARAMETERS.values(), *d])).ravel()
 
 
 def test_disturbance_of_an_input_is_added_to_it() -> None:

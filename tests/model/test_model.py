@@ -13,7 +13,7 @@ import pytest
 
 from rti_mpc.errors import OcpError
 from rti_mpc.model.model import Model, Signal, find_model
-from rti_mpc.model.robots.pioneer_3dx import NOMINAL
+from rti_mpc.model.robots.pioneer_3dx import NOMINAL_PARAMETERS
 
 
 def mass(**changes: Any) -> Model:
@@ -42,7 +42,7 @@ def right_hand_side(model: Model, x: list[float], u: list[float]) -> list[float]
 def test_pioneer_is_equation_9_of_the_paper() -> None:
     """Written down again, number by number, in plain Python."""
     x, y, psi, u, omega, u_c, omega_c = 0.3, -0.2, 0.7, 0.4, -0.5, 0.3, 0.6
-    t = list(NOMINAL.values())
+    t = list(NOMINAL_PARAMETERS.values())
     assert t == [0.24089, 0.2424, -0.00093603, 0.99629, -0.0037256, 1.0915, 0.2]
     expected = [
         u * math.cos(psi) - 0.2 * omega * math.sin(psi),

@@ -26,7 +26,7 @@ from tests.in_time import MS, in_time
 from tests.processes.system import CONFIG, KEYS, SPEED, System, heard, interrupted_in_time, rti_mpc, until
 
 STANDING = 1e-3  # m/s, rad/s
-OTHER_VERSION = f"@{cdr.VERSION + 1}"  # in a refusal
+OTHER_VERSION = f"@{cdr.MESSAGE_VERSION + 1}"  # in a refusal
 
 
 @pytest.fixture
@@ -181,7 +181,7 @@ def test_payload_of_every_malformed_kind_is_counted_and_published_while_control_
     ours = driven.bus.publisher(KEYS.state), driven.bus.publisher(KEYS.command)
     with Bus.join(BusSettings(connect=(driven.endpoint,)), KEYS) as another:
         with monkeypatch.context() as later:
-            later.setattr(cdr, "VERSION", cdr.VERSION + 1)
+            later.setattr(cdr, "MESSAGE_VERSION", cdr.MESSAGE_VERSION + 1)
             foreign = another.publisher(KEYS.state), another.publisher(KEYS.command)
         refuse_malformed(driven, ours, foreign)
 

@@ -14,7 +14,7 @@ from rti_mpc.array import Array
 from rti_mpc.model.model import Model, Signal
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
-from rti_mpc.rti.turns import FARTHEST_RAD
+from rti_mpc.rti.turns import MAX_ERROR_RAD
 from tests.problems import INF, beacon
 
 TURN = 2 * np.pi
@@ -139,11 +139,11 @@ def test_noise_at_half_a_turn_changes_the_way_at_most_once(turned: Rti, wrapped:
 def test_the_nearer_way_is_taken_where_the_other_has_become_too_long(turned: Rti) -> None:
     rti = turned
     rti.reset(np.full(1, 3.0), np.zeros(1))
-    before, beyond = held_at(rti, np.linspace(3.0, FARTHEST_RAD - 0.01, 10)), held_at(rti, np.array([FARTHEST_RAD + 0.01]))
+    before, beyond = held_at(rti, np.linspace(3.0, MAX_ERROR_RAD - 0.01, 10)), held_at(rti, np.array([MAX_ERROR_RAD + 0.01]))
     assert np.all(before < -0.1)
     assert beyond > 0.1
-    rti.reset(np.full(1, FARTHEST_RAD - 0.01), np.zeros(1))
-    assert held_at(rti, np.array([FARTHEST_RAD - 0.01])) > 0.1, "a cold start takes the nearer way at once"
+    rti.reset(np.full(1, MAX_ERROR_RAD - 0.01), np.zeros(1))
+    assert held_at(rti, np.array([MAX_ERROR_RAD - 0.01])) > 0.1, "a cold start takes the nearer way at once"
 
 
 def test_reference_that_turns_on_and_on_is_followed_through_every_turn(turned: Rti) -> None:

@@ -17,7 +17,7 @@ from rti_mpc.contract.latch import MAX_COUNTER_LEAP, Latch
 from rti_mpc.contract.message import Notice
 from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.wire.bus import Received
-from rti_mpc.wire.document import MAX_BYTES
+from rti_mpc.wire.document import MAX_DOCUMENT_BYTES
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service import operator_stop
 from rti_mpc_service.latch_file import LatchFile
@@ -175,7 +175,7 @@ def test_process_takes_over_what_others_describe_and_tells_it_on(disk: Disk) -> 
 def test_nothing_that_is_heard_ends_the_thread_that_hears(disk: Disk) -> None:
     process = Process(disk)
     leap = asdict(Latch(MAX_COUNTER_LEAP + 1, True, WHEN, "forged"))
-    huge = {"latch": asdict(STOPPED), "more": " " * MAX_BYTES}
+    huge = {"latch": asdict(STOPPED), "more": " " * MAX_DOCUMENT_BYTES}
     nonsense: list[Any] = [
         b"",
         b"\xff",

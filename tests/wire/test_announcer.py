@@ -10,7 +10,7 @@ import pytest
 
 from rti_mpc.contract.message import Event, Notice, Severity
 from rti_mpc.wire import announcer as announcer_module
-from rti_mpc.wire.announcer import PERIOD_NS, Announcer
+from rti_mpc.wire.announcer import MIN_INTERVAL_NS, Announcer
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
@@ -40,7 +40,7 @@ def said(notices: list[tuple[float, Notice]], monkeypatch: pytest.MonkeyPatch) -
 
         until(lambda: announcer.say(MET, 0) and hears("met")(), "the two have met")
         for at_s, notice in notices:
-            monkeypatch.setattr(announcer_module, "time", SimpleNamespace(monotonic_ns=lambda at_s=at_s: round(at_s * PERIOD_NS)))
+            monkeypatch.setattr(announcer_module, "time", SimpleNamespace(monotonic_ns=lambda at_s=at_s: round(at_s * MIN_INTERVAL_NS)))
             announcer.say(notice, 0)
         announcer.say(END, 0)
         until(hears("end"), "the last event")

@@ -23,8 +23,8 @@ from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Received, Subscrib
 from rti_mpc.wire.cdr import decode, encoding
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
-from rti_mpc.wire.layout import MAX_BYTES
-from rti_mpc.wire.streams import RING_BYTES
+from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
+from rti_mpc.wire.streams import MAX_RING_BYTES
 from rti_mpc.wire.zenoh_session import ZenohSession
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
@@ -246,7 +246,7 @@ def test_a_ring_holds_fewer_of_what_may_be_long(join: Any) -> None:
     references = robot.subscriber(KEYS.reference, capacity=RING_MESSAGES)
     marks = robot.subscriber(KEYS.event("planner"))  # of the same priority: what was sent before has come before
     planner, marker = other.publisher(KEYS.reference), other.publisher(KEYS.event("planner"))
-    most = RING_BYTES // MAX_BYTES[Reference]
+    most = MAX_RING_BYTES // MAX_PAYLOAD_BYTES[Reference]
     for seq in range(1, 2 * most):
         planner.put(replace(REFERENCE, seq=seq))
         marker.put(replace(EVENT, seq=seq))

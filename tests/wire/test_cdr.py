@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Event, Reference, Severity, State, Telemetry
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.errors import MessageError
-from rti_mpc.wire.cdr import PACKAGE, REASONS, Message, Refused, decode, encode, encoding, schema
+from rti_mpc.wire.cdr import MESSAGE_PACKAGE, REFUSAL_REASONS, Message, Refused, decode, encode, encoding, schema
 from rti_mpc.wire.layout import LAYOUTS, msg_text
 
 ROOT = Path(__file__).parents[2]
@@ -54,7 +54,7 @@ MESSAGES: list[Message] = [
 
 store = get_typestore(Stores.EMPTY)
 for path in sorted((ROOT / "deploy" / "msg").glob("*.msg")):
-    store.register(get_types_from_msg(path.read_text(), f"{PACKAGE}/{path.stem}"))
+    store.register(get_types_from_msg(path.read_text(), f"{MESSAGE_PACKAGE}/{path.stem}"))
 
 
 def same(a: Any, b: Any) -> bool:
@@ -81,10 +81,10 @@ def test_we_decode_what_rosbags_serialises(message: Message) -> None:
 
 
 def test_row_widths_on_the_wire_are_those_of_the_arrays() -> None:
-    decoded = store.deserialize_cdr(encode(TELEMETRY), f"{PACKAGE}/Telemetry")
+    decoded = store.deserialize_cdr(encode(TELEMETRY), f"{MESSAGE_PACKAGE}/Telemetry")
     assert (decoded.nx, decoded.nu, decoded.ny) == (5, 2, 3)
-    assert store.deserialize_cdr(encode(REFERENCE), f"{PACKAGE}/Reference").np == 2
-    assert store.deserialize_cdr(encode(COMMAND), f"{PACKAGE}/Command").nu == 2
+    assert store.deserialize_cdr(encode(REFERENCE), f"{MESSAGE_PACKAGE}/Reference").np == 2
+    assert store.deserialize_cdr(encode(COMMAND), f"{MESSAGE_PACKAGE}/Command").nu == 2
 
 
 def test_msg_files_list_the_enumerations_we_use() -> None:
@@ -209,7 +209,7 @@ def test_malformed_bytes_are_refused_with_their_reason(cls: type[Message], paylo
     with pytest.raises(Refused) as refusal:
         decode(cls, payload)
     assert refusal.value.reason == reason
-    assert reason in REASONS
+    assert reason in REFUSAL_REASONS
     assert isinstance(refusal.value, MessageError)
     assert len(str(refusal.value)) < 200
 

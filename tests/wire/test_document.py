@@ -6,7 +6,7 @@ import json
 import pytest
 
 from rti_mpc.errors import MessageError
-from rti_mpc.wire.document import MAX_BYTES, MAX_DEPTH, read
+from rti_mpc.wire.document import MAX_DEPTH, MAX_DOCUMENT_BYTES, read
 
 
 def nested(depth: int) -> bytes:
@@ -24,7 +24,7 @@ def test_an_object_is_read_as_it_was_written() -> None:
         "ok": True,
     }
     assert read(json.dumps(value).encode()) == value
-    assert read(b"{}".ljust(MAX_BYTES)) == {}
+    assert read(b"{}".ljust(MAX_DOCUMENT_BYTES)) == {}
     assert read(nested(MAX_DEPTH - 1))
 
 
@@ -47,7 +47,7 @@ def test_an_object_is_read_as_it_was_written() -> None:
         (b'{"version": 1' + 400 * b"0" + b"}", "2\\^64"),
         (b'{"version": -' + 5000 * b"9" + b"}", "2\\^64"),  # which Python would not even convert
         (b'{"version": 18446744073709551616}', "2\\^64"),
-        (b"{}".ljust(MAX_BYTES + 1), "at most"),
+        (b"{}".ljust(MAX_DOCUMENT_BYTES + 1), "at most"),
     ],
 )
 def test_all_else_is_refused_in_one_line(payload: bytes, wrong: str) -> None:

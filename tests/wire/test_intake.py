@@ -12,7 +12,7 @@ from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.wire.bus import Received
 from rti_mpc.wire.cdr import Message, encode, encoding
 from rti_mpc.wire.intake import Intake
-from rti_mpc.wire.layout import MAX_BYTES
+from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
 
 STATE = State(5, 1, 0, np.arange(5.0))
 REFERENCE = Reference(5, 1, 0, 10**8, End.HOLD, np.zeros((4, 3)), np.zeros((4, 0)))
@@ -149,7 +149,7 @@ def test_what_those_who_take_an_epoch_believe_is_believed_by_those_who_choose_on
 
 @pytest.mark.parametrize("message", [STATE, REFERENCE, COMMAND])
 def test_what_is_longer_than_its_key_takes_is_refused_unread(message: Message) -> None:
-    intake, most = Intake(type(message), stale_s=1.0), MAX_BYTES[type(message)]
+    intake, most = Intake(type(message), stale_s=1.0), MAX_PAYLOAD_BYTES[type(message)]
     assert intake.accept(Received(b"", encoding(type(message)), "key", withheld=most + 1), 0) is None
     assert intake.accept(replace(received(message), payload=encode(message).ljust(most + 1)), 0) is None
     assert intake.refused == {"oversized": 2}

@@ -5,7 +5,7 @@ import pytest
 
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.keys import Keys
-from rti_mpc.wire.streams import ROLES, role_of
+from rti_mpc.wire.streams import KNOWN_ROLES, role_of
 
 
 def test_streams_lie_below_prefix_and_robot() -> None:
@@ -31,7 +31,7 @@ def test_words_zenoh_would_take_for_more_are_refused(name: str, word: str) -> No
         Keys(**{name: word})
 
 
-@pytest.mark.parametrize("role", [*ROLES, "standby.7", "standby.1048575", "viewer_2"])
+@pytest.mark.parametrize("role", [*KNOWN_ROLES, "standby.7", "standby.1048575", "viewer_2"])
 def test_names_of_roles_are_roles(role: str) -> None:
     assert role_of(Keys().alive(role)) == role
 

@@ -22,8 +22,8 @@ PATIENCE_S = 30.0
 
 @pytest.fixture(autouse=True)
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reach, "FIRST_S", 0.3)
-    monkeypatch.setattr(reach, "AGAIN_S", 0.1)
+    monkeypatch.setattr(reach, "FIRST_REMINDER_S", 0.3)
+    monkeypatch.setattr(reach, "REMINDER_INTERVAL_S", 0.1)
 
 
 def expecting(bus: Bus) -> Callable[[], bool]:

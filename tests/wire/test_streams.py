@@ -6,7 +6,7 @@ import zenoh
 
 from rti_mpc.wire.bus import RING_MESSAGES
 from rti_mpc.wire.layout import LAYOUTS
-from rti_mpc.wire.streams import COMMAND, EVENT, INFO, REFERENCE, RING_BYTES, ROLES, STATE, STREAMS, TELEMETRY, Kind, Stream, admitted
+from rti_mpc.wire.streams import COMMAND, EVENT, INFO, KNOWN_ROLES, MAX_RING_BYTES, REFERENCE, STATE, STREAMS, TELEMETRY, Kind, Stream, admitted
 
 MESSAGES = [stream for stream in STREAMS if stream.kind is Kind.MESSAGE]
 
@@ -22,7 +22,7 @@ def test_every_message_has_a_stream() -> None:
 @pytest.mark.parametrize("stream", STREAMS, ids=lambda stream: stream.name)
 def test_a_row_names_roles_that_everybody_knows_and_words_of_zenoh(stream: Stream[object]) -> None:
     assert stream.publishers
-    assert {*stream.publishers, *stream.askers} <= set(ROLES)
+    assert {*stream.publishers, *stream.askers} <= set(KNOWN_ROLES)
     assert bool(stream.askers) == (stream.kind is Kind.QUERY)
     assert hasattr(zenoh.Priority, stream.qos.priority)
     assert hasattr(zenoh.CongestionControl, stream.qos.congestion)
@@ -35,7 +35,7 @@ def test_no_message_waits_for_a_congested_link(stream: Stream[object]) -> None:
 
 @pytest.mark.parametrize("stream", MESSAGES, ids=lambda stream: stream.name)
 def test_a_ring_of_the_longest_messages_is_bounded(stream: Stream[object]) -> None:
-    assert stream.capacity(10**9) * stream.max_bytes <= RING_BYTES
+    assert stream.capacity(10**9) * stream.max_bytes <= MAX_RING_BYTES
 
 
 @pytest.mark.parametrize("stream", [STATE, COMMAND, EVENT, INFO], ids=lambda stream: stream.name)

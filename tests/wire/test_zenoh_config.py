@@ -13,8 +13,8 @@ from rti_mpc.contract.message import Reference
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.keys import Keys
-from rti_mpc.wire.layout import MAX_BYTES
-from rti_mpc.wire.session import RENDEZVOUS, BusSettings, zenoh_config
+from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
+from rti_mpc.wire.session import RENDEZVOUS_ENDPOINT, BusSettings, zenoh_config
 
 SHIPPED = Path(__file__).parents[2] / "deploy" / "zenoh"
 ROBOT = "tcp/127.0.0.1:17447"
@@ -28,7 +28,7 @@ def value(settings: BusSettings, name: str) -> Any:
 def test_multicast_is_off_hangs_are_noticed_soon_and_no_message_is_larger_than_a_reference(settings: BusSettings) -> None:
     assert value(settings, "scouting/multicast/enabled") is False
     assert value(settings, "transport/link/tx/lease") == 2000
-    assert value(settings, "transport/link/rx/max_message_size") == MAX_BYTES[Reference] + 4096
+    assert value(settings, "transport/link/rx/max_message_size") == MAX_PAYLOAD_BYTES[Reference] + 4096
 
 
 @pytest.mark.parametrize("mode", ["peer", "client", "router"])
@@ -40,11 +40,11 @@ def test_shipped_configurations_say_what_the_settings_would(mode: str) -> None:
 
 def test_a_peer_listens_on_loopback_and_connects_to_the_rendezvous() -> None:
     assert value(BusSettings(), "listen/endpoints") == ["tcp/127.0.0.1:0"]
-    assert value(BusSettings(), "connect/endpoints") == [RENDEZVOUS]
+    assert value(BusSettings(), "connect/endpoints") == [RENDEZVOUS_ENDPOINT]
 
 
 def test_nobody_connects_to_himself() -> None:
-    assert value(BusSettings(listen=(RENDEZVOUS,)), "connect/endpoints") == []
+    assert value(BusSettings(listen=(RENDEZVOUS_ENDPOINT,)), "connect/endpoints") == []
     assert value(BusSettings(mode="router"), "connect/endpoints") == []
     assert value(BusSettings(mode="router", listen=("tcp/0.0.0.0:7447",)), "connect/endpoints") == []
 
@@ -92,12 +92,12 @@ def test_an_endpoint_already_taken_is_refused() -> None:
 def test_endpoint_that_is_none_is_refused_with_one_that_would_be(endpoint: str) -> None:
     """Zenoh would look for it for ever."""
     for settings in (BusSettings(connect=(endpoint,)), BusSettings(listen=(endpoint,))):
-        with pytest.raises(ConfigError, match=re.escape(f"such as {RENDEZVOUS}, got {endpoint!r}")):
+        with pytest.raises(ConfigError, match=re.escape(f"such as {RENDEZVOUS_ENDPOINT}, got {endpoint!r}")):
             zenoh_config(settings)
 
 
 @pytest.mark.parametrize(
-    "endpoint", [RENDEZVOUS, "tcp/[::1]:7447", "tls/robot.local:7447#iface=eth0", "unixsock-stream//run/zenoh.sock", "serial//dev/tty0"]
+    "endpoint", [RENDEZVOUS_ENDPOINT, "tcp/[::1]:7447", "tls/robot.local:7447#iface=eth0", "unixsock-stream//run/zenoh.sock", "serial//dev/tty0"]
 )
 def test_endpoints_of_every_kind_are_taken(endpoint: str) -> None:
     assert value(BusSettings(connect=(endpoint,)), "connect/endpoints") == [endpoint]

@@ -19,23 +19,23 @@ import casadi as ca
 
 from rti_mpc.model.model import Model, Signal
 
-NOMINAL = {
+NOMINAL_PARAMETERS = {
     "theta_1": 0.24089,
     "theta_2": 0.2424,
     "theta_3": -0.00093603,
     "theta_4": 0.99629,
     "theta_5": -0.0037256,
     "theta_6": 1.0915,
-    "a": 0.2,  # [m], not printed in the paper: the value its robot's authors use
+    "a": 0.2,  # [m], not printed in the paper: the value that the authors of its robot use
 }
-POSE = (Signal("x", "m", role="x"), Signal("y", "m", role="y"), Signal("psi", "rad", angle=True, role="heading"))
+POSE_SIGNALS = (Signal("x", "m", role="x"), Signal("y", "m", role="y"), Signal("psi", "rad", angle=True, role="heading"))
 
 
 def pioneer_3dx() -> Model:
     """Build the model with the paper's printed parameters and ``a = 0.2 m``."""
     x = ca.SX.sym("x", 5)
     v = ca.SX.sym("u", 2)
-    p = ca.SX.sym("p", len(NOMINAL))
+    p = ca.SX.sym("p", len(NOMINAL_PARAMETERS))
     _, _, psi, u, omega = ca.vertsplit(x)
     u_c, omega_c = ca.vertsplit(v)
     theta_1, theta_2, theta_3, theta_4, theta_5, theta_6, a = ca.vertsplit(p)
@@ -52,9 +52,9 @@ def pioneer_3dx() -> Model:
             -theta_5 / theta_2 * u * omega - theta_6 / theta_2 * omega + omega_c / theta_2,
         ),
         y_expr=x[:3],
-        states=(*POSE, Signal("u", "m/s"), Signal("omega", "rad/s")),
+        states=(*POSE_SIGNALS, Signal("u", "m/s"), Signal("omega", "rad/s")),
         inputs=(Signal("u_c", "m/s", commands="u"), Signal("omega_c", "rad/s", commands="omega")),
-        outputs=POSE,
+        outputs=POSE_SIGNALS,
         parameters=(
             Signal("theta_1", "s"),
             Signal("theta_2", "s"),
@@ -64,5 +64,5 @@ def pioneer_3dx() -> Model:
             Signal("theta_6", "1"),
             Signal("a", "m", role="axle_offset"),
         ),
-        p_nominal=tuple(NOMINAL.values()),
+        p_nominal=tuple(NOMINAL_PARAMETERS.values()),
     )

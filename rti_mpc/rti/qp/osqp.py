@@ -22,7 +22,7 @@ from rti_mpc.rti.qp.qp import Qp
 from rti_mpc.rti.scaled import Scaled
 
 # OSQP's codes, https://osqp.org/docs/interfaces/status_values.html, in its version 1.1.
-STATUS = {
+STATUS_BY_OSQP_CODE = {
     1: QpStatus.SOLVED,
     2: QpStatus.INACCURATE,
     3: QpStatus.INFEASIBLE,
@@ -33,8 +33,8 @@ STATUS = {
     8: QpStatus.TIME_LIMIT,
 }
 
-ACTING = 1e-6  # multiplier from which a bound acts: the others are zero exactly
-ACTING_SCALE = 30.0  # of such a row: its step size is that of an equation, about 1000 times the others'
+ACTING_MULTIPLIER = 1e-6  # a softened bound with a larger multiplier acts; those of the others are exactly zero
+ACTING_ROW_SCALE = 30.0  # factor on the row of such a bound: its step size becomes that of an equation, about 1000 times that of others
 
 
 @dataclass(frozen=True)
@@ -139,12 +139,12 @@ class Solver:
         Which act is seen from the last multipliers, a stage earlier.
         """
         y = self._solution.y * self._scale
-        acts = np.abs(y[self._soft]) > ACTING
+        acts = np.abs(y[self._soft]) > ACTING_MULTIPLIER
         active = np.zeros_like(acts) if self.cold else acts[self.qp.watched].any(axis=1)
         if np.array_equal(active, self._active):
             return False
         self._active = active
-        self._scale[self._soft] = np.where(active, ACTING_SCALE, 1.0)
+        self._scale[self._soft] = np.where(active, ACTING_ROW_SCALE, 1.0)
         self.workspace.warm_start(self._solution.x, y / self._scale)
         return True
 
@@ -163,7 +163,7 @@ class Solver:
             self.cold = True
             return QpStatus.FAILED
         workspace.solve()
-        status = STATUS.get(self._info.status_val, QpStatus.FAILED)
+        status = STATUS_BY_OSQP_CODE.get(self._info.status_val, QpStatus.FAILED)
         if status.usable:
             scaled.plan(self._solution.x)
         else:

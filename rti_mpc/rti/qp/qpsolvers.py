@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import qpsolvers
 
 # Their own names for how exact to be, where their defaults are not: near the solution the last digits cost an iteration or two.
-TOLERANCES: dict[str, dict[str, Any]] = {
+SOLVER_TOLERANCES: dict[str, dict[str, Any]] = {
     "clarabel": {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11},
     "daqp": {"primal_tol": 1e-10, "dual_tol": 1e-12},
     "piqp": {"eps_abs": 1e-12, "eps_rel": 1e-13, "eps_duality_gap_abs": 1e-12, "eps_duality_gap_rel": 1e-13},
@@ -72,7 +72,7 @@ class ForeignSolver:
             made, update = following(getattr(numbers, matrix), data, dense)
             setattr(self._problem, matrix, made)
             self._updates.append(update)
-        self.call = partial(qpsolvers.solve_problem, self._problem, name, **TOLERANCES.get(name, {}))
+        self.call = partial(qpsolvers.solve_problem, self._problem, name, **SOLVER_TOLERANCES.get(name, {}))
         try:
             self._call()
         except Exception as error:  # a licence that is missing, say: better now than as a failure of every sample

@@ -28,7 +28,7 @@ from rti_mpc.codegen import function
 from rti_mpc.rti.linearization import Linearization, change
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import (
-    KINDS,
+    KIND_NAMES,
     SLACK_UNIT,
     Blocks,
     BoundRows,
@@ -123,7 +123,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
     condensed = Condensing(ocp, lin)
     N, N_u, nu = ocp.N, ocp.N_u, ocp.model.nu
     ng = len(ocp.lg) if softened else 0
-    kind = KINDS[softened]
+    kind = KIND_NAMES[softened]
     to_s = N_u * nu
     n = to_s + N * ng
 

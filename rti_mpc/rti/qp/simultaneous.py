@@ -21,7 +21,7 @@ from rti_mpc.codegen import function
 from rti_mpc.rti.linearization import Linearization, change, nonzeros
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import (
-    KINDS,
+    KIND_NAMES,
     SLACK_UNIT,
     Blocks,
     BoundRows,
@@ -49,7 +49,7 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
     lin = Linearization(ocp)
     N, N_u, nx, nu = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu
     ng = len(ocp.lg) if softened else 0
-    kind = KINDS[softened]
+    kind = KIND_NAMES[softened]
     to_du, to_s = (N + 1) * nx, (N + 1) * nx + N_u * nu
     n = to_s + N * ng
 

@@ -20,9 +20,9 @@ from rti_mpc.codegen import function
 from rti_mpc.rti.linearization import Linearization
 from rti_mpc.rti.ocp import Ocp
 
-KINDS = {False: "relaxed", True: "whole"}  # by whether the softened bounds are there: functions compiled together differ in name
-INFINITY = 1e30  # OSQP's: a bound this far away is absent
-SLACK_UNIT = 0.1  # a slack variable counts tenths of its state's unit: the stiff penalty is then no stiffer than the rest, see docs/engine.md
+KIND_NAMES = {False: "relaxed", True: "whole"}  # key: whether the QP has softened bounds; functions compiled together need different names
+INFINITY = 1e30  # OSQP's own: a bound of this magnitude is absent
+SLACK_UNIT = 0.1  # a slack variable counts tenths of its state's unit, which makes its penalty as stiff as the other terms, see docs/engine.md
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from rich.table import Table
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.rti.qp.osqp import SolverSettings
-from rti_mpc.rti.rti import FORMULATIONS, SOLVERS, Rti
+from rti_mpc.rti.rti import BUILT_IN_SOLVERS, FORMULATIONS, Rti
 from rti_mpc_service.check.excursion import Bounds, excursions
 from rti_mpc_service.config.build import build_rti, robot_settings
 from rti_mpc_service.config.config import load
@@ -154,7 +154,7 @@ def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> CheckRepor
 
 def twin(rti: Rti, solver: str, formulation: str) -> Rti:
     """Return a controller's like whose solver is tight; those of qpsolvers are in any case."""
-    settings = TIGHT if solver in SOLVERS else None
+    settings = TIGHT if solver in BUILT_IN_SOLVERS else None
     return Rti(rti.ocp, settings, formulation=formulation, solver=solver, iterations=rti.iterations, tolerance=rti.tolerance, compile=False)
 
 

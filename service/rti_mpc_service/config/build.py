@@ -72,10 +72,10 @@ def retuned(config: Config, problem: Ocp) -> Ocp:
 
 def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
     """Return those of the problem that may change while it is solved, as `Ocp` names them."""
-    from rti_mpc.rti.ocp import SOFT_WEIGHT
+    from rti_mpc.rti.ocp import DEFAULT_SLACK_WEIGHT
 
     weights, limits = config.ocp.weights, config.ocp.bounds
-    z, Z = (SOFT_WEIGHT if weight is None else weight for weight in (limits.soft_weight, limits.soft_weight_L2))
+    z, Z = (DEFAULT_SLACK_WEIGHT if weight is None else weight for weight in (limits.soft_weight, limits.soft_weight_L2))
     lbu, ubu = bounds(limits.inputs, names(model.inputs))
     lbdu, ubdu = bounds(limits.increments, names(model.inputs))
     lbx, ubx = bounds(limits.states, names(model.states))

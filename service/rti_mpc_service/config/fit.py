@@ -147,9 +147,9 @@ def check_solver(config: Config) -> None:
     if "name" not in config.solver.model_fields_set:
         return
     from rti_mpc.rti.qp.qpsolvers import check_name  # a robot or a viewer has no use for solvers
-    from rti_mpc.rti.rti import SOLVERS
+    from rti_mpc.rti.rti import BUILT_IN_SOLVERS
 
-    if config.solver.name in SOLVERS:
+    if config.solver.name in BUILT_IN_SOLVERS:
         return
     try:
         check_name(config.solver.name)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from rti_mpc.reference.trajectory import Heading, Trajectory, followed_roles
-from rti_mpc.signals import POSE
+from rti_mpc.signals import POSE_ROLES
 from rti_mpc_service.config.build import build_model, with_initial_state
 from rti_mpc_service.config.schema import Config
 
@@ -20,7 +20,7 @@ def configured(config: Config, trajectory: Trajectory, heading: Heading, guard: 
     """
     model = build_model(config)
     followed_roles(model.name, model.outputs)
-    pose = dict(zip(POSE, trajectory.pose0, strict=True))
+    pose = dict(zip(POSE_ROLES, trajectory.pose0, strict=True))
     config = with_initial_state(config, [f"{state.name}={pose[state.role]!r}" for state in model.states if state.role in pose])
     content = config.model_dump(by_alias=True, exclude_unset=True, exclude={"bus"})
     if heading == "none":

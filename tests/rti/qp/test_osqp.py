@@ -9,7 +9,7 @@ import pytest
 
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
-from rti_mpc.rti.qp.osqp import STATUS, SolverSettings
+from rti_mpc.rti.qp.osqp import STATUS_BY_OSQP_CODE, SolverSettings
 from rti_mpc.rti.rti import FORMULATIONS, Rti
 from tests.problems import beacon, double_integrator, solve
 
@@ -28,7 +28,7 @@ def test_inner_object_of_osqp_offers_what_is_driven() -> None:
         assert callable(getattr(inner, name))
     codes = {"SOLVED": 1, "SOLVED_INACCURATE": 2, "PRIMAL_INFEASIBLE": 3, "DUAL_INFEASIBLE": 5, "MAX_ITER_REACHED": 7, "TIME_LIMIT_REACHED": 8}
     assert {name: int(osqp.SolverStatus[f"OSQP_{name}"]) for name in codes} == codes
-    assert set(codes.values()) <= set(STATUS)
+    assert set(codes.values()) <= set(STATUS_BY_OSQP_CODE)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

@@ -63,6 +63,6 @@ def test_a_bound_that_gives_way_is_told(tmp_path: Path, monkeypatch: pytest.Monk
     """The penalty that holds what is at its bound, too soft by far: the reference in a wave never touches one."""
     path = tmp_path / "robot.toml"
     path.write_text(CART)
-    monkeypatch.setattr("rti_mpc.rti.active_set.PATH", (10.0,))
+    monkeypatch.setattr("rti_mpc.rti.active_set.PENALTY_PATH", (10.0,))
     report = check.check(load(path))
     assert not report.agree or sum(report.statuses.values()) > report.statuses[QpStatus.SOLVED]

@@ -14,7 +14,7 @@ from rti_mpc.contract.status import QpStatus
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.errors import ConfigError
 from rti_mpc.reference.trajectory import circle
-from rti_mpc.rti.ocp import VALUES
+from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.build import build_ocp, build_rti
@@ -173,7 +173,7 @@ def test_problem_after_changes_is_the_one_its_file_would_have_built(tmp_path: An
     _, before = changed(config, built, {"ocp.bounds.soft_weight": 9.0, "ocp.weights.Q.x": 5.0})
     now, ocp = changed(config, before, CHANGES)
     wanted = build_ocp(now)
-    for name in VALUES:
+    for name in WEIGHTS_AND_BOUNDS:
         np.testing.assert_array_equal(getattr(ocp, name), getattr(wanted, name), err_msg=name)
     assert ocp.model is built.model
     assert ocp.h_expr is built.h_expr

@@ -17,7 +17,7 @@ from rti_mpc.wire.cdr import encode, encoding
 from rti_mpc.wire.info import Info
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
-from rti_mpc.wire.streams import MAX_UNKNOWN_ROLES, ROLES
+from rti_mpc.wire.streams import KNOWN_ROLES, MAX_UNKNOWN_ROLES
 from rti_mpc_service.view.listener import Listener
 
 
@@ -63,12 +63,12 @@ def sources(listener: Listener) -> list[str]:
 
 def test_invented_roles_take_no_place_of_those_that_everybody_knows(bus: ListBus, listener: Listener) -> None:
     invented = [f"role_{k}" for k in range(70)]
-    for role in (*invented, *ROLES):
+    for role in (*invented, *KNOWN_ROLES):
         bus.say(role)
-    assert sources(listener) == [*invented[:MAX_UNKNOWN_ROLES], *(role for role in ROLES if role != "viewer")]
-    for role in (*invented[::-1], *ROLES):
+    assert sources(listener) == [*invented[:MAX_UNKNOWN_ROLES], *(role for role in KNOWN_ROLES if role != "viewer")]
+    for role in (*invented[::-1], *KNOWN_ROLES):
         bus.say(role, seq=2)
-    assert set(sources(listener)) == {*invented[:MAX_UNKNOWN_ROLES], *ROLES} - {"viewer"}
+    assert set(sources(listener)) == {*invented[:MAX_UNKNOWN_ROLES], *KNOWN_ROLES} - {"viewer"}
 
 
 def test_events_are_of_whom_their_key_names(bus: ListBus, listener: Listener) -> None:
