@@ -8,10 +8,10 @@ import logging
 from rti_mpc.contract.message import Notice, Severity
 from rti_mpc.wire.announcer import Announcer
 
-LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
+LOG_LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
 
 
 def announce(log: logging.Logger, announcer: Announcer, notice: Notice, stamp_ns: int) -> None:
     """Publish and log a notice, with a time of the robot; neither, where it is a fault that just was."""
     if announcer.say(notice, stamp_ns):
-        log.log(LEVELS[notice.severity], "%s", notice.text)
+        log.log(LOG_LEVELS[notice.severity], "%s", notice.text)

@@ -323,10 +323,11 @@ def bench(
     if problem:
         from rti_mpc_service.bench import family_bench
 
-        raise typer.Exit(family_bench.main(problem, horizon or (), solver or family_bench.SOLVERS, quick=quick, path=path))
-    from rti_mpc_service.bench.bench import HORIZONS, main
+        raise typer.Exit(family_bench.main(problem, horizon or (), solver or family_bench.DEFAULT_SOLVERS, quick=quick, path=path))
+    from rti_mpc_service.bench.bench import DEFAULT_HORIZONS, main
 
-    raise typer.Exit(main(tuple(horizon or HORIZONS), solvers=tuple(solver or ()), interpreted=interpreted, quick=quick, costs=costs, path=path))
+    horizons, solvers = tuple(horizon or DEFAULT_HORIZONS), tuple(solver or ())
+    raise typer.Exit(main(horizons, solvers=solvers, interpreted=interpreted, quick=quick, costs=costs, path=path))
 
 
 @app.command()

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from rich.console import Console
 
-WIDTH = 140  # columns; a narrower terminal wraps lines, which loses nothing, where a narrower table cuts numbers off
+MIN_WIDTH_COLUMNS = 140  # a narrower terminal wraps lines, which loses nothing; a narrower table would cut numbers off
 
 
 def table_console() -> Console:
-    """Return a console of at least `WIDTH` columns."""
+    """Return a console of at least `MIN_WIDTH_COLUMNS` columns."""
     console = Console()
-    return console if console.width >= WIDTH else Console(width=WIDTH)
+    return console if console.width >= MIN_WIDTH_COLUMNS else Console(width=MIN_WIDTH_COLUMNS)

@@ -27,13 +27,13 @@ from typing import Any, NoReturn
 
 from rti_mpc.errors import RtiMpcError, Stopped
 
-REFUSED = 2  # exit status: bad input, which no restart mends
-FAILED = 1  # exit status: all else that went wrong
-BY_SIGNAL = 128  # exit status of a process that a signal has ended, less the signal's number
-END_S = 1.0  # to write at the end what still waits to be written, at most
-MAX_LINE = 2000  # characters
-CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
-EXTRAS = {"rerun": "view", "rerun_cli": "view", "matplotlib": "figure"}  # what a robot's own installation leaves out
+EXIT_REFUSED = 2  # bad input, which a restart does not repair
+EXIT_FAILED = 1  # every other failure
+EXIT_BY_SIGNAL = 128  # plus the signal's number: ended by a signal
+END_TIMEOUT_S = 1.0  # for writing buffered output at the end
+MAX_LINE_CHARACTERS = 2000  # of an error message
+CONTROL_CHARACTER = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+EXTRA_OF_MODULE = {"rerun": "view", "rerun_cli": "view", "matplotlib": "figure"}  # optional dependencies, which a robot does not need
 
 
 class OutputError(Exception):
@@ -97,45 +97,45 @@ def status_of(steps: Iterable[Callable[[], object]]) -> int:
             for step in steps:
                 step()
         except SystemExit as asked:
-            status = asked.code if isinstance(asked.code, int) else FAILED if asked.code else 0
+            status = asked.code if isinstance(asked.code, int) else EXIT_FAILED if asked.code else 0
         sys.stdout.flush()
         return status
     except KeyboardInterrupt:  # before it could be answered
-        return BY_SIGNAL + signal.SIGINT
+        return EXIT_BY_SIGNAL + signal.SIGINT
     except Stopped:
         return 0
     except OutputError as error:
         if error.errno == errno.EPIPE:  # whoever reads has read enough
-            return BY_SIGNAL + signal.SIGPIPE
+            return EXIT_BY_SIGNAL + signal.SIGPIPE
         say(str(error))
-        return FAILED
+        return EXIT_FAILED
     except RtiMpcError as error:
         say(str(error))
-        return REFUSED
+        return EXIT_REFUSED
     except ModuleNotFoundError as error:
-        if error.name not in EXTRAS:
+        if error.name not in EXTRA_OF_MODULE:
             traceback.print_exc()
-            return FAILED
-        say(f"{error.name} must be installed for this command: pip install 'rti-mpc[{EXTRAS[error.name]}]'")
-        return REFUSED
+            return EXIT_FAILED
+        say(f"{error.name} must be installed for this command: pip install 'rti-mpc[{EXTRA_OF_MODULE[error.name]}]'")
+        return EXIT_REFUSED
     except Exception:
         with suppress(OSError):
             traceback.print_exc()
-        return FAILED
+        return EXIT_FAILED
 
 
 def say(text: str) -> None:
     """Print one line to standard error, if anybody takes it; characters that steer a terminal are written as escapes."""
-    line = CONTROL.sub(lambda match: ascii(match[0])[1:-1], text[:MAX_LINE])
+    line = CONTROL_CHARACTER.sub(lambda match: ascii(match[0])[1:-1], text[:MAX_LINE_CHARACTERS])
     with suppress(OSError):
         print(f"rti-mpc: {line}", file=sys.stderr, flush=True)
 
 
 def end(status: int) -> NoReturn:
-    """End the process, once what still waits is written; within `END_S`, whoever may not take it."""
+    """End the process, once what still waits is written; within `END_TIMEOUT_S`, whoever may not take it."""
     writing = Thread(target=write_all, daemon=True)
     writing.start()
-    writing.join(END_S)
+    writing.join(END_TIMEOUT_S)
     os._exit(status)
 
 

@@ -36,8 +36,8 @@ from rti_mpc_service.latch_file import LatchFile
 from rti_mpc_service.operator_stop import OperatorStop
 
 ROLE = "guard"
-HEARING_S = 0.5  # for which a starting guard listens for another
-RAMP_S = 3.0  # of a guard that is being stopped, to bring the robot to rest, at most
+LISTEN_BEFORE_START_S = 0.5  # how long a starting guard listens for another one
+MAX_RAMP_S = 3.0  # how long a guard that is being stopped may take to bring the robot to rest
 
 log = logging.getLogger(ROLE)
 
@@ -62,8 +62,8 @@ def main(config: Config, bus_settings: BusSettings, *, state: Path | None = None
         raise ConfigError("guard.enabled must be true for the robot to take what a guard passes on, got false")
     stop = stop or stop_on_signals()
     with Bus.join(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
-        heard, intake = bus.subscriber(bus.keys.actuation, capacity=RING_MESSAGES), bus.intake(Command, HEARING_S, choosing=True)
-        if bus.is_alive(ROLE, HEARING_S):
+        heard, intake = bus.subscriber(bus.keys.actuation, capacity=RING_MESSAGES), bus.intake(Command, LISTEN_BEFORE_START_S, choosing=True)
+        if bus.is_alive(ROLE, LISTEN_BEFORE_START_S):
             print(f"rti-mpc: {config.robot} already has a guard: stop it first, or give this robot another name", file=sys.stderr)
             return 1
         known = max(unix_s() << NUMBER_BITS, intake.highest_epoch(heard.drain()))
@@ -74,7 +74,7 @@ def main(config: Config, bus_settings: BusSettings, *, state: Path | None = None
         return process.run(stop)
 
 
-def describe(config: Config) -> dict[str, object]:
+def guard_info(config: Config) -> dict[str, object]:
     """Describe a guard for ``info``: what it lets pass, per input; null where there is no limit."""
     limits, bounds = guard_limits(config), config.ocp.bounds
     return {
@@ -95,7 +95,7 @@ class Process:
         limits, keys = guard_limits(config), bus.keys
         self._bus = bus
         self._telling = Lock()
-        self._about = {**describe(config), "epoch": epoch}
+        self._about = {**guard_info(config), "epoch": epoch}
         self._guard = Guard(limits, epoch=epoch, config_hash=config.config_hash)
         self._tick_s = config.guard.tick_s
         self._lock = Lock()
@@ -107,8 +107,8 @@ class Process:
         self._commands = bus.intake(Command, config.stale_s, {"u": len(limits.u_rest)})
         self._operator_stop = OperatorStop(file, self._obey, self._guard.notices.append)
         self._operator_stop.listen(bus)
-        self._operator_stop.serve(bus, lambda: ROLE, self._describe)
-        self._describe()
+        self._operator_stop.serve(bus, lambda: ROLE, self._publish_info)
+        self._publish_info()
         self._threads = [
             Thread(target=self._follow, args=(act, bus.subscriber(key, capacity=RING_MESSAGES)), name=act.__name__, daemon=True)
             for act, key in ((self._state, keys.state), (self._command, keys.command))
@@ -124,7 +124,7 @@ class Process:
             self._tick()
         with self._lock:
             self._guard.stop(time.monotonic_ns())
-        deadline_s = time.monotonic() + RAMP_S
+        deadline_s = time.monotonic() + MAX_RAMP_S
         while not self._guard.at_rest and time.monotonic() < deadline_s:
             self._tick()
             time.sleep(self._tick_s)
@@ -141,10 +141,10 @@ class Process:
             else:
                 self._guard.enable()
 
-    def _describe(self) -> None:
+    def _publish_info(self) -> None:
         """Publish what this guard is."""
         with self._telling:
-            self._bus.publish_json(self._bus.keys.info(ROLE), {**self._about, **self._operator_stop.describe()})
+            self._bus.publish_json(self._bus.keys.info(ROLE), {**self._about, **self._operator_stop.latch_info()})
 
     def _state(self, received: Received) -> None:
         """Take a state in."""

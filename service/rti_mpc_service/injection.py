@@ -22,8 +22,8 @@ FAILURES = {
     "nan_model": "the model gives NaN",
     "over_budget": "a sample takes one and a half periods, of wall time",
 }
-PERIODS = 1.5  # that a sample over its budget takes
-MOST = 10_000  # samples of one request
+OVER_BUDGET_PERIODS = 1.5  # duration of a sample that exceeds its budget
+MAX_FAILING_SAMPLES = 10_000  # per request
 
 
 class FaultyRti(Rti):
@@ -38,8 +38,8 @@ class FaultyRti(Rti):
         failure, samples = request.get("failure"), request.get("samples", 1)
         if failure not in FAILURES:
             return {"ok": False, "error": f"failure must be one of {', '.join(FAILURES)}, got {failure!r}"}
-        if type(samples) is not int or not 1 <= samples <= MOST:
-            return {"ok": False, "error": f"samples must be a whole number from 1 to {MOST}, got {samples!r}"}
+        if type(samples) is not int or not 1 <= samples <= MAX_FAILING_SAMPLES:
+            return {"ok": False, "error": f"samples must be a whole number from 1 to {MAX_FAILING_SAMPLES}, got {samples!r}"}
         self._failure, self._left = failure, samples
         return {"ok": True, "request": "inject", "failure": failure, "samples": samples}
 
@@ -62,7 +62,7 @@ class FaultyRti(Rti):
     def feedback(self, x0: Array) -> QpStatus:
         """As `Rti.feedback`."""
         if self._failing == "over_budget":
-            time.sleep(PERIODS * self.ocp.dt)
+            time.sleep(OVER_BUDGET_PERIODS * self.ocp.dt)
         return super().feedback(x0)
 
     def solve(self) -> QpStatus:

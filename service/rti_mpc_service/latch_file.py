@@ -23,10 +23,10 @@ from rti_mpc.errors import MessageError
 from rti_mpc.wire import document
 from rti_mpc.wire.keys import Keys
 
-VERSION = 1
-MAX_BYTES = 4096  # of a file: more is none of ours
-LOCK_S = 5.0  # to wait for others that write: each syncs a file and a folder, which a busy disk holds up
-NOWHERE = "no folder is known for it: neither --state, $STATE_DIRECTORY, $XDG_STATE_HOME nor $HOME says where"
+FILE_VERSION = 1
+MAX_FILE_BYTES = 4096  # a larger file is not a latch file
+LOCK_TIMEOUT_S = 5.0  # other writers hold the lock while they sync a file and a folder, which takes long on a busy disk
+NO_FOLDER = "no folder is known for it: neither --state, $STATE_DIRECTORY, $XDG_STATE_HOME nor $HOME says where"
 
 
 def state_folder() -> Path | None:
@@ -79,12 +79,12 @@ class LatchFile:
             OSError: It cannot be stored.
         """
         if self.path is None:
-            raise OSError(0, NOWHERE)
+            raise OSError(0, NO_FOLDER)
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
             lock(folder)
-            content = json.dumps({"version": VERSION, **asdict(max(latch, self.read()[0]))})
+            content = json.dumps({"version": FILE_VERSION, **asdict(max(latch, self.read()[0]))})
             beside = self.path.with_name(f"{self.path.name}.tmp")
             beside.unlink(missing_ok=True)  # of a process that was killed while it wrote
             with beside.open("xb") as file:
@@ -99,7 +99,7 @@ class LatchFile:
     def obstacle(self) -> str:
         """Return why nothing can be stored, as far as it is known without trying; empty if it is not."""
         if self.path is None:
-            return NOWHERE
+            return NO_FOLDER
         there = next(folder for folder in self.path.parents if folder.exists())
         if not there.is_dir():
             return f"{there} must be a folder"
@@ -110,12 +110,12 @@ class LatchFile:
             return Latch()
         descriptor = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe of that name holds nobody up
         try:
-            payload = os.read(descriptor, MAX_BYTES + 1)
+            payload = os.read(descriptor, MAX_FILE_BYTES + 1)
         finally:
             os.close(descriptor)
-        content = document.read(payload, most=MAX_BYTES)
-        if content.get("version") != VERSION:
-            raise MessageError(f"must be of version {VERSION}, got {shown(content.get('version'))}")
+        content = document.read(payload, most=MAX_FILE_BYTES)
+        if content.get("version") != FILE_VERSION:
+            raise MessageError(f"must be of version {FILE_VERSION}, got {shown(content.get('version'))}")
         return read_latch(content)
 
 
@@ -126,11 +126,11 @@ def lock(folder: int) -> None:
     Raises:
         TimeoutError: Somebody else does for too long.
     """
-    deadline_s = time.monotonic() + LOCK_S
+    deadline_s = time.monotonic() + LOCK_TIMEOUT_S
     while True:
         try:
             return fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             if time.monotonic() > deadline_s:
-                raise TimeoutError(0, f"another process has held the lock of the folder for {LOCK_S:g} s") from None
+                raise TimeoutError(0, f"another process has held the lock of the folder for {LOCK_TIMEOUT_S:g} s") from None
             time.sleep(0.01)

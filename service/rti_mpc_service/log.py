@@ -12,8 +12,8 @@ from contextlib import suppress
 from queue import Full, Queue
 from threading import Thread
 
-MAX_LINES = 1000  # lines
-CLOSE_S = 0.5  # to write at the end what still waits, at most
+MAX_WAITING_LINES = 1000  # lines that wait to be written; further ones are dropped
+CLOSE_TIMEOUT_S = 0.5  # for writing the waiting lines at the end
 
 
 class JsonLines(logging.Formatter):
@@ -39,7 +39,7 @@ class Aside(logging.Handler):
     def __init__(self, descriptor: int) -> None:
         super().__init__()
         self._descriptor = descriptor
-        self._lines: Queue[tuple[int, str] | None] = Queue(MAX_LINES)  # each with how many before it were dropped
+        self._lines: Queue[tuple[int, str] | None] = Queue(MAX_WAITING_LINES)  # each with how many before it were dropped
         self._dropped = 0  # since the last one that was not
         self._thread = Thread(target=self._write, name="log", daemon=True)
         self._thread.start()
@@ -57,8 +57,8 @@ class Aside(logging.Handler):
     def close(self) -> None:
         """Wait until all is written, within a bounded time."""
         with suppress(Full):
-            self._lines.put(None, timeout=CLOSE_S)
-            self._thread.join(CLOSE_S)
+            self._lines.put(None, timeout=CLOSE_TIMEOUT_S)
+            self._thread.join(CLOSE_TIMEOUT_S)
         super().close()
 
     def _write(self) -> None:

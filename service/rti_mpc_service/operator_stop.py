@@ -23,11 +23,11 @@ from rti_mpc.wire import info
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received
 from rti_mpc_service.latch_file import LatchFile
 
-REQUESTS = ("stop", "enable")
-OPERATOR = "an operator"
-MAX_NAME = 100  # characters of who asks
-STORING_S = 0.5  # that an answer waits for the disk
-RETRY_S = 10.0  # between two attempts to store
+STOP_REQUESTS = ("stop", "enable")
+UNNAMED_OPERATOR = "an operator"
+MAX_NAME_CHARACTERS = 100  # of the operator's name
+STORE_TIMEOUT_S = 0.5  # how long an answer waits for the disk
+STORE_RETRY_S = 10.0  # period of further attempts to store
 
 log = logging.getLogger("stop")
 
@@ -68,7 +68,7 @@ class OperatorStop:
         self._attempted = self.latch
         Thread(target=self._store, name="stop_stored", daemon=True).start()
 
-    def describe(self) -> dict[str, Any]:
+    def latch_info(self) -> dict[str, Any]:
         """Return the latch as a part of the description of this process."""
         return info.latch(asdict(self.latch))
 
@@ -108,16 +108,16 @@ class OperatorStop:
             MessageError: Its latch is none.
         """
         what = request.get("request")
-        if what not in REQUESTS:
+        if what not in STOP_REQUESTS:
             raise ConfigError(f"request must be stop or enable, got {shown(what)}")
         if "latch" in request:
             self.hear(read_latch(request["latch"]))
         else:
-            by = request.get("by", OPERATOR)
-            if not (isinstance(by, str) and 0 < len(by) <= MAX_NAME and by.isprintable()):
-                raise ConfigError(f"by must be printable, of at most {MAX_NAME} characters, got {shown(by)}")
-            self._take(lambda known: known.change(stopped=what == "stop", reason=f"asked for by {by}", when=now()))
-        fault = self._stored(STORING_S)
+            by = request.get("by", UNNAMED_OPERATOR)
+            if not (isinstance(by, str) and 0 < len(by) <= MAX_NAME_CHARACTERS and by.isprintable()):
+                raise ConfigError(f"by must be printable, of at most {MAX_NAME_CHARACTERS} characters, got {shown(by)}")
+            self._take(lambda known: known.change(stopped=what == "stop", reason=f"asked for by {by}", when=utc_now()))
+        fault = self._stored(STORE_TIMEOUT_S)
         latch = self.latch
         answer = {"ok": latch.stopped == (what == "stop"), "request": what, "role": self._role(), "latch": asdict(latch)}
         if not answer["ok"]:
@@ -130,7 +130,7 @@ class OperatorStop:
 
     def close(self) -> None:
         """Give the disk the time it needs, up to a limit."""
-        self._stored(STORING_S)
+        self._stored(STORE_TIMEOUT_S)
 
     def _take(self, change: Callable[[Latch], Latch]) -> None:
         """Obey a change, then tell it, then have it stored."""
@@ -169,7 +169,7 @@ class OperatorStop:
         """Store what changes, and try again what could not be."""
         while True:
             with self._storing:
-                self._storing.wait_for(lambda: self._attempted < self.latch, RETRY_S if self._fault else None)
+                self._storing.wait_for(lambda: self._attempted < self.latch, STORE_RETRY_S if self._fault else None)
             latch, before, fault = self.latch, self._fault, ""
             try:
                 self._file.write(latch)
@@ -184,6 +184,6 @@ class OperatorStop:
                 self._say(Notice(Severity.INFO, "stop_stored", f"{latch} is stored now, in {self._file.path}"))
 
 
-def now() -> str:
+def utc_now() -> str:
     """Return UTC time as a latch holds it."""
     return f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"

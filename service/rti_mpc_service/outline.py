@@ -7,7 +7,9 @@ import numpy as np
 
 from rti_mpc.array import Array
 
-A = 0.2  # [m], the Pioneer's point ahead of its axle, as in `rti_mpc.model.robots.pioneer_3dx`
+AXLE_OFFSET_M = 0.2  # of the Pioneer's point x, y ahead of its axle, as in `rti_mpc.model.robots.pioneer_3dx`
+
+# Corners (x ahead, y to the left), in m, from the middle of the axle.
 
 PIONEER_BODY = [(0.2, 0.09), (0.13, 0.14), (-0.19, 0.14), (-0.255, 0.08), (-0.255, -0.08), (-0.19, -0.14), (0.13, -0.14), (0.2, -0.09)]
 PIONEER_WHEEL = [(0.0975, 0.145), (-0.0975, 0.145), (-0.0975, 0.19), (0.0975, 0.19)]
@@ -27,7 +29,7 @@ def outline(model: str) -> list[Array]:
         Polygons in m, x ahead and y to the left, each of shape ``(M, 2)``.
     """
     parts = OUTLINES.get(model)
-    return [np.array(ARROW)] if parts is None else [np.array(part) - (A, 0.0) for part in parts]
+    return [np.array(ARROW)] if parts is None else [np.array(part) - (AXLE_OFFSET_M, 0.0) for part in parts]
 
 
 def placed(polygon: Array, x: float, y: float, psi: float) -> Array:

@@ -28,9 +28,9 @@ from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 
 ROLE = "reference"
-LOOK_S = 0.02  # between two looks at the robot: waking for every state would take a core from those who control
-LOOK_AGAIN_NS = 500_000_000  # after which it is looked whether the robot was restarted
-STALE_S = 1.0  # silence of the robot, and time for which another one is heard alone, after which the reference is anchored to that one
+LOOK_PERIOD_S = 0.02  # period of reading states: waking at every state would take processor time from the controller
+RESTART_CHECK_NS = 500_000_000  # period of checking whether the robot was restarted
+STALE_S = 1.0  # silence of the robot, and time for which only another one is heard, before the reference is anchored to that one
 
 logger = logging.getLogger(ROLE)
 
@@ -77,7 +77,7 @@ def main(
         source = ReferenceSource(bus, trajectory, y, p, round(1e9 * period_s))
         bus.alive(ROLE)
         logger.info("%s, heading %s, for %s", trajectory.name, heading, keys.robot)
-        while not stop.wait(LOOK_S):
+        while not stop.wait(LOOK_PERIOD_S):
             source.look()
     return source.anchored
 
@@ -124,7 +124,7 @@ class ReferenceSource:
                 self._anchor(state.stamp_ns)
         if state is not None and self._lives.rival is None:
             self._states = None
-            self._look_again_ns = now_ns + LOOK_AGAIN_NS
+            self._look_again_ns = now_ns + RESTART_CHECK_NS
         for notice in self._intake.notices(now_ns):
             self._announcer.say(notice, 0 if state is None else state.stamp_ns)
 

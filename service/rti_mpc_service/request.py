@@ -21,10 +21,10 @@ from rti_mpc.wire.bus import RETRY_INTERVAL_S, Bus, BusSettings
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.config import toml
 from rti_mpc_service.latch_file import LatchFile
-from rti_mpc_service.operator_stop import MAX_NAME, now
+from rti_mpc_service.operator_stop import MAX_NAME_CHARACTERS, utc_now
 
-ASKED_S = 0.7  # until a stop is asked for again: who acts may hang, and another take over
-GUARD, LEADER = "guard", "controller"  # roles of those who may act
+REPEAT_AFTER_S = 0.7  # period at which a request is repeated: the acting process may hang, and another one take over
+GUARD, LEADER = "guard", "controller"  # roles that can act on a stop
 
 
 def main(bus_settings: BusSettings, keys: Keys, request: str, timeout_s: float, **details: Any) -> int:
@@ -82,12 +82,12 @@ def stop_or_enable(bus_settings: BusSettings, keys: Keys, what: str, timeout_s: 
     acting = GUARD if guarded else LEADER
     try:
         with Bus.join(bus_settings, keys, timeout_s=timeout_s) as bus:
-            for answer in asked_again(bus, {"request": what, "by": operator()}, timeout_s):
+            for answer in ask_repeatedly(bus, {"request": what, "by": operator()}, timeout_s):
                 answers[str(answer.get("role", "somebody"))] = answer
                 if answers.get(acting, {}).get("ok") is True:
                     break
     except ConfigError as error:  # no router, for one
-        raise ConfigError(f"{error}; nobody was asked to {what}; {noted(LatchFile(keys, state), what)}") from error
+        raise ConfigError(f"{error}; nobody was asked to {what}; {note_for_later(LatchFile(keys, state), what)}") from error
     confirmed = [role for role, answer in answers.items() if answer.get("ok") is True]
     if acting in confirmed:
         print(json.dumps(answers[acting]))
@@ -97,30 +97,30 @@ def stop_or_enable(bus_settings: BusSettings, keys: Keys, what: str, timeout_s: 
     print(
         f"rti-mpc: {keys.robot}: the {acting} has not confirmed {what} within {timeout_s:g} s; {' and '.join(confirmed) or 'nobody'} has",
         *(f"{role}: {answer['error']}" for role, answer in answers.items() if "error" in answer),
-        *([] if answers else [noted(LatchFile(keys, state), what)]),
+        *([] if answers else [note_for_later(LatchFile(keys, state), what)]),
         sep="; ",
         file=sys.stderr,
     )
     return 1
 
 
-def asked_again(bus: Bus, request: dict[str, Any], timeout_s: float) -> Iterator[dict[str, Any]]:
+def ask_repeatedly(bus: Bus, request: dict[str, Any], timeout_s: float) -> Iterator[dict[str, Any]]:
     """Yield answers to one request, which is asked again until the time is over; those who know of it by then are not to do it twice."""
     deadline_s = time.monotonic() + timeout_s
     latch = Latch()
     while (left_s := deadline_s - time.monotonic()) > 0.0:
         again = {"latch": asdict(latch)} if latch.counter else {}
-        for answer in bus.answers(bus.keys.stop, request | again, min(ASKED_S, left_s)):
+        for answer in bus.answers(bus.keys.stop, request | again, min(REPEAT_AFTER_S, left_s)):
             yield answer
             with suppress(MessageError):
                 latch = max(latch, read_latch(answer.get("latch")))
         time.sleep(min(RETRY_INTERVAL_S, left_s))
 
 
-def noted(file: LatchFile, what: str) -> str:
+def note_for_later(file: LatchFile, what: str) -> str:
     """Note what nobody has confirmed for those who are started later, and say so."""
     latch, _ = file.read()
-    changed = latch.change(stopped=what == "stop", reason=f"asked for by {operator()}", when=now())
+    changed = latch.change(stopped=what == "stop", reason=f"asked for by {operator()}", when=utc_now())
     try:
         if changed != latch or file.path is None:
             file.write(changed)
@@ -135,7 +135,7 @@ def operator() -> str:
         name = getpass.getuser()
     except (KeyError, OSError):  # no name for this user
         name = str(os.getuid())
-    return f"{name}@{socket.gethostname()}"[:MAX_NAME]
+    return f"{name}@{socket.gethostname()}"[:MAX_NAME_CHARACTERS]
 
 
 def params(bus_settings: BusSettings, keys: Keys, words: Sequence[str], timeout_s: float) -> int:
@@ -156,7 +156,7 @@ def params(bus_settings: BusSettings, keys: Keys, words: Sequence[str], timeout_
     """
     action, *wanted = words
     if action == "set":
-        return main(bus_settings, keys, "params", timeout_s, set=assigned(wanted))
+        return main(bus_settings, keys, "params", timeout_s, set=parse_assignments(wanted))
     if action != "get":
         raise ConfigError(f"params must be followed by get or set, got {action}")
     answer = ask(bus_settings, keys, {"request": "params", "get": True}, timeout_s)
@@ -172,7 +172,7 @@ def params(bus_settings: BusSettings, keys: Keys, words: Sequence[str], timeout_
     return 0
 
 
-def assigned(assignments: Sequence[str]) -> dict[str, Any]:
+def parse_assignments(assignments: Sequence[str]) -> dict[str, Any]:
     """
     Read ``KEY=VALUE`` as a line of TOML each.
 

@@ -8,13 +8,13 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.rti.rti import Rti
 
-WARM_UP = 20  # solves before the first command: the first real sample is not the first call
+WARM_UP_SOLVES = 20  # before the first command: the first real sample must not be the first call
 
 
 def warm_up(rti: Rti) -> None:
     """Solve a few samples at rest."""
     x0: Array = np.zeros(rti.ocp.model.nx)
     rti.reset(x0, rti.u_prev.copy())
-    for _ in range(WARM_UP):
+    for _ in range(WARM_UP_SOLVES):
         rti.prepare(rti.y_ref.copy())
         rti.feedback(x0)

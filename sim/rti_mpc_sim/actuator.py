@@ -19,7 +19,7 @@ from rti_mpc.contract.message import Command
 from rti_mpc.contract.schedule import NO_COMMAND, Schedule, end_ns, unfit
 from rti_mpc.wire.source import Source
 
-EARLY_NS = 250_000_000  # by which a state that is answered may be ahead of the robot's clock: a guard knows that clock no better
+MAX_EARLY_NS = 250_000_000  # how far the stamp of an answered state may be ahead of the robot's clock, which a guard knows no better
 STALE_NS = 250_000_000  # silence after which another controller may take over, even one of a lower epoch
 
 
@@ -98,7 +98,7 @@ class Actuator:
         Returns:
             The reason for refusing it, empty if it was taken.
         """
-        early = command.state_stamp_ns > arrival_ns + EARLY_NS
+        early = command.state_stamp_ns > arrival_ns + MAX_EARLY_NS
         arrival_ns += self._delay_ns
         reason = "switched_off" if self._off else unfit(command, len(self.u), self._robot_epoch) or ("early" if early else "")
         start_ns = max(command.stamp_ns, arrival_ns)

@@ -9,8 +9,8 @@ from threading import Event
 
 from rti_mpc.errors import ConfigError
 
-LAST_NS = 200_000  # of a wait: sleeps end up to 0.1 ms late, so the last bit is not slept
-SLICE_S = 0.05  # between two looks at `stop`
+UNSLEPT_END_NS = 200_000  # last part of a wait, polled and not slept: sleeps end up to 0.1 ms late
+MAX_SLEEP_S = 0.05  # `stop` is checked at least this often
 
 
 class Clock:
@@ -42,7 +42,7 @@ class Clock:
             left_ns = deadline_ns - time.monotonic_ns()
             if left_ns <= 0:
                 return
-            time.sleep(min(SLICE_S, 1e-9 * max(0, left_ns - LAST_NS)))
+            time.sleep(min(MAX_SLEEP_S, 1e-9 * max(0, left_ns - UNSLEPT_END_NS)))
 
     def set_back(self, robot_ns: int) -> int:
         """Make it a past robot time now; return by how much wall time, in ns."""

@@ -20,7 +20,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, State
 from rti_mpc_sim.actuator import Actuator, Counters
 from rti_mpc_sim.plant import Plant
-from rti_mpc_sim.sensor import NOTHING, Sensor
+from rti_mpc_sim.sensor import UNREPORTED, Sensor
 from rti_mpc_sim.settings import RobotSettings
 
 
@@ -84,7 +84,7 @@ class Lockstep:
             return None
         self._next_ns = (self.now_ns // self.period_ns + 1) * self.period_ns
         actuator = self.actuator
-        acting = (actuator.u, *actuator.source) if self._reports_inputs else NOTHING
+        acting = (actuator.u, *actuator.source) if self._reports_inputs else UNREPORTED
         return self.sensor.measure(self.x, self.now_ns, *acting)
 
     def tick(self) -> State:

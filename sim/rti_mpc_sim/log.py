@@ -22,7 +22,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.model.model import Model
 from rti_mpc_sim.actuator import Counters
 
-PATIENCE_NS = 1_000_000_000  # monotonic: a state not answered by then stays without an answer
+ANSWER_TIMEOUT_NS = 1_000_000_000  # by the monotonic clock: later answers to a state are not recorded
 
 
 @dataclass(slots=True)
@@ -74,7 +74,7 @@ class Log:
         """Write the lines, in order, up to the first that may still be answered."""
         while self._lines:
             seq, line = next(iter(self._lines.items()))
-            if line.command_seq is None and monotonic_ns - line.measured_ns < PATIENCE_NS:
+            if line.command_seq is None and monotonic_ns - line.measured_ns < ANSWER_TIMEOUT_NS:
                 return
             del self._lines[seq]
             self._writer.writerow([*line.before, line.command_seq, line.latency_us, *line.after])

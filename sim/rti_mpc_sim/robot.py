@@ -32,16 +32,16 @@ from rti_mpc.wire.info import labels
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Key, Keys
 from rti_mpc_sim.actuator import STALE_NS, Counters
-from rti_mpc_sim.clock import SLICE_S, Clock
+from rti_mpc_sim.clock import MAX_SLEEP_S, Clock
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.log import Log
 from rti_mpc_sim.settings import RobotSettings
 
 ROLE = "robot"
-STANDING = 1e-6  # change of the state in a period, in any unit, below which the robot stands
-COAST_NS = 10_000_000_000  # robot time after which it is taken to stand anyway
-HEARING_S = 0.5  # for which a starting robot listens for another one of its name
-LEASE_S = 2.0  # after which the presence of a process that was killed, or hangs, has ended
+STANDSTILL_CHANGE = 1e-6  # the robot stands if no state changes by more in a period, in any unit
+MAX_COAST_NS = 10_000_000_000  # robot time after which it counts as standing in any case
+LISTEN_BEFORE_START_S = 0.5  # how long a starting robot listens for another one of its name
+PRESENCE_LEASE_S = 2.0  # time after which the presence of a process that was killed or hangs has ended
 
 logger = logging.getLogger(ROLE)
 
@@ -97,7 +97,7 @@ def main(
         robot = Robot(settings, bus, keys.actuation if guarded else keys.command, speed, log)
         life = {"role": ROLE, "epoch": robot.body.epoch, "speed": speed, "state_period_s": settings.state_period_s}
         life |= {"reports_inputs": settings.reports_inputs, "approaches": settings.increments is not None}
-        bus.publish_json(keys.info(ROLE), {**describe(settings.model), **(info or {}), **life})
+        bus.publish_json(keys.info(ROLE), {**model_info(settings.model), **(info or {}), **life})
         bus.alive(ROLE)
         logger.info("epoch %d of %s, %s, at %g times real speed", robot.body.epoch, keys.robot, settings.model.name, speed)
         gc.collect()
@@ -108,19 +108,19 @@ def main(
 
 def wait_for_another(bus: Bus, stop: Event) -> None:
     """Wait until no other robot of this name is present, for one lease at most: either it was killed and is about to vanish, or it lives."""
-    if not bus.is_alive(ROLE, HEARING_S):
+    if not bus.is_alive(ROLE, LISTEN_BEFORE_START_S):
         return
-    logger.warning("another robot is present as %s: waiting for at most %g s until it is gone", bus.keys.robot, LEASE_S)
-    deadline_s = time.monotonic() + LEASE_S
+    logger.warning("another robot is present as %s: waiting for at most %g s until it is gone", bus.keys.robot, PRESENCE_LEASE_S)
+    deadline_s = time.monotonic() + PRESENCE_LEASE_S
     while not stop.is_set() and time.monotonic() < deadline_s:
-        if not bus.is_alive(ROLE, SLICE_S):
+        if not bus.is_alive(ROLE, MAX_SLEEP_S):
             logger.info("the other robot is gone")
             return
-        stop.wait(SLICE_S)
+        stop.wait(MAX_SLEEP_S)
     logger.warning("two robots use the name %s: stop one of them, or give it another name", bus.keys.robot)
 
 
-def describe(model: Model) -> dict[str, Any]:
+def model_info(model: Model) -> dict[str, Any]:
     """Describe a model for ``info``."""
     return {
         "version": rti_mpc.__version__,
@@ -172,9 +172,9 @@ class Robot:
         """Ramp to rest, coast until the robot stands, send that state, and sum up."""
         body = self.body
         body.actuator.switch_off()
-        deadline_ns, x = body.now_ns + COAST_NS, np.full_like(body.x, np.inf)
+        deadline_ns, x = body.now_ns + MAX_COAST_NS, np.full_like(body.x, np.inf)
         last = None
-        while body.now_ns < deadline_ns and not (body.actuator.at_rest and np.abs(body.x - x).max() < STANDING):
+        while body.now_ns < deadline_ns and not (body.actuator.at_rest and np.abs(body.x - x).max() < STANDSTILL_CHANGE):
             x[:] = body.x
             self._advance(body.due_ns)
             last = body.sensor.take(body.now_ns) or last

@@ -10,7 +10,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.message import State
 
-NOTHING: tuple[Array, int, int] = (np.zeros(0), 0, 0)  # told of what acts
+UNREPORTED: tuple[Array, int, int] = (np.zeros(0), 0, 0)  # input, command epoch and number of a state that reports no inputs
 
 
 class Sensor:
@@ -47,7 +47,7 @@ class Sensor:
         """When the next state on the way is due; far in the future if there is none."""
         return self._on_the_way[0].stamp_ns + self._delay_ns if self._on_the_way else 2**63
 
-    def measure(self, x: Array, stamp_ns: int, u: Array = NOTHING[0], command_epoch: int = 0, command_seq: int = 0) -> int:
+    def measure(self, x: Array, stamp_ns: int, u: Array = UNREPORTED[0], command_epoch: int = 0, command_seq: int = 0) -> int:
         """
         Measure.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rti_mpc_service.bench.bench import ENTRIES, main, measure
+from rti_mpc_service.bench.bench import DEFAULT_ENTRIES, main, measure_horizon
 
 SHORT = "CI" in os.environ  # to see that all of it runs: figures need a quiet machine, and `make bench`
 KEYS = {"N", "formulation", "solver", "compiled", "step_us", "prepare_us", "feedback_us", "ipopt_us", "speedup"}
@@ -21,7 +21,7 @@ def test_bench_prints_and_writes_a_row_for_each_contender_and_each_is_faster_tha
     assert main((7, 20), interpreted=True, quick=True, costs=True, path=path) == 0
     result = json.loads(path.read_text())
     assert {(row["N"], row["solver"], row["formulation"], row["compiled"]) for row in result} == {
-        (N, *entry, compiled) for N in (7, 20) for entry in ENTRIES for compiled in (True, False)
+        (N, *entry, compiled) for N in (7, 20) for entry in DEFAULT_ENTRIES for compiled in (True, False)
     }
     for row in result:
         assert row.keys() >= KEYS
@@ -35,12 +35,12 @@ def test_bench_prints_and_writes_a_row_for_each_contender_and_each_is_faster_tha
 @pytest.mark.parametrize(("N", "faster", "feedback_faster"), [(7, 40, 90), (20, 30, 60), (50, 17, 35), (100, 17, 35)])
 def test_step_is_as_much_faster_than_ipopt_as_promised(N: int, faster: float, feedback_faster: float) -> None:
     """Over all samples. On a quiet machine they are 1.5 to 7 times these; both sides of a ratio are interleaved, so that load spares it."""
-    (row,) = measure(N, entries=[("riccati", "simultaneous")], compiled=(True,), quick=SHORT, tick=lambda: None)
+    (row,) = measure_horizon(N, entries=[("riccati", "simultaneous")], compiled=(True,), quick=SHORT, tick=lambda: None)
     assert SHORT or (row["speedup"] > faster and row["feedback_speedup"] > feedback_faster), row
 
 
 @pytest.mark.benchmark
 def test_python_around_the_native_calls_is_little() -> None:
     """At most 15 % of a step at N = 20 on a quiet machine, 10 to 13 as measured; it is a difference of medians, and those of a busy one move."""
-    row, _ = measure(20, entries=ENTRIES[:2], compiled=(True,), quick=SHORT, tick=lambda: None)
+    row, _ = measure_horizon(20, entries=DEFAULT_ENTRIES[:2], compiled=(True,), quick=SHORT, tick=lambda: None)
     assert SHORT or row["python_us"] < 0.2 * row["step_us"]["p50"]

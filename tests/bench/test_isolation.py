@@ -81,7 +81,7 @@ def test_no_trouble_of_a_viewer_can_be_told_from_the_noise_of_the_machine(tmp_pa
     inside = {name: np.array([[sample.latency_us for sample in one] for one in blocks[name]]) for name in BLOCKS}
     outside = {name: np.array([[answered_us[sample.state_seq] for sample in one] for one in blocks[name]]) for name in BLOCKS}
     with capsys.disabled():
-        print(f"\n{machine.describe()}\n{ROUNDS} rounds of {len(BLOCKS)} blocks of {BLOCK} samples, {granted}")
+        print(f"\n{machine.machine_info()}\n{ROUNDS} rounds of {len(BLOCKS)} blocks of {BLOCK} samples, {granted}")
         for what, times in {"state in to command out": inside, "state sent to command received, at the robot": outside}.items():
             p99, spread = compared(times)
             print(f"{what}; two equal blocks differ in p99 by {spread:.1%}")

@@ -131,7 +131,7 @@ def test_command_takes_at_most_one_and_a_half_echoes_and_the_feedback(config: Co
     latency, echo = latency[np.isfinite(latency)], np.array(pings.round_trip_us[COLD:])
     allowed_us = 1.5 * np.median(echo) + np.median(feedback)
     with capsys.disabled():
-        print(f"\n{machine.describe()}")
+        print(f"\n{machine.machine_info()}")
         for name, values in {"state to command": latency, "bare echo": echo, "feedback": feedback, "preparation": prepare}.items():
             print(f"{name:16} {quantiles(values)}, {len(values)} samples")
         print(f"p50 of state to command is {np.median(latency) / allowed_us:.2f} of 1.5 echoes and the feedback, {allowed_us:.0f} us")

@@ -64,6 +64,6 @@ def test_what_real_time_is_worth_here(tmp_path: Path, capsys: pytest.CaptureFixt
                     robot.samples(COLD)
                     times[name, number].append(np.array([sample.latency_us for sample in robot.samples(BLOCK)]))
     with capsys.disabled():
-        print(f"\n{machine.describe()}\nstate in to command out, {ROUNDS} rounds of {BLOCK} samples")
+        print(f"\n{machine.machine_info()}\nstate in to command out, {ROUNDS} rounds of {BLOCK} samples")
         for (name, number), blocks in times.items():
             print(f"  {name:9} beside {number} that never rest  {quantiles(np.concatenate(blocks))}")

@@ -63,7 +63,7 @@ def test_no_request_costs_samples(tmp_path: Path, capsys: pytest.CaptureFixture[
     granted = next(line for line in said.splitlines() if "real time: " in line)
     answered_us = dict(zip(log.seq.tolist(), log.latency_us.tolist(), strict=True))
     with capsys.disabled():
-        print(f"\n{machine.describe()}\n{ROUNDS} rounds of {len(BLOCKS)} blocks of {BLOCK} samples, {granted}\n{dict(asker.answers)}")
+        print(f"\n{machine.machine_info()}\n{ROUNDS} rounds of {len(BLOCKS)} blocks of {BLOCK} samples, {granted}\n{dict(asker.answers)}")
         print("state sent to command received, at the robot; preparation")
         for name, each in blocks.items():
             times = np.array([[(answered_us[sample.state_seq], sample.prepare_us) for sample in one] for one in each])

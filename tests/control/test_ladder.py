@@ -12,7 +12,7 @@ from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.control.ladder import MAX_FALLBACK_SAMPLES, Ladder
 from rti_mpc.reference.trajectory import circle
 from rti_mpc.rti.qp.osqp import SolverSettings
-from rti_mpc_service.injection import FAILURES, MOST, FaultyRti, answer
+from rti_mpc_service.injection import FAILURES, MAX_FAILING_SAMPLES, FaultyRti, answer
 from rti_mpc_sim.lockstep import Lockstep
 from tests.loop import MS, Run, drive, reference, robot
 from tests.problems import pioneer
@@ -263,7 +263,7 @@ def assert_applied_inside_slew(controller: Controller, body: Lockstep, run: Run)
     [
         ({"failure": "flood"}, "failure must be one of solver, qp, nan_model, over_budget, got 'flood'"),
         ({}, "got None"),
-        ({"failure": "qp", "samples": 0}, f"samples must be a whole number from 1 to {MOST}, got 0"),
+        ({"failure": "qp", "samples": 0}, f"samples must be a whole number from 1 to {MAX_FAILING_SAMPLES}, got 0"),
         ({"failure": "qp", "samples": "3"}, "got '3'"),
         ({"failure": "qp", "samples": True}, "got True"),
     ],

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from rti_mpc_service.faults.promise import BRAKES
+from rti_mpc_service.faults.promise import BRAKING
 from rti_mpc_service.faults.table import FAULTS
 from tests.processes.system import rti_mpc
 
@@ -42,7 +42,7 @@ def test_robot_stops_in_time_and_drives_again(tmp_path: Path, names: tuple[str, 
     for row in rows.values():
         assert row["kept"], row
         assert 0.0 < row["brake_s"] <= row["zero_s"] < row["still_s"]
-        assert row["excused"] or (row["brake_s"] <= BRAKES["brake_s"] == 0.3 and row["zero_s"] <= BRAKES["zero_s"] == 0.5 and row["still_s"] <= 2.5)
+        assert row["excused"] or (row["brake_s"] <= BRAKING["brake_s"] == 0.3 and row["zero_s"] <= BRAKING["zero_s"] == 0.5 and row["still_s"] <= 2.5)
         assert row["recovery_s"] > 0.0
         assert row["robot"] == "braked, stood, drove again"
 

@@ -194,7 +194,7 @@ def test_hours_of_samples_miss_no_period_lose_no_message_and_take_no_memory(
     account, missed_ns = seen.account(), seen.missed_ns()
     warm = seen.looks[seen.looks[:, 0] > seen.looks[0, 0] + min(WARM_UP_S, 0.25 * duration_s)]
     with capsys.disabled():
-        print(f"\n{machine.describe()}")
+        print(f"\n{machine.machine_info()}")
         print(f"{duration_s:g} s at {1 / DT_S:g} Hz, {seen.span.sum()} states: {account}, {seen.silences} silences, {seen.log.counters}")
         print(f"state to command  {quantiles(seen.log.latency_us[seen.span])}; {len(missed_ns)} missed the period")
         between = 1e9 * seen.looks[[0, -1], 0]

@@ -18,7 +18,7 @@ import pytest
 from rti_mpc.contract.latch import Latch
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service import latch_file
-from rti_mpc_service.latch_file import MAX_BYTES, LatchFile, state_folder
+from rti_mpc_service.latch_file import MAX_FILE_BYTES, LatchFile, state_folder
 
 WHEN = "2026-11-28T09:30:00Z"
 STOPPED = Latch(5, True, WHEN, "asked for by ada@lab")
@@ -56,7 +56,7 @@ def test_latch_of_another_process_that_is_greater_is_not_overwritten(file: Latch
 
 
 def count(folder: Path, first: int) -> None:
-    latch_file.LOCK_S = 60.0  # two that never pause may starve each other for as long as a busy disk holds them up
+    latch_file.LOCK_TIMEOUT_S = 60.0  # two that never pause may starve each other for as long as a busy disk holds them up
     file = LatchFile(Keys(), folder)
     for counter in range(first, first + 10, 2):
         file.write(Latch(counter, counter % 4 == 0, WHEN, "many"))
@@ -114,7 +114,10 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "binary": (lambda path: path.write_bytes(b"\xff\x00\xfe"), "message must be a JSON object"),
     "a list": (lambda path: path.write_text("[]"), "message must be a JSON object"),
     "nested": (lambda path: path.write_text("[" * 4000), "message must be a JSON object"),
-    "long": (lambda path: path.write_text("{" + " " * MAX_BYTES + "}"), f"message must have at most {MAX_BYTES} bytes, got {MAX_BYTES + 1}"),
+    "long": (
+        lambda path: path.write_text("{" + " " * MAX_FILE_BYTES + "}"),
+        f"message must have at most {MAX_FILE_BYTES} bytes, got {MAX_FILE_BYTES + 1}",
+    ),
     "of the future": (lambda path: path.write_text('{"version": 2, "stops": []}'), "must be of version 1, got 2"),
     "without a counter": (lambda path: path.write_text('{"version": 1}'), "latch.counter must be a whole number from 0 to 2^62, got None"),
     "a folder": (lambda path: path.mkdir(), "Is a directory"),
@@ -167,7 +170,7 @@ def test_folder_that_cannot_be_made_is_an_error_that_is_known_beforehand(tmp_pat
 
 def test_writer_that_hangs_with_the_lock_is_waited_for_so_long_only(file: LatchFile, monkeypatch: pytest.MonkeyPatch) -> None:
     file.write(STOPPED)
-    monkeypatch.setattr(latch_file, "LOCK_S", 0.05)
+    monkeypatch.setattr(latch_file, "LOCK_TIMEOUT_S", 0.05)
     other = os.open(path(file).parent, os.O_RDONLY)
     try:
         fcntl.flock(other, fcntl.LOCK_EX)

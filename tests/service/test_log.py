@@ -12,12 +12,12 @@ from threading import Timer
 
 import pytest
 
-from rti_mpc_service.log import MAX_LINES, Aside
+from rti_mpc_service.log import MAX_WAITING_LINES, Aside
 from tests.processes.system import PATIENCE_S, ROOT, environment
 
 PIPE_BYTES = 4096
 TAKEN = PIPE_BYTES // 60  # lines that the pipe takes before anybody reads it, of 60 bytes and more
-LINES = 10 * MAX_LINES
+LINES = 10 * MAX_WAITING_LINES
 TALK = f"""
 import logging, sys
 from rti_mpc_service import log

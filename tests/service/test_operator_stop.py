@@ -57,7 +57,7 @@ class Process:
         self.served: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {}
         self.stop = OperatorStop(file, self.obeyed.append, self.said.put)
         self.stop.listen(cast(Any, self))
-        self.stop.serve(cast(Any, self), lambda: "controller", lambda: self.told.append(self.stop.describe()["latch"]))
+        self.stop.serve(cast(Any, self), lambda: "controller", lambda: self.told.append(self.stop.latch_info()["latch"]))
 
     def subscriber(self, key: str, **_: object) -> Any:
         assert key == self.keys.infos
@@ -111,7 +111,7 @@ def test_stop_acts_and_is_told_before_it_is_stored(disk: Disk) -> None:
 
 
 def test_slow_disk_holds_no_answer_up_and_is_told_of(disk: Disk, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(operator_stop, "STORING_S", 0.02)
+    monkeypatch.setattr(operator_stop, "STORE_TIMEOUT_S", 0.02)
     process = Process(disk)
     disk.works.clear()
     answer = process.ask("stop")
@@ -120,7 +120,7 @@ def test_slow_disk_holds_no_answer_up_and_is_told_of(disk: Disk, monkeypatch: py
 
 
 def test_what_cannot_be_stored_is_said_at_once_and_stored_as_soon_as_it_can_be(disk: Disk, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(operator_stop, "RETRY_S", 0.02)
+    monkeypatch.setattr(operator_stop, "STORE_RETRY_S", 0.02)
     process = Process(disk)
     disk.fault = OSError(28, "No space left on device")
     answer = process.ask("stop")

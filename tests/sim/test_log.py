@@ -12,7 +12,7 @@ import pytest
 from rti_mpc.errors import ConfigError
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc_sim.actuator import Counters
-from rti_mpc_sim.log import PATIENCE_NS, Log
+from rti_mpc_sim.log import ANSWER_TIMEOUT_NS, Log
 
 X = np.array([1.0, 2.0, 0.1 + 0.2, 0.0, 0.0])
 U = np.zeros(2)
@@ -46,7 +46,7 @@ def test_first_answer_counts_and_a_state_nobody_answers_stays_blank(tmp_path: Pa
     log.answered(99, 9, 9000)
     log.write(10_000)
     assert read(tmp_path / "robot.csv") == []  # the first may still be answered
-    log.write(PATIENCE_NS + 1000)
+    log.write(ANSWER_TIMEOUT_NS + 1000)
     assert [(line["seq"], line["command_seq"], line["latency_us"]) for line in read(tmp_path / "robot.csv")] == [("1", "", ""), ("2", "7", "3.0")]
     log.close()
     assert len(read(tmp_path / "robot.csv")) == 3

@@ -13,7 +13,7 @@ from rti_mpc.wire.info import Info, Label, Leader, Obstacle, bounds, labels, obs
 from rti_mpc.wire.received import Received
 from rti_mpc_service.config.build import build_ocp
 from rti_mpc_service.config.config import load
-from rti_mpc_service.controller.daemon import describe
+from rti_mpc_service.controller.description import controller_info
 from tests.service.config.test_config import DISC, MINIMAL
 
 PIONEER: dict[str, Any] = {
@@ -138,7 +138,7 @@ def test_a_controller_lists_what_a_planner_sends_and_where_obstacles_are_in_it(t
     path = tmp_path / "robot.toml"
     path.write_text(MINIMAL + DISC + "radius_m = 0.3\nmargin_m = 0.1\n" + "[observer.disturbances]\nu_c = { drift = 0.1, limit = 0.2 }\n")
     model = (ocp := build_ocp(load(path))).model
-    document = json.loads(json.dumps({"role": "controller", **describe(ocp, model.np_ - 1)}))
+    document = json.loads(json.dumps({"role": "controller", **controller_info(ocp, model.np_ - 1)}))
     assert [parameter["name"] for parameter in document["parameters"][-4:]] == ["a", "disc_0_x", "disc_0_y", "disc_0_r"]
     assert document["p_nominal"] == list(model.p_nominal[:-1])
     info = Info.from_json(document)

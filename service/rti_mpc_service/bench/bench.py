@@ -38,11 +38,11 @@ from rti_mpc_service.bench.yardstick import Ipopt
 from rti_mpc_service.console import table_console
 from rti_mpc_service.host import machine
 
-HORIZONS = (7, 20, 50, 100, 200)
-ENTRIES = (("riccati", "simultaneous"), ("osqp", "simultaneous"), ("osqp", "sequential"))
-FORMULATIONS = ("simultaneous", "sequential")  # of a solver asked for by name
-DT = 0.1
-EXACT = SolverSettings(eps=1e-9, max_iter=20_000)
+DEFAULT_HORIZONS = (7, 20, 50, 100, 200)
+DEFAULT_ENTRIES = (("riccati", "simultaneous"), ("osqp", "simultaneous"), ("osqp", "sequential"))
+FORMULATIONS = ("simultaneous", "sequential")  # measured for a solver that is requested by name
+DT_S = 0.1
+EXACT_SETTINGS = SolverSettings(eps=1e-9, max_iter=20_000)
 
 
 @dataclass
@@ -68,7 +68,7 @@ def paper_ocp(N: int) -> Ocp:
     return Ocp(
         pioneer_3dx(),
         N=N,
-        dt=DT,
+        dt=DT_S,
         method="euler",
         Q=[1, 1, 0.05],
         R=[1, 1],
@@ -85,8 +85,8 @@ def samples(N: int, quick: bool) -> Iterator[tuple[str, int, Array, Array]]:
     """Yield scenario, sample, reference rows at nodes 1 to N, and the initial state, for all samples of both scenarios."""
     for trajectory, duration_s in ((eight(), 4.0 if quick else 80.0), (positioning(), 4.0 if quick else 40.0)):
         x0 = np.array([*trajectory.pose0, 0.0, 0.0])
-        count = round(duration_s / DT)
-        y = rows(trajectory.lasting(duration_s + (N + 2) * DT), DT, "tangent")
+        count = round(duration_s / DT_S)
+        y = rows(trajectory.lasting(duration_s + (N + 2) * DT_S), DT_S, "tangent")
         y[:, 2] += 2 * np.pi * np.round((x0[2] - y[0, 2]) / (2 * np.pi))
         for k in range(count):
             yield trajectory.name, k, y[k + 1 : k + 1 + N], x0
@@ -103,7 +103,7 @@ def closed_loop_cost(N: int, quick: bool, contender: Rti | Ipopt) -> float:
             contender.reset(x) if isinstance(contender, Ipopt) else contender.reset(x, u)
         last = u
         u = solve(contender, x, last, y_ref, shift=k > 0)
-        x = np.array(plant(x, u, p, DT)).ravel()
+        x = np.array(plant(x, u, p, DT_S)).ravel()
         e = x[:3] - y_ref[0]
         total += 28 * float(e @ (np.array([1, 1, 0.05]) * e)) + 0.8 * float((u - last) @ (u - last))
     return total
@@ -159,19 +159,19 @@ def race(N: int, contenders: dict[str, Rti], ipopt: Ipopt, quick: bool, tick: An
                 row.taken.append(rti.taken)
                 row.capped += status is QpStatus.MAX_ITER
             u = driver.u[0].copy()
-            x = np.array(plant(x, u, p, DT)).ravel()
+            x = np.array(plant(x, u, p, DT_S)).ravel()
             tick()
     finally:
         gc.enable()
     return times, ipopt_us
 
 
-def spread(values: Any) -> dict[str, float]:
+def quantiles_us(values: Any) -> dict[str, float]:
     """Return median, p99 and maximum, us."""
     return {name: round(float(np.percentile(values, share)), 1) for name, share in (("p50", 50), ("p99", 99), ("max", 100))}
 
 
-def measure(N: int, *, entries: Sequence[tuple[str, str]], compiled: tuple[bool, ...], quick: bool, tick: Any) -> list[dict[str, Any]]:
+def measure_horizon(N: int, *, entries: Sequence[tuple[str, str]], compiled: tuple[bool, ...], quick: bool, tick: Any) -> list[dict[str, Any]]:
     """Race at one horizon, an entry being solver and formulation; return a row for each contender."""
     ocp = paper_ocp(N)
     contenders = {
@@ -181,11 +181,11 @@ def measure(N: int, *, entries: Sequence[tuple[str, str]], compiled: tuple[bool,
     }
     ipopt = Ipopt(ocp)
     times, ipopt_us = race(N, contenders, ipopt, quick, tick)
-    against = spread(ipopt_us)
+    against = quantiles_us(ipopt_us)
     result = []
     for name, row in times.items():
         rti = contenders[name]
-        step, feedback = spread(row.step), spread(row.feedback)
+        step, feedback = quantiles_us(row.step), quantiles_us(row.feedback)
         native_us = float(np.median(np.sum(list(row.parts.values()), axis=0)))
         result.append(
             {
@@ -194,7 +194,7 @@ def measure(N: int, *, entries: Sequence[tuple[str, str]], compiled: tuple[bool,
                 "solver": name.split()[0],
                 "compiled": name.endswith(" compiled"),
                 "step_us": step,
-                "prepare_us": spread(row.prepare),
+                "prepare_us": quantiles_us(row.prepare),
                 "feedback_us": feedback,
                 "ipopt_us": against,
                 "speedup": round(against["p50"] / step["p50"], 1),
@@ -211,9 +211,9 @@ def measure(N: int, *, entries: Sequence[tuple[str, str]], compiled: tuple[bool,
 
 
 def main(
-    horizons: tuple[int, ...] = HORIZONS,
+    horizons: tuple[int, ...] = DEFAULT_HORIZONS,
     *,
-    entries: tuple[tuple[str, str], ...] = ENTRIES,
+    entries: tuple[tuple[str, str], ...] = DEFAULT_ENTRIES,
     solvers: tuple[str, ...] = (),
     interpreted: bool,
     quick: bool,
@@ -236,29 +236,29 @@ def main(
         check_name(solver)
     entries += tuple((solver, formulation) for solver in solvers for formulation in FORMULATIONS)
     console = table_console()
-    console.print(", ".join(f"{name} {value}" for name, value in machine.describe().items()), soft_wrap=True)
+    console.print(", ".join(f"{name} {value}" for name, value in machine.machine_info().items()), soft_wrap=True)
     result: list[dict[str, Any]] = []
     with Progress(console=console, transient=True) as progress:
         for N in horizons:
             task = progress.add_task(f"N = {N}", total=sum(1 for _ in samples(N, quick)))
             chosen = [entry for entry in entries if entry[1] != "sequential" or N <= 20]
-            found = measure(
+            found = measure_horizon(
                 N, entries=chosen, compiled=(True, False) if interpreted else (True,), quick=quick, tick=lambda t=task: progress.advance(t)
             )
             if costs:
-                exact = closed_loop_cost(N, quick, Rti(paper_ocp(N), EXACT, formulation="simultaneous", solver="osqp"))
+                exact = closed_loop_cost(N, quick, Rti(paper_ocp(N), EXACT_SETTINGS, formulation="simultaneous", solver="osqp"))
                 converged = closed_loop_cost(N, quick, Ipopt(paper_ocp(N)))
                 for row in found:
                     cost = closed_loop_cost(N, quick, Rti(paper_ocp(N), formulation=row["formulation"], solver=row["solver"]))
                     row |= {"cost": round(cost, 3), "over_exact": round(cost / exact - 1, 6), "over_converged": round(cost / converged - 1, 6)}
             result += found
-    show(console, result, costs=costs)
+    print_tables(console, result, costs=costs)
     if path is not None:
         path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     return 0
 
 
-def show(console: Console, result: list[dict[str, Any]], *, costs: bool) -> None:
+def print_tables(console: Console, result: list[dict[str, Any]], *, costs: bool) -> None:
     """Print the rows, and how the step grows with N."""
     table = Table(title="us a sample: median / p99")
     for name in (

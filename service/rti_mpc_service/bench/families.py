@@ -24,10 +24,10 @@ from rti_mpc.reference.trajectory import Trajectory, eight, positioning, rows
 from rti_mpc.rti.ocp import Ocp
 
 INF = np.inf
-SPEEDS: dict[str, Any] = {"lbx": [-INF, -INF, -INF, -0.5, -0.745], "ubx": [INF, INF, INF, 0.5, 0.745]}  # of the paper's robot, m/s and rad/s
-INPUTS: dict[str, Any] = {"lbu": [-0.5, -0.745], "ubu": [0.5, 0.745]}
-SLEW: dict[str, Any] = {"lbdu": [-0.25, -0.4], "ubdu": [0.25, 0.4]}  # per 0.1 s
-COST: dict[str, Any] = {"R": [1.0, 1.0], "delta": 28.0, "lambda_": 0.8}
+SPEED_BOUNDS: dict[str, Any] = {"lbx": [-INF, -INF, -INF, -0.5, -0.745], "ubx": [INF, INF, INF, 0.5, 0.745]}
+INPUT_BOUNDS: dict[str, Any] = {"lbu": [-0.5, -0.745], "ubu": [0.5, 0.745]}
+INCREMENT_BOUNDS: dict[str, Any] = {"lbdu": [-0.25, -0.4], "ubdu": [0.25, 0.4]}  # per sample of 0.1 s
+COST_WEIGHTS: dict[str, Any] = {"R": [1.0, 1.0], "delta": 28.0, "lambda_": 0.8}
 
 Start = Callable[[int], Array | None]
 
@@ -80,9 +80,9 @@ class Family:
 
 def paper(N: int) -> Family:
     """Return the paper's problem on its two trajectories."""
-    ocp = Ocp(pioneer_3dx(), N=N, dt=0.1, method="euler", Q=[1, 1, 0.05], **COST, **INPUTS, **SPEEDS)
+    ocp = Ocp(pioneer_3dx(), N=N, dt=0.1, method="euler", Q=[1, 1, 0.05], **COST_WEIGHTS, **INPUT_BOUNDS, **SPEED_BOUNDS)
     driven = (eight(), 800), (positioning(), 400)
-    legs = [(reference(trajectory, count, N), np.array([*trajectory.pose0, 0.0, 0.0])) for trajectory, count in driven]
+    legs = [(reference_rows(trajectory, count, N), np.array([*trajectory.pose0, 0.0, 0.0])) for trajectory, count in driven]
 
     def at(k: int) -> tuple[Array, None]:
         leg, j = divmod(k, 800)
@@ -99,12 +99,12 @@ def tight(N: int) -> Family:
         "lbdu": [-0.05, -0.08],
         "ubdu": [0.05, 0.08],
     }
-    ocp = Ocp(pioneer_3dx(), N=N, dt=0.1, Q=[1, 1, 0], **COST, **INPUTS, **bounds)
-    y, x0 = reference(eight(), 600, N), np.array([*eight().pose0, 0.0, 0.0])
+    ocp = Ocp(pioneer_3dx(), N=N, dt=0.1, Q=[1, 1, 0], **COST_WEIGHTS, **INPUT_BOUNDS, **bounds)
+    y, x0 = reference_rows(eight(), 600, N), np.array([*eight().pose0, 0.0, 0.0])
     return Family(ocp, 600, lambda k: (y[k + 1 : k + 1 + N], None), once(x0))
 
 
-def reference(trajectory: Trajectory, samples: int, N: int) -> Array:
+def reference_rows(trajectory: Trajectory, samples: int, N: int) -> Array:
     """Return rows of a trajectory for so many samples of 0.1 s and the horizon after them, headings nearest to the pose at the start."""
     y = rows(trajectory.lasting(0.1 * (samples + N + 2)), 0.1, "tangent")
     y[:, 2] += 2.0 * np.pi * np.round((trajectory.pose0[2] - y[0, 2]) / (2.0 * np.pi))
@@ -119,7 +119,7 @@ def once(x0: Array) -> Start:
 def discs(N: int, centres: list[tuple[float, float, float]], speeds: list[tuple[float, float]], end_m: float) -> Family:
     """Return a straight line at 0.25 m/s among discs, each with x, y, radius in m and a velocity in m/s."""
     model = with_obstacles(pioneer_3dx(), centres)
-    ocp = Ocp(model, N=N, dt=0.1, Q=[1, 1, 0], lh=0.0, **COST, **INPUTS, **SLEW, **SPEEDS)
+    ocp = Ocp(model, N=N, dt=0.1, Q=[1, 1, 0], lh=0.0, **COST_WEIGHTS, **INPUT_BOUNDS, **INCREMENT_BOUNDS, **SPEED_BOUNDS)
     own, placed, moving = np.array(pioneer_3dx().p_nominal), np.array(centres), np.array([(*speed, 0.0) for speed in speeds])
 
     def at(k: int) -> tuple[Array, Array]:
@@ -276,7 +276,7 @@ def chain_7(N: int) -> Family:
 
 def restarts(N: int) -> Family:
     """Return 80 cold starts of the shipped problem from random states on random lines, five samples each."""
-    ocp = Ocp(pioneer_3dx(), N=N, dt=0.1, Q=[1, 1, 0.05], **COST, **INPUTS, **SLEW, **SPEEDS)
+    ocp = Ocp(pioneer_3dx(), N=N, dt=0.1, Q=[1, 1, 0.05], **COST_WEIGHTS, **INPUT_BOUNDS, **INCREMENT_BOUNDS, **SPEED_BOUNDS)
     rng, starts, lines = np.random.default_rng(11), [], []
     t = 0.1 * np.arange(N + 7)
     for _ in range(80):

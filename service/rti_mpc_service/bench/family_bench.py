@@ -31,23 +31,23 @@ from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import ConfigError
 from rti_mpc.rti.rti import Rti
-from rti_mpc_service.bench.bench import spread
+from rti_mpc_service.bench.bench import quantiles_us
 from rti_mpc_service.bench.families import FAMILIES, Family
 from rti_mpc_service.bench.yardstick import Ipopt
 from rti_mpc_service.console import table_console
 from rti_mpc_service.host import machine
 
-COPIES = 5  # that solve each sample; its time is their least
-SOLVERS = ("riccati", "osqp")  # unless others are asked for
-QUICK = 40  # samples of a first look
+COPIES_PER_SAMPLE = 5  # controllers that solve the same sample, whose shortest time counts
+DEFAULT_SOLVERS = ("riccati", "osqp")
+QUICK_SAMPLES = 40  # per family, with --quick
 
 
-def drive(family: Family, solver: str, samples: int, tick: Callable[[], None]) -> dict[str, Any]:
+def drive_family(family: Family, solver: str, samples: int, tick: Callable[[], None]) -> dict[str, Any]:
     """Drive one closed loop by one solver; return times, us, counts and the cost."""
     ocp = family.ocp
-    copies = [Rti(ocp, solver=solver, formulation="simultaneous") for _ in range(COPIES)]
-    step: Array = np.zeros((samples, COPIES))
-    feedback: Array = np.zeros((samples, COPIES))
+    copies = [Rti(ocp, solver=solver, formulation="simultaneous") for _ in range(COPIES_PER_SAMPLE)]
+    step: Array = np.zeros((samples, COPIES_PER_SAMPLE))
+    feedback: Array = np.zeros((samples, COPIES_PER_SAMPLE))
     unsolved, iterations, cost = 0, [], 0.0
     x, u = np.zeros(ocp.model.nx), family.u0
     gc.collect()
@@ -73,8 +73,8 @@ def drive(family: Family, solver: str, samples: int, tick: Callable[[], None]) -
     finally:
         gc.enable()
     return {
-        "cpu_us": spread(step.min(axis=1)),
-        "feedback_us": spread(feedback.min(axis=1)),
+        "cpu_us": quantiles_us(step.min(axis=1)),
+        "feedback_us": quantiles_us(feedback.min(axis=1)),
         "unsolved": unsolved,
         "iterations": {"p50": int(np.median(iterations)), "max": max(iterations)},
         "cost": cost,
@@ -96,7 +96,7 @@ def converge(family: Family, samples: int, tick: Callable[[], None]) -> dict[str
         times_us.append(1e-3 * (time.thread_time_ns() - began_ns))
         x, u, cost = advance(family, x, u, command, y_ref, p, cost)
         tick()
-    return {"ipopt_us": spread(times_us), "cost": cost}
+    return {"ipopt_us": quantiles_us(times_us), "cost": cost}
 
 
 def advance(family: Family, x: Array, u_prev: Array, u: Array, y_ref: Array, p: Array | None, cost: float) -> tuple[Array, Array, float]:
@@ -142,30 +142,30 @@ def main(names: Sequence[str], horizons: Sequence[int], solvers: Sequence[str], 
             raise ConfigError(f"--problem must be all or one of {', '.join(FAMILIES)}; {near}got {name!r}")
     chosen = list(FAMILIES) if "all" in names else list(dict.fromkeys(names))
     console = table_console()
-    console.print(", ".join(f"{key} {value}" for key, value in machine.describe().items()), soft_wrap=True)
+    console.print(", ".join(f"{key} {value}" for key, value in machine.machine_info().items()), soft_wrap=True)
     rows: list[dict[str, Any]] = []
     with Progress(console=console, transient=True) as progress:
         for name in chosen:
             make, usual = FAMILIES[name]
             for N in horizons or usual:
                 family = make(N)
-                samples = min(QUICK, family.samples) if quick else family.samples
+                samples = min(QUICK_SAMPLES, family.samples) if quick else family.samples
                 task = progress.add_task(f"{name}, N = {N}", total=samples * (1 + len(solvers)))
                 tick = lambda t=task: progress.advance(t)  # noqa: E731
                 converged = converge(family, samples, tick)
                 for solver in solvers:
                     compile_s, compile_mib = build_alone(name, N, solver)
-                    row = drive(family, solver, samples, tick)
+                    row = drive_family(family, solver, samples, tick)
                     row |= {"cost_over_converged": row["cost"] / converged["cost"] - 1.0, "ipopt_us": converged["ipopt_us"], "samples": samples}
                     row |= {"compile_s": round(compile_s, 2), "compile_mib": round(compile_mib)}
                     rows.append({"problem": name, "N": N, "solver": solver, **row})
-    show(console, rows)
+    print_table(console, rows)
     if path is not None:
         path.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     return 0
 
 
-def show(console: Console, rows: list[dict[str, Any]]) -> None:
+def print_table(console: Console, rows: list[dict[str, Any]]) -> None:
     """Print the rows."""
     table = Table(title="CPU time of a sample, us: median / p99 / most")
     for heading in ("problem", "N", "solver", "step", "feedback", "IPOPT", "unsolved", "iterations", "cost", "compile"):

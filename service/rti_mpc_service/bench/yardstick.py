@@ -16,7 +16,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.rti.ocp import Ocp
 
-OPTIONS: dict[str, Any] = {
+IPOPT_OPTIONS: dict[str, Any] = {
     "print_time": False,
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
@@ -71,7 +71,7 @@ class Ipopt:
                 if slewed:
                     rows.append((du, ocp.lbdu, ocp.ubdu))
         nlp = {"x": ca.veccat(x, u, s), "f": cost, "g": ca.veccat(*(row for row, _, _ in rows)), "p": ca.veccat(x0, u_prev, y_ref, p)}
-        self._solver = ca.nlpsol("ipopt", "ipopt", nlp, OPTIONS)
+        self._solver = ca.nlpsol("ipopt", "ipopt", nlp, IPOPT_OPTIONS)
         self._lbg, self._ubg = (np.concatenate(bounds) for bounds in list(zip(*rows, strict=True))[1:])
         free, slack = np.full(model.nx, np.inf), np.zeros(N * ng)
         lbx, ubx = (-free, free) if softened else (ocp.lbx, ocp.ubx)

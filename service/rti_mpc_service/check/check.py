@@ -34,14 +34,13 @@ from rti_mpc_service.config.fit import check_stop
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.rig.wave import wave
 
-SAMPLES = 200
-OPINIONS = 20  # samples of these whose QP the second solver is asked about
-EACH = 4  # samples of an excursion to a bound; the second solver is asked about the first and the last
-SECOND = "daqp"  # or OSQP where that is the first
-TIGHT = SolverSettings(eps=1e-9, max_iter=100_000, scaling=10)  # Ruiz scaling helps where bounds are far exceeded
-TOLERANCE = 1e-5  # what two tight answers to one QP may differ by, relative to half the range of each input
-
-NOISE = 0.01  # standard deviation of the disturbance, in the unit of each state
+WAVE_SAMPLES = 200
+COMPARED_WAVE_SAMPLES = 20  # this many of the wave's samples are solved by the second solver, too
+EXCURSION_SAMPLES = 4  # per excursion to a bound; the second solver solves the first and the last of them, too
+SECOND_SOLVER = "daqp"  # OSQP is the second solver where daqp is the first
+TIGHT_SETTINGS = SolverSettings(eps=1e-9, max_iter=100_000, scaling=10)  # Ruiz scaling helps where bounds are far exceeded
+AGREEMENT_TOLERANCE = 1e-5  # largest difference between two tight solutions of one QP, relative to half the range of each input
+DISTURBANCE_STD = 0.01  # standard deviation, in the unit of each state
 
 
 @dataclass(frozen=True)
@@ -50,8 +49,8 @@ class CheckReport:
     Outcome of a dry run.
 
     Attributes:
-        prepare_us: Time of each preparation, shape ``(SAMPLES,)``.
-        feedback_us: Time of each feedback, shape ``(SAMPLES,)``.
+        prepare_us: Time of each preparation, shape ``(WAVE_SAMPLES,)``.
+        feedback_us: Time of each feedback, shape ``(WAVE_SAMPLES,)``.
         statuses: How often each status came out.
         second: The other solver.
         opinions: How many QPs both have solved.
@@ -74,7 +73,7 @@ class CheckReport:
     @property
     def agree(self) -> bool:
         """Whether the other solver confirms the first."""
-        return self.opinions > 0 and self.difference <= TOLERANCE
+        return self.opinions > 0 and self.difference <= AGREEMENT_TOLERANCE
 
 
 def main(path: Path) -> int:
@@ -82,7 +81,7 @@ def main(path: Path) -> int:
     config = load(path)
     check_stop(config)
     console = Console()
-    report = check(config, track(range(SAMPLES), "solving", console=console, transient=True, disable=not console.is_terminal))
+    report = check(config, track(range(WAVE_SAMPLES), "solving", console=console, transient=True, disable=not console.is_terminal))
     table = Table("phase, us", "p50", "p99", "max")
     for phase, times in (("preparation", report.prepare_us), ("feedback", report.feedback_us)):
         table.add_row(phase, *(f"{np.percentile(times, share):.0f}" for share in (50, 99, 100)))
@@ -94,7 +93,7 @@ def main(path: Path) -> int:
         f"{sum(report.statuses.values())} samples: " + ", ".join(f"{count} {status.name}" for status, count in sorted(report.statuses.items()))
     )
     verdict = "agree" if report.agree else "DISAGREE"
-    difference = f"solved tightly they differ by at most {report.difference:.1e}, {TOLERANCE:.0e} allowed"
+    difference = f"solved tightly they differ by at most {report.difference:.1e}, {AGREEMENT_TOLERANCE:.0e} allowed"
     console.print(f"{config.solver.name} and {report.second} {verdict}: on {report.opinions} QPs {difference}", soft_wrap=True)
     console.print(f"the controller's own plans are within {report.deviation:.1e} of them, relative to half the range of each input", soft_wrap=True)
     reached = f"driven to {report.bounds - len(report.missed)} of {report.bounds} bounds"
@@ -102,19 +101,19 @@ def main(path: Path) -> int:
     return 0 if report.agree and all(status.usable for status in report.statuses) else 1
 
 
-def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> CheckReport:
+def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> CheckReport:
     """Solve one QP for each of the samples, and drive to the bounds."""
     rti = build_rti(config)
     ocp = rti.ocp
     model, N = ocp.model, ocp.N
-    first, second = config.solver.name, SECOND if config.solver.name != SECOND else "osqp"
+    first, second = config.solver.name, SECOND_SOLVER if config.solver.name != SECOND_SOLVER else "osqp"
     other = next(name for name in FORMULATIONS if name != rti.formulation)
-    tight, judge = (twin(rti, solver, formulation) for solver, formulation in ((first, rti.formulation), (second, other)))
+    tight, judge = (tight_copy(rti, solver, formulation) for solver, formulation in ((first, rti.formulation), (second, other)))
     bounds, scale = Bounds(rti), rti.scale[model.nx : model.nx + model.nu]
     rng = np.random.default_rng(1)
     x = np.array(robot_settings(config)["x0"])
     reference = wave(ocp, x, rng)
-    prepare_us, feedback_us = np.zeros(SAMPLES), np.zeros(SAMPLES)
+    prepare_us, feedback_us = np.zeros(WAVE_SAMPLES), np.zeros(WAVE_SAMPLES)
     statuses: Counter[QpStatus] = Counter()
     differences: list[float] = []
     deviations: list[float] = []
@@ -131,7 +130,7 @@ def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> CheckRepor
         statuses[status] += 1
         bounds.look()
         if asked and status.usable:
-            mine, theirs = (answer(one, guess, y_ref, x) for one in (tight, judge))
+            mine, theirs = (solution(one, guess, y_ref, x) for one in (tight, judge))
             if mine is not None and theirs is not None:
                 differences.append(float(np.max(np.abs(mine - theirs) / scale)))
                 deviations.append(float(np.max(np.abs(rti.u - theirs) / scale)))
@@ -140,25 +139,25 @@ def check(config: Config, samples: Iterable[int] = range(SAMPLES)) -> CheckRepor
     start = x
     rti.reset(x, np.array(model.u_rest))
     for k in samples:
-        prepare_us[k], feedback_us[k] = sample(x, reference(k + 1 + np.arange(N)), asked=k % (SAMPLES // OPINIONS) == 0)
-        x = rti.x[1] + NOISE * rng.standard_normal(model.nx)
+        prepare_us[k], feedback_us[k] = sample(x, reference(k + 1 + np.arange(N)), asked=k % (WAVE_SAMPLES // COMPARED_WAVE_SAMPLES) == 0)
+        x = rti.x[1] + DISTURBANCE_STD * rng.standard_normal(model.nx)
     for excursion in excursions(rti, start):
         x = excursion.x0
         rti.reset(x, np.array(model.u_rest))
-        for k in range(EACH):
-            sample(x, excursion.y_ref, asked=k in (0, EACH - 1))
+        for k in range(EXCURSION_SAMPLES):
+            sample(x, excursion.y_ref, asked=k in (0, EXCURSION_SAMPLES - 1))
             x = rti.x[1].copy()
     difference, deviation = (max(values, default=np.inf) for values in (differences, deviations))
     return CheckReport(prepare_us, feedback_us, statuses, second, len(differences), difference, deviation, len(bounds.names), bounds.missed)
 
 
-def twin(rti: Rti, solver: str, formulation: str) -> Rti:
+def tight_copy(rti: Rti, solver: str, formulation: str) -> Rti:
     """Return a controller's like whose solver is tight; those of qpsolvers are in any case."""
-    settings = TIGHT if solver in BUILT_IN_SOLVERS else None
+    settings = TIGHT_SETTINGS if solver in BUILT_IN_SOLVERS else None
     return Rti(rti.ocp, settings, formulation=formulation, solver=solver, iterations=rti.iterations, tolerance=rti.tolerance, compile=False)
 
 
-def answer(one: Rti, guess: tuple[Array, ...], y_ref: Array, x0: Array) -> Array | None:
+def solution(one: Rti, guess: tuple[Array, ...], y_ref: Array, x0: Array) -> Array | None:
     """Return the inputs that an iteration makes of a sample, from a guess of x, u and u_prev; shape ``(N_u, nu)``, None if it makes none."""
     one.x[:], one.u[:], one.u_prev[:] = guess
     one.prepare(y_ref, shift=False)

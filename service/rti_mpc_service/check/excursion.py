@@ -19,10 +19,10 @@ from rti_mpc.array import Array
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
 
-FAR = 10.0  # times what an input reaches within the horizon lies the reference that drives it to its bounds
-BEYOND = 1.0  # of its scale by which the start exceeds a softened bound
-STEPS = 8  # Newton steps to such a start; what is linear takes one
-AT = 1e-3  # of its scale within which a plan counts as being at a bound
+REFERENCE_DISTANCE_FACTOR = 10.0  # the reference is this factor farther away than the outputs that a bound can reach
+START_EXCESS_SCALES = 1.0  # the start exceeds a softened bound by this many scales of the bounded quantity
+NEWTON_STEPS = 8  # to find such a start; a linear constraint takes one step
+AT_BOUND_SCALES = 1e-3  # a plan this close to a bound, in scales of the bounded quantity, counts as at it
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Bounds:
             (increments, ocp.lbdu, ocp.ubdu, self._scale_u),
             (softened, ocp.lg, ocp.ug, self._scale_g),
         ):
-            found += [(values <= lower + AT * scale).any(axis=0), (values >= upper - AT * scale).any(axis=0)]
+            found += [(values <= lower + AT_BOUND_SCALES * scale).any(axis=0), (values >= upper - AT_BOUND_SCALES * scale).any(axis=0)]
         self.reached |= np.concatenate(found)[self._there]
 
     @property
@@ -87,9 +87,9 @@ def excursions(rti: Rti, x0: Array) -> Iterator[Excursion]:
             for j in np.flatnonzero(np.isfinite(bounds)):
                 u = rest.copy()
                 u[j] += reach * (bounds[j] - rest[j])
-                yield Excursion(x0, nominal + FAR * (outputs(ocp, x0, u) - nominal))
+                yield Excursion(x0, nominal + REFERENCE_DISTANCE_FACTOR * (outputs(ocp, x0, u) - nominal))
     scale_g = rti.scale[ocp.model.nx + ocp.model.nu :]
-    for bounds, outward in ((ocp.lg, -BEYOND), (ocp.ug, BEYOND)):
+    for bounds, outward in ((ocp.lg, -START_EXCESS_SCALES), (ocp.ug, START_EXCESS_SCALES)):
         for j in np.flatnonzero(np.isfinite(bounds)):
             yield Excursion(start_at(rti, x0, int(j), bounds[j] + outward * scale_g[j]), nominal)
 
@@ -112,7 +112,7 @@ def start_at(rti: Rti, x0: Array, j: int, wanted: float) -> Array:
     value = ca.Function("value", [model.x, model.u, model.p], [g, ca.densify(ca.gradient(g, model.x))])
     squares = rti.scale[: model.nx] ** 2
     x = x0.copy()
-    for _ in range(STEPS):
+    for _ in range(NEWTON_STEPS):
         now, slope = (np.array(part).ravel() for part in value(x, model.u_rest, model.p_nominal))
         curvature = float(squares @ slope**2)
         if curvature <= 0.0 or not np.isfinite(curvature):

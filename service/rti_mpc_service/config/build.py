@@ -16,7 +16,7 @@ import numpy as np
 
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.config.refusal import unknown_name
-from rti_mpc_service.config.schema import ITERATIONS, Config
+from rti_mpc_service.config.schema import ITERATION_KEYS, Config
 
 if TYPE_CHECKING:
     from rti_mpc.array import Array
@@ -82,8 +82,8 @@ def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
     return {
         "Q": [weights.Q[output.name] for output in model.outputs],
         "R": [weights.R[input.name] for input in model.inputs],
-        "delta": spread(weights.delta, config.ocp.N),
-        "lambda_": spread(weights.lambda_, config.N_u),
+        "delta": as_sequence(weights.delta, config.ocp.N),
+        "lambda_": as_sequence(weights.lambda_, config.N_u),
         "lbu": lbu,
         "ubu": ubu,
         "lbdu": lbdu,
@@ -214,13 +214,13 @@ def solver_settings(config: Config) -> SolverSettings | None:
     """Return the settings of OSQP, None if none are given."""
     from rti_mpc.rti.qp.osqp import SolverSettings
 
-    given = config.solver.model_dump(exclude_none=True, exclude=ITERATIONS | {"name"})
+    given = config.solver.model_dump(exclude_none=True, exclude=ITERATION_KEYS | {"name"})
     return SolverSettings(**given) if given else None
 
 
 def iterations(config: Config) -> dict[str, Any]:
     """Return the limits of the iterations a sample, as `Rti` names them, that are given."""
-    return config.solver.model_dump(exclude_none=True, include=ITERATIONS)
+    return config.solver.model_dump(exclude_none=True, include=ITERATION_KEYS)
 
 
 def bus_settings(config: Config) -> BusSettings:
@@ -230,7 +230,7 @@ def bus_settings(config: Config) -> BusSettings:
     return BusSettings(**config.bus.model_dump(exclude_none=True, exclude={"listen"}))
 
 
-def spread(values: tuple[float, ...], length: int) -> tuple[float, ...]:
+def as_sequence(values: tuple[float, ...], length: int) -> tuple[float, ...]:
     """Return a sequence, or the constant that a single value stands for."""
     return values if len(values) == length else values * length
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc_service.config.build import build_ocp, names
 from rti_mpc_service.config.refusal import quoted, unknown_name
-from rti_mpc_service.config.schema import ITERATIONS, Config, RegulatorSection
+from rti_mpc_service.config.schema import ITERATION_KEYS, Config, RegulatorSection
 
 if TYPE_CHECKING:
     from rti_mpc.model.model import Model, Signal
@@ -155,6 +155,6 @@ def check_solver(config: Config) -> None:
         check_name(config.solver.name)
     except OcpError as error:
         raise ConfigError(f"solver.name: {error}") from error
-    if foreign := config.solver.model_dump(exclude_none=True, exclude=ITERATIONS | {"name"}):
+    if foreign := config.solver.model_dump(exclude_none=True, exclude=ITERATION_KEYS | {"name"}):
         key, got = next(iter(foreign.items()))
         raise ConfigError(f"solver.{key} is a setting of osqp, it must be left out for solver.name = {config.solver.name!r}, got {got}")

@@ -13,10 +13,10 @@ from pydantic import BaseModel, ValidationError
 if TYPE_CHECKING:
     from rti_mpc.model.model import Signal
 
-QUOTE = 200  # characters of a value in a refusal
+MAX_QUOTED_CHARACTERS = 200  # of a value in a refusal
 
-# Pydantic's words, in those of a TOML file.
-WORDS = (
+# Patterns in Pydantic's messages, and the wording for a TOML file.
+REWORDINGS = (
     (r"^Value error, ", ""),
     (r"^(Input|String) should ", "must "),
     (r"be a valid dictionary.*", "be a table"),
@@ -33,13 +33,13 @@ def explain(error: ValidationError, tree: type[BaseModel]) -> str:
     """Word one complaint; an unknown key comes first, for it is often why another is missing."""
     complaint = min(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden")
     loc, got, keys = complaint["loc"], complaint["input"], dict(entries(tree))
-    key, what = dotted(loc), describe(loc, keys)
+    key, what = dotted(loc), description_of(loc, keys)
     if complaint["type"] == "extra_forbidden":
-        return f"{key} is unknown, {meant(described(loc), keys)}, got {quoted(got)}"
+        return f"{key} is unknown, {suggestion(tree_key(loc), keys)}, got {quoted(got)}"
     if complaint["type"] == "missing":
         return f"{key} is missing: {what}"
     must = complaint["msg"]
-    for pattern, words in WORDS:
+    for pattern, words in REWORDINGS:
         must = re.sub(pattern, words, must)
     return f"{key} ({what}) {must}, got {quoted(got)}"
 
@@ -47,7 +47,7 @@ def explain(error: ValidationError, tree: type[BaseModel]) -> str:
 def quoted(value: object) -> str:
     """Return a value as text of bounded length."""
     text = repr(value)
-    return text if len(text) <= QUOTE else f"{text[:QUOTE]}..."
+    return text if len(text) <= MAX_QUOTED_CHARACTERS else f"{text[:MAX_QUOTED_CHARACTERS]}..."
 
 
 def unknown_name(key: str, table: Mapping[str, object], kind: str, signals: Sequence[Signal], *, complete: bool) -> str | None:
@@ -65,7 +65,7 @@ def unknown_name(key: str, table: Mapping[str, object], kind: str, signals: Sequ
     for name, got in table.items():
         if name not in units:
             near = [units[n] for n in get_close_matches(name, units, 1)]
-            meaning = f"perhaps {near[0]} is meant" if near else known(units.values())
+            meaning = f"perhaps {near[0]} is meant" if near else list_known(units.values())
             return f"{key}.{name} is no {kind} of the model, {meaning}, got {quoted(got)}"
     missing = [unit for name, unit in units.items() if complete and name not in table]
     return f"{key} must name every {kind} of the model, {missing[0]} is missing, got {quoted(dict(table))}" if missing else None
@@ -86,25 +86,25 @@ def dotted(loc: Sequence[int | str]) -> str:
     return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in loc).removeprefix(".")
 
 
-def described(loc: Sequence[int | str]) -> str:
+def tree_key(loc: Sequence[int | str]) -> str:
     """Write a location as the tree does, whichever table of a list it is in."""
     return ".".join(step for step in loc if isinstance(step, str))
 
 
-def describe(loc: Sequence[int | str], tree: dict[str, str]) -> str:
+def description_of(loc: Sequence[int | str], tree: dict[str, str]) -> str:
     """Return the description of the innermost key that has one."""
-    return next((tree[key] for n in range(len(loc), 0, -1) if (key := described(loc[:n])) in tree), "")
+    return next((tree[key] for n in range(len(loc), 0, -1) if (key := tree_key(loc[:n])) in tree), "")
 
 
-def meant(key: str, tree: dict[str, str]) -> str:
+def suggestion(key: str, tree: dict[str, str]) -> str:
     """Return the same key elsewhere, or the nearest beside this one, or all that are beside it."""
     section, _, name = key.rpartition(".")
     beside = {other.rpartition(".")[2]: other for other in tree if other.rpartition(".")[0] == section}
     near = [other for other in tree if other.rpartition(".")[2] == name]
     near += [other for n, other in beside.items() if n.lower() == name.lower()] + [beside[n] for n in get_close_matches(name, beside, 1)]
-    return f"perhaps {near[0]} is meant ({tree[near[0]]})" if near else known(beside)
+    return f"perhaps {near[0]} is meant ({tree[near[0]]})" if near else list_known(beside)
 
 
-def known(names: Iterable[str]) -> str:
+def list_known(names: Iterable[str]) -> str:
     """List what there is."""
     return f"known: {', '.join(names) or 'none'}"

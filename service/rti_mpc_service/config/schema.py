@@ -56,8 +56,8 @@ Period = Annotated[float, Field(ge=1e-4, le=10)]
 Endpoint = Annotated[str, Field(pattern=r"^[a-z0-9_-]+/\S+$")]
 Endpoints = Annotated[tuple[Endpoint, ...], Field(strict=False)]
 
-ITERATIONS = {"iterations", "tolerance"}  # what of the solver's section is not OSQP's
-RAMP_LEAD_S = 0.025  # from a state going stale to the end of its plan: in it the ramp is made, and reaches the robot
+ITERATION_KEYS = {"iterations", "tolerance"}  # keys of [solver] that are settings of `Rti`, not of OSQP
+RAMP_LEAD_S = 0.025  # time from a state going stale to the end of its plan, in which the ramp is computed and sent
 
 
 class Section(BaseModel):

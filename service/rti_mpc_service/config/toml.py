@@ -14,7 +14,7 @@ from rti_mpc.errors import ConfigError
 if TYPE_CHECKING:
     from rti_mpc_service.config.schema import Config
 
-MAX_DEPTH = 16  # tables and lists inside each other; a configuration has five
+MAX_NESTING = 16  # levels of tables and lists inside each other; a configuration has five
 
 
 def read(text: str) -> dict[str, Any]:
@@ -22,7 +22,7 @@ def read(text: str) -> dict[str, Any]:
     Return the content of TOML.
 
     Raises:
-        ConfigError: It is none, or nested deeper than `MAX_DEPTH`.
+        ConfigError: It is none, or nested deeper than `MAX_NESTING`.
     """
     try:
         content = tomllib.loads(text)
@@ -31,14 +31,14 @@ def read(text: str) -> dict[str, Any]:
     except RecursionError:
         content = None
     if content is None or too_deep(content):
-        raise ConfigError(f"must be TOML of at most {MAX_DEPTH} tables and lists inside each other")
+        raise ConfigError(f"must be TOML of at most {MAX_NESTING} tables and lists inside each other")
     return content
 
 
 def too_deep(content: dict[str, Any]) -> bool:
-    """Whether more than `MAX_DEPTH` tables and lists are inside each other."""
+    """Whether more than `MAX_NESTING` tables and lists are inside each other."""
     level: list[Any] = [content]
-    for _ in range(MAX_DEPTH):
+    for _ in range(MAX_NESTING):
         tables = [value for value in level if isinstance(value, dict | list)]
         level = [inner for table in tables for inner in (table.values() if isinstance(table, dict) else table)]
     return any(isinstance(value, dict | list) for value in level)

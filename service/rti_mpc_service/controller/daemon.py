@@ -39,8 +39,8 @@ from rti_mpc_service.announce import announce
 from rti_mpc_service.config.build import build_observer, build_rti
 from rti_mpc_service.config.fit import check_stop
 from rti_mpc_service.config.schema import Config
-from rti_mpc_service.controller.description import describe
-from rti_mpc_service.controller.leadership import HEARING_S, LEADER, STANDBY, Candidate, hear_others
+from rti_mpc_service.controller.description import controller_info
+from rti_mpc_service.controller.leadership import LEADER, LISTEN_BEFORE_START_S, STANDBY, Candidate, hear_others
 from rti_mpc_service.controller.orders import Orders
 from rti_mpc_service.controller.params import Params
 from rti_mpc_service.controller.references import References
@@ -49,8 +49,8 @@ from rti_mpc_service.latch_file import LatchFile
 from rti_mpc_service.operator_stop import OperatorStop
 from rti_mpc_service.warm_up import warm_up
 
-TICK_S = 0.01  # between two looks for silence
-RAMP_S = 0.6  # of a controller that is being stopped, to bring the robot to rest
+TICK_PERIOD_S = 0.01  # period of the check for silence
+MAX_RAMP_S = 0.6  # how long a controller that is being stopped may take to bring the robot to rest
 
 log = logging.getLogger(LEADER)
 
@@ -95,7 +95,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
         others = hear_others(bus, stop)
         if standby and others.config_hash not in (None, config.config_hash):
             raise ConfigError(differ(others.config_hash, config.config_hash))
-        if not standby and bus.is_alive(LEADER, HEARING_S):
+        if not standby and bus.is_alive(LEADER, LISTEN_BEFORE_START_S):
             print(
                 f"rti-mpc: {config.robot} already has a controller: stop it first, run this one with --standby, or give this robot another name",
                 file=sys.stderr,
@@ -104,7 +104,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
         ocp = rti.ocp
         leadership = Candidate(bus, controller, others, config_hash=config.config_hash, dt_s=ocp.dt, nu=ocp.model.nu, standby=standby)
         daemon = Daemon(config, controller, bus, leadership, params, lock, rti, outcomes, operator_stop)
-        operator_stop.serve(bus, lambda: leadership.role, daemon.describe)
+        operator_stop.serve(bus, lambda: leadership.role, daemon.publish_info)
         bus.serve(bus.keys.request, daemon.orders.answer)
         log.info("epoch %d controls %s every %g s" if leadership.leading else "%d stands by %s, every %g s", leadership.epoch, config.robot, ocp.dt)
         if outcomes:
@@ -141,7 +141,7 @@ class Daemon:
         self._bus = bus
         self._leadership = leadership
         self._params = params
-        self.orders = Orders(controller, rti, params, lock, operator_stop, lambda: leadership.leading, self.describe)
+        self.orders = Orders(controller, rti, params, lock, operator_stop, lambda: leadership.leading, self.publish_info)
         self._operator_stop = operator_stop
         self._lock = lock
         self._telling = Lock()
@@ -178,14 +178,14 @@ class Daemon:
         self._tick()
         for thread in self._threads:
             thread.start()
-        while not stop.wait(TICK_S) and not self._crashed.is_set():
+        while not stop.wait(TICK_PERIOD_S) and not self._crashed.is_set():
             self._tick()
         with self._lock:
             relieved = self._ending = self._leadership.relieved
             self._controller.stop("the controller is being stopped")
-        deadline_s = time.monotonic() + RAMP_S
+        deadline_s = time.monotonic() + MAX_RAMP_S
         while not (relieved or self._crashed.is_set() or self._controller.at_rest) and time.monotonic() < deadline_s:
-            time.sleep(TICK_S)
+            time.sleep(TICK_PERIOD_S)
         with self._lock:
             self._ending = True
             # Whatever happened above, the last thing the robot hears is to come to rest, and stay there.
@@ -254,7 +254,7 @@ class Daemon:
     def _tick(self) -> None:
         """Look for silence, and say what there is to say when no state does."""
         now_ns = time.monotonic_ns()
-        held_up = now_ns - self._ticked_ns > 3e9 * TICK_S  # then states may have come that nobody has looked at yet
+        held_up = now_ns - self._ticked_ns > 3e9 * TICK_PERIOD_S  # then states may have come that nobody has looked at yet
         self._ticked_ns = now_ns
         with self._lock:
             self._leadership.listen(now_ns)
@@ -270,19 +270,19 @@ class Daemon:
     def _introduce(self) -> None:
         """Speak in the role that is played now."""
         role = self._leadership.role
-        self.describe()
+        self.publish_info()
         self._bus.withdraw_json(self._bus.keys.info(STANDBY if role == LEADER else LEADER))
         self._announcer = Announcer(self._bus, role, self._leadership.epoch)
 
-    def describe(self) -> None:
+    def publish_info(self) -> None:
         """Publish what this controller is."""
         with self._telling:
             role, config = self._leadership.role, self._config
             self._told += 1
             life = {"role": role, "epoch": self._leadership.epoch, "seq": self._told}
             about = {**life, "config_hash": config.config_hash, "stale_s": config.stale_s}
-            model = {**describe(self._params.ocp, self._controller.np_), "formulation": self._formulation, "realtime": self._granted}
-            self._bus.publish_json(self._bus.keys.info(role), {**model, **about, **self.orders.describe()})
+            model = {**controller_info(self._params.ocp, self._controller.np_), "formulation": self._formulation, "realtime": self._granted}
+            self._bus.publish_json(self._bus.keys.info(role), {**model, **about, **self.orders.orders_info()})
 
     def _announce(self) -> None:
         """Publish and log mode changes and faults."""

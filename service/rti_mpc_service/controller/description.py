@@ -11,7 +11,7 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.wire import info
 
 
-def describe(ocp: Ocp, np_: int) -> dict[str, Any]:
+def controller_info(ocp: Ocp, np_: int) -> dict[str, Any]:
     """Describe a controller: names, units, limits; null where there is none. Parameters from `np_` on are disturbances."""
     model = ocp.model
     vectors = {"states": model.states, "inputs": model.inputs, "outputs": model.outputs}

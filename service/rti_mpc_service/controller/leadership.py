@@ -24,11 +24,11 @@ from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received, Subscriber, unix_s
 from rti_mpc.wire.info import Leader
 
 LEADER, STANDBY = "controller", "standby"  # roles
-HEARING_S = 0.5  # for which a starting controller listens for others
-LOOK = 64  # messages that are read at one look: of 100 looks a second, three times what waits at 2000 a second of anybody's
-LOOK_BYTES = 65_536  # after which a look ends; 64 commands of 60 rows
-NUMBERED = re.compile(rf"{STANDBY}\.([0-9]{{1,7}})")  # role of one who stands by
-UNREADY = (Mode.IDLE, Mode.WAITING)  # with nothing to command
+LISTEN_BEFORE_START_S = 0.5  # how long a starting controller listens for others
+MAX_MESSAGES_PER_LOOK = 64  # at 100 looks per second three times the rate of a sender of 2000 messages per second
+MAX_BYTES_PER_LOOK = 65_536  # 64 commands of 60 rows
+NUMBERED_STANDBY = re.compile(rf"{STANDBY}\.([0-9]{{1,7}})")  # role of a numbered standby
+UNREADY_MODES = (Mode.IDLE, Mode.WAITING)  # modes without a command to send
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class Others:
 
 
 def hear_others(bus: Bus, stop: Event) -> Others:
-    """Listen for `HEARING_S`."""
+    """Listen for `LISTEN_BEFORE_START_S`."""
     commands = [bus.subscriber(key, capacity=RING_MESSAGES) for key in (bus.keys.command, bus.keys.actuation)]
     infos = bus.subscriber(bus.keys.info(LEADER), capacity=RING_MESSAGES)
-    intake = bus.intake(Command, HEARING_S, choosing=True)
-    stop.wait(HEARING_S)
+    intake = bus.intake(Command, LISTEN_BEFORE_START_S, choosing=True)
+    stop.wait(LISTEN_BEFORE_START_S)
     epoch = max(intake.highest_epoch(subscriber.drain()) for subscriber in commands)
     highest = highest_believed(unix_s(), epoch, choosing=True)
     leaders = [leader for received in infos.drain() if (leader := Leader.from_received(received, highest)) is not None]
@@ -113,7 +113,7 @@ class Candidate:
         """
         self.listen(local_ns)
         late_ns = self._controller.robot_now_ns(local_ns) - state.stamp_ns
-        self._decision.hear(state, local_ns, late_ns=late_ns, ready=self._controller.mode not in UNREADY)
+        self._decision.hear(state, local_ns, late_ns=late_ns, ready=self._controller.mode not in UNREADY_MODES)
         self._apply()
 
     def sends(self, command: Command) -> bool:
@@ -171,8 +171,8 @@ class Candidate:
     def _look(self, subscriber: Subscriber) -> Iterator[Received]:
         """Yield what waits, oldest first: no more than a look takes; the rest waits on."""
         size = 0
-        for _ in range(LOOK):
-            if size >= LOOK_BYTES or (received := subscriber.try_recv()) is None:
+        for _ in range(MAX_MESSAGES_PER_LOOK):
+            if size >= MAX_BYTES_PER_LOOK or (received := subscriber.try_recv()) is None:
                 return
             size += len(received.payload)
             yield received
@@ -189,5 +189,5 @@ class Candidate:
 
     def _meet(self, role: str, present: bool) -> None:
         """Count who stands by; in a thread of the bus."""
-        if (numbered := NUMBERED.fullmatch(role)) is not None:
+        if (numbered := NUMBERED_STANDBY.fullmatch(role)) is not None:
             self._decision.meet(int(numbered[1]), present=present)

@@ -21,7 +21,7 @@ from rti_mpc.wire import info
 from rti_mpc.wire.info import Leader
 from rti_mpc_service import injection
 from rti_mpc_service.controller.params import Params
-from rti_mpc_service.operator_stop import REQUESTS, OperatorStop
+from rti_mpc_service.operator_stop import STOP_REQUESTS, OperatorStop
 
 
 class Orders:
@@ -45,9 +45,9 @@ class Orders:
         self._leading = leading
         self._tell = tell  # publishes the description
 
-    def describe(self) -> dict[str, Any]:
+    def orders_info(self) -> dict[str, Any]:
         """Return them as a part of the description."""
-        return {**self._stop.describe(), **info.parameters(self._params.version, self._params.changes)}
+        return {**self._stop.latch_info(), **info.parameters(self._params.version, self._params.changes)}
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any] | None:
         """
@@ -57,7 +57,7 @@ class Orders:
             ConfigError: It is refused, and why.
         """
         what = request.get("request")
-        if what in REQUESTS:  # also here, for those who know no key of its own
+        if what in STOP_REQUESTS:  # also here, for those who know no key of its own
             return self._stop.answer(request)
         if what not in ("params", "inject"):
             raise ConfigError(f"request must be stop, enable, params or inject, got {what!r}")

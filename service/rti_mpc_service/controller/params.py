@@ -28,11 +28,11 @@ from rti_mpc_service.config.fit import check_names, check_rest, check_tree
 from rti_mpc_service.config.refusal import entries, explain
 from rti_mpc_service.config.schema import Config
 
-WEIGHTS = ("ocp.weights.Q", "ocp.weights.R", "ocp.weights.delta", "ocp.weights.lambda", "ocp.bounds.soft_weight")
-BOUNDS = ("ocp.bounds.inputs", "ocp.bounds.increments", "ocp.bounds.states")
-VERSIONS = 2**32  # as many as telemetry can tell
-PATIENCE = 2  # periods, for a sample
-SAMPLE = ("x", "u", "u_prev", "y_ref", "p")  # of an `Rti`
+WEIGHT_KEYS = ("ocp.weights.Q", "ocp.weights.R", "ocp.weights.delta", "ocp.weights.lambda", "ocp.bounds.soft_weight")
+BOUND_KEYS = ("ocp.bounds.inputs", "ocp.bounds.increments", "ocp.bounds.states")
+VERSION_COUNT = 2**32  # telemetry has 32 bits for the version
+SAMPLE_TIMEOUT_PERIODS = 2  # how long to wait for the end of a sample
+SAMPLE_ARRAYS = ("x", "u", "u_prev", "y_ref", "p")  # arrays of an `Rti` that hold the present sample
 
 
 class Params:
@@ -50,7 +50,7 @@ class Params:
         self.version = 0
         self.changes: dict[str, Any] = {}
         self._file = config
-        self._values = values(config)
+        self._values = parameter_values(config)
         self._controller = controller
         self._rti = rti
         self._lock = lock  # held while a sample is made; notified when one has been
@@ -70,7 +70,7 @@ class Params:
             raise ConfigError(f'params must be asked for with "get": true or "set": {{key: value}}, got {dict(request)!r}')
         if self._trial is None:
             raise ConfigError("params.live must be true in the controller's file for a change while it runs, got false")
-        config, ocp = changed(self._file, self.ocp, {**self.changes, **given})
+        config, ocp = changed_problem(self._file, self.ocp, {**self.changes, **given})
         self._try(self._trial, ocp)
         seq = self._take(config, ocp, self.version + 1, {**self.changes, **given})
         return {"version": self.version, "from_seq": seq}
@@ -82,22 +82,22 @@ class Params:
         Raises:
             ConfigError: It does not fit.
         """
-        if type(version) is not int or not 0 <= version < VERSIONS:
-            raise ConfigError(f"version of parameters must be an integer from 0 to {VERSIONS - 1}, got {version!r}")
+        if type(version) is not int or not 0 <= version < VERSION_COUNT:
+            raise ConfigError(f"version of parameters must be an integer from 0 to {VERSION_COUNT - 1}, got {version!r}")
         if version != self.version:
-            self._take(*changed(self._file, self.ocp, changes), version, dict(changes))
+            self._take(*changed_problem(self._file, self.ocp, changes), version, dict(changes))
 
     def _take(self, config: Config, ocp: Ocp, version: int, changes: dict[str, Any]) -> int:
         with self._lock:
             seq = self._controller.retune(ocp, version)
-        self.ocp, self.version, self.changes, self._values = ocp, version, changes, values(config)
+        self.ocp, self.version, self.changes, self._values = ocp, version, changes, parameter_values(config)
         return seq
 
     def _try(self, trial: Rti, ocp: Ocp) -> None:
         """Solve the QP that is prepared now with other weights and bounds, on a copy."""
         with self._lock:
-            self._lock.wait(PATIENCE * self.ocp.dt)  # for a sample to end: what follows then falls into the slack before the next
-            sample = {name: getattr(self._rti, name).copy() for name in SAMPLE}
+            self._lock.wait(SAMPLE_TIMEOUT_PERIODS * self.ocp.dt)  # for a sample to end: what follows then falls into the slack before the next
+            sample = {name: getattr(self._rti, name).copy() for name in SAMPLE_ARRAYS}
         trial.reset(sample["x"][0], sample["u_prev"])
         for name, value in sample.items():
             getattr(trial, name)[:] = value
@@ -111,10 +111,10 @@ class Params:
             raise ConfigError(f"the present sample must have a solution with the new values, its QP is {status.name.lower()}")
 
 
-def values(config: Config) -> dict[str, Any]:
+def parameter_values(config: Config) -> dict[str, Any]:
     """Return what may be changed, by key."""
     document = config.model_dump(by_alias=True)
-    tables = {key: branch(document, key) for key in (*WEIGHTS, *BOUNDS)}
+    tables = {key: entry_at(document, key) for key in (*WEIGHT_KEYS, *BOUND_KEYS)}
     return {
         f"{key}.{name}" if isinstance(table, dict) else key: value
         for key, table in tables.items()
@@ -122,14 +122,14 @@ def values(config: Config) -> dict[str, Any]:
     }
 
 
-def branch(document: Mapping[str, Any], key: str) -> Any:
+def entry_at(document: Mapping[str, Any], key: str) -> Any:
     """Return what a dotted key leads to."""
     for step in key.split("."):
         document = document[step]
     return document
 
 
-def changed(file: Config, ocp: Ocp, changes: Mapping[str, Any]) -> tuple[Config, Ocp]:
+def changed_problem(file: Config, ocp: Ocp, changes: Mapping[str, Any]) -> tuple[Config, Ocp]:
     """
     Return a configuration with other values, and its problem, made of one that was built of the file.
 
@@ -142,9 +142,9 @@ def changed(file: Config, ocp: Ocp, changes: Mapping[str, Any]) -> tuple[Config,
     document = file.model_dump(by_alias=True)
     for key, value in changes.items():
         table, _, name = key.rpartition(".")
-        if key not in WEIGHTS and table not in (*WEIGHTS[:2], *BOUNDS):
-            raise ConfigError(f"{key} {refused(key)}, got {value!r}")
-        branch(document, table)[name] = value
+        if key not in WEIGHT_KEYS and table not in (*WEIGHT_KEYS[:2], *BOUND_KEYS):
+            raise ConfigError(f"{key} {why_fixed(key)}, got {value!r}")
+        entry_at(document, table)[name] = value
     try:
         config = Config.model_validate(document)
         check_tree(config)
@@ -155,25 +155,29 @@ def changed(file: Config, ocp: Ocp, changes: Mapping[str, Any]) -> tuple[Config,
         raise ConfigError(explain(error, Config)) from error
     except OcpError as error:
         raise ConfigError(str(error)) from error
-    for wrong in wider(file, config, changes):
+    for wrong in wider_bounds(file, config, changes):
         raise ConfigError(wrong)
     return config, ocp
 
 
-def refused(key: str) -> str:
+def why_fixed(key: str) -> str:
     """Say why a key is none that may change."""
     known = dict(entries(Config))
     table = key.rpartition(".")[0]
     named = known.get(table, "") if not any(other.startswith(f"{table}.") for other in known) else ""  # a table of names
     what = known.get(key, named)
-    return f"({what}) is fixed while the controller runs: change its file, and restart it" if what else f"is none of {', '.join((*WEIGHTS, *BOUNDS))}"
+    return (
+        f"({what}) is fixed while the controller runs: change its file, and restart it"
+        if what
+        else f"is none of {', '.join((*WEIGHT_KEYS, *BOUND_KEYS))}"
+    )
 
 
-def wider(file: Config, config: Config, changes: Mapping[str, Any]) -> Iterator[str]:
+def wider_bounds(file: Config, config: Config, changes: Mapping[str, Any]) -> Iterator[str]:
     """Say which bounds are new, gone, or wider than the file's."""
-    now, before = values(config), values(file)
+    now, before = parameter_values(config), parameter_values(file)
     for key in changes:
-        if key.rpartition(".")[0] not in BOUNDS:
+        if key.rpartition(".")[0] not in BOUND_KEYS:
             continue
         if key not in before:
             yield f"{key} is not in the controller's file, and which bounds there are is fixed while it runs, got {list(now[key])}"

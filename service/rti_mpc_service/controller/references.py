@@ -17,7 +17,7 @@ from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Reference
 from rti_mpc.control.controller import Controller
 from rti_mpc.wire.bus import Bus, Subscriber
 
-STALE_S = 60.0  # silence of a planner after which one of a lower epoch may take over; a restarted one has a higher
+STALE_S = 60.0  # silence of a planner after which one of a lower epoch may take over; a restarted planner has a higher epoch
 
 LaidOut = tuple[Reference, Array | None]  # a reference, and what `Controller.lay_out` has made of it
 
@@ -74,10 +74,10 @@ class References:
         planned = self._planned.pop() if self._planned else None
         stamped = self._stamped.pop() if self._stamped else None
         if planned is not None:
-            self._last_planned = order(planned[0])
-            if self._anchored is not None and planned[0].stamp_ns == STAMP_ON_ARRIVAL and order(self._anchored) == self._last_planned:
+            self._last_planned = epoch_and_seq(planned[0])
+            if self._anchored is not None and planned[0].stamp_ns == STAMP_ON_ARRIVAL and epoch_and_seq(self._anchored) == self._last_planned:
                 planned = None  # the leader was faster: it has started already
-        if stamped is not None and not led and order(stamped[0]) >= self._last_planned:
+        if stamped is not None and not led and epoch_and_seq(stamped[0]) >= self._last_planned:
             return stamped
         return planned
 
@@ -93,6 +93,6 @@ class References:
         self._anchored = anchored if arriving else reference
 
 
-def order(reference: Reference) -> tuple[int, int]:
+def epoch_and_seq(reference: Reference) -> tuple[int, int]:
     """Return what references are ordered by, within one planner and across its restarts."""
     return reference.epoch, reference.seq

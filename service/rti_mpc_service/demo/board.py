@@ -16,10 +16,10 @@ from rti_mpc.contract.message import Event, Severity, Telemetry
 from rti_mpc.model.model import Signal
 from rti_mpc_service.redrawn import Redrawn
 
-RECENT = 200  # samples the medians are of
-EVENTS = 3  # shown
-LINES = 10  # of progress, without a terminal
-MISSING = "none"
+MEDIAN_SAMPLES = 200  # the shown medians are over the last samples
+MAX_SHOWN_EVENTS = 3
+PROGRESS_LINES = 10  # per run, where there is no terminal
+MISSING_TEXT = "none"
 
 
 class Board(Redrawn):
@@ -50,15 +50,15 @@ class Board(Redrawn):
             news = [Text(event.text, "red" if event.severity is Severity.ERROR else "yellow") for event in events if event.severity]
             head = Table.grid(padding=(0, 2))
             head.add_row(self._title, bar, f"{max(time_s, 0.0):.0f} of {self._duration_s:.0f} s")
-            self.draw(Group(head, table, *news[-EVENTS:]))
-        elif time_s >= self._said * self._duration_s / LINES:
-            self._said = int(time_s * LINES / self._duration_s) + 1
+            self.draw(Group(head, table, *news[-MAX_SHOWN_EVENTS:]))
+        elif time_s >= self._said * self._duration_s / PROGRESS_LINES:
+            self._said = int(time_s * PROGRESS_LINES / self._duration_s) + 1
             self.console.print(
                 f"{time_s:5.0f} of {self._duration_s:.0f} s: " + ", ".join(f"{name} {text}" for name, text in rows.items()), soft_wrap=True
             )
 
     def _rows(self, error_mm: float | None, telemetry: Sequence[Telemetry]) -> dict[str, str]:
-        last, recent = telemetry[-1], telemetry[-RECENT:]
+        last, recent = telemetry[-1], telemetry[-MEDIAN_SAMPLES:]
         medians = {name: np.median([getattr(sample, name) for sample in recent]) for name in ("prepare_us", "feedback_us")}
         return {
             "mode": last.mode.name.lower(),
@@ -75,11 +75,11 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
     """Print the sum of a run."""
     table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
     rows = [
-        (f"error after {summary['transient_s']:g} s", "max {} mm, rms {} mm".format(*said(summary, "max_error_mm", "rms_error_mm"))),
-        ("error of the last lap", "max {} mm".format(*said(summary, "last_lap_max_error_mm"))),
-        ("at the end", "{} mm from the reference, at {} mm/s".format(*said(summary, "final_error_mm", "final_speed_mm_s"))),
+        (f"error after {summary['transient_s']:g} s", "max {} mm, rms {} mm".format(*number_texts(summary, "max_error_mm", "rms_error_mm"))),
+        ("error of the last lap", "max {} mm".format(*number_texts(summary, "last_lap_max_error_mm"))),
+        ("at the end", "{} mm from the reference, at {} mm/s".format(*number_texts(summary, "final_error_mm", "final_speed_mm_s"))),
     ]
-    rows = [row for row in rows if MISSING not in row[1]]
+    rows = [row for row in rows if MISSING_TEXT not in row[1]]
     rows += [
         ("samples in period", f"{summary['in_period_share']:.2%} of {summary['samples']}, {summary['skipped']} skipped"),
         ("inputs in bounds", "always" if inputs_in_bounds(summary) else "NOT ALWAYS"),
@@ -102,9 +102,9 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
         console.print("{severity} of the {source} at {at_s:.1f} s: {text}".format(**fault), soft_wrap=True, markup=False)
 
 
-def said(summary: Mapping[str, Any], *names: str) -> list[str]:
-    """Return numbers in words, `MISSING` for what the run was too short for."""
-    return [MISSING if summary[name] is None else f"{summary[name]:.3g}" for name in names]
+def number_texts(summary: Mapping[str, Any], *names: str) -> list[str]:
+    """Return numbers in words, `MISSING_TEXT` for what the run was too short for."""
+    return [MISSING_TEXT if summary[name] is None else f"{summary[name]:.3g}" for name in names]
 
 
 def inputs_in_bounds(summary: Mapping[str, Any]) -> bool:

@@ -41,21 +41,21 @@ from rti_mpc_service.host.echo import ROLE as ECHO
 from rti_mpc_service.host.echo import Echo
 from rti_mpc_service.rig import robot_log
 from rti_mpc_service.rig.children import Children
-from rti_mpc_service.rig.company import CLI, POLITE, Failed, check, wait
+from rti_mpc_service.rig.company import CLI_MODULE, WATCHER_NICENESS, Failed, check_children, wait
 from rti_mpc_service.rig.endpoint import free_endpoint
-from rti_mpc_service.rig.scenario import HEADINGS, configured
+from rti_mpc_service.rig.scenario import BEST_HEADINGS, configured
 from rti_mpc_service.rig.summary import Outcome, summarize
 from rti_mpc_service.rig.witness import Witness
 
-PATIENCE_S = 60.0  # for everybody to be there: the first controller on a machine compiles
-SILENCE_S = 5.0  # of the controller, after which the robot will not be driven any further
-PATIENCE_END_S = 3.0
-LOOK_S = 0.1
-SHOW_S = 0.25
-MARGIN_S = 5.0  # of reference past the horizon of the last sample: near its last row a controller slows down
-RECORDER_S = 8.0  # to write what it has
-# The recorder first: a reference that goes on without a robot is nothing to look at.
-ENDING = (*(("recorder",) if find_spec("rerun") else ()), "controller", "guard", "robot", "reference", "echo")
+START_TIMEOUT_S = 60.0  # for all processes to be present; the first controller on a machine compiles
+CONTROLLER_SILENCE_S = 5.0  # after which the run ends: the robot will not be driven any further
+END_TIMEOUT_S = 3.0
+POLL_PERIOD_S = 0.1
+DRAW_PERIOD_S = 0.25
+REFERENCE_MARGIN_S = 5.0  # reference beyond the last sample's horizon: near the last row a controller slows down
+RECORDER_END_TIMEOUT_S = 8.0  # for the recorder to write what it has received
+# The recorder ends first, so that the recording ends while the robot is still driven.
+END_ORDER = (*(("recorder",) if find_spec("rerun") else ()), "controller", "guard", "robot", "reference", "echo")
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class DemoPlan:
     @property
     def reference_s(self) -> float:
         """How long the reference lasts."""
-        return self.duration_s + self.config.ocp.N * self.config.ocp.dt_s + MARGIN_S
+        return self.duration_s + self.config.ocp.N * self.config.ocp.dt_s + REFERENCE_MARGIN_S
 
 
 def plan(
@@ -99,7 +99,7 @@ def plan(
         ConfigError: There is no such scenario, or the model has outputs that no path fills.
     """
     trajectory = find_trajectory(scenario)
-    heading = heading or HEADINGS.get(scenario, "consistent")
+    heading = heading or BEST_HEADINGS.get(scenario, "consistent")
     return DemoPlan(
         config=configured(config, trajectory, heading, guard),
         scenario=scenario,
@@ -162,15 +162,15 @@ def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:
         start(run, children, endpoint, len(encode(command)))
         company = {"controller", "reference", ECHO, *(["viewer"] if recorded() else []), *guards(run)}
         board.wait(f"starting {', '.join(sorted(company))}")
-        wait(lambda: witness.listen().met(company), children, stop, PATIENCE_S, "all processes")
+        wait(lambda: witness.listen().met(company), children, stop, START_TIMEOUT_S, "all processes")
         echo = Echo(bus, State(0, 0, 0, np.zeros(ocp.model.nx)), 0.5 * ocp.dt / run.speed)
         meeting = ("-l", "tcp/127.0.0.1:0", "-e", endpoint)
-        children.start("robot", CLI, "sim", run.folder / "config.toml", *meeting, "--speed", run.speed, "--log", run.folder / "robot.csv")
+        children.start("robot", CLI_MODULE, "sim", run.folder / "config.toml", *meeting, "--speed", run.speed, "--log", run.folder / "robot.csv")
         board.wait("starting the robot")
         follow(run, witness, board, children, stop)
         board.wait("stopping all processes")
-        for name in (name for name in ENDING if name != "guard" or guards(run)):
-            if children.end(name, RECORDER_S if name == "recorder" else PATIENCE_END_S):
+        for name in (name for name in END_ORDER if name != "guard" or guards(run)):
+            if children.end(name, RECORDER_END_TIMEOUT_S if name == "recorder" else END_TIMEOUT_S):
                 board.console.print(f"{name} did not end well, see {children.log(name)}", soft_wrap=True, markup=False)
         witness.listen()
     if witness.info is None or witness.reference is None:
@@ -194,14 +194,14 @@ def start(run: DemoPlan, children: Children, endpoint: str, size: int) -> None:
     """Start everybody but the robot."""
     keys, config = run.config.keys(), run.folder / "config.toml"
     scenario = ("--scenario", run.scenario, "--heading", run.heading, "--duration", run.reference_s)
-    children.start("controller", CLI, "run", config, "-e", endpoint)
+    children.start("controller", CLI_MODULE, "run", config, "-e", endpoint)
     for name in guards(run):
-        children.start(name, CLI, "guard", config, "-e", endpoint)
-    children.start("reference", CLI, "reference", config, "-e", endpoint, *scenario, nice=POLITE)
+        children.start(name, CLI_MODULE, "guard", config, "-e", endpoint)
+    children.start("reference", CLI_MODULE, "reference", config, "-e", endpoint, *scenario, nice=WATCHER_NICENESS)
     children.start("echo", "rti_mpc_service.host.echo", endpoint, keys.prefix, keys.robot, size)
     if recorded():
         live = ("--rerun-spawn",) if run.viewer else ()
-        children.start("recorder", CLI, "view", config, "-e", endpoint, "--rerun-save", run.folder / "run.rrd", *live, nice=POLITE)
+        children.start("recorder", CLI_MODULE, "view", config, "-e", endpoint, "--rerun-save", run.folder / "run.rrd", *live, nice=WATCHER_NICENESS)
 
 
 def follow(run: DemoPlan, witness: Witness, board: Board, children: Children, stop: Event) -> None:
@@ -211,20 +211,20 @@ def follow(run: DemoPlan, witness: Witness, board: Board, children: Children, st
     Raises:
         Failed: A process has ended by itself, or nothing was ever driven.
     """
-    wait(lambda: witness.listen().begun, children, stop, PATIENCE_S, "the first sample")
+    wait(lambda: witness.listen().begun, children, stop, START_TIMEOUT_S, "the first sample")
     heard, heard_s, shown_s = 0, time.monotonic(), 0.0
     while not stop.is_set() and witness.reference is not None:
         now_s, last = time.monotonic(), witness.telemetry[-1]
         time_s = 1e-9 * (last.state_stamp_ns - witness.reference.stamp_ns)
         if len(witness.telemetry) > heard:
             heard, heard_s = len(witness.telemetry), now_s
-        if time_s >= run.duration_s or now_s - heard_s > SILENCE_S:
+        if time_s >= run.duration_s or now_s - heard_s > CONTROLLER_SILENCE_S:
             return
-        if now_s - shown_s > SHOW_S:
+        if now_s - shown_s > DRAW_PERIOD_S:
             shown_s = now_s
             board.show(time_s, error_mm(run, witness.info, last, witness.reference), witness.telemetry, witness.events)
-        check(children)
-        stop.wait(LOOK_S)
+        check_children(children)
+        stop.wait(POLL_PERIOD_S)
         witness.listen()
 
 
@@ -238,7 +238,7 @@ def error_mm(run: DemoPlan, info: Info | None, sample: Telemetry, reference: Ref
 
 def conclude(run: DemoPlan, outcome: Outcome, console: Console) -> int:
     """Write and print the sum of a run, draw it, and tell how to look at it; return the exit status."""
-    summary = {**summarize(outcome), "heading": run.heading, "machine": machine.describe()}
+    summary = {**summarize(outcome), "heading": run.heading, "machine": machine.machine_info()}
     (run.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     if not summary["samples"]:
         console.print(f"rti-mpc: nothing was driven, see {run.folder / 'logs'}", soft_wrap=True, markup=False)
@@ -254,7 +254,7 @@ def conclude(run: DemoPlan, outcome: Outcome, console: Console) -> int:
         console.print(f"figure     {run.folder / 'run.png'}", soft_wrap=True, markup=False)
     if recorded():
         rerun = Path(sys.executable).with_name("rerun")
-        console.print(f"recording  {shown(rerun) if rerun.exists() else 'rerun'} {run.folder / 'run.rrd'}", soft_wrap=True, markup=False)
+        console.print(f"recording  {path_as_typed(rerun) if rerun.exists() else 'rerun'} {run.folder / 'run.rrd'}", soft_wrap=True, markup=False)
     console.print(f"all of it  {run.folder}", soft_wrap=True, markup=False)
     if not summary["driven"]:
         console.print("rti-mpc: the robot was not driven to the end", markup=False)
@@ -271,6 +271,6 @@ def recorded() -> bool:
     return find_spec("rerun") is not None
 
 
-def shown(path: Path) -> Path:
+def path_as_typed(path: Path) -> Path:
     """Return a path as it would be typed here."""
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

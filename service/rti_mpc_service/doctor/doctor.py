@@ -47,15 +47,15 @@ from rti_mpc_service.rig.summary import quantiles
 from rti_mpc_service.rig.wave import wave
 from rti_mpc_service.warm_up import warm_up
 
-TICK_S, TICKS = 0.001, 1000
-PAUSE_S = 0.005  # between two pings, and between two samples
-PINGS, SAMPLES = 200, 200
-PATIENCE_S = 10.0  # for the process that echoes
-PRIORITY = 20  # tried where the configuration asks for none
-MARGIN = 1.5  # on the sum of all p99, for the shortest period
+TIMER_PERIOD_S, TIMER_TICKS = 0.001, 1000
+PAUSE_S = 0.005  # before each ping and before each sample
+PING_COUNT, SAMPLE_COUNT = 200, 200
+ECHO_TIMEOUT_S = 10.0  # for the echo process to start
+DEFAULT_PRIORITY = 20  # tried where the configuration asks for no priority
+PERIOD_MARGIN_FACTOR = 1.5  # the shortest period is this factor times the sum of all p99
 CLOCK_SOURCE = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
 TIMER_SLACK = Path("/proc/self/timerslack_ns")
-EXTRAS = {"rerun-sdk": "view", "matplotlib": "figure"}
+EXTRA_OF_PACKAGE = {"rerun-sdk": "view", "matplotlib": "figure"}
 
 
 def main(path: Path, json_path: Path | None = None) -> int:
@@ -67,12 +67,12 @@ def main(path: Path, json_path: Path | None = None) -> int:
     if json_path is not None:
         json_path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     table = Table("what", "here", "which means", box=None, padding=(0, 2, 0, 0))
-    for row in rows(report):
+    for row in finding_rows(report):
         table.add_row(*row)
     console.print(table)
     loop = report["loop"]
     fits = "can be kept here" if loop["fits"] else "CANNOT be kept here"
-    console.print(f"{path}: a period of {1e3 * config.ocp.dt_s:g} ms {fits}, the shortest is {shortest(loop)}", soft_wrap=True, markup=False)
+    console.print(f"{path}: a period of {1e3 * config.ocp.dt_s:g} ms {fits}, the shortest is {shortest_text(loop)}", soft_wrap=True, markup=False)
     return 0 if loop["fits"] else 1
 
 
@@ -80,36 +80,36 @@ def examine(config: Config) -> dict[str, Any]:
     """Measure everything, one after the other, in JSON; times in the unit of the name."""
     ticks = count()
     report: dict[str, Any] = {
-        "machine": machine.describe(),
+        "machine": machine.machine_info(),
         "realtime": permissions(config),
-        "clock": clock(),
-        "timer_us": quantiles(np.array(1e-3) * bare_timer(TICK_S, lambda: next(ticks) < TICKS)[:, 1]),
+        "clock": clock_info(),
+        "timer_us": quantiles(np.array(1e-3) * bare_timer(TIMER_PERIOD_S, lambda: next(ticks) < TIMER_TICKS)[:, 1]),
         "round_trip_us": quantiles(round_trip_us(config)),
         "compiler": compiler(),
-        "cache": cache(),
-        "extras": {name: installed(name) for name in EXTRAS},
+        "cache": cache_info(),
+        "extras": {name: installed(name) for name in EXTRA_OF_PACKAGE},
     }
     prepare_us, feedback_us = phases_us(config)
     report |= {"prepare_us": quantiles(prepare_us), "feedback_us": quantiles(feedback_us)}
-    return report | {"loop": promise(report, config.ocp.dt_s)}
+    return report | {"loop": period_verdict(report, config.ocp.dt_s)}
 
 
-def promise(report: dict[str, Any], dt_s: float) -> dict[str, Any]:
+def period_verdict(report: dict[str, Any], dt_s: float) -> dict[str, Any]:
     """Say which period can be kept: all that happens between two states, each at its p99, and half as much again; none if a part is unknown."""
     parts = [report[part]["p99"] for part in ("prepare_us", "feedback_us", "timer_us", "round_trip_us")]
-    shortest_us = None if None in parts else MARGIN * sum(parts)
-    return {"margin": MARGIN, "shortest_period_us": shortest_us, "fits": shortest_us is not None and shortest_us <= 1e6 * dt_s}
+    shortest_us = None if None in parts else PERIOD_MARGIN_FACTOR * sum(parts)
+    return {"margin": PERIOD_MARGIN_FACTOR, "shortest_period_us": shortest_us, "fits": shortest_us is not None and shortest_us <= 1e6 * dt_s}
 
 
 def permissions(config: Config) -> dict[str, dict[str, Any]]:
     """Attempt what a controller may ask for, in a thread that then ends."""
     wanted = config.realtime
     with ThreadPoolExecutor(1) as pool:
-        outcomes = pool.submit(realtime.attempt, wanted.priority or PRIORITY, wanted.cores or realtime.available(), lock_memory=True).result()
+        outcomes = pool.submit(realtime.attempt, wanted.priority or DEFAULT_PRIORITY, wanted.cores or realtime.available(), lock_memory=True).result()
     return {outcome.what: asdict(outcome) for outcome in outcomes}
 
 
-def clock() -> dict[str, Any]:
+def clock_info() -> dict[str, Any]:
     """Describe the monotonic clock and the timers."""
     began_ns = time.perf_counter_ns()
     readings = [time.monotonic_ns() for _ in range(10_000)]
@@ -133,8 +133,8 @@ def round_trip_us(config: Config) -> Array:
     ):
         pinger = Pinger(bus, State(0, 0, 0, np.zeros(model.nx)))
         children.start("echo", "rti_mpc_service.host.echo", endpoint, keys.prefix, keys.robot, len(encode(command)))
-        if bus.is_alive(ECHO, PATIENCE_S):
-            for _ in paced(PINGS):
+        if bus.is_alive(ECHO, ECHO_TIMEOUT_S):
+            for _ in paced(PING_COUNT):
                 pinger.ping()
     return np.array(pinger.round_trip_us)
 
@@ -144,10 +144,10 @@ def phases_us(config: Config) -> tuple[Array, Array]:
     rti, x = build_rti(config), np.array(robot_settings(config)["x0"])
     warm_up(rti)
     dt_ns = round(1e9 * config.ocp.dt_s)
-    y = wave(rti.ocp, x, np.random.default_rng(1))(np.arange(SAMPLES + config.ocp.N + 1))
+    y = wave(rti.ocp, x, np.random.default_rng(1))(np.arange(SAMPLE_COUNT + config.ocp.N + 1))
     controller = Controller(rti, Timing())
     controller.receive_reference(Reference(1, 1, 0, dt_ns, End.HOLD, y, np.empty((len(y), 0))))
-    prepare_us, feedback_us = np.zeros(SAMPLES), np.zeros(SAMPLES)
+    prepare_us, feedback_us = np.zeros(SAMPLE_COUNT), np.zeros(SAMPLE_COUNT)
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -163,7 +163,7 @@ def phases_us(config: Config) -> tuple[Array, Array]:
         pass
     controller.commit(command)
     controller.prepare()
-    for k in paced(SAMPLES):
+    for k in paced(SAMPLE_COUNT):
         arrival_ns = time.monotonic_ns()
         command = answer()
         assert command is not None
@@ -190,7 +190,7 @@ def compiler() -> str | None:
     return subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout.partition("\n")[0] if path else None
 
 
-def cache() -> dict[str, Any]:
+def cache_info() -> dict[str, Any]:
     """Say where compiled code is kept, and what keeps it from being kept there, if anything does."""
     try:
         folder = cache_dir()
@@ -208,33 +208,33 @@ def installed(name: str) -> str | None:
         return None
 
 
-def rows(report: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+def finding_rows(report: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     """Say each finding and what it means, in a line."""
-    host, clock, loop, cache = report["machine"], report["clock"], report["loop"], report["cache"]
-    slack = "unknown" if clock["timer_slack_us"] is None else f"{clock['timer_slack_us']:g} us"
+    host, clock_info, loop, cache_info = report["machine"], report["clock"], report["loop"], report["cache"]
+    slack = "unknown" if clock_info["timer_slack_us"] is None else f"{clock_info['timer_slack_us']:g} us"
     yield "processor", f"{host['processor']}, {host['cores']} cores, load {host['load']}", "robot and controller want a core each"
     yield "governor", host["governor"], "performance keeps times even"
     for what, outcome in report["realtime"].items():
         yield what.replace("_", " "), outcome["text"], f"realtime.{what} {'would be granted' if outcome['granted'] else 'would be refused'}"
-    yield "clock", f"{clock['source']}, {clock['resolution_ns']:g} ns, {clock['reading_ns']:.0f} ns a reading", ""
+    yield "clock", f"{clock_info['source']}, {clock_info['resolution_ns']:g} ns, {clock_info['reading_ns']:.0f} ns a reading", ""
     yield "timer slack", slack, "what the kernel may add to a sleep"
-    yield "bare timer loop", said(report["timer_us"]), f"how late it wakes, every {1e3 * TICK_S:g} ms"
-    yield "Zenoh round trip", said(report["round_trip_us"]), "a state out, a command in, nothing between"
+    yield "bare timer loop", quantiles_text(report["timer_us"]), f"how late it wakes, every {1e3 * TIMER_PERIOD_S:g} ms"
+    yield "Zenoh round trip", quantiles_text(report["round_trip_us"]), "a state out, a command in, nothing between"
     yield "compiler", report["compiler"] or "none", "what it compiled is cached" if report["compiler"] else "preparation takes several times longer"
-    yield "cache", cache["path"] or "none", "is kept" if cache["error"] is None else f"compiles at EVERY start: {cache['error']}"
+    yield "cache", cache_info["path"] or "none", "is kept" if cache_info["error"] is None else f"compiles at EVERY start: {cache_info['error']}"
     for name, found in report["extras"].items():
-        yield name, found or "not installed", f"pip install 'rti-mpc[{EXTRAS[name]}]'" if found is None else ""
+        yield name, found or "not installed", f"pip install 'rti-mpc[{EXTRA_OF_PACKAGE[name]}]'" if found is None else ""
     yield "versions", ", ".join(f"{name} {found}" for name, found in {"python": host["python"], **host["packages"]}.items()), host["system"]
-    yield "preparation", said(report["prepare_us"]), f"of {SAMPLES} samples, {1e3 * PAUSE_S:g} ms apart"
-    yield "feedback", said(report["feedback_us"]), ""
-    yield "shortest period", shortest(loop), f"{loop['margin']:g} times preparation, feedback, timer and round trip at p99"
+    yield "preparation", quantiles_text(report["prepare_us"]), f"of {SAMPLE_COUNT} samples, {1e3 * PAUSE_S:g} ms apart"
+    yield "feedback", quantiles_text(report["feedback_us"]), ""
+    yield "shortest period", shortest_text(loop), f"{loop['margin']:g} times preparation, feedback, timer and round trip at p99"
 
 
-def shortest(loop: dict[str, Any]) -> str:
+def shortest_text(loop: dict[str, Any]) -> str:
     """Return the shortest period in words."""
     return "unknown" if loop["shortest_period_us"] is None else f"{1e-3 * loop['shortest_period_us']:.1f} ms"
 
 
-def said(times: dict[str, float]) -> str:
+def quantiles_text(times: dict[str, float]) -> str:
     """Return quantiles in words."""
     return "not measured" if times["p50"] is None else f"p50 {times['p50']:.0f}, p99 {times['p99']:.0f}, max {times['max']:.0f} us"

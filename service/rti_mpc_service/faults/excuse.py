@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from rti_mpc_service.faults.measure import Incident, Measured
 from rti_mpc_service.faults.promise import Promise
 
-SHARE = 0.25  # of a period: a sample takes a fiftieth of one, and is missed when it takes a whole one
-TIMES = {"brake_s": "fault_ns", "zero_s": "fault_ns", "still_s": "fault_ns", "recovery_s": "mend_ns"}  # and where each begins
+HELD_UP_SHARE = 0.25  # a sample takes a fiftieth of a period, and is missed when it takes a whole one
+START_OF_TIME = {"brake_s": "fault_ns", "zero_s": "fault_ns", "still_s": "fault_ns", "recovery_s": "mend_ns"}  # instant from which each is counted
 
 HeldUp = Callable[[int, int], float]
 
@@ -34,8 +34,8 @@ def excuses(measured: Measured, missed_ns: NDArray[np.int64], incident: Incident
         period_ns: Of the controller.
         held_up_ms: For how long the host held the processes up between two instants, ms. All instants are in robot time.
     """
-    excused = {"missed": float(sum(held_up_ms(at - period_ns, at + period_ns) > 1e-6 * SHARE * period_ns for at in missed_ns.tolist()))}
-    for name, begin in TIMES.items():
+    excused = {"missed": float(sum(held_up_ms(at - period_ns, at + period_ns) > 1e-6 * HELD_UP_SHARE * period_ns for at in missed_ns.tolist()))}
+    for name, begin in START_OF_TIME.items():
         if (took_s := getattr(measured, name)) is not None:
             excused[name] = 1e-3 * held_up_ms(getattr(incident, begin), getattr(incident, begin) + round(1e9 * took_s))
     return excused

@@ -27,12 +27,12 @@ from rti_mpc.contract.message import Reference
 from rti_mpc.contract.schedule import RAMP_STEP_NS
 from rti_mpc_service.rig.robot_log import RobotLog
 
-STANDING_M_S = 1e-3
-AT_REST = 1e-9  # of an input, in its unit
-LATE_S = 0.02  # by which a ramp may be behind one that began in time: two steps of ten milliseconds
-SLOWER = 1.5  # times as long as the slew limits need may a ramp take that is put together of several
-RAMP_STEP = 0.09  # share of a period's change with which a ramp begins at least: a step of ten milliseconds
-FRESH_S = 0.25  # age up to which a state may be answered
+STANDSTILL_SPEED_M_S = 1e-3
+REST_TOLERANCE = 1e-9  # largest deviation of an input from rest, in its unit
+MAX_RAMP_LATENESS_S = 0.02  # how far a ramp may lag behind one that began in time: two steps of 10 ms
+MAX_RAMP_STRETCH = 1.5  # a ramp composed of several may take this factor longer than the slew limits need
+MIN_RAMP_STEP_SHARE = 0.09  # least first step of a ramp, as a share of a period's largest change: just under a step of 10 ms in a period of 0.1 s
+MAX_FRESH_AGE_S = 0.25  # age up to which a state may be answered
 
 Mask = NDArray[np.bool_]
 
@@ -99,7 +99,7 @@ def measure(log: RobotLog, place: tuple[int, int], reference: Array, incident: I
     t = log.stamp_ns
     broken = (t >= incident.fault_ns) & (t <= incident.mend_ns)
     seen = (t >= incident.fault_ns) & (t <= incident.end_ns)
-    moving: Mask = np.abs(log.u - limits.u_rest).max(axis=1) > AT_REST
+    moving: Mask = np.abs(log.u - limits.u_rest).max(axis=1) > REST_TOLERANCE
     position = log.x[:, list(place)]
     way = np.hypot(*np.diff(position, axis=0, prepend=position[:1]).T)
     speed: Array = way / (1e-9 * np.diff(t, prepend=t[0] - 1))
@@ -107,8 +107,8 @@ def measure(log: RobotLog, place: tuple[int, int], reference: Array, incident: I
 
     zero = settled(~moving, broken)
     brake = None if zero is None or zero == np.argmax(broken) else braking(log, limits, int(np.argmax(broken)), zero)
-    still = settled(speed < STANDING_M_S, broken)
-    again = moving if zero is not None else speed > STANDING_M_S if still is not None else np.isfinite(log.latency_us)
+    still = settled(speed < STANDSTILL_SPEED_M_S, broken)
+    again = moving if zero is not None else speed > STANDSTILL_SPEED_M_S if still is not None else np.isfinite(log.latency_us)
     driven = np.flatnonzero(again & seen & (t > incident.mend_ns))
 
     def after(instant_ns: int, row: int | None) -> float | None:
@@ -158,7 +158,7 @@ def braking(log: RobotLog, limits: Limits, first: int, zero: int) -> int:
     way = np.abs(log.u - limits.u_rest)
     for row in range(max(first, 1), zero):
         share = float(((way[row - 1] - way[row]) / step(limits)).max())
-        if share >= RAMP_STEP and -t_s[row - 1] <= SLOWER * left_s[row - 1] + LATE_S:
+        if share >= MIN_RAMP_STEP_SHARE and -t_s[row - 1] <= MAX_RAMP_STRETCH * left_s[row - 1] + MAX_RAMP_LATENESS_S:
             return row
     return zero
 
@@ -166,7 +166,7 @@ def braking(log: RobotLog, limits: Limits, first: int, zero: int) -> int:
 def fresh_ns(log: RobotLog, incident: Incident) -> int:
     """Return the first stamp, of states fresh when mended, that was answered after that; the end if none was."""
     arrival_ns = log.stamp_ns + 1e3 * log.latency_us
-    answered = log.stamp_ns[(log.stamp_ns >= incident.mend_ns - round(1e9 * FRESH_S)) & (arrival_ns >= incident.mend_ns)]
+    answered = log.stamp_ns[(log.stamp_ns >= incident.mend_ns - round(1e9 * MAX_FRESH_AGE_S)) & (arrival_ns >= incident.mend_ns)]
     return int(answered[0]) if answered.size else incident.end_ns
 
 

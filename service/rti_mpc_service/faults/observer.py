@@ -15,8 +15,8 @@ from rti_mpc.wire.bus import RING_MESSAGES, Bus, Subscriber
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
 
-STALE_S = 0.25  # without a message after which another life is looked at
-LOOK_BACK_NS = 200_000_000  # over which speed is measured
+STALE_S = 0.25  # silence after which another life of the sender is accepted
+SPEED_WINDOW_NS = 200_000_000  # time over which the speed is measured
 
 
 class RunObserver:
@@ -70,9 +70,9 @@ class RunObserver:
     def speed_m_s(self) -> float:
         """Speed over the last states; 0 if they do not come."""
         states = list(self._states)
-        if not states or self.now_ns() - states[-1][0] > LOOK_BACK_NS:
+        if not states or self.now_ns() - states[-1][0] > SPEED_WINDOW_NS:
             return 0.0
-        first = next(state for state in states if states[-1][0] - state[0] <= LOOK_BACK_NS)
+        first = next(state for state in states if states[-1][0] - state[0] <= SPEED_WINDOW_NS)
         return float(np.hypot(*(states[-1][2] - first[2]))) / max(1e-9 * (states[-1][0] - first[0]), 1e-3)
 
     def _receive(self, subscriber: Subscriber, intake: Intake[State]) -> None:

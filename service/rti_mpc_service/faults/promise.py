@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 from rti_mpc_service.faults.measure import Measured
 
-NOTHING: Mapping[str, float] = {}
-ROUNDING = 1e-6  # of a share
-EVERYWHERE = {"step_share": 1.0 + ROUNDING, "stale": 0.0}
-BRAKES = {"brake_s": 0.3, "zero_s": 0.5}
-AGAIN = {"recovery_s": 20.0}  # processes started again included
+NO_EXCUSE: Mapping[str, float] = {}
+SHARE_ROUNDING = 1e-6  # rounding of `Measured.step_share`
+ALWAYS = {"step_share": 1.0 + SHARE_ROUNDING, "stale": 0.0}
+BRAKING = {"brake_s": 0.3, "zero_s": 0.5}
+RECOVERY = {"recovery_s": 20.0}  # includes the start of processes that were killed
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Promise:
         """Whether it is about the distance from the reference."""
         return not {"error_m", "final_error_m"}.isdisjoint(self.at_most)
 
-    def broken(self, measured: Measured, excused: Mapping[str, float] = NOTHING) -> list[str]:
+    def broken(self, measured: Measured, excused: Mapping[str, float] = NO_EXCUSE) -> list[str]:
         """Return what is not within the promise, nor excused: by how much each number may be more than its limit."""
         values = {name: getattr(measured, name) for name in self.at_most}
         return [
@@ -43,11 +43,11 @@ class Promise:
         ]
 
 
-STOPS = Promise("stops, and drives again when mended", {**EVERYWHERE, **BRAKES, "still_s": 2.5, **AGAIN})
+STOPS = Promise("stops, and drives again when mended", {**ALWAYS, **BRAKING, "still_s": 2.5, **RECOVERY})
 STAYS = Promise("stops, stands whoever is restarted, and drives again when released", STOPS.at_most)
-PAUSES = Promise("brakes to zero, and drives again when mended", {**EVERYWHERE, **BRAKES, **AGAIN})
-KEEPS_ON = Promise("keeps on", {**EVERYWHERE, "missed": 0.0, "error_m": 0.01})
-RECOVERS = Promise("is driven again when mended", {**EVERYWHERE, **AGAIN})
-REJOINS = Promise("moves over to the new reference", {**EVERYWHERE, "missed": 0.0, "final_error_m": 0.01})
-HOLDS = Promise("stands where the reference ends, and drives again when mended", {**EVERYWHERE, "still_s": 5.0, "final_error_m": 0.01, **AGAIN})
-WAITS = Promise("does not move before there is a reference", {**EVERYWHERE, "distance_m": 1e-6, **AGAIN})
+PAUSES = Promise("brakes to zero, and drives again when mended", {**ALWAYS, **BRAKING, **RECOVERY})
+KEEPS_ON = Promise("keeps on", {**ALWAYS, "missed": 0.0, "error_m": 0.01})
+RECOVERS = Promise("is driven again when mended", {**ALWAYS, **RECOVERY})
+REJOINS = Promise("moves over to the new reference", {**ALWAYS, "missed": 0.0, "final_error_m": 0.01})
+HOLDS = Promise("stands where the reference ends, and drives again when mended", {**ALWAYS, "still_s": 5.0, "final_error_m": 0.01, **RECOVERY})
+WAITS = Promise("does not move before there is a reference", {**ALWAYS, "distance_m": 1e-6, **RECOVERY})

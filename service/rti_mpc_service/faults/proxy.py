@@ -7,7 +7,7 @@ import socket
 from contextlib import suppress
 from threading import Event, Thread
 
-CHUNK = 65536
+CHUNK_BYTES = 65536
 
 
 class Proxy:
@@ -65,7 +65,7 @@ class Proxy:
     def _pump(self, source: socket.socket, sink: socket.socket) -> None:
         """Forward one direction of a connection until either end closes; a thread of its own."""
         with suppress(OSError):
-            while data := source.recv(CHUNK):
+            while data := source.recv(CHUNK_BYTES):
                 self._passing.wait()
                 sink.sendall(data)
         for end in (source, sink):

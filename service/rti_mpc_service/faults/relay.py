@@ -31,11 +31,11 @@ from rti_mpc.wire.zenoh_session import ZenohSession
 
 ROLE = "relay"
 STALE_S = 0.25
-LATE_NS = 400_000_000
-JUMP_NS = 5_000_000_000
+STATE_DELAY_NS = 400_000_000
+CLOCK_JUMP_NS = 5_000_000_000
 
 Change = Callable[[State, "deque[State]"], Iterable[State]]
-STAMPS = ("stamp_ns", "state_stamp_ns", "valid_until_ns")  # of a command
+COMMAND_STAMPS = ("stamp_ns", "state_stamp_ns", "valid_until_ns")  # fields of a command that are times of the robot's clock
 
 
 def frozen(state: State, held: deque[State]) -> Iterable[State]:
@@ -47,7 +47,7 @@ def frozen(state: State, held: deque[State]) -> Iterable[State]:
 def late(state: State, held: deque[State]) -> Iterable[State]:
     """Every state so much later."""
     held.append(state)
-    while state.stamp_ns - held[0].stamp_ns >= LATE_NS:
+    while state.stamp_ns - held[0].stamp_ns >= STATE_DELAY_NS:
         yield held.popleft()
 
 
@@ -57,8 +57,8 @@ def reordered(state: State, held: deque[State]) -> Iterable[State]:
     return [held.pop(), held.pop()] if len(held) == 2 else []
 
 
-# What becomes of a state, by name.
-CHANGES: dict[str, Change] = {
+# The messages that are sent in place of one state, by the name of the fault.
+STATE_CHANGES: dict[str, Change] = {
     "none": lambda state, _: [state],
     "frozen": frozen,
     "late": late,
@@ -69,8 +69,8 @@ CHANGES: dict[str, Change] = {
     "nan": lambda state, _: [replace(state, x=np.where(np.arange(len(state.x)), state.x, np.nan))],
     "short": lambda state, _: [replace(state, x=state.x[:-1])],
 }
-LOST = "commands_lost"  # states pass, commands do not
-JUMPS = {"ahead": JUMP_NS, "behind": -JUMP_NS}  # of the robot's clock
+COMMANDS_LOST = "commands_lost"  # name of the fault in which states pass and commands do not
+CLOCK_JUMPS_NS = {"ahead": CLOCK_JUMP_NS, "behind": -CLOCK_JUMP_NS}
 
 
 class Relay:
@@ -97,12 +97,12 @@ class Relay:
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Change the states from now on: ``{"fault": NAME, "states": HOW_MANY}``, all of them without a number; answer since when, robot time."""
         name = request["fault"]
-        if name in JUMPS:
-            self._offset_ns += JUMPS[name]
+        if name in CLOCK_JUMPS_NS:
+            self._offset_ns += CLOCK_JUMPS_NS[name]
             return {"ok": True, "stamp_ns": self._stamp_ns}
-        if name not in CHANGES and name != LOST:
-            return {"ok": False, "error": f"fault must be one of {', '.join([*CHANGES, *JUMPS, LOST])}, got {name!r}"}
-        self._losing = name == LOST
+        if name not in STATE_CHANGES and name != COMMANDS_LOST:
+            return {"ok": False, "error": f"fault must be one of {', '.join([*STATE_CHANGES, *CLOCK_JUMPS_NS, COMMANDS_LOST])}, got {name!r}"}
+        self._losing = name == COMMANDS_LOST
         self._fault = ("none" if self._losing else name, request.get("states", 2**62), deque())
         return {"ok": True, "stamp_ns": self._stamp_ns}
 
@@ -110,7 +110,7 @@ class Relay:
         """Pass a state on, or what becomes of it."""
         name, states, held = self._fault
         self._stamp_ns = state.stamp_ns
-        for changed in CHANGES[name](state, held):
+        for changed in STATE_CHANGES[name](state, held):
             self._states.put(replace(changed, stamp_ns=changed.stamp_ns + self._offset_ns))
         if name != "none" and self._fault[2] is held:
             self._fault = (name, states - 1, held) if states > 1 else ("none", 0, deque())
@@ -119,7 +119,7 @@ class Relay:
         """Pass a command back, if the link does."""
         if self._losing:
             return
-        publisher.put(replace(command, **{name: getattr(command, name) - self._offset_ns for name in STAMPS}))
+        publisher.put(replace(command, **{name: getattr(command, name) - self._offset_ns for name in COMMAND_STAMPS}))
 
     def _follow(self, subscriber: Subscriber, intake: Intake[M], act: Callable[[M], None]) -> None:
         def follow() -> None:

@@ -17,8 +17,8 @@ from rti_mpc_service.host import machine
 from rti_mpc_service.redrawn import Redrawn
 
 COLUMNS = ("fault", "the robot", "speed\nm/s", "braking\nms", "zero\nms", "standstill\ns", "way\nm", "step\n%", "error\nmm", "recovery\ns", "kept")
-NONE = "-"
-WIDTH = 130
+NO_VALUE = "-"
+MATRIX_WIDTH_COLUMNS = 130
 
 
 @dataclass(frozen=True)
@@ -71,31 +71,31 @@ class MatrixRow:
         promised = self.fault.promise.at_most
         measured, verdict = self.measured, "NO" if self.broken else "host" if self.excused else "yes"
         if measured is None:
-            return (self.fault.name, self.did, *[NONE] * (len(COLUMNS) - 3), verdict)
+            return (self.fault.name, self.did, *[NO_VALUE] * (len(COLUMNS) - 3), verdict)
         return (
             self.fault.name,
             self.did,
             f"{measured.speed_m_s:.2f}",
-            shown(measured.brake_s, 1e3, 0),
-            shown(measured.zero_s, 1e3, 0),
-            shown(measured.still_s, 1.0, 2),
+            number_text(measured.brake_s, 1e3, 0),
+            number_text(measured.zero_s, 1e3, 0),
+            number_text(measured.still_s, 1.0, 2),
             f"{measured.distance_m:.3f}",
             f"{100 * measured.step_share:.0f}",
-            shown(next((getattr(measured, name) for name in ("error_m", "final_error_m") if name in promised), None), 1e3, 1),
-            shown(measured.recovery_s if "recovery_s" in promised else None, 1.0, 2),
+            number_text(next((getattr(measured, name) for name in ("error_m", "final_error_m") if name in promised), None), 1e3, 1),
+            number_text(measured.recovery_s if "recovery_s" in promised else None, 1.0, 2),
             verdict,
         )
 
 
-def shown(value: float | None, factor: float, digits: int) -> str:
+def number_text(value: float | None, factor: float, digits: int) -> str:
     """Return a number as it is shown."""
-    return NONE if value is None else f"{factor * value:.{digits}f}"
+    return NO_VALUE if value is None else f"{factor * value:.{digits}f}"
 
 
 def report_console() -> Console:
     """Return a console, wide enough for the matrix where there is no terminal."""
     console = Console()
-    return console if console.is_terminal else Console(width=WIDTH)
+    return console if console.is_terminal else Console(width=MATRIX_WIDTH_COLUMNS)
 
 
 class MatrixReport(Redrawn):
@@ -137,7 +137,7 @@ class MatrixReport(Redrawn):
             if words := [*row.broken, *row.excused]:
                 self.console.print(f"{row.fault.name}: {row.fault.promise.text}: {'; '.join(words)}", soft_wrap=True, markup=False)
         kept = sum(not row.broken for row in self.rows)
-        about = machine.describe()
+        about = machine.machine_info()
         self.console.print(
             f"{kept} of {len(self.rows)} within their promise; robot time at speed 1, {about['processor']}, {about['cores']} cores", soft_wrap=True
         )

@@ -38,18 +38,18 @@ from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.company import Failed
 from rti_mpc_service.rig.scenario import configured
 
-STATE_PERIOD_S = 0.01  # of the robot, and so of its record: what times are known to
-COMPANY = {
+STATE_PERIOD_S = 0.01  # of the robot and of its record: the resolution of every measured time
+ROLES_OF_WIRING = {
     Wiring.PEERS: ("controller", "guard", "reference", "robot"),
     Wiring.ROUTER: ("router", "controller", "guard", "reference", "robot"),
     Wiring.LINK: (RELAY, "controller", "guard", "reference", "robot"),
     Wiring.SENSOR: (RELAY, "controller", "guard", "reference", "robot"),
 }
-SETTLED_M = 0.001
-RECOVERY_S = 20.0
-LEFT_S = 40.0  # of reference, that a fault may take
-A_MOMENT_S = 0.3  # more, to see what comes of it
-FLUSH_S = 5.0  # for the robot to write what it knows; a line waits a second for an answer
+MAX_SETTLED_ERROR_M = 0.001
+RECOVERY_TIMEOUT_S = 20.0
+MIN_REFERENCE_LEFT_S = 40.0  # duration of the reference that a fault may need
+AFTER_RECOVERY_S = 0.3  # how long the robot is recorded after it has recovered
+RECORD_TIMEOUT_S = 5.0  # for the robot to write its record; a line waits up to a second for an answer
 
 
 def main(config_path: Path, only: Sequence[str], path: Path | None) -> int:
@@ -148,11 +148,11 @@ def make_ready(system: System, fault: Fault, report: MatrixReport) -> None:
         Failed: It is not.
     """
     report.say(fault, "waiting for the robot to be driven")
-    system.ensure(*COMPANY[fault.wiring], *(("viewer",) if fault.viewer else ()))
-    if system.witness.begun and system.reference_left_s() < LEFT_S:
+    system.ensure(*ROLES_OF_WIRING[fault.wiring], *(("viewer",) if fault.viewer else ()))
+    if system.witness.begun and system.reference_left_s() < MIN_REFERENCE_LEFT_S:
         system.restart("reference")
-        system.wait(lambda: system.witness.listen() and system.reference_left_s() > LEFT_S, "another reference")
-    error_m = SETTLED_M if fault.promise.on_path else np.inf
+        system.wait(lambda: system.witness.listen() and system.reference_left_s() > MIN_REFERENCE_LEFT_S, "another reference")
+    error_m = MAX_SETTLED_ERROR_M if fault.promise.on_path else np.inf
     system.wait(lambda: system.driven(error_m), "the robot to be driven")
 
 
@@ -176,9 +176,9 @@ def suffer(system: System, fault: Fault, limits: Limits, report: MatrixReport, h
         system.wait(lambda: system.observer.epoch, "the robot's first state")
         fault_ns = mend_ns = 0
     recovered(system, mend_ns)
-    system.pause(A_MOMENT_S)
+    system.pause(AFTER_RECOVERY_S)
     end_ns = system.now_ns()
-    system.wait(lambda: system.logged_ns() >= end_ns, "the robot's record", FLUSH_S)
+    system.wait(lambda: system.logged_ns() >= end_ns, "the robot's record", RECORD_TIMEOUT_S)
     if system.stopped:
         raise Failed("stopped")
     log, incident = system.log(), Incident(fault_ns, mend_ns, end_ns)
@@ -197,6 +197,6 @@ def suffer(system: System, fault: Fault, limits: Limits, report: MatrixReport, h
 def recovered(system: System, mend_ns: int) -> None:
     """Wait until the robot is driven by answers to its present states; if it is not, the measurement says so."""
     try:
-        system.wait(lambda: system.driven() and system.last_sample_ns() > mend_ns, "the robot to be driven", RECOVERY_S)
+        system.wait(lambda: system.driven() and system.last_sample_ns() > mend_ns, "the robot to be driven", RECOVERY_TIMEOUT_S)
     except Failed:
         return

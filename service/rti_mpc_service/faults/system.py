@@ -33,7 +33,7 @@ from rti_mpc_service.faults.proxy import Proxy
 from rti_mpc_service.faults.relay import ROLE as RELAY
 from rti_mpc_service.rig import robot_log
 from rti_mpc_service.rig.children import Children
-from rti_mpc_service.rig.company import CLI, POLITE, Failed, wait
+from rti_mpc_service.rig.company import CLI_MODULE, WATCHER_NICENESS, Failed, wait
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.rig.robot_log import RobotLog
 from rti_mpc_service.rig.witness import Witness
@@ -43,10 +43,10 @@ if TYPE_CHECKING:
 
 SCENARIO = "eight"
 HEADING: Heading = "consistent"
-REFERENCE_S = 120  # 58 kB: one packet, which a busy host does not drop half of
-PATIENCE_S = 60.0  # for processes to start and the robot to be driven; the first controller on a machine compiles
-DRIVEN_M_S = 0.1
-REQUEST_S = 2.0
+REFERENCE_DURATION_S = 120  # 58 kB fit into one packet, so that a busy host cannot drop a part of it
+START_TIMEOUT_S = 60.0  # for processes to start and the robot to be driven; the first controller on a machine compiles
+MIN_DRIVEN_SPEED_M_S = 0.1
+REQUEST_TIMEOUT_S = 2.0
 
 
 def measured_places(model: Model) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -115,7 +115,7 @@ class System:
                 self.start("router")
             client = BusSettings(mode="client", connect=(self._endpoint,))
             settings = client if wiring is Wiring.ROUTER else BusSettings(listen=(self._endpoint,), connect=())
-            self.bus = Bus.join(settings, self.keys, timeout_s=PATIENCE_S, stop=stop)
+            self.bus = Bus.join(settings, self.keys, timeout_s=START_TIMEOUT_S, stop=stop)
             self.witness = Witness(self.bus)
             self._references = self.bus.publisher(self.keys.reference)
             self.observer = RunObserver(self.bus, self._robot_keys, self.place)
@@ -142,7 +142,7 @@ class System:
                 self.robots += 1
                 self.observer.forget()
             module, *arguments = self._command(role)
-            self.children.start(role, str(module), *arguments, nice=POLITE if role == "viewer" else 0)
+            self.children.start(role, str(module), *arguments, nice=WATCHER_NICENESS if role == "viewer" else 0)
 
     def kill(self, *roles: str) -> None:
         """SIGKILL."""
@@ -183,14 +183,14 @@ class System:
         here = self._folder / ("config.toml" if self._keys_of(role) is self.keys else "robot.toml")
         through = self.link.endpoint if self.wiring is Wiring.ROUTER and role == "controller" else self._endpoint
         meeting: tuple[object, ...] = (here, *(("-m", "client") if self.wiring is Wiring.ROUTER else ()), "-e", through)
-        scenario = ("--scenario", SCENARIO, "--heading", HEADING, "--duration", REFERENCE_S)
+        scenario = ("--scenario", SCENARIO, "--heading", HEADING, "--duration", REFERENCE_DURATION_S)
         commands: dict[str, tuple[object, ...]] = {
-            "controller": (CLI, "run", *meeting),
-            "guard": (CLI, "guard", *meeting),
-            "reference": (CLI, "reference", *meeting, *scenario),
-            "robot": (CLI, "sim", *meeting, *(() if "-m" in meeting else ("-l", "tcp/127.0.0.1:0")), "--log", self.log_path),
-            "viewer": (CLI, "view", *meeting, "--rerun-save", self._folder / "run.rrd"),
-            "router": (CLI, "router", here, "-l", self._endpoint),
+            "controller": (CLI_MODULE, "run", *meeting),
+            "guard": (CLI_MODULE, "guard", *meeting),
+            "reference": (CLI_MODULE, "reference", *meeting, *scenario),
+            "robot": (CLI_MODULE, "sim", *meeting, *(() if "-m" in meeting else ("-l", "tcp/127.0.0.1:0")), "--log", self.log_path),
+            "viewer": (CLI_MODULE, "view", *meeting, "--rerun-save", self._folder / "run.rrd"),
+            "router": (CLI_MODULE, "router", here, "-l", self._endpoint),
             RELAY: ("rti_mpc_service.faults.relay", self._endpoint, self._robot_keys.prefix, self.keys.prefix, self.keys.robot),
         }
         return commands[role]
@@ -233,9 +233,9 @@ class System:
     def driven(self, error_m: float = np.inf) -> bool:
         """Whether the robot is driven, and as near to its reference as told."""
         self.witness.listen()
-        return self.witness.begun and self.observer.speed_m_s() > DRIVEN_M_S and self.error_m() < error_m
+        return self.witness.begun and self.observer.speed_m_s() > MIN_DRIVEN_SPEED_M_S and self.error_m() < error_m
 
-    def wait(self, condition: Callable[[], object], what: str, patience_s: float = PATIENCE_S) -> None:
+    def wait(self, condition: Callable[[], object], what: str, patience_s: float = START_TIMEOUT_S) -> None:
         """
         Wait for a condition, or until stopped.
 
@@ -281,9 +281,9 @@ class System:
             Failed: It refuses, or does not answer.
         """
         try:
-            answer = self.bus.request(key, request, timeout_s=REQUEST_S)
+            answer = self.bus.request(key, request, timeout_s=REQUEST_TIMEOUT_S)
         except TimeoutError:
-            answer = {"error": f"no answer within {REQUEST_S:g} s"}
+            answer = {"error": f"no answer within {REQUEST_TIMEOUT_S:g} s"}
         if answer.get("ok") is not True:
             raise Failed(f"{key} was asked for {request}: {answer.get('error')}")
         return answer

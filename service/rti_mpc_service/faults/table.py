@@ -16,22 +16,22 @@ from typing import Any
 from rti_mpc.contract.message import End, Reference
 from rti_mpc.wire.streams import RELAY
 from rti_mpc_service.faults.promise import HOLDS, KEEPS_ON, PAUSES, RECOVERS, REJOINS, STAYS, STOPS, WAITS, Promise
-from rti_mpc_service.faults.relay import LOST
+from rti_mpc_service.faults.relay import COMMANDS_LOST
 from rti_mpc_service.faults.system import System, Wiring
 
 Act = Callable[[System], int | None]
 
 HOLD_S = 3.5
-PAUSE_S = 1.5
-LOSS_S = 0.8
-TWINS_S = 1.0
-MALFORMED = 10_000
+PAUSE_S = 1.5  # of the controller
+LOSS_S = 0.8  # of commands
+SECOND_ROBOT_S = 1.0  # life of a second robot
+MALFORMED_MESSAGES = 10_000
 GARBAGE = (b"", b"\x00\x00\x00\x00", b"\x00\x01\x00\x00" + bytes(24), b"\x00\x01\x00\x00" + b"\xff" * 400)  # none is a message
-SLICE_S, SHARE = 0.1, 0.05  # of time a slow process gets
+VIEWER_CYCLE_S, VIEWER_SHARE = 0.1, 0.05  # a slow viewer runs for this share of each cycle
 REFERENCE_ENDS_S = 1.0
-STALE_NS = 10**12
-UNTIL_MENDED = 10_000  # samples
-JUMP_S = 2.0
+REFERENCE_AGE_NS = 10**12
+SAMPLES_UNTIL_MENDED = 10_000  # more than a fault lasts
+REFERENCE_JUMP_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Fault:
     viewer: bool = False
 
 
-def nothing(system: System) -> None:
+def do_nothing(system: System) -> None:
     """Leave it as it is."""
 
 
@@ -89,9 +89,9 @@ def slow_viewer(system: System) -> None:
     deadline_s = time.monotonic() + HOLD_S
     while time.monotonic() < deadline_s:
         system.suspend("viewer")
-        system.pause((1.0 - SHARE) * SLICE_S)
+        system.pause((1.0 - VIEWER_SHARE) * VIEWER_CYCLE_S)
         system.resume("viewer")
-        system.pause(SHARE * SLICE_S)
+        system.pause(VIEWER_SHARE * VIEWER_CYCLE_S)
 
 
 def states(change: str, count: int | None = None) -> Act:
@@ -137,7 +137,7 @@ def flood(system: System) -> None:
     """Publish what is no message on every key that somebody acts on, as fast as it goes."""
     keys = system.keys
     ends: list[Any] = [system.bus.publisher(key) for key in (keys.state, keys.reference, keys.command, keys.actuation)]
-    for number in range(MALFORMED):
+    for number in range(MALFORMED_MESSAGES):
         ends[number % len(ends)].put_bytes(GARBAGE[number // len(ends) % len(GARBAGE)])
 
 
@@ -162,7 +162,7 @@ def free_disk(system: System) -> None:
     system.limit_files(None, "viewer", "controller")
 
 
-def part(system: System, from_s: float, duration_s: float) -> Reference:
+def reference_part(system: System, from_s: float, duration_s: float) -> Reference:
     """Return rows of the followed reference, from some time after now on, stamped as they are: few enough for one packet."""
     followed, period_ns = system.reference, system.reference.period_ns
     first = (system.now_ns() + round(1e9 * from_s) - followed.stamp_ns) // period_ns
@@ -174,7 +174,7 @@ def reference_ends(end: End) -> Act:
     """Let the reference end in a moment; the fault is its last row."""
 
     def act(system: System) -> int:
-        short = replace(part(system, 0.0, REFERENCE_ENDS_S), end=end)
+        short = replace(reference_part(system, 0.0, REFERENCE_ENDS_S), end=end)
         system.refer(short)
         return short.stamp_ns + (len(short.y) - 1) * short.period_ns
 
@@ -183,14 +183,14 @@ def reference_ends(end: End) -> Act:
 
 def reference_in_the_past(system: System) -> None:
     """Publish a reference that ended long ago."""
-    short = part(system, 0.0, REFERENCE_ENDS_S)
-    system.refer(replace(short, end=End.STOP, stamp_ns=short.stamp_ns - STALE_NS))
+    short = reference_part(system, 0.0, REFERENCE_ENDS_S)
+    system.refer(replace(short, end=End.STOP, stamp_ns=short.stamp_ns - REFERENCE_AGE_NS))
 
 
 def reference_jumps(system: System) -> None:
     """Follow the same path some seconds further on."""
-    later = part(system, JUMP_S, 10 * JUMP_S)
-    system.refer(replace(later, stamp_ns=later.stamp_ns - round(1e9 * JUMP_S)))
+    later = reference_part(system, REFERENCE_JUMP_S, 10 * REFERENCE_JUMP_S)
+    system.refer(replace(later, stamp_ns=later.stamp_ns - round(1e9 * REFERENCE_JUMP_S)))
 
 
 def no_reference(system: System) -> int:
@@ -203,15 +203,15 @@ def no_reference(system: System) -> int:
 
 PEERS, ROUTER, LINK, SENSOR = Wiring
 FAULTS = (
-    Fault("viewer_killed", "SIGKILL of the viewer", PEERS, KEEPS_ON, kill("viewer"), nothing, viewer=True),
+    Fault("viewer_killed", "SIGKILL of the viewer", PEERS, KEEPS_ON, kill("viewer"), do_nothing, viewer=True),
     Fault("viewer_hung", "SIGSTOP of the viewer", PEERS, KEEPS_ON, suspend("viewer"), resume("viewer"), viewer=True),
-    Fault("viewer_slow", "the viewer gets 5 % of its time", PEERS, KEEPS_ON, slow_viewer, nothing, 0.0, viewer=True),
+    Fault("viewer_slow", "the viewer gets 5 % of its time", PEERS, KEEPS_ON, slow_viewer, do_nothing, 0.0, viewer=True),
     Fault("disk_full", "viewer and controller cannot write", PEERS, KEEPS_ON, fill_disk, free_disk, viewer=True),
-    Fault("malformed_flood", f"{MALFORMED} malformed messages at once", PEERS, KEEPS_ON, flood, nothing),
-    Fault("solver_fails", "the first solver finds nothing", PEERS, KEEPS_ON, solver("solver", UNTIL_MENDED), solver_works),
-    Fault("qp_fails_twice", "no solver finds anything, twice", PEERS, KEEPS_ON, solver("qp", 2), nothing),
-    Fault("reference_killed", "SIGKILL of the reference's source", PEERS, KEEPS_ON, kill("reference"), nothing),
-    Fault("reference_jumps", f"the reference is {JUMP_S:g} s further on", PEERS, REJOINS, reference_jumps, restart("reference"), 8.0),
+    Fault("malformed_flood", f"{MALFORMED_MESSAGES} malformed messages at once", PEERS, KEEPS_ON, flood, do_nothing),
+    Fault("solver_fails", "the first solver finds nothing", PEERS, KEEPS_ON, solver("solver", SAMPLES_UNTIL_MENDED), solver_works),
+    Fault("qp_fails_twice", "no solver finds anything, twice", PEERS, KEEPS_ON, solver("qp", 2), do_nothing),
+    Fault("reference_killed", "SIGKILL of the reference's source", PEERS, KEEPS_ON, kill("reference"), do_nothing),
+    Fault("reference_jumps", f"the reference is {REFERENCE_JUMP_S:g} s further on", PEERS, REJOINS, reference_jumps, restart("reference"), 8.0),
     Fault("reference_ends_hold", "the reference ends, to be held", PEERS, HOLDS, reference_ends(End.HOLD), restart("reference"), 6.0),
     Fault("controller_killed", "SIGKILL of the controller", PEERS, STOPS, kill("controller"), start("controller")),
     Fault("controller_hung", "SIGSTOP of the controller", PEERS, STOPS, suspend("controller"), resume("controller")),
@@ -228,9 +228,9 @@ FAULTS = (
         stop_and_kill("guard", "controller"),
         enable,
     ),
-    Fault("qp_fails", "no solver finds anything", PEERS, STOPS, solver("qp", UNTIL_MENDED), solver_works),
-    Fault("nan_model", "the model gives NaN", PEERS, STOPS, solver("nan_model", UNTIL_MENDED), solver_works),
-    Fault("over_budget", "a sample takes 1.5 periods", PEERS, STOPS, solver("over_budget", UNTIL_MENDED), solver_works),
+    Fault("qp_fails", "no solver finds anything", PEERS, STOPS, solver("qp", SAMPLES_UNTIL_MENDED), solver_works),
+    Fault("nan_model", "the model gives NaN", PEERS, STOPS, solver("nan_model", SAMPLES_UNTIL_MENDED), solver_works),
+    Fault("over_budget", "a sample takes 1.5 periods", PEERS, STOPS, solver("over_budget", SAMPLES_UNTIL_MENDED), solver_works),
     Fault("reference_ends_stop", "the reference ends with a stop", PEERS, STOPS, reference_ends(End.STOP), restart("reference"), 5.0),
     Fault("reference_stale", "a reference that ended long ago", PEERS, STOPS, reference_in_the_past, restart("reference")),
     Fault("reference_missing", "all start, but no reference", PEERS, WAITS, no_reference, start("reference")),
@@ -240,14 +240,16 @@ FAULTS = (
     Fault("router_killed", "SIGKILL of the router", ROUTER, STOPS, kill("router"), start("router")),
     Fault("state_duplicated", "every state comes three times", LINK, KEEPS_ON, states("duplicated"), states("none")),
     Fault("state_reordered", "every two states in the wrong order", LINK, KEEPS_ON, states("reordered"), states("none")),
-    Fault("commands_lost", f"commands are lost for {LOSS_S:g} s, states are not", LINK, PAUSES, states(LOST), states("none"), LOSS_S),
+    Fault("commands_lost", f"commands are lost for {LOSS_S:g} s, states are not", LINK, PAUSES, states(COMMANDS_LOST), states("none"), LOSS_S),
     Fault("state_late", "every state 0.4 s late", LINK, STOPS, states("late"), states("none")),
-    Fault("state_nan_once", "one state with a NaN", SENSOR, KEEPS_ON, states("nan", 1), nothing),
+    Fault("state_nan_once", "one state with a NaN", SENSOR, KEEPS_ON, states("nan", 1), do_nothing),
     Fault("state_nan", "every state with a NaN", SENSOR, STOPS, states("nan"), states("none")),
     Fault("state_wrong_length", "every state one number short", SENSOR, STOPS, states("short"), states("none")),
-    Fault("two_robots", f"a second robot of this name lives for {TWINS_S:g} s", SENSOR, PAUSES, states("twins"), states("none"), TWINS_S),
+    Fault(
+        "two_robots", f"a second robot of this name lives for {SECOND_ROBOT_S:g} s", SENSOR, PAUSES, states("twins"), states("none"), SECOND_ROBOT_S
+    ),
     Fault("state_frozen", "the same state again and again", SENSOR, STOPS, states("frozen"), states("none")),
     Fault("clock_in_us", "the robot's stamps change from ns to us", SENSOR, STOPS, states("microseconds"), clock_in_ns),
     Fault("clock_back", "the robot's clock jumps back by 5 s", SENSOR, STOPS, states("behind"), restart("reference")),
-    Fault("clock_ahead", "the robot's clock jumps ahead by 5 s", SENSOR, RECOVERS, states("ahead"), nothing),
+    Fault("clock_ahead", "the robot's clock jumps ahead by 5 s", SENSOR, RECOVERS, states("ahead"), do_nothing),
 )

@@ -27,12 +27,12 @@ from typing import NamedTuple
 
 from rti_mpc_service.host.realtime import available
 
-TICK_NS = 2_000_000
-LATE_NS = 500_000  # from which on a tick is late: a core that sleeps deeply needs less to wake
-TICKS = 5  # a row: 10 ms
-ROWS = 10  # between two looks for new threads: 0.1 s
-LAYOUT = struct.Struct("<4q")
-PATIENCE_S = 10.0  # for the timers to have seen what is asked for
+TICK_PERIOD_NS = 2_000_000
+MIN_COUNTED_LATENESS_NS = 500_000  # less is not counted: even a core in deep sleep wakes faster
+TICKS_PER_ROW = 5  # a timer writes one row every 10 ms
+ROWS_PER_THREAD_SEARCH = 10  # new threads are searched for every 0.1 s
+ROW_LAYOUT = struct.Struct("<4q")  # the fields of `Row`
+ROW_TIMEOUT_S = 10.0  # how long to wait for the rows of a requested time
 
 
 class Row(NamedTuple):
@@ -112,12 +112,14 @@ class Timer:
 
     def rows(self, from_ns: int, to_ns: int) -> Iterator[Row]:
         """Wait until it has seen a time whole, and return what it saw then, the last first."""
-        deadline_s = time.monotonic() + PATIENCE_S
+        deadline_s = time.monotonic() + ROW_TIMEOUT_S
         while not self._rows or self._rows[-1].until_ns < to_ns:
             if time.monotonic() > deadline_s:
-                raise TimeoutError(f"the host's witness must tell every {1e-6 * TICKS * TICK_NS:g} ms, and was silent for {PATIENCE_S:g} s")
-            time.sleep(1e-9 * TICK_NS)
-            self._rows += map(Row._make, LAYOUT.iter_unpack(self._file.read()))  # a row is written at once
+                raise TimeoutError(
+                    f"the host's witness must tell every {1e-6 * TICKS_PER_ROW * TICK_PERIOD_NS:g} ms, and was silent for {ROW_TIMEOUT_S:g} s"
+                )
+            time.sleep(1e-9 * TICK_PERIOD_NS)
+            self._rows += map(Row._make, ROW_LAYOUT.iter_unpack(self._file.read()))  # a row is written at once
         for row in reversed(self._rows):
             if row.until_ns < from_ns:
                 return
@@ -204,16 +206,16 @@ def main(path: str, core: int, pid: int) -> None:
     with Path(path).open("ab", buffering=0) as file:
         while os.getppid() == parent:
             late_ns = 0
-            for _ in range(TICKS):
-                due_ns += TICK_NS
-                due_ns += max(0, time.monotonic_ns() - due_ns) // TICK_NS * TICK_NS  # those that were slept through are not made up for
+            for _ in range(TICKS_PER_ROW):
+                due_ns += TICK_PERIOD_NS
+                due_ns += max(0, time.monotonic_ns() - due_ns) // TICK_PERIOD_NS * TICK_PERIOD_NS  # those that were slept through are not made up for
                 time.sleep(max(0.0, 1e-9 * (due_ns - time.monotonic_ns())))
-                if (lateness_ns := time.monotonic_ns() - due_ns) > LATE_NS:
+                if (lateness_ns := time.monotonic_ns() - due_ns) > MIN_COUNTED_LATENESS_NS:
                     late_ns += lateness_ns
-            if (number := number + 1) % ROWS == 0:
+            if (number := number + 1) % ROWS_PER_THREAD_SEARCH == 0:
                 threads.look()
             waited_ns, now_ns = threads.waited_ns(), time.monotonic_ns()
-            file.write(LAYOUT.pack(since_ns, now_ns, late_ns, waited_ns))
+            file.write(ROW_LAYOUT.pack(since_ns, now_ns, late_ns, waited_ns))
             since_ns = now_ns
 
 

@@ -14,7 +14,7 @@ GOVERNOR = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
 PACKAGES = ("casadi", "eclipse-zenoh", "numpy", "osqp")
 
 
-def describe() -> dict[str, Any]:
+def machine_info() -> dict[str, Any]:
     """Describe this machine and what runs on it, in JSON."""
     return {
         "processor": processor(),

@@ -10,7 +10,7 @@ that is preempted while it holds the lock would stop the control of the robot.
 
 SCHED_FIFO can hang a machine: a thread that never pauses takes its core from
 everybody of lower priority. No thread here spins, and the kernel is asked to kill
-the process (RLIMIT_RTTIME) should one compute for `RUNAWAY_US` without a pause;
+the process (RLIMIT_RTTIME) should one compute for `MAX_UNBROKEN_COMPUTING_US` without a pause;
 the robot then brakes, and a supervisor starts the controller again.
 """
 
@@ -22,8 +22,8 @@ import resource
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-RUNAWAY_US = 1_000_000  # of computing without a pause
-MCL_CURRENT, MCL_ONFAULT = 1, 4  # of mlockall(2)
+MAX_UNBROKEN_COMPUTING_US = 1_000_000  # a thread that computes longer without a pause is killed by the kernel
+MCL_CURRENT, MCL_ONFAULT = 1, 4  # flags of mlockall(2)
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def _outcome(what: str, act: Callable[[], str], why_not: Callable[[], str]) -> R
 
 def _schedule(priority: int) -> str:
     _, hard = resource.getrlimit(resource.RLIMIT_RTTIME)
-    runaway_us = RUNAWAY_US if hard == resource.RLIM_INFINITY else min(hard, RUNAWAY_US)
+    runaway_us = MAX_UNBROKEN_COMPUTING_US if hard == resource.RLIM_INFINITY else min(hard, MAX_UNBROKEN_COMPUTING_US)
     resource.setrlimit(resource.RLIMIT_RTTIME, (runaway_us, runaway_us))
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     return f"SCHED_FIFO {priority}"

@@ -15,9 +15,9 @@ from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.reference.trajectory import Trajectory, rows
 from rti_mpc.rti.ocp import Ocp
 
-Q, R, DELTA = np.array([1.0, 1.0, 0.05]), np.array([1.0, 1.0]), 28.0
-BEST: dict[str, Any] = {"heading": "none", "method": "rk4", "lambda_": 0.008}  # settings that follow the paths best, shown by the sweeps
-U_MAX = np.array([0.5, 0.745])  # of the inputs, and of the speeds they are about: m/s, rad/s
+Q, R, DELTA = np.array([1.0, 1.0, 0.05]), np.array([1.0, 1.0]), 28.0  # the paper's weights
+BEST_SETTINGS: dict[str, Any] = {"heading": "none", "method": "rk4", "lambda_": 0.008}  # those with the smallest errors in the sweeps
+INPUT_LIMITS = np.array([0.5, 0.745])  # largest magnitude of the inputs and of the speeds they command, in m/s and rad/s
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,10 +86,10 @@ class Experiment:
             R=R,
             delta=[DELTA] * (self.N - 1) + [DELTA * self.delta_N],
             lambda_=self.lambda_,
-            lbu=-U_MAX,
-            ubu=U_MAX,
-            lbx=np.concatenate([-free, -U_MAX]),
-            ubx=np.concatenate([free, U_MAX]),
+            lbu=-INPUT_LIMITS,
+            ubu=INPUT_LIMITS,
+            lbx=np.concatenate([-free, -INPUT_LIMITS]),
+            ubx=np.concatenate([free, INPUT_LIMITS]),
         )
 
     def reference(self) -> Array:

@@ -15,9 +15,9 @@ from rti_mpc.model.integrator import integrator
 from rti_mpc_service.paper.contender import Contender
 from rti_mpc_service.paper.experiment import DELTA, Experiment, Q, R
 
-LOOKS = 20  # at the robot in a sample of 0.1 s, and RK4 steps of it
-NOISE = np.array([1e-3, 1e-3, 2e-3, 5e-3, 5e-3])  # standard deviation of what is measured: m, m, rad, m/s, rad/s
-WARM_UP = 5  # solves before the first that counts
+PLANT_STEPS_IN_100_MS = 20  # RK4 steps of the robot, after each of which its distance from the path is taken
+NOISE_STD = np.array([1e-3, 1e-3, 2e-3, 5e-3, 5e-3])  # standard deviation of the measured state, in m, m, rad, m/s, rad/s
+WARM_UP_SOLVES = 5  # before the first solve that is timed
 
 
 class Loop:
@@ -45,14 +45,14 @@ class Loop:
         self._k = 0
         self._rng = np.random.default_rng(seed)
         euler = experiment.plant == "euler"
-        looks = 1 if euler else max(1, round(LOOKS * experiment.T0 / 0.1))
+        looks = 1 if euler else max(1, round(PLANT_STEPS_IN_100_MS * experiment.T0 / 0.1))
         self._acting, self._p = np.zeros((looks, model.nu)), np.tile(model.p_nominal, (looks, 1))
         self._start, self._path = np.zeros(model.nx), np.zeros((looks, model.nx))
         step = integrator(model, "euler" if euler else "rk4").mapaccum("plant", looks)
         inputs = {"x": self._start, "u": self._acting, "p": self._p, "dt": np.full(looks, experiment.T0 / looks)}
         self._advance = bind(step, inputs, {"x_next": self._path})
         self._offsets = experiment.T0 * np.arange(1, looks + 1) / looks
-        for _ in range(WARM_UP):
+        for _ in range(WARM_UP_SOLVES):
             contender.reset(experiment.x0)
             contender.solve(experiment.x0, np.zeros(model.nu), self.y[1 : 1 + experiment.N])
         contender.reset(experiment.x0)
@@ -60,7 +60,7 @@ class Loop:
     def step(self) -> None:
         """Take one sample: measure, solve, act."""
         k, N = self._k, self.experiment.N
-        x = self.x[k] + NOISE * self._rng.standard_normal(len(NOISE)) if self.experiment.noise else self.x[k]
+        x = self.x[k] + NOISE_STD * self._rng.standard_normal(len(NOISE_STD)) if self.experiment.noise else self.x[k]
         u_prev, y_ref = self.u[k - 1] if k else np.zeros_like(self.u[0]), self.y[k + 1 : k + 1 + N]
         cpu_ns, wall_ns = time.thread_time_ns(), time.perf_counter_ns()
         u = self.contender.solve(x, u_prev, y_ref)

@@ -17,11 +17,11 @@ import numpy as np
 
 from rti_mpc.reference.trajectory import eight, positioning
 from rti_mpc_service.paper.contender import CONTENDERS, Contender
-from rti_mpc_service.paper.experiment import BEST, Experiment
+from rti_mpc_service.paper.experiment import BEST_SETTINGS, Experiment
 from rti_mpc_service.paper.loop import Loop
 
-DURATION_S = 82.8  # a lap after the transient
-QUICK_S, QUICK_TRANSIENT_S = 3.0, 2.0  # of a first look
+DURATION_S = 82.8  # one lap after the transient
+QUICK_DURATION_S, QUICK_TRANSIENT_S = 3.0, 2.0  # with --quick
 
 # On the eight the heading is the one of the reading that gives the paper's 3 mm (`rti_mpc_service.paper.readings`).
 EIGHT = Experiment(eight().lasting(DURATION_S), heading="consistent")
@@ -30,13 +30,13 @@ SCENARIOS = {"eight": EIGHT, "positioning": Experiment(positioning())}
 
 def shortened(experiment: Experiment) -> Experiment:
     """Return an experiment that ends early."""
-    return replace(experiment, trajectory=experiment.trajectory.lasting(QUICK_S), transient_s=QUICK_TRANSIENT_S)
+    return replace(experiment, trajectory=experiment.trajectory.lasting(QUICK_DURATION_S), transient_s=QUICK_TRANSIENT_S)
 
 
 def grid(experiment: Experiment, build: Callable[[str, Experiment], Contender]) -> dict[str, Loop]:
-    """Put all contenders at the start of an experiment; the last of them, ``"best"``, has `BEST` settings."""
+    """Put all contenders at the start of an experiment; the last of them, ``"best"``, has `BEST_SETTINGS` settings."""
     loops = {name: Loop(experiment, build(name, experiment)) for name in CONTENDERS}
-    best = replace(experiment, **BEST)
+    best = replace(experiment, **BEST_SETTINGS)
     return loops | {"best": Loop(best, build("rti_simultaneous", best))}
 
 

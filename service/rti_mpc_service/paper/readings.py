@@ -15,19 +15,19 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.reference.trajectory import Trajectory, circle, eight, positioning
-from rti_mpc_service.paper.experiment import BEST, Experiment
+from rti_mpc_service.paper.experiment import BEST_SETTINGS, Experiment
 from rti_mpc_service.paper.race import DURATION_S
 
 PRINTED_MM = 3.0
 PRINTED_SPEED_M_S = 0.25
 OFFSETS_M = (0.0, 0.05, 0.1, 0.2, 0.3)
-CLOSED = (circle().lasting(DURATION_S), eight().lasting(DURATION_S))
-FOUND = Experiment(CLOSED[1], heading="consistent", plant="euler")
+CLOSED_PATHS = (circle().lasting(DURATION_S), eight().lasting(DURATION_S))
+FOUND = Experiment(CLOSED_PATHS[1], heading="consistent", plant="euler")
 
 
 def headings() -> Iterator[Experiment]:
     """Yield every reading of the first experiment: curve, heading, `a`, plant."""
-    for trajectory in CLOSED:
+    for trajectory in CLOSED_PATHS:
         for plant in ("euler", "continuous"):
             yield Experiment(trajectory, heading="atan", plant=plant)
             for heading in ("tangent", "consistent", "none"):
@@ -37,7 +37,7 @@ def headings() -> Iterator[Experiment]:
 
 def converged() -> tuple[Experiment, ...]:
     """Return the readings that are judged by converged NMPC, too."""
-    return FOUND, replace(FOUND, plant="continuous"), replace(FOUND, heading="tangent"), Experiment(CLOSED[0], plant="euler")
+    return (FOUND, replace(FOUND, plant="continuous"), replace(FOUND, heading="tangent"), Experiment(CLOSED_PATHS[0], plant="euler"))
 
 
 def faster(trajectory: Trajectory, factor: float) -> Trajectory:
@@ -64,11 +64,11 @@ def speeds() -> dict[str, dict[str, float]]:
 
 def at_printed_speed() -> Iterator[Experiment]:
     """Yield the closed paths as their formulas say, and at the mean speed the paper says."""
-    for trajectory in CLOSED:
+    for trajectory in CLOSED_PATHS:
         factor = PRINTED_SPEED_M_S / speed(trajectory)["mean"]
         for path in (trajectory, faster(trajectory, factor)):
             yield Experiment(path, heading="consistent")
-            yield Experiment(path, **BEST)
+            yield Experiment(path, **BEST_SETTINGS)
 
 
 def goals() -> dict[str, Experiment]:

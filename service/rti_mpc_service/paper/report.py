@@ -11,11 +11,11 @@ TEMPLATE = Path(__file__).with_name("report.md")
 Row = dict[str, Any]
 
 # What the paper prints of its own runs: largest error in mm, and the share of solves inside the sampling time.
-PRINTED: dict[str, dict[str, Row]] = {
+PRINTED_IN_PAPER: dict[str, dict[str, Row]] = {
     "eight": {"sequential": {"max_mm": 3, "inside_period": 0.97}, "simultaneous": {"max_mm": 3, "inside_period": 0.72}},
     "positioning": {"sequential": {"inside_period": 0.93}, "simultaneous": {"inside_period": 0.81}},
 }
-CONTENDERS = {
+CONTENDER_TITLES = {
     "slsqp_sequential": "the paper's sequential, SLSQP, finite differences",
     "slsqp_simultaneous": "the paper's simultaneous, SLSQP, analytic gradients",
     "ipopt": "converged NMPC, IPOPT",
@@ -25,8 +25,8 @@ CONTENDERS = {
     "rti_simultaneous": "real-time iteration, simultaneous, default solver",
     "best": "real-time iteration, best settings",
 }
-MISMATCH = {"theta_1": "inertia (theta_1, theta_2)", "theta_4": "friction (theta_4, theta_6)", "a": "offset a"}
-WEIGHTS = {"consistent": "the paper's", "none": "best"}
+MISMATCH_TITLES = {"theta_1": "inertia (theta_1, theta_2)", "theta_4": "friction (theta_4, theta_6)", "a": "offset a"}
+WEIGHT_TITLES = {"consistent": "the paper's", "none": "best"}
 Column = tuple[str, Callable[[Row], str]]
 
 
@@ -42,12 +42,12 @@ def table(rows: Iterable[Row], columns: Sequence[Column]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def number(key: str, digits: int = 3) -> Callable[[Row], str]:
+def number_cell(key: str, digits: int = 3) -> Callable[[Row], str]:
     """Return a cell of significant digits."""
     return lambda row: f"{row[key]:.{digits}g}"
 
 
-def share(key: str) -> Callable[[Row], str]:
+def percent_cell(key: str) -> Callable[[Row], str]:
     """Return a cell of percent."""
     return lambda row: percent(row[key])
 
@@ -57,13 +57,13 @@ def percent(value: float) -> str:
     return f"{100.0 * value:.4g} %" if value < 1.0 else "100 %"
 
 
-def spread(key: str, unit_us: float) -> Callable[[Row], str]:
+def quantiles_cell(key: str, unit_us: float) -> Callable[[Row], str]:
     """Return a cell of median, p99 and maximum."""
     return lambda row: " / ".join(f"{row[key][name] / unit_us:.3g}" for name in ("p50", "p99", "max"))
 
 
-WALL_US: Column = ("time of a solve, us, p50 / p99 / max", spread("wall_us", 1.0))
-MAX: Column = ("largest error, mm", number("max_mm"))
+WALL_TIME_COLUMN: Column = ("time of a solve, us, p50 / p99 / max", quantiles_cell("wall_us", 1.0))
+MAX_ERROR_COLUMN: Column = ("largest error, mm", number_cell("max_mm"))
 
 
 def headline(scenario: str) -> Callable[[Row], str]:
@@ -72,24 +72,24 @@ def headline(scenario: str) -> Callable[[Row], str]:
     def make(run: Row) -> str:
         columns: Sequence[Column] = (
             ("", lambda row: row["name"]),
-            MAX,
-            ("between samples, mm", number("between_mm")),
-            ("error at the end, mm", number("end_mm")),
-            ("speed at the end, mm/s", number("end_speed_mm_s", 2)),
-            ("cost", lambda row: "-" if row["name"] == CONTENDERS["best"] else f"{row['cost']:.5g}"),
-            ("wall time of a solve, ms, p50 / p99 / max", spread("wall_us", 1e3)),
-            ("CPU time, ms, p50 / p99 / max", spread("cpu_us", 1e3)),
-            ("inside T0", share("inside_period")),
-            ("inside 1 % of T0, wall", share("inside_percent_wall")),
-            ("inside 1 % of T0, CPU", share("inside_percent_cpu")),
+            MAX_ERROR_COLUMN,
+            ("between samples, mm", number_cell("between_mm")),
+            ("error at the end, mm", number_cell("end_mm")),
+            ("speed at the end, mm/s", number_cell("end_speed_mm_s", 2)),
+            ("cost", lambda row: "-" if row["name"] == CONTENDER_TITLES["best"] else f"{row['cost']:.5g}"),
+            ("wall time of a solve, ms, p50 / p99 / max", quantiles_cell("wall_us", 1e3)),
+            ("CPU time, ms, p50 / p99 / max", quantiles_cell("cpu_us", 1e3)),
+            ("inside T0", percent_cell("inside_period")),
+            ("inside 1 % of T0, wall", percent_cell("inside_percent_wall")),
+            ("inside 1 % of T0, CPU", percent_cell("inside_percent_cpu")),
         )
         printed = []
-        for formulation, row in PRINTED[scenario].items():
+        for formulation, row in PRINTED_IN_PAPER[scenario].items():
             cells = ["-"] * len(columns)
             cells[0], cells[8] = f"*printed in the paper, {formulation}*", percent(row["inside_period"])
             cells[1] = str(row.get("max_mm", "-"))
             printed.append(f"| {' | '.join(cells)} |")
-        ours = table(({"name": title} | run["race"][scenario][name] for name, title in CONTENDERS.items()), columns).split("\n")
+        ours = table(({"name": title} | run["race"][scenario][name] for name, title in CONTENDER_TITLES.items()), columns).split("\n")
         return "\n".join([*ours[:2], *printed, *ours[2:]])
 
     return make
@@ -99,7 +99,7 @@ def short(run: Row) -> str:
     """Return the figures of both experiments in one small table, Markdown."""
     eight, positioning = run["race"]["eight"], run["race"]["positioning"]
     chosen = ("slsqp_sequential", "slsqp_simultaneous", "ipopt", "rti_simultaneous", "best")
-    rows = [{"name": CONTENDERS[name], "eight": eight[name], "positioning": positioning[name]} for name in chosen]
+    rows = [{"name": CONTENDER_TITLES[name], "eight": eight[name], "positioning": positioning[name]} for name in chosen]
     columns: Sequence[Column] = (
         ("", lambda row: row["name"]),
         ("eight, largest error, mm", lambda row: f"{row['eight']['max_mm']:.3g}"),
@@ -119,11 +119,11 @@ def headings(run: Row) -> str:
     columns: Sequence[Column] = (
         ("curve", lambda row: row["trajectory"]),
         ("heading", lambda row: row["heading"]),
-        ("a, m", number("a_m")),
+        ("a, m", number_cell("a_m")),
         ("robot", lambda row: row["plant"]),
-        MAX,
-        ("squared, m²", number("max_squared_m2", 2)),
-        ("error at the end, mm", number("end_mm")),
+        MAX_ERROR_COLUMN,
+        ("squared, m²", number_cell("max_squared_m2", 2)),
+        ("error at the end, mm", number_cell("end_mm")),
     )
     return table(run["readings"]["headings"], columns)
 
@@ -134,8 +134,8 @@ def converged(run: Row) -> str:
         ("curve", lambda row: row["trajectory"]),
         ("heading", lambda row: row["heading"]),
         ("robot", lambda row: row["plant"]),
-        ("largest error, converged NMPC, mm", number("max_mm")),
-        ("squared, m²", number("max_squared_m2", 2)),
+        ("largest error, converged NMPC, mm", number_cell("max_mm")),
+        ("squared, m²", number_cell("max_squared_m2", 2)),
     )
     return table(run["readings"]["converged"], columns)
 
@@ -143,7 +143,7 @@ def converged(run: Row) -> str:
 def speeds(run: Row) -> str:
     """Return the speeds of the references."""
     rows = ({"name": name} | row for name, row in run["readings"]["speeds"].items())
-    return table(rows, (("reference", lambda row: row["name"]), *((f"{key}, m/s", number(key)) for key in ("min", "mean", "max"))))
+    return table(rows, (("reference", lambda row: row["name"]), *((f"{key}, m/s", number_cell(key)) for key in ("min", "mean", "max"))))
 
 
 def at_printed_speed(run: Row) -> str:
@@ -151,10 +151,10 @@ def at_printed_speed(run: Row) -> str:
     rows = run["readings"]["at_printed_speed"]
     columns: Sequence[Column] = (
         ("curve", lambda row: row["trajectory"]),
-        ("mean speed, m/s", number("mean_speed_m_s")),
-        ("weights", lambda row: WEIGHTS[row["heading"]]),
+        ("mean speed, m/s", number_cell("mean_speed_m_s")),
+        ("weights", lambda row: WEIGHT_TITLES[row["heading"]]),
         ("integrator", lambda row: row["method"]),
-        MAX,
+        MAX_ERROR_COLUMN,
     )
     return table(rows, columns)
 
@@ -164,8 +164,8 @@ def goals(run: Row) -> str:
     rows = ({"name": name} | row for name, row in run["readings"]["goals"].items())
     columns: Sequence[Column] = (
         ("end", lambda row: {"continuous": "(-r √2, -r √2/2)", "jumping": "(-r √2, -r √2)"}[row["name"]]),
-        ("leap of the reference, mm", number("jump_mm")),
-        ("error at the end, mm", number("end_mm")),
+        ("leap of the reference, mm", number_cell("jump_mm")),
+        ("error at the end, mm", number_cell("end_mm")),
     )
     return table(rows, columns)
 
@@ -173,12 +173,12 @@ def goals(run: Row) -> str:
 def increments(run: Row) -> str:
     """Return the sweep of the weight on increments."""
     columns: Sequence[Column] = (
-        ("λ", number("lambda")),
+        ("λ", number_cell("lambda")),
         ("heading", lambda row: row["heading"]),
         ("noise", lambda row: "yes" if row["noise"] else "no"),
-        MAX,
-        ("rms of increments", number("increment_rms")),
-        WALL_US,
+        MAX_ERROR_COLUMN,
+        ("rms of increments", number_cell("increment_rms")),
+        WALL_TIME_COLUMN,
     )
     return table(run["sweeps"]["lambda"], columns)
 
@@ -188,12 +188,12 @@ def horizons(name: str) -> Callable[[Row], str]:
 
     def make(run: Row) -> str:
         columns: Sequence[Column] = (
-            ("N", number("N")),
-            ("N_u", number("N_u")),
-            ("weights", lambda row: WEIGHTS[row["heading"]]),
+            ("N", number_cell("N")),
+            ("N_u", number_cell("N_u")),
+            ("weights", lambda row: WEIGHT_TITLES[row["heading"]]),
             ("integrator", lambda row: row["method"]),
-            MAX,
-            WALL_US,
+            MAX_ERROR_COLUMN,
+            WALL_TIME_COLUMN,
         )
         return table(run["sweeps"][name], columns)
 
@@ -204,11 +204,11 @@ def periods(run: Row) -> str:
     """Return the sweep of the sampling time."""
     columns: Sequence[Column] = (
         ("T0, ms", lambda row: f"{1e3 * row['T0_s']:.3g}"),
-        MAX,
-        ("between samples, mm", number("between_mm")),
-        WALL_US,
-        ("CPU time, us, p50 / p99 / max", spread("cpu_us", 1.0)),
-        ("inside T0", share("inside_period")),
+        MAX_ERROR_COLUMN,
+        ("between samples, mm", number_cell("between_mm")),
+        WALL_TIME_COLUMN,
+        ("CPU time, us, p50 / p99 / max", quantiles_cell("cpu_us", 1.0)),
+        ("inside T0", percent_cell("inside_period")),
     )
     return table(run["sweeps"]["T0"], columns)
 
@@ -216,10 +216,10 @@ def periods(run: Row) -> str:
 def mismatch(run: Row) -> str:
     """Return the sweep of the robot's parameters."""
     columns: Sequence[Column] = (
-        ("the robot's", lambda row: MISMATCH[next(iter(row["mismatch"]))]),
+        ("the robot's", lambda row: MISMATCH_TITLES[next(iter(row["mismatch"]))]),
         ("times the model's", lambda row: f"{next(iter(row['mismatch'].values())):.3g}"),
-        ("weights", lambda row: WEIGHTS[row["heading"]]),
-        MAX,
+        ("weights", lambda row: WEIGHT_TITLES[row["heading"]]),
+        MAX_ERROR_COLUMN,
     )
     return table(run["sweeps"]["mismatch"], columns)
 

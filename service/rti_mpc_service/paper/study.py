@@ -17,16 +17,16 @@ from rti_mpc import __version__
 from rti_mpc_service.host import machine
 from rti_mpc_service.paper import readings
 from rti_mpc_service.paper.contender import CONTENDERS, Contender, RealTimeIteration
-from rti_mpc_service.paper.experiment import BEST, Experiment
+from rti_mpc_service.paper.experiment import BEST_SETTINGS, Experiment
 from rti_mpc_service.paper.figures import draw
 from rti_mpc_service.paper.loop import Loop
 from rti_mpc_service.paper.race import SCENARIOS, grid, race, shortened
 from rti_mpc_service.paper.report import report, short
 from rti_mpc_service.paper.sweeps import SWEEPS
 
-OWN, CONVERGED = "rti_simultaneous", "ipopt"
-QUICK_STRIDE = 15  # of a sweep, in a first look
-DIGITS = 5  # of every number written
+OWN_CONTENDER, CONVERGED_CONTENDER = "rti_simultaneous", "ipopt"
+QUICK_STRIDE = 15  # --quick takes every 15th experiment of a sweep
+SIGNIFICANT_DIGITS = 5  # of every written number
 
 
 class Study:
@@ -45,9 +45,9 @@ class Study:
         self.races: dict[str, dict[str, Loop]] = {}
         self.run: dict[str, Any] = {
             "version": __version__,
-            "machine": machine.describe(),
+            "machine": machine.machine_info(),
             "quick": quick,
-            "best": BEST,
+            "best": BEST_SETTINGS,
             "race": {},
             "readings": {},
             "sweeps": {},
@@ -59,7 +59,7 @@ class Study:
             self._race(name, shortened(experiment) if self._quick else experiment)
         found = self.run["readings"]
         found["headings"] = self._drive("readings", readings.headings())
-        found["converged"] = self._drive("readings, converged", readings.converged(), CONVERGED, whole=True)
+        found["converged"] = self._drive("readings, converged", readings.converged(), CONVERGED_CONTENDER, whole=True)
         found["speeds"] = readings.speeds()
         driven = list(readings.at_printed_speed())
         found["at_printed_speed"] = [
@@ -91,7 +91,7 @@ class Study:
         self.races[name] = loops
         self.run["race"][name] = {contender: loop.experiment.settings() | loop.summary() for contender, loop in loops.items()}
 
-    def _drive(self, title: str, experiments: Iterable[Experiment], contender: str = OWN, *, whole: bool = False) -> list[dict[str, Any]]:
+    def _drive(self, title: str, experiments: Iterable[Experiment], contender: str = OWN_CONTENDER, *, whole: bool = False) -> list[dict[str, Any]]:
         """Drive experiments one after the other; return their settings and what came of each."""
         experiments = list(experiments)
         if self._quick:
@@ -144,4 +144,4 @@ def rounded(value: Any) -> Any:
         return {key: rounded(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [rounded(entry) for entry in value]
-    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
+    return float(f"{value:.{SIGNIFICANT_DIGITS}g}") if isinstance(value, float) else value

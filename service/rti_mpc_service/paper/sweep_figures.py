@@ -14,7 +14,7 @@ from rti_mpc_service.paper.sweeps import MISMATCHES
 
 BLUE, ORANGE, GREEN, PURPLE, YELLOW, BLACK = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#000000"
 Row = dict[str, Any]
-LABEL = {"consistent": "the paper's weights", "none": "best weights"}
+WEIGHT_LABELS = {"consistent": "the paper's weights", "none": "best weights"}
 
 
 def curve(axes: Axes, rows: Iterable[Row], x: Callable[[Row], float], y: Callable[[Row], float], **look: Any) -> None:
@@ -70,11 +70,13 @@ def horizons(figure: Figure, run: Row) -> None:
     for heading, color in (("consistent", BLUE), ("none", YELLOW)):
         for method, marker, style in (("euler", "s", "--"), ("rk4", "o", "-")):
             chosen = [row for row in run["sweeps"]["N"] if (row["heading"], row["method"]) == (heading, method)]
-            look: Row = {"color": color, "marker": marker, "linestyle": style, "markersize": 4.0, "label": f"{LABEL[heading]}, {method}"}
+            look: Row = {"color": color, "marker": marker, "linestyle": style, "markersize": 4.0, "label": f"{WEIGHT_LABELS[heading]}, {method}"}
             curve(left, chosen, lambda row: row["N"], lambda row: row["max_mm"], **look)
             curve(right, chosen, lambda row: row["N"], lambda row: row["wall_us"]["p50"], **look)
         chosen = [row for row in run["sweeps"]["N_u"] if row["heading"] == heading]
-        curve(middle, chosen, lambda row: row["N_u"], lambda row: row["max_mm"], color=color, marker="o", markersize=4.0, label=LABEL[heading])
+        curve(
+            middle, chosen, lambda row: row["N_u"], lambda row: row["max_mm"], color=color, marker="o", markersize=4.0, label=WEIGHT_LABELS[heading]
+        )
     left.set(title="horizon", xscale="log", yscale="log", xlabel="N", ylabel="largest error after 20 s [mm]")
     middle.set(title="control horizon, N = 20", xscale="log", yscale="log", xlabel="$N_u$", ylabel="largest error after 20 s [mm]")
     right.set(title="time of a solve", xscale="log", yscale="log", xlabel="N", ylabel="median time of a solve [us]")
@@ -107,7 +109,7 @@ def mismatch(figure: Figure, run: Row) -> None:
     for axes, (title, names) in zip(figure.subplots(1, 3, sharey=True), MISMATCHES.items(), strict=True):
         for heading, color, marker in (("consistent", BLUE, "o"), ("none", YELLOW, "s")):
             chosen = [row for row in run["sweeps"]["mismatch"] if row["heading"] == heading and tuple(row["mismatch"]) == names]
-            look: Row = {"color": color, "marker": marker, "label": LABEL[heading]}
+            look: Row = {"color": color, "marker": marker, "label": WEIGHT_LABELS[heading]}
             curve(axes, chosen, lambda row: next(iter(row["mismatch"].values())), lambda row: row["max_mm"], **look)
         axes.set(title=f"{title}: {', '.join(names)}", yscale="log", xlabel="the robot's, times the model's")
         below(axes, 1)

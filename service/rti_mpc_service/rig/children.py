@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from types import TracebackType
 
-PATIENCE_S = 3.0
+END_TIMEOUT_S = 3.0  # between Ctrl-C and SIGKILL
 
 
 class Children:
@@ -36,7 +36,7 @@ class Children:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
         for name in list(self._running):
-            self.end(name, 0.0 if kind else PATIENCE_S)
+            self.end(name, 0.0 if kind else END_TIMEOUT_S)
 
     def start(self, name: str, module: str, *arguments: object, nice: int = 0) -> int:
         """
@@ -84,7 +84,7 @@ class Children:
         """Return the id of a process that was started and not ended by us; None if there is none."""
         return self._running[name].pid if name in self._running else None
 
-    def end(self, name: str, patience_s: float = PATIENCE_S) -> int:
+    def end(self, name: str, patience_s: float = END_TIMEOUT_S) -> int:
         """Ask a process to end as Ctrl-C does, insist after a while, and return its exit status."""
         child = self._running.pop(name)
         if child.poll() is None:

@@ -9,9 +9,9 @@ from threading import Event
 
 from rti_mpc_service.rig.children import Children
 
-CLI = "rti_mpc_service.cli"  # module of the command line, as children are started with it
-POLITE = 10  # niceness of those who only watch
-LOOK_S = 0.05  # between two looks at a condition
+CLI_MODULE = "rti_mpc_service.cli"  # module of the command line, as children are started with it
+WATCHER_NICENESS = 10  # niceness of processes that only watch
+POLL_PERIOD_S = 0.05  # period at which a condition is checked
 
 
 class Failed(Exception):
@@ -27,13 +27,13 @@ def wait(condition: Callable[[], object], children: Children, stop: Event, patie
     """
     deadline_s = time.monotonic() + patience_s
     while not condition() and not stop.is_set():
-        check(children)
+        check_children(children)
         if time.monotonic() > deadline_s:
             raise Failed(f"waited {patience_s:g} s for {what} in vain, see {children.folder}")
-        stop.wait(LOOK_S)
+        stop.wait(POLL_PERIOD_S)
 
 
-def check(children: Children) -> None:
+def check_children(children: Children) -> None:
     """
     Look after everybody.
 

@@ -17,16 +17,16 @@ from matplotlib.figure import Figure
 from rti_mpc_service.outline import outline, placed
 from rti_mpc_service.rig.run_data import Run
 
-INK, GRID, SHADE = "#2b303b", "#dfe3ea", "#e6eaf2"
-REFERENCE, MEASURED, COMMAND, LIMIT, ERROR = "#9aa3b2", "#2f6fd0", "#e08a1e", "#c8404a", "#b8377e"
-PHASES = {"prepare": "#4c9f6b", "feedback": "#e08a1e", "latency": "#7a5cc9"}
-FLOOR_MM = 1e-4  # drawn for anything closer: a logarithm has no zero
-LOOK: Any = {
+INK_COLOR, GRID_COLOR, SHADE_COLOR = "#2b303b", "#dfe3ea", "#e6eaf2"
+REFERENCE_COLOR, MEASURED_COLOR, COMMAND_COLOR, LIMIT_COLOR, ERROR_COLOR = "#9aa3b2", "#2f6fd0", "#e08a1e", "#c8404a", "#b8377e"
+PHASE_COLORS = {"prepare": "#4c9f6b", "feedback": "#e08a1e", "latency": "#7a5cc9"}
+MIN_DRAWN_MM = 1e-4  # smaller errors are drawn as this: a logarithmic axis has no zero
+PLOT_STYLE: Any = {
     "font.size": 9.5,
     "font.family": "DejaVu Sans",
     "axes.edgecolor": "#b4bac6",
-    "axes.labelcolor": INK,
-    "axes.titlecolor": INK,
+    "axes.labelcolor": INK_COLOR,
+    "axes.titlecolor": INK_COLOR,
     "axes.titlesize": 10.5,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
@@ -34,10 +34,10 @@ LOOK: Any = {
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.axisbelow": True,
-    "grid.color": GRID,
+    "grid.color": GRID_COLOR,
     "grid.linewidth": 0.7,
-    "xtick.color": INK,
-    "ytick.color": INK,
+    "xtick.color": INK_COLOR,
+    "ytick.color": INK_COLOR,
     "lines.linewidth": 1.5,
     "legend.frameon": False,
     "legend.fontsize": 8.5,
@@ -53,7 +53,7 @@ def figure(run: Run, path: Path) -> None:
         path: Image to write; its suffix is the format.
     """
     nu = len(run.info.inputs)
-    with mpl.rc_context(LOOK):
+    with mpl.rc_context(PLOT_STYLE):
         page = Figure(figsize=(13.0, 7.6), layout="constrained")
         FigureCanvasAgg(page)
         panels: list[Callable[[Axes, Run], None]] = [*(partial(_command, i=i) for i in range(nu)), _phases]
@@ -77,15 +77,15 @@ def figure(run: Run, path: Path) -> None:
 
 def _path(axes: Axes, run: Run) -> None:
     """Draw the plane, equal axes, with the robot where it started and where it ended."""
-    axes.plot(*run.reference.T, color=REFERENCE, linewidth=5.0, alpha=0.55, solid_capstyle="round", label="reference")
-    axes.plot(*run.position.T, color=MEASURED, label="robot, true position")
+    axes.plot(*run.reference.T, color=REFERENCE_COLOR, linewidth=5.0, alpha=0.55, solid_capstyle="round", label="reference")
+    axes.plot(*run.position.T, color=MEASURED_COLOR, label="robot, true position")
     if run.info.heading is not None:
         for row, alpha in ((0, 0.5), (-1, 1.0)):
             pose = (*run.position[row], run.x[row, run.info.heading])
             for polygon in outline(run.info.model):
-                axes.fill(*placed(polygon, *pose).T, facecolor=SHADE, edgecolor=INK, linewidth=1.0, alpha=alpha, zorder=1)
-    axes.plot(*run.position[0], "o", color=MEASURED, markerfacecolor="white", zorder=4, label="start")
-    axes.plot(*run.position[-1], "o", color=MEASURED, zorder=4, label="end")
+                axes.fill(*placed(polygon, *pose).T, facecolor=SHADE_COLOR, edgecolor=INK_COLOR, linewidth=1.0, alpha=alpha, zorder=1)
+    axes.plot(*run.position[0], "o", color=MEASURED_COLOR, markerfacecolor="white", zorder=4, label="start")
+    axes.plot(*run.position[-1], "o", color=MEASURED_COLOR, zorder=4, label="end")
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.08)
     axes.set(title=f"Path: {run.scenario}", xlabel="x [m]", ylabel="y [m]")
@@ -94,12 +94,12 @@ def _path(axes: Axes, run: Run) -> None:
 
 def _error(axes: Axes, run: Run) -> None:
     """Draw the error on a logarithmic scale, which shows transient and steady tracking alike."""
-    axes.axvspan(0.0, min(run.transient_s, run.time_s[-1]), color=SHADE, label="transient")
-    axes.semilogy(run.time_s, np.maximum(run.error_mm, FLOOR_MM), color=ERROR, linewidth=1.2)
+    axes.axvspan(0.0, min(run.transient_s, run.time_s[-1]), color=SHADE_COLOR, label="transient")
+    axes.semilogy(run.time_s, np.maximum(run.error_mm, MIN_DRAWN_MM), color=ERROR_COLOR, linewidth=1.2)
     settled = run.error_mm[run.settled]
     if settled.size:
         label = f"after the transient: max {settled.max():.3g} mm, rms {np.sqrt((settled**2).mean()):.3g} mm"
-        axes.axhline(settled.max(), color=ERROR, linewidth=0.9, linestyle="--", label=label)
+        axes.axhline(settled.max(), color=ERROR_COLOR, linewidth=0.9, linestyle="--", label=label)
     axes.set(title="Tracking error", ylabel="distance [mm]")
     _legend_above(axes)
 
@@ -109,11 +109,11 @@ def _command(axes: Axes, run: Run, i: int) -> None:
     label, measured = run.info.inputs[i], run.info.measured(i)
     for bound in (run.info.lbu[i], run.info.ubu[i]):
         if np.isfinite(bound):
-            axes.axhline(bound, color=LIMIT, linewidth=1.0, linestyle="--")
-    axes.step(run.time_s, run.u_applied[:, i], where="post", color=COMMAND, label=f"{label.name}, applied")
+            axes.axhline(bound, color=LIMIT_COLOR, linewidth=1.0, linestyle="--")
+    axes.step(run.time_s, run.u_applied[:, i], where="post", color=COMMAND_COLOR, label=f"{label.name}, applied")
     if measured is not None:
-        axes.plot(run.time_s, run.x[:, measured], color=MEASURED, linewidth=1.2, label=f"{run.info.states[measured].name}, true")
-    axes.plot([], [], color=LIMIT, linewidth=1.0, linestyle="--", label="limits")
+        axes.plot(run.time_s, run.x[:, measured], color=MEASURED_COLOR, linewidth=1.2, label=f"{run.info.states[measured].name}, true")
+    axes.plot([], [], color=LIMIT_COLOR, linewidth=1.0, linestyle="--", label="limits")
     axes.margins(y=0.12)
     axes.set(title=f"Command {label.name}", ylabel=f"[{label.unit}]")
     _legend_above(axes)
@@ -121,7 +121,7 @@ def _command(axes: Axes, run: Run, i: int) -> None:
 
 def _phases(axes: Axes, run: Run) -> None:
     """Draw phase times on a logarithmic scale, for the period is far away."""
-    for name, color in PHASES.items():
+    for name, color in PHASE_COLORS.items():
         values = getattr(run, f"{name}_us")
         median, p99 = np.percentile(values, [50, 99])
         label = f"{name}: median {median:.0f}, p99 {p99:.0f} us"
@@ -129,7 +129,7 @@ def _phases(axes: Axes, run: Run) -> None:
         axes.plot([], [], "o", color=color, markersize=4, label=label)
         axes.axhline(median, color=color, linewidth=0.9)
         axes.axhline(p99, color=color, linewidth=0.9, linestyle=":")
-    axes.axhline(run.period_us, color=LIMIT, linewidth=1.2, linestyle="--", label=f"period at speed {run.speed:g}: {run.period_us:.0f} us")
+    axes.axhline(run.period_us, color=LIMIT_COLOR, linewidth=1.2, linestyle="--", label=f"period at speed {run.speed:g}: {run.period_us:.0f} us")
     axes.set(title="Phase times (lines: median, dotted p99)", ylabel="[us]", ylim=(None, 30 * run.period_us))
     axes.legend(loc="upper right", ncols=2)
 

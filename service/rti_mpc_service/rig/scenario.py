@@ -8,7 +8,7 @@ from rti_mpc.signals import POSE_ROLES
 from rti_mpc_service.config.build import build_model, with_initial_state
 from rti_mpc_service.config.schema import Config
 
-HEADINGS: dict[str, Heading] = {"circle": "none", "positioning": "none"}  # what ends nearest; "consistent" for all others
+BEST_HEADINGS: dict[str, Heading] = {"circle": "none", "positioning": "none"}  # heading with the smallest error; "consistent" for all others
 
 
 def configured(config: Config, trajectory: Trajectory, heading: Heading, guard: bool) -> Config:

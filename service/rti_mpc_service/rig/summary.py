@@ -25,9 +25,9 @@ from rti_mpc_service.rig.robot_log import RobotLog
 from rti_mpc_service.rig.run_data import Run
 
 TRANSIENT_S = 20.0
-DRIVING = (Mode.TRACKING, Mode.HOLDING)
-ERRORS = ("max_error_mm", "rms_error_mm", "last_lap_max_error_mm", "final_error_mm", "final_speed_mm_s")
-ROUNDING = 1e-9  # of a difference of two inputs; bounds themselves are compared exactly
+DRIVING_MODES = (Mode.TRACKING, Mode.HOLDING)
+ERROR_KEYS = ("max_error_mm", "rms_error_mm", "last_lap_max_error_mm", "final_error_mm", "final_speed_mm_s")
+INCREMENT_ROUNDING = 1e-9  # rounding of a difference of two inputs, in the input's unit; inputs are compared exactly
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ class Outcome:
     def driven(self) -> bool:
         """Whether the robot was driven to the end: it got there, and a plan for the reference was acting."""
         reached = self.log.stamp_ns.size > 0 and self.log.stamp_ns[-1] >= self.end_ns
-        return bool(reached and self.samples and self.samples[-1].mode in DRIVING and self._until_the_end())
+        return bool(reached and self.samples and self.samples[-1].mode in DRIVING_MODES and self._until_the_end())
 
     def _until_the_end(self) -> bool:
         """Whether the last sample is about the end."""
@@ -111,7 +111,7 @@ def summarize(outcome: Outcome) -> dict[str, Any]:
     """
     run, samples, counters = outcome.run(), outcome.samples, outcome.log.counters
     if not run.stamp_ns.size or not samples:
-        return {"scenario": run.scenario, "driven": False, "samples": 0, "events": faults(outcome.events)}
+        return {"scenario": run.scenario, "driven": False, "samples": 0, "events": fault_events(outcome.events)}
     skipped = samples[-1].skipped - samples[0].skipped
     misses = [sample for sample in samples if sample.slack_s < 0.0]
     return {
@@ -143,14 +143,14 @@ def summarize(outcome: Outcome) -> dict[str, Any]:
         "feedback_us": quantiles(run.feedback_us),
         "latency_us": quantiles(run.latency_us),
         "echo_us": quantiles(np.array(outcome.echo_us)),
-        "events": faults(outcome.events),
+        "events": fault_events(outcome.events),
     }
 
 
 def errors(run: Run, lap_s: float | None) -> dict[str, float | None]:
     """Sum up the distance from the reference, and the speed in the end; null where the run did not get so far, or the model has no position."""
     if run.info.position is None:
-        return dict.fromkeys(ERRORS)
+        return dict.fromkeys(ERROR_KEYS)
     settled = run.error_mm[run.settled]
     last_lap = run.error_mm[run.time_s >= run.time_s[-1] - lap_s] if lap_s and run.time_s[-1] - lap_s >= run.transient_s else settled[:0]
     steps_mm, steps_s = 1e3 * np.hypot(*np.diff(run.position, axis=0).T), np.diff(run.time_s)
@@ -161,7 +161,7 @@ def errors(run: Run, lap_s: float | None) -> dict[str, float | None]:
         float(run.error_mm[-1]),
         float(steps_mm[-1] / steps_s[-1]) if steps_s.size else None,
     )
-    return dict(zip(ERRORS, numbers, strict=True))
+    return dict(zip(ERROR_KEYS, numbers, strict=True))
 
 
 def limits(outcome: Outcome, samples: Sequence[Telemetry]) -> dict[str, Any]:
@@ -170,19 +170,19 @@ def limits(outcome: Outcome, samples: Sequence[Telemetry]) -> dict[str, Any]:
     commanded = np.vstack([sample.u for sample in samples])
     steps = np.vstack([np.diff(sample.u, axis=0) for sample in samples])
     return {
-        "commanded_inputs_in_bounds": not beyond(commanded, ocp.lbu, ocp.ubu).any(),
-        "commanded_increments_in_bounds": not (beyond(steps, ocp.lbdu, ocp.ubdu) > ROUNDING).any(),
-        "applied_inputs_in_bounds": not beyond(log.u, ocp.lbu, ocp.ubu).any(),
-        "states_over_share": float(over_share(log.x, ocp.lbx, ocp.ubx).max()),
+        "commanded_inputs_in_bounds": not excess(commanded, ocp.lbu, ocp.ubu).any(),
+        "commanded_increments_in_bounds": not (excess(steps, ocp.lbdu, ocp.ubdu) > INCREMENT_ROUNDING).any(),
+        "applied_inputs_in_bounds": not excess(log.u, ocp.lbu, ocp.ubu).any(),
+        "states_over_share": float(excess_share(log.x, ocp.lbx, ocp.ubx).max()),
     }
 
 
-def beyond(values: Array, lower: Array, upper: Array) -> Array:
+def excess(values: Array, lower: Array, upper: Array) -> Array:
     """Return by how much values, shape ``(M, n)``, are outside their bounds, shape ``(n,)``; 0 inside, exactly."""
     return np.asarray(np.maximum(np.maximum(values - upper, lower - values), 0.0))
 
 
-def over_share(values: Array, lower: Array, upper: Array) -> Array:
+def excess_share(values: Array, lower: Array, upper: Array) -> Array:
     """Return the same as a share of the bound that is broken; of the other one where that is 0."""
     above, below = np.maximum(values - upper, 0.0), np.maximum(lower - values, 0.0)
     size = np.where(above > 0.0, np.abs(upper), np.abs(lower))
@@ -198,7 +198,7 @@ def quantiles(values: Array) -> dict[str, float | None]:
     return {name: round(float(np.percentile(values, share)), 1) for name, share in (("p50", 50), ("p99", 99), ("max", 100))}
 
 
-def faults(events: Sequence[Event]) -> list[dict[str, Any]]:
+def fault_events(events: Sequence[Event]) -> list[dict[str, Any]]:
     """Return the events that are not news only."""
     return [
         {"at_s": 1e-9 * event.stamp_ns, "source": event.source, "severity": event.severity.name, "code": event.code, "text": event.text}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rti_mpc.array import Array
 from rti_mpc.rti.ocp import Ocp
 
-WAVE_S = 40.0  # period of the reference, s
+WAVE_PERIOD_S = 40.0
 
 
 def wave(ocp: Ocp, x: Array, rng: np.random.Generator) -> Callable[[NDArray[np.int64]], Array]:
@@ -19,4 +19,4 @@ def wave(ocp: Ocp, x: Array, rng: np.random.Generator) -> Callable[[NDArray[np.i
     model = ocp.model
     phases = rng.uniform(-np.pi, np.pi, model.ny)
     start = np.array([x[[state.name for state in model.states].index(y.name)] if y in model.states else 0.0 for y in model.outputs])
-    return lambda k: np.asarray(start + np.sin(2 * np.pi / WAVE_S * ocp.dt * k[:, None] + phases) - np.sin(phases))
+    return lambda k: np.asarray(start + np.sin(2 * np.pi / WAVE_PERIOD_S * ocp.dt * k[:, None] + phases) - np.sin(phases))

@@ -13,8 +13,8 @@ from rti_mpc.wire.info import Info
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.streams import admitted
 
-CAPACITY = 4096  # samples between two looks: seconds, at any rate
-STALE_S = 60.0  # one life of each process is a run
+MAX_WAITING_MESSAGES = 4096  # per stream, between two calls of `listen`: several seconds at any rate
+STALE_S = 60.0  # longer than a pause in a run: each process has one life per run
 
 
 class Witness:
@@ -36,9 +36,9 @@ class Witness:
         self.info: Info | None = None
         self.lives: set[str] = set()
         self._bus = bus
-        self._samples, self._samples_in = bus.subscriber(bus.keys.telemetry, capacity=CAPACITY), bus.intake(Telemetry, STALE_S)
+        self._samples, self._samples_in = bus.subscriber(bus.keys.telemetry, capacity=MAX_WAITING_MESSAGES), bus.intake(Telemetry, STALE_S)
         self._references, self._references_in = bus.subscriber(bus.keys.reference, capacity=RING_MESSAGES), bus.intake(Reference, STALE_S)
-        self._events, self._events_in = bus.subscriber(bus.keys.events, capacity=CAPACITY), dict[str, Intake[Event]]()
+        self._events, self._events_in = bus.subscriber(bus.keys.events, capacity=MAX_WAITING_MESSAGES), dict[str, Intake[Event]]()
         self._infos = bus.subscriber(bus.keys.info("controller"), capacity=RING_MESSAGES)
         bus.watch_alive(self._notice)
 

@@ -18,10 +18,10 @@ from rti_mpc_service.outline import outline
 
 TIMELINE = "robot_time"
 TRAIL_S = 90.0
-WINDOW_S = (-60.0, 15.0)  # around now; the legend lies on what is yet to come
-HALF_FIELD = 0.52  # tangent of half the viewer's vertical field of view
+WINDOW_S = (-60.0, 15.0)  # shown time, relative to now; the legend covers the empty part after now
+HALF_FIELD_TANGENT = 0.52  # tangent of half the viewer's vertical field of view
 GRID_M = 0.5
-MARGIN_M = 0.35  # a robot around a reference
+MARGIN_M = 0.35  # space around the reference, enough for a robot
 
 COLORS = {
     "reference": (150, 156, 168),
@@ -43,10 +43,15 @@ COLORS = {
     "bad": (214, 70, 70),
 }
 PHASES = ("prepare", "feedback", "latency")
-RUNGS = {"softened": "measured", "shifted": "warning", "braked": "bad", "rested": "latency"}  # of the ladder of fallbacks, as telemetry counts them
-MODES = dict(zip(Mode, ("idle", "idle", "good", "good", "warning", "warning", "bad"), strict=True))
-STATUSES = dict(zip(QpStatus, ("good", "warning", "warning", "warning", "bad", "bad", "idle"), strict=True))
-LANES: dict[str, dict[Any, str]] = {"guard": MODES, "mode": MODES, "status": STATUSES}  # a leader is any epoch
+RUNG_COLORS = {
+    "softened": "measured",
+    "shifted": "warning",
+    "braked": "bad",
+    "rested": "latency",
+}  # the fallbacks
+MODE_COLORS = dict(zip(Mode, ("idle", "idle", "good", "good", "warning", "warning", "bad"), strict=True))
+STATUS_COLORS = dict(zip(QpStatus, ("good", "warning", "warning", "warning", "bad", "bad", "idle"), strict=True))
+LANE_COLORS: dict[str, dict[Any, str]] = {"guard": MODE_COLORS, "mode": MODE_COLORS, "status": STATUS_COLORS}  # a leader is any epoch
 
 
 @dataclass(frozen=True)
@@ -72,7 +77,7 @@ class Frame:
     @property
     def eye_height(self) -> float:
         """How far above the plane to look from, in m, for a view wider than high."""
-        return (max(self.half[1], self.half[0] / 1.3) + MARGIN_M) / HALF_FIELD
+        return (max(self.half[1], self.half[0] / 1.3) + MARGIN_M) / HALF_FIELD_TANGENT
 
 
 def blueprint(info: Info, frame: Frame | None = None) -> rrb.Blueprint:
@@ -167,7 +172,7 @@ def _times(info: Info) -> rrb.Container:
 def _troubles() -> rrb.Container:
     """Show what was sent instead of a plan, and how long a state takes to act."""
     return rrb.Vertical(
-        _series("Samples since start, softened or without a plan of their own", [f"telemetry/{rung}" for rung in RUNGS]),
+        _series("Samples since start, softened or without a plan of their own", [f"telemetry/{rung}" for rung in RUNG_COLORS]),
         _series("From a state to the act of its command [s]", ["telemetry/delay_s", "telemetry/state_age_s"]),
         name="Fallbacks and delay",
     )
@@ -192,11 +197,11 @@ STRIPS = {
     "world/trail": Strip("measured", 2.0, 0.004),
     "world/horizon": Strip("command", 4.0, 0.02),
 }
-LEGEND = {"reference": "reference", "driven": "measured", "planned": "command"}
-OBSTACLE_Z = -0.004  # [m], below everything
-FARTHEST = 1e38  # m, within single precision, in which Rerun draws
-CIRCLE: Array = np.column_stack([np.cos(angles := np.linspace(0, 2 * np.pi, 48, endpoint=False)), np.sin(angles)])
-ROBOT_Z = 0.008  # [m], between trail and horizon
+LEGEND_COLORS = {"reference": "reference", "driven": "measured", "planned": "command"}
+OBSTACLE_Z_M = -0.004  # [m], below everything
+MAX_COORDINATE_M = 1e38  # m, within single precision, in which Rerun draws
+UNIT_CIRCLE: Array = np.column_stack([np.cos(angles := np.linspace(0, 2 * np.pi, 48, endpoint=False)), np.sin(angles)])
+ROBOT_Z_M = 0.008  # [m], between trail and horizon
 
 
 def looks(info: Info) -> dict[str, rr.AsComponents]:
@@ -206,16 +211,20 @@ def looks(info: Info) -> dict[str, rr.AsComponents]:
 
 def legend(frame: Frame) -> rr.Points3D:
     """Return what tells the lines in the plane apart, at the bottom of what is seen."""
-    (x, y), reach = frame.center, HALF_FIELD * frame.eye_height
+    (x, y), reach = frame.center, HALF_FIELD_TANGENT * frame.eye_height
     xy = np.array([(x + shift * reach, y - 0.88 * reach) for shift in (-0.6, 0.0, 0.6)])
     return rr.Points3D(
-        lifted(xy, 0.0), labels=list(LEGEND), show_labels=True, colors=[COLORS[color] for color in LEGEND.values()], radii=rr.Radius.ui_points(4.0)
+        lifted(xy, 0.0),
+        labels=list(LEGEND_COLORS),
+        show_labels=True,
+        colors=[COLORS[color] for color in LEGEND_COLORS.values()],
+        radii=rr.Radius.ui_points(4.0),
     )
 
 
 def lifted(xy: Array, z: float) -> Array:
     """Return points in the plane, shape ``(..., 2)``, at a height, shape ``(..., 3)``; those beyond single precision where that ends."""
-    return np.concatenate([np.clip(xy, -FARTHEST, FARTHEST), np.full((*xy.shape[:-1], 1), z)], axis=-1)
+    return np.concatenate([np.clip(xy, -MAX_COORDINATE_M, MAX_COORDINATE_M), np.full((*xy.shape[:-1], 1), z)], axis=-1)
 
 
 def _series_looks(info: Info) -> dict[str, rr.AsComponents]:
@@ -229,7 +238,7 @@ def _series_looks(info: Info) -> dict[str, rr.AsComponents]:
         looks |= {f"command/{label.name}/{side}": limits for side in ("min", "max")}
     looks |= {f"error/{info.outputs[i].name}": _line(str(info.outputs[i]), "error") for i, _ in info.tracked}
     looks |= {f"telemetry/{phase}_us": _line(phase, phase) for phase in PHASES}
-    looks |= {f"telemetry/{rung}": _line(rung, color) for rung, color in RUNGS.items()}
+    looks |= {f"telemetry/{rung}": _line(rung, color) for rung, color in RUNG_COLORS.items()}
     looks |= {"telemetry/delay_s": _line("delay", "measured"), "telemetry/state_age_s": _line("age of the state", "idle")}
     looks |= {"error/position": _line("position [mm]", "error"), "slack": _line("left", "feedback"), "slack/period": _line("period", "limit", 1.0)}
     return looks
@@ -237,7 +246,7 @@ def _series_looks(info: Info) -> dict[str, rr.AsComponents]:
 
 def _lane_looks() -> dict[str, rr.AsComponents]:
     looks: dict[str, rr.AsComponents] = {}
-    for lane, values in LANES.items():
+    for lane, values in LANE_COLORS.items():
         names, colors = [value.name for value in values], [COLORS[color] for color in values.values()]
         looks[f"lane/{lane}"] = rr.StateConfiguration(values=names, labels=names, colors=colors)
     return looks
@@ -248,13 +257,13 @@ def _world_looks(info: Info) -> dict[str, rr.AsComponents]:
     for path, strip in STRIPS.items():
         looks[path] = rr.LineStrips3D.from_fields(colors=COLORS[strip.color], radii=rr.Radius.ui_points(strip.width / 2))
     for k, polygon in enumerate(outline(info.model) if info.heading is not None else []):
-        edge = lifted(np.vstack([polygon, polygon[:1]]), ROBOT_Z + 0.002)
-        looks[f"world/robot/part_{k}"] = _filled(polygon, ROBOT_Z - 0.001 * (k > 0), COLORS["wheel" if k else "body"])
+        edge = lifted(np.vstack([polygon, polygon[:1]]), ROBOT_Z_M + 0.002)
+        looks[f"world/robot/part_{k}"] = _filled(polygon, ROBOT_Z_M - 0.001 * (k > 0), COLORS["wheel" if k else "body"])
         looks[f"world/robot/part_{k}/edge"] = rr.LineStrips3D([edge], colors=COLORS["edge"], radii=rr.Radius.ui_points(0.75))
     for i in range(len(info.obstacles)):  # of radius 1 m: where each is, and its radius, come with the samples
-        looks[f"world/obstacle_{i}/disc"] = _filled(CIRCLE, OBSTACLE_Z, COLORS["obstacle"])
+        looks[f"world/obstacle_{i}/disc"] = _filled(UNIT_CIRCLE, OBSTACLE_Z_M, COLORS["obstacle"])
         looks[f"world/obstacle_{i}/edge"] = rr.LineStrips3D(
-            [lifted(np.vstack([CIRCLE, CIRCLE[:1]]), OBSTACLE_Z)], colors=COLORS["limit"], radii=rr.Radius.ui_points(0.75)
+            [lifted(np.vstack([UNIT_CIRCLE, UNIT_CIRCLE[:1]]), OBSTACLE_Z_M)], colors=COLORS["limit"], radii=rr.Radius.ui_points(0.75)
         )
     looks["world/robot/point"] = rr.Points3D([[0.0, 0.0, 0.02]], colors=COLORS["measured"], radii=rr.Radius.ui_points(3.0))
     return looks

@@ -19,7 +19,7 @@ from rti_mpc_service.view.playback import Actuation
 from rti_mpc_service.view.recording import Entry
 from rti_mpc_service.view.timeline import Timeline
 
-CAPACITY = 2048  # messages a stream may be ahead of us: 2 s at 1 kHz
+MAX_WAITING_MESSAGES = 2048  # per stream: 2 s at 1 kHz
 STALE_S = 2.0
 
 Door = Intake[Any]
@@ -36,7 +36,7 @@ class Listener:
         received: Messages accepted.
     """
 
-    def __init__(self, bus: Bus, capacity: int = CAPACITY) -> None:
+    def __init__(self, bus: Bus, capacity: int = MAX_WAITING_MESSAGES) -> None:
         keys = bus.keys
         self._actuation = keys.actuation
         self.received = 0

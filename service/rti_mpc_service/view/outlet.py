@@ -20,15 +20,15 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.wire.info import Info
 from rti_mpc_service.view.recording import Entry, Recording
 
-APPLICATION = "rti_mpc"
-CAPACITY = 8192  # entries; some 50 MB of long horizons
-FILE_PERIOD_S = 1.0  # fewer, larger chunks: a recording that opens fast
+RERUN_APPLICATION_ID = "rti_mpc"
+MAX_QUEUED_ENTRIES = 8192  # about 50 MB with long horizons
+FILE_PERIOD_S = 1.0  # larger chunks make a recording that opens fast
 VIEWER_PERIOD_S = 1 / 15
-FILE_FLUSH_S = 10.0
-FILE_CLOSE_S = 5.0  # a recording is worth waiting for; milliseconds where the disk works
-VIEWER_FLUSH_S = 2.0
-VIEWER_CLOSE_S = 0.5
-PROBE_S = 0.2  # Rerun itself waits 5 s for a viewer that is not there
+FILE_FLUSH_TIMEOUT_S = 10.0
+FILE_CLOSE_TIMEOUT_S = 5.0  # takes milliseconds on a disk that works
+VIEWER_FLUSH_TIMEOUT_S = 2.0
+VIEWER_CLOSE_TIMEOUT_S = 0.5
+PROBE_TIMEOUT_S = 0.2  # of our own attempt to connect: Rerun waits 5 s for a viewer that is not there
 
 log = logging.getLogger(__name__)
 
@@ -57,9 +57,9 @@ class Outlet:
         open_stream: Callable[[], rr.RecordingStream],
         *,
         period_s: float = VIEWER_PERIOD_S,
-        flush_s: float = VIEWER_FLUSH_S,
-        close_s: float = VIEWER_CLOSE_S,
-        capacity: int = CAPACITY,
+        flush_s: float = VIEWER_FLUSH_TIMEOUT_S,
+        close_s: float = VIEWER_CLOSE_TIMEOUT_S,
+        capacity: int = MAX_QUEUED_ENTRIES,
         epitaph: Callable[[], str] = lambda: "given up, what it had not taken is lost",
     ) -> None:
         self.name = name
@@ -99,7 +99,7 @@ class Outlet:
     def close(self) -> bool:
         """Write what is queued and end the stream, within a bounded time; return whether nothing was lost on the way."""
         self._closing.set()
-        self._thread.join(min(self._close_s, VIEWER_CLOSE_S) if self.failures else self._close_s)
+        self._thread.join(min(self._close_s, VIEWER_CLOSE_TIMEOUT_S) if self.failures else self._close_s)
         return not (self._thread.is_alive() or self._queue or self.dropped or self.failures)
 
     def _run(self) -> None:
@@ -172,7 +172,7 @@ def file_outlet(path: Path, name: str) -> Outlet:
     def epitaph() -> str:
         return f"the recording ends here, with {1e-6 * shutil.disk_usage(path.parent).free:.1f} MB free on its disk"
 
-    return Outlet(str(path), open_stream, period_s=FILE_PERIOD_S, flush_s=FILE_FLUSH_S, close_s=FILE_CLOSE_S, epitaph=epitaph)
+    return Outlet(str(path), open_stream, period_s=FILE_PERIOD_S, flush_s=FILE_FLUSH_TIMEOUT_S, close_s=FILE_CLOSE_TIMEOUT_S, epitaph=epitaph)
 
 
 def viewer_outlet(url: str, name: str) -> Outlet:
@@ -183,7 +183,7 @@ def viewer_outlet(url: str, name: str) -> Outlet:
 
     def open_stream() -> rr.RecordingStream:
         try:
-            socket.create_connection(where, PROBE_S).close()
+            socket.create_connection(where, PROBE_TIMEOUT_S).close()
         except OSError as error:
             raise Unavailable from error
         stream = _stream(name, recording_id)
@@ -195,6 +195,6 @@ def viewer_outlet(url: str, name: str) -> Outlet:
 
 def _stream(name: str, recording_id: uuid.UUID | None = None) -> rr.RecordingStream:
     rr.unregister_shutdown()  # at exit it would wait without limit for a viewer that hangs; `Outlet.close` is bounded
-    stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+    stream = rr.RecordingStream(RERUN_APPLICATION_ID, recording_id=recording_id)
     stream.send_recording_name(name)
     return stream

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.status import Mode
-from rti_mpc_service.view.timeline import AHEAD_NS
+from rti_mpc_service.view.timeline import MAX_AHEAD_NS
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class Playback:
 
     def end(self) -> list[PlayedRow]:
         """Return what is played of the last plan if no other one follows."""
-        return [row for time_ns, command in self._last for row in self._play(time_ns, command, time_ns + AHEAD_NS)]
+        return [row for time_ns, command in self._last for row in self._play(time_ns, command, time_ns + MAX_AHEAD_NS)]
 
     def _play(self, time_ns: int, command: Command, end_ns: int) -> list[PlayedRow]:
         rows = []

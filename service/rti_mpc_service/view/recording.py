@@ -16,7 +16,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, Event, Reference, Severity, State, Telemetry
 from rti_mpc.signals import plane
 from rti_mpc.wire.info import Info, Label, Obstacle
-from rti_mpc_service.view.blueprint import RUNGS, STRIPS, TIMELINE, Frame, blueprint, legend, lifted, looks
+from rti_mpc_service.view.blueprint import RUNG_COLORS, STRIPS, TIMELINE, Frame, blueprint, legend, lifted, looks
 from rti_mpc_service.view.playback import Actuation, Playback, PlayedRow
 from rti_mpc_service.view.tracking_error import tracking_error
 
@@ -24,16 +24,16 @@ Message = Info | Reference | State | Command | Actuation | Telemetry | Event
 Columns = Iterable[rr.ComponentColumn]
 Times = NDArray[np.int64]
 
-VECTORS = {"x": "states", "u": "inputs", "y": "outputs", "y_ref": "outputs"}  # of messages, and whose labels they take
-HELD = 10_000  # entries kept until an info tells their names
-SCALARS = (
+LABELS_OF_VECTOR = {"x": "states", "u": "inputs", "y": "outputs", "y_ref": "outputs"}  # field of a message: field of `Info` with its labels
+MAX_HELD_ENTRIES = 10_000  # kept until an info tells the names of their signals
+TELEMETRY_SCALARS = (
     *("prepare_us", "feedback_us", "latency_us"),
     *("iterations", "res_prim", "res_dual", "cost", "violation"),
-    *("state_age_s", "slack_s", "delay_s", "skipped", "fallbacks", *RUNGS, "parameter_version"),
+    *("state_age_s", "slack_s", "delay_s", "skipped", "fallbacks", *RUNG_COLORS, "parameter_version"),
 )
-LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
-MS = 1_000_000  # [ns], to which events lie: the column of times is not wider
-ROWS = 5000  # of a reference, drawn
+RERUN_LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
+EVENT_GRID_NS = 1_000_000  # times of events are rounded down to 1 ms, which keeps the time column narrow
+MAX_DRAWN_ROWS = 5000  # per reference
 
 
 @dataclass(slots=True, eq=False)
@@ -63,7 +63,7 @@ class Recording:
         self.info: Info | None = None
         self._reference: Reference | None = None
         self._frame: Frame | None = None
-        self._held: deque[Entry] = deque(maxlen=HELD)
+        self._held: deque[Entry] = deque(maxlen=MAX_HELD_ENTRIES)
         self._last: State | None = None
         self._playback = Playback()
         self._lanes: dict[str, tuple[str, int]] = {}  # the last change of each: to what, and where it lies
@@ -112,12 +112,12 @@ class Recording:
         for path, archetype in looks(info).items():
             self.stream.log(path, archetype, static=True)
         self.stream.send_blueprint(blueprint(info, self._frame))
-        held, self._held = list(self._held), deque(maxlen=HELD)
+        held, self._held = list(self._held), deque(maxlen=MAX_HELD_ENTRIES)
         self.send(held)
 
     def _fits(self, message: Message) -> bool:
         """Whether the vectors of a message are as long as the info says: it may be about another model."""
-        return self.info is None or all(width == len(getattr(self.info, VECTORS[name])) for name, width in _widths(message).items())
+        return self.info is None or all(width == len(getattr(self.info, LABELS_OF_VECTOR[name])) for name, width in _widths(message).items())
 
     def _columns(self, path: str, times: Times, *columns: Columns) -> None:
         index = rr.TimeColumn(TIMELINE, duration=times.astype("timedelta64[ns]"))
@@ -144,7 +144,7 @@ class Recording:
                 self._frame = frame
                 self.stream.log("world/legend", legend(frame), static=True)
                 self.stream.send_blueprint(blueprint(self.info, frame))
-            self._strips("world/reference", times, [r.y[:: 1 + len(r.y) // ROWS, pair] for r in references])
+            self._strips("world/reference", times, [r.y[:: 1 + len(r.y) // MAX_DRAWN_ROWS, pair] for r in references])
 
     def _states(self, times: Times, states: list[State]) -> None:
         assert self.info is not None
@@ -198,7 +198,7 @@ class Recording:
 
     def _telemetry(self, times: Times, samples: list[Telemetry]) -> None:
         assert self.info is not None
-        for name in SCALARS:
+        for name in TELEMETRY_SCALARS:
             self._scalars(f"telemetry/{name}", times, np.array([getattr(sample, name) for sample in samples], float))
         for i, label in enumerate(self.info.disturbances):
             self._scalars(f"disturbance/{label.name}", times, np.array([sample.d[i] if i < len(sample.d) else np.nan for sample in samples]))
@@ -236,8 +236,8 @@ class Recording:
         for source in sorted({event.source for event in events}):
             mine = [k for k, event in enumerate(events) if event.source == source]
             text = [f"{source}: {events[k].text} ({events[k].code})" for k in mine]
-            columns = rr.TextLog.columns(text=text, level=[LEVELS[events[k].severity] for k in mine])
-            self._columns(f"event/{rr.escape_entity_path_part(source)}", times[mine] // MS * MS, columns)
+            columns = rr.TextLog.columns(text=text, level=[RERUN_LEVELS[events[k].severity] for k in mine])
+            self._columns(f"event/{rr.escape_entity_path_part(source)}", times[mine] // EVENT_GRID_NS * EVENT_GRID_NS, columns)
 
 
 def located(obstacle: Obstacle, reference: Reference | None, stamps: NDArray[np.int64]) -> tuple[Array, Array, Array]:
@@ -252,7 +252,7 @@ def located(obstacle: Obstacle, reference: Reference | None, stamps: NDArray[np.
 
 def _widths(message: Message) -> dict[str, int]:
     """Return how many numbers the vectors of a message have, or the rows of its matrices; inputs that a state does not report are left out."""
-    arrays = {name: getattr(message, name) for name in VECTORS if hasattr(message, name)}
+    arrays = {name: getattr(message, name) for name in LABELS_OF_VECTOR if hasattr(message, name)}
     return {name: array.shape[-1] for name, array in arrays.items() if array.ndim > 1 or array.size}
 
 

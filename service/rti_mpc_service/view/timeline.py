@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-GAP_NS = 1_000_000_000  # between two lives of a robot whose clock began again
-LAST_NS = 2**62  # a century and a half: the axis begins again rather than leave int64
-AHEAD_NS = 1_000_000_000  # commands act a little after the newest state; nothing is drawn later than this
+GAP_BETWEEN_LIVES_NS = 1_000_000_000  # drawn between two lives of a robot whose clock began again
+MAX_TIME_NS = 2**62  # 146 years; beyond it the axis begins again, so that it never exceeds int64
+MAX_AHEAD_NS = 1_000_000_000  # latest drawn time after the newest state; commands act a little after it
 
 
 class Timeline:
@@ -31,8 +31,8 @@ class Timeline:
         """Return where a state lies, and let the axis advance to it."""
         if epoch != self._epoch:
             if self._epoch is not None and stamp_ns < self._latest_ns:
-                self._offset_ns += self._latest_ns + GAP_NS - stamp_ns
-                self._offset_ns *= self._offset_ns + stamp_ns < LAST_NS
+                self._offset_ns += self._latest_ns + GAP_BETWEEN_LIVES_NS - stamp_ns
+                self._offset_ns *= self._offset_ns + stamp_ns < MAX_TIME_NS
             self._epoch, self._first_ns, self._latest_ns = epoch, stamp_ns, stamp_ns
         self._latest_ns = max(self._latest_ns, stamp_ns)
         return self._offset_ns + stamp_ns
@@ -41,4 +41,4 @@ class Timeline:
         """Return where anything else lies: within the robot's present life, for a late message of a former one cannot be told."""
         if self._epoch is None:
             return max(stamp_ns, 0)
-        return self._offset_ns + min(max(stamp_ns, self._first_ns), self._latest_ns + AHEAD_NS)
+        return self._offset_ns + min(max(stamp_ns, self._first_ns), self._latest_ns + MAX_AHEAD_NS)

@@ -23,8 +23,8 @@ from rti_mpc_service.view.listener import Listener
 from rti_mpc_service.view.outlet import Outlet, file_outlet, viewer_outlet
 
 ROLE = "viewer"
-ADDRESS = "127.0.0.1:9876"
-PERIOD_S = 0.05
+RERUN_ADDRESS = "127.0.0.1:9876"
+DRAIN_PERIOD_S = 0.05
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +58,7 @@ def main(
         ConfigError: An address or a file is not one.
     """
     rerun_spawn |= rerun_connect is None and rerun_save is None
-    url = viewer_url(rerun_connect or ADDRESS)
+    url = viewer_url(rerun_connect or RERUN_ADDRESS)
     stop = stop or stop_on_signals()
     with Bus.join(bus_settings, keys, stop=stop, say=log.warning) as bus:
         listener = Listener(bus)
@@ -81,7 +81,7 @@ def pump(listener: Listener, outlets: Sequence[Outlet], spawned: subprocess.Pope
     """Pass on what is heard until told to stop, and then what is still there; say where an outlet or viewer failed, to the bus and to the others."""
     stopped = False
     while not stopped:
-        stopped = stop.wait(PERIOD_S)
+        stopped = stop.wait(DRAIN_PERIOD_S)
         entries = listener.drain()
         said = notices(outlets)
         if spawned is not None and spawned.poll() is not None:

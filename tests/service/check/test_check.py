@@ -21,7 +21,7 @@ def test_two_solvers_are_compared_tightly_whatever_the_controllers_tolerance(fir
     path.write_text(MINIMAL + f"[ocp.bounds]\ninputs = {{ u_c = [-0.2, 0.2] }}\n[solver]\nname = '{first}'\n{loose}")
     report = check.check(load(path))
     assert report.second == second
-    assert report.opinions > check.OPINIONS, "those at the bounds are asked about, too"
+    assert report.opinions > check.COMPARED_WAVE_SAMPLES, "those at the bounds are asked about, too"
     assert report.agree
     assert report.difference < 1e-6
     assert (report.deviation > 1e-4) is (first == "osqp"), "what the tolerance costs is told apart from whether the QP is right"
@@ -30,8 +30,8 @@ def test_two_solvers_are_compared_tightly_whatever_the_controllers_tolerance(fir
 def test_a_qp_that_is_not_the_other_formulations_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(MINIMAL + "[ocp.bounds]\ninputs = { u_c = [-1, 1], omega_c = [-1, 1] }\n")
-    right = check.answer
-    monkeypatch.setattr(check, "answer", lambda one, *sample: right(one, *sample) + (1e-4 if one.formulation == "simultaneous" else 0.0))
+    right = check.solution
+    monkeypatch.setattr(check, "solution", lambda one, *sample: right(one, *sample) + (1e-4 if one.formulation == "simultaneous" else 0.0))
     report = check.check(load(path))
     assert not report.agree
     np.testing.assert_allclose(report.difference, 1e-4, rtol=0.01)

@@ -15,7 +15,7 @@ from rti_mpc.reference.trajectory import find_trajectory
 from rti_mpc.wire.session import BusSettings, zenoh_config
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
-from rti_mpc_service.request import assigned
+from rti_mpc_service.request import parse_assignments
 from tests.processes.system import rti_mpc
 
 TEXT = SHIPPED.read_text()
@@ -156,4 +156,4 @@ def test_zenoh_file_of_many_brackets_is_refused_and_ends_no_process(tmp_path: Pa
 @pytest.mark.parametrize("value", ["[" * DEEP, f"1{'0' * 5000}", "", "1\nb = 2", "{" * DEEP])
 def test_parameter_that_is_no_value_is_one_line(value: str) -> None:
     with pytest.raises(ConfigError, match="params must be set by KEY=VALUE"):
-        assigned([f"ocp.weights.Q.x={value}"])
+        parse_assignments([f"ocp.weights.Q.x={value}"])

@@ -18,7 +18,7 @@ from rti_mpc.wire.bus import Received, unix_s
 from rti_mpc.wire.cdr import encode, encoding
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
-from rti_mpc_service.controller.leadership import LOOK, LOOK_BYTES, Candidate, Others
+from rti_mpc_service.controller.leadership import MAX_BYTES_PER_LOOK, MAX_MESSAGES_PER_LOOK, Candidate, Others
 
 DT_S = 0.1
 DT_NS = 100_000_000
@@ -208,12 +208,12 @@ def test_what_is_decided_reaches_the_controller_and_the_bus(pair: tuple[One, One
     assert [command.state_stamp_ns for command in leader.puppet.heard] == [6 * DT_NS]
 
 
-@pytest.mark.parametrize(("rows", "most"), [(1, LOOK), (LOOK_BYTES // 8, 1)], ids=["many", "long"])
+@pytest.mark.parametrize(("rows", "most"), [(1, MAX_MESSAGES_PER_LOOK), (MAX_BYTES_PER_LOOK // 8, 1)], ids=["many", "long"])
 def test_one_look_reads_no_more_than_it_takes_whatever_waits(pair: tuple[One, One], rows: int, most: int) -> None:
     """Each has a higher sequence number than all before: none is left out by what was read."""
     leader, standby = pair
     long = np.zeros((rows, 1))
-    flood = [replace(leader.made(4), epoch=leader.leadership.epoch, state_seq=40, seq=100 + i, u=long) for i in range(3 * LOOK)]
+    flood = [replace(leader.made(4), epoch=leader.leadership.epoch, state_seq=40, seq=100 + i, u=long) for i in range(3 * MAX_MESSAGES_PER_LOOK)]
     waiting = [Received(encode(command), encoding(Command), "") for command in flood]
     before = len(standby.puppet.heard)
     standby.bus.commands.extend(waiting)
@@ -227,7 +227,7 @@ def test_leader_that_slept_finds_out_within_the_time_it_listens_though_all_that_
     """The new leader's command lies behind a full ring of an old one's, repeated."""
     leader, standby = pair
     old = replace(leader.made(4), epoch=leader.leadership.epoch)
-    leader.bus.commands.extend([Received(encode(old), encoding(Command), "")] * LOOK)
+    leader.bus.commands.extend([Received(encode(old), encoding(Command), "")] * MAX_MESSAGES_PER_LOOK)
     assert [standby.see(k) for k in (5, 6)] == [False, True]
     assert not leader.see(7)
     leader.leadership.listen(7 * DT_NS + 10_000_000)

@@ -20,7 +20,7 @@ from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.build import build_ocp, build_rti
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
-from rti_mpc_service.controller.params import Params, changed, values
+from rti_mpc_service.controller.params import Params, changed_problem, parameter_values
 from tests.loop import drive, reference, robot
 from tests.service.config.test_config import MINIMAL
 
@@ -50,7 +50,7 @@ def test_values_are_those_of_the_file_by_its_keys(running: tuple[Controller, Par
     _, params, config = running
     answer = params.answer({"get": True})
     assert (answer["version"], answer["live"]) == (0, True)
-    assert answer["values"] == values(config)
+    assert answer["values"] == parameter_values(config)
     assert answer["values"]["ocp.weights.Q.psi"] == 0.05
     assert answer["values"]["ocp.weights.lambda"] == (0.8,)
     assert answer["values"]["ocp.bounds.increments.omega_c"] == (-0.40, 0.40)
@@ -113,7 +113,7 @@ def test_change_that_does_not_fit_is_refused_in_one_line_and_nothing_of_it_is_ta
     assert "\n" not in str(refusal.value)
     for word in words:
         assert word in str(refusal.value)
-    assert (params.version, params.changes, params.answer({"get": True})["values"]) == (0, {}, values(config))
+    assert (params.version, params.changes, params.answer({"get": True})["values"]) == (0, {}, parameter_values(config))
     assert controller.telemetry(prepare_us=0, feedback_us=0, latency_us=0, slack_s=0).parameter_version == 0
 
 
@@ -124,7 +124,7 @@ def test_change_without_a_solution_on_the_present_sample_is_refused(
     monkeypatch.setattr(Rti, "feedback", lambda *_: QpStatus.FAILED)
     with pytest.raises(ConfigError, match="present sample must have a solution with the new values, its QP is failed"):
         params.answer({"set": {"ocp.weights.R.u_c": 2.0}})
-    assert (params.version, params.answer({"get": True})["values"]) == (0, values(config))
+    assert (params.version, params.answer({"get": True})["values"]) == (0, parameter_values(config))
 
 
 def test_nothing_changes_unless_the_file_allows_it(tmp_path: Any) -> None:
@@ -150,8 +150,8 @@ def test_a_bound_on_one_side_stays_on_that_side(tmp_path: Any) -> None:
     path.write_text(MINIMAL + "ocp.bounds.inputs = { u_c = [-inf, 0.5] }\nparams.live = true\n")
     config = load(path)
     with pytest.raises(ConfigError, match="be finite where it is"):
-        changed(config, build_ocp(config), {"ocp.bounds.inputs.u_c": [-1.0, 0.5]})
-    assert changed(config, build_ocp(config), {"ocp.bounds.inputs.u_c": [-float("inf"), 0.4]})[1].ubu[0] == 0.4
+        changed_problem(config, build_ocp(config), {"ocp.bounds.inputs.u_c": [-1.0, 0.5]})
+    assert changed_problem(config, build_ocp(config), {"ocp.bounds.inputs.u_c": [-float("inf"), 0.4]})[1].ubu[0] == 0.4
 
 
 FILES = {
@@ -170,8 +170,8 @@ def test_problem_after_changes_is_the_one_its_file_would_have_built(tmp_path: An
     path.write_text(MINIMAL + file)
     config = load(path)
     built = build_ocp(config)
-    _, before = changed(config, built, {"ocp.bounds.soft_weight": 9.0, "ocp.weights.Q.x": 5.0})
-    now, ocp = changed(config, before, CHANGES)
+    _, before = changed_problem(config, built, {"ocp.bounds.soft_weight": 9.0, "ocp.weights.Q.x": 5.0})
+    now, ocp = changed_problem(config, before, CHANGES)
     wanted = build_ocp(now)
     for name in WEIGHTS_AND_BOUNDS:
         np.testing.assert_array_equal(getattr(ocp, name), getattr(wanted, name), err_msg=name)
@@ -188,7 +188,7 @@ def test_change_builds_no_expression(running: tuple[Controller, Params, Config],
 
     monkeypatch.setattr(ca, "Function", refuse)
     monkeypatch.setattr(ca.SX, "sym", refuse)
-    assert changed(config, params.ocp, {"ocp.weights.Q.psi": 0.3})[1].Q[2, 2] == 0.3
+    assert changed_problem(config, params.ocp, {"ocp.weights.Q.psi": 0.3})[1].Q[2, 2] == 0.3
 
 
 def test_change_is_tried_when_a_sample_has_just_ended(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rti_mpc_service.cli import SHIPPED
-from rti_mpc_service.doctor.doctor import MARGIN, promise, rows
+from rti_mpc_service.doctor.doctor import PERIOD_MARGIN_FACTOR, finding_rows, period_verdict
 from rti_mpc_service.host.jitter import bare_timer
 from tests.processes.system import rti_mpc
 
@@ -30,7 +30,9 @@ def test_doctor_measures_what_the_loop_needs_and_says_that_the_period_is_too_sho
     status, printed, report = examined
     for part in PARTS:
         assert 0.0 < report[part]["p50"] <= report[part]["p99"] <= report[part]["max"], part
-    assert report["loop"]["shortest_period_us"] == pytest.approx(MARGIN * sum(report[part]["p99"] for part in PARTS), rel=1e-9)  # rounding
+    assert report["loop"]["shortest_period_us"] == pytest.approx(
+        PERIOD_MARGIN_FACTOR * sum(report[part]["p99"] for part in PARTS), rel=1e-9
+    )  # rounding
     assert (status, report["loop"]["fits"]) == (1, False)
     assert "a period of 0.1 ms CANNOT be kept here" in printed
 
@@ -39,17 +41,17 @@ def test_doctor_tells_what_the_host_grants_and_has(examined: tuple[int, str, Any
     _, printed, report = examined
     assert set(report["realtime"]) == {"priority", "cores", "lock_memory"}
     assert report["cache"]["error"] is None
-    for what, *_ in rows(report):
+    for what, *_ in finding_rows(report):
         assert f"\n{what} " in printed, what
 
 
 @pytest.mark.parametrize(("dt_s", "fits"), [(0.0061, True), (0.0059, False)])
 def test_a_period_fits_that_holds_one_and_a_half_times_all_parts_at_p99(dt_s: float, fits: bool) -> None:
-    assert promise({part: {"p99": 1000.0} for part in PARTS}, dt_s)["fits"] is fits
+    assert period_verdict({part: {"p99": 1000.0} for part in PARTS}, dt_s)["fits"] is fits
 
 
 def test_nothing_is_promised_where_a_part_could_not_be_measured() -> None:
-    loop = promise({**{part: {"p99": 1.0} for part in PARTS}, "round_trip_us": {"p99": None}}, 10.0)
+    loop = period_verdict({**{part: {"p99": 1.0} for part in PARTS}, "round_trip_us": {"p99": None}}, 10.0)
     assert (loop["shortest_period_us"], loop["fits"]) == (None, False)
 
 

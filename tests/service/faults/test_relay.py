@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rti_mpc.contract.message import State
-from rti_mpc_service.faults.relay import CHANGES
+from rti_mpc_service.faults.relay import STATE_CHANGES
 
 PERIOD_NS = 10_000_000
 SENT = [State(7, seq, seq * PERIOD_NS, np.array([0.1 * seq, 1.0, 2.0])) for seq in range(1, 81)]
@@ -16,7 +16,7 @@ SENT = [State(7, seq, seq * PERIOD_NS, np.array([0.1 * seq, 1.0, 2.0])) for seq 
 
 def relayed(change: str) -> list[State]:
     held: deque[State] = deque()
-    return [state for sent in SENT for state in CHANGES[change](sent, held)]
+    return [state for sent in SENT for state in STATE_CHANGES[change](sent, held)]
 
 
 @pytest.mark.parametrize(

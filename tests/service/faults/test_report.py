@@ -11,7 +11,7 @@ from rich.console import Console
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.faults import run
 from rti_mpc_service.faults.measure import Measured
-from rti_mpc_service.faults.report import WIDTH, MatrixReport, MatrixRow
+from rti_mpc_service.faults.report import MATRIX_WIDTH_COLUMNS, MatrixReport, MatrixRow
 from rti_mpc_service.faults.table import FAULTS
 
 BY_NAME = {fault.name: fault for fault in FAULTS}
@@ -42,7 +42,7 @@ def test_row_holds_every_number_in_json_and_those_that_were_promised_in_the_tabl
 
 
 def test_matrix_is_printed_with_what_was_not_kept() -> None:
-    console = Console(file=io.StringIO(), width=WIDTH)
+    console = Console(file=io.StringIO(), width=MATRIX_WIDTH_COLUMNS)
     with MatrixReport(console, 2) as report:
         report.add(row("controller_killed", replace(STOPPED, brake_s=0.31)))
         report.add(row("viewer_killed", DRIVING))

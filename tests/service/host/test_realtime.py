@@ -43,7 +43,7 @@ print(*realtime.attempt(10, (4096,), lock_memory=True), sep="\\n")
 """
 RUNAWAY = """
 from rti_mpc_service.host import realtime
-realtime.RUNAWAY_US = 50_000
+realtime.MAX_UNBROKEN_COMPUTING_US = 50_000
 outcome, = realtime.attempt(1)
 print(outcome.granted, flush=True)
 while outcome.granted:

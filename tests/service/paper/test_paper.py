@@ -18,7 +18,7 @@ import pytest
 from rti_mpc.reference.trajectory import eight, positioning
 from rti_mpc_service.bench.yardstick import Ipopt
 from rti_mpc_service.paper.contender import CONTENDERS
-from rti_mpc_service.paper.experiment import BEST, Experiment
+from rti_mpc_service.paper.experiment import BEST_SETTINGS, Experiment
 from rti_mpc_service.paper.loop import Loop
 from rti_mpc_service.paper.race import EIGHT, shortened
 from rti_mpc_service.paper.readings import FOUND, faster, goals, jump_mm, speeds
@@ -55,11 +55,11 @@ def structure(text: str) -> list[str]:
 
 @pytest.mark.parametrize("between", ["max_mm", "between_mm"])
 def test_best_settings_follow_the_eight_within_a_tenth_of_a_millimetre_at_the_samples_and_between(between: str) -> None:
-    assert drive(lasting(replace(EIGHT, **BEST), 60.0)).summary()[between] <= 0.1
+    assert drive(lasting(replace(EIGHT, **BEST_SETTINGS), 60.0)).summary()[between] <= 0.1
 
 
 def test_best_settings_end_at_the_goal_at_rest() -> None:
-    found = drive(Experiment(positioning().lasting(30.0), **BEST)).summary()
+    found = drive(Experiment(positioning().lasting(30.0), **BEST_SETTINGS)).summary()
     assert found["end_mm"] < 0.01
     assert found["end_speed_mm_s"] < 1e-3
 

@@ -18,7 +18,7 @@ from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.build import build_ocp
 from rti_mpc_service.config.config import load
 from rti_mpc_service.rig.robot_log import COUNTERS, RobotLog
-from rti_mpc_service.rig.summary import Outcome, beyond, over_share, summarize
+from rti_mpc_service.rig.summary import Outcome, excess, excess_share, summarize
 
 MS = 1_000_000
 ANCHOR_NS = 700 * MS
@@ -125,8 +125,8 @@ def test_states_over_their_bounds_are_a_share_of_them(outcome: Outcome) -> None:
 
 def test_bounds_that_are_infinite_or_zero_are_no_trouble() -> None:
     values, lower, upper = np.array([[9.0, -0.1, 0.3]]), np.array([-np.inf, 0.0, -1.0]), np.array([np.inf, 0.5, 0.0])
-    assert beyond(values, lower, upper).tolist() == [[0.0, 0.1, 0.3]]
-    assert over_share(values, lower, upper)[0] == pytest.approx([0.0, 0.2, 0.3])
+    assert excess(values, lower, upper).tolist() == [[0.0, 0.1, 0.3]]
+    assert excess_share(values, lower, upper)[0] == pytest.approx([0.0, 0.2, 0.3])
 
 
 def test_latency_is_that_of_the_robot_and_is_listed_with_its_parts_and_the_echo(outcome: Outcome) -> None:

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL
-from rti_mpc_service.view.timeline import AHEAD_NS, GAP_NS, Timeline
+from rti_mpc_service.view.timeline import GAP_BETWEEN_LIVES_NS, MAX_AHEAD_NS, Timeline
 
 SECOND = 1_000_000_000
 
@@ -16,10 +16,10 @@ def test_the_axis_is_the_robots_clock() -> None:
 def test_a_clock_that_begins_again_is_appended() -> None:
     timeline = Timeline()
     timeline.place_state(3, 20 * SECOND)
-    assert timeline.place_state(4, 0) == 20 * SECOND + GAP_NS
-    assert timeline.place(SECOND // 2) == 20 * SECOND + GAP_NS + SECOND // 2
-    assert timeline.place_state(4, 2 * SECOND) == 22 * SECOND + GAP_NS
-    assert timeline.place_state(5, 0) == 22 * SECOND + 2 * GAP_NS
+    assert timeline.place_state(4, 0) == 20 * SECOND + GAP_BETWEEN_LIVES_NS
+    assert timeline.place(SECOND // 2) == 20 * SECOND + GAP_BETWEEN_LIVES_NS + SECOND // 2
+    assert timeline.place_state(4, 2 * SECOND) == 22 * SECOND + GAP_BETWEEN_LIVES_NS
+    assert timeline.place_state(5, 0) == 22 * SECOND + 2 * GAP_BETWEEN_LIVES_NS
 
 
 def test_a_clock_that_goes_on_through_a_restart_stays_as_it_is() -> None:
@@ -32,7 +32,7 @@ def test_stamps_of_a_former_life_do_not_run_ahead_of_the_present_one() -> None:
     timeline = Timeline()
     timeline.place_state(3, 900 * SECOND)
     now = timeline.place_state(4, 0)
-    assert timeline.place(900 * SECOND) == now + AHEAD_NS
+    assert timeline.place(900 * SECOND) == now + MAX_AHEAD_NS
 
 
 def test_what_comes_before_any_state_is_placed_where_a_clock_can_be() -> None:
