@@ -51,9 +51,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rti_mpc.control.controller import Controller as Controller
+    from rti_mpc.model.find import find_model as find_model
     from rti_mpc.model.model import Model as Model
     from rti_mpc.model.model import Signal as Signal
-    from rti_mpc.model.model import find_model as find_model
     from rti_mpc.rti.ocp import Ocp as Ocp
     from rti_mpc.rti.rti import Rti as Rti
 
@@ -63,7 +63,7 @@ MODULE_OF_NAME = {
     "Ocp": "rti_mpc.rti.ocp",
     "Rti": "rti_mpc.rti.rti",
     "Signal": "rti_mpc.model.model",
-    "find_model": "rti_mpc.model.model",
+    "find_model": "rti_mpc.model.find",
 }
 
 __version__ = "0.1.0"

@@ -8,12 +8,6 @@ can be brought along.
 
 from __future__ import annotations
 
-import importlib
-import re
-import sys
-import sysconfig
-import traceback
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -140,50 +134,3 @@ class Model:
             if name not in names:
                 raise OcpError(f"model {self.name} has parameters {', '.join(names) or 'none'}, got {name}")
         return replace(self, p_nominal=tuple(values.get(n, v) for n, v in zip(names, self.p_nominal, strict=True)))
-
-
-MODEL_NAME_PATTERN = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")  # package.module:function
-SHIPPED_MODELS = {"pioneer_3dx": "rti_mpc.model.robots.pioneer_3dx:pioneer_3dx"}
-
-
-def find_model(name: str) -> Model:
-    """
-    Find a model by the name of a shipped one, or by ``package.module:function``.
-
-    Raises:
-        OcpError: There is no such model, its module cannot be imported, or the function does not return one. One line, with the user's file and line.
-    """
-    path = SHIPPED_MODELS.get(name, name)
-    wanted = f"a model must be one of {', '.join(SHIPPED_MODELS)} or an importable package.module:function of your own, got {name!r}"
-    if not MODEL_NAME_PATTERN.fullmatch(path):
-        raise OcpError(wanted)
-    module_name, _, function_name = path.partition(":")
-    package = module_name.partition(".")[0]
-    if package in sys.stdlib_module_names:
-        raise OcpError(f"{wanted} ({package} is Python's own)")
-    try:
-        module = importlib.import_module(module_name)
-    except (Exception, SystemExit) as error:
-        if isinstance(error, ModuleNotFoundError) and f"{module_name}.".startswith(f"{error.name}."):
-            raise OcpError(f"{wanted} ({error})") from None
-        raise OcpError(f"{module_name} must be importable, {raised(error)}") from error
-    build: Callable[[], Model] | None = getattr(module, function_name, None)
-    if not callable(build):
-        raise OcpError(f"{wanted} ({module_name} has no function {function_name})")
-    try:
-        model = build()
-    except (Exception, SystemExit) as error:  # whatever a user's function raises, named as theirs
-        raise OcpError(f"{name} must return a model, {raised(error)}") from error
-    if not isinstance(model, Model):
-        raise OcpError(f"{name} must return a rti_mpc.Model, got {type(model).__name__}")
-    return model
-
-
-def raised(error: BaseException) -> str:
-    """Say in one line what a user's code raised, and where."""
-    if isinstance(error, SyntaxError):
-        return f"it raised {type(error).__name__} in {error.filename}, line {error.lineno}: {error.msg}"
-    foreign = (__file__, "<", sysconfig.get_paths()["purelib"])  # the user's own line, not one of a library called there
-    theirs = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(foreign)]
-    where = f" in {theirs[-1].filename}, line {theirs[-1].lineno}" if theirs else ""
-    return f"it raised {type(error).__name__}{where}: {' '.join(str(error).split()) or 'nothing said'}"

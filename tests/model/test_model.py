@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from rti_mpc.errors import OcpError
-from rti_mpc.model.model import Model, Signal, find_model
+from rti_mpc.model.find import find_model
+from rti_mpc.model.model import Model, Signal
 from rti_mpc.model.robots.pioneer_3dx import NOMINAL_PARAMETERS
 
 
@@ -143,9 +144,9 @@ def test_model_that_does_not_exist_is_refused_with_what_would_be_right(name: str
         ("import sys\ndef model():\n    sys.exit(0)", "{module}:model must return a model, it raised SystemExit in {file}, line 3: 0"),
         ("import numpy\ndef model():\n    numpy.zeros(-1)", "{module}:model must return a model, it raised ValueError in {file}, line 3: "),
         ("def model():\n    return model()", "{module}:model must return a model, it raised RecursionError in {file}, line 2: "),
-        ("def model(x):\n    pass", "{module}:model must return a model, it raised TypeError: "),
+        ("def model(x):\n    pass", "{module}:model must return a model, it raised TypeError in {file}, line 1: "),
         ("def model():\n    pass", "{module}:model must return a rti_mpc.Model, got NoneType"),
-        ("model = 1", "of your own, got '{module}:model' ({module} has no function model)"),
+        ("model = 1", "of your own, got '{module}:model' ({file} has no function model)"),
         ("\0", "{module} must be importable, it raised "),
     ],
 )

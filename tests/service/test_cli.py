@@ -13,6 +13,7 @@ import pytest
 import typer.main
 from typer.testing import CliRunner
 
+from rti_mpc.errors import ConfigError
 from rti_mpc_service.cli import SHIPPED, app
 from tests.in_time import awake_ms
 from tests.robots import toml
@@ -67,6 +68,17 @@ def test_outputs_that_no_path_fills_are_refused_by_name_in_the_terminal(command:
     assert (process.returncode, stdout) == (2, "")
     said = "rti-mpc: model arm: a path in the plane fills outputs whose role is x, y, heading, not x, elbow: "
     assert stderr == f"{said}give each its role, or publish rows of your own\n"
+
+
+@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "enable", "guard", "paper", "params", "schema", "stop"}))
+def test_model_that_cannot_be_imported_is_refused_by_every_process_that_loads_it_with_file_and_line(command: str, tmp_path: Path) -> None:
+    (tmp_path / "my_robot.py").write_text("\n\ndef car(:\n")
+    path = tmp_path / "robot.toml"
+    path.write_text(SHIPPED.read_text().replace('"pioneer_3dx"', '"my_robot:car"'))
+    refused = CliRunner().invoke(app, [command, str(path)]).exception
+    assert isinstance(refused, ConfigError)
+    assert str(refused).startswith(f"{path}: model.name: my_robot must be importable, it raised SyntaxError in {tmp_path}/my_robot.py, line 3: ")
+    assert "\n" not in str(refused)
 
 
 def test_bad_option_is_exit_status_2() -> None:

@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
 def build_model(config: Config) -> Model:
     """Return the controller's model."""
-    from rti_mpc.model.model import find_model
+    from rti_mpc.model.find import find_model
 
-    return find_model(config.model.name).with_parameters(**config.model.parameters)
+    return find_model(config.model.name, config.model.folder).with_parameters(**config.model.parameters)
 
 
 def build_ocp(config: Config) -> Ocp:

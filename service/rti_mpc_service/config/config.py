@@ -10,6 +10,7 @@ against the model (`rti_mpc_service.config.fit`), which ends with building the `
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -38,6 +39,9 @@ def load(path: Path, *, with_model: bool = True) -> Config:
         config = Config.model_validate(toml.read(content))
         if config.bus.config is not None:
             config = config.model_copy(update={"bus": config.bus.model_copy(update={"config": path.parent / config.bus.config})})
+        if ":" in config.model.name:  # a model of the user's own, which no process looks for anywhere else, wherever it is started
+            folder = Path(os.path.abspath(path.parent / (config.model.folder or "")))
+            config = config.model_copy(update={"model": config.model.model_copy(update={"folder": folder})})
         check_tree(config)
         if with_model:
             check_model(config)

@@ -50,11 +50,11 @@ def check_model(config: Config) -> Ocp:
         ConfigError: A key does not fit the model.
         OcpError: The problem is ill-posed in some other way.
     """
-    from rti_mpc.model.model import find_model
+    from rti_mpc.model.find import find_model
     from rti_mpc.model.obstacle import with_obstacles
 
     try:
-        model = find_model(config.model.name)
+        model = find_model(config.model.name, config.model.folder)
     except OcpError as error:
         raise ConfigError(f"model.name: {error}") from error
     check_names(config, model)

@@ -69,7 +69,10 @@ class Section(BaseModel):
 class ModelSection(Section):
     """Which robot."""
 
-    name: str = Field(description="a shipped model, or package.module:function of your own")
+    name: str = Field(description="a shipped model, or one of your own: module:function or file.py:function, found beside this file first")
+    folder: Annotated[Path, Field(strict=False)] | None = Field(
+        default=None, description="folder that your module or file is looked for in first; that of this file if left out"
+    )
     parameters: dict[str, float] = Field(default={}, description="parameters that differ from the model's by name, each in its own unit")
     stop: Literal["rests", "coasts"] = Field(
         default="rests", description="what a stop, its inputs at rest, does to the robot: it rests, which is checked, or it coasts or falls"
@@ -272,8 +275,8 @@ class Config(Section):
 
     @property
     def config_hash(self) -> int:
-        """64 bits of everything that decides a command: not of the bus, the guard, the scheduler, the simulation or failures on request."""
-        content = self.model_dump(mode="json", exclude={"bus", "debug", "guard", "realtime", "sim"})
+        """64 bits of everything that decides a command: not of the bus, the guard, the scheduler, the simulation, failures on request or folders."""
+        content = self.model_dump(mode="json", exclude={**dict.fromkeys(("bus", "debug", "guard", "realtime", "sim"), True), "model": {"folder"}})
         return int.from_bytes(hashlib.sha256(json.dumps(content, sort_keys=True).encode()).digest()[:8], "little")
 
     def keys(self) -> Keys:

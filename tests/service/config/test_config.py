@@ -18,6 +18,7 @@ from rti_mpc.rti.qp.qpsolvers import ForeignSolver
 from rti_mpc.rti.terminal import lqr_weight
 from rti_mpc.wire.bus import BusSettings
 from rti_mpc_service.check import check
+from rti_mpc_service.config import toml
 from rti_mpc_service.config.build import (
     build_model,
     build_ocp,
@@ -209,6 +210,49 @@ def test_parameters_by_name_reach_the_model(tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(MINIMAL.replace('"pioneer_3dx"', '"pioneer_3dx", parameters = { a = 0.1 }'))
     assert build_model(load(path)).p_nominal[-1] == 0.1
+
+
+OWN = """
+import casadi as ca
+from rti_mpc import Model, Signal
+
+def robot():
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    s = (Signal("s", "m"),)
+    return Model(name="own", x=x, u=u, f_expl_expr=u, y_expr=x, states=s, inputs=(Signal("v", "m/s"),), outputs=s)
+"""
+OWN_TOML = """
+robot = "own"
+model = { name = "NAME" }
+ocp = { N = 3, dt_s = 0.1, weights = { Q = { s = 1 }, R = { v = 1 } } }
+"""
+
+
+@pytest.mark.parametrize("name", ["my_robot:robot", "my_robot.py:robot"])
+def test_model_is_found_beside_its_configuration_wherever_a_copy_of_that_is(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A demo leaves such a copy in a folder of its own, which its processes load."""
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "my_robot.py").write_text(OWN)
+    path, copied = tmp_path / "own" / "robot.toml", tmp_path / "copied.toml"
+    path.write_text(OWN_TOML.replace("NAME", name))
+    monkeypatch.chdir(tmp_path)
+    config = load(Path("own/robot.toml"))
+    copied.write_text(toml.write(config))
+    monkeypatch.chdir("/")
+    for again in (load(path), load(copied)):
+        assert build_model(again).name == "own"
+        assert again.config_hash == config.config_hash == load(path, with_model=False).config_hash, "a standby may have it in another folder"
+
+
+def test_folder_of_the_model_may_be_another_one(tmp_path: Path) -> None:
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "my_robot.py").write_text(OWN)
+    path = tmp_path / "robot.toml"
+    path.write_text(OWN_TOML.replace('"NAME"', '"my_robot:robot", folder = "models"'))
+    assert build_model(load(path)).name == "own"
+    path.write_text(OWN_TOML.replace("NAME", "my_robot:robot"))
+    with pytest.raises(ConfigError, match=rf"model\.name: .* \(No module named 'my_robot', neither in {tmp_path} nor installed\)"):
+        load(path)
 
 
 def test_zenoh_file_is_found_beside_the_configuration(tmp_path: Path) -> None:
