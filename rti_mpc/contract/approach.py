@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Slew limits of what is really applied: the rows of a plan, approached from the inputs that acted before.
+Slew limits of the inputs that really act: the rows of a plan, approached from the inputs that acted before.
 
-A controller that has not heard of a loss begins where it believes the robot to be.
-Whoever plays its rows, or passes them on, brings them inside the limits of what
-acted: no two inputs within three quarters of a period differ by more than one
-increment. The last quarter is left to messages on their way, as in `rti_mpc.control.sent`:
-limits over a whole period would clip healthy plans by the milliseconds in which
-commands come sooner or later.
+A controller that does not know of a lost command starts its plan from an input that
+does not act. Whoever plays the rows, or passes them on, therefore brings them inside the
+slew limits of the inputs that acted: no two inputs within three quarters of a period
+differ by more than one increment. The last quarter is left to transport, as in
+`rti_mpc.control.sent`: with limits over a whole period, commands that arrive some
+milliseconds sooner or later would clip healthy plans.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ INPUT_ROUNDING = 1e-9  # in the unit of the input: a row that differs by less ha
 @dataclass(frozen=True, eq=False)
 class Increments:
     """
-    By how much inputs may change in a period.
+    Limits of the change of inputs over one period.
 
     Attributes:
         lbdu: Lower bound of an input's change over `dt_ns`, shape ``(nu,)``, at most 0.
@@ -40,7 +40,7 @@ class Increments:
 
 
 def segments(at: Callable[[int], tuple[Array, int, bool]], from_ns: int, to_ns: int) -> list[tuple[int, Array]]:
-    """Return until when, and the input that acted until then, for all inputs of an interval, the oldest first; `at` is that of a `Schedule`."""
+    """Return the inputs that acted in an interval, oldest first, each behind the time until which it acted; `at` is that of a `Schedule`."""
     acted = []
     while from_ns < to_ns:
         u, change_ns, _ = at(from_ns)
@@ -57,8 +57,8 @@ def approach(u: Array, stamp_ns: int, period_ns: int, start_ns: int, acted: list
         u: Rows, shape ``(n, nu)``; row ``i`` acts from ``stamp_ns + i * period_ns``.
         stamp_ns: When row 0 would act.
         period_ns: Time between rows.
-        start_ns: When the plan begins to act, with the row of that time.
-        acted: What acted in the period before `start_ns`, as `segments` returns it.
+        start_ns: When the plan begins to act, with its row for that time.
+        acted: Inputs that acted in the period before `start_ns`, as `segments` returns them.
         limits: The slew limits.
 
     Returns:
@@ -81,7 +81,7 @@ def approach(u: Array, stamp_ns: int, period_ns: int, start_ns: int, acted: list
         if limited or was_limited:
             if rows is u:
                 rows = u.copy()
-                near = [(begins_ns, before) for _, before in near]  # should it come late, the robot begins with the second row
+                near = [(begins_ns, before) for _, before in near]  # if the plan comes late, the robot begins with the second row
             row = within(u[k], near, row_ns - limits.dt_ns, limits)
             if k > first:
                 row = np.minimum(np.maximum(row, rows[k - 1] + lowest), rows[k - 1] + highest)
@@ -92,7 +92,7 @@ def approach(u: Array, stamp_ns: int, period_ns: int, start_ns: int, acted: list
 
 
 def within(row: Array, acted: list[tuple[int, Array]], after_ns: int, limits: Increments) -> Array:
-    """Return what is nearest to a row and within the limits of all that has acted after a time; where nothing is, between them and the last."""
+    """Return the input nearest to a row inside the slew limits of all inputs that acted after a time; the last of them is always allowed."""
     now = acted[-1][1]
     near = np.array([u for until_ns, u in acted if until_ns > after_ns] or [now])
     lower = np.minimum(near.max(axis=0) + limits.lbdu, now)

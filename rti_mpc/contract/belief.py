@@ -2,12 +2,12 @@
 """
 Schedule of inputs as the sender of commands believes it, corrected by what the robot reports.
 
-A state of a robot that reports tells which input acts at its stamp, and the command
-that it comes from. Commands that should have acted by then and do not are believed to
-come next, and taken out a period later: they are lost, and what acts instead is the plan before, or the robot's own
-ramp. One that comes late after all is put back. Where the report names a command that
-is not known (a guard has numbers of its own), the input itself tells how many of the
-last commands are missing; an input that no plan explains is taken as it is.
+The state of a robot that reports says which input acts at its stamp, and which command
+that input comes from. A command that should act by then and does not is still expected
+for one period. After that it counts as lost: the plan before it acts, or the robot's own
+ramp. If it arrives later after all, it is put back. If the report names an unknown
+command (a guard numbers its commands itself), the input shows how many of the last
+commands are missing. An input that no plan explains is believed as it is reported.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ MAX_MISSING_PLANS = 8  # missing plans that are remembered, since each may still
 
 class Belief(Schedule):
     """
-    The plans of one robot, as far as anybody knows who has sent them.
+    The plans of one robot, as their sender believes them to act.
 
     Attributes:
-        confirmed: Reports in a row that have named the command which was to act.
+        confirmed: Consecutive reports that have named the expected command.
     """
 
     def __init__(self, u_rest: Array, slew: Array, increments: Increments) -> None:
@@ -52,22 +52,22 @@ class Belief(Schedule):
         self._reported_ns = BEFORE_ALL_NS
 
     def cut(self, t_ns: int, now_ns: int) -> None:
-        """Let what acts at a time end there, and drop what would follow; the clock has jumped since, and shows another time."""
+        """End the plan that acts at a time there, and drop later ones; the robot's clock has jumped since, and that time is now `now_ns`."""
         super().cut(t_ns, now_ns)
         self._missing.clear()
         self._reported_ns = BEFORE_ALL_NS
 
     def correct(self, t_ns: int, u: Array, source: tuple[int, int]) -> bool:
         """
-        Take note of what acts; reports must come in the order of their times.
+        Correct the belief by a report; reports must come in the order of their times.
 
         Args:
-            t_ns: When.
+            t_ns: Time of the report.
             u: Input that acts, shape ``(nu,)``, finite and inside the bounds.
-            source: Epoch and sequence number of the command it comes from, as `Schedule.add` was given it; a number of 0: the robot's own ramp.
+            source: Epoch and sequence number of the command it comes from, as `Schedule.add` was given it; number 0 is the robot's own ramp.
 
         Returns:
-            Whether that was not known.
+            Whether the belief was another.
         """
         before_ns, self._reported_ns = max(self._reported_ns, t_ns - self._period_ns), t_ns
         self.forget(before_ns - self._period_ns)
@@ -90,7 +90,7 @@ class Belief(Schedule):
         return True
 
     def _expects(self, source: tuple[int, int], t_ns: int) -> bool:
-        """Whether a command is believed to act at a time; also if it is of somebody who has numbers of his own."""
+        """Whether a command, or the robot's ramp, is believed to act at a time; true for a command of an unknown epoch, whose number says nothing."""
         for plan in reversed(self._plans):
             if plan.source == source and source[1] and plan.start_ns <= t_ns + self._tolerance_ns:
                 return True
@@ -99,13 +99,13 @@ class Belief(Schedule):
         return False
 
     def _plays(self, u: Array, t_ns: int, *, or_after: bool = True) -> bool:
-        """Whether an input is believed to act at a time, or nearly then; shortly before it only, unless `or_after`."""
+        """Whether an input is believed to act at a time or shortly before it; with `or_after`, shortly after it as well."""
         most = INPUT_TOLERANCE * (1.0 + np.abs(u))
         times = (t_ns - 1, t_ns, t_ns - self._tolerance_ns, t_ns + self._tolerance_ns) if or_after else (t_ns - 1, t_ns - self._tolerance_ns)
         return any((np.abs(self.at(t)[0] - u) <= most).all() for t in times)
 
     def _find(self, source: tuple[int, int], u: Array, t_ns: int, before_ns: int, coming: deque[Plan]) -> None:
-        """Leave of the plans whose time has come those up to the one that acts."""
+        """Remove the plans that are due after the one that acts: they are missing."""
         plans, missing = self._plans, self._missing
         if not source[1]:
             while plans and plans[-1].end_ns > t_ns:
@@ -132,7 +132,7 @@ class Belief(Schedule):
                 plans.extend(known)
 
     def _take(self, source: tuple[int, int], u: Array, t_ns: int, before_ns: int) -> None:
-        """Believe that an input has acted since the last report; from here on the newest plan goes on, or the robot's own ramp."""
+        """Believe that an input has acted since the last report; from now on the newest plan continues, or the robot's own ramp."""
         plans = self._plans
         newest = plans[-1] if plans else None
         while plans and plans[-1].start_ns > before_ns:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The cadence of a robot's states: whether they count, and whether their stamps advance as nanoseconds do.
+The cadence of a robot's states: whether their sequence numbers increase, and whether their stamps advance as nanoseconds do.
 
-A stamp in another unit looks like a clock that runs a thousand times too slowly, or
-more: whatever is commanded by it acts for a thousand times too long. So nothing is
-commanded before the rate was seen to be one that a simulation may have, nor when it no longer is.
+Stamps in another unit look like a clock that runs a thousand times too slowly, or worse:
+a command would act a thousand times too long. So nothing is commanded until stamps were
+seen to advance at a rate that a simulation may have, nor when they no longer do.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ UNIT_BY_EXPONENT = {-9: "s (seconds)", -6: "ms (milliseconds)", -3: "us (microse
 
 class Cadence:
     """
-    Judges one life of a robot.
+    Judge of the states of one life of a robot.
 
     Attributes:
-        known: Whether stamps were seen to advance at a rate that is possible, and still do.
-        fault: What is wrong with that rate and what would be right; empty if nothing was seen to be.
-        rate: The last one measured, ns of the stamps per local ns; 0 before the first.
-        notice: What the last state has shown that people must know, None as a rule.
+        known: Whether stamps were seen to advance at a possible rate, and still do.
+        fault: What is wrong with that rate, and what would be right; empty if no fault was seen.
+        rate: The rate measured last, ns of the stamps per local ns; 0 before the first.
+        notice: Notice about the last state; None for most states.
     """
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: another life of the robot."""
+        """Forget everything, for another life of the robot."""
         self.known = False
         self.fault = ""
         self.notice: Notice | None = None
@@ -48,20 +48,20 @@ class Cadence:
         self.jump()
 
     def jump(self) -> None:
-        """Begin to measure anew: the robot's clock has gone back."""
+        """Restart the measurement, because the robot's clock has gone back."""
         self.rate = 0.0
-        self._side = 0  # of the range, on which the last window was: below -1, above 1, inside 0
+        self._side = 0  # of the range in the last window: below -1, inside 0, above 1
         self._mark: tuple[int, int] | None = None  # stamp and local time of the state that began the window
         self._moved: tuple[int, int] | None = None  # those of the last state whose stamp was another than before
         self._standing = 0  # states since then
 
     def counts(self, seq: int) -> bool:
-        """Whether a sequence number goes on from the last one."""
+        """Whether a sequence number continues the last one."""
         return self._seq is None or self._seq < seq <= self._seq + MAX_SEQ_GAP
 
     def observe(self, seq: int, stamp_ns: int, local_ns: int) -> bool:
         """
-        Take note of a state, and tell whether its number counts: it is above the last one.
+        Judge a state, and return whether its sequence number continues the last one, or a new numbering is accepted.
 
         Args:
             seq: Sequence number of the state.
@@ -79,7 +79,7 @@ class Cadence:
         if self.counts(seq) or (seq != last and silent_ns > STANDSTILL_NS):
             self._seq, self._counted_ns, self._uncounted = seq, local_ns, 0
             return True
-        self._uncounted += self._moved is not None and stamp_ns > self._moved[0]  # what is sent twice has no stamp of its own
+        self._uncounted += self._moved is not None and stamp_ns > self._moved[0]  # a state that is sent twice has no stamp of its own
         if self._uncounted >= STANDSTILL_STATES and silent_ns >= STANDSTILL_NS:
             text = f"seq must be above the one before in every state, got {seq} after {last} for {1e-9 * silent_ns:.1f} s: nothing is commanded"
             self._tell("seq_stands_still", text)
@@ -102,7 +102,7 @@ class Cadence:
             self._mark = stamp_ns, local_ns
 
     def _measure(self, rate: float) -> None:
-        """Judge the rate of a window, and that of the one before with it: whatever is between may be held up once."""
+        """Judge the rate of a window together with that of the window before, since one window may be held up."""
         side, self.rate = (rate > RATE_RANGE[1] * RATE_TOLERANCE_FACTOR) - (rate < RATE_RANGE[0] / RATE_TOLERANCE_FACTOR), rate
         if side == 0:
             self.known, self.fault, self._told = True, "", False

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Epochs: one life of a publisher, higher than all it knows of.
+Epochs: the number of one life of a publisher, higher than all epochs it knows of.
 
-Those of controllers and guards are Unix seconds times ``2 ** NUMBER_BITS``, or above:
-the low bits are the number of their owner, drawn at its start, so that whatever two
-processes have heard, they never arrive at the same epoch. Robots and planners count
-from lower numbers, such as the milliseconds or seconds since 1970.
+Epochs of controllers and guards are Unix seconds times ``2 ** NUMBER_BITS``, or above.
+Their low bits are the number of the owner, drawn at its start: whatever two processes
+have heard, they never choose the same epoch. Robots and planners use lower numbers, such
+as the milliseconds or seconds since 1970.
 
-Receivers prefer the highest epoch, so one that nothing can exceed would shut everybody
-else out. `highest_believed` limits them by the time of day, which goes on: whatever is
-let pass, an epoch above it is believed by those who have followed it at once, by all
-others a second later. Whoever chooses an epoch believes a little more than those who
-take it, so that it does not miss what they follow where clocks differ.
+Receivers prefer the highest epoch, so an epoch that nothing can exceed would shut out
+everybody else. `highest_believed` limits epochs by the time of day, which goes on: above
+any epoch that is accepted, a higher one is believed at once by those who have followed
+the former, and a second later by all others. A process that chooses an epoch believes
+slightly higher ones than those who receive it, so that it does not miss what they follow
+where clocks differ.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ MAX_SEQ_GAP = 1_000_000  # messages of one epoch that may be lost in a row; a la
 
 
 def epoch_above(epoch: int, number: int) -> int:
-    """Return the lowest epoch above another that ends with a number of `NUMBER_BITS`."""
+    """Return the lowest epoch above another whose low `NUMBER_BITS` are a number."""
     return epoch + 1 + (number - epoch - 1) % (1 << NUMBER_BITS)
 
 
 def highest_believed(unix_s: int, known: int = 0, *, choosing: bool = False) -> int:
     """
-    Return the highest epoch that is one.
+    Return the highest epoch that is believed.
 
     Args:
         unix_s: Unix time, s.

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The guard of one robot: what a controller commands passes only if it is fresh, its own and inside every limit.
+The guard of one robot: passes a controller's command only if it is fresh, for this robot and inside every limit.
 
-No clock inside: every time is a stamp of the robot, or local monotonic time
-handed in. A healthy command passes at once and whole, so that the robot plays
-the rest of the plan if nothing follows, even if it is the guard that has died.
-Before the last plan ends the guard tells the robot the ramp to rest, in short
-commands, and then to stand, until a controller commands again.
+It reads no clock: every time is a stamp of the robot or local monotonic time that the
+caller hands in. A healthy command passes at once and whole, so that the robot plays the
+rest of the plan if nothing follows, even after the guard itself has died. Before the
+last plan ends, the guard sends the ramp to rest, in short commands, and then commands to
+stand, until a controller commands again.
 
-It trusts nobody: not a controller that was stopped and goes on where it was, nor
-an old leader, nor messages that have waited somewhere, nor a clock that jumps.
+It trusts neither a controller that was stopped and continues where it was, nor an old
+leader, nor messages that have waited somewhere, nor a clock that jumps.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ INPUT_ROUNDING = 1e-6  # in the unit of the input: above any rounding, single pr
 @dataclass(frozen=True, eq=False)
 class Limits:
     """
-    What a robot may be commanded.
+    Limits of the commands to a robot.
 
     Attributes:
-        u_rest: Input at which it stands still, shape ``(nu,)``.
+        u_rest: Input at which the robot stands still, shape ``(nu,)``.
         lbu: Lower bound of the inputs, shape ``(nu,)``.
         ubu: Upper bound of the inputs.
         lbdu: Lower bound of an input's change over `dt_s`, shape ``(nu,)``, below 0.
         ubdu: Upper bound of an input's change, above 0.
         dt_s: Period of the controller, s.
-        delay_s: Delay from a state to the act of its command, s.
-        stale_s: Age from which neither a state nor what answers it is used, s of the robot.
+        delay_s: Delay from a state to the time at which its command acts, s.
+        stale_s: Age from which neither a state nor a command that answers it is used, s of the robot.
     """
 
     u_rest: Array
@@ -73,7 +73,7 @@ class Limits:
 
     @property
     def settling_s(self) -> float:
-        """How long after its state a command of anybody may still move the inputs: to its end, and down the ramp."""
+        """Time in s for which any command may still move the robot after the state that it answers: to its end, and down the ramp."""
         way = np.maximum(np.abs(self.lbu - self.u_rest), np.abs(self.ubu - self.u_rest))
         limited = np.isfinite(self.slew)
         ramp = np.where(limited, way / np.where(limited, self.slew, 1.0), 0.0)
@@ -82,14 +82,14 @@ class Limits:
 
 class Guard:
     """
-    One life of the guard.
+    Decisions of one guard, from its start to its end.
 
-    The caller hands in each message as it comes, and the time now and then, and
-    publishes what is returned.
+    The caller hands in each message when it arrives, calls `tick` regularly, and
+    publishes the commands that are returned.
 
     Attributes:
-        epoch: Epoch of what it publishes: never below the highest of a controller, so that one which starts hears what to exceed.
-        notices: What it did and why, since the caller last emptied it.
+        epoch: Epoch of its commands: never below the highest of a controller, so that a starting controller hears which one to exceed.
+        notices: Notices of what it did and why; the caller takes them.
         passing: Whether a controller's plan acts.
     """
 
@@ -107,7 +107,7 @@ class Guard:
         self._cadence = Cadence()
         self._clock = RobotClock()
         increments = Increments(limits.lbdu, limits.ubdu, self._dt_ns)
-        self._schedule = Belief(limits.u_rest, limits.slew, increments)  # what the robot was told by controllers, and its ramp after that
+        self._schedule = Belief(limits.u_rest, limits.slew, increments)  # the plans that were passed to the robot, and its ramp after them
         self._state: State | None = None  # the last one that came in time
         self._heard_ns = 0  # stamp of the last state
         self._late = Backlog()
@@ -115,13 +115,13 @@ class Guard:
         self._open_ns = BEFORE_ALL_NS  # robot time from which commands pass
         self._leader = (0, -1)  # epoch and sequence number of the last command that was in order
         self._led_ns = BEFORE_ALL_NS  # robot time of it
-        self._told_ns = BEFORE_ALL_NS  # until when the robot knows what to do
-        self._engaged = False  # whether this robot was ever told anything
-        self._untold = False  # whether it is still to be told to brake
+        self._told_ns = BEFORE_ALL_NS  # end of the last command that the robot was sent
+        self._engaged = False  # whether this robot was ever sent a command
+        self._untold = False  # whether the command to brake has still to be sent
         self._stopped = False
         self._latched = ""  # why an operator's stop is latched
-        self._rest_by_ns = BEFORE_ALL_NS  # robot time from which a latched guard passes rest only, and no way there any more
-        self._waiting = False  # whether it was said that commands wait for `_open_ns`
+        self._rest_by_ns = BEFORE_ALL_NS  # robot time from which a latched guard passes only commands at rest, and no way to rest any more
+        self._waiting = False  # whether the notice that commands wait for `_open_ns` was given
 
     def robot_now_ns(self, local_ns: int) -> int:
         """Return robot time at a local monotonic time, 0 before the first state."""
@@ -134,18 +134,18 @@ class Guard:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the robot was told to stand, or never to move."""
+        """Whether the last command was to stand, or the robot was never commanded."""
         return not self._engaged or bool(np.array_equal(self._schedule.at(self._told_ns - 1)[0], self._limits.u_rest))
 
-    # What comes in.
+    # Incoming messages.
 
     def receive_state(self, state: State, local_ns: int) -> None:
-        """Take the robot's clock, and the beginning of another of its lives, from a state."""
+        """Follow the robot's clock by a state, and notice the beginning of another life."""
         self._wake(local_ns)
         whose = self._lives.hear(state.epoch, local_ns, self._clock.rate)
         if self._lives.notice is not None:
             self.notices.append(self._lives.notice)
-            begin_ns = self._clock.now_ns(local_ns) + round(RAMP_LEAD_NS * self._clock.rate)  # the robot is told before it is due
+            begin_ns = self._clock.now_ns(local_ns) + round(RAMP_LEAD_NS * self._clock.rate)  # the command to brake is sent before it is due
             self._brake(begin_ns, begin_ns)
         if whose is Heard.OTHER or not self._counts(state, local_ns, begins=whose is Heard.BEGINS):
             return
@@ -178,7 +178,7 @@ class Guard:
         Judge a command.
 
         Returns:
-            What to publish at once, None if it is refused.
+            The command to publish at once; None if it is refused.
         """
         self._wake(local_ns)
         now_ns = self._clock.now_ns(local_ns)
@@ -212,10 +212,10 @@ class Guard:
 
     def tick(self, local_ns: int) -> Command | None:
         """
-        Look after the time.
+        Keep the robot commanded as time goes on.
 
         Returns:
-            The next piece of the ramp to rest, or of standing, if the robot must soon know it, for the caller to publish.
+            The next piece of the ramp to rest, or of standing, for the caller to publish; None while the last command lasts long enough.
         """
         self._wake(local_ns)
         if self._state is None or not self._engaged:
@@ -233,19 +233,19 @@ class Guard:
         period_ns = RAMP_STEP_NS
         if not (u - self._limits.u_rest).any():
             if now_ns - self._state.stamp_ns > 10 * self._stale_ns:
-                return None  # nobody is there to be told to stand
+                return None  # no robot is there that could be told to stand
             u, period_ns = u[:1], RAMP_STEPS_PER_COMMAND * RAMP_STEP_NS
         return self._tell(start_ns, RAMP_STEPS_PER_COMMAND * RAMP_STEP_NS, period_ns, u, self._state)
 
     def _last_step(self, state: State) -> Command:
-        """Return the last command to a robot whose clock is none: each row is the next step to rest, whichever acts and for however long."""
+        """Return the last command to a robot whose stamps are no clock: each row is the next step to rest, whichever acts and for how long."""
         t_ns = state.stamp_ns
         u = np.tile(self._schedule.nearest(self._limits.u_rest, t_ns), (RAMP_STEPS_PER_COMMAND, 1))
         valid_ns = max(1, round(MAX_VALID_NS * min(1.0, self._cadence.rate)))  # as long as it should act, in the unit of the stamps
         return self._tell(t_ns, valid_ns, RAMP_STEP_NS, u, state)
 
     def _tell(self, start_ns: int, valid_ns: int, period_ns: int, u: Array, state: State) -> Command:
-        """Return a command of our own, which the robot is then told of."""
+        """Return a command of the guard's own, and note until when it lasts."""
         self._told_ns, self._untold = start_ns + valid_ns, False
         return self._numbered(
             Command(
@@ -265,7 +265,7 @@ class Guard:
         )
 
     def _watch(self, now_ns: int) -> None:
-        """Brake where the last plan ends, or goes on for longer than a latched stop lets it."""
+        """Brake when the last plan has ended, or moves the robot for longer than a latched stop allows."""
         u, _, ended = self._schedule.at(now_ns)
         moving = not np.array_equal(u, self._limits.u_rest)
         if ended:
@@ -277,17 +277,17 @@ class Guard:
             self._say(Severity.ERROR, "guard_braking", "the robot was to stand by now: braking to rest", change=True)
 
     def stop(self, local_ns: int) -> None:
-        """Take no command any more: from now on the robot is told to ramp to rest, and to stand."""
+        """Refuse all further commands: from now on the robot is commanded to ramp to rest, and to stand."""
         self._stopped = True
         if not self._cadence.fault:
             self._brake(self._clock.now_ns(local_ns), self._clock.now_ns(local_ns))
 
     def latch(self, reason: str, local_ns: int) -> None:
         """
-        Pass only ways to rest until `enable`, and rest alone once there was time to get there.
+        Pass only ways to rest until `enable`, and only rest once there was time to get there.
 
-        The last plan plays on meanwhile, up to its end: it is the controller's to
-        ramp down, and the guard's if the controller does not.
+        The last plan continues meanwhile, up to its end. The controller is expected to
+        ramp to rest; if it does not, the guard does.
         """
         if not self._latched:
             self._latched = reason
@@ -303,7 +303,7 @@ class Guard:
     # Commands.
 
     def _objection(self, command: Command, now_ns: int, until_ns: int) -> str:
-        """Return what is wrong with a command, as a code and perhaps a reason; empty if nothing is."""
+        """Return what is wrong with a command, as a code that a reason may follow; empty if nothing is."""
         limits, epoch, seq = self._limits, *self._leader
         if self._state is None:
             return "no_state: no state of the robot was heard yet"
@@ -341,7 +341,7 @@ class Guard:
         return ""
 
     def _comes_to_rest(self, command: Command, now_ns: int) -> bool:
-        """Whether the rows that would act only approach rest, from what acts now, and stay there; long after a `latch`, whether they are rest."""
+        """Whether the rows that would act only approach rest from the present input, and end there; long after a `latch`, whether all are rest."""
         start_ns = max(command.stamp_ns, now_ns)
         first = (start_ns - command.stamp_ns) // command.period_ns
         before = self._limits.u_rest if now_ns >= self._rest_by_ns else self._schedule.at(start_ns - 1)[0]
@@ -350,30 +350,30 @@ class Guard:
         return bool((np.abs(way[-1]) <= INPUT_ROUNDING).all() and ((way[1:] >= lower) & (way[1:] <= upper)).all())
 
     def _follow(self, command: Command) -> None:
-        """Take the source of a command in order for the leader: no lower epoch will pass again in this life of the robot."""
+        """Take the sender of a command in order as the leader: no lower epoch passes again in this life of the robot."""
         if self._leader[0] and command.epoch != self._leader[0]:
             self._say(Severity.WARNING, "source_changed", f"epoch {command.epoch} took over from {self._leader[0]}")
         self._leader = command.epoch, command.seq
         if command.epoch > self.epoch:
-            self.epoch = epoch_above(command.epoch, self.epoch)  # with our own number: never that of another guard, whose numbering is not ours
+            self.epoch = epoch_above(command.epoch, self.epoch)  # keeps the guard's own number, so that no other guard uses this epoch
 
     def _approach(self, command: Command, start_ns: int) -> Array:
         """Return the rows of a command as they would act from a time on."""
         return self._schedule.approached(replace(command, u=np.clip(command.u, self._limits.lbu, self._limits.ubu)), start_ns)
 
     def _share(self, command: Command) -> float:
-        """Return how much of the slew limits over `dt` a row may use."""
+        """Return the share of the slew limits over `dt` that one row may use."""
         return min(1.0, command.period_ns / self._dt_ns)
 
     def _numbered(self, command: Command) -> Command:
-        """Return a command as one of ours."""
+        """Return a command with the guard's epoch and next number."""
         self._seq += 1
         return replace(command, epoch=self.epoch, seq=self._seq)
 
     # Times and lives.
 
     def _counts(self, state: State, local_ns: int, *, begins: bool) -> bool:
-        """Whether a state is another than before, of a clock that is one; where it no longer is, the robot is told one more step to rest."""
+        """Whether a state is a new one with stamps that are a clock; when they cease to be one, the robot is sent one more step to rest."""
         if begins:
             self._cadence.reset()
         untimed = bool(self._cadence.fault)
@@ -387,20 +387,20 @@ class Guard:
         return counts and not (untimed or self._cadence.fault)
 
     def _take(self, state: State, local_ns: int) -> None:
-        """Go by the clock and the life of a state."""
+        """Follow the clock and the life of a state."""
         self._heard_ns = state.stamp_ns
         self._clock.observe(state.seq, state.stamp_ns, local_ns)
         self._state = state
 
     def _wake(self, local_ns: int) -> None:
-        """Note if this process was held up: what has waited meanwhile is judged by its age, after a state that came in time."""
+        """Report if this process was held up; messages that have waited meanwhile are judged by their age as always."""
         held_up_ns = local_ns - self._awake_ns
         if self._awake_ns and held_up_ns > HELD_UP_NS:
             self._say(Severity.WARNING, "guard_held_up", f"the guard was held up for {1e-9 * held_up_ns:.3f} s")
         self._awake_ns = local_ns
 
     def _begin(self, state: State) -> None:
-        """Begin with a robot, or with another life of it: then it stands, and any controller may be the first."""
+        """Begin with a robot, or with another life of it: then it is at rest, and any controller may be the first."""
         if self._state is None:
             self._open_ns = state.stamp_ns + round(1e9 * self._limits.settling_s)
         else:
@@ -410,12 +410,12 @@ class Guard:
         self._schedule.brake(self._limits.u_rest, BEFORE_ALL_NS)
         self._leader = 0, -1
         self._told_ns = BEFORE_ALL_NS
-        self._rest_by_ns = BEFORE_ALL_NS  # it stands: a latch from before lets rest alone pass
+        self._rest_by_ns = BEFORE_ALL_NS  # the robot is at rest: a latch from before passes nothing but rest
         self._engaged = self._untold = self.passing = False
         self._late.clear()
 
     def _jump(self, state: State, local_ns: int, where: str) -> None:
-        """Go on from a clock that has jumped: the robot brakes from what acts."""
+        """Continue after a jump of the robot's clock: the robot brakes from the input that acts."""
         before_ns = self._clock.now_ns(local_ns)
         text = f"the robot's clock jumped {where} by {1e-9 * abs(state.stamp_ns - before_ns):.3f} s: braking"
         self._say(Severity.WARNING, "clock_jumped", text)
@@ -424,10 +424,10 @@ class Guard:
         self._clock.jump()
 
     def _brake(self, before_ns: int, now_ns: int) -> None:
-        """Let the robot brake now from what acts at a time, which may be one of another clock."""
+        """Let the robot brake now from the input that acts at `before_ns`, a time that may be of the clock before a jump."""
         self._schedule.cut(before_ns, now_ns)
         self._told_ns, self._untold = now_ns, self._engaged
-        self._rest_by_ns = BEFORE_ALL_NS  # of another clock, perhaps
+        self._rest_by_ns = BEFORE_ALL_NS  # it may be a time of the clock before a jump
         self.passing = False
 
     def _say(self, severity: Severity, code: str, text: str, *, change: bool = False) -> None:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Latch of an operator's stop: what every controller and guard of a robot keeps, and tells the others.
+Latch of an operator's stop, which every controller and guard of a robot keeps and publishes.
 
-Whoever changes it takes one more than the highest counter known. Of two latches
-the higher counter wins, of equal ones that which stops: the order of `Latch`. So
-all who hear of each other agree in the end, whatever the order of messages, and
-what a restarted process has forgotten the others tell it.
+A change takes one more than the highest counter known. Of two latches the one with the
+higher counter wins, of equal counters the one that stops: this is the order of `Latch`.
+So all processes that hear of each other agree in the end, whatever the order of their
+messages, and a restarted process learns from the others what it has forgotten.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ UTC_TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", re.ASCII)
 @dataclass(frozen=True, order=True, slots=True)
 class Latch:
     """
-    An operator's last word: stopped or released. The greater one holds.
+    An operator's last word: stopped or released. Of two latches the greater one holds.
 
     Attributes:
-        counter: How many changes there were, 0 before the first.
-        stopped: Whether the robot is to stand.
+        counter: Number of changes so far, 0 before the first.
+        stopped: Whether the robot must stand.
         when: UTC time of the change, such as ``2026-11-28T09:30:00Z``; empty before the first.
-        reason: Who asked for it, or why it stands.
+        reason: Who asked for the change, or why.
     """
 
     counter: int = 0
@@ -41,7 +41,7 @@ class Latch:
     reason: str = ""
 
     def change(self, *, stopped: bool, reason: str, when: str) -> Latch:
-        """Return the latch after an operator's word: this one if it says so already."""
+        """Return the latch after an operator's word: this one if it is in that state already."""
         return self if self.stopped == stopped else Latch(self.counter + 1, stopped, when, reason)
 
     def __str__(self) -> str:
@@ -50,7 +50,7 @@ class Latch:
 
 
 def merge(known: Latch, heard: Latch) -> Latch:
-    """Return which of two latches holds; one whose counter leaps is not believed."""
+    """Return which of two latches holds; one whose counter is too far ahead is not believed."""
     return max(known, heard) if heard.counter - known.counter <= MAX_COUNTER_LEAP else known
 
 
@@ -59,7 +59,7 @@ def read_latch(content: object) -> Latch:
     Return the latch in a JSON object of a file or a message.
 
     Raises:
-        MessageError: What must hold, and what was got.
+        MessageError: A field is missing or out of range.
     """
     if not isinstance(content, Mapping):
         raise MessageError("latch must be an object")
@@ -77,6 +77,6 @@ def read_latch(content: object) -> Latch:
 
 
 def shown(value: object) -> str:
-    """Return a peer's own words, cut to what fits a line."""
+    """Return a value as text, cut to what fits on a line."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,21 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Leadership among the controllers of one robot: the one of the highest epoch leads.
+Leader election among the controllers of one robot: the highest epoch leads.
 
-No clock inside: every time is a stamp of the robot, or local monotonic time
-handed in. There is no arbiter. Receivers take commands of the highest epoch they
-have heard and no others, and so does each controller: one that hears a higher
-epoch than its own stands by. It then plans like the leader, unheard, until the
-leader leaves states unanswered for `SILENCE_PERIODS`; then it leads, with a higher
-epoch. Of several that stand by the one of the lowest number is first, the
-others wait a period longer each. A leader that has itself left states unanswered
-for so long, or is shown one so late that another may lead by now, says nothing
-until it has listened. One that stands by and has missed states, or is shown one
-so late, knows nothing of the leader's silence: the host may have held both up.
-It counts anew, from when a leader would have listened.
+It reads no clock: every time is a stamp of the robot or local monotonic time that the
+caller hands in. There is no arbiter. Receivers take commands of the highest epoch they
+have heard and no others, and so does each controller: one that hears a higher epoch than
+its own stands by. A standby plans like the leader, but publishes no command, until the
+leader has left states unanswered for `SILENCE_PERIODS`; then it leads, with a higher
+epoch. Of several standbys the one with the lowest number is first, the others wait one
+period longer each.
 
-The low bits of an epoch are the number of its owner, drawn at its start:
-whatever two controllers have heard, they never arrive at the same one.
+A leader is in doubt if it has itself left states unanswered for that long, or receives a
+state so late that another may lead by now: then it sends nothing until it has listened. A
+standby that has missed states, or receives one so late, cannot judge the leader's
+silence, since the host may have held up both. It counts anew, from the time at which a
+leader would have listened.
+
+The low bits of an epoch are the number of its owner, drawn at its start: whatever two
+controllers have heard, they never choose the same epoch.
 """
 
 from __future__ import annotations
@@ -36,16 +38,16 @@ ABOVE_EVERY_SEQ = 2**64  # larger than every sequence number: no command of our 
 
 class Leadership:
     """
-    Decides whether one controller leads or stands by.
+    Decision whether one controller leads or stands by.
 
-    The caller hands in what it hears, each with its time. After each call, commands
-    of the controller act or do not, as `acting` says.
+    The caller hands in all that it hears, with the time. After each call `acting` says
+    whether commands of the controller act.
 
     Attributes:
-        number: What the controller's epochs end with.
-        epoch: Of its commands.
+        number: Low bits of the controller's epochs.
+        epoch: Epoch of its commands.
         leading: Whether it leads.
-        misfit: Why it takes over from nobody: whoever leads has another configuration, and ours never led. Empty while it may.
+        misfit: Why it takes over from nobody: the leader has another configuration, and none of ours has led. Empty if it may take over.
     """
 
     def __init__(
@@ -55,12 +57,12 @@ class Leadership:
         Begin to lead, or to stand by.
 
         Args:
-            number: Of `rti_mpc.contract.epoch.NUMBER_BITS`, drawn at random.
-            epoch: Of the first commands, at least; above all that were heard.
-            config_hash: Of the controller's configuration.
+            number: Number of `rti_mpc.contract.epoch.NUMBER_BITS` bits, drawn at random.
+            epoch: Lower limit of the first epoch; above all epochs that were heard.
+            config_hash: Hash of the controller's configuration.
             dt_s: Period of the controller, s.
             standby: Whether it stands by at first.
-            say: Takes a notice.
+            say: Receiver of notices.
             local_ns: Local monotonic time.
         """
         self.number = number
@@ -71,43 +73,43 @@ class Leadership:
         self._say = say
         self._dt_ns = round(1e9 * dt_s)
         self._silence_ns = round(1e9 * max(SILENCE_PERIODS * dt_s, MIN_SILENCE_S))
-        self._late_ns = -((self._dt_ns - self._silence_ns) // self._dt_ns) * self._dt_ns  # age of a state not answered at which another leads
-        self._last = (
-            (0, -1) if standby else (self.epoch, ABOVE_EVERY_SEQ)
-        )  # the last command of the highest epoch, ours included; a guard counts its own
+        self._late_ns = (
+            -((self._dt_ns - self._silence_ns) // self._dt_ns) * self._dt_ns
+        )  # age of an unanswered state at which another controller leads
+        self._last = (0, -1) if standby else (self.epoch, ABOVE_EVERY_SEQ)  # epoch and number of the last command of the highest epoch
         self._belongs = not standby  # whether a controller of this configuration has ever led this robot
         self._robot_epoch = 0
         self._seen_ns = 0  # stamp of the last state
-        self._quiet_ns = 0  # stamp of the last state that the leader, we or another, is known to have answered, or from which on we listen
+        self._quiet_ns = 0  # stamp of the last state that the leader is known to have answered, or from which this one listens
         self._doubt_ns: int | None = None  # local time from which on this leader is in doubt
         self._replaced = (0, -1)  # the last command of the leader before
-        self._took_over: Notice | None = None  # until the first command
+        self._took_over: Notice | None = None  # notice of the takeover, until the first command
         self._looked_ns = local_ns
         self._company: frozenset[int] = frozenset()  # numbers of those who stand by
         self._accompanied = False  # whether there ever was one
 
     @property
     def acting(self) -> int | None:
-        """Epoch of the controller's commands if they act, None if they do not: it stands by, or is in doubt."""
+        """Epoch of the controller's commands if they act; None if it stands by or is in doubt."""
         return self.epoch if self.leading and self._doubt_ns is None else None
 
     @property
     def known(self) -> int:
-        """Highest epoch that is followed, of ours or of another's."""
+        """Highest epoch that is followed, this controller's or another's."""
         return self._last[0]
 
     @property
     def replaced(self) -> int | None:
-        """Epoch of the leader that was replaced, until the first command of this one, which acts; else None."""
+        """Epoch of the leader that was replaced, until this controller's first command; else None."""
         return None if self._took_over is None or self.acting is None else self._replaced[0]
 
     @property
     def relieved(self) -> bool:
-        """Whether another one takes over when this one ends."""
+        """Whether another controller leads when this one ends."""
         return not self.leading or bool(self._company)
 
     def meet(self, number: int, *, present: bool) -> None:
-        """Count one of those who stand by, or one less; in any thread."""
+        """Add or remove a standby by its number; may be called in any thread."""
         if number == self.number:
             return
         if not present:
@@ -118,7 +120,7 @@ class Leadership:
 
     def look(self, local_ns: int, rate: float) -> None:
         """
-        Take note of the time, and be in doubt after a sleep.
+        Note the time; after a sleep the leader is in doubt.
 
         Args:
             local_ns: Local monotonic time.
@@ -130,14 +132,14 @@ class Leadership:
 
     def follow(self, command: Command, *, late: bool = False) -> bool:
         """
-        Take in what another controller commands, and stand by if it leads.
+        Take a command of another controller, and stand by if that one leads.
 
         Args:
-            command: Of anybody; one that does not go on from the last one, or is for another life of the robot, does not act.
-            late: Whether it came before the first command of a leader that has taken over, and is to be answered to the one that was replaced.
+            command: Command of any controller; one that does not continue the last one, or is for another life of the robot, does not act.
+            late: Whether it came after a takeover, but before the new leader's first command: then it must continue the replaced leader's last one.
 
         Returns:
-            Whether it acts.
+            Whether the command acts.
         """
         last = self._replaced if late and self._took_over is not None else self._last
         if self._robot_epoch and command.state_epoch != self._robot_epoch:
@@ -160,26 +162,26 @@ class Leadership:
 
     def hear(self, state: State, local_ns: int, *, late_ns: int, ready: bool) -> None:
         """
-        Decide who answers a state; before the controller does, and when all was taken in that others have commanded.
+        Decide who answers a state. Called before the controller answers it, and after all commands of others were handed in.
 
         Args:
             state: The state.
             local_ns: Local monotonic time.
-            late_ns: How late it comes, robot time.
+            late_ns: Lateness of the state, robot time.
             ready: Whether the controller has something to command.
         """
         elapsed_ns, self._seen_ns = state.stamp_ns - self._seen_ns, state.stamp_ns
-        if state.epoch != self._robot_epoch or not ready or elapsed_ns < 0:  # the clock of the robot may be set back
+        if state.epoch != self._robot_epoch or not ready or elapsed_ns < 0:  # the robot's clock may have gone back
             self._robot_epoch, self._quiet_ns = state.epoch, state.stamp_ns
         elif not self.leading and (elapsed_ns >= self._silence_ns or late_ns >= self._late_ns):
-            # Held up, as the leader may be, which listens first; a clock of the robot that has waited looks late by more than any state.
+            # This process was held up, and so may be the leader, which then listens first. The limit is for a robot's clock that has waited.
             self._quiet_ns = state.stamp_ns + max(0, min(late_ns, self._late_ns)) + round(1e9 * LISTENING_S)
         silent_ns = state.stamp_ns - self._quiet_ns
         if not self.leading:
             rank = min(MAX_RANK, sum(number < self.number for number in self._company))
             if silent_ns >= self._silence_ns + rank * self._dt_ns and not self.misfit:
                 self._take_over(silent_ns)
-                self._quiet_ns = state.stamp_ns  # the silence was another's, and our first sample may be states away
+                self._quiet_ns = state.stamp_ns  # the silence was the other leader's; the first sample of this one may be several states away
         elif self._doubt_ns is None:
             if silent_ns >= self._silence_ns or late_ns >= self._late_ns:
                 self._doubt(local_ns)
@@ -187,7 +189,7 @@ class Leadership:
             self._doubt_ns = None
 
     def sends(self, command: Command) -> bool:
-        """Whether a command is ours to send; it then counts as sent."""
+        """Return whether this controller may send a command; it then counts as sent."""
         if self.acting is None:
             return False
         if self._took_over is not None:
@@ -197,7 +199,7 @@ class Leadership:
         return True
 
     def fit(self, config_hash: int) -> None:
-        """Take over from whoever falls silent, if a controller of our configuration has ever led; else from none of another one."""
+        """Compare the leader's configuration: unless one of ours has ever led, this controller takes over from none of another configuration."""
         self._belongs |= config_hash == self._config_hash
         misfit = "" if self._belongs else differ(config_hash, self._config_hash)
         if misfit and misfit != self.misfit:
@@ -217,11 +219,11 @@ class Leadership:
         self._quiet_ns, self._doubt_ns = self._seen_ns, None
 
     def _doubt(self, local_ns: int) -> None:
-        """Say nothing for a while, if there is somebody who may lead by now."""
+        """Send nothing for a while, if another controller may lead by now."""
         if self.leading and self._accompanied:
             self._doubt_ns = local_ns
 
 
 def differ(leader: int, ours: int) -> str:
-    """Say that configurations differ."""
+    """Return the text that two configurations differ."""
     return f"a standby needs the leader's configuration: its hash is {leader:016x}, ours {ours:016x}"

@@ -2,14 +2,14 @@
 """
 The lives of the robot that are heard: which one is commanded, and whether two robots use one name.
 
-An epoch is one life of a robot. The first one heard is believed. Another one,
-heard within the stale time of it, is a second robot of that name, or a forgery:
-then neither may be moved, until only one was heard for as long as any command
-can still move it. If that is the life which was believed before, it goes on where
-it was. Another life is believed only then; or, if the one before has been silent
-for longer than the stale time, once it was heard alone for that long.
+An epoch is one life of a robot. The first life heard is believed. A second one that is
+heard within the stale time of the first is another robot of that name, or a forgery.
+Then neither may be moved until only one was heard for as long as any command can still
+move it. If that is the life which was believed before, it continues where it was.
+Another life is believed only then; or, if the one before was silent for longer than the
+stale time, once the new one was heard alone for that long.
 
-No clock inside: local times are handed in. Two epochs are remembered, however many are heard.
+It reads no clock: local times are handed in. Two epochs are remembered, however many are heard.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from rti_mpc.contract.message import Notice, Severity
 
 
 class Heard(Enum):
-    """Whose a state is."""
+    """Life that a state belongs to."""
 
-    OURS = "ours"  # of the life that is believed
-    BEGINS = "begins"  # the first one of a life that is believed from now on
-    OTHER = "other"  # of another robot, or of a life that is not sure yet
+    OURS = "ours"  # the life that is believed
+    BEGINS = "begins"  # a life that is believed from this state on
+    OTHER = "other"  # another robot, or a life that is not believed yet
 
 
 @dataclass(slots=True)
 class Life:
     """
-    One life, as heard.
+    One life that was heard.
 
     Attributes:
-        epoch: Of its states.
-        since_ns: Local time since when it was the last one heard beside the one that is believed.
+        epoch: Epoch of its states.
+        since_ns: Local time since which it has been the only one heard beside the life that is believed.
         heard_ns: Local time of its last state.
     """
 
@@ -46,11 +46,11 @@ class Life:
 
 class Lives:
     """
-    Decides from the epochs of states alone.
+    Judge of the robot's lives, by the epochs of states only.
 
     Attributes:
-        disputed: Whether two robots are there: nothing may move.
-        notice: What the last state has shown that people must know, None as a rule.
+        disputed: Whether two robots use the name, so that neither may move.
+        notice: Notice about the last state; None for most states.
     """
 
     def __init__(self, stale_s: float, settling_s: float) -> None:
@@ -58,8 +58,8 @@ class Lives:
         Begin with nothing heard.
 
         Args:
-            stale_s: Silence of the robot that is no silence yet, s of the robot.
-            settling_s: How long after its state a command of anybody may still move the robot, s of the robot.
+            stale_s: Time without a state after which the robot counts as silent, s of the robot.
+            settling_s: Time for which any command may still move the robot after the state that it answers, s of the robot.
         """
         self.disputed = False
         self.notice: Notice | None = None
@@ -69,7 +69,7 @@ class Lives:
 
     @property
     def rival(self) -> int | None:
-        """Epoch of a life that may be believed next, None if there is none."""
+        """Epoch of the life that may be believed next, None if there is none."""
         return None if self._rival is None else self._rival.epoch
 
     def hear(self, epoch: int, local_ns: int, rate: float = 1.0) -> Heard:
@@ -79,7 +79,7 @@ class Lives:
         Args:
             epoch: Epoch of the state.
             local_ns: Local monotonic time.
-            rate: Seconds of the robot that is believed, per local second.
+            rate: Seconds of the believed robot's clock per local second.
         """
         self.notice = None
         stale_ns, settling_ns = 1e9 * self._stale_s / rate, 1e9 * self._settling_s / rate
@@ -93,7 +93,7 @@ class Lives:
             elif rival is not None and (not self.disputed or local_ns - rival.heard_ns > settling_ns):
                 self._rival, self.disputed = None, False
             return Heard.OURS
-        beside = life if rival is None or rival.epoch == epoch or life.heard_ns > rival.heard_ns else rival  # who else was heard last
+        beside = life if rival is None or rival.epoch == epoch or life.heard_ns > rival.heard_ns else rival  # the other life that was heard last
         if rival is None or rival.epoch != epoch:
             self._rival = rival = Life(epoch, local_ns, local_ns)
         if not self.disputed and local_ns - beside.heard_ns <= stale_ns:

@@ -4,8 +4,8 @@ The messages between robot, planner, controller and viewer, as values.
 
 Every message starts with ``epoch, seq, stamp_ns``: `seq` increases within an
 epoch, an epoch is one life of its publisher, and `stamp_ns` is integer
-nanoseconds of the robot's clock. SI units unless a name says otherwise. Bytes
-are the business of `rti_mpc.wire.cdr`.
+nanoseconds of the robot's clock. SI units unless a name says otherwise.
+`rti_mpc.wire.cdr` turns them into bytes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.status import Mode, QpStatus
 
-STAMP_ON_ARRIVAL = -(2**63)  # a Reference that starts at the state current when it arrives
+STAMP_ON_ARRIVAL = -(2**63)  # stamp of a Reference that starts at the newest state when it arrives
 
 
 class End(IntEnum):
@@ -29,7 +29,7 @@ class End(IntEnum):
 
 
 class Severity(IntEnum):
-    """How bad an event is: we coped (WARNING) or something was lost or stopped (ERROR)."""
+    """Severity of an event: WARNING if the process coped, ERROR if something was lost or stopped."""
 
     INFO = 0
     WARNING = 1
@@ -88,7 +88,7 @@ class Command:
         stamp_ns: When row 0 acts.
         state_epoch: Epoch of the state this command answers.
         state_seq: Its sequence number.
-        state_stamp_ns: Its stamp: age and delay are computed, not guessed.
+        state_stamp_ns: Its stamp, from which age and delay are computed.
         valid_until_ns: The command is dropped from this stamp on.
         config_hash: Configuration of the controller, as in `info`.
         mode: What the controller was doing.
@@ -136,7 +136,7 @@ class Telemetry:
         prepare_us: Time of the preparation phase before this sample.
         feedback_us: Time of the feedback phase.
         latency_us: From the state's arrival to the command's hand-over to the bus.
-        state_age_s: How much older than the command's stamp the state was, robot time.
+        state_age_s: Stamp of the command minus stamp of the state, robot time.
         slack_s: Time left to the next state when its sample was prepared, robot time; negative: the sample overran its period.
         skipped: Samples skipped since start.
         fallbacks: Samples without a plan of their own since start.
@@ -146,9 +146,9 @@ class Telemetry:
         u: Planned inputs, shape ``(N, nu)``; row 0 is what was commanded.
         y_ref: Reference rows used, shape ``(N, ny)``.
         d: Estimated disturbances, shape ``(nd,)``, those of ``info``; none without an observer.
-        delay_s: From a state to the act of its command, as configured or measured, robot time.
-        softened: Samples since start whose plan another solver had to find than the first.
-        shifted: Samples since start, of the fallbacks, on which the previous plan played on.
+        delay_s: Delay from a state to the time at which its command acts, configured or measured, robot time.
+        softened: Samples since start whose plan came from another solver than the first.
+        shifted: Samples since start, of the fallbacks, on which the previous plan was continued.
         braked: Samples since start, of the fallbacks, that were answered by the ramp to rest.
         rested: Samples since start, of the fallbacks, that were answered by a standstill.
     """
@@ -208,12 +208,12 @@ class Event:
 @dataclass(frozen=True, slots=True)
 class Notice:
     """
-    What an event is to say; whoever publishes it adds who, when and its number.
+    Content of an event; its publisher adds source, stamp and sequence number.
 
     Attributes:
         code: Stable word for machines, such as ``state_stale``.
         text: One sentence for people.
-        change: Whether it is a change of mode: those are told each, faults of one code now and then.
+        change: Whether it is a change of mode: each change is published, faults of one code at a limited rate.
     """
 
     severity: Severity

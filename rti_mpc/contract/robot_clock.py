@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot's clock, as seen from here: the last stamp, and how fast stamps have lately come."""
+"""The robot's clock, as estimated by a receiver of its states: the last stamp, and the rate at which stamps advance."""
 
 from __future__ import annotations
 
@@ -18,25 +18,26 @@ MAX_INITIAL_RATE = 10.0  # robot seconds per local second that are assumed at mo
 
 class Backlog:
     """
-    Late states in a row: those that have waited on their way come at once, or in clumps where this process gets few turns.
+    Late states in a row: have they waited on their way, or has the robot's clock waited?
 
-    If each of the next ones takes its time, it is the robot's clock that has waited,
-    as a simulation's may, and goes on from here.
+    States that have waited on their way arrive at once, or in bunches where this process
+    gets little time to run. If each of them arrives at its own pace instead, the robot's
+    clock has waited, as that of a simulation may, and goes on from here.
 
     Attributes:
-        last: Stamp and arrival of the last state, if that was late.
+        last: Stamp and arrival of the last state, if it was late; else None.
     """
 
     def __init__(self) -> None:
         self.clear()
 
     def clear(self) -> None:
-        """Take note of a state that came in time, or forget everything."""
+        """Forget all late states, because a state came in time."""
         self.last: tuple[int, int] | None = None
-        self._paced = 0  # such states in a row that have each taken their time
+        self._paced = 0  # late states in a row that came at their own pace
 
     def believed(self, stamp_ns: int, arrival_ns: int, clock: RobotClock) -> bool:
-        """Take note of a late state, and tell whether it is the clock that has waited."""
+        """Add a late state, and return whether it is the robot's clock that has waited."""
         last, self.last = self.last, (stamp_ns, arrival_ns)
         paced = last is not None and 2 * clock.rate * (arrival_ns - last[1]) >= stamp_ns - last[0]
         self._paced = self._paced + 1 if paced else 0
@@ -48,17 +49,17 @@ class RobotClock:
     """
     Robot time from stamps and local monotonic arrival times.
 
-    No clocks need to agree, and simulated time, slower or faster, works
-    unchanged: timeouts are local time since arrival, times `rate`.
+    Clocks need not agree, and simulated time, slower or faster, works unchanged:
+    timeouts are local time since arrival, multiplied by `rate`.
 
     Attributes:
         stamp_ns: Stamp of the last state that was fresh, robot time.
         arrival_ns: When it arrived, local monotonic time.
-        rate: Robot seconds per local second; assumed low until measured, or a slow simulation would be taken for a dead robot.
-        rate_most: What it is at most: until measured, as fast as states have come so far.
-        late_ns: By how much the last state came later than the least late of those before it, robot time.
-        doubt_ns: By how much that may be wrong: a clock that was not heard for a while has gone on faster or slower than thought.
-        leapt: Whether the last stamp was far ahead of its time: the robot's clock has jumped.
+        rate: Robot seconds per local second; assumed low until measured, since a slow simulation must not be taken for a dead robot.
+        rate_most: Upper limit of the rate: until it is measured, the fastest that the states so far allow.
+        late_ns: Lateness of the last state compared with the least late of those before it, robot time.
+        doubt_ns: Possible error of `late_ns`: a clock that was not heard for a while has run faster or slower than assumed.
+        leapt: Whether the last stamp was far ahead of its time, because the robot's clock has jumped.
         period_ns: Time between states, robot time, smoothed; 0 until two have come.
     """
 
@@ -73,7 +74,7 @@ class RobotClock:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: another life of the robot."""
+        """Forget everything, for another life of the robot."""
         self.stamp_ns = 0
         self.arrival_ns = 0
         self.rate = 0.1
@@ -90,18 +91,18 @@ class RobotClock:
         self.leapt = False
 
     def jump(self) -> None:
-        """Forget stamps and arrivals, but not how fast the clock runs: it has jumped."""
+        """Forget stamps and arrivals, because the clock has jumped; its rate is kept."""
         known = self.rate, self.rate_most, self._measured, self._settling
         self.reset()
         self.rate, self.rate_most, self._measured, self._settling = known
 
     def observe(self, seq: int, stamp_ns: int, arrival_ns: int) -> bool:
         """
-        Take note of a state's stamp and arrival, and tell whether it is fresh.
+        Update the clock by a state's stamp and arrival, and return whether the state is fresh.
 
-        One that comes much later than the others did has waited on its way, in
-        the queues of a process that was stopped for instance; or it is the
-        robot's clock that has waited, as a `Backlog` tells.
+        A state that comes much later than the others has waited on its way, for
+        instance in the queues of a process that was stopped; or the robot's clock
+        itself has waited, which `Backlog` decides.
         """
         ahead_ns = stamp_ns - self.now_ns(arrival_ns)
         since_ns = self.arrival_ns or arrival_ns
@@ -116,7 +117,9 @@ class RobotClock:
             self._recent.clear()
             since_ns = before[1]
             rate = self._rate(stamp_ns - before[0], arrival_ns - before[1])
-            self.rate = min(self.rate, rate) if self._measured else rate  # what was held up together comes at once, though no clock runs faster
+            self.rate = (
+                min(self.rate, rate) if self._measured else rate
+            )  # states that were held up arrive at once, which does not mean that the clock runs faster
             self.rate_most = max(self.rate_most, self.rate)
             self._anchor = (stamp_ns, arrival_ns)
         elif stamp_ns > self.stamp_ns:
@@ -134,7 +137,7 @@ class RobotClock:
         return True
 
     def _measure(self, stamp_ns: int, arrival_ns: int, stamp_0_ns: int, arrival_0_ns: int) -> None:
-        """Measure the rate, from one state that came in time to another; or to one that came late, if the one before did."""
+        """Measure the rate since the anchor, a state that came in time; a single late state is not used."""
         elapsed_ns = arrival_ns - arrival_0_ns
         rate = self._rate(stamp_ns - stamp_0_ns, max(1, elapsed_ns))
         if not self._measured:
@@ -149,14 +152,14 @@ class RobotClock:
             self._anchor = (stamp_ns, arrival_ns)
 
     def _late_ns(self, stamp_ns: int, arrival_ns: int) -> int:
-        """Return by how much a state comes later than the least late of those before it."""
+        """Return the lateness of a state compared with the least late of those before it, robot time."""
         return max([0, *(stamp + round((arrival_ns - arrival) * self.rate) - stamp_ns for stamp, arrival in self._recent)])
 
     def _rate(self, robot_ns: int, local_ns: int) -> float:
         return min(max(robot_ns / local_ns, 1e-3), 1e3)
 
     def latest_ns(self, local_ns: int) -> int:
-        """Return what robot time is at a local time at most, for a state that came as late as the last one did."""
+        """Return the latest that robot time can be at a local time, if the last state came as late as it seems."""
         return self.stamp_ns + self.late_ns + round((local_ns - self.arrival_ns) * self.rate_most)
 
     def now_ns(self, local_ns: int) -> int:

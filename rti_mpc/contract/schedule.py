@@ -3,11 +3,11 @@
 Schedule of inputs: the command contract as a function of time.
 
 Row ``i`` of the newest plan whose time has come acts from ``stamp_ns + i * period_ns``,
-never before it arrived; a plan ahead of its time waits while the previous one plays on.
-A plan that begins elsewhere than the inputs are is approached inside the slew limits
-(`rti_mpc.contract.approach`). Nothing acts from the plan's end on: then the inputs ramp to rest
-inside the slew limits, and stay there. Whoever knows the plans knows what acts: the robot
-plays them, guard and controller tell from them what the robot does.
+but never before the plan has arrived. A plan ahead of its time waits while the previous
+one continues. A plan that does not begin at the present input is approached inside the
+slew limits (`rti_mpc.contract.approach`). When a plan has ended, the inputs ramp to rest
+inside the slew limits, and stay there. The robot plays the schedule; guard and
+controller compute from it what the robot does.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ NO_COMMAND = (0, 0)  # epoch and sequence number of inputs that come from no com
 
 
 def unfit(command: Command, nu: int, robot_epoch: int) -> str:
-    """Return why a command can be no plan for this life of a robot with `nu` inputs; empty if it can."""
+    """Return why a command cannot be a plan for this life of a robot with `nu` inputs; empty if it can."""
     if command.state_epoch != robot_epoch:
         return "foreign_epoch"
     if command.u.ndim != 2 or not 1 <= len(command.u) <= MAX_ROWS or command.u.shape[1] != nu or command.period_ns <= 0:
@@ -47,16 +47,16 @@ def end_ns(command: Command) -> int:
 @dataclass(slots=True)
 class Plan:
     """
-    What acts from `start_ns` until `end_ns`.
+    Rows of inputs that act from `start_ns` until `end_ns`.
 
     Attributes:
         stamp_ns: When row 0 would act.
         period_ns: Time between rows.
         asked: Rows as they were commanded, shape ``(n, nu)``.
         u: Rows as they act, shape ``(n, nu)``.
-        before: Input that acted before it, shape ``(nu,)``.
-        source: Epoch and sequence number of the command it comes from; zeros: the robot's own.
-        pause_ns: After its end, until the ramp to rest begins, shape ``(nu,)``; None until somebody asks.
+        before: Input that acted before the plan, shape ``(nu,)``.
+        source: Epoch and sequence number of the command it comes from; zeros for inputs that come from no command.
+        pause_ns: Time from its end until the ramp to rest begins, shape ``(nu,)``; None until it is computed.
     """
 
     start_ns: int
@@ -78,8 +78,8 @@ class Schedule:
     """
     The plans of one robot.
 
-    The ramp to rest goes at the rate of the slew limits, less what the last rows have
-    just used up of them: over any duration the change stays inside.
+    The ramp to rest goes at the rate of the slew limits, and begins later where the last
+    rows have just used them: over any duration the change stays inside the limits.
     """
 
     def __init__(self, u_rest: Array, slew: Array, increments: Increments | None = None) -> None:
@@ -108,7 +108,7 @@ class Schedule:
         self._plans.append(Plan(t_ns, t_ns, t_ns, 1, u[None], u[None], u))
 
     def cut(self, t_ns: int, now_ns: int) -> None:
-        """Let what acts at a time end there, and drop what would follow; the clock has jumped since, and shows another time."""
+        """End the plan that acts at a time there, and drop later ones; the robot's clock has jumped since, and that time is now `now_ns`."""
         plans, shift_ns = self._plans, now_ns - t_ns
         while plans and plans[-1].start_ns > t_ns:
             before = plans.pop().before
@@ -123,7 +123,7 @@ class Schedule:
 
     def add(self, command: Command, start_ns: int, end_ns: int, *, approached: bool = True) -> Array:
         """
-        Put a command in line; those that would start after it never act.
+        Add the plan of a command; plans that would start after it never act.
 
         Args:
             command: The command.
@@ -139,7 +139,7 @@ class Schedule:
         return self._put(plan, self._increments if approached else None)
 
     def _put(self, plan: Plan, limits: Increments | None) -> Array:
-        """Put a plan in line, approached inside limits from what acts before it."""
+        """Add a plan, approached inside the limits from the inputs that act before it."""
         plans, start_ns = self._plans, plan.start_ns
         plan.u, plan.pause_ns = plan.asked, None
         if limits is not None:
@@ -154,11 +154,11 @@ class Schedule:
         return plan.u
 
     def copy(self, other: Schedule) -> None:
-        """Hold the same plans as another one."""
+        """Take the plans of another schedule."""
         self._plans = deque(replace(plan) for plan in other._plans)
 
     def forget(self, t_ns: int) -> None:
-        """Drop what is over before a time, and counts against no limit any more."""
+        """Drop plans that are over before a time, and count against no slew limit any more."""
         t_ns -= self._increments.dt_ns if self._increments is not None else 0
         while len(self._plans) > 1 and self._plans[1].start_ns <= t_ns:
             self._plans.popleft()
@@ -171,7 +171,7 @@ class Schedule:
         return approach(u, command.stamp_ns, command.period_ns, start_ns, segments(self.at, start_ns - limits.dt_ns, start_ns), limits)
 
     def nearest(self, u: Array, t_ns: int) -> Array:
-        """Return what is nearest to an input, shape ``(nu,)``, of those that may begin to act at a time, inside the slew limits."""
+        """Return the input nearest to `u`, shape ``(nu,)``, that may begin to act at a time inside the slew limits."""
         limits = self._increments
         return u if limits is None else within(u, segments(self.at, t_ns - limits.dt_ns, t_ns), t_ns - limits.dt_ns, limits)
 
@@ -181,7 +181,7 @@ class Schedule:
         return NO_COMMAND if plan is None or t_ns >= plan.end_ns else plan.source
 
     def at(self, t_ns: int) -> tuple[Array, int, bool]:
-        """Return the input that acts at a time, shape ``(nu,)``, until when it does, and whether no plan acts."""
+        """Return the input that acts at a time, shape ``(nu,)``, the time until which it acts, and whether no plan acts."""
         change_ns = NEVER_NS
         for plan in reversed(self._plans):
             if plan.start_ns <= t_ns:
@@ -213,9 +213,9 @@ class Schedule:
 
     def _pause_ns(self, plan: Plan, last: Array, way: Array) -> Array:
         """
-        Return how long after its end the ramp waits until earlier jumps to the same side are paid for, shape ``(nu,)``.
+        Return how long the ramp waits after the end of a plan, because earlier jumps to the same side have used the slew limits, shape ``(nu,)``.
 
-        An input that acted until some time goes on counting until the ramp, had it begun then, would be at the last row.
+        An input that acted until some time counts until a ramp from it, begun at that time, would have reached the last row.
         """
         window_ns = plan.period_ns if self._increments is None else self._increments.dt_ns
         pause_ns: Array = np.zeros(len(last))
@@ -224,4 +224,4 @@ class Schedule:
             with np.errstate(invalid="ignore"):
                 paid_ns = np.where(jump * way > 0.0, np.minimum(np.abs(jump) / self._slew, window_ns), -np.inf)
             pause_ns = np.maximum(pause_ns, until_ns + RAMP_STEP_NS - plan.end_ns + paid_ns)
-        return np.ceil(pause_ns)  # whole ns: where a step begins, it has begun
+        return np.ceil(pause_ns)  # whole ns, so that a step has begun at the time that is returned for it

@@ -26,10 +26,10 @@ class QpStatus(IntEnum):
 class Mode(IntEnum):
     """What the controller is doing, one lane in the viewer."""
 
-    IDLE = 0  # started, has heard no state yet
-    WAITING = 1  # a state, but no reference yet
+    IDLE = 0  # started, no state has arrived yet
+    WAITING = 1  # a state has arrived, but no reference
     TRACKING = 2  # solving along the reference
     HOLDING = 3  # the reference ended with HOLD: solving around its last row
-    FALLBACK = 4  # the QP gave nothing usable: playing the shifted previous plan
+    FALLBACK = 4  # no plan for this sample: the shifted previous plan is played
     BRAKING = 5  # ramping to standstill inside the slew limits
-    STOPPED = 6  # latched by an operator: only `enable` resumes
+    STOPPED = 6  # stopped by an operator until `enable`

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Calls that change an object, told one by one as they are made, so that they can be made again.
+Calls that change an object, reported one by one as they are made, so that they can be repeated.
 
-An object whose state follows from such calls alone, with every time and every
-decision among their arguments, does the same when they are repeated on another one.
+If the state of an object depends on such calls only, and every time and decision is
+among their arguments, the same calls on a second object make it do the same.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ class Call(NamedTuple):
     One call of a method.
 
     Attributes:
-        name: Of the method.
-        args: Its arguments by position; whoever keeps them copies what may change.
+        name: Name of the method.
+        args: Its arguments by position; whoever keeps them must copy those that may change.
         kwargs: Its arguments by name.
     """
 
@@ -33,11 +33,11 @@ class Call(NamedTuple):
 
 
 class Told(Protocol):
-    """An object that tells of its calls."""
+    """An object that reports its calls."""
 
     @property
     def on_call(self) -> Callable[[Call], object] | None:
-        """Takes each call before it is made, if anybody wants to know."""
+        """Receiver of each call before it is made; None if nobody listens."""
 
 
 S = TypeVar("S", bound=Told)
@@ -46,7 +46,7 @@ T = TypeVar("T")
 
 
 def told(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
-    """Let a method tell of its calls; it calls no other such method of its object."""
+    """Report each call of a method; the method must not call another such method of its object."""
     name = method.__name__
 
     @wraps(method)

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-State and reference in, command out: the real-time iteration on the robot's time grid.
+Controller of one robot: the real-time iteration on the robot's time grid, from state and reference to command.
 
-No clock inside: every time is a stamp of the robot, or local monotonic time
-handed in. Samples lie on a grid that follows the robot (`rti_mpc.control.grid`).
-Preparation fixes the time :math:`t_k` at which the next command acts, looks the
-reference up from there on, shifts and linearizes. Feedback starts with the
-state that is due; it integrates that state to :math:`t_k` with the inputs already
-sent, embeds it and solves. Reference, plan and command all start at :math:`t_k`.
+It reads no clock: every time is a stamp of the robot or local monotonic time that the
+caller hands in. Samples lie on a grid that follows the robot (`rti_mpc.control.grid`).
+Preparation fixes the time :math:`t_k` at which the next command acts, looks up the
+reference from there on, shifts and linearizes. Feedback starts with the state that is
+due. It integrates that state to :math:`t_k` with the inputs already sent, embeds it and
+solves. Reference, plan and command all start at :math:`t_k`.
 
-A plan that cannot be made, or comes too late, is replaced rung by rung
-(`rti_mpc.control.ladder`). Whatever goes out has passed the `rti_mpc.control.envelope.Envelope`.
-What follows a gap starts cold, and acts late enough to be there in time.
+When a plan cannot be computed, or is too late, the ladder of fallbacks
+(`rti_mpc.control.ladder`) replaces it. Every command passes the
+`rti_mpc.control.envelope.Envelope`. After a gap the controller starts cold, and the
+first command acts late enough to arrive in time.
 """
 
 from __future__ import annotations
@@ -55,24 +56,24 @@ class Controller:
     """
     The controller of one robot.
 
-    The caller hands in each message as it comes. What is returned is a proposal:
-    `in_time` judges it, the caller publishes it and calls `commit`, and what was
-    not committed was never sent. After each sample it calls `prepare`, off the
-    path from state to command.
+    The caller hands in each message when it arrives. A command that is returned is a
+    proposal: `in_time` judges it, then the caller publishes it and calls `commit`. A
+    proposal that is not committed counts as never sent. After each sample the caller
+    calls `prepare`, off the path from state to command.
 
-    What commands depend on changes by the calls marked `told` alone, each of which
-    `on_call` is told of: repeated on a controller built alike, they give the same commands.
+    Only the calls marked `told` change what commands depend on, and `on_call` receives
+    each of them. The same calls on a second controller, built alike, give the same commands.
 
     Attributes:
-        on_call: Takes each call that may change a command, before it is made; None: nobody does.
+        on_call: Receiver of each call that may change a command, before it is made; None for no receiver.
         skipped: Samples skipped since start.
         ladder: Samples without a plan of their own, by what replaced it.
-        np_: Parameters a row of a reference may carry: the model's, without the disturbances an observer estimates.
-        envelope: What inputs may be.
-        grid: When commands act.
+        np_: Parameters that a row of a reference may carry: the model's, without the disturbances that an observer estimates.
+        envelope: Limits of the inputs.
+        grid: Times at which commands act.
 
     Raises:
-        OcpError: Bounds leave out the input at which the robot rests.
+        OcpError: The bounds exclude the input at which the robot rests.
     """
 
     def __init__(
@@ -118,19 +119,19 @@ class Controller:
         return self._modes.mode
 
     def say(self, notice: Notice) -> None:
-        """Have something said beside what the controller says itself; in any thread."""
+        """Add a notice to the controller's own; may be called in any thread."""
         self._modes.notices.append(notice)
 
     def notices(self) -> list[Notice]:
-        """Take what is to be said: mode changes and faults since the last call; in any thread."""
+        """Take the notices of mode changes and faults since the last call; may be called in any thread."""
         return self._modes.take()
 
     @property
     def shadowing(self) -> bool:
-        """Whether another controller's commands act, those handed to `overhear`, and not what is made here."""
+        """Whether the commands of another controller act, those handed to `overhear`, and not those of this one."""
         return self._shadowing
 
-    # What comes in.
+    # Incoming messages.
 
     @property
     def heard(self) -> bool:
@@ -138,11 +139,11 @@ class Controller:
         return self._states.last is not None
 
     def follows(self, state: State) -> bool:
-        """Whether a state is of the life that is followed, or may be the first one."""
+        """Whether a state belongs to the life of the robot that is followed, or may be the first one."""
         return self._states.last is None or state.epoch == self._states.last.epoch
 
     def awaits(self, state: State) -> bool:
-        """Whether a state goes on from the last one, by life and number."""
+        """Whether a state continues the last one, by life and sequence number."""
         return self.follows(state) and self._states.cadence.counts(state.seq)
 
     @told
@@ -155,7 +156,7 @@ class Controller:
             arrival_ns: Local monotonic time.
 
         Returns:
-            The command to publish at once, a proposal, or None: then the state is only kept as the freshest.
+            The command to publish at once, as a proposal; None if no sample is due, and the state is only kept as the newest.
         """
         arrival = self._states.receive(state, arrival_ns)
         if (notice := self._states.notice) is not None:
@@ -186,7 +187,7 @@ class Controller:
         return self._act(state) if grid.running else None
 
     def lay_out(self, reference: Reference) -> Array | None:
-        """Do of `receive_reference` what may be done in any thread, and takes longer the more rows there are; None if it will be refused."""
+        """Do the part of `receive_reference` whose duration grows with the rows, in any thread; None if the reference will be refused."""
         return None if self._track.misfit(reference, self.np_) else self._track.lay_out(reference)
 
     @told
@@ -196,10 +197,10 @@ class Controller:
 
         Args:
             reference: Message of a planner.
-            rows: What `lay_out` has made of it; done here if None.
+            rows: Result of `lay_out`; None to compute it here.
 
         Returns:
-            The reference with its real stamp, to be published, if it was to start on arrival and a state is there to start at.
+            The reference with its real stamp, to be published, if it starts on arrival and a state has arrived; else None.
         """
         if misfit := self._track.misfit(reference, self.np_):
             self._modes.say(Severity.WARNING, "reference_refused", misfit)
@@ -218,7 +219,7 @@ class Controller:
 
     @told
     def enable(self) -> None:
-        """Release a `stop`: start cold, from the input that acts."""
+        """Release a `stop`, and start cold from the input that acts."""
         if self._stopped:
             self._stopped = ""
             self._modes.say(Severity.INFO, "enable", "released by an operator")
@@ -229,13 +230,13 @@ class Controller:
     @told
     def retune(self, ocp: Ocp, version: int) -> int:
         """
-        Plan with other weights and bounds, from the next sample on that is not prepared yet; a stop keeps the slew limits it was built with.
+        Plan with other weights and bounds, from the next sample that is not prepared yet. The ramp of a stop keeps the slew limits it was built with.
 
         Returns:
-            Sequence number of its command.
+            Sequence number of the command of that sample.
 
         Raises:
-            OcpError: The problem differs in more than these.
+            OcpError: The problem differs in more than weights and bounds.
         """
         self._tuning.change(ocp, version)
         return self._issued.seq + 1 + self._loaded
@@ -249,12 +250,12 @@ class Controller:
 
     @told
     def shadow(self) -> None:
-        """Let what is made here not act, but what is handed to `overhear`."""
+        """Compute commands that do not act; those handed to `overhear` do."""
         self._shadowing = True
 
     @told
     def lead(self, epoch: int) -> None:
-        """Let what is made here act from the next command on; it goes on from what has acted so far."""
+        """Let the commands of this controller act from the next one on; it continues from the inputs that have acted so far."""
         self._issued.epoch, self._shadowing = epoch, False
         if self._loaded:
             self._load(shift=False)
@@ -262,7 +263,7 @@ class Controller:
     @told
     def tick(self, local_ns: int) -> Command | None:
         """
-        Notice silence: propose a ramp to rest, once, when the last state has become stale.
+        Watch for silence: propose a ramp to rest, once, when the last state has become stale.
 
         Args:
             local_ns: Local monotonic time.
@@ -285,14 +286,14 @@ class Controller:
         Hold a sample to its budget: its command must be there before its first row is over.
 
         Args:
-            command: What was proposed for it.
+            command: The proposal for this sample.
             local_ns: Local monotonic time.
 
         Returns:
-            What to publish: the command; nothing if it is too late and the previous plan plays on in the robot's hands; or a ramp.
+            What to publish: the command itself; None if it is too late and the robot goes on with the previous plan; or a ramp to rest.
         """
         if self._states.cadence.fault:
-            return command  # nobody knows how late it is, and none follows
+            return command  # its lateness is unknown, and no other command follows
         now_ns = self._states.clock.latest_ns(local_ns)
         if not self.grid.too_late(now_ns - command.stamp_ns):
             if self._overran:
@@ -313,11 +314,11 @@ class Controller:
     @told
     def commit(self, command: Command, left_ns: int | None = None) -> None:
         """
-        Record a proposal as sent, now that it has left; of a shadow, as one that would have been.
+        Record a proposal as sent, once it has left; a shadow records it as one that would have been sent.
 
         Args:
             command: The last proposal.
-            left_ns: Local monotonic time at which it left at the earliest; None if it answers no state, and robot time is a guess.
+            left_ns: Earliest local monotonic time at which it left; None if it answers no state, so that robot time is a guess.
         """
         self._issued.commit(command)
         if self._shadowing:
@@ -356,7 +357,7 @@ class Controller:
         self.grid.adapt(estimator.delay_ns)
 
     def _look_ahead(self) -> None:
-        """Say that the way is blocked, or free again."""
+        """Report that the way is blocked, or free again."""
         if self.mode not in (Mode.TRACKING, Mode.HOLDING) or not self._blockage.look():
             return
         if self._blockage.blocked:
@@ -376,10 +377,10 @@ class Controller:
         self._loaded = True
 
     def _rejoin(self, stamp_ns: int, behind: int) -> None:
-        """Bring plan and grid to a state that the grid has not expected: one that comes late, or the first after a gap."""
+        """Move plan and grid to a state that the grid did not expect: a late one, or the first one after a gap."""
         self.skipped += behind
         last = self._issued.last
-        if behind and last is not None and stamp_ns + self.grid.delay_ns < last.valid_until_ns:  # what was sent still acts
+        if behind and last is not None and stamp_ns + self.grid.delay_ns < last.valid_until_ns:  # the last command still acts
             self.grid.catch_up(behind, stamp_ns)
             if self._loaded:
                 for _ in range(behind - 1):
@@ -394,7 +395,7 @@ class Controller:
         clock = self._states.clock
         if not self.grid.too_late(clock.late_ns + clock.doubt_ns):
             self.grid.start(stamp_ns)
-        else:  # it may have waited on its way for too long to be answered: the next one will tell
+        else:  # this state may have waited on its way for too long to be answered: the next one will show
             self.grid.running = False
 
     def _act(self, state: State) -> Command:
@@ -418,7 +419,7 @@ class Controller:
         return self._issued.propose(state, act_ns, valid_until_ns, mode, status, self.envelope.fit(self._rti.u, self._reach), plan=True)
 
     def _feedback_cold(self) -> QpStatus:
-        """Solve a first sample: the guess stays where the robot is, and is iterated on."""
+        """Solve the first sample: the guess is the present state at all stages, and is iterated on."""
         self._rti.reset(self._x0, self._sent.at(self.grid.act_ns - 1)[0])
         self._tuning.begin()
         status = QpStatus.FAILED
@@ -427,7 +428,7 @@ class Controller:
             status = self._rti.feedback(self._x0)
         return status
 
-    # What replaces a plan.
+    # Fallbacks.
 
     def _plays_on(self, now_ns: int, *, counted: bool = False) -> bool:
         """Whether the previous plan may serve a sample that has none of its own."""
@@ -436,7 +437,7 @@ class Controller:
         return left if counted else self.ladder.fall(plan_left=left)
 
     def _fall_back(self, state: State, status: QpStatus) -> Command:
-        """Replace a plan that could not be made."""
+        """Replace a plan that could not be computed."""
         act_ns, plan, failure = self.grid.act_ns, self._issued.plan, f"the QP is {status.name.lower()}"
         if self._plays_on(act_ns) and plan is not None:
             self._modes.enter(Mode.FALLBACK, f"{failure}: playing the previous plan", Severity.WARNING, "qp_failed")
@@ -447,10 +448,10 @@ class Controller:
 
     def _brake(self, state: State, act_ns: int, status: QpStatus, *, wanted: bool = False) -> Command:
         """
-        Propose the brake law, because a stop is `wanted` or for want of a plan.
+        Propose the brake law, because a stop is `wanted` or because there is no plan.
 
-        It is valid from its own time on, not from its state's: made of past commands
-        and never further from rest than they, it is as right without a state.
+        Its validity counts from its own time, not from its state's: it depends on past
+        commands only, and never leads further from rest than they do.
         """
         rows = self.envelope.ramp(self._sent.reach(act_ns))
         if not wanted:
@@ -461,9 +462,9 @@ class Controller:
 
     def _give_up(self, state: State) -> Command | None:
         """
-        End what is commanded to a robot whose clock is none: one command, each of whose rows is the next step to rest, and nothing after it.
+        Stop commanding a robot whose stamps are no clock: send one last command, each of whose rows is the next step to rest.
 
-        Whichever row acts there, and for however long, it is inside the slew limits.
+        Whichever of its rows acts, and for however long, the inputs stay inside the slew limits.
         """
         if self.mode is Mode.IDLE:
             return None
@@ -480,17 +481,17 @@ class Controller:
 
     @told
     def standstill(self, local_ns: int) -> Command | None:
-        """Propose the last command of a life: to rest as fast as the slew limits allow; None if nothing was ever commanded, or its clock is none."""
+        """Propose a last command, to rest as fast as the slew limits allow; None if nothing was ever commanded, or the stamps are no clock."""
         state = self._states.last
         if self._issued.last is None or state is None or self._states.cadence.fault:
             return None
         return self._brake(state, self.robot_now_ns(local_ns) + self.grid.delay_ns, QpStatus.NONE, wanted=True)
 
-    # What goes out.
+    # Outgoing messages.
 
     @property
     def at_rest(self) -> bool:
-        """Whether the last command that has left is rest from its first row on, or there never was one."""
+        """Whether the last command that was sent is rest from its first row on, or none was ever sent."""
         last = self._issued.last
         return last is None or np.array_equal(last.u[0], self._u_rest)
 
@@ -508,7 +509,7 @@ class Controller:
         return self._states.clock.now_ns(local_ns)
 
     def telemetry(self, *, prepare_us: float, feedback_us: float, latency_us: float, slack_s: float) -> Telemetry:
-        """Describe the last sample; the times are the caller's, who has a clock."""
+        """Return the telemetry of the last sample; the times come from the caller, who has a clock."""
         assert self._issued.last is not None
         times = prepare_us, feedback_us, latency_us, slack_s
         return self._record.telemetry(
@@ -518,10 +519,10 @@ class Controller:
     # Small parts.
 
     def _hear(self, state: State) -> bool:
-        """Learn which input acts from a robot that reports it; return whether that was not known."""
+        """Learn which input acts from a robot that reports it; return whether it was another than believed."""
         if not len(state.u):
             return False
-        limits, believed = self.envelope.limits, self._sent.at(state.stamp_ns - 1)[0]  # which is outside after bounds were tightened
+        limits, believed = self.envelope.limits, self._sent.at(state.stamp_ns - 1)[0]  # the believed input may be outside bounds that were tightened
         u = np.minimum(np.maximum(state.u, np.minimum(limits["lbu"], believed)), np.maximum(limits["ubu"], believed))
         return self._sent.correct(state.stamp_ns, u, (state.command_epoch, state.command_seq))
 
@@ -533,7 +534,7 @@ class Controller:
         return anchored
 
     def _forget(self, arrival: Arrival, state: State) -> None:
-        """Keep nothing of the robot's last life, or of the time before its clock jumped but that it brakes since then."""
+        """Forget the robot's last life; or, after a jump of its clock, all but the inputs from which it has braked since then."""
         if arrival is Arrival.NEW_LIFE:
             self._sent.clear()
         else:
@@ -543,7 +544,7 @@ class Controller:
             self._track.clear()
             self._blockage.clear()
         if arrival is Arrival.NEW_LIFE and self._for_rival[0] == state.epoch:
-            self._track.arriving = self._for_rival[1]  # it came when the new life was heard, but not sure yet
+            self._track.arriving = self._for_rival[1]  # this reference came when the new life was heard, but not believed yet
         if self._delay is not None:
             self._delay.clear()
         self._issued.plan = None

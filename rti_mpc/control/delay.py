@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-The delay from a state to the act of its command, measured from how the robot responds.
+The delay from a state to the time at which its command acts, measured from how the robot responds.
 
-Each candidate :math:`d_j` says when every command sent would have begun to act: at
-its stamp, or :math:`d_j` after the state that it answers if that is later. The
-step from one state to the next is predicted for all of them, and the squared
-errors are summed and forgotten,
+With each candidate delay :math:`d_j` every command that was sent would have begun to
+act at its stamp, or :math:`d_j` after the state that it answers if that is later. The
+step from one state to the next is predicted with each candidate, and the squared
+errors are summed with exponential forgetting,
 
 .. math::
 
     J_j \leftarrow \gamma J_j + \sum_i \left( \frac{x_i - \phi(x^-, u(\cdot; d_j))_i}{\sigma_i} \right)^2,
 
 with :math:`\sigma_i^2` the mean squared error of state `i` under the best candidate
-of each step: noise, and the model's. Where the inputs do not change all errors are the same, and nothing
-is forgotten: such a step says nothing. The estimate is the least of a parabola
-through the best candidate and its neighbours.
+of each step, from noise and from errors of the model. Where the inputs do not change, all
+candidates have the same error: such a step is not informative, and nothing is forgotten.
+The estimate is the minimum of a parabola through the best candidate and its neighbours.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MIN_STATE_DEVIATION = 1e-4  # lower limit of sigma_i, in the unit of the state: 
 
 class DelayEstimator:
     """
-    Compares candidate delays over recent commands and states.
+    Comparison of candidate delays over recent commands and states.
 
     Attributes:
         delay_ns: The estimate, ns.
@@ -68,21 +68,21 @@ class DelayEstimator:
         self._integrate = bind(integrate, inputs, {"x_next": self._next})
 
     def sent(self, command: Command) -> None:
-        """Take note of the last command that was sent, if it is another one."""
+        """Remember the last command that was sent, if it is a new one."""
         if not self._commands or self._commands[-1] is not command:
             self._commands.append(command)
 
     def clear(self) -> None:
-        """Forget states and commands, of another life of the robot. What was learnt is kept."""
+        """Forget states and commands, for another life of the robot; the estimate is kept."""
         self._commands.clear()
         self._last = None
 
     def hear(self, confirmed: int) -> None:
         """
-        Take back what was learnt from responses to commands that were lost.
+        Restore the last good estimate after commands were lost: what was learnt meanwhile is wrong.
 
         Args:
-            confirmed: Reports of the robot in a row that have named the command which was to act; 0 where it does not report.
+            confirmed: Consecutive reports of the robot that have named the expected command; 0 where it does not report.
         """
         if confirmed >= CONFIRMED_REPORTS:
             self._kept = self._costs.copy(), self._variance.copy(), self.delay_ns
@@ -97,10 +97,10 @@ class DelayEstimator:
 
     def observe(self, x: Array, stamp_ns: int) -> None:
         """
-        Take note of a state, and improve the estimate.
+        Improve the estimate with a state.
 
         Args:
-            x: State, shape ``(nx,)``, its angles next to those of the last one.
+            x: State, shape ``(nx,)``, each angle within half a turn of the last state's.
             stamp_ns: Its stamp.
         """
         last, self._last = self._last, (x.copy(), stamp_ns)
@@ -111,7 +111,9 @@ class DelayEstimator:
         played = np.flatnonzero(np.isfinite(squared.sum(axis=1)))
         if not len(played):
             return
-        squared = np.where(np.isfinite(squared), squared, squared[played].max(axis=0))  # the robot would have had to brake: it is no such delay
+        squared = np.where(
+            np.isfinite(squared), squared, squared[played].max(axis=0)
+        )  # with this delay the robot would have had to brake, so it cannot be the delay
         self._variance += (1.0 - FORGETTING_FACTOR if self._variance.any() else 1.0) * (squared.min(axis=0) - self._variance)
         step = (squared / np.maximum(self._variance, MIN_STATE_DEVIATION**2)).sum(axis=1)
         if np.ptp(step) <= MIN_ERROR_SPREAD:
@@ -121,7 +123,7 @@ class DelayEstimator:
         self._estimate()
 
     def _errors(self, x: Array, from_ns: int, x_next: Array, to_ns: int) -> Array:
-        """Return what each candidate misses a step by, shape ``(candidates, nx)``; NaN where no plan would have acted all the time."""
+        """Return the prediction error of each candidate over one step, shape ``(candidates, nx)``; NaN where at times no plan would have acted."""
         known: dict[tuple[int, ...], Array] = {}
         errors = []
         for delay_ns in self._candidates:
@@ -132,7 +134,7 @@ class DelayEstimator:
         return np.array(errors)
 
     def _play(self, starts: tuple[int, ...], x: Array, t_ns: int, to_ns: int) -> bool:
-        """Predict with commands that begin to act at these times; tell whether one did all the time."""
+        """Predict with commands that begin to act at these times; return whether one of them acted all the time."""
         self._x[:] = x
         while t_ns < to_ns:
             newest = next((i for i in range(len(starts) - 1, -1, -1) if starts[i] <= t_ns), -1)

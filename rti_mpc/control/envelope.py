@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Envelope of the inputs: the last check of every plan, whatever made it.
+Envelope of the inputs: the last check of every plan, whichever solver made it.
 
-Bounds hold for each row, slew limits from row to row; the first two are held to
-what `rti_mpc.control.sent.Sent.reach` allows. No solver is asked, and a plan that keeps
-all of it already passes unchanged.
+Bounds hold for each row, slew limits from row to row; the first two rows are also held
+to what `rti_mpc.control.sent.Sent.reach` allows. The check needs no solver, and a plan
+that is inside already passes unchanged.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Envelope:
     Bounds and slew limits of the inputs.
 
     Attributes:
-        limits: Those of the OCP by name, each of shape ``(nu,)``; owned, and obeyed as they are when a plan passes.
+        limits: Bounds by the names in `INPUT_BOUNDS`, each of shape ``(nu,)``; may be overwritten, and hold from the next plan on.
     """
 
     def __init__(self, ocp: Ocp, *, compile: bool = True) -> None:
@@ -40,7 +40,7 @@ class Envelope:
 
     def fit(self, u: Array, reach: tuple[Array, Array]) -> Array:
         """
-        Bring a finite plan inside, each row as near to what it was as the rows before it allow.
+        Bring a finite plan inside, each row as near to the planned one as the rows before it allow.
 
         Args:
             u: Inputs, shape ``(N_u, nu)``.
@@ -56,7 +56,7 @@ class Envelope:
 
     def refit(self, rows: Array, elapsed: int, reach: tuple[Array, Array]) -> Array:
         """
-        Bring an earlier plan inside once more, shifted by the rows that are over.
+        Bring an earlier plan inside again, without its first rows, whose time is over.
 
         Args:
             rows: Inputs of all stages, shape ``(N, nu)``; the last is repeated.
@@ -73,7 +73,7 @@ class Envelope:
         return shifted
 
     def ramp(self, reach: tuple[Array, Array]) -> Array:
-        """Return the brake law, shape ``(N, nu)``: from the inputs sent, never from a measured speed, to rest as fast as the slew limits allow."""
+        """Return the brake law, shape ``(N, nu)``: from the inputs sent to rest, as fast as the slew limits allow; no measured speed enters."""
         return self.refit(np.tile(self._u_rest, (len(self._rows), 1)), 0, reach)
 
 

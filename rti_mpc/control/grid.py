@@ -2,10 +2,10 @@
 """
 The grid in time on which commands act: it follows the robot's states.
 
-A sample's command acts at :math:`t_k`, `d` after its state. The next sample is
-due with the first state stamped :math:`t_k + dt - d - h` or later, `h` being half
-the period of the states, so that jitter, drift and faster states neither skip
-nor double one.
+The command of a sample acts at :math:`t_k`, the delay `d` after its state. The next
+sample is due with the first state that is stamped :math:`t_k + dt - d - T/2` or later,
+where `T` is the period of the states. So jitter, drift and faster states neither skip
+nor double a sample.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class Timing:
     Delays and timeouts, in the robot's time.
 
     Attributes:
-        delay_s: From a state to the act of its command, s; None: measured.
+        delay_s: Delay from a state to the time at which its command acts, s; None to measure it.
         stale_s: Age from which a state is not used, s.
-        valid_s: How long after its state, and the delay, a command may act, s.
+        valid_s: Time after its state, and after the delay, for which a command is valid, s.
     """
 
     delay_s: float | None = 0.0
@@ -36,13 +36,13 @@ class Timing:
 
 class Grid:
     """
-    When commands act. All times are the robot's, in ns.
+    Times at which commands act, in ns of the robot's clock.
 
     Attributes:
-        act_ns: When the next command acts, or the last one before `advance`: t_k.
-        delay_ns: From a state to the act of its command: d.
+        act_ns: Time t_k at which the next command acts; until `advance`, that of the last command.
+        delay_ns: Delay d from a state to the time at which its command acts.
         dt_ns: Period of the commands.
-        most_ns: What the delay may be at most.
+        most_ns: Largest delay.
         running: Whether there is a grid: not before the first sample, nor after a gap.
     """
 
@@ -54,32 +54,32 @@ class Grid:
         self.running = False
 
     def early(self, stamp_ns: int, period_ns: float) -> bool:
-        """Whether a state comes before the next sample's; `period_ns` is that of the states."""
+        """Whether a state comes before the one that the next sample is due with; `period_ns` is the period of the states."""
         return self.running and self.act_ns - self.delay_ns - stamp_ns > period_ns / 2
 
     def too_late(self, late_ns: int) -> bool:
-        """Whether a command that leaves by so much after its time is not there before its first row is over."""
+        """Whether a command that leaves this long after its time would arrive after its first row is over."""
         return late_ns >= MAX_LATENESS_PERIODS * self.dt_ns
 
     def behind(self, stamp_ns: int) -> int:
-        """Samples that a state shows to have been missed."""
+        """Return how many samples were missed when this state arrives."""
         return max(0, round((stamp_ns + self.delay_ns - self.act_ns) / self.dt_ns)) if self.running else 0
 
     def catch_up(self, samples: int, stamp_ns: int) -> None:
-        """Leave out samples that were missed; the next command acts not before its state, and the delay."""
+        """Skip samples that were missed; the next command acts no earlier than its state plus the delay."""
         self.act_ns = max(self.act_ns + samples * self.dt_ns, stamp_ns + self.delay_ns)
 
     def start(self, stamp_ns: int) -> None:
-        """Begin anew with a state."""
+        """Start the grid at a state."""
         self.act_ns = stamp_ns + self.delay_ns
         self.running = True
 
     def advance(self, stamp_ns: int, period_ns: float) -> None:
-        """Go on to the next sample, after one that answered this state; what is late beyond jitter does not move the grid."""
+        """Go on to the next sample, after one that answered this state; a state later than jitter explains does not move the grid."""
         offset_ns = stamp_ns + self.delay_ns - self.act_ns
         self.act_ns += self.dt_ns + (offset_ns if abs(offset_ns) <= period_ns / 2 else 0)
 
     def adapt(self, delay_ns: int) -> None:
-        """Let the delay come nearer to a measured one, by little enough that nothing jumps; a command rather waits a little than comes too late."""
+        """Move the delay towards a measured one plus a margin, slowly enough that commands do not jump."""
         change_ns, wanted_ns = self.dt_ns // DELAY_SLEW_SAMPLES, min(max(delay_ns, 0) + int(DELAY_MARGIN_PERIODS * self.dt_ns), self.most_ns)
         self.delay_ns += min(max(wanted_ns - self.delay_ns, -change_ns), change_ns)

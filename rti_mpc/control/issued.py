@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands of a controller, numbered without a gap: proposed, and issued once they have left."""
+"""The commands of a controller, numbered without a gap: first proposed, then committed once they have left."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ class Issued:
     The commands of one controller.
 
     Attributes:
-        epoch: Of the next one.
-        seq: Number of the last one that has left.
-        last: The last one that has left; None before the first.
-        plan: The last of them with a plan of its own, as long as that may be gone on with; else None.
+        epoch: Epoch of the next command.
+        seq: Sequence number of the last command that has left.
+        last: The last command that has left; None before the first.
+        plan: The last command with a plan of its own, as long as that plan may be continued; else None.
     """
 
     def __init__(self, epoch: int, config_hash: int, period_ns: int) -> None:
@@ -30,16 +30,16 @@ class Issued:
 
     def propose(self, state: State, act_ns: int, valid_until_ns: int, mode: Mode, status: QpStatus, u: Array, *, plan: bool = False) -> Command:
         """
-        Make what may be the next one; until it is committed, nothing has happened.
+        Build the next command; nothing changes until it is committed.
 
         Args:
             state: The state it answers.
             act_ns: When its first row acts, robot time.
             valid_until_ns: When it ends, robot time.
             mode: What the controller is doing.
-            status: Of the QP.
-            u: Rows, shape ``(N, nu)``.
-            plan: Whether that is a plan of its own.
+            status: Outcome of the QP.
+            u: Inputs, shape ``(N, nu)``.
+            plan: Whether these are a plan of its own, not a fallback.
         """
         command = Command(
             epoch=self.epoch,
@@ -59,7 +59,7 @@ class Issued:
         return command
 
     def commit(self, command: Command) -> None:
-        """Take a proposal for the last one: the next one has the next number."""
+        """Record a proposal as the last command that has left; the next one has the next number."""
         self.seq, self.last = command.seq, command
         if command is self._planned:
             self.plan = command

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Ladder of fallbacks for a plan that cannot be made, each rung counted.
+Ladder of fallbacks: what is sent when no plan could be computed. Each rung is counted.
 
-1. The plan of the second solver, with softened bounds: made inside `Rti`.
+1. The plan of the second solver, with softened bounds, computed inside `Rti`.
 2. The previous plan, shifted: at most `MAX_FALLBACK_SAMPLES` samples in a row, and never past its validity.
 3. The brake law: a ramp to rest inside the slew limits, from past commands alone.
 4. Standstill.
@@ -18,14 +18,14 @@ MAX_FALLBACK_SAMPLES = 3  # consecutive samples that the shifted previous plan m
 @dataclass(slots=True)
 class Ladder:
     """
-    How far down the commands have come.
+    Counts of the fallbacks used.
 
     Attributes:
-        failed: Samples in a row without a plan of their own.
-        softened: Samples since start whose plan another solver had to find than the first, with softened bounds.
-        shifted: Samples since start on which the previous plan played on.
-        braked: Samples since start that were answered by the brake law, for want of a plan.
-        rested: Samples since start that were answered by a standstill, for want of a plan.
+        failed: Consecutive samples without a plan of their own.
+        softened: Samples since start whose plan came from another solver than the first, with softened bounds.
+        shifted: Samples since start on which the previous plan was continued.
+        braked: Samples since start without a plan that were answered by the brake law.
+        rested: Samples since start without a plan that were answered by a standstill.
     """
 
     failed: int = 0
@@ -35,14 +35,14 @@ class Ladder:
     rested: int = 0
 
     def fall(self, *, plan_left: bool) -> bool:
-        """Note a sample without a plan of its own, and tell whether the previous one may play on."""
+        """Count a sample without a plan of its own, and return whether the previous plan may be continued."""
         self.failed += 1
         plays_on = plan_left and self.failed <= MAX_FALLBACK_SAMPLES
         self.shifted += plays_on
         return plays_on
 
     def brake(self, *, at_rest: bool) -> None:
-        """Note which of the last two rungs was taken."""
+        """Count one of the last two rungs: standstill if `at_rest`, else the brake law."""
         self.rested += at_rest
         self.braked += not at_rest
 

@@ -10,7 +10,7 @@ from rti_mpc.contract.status import Mode
 
 ANSWERING_MODES = {Mode.TRACKING, Mode.HOLDING, Mode.BRAKING, Mode.STOPPED}  # modes that may follow any other but IDLE and STOPPED
 
-# From each mode the ones that may follow; idle follows all, when the robot begins another life.
+# For each mode those that may follow it. IDLE may follow every other mode, when another life of the robot begins.
 TRANSITIONS: dict[Mode, set[Mode]] = {
     Mode.IDLE: {Mode.WAITING},
     Mode.WAITING: ANSWERING_MODES | {Mode.IDLE},
@@ -24,11 +24,11 @@ TRANSITIONS: dict[Mode, set[Mode]] = {
 
 class ModeMachine:
     """
-    The mode, and what is to be said of its changes.
+    The mode of the controller, and the notices of its changes.
 
     Attributes:
         mode: What the controller is doing.
-        notices: Mode changes and faults since somebody last emptied it; the oldest make room.
+        notices: Notices of mode changes and faults that have not been taken yet; when it is full the oldest is dropped.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class ModeMachine:
         self.notices: deque[Notice] = deque(maxlen=64)
 
     def take(self) -> list[Notice]:
-        """Take all notices, oldest first; in any thread."""
+        """Take all notices, oldest first; may be called in any thread."""
         taken: list[Notice] = []
         try:
             while True:
@@ -45,7 +45,7 @@ class ModeMachine:
             return taken
 
     def enter(self, mode: Mode, reason: str, severity: Severity = Severity.INFO, code: str = "mode") -> None:
-        """Change the mode, and say why; nothing happens if it is the mode already."""
+        """Change the mode and add a notice with the reason; does nothing if the mode is the same."""
         if mode is self.mode:
             return
         assert mode in TRANSITIONS[self.mode], f"{self.mode.name} to {mode.name}"
@@ -53,5 +53,5 @@ class ModeMachine:
         self.mode = mode
 
     def say(self, severity: Severity, code: str, text: str) -> None:
-        """Say something that changes no mode."""
+        """Add a notice that is no change of mode."""
         self.notices.append(Notice(severity, code, text))

@@ -5,9 +5,9 @@ State and disturbances of a robot, estimated together by an extended Kalman filt
 The state is augmented by disturbances that walk at random, :math:`z = (x, d)`,
 :math:`\dot x = f(x, u, p, d)`, :math:`\dot d = w`. A controller that predicts with
 the estimate tracks without offset although its model is wrong
-[Pannocchia2003]_. The measured states are taken in one by one, in the
-form of Joseph, which holds for any gain: the disturbances' is set to zero where they
-are frozen, and they are kept inside limits.
+[Pannocchia2003]_. The filter is corrected by one measured state after the other, in
+Joseph's form, which holds for any gain: the gain of the disturbances is set to zero
+where they are frozen. The disturbances are clipped to their limits.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ DEFAULT_PROCESS_NOISE = 1e-3  # standard deviation of the random walk that is ad
 @dataclass(frozen=True, slots=True)
 class Disturbance:
     """
-    What is known of one disturbance, in the unit it has in `with_disturbances`.
+    Settings of one disturbance, in the unit it has in `with_disturbances`.
 
     Attributes:
-        drift: Standard deviation of its random walk, in its unit / sqrt(s): the larger, the faster it is followed, and the noisier.
-        limit: Largest magnitude the estimate may take.
+        drift: Standard deviation of its random walk, in its unit / sqrt(s). A larger one gives a faster and noisier estimate.
+        limit: Largest magnitude of the estimate.
     """
 
     drift: float
@@ -46,13 +46,14 @@ class Disturbance:
 @dataclass(frozen=True)
 class ObserverSettings:
     """
-    What the filter assumes.
+    Settings of the filter.
 
     Attributes:
-        disturbances: By the name of an input or a state.
-        measured: Names of the states that are measured; all of them if there are none.
+        disturbances: Settings of each disturbance, by the name of an input or a state.
+        measured: Names of the states that are measured; empty if all are.
         noise: Standard deviation of measured states by name, in the state's unit; `DEFAULT_NOISE` if left out.
-        process: Random walk of states beside their model by name, in the state's unit / sqrt(s); `DEFAULT_PROCESS_NOISE` if left out.
+        process: Standard deviation of the random walk that is added to states, by name, in the state's unit / sqrt(s);
+            `DEFAULT_PROCESS_NOISE` if left out.
     """
 
     disturbances: Mapping[str, Disturbance] = field(default_factory=dict)
@@ -66,10 +67,10 @@ class Observer:
     The filter of one robot.
 
     Attributes:
-        model: The model with its disturbances; what a controller must predict with.
+        model: The model with its disturbances, which the controller must predict with.
         x: Estimated state, shape ``(nx,)``.
         d: Estimated disturbances, shape ``(nd,)``: the last parameters of `model`.
-        frozen: Whether disturbances keep their values: where it is not known which inputs act.
+        frozen: Whether the disturbances keep their values, because it is not known which inputs act.
 
     Raises:
         OcpError: A name is unknown, or a number not positive.
@@ -110,19 +111,19 @@ class Observer:
         self._z = z
 
     def reset(self, x: Array) -> None:
-        """Start from a measured state, what is not measured of it at its value; the disturbances are kept, what is known of them is not."""
+        """Start from a state, shape ``(nx,)``; the disturbances keep their values, and the covariance starts anew."""
         self.x[:] = x
         self._P[:] = self._initial
 
     def predict(self, u: Array, span_s: float) -> None:
-        """Go on with an input, shape ``(nu,)``, for some time, s."""
+        """Predict over a time in s, under one input, shape ``(nu,)``."""
         self._u[:] = u
         self._span[0] = span_s
         self._predict()
         self._z[:], self._P[:] = self._predicted
 
     def correct(self, y: Array) -> None:
-        """Take a measured state in, shape ``(nx,)``, its angles next to those of `x`; what is not measured of it is not looked at."""
+        """Correct by a state, shape ``(nx,)``, its angles within half a turn of those of `x`; components that are not measured are ignored."""
         self._predicted[0][:], self._predicted[1][:] = self._z, self._P
         self._y[:] = y
         self._gain[0] = not self.frozen
@@ -130,7 +131,7 @@ class Observer:
 
 
 def predict(model: Model, nd: int, walks: Array) -> ca.Function:
-    """Build ``(z, P, u, p, span) -> (z_next, P_next)``: one step of the dynamics with the sensitivities of it."""
+    """Build ``(z, P, u, p, span) -> (z_next, P_next)``: one step of the dynamics and of the covariance."""
     nx, n = model.nx, model.nx + nd
     z, P, span = ca.SX.sym("z", n), ca.SX.sym("P", n, n), ca.SX.sym("span")
     p = ca.SX.sym("p", model.np_ - nd)
@@ -143,7 +144,7 @@ def predict(model: Model, nd: int, walks: Array) -> ca.Function:
 
 
 def correct(nx: int, nd: int, measured: list[int], variances: list[float], limits: Array) -> ca.Function:
-    """Build ``(z, P, y, gain) -> (z_corrected, P_corrected)``; a gain of 0 freezes the disturbances, 1 does not."""
+    """Build ``(z, P, y, gain) -> (z_corrected, P_corrected)``; a `gain` of 0 freezes the disturbances, 1 does not."""
     z, P = ca.SX.sym("z", nx + nd), ca.SX.sym("P", nx + nd, nx + nd)
     y, gain = ca.SX.sym("y", nx), ca.SX.sym("gain")
     inputs = {"z": z, "P": P, "y": y, "gain": gain}

@@ -14,11 +14,11 @@ from rti_mpc.model.model import Model
 
 class Prediction:
     """
-    Integrates a state over the inputs already sent: its whole vector, speeds as well as pose.
+    Integration of the whole state, speeds as well as pose, over the inputs already sent.
 
     Attributes:
-        x: The state predicted last, shape ``(nx,)``. Overwritten by the next one.
-        p: Parameters it predicts with, shape ``(np,)``; the model's nominal ones unless set.
+        x: The state predicted last, shape ``(nx,)``. Overwritten by the next prediction.
+        p: Parameters of the prediction, shape ``(np,)``; the model's nominal ones unless set.
     """
 
     def __init__(self, model: Model, sent: Sent, *, compile: bool = True) -> None:
@@ -34,7 +34,7 @@ class Prediction:
 
     def predict(self, x: Array, from_ns: int, to_ns: int) -> Array:
         """
-        Integrate from one time to another, one RK4 step over each input; a little backward, if need be.
+        Integrate from one time to another, with one RK4 step per input; `to_ns` may also be a little before `from_ns`.
 
         Args:
             x: State at `from_ns`, shape ``(nx,)``.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Record of a sample for telemetry, made after its command has gone out."""
+"""Telemetry of one sample, assembled after its command has left."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Record:
         self._version = 0  # of the parameters
 
     def keep(self, seq: int) -> None:
-        """Keep the plan of a command, by its number, if it is not kept already."""
+        """Keep the plan of a command, by its sequence number, unless it is kept already."""
         if self._seq != seq:
             self._plan = (self._rti.x.copy(), self._rti.y_ref.copy(), self._rti.cost)
             self._seq, self._version = seq, self._tuning.version
@@ -30,14 +30,14 @@ class Record:
         self, command: Command, x0: Array, d: Array, times: tuple[float, float, float, float], *, delay_s: float, skipped: int, ladder: Ladder
     ) -> Telemetry:
         """
-        Describe the sample of the last command.
+        Return the telemetry of the last command's sample.
 
         Args:
             command: Command of the sample, as it was sent.
             x0: State embedded at stage 0, shape ``(nx,)``.
             d: Estimated disturbances, shape ``(nd,)``.
             times: Preparation, feedback and latency, us, and slack, s.
-            delay_s: From a state to the act of its command, s.
+            delay_s: Delay from a state to the time at which its command acts, s.
             skipped: Samples skipped since start.
             ladder: Samples without a plan of their own.
         """

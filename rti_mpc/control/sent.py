@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The inputs already sent: what the robot does until the next command acts.
+The inputs already sent, which the robot plays until the next command acts.
 
-Commands are believed to act as soon as they can, until a robot that reports what acts
-tells otherwise (`rti_mpc.contract.belief`).
+Commands are believed to act as soon as they can, unless a robot that reports its inputs
+shows something else (`rti_mpc.contract.belief`).
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ SLEW_WINDOW_PERIODS = 0.75  # a late command is held to the slew limits over thi
 
 class Sent:
     """
-    The last commands, as the robot plays them if none is later than expected.
+    The last commands, as the robot plays them if none arrives later than expected.
 
     Attributes:
-        delay_ns: How long after the state that it answers a command can act, though its time have come before.
+        delay_ns: A command acts no earlier than this long after the state that it answers, even if its own time is earlier.
     """
 
     def __init__(self, u_rest: Array, lbdu: Array, ubdu: Array, dt_ns: int) -> None:
@@ -40,15 +40,15 @@ class Sent:
         slew = 1e9 * np.minimum(-lbdu, ubdu) / dt_ns
         increments = Increments(lbdu, ubdu, dt_ns)
         self._schedule = Belief(u_rest, slew, increments)
-        self._slowest = Schedule(u_rest, slew, increments)  # if each command was on its way for as long as it may be
+        self._slowest = Schedule(u_rest, slew, increments)  # the same if each command took the longest transit time
 
     def append(self, command: Command, left_ns: int = BEFORE_ALL_NS) -> None:
         """
-        Remember a command that has left, unless it has expired before its time: the robot refuses it.
+        Remember a command that has left, unless it expires before it can act: then the robot refuses it.
 
         Args:
             command: The command.
-            left_ns: When it left at the earliest, robot time, if that is known: what was sent before acts at least until then.
+            left_ns: Earliest robot time at which it left, if that is known: the command before acts at least until then.
         """
         self._left_ns = max(self._left_ns + 1, left_ns)  # commands leave one after the other, whatever our idea of the robot's clock
         start_ns = max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, self._left_ns)
@@ -62,7 +62,7 @@ class Sent:
             self._slowest.add(command, start_ns, end_ns(command), approached=False)
 
     def correct(self, t_ns: int, u: Array, source: tuple[int, int]) -> bool:
-        """Take note of what the robot reports to act, as `Belief.correct`; return whether that was not known."""
+        """Correct the belief by the input that the robot reports, see `Belief.correct`; return whether it was another than believed."""
         changed = self._schedule.correct(t_ns, u, source)
         if changed:
             self._slowest.copy(self._schedule)
@@ -71,23 +71,23 @@ class Sent:
 
     @property
     def confirmed(self) -> int:
-        """Reports of the robot in a row that have named the command which was to act."""
+        """Consecutive reports of the robot that have named the expected command."""
         return self._schedule.confirmed
 
     def brake(self, before_ns: int, now_ns: int) -> None:
-        """Assume that the robot, whose clock has jumped from one time to another, brakes from what acted."""
+        """Assume that the robot, whose clock has jumped from one time to another, brakes from the input that acted."""
         self._left_ns = BEFORE_ALL_NS
         for schedule in (self._schedule, self._slowest):
             schedule.cut(before_ns, now_ns)
 
     def clear(self) -> None:
-        """Forget everything: the robot was restarted, and stands."""
+        """Forget everything: the robot was restarted, and is at rest."""
         self._left_ns = BEFORE_ALL_NS
         for schedule in (self._schedule, self._slowest):
             schedule.brake(schedule.u_rest, BEFORE_ALL_NS)
 
     def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Array, float]]:
-        """Yield the inputs that act between two times, shape ``(nu,)``, each with for how long, s; backward, the one that acts at the end."""
+        """Yield the inputs that act between two times, shape ``(nu,)``, each with its duration in s; backward, the one that acts at `to_ns`."""
         if to_ns < from_ns:
             yield self.at(to_ns)[0], 1e-9 * (to_ns - from_ns)
         while from_ns < to_ns:
@@ -103,15 +103,15 @@ class Sent:
 
     def reach(self, t_ns: int) -> tuple[Array, Array]:
         """
-        Return what the first two rows of a plan may be at least and at most, each of shape ``(2, nu)``.
+        Return the lowest and the highest first two rows of a plan, each of shape ``(2, nu)``.
 
-        Row 0 takes over at a time, or late by up to a period. It is to be within
-        the slew limits of every input that acts in the period before, and of those
-        that act until it arrives; so is row 1 of the latter. Then the inputs change
+        Row 0 takes over at `t_ns`, or up to one period later. It must be within the slew
+        limits of every input that acts in the period before, and of those that act until
+        it arrives; row 1 must be within the limits of the latter. Then the inputs change
         by no more than the limits within any period, whenever the plan arrives, and
-        within three quarters of one, however long commands are on their way.
-        Where the robot brakes on its own, that leaves it the speed it has; a plan
-        that has ended this may be late, too, and the robot have braked on.
+        within three quarters of a period, however long commands are on their way.
+        Where the robot brakes on its own, this leaves it the speed that it has. The plan
+        that ended the braking may itself be late, and the robot have braked further.
         """
         acting = self.at(t_ns)[0]
         second = self._near(self._schedule, acting + self._slew[0], acting + self._slew[1], t_ns, t_ns + self._dt_ns - 1)
@@ -124,7 +124,7 @@ class Sent:
         return np.array([first[0], second[0]]), np.array([first[1], second[1]])
 
     def _near(self, schedule: Schedule, lowest: Array, highest: Array, at_ns: int, last_ns: int) -> tuple[Array, Array]:
-        """Narrow an interval to what is within the slew limits of all inputs from one time to another; if nothing is, to what comes nearest."""
+        """Narrow an interval to the slew limits of all inputs from one time to another; if that leaves nothing, to the nearest value."""
         while at_ns <= last_ns:
             u, change_ns, _ = schedule.at(at_ns)
             lowest, highest = self._within(lowest, highest, u)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot as its states show it: its life, its clock, and where it is, with angles that do not wrap."""
+"""The states of one robot: its life, its clock and its state vector, with angles that do not wrap."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ MAX_STATE_MAGNITUDE = 1e9  # in any unit; a state with a larger number is refuse
 
 
 class Arrival(Enum):
-    """What a state is to the controller."""
+    """Verdict on a state that has arrived."""
 
-    FRESH = "fresh"  # to be acted on
-    REPEATED = "repeated"  # not newer than the last one
-    FOREIGN = "foreign"  # of another robot, or of a life that is not sure yet
-    UNTIMED = "untimed"  # of a clock that is none: its stamps do not advance as nanoseconds
-    REFUSED = "refused"  # no numbers of a robot
-    OLD = "old"  # it has waited on its way
-    NEW_LIFE = "new life"  # the first one after a restart of the robot
-    JUMPED_AHEAD = "jumped ahead"  # the first one after a jump of the robot's clock
-    JUMPED_BACK = "jumped back"  # likewise; whatever was to happen at a certain time will not
+    FRESH = "fresh"  # may be answered
+    REPEATED = "repeated"  # not newer than the last state
+    FOREIGN = "foreign"  # of another robot, or of a life that is not believed yet
+    UNTIMED = "untimed"  # its stamps do not advance as nanoseconds do
+    REFUSED = "refused"  # not finite, or too large
+    OLD = "old"  # has waited on its way
+    NEW_LIFE = "new life"  # the first state after a restart of the robot
+    JUMPED_AHEAD = "jumped ahead"  # the first state after the robot's clock has jumped ahead
+    JUMPED_BACK = "jumped back"  # the first state after the robot's clock has gone back: earlier stamps mean nothing any more
 
 
 class StateStream:
@@ -39,14 +39,14 @@ class StateStream:
     The states of one robot.
 
     Attributes:
-        lives: Which of the lives heard is followed, and whether two robots are there.
-        cadence: Whether its states count and its stamps are nanoseconds.
+        lives: Lives of the robot that were heard, and which of them is followed.
+        cadence: Judge of sequence numbers and of the unit of the stamps.
         last: The newest state, None before the first.
-        x: That state, shape ``(nx,)``, its angles nearest to those of the one before; or the observer's estimate of it.
-        d: Estimated disturbances, shape ``(nd,)``; none without an observer.
+        x: That state, shape ``(nx,)``, its angles nearest to those of the state before; or the observer's estimate of it.
+        d: Estimated disturbances, shape ``(nd,)``; empty without an observer.
         clock: The robot's clock.
-        before_ns: When that was, by the clock before it jumped.
-        notice: What is to be said of the last state, None if it is like the one before.
+        before_ns: Arrival of the newest state in robot time, by the clock as it was before that state.
+        notice: Notice about the last state, None if there is nothing new to report.
     """
 
     def __init__(self, model: Model, stale_ns: int, late_ns: int, settling_s: float, observer: Observer | None = None) -> None:
@@ -54,11 +54,11 @@ class StateStream:
         Begin with no state.
 
         Args:
-            model: The robot's.
+            model: Model of the robot.
             stale_ns: Age from which a state is not used, robot time.
             late_ns: Robot time by which a state may be late and still be fresh.
-            settling_s: How long after its state a command of anybody may still move the robot, robot time.
-            observer: Estimates disturbances, if there is one.
+            settling_s: Robot time for which any command may still move the robot after the state that it answers.
+            observer: Estimator of disturbances, None for none.
         """
         self.lives = Lives(1e-9 * stale_ns, settling_s)
         self.cadence = Cadence()
@@ -76,10 +76,10 @@ class StateStream:
 
     def receive(self, state: State, arrival_ns: int) -> Arrival:
         """
-        Take a state in. Of another life nothing of the last one is kept.
+        Judge and keep a state. When another life of the robot begins, the last state is forgotten.
 
         Args:
-            state: Of the model's `nx`.
+            state: A state with the model's `nx` numbers.
             arrival_ns: Local monotonic time.
         """
         self.before_ns = self.clock.now_ns(arrival_ns)
@@ -105,7 +105,7 @@ class StateStream:
 
         Args:
             sent: The inputs that have acted since the state before.
-            known: Whether they surely have; otherwise the disturbances are left as they are.
+            known: Whether it is certain that they acted; otherwise the disturbances keep their values.
         """
         observer, last = self._observer, self.last
         if observer is None or last is None:
@@ -122,7 +122,7 @@ class StateStream:
         self.x[:] = observer.x
 
     def _judge(self, state: State, arrival_ns: int) -> tuple[Arrival, str, str]:
-        """Judge a state, with the code and the text of what is to be said of it."""
+        """Return the verdict on a state, with the code and the text of its notice."""
         if not abs(state.x).max() <= MAX_STATE_MAGNITUDE:
             return Arrival.REFUSED, "state_refused", f"a state must be finite and at most {MAX_STATE_MAGNITUDE:g}, got {state.x.tolist()}"
         heard = self.lives.hear(state.epoch, arrival_ns, self.clock.rate)

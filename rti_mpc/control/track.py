@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A reference, laid on the controller's stages.
+The reference that is followed, interpolated at the controller's nodes.
 
-Angles are unwrapped along time, and only then interpolated: a reference that
-crosses pi changes nothing. In which turn the whole of it is followed is decided
-by `rti_mpc.rti.turns`. Past its last row a reference is held, never extrapolated;
-before its first, likewise.
+Angles are unwrapped along time before they are interpolated, so a reference may cross
+pi. `rti_mpc.rti.turns` decides in which turn all of it is followed. Before its first
+row and after its last one a reference is held, never extrapolated.
 
-What takes longer the more rows there are is done by `Track.lay_out`, which any
-thread may call; to follow the result takes the same time for all.
+`Track.lay_out` does the work that grows with the number of rows, and any thread may
+call it. Following its result takes the same time for any number of rows.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ class Track:
     Attributes:
         y_ref: Reference at nodes 1 to N of the last `look_up`, shape ``(N, ny)``.
         p: Stage parameters at nodes 0 to N of the last `look_up`, shape ``(N + 1, np)``.
-        arriving: A reference, checked, and what `lay_out` makes of it, until `anchor` has a state to start at.
+        arriving: A checked reference and its `lay_out`, until `anchor` has a state to start at; else None.
     """
 
     def __init__(self, model: Model, N: int, dt_ns: int) -> None:
@@ -46,11 +45,11 @@ class Track:
 
     def misfit(self, reference: Reference, right_np: int) -> str:
         """
-        Return what is wrong with a reference and what would be right, empty if it can be followed.
+        Return why a reference cannot be followed, and what would be right; empty if it can.
 
         Args:
-            reference: As it came.
-            right_np: Parameters that a row may have.
+            reference: The message as it came.
+            right_np: Number of parameters that a row may have.
         """
         (rows, ny), np_, right_ny = reference.y.shape, reference.p.shape[1], self.y_ref.shape[1]
         if rows >= 1 and ny == right_ny and np_ in (0, right_np) and reference.period_ns > 0:
@@ -62,10 +61,10 @@ class Track:
 
     def lay_out(self, reference: Reference) -> Array:
         """
-        Return the rows of a reference as `anchor` wants them: outputs, angles unwrapped along time, and the parameters given. Changes nothing here.
+        Return the rows of a reference for `anchor`: outputs, with angles unwrapped along time, and the parameters given. Changes no attribute.
 
         Args:
-            reference: Checked: of the model's `ny`, and of the first of its `np` or none; the others are nominal.
+            reference: A checked reference, with the model's `ny` and none or the first of its `np`; the other parameters are nominal.
         """
         rows = np.hstack([reference.y, reference.p])
         for j in self._angles:
@@ -87,7 +86,7 @@ class Track:
         return reference
 
     def clear(self) -> None:
-        """Follow nothing."""
+        """Forget the reference."""
         self._reference = None
 
     @property
@@ -96,7 +95,7 @@ class Track:
         return self._reference is not None
 
     def ended(self, t_ns: int) -> End | None:
-        """Return what to do after the end, if the reference is over by then."""
+        """Return what to do after the end if the reference is over at a time, else None."""
         reference = self._reference
         if reference is None or t_ns <= reference.stamp_ns + (len(reference.y) - 1) * reference.period_ns:
             return None

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Other weights and bounds for a controller that runs, without a bump.
+Change of weights and bounds while the controller runs, without a jump of the inputs.
 
-Weights change from one sample to the next: what a plan may do with an input is
-bounded all the same. A bound that the input is beyond is approached as fast as
-the slew limits allow: until then it stays just so far out that a plan can keep
-it. The first increment keeps the old slew limits and the new ones.
+Weights change from one sample to the next, since the bounds limit the inputs anyway. If
+the present input is outside a new bound, the bound moves there as fast as the slew
+limits allow, so that every plan can keep it. The first increment keeps both the old
+slew limits and the new ones.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ COMPILED_BOUNDS = (*INPUT_BOUNDS, "lbx", "ubx", "lh", "uh")  # bounds of the Ocp
 
 class Tuning:
     """
-    What an `Rti` is to be tuned to.
+    Weights and bounds of an `Rti`, wanted and acting.
 
     Attributes:
-        version: Of the weights and bounds that act; 0 for those it was built with.
+        version: Version of the weights and bounds that act; 0 for those that the `Rti` was built with.
     """
 
     def __init__(self, rti: Rti, limits: Mapping[str, Array] | None = None) -> None:
         """
-        Begin with what an `Rti` was built with.
+        Begin with the weights and bounds that an `Rti` was built with.
 
         Args:
             rti: Real-time iteration to be tuned.
-            limits: Where else the bounds that act are to be written, by name: ``lbu`` and ``ubu``, each of shape ``(nu,)``.
+            limits: Further arrays that the acting bounds are written to, by name: ``lbu`` and ``ubu``, each of shape ``(nu,)``.
         """
         self.version = 0
         self._rti = rti
@@ -56,7 +56,7 @@ class Tuning:
         Tune to the weights and bounds of an OCP, from the next `begin` on.
 
         Raises:
-            OcpError: Something else of it differs, such as which bounds there are, or its bounds leave out rest.
+            OcpError: Something else differs, such as which bounds are finite, or the bounds exclude the input at rest.
         """
         built = self._rti.ocp
         for name in COMPILED_FIELDS:
@@ -71,7 +71,7 @@ class Tuning:
         self._changed = True
 
     def begin(self) -> None:
-        """Begin the preparation of another sample."""
+        """Begin the preparation of the next sample."""
         lbdu, ubdu = self._wanted.lbdu, self._wanted.ubdu
         if self.version != self._wanted_version:
             self.version = self._wanted_version
@@ -80,7 +80,7 @@ class Tuning:
 
     def follow(self, u_prev: Array) -> None:
         """
-        Go there, as far as the input allows; before each preparation.
+        Move the acting weights and bounds towards the wanted ones as far as the input allows; called before each preparation.
 
         Args:
             u_prev: Input before the plan, shape ``(nu,)``.
