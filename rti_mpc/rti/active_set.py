@@ -2,10 +2,10 @@
 """
 Active-set solver on the Riccati recursion. Solves nearly every sample without a QP solver.
 
-The places are remembered from sample to sample and shifted with the plan, so
-that one roll-out mostly does. When they do not settle, the penalty that holds
-what is at its bound is softened and stiffened again in steps. A plan is certified
-from the problem's own data, and refined where the penalty has given way.
+The places, which say what is at a bound, are kept from sample to sample and shifted
+with the plan, so that one roll-out is usually enough. When they do not settle, the
+penalty that holds values at their bounds is softened, and stiffened again in steps. A
+plan is certified from the problem's own data, and refined where the penalty has yielded.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ class ActiveSet:
     The QP of a sample, solved to rounding without a QP solver.
 
     Attributes:
-        advance: Moves the last plan on by one stage to be the guess, and linearizes there.
-        linearize: Does so at the guess as it is.
-        gain: Computes the gains; after either of these, that is all of the preparation.
-        roll_out: Makes the plan, and finds the places; `certify` judges that plan, `refine` improves it.
+        advance: Call that shifts the last plan by one stage into the guess, and linearizes there.
+        linearize: Call that linearizes at the guess as it is.
+        gain: Call that computes the gains; with it, after one of the former two, preparation is complete.
+        roll_out: Call that makes the plan, and finds the places; `certify` judges that plan, `refine` improves it.
         iterations: Roll-outs of the last solve.
-        res_prim: Largest violation of dynamics, bounds and increments by the last plan that was certified, relative to their scales.
-        res_dual: Largest amount by which the cost of that plan can be above the optimum, relative to 1 plus its cost, normalised.
+        res_prim: Largest violation of dynamics, bounds and increments by the plan that was judged last, relative to their scales.
+        res_dual: Bound on the cost of that plan above the optimum, relative to 1 plus its normalised cost.
     """
 
     def __init__(self, functions: Places, certificate: ca.Function, guess: Guess, make: Callable[[ca.Function], ca.Function]) -> None:
         stages: Array = np.zeros(functions.linearize.numel_out("stages"))
         gains: Array = np.zeros(functions.gains.numel_out("gains"))
-        # Like the guess and the plan made at it: these are found at those, and the next ones are those moved on by a stage.
+        # As with guess and plan: a roll-out reads the places and writes those found, and `advance` shifts the found ones by a stage.
         self._places: Array = np.zeros(functions.roll_out.numel_out("places_found"))
         self._found = np.zeros_like(self._places)
         changes: Array = np.zeros(1)
@@ -81,15 +81,15 @@ class ActiveSet:
         self.res_prim = self.res_dual = 0.0
 
     def forget(self) -> None:
-        """Start cold: no bound acts."""
+        """Start cold, with no bound acting."""
         self._places[:] = self._found[:] = 0.0
 
     def keep(self) -> None:
-        """Let the places be those of a guess that is the plan."""
+        """Take the places of the guess as those found, because the guess is the plan."""
         self._found[:] = self._places
 
     def certified(self) -> QpStatus:
-        """Return what the last plan is for its QP, from the problem's own data; it is refined where it is not yet the solution."""
+        """Refine the last plan until it is certified, and return its status; the certificate uses the problem's own data only."""
         status = self._judged()
         for _ in range(MAX_REFINEMENTS):
             if status is SOLVED:
@@ -97,14 +97,14 @@ class ActiveSet:
             gap, before = self.res_dual, [array.copy() for array in self._refined]
             self.refine()
             status = self._judged()
-            if not self.res_dual < gap:  # where places are degenerate, a step may lead away
+            if not self.res_dual < gap:  # with degenerate places a refinement may make the plan worse
                 for array, kept in zip(self._refined, before, strict=True):
                     array[:] = kept
                 return self._judged()
         return status
 
     def _judged(self) -> QpStatus:
-        """Judge the plan as it is."""
+        """Certify the plan as it is."""
         self.certify()
         primal, gap, cost = (part[0] for part in self._verdict)
         self.res_prim, self.res_dual = primal, gap / (1.0 + cost)
@@ -113,7 +113,7 @@ class ActiveSet:
         return INACCURATE if primal <= MAX_VIOLATION_INACCURATE and self.res_dual <= MAX_GAP_INACCURATE else FAILED
 
     def solve(self) -> bool:
-        """Find the places, and make the plan; tell whether they settled, and numbers are finite."""
+        """Find the places, and make the plan; return whether the places have settled and all numbers are finite."""
         self.roll_out()
         self.iterations = 1
         if self._changes[0] == 0.0 or self._settle(MAX_ROLL_OUTS):
@@ -130,10 +130,10 @@ class ActiveSet:
 
     def _settle(self, most: int) -> bool:
         """
-        Change places until a roll-out changes none, after so many at most, and tell whether that gave a plan.
+        Roll out until no place changes, `most` times at most, and return whether that gave a plan.
 
-        All places change at once as long as there are fewer and fewer that
-        do; then the first alone, which cannot go round in circles [Judice1994]_.
+        All places change at once as long as fewer and fewer of them do. After that
+        only the first one changes, which cannot cycle [Judice1994]_.
         """
         fewest, patience = np.inf, MAX_STALLED_ROLL_OUTS
         for _ in range(most - 1):

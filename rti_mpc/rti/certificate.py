@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Certificate of the QP of a sample: how far a plan can be from the optimum, from the problem's own data.
+Certificate of a plan for the QP of a sample: a bound on its cost above the optimum, from the problem's own data.
 
-Nothing of the recursion is used, multipliers of increments and softened bounds
-apart, which may come from any solver: wrong ones make the certificate worse, never
-better. With the gradient of the Lagrangian reduced to the inputs by one adjoint
-sweep, r, convexity bounds the cost of every plan from below, so that a plan costs
-at most
+It uses nothing of the recursion but the multipliers of increments and softened bounds.
+These may come from any solver: wrong ones make the certificate worse, never better. Let
+r be the gradient of the Lagrangian, reduced to the inputs by one adjoint sweep. By
+convexity it bounds the cost of every plan from below, so that a plan costs at most
 
 .. math::
 
@@ -14,8 +13,8 @@ at most
     + \sum_j \mu_j \, (\text{distance to its bound})
     + \sum_j \left( p_j(s_j) - \mu_j s_j - \min_{s \ge 0} (p_j(s) - \mu_j s) \right)
 
-more than the optimum: the duality gap. p is the penalty on a slack. Multipliers of
-bounds on inputs are r where it pushes against them, and need not be known.
+more than the optimum: the duality gap, where p is the penalty on a slack. The
+multipliers of bounds on inputs follow from r, and need not be known.
 """
 
 from __future__ import annotations
@@ -34,10 +33,10 @@ def certificate(ocp: Ocp) -> ca.Function:
     """
     Build ``(x, u, u_prev, x0, stages, x_plan, u_plan, multipliers, *WEIGHTS, scale) -> (r, primal, gap, cost)``.
 
-    `multipliers` are those of increments, shape ``(nu, N_u)``, and of what has softened bounds, shape ``(ng, N)``, positive at an upper bound, one
-    after the other. `r` is the gradient of the Lagrangian reduced to the inputs, shape ``(nu, N_u)``, those of bounds on inputs left out; `primal`
-    the largest violation of dynamics, bounds and increments relative to their scales; `gap` a bound on the cost above the optimum, and `cost` that of
-    the plan, penalties included, both normalised.
+    `multipliers` holds those of increments, shape ``(nu, N_u)``, and then those of softened bounds, shape ``(ng, N)``; positive at an upper bound.
+    `r` is the gradient of the Lagrangian reduced to the inputs, shape ``(nu, N_u)``, without the multipliers of bounds on inputs. `primal` is the
+    largest violation of dynamics, bounds and increments relative to their scales. `gap` is a bound on the cost above the optimum, and `cost` the
+    cost of the plan, penalties included, both normalised.
     """
     lin = Linearization(ocp)
     N, N_u, nx, nu, ng = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu, len(ocp.lg)
@@ -96,7 +95,7 @@ def node(ocp: Ocp, lin: Linearization) -> ca.Function:
                 beyond = sign * value[j] - bound
                 s = ca.fmax(0, beyond)
                 penalty = (zg[j] * s + Zg[j] * s**2 / 2) / 2
-                most = (zg[j] + Zg[j] * s) / 2  # what the slack pays for: no multiplier is larger
+                most = (zg[j] + Zg[j] * s) / 2  # slope of the penalty at this slack: no multiplier is larger
                 multiplier = ca.fmax(0, ca.fmin(sign * mu[j], most))
                 gap += penalty - multiplier * beyond + ca.fmax(0, multiplier - zg[j] / 2) ** 2 / ca.fmax(Zg[j], SMALLEST_DIVISOR)
                 cost += penalty

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-The linear-quadratic approximation of the OCP at a guess, stage by stage: what both formulations are made of.
+Linear-quadratic approximation of the OCP at a guess, stage by stage: the data of every formulation.
 
 At a guess :math:`(x, u)`, in the deviations
 :math:`\Delta x_k = x_k^+ - x_k`, :math:`\Delta u_k = u_k^+ - u_k`, the
@@ -10,15 +10,15 @@ dynamics and outputs of `rti_mpc.rti.ocp` become
 
     \Delta x_0 &= \bar x_0 - x_0 \\
     \Delta x_{k+1} &= A_k \Delta x_k + B_k \Delta u_k + b_k, \qquad b_k = \phi(x_k, u_k, p_k) - x_{k+1} \\
-    y_i &\approx h(x_i, p_i) + C_i \Delta x_i
+    y_i &\approx y(x_i, p_i) + C_i \Delta x_i
 
-and the cost its Gauss-Newton approximation. It is halved, to read
-:math:`\tfrac12 z^T P z + q^T z` as a QP solver wants it.
+and the cost becomes its Gauss-Newton approximation. It is halved, to have the form
+:math:`\tfrac12 z^T P z + q^T z` of a QP.
 
-Far from the reference the curvature that Gauss-Newton leaves out, residual times
-second derivative, is the larger part, and full steps go to and fro. So steps are
-damped in proportion to the cost at the guess (Levenberg-Marquardt
-[FanYuan2005]_): where the reference is met, not at all; the optimum stays.
+Gauss-Newton neglects a part of the curvature, residual times second derivative. Far from
+the reference this is the larger part, and full steps oscillate. So steps are damped in
+proportion to the cost at the guess (Levenberg-Marquardt [FanYuan2005]_): there is no
+damping where the reference is met, and the optimum stays the same.
 """
 
 from __future__ import annotations
@@ -41,21 +41,21 @@ DAMPING_PER_COST = 0.005  # weight of half the square of a step, in half ranges 
 
 class Forms(NamedTuple):
     """
-    What a structured solver needs of a linearization, as expressions; see `Linearization` for each. Columns are stages or nodes.
+    The part of a linearization that a structured solver needs, as expressions; see `Linearization` for each. Columns are stages or nodes.
 
     Attributes:
         A: Nonzeros of the sensitivities to the state, shape ``(nnz, N)``.
-        B: Those to the input, shape ``(nnz, N)``.
+        B: Nonzeros of the sensitivities to the input, shape ``(nnz, N)``.
         b: Defects, shape ``(nx, N)``.
         H: Nonzeros of the Hessian of half the output cost, shape ``(nnz, N)``.
-        h: Its gradient, shape ``(nx, N)``.
-        force: Gradient of half the cost of the increments in themselves, shape ``(nu, N_u)``.
+        h: Gradient of half the output cost, shape ``(nx, N)``.
+        force: Gradient of half the increment cost in the increments, shape ``(nu, N_u)``.
         increments: Increments, shape ``(nu, N_u)``.
-        g: What has softened bounds, shape ``(ng, N)``.
-        g_x: Nonzeros of its sensitivities to the state, shape ``(nnz, N)``.
-        g_u: Those to the input, shape ``(nnz, N)``.
+        g: Expressions with softened bounds, shape ``(ng, N)``.
+        g_x: Nonzeros of the sensitivities of g to the state, shape ``(nnz, N)``.
+        g_u: Nonzeros of the sensitivities of g to the input, shape ``(nnz, N)``.
         damping: Weight of half the square of a step in each input, shape ``(nu, 1)``.
-        checksum: Finite if and only if all of this is.
+        checksum: A number that is finite if and only if all of this is.
         cost: The cost (4) at the guess.
     """
 
@@ -76,7 +76,7 @@ class Forms(NamedTuple):
 
 class Linearization:
     """
-    Expressions of one sample. Columns are stages or nodes.
+    Expressions of the linearization of one sample. Columns are stages or nodes.
 
     Attributes:
         x: State guess, shape ``(nx, N + 1)``.
@@ -85,28 +85,28 @@ class Linearization:
         y_ref: Reference, shape ``(ny, N)``.
         p: Stage parameters, shape ``(np, N + 1)``.
         w: The weights and bounds, by the names in `WEIGHTS`.
-        scale_x: What states are measured by inside the solvers, shape ``(nx, 1)``; `scale_u`, inputs; `scale_g`, what has softened bounds.
+        scale_x: Scales of the states, see `rti_mpc.rti.scale`, shape ``(nx, 1)``; `scale_u` those of the inputs, `scale_g` those of g.
         A: Sensitivities to the state, nonzeros of `A_k` column by column, shape ``(nnz, N)``.
         B: Sensitivities to the input, nonzeros of `B_k`, shape ``(nnz, N)``.
-        A_k: Pattern of one A, shape ``(nx, nx)``.
-        B_k: Pattern of one B, shape ``(nx, nu)``.
+        A_k: Sparsity of A at one stage, shape ``(nx, nx)``.
+        B_k: Sparsity of B at one stage, shape ``(nx, nu)``.
         b: Defects, shape ``(nx, N)``.
         gradient: Gradient of half the output cost in the states at nodes 1 to N, shape ``(nx, N)``.
-        hessian: Its Gauss-Newton Hessian, nonzeros of `H_i`, shape ``(nnz, N)``.
-        H_i: Pattern of one Hessian, symmetric, shape ``(nx, nx)``.
-        g: What has softened bounds, at nodes 1 to N: states, then general constraints; shape ``(ng, N)``.
-        g_x: Its sensitivities to the state of the node, nonzeros of `G_x`, shape ``(nnz, N)``.
-        g_u: Its sensitivities to the input that led there, nonzeros of `G_u`, shape ``(nnz, N)``.
-        G_x: Pattern of one, shape ``(ng, nx)``.
-        G_u: Pattern of one, shape ``(ng, nu)``.
+        hessian: Gauss-Newton Hessian of half the output cost, nonzeros of `H_i`, shape ``(nnz, N)``.
+        H_i: Sparsity of the Hessian at one node, symmetric, shape ``(nx, nx)``.
+        g: Expressions with softened bounds at nodes 1 to N: states, then general constraints; shape ``(ng, N)``.
+        g_x: Sensitivities of g to the state of the node, nonzeros of `G_x`, shape ``(nnz, N)``.
+        g_u: Sensitivities of g to the input of the stage before the node, nonzeros of `G_u`, shape ``(nnz, N)``.
+        G_x: Sparsity of the sensitivities to the state at one node, shape ``(ng, nx)``.
+        G_u: Sparsity of the sensitivities to the input at one node, shape ``(ng, nu)``.
         lg: Lower bounds on g, shape ``(ng, 1)``; `ug`, upper bounds; `zg` and `Zg`, weights of the slacks.
         increments: ``u_k - u_{k-1}``, shape ``(nu, N_u)``.
         force: ``lambda_k R (u_k - u_{k-1})``, shape ``(nu, N_u)``.
         damping: Weight of half the square of a step in each input, shape ``(nu, 1)``; zero for a linear model.
-        R: The increment weight, sparse.
+        R: Increment weight, sparse, shape ``(nu, nu)``.
         cost: The cost (4) at the guess.
-        checksum: Finite if and only if everything above is.
-        forms: What of these a structured solver needs.
+        checksum: A number that is finite if and only if all of the above is.
+        forms: The part of these that a structured solver needs.
         stages: All forms in one column.
     """
 
@@ -169,21 +169,21 @@ class Linearization:
 
     @property
     def arguments(self) -> dict[str, ca.MX]:
-        """What the data of a sample depends on, by name, in the order of all compiled functions."""
+        """Arguments of all data of a sample, by name, in the order of the compiled functions."""
         return self.sample | self.weights
 
     @property
     def weights(self) -> dict[str, ca.MX]:
-        """What stays from sample to sample: weights and bounds, by the names in `WEIGHTS`, and the scale."""
+        """Arguments that stay from sample to sample: weights and bounds, by the names in `WEIGHTS`, and the scale."""
         return self.w | {"scale": self._scale}
 
     @property
     def sample(self) -> dict[str, ca.MX]:
-        """What changes from sample to sample: all but the weights."""
+        """Arguments that change from sample to sample: all but the weights."""
         return {"x": self.x, "u": self.u, "u_prev": self.u_prev, "y_ref": self.y_ref, "p": self.p}
 
     def forms_in(self, stages: ca.MX) -> Forms:
-        """Return the forms that a column of them holds."""
+        """Return the forms from a column like `stages`."""
         return Forms(*divided(stages, self.forms))
 
     def increment_gradient(self) -> ca.MX:
@@ -220,7 +220,7 @@ def linearize(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
 
 def gauss_newton(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity]:
     r"""
-    Build the terms of :math:`\tfrac12 \|h(x, p) - y_{ref}\|_W^2` at one node.
+    Build the terms of :math:`\tfrac12 \|y(x, p) - y_{ref}\|_W^2` at one node.
 
     Returns:
         ``node(x, p, y_ref, W) -> [gradient in x; twice the term itself; nonzeros of C' W C]``, and the pattern of the last.
@@ -238,7 +238,7 @@ def gauss_newton(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity]:
 
 def constraints(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
     """
-    Linearize what has softened bounds: the bounded states, then the general constraints.
+    Linearize the expressions with softened bounds: the bounded states, then the general constraints.
 
     Returns:
         ``constraint(x, u, p) -> [g; nonzeros of G_x; nonzeros of G_u]``, with their patterns.
@@ -261,7 +261,7 @@ def output_pattern(ocp: Ocp) -> ca.DM:
 
 
 def pattern(weight: np.ndarray[Any, Any]) -> ca.DM:
-    """Return ones where a weight matrix may become nonzero: its diagonal, and what is nonzero now."""
+    """Return ones where a weight matrix may become nonzero: on its diagonal, and where it is nonzero now."""
     return ca.DM(sp.csc_matrix(((weight != 0) | np.eye(len(weight), dtype=bool)).astype(float)))
 
 
@@ -275,12 +275,12 @@ def shift(ocp: Ocp) -> ca.Function:
 
 
 def change(lin: Linearization, u: Any) -> Any:
-    """Return the size of a step from the guess to inputs `u` as an expression: what an input changes by at most, relative to its scale."""
+    """Return the size of a step from the guess to inputs `u` as an expression: the largest change of an input, relative to its scale."""
     return ca.mmax(ca.fabs(u - lin.u) / ca.repmat(lin.scale_u, 1, u.shape[1]))
 
 
 def damping(ocp: Ocp) -> float:
-    """Return the damping of a step of the scale of an input, relative to the cost: none for a linear model, whose full step is exact."""
+    """Return the damping of a step as large as an input's scale, per cost: zero for a linear model, whose full step is exact."""
     model = ocp.model
     variables = ca.vertcat(model.x, model.u)
     first = ca.jacobian(ca.vertcat(model.f_expl_expr, model.y_expr), variables)

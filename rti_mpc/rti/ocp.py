@@ -2,8 +2,9 @@
 r"""
 The optimal control problem of one sample, frozen and validated.
 
-Over stages of `dt` seconds, with :math:`y_i = h(x_i, p_i)`, the previous input
-:math:`u_{-1}`, and inputs held after the control horizon,
+Over stages of `dt` seconds, with the outputs :math:`y_i = y(x_i, p_i)` (`y_expr`), the
+general constraints :math:`h(x, u, p)` (`h_expr`), the previous input :math:`u_{-1}`, and
+inputs held after the control horizon,
 
 .. math::
 
@@ -16,10 +17,10 @@ Over stages of `dt` seconds, with :math:`y_i = h(x_i, p_i)`, the previous input
     & lbx - s_i \le x_i \le ubx + s_i, \quad
       lh - s_i \le h(x_i, u_{i-1}, p_i) \le uh + s_i, \quad s_i \ge 0 .
 
-This is the cost (4) of [Rosales]_ in full, with a terminal weight beside it.
+This is the cost (4) of [Rosales]_ in full, with an additional terminal weight.
 Bounds on states and general constraints, each with its own slacks, are softened
-by an exact penalty, so that no measurement makes the problem infeasible. Names of
-bounds and slack weights are those of acados [Verschueren2022]_.
+by an exact penalty, so that no measurement makes the problem infeasible. Outputs,
+constraints, bounds and slack weights have the names of acados [Verschueren2022]_.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ DEFAULT_SLACK_WEIGHT = 1e3  # L1 weight, in cost per unit of the state, and L2 w
 @dataclass(frozen=True, eq=False, init=False)
 class Ocp:
     r"""
-    An optimal control problem. Everything is checked, and every array owned and read-only.
+    An optimal control problem. All arguments are checked, and all arrays are copies and read-only.
 
     Attributes:
         model: Dynamics and outputs.
@@ -52,27 +53,27 @@ class Ocp:
         N_u: Control horizon, ``1 <= N_u <= N``; `N` by default.
         dt: Duration of a stage, s.
         method: Integrator of a stage, ``"rk4"`` or ``"euler"``.
-        Q: Output weight, shape ``(ny, ny)``, given so or by its diagonal; cost / unit of the outputs squared.
-        R: Increment weight, shape ``(nu, nu)``, given so or by its diagonal; cost / unit of the inputs squared.
-        delta: Penalty sequence on outputs, shape ``(N,)``, given so or as a constant.
-        lambda_: Penalty sequence on increments, shape ``(N_u,)``, given so or as a constant.
+        Q: Output weight, shape ``(ny, ny)``, or given by its diagonal; cost / unit of the outputs squared.
+        R: Increment weight, shape ``(nu, nu)``, or given by its diagonal; cost / unit of the inputs squared.
+        delta: Penalty sequence on outputs, shape ``(N,)``, or given as a constant.
+        lambda_: Penalty sequence on increments, shape ``(N_u,)``, or given as a constant.
         lbu: Lower bound on inputs, shape ``(nu,)``; none by default, as for the following.
         ubu: Upper bound on inputs, shape ``(nu,)``.
         lbdu: Lower bound on the increment of inputs from stage to stage, shape ``(nu,)``.
         ubdu: Upper bound on the increment of inputs, shape ``(nu,)``.
         lbx: Softened lower bound on states at nodes 1 to N, shape ``(nx,)``.
         ubx: Softened upper bound on states, shape ``(nx,)``.
-        z: L1 weight of the slacks, shape ``(nx,)``, given so or as a constant; cost / unit of the state.
-        Z: L2 weight of the slacks, shape ``(nx,)``, given so or as a constant; cost / unit of the state squared.
-        Q_e: Terminal weight beside ``delta_N Q``, shape ``(ny, ny)``, given so or by its diagonal; none by default.
+        z: L1 weight of the slacks, shape ``(nx,)``, or given as a constant; cost / unit of the state.
+        Z: L2 weight of the slacks, shape ``(nx,)``, or given as a constant; cost / unit of the state squared.
+        Q_e: Terminal weight, added to ``delta_N Q``, shape ``(ny, ny)``, or given by its diagonal; none by default.
         h_expr: General constraints h(x, u, p) in the model's symbols, shape ``(nh, 1)``; the model's by default.
-        lh: Softened lower bound on them, shape ``(nh,)``.
-        uh: Softened upper bound on them, shape ``(nh,)``.
-        zh: L1 weight of their slacks, shape ``(nh,)``, given so or as a constant.
-        Zh: L2 weight of their slacks, shape ``(nh,)``, given so or as a constant.
+        lh: Softened lower bound on h, shape ``(nh,)``.
+        uh: Softened upper bound on h, shape ``(nh,)``.
+        zh: L1 weight of the slacks of h, shape ``(nh,)``, or given as a constant.
+        Zh: L2 weight of the slacks of h, shape ``(nh,)``, or given as a constant.
 
     Raises:
-        OcpError: An argument does not fit; the message names it, and what it must be. A rest input that is declared, and not zero, must fit, too.
+        OcpError: An argument does not fit; the message names it, and what it must be. A rest input other than zero must be inside the bounds.
     """
 
     model: Model
@@ -157,7 +158,7 @@ class Ocp:
         return other
 
     def _take(self, values: Mapping[str, ArrayLike]) -> None:
-        """Check and own weights and bounds; for what has no reader yet."""
+        """Check and copy weights and bounds; only for an object that nobody reads yet."""
         sizes = {"nx": self.model.nx, "nu": self.model.nu, "ny": self.model.ny, "nh": self.h_expr.numel(), "N": self.N, "N_u": self.N_u}
         for name, value in values.items():
             check, size = WEIGHTS_AND_BOUNDS[name]
@@ -174,17 +175,17 @@ class Ocp:
 
     @property
     def soft(self) -> tuple[int, ...]:
-        """Indices of the states with a bound, each with one slack a node."""
+        """Indices of the states with a bound, each of which has one slack per node."""
         return tuple(int(j) for j in np.flatnonzero(np.isfinite(self.lbx) | np.isfinite(self.ubx)))
 
     @property
     def lg(self) -> Array:
-        """Lower bounds of everything softened: of the states in `soft`, then of `h_expr`."""
+        """Softened lower bounds: of the states in `soft`, then of `h_expr`; shape ``(ng,)``."""
         return np.concatenate([self.lbx[list(self.soft)], self.lh])
 
     @property
     def ug(self) -> Array:
-        """Upper bounds of everything softened."""
+        """Softened upper bounds, as `lg`."""
         return np.concatenate([self.ubx[list(self.soft)], self.uh])
 
     def phi(self) -> ca.Function:
@@ -198,7 +199,7 @@ def restless(ocp: Ocp) -> str:
     """
     Return why a robot could not be brought to its rest input inside the bounds, empty if it can.
 
-    A problem whose model declares no rest other than zero may leave it out; whoever is to stop a robot may not.
+    A problem whose rest input is zero may exclude it; a controller that must stop a robot may not.
     """
     for signal, rest, *limits in zip(ocp.model.inputs, ocp.model.u_rest, ocp.lbu, ocp.ubu, ocp.lbdu, ocp.ubdu, strict=True):
         lower, upper, falling, rising = map(float, limits)
@@ -210,7 +211,7 @@ def restless(ocp: Ocp) -> str:
 
 
 def weights(name: str, value: ArrayLike, length: int) -> Array:
-    """Return finite weights >= 0 of shape ``(length,)`` from these or a constant."""
+    """Return finite weights >= 0 of shape ``(length,)``, given so or as a constant."""
     array = vector(name, value, length)
     if not np.all(np.isfinite(array)) or np.any(array < 0):
         raise OcpError(f"{name} must be finite and not negative, got {array.tolist()}")
@@ -218,7 +219,7 @@ def weights(name: str, value: ArrayLike, length: int) -> Array:
 
 
 def weight_matrix(name: str, value: ArrayLike, size: int) -> Array:
-    """Return a finite symmetric positive semidefinite matrix from itself or its diagonal."""
+    """Return a finite symmetric positive semidefinite matrix, given so or by its diagonal."""
     array = np.array(value, dtype=np.float64)
     if array.shape == (size,):
         array = np.diag(array)
@@ -234,7 +235,7 @@ def weight_matrix(name: str, value: ArrayLike, size: int) -> Array:
 
 
 def bound(name: str, value: ArrayLike, length: int) -> Array:
-    """Return bounds of shape ``(length,)`` from these or a constant; infinite where there is none."""
+    """Return bounds of shape ``(length,)``, given so or as a constant; infinite where there is none."""
     array = vector(name, value, length)
     if np.any(np.isnan(array)):
         raise OcpError(f"{name} must not be NaN, got {array.tolist()}")
@@ -242,7 +243,7 @@ def bound(name: str, value: ArrayLike, length: int) -> Array:
 
 
 def vector(name: str, value: ArrayLike, length: int) -> Array:
-    """Return an owned array of shape ``(length,)`` from one or from a constant."""
+    """Return a copy of shape ``(length,)`` of an array or a constant."""
     array = np.array(value, dtype=np.float64)
     if array.shape not in ((), (length,)):
         raise OcpError(f"{name} must be a number or have shape ({length},), got shape {array.shape}")

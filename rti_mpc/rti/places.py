@@ -2,12 +2,13 @@
 r"""
 Functions of the active-set method: bounds enter the Riccati recursion by the *place* of what they bound.
 
-At a bound it is held by a penalty too stiff to give way noticeably; beyond a
-softened one it pays for it; elsewhere it is free. Rolled out from the initial
-state, whatever crosses a bound is placed there, and a bound whose multiplier has
-changed its sign is released: a primal-dual active set method [Hintermueller2003]_.
-A roll-out that changes no place is the solution, up to what the penalty gives way;
-a refinement, one sweep over vectors with the gains as they are, takes that away.
+A value at its bound is held there by a penalty too stiff to yield noticeably; a value
+beyond a softened bound pays the penalty of its slack; any other value is free. In a
+roll-out from the initial state, a value that crosses a bound is placed at it, and a
+bound whose multiplier has changed its sign is released: a primal-dual active-set method
+[Hintermueller2003]_. A roll-out that changes no place is the solution, up to the small
+amount by which the penalty yields; a refinement, one sweep over vectors with the same
+gains, removes that.
 """
 
 from __future__ import annotations
@@ -33,22 +34,22 @@ class Places:
     """
     The functions of the two phases.
 
-    The places are 0 for what is free, -1 and 1 at the lower and the upper bound, -2 and 2 beyond a softened one: of inputs and of increments, shapes
-    ``(nu, N_u)``, and of what has softened bounds, shape ``(ng, N)``, one after the other. Multipliers, of increments and of what has softened
+    A place is 0 for a free value, -1 or 1 at the lower or upper bound, -2 or 2 beyond a softened bound. There are places of inputs and of increments,
+    shapes ``(nu, N_u)``, and of expressions with softened bounds, shape ``(ng, N)``, one after the other. Multipliers, of increments and of softened
     bounds, are positive at an upper bound.
 
     Attributes:
         linearize: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale) -> stages``.
-        advance: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale, places) -> (x_next, u_next, places_next, stages)``: the same of a plan moved on by one
-            stage.
-        gains: ``(stages, u, *WEIGHTS, scale, places, stiff) -> gains``; `stiff` is the weight of the penalty that holds what is at its bound, for
-            what is measured by its scale.
+        advance: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale, places) -> (x_next, u_next, places_next, stages)``: the same at the plan shifted by
+            one stage.
+        gains: ``(stages, u, *WEIGHTS, scale, places, stiff) -> gains``; `stiff` is the weight of the penalty that holds values at their
+            bounds, for values in units of their scale.
         roll_out: ``(x, u, u_prev, x0, stages, gains, *WEIGHTS, scale, places, stiff) -> (x_plan, u_plan, violation, change, changes, places_found,
-            multipliers)``: the full step, by how much it exceeds softened bounds, as it is and relative to their scale, its size, and how many
-            places change: -1 if data, gains or plan are not finite.
+            multipliers)``: the plan after the full step, its largest violation of softened bounds, in their unit and relative to their scale,
+            the size of the step, and how many places change: -1 if data, gains or plan are not finite.
         refine: ``(x, u, u_prev, stages, gains, *WEIGHTS, scale, places, stiff, r, x_plan, u_plan, multipliers) -> (x_refined, u_refined,
-            multipliers_refined)``: what a plan and its multipliers become if the gradient r that is left of the Lagrangian, see
-            `rti_mpc.rti.certificate`, is taken away.
+            multipliers_refined)``: plan and multipliers after a Newton step that removes the remaining gradient r of the Lagrangian,
+            see `rti_mpc.rti.certificate`.
     """
 
     linearize: ca.Function
@@ -67,7 +68,7 @@ class Sample(NamedTuple):
         forms: Its linearization.
         gains: Gains of all stages, shape ``(size, N_u)``.
         place: Places of all rows.
-        stiff: Weight of the penalty that holds what is at its bound.
+        stiff: Weight of the penalty that holds values at their bounds.
     """
 
     lin: Linearization
@@ -110,7 +111,7 @@ def places(ocp: Ocp) -> Places:
 
 
 def penalties(ocp: Ocp, at: Sample) -> tuple[Rows, Rows]:
-    """Return weight and pull of each row, by its place."""
+    """Return the weight and the pull of each row, which follow from its place."""
     lin, w, nu, ng = at.lin, at.lin.w, ocp.model.nu, len(ocp.lg)
     place, value, lower, upper, weight = (ca.SX.sym(name, nu) for name in ("place", "value", "lower", "upper", "weight"))
     held = ca.Function("hold", [place, value, lower, upper, weight], [*hold(place, value, lower, upper, weight)]).map(ocp.N_u)
@@ -138,7 +139,7 @@ def hold(place: ca.SX, value: ca.SX, lower: ca.SX, upper: ca.SX, weight: ca.SX) 
 
 
 def roll_out(ocp: Ocp, at: Sample, x0: ca.MX) -> dict[str, ca.MX]:
-    """Return what a roll-out returns, by name."""
+    """Return the outputs of `Places.roll_out`, by name."""
     lin, forms, w, N_u = at.lin, at.forms, at.lin.w, ocp.N_u
     free, held = roll_free(ocp, lin), roll_held(ocp, lin)
     x_k = columns(lin.x)
@@ -162,7 +163,7 @@ def roll_out(ocp: Ocp, at: Sample, x0: ca.MX) -> dict[str, ca.MX]:
         return ca.MX(ca.horzcat(*(after[name] for after in rolled[:count])))
 
     x_plan, u_plan = ca.horzcat(*states), along("u_plan", N_u)
-    finite = forms.checksum + ca.sum1(ca.vec(u_plan)) + ca.sumsqr(x_plan) ** 2  # overflows for what is no state
+    finite = forms.checksum + ca.sum1(ca.vec(u_plan)) + ca.sumsqr(x_plan) ** 2  # overflows if a state is too large
     return {
         "x_plan": x_plan,
         "u_plan": u_plan,
@@ -176,12 +177,12 @@ def roll_out(ocp: Ocp, at: Sample, x0: ca.MX) -> dict[str, ca.MX]:
 
 class Softened(NamedTuple):
     """
-    A stage of the roll-out as far as it is the same with an input and without.
+    The part of a stage of the roll-out that free and held stages share.
 
     Attributes:
-        symbols: What it depends on, by name.
-        outputs: What it returns, by name, but for the verdict.
-        verdict: How many places have changed so far, by how much a softened bound is exceeded at most, and by what share of its scale.
+        symbols: Symbols that it depends on, by name.
+        outputs: Expressions that it returns, by name, without the verdict.
+        verdict: Number of places changed so far, largest violation of a softened bound, and the same relative to its scale.
     """
 
     symbols: dict[str, ca.SX]
@@ -191,15 +192,15 @@ class Softened(NamedTuple):
 
 def softened_rows(ocp: Ocp, of: Stage, s: ca.SX, slip: ca.SX, du: ca.SX, slipped: ca.SX) -> Softened:
     """
-    Return the end of a stage, and the places of what has softened bounds there.
+    Return the end of a stage, and the places of the expressions with softened bounds there.
 
     Args:
         ocp: The problem.
         of: Symbols of the stage.
-        s: Symbol of the deviation that it begins with, shape ``(nx + nu,)``.
-        slip: Symbol of what meeting bounds to the last bit has changed of s so far.
+        s: Symbol of the deviation at the start of the stage, shape ``(nx + nu,)``.
+        slip: Symbol of the change of s so far that comes from clipping inputs exactly to their bounds.
         du: Deviation of its input.
-        slipped: By how much the input that meets its bounds differs from that.
+        slipped: Difference between the clipped input and the input with that deviation.
     """
     nx = of.nx
     x_next, verdict = ca.SX.sym("x_next", nx), ca.SX.sym("verdict", 3)
@@ -246,7 +247,7 @@ def roll_free(ocp: Ocp, lin: Linearization) -> ca.Function:
     names = ("increment", "u", "before", "place_u", "place_du", "lbu", "ubu", "lbdu", "ubdu", "stiff_u", "scale_u")
     increment, u, before, place_u, place_du, lbu, ubu, lbdu, ubdu, stiff, scale = own = [ca.SX.sym(name, nu) for name in names]
     du = -(gain.K @ s + gain.kappa)
-    # By so little the penalty gives way. States are to know what the actuator will do, places are not: degenerate ones would go in circles.
+    # Clipping removes the small amount by which the penalty yields. States follow the clipped input, places do not: degenerate ones would cycle.
     u_plan = met(u + du, before, lbu, ubu, lbdu, ubdu)
     symbols, outputs, verdict = softened_rows(ocp, of, s, slip, du, u_plan - u - du)
 
@@ -265,19 +266,19 @@ def roll_free(ocp: Ocp, lin: Linearization) -> ca.Function:
 
 
 def met(u: ca.SX, before: ca.SX, lbu: ca.SX, ubu: ca.SX, lbdu: ca.SX, ubdu: ca.SX) -> ca.SX:
-    """Return an input that meets its bounds to the last bit, as an actuator wants it."""
+    """Return an input clipped exactly to its bounds, as an actuator needs it."""
     paced = ca.fmax(ca.fmin(u, before + ubdu), before + lbdu)
     return ca.fmax(ca.fmin(paced, ubu), lbu)
 
 
 def exceeded(value: ca.SX, lower: ca.SX, upper: ca.SX, lb: float, ub: float) -> tuple[ca.SX, ca.SX]:
-    """Return by how much a value is over its upper and under its lower bound, far from it where there is none."""
+    """Return by how much a value is above its upper and below its lower bound; minus `INFINITY` where there is no bound."""
     absent = ca.SX(-INFINITY)
     return value - upper if np.isfinite(ub) else absent, lower - value if np.isfinite(lb) else absent
 
 
 def belongs(place: ca.SX, stiff: ca.SX, scale: ca.SX, over: ca.SX, under: ca.SX, most: ca.SX | float) -> ca.SX:
-    """Return where something belongs that exceeds its bounds by so much; `most` is the pull that brings it beyond, if they are softened."""
+    """Return the new place of a value that exceeds its bounds by `over` and `under`; a pull above `most` places it beyond a softened bound."""
     tolerance = BOUND_TOLERANCE * scale
     side = ca.sign(place)
     by = ca.if_else(place > 0, over, under)
@@ -288,7 +289,7 @@ def belongs(place: ca.SX, stiff: ca.SX, scale: ca.SX, over: ca.SX, under: ca.SX,
 
 
 def refine(ocp: Ocp, recursion: Riccati, at: Sample, *, r: ca.MX, x_plan: ca.MX, u_plan: ca.MX, multipliers: ca.MX) -> dict[str, ca.MX]:
-    """Return what a refinement returns: one Newton step on the optimality conditions, softened rows that are held brought to their bounds."""
+    """Return the outputs of `Places.refine`, by name: a Newton step on the optimality conditions that brings held softened rows to their bounds."""
     lin, forms, place, stiff = at.lin, at.forms, at.place, at.stiff
     N, N_u, nu, w = ocp.N, ocp.N_u, ocp.model.nu, lin.w
     of_increments, of_softened = divided(multipliers, [lin.u, lin.g])
@@ -324,7 +325,7 @@ def refine(ocp: Ocp, recursion: Riccati, at: Sample, *, r: ca.MX, x_plan: ca.MX,
 
 
 def follow_function(lin: Linearization) -> ca.Function:
-    """Return ``(A, B, dx, du) -> dx`` at the end of a stage: what states become of inputs as they were clipped."""
+    """Return ``(A, B, dx, du) -> dx`` at the end of a stage: the change of states that clipped inputs cause."""
     a, b = ca.SX.sym("a", lin.A_k.nnz()), ca.SX.sym("b", lin.B_k.nnz())
     dx, du = ca.SX.sym("dx", lin.A_k.size1()), ca.SX.sym("du", lin.B_k.size2())
     return ca.Function("follow", [a, b, dx, du], [ca.densify(ca.SX(lin.A_k, a) @ dx + ca.SX(lin.B_k, b) @ du)])

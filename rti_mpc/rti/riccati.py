@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Riccati recursion for the QP of a sample, its bounds as quadratic terms: what the active set and the interior point are made of.
+Riccati recursion for the QP of a sample, with bounds as quadratic terms.
 
 The increments couple an input to the one before, so the recursion is in
 :math:`s_k = (\Delta x_k, \Delta u_{k-1})`. From the cost-to-go
-:math:`\tfrac12 s^T P s + p^T s` behind stage k follow the terms of its input,
+:math:`\tfrac12 s^T P s + p^T s` after stage k follow the terms of its input,
 
 .. math::
 
     \tfrac12 \Delta u_k^T Q_{uu} \Delta u_k + \Delta u_k^T (Q_{us} s_k + q_u) ,
 
-and from these the gains. Each bounded *row* d, an input, an increment or what has
-softened bounds, adds :math:`\tfrac12 W d^2 + v d` in its deviation from the guess;
-weight W and pull v are the solver's. With the gains known, other pulls cost a sweep
-over vectors alone.
+and from these the gains. Each bounded *row*, an input, an increment or an expression
+with softened bounds, adds :math:`\tfrac12 W d^2 + v d` in its deviation d from the guess;
+the solver chooses the weight W and the pull v. Once the gains are known, other pulls
+cost only a sweep over vectors.
 
-Stages are functions of their own, called by name: *free* ones, whose input is a
-variable, and those after the control horizon, where the input before is *held*.
+Stages are separate functions: *free* ones, whose input is a variable, and those after
+the control horizon, where the input before is *held*.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ Columns = list[ca.MX]  # one expression per stage
 @dataclass(frozen=True, eq=False)
 class Rows:
     """
-    A number for each bounded row.
+    One number for each bounded row.
 
     Attributes:
-        u: Of the inputs, shape ``(nu, N_u)``.
-        du: Of the increments, shape ``(nu, N_u)``.
-        g: Of what has softened bounds, shape ``(ng, N)``.
+        u: Numbers of the inputs, shape ``(nu, N_u)``.
+        du: Numbers of the increments, shape ``(nu, N_u)``.
+        g: Numbers of the expressions with softened bounds, shape ``(ng, N)``.
     """
 
     u: ca.MX
@@ -50,7 +50,7 @@ class Rows:
 
 
 def columns(matrix: ca.MX) -> Columns:
-    """Return a matrix column by column, one without rows as well."""
+    """Return the columns of a matrix, which may have no rows."""
     return list(ca.horzsplit(matrix)) if matrix.size1() else [ca.MX(0, 1)] * matrix.size2()
 
 
@@ -79,7 +79,7 @@ class Riccati:
         self._forward_free, self._forward_held = forward_free(ocp, lin), forward_held(ocp, lin)
 
     def gains(self, forms: Forms, weight: Rows, pull: Rows) -> ca.MX:
-        """Return the gains of all stages with an input, one a column, shape ``(size, N_u)``."""
+        """Return the gains of all free stages, one column per stage, shape ``(size, N_u)``."""
         n = self._n
         stages = stagewise(A=forms.A, B=forms.B, b=forms.b, H=forms.H, h=forms.h, g_x=forms.g_x, g_u=forms.g_u, weight_g=weight.g, pull_g=pull.g)
         inputs = stagewise(force=forms.force, weight_u=weight.u, pull_u=pull.u, weight_du=weight.du, pull_du=pull.du)
@@ -97,7 +97,7 @@ class Riccati:
         return ca.horzcat(*reversed(found))
 
     def corrected(self, forms: Forms, gains: ca.MX, pull: Rows) -> ca.MX:
-        """Return gains whose kappa is that of pulls alone: rolled out from s = 0 without defects they make the change that these pulls make."""
+        """Return gains whose kappa comes from pulls only: rolled out from s = 0 without defects, they give the change that these pulls cause."""
         stages = stagewise(A=forms.A, B=forms.B, g_x=forms.g_x, g_u=forms.g_u, pull_g=pull.g)
         inputs = stagewise(gain=gains, pull_u=pull.u, pull_du=pull.du)
         p = ca.MX.zeros(self._n)
@@ -175,7 +175,7 @@ class Gain:
 
 
 class Behind(NamedTuple):
-    """Cost-to-go of a stage in its state and its input, before that is eliminated, and the symbols it depends on."""
+    """Cost-to-go of a stage in its state and its input, before the input is eliminated, and the symbols it depends on."""
 
     Qxx: ca.SX
     Qux: ca.SX
@@ -186,7 +186,7 @@ class Behind(NamedTuple):
 
 
 def behind(of: Stage) -> Behind:
-    """Return the cost-to-go of a stage from that behind it."""
+    """Return the cost-to-go of a stage from that of the next stage."""
     nx, upper = of.nx, ca.Sparsity.upper(of.n)
     P_nz, p = ca.SX.sym("P", upper.nnz()), ca.SX.sym("p", of.n)
     weight, pull = ca.SX.sym("weight_g", of.ng), ca.SX.sym("pull_g", of.ng)
@@ -226,7 +226,7 @@ def backward_free(ocp: Ocp, lin: Linearization) -> ca.Function:
     Qus = ca.horzcat(Qux, -R)
     L = cholesky(Quu)
     gain = cholesky_solve(L, ca.horzcat(Qus, qu))
-    # The cost with du = -K s - kappa in it.
+    # The cost with du = -K s - kappa inserted.
     P_before = ca.diagcat(Qxx, R) - Qus.T @ gain[:, :n]
     p_before = ca.vertcat(qx, -force) - Qus.T @ gain[:, n]
     found = ca.vertcat(ca.vec(ca.densify(gain)), nonzeros(L))

@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The real-time iteration: one Newton-type step of the OCP a sample, in two phases.
+The real-time iteration: one Newton-type step of the OCP per sample, in two phases.
 
 Preparation needs no state: it shifts the guess, linearizes there and prepares the
 solver, factorization included. Feedback embeds the initial state, solves and takes
 the full step. Only feedback is on the path from sensor to actuator
-[Diehl2005]_ [Gros2020]_. Where that step is large, one linearization was not
-enough: feedback then iterates, a few times at most. One iteration at most is the
-plain scheme; many, and a small tolerance, are sequential quadratic programming.
+[Diehl2005]_ [Gros2020]_. If that step is large, one linearization was not enough, and
+feedback iterates a few times at most. With at most one iteration this is the plain
+scheme; with many, and a small tolerance, it is sequential quadratic programming.
 
-Nearly always the QP is solved by `ActiveSet`; a QP solver is there for when that
-finds no way. Softened bounds rarely act: the QP without them is solved first; a
-plan that keeps them all the same is the solution of the whole QP too. If it does
-not, the whole QP is solved, and is the one prepared until its plan has left them.
+`ActiveSet` solves nearly every QP; a QP solver takes over when it fails. Softened bounds
+rarely act, so the QP solver first solves the QP without them. A plan that keeps them
+anyway also solves the whole QP. Otherwise the whole QP is solved, and is the one that is
+prepared until its plan has left the softened bounds.
 """
 
 from __future__ import annotations
@@ -55,34 +55,34 @@ class Rti:
     """
     Real-time iteration on a fixed OCP.
 
-    Between samples it remembers the guess, the previous input, and what its
-    solvers start from; nothing else.
+    Between samples it remembers the guess, the previous input, and the starting points
+    of its solvers; nothing else.
 
     Attributes:
         ocp: The problem.
         formulation: ``"simultaneous"`` or ``"sequential"``.
-        iterations: QPs a sample, at most: 1 is the plain real-time iteration, many with a small tolerance converged SQP.
-        tolerance: Change of the inputs by one iteration, relative to their scale, half their range, from which on another follows.
+        iterations: QPs per sample at most: 1 is the plain real-time iteration, many with a small tolerance are converged SQP.
+        tolerance: Change of the inputs, relative to their scale, half their range: an iteration with a larger change is followed by another.
         taken: Iterations of the last feedback.
-        x: States of the plan, shape ``(N + 1, nx)``: of the last feedback, and the next guess.
+        x: States of the plan of the last feedback, shape ``(N + 1, nx)``; the next guess is made of them.
         u: Inputs of the plan, shape ``(N_u, nu)``. Row 0 is the command.
-        u_prev: Input before the plan, shape ``(nu,)``: what increments are counted from.
+        u_prev: Input before the plan, shape ``(nu,)``, from which the first increment is counted.
         y_ref: Reference rows of the current sample, shape ``(N, ny)``.
         p: Stage parameters of the current sample, shape ``(N + 1, np)``.
         x0: Initial state of the current sample, shape ``(nx,)``, its angles in the turn of the plan.
-        scale: What states, inputs and softened bounds are measured by inside, see `rti_mpc.rti.scale`; shape ``(nx + nu + ng,)``.
-        cost_scale: What costs are multiplied by inside.
-        guess: Where the current sample is linearized, and what the solvers read and write.
-        active_set: What is tried first; None if the solver is another.
+        scale: Scales of states, inputs and softened bounds inside the solvers, see `rti_mpc.rti.scale`; shape ``(nx + nu + ng,)``.
+        cost_scale: Factor of the cost inside the solvers.
+        guess: Arrays of the guess at which the current sample is linearized, which the solvers read and write.
+        active_set: The solver that is tried first; None if another one was asked for.
         solvers: The QP solvers, each with its QP: without softened bounds and, if there are any, with them.
-        solver: What solved the current sample, or is about to.
+        solver: The solver that solved the current sample, or that is prepared for it.
         status: Outcome of the last feedback.
-        advance: Native call: moves the plan on by one stage, to be the guess.
-        evaluate: Native call: the cost of the plan.
+        advance: Compiled call that shifts the plan by one stage into the guess.
+        evaluate: Compiled call that computes the cost of the plan.
 
     Args:
         ocp: The problem.
-        settings: OSQP's, as a solver or as what is there for when `riccati` finds no way.
+        settings: Settings of OSQP, as the solver or as the one that takes over from `riccati`.
         formulation: ``"simultaneous"``, ``"sequential"``, or ``"auto"`` for the faster one.
         solver: ``"riccati"``, ``"osqp"``, or another one's name in qpsolvers.
         compile: Whether to compile the model.
@@ -111,11 +111,11 @@ class Rti:
         self.ocp = ocp
         self.formulation = formulation_of(ocp, formulation)
         self.iterations, self.tolerance, self.taken = iterations, tolerance, 0
-        # A step leads from a guess to a plan; the next guess is that plan, moved on by a stage. No memory is both.
+        # A step leads from a guess to a plan; the next guess is that plan, shifted by one stage. The two never share memory.
         self.x: Array = np.zeros((N + 1, model.nx))
         self.u: Array = np.zeros((N_u, model.nu))
         x, u = np.zeros_like(self.x), np.zeros_like(self.u)
-        # Moved through views of bytes laid out before: numpy decides anew each time how to copy, which takes longer than to do it.
+        # Copied through memory views that are made once: numpy decides at each copy how to do it, which takes longer than the copy.
         self._pairs = tuple((guess.reshape(-1).data, plan.reshape(-1).data) for guess, plan in ((x, self.x), (u, self.u)))
         self.u_prev: Array = np.array(model.u_rest, dtype=np.float64)
         self.y_ref: Array = np.zeros((N, model.ny))
@@ -127,7 +127,7 @@ class Rti:
         self._violation: Array = np.zeros(2)  # of softened bounds, as it is and relative to their scales
         change: Array = np.zeros(1)
         self._change = change.data
-        # OSQP has its own infinity, and reads no other.
+        # OSQP knows no infinity but its own.
         self._weights = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS}
         self.scale: Array = np.ones(model.nx + model.nu + len(ocp.lg))
         self.guess = Guess(
@@ -160,7 +160,7 @@ class Rti:
         self.reset(np.zeros(model.nx), np.array(model.u_rest))
 
     def _normalise(self, qps: Sequence[Qp]) -> None:
-        """Find what variables are measured by, and normalise the cost, so that one step size of ADMM, and one tolerance, fit every problem."""
+        """Compute the scales of the variables, and normalise the cost, so that one step size of ADMM and one tolerance fit every problem."""
         self._roll_out()
         qps[0].fill()
         if not qps[0].sound:
@@ -179,7 +179,7 @@ class Rti:
         return self._backup.qp if isinstance(self.solver, ActiveSet) else self.solver.qp
 
     def reset(self, x0: Array, u_prev: Array) -> None:
-        """Start cold: the guess stays at one state and one input, and no earlier solution seeds the next."""
+        """Start cold: the guess is one state and one input at all stages, and no solver starts from an earlier solution."""
         self.u_prev[:] = u_prev
         self.u[:] = np.clip(u_prev, self.ocp.lbu, self.ocp.ubu)
         self.x[:] = x0
@@ -195,7 +195,7 @@ class Rti:
             self.active_set.forget()
 
     def use_whole_qp(self) -> None:
-        """Let the QP solver, where it is asked next, solve the QP with its softened bounds."""
+        """Let the QP solver, if it is needed next, solve the QP with its softened bounds."""
         self._backup, self._loaded = self.solvers[-1], False
 
     def retune(self, values: Mapping[str, Array]) -> None:
@@ -203,7 +203,7 @@ class Rti:
         Take other weights and bounds from the next `prepare` on; `ocp` keeps those it was built with.
 
         Args:
-            values: By the names in `WEIGHTS`, shapes as in `Ocp`. Finite where the problem's are: which bounds there are is compiled in.
+            values: Weights and bounds by the names in `WEIGHTS`, shapes as in `Ocp`. The same bounds must be finite: which are is compiled in.
         """
         for name, value in values.items():
             self._weights[name][:] = np.clip(value, -INFINITY, INFINITY)
@@ -218,9 +218,9 @@ class Rti:
 
         Args:
             y_ref: Reference at nodes 1 to N, shape ``(N, ny)``; angles may wrap.
-            p: Stage parameters at nodes 0 to N, shape ``(N + 1, np)``; those of the last sample if none are given.
-            shift: Whether time goes on. Without, the same sample is iterated on.
-            u_prev: Input that acts before the plan, shape ``(nu,)``, where it is not the first input of the last plan.
+            p: Stage parameters at nodes 0 to N, shape ``(N + 1, np)``; None for those of the last sample.
+            shift: Whether to shift to the next sample; False iterates on the same one.
+            u_prev: Input that acts before the plan, shape ``(nu,)``, if it is not the first input of the last plan.
 
         Raises:
             ShapeError: A shape does not fit.
@@ -249,7 +249,7 @@ class Rti:
             self.active_set.gain()
         else:
             self.advance()
-        if self.solver is not self.active_set:  # so that a sample like the last is prepared in full
+        if self.solver is not self.active_set:  # if the QP solver was needed last, it is prepared as well
             self._load()
 
     def _relinearize(self) -> None:
@@ -273,14 +273,14 @@ class Rti:
         self._loaded = True
 
     def keep_guess(self) -> None:
-        """Let the guess be the plan: for want of a better one."""
+        """Take the guess as the plan, because there is no better one."""
         for guess, plan in self._pairs:
             plan[:] = guess
         if self.active_set is not None:
             self.active_set.keep()
 
     def _roll_out(self) -> None:
-        """Make a guess in motion, half way to the upper bounds of the inputs, on its reference: there the problem shows its scale, undamped."""
+        """Make a guess in motion, with inputs half way to their upper bounds, that is its own reference: scales are computed there, undamped."""
         ubu = self.ocp.ubu
         self.u[:] = np.where(np.isfinite(ubu), 0.5 * (np.clip(ubu, -INFINITY, INFINITY) + self.u_prev), self.u_prev)
         self.x[:] = 0.0
@@ -290,7 +290,7 @@ class Rti:
         self.y_ref[:] = np.array(self.ocp.model.h().map(self.ocp.N)(self.x[1:].T, self.p[1:].T)).T
 
     def shift(self) -> None:
-        """Move the plan on by one stage: its first input becomes the previous one, its last is repeated, with the state the model predicts."""
+        """Shift the plan by one stage: its first input becomes the previous one, its last is repeated, with the state that the model predicts."""
         if self._pending:
             self.keep_guess()
         self.u_prev[...] = self.u[0]
@@ -302,13 +302,13 @@ class Rti:
 
     def feedback(self, x0: Array) -> QpStatus:
         """
-        Embed the initial state, solve the QP and take the full step; iterate while that was large.
+        Embed the initial state, solve the QP and take the full step; iterate while the step is large.
 
-        A status that is not `usable` leaves the guess for a plan, and the next
-        solve starts cold: a failure never seeds what follows.
+        If the status is not `usable`, the plan is the guess, and the next solve starts
+        cold: no solve starts from a failed one.
 
         Args:
-            x0: State at node 0, shape ``(nx,)``; angles may wrap: those of the plan continue the last one's.
+            x0: State at node 0, shape ``(nx,)``; angles may wrap, those of the plan continue the last plan's.
         """
         self.x0[...] = x0
         self._pending = False
@@ -323,7 +323,7 @@ class Rti:
         return self.status
 
     def _certified(self, active_set: ActiveSet) -> QpStatus:
-        """Judge the plan of the last QP; one that is neither certified nor nearly so leaves the plan of the iteration before, or the guess."""
+        """Certify the plan of the last QP; if that fails, the plan is the guess at which the QP was linearized."""
         if self.solver is not active_set:
             return INACCURATE  # a plan of the QP solver, to its tolerance
         status = active_set.certified()
@@ -333,7 +333,7 @@ class Rti:
         return status
 
     def solve(self) -> QpStatus:
-        """Solve the QP, whoever can, and make the plan; without one, the guess stays."""
+        """Solve the QP by the first solver that can, and make the plan; if none can, the plan is the guess."""
         active_set = self.active_set
         if active_set is not None and active_set.solve():
             self.solver = active_set
@@ -348,7 +348,7 @@ class Rti:
         while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
             self._relinearize()
             if not (status := self.solve()).usable:
-                self.status = INACCURATE  # the plan is that of a QP before the last, which nobody can certify any more
+                self.status = INACCURATE  # the plan comes from an earlier QP, which cannot be certified any more
                 break
             self.status = status
             self.taken += 1
@@ -356,7 +356,7 @@ class Rti:
     def solve_qp(self) -> QpStatus:
         """Solve with the QP solver."""
         self.solver = self._backup
-        if not (np.abs(self.x0) < INFINITY).all():  # nor NaN
+        if not (np.abs(self.x0) < INFINITY).all():  # false for NaN, too
             return QpStatus.FAILED
         violation = self._violation
         if not self._loaded:
@@ -368,7 +368,7 @@ class Rti:
             status = self._backup.solve()
         if status.usable:
             self.evaluate()
-            if not isfinite(self._cost[0]):  # numbers of such a size that they overflowed inside the solver
+            if not isfinite(self._cost[0]):  # numbers so large that they overflowed inside the solver
                 self.solver.cold = True
                 return QpStatus.FAILED
             if violation[1] < -TOUCHING_DISTANCE:
@@ -377,23 +377,28 @@ class Rti:
 
     @property
     def cost(self) -> float:
-        """The cost (4) of the plan, with the penalties for what it exceeds; ask before the next `prepare`, which overwrites what it depends on."""
+        """The cost (4) of the plan, penalties on slacks included; read it before the next `prepare`, which overwrites its arguments."""
         self.evaluate()
         return float(self._cost[0]) / self.cost_scale
 
     @property
     def violation(self) -> float:
-        """By how much the plan exceeds a softened bound at most, in the unit of what is bounded; 0 if it exceeds none."""
+        """Largest amount by which the plan exceeds a softened bound, in the unit of that bound; 0 if it exceeds none."""
         return max(0.0, float(self._violation[0]))
 
     @property
     def touches(self) -> bool:
-        """Whether the last plan is at a softened bound, or beyond it."""
+        """Whether the last plan is at a softened bound or beyond it."""
         return bool(self._violation[1] > -TOUCHING_DISTANCE)
 
 
 def check_options(solver: str, settings: SolverSettings | None, iterations: int, tolerance: float) -> None:
-    """Refuse options of an `Rti` that make no sense; see there."""
+    """
+    Refuse options of an `Rti` that do not fit.
+
+    Raises:
+        OcpError: As `Rti`.
+    """
     if solver not in BUILT_IN_SOLVERS:
         check_name(solver)
         if settings is not None:
@@ -403,7 +408,7 @@ def check_options(solver: str, settings: SolverSettings | None, iterations: int,
 
 
 def formulation_of(ocp: Ocp, formulation: str) -> str:
-    """Return which formulation is meant."""
+    """Return the name of the formulation, ``auto`` replaced by the faster one."""
     if formulation == "auto":
         return "sequential" if ocp.N_u <= MAX_SEQUENTIAL_N_U else "simultaneous"
     if formulation not in FORMULATIONS:
@@ -415,8 +420,8 @@ def natives(transcriptions: Sequence[Transcription], structured: tuple[Places, A
     """
     Return the functions of a problem's solver that are worth compiling.
 
-    A QP solver behind the active set is so rarely asked that its QP is left to the
-    virtual machine: it would double the build.
+    Behind the active set a QP solver is needed so rarely that its QP is left to CasADi's
+    virtual machine: compiling it would double the build time.
     """
     if structured is not None:
         return [*vars(structured[0]).values(), structured[1]]

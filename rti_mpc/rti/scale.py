@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Scale of each variable: what one unit of it is inside the solvers, so that the units of a model mean nothing.
+Scale of each variable: its unit inside the solvers, so that the units of a model do not matter.
 
-An input is measured by half the range between its bounds, by what its increments
-add up to over the control horizon, or by the curvature of the cost. A state is
-measured by half the range between its bounds, or by how far the inputs can move
-it over the horizon, its reach; what has general constraints likewise. Every
-tolerance is a share of these.
+The scale of an input is half the range between its bounds, or the sum of its largest
+increments over the control horizon, or follows from the curvature of the cost. The
+scale of a state is half the range between its bounds, or its reach: how far the inputs
+can move it over the horizon. The same holds for general constraints. Every tolerance is
+relative to these scales.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rti_mpc.rti.ocp import Ocp
 
 def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
     """
-    Return the scales of states, inputs and what has softened bounds, one after the other, shape ``(nx + nu + ng,)``, all positive.
+    Return the scales of states, inputs and softened bounds, one after the other, shape ``(nx + nu + ng,)``, all positive.
 
     Args:
         ocp: The problem.
@@ -35,7 +35,7 @@ def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
     stage, A_k, B_k = linearize(ocp)
     columns = np.array(stage.map(N)(x[:-1].T, held.T, p[:-1].T))[model.nx :]
     A, B = dense(A_k, columns[: A_k.nnz()]), dense(B_k, columns[A_k.nnz() :])
-    response = np.zeros((N + 1, model.nx, model.nu))  # of the states to a step of each input
+    response = np.zeros((N + 1, model.nx, model.nu))  # response of the states to a step of each input
     for k in range(N):
         response[k + 1] = A[k] @ response[k] + B[k]
     response = response[1:]
@@ -65,7 +65,7 @@ def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
 
 
 def shared(reach: Array, units: list[str]) -> Array:
-    """Return the largest reach of all states of the same unit for each: x and y of a position are measured alike, whichever way the robot faces."""
+    """Return for each state the largest reach of all states of its unit: x and y of a position have one scale, whichever way the robot faces."""
     alike = np.array([[a == b and a not in ("", "1") for b in units] for a in units]) | np.eye(len(units), dtype=bool)
     return np.asarray(np.where(alike, reach, 0.0).max(axis=1))
 
@@ -76,7 +76,7 @@ def half(lower: Array, upper: Array) -> Array:
 
 
 def beyond(lower: Array, upper: Array, origin: Array) -> Array:
-    """Return the distance from an origin to the nearest bound that is there."""
+    """Return the distance from an origin to the nearest finite bound."""
     return np.asarray(np.minimum(np.abs(upper - origin), np.abs(lower - origin)))
 
 

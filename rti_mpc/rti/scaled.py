@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The QP as solvers see it: variables and rows measured by their scales, so that tolerances mean the same in any unit.
+The QP in scaled variables and rows, as solvers see it, so that tolerances mean the same in any unit.
 
-A `Qp` keeps the units of the model; this copy of its data is what reaches a solver.
+A `Qp` keeps the units of the model; solvers read this scaled copy of its data.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rti_mpc.rti.qp.transcription import INFINITY
 
 class Scaled(QpData):
     """
-    A scaled copy of one `Qp`, its arrays owned and in place for good.
+    A scaled copy of one `Qp`, in arrays of its own that never move.
 
     Attributes:
         qp: The QP in the units of the model.
@@ -35,17 +35,17 @@ class Scaled(QpData):
         self.vectors()
 
     def matrices(self) -> None:
-        """Take over the matrices."""
+        """Scale the matrices P and A."""
         np.multiply(self.qp.P.data, self._P, out=self.P.data)
         np.multiply(self.qp.A.data, self._A, out=self.A.data)
 
     def vectors(self) -> None:
-        """Take over gradient and bounds."""
+        """Scale the gradient and the bounds."""
         np.multiply(self.qp.q, self._columns, out=self.q)
         np.multiply(self.qp.l, self._lower, out=self.l)
         np.multiply(self.qp.u, self._upper, out=self.u)
 
     def plan(self, z: Array) -> None:
-        """Make the plan of a solution."""
+        """Make the plan from a scaled solution, shape ``(n,)``."""
         np.multiply(z, self._columns, out=self.qp.z)
         self.qp.step()

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-A terminal weight from the linear-quadratic regulator: what the horizon does not see any more, as if it went on for ever.
+Terminal weight from the linear-quadratic regulator: the cost after the horizon, as if it went on for ever.
 
-Around a point of motion the dynamics are :math:`x^+ = A x + B u`, outputs
-:math:`y = C x`. With the previous input as a state, so that increments
-:math:`v` are the inputs,
+Around a point of motion the dynamics are :math:`x^+ = A x + B u`, the outputs
+:math:`y = C x`. With the previous input as a further state, and the increments
+:math:`v` as inputs,
 
 .. math::
 
     \begin{bmatrix} x \\ u \end{bmatrix}^+ =
     \begin{bmatrix} A & B \\ 0 & I \end{bmatrix} \begin{bmatrix} x \\ u \end{bmatrix} + \begin{bmatrix} B \\ I \end{bmatrix} v ,
 
-the cost to go is :math:`\xi^T S \xi`, S from the Riccati equation. A reference
-says nothing of the states that are no outputs: they are taken at their best,
-which leaves the Schur complement of S in the outputs.
+the cost to go is :math:`\xi^T S \xi`, with S from the Riccati equation. A reference
+gives no values for states that are not outputs. The cost is minimised over them, which
+leaves the Schur complement of S in the outputs.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def lqr_weight(ocp: Ocp, x: Array, u: Array) -> Array:
     Return the terminal weight `Q_e` that continues a horizon for ever.
 
     Args:
-        ocp: Its dynamics, `Q`, `R` and the last of `delta` and `lambda_`.
+        ocp: The problem, of which the dynamics, `Q`, `R` and the last of `delta` and `lambda_` are used.
         x: State to linearize at, shape ``(nx,)``; a wheeled robot must be in motion, or it cannot be stabilized.
         u: Input there, shape ``(nu,)``.
 

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Whole turns of angles: which of :math:`\psi + 2 \pi k` is meant.
+Whole turns of angles: the choice of k in :math:`\psi + 2 \pi k`.
 
-Measurements and references wrap, plans do not. One wrong heading may leave the two
-a turn apart, and a robot would then turn once round itself to follow its reference.
-So the state continues the plan, and the error of each angle continues the error of
-the sample before, until it exceeds half a turn by `HYSTERESIS_RAD`: then the nearer
-way round is taken. Noise at half a turn therefore changes the way at most once.
+Measurements and references wrap, plans do not. After one wrong heading plan and
+reference may differ by a whole turn, and the robot would turn once round itself to
+follow its reference. So each angle of the state is taken next to the plan's, and its
+error next to the error of the sample before, until the error exceeds half a turn by
+`HYSTERESIS_RAD`: then the shorter way round is taken. Noise near half a turn therefore
+changes the direction at most once.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class Turns:
         y: Array = np.zeros(model.ny)
         self._x, self._y_ref = x, y_ref
         self._lbx, self._ubx = bounds
-        views: list[Any] = [array.data for array in (x0, x[0], y, y_ref[0])]  # read faster than arrays are
+        views: list[Any] = [array.data for array in (x0, x[0], y, y_ref[0])]  # read faster than arrays
         self._x0, self._guess, self._y, self._y_first = views
         self._output = bind(model.h(), {"x": x0, "p": p[0]}, {"y": y})
         self._states = [j for j, signal in enumerate(model.states) if signal.angle]
@@ -53,24 +54,24 @@ class Turns:
         self._bounded = [j for j in self._states if ocp.ubx[j] - ocp.lbx[j] <= math.tau]
         self._steps = [(y_ref[1:, j], y_ref[:-1, j]) for j in self._outputs]
         self._step: Array = np.zeros(ocp.N - 1)
-        self._added: Array = np.zeros(model.ny)  # to reference rows as they are given
+        self._added: Array = np.zeros(model.ny)  # whole turns added to the rows of the reference as they are given
         self._errors = [0.0] * model.ny
 
     def forget(self) -> None:
-        """Start cold: the nearest way round is taken again."""
+        """Start cold: the next sample takes the shorter way round."""
         self._errors = [0.0] * len(self._errors)
 
     def take_reference(self) -> None:
-        """Unwrap reference rows as they were given, and add the turns of the sample before."""
+        """Unwrap the rows of the reference, and add the turns of the sample before."""
         for j, (later, earlier) in zip(self._outputs, self._steps, strict=True):
             np.subtract(later, earlier, out=self._step)
-            if np.dot(self._step, self._step) >= math.pi**2:  # one of them may be half a turn
+            if np.dot(self._step, self._step) >= math.pi**2:  # one of the steps may exceed half a turn
                 self._y_ref[:, j] = np.unwrap(self._y_ref[:, j])
             if self._added[j]:
                 self._y_ref[:, j] += self._added[j]
 
     def settle(self) -> bool:
-        """Bring a new initial state, the guess and the reference into the same turn; tell whether guess or reference have changed."""
+        """Bring a new initial state, the guess and the reference into the same turn; return whether guess or reference have changed."""
         changed = False
         for j in self._states:
             self._x0[j] -= whole_turns(self._x0[j] - self._guess[j])

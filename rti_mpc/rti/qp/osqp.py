@@ -2,12 +2,11 @@
 """
 One OSQP workspace, held for the life of the controller and updated in place.
 
-OSQP checks nothing of what it is given [Stellato2020]_: a NaN poisons every
-later solve, a short array is read past its end, and an infeasible problem
-fills the solution with a finite number. So only the owned arrays of a `Qp`
-reach it, `Rti` shows it finite numbers only, and a solution is judged by its
-status alone. Its inner object is driven directly: the public one copies and
-builds namespaces at every call, which costs more than the solve.
+OSQP does not check its arguments [Stellato2020]_: a NaN spoils every later solve, a
+short array is read past its end, and an infeasible problem fills the solution with a
+finite number. So it receives only arrays that a `Qp` owns, with finite numbers, and a
+solution is judged by its status only. Its inner object is called directly: the public
+one copies and builds namespaces at every call, which costs more than the solve.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from rti_mpc.contract.status import QpStatus
 from rti_mpc.rti.qp.qp import Qp
 from rti_mpc.rti.scaled import Scaled
 
-# OSQP's codes, https://osqp.org/docs/interfaces/status_values.html, in its version 1.1.
+# Codes of OSQP 1.1, https://osqp.org/docs/interfaces/status_values.html.
 STATUS_BY_OSQP_CODE = {
     1: QpStatus.SOLVED,
     2: QpStatus.INACCURATE,
@@ -44,10 +43,10 @@ class SolverSettings:
 
     Attributes:
         eps: Absolute and relative tolerance on the residuals; ten times tighter changes the closed-loop cost by less than 0.01 %.
-        max_iter: Iterations at most; the iterate is then taken as it is.
-        rho: Step size of ADMM, relative to the one that `rti_mpc.rti.qp.qp.step_size` holds best.
-        check_termination: Iterations between two looks at the residuals.
-        scaling: Sweeps of Ruiz scaling; none by default: they break the symmetry of the problem, and cost a sample more than they save.
+        max_iter: Largest number of iterations; the last iterate is then used as it is.
+        rho: Step size of ADMM, relative to that of `rti_mpc.rti.qp.qp.step_size`.
+        check_termination: Iterations between two checks of the residuals.
+        scaling: Sweeps of Ruiz scaling; none by default, since they break the symmetry of the problem and cost more time than they save.
         alpha: Over-relaxation, between 0 and 2.
     """
 
@@ -65,7 +64,7 @@ class Solver:
 
     Attributes:
         qp: The problem.
-        workspace: OSQP's own, held for good and updated in place.
+        workspace: OSQP's inner object, kept for ever and updated in place.
         cold: Whether the next `load` forgets the last solution.
     """
 
@@ -77,7 +76,7 @@ class Solver:
         self._zero = (np.zeros_like(qp.q), np.zeros_like(qp.l))
         public = osqp.OSQP(algebra="builtin")
         public.setup(
-            scaled.P.copy(),  # OSQP keeps what it is given, and writes into it
+            scaled.P.copy(),  # OSQP keeps its arguments, and writes into them
             scaled.q,
             scaled.A.copy(),
             scaled.l,
@@ -100,7 +99,7 @@ class Solver:
         refused = self.workspace.update_data_mat(P_x=scaled.P.data, P_i=None, A_x=scaled.A.data, A_i=None)
         assert not refused, "OSQP must have kept the patterns it was given"
         self._P_x = scaled.P.data if qp.varies_P else None
-        # The softened rows, the last of all, are weighed by whether they act; OSQP sees what comes of that.
+        # The softened rows, which are the last ones, are scaled by whether they act; OSQP receives the scaled rows.
         self._soft = slice(len(qp.l) - len(qp.watched), None)
         self._active = np.zeros(len(qp.watched), dtype=bool)
         self._scale = np.ones_like(qp.l)
@@ -108,11 +107,11 @@ class Solver:
         self._A_x, self._l, self._u = (array.copy() if weighed else array for array in (scaled.A.data, scaled.l, scaled.u))
 
     def load(self) -> None:
-        """Linearize at the guess, and take over the new matrices, factorization included; off the path from state to command."""
+        """Linearize at the guess, and load the new matrices, factorization included; off the path from state to command."""
         qp, scaled = self.qp, self._scaled
         qp.linearize()
         self._sound = qp.sound
-        if not self._sound:  # or OSQP would never recover
+        if not self._sound:  # OSQP would never recover from such numbers
             return
         scaled.matrices()
         changed = qp.varies_A or self._P_x is not None
@@ -126,17 +125,17 @@ class Solver:
             self.cold = False
 
     def refill(self) -> None:
-        """Take over, with the next `load`, what no sample changes, too: after a change of weights."""
+        """After a change of weights: let the next `load` also update the data that no sample changes."""
         self.qp.fill()
         self._P_x = self._scaled.P.data
 
     def _weigh(self) -> bool:
         """
-        Give softened rows that act the step size of equations, and tell whether anything changed.
+        Give softened rows that act the step size of equations, and return whether anything changed.
 
-        One step size does not fit both: where such a bound acts, its multiplier
-        must travel far; where it does not, it must not hold the solution back.
-        Which act is seen from the last multipliers, a stage earlier.
+        One step size does not fit both: where such a bound acts, its multiplier must
+        become large; where it does not, it must not slow the solution down. The last
+        multipliers, one stage earlier, show which bounds act.
         """
         y = self._solution.y * self._scale
         acts = np.abs(y[self._soft]) > ACTING_MULTIPLIER
@@ -159,7 +158,7 @@ class Solver:
         if self._l is not scaled.l:
             np.multiply(scaled.l, self._scale, out=self._l)
             np.multiply(scaled.u, self._scale, out=self._u)
-        if workspace.update_data_vec(q=scaled.q, l=self._l, u=self._u):  # refused: what it holds is another problem
+        if workspace.update_data_vec(q=scaled.q, l=self._l, u=self._u):  # refused: the workspace then holds another problem
             self.cold = True
             return QpStatus.FAILED
         workspace.solve()
@@ -167,7 +166,7 @@ class Solver:
         if status.usable:
             scaled.plan(self._solution.x)
         else:
-            self.cold = True  # a failed solve never seeds the next
+            self.cold = True  # no solve starts from a failed one
         return status
 
     @property

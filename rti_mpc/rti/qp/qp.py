@@ -2,7 +2,7 @@
 r"""
 One QP, :math:`\min \tfrac12 z^T P z + q^T z` subject to :math:`l \le A z \le u`, in arrays that never move.
 
-Compiled code fills them, the solver reads them, and nothing else is in between.
+Compiled code fills the arrays, and the solver reads them; nothing is copied in between.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 class Step(NamedTuple):
     """
-    What a full step leads to.
+    The plan that a full step leads to.
 
     Attributes:
         x: States, shape ``(N + 1, nx)``.
         u: Inputs, shape ``(N_u, nu)``.
-        violation: By how much softened bounds are exceeded at most, as it is and relative to their scale, shape ``(2,)``.
+        violation: Largest violation of a softened bound, in its unit and relative to its scale, shape ``(2,)``.
         change: Size of the step, see `rti_mpc.rti.linearization.change`, shape ``(1,)``.
     """
 
@@ -40,20 +40,20 @@ class Step(NamedTuple):
     change: Array
 
     def outputs(self) -> dict[str, Array]:
-        """Return these by the names of the functions that make them."""
+        """Return these by their names in the compiled functions."""
         return {"x_plan": self.x, "u_plan": self.u, "violation": self.violation, "change": self.change}
 
 
 @dataclass(frozen=True, eq=False)
 class Guess:
     """
-    Where the QPs of an OCP are made, and what comes out: arrays that all of them share.
+    Arrays that all QPs of an OCP share: the guess at which they are linearized, and the plan.
 
     Attributes:
-        sample: x, u, u_prev, y_ref and p, by these names.
+        sample: Arrays x, u, u_prev, y_ref and p, by these names.
         weights: Weights and bounds, by the names in `rti_mpc.rti.linearization.WEIGHTS`, and the scale.
         x0: State embedded at node 0, shape ``(nx,)``.
-        plan: What the full step from there leads to.
+        plan: The plan that the full step from the guess leads to.
     """
 
     sample: dict[str, Array]
@@ -63,12 +63,12 @@ class Guess:
 
     @property
     def arguments(self) -> dict[str, Array]:
-        """What the data of a sample depends on, by name."""
+        """Arguments of all data of a sample, by name."""
         return self.sample | self.weights
 
     @property
     def start(self) -> dict[str, Array]:
-        """What a step begins with: x, u and u_prev."""
+        """Arguments that a step starts from: x, u and u_prev."""
         return {name: self.sample[name] for name in ("x", "u", "u_prev")}
 
 
@@ -91,17 +91,17 @@ class QpData:
     u: Array
 
     def sides(self) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-        """Return which rows are equations, and which of the others have an upper and a lower bound, each of shape ``(m,)``."""
+        """Return three masks of rows, each of shape ``(m,)``: equations, other rows with an upper bound, other rows with a lower bound."""
         equal = self.l == self.u
         return equal, ~equal & (self.u < INFINITY), ~equal & (self.l > -INFINITY)
 
     def to_problem(self) -> qpsolvers.Problem:
         """
-        Return a copy in the form of qpsolvers, for a second opinion or a dump.
+        Return a copy as a problem of qpsolvers, to solve it independently or to save it.
 
-        Rows with equal bounds become equalities, the others one inequality for each bound that is there.
+        Rows with equal bounds become equalities, the others one inequality for each finite bound.
         """
-        import qpsolvers  # the second opinion is never on the hot path, nor in memory until asked for
+        import qpsolvers  # never on the hot path, so imported only when it is needed
 
         equal, above, below = self.sides()
         A = sp.csr_matrix(self.A)
@@ -121,16 +121,16 @@ class Qp(QpData):
     The QP of a sample, in the units of the model, filled by compiled code.
 
     Attributes:
-        z: Where the solver puts its solution, shape ``(n,)``.
+        z: Solution, written by the solver, shape ``(n,)``.
         cost: The cost (4) at the guess, shape ``(1,)``.
-        checksum: Sum of all of this, finite if and only if it is, shape ``(1,)``.
-        watched: For each softened row, the last ones, those by which it is known to act, see `Transcription`; shape ``(rows, 4)``.
+        checksum: Sum of all data, finite if and only if all of it is, shape ``(1,)``.
+        watched: For each softened row the rows that show whether it acts, see `Transcription`; shape ``(rows, 4)``.
         varies_P: Whether the Hessian changes from sample to sample.
-        varies_A: Whether the constraint matrix does.
-        fill: Writes all but `z` from the guess: slow, uncompiled, after a change of weights.
-        linearize: Writes of that what changes from sample to sample.
-        embed: Writes the initial state into it.
-        step: Makes the plan of `z`.
+        varies_A: Whether the constraint matrix changes from sample to sample.
+        fill: Call that writes all but `z` from the guess; slow and not compiled, for a change of weights.
+        linearize: Call that writes the data that changes from sample to sample.
+        embed: Call that writes the initial state into the data.
+        step: Call that makes the plan from `z`.
     """
 
     fill: Callable[[], None]
@@ -166,15 +166,15 @@ class Qp(QpData):
 
     @property
     def sound(self) -> bool:
-        """Whether all of it is finite, and of a size that a factorization survives: OSQP prints, in the middle of a sample, what it refuses."""
-        return bool(abs(self.checksum[0]) < 1e6 * INFINITY)  # of which it holds one for each bound that is absent
+        """Whether all data is finite, and small enough to be factorized: OSQP would print an error in the middle of a sample."""
+        return bool(abs(self.checksum[0]) < 1e6 * INFINITY)  # the sum holds one INFINITY for each bound that is absent
 
     def scales(self) -> tuple[Array, Array]:
-        """Return what variables and rows are measured by, shapes ``(n,)`` and ``(m,)``; a slack's unit is a part of what it softens already."""
+        """Return the scales of variables and rows, shapes ``(n,)`` and ``(m,)``; a slack has the scale of what it softens."""
         return self._scale[self._columns], self._scale[self._rows]
 
     def reduced_hessian(self) -> Array:
-        """Return the Hessian in the inputs alone, measured by their scales, the states eliminated by the dynamics; of a QP without slacks."""
+        """Return the scaled Hessian in the inputs only, with the states eliminated by the dynamics; for a QP without slacks."""
         k = self._eliminable
         P = (self.P + sp.triu(self.P, k=1).T).toarray()
         A = self.A.toarray()
@@ -189,7 +189,7 @@ def step_size(qp: Qp) -> float:
     r"""
     Return the step size at which ADMM converges fastest on a QP, :math:`\sqrt{\lambda_{min} \lambda_{max}}` of its reduced Hessian.
 
-    That is the optimum for a problem of inequalities alone [Ghadimi2015]_; for others `docs/engine.md` shows that it holds as well.
+    This is the optimum for a problem with inequalities only [Ghadimi2015]_; `docs/engine.md` shows that it also fits the others.
     """
     eigenvalues = np.linalg.eigvalsh(qp.reduced_hessian())
     curved = eigenvalues[eigenvalues > 1e-9 * eigenvalues[-1]]

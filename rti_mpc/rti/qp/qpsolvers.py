@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Any other QP solver, by its name in qpsolvers: set up anew for every sample, without memory of the last.
+Any other QP solver, by its name in qpsolvers: set up anew for every sample, without a warm start.
 
-It sees the QP as qpsolvers writes one, in matrices that are made once and
-updated in place: dense ones for a solver that knows no others. What it warns
-of or raises is a failed solve, and nothing of that outlives the sample.
+It receives the QP as qpsolvers defines one, in matrices that are allocated once and
+updated in place; dense ones for a solver that takes no others. If it raises, the solve
+has failed, and nothing of that remains for the next sample.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from rti_mpc.rti.scaled import Scaled
 if TYPE_CHECKING:
     import qpsolvers
 
-# Their own names for how exact to be, where their defaults are not: near the solution the last digits cost an iteration or two.
+# Tolerances by each solver's own option names, where its defaults are too loose; the last digits cost one or two iterations.
 SOLVER_TOLERANCES: dict[str, dict[str, Any]] = {
     "clarabel": {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11},
     "daqp": {"primal_tol": 1e-10, "dual_tol": 1e-12},
@@ -43,9 +43,9 @@ class ForeignSolver:
 
     Attributes:
         qp: The problem.
-        call: Solves the problem as it is, in the form of qpsolvers.
-        cold: Whether the next solve forgets the last: it does in any case.
-        iterations: Iterations of the last solve; 0 of a solver that does not tell.
+        call: Call that solves the problem as it is, and returns a solution of qpsolvers.
+        cold: Whether the next solve forgets the last one; here every solve does.
+        iterations: Iterations of the last solve; 0 if the solver does not report them.
         res_prim: Primal residual of the last solve, infinity norm, relative to the scales.
         res_dual: Dual residual of the last solve, infinity norm, relative to the scales.
 
@@ -55,7 +55,7 @@ class ForeignSolver:
 
     def __init__(self, qp: Qp, name: str) -> None:
         check_name(name)
-        import qpsolvers  # loads every solver that is installed: only where one of them is wanted
+        import qpsolvers  # loads every solver that is installed, so imported only where one of them is wanted
 
         self.qp = qp
         self.cold = False
@@ -75,11 +75,11 @@ class ForeignSolver:
         self.call = partial(qpsolvers.solve_problem, self._problem, name, **SOLVER_TOLERANCES.get(name, {}))
         try:
             self._call()
-        except Exception as error:  # a licence that is missing, say: better now than as a failure of every sample
+        except Exception as error:  # for example a missing licence: better reported now than as a failure of every sample
             raise OcpError(f"solver {name} must be able to solve, it raised {type(error).__name__}: {str(error).partition(chr(10))[0]}") from error
 
     def load(self) -> None:
-        """Linearize at the guess, and take over the new matrices; off the path from state to command."""
+        """Linearize at the guess, and load the new matrices; off the path from state to command."""
         self.qp.linearize()
         self._sound = self.qp.sound
         if self._sound:
@@ -88,7 +88,7 @@ class ForeignSolver:
                 update()
 
     def refill(self) -> None:
-        """Take over, with the next `load`, what no sample changes, too: after a change of weights."""
+        """After a change of weights: let the next `load` also update the data that no sample changes."""
         self.qp.fill()
 
     def solve(self) -> QpStatus:
@@ -103,7 +103,7 @@ class ForeignSolver:
         problem.b[:] = qp.u[self._equal]
         try:
             solution = self._call()
-        except Exception:  # whatever a foreign solver raises; the controller knows what to do without a plan
+        except Exception:  # a foreign solver may raise anything; the controller has its fallbacks
             return QpStatus.FAILED
         status = outcome(solution)
         self.iterations = iterations(solution)
@@ -114,7 +114,7 @@ class ForeignSolver:
 
     def _call(self) -> qpsolvers.Solution:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a solve that failed, which the status says
+            warnings.simplefilter("ignore")  # warnings of a failed solve: the status says the same
             return self.call()
 
 
@@ -137,7 +137,7 @@ def check_name(name: str) -> None:
 
 
 def outcome(solution: qpsolvers.Solution) -> QpStatus:
-    """Map what a solver says: an iterate that is not the solution is none to be commanded."""
+    """Map a solver's result to a status: an iterate that is not a solution must not be commanded."""
     if solution.found and solution.x is not None and isfinite(solution.x.sum()):
         return QpStatus.SOLVED
     info = solution.extras.get("info")
@@ -146,13 +146,13 @@ def outcome(solution: qpsolvers.Solution) -> QpStatus:
 
 
 def iterations(solution: qpsolvers.Solution) -> int:
-    """Return the iterations of a solver that tells them, 0 of another."""
+    """Return the iterations that a solver reports, 0 if it reports none."""
     extras = solution.extras
     return int(next((extras[key] for key in ("iterations", "iter") if key in extras), getattr(extras.get("info"), "iter", 0)))
 
 
 def residuals(problem: Any, solution: qpsolvers.Solution) -> tuple[float, float]:
-    """Return the primal and the dual residual of a solution, NaN if it has no multipliers; qpsolvers' own want rows of every kind."""
+    """Return the primal and the dual residual of a solution, NaN if it has no multipliers; those of qpsolvers need rows of every kind."""
     x = solution.x
     primal = max(np.max(problem.G @ x - problem.h, initial=0.0), np.max(np.abs(problem.A @ x - problem.b), initial=0.0))
     if solution.y is None or solution.z is None:
@@ -161,7 +161,7 @@ def residuals(problem: Any, solution: qpsolvers.Solution) -> tuple[float, float]
 
 
 def numbered(qp: QpData) -> qpsolvers.Problem:
-    """Return the problem with numbers in its matrices: which nonzero of the QP's an entry is, counted from 1, negative where its sign changes."""
+    """Return the problem with, in its matrices, the index of the QP's nonzero that belongs there, counted from 1, negative where its sign changes."""
     kept = [(matrix, matrix.data.copy()) for matrix in (qp.P, qp.A)]
     for matrix, _ in kept:
         matrix.data[:] = np.arange(1, matrix.nnz + 1)
@@ -172,7 +172,7 @@ def numbered(qp: QpData) -> qpsolvers.Problem:
 
 
 def following(numbers: sp.csc_matrix[Any], data: Array, dense: bool) -> tuple[Any, Callable[[], None]]:
-    """Return a matrix of a numbered pattern, dense or sparse, and what updates it in place from the data numbered."""
+    """Return a matrix, dense or sparse, for the indices that `numbered` gives, and the call that updates it in place from the data."""
     matrix: Any = numbers.toarray(order="C") if dense else numbers.copy()
     values: Array = matrix.reshape(-1) if dense else matrix.data
     places = np.flatnonzero(values)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-The sequential formulation: the states are eliminated, inputs alone are variables, the QP is small and dense.
+The sequential formulation: the states are eliminated, only inputs are variables, the QP is small and dense.
 
 With the response of the states to the inputs, to the initial state and to the
 defects,
@@ -11,9 +11,9 @@ defects,
 
 the QP in :math:`z = (\Delta u_0, \dots, \Delta u_{N_u - 1}, s_1, \dots, s_N)`
 has the Hessian :math:`\sum_i G_i^T H_i G_i` and the gradient :math:`\sum_i G_i^T
-(H_i (\Phi_i \Delta x_0 + c_i) + g_i)`, plus what belongs to the increments. A
-backward recursion makes both with :math:`O(N^2)` operations: "condensing",
-[Andersson2013]_. Feedback adds the terms in :math:`\Delta x_0`.
+(H_i (\Phi_i \Delta x_0 + c_i) + g_i)`, plus the terms of the increments. A backward
+recursion computes both with :math:`O(N^2)` operations ("condensing" [Andersson2013]_).
+Feedback adds the terms in :math:`\Delta x_0`.
 """
 
 from __future__ import annotations
@@ -107,13 +107,13 @@ def kernels(lin: Linearization, width: int) -> tuple[ca.Function, ca.Function, c
 
 
 def over(function: ca.Function, blocks: int, shared: list[int]) -> ca.Function:
-    """Return a function of so many blocks side by side; the arguments in `shared` are the same for all."""
+    """Return a function mapped over blocks side by side; the arguments in `shared` are the same for all blocks."""
     return function if blocks == 1 else function.map(f"{function.name()}_{blocks}", "serial", blocks, shared, [], {})
 
 
 def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
     """
-    Transcribe an OCP with the inputs alone as variables.
+    Transcribe an OCP with only the inputs as variables.
 
     Args:
         ocp: The problem.
@@ -156,7 +156,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
         rows.follow(row, ng, sides)
         A.place(row, to_s, sp.eye_array(N * ng))
     if not rows.count:
-        A.place(rows.add(None, ca.MX.zeros(1), None, by_input[:1]), 0, sp.csc_array(np.eye(1)))  # OSQP wants a row
+        A.place(rows.add(None, ca.MX.zeros(1), None, by_input[:1]), 0, sp.csc_array(np.eye(1)))  # OSQP needs at least one row
 
     P = Blocks()
     for k in range(N_u):
@@ -215,7 +215,7 @@ def embed(ocp: Ocp, kind: str, remembered: int, start: int, soft_rows: int) -> c
 
 
 def full_step(ocp: Ocp, kind: str, lin: Linearization, n: int, remembered: int) -> ca.Function:
-    """Read the inputs off the solution, and let the linearized dynamics make the states."""
+    """Read the inputs from the solution, and compute the states by the linearized dynamics."""
     N, N_u, nx = ocp.N, ocp.N_u, ocp.model.nx
     z = ca.MX.sym("z", n)
     x0 = ca.MX.sym("x0", nx)

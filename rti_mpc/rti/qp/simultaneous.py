@@ -135,7 +135,7 @@ def embed(ocp: Ocp, kind: str, remembered: int) -> ca.Function:
 
 
 def full_step(ocp: Ocp, kind: str, lin: Linearization, n: int, remembered: int) -> ca.Function:
-    """Read states and inputs off the solution."""
+    """Read states and inputs from the solution."""
     z = ca.MX.sym("z", n)
     x0 = ca.MX.sym("x0", ocp.model.nx)
     known = Remembered(ocp, lin, remembered)

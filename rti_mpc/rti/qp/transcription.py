@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-A QP with a fixed sparsity pattern, as expressions: what either formulation makes of an OCP.
+Transcription of an OCP to a QP with a fixed sparsity pattern, as expressions, for both formulations.
 
-Beside the QP itself there are two small functions of the feedback phase:
-`embed` writes the initial state into it, `step` makes a plan of its solution.
+Besides the data of the QP there are two small functions for the feedback phase:
+`embed` writes the initial state into the data, `step` makes a plan from the solution.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ class Transcription:
     Attributes:
         P: Pattern of the upper triangle of the Hessian, shape ``(n, n)``.
         A: Pattern of the constraint matrix, shape ``(m, n)``.
-        everything: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale) -> (q, P_data, A_data, lower, upper, memory, checksum, cost)``; `memory` is what
-            `embed` and `step` want to know, and `checksum` is finite if and only if all the others are.
-        varying: Which of these eight change from sample to sample, by name.
-        data: As `everything`, but returns only what varies.
-        embed: ``(x0, x, memory) -> `` what of the QP depends on the initial state, named as what it is a part of, with ``_embedded``.
-        embedded: Where that goes: q, lower or upper, and place in it.
-        step: ``(x, u, u_prev, solution, x0, memory, *WEIGHTS, scale) -> (x_plan, u_plan, violation, change)``: the full step, by how much it
-            exceeds softened bounds, as it is and relative to their scale, and its size.
-        columns: Which entry of the scale each variable is measured by, see `rti_mpc.rti.scale`; shape ``(n,)``.
-        rows: Which entry each row is measured by; shape ``(m,)``.
-        eliminable: States in z, which as many first rows determine.
-        watched: For each softened row, the last rows of all, those by which it is known a stage earlier to act: itself and its like one stage
-            later; for the sign of a slack, those of the bounds that it softens. Counted from the first of them; shape ``(rows, 4)``.
+        everything: ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale) -> (q, P_data, A_data, lower, upper, memory, checksum, cost)``; `memory` holds
+            the further arguments of `embed` and `step`, and `checksum` is finite if and only if all the others are.
+        varying: Names of those of these eight that change from sample to sample.
+        data: As `everything`, but returns only those in `varying`.
+        embed: ``(x0, x, memory) -> `` the parts of the QP that depend on the initial state, with the name of the vector and ``_embedded``.
+        embedded: Vector (q, lower or upper) and slice that each of these parts is written to.
+        step: ``(x, u, u_prev, solution, x0, memory, *WEIGHTS, scale) -> (x_plan, u_plan, violation, change)``: the plan after the full step, its
+            largest violation of softened bounds, in their unit and relative to their scale, and the size of the step.
+        columns: Index of each variable's scale, see `rti_mpc.rti.scale`; shape ``(n,)``.
+        rows: Index of each row's scale; shape ``(m,)``.
+        eliminable: Number of states in z, which are determined by as many first rows.
+        watched: For each softened row the rows whose last multipliers show whether it acts: itself and the same row one stage later; for
+            ``s >= 0``, the rows of the bounds that the slack softens. Counted from the first softened row; shape ``(rows, 4)``.
     """
 
     P: sp.csc_array[Any]
@@ -66,7 +66,7 @@ class Blocks:
     """
     A sparse matrix under assembly, its nonzeros gathered from a pool of values.
 
-    CasADi and OSQP both count nonzeros column by column, so that one index vector, computed here once, makes ``A.data`` in compiled code.
+    CasADi and OSQP both store nonzeros column by column, so compiled code fills ``A.data`` by one index vector, which is computed here once.
     """
 
     def __init__(self) -> None:
@@ -77,7 +77,7 @@ class Blocks:
     def place(self, row: int, col: int, block: Any) -> None:
         """Place a constant block with its corner at ``(row, col)``."""
         coo = sp.coo_array(block)
-        coo.eliminate_zeros()  # kron stores those of dense blocks
+        coo.eliminate_zeros()  # kron stores the zeros of dense blocks
         values, sources = np.unique(coo.data, return_inverse=True)
         self._entries.append((coo.row + row, coo.col + col, self._pooled + sources))
         self._pooled += len(values)
@@ -94,7 +94,7 @@ class Blocks:
     def finish(self, m: int, n: int) -> tuple[sp.csc_array[Any], ca.MX]:
         """Return the pattern, shape ``(m, n)``, and its nonzeros as an expression."""
         rows, cols, sources = (np.concatenate(parts) for parts in zip(*self._entries, strict=True))
-        numbers = sp.csc_array((sources + 1, (rows, cols)), shape=(m, n))  # counted from 1, or the first would vanish
+        numbers = sp.csc_array((sources + 1, (rows, cols)), shape=(m, n))  # counted from 1, since an entry of 0 would vanish
         numbers.sort_indices()
         ones = sp.csc_array((np.ones(numbers.nnz), numbers.indices, numbers.indptr), shape=(m, n))
         return ones, ca.vertcat(*self._pool)[(numbers.data - 1).tolist()]
@@ -112,9 +112,9 @@ class BoundRows:
 
     def add(self, lb: ca.MX | None, value: ca.MX, ub: ca.MX | None, scales: np.ndarray[Any, Any]) -> int:
         """
-        Append rows whose left-hand side is `value` at the guess; None: no bound. Return the first of them.
+        Append rows whose left-hand side is `value` at the guess, and return the index of the first one.
 
-        `scales` says which entry of the scale each row of a column of `value` is measured by.
+        A bound of None is absent. `scales` holds the index of the scale for each row of a column of `value`.
         """
         first = self.count
         absent = ca.MX(ca.DM.ones(value.numel()) * INFINITY)
@@ -126,16 +126,16 @@ class BoundRows:
         return first
 
     def chain(self, first: int, width: int) -> None:
-        """Let each row from `first` on watch its like one stage, that is `width` rows, later."""
+        """Let each row from `first` on also watch the same row of the next stage, `width` rows later."""
         for row in range(first, self.count - width):
             self.watched[row][1] = row + width
 
     def watched_from(self, first: int) -> np.ndarray[Any, Any]:
-        """Return what the rows from `first` on watch, counted from there."""
+        """Return the rows that the rows from `first` on watch, counted from `first`."""
         return np.array(self.watched[first : self.count], dtype=np.intp).reshape(-1, 4) - first
 
     def follow(self, first: int, ng: int, sides: list[tuple[int, list[int]]]) -> None:
-        """Let the signs of slacks, ng a node from `first` on, watch the bounds they soften, each ``(first row, which of the ng)``."""
+        """Let the rows ``s >= 0``, ng per node from `first` on, watch the bounds that the slacks soften, each ``(first row, which of the ng)``."""
         for row in range(first, self.count):
             i, j = divmod(row - first, ng)
             watched = [start + i * len(at) + at.index(j) for start, at in sides if j in at]
@@ -155,16 +155,16 @@ def input_rows(ocp: Ocp, lin: Linearization, rows: BoundRows, A: Blocks, to_du: 
 
 
 def measured_by(ocp: Ocp) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Return the entries of the scale that belong to states, to inputs and to what has softened bounds."""
+    """Return the indices of the scales of states, of inputs and of softened bounds."""
     nx, nu = ocp.model.nx, ocp.model.nu
     return np.arange(nx), nx + np.arange(nu), nx + nu + np.arange(len(ocp.lg))
 
 
 def clipped(u: ca.MX, u_prev: ca.MX, w: dict[str, ca.MX]) -> ca.MX:
     """
-    Return inputs that meet their bounds exactly, as an actuator wants them: a solver's iterate does so to its tolerance.
+    Return inputs clipped exactly to their bounds, as an actuator needs them: a solver's iterate keeps them only to its tolerance.
 
-    Increments first: from an input inside its bounds, that leaves both satisfied.
+    Increments are clipped first: after an input inside its bounds, both are then satisfied.
     """
     nu, N_u = u.shape
     last, wanted, lbdu, ubdu, lbu, ubu = (ca.SX.sym(name, nu) for name in ("last", "wanted", "lbdu", "ubdu", "lbu", "ubu"))
@@ -178,11 +178,11 @@ def clipped(u: ca.MX, u_prev: ca.MX, w: dict[str, ca.MX]) -> ca.MX:
 
 class Remembered:
     """
-    What the full step wants to know of the linearization of the softened constraints: the head of `memory`, as symbols.
+    The linearization of the softened constraints in the head of `memory`, as symbols for the full step.
 
     Attributes:
-        memory: All of it, shape ``(remembered, 1)``.
-        rest: What comes behind.
+        memory: The whole memory, shape ``(remembered, 1)``.
+        rest: The memory after its head.
     """
 
     def __init__(self, ocp: Ocp, lin: Linearization, remembered: int) -> None:
@@ -195,9 +195,9 @@ class Remembered:
 
     def violation(self, dx: ca.MX, du: ca.MX, w: dict[str, ca.MX]) -> ca.MX:
         """
-        Return by how much a plan exceeds the linearized constraints at most, as it is and relative to their scale; `dx` from node 0 on.
+        Return the largest violation of the linearized constraints by a plan, in their unit and relative to their scale; `dx` from node 0 on.
 
-        Negative if it keeps them all.
+        Negative if the plan keeps all of them.
         """
         ocp, lin = self._ocp, self._lin
         ng, N = len(ocp.lg), ocp.N
@@ -218,7 +218,7 @@ class Remembered:
 
 
 def softened_bounds(ocp: Ocp, w: dict[str, Any]) -> tuple[Any, Any]:
-    """Return lower and upper bounds of everything softened, as expressions."""
+    """Return the softened lower and upper bounds as expressions, each of shape ``(ng, 1)``."""
     soft = list(ocp.soft)
     return ca.vertcat(w["lbx"][soft, 0], w["lh"]), ca.vertcat(w["ubx"][soft, 0], w["uh"])
 
@@ -235,7 +235,7 @@ def picked(sparsity: ca.Sparsity, rows: list[int]) -> tuple[list[int], ca.Sparsi
 
 
 def finite(*bounds: np.ndarray[Any, Any]) -> list[int]:
-    """Return where any of these bounds is present."""
+    """Return the indices at which any of these bounds is finite."""
     return [int(j) for j in np.flatnonzero(np.any(np.isfinite(bounds), axis=0))]
 
 
@@ -245,7 +245,7 @@ def each(column: ca.MX, times: int) -> ca.MX:
 
 
 def data_functions(lin: Linearization, kind: str, **data: ca.MX) -> tuple[ca.Function, tuple[str, ...], ca.Function]:
-    """Return the function of all data of a QP, the cost among them, which of them vary with the sample, and the function of these."""
+    """Return the function of all data of a QP, cost included; the names of the data that vary with the sample; and the function of these."""
     outputs = {name: ca.densify(output) for name, output in (data | {"cost": lin.cost}).items()}
     sample = ca.veccat(*lin.sample.values())
     varying = tuple(name for name, output in outputs.items() if output.numel() and ca.depends_on(output, sample))
