@@ -2,15 +2,15 @@
 """
 Real-time nonlinear model predictive control: numbers in, numbers out.
 
-Data flows one way: model, ocp, linearization, riccati, active_set, rti. What the
-active set cannot solve, or another solver is asked for, takes the side branch of the
-sample's QP: transcription, qp, solver. The controller stands behind rti, the wire
-beside it. Names are imported on first use, so that a process which only speaks the
-wire contract loads neither CasADi nor OSQP.
+Data flows one way: model, ocp, linearization, riccati, active_set, rti. A QP that the
+active set cannot solve, or for which another solver is asked for, takes the side branch:
+transcription, qp, solver. The controller uses rti; the wire is independent of it. Names
+are imported on first use, so that a process which only uses the wire contract loads
+neither CasADi nor OSQP.
 
 Public names: `Model` and `Signal` describe a robot, `find_model` finds one that ships,
-`Ocp` is the problem, `Rti` solves one sample of it, `Controller` does so on a robot's
-time with everything that may go wrong.
+`Ocp` is the problem, `Rti` solves one sample of it, `Controller` does so in the robot's
+time and handles everything that may go wrong.
 
 Example:
     >>> from rti_mpc import Ocp, Rti, find_model

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Cache of compiled code: one file per problem, in a folder that nobody else may write.
+Cache of compiled code: one file per problem, in a folder that no other user may write to.
 
-What is loaded runs with our rights, and what is cut off ends the process by
-SIGBUS. So a file is loaded only if it is ours, nobody else may write it, and it
-is whole: it ends with its seal, a hash of its key and content. It comes into
-being by a rename, so that neither another process nor a power cut sees half of
-it. Whatever is wrong is built anew.
+Loaded code runs with the rights of this process, and a truncated file ends it by SIGBUS.
+So a file is loaded only if it belongs to this user, no other user may write to it, and it
+is complete: it ends with its seal, a hash of its key and content. A file is put in place
+by a rename, so that neither another process nor a power cut leaves half of it. A file
+that fails a check is built anew.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ def cache_dir() -> Path:
     Return where compiled code is kept (XDG base directory specification).
 
     Raises:
-        OSError: Nothing says where.
+        OSError: No folder is known.
     """
     given = os.environ.get("XDG_CACHE_HOME", "")
-    if os.path.isabs(given):  # the specification: a relative one is ignored
+    if os.path.isabs(given):  # by the specification a relative path is ignored
         return Path(given) / "rti_mpc"
     try:
         return Path.home() / ".cache" / "rti_mpc"
@@ -38,10 +38,10 @@ def cache_dir() -> Path:
 
 def own(folder: Path) -> None:
     """
-    Make a folder that nobody else may write, or make sure that it is one.
+    Create a folder that no other user may write to, or check that it is one.
 
     Raises:
-        OSError: It cannot be made, or others could put a file there, or another folder in its place.
+        OSError: The folder cannot be created, or other users could write to it or replace it.
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     folder = folder.resolve()
@@ -54,7 +54,7 @@ def own(folder: Path) -> None:
 
 
 def sealed(path: Path, key: str) -> bool:
-    """Whether a file holds, whole, what was kept under a key by this user."""
+    """Whether a file is complete, was kept under this key, and belongs to this user."""
     try:
         state = path.lstat()
         if not (stat.S_ISREG(state.st_mode) and _ours(state)):
@@ -67,10 +67,10 @@ def sealed(path: Path, key: str) -> bool:
 
 def keep(path: Path, key: str, content: bytes) -> None:
     """
-    Put a sealed file in place, all of it or nothing; a loader ignores what follows the end of a shared object.
+    Write a sealed file, completely or not at all; a loader ignores the seal behind the end of a shared object.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     temporary = path.with_name(f"{path.name}.{os.getpid()}")
     try:
@@ -89,7 +89,7 @@ def keep(path: Path, key: str, content: bytes) -> None:
 
 
 def _ours(state: os.stat_result) -> bool:
-    """Whether something belongs to this user and nobody else may write it."""
+    """Whether a file or folder belongs to this user, and no other user may write to it."""
     return state.st_uid == os.geteuid() and not state.st_mode & WRITABLE_BY_OTHERS
 
 

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Compile CasADi functions, and bind them to arrays that the caller owns.
+Compilation of CasADi functions, and their binding to arrays that the caller owns.
 
 The shared object is cached by content, see `rti_mpc.cache`. Without a compiler
 CasADi's virtual machine evaluates the same function into the same arrays: slower,
@@ -34,13 +34,12 @@ def compiled(*functions: ca.Function) -> list[ca.Function]:
     """
     Return functions as machine code, or themselves where there is no compiler.
 
-    They are compiled together, which takes half as long as one by one. A cache
-    that cannot be used, or trusted, costs the compilation at every start; a
-    build that fails, a broken compiler, is no error either: the virtual machine
-    takes over. A warning says which, in one line.
+    They are compiled together, which takes half as long as one by one. If the cache
+    cannot be used or trusted, they are compiled at every start. If compilation fails,
+    CasADi's virtual machine evaluates them. Either is reported by a warning of one line.
 
     Args:
-        functions: Of different names.
+        functions: Functions with different names.
     """
     compiler = shutil.which("cc")
     if compiler is None:
@@ -67,7 +66,7 @@ def compiled(*functions: ca.Function) -> list[ca.Function]:
 
 def load(functions: Sequence[ca.Function], library: Path, key: str, compiler: str, source: str) -> list[ca.Function]:
     """
-    Load functions from a file, which is made first if it is not there, whole and ours.
+    Load functions from a file, which is built first if it is not there or fails a check, see `rti_mpc.cache`.
 
     Raises:
         OSError: The file cannot be written, or not be loaded.
@@ -76,7 +75,7 @@ def load(functions: Sequence[ca.Function], library: Path, key: str, compiler: st
     if not sealed(library, key):
         keep(library, key, build(compiler, source))
     try:
-        path = os.fsencode(library).decode()  # CasADi wants UTF-8, whatever the locale is
+        path = os.fsencode(library).decode()  # CasADi needs UTF-8 in any locale
         return [ca.external(function.name(), path) for function in functions]
     except (RuntimeError, UnicodeDecodeError) as error:
         why = str(error).partition("Error code: ")[2] or str(error)
@@ -105,20 +104,20 @@ def _first_line(text: str) -> str:
 
 
 def function(name: str, inputs: Mapping[str, Any], outputs: Mapping[str, Any]) -> ca.Function:
-    """Build a CasADi function from expressions by name; no output is called as an input is."""
+    """Build a CasADi function from expressions by name; no output may have the name of an input."""
     return ca.Function(name, [*inputs.values()], [*outputs.values()], [*inputs], [*outputs])
 
 
 def bind(function: ca.Function, inputs: Mapping[str, Array], outputs: Mapping[str, Array]) -> Callable[[], None]:
     """
-    Fix where a function reads and writes, and return the call.
+    Fix the arrays that a function reads and writes, and return the call.
 
-    CasADi counts column by column: a C-ordered array of shape ``(N, nx)`` is
-    its ``(nx, N)``. Outputs are dense, or only their nonzeros are written.
+    CasADi stores matrices column by column: a C-ordered array of shape ``(N, nx)`` is its
+    ``(nx, N)``. Outputs are dense, or only their nonzeros are written.
 
     Args:
-        function: Compiled or not.
-        inputs: One array for each input, by its name, owned by the caller, who keeps their memory in place.
+        function: A CasADi function, compiled or not.
+        inputs: One array for each input, by its name, owned by the caller, who must keep its memory in place.
         outputs: One array for each output, by its name, overwritten by every call.
 
     Raises:

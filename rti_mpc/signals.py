@@ -2,9 +2,9 @@
 """
 Signals, the named components of a model's vectors, and their roles.
 
-A role says what a signal is to others than the optimal control problem: a path fills
-outputs by their roles, obstacles are kept from the position, viewers draw it. Names
-mean nothing but to people, and nothing is inferred from them, from units or from places.
+A role gives a signal its meaning outside the optimal control problem: a path fills
+outputs by their roles, obstacles keep away from the position, viewers draw it. Names are
+for people: nothing is inferred from names, units or the order of signals.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Signal:
     Attributes:
         name: Unique within its vector; what configuration and viewers call it.
         unit: SI unit, ``"1"`` if none.
-        angle: Whether it is an angle in rad of which whole turns mean nothing: it may wrap at :math:`\pm\pi`, and the dynamics repeat with each turn.
+        angle: Whether it is an angle in rad whose whole turns do not matter: it may wrap at :math:`\pm\pi`, and the dynamics repeat with each turn.
         role: Of states and outputs ``"x"``, ``"y"`` (position in the plane, m) and ``"heading"`` (an angle, from the x axis to the left); of a
             parameter ``"axle_offset"``: distance in m from the axle ahead to the point whose position this is. Empty: none of these.
         commands: Of an input, the name of the state that follows it, a speed; empty: none.
@@ -68,7 +68,7 @@ def plane(signals: Sequence[HasRole]) -> tuple[int, int] | None:
 
 
 def misplaced(vector: str, signals: Sequence[Signal], states: Sequence[Signal]) -> str:
-    """Return what is wrong with roles in a vector, empty if nothing is."""
+    """Return what is wrong with the roles in a vector, empty if nothing is."""
     roles = [signal.role for signal in signals if signal.role not in REPEATABLE_ROLES]
     for signal in signals:
         if signal.role and signal.role not in ROLES_OF_VECTOR[vector]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text files of a user's: regular, of bounded size, UTF-8 with or without a byte-order mark."""
+"""Text files of users: regular files of bounded size, in UTF-8 with or without a byte-order mark."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ MAX_FILE_BYTES = 1 << 17  # ten times what a configuration with a weight for eac
 
 def read_text_file(path: Path, kind: str = "text", max_bytes: int = MAX_FILE_BYTES) -> str:
     """
-    Read a whole file; never waits, as for a pipe, and takes no more memory than is right.
+    Read a whole file; never waits, as it would for a pipe, and refuses a file that is too large.
 
     Args:
-        path: Where it is.
-        kind: What it is to be, for the error.
+        path: Path of the file.
+        kind: Expected content, for the error.
         max_bytes: Largest size.
 
     Raises:
-        ConfigError: It is not there, no file, too large, or not text.
+        ConfigError: The file is missing, not a regular file, too large, or not text.
     """
     try:
         state = path.stat()

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Disturbances, the part of the dynamics that a model leaves out, as parameters of it: :math:`\dot x = f(x, u + d_u, p) + d_x`.
+Disturbances, the part of the dynamics that a model leaves out, as further parameters: :math:`\dot x = f(x, u + d_u, p) + d_x`.
 
-A disturbance of an input stands for wrong gains and friction, one of a state
-for slip and wind. They are parameters like others, so whatever predicts with the
-model predicts with them [Pannocchia2003]_.
+A disturbance of an input represents wrong gains and friction, one of a state slip and
+wind. They are parameters like others, so every prediction with the model includes them
+[Pannocchia2003]_.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def with_disturbances(model: Model, names: Iterable[str]) -> Model:
 
     Args:
         model: The undisturbed one.
-        names: Inputs, which they are added to, in the input's unit; or states, to whose derivative they are added, in the state's unit / s.
+        names: Names of inputs, to which disturbances are added in the input's unit, or of states, to whose derivatives they are added in unit / s.
 
     Returns:
         The model with parameters ``d_<name>`` at the end, nominally zero.

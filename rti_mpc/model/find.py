@@ -40,7 +40,7 @@ def find_model(name: str, folder: Path | None = None) -> Model:
         folder: Where module or file are looked for first; a module that is not there must be installed. None: the working directory for a file.
 
     Raises:
-        OcpError: There is no such model, its module cannot be imported, or the function does not return one. One line, with the user's file and line.
+        OcpError: There is no such model, its module cannot be imported, or the function returns none. One line, which names the user's file and line.
     """
     wanted = f"a model must be one of {', '.join(SHIPPED_MODELS)} or an importable package.module:function of your own, got {name!r}"
     match = MODEL_NAME_PATTERN.fullmatch(SHIPPED_MODELS.get(name, name))
@@ -72,7 +72,7 @@ def find_model(name: str, folder: Path | None = None) -> Model:
         code = getattr(build, "__code__", None)
         try:
             model = build()
-        except (Exception, SystemExit) as error:  # whatever a user's function raises, named as theirs
+        except (Exception, SystemExit) as error:  # a user's function may raise anything; the error names it as the user's
             raise OcpError(f"{name} must return a model, {raised(error, code)}") from error
         if not isinstance(model, Model):
             raise OcpError(f"{name} must return a rti_mpc.Model, got {type(model).__name__}{at(code)}")
@@ -157,7 +157,7 @@ def at(code: CodeType | None) -> str:
 
 
 def raised(error: BaseException, code: CodeType | None = None) -> str:
-    """Say in one line what a user's code raised, and where: in his own line, or else in the function that was called."""
+    """Return in one line what a user's code has raised, and where: in the user's own line, or else in the function that was called."""
     kind, text = type(error).__name__, " ".join(str(error).split()) or "nothing said"
     if isinstance(error, SyntaxError) and error.filename:
         return f"it raised {kind} in {error.filename}, line {error.lineno}: {error.msg}"

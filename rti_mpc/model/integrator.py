@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-r"""One stage of the dynamics: :math:`x_{k+1} = \phi(x_k, u_k, p)`, explicit, the input held over the stage."""
+r"""Explicit integrator over one stage, :math:`x_{k+1} = \phi(x_k, u_k, p)`, with the input held constant."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def integrator(model: Model, method: str = "rk4", substeps: int = 1) -> ca.Funct
     Args:
         model: The dynamics f(x, u, p).
         method: ``"euler"`` or ``"rk4"``.
-        substeps: Equal steps the duration is cut into.
+        substeps: Number of equal steps into which `dt` is divided.
 
     Returns:
         SX function ``phi(x, u, p, dt) -> x_next``; `dt` in seconds, of either sign.
 
     Raises:
-        OcpError: The method is unknown or there is no step to take.
+        OcpError: The method is unknown, or `substeps` is below 1.
     """
     if method not in TABLEAUS:
         raise OcpError(f"integrator must be one of {', '.join(TABLEAUS)}, got {method!r}")

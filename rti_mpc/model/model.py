@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-A robot as CasADi expressions: :math:`\dot x = f(x, u, p)`, outputs, and what else is to be kept inside bounds, with names and units.
+Model of a robot as CasADi expressions: :math:`\dot x = f(x, u, p)`, outputs and general constraints, with names and units.
 
-The names are those of acados (`f_expl_expr`), so that a model written for it
-can be brought along.
+The attributes have the names of acados (`f_expl_expr`), so that a model written for it
+can be reused.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ class Model:
     A continuous-time model.
 
     Attributes:
-        name: Name, as in the configuration.
+        name: Name of the model, as in the configuration.
         x: State symbol, shape ``(nx, 1)``.
         u: Input symbol, shape ``(nu, 1)``.
         p: Parameter symbol, shape ``(np, 1)``.
         f_expl_expr: Right-hand side f(x, u, p), shape ``(nx, 1)``.
-        y_expr: Output h(x, p), shape ``(ny, 1)``.
+        y_expr: Output y(x, p), shape ``(ny, 1)``.
         states: Names and units of `x`.
         inputs: Names and units of `u`.
         outputs: Names and units of `y_expr`.
         parameters: Names and units of `p`.
-        h_expr: What else than inputs and states may be bounded, h(x, u, p), shape ``(nh, 1)``; nothing by default.
+        h_expr: General constraints h(x, u, p), which may be bounded like states, shape ``(nh, 1)``; none by default.
         constraints: Names and units of `h_expr`.
-        p_nominal: Values of `p` unless a reference carries others.
+        p_nominal: Values of `p`, unless a reference carries others.
         u_rest: Input at which the robot stands still; zeros by default.
 
     Raises:
@@ -114,7 +114,7 @@ class Model:
         return ca.Function("h", [self.x, self.p], [ca.densify(self.y_expr)], ["x", "p"], ["y"])
 
     def counterparts(self) -> dict[str, list[str]]:
-        """Return the names of the states that ``inputs`` command, and that ``outputs`` are; of each component, empty where there is none."""
+        """Return, for each of the ``inputs`` and ``outputs``, the name of the state that it commands or is; empty where there is none."""
         x, y = ca.vertsplit(self.x), ca.vertsplit(ca.densify(self.y_expr))
         named = [(state.name, x_j) for state, x_j in zip(self.states, x, strict=True)]
         return {

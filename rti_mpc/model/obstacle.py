@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Discs to keep out of, as stage parameters: one that moves is one whose parameters do.
+Discs that the robot must stay out of, as stage parameters: a disc moves if its parameters change along the horizon.
 
     model = with_obstacles(pioneer_3dx(), [(1.0, 0.5, 0.3)])
     ocp = Ocp(model, ..., lh=0.0)
@@ -25,11 +25,11 @@ def with_obstacles(model: Model, discs: Sequence[tuple[float, float, float]]) ->
     r"""
     Add discs to the parameters of a model, and the clearance from each to its constraints.
 
-    The robot is a point: a disc's radius includes the robot's own, and what it
-    may cut short between two nodes, :math:`(v \, dt)^2 / 8 r`.
+    The robot is a point: the radius of a disc must include the robot's own, and
+    :math:`(v \, dt)^2 / 8 r`, by which the path between two nodes may cut into the disc.
 
     Args:
-        model: A model with outputs of the roles x and y.
+        model: A model that has outputs with the roles x and y.
         discs: x, y and radius of each, in m; a reference may carry others, row by row.
 
     Returns:
@@ -58,6 +58,6 @@ def with_obstacles(model: Model, discs: Sequence[tuple[float, float, float]]) ->
 
 
 def discs_of(model: Model) -> list[tuple[int, float, float, float]]:
-    """Return the discs among the parameters of a model: the place of the first of its three, and nominal x, y and radius, in m."""
+    """Return the discs among the parameters of a model: the index of each disc's x, and its nominal x, y and radius in m."""
     p = model.p_nominal
     return [(i, p[i], p[i + 1], p[i + 2]) for i, signal in enumerate(model.parameters) if signal.role == "disc_x"]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Headings for a point path: the tangent, and the one a unicycle can follow.
+Headings along the path of a point: the tangent, and the heading that a unicycle can follow.
 
-The paper's reference point lies `a` ahead of the axle. Tracking its path
-exactly leaves no freedom: with :math:`\dot x = u \cos\psi - a \omega \sin\psi`
+The paper's reference point lies a distance `a` ahead of the axle. Exact tracking of its
+path leaves no freedom: with :math:`\dot x = u \cos\psi - a \omega \sin\psi`
 and :math:`\dot y = u \sin\psi + a \omega \cos\psi` the heading must obey
 
 .. math::
@@ -32,7 +32,7 @@ Curve = Callable[[Array], Array]
 
 def tangent(velocity: Curve, t: Array) -> Array:
     """
-    Direction of motion, unwrapped along `t`; it stays put where the motion rests.
+    Direction of motion, unwrapped along `t`; constant where there is no motion.
 
     Args:
         velocity: Velocity of the path, ``(M,)`` to ``(M, 2)``, in m/s.
@@ -85,10 +85,10 @@ def consistent(velocity: Curve, t: Array, a: float, psi0: float) -> Array:
 
 def periodic(velocity: Curve, lap_s: float, a: float, psi0: float, laps: int = 50) -> float:
     """
-    Start of the consistent heading that repeats every lap of a closed path.
+    Initial value of the consistent heading that repeats in every lap of a closed path.
 
-    Driving forward forgets a wrong heading, so laps are driven from `psi0`
-    until one ends as it began.
+    A wrong initial heading decays when driving forward, so laps are integrated from
+    `psi0` until one ends as it began.
 
     Raises:
         OcpError: No heading repeats: the path is too tight for a point so far ahead of the axle.

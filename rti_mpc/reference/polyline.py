@@ -26,11 +26,11 @@ class Polyline:
 
     Attributes:
         s0: Arc length at which each piece begins, shape ``(n,)``, in m.
-        xy0: Where it begins, shape ``(n, 2)``, in m.
-        theta0: Its direction there, shape ``(n,)``, in rad.
-        kappa: Its curvature, shape ``(n,)``, in 1/m: 0 on lines.
-        length: Arc length of the whole, in m.
-        closed: Whether it ends where it began.
+        xy0: Point at which each piece begins, shape ``(n, 2)``, in m.
+        theta0: Direction of each piece at its beginning, shape ``(n,)``, in rad.
+        kappa: Curvature of each piece, shape ``(n,)``, in 1/m: 0 on lines.
+        length: Total arc length, in m.
+        closed: Whether the path ends where it begins.
     """
 
     s0: Array
@@ -41,7 +41,7 @@ class Polyline:
     closed: bool
 
     def position(self, s: Array) -> Array:
-        """Point at arc length `s`, shape ``(..., 2)``; a closed one goes round, an open one ends."""
+        """Point at arc length `s`, shape ``(..., 2)``; a closed path repeats, an open one stays at its end."""
         i, ds = self._locate(s)
         half = 0.5 * self.kappa[i] * ds
         chord = ds * np.sinc(half / np.pi)
@@ -122,17 +122,17 @@ def polyline(points: Array, corner_m: float) -> Polyline:
 
 def read_csv(path: Path) -> Array:
     """
-    Read waypoints: a line a point, columns ``x`` and ``y`` in m.
+    Read waypoints: one line per point, columns ``x`` and ``y`` in m.
 
-    A header names the columns, in any order and among others; without one the
-    first two columns are meant. Empty lines and lines that begin with ``#`` are
+    A header names the columns, in any order and among others; without a header the
+    first two columns are used. Empty lines and lines that begin with ``#`` are
     skipped.
 
     Returns:
         Points, shape ``(n, 2)``.
 
     Raises:
-        ConfigError: The file cannot be read, or a number in it: file, line and column are named.
+        ConfigError: The file or a number in it cannot be read; the message names file, line and column.
     """
     lines = read_text_file(path, "CSV with waypoints", MAX_CSV_BYTES).splitlines()
     try:

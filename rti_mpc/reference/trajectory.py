@@ -30,16 +30,16 @@ HEADINGS: tuple[Heading, ...] = get_args(Heading)
 @dataclass(frozen=True)
 class Trajectory:
     """
-    A timed path of the reference point, analytic.
+    A path of the reference point as analytic functions of time.
 
     Attributes:
-        name: Scenario, as on the command line.
+        name: Name of the scenario, as on the command line.
         position: Points at times ``(...)``, shape ``(..., 2)``, in m.
         velocity: Velocities there, shape ``(..., 2)``, in m/s.
-        duration_s: How long it is followed; closed paths may go round several times.
+        duration_s: Time for which it is followed; closed paths may be repeated.
         end: What to do after its last row.
         pose0: Where the scenario's robot starts, at rest: x, y in m, psi in rad.
-        lap_s: Time of one lap of a closed path; None: the path is open and rests at its end.
+        lap_s: Time of one lap of a closed path; None if the path is open and rests at its end.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Trajectory:
 
 
 def circle(k: float = 10.0) -> Trajectory:
-    """Build the curve the paper prints, ``sin(t/k), cos(t/k)``, with the initial condition of its first simulation; two laps."""
+    """Build the curve that the paper prints, ``sin(t/k), cos(t/k)``, with the initial condition of its first simulation; two laps."""
     return Trajectory(
         name="circle",
         position=lambda t: np.stack([np.sin(t / k), np.cos(t / k)], axis=-1),
@@ -74,7 +74,7 @@ def circle(k: float = 10.0) -> Trajectory:
 
 
 def eight() -> Trajectory:
-    """Build the eight the paper draws, ``sin(t/10), sin(t/5)``, with the initial condition of its first simulation; two laps."""
+    """Build the eight that the paper draws, ``sin(t/10), sin(t/5)``, with the initial condition of its first simulation; two laps."""
     return Trajectory(
         name="eight",
         position=lambda t: np.stack([np.sin(t / 10), np.sin(t / 5)], axis=-1),
@@ -105,14 +105,14 @@ def waypoints(points: Array, speed_m_s: float = 0.25, corner_m: float = 0.15, na
     """
     Follow a polyline at constant speed, with corners rounded so that they can be driven.
 
-    An open one rests at its last point; a closed one (first point equal to the
-    last) goes round, two laps unless another duration is asked for. The robot
-    starts on the path, in its direction.
+    An open polyline rests at its last point. A closed one (first point equal to the
+    last) is repeated, two laps unless another duration is asked for. The robot starts
+    on the path, in its direction.
 
     Args:
         points: Waypoints, shape ``(n, 2)``, in m.
         speed_m_s: Speed of the reference along the path.
-        corner_m: Largest distance at which the path passes a waypoint; 0 passes through it, with a corner no robot can follow.
+        corner_m: Largest distance at which the path passes a waypoint; with 0 it has corners that no robot can follow.
         name: Name of the scenario.
 
     Raises:
@@ -147,7 +147,7 @@ def find_trajectory(scenario: str, speed_m_s: float = 0.25, corner_m: float = 0.
 
     Args:
         scenario: One of `SCENARIOS`, or a path that ends in ``.csv``.
-        speed_m_s: Speed along waypoints; the paper's curves bring their own.
+        speed_m_s: Speed along waypoints; the paper's curves have their own.
         corner_m: Largest distance at which the path passes a waypoint.
 
     Raises:
@@ -177,13 +177,13 @@ def rows(
     Sample a trajectory into reference rows.
 
     Args:
-        trajectory: What to follow.
+        trajectory: Trajectory to sample.
         period_s: Time between rows.
         heading: ``"tangent"``, or ``"consistent"`` for a point ahead of the axle; ``"none"`` is for controllers without weight on the heading,
             its rows carry the tangent for viewers.
         a: Distance of the reference point ahead of the axle, in m; None: it is on the axle, where the consistent heading is the tangent.
         psi0: Initial consistent heading of an open path, in rad: its tangent by default. Closed paths have the heading that repeats.
-        roles: What the columns are, in their order: those of `rti_mpc.signals.POSE_ROLES`.
+        roles: Roles of the columns, in their order: those of `rti_mpc.signals.POSE_ROLES`.
 
     Returns:
         Rows, shape ``(M, len(roles))``, from time 0 to the first at or after the duration, so that an open path ends at its last point; the
@@ -195,7 +195,7 @@ def rows(
     """
     if heading not in HEADINGS:
         raise ConfigError(f"heading must be one of {', '.join(HEADINGS)}, got {heading!r}")
-    periods = math.ceil(trajectory.duration_s / _positive("period_s", period_s) - 1e-9)  # all of the last one, where it is not a whole one
+    periods = math.ceil(trajectory.duration_s / _positive("period_s", period_s) - 1e-9)  # the last period counts as a whole one
     t: Array = np.arange(periods + 1) * np.float64(period_s)
     columns = dict(zip(("x", "y"), trajectory.position(t).T, strict=True))
     if "heading" in roles:
@@ -220,11 +220,11 @@ def followed_roles(model: str, outputs: Sequence[Signal]) -> tuple[Role, ...]:
     Return the roles of a model's outputs, which the columns of its reference take.
 
     Args:
-        model: Its name.
-        outputs: Its outputs.
+        model: Name of the model.
+        outputs: Outputs of the model.
 
     Raises:
-        ConfigError: A path says nothing of an output.
+        ConfigError: A path gives no values for an output.
     """
     if unfilled := [output.name for output in outputs if output.role not in POSE_ROLES]:
         raise ConfigError(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events of a process of this package: mode changes each, faults at most once a second a kind."""
+"""Events of a process of this package: every mode change, and faults of one code at most once per second."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ MIN_INTERVAL_NS = 1_000_000_000  # local time between two faults of one code
 
 class Announcer:
     """
-    Publishes events of one role.
+    Publisher of the events of one role.
 
     Attributes:
-        role: Which one.
+        role: Role of the process, the last part of its key.
     """
 
     def __init__(self, bus: Bus, role: str, epoch: int) -> None:
@@ -28,13 +28,13 @@ class Announcer:
         self._last_ns: dict[str, int] = {}  # by code
 
     def say(self, notice: Notice, stamp_ns: int) -> bool:
-        """Publish a notice; a fault not, if one of its code just was. Return whether it was published."""
+        """Publish a notice, unless it is a fault and one of its code was published just before; return whether it was published."""
         now_ns, code = time.monotonic_ns(), notice.code
         each = notice.change or notice.severity is Severity.INFO
         due = each or now_ns - self._last_ns.get(code, -MIN_INTERVAL_NS) >= MIN_INTERVAL_NS
         if due:
             self._last_ns[code] = now_ns
             self._seq += 1
-            stamp_ns = min(max(stamp_ns, 1 - STAMP_LIMIT_NS), STAMP_LIMIT_NS - 1)  # of a clock that runs out of numbers
+            stamp_ns = min(max(stamp_ns, 1 - STAMP_LIMIT_NS), STAMP_LIMIT_NS - 1)  # a robot's clock may exceed the limits of the message
             self._publisher.put(Event(self._epoch, self._seq, stamp_ns, self.role, notice.severity, code, notice.text))
         return due

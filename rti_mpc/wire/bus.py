@@ -29,15 +29,15 @@ Sent = TypeVar("Sent", bound=Message, contravariant=True)
 
 
 def unix_s() -> int:
-    """Return the Unix time, s: of no two hosts the same, and good enough to tell what epochs there can be."""
+    """Return the Unix time in s; it differs between hosts, but limits the epochs that can exist."""
     return time.time_ns() // 1_000_000_000
 
 
 class Declared(Protocol):
-    """What lasts until it is undeclared."""
+    """A declaration on the bus that lasts until it is undeclared."""
 
     def undeclare(self) -> object:
-        """End it."""
+        """End the declaration."""
 
 
 class Publisher(Protocol[Sent]):
@@ -45,7 +45,7 @@ class Publisher(Protocol[Sent]):
 
     @property
     def heard(self) -> bool:
-        """Whether anybody listens now; of a cached publisher always true."""
+        """Whether anybody listens now; always true for a cached publisher."""
 
     def put(self, message: Sent) -> None:
         """Send a message; never blocks, and does nothing once the session is closed."""
@@ -70,19 +70,19 @@ class Subscriber(Protocol):
         """All samples there are now, oldest first."""
 
     def undeclare(self) -> object:
-        """Hear no more."""
+        """Stop receiving."""
 
 
 class Session(Protocol):
-    """Connection of one process to the others, whatever their robots: all of Zenoh that a bus needs, see `rti_mpc.wire.zenoh_session`."""
+    """Connection of one process to the others, of any robot: the part of Zenoh that a bus needs, see `rti_mpc.wire.zenoh_session`."""
 
     @property
     def connects_to(self) -> str:
-        """Where it connects to, in words; empty if it waits for others to come."""
+        """Endpoints that it connects to, in words; empty if it waits for others to connect."""
 
     @property
     def links(self) -> int | None:
-        """How many others this process is linked to; None once it is closed."""
+        """Number of other processes that this one is linked to; None once it is closed."""
 
     def publisher(self, key: Key[M]) -> Publisher[M]:
         """Publisher of a stream."""
@@ -94,19 +94,19 @@ class Session(Protocol):
         """Answer queries, in a thread of its own."""
 
     def ask(self, key: Key[Any], payload: bytes, timeout_s: float) -> Iterator[Received]:
-        """Yield what all who serve a key answer."""
+        """Yield the answers of all processes that serve a key."""
 
     def token(self, key: Key[Any]) -> Declared:
         """Show presence."""
 
     def present(self, key: Key[Any], timeout_s: float) -> bool:
-        """Whether anybody shows presence, and is heard of in time."""
+        """Whether anybody shows presence within the timeout."""
 
     def watch(self, key: Key[Any], tell: Callable[[str, bool], None]) -> Declared:
-        """Tell the keys of those present and whether they are, now and at every change."""
+        """Report each key with whether its owner is present, for all now and then at every change."""
 
     def close(self) -> None:
-        """Close it, in bounded time."""
+        """Close the session, in bounded time."""
 
 
 class Bus:
@@ -114,18 +114,18 @@ class Bus:
     Streams of one robot.
 
     Attributes:
-        keys: Where the streams are.
+        keys: Keys of the robot's streams.
         closed: Whether `close` was called.
     """
 
     def __init__(self, session: Session, keys: Keys, *, say: Callable[[str], object] = lambda _: None) -> None:
         """
-        Speak for a robot on a session, beside others who may do so for theirs.
+        Open the streams of one robot on a session, which may carry those of other robots as well.
 
         Args:
-            session: The process's connection; `close` leaves it open.
-            keys: Of which robot.
-            say: Takes a line about who is not reached.
+            session: The connection of the process; `close` leaves it open.
+            keys: Keys of the robot's streams.
+            say: Receiver of a line about processes that are not reached.
         """
         self.keys = keys
         self.closed = False
@@ -133,8 +133,8 @@ class Bus:
         self._leave: Callable[[], None] = self._undeclare
         self._say = say
         self._over = threading.Event()
-        self._publishers: dict[str, Publisher[Any]] = {}  # by key: whoever changes its role and back publishes there as before
-        self._subscribers: WeakSet[Subscriber] = WeakSet()  # which end with their last use
+        self._publishers: dict[str, Publisher[Any]] = {}  # by key, kept so that a process which changes its role and back uses the same one
+        self._subscribers: WeakSet[Subscriber] = WeakSet()  # weak, because a subscriber ends with its last use
         self._tokens: dict[str, Declared] = {}  # by role
         self._declared: list[Declared] = []  # queryables and watches
 
@@ -152,11 +152,11 @@ class Bus:
         Join with a session of its own, which ends with the bus.
 
         Args:
-            settings: How.
-            keys: Of which robot.
-            timeout_s: How long a client waits for its router.
+            settings: Settings of the session.
+            keys: Keys of the robot's streams.
+            timeout_s: Time for which a client waits for its router.
             stop: Ends that wait when set.
-            say: Takes a line about who is not reached.
+            say: Receiver of a line about processes that are not reached.
 
         Raises:
             ConfigError: Zenoh refuses a setting, an endpoint is taken, or no router was there in time.
@@ -182,7 +182,7 @@ class Bus:
         self._leave()
 
     def _undeclare(self) -> None:
-        """Take back all that was declared here."""
+        """Undeclare everything that was declared here."""
         declared: list[Declared] = [*self._publishers.values(), *self._subscribers, *self._tokens.values(), *self._declared]
 
         def undeclare() -> None:
@@ -195,11 +195,11 @@ class Bus:
 
     def expect(self, what: str, heard: Callable[[], object]) -> None:
         """
-        Remind of what does not come, and whom this process is linked to, until it has.
+        Report from time to time that a message has not arrived yet, and how many processes this one is linked to, until it has.
 
         Args:
-            what: Such as ``"state"``.
-            heard: Whether it has come.
+            what: Name of the message, such as ``"state"``.
+            heard: Whether it has arrived.
         """
 
         def wanted() -> str:
@@ -213,21 +213,21 @@ class Bus:
         remind(self._say, wanted, self._over)
 
     def publisher(self, key: Key[M]) -> Publisher[M]:
-        """Publisher of the messages of a stream, the same one whenever a key is asked for again."""
+        """Return the publisher of a stream; the same one for the same key."""
         if key not in self._publishers:
             self._publishers[key] = self._session.publisher(key)
         return self._publishers[key]
 
     def subscriber(self, key: Key[Any], *, capacity: int = 1, history: bool = True) -> Subscriber:
         """
-        Subscriber to a stream.
+        Return a subscriber to a stream.
 
         Args:
-            key: What to listen to; may hold wildcards.
-            capacity: Messages kept, the oldest dropped first; fewer where so many of the longest would not fit into
-                `rti_mpc.wire.streams.MAX_RING_BYTES`. A receiver that wants the last message alone keeps `RING_MESSAGES` all the same, and takes
-                the newest that is accepted: what anybody sends behind it must not push it out.
-            history: Whether to ask publishers for their last message, those which come later included, where the stream is cached.
+            key: Key of the stream; may hold wildcards.
+            capacity: Messages kept, the oldest dropped first; fewer if that many of the longest would not fit into
+                `rti_mpc.wire.streams.MAX_RING_BYTES`. A receiver that needs only the last message should keep `RING_MESSAGES` as well, and take
+                the newest that is accepted: messages of others that follow it must not displace it.
+            history: Whether to ask publishers for their last message, later ones included, if the stream is cached.
         """
         subscriber = self._session.subscriber(key, capacity, history=history)
         self._subscribers.add(subscriber)
@@ -243,23 +243,23 @@ class Bus:
         unfit: Callable[[M], str] = lambda _: "",
     ) -> Intake[M]:
         """
-        Return a door for messages of one class, that knows what epochs may be now.
+        Return an intake for messages of one class, which limits epochs by the present time.
 
         Args:
             cls: Class of the messages.
             stale_s: Time without an accepted message after which another source may take over.
-            widths: Numbers a row must have, by array.
-            choosing: Whether an epoch is chosen above those heard.
-            unfit: Why a message cannot be for us, as a code; empty if it can.
+            widths: Numbers that a row must have, by the name of the array.
+            choosing: Whether an epoch is to be chosen above those heard.
+            unfit: Returns why a message is not for this receiver, as a code; empty if it is.
         """
         return Intake(cls, stale_s, widths, unix_s=unix_s, choosing=choosing, unfit=unfit)
 
     def publish_json(self, key: Key[Any], value: dict[str, Any]) -> None:
-        """Publish a JSON object that late joiners get, too."""
+        """Publish a JSON object, which late joiners receive as well."""
         self.publisher(key).put_bytes(json.dumps(value).encode())
 
     def withdraw_json(self, key: Key[Any]) -> None:
-        """Publish on a key no more, and let late joiners find nothing there."""
+        """Stop publishing on a key, so that late joiners find nothing there."""
         if (publisher := self._publishers.pop(key, None)) is not None:
             publisher.undeclare()
 
@@ -267,9 +267,9 @@ class Bus:
         """
         Answer requests on a key, in a thread of its own.
 
-        What the handler raises, and requests that are not a JSON object or longer
-        than `MAX_REQUEST_BYTES`, are answered ``{"ok": false, "error": ...}``; None is no
-        answer: another gives it.
+        Requests that are not a JSON object or longer than `MAX_REQUEST_BYTES`, and those for
+        which the handler raises, are answered ``{"ok": false, "error": ...}``. If the handler
+        returns None, nothing is answered: another process answers.
         """
 
         def answer(received: Received) -> bytes | None:
@@ -277,17 +277,17 @@ class Bus:
             try:
                 value = request if request.get("ok") is False else handler(request)
                 return None if value is None else json.dumps(value).encode()
-            except Exception as error:  # a handler's fault is the requester's to hear, not ours to die of
+            except Exception as error:  # a fault of a handler is reported to the requester, and must not end this process
                 return json.dumps({"ok": False, "error": str(error)}).encode()
 
         self._declared.append(self._session.serve(key, answer))
 
     def request(self, key: Key[Any], value: dict[str, Any], timeout_s: float) -> dict[str, Any]:
         """
-        Answer of whoever serves a key; where several do, a refusal before a consent.
+        Return the answer of the process that serves a key; where several do, a refusal before a consent.
 
         Raises:
-            TimeoutError: If nobody answers in time.
+            TimeoutError: Nobody answers in time.
         """
         deadline_s = time.monotonic() + timeout_s
         while (left_s := deadline_s - time.monotonic()) > 0.0:
@@ -297,7 +297,7 @@ class Bus:
         raise TimeoutError(f"{key} must be served, got no answer within {timeout_s} s")
 
     def answers(self, key: Key[Any], value: dict[str, Any], timeout_s: float) -> Iterator[dict[str, Any]]:
-        """Yield the answers of all who serve a key, as they come."""
+        """Yield the answers of all processes that serve a key, as they arrive."""
         for received in self._session.ask(key, json.dumps(value).encode(), timeout_s):
             yield _object(received, document.MAX_DOCUMENT_BYTES)
 
@@ -307,7 +307,7 @@ class Bus:
         return self._tokens[role]
 
     def is_alive(self, role: str, timeout_s: float = 0.5) -> bool:
-        """Whether anybody shows presence in a role, ourselves included; just started, it may take a moment to meet the others."""
+        """Whether anybody shows presence in a role, this process included; it may take a moment after the start to meet the others."""
         deadline_s = time.monotonic() + timeout_s
         while True:
             left_s = deadline_s - time.monotonic()
@@ -318,7 +318,7 @@ class Bus:
             time.sleep(min(RETRY_INTERVAL_S, left_s))
 
     def watch_alive(self, callback: Callable[[str, bool], None]) -> None:
-        """Call back, in a thread of its own, with a role and whether it is present, for those present now and at every change."""
+        """Call back in a thread of its own, with a role and whether it is present: for all roles present now, then at every change."""
 
         def tell(key: str, present: bool) -> None:
             if role := role_of(key):

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Messages as CDR bytes, and back, as the field table in `rti_mpc.wire.layout` says.
+Codec between messages and CDR bytes, by the field table in `rti_mpc.wire.layout`.
 
 XCDR1, little-endian: four header bytes ``00 01 00 00``, then the fields, each
 aligned to its own size counted from the end of the header. ``float64[]`` is a
 ``uint32`` length and its elements, aligned to eight where there are any.
 
-What a message must satisfy is checked here, at the door: sizes that agree, rows
-where rows are needed, finite numbers, integers in range, known enumeration
-values. Nothing is allocated from a declared length before as many bytes are there.
+Decoding checks all that a message must satisfy: sizes that agree, rows where rows are
+needed, finite numbers, integers in range, known enumeration values. No memory is
+allocated for a declared length before that many bytes are there.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Reader = Callable[[bytes, int, list[Any]], int]
 
 class Refused(MessageError):
     """
-    A payload is not the message expected.
+    A payload that is not the expected message.
 
     Attributes:
         reason: One of `REFUSAL_REASONS`, for counters.
@@ -89,7 +89,7 @@ def decode(cls: type[M], payload: bytes) -> M:
     Message in a payload; its arrays are owned, C-contiguous float64.
 
     Raises:
-        MessageError: If the bytes are not exactly one such message; `reason` is one of `REFUSAL_REASONS`.
+        Refused: The bytes are not exactly one such message; `reason` is one of `REFUSAL_REASONS`.
     """
     if payload[:HEADER_BYTES] != HEADER:
         raise _header_error(payload)
@@ -116,7 +116,7 @@ def _header_error(payload: bytes) -> Refused:
     return Refused("header", f"payload must begin with the CDR header {HEADER.hex(' ')}, got {got}")
 
 
-# Scalars, as many in one call as follow one another.
+# Scalars: one call for each run of them.
 
 
 def _layouts(fields: Sequence[Field]) -> tuple[Struct, ...]:
@@ -193,8 +193,8 @@ def _array_reader(field: Field, *, width_at: int | None) -> Reader:
     Reader of an array.
 
     Args:
-        field: Which one.
-        width_at: Position, among the values read, of an earlier matrix of the same row width; None: a width of its own stands before it.
+        field: Field of the array.
+        width_at: Index, among the values read, of an earlier matrix with the same row width; None if the width is stored before this array.
     """
     name = field.name
 
@@ -241,7 +241,7 @@ def _rows(flat: Array, width: int, name: str) -> Array:
 def _string_writer(field: Field) -> Writer:
     def write(message: Any, offset: int) -> bytes:
         text: str = getattr(message, field.name)
-        if not text.isprintable():  # such as a line break in somebody else's words
+        if not text.isprintable():  # for example a line break in a quoted text
             text = "".join(c if c.isprintable() else " " for c in text)
         encoded = text.encode("utf-8", "replace")[: field.high and field.high - 1].decode("utf-8", "ignore").encode() + b"\x00"
         return bytes(-offset % 4) + UINT32.pack(len(encoded)) + encoded
@@ -274,7 +274,7 @@ def _string_reader(field: Field) -> Reader:
     return read
 
 
-# What the fields of one message must satisfy together.
+# Conditions on several fields of one message.
 
 
 def _check_reference(message: Reference) -> None:
@@ -308,7 +308,7 @@ def _codec(fields: Sequence[Field]) -> tuple[tuple[Writer, ...], tuple[Reader, .
     """Writers and readers of a message, one for each run of scalars, array and string."""
     writers: list[Writer] = []
     readers: list[Reader] = []
-    first: dict[str, int] = {}  # position of the first array of a row width
+    first: dict[str, int] = {}  # position of the first array with each row width
     position = 0
     for scalar, run in groupby(fields, key=lambda field: field.kind in STRUCT_FORMATS):
         group = list(run)

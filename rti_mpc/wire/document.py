@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-JSON objects as peers send them: descriptions, requests and answers.
+Reader of JSON objects from peers: descriptions, requests and answers.
 
-To parse JSON holds the interpreter's lock, 30 ms a megabyte, so nothing long is
-parsed, and whatever is accepted may be converted, compared and printed without
-a thought: no number is infinite or longer than 64 bits, nothing is deep, all text is text.
+Parsing JSON holds the interpreter's lock for 30 ms per megabyte, so nothing long is
+parsed. What is accepted is safe to convert, compare and print: no number is infinite or
+longer than 64 bits, nothing is deeply nested, and all text can be encoded.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ def read(payload: bytes, size: int | None = None, most: int = MAX_DOCUMENT_BYTES
     Return the JSON object in a payload.
 
     Args:
-        payload: Its bytes.
-        size: How many were sent, where they are withheld.
-        most: How many there may be.
+        payload: Bytes of the object.
+        size: Number of bytes that were sent, if the payload is withheld.
+        most: Largest number of bytes.
 
     Raises:
-        MessageError: It is none, or too long, too deep, or has a number that is none.
+        MessageError: The payload is no JSON object, too long or too deep, or a number is out of range.
     """
     size = len(payload) if size is None else size
     if size > most:
         raise Refused("oversized", f"message must have at most {most} bytes, got {size}")
     try:
         value = json.loads(payload, parse_int=_integer, parse_float=_number, parse_constant=_number)
-        json.dumps(value, ensure_ascii=False).encode()  # which half of a surrogate pair cannot
+        json.dumps(value, ensure_ascii=False).encode()  # raises for half of a surrogate pair
     except Refused:
         raise
     except (ValueError, RecursionError):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Descriptions on ``info/<role>``, JSON that late joiners get: how their parts are written, and how they are read.
+Writer and reader of the descriptions on ``info/<role>``, JSON that late joiners receive as well.
 
-Viewers and figures take names, units and limits from them, those who stand by
-what the leader has been told, and everybody an operator's stop that was missed.
+Viewers and figures take names, units and limits from them, standbys take the parameters
+of the leader, and all controllers and guards an operator's stop that they have missed.
 """
 
 from __future__ import annotations
@@ -51,12 +51,13 @@ class Label:
 @dataclass(frozen=True)
 class Obstacle:
     """
-    A disc that the robot keeps out of.
+    A disc that the robot must stay out of.
 
     Attributes:
-        at: Column of a reference's `p` that is its x; y and r follow.
-        x: Where it is, in m, unless a reference says where else; y likewise.
-        r: Its radius, in m.
+        at: Column of its x in a reference's `p`; y and r follow.
+        x: Position in m, unless a reference carries another.
+        y: Position in m, likewise.
+        r: Radius in m.
     """
 
     at: int
@@ -68,17 +69,17 @@ class Obstacle:
 @dataclass(frozen=True)
 class Info:
     """
-    Description of a process on the bus; a controller's names every vector. Equal if it labels alike.
+    Description of a process on the bus; that of a controller labels every vector. Two are equal if all but role and document are.
 
     Attributes:
-        role: Who published it: controller, robot, ...
-        document: All of it, as indented JSON.
+        role: Role of the publisher: controller, robot, ...
+        document: The whole description, as indented JSON.
         model: Name of the model.
         states: Labels of ``x``; empty where the publisher does not know the model.
         inputs: Labels of ``u``.
         outputs: Labels of ``y``.
-        disturbances: Labels of what an observer estimates besides.
-        obstacles: What it keeps out of.
+        disturbances: Labels of the disturbances that an observer estimates.
+        obstacles: Obstacles that the robot must stay out of.
         dt_s: Sample period; NaN if not said.
         lbu: Lower bounds of the inputs, infinite where there is none.
         ubu: Upper bounds of the inputs.
@@ -106,7 +107,7 @@ class Info:
         Read a description as published, infinities as null.
 
         Raises:
-            MessageError: It is not one.
+            MessageError: The document is no description.
         """
         try:
             vectors: dict[str, Any] = {name: tuple(_label(signal) for signal in _few(document.get(name, ()))) for name in INFO_VECTORS}
@@ -126,10 +127,10 @@ class Info:
     @classmethod
     def from_received(cls, received: Received) -> Info:
         """
-        Read a description as it came, on a key that ends with the role that it describes.
+        Read a description from the bus; its key must end with the role that it describes.
 
         Raises:
-            MessageError: It is none.
+            MessageError: The payload is no description, or of another role.
         """
         info, key = cls.from_json(read(received.payload, received.size)), received.key
         if not info.role or info.role != role_of(key):
@@ -156,12 +157,12 @@ class Info:
 
     @property
     def tracked(self) -> list[tuple[int, int]]:
-        """Pairs of an output and the state that it is, by index."""
+        """Index pairs of each output that is a state, and of that state."""
         return [(i, k) for i, label in enumerate(self.outputs) if (k := self._state(label)) is not None]
 
     @property
     def tracked_position(self) -> tuple[int, int] | None:
-        """Indices of the outputs that are the position in the plane; None: there are none, or they are no states."""
+        """Indices of the outputs that are the position in the plane; None if there are none, or they are not states."""
         position, tracked = plane(self.outputs), [i for i, _ in self.tracked]
         return position if position is not None and set(position) <= set(tracked) else None
 
@@ -183,8 +184,8 @@ def labels(counterparts: Mapping[str, Sequence[str]] | None = None, /, **vectors
     Write the components of vectors, such as ``states``, as a part of a description.
 
     Args:
-        counterparts: By name of a vector, what `Label` calls the state of each of its components; empty if left out.
-        vectors: By name, their components.
+        counterparts: For each vector by name, the `Label.state` of each of its components; empty strings if left out.
+        vectors: For each vector by name, its components.
     """
     return {
         vector: [
@@ -201,7 +202,7 @@ def bounds(**vectors: Iterable[float]) -> dict[str, Any]:
 
 
 def obstacles(discs: Iterable[tuple[int, float, float, float]]) -> dict[str, Any]:
-    """Write obstacles, each as `Obstacle` has it, as a part of a description."""
+    """Write obstacles, each with the attributes of `Obstacle`, as a part of a description."""
     return {"obstacles": [{"at": at, "x": x, "y": y, "r": r} for at, x, y, r in discs]}
 
 
@@ -217,10 +218,10 @@ def latch(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def latches(received: Received) -> tuple[Any, ...]:
     """
-    Read what a description says of an operator's stop, to be judged by `rti_mpc.contract.latch.read_latch`; empty where it says nothing.
+    Return the latch of a description, not checked yet, for `rti_mpc.contract.latch.read_latch`; empty if there is none.
 
     Raises:
-        MessageError: It is no JSON object.
+        MessageError: The payload is no JSON object.
     """
     document = read(received.payload, received.size)
     return (document["latch"],) if "latch" in document else ()
@@ -229,13 +230,13 @@ def latches(received: Received) -> tuple[Any, ...]:
 @dataclass(frozen=True)
 class Leader:
     """
-    A controller that leads, by its own description.
+    The leading controller, from its own description.
 
     Attributes:
-        epoch: Of its commands.
-        seq: Of the description.
-        config_hash: Of its configuration.
-        parameters: Version and changes of its parameters as they came, see `parameters`; None where they are not told.
+        epoch: Epoch of its commands.
+        seq: Sequence number of the description.
+        config_hash: Hash of its configuration.
+        parameters: Version and changes of its parameters as they came, see `parameters`; None if the description has none.
     """
 
     epoch: int
@@ -245,7 +246,7 @@ class Leader:
 
     @classmethod
     def from_received(cls, received: Received, highest: int) -> Leader | None:
-        """Read the description of a leader, whose epoch is at most `highest`; None if it is none."""
+        """Read the description of a leader with an epoch of at most `highest`; None if it is not one."""
         try:
             document = read(received.payload, received.size)
         except MessageError:
@@ -282,7 +283,7 @@ def _obstacle(disc: Mapping[str, Any]) -> Obstacle:
 
 
 def _bounds(values: Sequence[float | None] | None, sign: int, length: int) -> tuple[float, ...]:
-    """Replace what JSON cannot say: null by the infinity of this side."""
+    """Replace null, which stands for no bound, by the infinity of this side."""
     bounds = tuple(sign * math.inf if v is None else float(v) for v in (values or [None] * length))
     if len(bounds) != length:
         raise ValueError(f"{length} bounds expected, got {len(bounds)}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The door of a receiver: whatever a peer sends becomes a message or a count, never an exception."""
+"""Intake of a receiver: every payload of a peer becomes a message or a count, never an exception."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MAX_QUOTED_CHARS = 120  # of an encoding that a notice quotes
 
 
 class Payload(Protocol):
-    """What the bus hands over, `rti_mpc.wire.bus.Received`."""
+    """Payload from the bus, see `rti_mpc.wire.received.Received`."""
 
     @property
     def payload(self) -> bytes:
@@ -26,20 +26,20 @@ class Payload(Protocol):
 
     @property
     def encoding(self) -> str:
-        """What the sender says they are."""
+        """Encoding that the sender declares."""
 
     @property
     def size(self) -> int:
-        """How many bytes were sent; where they are more than the key takes, `payload` is empty."""
+        """Number of bytes sent; if they are more than the key allows, `payload` is empty."""
 
 
 class Intake(Generic[M]):
     """
-    Takes the messages of one class from one source.
+    Receiver of the messages of one class from one source.
 
     Attributes:
-        source: The source it is locked to, with its counts of lost and dropped messages.
-        refused: Payloads that were no message, or none for us, by reason: one of `rti_mpc.wire.cdr.REFUSAL_REASONS`, or of `unfit`.
+        source: The source that the receiver is locked to, with its counts of lost and dropped messages.
+        refused: Count of refused payloads by reason: one of `rti_mpc.wire.cdr.REFUSAL_REASONS`, or of `unfit`.
     """
 
     def __init__(
@@ -53,16 +53,17 @@ class Intake(Generic[M]):
         unfit: Callable[[M], str] = lambda _: "",
     ) -> None:
         """
-        Open the door.
+        Begin without a source.
 
         Args:
             cls: Class of the messages.
             stale_s: Time without an accepted message after which another source may take over.
-            widths: Numbers a row must have, by array, such as ``{"x": 5}``; those of `OPTIONAL_ARRAYS` may be left out.
+            widths: Numbers that a row must have, by the name of the array, such as ``{"x": 5}``; those of `OPTIONAL_ARRAYS` may be left out.
             quiet_s: Shortest time between two notices of one code.
-            unix_s: Tells the Unix time, s, which limits epochs, see `rti_mpc.contract.epoch.highest_believed`.
-            choosing: Whether an epoch is chosen above those heard.
-            unfit: Why a message cannot be for us, as a code such as ``foreign_epoch``; empty if it can. Its source is then not judged at all.
+            unix_s: Returns the Unix time in s, which limits epochs, see `rti_mpc.contract.epoch.highest_believed`.
+            choosing: Whether an epoch is to be chosen above those heard.
+            unfit: Returns why a message is not for this receiver, as a code such as ``foreign_epoch``; empty if it is. The source of a
+                message that is unfit is not judged.
         """
         self.source = Source(round(1e9 * stale_s))
         self.refused: Counter[str] = Counter()
@@ -79,7 +80,7 @@ class Intake(Generic[M]):
 
     def read(self, received: Payload, known: int = 0) -> M | None:
         """
-        Message in a payload, whoever sent it; None if it is malformed, or of an epoch that is none.
+        Return the message in a payload of any sender; None if it is malformed, or its epoch is not believed.
 
         Args:
             received: Payload and encoding as they came.
@@ -93,7 +94,7 @@ class Intake(Generic[M]):
             message = decode(self._cls, received.payload)
             for name, width in self._widths:
                 self._check_width(message, name, width)
-            if message.epoch > EPOCH_LEAD:  # above all that honest clocks make: only then is there a clock to be read
+            if message.epoch > EPOCH_LEAD:  # higher than any epoch of a correct clock: the clock is only read in this case
                 self._check_epoch(message.epoch, max(known, self.source.epoch or 0))
         except Refused as error:
             self.refused[error.reason] += 1
@@ -103,7 +104,7 @@ class Intake(Generic[M]):
 
     def accept(self, received: Payload, now_ns: int) -> M | None:
         """
-        Message in a payload; None if it is malformed, repeated or not from our source.
+        Return the message in a payload; None if it is malformed, repeated or not from the source.
 
         Args:
             received: Payload and encoding as they came.
@@ -131,7 +132,7 @@ class Intake(Generic[M]):
         return None
 
     def newest(self, waiting: Iterable[Payload], now_ns: int) -> M | None:
-        """Last of several payloads, oldest first, that is accepted, whatever has come behind it; None if none is."""
+        """Return the last message that is accepted among several payloads, oldest first; None if none is."""
         message = None
         for received in waiting:
             message = self.accept(received, now_ns) or message
@@ -139,11 +140,11 @@ class Intake(Generic[M]):
 
     def newest_of_each(self, waiting: Iterable[Payload], counts: Callable[[M], bool] = lambda _: True) -> list[M]:
         """
-        Last of several payloads for each epoch, where the receiver itself is to judge all sources.
+        Return the last message of each epoch among several payloads, for a receiver that judges all sources itself.
 
         Args:
             waiting: Payloads, oldest first.
-            counts: Whether a message goes on from what was received before: one that does not, such as a replayed one, takes the place of none.
+            counts: Whether a message continues those received before: one that does not, such as a replayed one, replaces no other.
         """
         newest: dict[int, M] = {}
         for received in waiting:
@@ -155,7 +156,7 @@ class Intake(Generic[M]):
         return list(newest.values())
 
     def highest_epoch(self, waiting: Iterable[Payload]) -> int:
-        """Highest epoch among several payloads, whoever sent them; 0 if none is a message."""
+        """Return the highest epoch among several payloads of any sender; 0 if none is a message."""
         epoch = 0
         for received in waiting:
             if (message := self.read(received, epoch)) is not None:
@@ -163,10 +164,10 @@ class Intake(Generic[M]):
         return epoch
 
     def notices(self, now_ns: int) -> list[Notice]:
-        """Take what there is to publish now: per code the latest, and not again before `quiet_s` has passed."""
+        """Take the notices to publish now: the latest per code, and none of a code again before `quiet_s` has passed."""
         if not self._pending:
             return []
-        pending = list(self._pending)  # at once: other threads add to it and take from it
+        pending = list(self._pending)  # copied at once, since other threads change it
         due = [code for code in pending if now_ns - self._said_ns.get(code, now_ns - self._quiet_ns) >= self._quiet_ns]
         self._said_ns.update(dict.fromkeys(due, now_ns))
         return [notice for code in due if (notice := self._pending.pop(code, None)) is not None]

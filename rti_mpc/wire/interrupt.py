@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ctrl-C, SIGTERM and a terminal that hangs up as an event that loops look at: nothing is cut off halfway."""
+"""Event that is set by Ctrl-C, SIGTERM or the end of the terminal: loops check it, so nothing is interrupted halfway."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from threading import Event, Thread
 
 def stop_on_signals() -> Event:
     """
-    Return an event that is set by SIGINT, SIGTERM and SIGHUP, by the last not where it is ignored, as under nohup.
+    Return an event that is set by SIGINT, SIGTERM and SIGHUP; by SIGHUP only if it is not ignored, as under nohup.
 
-    Call it in the main thread. The event is set by a thread of its own: the kernel
-    may hand a signal to any thread, of Zenoh's too, and a main thread that waits
-    for the event would then not wake up to handle it; nor may it set the event
-    itself, whose lock it may hold.
+    Call it in the main thread. A separate thread sets the event: the kernel may deliver
+    a signal to any thread, also to one of Zenoh's, and a main thread that waits for the
+    event would then not wake up to handle it. Nor may a signal handler in the main
+    thread set the event, because that thread may hold its lock.
     """
     stop = Event()
     numbers = {signal.SIGINT, signal.SIGTERM}

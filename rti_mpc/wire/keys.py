@@ -26,7 +26,7 @@ class Key(str, Generic[M]):
     stream: Stream[M]
 
     def __new__(cls, text: str, stream: Stream[M]) -> Key[M]:
-        """Make it of text and stream."""
+        """Make a key from its text and its stream."""
         key = super().__new__(cls, text)
         key.stream = stream
         return key
@@ -52,11 +52,11 @@ class Keys:
                 raise ConfigError(f"{name} must be words joined by single slashes, without any of * $ ? # or a leading @, got {value!r}")
 
     def below(self, name: str) -> str:
-        """Key of whatever name below this robot, such as ``"**"``."""
+        """Return the key of any name below this robot, such as ``"**"``."""
         return f"{self.prefix}/{self.robot}/{name}"
 
     def of(self, stream: Stream[M], role: str = "") -> Key[M]:
-        """Key of a stream; of those by role with the role, or a wildcard for it."""
+        """Return the key of a stream; for a stream by role, with the role or a wildcard."""
         return Key(self.below(f"{stream.name}/{role}" if stream.by_role else stream.name), stream)
 
     @property
@@ -71,7 +71,7 @@ class Keys:
 
     @property
     def anchored(self) -> Key[Reference]:
-        """`Reference` with its real stamp, by the controller, for one that came to start on arrival."""
+        """`Reference` with its real stamp, by the controller, for one that starts on arrival."""
         return self.of(streams.ANCHORED)
 
     @property
@@ -91,7 +91,7 @@ class Keys:
 
     @property
     def shadow_telemetry(self) -> Key[Telemetry]:
-        """`Telemetry`, by a controller that stands by."""
+        """`Telemetry`, by a standby."""
         return self.of(streams.SHADOW_TELEMETRY)
 
     @property

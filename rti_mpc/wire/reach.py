@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reminder of what a process still waits for: said soon after the start, and now and then again until it has come."""
+"""Reminder of a message that a process still waits for: soon after the start, and again from time to time until it arrives."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ REMINDER_INTERVAL_S = 60.0  # between later reminders
 
 def remind(say: Callable[[str], object], wanted: Callable[[], str], over: Event) -> None:
     """
-    Say what is wanted, in a thread of its own.
+    Report what a process waits for, in a thread of its own.
 
     Args:
-        say: Takes a line.
-        wanted: What is, and what may be wrong; empty once it has come, which ends the reminder.
-        over: Ends it when set.
+        say: Receiver of a line.
+        wanted: Returns what is missing and what may be wrong; empty once it has arrived, which ends the reminder.
+        over: Ends the reminder when set.
     """
 
     def watch() -> None:

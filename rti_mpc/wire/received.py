@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Payload as a session hands it over."""
+"""Payload that a session has received."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from dataclasses import dataclass
 @dataclass(frozen=True, slots=True)
 class Received:
     """
-    A payload as it came, not yet looked at.
+    A payload as it came, not decoded yet.
 
     Attributes:
-        payload: Its bytes; none where they are more than its key takes.
-        encoding: What the sender says they are.
-        key: Where it was published.
-        withheld: How many bytes were sent, where there are none in `payload` for it.
+        payload: Bytes of the payload; empty if they are more than the key allows.
+        encoding: Encoding that the sender declares.
+        key: Key on which it was published.
+        withheld: Number of bytes sent, if `payload` is empty because they were too many; else 0.
     """
 
     payload: bytes
@@ -25,5 +25,5 @@ class Received:
 
     @property
     def size(self) -> int:
-        """How many bytes were sent."""
+        """Number of bytes that were sent."""
         return self.withheld or len(self.payload)

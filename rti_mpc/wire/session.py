@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Settings of a session, with which a process joins the bus, and the Zenoh session made of them.
+Settings with which a process joins the bus, and the Zenoh session made from them.
 
-Peers find each other by gossip. One, the robot, listens on the rendezvous
-endpoint, the others on a free loopback port; those connect to the robot, again and
-again until it is there, learn of one another and link directly. So processes
-start and restart in any order, and those already linked stay so without the
-robot. Multicast is off. Across hosts, name the endpoint to listen on; across a
-security boundary, use ``mode="client"`` and a router: a peer never forwards, and
-never passes a router's access control.
+Peers find each other by gossip. The robot listens on the rendezvous endpoint, the others
+on a free loopback port. Those connect to the robot, trying until it is there, learn of
+one another and link directly. So processes may start and restart in any order, and those
+already linked stay so without the robot. Multicast is off. Across hosts, name the
+endpoint to listen on. Across a security boundary, use ``mode="client"`` and a router: a
+peer never forwards, and never passes a router's access control.
 """
 
 from __future__ import annotations
@@ -59,12 +58,12 @@ ZENOH_DEFAULTS: dict[str, Any] = {
 @dataclass(frozen=True, slots=True)
 class BusSettings:
     """
-    How a process joins the bus. A Zenoh configuration file yields to attributes that differ from their defaults.
+    Settings with which a process joins the bus. Attributes that differ from their defaults override a Zenoh configuration file.
 
     Attributes:
         mode: peer, client or router.
-        listen: Endpoints to listen on; none: a free loopback port, for a router the rendezvous.
-        connect: Endpoints to connect to; those in `listen` are left out, for a router the rendezvous, too.
+        listen: Endpoints to listen on; none for a free loopback port, or for the rendezvous endpoint of a router.
+        connect: Endpoints to connect to, without those in `listen`; a router does not connect to the rendezvous endpoint.
         config: Configuration file of Zenoh, JSON5.
         multicast: Whether to look for others by multicast.
         cfg: Further settings of Zenoh, each ``KEY:VALUE``, applied last.
@@ -83,7 +82,7 @@ def zenoh_config(settings: BusSettings) -> zenoh.Config:
     Zenoh configuration of a process.
 
     Raises:
-        ConfigError: An endpoint is none, Zenoh refuses a value, or cannot read the file.
+        ConfigError: An endpoint is malformed, or Zenoh refuses a value or cannot read the file.
     """
     for endpoint in (*settings.listen, *settings.connect):
         if not ENDPOINT_PATTERN.match(endpoint):
@@ -109,7 +108,7 @@ def zenoh_config(settings: BusSettings) -> zenoh.Config:
 
 
 def _by_name(settings: BusSettings, mode: str) -> dict[str, Any]:
-    """Settings by their names in Zenoh. Nobody connects to himself, and a router to nobody unless told."""
+    """Return the settings by their names in Zenoh. No process connects to itself, and a router to none by default."""
     others = () if mode == "router" and settings.connect == (RENDEZVOUS_ENDPOINT,) else settings.connect
     return {
         "listen/endpoints": settings.listen or {"client": [], "peer": ["tcp/127.0.0.1:0"], "router": [RENDEZVOUS_ENDPOINT]}.get(mode, []),
@@ -125,7 +124,7 @@ def _brief(error: Exception) -> str:
 
 
 def endpoints(config: zenoh.Config) -> str:
-    """Return where a process connects to, and what may be wrong there, in words; empty if it waits for others to come."""
+    """Return the endpoints that a process connects to, and what may be wrong there, in words; empty if it waits for others to connect."""
     given = json.loads(config.get_json("connect/endpoints"))
     text = ", ".join(given if isinstance(given, list) else [end for ends in given.values() for end in ends])
     wrong = (
@@ -138,7 +137,7 @@ def endpoints(config: zenoh.Config) -> str:
 
 def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event | None, say: Callable[[str], object]) -> zenoh.Session:
     """
-    Open a session; a client waits for its router, and says so.
+    Open a session; a client waits for its router, and reports that.
 
     Raises:
         ConfigError: Zenoh refuses a setting, or no router was there in time.

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-One source a key.
+Source of a stream: the one publisher per key that a receiver accepts.
 
-Several processes may publish on one key: a robot that was started twice, a
-planner forgotten in another terminal. A receiver locks to one epoch and takes
-nothing else, unless the epoch is higher (a restart) or nothing of its own was
-accepted for long: a single message of whatever number deafens nobody for longer.
-Its own epoch under other numbers must have counted on for as long, too: what is
-sent again by somebody who has recorded it does not.
+Several processes may publish on one key: a robot that was started twice, a planner
+forgotten in another terminal. A receiver locks to one epoch and accepts no other, unless
+the epoch is higher (a restart) or no message of its own epoch was accepted for the stale
+time. So a single message with any number blocks a receiver for no longer than that. If
+the same epoch goes on under other numbers, these must have increased for the stale time
+as well, which a recording that is sent again does not do.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from rti_mpc.contract.epoch import MAX_SEQ_GAP
 
 
 class Verdict(Enum):
-    """What a message is to a receiver."""
+    """Verdict on a message."""
 
-    NEW = "new"  # accepted, the first of a source, or of another count of it: whatever is remembered of the last no longer holds
+    NEW = "new"  # accepted: the first message of a source, or of a new numbering; what was remembered of the last source does not hold any more
     NEXT = "next"  # accepted
-    REPEATED = "repeated"  # refused: the last accepted message once more, as caches send it
+    REPEATED = "repeated"  # refused: the last accepted message again, as caches send it
     OLD = "old"  # refused: a later sequence number was accepted before
-    AHEAD = "ahead"  # refused: so many messages are not lost between two
-    FOREIGN = "foreign"  # refused: somebody else's, while our source is alive
+    AHEAD = "ahead"  # refused: the gap in sequence numbers is too large for lost messages
+    FOREIGN = "foreign"  # refused: from another source, while the present one is alive
 
     @property
     def accepted(self) -> bool:
@@ -35,7 +35,7 @@ class Verdict(Enum):
 
 class Source:
     """
-    The source a receiver is locked to.
+    The source that a receiver is locked to.
 
     Attributes:
         stale_ns: Time without an accepted message after which another epoch may take over, even a lower one.
@@ -52,7 +52,7 @@ class Source:
         self.lost = 0
         self.dropped = 0
         self._accepted_ns = 0
-        self._other_count = (2**64, 0)  # the last number that was refused of our epoch, and since when those went up
+        self._other_count = (2**64, 0)  # last refused number of the source's epoch, and time since which such numbers increase
 
     def accept(self, epoch: int, seq: int, now_ns: int) -> Verdict:
         """

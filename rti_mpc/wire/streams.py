@@ -2,9 +2,9 @@
 """
 Table of the streams of one robot: key, message, who may publish, quality of service, rate and size.
 
-The bus publishes and subscribes as the table says, the page of messages of the
-documentation is made from it, and so are the roles that everybody knows. A test
-starts each process and holds what it publishes against `publishers`.
+The bus publishes and subscribes by this table, and the documentation's page of messages
+is generated from it. A test starts each process and compares what it publishes with
+`publishers`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MAX_RING_BYTES = 1 << 30  # of one receiver's ring if peers send nothing but the
 
 
 class Kind(Enum):
-    """How a key is used."""
+    """Use of a key."""
 
     MESSAGE = "publisher"
     QUERY = "queryable"  # with a JSON object as request and as answer
@@ -42,10 +42,10 @@ class Qos:
     Quality of service.
 
     Attributes:
-        priority: Zenoh's name of it.
-        express: Whether it is sent at once, unbatched.
-        cached: Whether late joiners get the last message of each publisher.
-        congestion: Whether it is dropped where a link is congested, or waits.
+        priority: Zenoh's name of the priority.
+        express: Whether messages are sent at once, without batching.
+        cached: Whether late joiners receive the last message of each publisher.
+        congestion: Whether messages are dropped or wait where a link is congested.
     """
 
     priority: Literal["REAL_TIME", "DATA", "DATA_LOW"] = "DATA"
@@ -67,14 +67,14 @@ class Stream(Generic[M]):
     One row of the table.
 
     Attributes:
-        name: Key below ``<prefix>/<robot>/``; without the role that the keys of some end with.
-        message: Class of the messages; None: a JSON object, or nothing.
-        publishers: Roles that may publish, answer or show presence on it. A controller that stands by is ready to lead: it has both its roles.
-        qos: Quality of service; of a query its request's.
-        rate: How often, in words.
-        about: What it is for, in words.
-        kind: How the key is used.
-        by_role: Whether the key ends with the role of the publisher, each under its own.
+        name: Key below ``<prefix>/<robot>/``, without the role that some keys end with.
+        message: Class of the messages; None for a JSON object, or for nothing.
+        publishers: Roles that may publish, answer or show presence on it. A standby must be ready to lead, so it has both its roles.
+        qos: Quality of service; for a query that of the request.
+        rate: Rate of the messages, in words.
+        about: Purpose, in words.
+        kind: Use of the key.
+        by_role: Whether the key ends with the role of the publisher.
         askers: Roles that may send queries.
     """
 
@@ -96,7 +96,7 @@ class Stream(Generic[M]):
         return document.MAX_DOCUMENT_BYTES if self.message is None else MAX_PAYLOAD_BYTES[self.message]
 
     def capacity(self, messages: int) -> int:
-        """Return how many messages a ring may hold, of those that a receiver wants, within `MAX_RING_BYTES`."""
+        """Return the number of messages wanted, limited so that the longest ones fit into `MAX_RING_BYTES`."""
         return min(messages, MAX_RING_BYTES // self.max_bytes)
 
 
@@ -155,17 +155,17 @@ STREAMS: tuple[Stream[Any], ...] = (
 
 
 def role_of(key: str) -> str:
-    """Return the role that a key of an event, a description or a token ends with; empty if it is no name of one."""
+    """Return the role that a key of an event, a description or a token ends with; empty if that is not a role."""
     role = key.rpartition("/")[2]
     return role if ROLE_PATTERN.fullmatch(role) else ""
 
 
 def admitted(key: str, known: Collection[str]) -> bool:
     """
-    Return whether to listen to the role that a key ends with: of any in `KNOWN_ROLES`, and of `MAX_UNKNOWN_ROLES` others.
+    Return whether to listen to the role that a key ends with: to all in `KNOWN_ROLES`, and to `MAX_UNKNOWN_ROLES` others.
 
     Args:
-        key: Of an event, a description or a token.
+        key: Key of an event, a description or a token.
         known: Keys of this stream that were admitted before.
     """
     if key in known or role_of(key) in KNOWN_ROLES:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Zenoh session of one process, with every trap of it closed off: what a `rti_mpc.wire.bus.Bus` speaks through.
+Zenoh session of one process, which carries the buses of its robots (`rti_mpc.wire.bus.Bus`).
 
-* Whatever is received waits in a ring of fixed size that drops the oldest: an
-  unread subscriber stops nobody, and no Python runs in a thread of Zenoh.
-* Whatever is sent is dropped rather than waited for where a link is congested.
-* A session hears nothing of what it publishes itself.
+* Received messages wait in a ring of fixed size that drops the oldest: an unread
+  subscriber blocks nobody, and no Python code runs in a thread of Zenoh.
+* Messages are dropped, not waited for, where a link is congested.
+* A session does not receive what it publishes itself.
 * `ZenohSession.close` is bounded, unblocks every `recv`, and the interpreter then exits.
 """
 
@@ -39,7 +39,7 @@ give_way: Callable[[], None] = getattr(os, "sched_yield", lambda: None)  # not o
 
 
 class ZenohPublisher(Generic[M]):
-    """Sends the messages of a stream. `put` never blocks, and does nothing once it is undeclared or the session closed."""
+    """Publisher of a stream. `put` never blocks, and does nothing once the publisher is undeclared or the session closed."""
 
     def __init__(self, publisher: zenoh.Publisher | ext.AdvancedPublisher, *, realtime: bool = False) -> None:
         self._publisher = publisher
@@ -47,14 +47,14 @@ class ZenohPublisher(Generic[M]):
 
     @property
     def heard(self) -> bool:
-        """Whether anybody listens now; of a cached publisher always true, since its last message waits for them."""
+        """Whether anybody listens now; always true for a cached publisher, whose last message waits for late joiners."""
         if not isinstance(self._publisher, zenoh.Publisher):
             return True
         status: Any = self._publisher.matching_status  # an object, always true, whatever its type hint says
         return bool(status.matching)
 
     def put(self, message: M) -> None:
-        """Send a message to whoever listens now, and to late joiners if the publisher is cached."""
+        """Send a message to all who listen now, and to late joiners if the publisher is cached."""
         self.put_bytes(encode(message))
 
     def put_bytes(self, payload: bytes) -> None:
@@ -65,7 +65,7 @@ class ZenohPublisher(Generic[M]):
             if not any(word in str(error) for word in CLOSED_WORDS):
                 raise
         if self._realtime:
-            give_way()  # to the thread that sends it: whoever puts goes on computing, and cores may be few
+            give_way()  # to Zenoh's sending thread: the caller goes on computing, and there may be few cores
 
     def undeclare(self) -> None:
         """Leave the key."""
@@ -74,7 +74,7 @@ class ZenohPublisher(Generic[M]):
 
 
 class ZenohSubscriber:
-    """Receives from one key expression into a ring: the newest samples, oldest first. After `ZenohSession.close`, nothing."""
+    """Subscriber to one key expression, with a ring of the newest samples, oldest first. It is empty after `ZenohSession.close`."""
 
     def __init__(self, subscriber: zenoh.Subscriber[Any] | ext.AdvancedSubscriber[Any], key: Key[Any], capacity: int, own: str) -> None:
         self._subscriber = subscriber
@@ -82,8 +82,8 @@ class ZenohSubscriber:
         self._handler = subscriber.handler
         self._key = "" if "*" in key else str(key)
         self._max_bytes = key.stream.max_bytes
-        self._own = own  # a cache answers its own session, too
-        self._encoding: tuple[zenoh.Encoding | None, str] = None, ""  # the last one, and its text: to compare costs a fifth of making it
+        self._own = own  # a cache also answers its own session
+        self._encoding: tuple[zenoh.Encoding | None, str] = None, ""  # the last one, and its text: comparing costs a fifth of making the text
 
     def recv(self) -> Received | None:
         """Next sample, waiting for it; None once the session is closed."""
@@ -105,11 +105,11 @@ class ZenohSubscriber:
         return None
 
     def drain(self) -> list[Received]:
-        """All samples there are now, oldest first, and of those that come meanwhile no more than the ring holds."""
+        """All samples there are now, oldest first; no more than the ring holds, even if others arrive meanwhile."""
         return list(islice(iter(self.try_recv, None), self._capacity))
 
     def undeclare(self) -> None:
-        """Hear no more; whoever waits is told so."""
+        """Stop receiving; a waiting `recv` returns None."""
         subscriber: Any = self._subscriber
         subscriber.undeclare()
 
@@ -139,10 +139,10 @@ class ZenohSession:
         Open a session.
 
         Args:
-            settings: How.
-            timeout_s: How long a client waits for its router.
+            settings: Settings of the session.
+            timeout_s: Time for which a client waits for its router.
             stop: Ends that wait when set.
-            say: Takes a line about who is not reached.
+            say: Receiver of a line about processes that are not reached.
 
         Raises:
             ConfigError: Zenoh refuses a setting, an endpoint is taken, or no router was there in time.
@@ -158,14 +158,14 @@ class ZenohSession:
         self.close()
 
     def close(self) -> None:
-        """Close it within half a second, even where Zenoh takes longer; every `recv` returns None."""
+        """Close the session within half a second, even where Zenoh takes longer; every `recv` then returns None."""
         closing = threading.Thread(target=self._session.close, daemon=True)
         closing.start()
         closing.join(CLOSE_TIMEOUT_S)
 
     @property
     def links(self) -> int | None:
-        """How many others this process is linked to; None once it is closed."""
+        """Number of other processes that this one is linked to; None once it is closed."""
         try:
             return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
         except zenoh.ZError:
@@ -183,7 +183,7 @@ class ZenohSession:
         }
         if not qos.cached:
             return ZenohPublisher(self._session.declare_publisher(key, **options), realtime=qos.express)
-        # A last message that was dropped would not be missed without heartbeats.
+        # Without heartbeats a subscriber would not notice that the last message was dropped.
         options["sample_miss_detection"] = ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None)
         return ZenohPublisher(ext.declare_advanced_publisher(self._session, key, cache=ext.CacheConfig(1), publisher_detection=True, **options))
 
@@ -214,7 +214,7 @@ class ZenohSession:
         return queryable
 
     def ask(self, key: Key[Any], payload: bytes, timeout_s: float) -> Iterator[Received]:
-        """Yield what all who serve a key answer, as it comes."""
+        """Yield the answers of all processes that serve a key, as they arrive."""
         replies = self._session.get(
             key,
             timeout=timeout_s,
@@ -234,11 +234,11 @@ class ZenohSession:
         return self._session.liveliness().declare_token(key)
 
     def present(self, key: Key[Any], timeout_s: float) -> bool:
-        """Whether anybody shows presence, ourselves included, and is heard of in time."""
+        """Whether anybody shows presence within the timeout, this process included."""
         return any(reply.ok is not None for reply in self._session.liveliness().get(key, timeout=timeout_s))
 
     def watch(self, key: Key[Any], tell: Callable[[str, bool], None]) -> Any:
-        """Tell, in a thread of its own, the keys of those present and whether they are, now and at every change."""
+        """Report, in a thread of its own, each key with whether its owner is present, for all now and then at every change."""
         ring: Any = zenoh.handlers.RingChannel(RING_TOKENS)
         subscriber = self._session.liveliness().declare_subscriber(key, ring, history=True)
         _follow(subscriber.handler, lambda sample: tell(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
@@ -246,13 +246,13 @@ class ZenohSession:
 
 
 def _withheld(payload: zenoh.ZBytes | None, key: str, max_bytes: int) -> Received:
-    """Return a payload, without its bytes where those are too many."""
+    """Return a payload, without its bytes if they are too many."""
     size = 0 if payload is None else len(payload)
     return Received(b"" if payload is None or size > max_bytes else payload.to_bytes(), JSON_ENCODING, key, withheld=size if size > max_bytes else 0)
 
 
 def _follow(handler: Any, act: Callable[[Any], None]) -> None:
-    """Act on what comes, in a thread of its own, until the session is closed."""
+    """Act on each item of a handler, in a thread of its own, until the session is closed."""
 
     def follow() -> None:
         while True:
@@ -262,7 +262,7 @@ def _follow(handler: Any, act: Callable[[Any], None]) -> None:
                 return
             try:
                 act(item)
-            except zenoh.ZError:  # whoever asked, or the session, is gone
+            except zenoh.ZError:  # the requester or the session is gone
                 continue
 
     threading.Thread(target=follow, daemon=True).start()
