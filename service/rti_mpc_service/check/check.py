@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A dry run of one configuration: does it load, how long does a sample take here, is its QP solver right?
+Dry run of one configuration: it loads, a sample is timed here, and a second solver confirms its QPs.
 
-The plan's own prediction, disturbed, is the next state: 200 samples of closed
-loop around a wave in every output, seeded, then excursions to each bound that
-there is. Every tenth QP, and those of the excursions, are solved again, by the
-same solver as tightly as it can, and by another one in the other way of writing
-the problem. That those two agree says that the QP is solved right; how far the
-controller's own plan is from theirs, what its tolerance costs.
+The closed loop has 200 samples along a wave in every output; the next state is the
+plan's own prediction plus a seeded disturbance. Excursions to every bound follow.
+Every tenth QP of the wave, and the first and the last of each excursion, are solved
+again: by the same solver with a tight tolerance, and by a second solver in the other
+formulation. If those two agree, the QP is solved correctly; the distance of the
+controller's own plan from theirs is the error of its tolerance.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ class CheckReport:
     Attributes:
         prepare_us: Time of each preparation, shape ``(WAVE_SAMPLES,)``.
         feedback_us: Time of each feedback, shape ``(WAVE_SAMPLES,)``.
-        statuses: How often each status came out.
-        second: The other solver.
-        opinions: How many QPs both have solved.
-        difference: Largest difference of its inputs from those of the first, solved tightly, relative to half the range of each.
-        deviation: Largest difference of the controller's own inputs from them.
-        bounds: How many bounds there are.
-        missed: Names of those that no plan has been at.
+        statuses: Number of samples with each status.
+        second: Name of the second solver.
+        opinions: Number of QPs that both have solved.
+        difference: Largest difference between the inputs of both tight solutions, relative to half the range of each input.
+        deviation: Largest difference of the controller's own inputs from those of the second solver, likewise.
+        bounds: Number of bounds.
+        missed: Names of the bounds that no plan has reached.
     """
 
     prepare_us: Array
@@ -72,7 +72,7 @@ class CheckReport:
 
     @property
     def agree(self) -> bool:
-        """Whether the other solver confirms the first."""
+        """Whether the second solver confirms the first."""
         return self.opinions > 0 and self.difference <= AGREEMENT_TOLERANCE
 
 
@@ -119,7 +119,7 @@ def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> Check
     deviations: list[float] = []
 
     def sample(x: Array, y_ref: Array, *, asked: bool) -> tuple[float, float]:
-        """Solve one sample, and have its QP solved again; return the times of both phases, us."""
+        """Solve one sample, and compare its QP if `asked`; return the times of both phases, us."""
         began_ns = time.perf_counter_ns()
         rti.prepare(y_ref)
         prepared_ns = time.perf_counter_ns()
@@ -152,13 +152,13 @@ def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> Check
 
 
 def tight_copy(rti: Rti, solver: str, formulation: str) -> Rti:
-    """Return a controller's like whose solver is tight; those of qpsolvers are in any case."""
+    """Return a controller of the same problem with a tight tolerance; solvers of qpsolvers keep their own, which is tight."""
     settings = TIGHT_SETTINGS if solver in BUILT_IN_SOLVERS else None
     return Rti(rti.ocp, settings, formulation=formulation, solver=solver, iterations=rti.iterations, tolerance=rti.tolerance, compile=False)
 
 
 def solution(one: Rti, guess: tuple[Array, ...], y_ref: Array, x0: Array) -> Array | None:
-    """Return the inputs that an iteration makes of a sample, from a guess of x, u and u_prev; shape ``(N_u, nu)``, None if it makes none."""
+    """Return the inputs of one iteration from a guess of x, u and u_prev, shape ``(N_u, nu)``; None if the QP is not solved."""
     one.x[:], one.u[:], one.u_prev[:] = guess
     one.prepare(y_ref, shift=False)
     return one.u.copy() if one.feedback(x0) is QpStatus.SOLVED else None

@@ -2,9 +2,9 @@
 """
 Excursions: starts and references that drive a controller to each of its bounds.
 
-A wave of moderate size touches few of them, and a solver that is wrong at a
-bound would go unnoticed. Inputs and increments are driven by a reference that
-lies ten times as far as they reach, softened bounds by a start beyond them.
+A wave of moderate size reaches few bounds, so an error of a solver at a bound could
+stay hidden. Bounds of inputs and increments are reached by a reference ten times as far
+away as those inputs can drive the outputs, softened bounds by a start beyond them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ AT_BOUND_SCALES = 1e-3  # a plan this close to a bound, in scales of the bounded
 
 @dataclass(frozen=True)
 class Excursion:
-    """Where it starts, shape ``(nx,)``, and the reference rows that it follows, shape ``(N, ny)``."""
+    """Initial state, shape ``(nx,)``, and reference rows, shape ``(N, ny)``."""
 
     x0: Array
     y_ref: Array
@@ -35,11 +35,11 @@ class Excursion:
 
 class Bounds:
     """
-    The bounds of a problem, and which of them a controller has been at.
+    The bounds of a problem, and which of them the plans of a controller have reached.
 
     Attributes:
-        names: What each is called; upper and lower are two.
-        reached: Which of them plans have been at so far, shape ``(len(names),)``.
+        names: Name of each finite bound; lower and upper bounds count separately.
+        reached: Which of them have been reached so far, shape ``(len(names),)``.
     """
 
     def __init__(self, rti: Rti) -> None:
@@ -57,7 +57,7 @@ class Bounds:
         self._softened = ca.Function("softened", [model.x, model.u, model.p], [ca.vertcat(model.x[list(ocp.soft), 0], ocp.h_expr)]).map(ocp.N)
 
     def look(self) -> None:
-        """Note which bounds the last plan is at."""
+        """Note which bounds the last plan has reached."""
         rti, ocp = self._rti, self._rti.ocp
         held = rti.u[np.minimum(np.arange(ocp.N), ocp.N_u - 1)]
         increments = np.diff(rti.u, axis=0, prepend=rti.u_prev[None])
@@ -73,12 +73,12 @@ class Bounds:
 
     @property
     def missed(self) -> list[str]:
-        """Names of the bounds that no plan has been at."""
+        """Names of the bounds that no plan has reached."""
         return [name for name, reached in zip(self.names, self.reached, strict=True) if not reached]
 
 
 def excursions(rti: Rti, x0: Array) -> Iterator[Excursion]:
-    """Yield an excursion to each bound, from around a state of shape ``(nx,)``."""
+    """Yield an excursion to each finite bound, near the state `x0`, shape ``(nx,)``."""
     ocp = rti.ocp
     rest = np.array(ocp.model.u_rest)
     nominal = outputs(ocp, x0, rest)
@@ -95,7 +95,7 @@ def excursions(rti: Rti, x0: Array) -> Iterator[Excursion]:
 
 
 def outputs(ocp: Ocp, x: Array, u: Array) -> Array:
-    """Return the outputs at nodes 1 to N if an input is held, shape ``(N, ny)``."""
+    """Return the outputs at nodes 1 to N under a constant input, shape ``(N, ny)``."""
     phi, h, p = ocp.phi(), ocp.model.h(), np.array(ocp.model.p_nominal)
     rows = []
     for _ in range(ocp.N):
@@ -105,7 +105,7 @@ def outputs(ocp: Ocp, x: Array, u: Array) -> Array:
 
 
 def start_at(rti: Rti, x0: Array, j: int, wanted: float) -> Array:
-    """Return the state near `x0`, by its scale, at which the j-th of what has softened bounds has a value; as near as Newton's method comes."""
+    """Return the state nearest to `x0`, in scales, at which the j-th softly bounded quantity is `wanted`; approximate, by Newton's method."""
     ocp = rti.ocp
     model = ocp.model
     g = ca.vertcat(model.x[list(ocp.soft), 0], ocp.h_expr)[j]

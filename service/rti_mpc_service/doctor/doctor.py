@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Doctor: measurements of what this host gives to a control loop, and the period that the loop can keep on it.
+Measurement of this host: timer, bus and controller, and the shortest period that a control loop can keep here.
 
-Each part is measured alone, for a second: how late a bare timer wakes, how long a
-message takes to another process and back, how long preparation and feedback of
+Each part is measured alone for a second: how late a bare timer wakes, how long a
+message takes to another process and back, and how long preparation and feedback of
 this configuration take after a pause, with caches as cold as in a service.
 """
 
@@ -77,7 +77,7 @@ def main(path: Path, json_path: Path | None = None) -> int:
 
 
 def examine(config: Config) -> dict[str, Any]:
-    """Measure everything, one after the other, in JSON; times in the unit of the name."""
+    """Measure all parts one after the other, and return the results in JSON; the name of a time ends with its unit."""
     ticks = count()
     report: dict[str, Any] = {
         "machine": machine.machine_info(),
@@ -95,14 +95,14 @@ def examine(config: Config) -> dict[str, Any]:
 
 
 def period_verdict(report: dict[str, Any], dt_s: float) -> dict[str, Any]:
-    """Say which period can be kept: all that happens between two states, each at its p99, and half as much again; none if a part is unknown."""
+    """Return the shortest period, `PERIOD_MARGIN_FACTOR` times the sum of all parts at p99, None if one is unknown; and whether `dt_s` is as long."""
     parts = [report[part]["p99"] for part in ("prepare_us", "feedback_us", "timer_us", "round_trip_us")]
     shortest_us = None if None in parts else PERIOD_MARGIN_FACTOR * sum(parts)
     return {"margin": PERIOD_MARGIN_FACTOR, "shortest_period_us": shortest_us, "fits": shortest_us is not None and shortest_us <= 1e6 * dt_s}
 
 
 def permissions(config: Config) -> dict[str, dict[str, Any]]:
-    """Attempt what a controller may ask for, in a thread that then ends."""
+    """Attempt the real-time settings of a controller in a thread that ends afterwards."""
     wanted = config.realtime
     with ThreadPoolExecutor(1) as pool:
         outcomes = pool.submit(realtime.attempt, wanted.priority or DEFAULT_PRIORITY, wanted.cores or realtime.available(), lock_memory=True).result()
@@ -123,7 +123,7 @@ def clock_info() -> dict[str, Any]:
 
 
 def round_trip_us(config: Config) -> Array:
-    """Send a state to another process, which answers with a command's size; empty if it never came up."""
+    """Return round-trip times of a state to another process and a message of a command's size back; empty if that process did not start."""
     model, keys, endpoint = build_model(config), config.keys(), free_endpoint()
     command = Command(0, 0, 0, 0, 0, 0, 0, 0, Mode.TRACKING, QpStatus.SOLVED, 0, np.zeros((config.ocp.N, model.nu)))
     with (
@@ -140,7 +140,7 @@ def round_trip_us(config: Config) -> Array:
 
 
 def phases_us(config: Config) -> tuple[Array, Array]:
-    """Control a robot that does what the plan says, as the daemon does, each state in its time; return the times of preparation and of feedback."""
+    """Control a robot that follows the plan exactly, with a pause before each sample; return the times of preparation and of feedback."""
     rti, x = build_rti(config), np.array(robot_settings(config)["x0"])
     warm_up(rti)
     dt_ns = round(1e9 * config.ocp.dt_s)
@@ -178,20 +178,20 @@ def phases_us(config: Config) -> tuple[Array, Array]:
 
 
 def paced(number: int) -> Iterator[int]:
-    """Count, with a pause before each."""
+    """Yield the numbers from 0 on, each after a pause."""
     for k in range(number):
         time.sleep(PAUSE_S)
         yield k
 
 
 def compiler() -> str | None:
-    """Return the first line of what the C compiler says of itself, None if there is none."""
+    """Return the first line of the C compiler's version, None if there is no compiler."""
     path = shutil.which("cc")
     return subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout.partition("\n")[0] if path else None
 
 
 def cache_info() -> dict[str, Any]:
-    """Say where compiled code is kept, and what keeps it from being kept there, if anything does."""
+    """Return the folder of compiled code, or the error that prevents its use."""
     try:
         folder = cache_dir()
         own(folder)
@@ -209,7 +209,7 @@ def installed(name: str) -> str | None:
 
 
 def finding_rows(report: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Say each finding and what it means, in a line."""
+    """Yield each finding as a row: what, its value here, what it means."""
     host, clock_info, loop, cache_info = report["machine"], report["clock"], report["loop"], report["cache"]
     slack = "unknown" if clock_info["timer_slack_us"] is None else f"{clock_info['timer_slack_us']:g} us"
     yield "processor", f"{host['processor']}, {host['cores']} cores, load {host['load']}", "robot and controller want a core each"
@@ -231,10 +231,10 @@ def finding_rows(report: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
 
 
 def shortest_text(loop: dict[str, Any]) -> str:
-    """Return the shortest period in words."""
+    """Return the shortest period as text."""
     return "unknown" if loop["shortest_period_us"] is None else f"{1e-3 * loop['shortest_period_us']:.1f} ms"
 
 
 def quantiles_text(times: dict[str, float]) -> str:
-    """Return quantiles in words."""
+    """Return quantiles as text."""
     return "not measured" if times["p50"] is None else f"p50 {times['p50']:.0f}, p99 {times['p99']:.0f}, max {times['max']:.0f} us"

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The floor under every latency: a bare echo over the same bus, in a process of its own.
+Bare echo over the same bus, in a process of its own: the lower limit of every latency.
 
 A message of a state's size goes out, one of a command's size comes back, and
-nothing is computed between. `python -m rti_mpc_service.host.echo ENDPOINT PREFIX ROBOT BYTES`
-answers; `Echo` asks, half a period after each sample, so that the two do
-not get into each other's way.
+nothing is computed in between. `python -m rti_mpc_service.host.echo ENDPOINT PREFIX ROBOT BYTES`
+answers. `Echo` sends its pings half a period after each sample, so that pings
+and samples do not disturb each other.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ ROLE = "echo"
 
 class Pinger:
     """
-    Asks.
+    Sends pings and measures how long the answers take.
 
     Attributes:
-        round_trip_us: Every answer's time so far.
+        round_trip_us: Round-trip time of every answered ping so far.
     """
 
     def __init__(self, bus: Bus, state: State) -> None:
         """
-        Begin.
+        Open the publisher and the subscriber.
 
         Args:
-            bus: Where the answering process is.
-            state: What is sent.
+            bus: Bus of the answering process.
+            state: The message that is sent as a ping.
         """
         self.round_trip_us: list[float] = []
         self._payload = encode(state)
@@ -47,7 +47,7 @@ class Pinger:
         self._pongs = bus.subscriber(bus.keys.of(PONG))
 
     def ping(self) -> bool:
-        """Ask once; return whether there was an answer before the bus was closed."""
+        """Send a ping and wait for its answer; return False if the bus was closed before it came."""
         self._pongs.drain()
         sent_ns = time.monotonic_ns()
         self._pings.put_bytes(self._payload)
@@ -58,16 +58,16 @@ class Pinger:
 
 
 class Echo(Pinger):
-    """Pings, at the pace of telemetry."""
+    """Sends one ping after each message of telemetry."""
 
     def __init__(self, bus: Bus, state: State, pause_s: float) -> None:
         """
-        Begin.
+        Start the thread that sends pings.
 
         Args:
-            bus: Where telemetry and the answering process are.
-            state: What is sent.
-            pause_s: From hearing of a sample to the next ping.
+            bus: Bus of telemetry and of the answering process.
+            state: The message that is sent as a ping.
+            pause_s: Time from the telemetry of a sample to the ping.
         """
         super().__init__(bus, state)
         self._pause_s = pause_s
@@ -83,7 +83,7 @@ class Echo(Pinger):
 
 
 def main(settings: BusSettings, keys: Keys, size: int) -> None:
-    """Answer every ping with so many bytes, until stopped."""
+    """Answer every ping with a message of `size` bytes, until stopped."""
     stop = stop_on_signals()
     with Bus.join(settings, keys) as bus:
         pings, pongs = bus.subscriber(keys.of(PING)), bus.publisher(keys.of(PONG))
@@ -93,7 +93,7 @@ def main(settings: BusSettings, keys: Keys, size: int) -> None:
 
 
 def _answer(pings: Subscriber, pongs: Publisher[Command], payload: bytes) -> None:
-    """Receive, send, and nothing else."""
+    """Answer each ping; a thread of its own."""
     while pings.recv() is not None:
         pongs.put_bytes(payload)
 

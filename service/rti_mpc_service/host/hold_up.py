@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A witness of the host: how long it kept its cores from a process and all that it has started.
+Witness of the host: for how long a process and its descendants were ready to run and got no core.
 
-On each core a bare timer, which computes nothing, tells when that core stood still.
-One of them adds up how long each thread of the watched processes was ready to run
-and had no core (`schedstat` in `proc(5)`). What one process waits for the next,
-so the sum over all of them bounds what a chain of them may be late by.
+A bare timer on each core, which computes nothing, measures when that core stood still.
+One of the timers adds up how long each thread of the watched processes was ready to run
+and had no core (`schedstat` in `proc(5)`). Where processes wait for each other, the sum
+over all of them is an upper bound on the delay of the chain.
 
-`python -m rti_mpc_service.host.hold_up FILE CORE PID` is one such timer; a PID of 0 watches nobody.
+`python -m rti_mpc_service.host.hold_up FILE CORE PID` is one such timer; with PID 0 it watches no process.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ ROW_TIMEOUT_S = 10.0  # how long to wait for the rows of a requested time
 
 
 class Row(NamedTuple):
-    """What one timer saw, ns: between two instants of the monotonic clock, by how much its ticks were late and for how long threads waited."""
+    """Record of one timer between two instants of the monotonic clock: lateness of its ticks, and waiting time of the watched threads, ns."""
 
     since_ns: int
     until_ns: int
@@ -45,12 +45,12 @@ class Row(NamedTuple):
 
     @property
     def held_up_ns(self) -> int:
-        """Both."""
+        """Lateness and waiting time together."""
         return self.late_ns + self.waited_ns
 
 
 class Host:
-    """Watches this process and all its descendants, from when it is entered until it is left."""
+    """Witness that watches this process and all its descendants while its context is open."""
 
     def __enter__(self) -> Host:
         with ExitStack() as stack:
@@ -65,28 +65,28 @@ class Host:
 
     def held_up_ms(self, from_ns: int, to_ns: int) -> float:
         """
-        Return for how long the host held the watched processes up in a time that has passed, all cores and threads added up, ms.
+        Return for how long the host held the watched processes up in a past interval, summed over all cores and threads, ms.
 
         Args:
-            from_ns: From when on, by the monotonic clock.
-            to_ns: To when.
+            from_ns: Start of the interval, by the monotonic clock.
+            to_ns: End of the interval.
 
         Raises:
-            TimeoutError: A timer has not come to its end within ten seconds.
+            TimeoutError: A timer has not recorded the interval within ten seconds.
         """
         return 1e-6 * sum(row.held_up_ns for timer in self._timers for row in timer.rows(from_ns, to_ns))
 
     def worst_ms(self, from_ns: int, to_ns: int, within_ns: int) -> float:
         """
-        Return for how long the host held the watched processes up at worst within some time, ms.
+        Return the longest hold-up within any window of an interval, ms.
 
         Args:
-            from_ns: From when on, by the monotonic clock.
-            to_ns: To when.
-            within_ns: How much time.
+            from_ns: Start of the interval, by the monotonic clock.
+            to_ns: End of the interval.
+            within_ns: Length of the window.
 
         Raises:
-            TimeoutError: A timer has not come to its end within ten seconds.
+            TimeoutError: A timer has not recorded the interval within ten seconds.
         """
         rows = sorted(row for timer in self._timers for row in timer.rows(from_ns, to_ns))
         recent, held_up_ns, worst_ns = deque[Row](), 0, 0
@@ -111,7 +111,7 @@ class Timer:
         stack.callback(self.process.kill)
 
     def rows(self, from_ns: int, to_ns: int) -> Iterator[Row]:
-        """Wait until it has seen a time whole, and return what it saw then, the last first."""
+        """Wait until the timer has recorded an interval completely, and yield its rows, the last one first."""
         deadline_s = time.monotonic() + ROW_TIMEOUT_S
         while not self._rows or self._rows[-1].until_ns < to_ns:
             if time.monotonic() > deadline_s:
@@ -129,10 +129,10 @@ class Timer:
 
 class Threads:
     """
-    All threads of a process and its descendants, but for our own, and how long each has waited for a core.
+    All threads of a process and its descendants, except this timer's own, and how long each has waited for a core.
 
-    The kernel adds a wait up when it is over. One that lasts is told meanwhile, as is
-    the last one of a thread that then ends: the thread is runnable, and does not run.
+    The kernel counts a wait only when it is over. A wait that still lasts is counted here
+    meanwhile, since the thread is runnable and does not run; so is the last wait of a thread that ends in it.
     """
 
     def __init__(self, pid: int) -> None:
@@ -143,7 +143,7 @@ class Threads:
         self.waited_ns()
 
     def look(self) -> None:
-        """Find the threads there are now."""
+        """Find the threads that exist now."""
         pids = [str(self._pid)] if self._pid else []
         for pid in pids:
             with suppress(OSError):  # it ends meanwhile
@@ -155,7 +155,7 @@ class Threads:
                         self._open[folder] = Waits(folder)
 
     def waited_ns(self) -> int:
-        """Return what they have waited since the last call, ns."""
+        """Return how long all threads together have waited since the last call, ns."""
         total_ns, now_ns = 0, time.monotonic_ns()
         for folder, waits in list(self._open.items()):
             try:
@@ -174,14 +174,14 @@ class Waits:
         self._stat = f"{folder}/stat"
         self._descriptor = os.open(f"{folder}/schedstat", os.O_RDONLY)
         self._ran_ns = self._waited_ns = 0
-        self._told_ns = 0  # of a wait that lasts
+        self._told_ns = 0  # already returned part of a wait that still lasts
 
     def since(self, elapsed_ns: int) -> int:
         """
-        Return what it has waited since the last call, so many ns ago.
+        Return how long the thread has waited since the last call, which was `elapsed_ns` ago.
 
         Raises:
-            OSError: It has ended.
+            OSError: The thread has ended.
         """
         ran_ns, waited_ns, _ = map(int, os.pread(self._descriptor, 128, 0).split())
         if (ran_ns, waited_ns) == (self._ran_ns, self._waited_ns):
@@ -194,12 +194,12 @@ class Waits:
         return more_ns
 
     def close(self) -> None:
-        """Let it go."""
+        """Close the thread's file in proc."""
         os.close(self._descriptor)
 
 
 def main(path: str, core: int, pid: int) -> None:
-    """Write a row every ten milliseconds for as long as our parent lives."""
+    """Write a row every ten milliseconds while the parent process lives."""
     os.sched_setaffinity(0, {core})
     parent, threads, number = os.getppid(), Threads(pid), 0
     since_ns = due_ns = time.monotonic_ns()
@@ -208,7 +208,7 @@ def main(path: str, core: int, pid: int) -> None:
             late_ns = 0
             for _ in range(TICKS_PER_ROW):
                 due_ns += TICK_PERIOD_NS
-                due_ns += max(0, time.monotonic_ns() - due_ns) // TICK_PERIOD_NS * TICK_PERIOD_NS  # those that were slept through are not made up for
+                due_ns += max(0, time.monotonic_ns() - due_ns) // TICK_PERIOD_NS * TICK_PERIOD_NS  # missed ticks are skipped
                 time.sleep(max(0.0, 1e-9 * (due_ns - time.monotonic_ns())))
                 if (lateness_ns := time.monotonic_ns() - due_ns) > MIN_COUNTED_LATENESS_NS:
                     late_ns += lateness_ns

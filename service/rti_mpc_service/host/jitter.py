@@ -15,8 +15,8 @@ def bare_timer(period_s: float, go_on: Callable[[], object]) -> NDArray[np.int64
     Sleep to the ticks of an absolute grid, and note when each was due and how late the wake-up is.
 
     Args:
-        period_s: Between two ticks, s; those that were slept through are left out.
-        go_on: Asked at each tick.
+        period_s: Time between two ticks, s; missed ticks are skipped.
+        go_on: Called at each tick; the timer ends when it returns a false value.
 
     Returns:
         Due times by the monotonic clock, and lateness, ns, shape ``(n, 2)``.

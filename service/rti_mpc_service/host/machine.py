@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The machine a figure was measured on: a time without it says nothing."""
+"""Description of the machine on which figures are measured."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PACKAGES = ("casadi", "eclipse-zenoh", "numpy", "osqp")
 
 
 def machine_info() -> dict[str, Any]:
-    """Describe this machine and what runs on it, in JSON."""
+    """Return processor, load, system and package versions, in JSON."""
     return {
         "processor": processor(),
         "cores": os.cpu_count(),
@@ -33,7 +33,7 @@ def packages() -> dict[str, str]:
 
 
 def processor() -> str:
-    """Return the name of the processor, as far as the system tells."""
+    """Return the name of the processor; the architecture where the system tells no name."""
     if CPUINFO.is_file():
         for line in CPUINFO.read_text(encoding="utf-8", errors="replace").splitlines():
             name, _, value = line.partition(":")

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Real time as far as the host gives it: each part attempted, its outcome told, none required.
+Real-time settings of a process: each is attempted and reported, and none is required.
 
-What is granted to the calling thread is inherited by every thread it starts, and
-by those they start: called before the bus is opened, it holds for the thread that
-controls, for Zenoh's that receive and send, and for all others of Python. These
-must not stay behind: the interpreter's lock knows no priority inheritance, so one
-that is preempted while it holds the lock would stop the control of the robot.
+Settings granted to the calling thread are inherited by every thread it starts, and
+by their threads. Called before the bus is opened, they hold for the control
+thread, for Zenoh's receiving and sending threads, and for all other Python threads.
+All of them need the priority: the interpreter's lock has no priority inheritance,
+so a thread of low priority, preempted while it holds the lock, would stop the control.
 
-SCHED_FIFO can hang a machine: a thread that never pauses takes its core from
-everybody of lower priority. No thread here spins, and the kernel is asked to kill
-the process (RLIMIT_RTTIME) should one compute for `MAX_UNBROKEN_COMPUTING_US` without a pause;
-the robot then brakes, and a supervisor starts the controller again.
+SCHED_FIFO can hang a machine: a thread that never pauses takes its core from all
+threads of lower priority. No thread here spins, and the kernel kills the process
+(RLIMIT_RTTIME) if a thread computes for `MAX_UNBROKEN_COMPUTING_US` without a pause.
+The robot then brakes, and a supervisor restarts the controller.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MCL_CURRENT, MCL_ONFAULT = 1, 4  # flags of mlockall(2)
 
 @dataclass(frozen=True)
 class RealtimeOutcome:
-    """What became of one attempt."""
+    """Outcome of one attempted setting."""
 
     what: str
     granted: bool
@@ -40,15 +40,15 @@ class RealtimeOutcome:
 
 def attempt(priority: int | None = None, cores: Sequence[int] = (), *, lock_memory: bool = False) -> list[RealtimeOutcome]:
     """
-    Ask the operating system for what is configured.
+    Request the configured settings from the operating system.
 
     Args:
-        priority: Of SCHED_FIFO; the usual scheduler if None.
-        cores: To run on; on any if empty.
-        lock_memory: Whether to keep in memory what has been used, and what of it will be.
+        priority: Priority of SCHED_FIFO; None: the usual scheduler.
+        cores: Numbers of the cores to run on; empty: any core.
+        lock_memory: Whether every used page of the present mappings stays in memory.
 
     Returns:
-        An outcome for each part that was asked for.
+        An outcome for each requested setting.
     """
     parts: list[tuple[bool, str, Callable[[], str], Callable[[], str]]] = [
         (priority is not None, "priority", lambda: _schedule(priority or 0), lambda: f"RLIMIT_RTPRIO is {limit(resource.RLIMIT_RTPRIO)}"),
@@ -59,7 +59,7 @@ def attempt(priority: int | None = None, cores: Sequence[int] = (), *, lock_memo
 
 
 def limit(number: int) -> str:
-    """Return a limit of this process in words."""
+    """Return a resource limit of this process as text."""
     soft, _ = resource.getrlimit(number)
     return "unlimited" if soft == resource.RLIM_INFINITY else str(soft)
 
@@ -92,8 +92,8 @@ def _pin(cores: Sequence[int]) -> str:
 
 
 def _lock() -> str:
-    # On fault: the whole address space, its unused stacks included, is ten times what is ever touched. Not of the
-    # future: behind a limit, an allocation that cannot be locked would fail.
+    # On fault: the whole address space, with its unused stacks, is ten times what is ever touched. Not MCL_FUTURE:
+    # with a limit on locked memory, an allocation that cannot be locked would fail.
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.mlockall(MCL_CURRENT | MCL_ONFAULT):
         number = ctypes.get_errno()
