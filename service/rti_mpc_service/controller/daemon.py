@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The controller as a process: waits for the state, acts, prepares the next sample in the slack.
+Controller process: waits for a state, sends its command, and prepares the next sample in the slack.
 
-One thread waits for states and does all of the control, so that nothing stands
-between a state and its command but `Controller.receive_state` and one `put`. The
-others only hand things over: references through an inbox that is emptied in the
-slack, requests and the watch for silence through a lock that is held for
+One thread receives states and does all of the control, so that only
+`Controller.receive_state` and one `put` lie between a state and its command. The
+other threads only hand things over: references through an inbox that is emptied in
+the slack, requests and the check for silence through a lock that is held for
 microseconds.
 
-All of them share the interpreter's lock with the thread that controls, so none may
-compute for long: references are laid out where they are received, of a change of
-parameters nothing is built, and it is tried when a sample has just ended. A switch
-interval below the interpreter's 5 ms does not help, as measured: a sample then
+All threads share the interpreter's lock with the control thread, so none may compute
+for long. References are laid out by the thread that receives them. A change of
+parameters builds no expressions, and is tried just after a sample has ended. A switch
+interval below the interpreter's 5 ms was measured and does not help: a sample then
 loses the lock as often as it takes it, and preparations take twice as long.
 """
 
@@ -60,14 +60,14 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
     Control one robot until stopped.
 
     Args:
-        config: The robot.
+        config: The robot's configuration.
         bus_settings: How to join the bus.
         standby: Whether to stand by while another controller leads.
-        state: Folder that remembers an operator's stop; None: the user's, or the service's.
-        stop: Stops the controller when set; SIGINT and SIGTERM if there is none.
+        state: Folder in which an operator's stop is stored; None: the folder of the user or of the service.
+        stop: Event that stops the controller; None: SIGINT and SIGTERM do.
 
     Returns:
-        Exit status: 0 when stopped, 1 when another controller is there or an unforeseen error ended this one.
+        Exit status: 0 when stopped, 1 when another controller is present or an unforeseen error ended this one.
 
     Raises:
         ConfigError: A stop would not bring the robot to rest, or the leader has another configuration than its standby.
@@ -88,7 +88,8 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
             else:
                 controller.enable()
 
-    outcomes = realtime.attempt(**config.realtime.model_dump())  # when all is compiled, and before any thread is started, for all of them
+    # After compiling, and before any thread is started, so that all threads inherit the settings.
+    outcomes = realtime.attempt(**config.realtime.model_dump())
     with Bus.join(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
         operator_stop = OperatorStop(LatchFile(bus.keys, state), obey, controller.say)
         operator_stop.listen(bus)
@@ -118,7 +119,7 @@ class Daemon:
     One life of a controller on the bus.
 
     Attributes:
-        orders: What answers requests.
+        orders: Answers requests.
     """
 
     def __init__(
@@ -171,7 +172,7 @@ class Daemon:
         ]
 
     def run(self, stop: Event) -> int:
-        """Control until stopped; then bring the robot to rest, and make rest the last command, unless another takes over."""
+        """Control until stopped; then bring the robot to rest and send rest as the last command, unless another controller takes over."""
         gc.collect()
         gc.freeze()
         gc.disable()
@@ -188,7 +189,7 @@ class Daemon:
             time.sleep(TICK_PERIOD_S)
         with self._lock:
             self._ending = True
-            # Whatever happened above, the last thing the robot hears is to come to rest, and stay there.
+            # Whatever happened above, the last command makes the robot come to rest and stay there.
             if not relieved and (command := self._controller.standstill(time.monotonic_ns())) is not None:
                 self._commands.put(command)
                 self._controller.commit(command)
@@ -198,7 +199,7 @@ class Daemon:
         return int(self._crashed.is_set())
 
     def _control(self, subscriber: Subscriber) -> None:
-        """Act on states as they come: the loop that counts."""
+        """Answer states as they arrive: the control loop."""
         for received in iter(subscriber.recv, None):
             arrival_ns = time.monotonic_ns()
             for state in self._states_in.newest_of_each((received, *subscriber.drain()), self._controller.awaits):
@@ -206,12 +207,12 @@ class Daemon:
             self._announce()
 
     def _sample(self, state: State, arrival_ns: int) -> None:
-        """Act on one state."""
+        """Answer one state: command, preparation of the next sample, telemetry."""
         controller = self._controller
         with self._lock:
             if self._ending:
                 return
-            if controller.awaits(state):  # not for one that is replayed
+            if controller.awaits(state):  # not for a repeated or outdated state
                 self._leadership.hear(state, arrival_ns)
             command = controller.receive_state(state, arrival_ns)
             acted_ns = time.monotonic_ns()
@@ -236,25 +237,25 @@ class Daemon:
             self._prepare_us = 1e-3 * (prepared_ns - sent_ns)
 
     def _send(self, command: Command, left_ns: int | None = None) -> None:
-        """Send a command, if it is ours to send, and record it."""
+        """Send a command if this controller leads, and record it."""
         if self._leadership.sends(command):
             self._commands.put(command)
         self._controller.commit(command, left_ns)
 
     def _guarded(self, act: Any, subscriber: Subscriber) -> None:
-        """Run a loop; what nobody foresaw ends in a standstill and a non-zero exit, for the supervisor to restart."""
+        """Run a receiving loop; an unforeseen error leads to a standstill and exit status 1, so that a supervisor restarts the controller."""
         try:
             act(subscriber)
         except Exception:
             if self._bus.closed:
-                return  # under our hands: nothing of it was wanted any more
+                return  # by another thread, at the end of the process: the error does not matter
             log.exception("stopping after an unforeseen error")
             self._crashed.set()
 
     def _tick(self) -> None:
-        """Look for silence, and say what there is to say when no state does."""
+        """Check for silence of the robot or the leader, and announce what has happened; needed when no states come."""
         now_ns = time.monotonic_ns()
-        held_up = now_ns - self._ticked_ns > 3e9 * TICK_PERIOD_S  # then states may have come that nobody has looked at yet
+        held_up = now_ns - self._ticked_ns > 3e9 * TICK_PERIOD_S  # then received states may still wait to be processed
         self._ticked_ns = now_ns
         with self._lock:
             self._leadership.listen(now_ns)
@@ -268,14 +269,14 @@ class Daemon:
         self._announce()
 
     def _introduce(self) -> None:
-        """Speak in the role that is played now."""
+        """Publish description and events under the present role from now on."""
         role = self._leadership.role
         self.publish_info()
         self._bus.withdraw_json(self._bus.keys.info(STANDBY if role == LEADER else LEADER))
         self._announcer = Announcer(self._bus, role, self._leadership.epoch)
 
     def publish_info(self) -> None:
-        """Publish what this controller is."""
+        """Publish the description of this controller on ``info``."""
         with self._telling:
             role, config = self._leadership.role, self._config
             self._told += 1
@@ -288,7 +289,7 @@ class Daemon:
         """Publish and log mode changes and faults."""
         announcer, now_ns = self._announcer, time.monotonic_ns()
         if announcer is None or announcer.role != self._leadership.role:
-            return  # the next tick introduces us
+            return  # the next tick introduces the new role
         for notice in self._controller.notices():
             announce(log, announcer, notice, self._controller.robot_now_ns(now_ns))
         for intake in (self._states_in, self._references.planners, self._references.leaders, self._leadership.commands_in):

@@ -12,7 +12,7 @@ from rti_mpc.wire import info
 
 
 def controller_info(ocp: Ocp, np_: int) -> dict[str, Any]:
-    """Describe a controller: names, units, limits; null where there is none. Parameters from `np_` on are disturbances."""
+    """Return names, units and limits, null where there is no limit. Parameters from index `np_` on are disturbances."""
     model = ocp.model
     vectors = {"states": model.states, "inputs": model.inputs, "outputs": model.outputs}
     vectors |= {"parameters": model.parameters[:np_], "disturbances": model.parameters[np_:]}

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Leadership of one process: what it hears of other controllers, and what follows for its own.
+Leadership of one process: it listens to other controllers, and lets its own controller lead or stand by.
 
-Who leads is decided by `rti_mpc.contract.leadership`. Here are the bus, the clock and the controller.
+`rti_mpc.contract.leadership` decides who leads. This module connects it to the bus, the clock and the controller.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ UNREADY_MODES = (Mode.IDLE, Mode.WAITING)  # modes without a command to send
 @dataclass(frozen=True)
 class Others:
     """
-    What a starting controller hears of others.
+    Other controllers, as a starting controller has heard them.
 
     Attributes:
         epoch: Highest epoch of a controller or a guard, 0 if there is none.
-        config_hash: Of the controller that leads, None if there is none.
+        config_hash: Configuration hash of the leading controller, None if there is none.
     """
 
     epoch: int
@@ -46,7 +46,7 @@ class Others:
 
 
 def hear_others(bus: Bus, stop: Event) -> Others:
-    """Listen for `LISTEN_BEFORE_START_S`."""
+    """Listen to other controllers for `LISTEN_BEFORE_START_S`."""
     commands = [bus.subscriber(key, capacity=RING_MESSAGES) for key in (bus.keys.command, bus.keys.actuation)]
     infos = bus.subscriber(bus.keys.info(LEADER), capacity=RING_MESSAGES)
     intake = bus.intake(Command, LISTEN_BEFORE_START_S, choosing=True)
@@ -63,7 +63,7 @@ class Candidate:
     One controller among others on the bus.
 
     Attributes:
-        commands_in: Door of what other controllers send.
+        commands_in: Intake of other controllers' commands.
     """
 
     def __init__(self, bus: Bus, controller: Controller, others: Others, *, config_hash: int, dt_s: float, nu: int, standby: bool) -> None:
@@ -74,7 +74,7 @@ class Candidate:
         )
         self._bus = bus
         self._controller = controller
-        self._acting: int | None = None  # epoch of commands that act, as the controller knows it
+        self._acting: int | None = None  # epoch with which the controller's commands act; None: they do not
         self._infos = bus.subscriber(bus.keys.info(LEADER), capacity=RING_MESSAGES)
         self._told = (0, -1)  # epoch and sequence number of the last description of a leader that was read
         self._commands = bus.subscriber(bus.keys.command, capacity=RING_MESSAGES)
@@ -85,27 +85,27 @@ class Candidate:
 
     @property
     def leading(self) -> bool:
-        """Whether this one leads."""
+        """Whether this controller leads."""
         return self._decision.leading
 
     @property
     def epoch(self) -> int:
-        """Epoch of its commands; those of the robot's first leader are the Unix seconds at its start, times ``2 ** NUMBER_BITS``, or above."""
+        """Epoch of its commands; the first leader's is at least the Unix seconds at its start times ``2 ** NUMBER_BITS``."""
         return self._decision.epoch
 
     @property
     def role(self) -> str:
-        """Role it plays."""
+        """Present role, ``"controller"`` or ``"standby"``."""
         return LEADER if self.leading else STANDBY
 
     @property
     def relieved(self) -> bool:
-        """Whether another one takes over when this one ends."""
+        """Whether another controller takes over when this one ends."""
         return self._decision.relieved
 
     def hear(self, state: State, local_ns: int) -> None:
         """
-        Decide who answers a state; before the controller does.
+        Decide who answers a state; to be called before the controller receives it.
 
         Args:
             state: The state.
@@ -117,14 +117,14 @@ class Candidate:
         self._apply()
 
     def sends(self, command: Command) -> bool:
-        """Whether a command is ours to send; it then counts as sent. The first one is not if the one that was replaced has answered after all."""
+        """Whether to send a command, which then counts as sent. The first one is not sent if the replaced leader has answered after all."""
         if (replaced := self._decision.replaced) is not None:
             self._follow(replaced, late=True)
         return self._decision.sends(command)
 
     def listen(self, local_ns: int) -> None:
         """
-        Take in what others command, and stand by if one of them leads.
+        Process the commands of other controllers, and stand by if one of them leads.
 
         Args:
             local_ns: Local monotonic time.
@@ -133,7 +133,7 @@ class Candidate:
         self._follow(self._decision.known)
 
     def leader(self) -> Leader | None:
-        """Return what the leader has last said of itself, once; None while this one leads."""
+        """Return the leader's last description, each one once; None while this controller leads."""
         waiting = self._look(self._infos)
         if self.leading:
             for _ in waiting:
@@ -150,7 +150,7 @@ class Candidate:
         return news
 
     def declare(self) -> bool:
-        """Show on the bus which role is played, if that has changed, and tell whether it has; off the path from state to command."""
+        """Show the present role on the bus, and return whether it has changed; called off the path from state to command."""
         roles = (LEADER,) if self.leading else (STANDBY, f"{STANDBY}.{self._decision.number}")
         if tuple(self._tokens) == roles:
             return False
@@ -160,7 +160,7 @@ class Candidate:
         return True
 
     def _follow(self, known: int, *, late: bool = False) -> None:
-        """Let act what others have commanded and acts."""
+        """Process waiting commands of others; the controller takes over those that act on the robot."""
         for received in self._look(self._commands):
             command = self.commands_in.read(received, known=known)
             if command is not None and self._decision.follow(command, late=late):
@@ -169,7 +169,7 @@ class Candidate:
         self._apply()
 
     def _look(self, subscriber: Subscriber) -> Iterator[Received]:
-        """Yield what waits, oldest first: no more than a look takes; the rest waits on."""
+        """Yield waiting messages, oldest first, up to the limits per look; the rest keeps waiting."""
         size = 0
         for _ in range(MAX_MESSAGES_PER_LOOK):
             if size >= MAX_BYTES_PER_LOOK or (received := subscriber.try_recv()) is None:
@@ -178,7 +178,7 @@ class Candidate:
             yield received
 
     def _apply(self) -> None:
-        """Let the controller's commands act, or not, as was decided."""
+        """Let the controller lead or shadow, as decided."""
         if (acting := self._decision.acting) == self._acting:
             return
         self._acting = acting
@@ -188,6 +188,6 @@ class Candidate:
             self._controller.lead(acting)
 
     def _meet(self, role: str, present: bool) -> None:
-        """Count who stands by; in a thread of the bus."""
+        """Count the standbys; called in a thread of the bus."""
         if (numbered := NUMBERED_STANDBY.fullmatch(role)) is not None:
             self._decision.meet(int(numbered[1]), present=present)

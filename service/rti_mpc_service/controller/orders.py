@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Standing orders: an operator's stop, and parameters. They hold whoever leads.
+Standing orders: an operator's stop and changed parameters, which hold across changes of the leader.
 
 A stop reaches every controller, and each obeys (`rti_mpc_service.operator_stop`). A
-change of parameters is the leader's to grant. It stands in the leader's
-description, from which those that stand by take it over.
+change of parameters is granted by the leader and published in its description, from
+which the standbys take it over.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rti_mpc_service.operator_stop import STOP_REQUESTS, OperatorStop
 
 
 class Orders:
-    """The orders one controller has."""
+    """The standing orders of one controller."""
 
     def __init__(
         self,
@@ -46,18 +46,18 @@ class Orders:
         self._tell = tell  # publishes the description
 
     def orders_info(self) -> dict[str, Any]:
-        """Return them as a part of the description."""
+        """Return the orders as a part of the controller's description."""
         return {**self._stop.latch_info(), **info.parameters(self._params.version, self._params.changes)}
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any] | None:
         """
-        Grant a request of an operator; None if that is for another to do.
+        Answer a request of an operator; None if another controller has to answer it.
 
         Raises:
-            ConfigError: It is refused, and why.
+            ConfigError: The request is refused.
         """
         what = request.get("request")
-        if what in STOP_REQUESTS:  # also here, for those who know no key of its own
+        if what in STOP_REQUESTS:  # also accepted here, from clients that do not know the stop's own key
             return self._stop.answer(request)
         if what not in ("params", "inject"):
             raise ConfigError(f"request must be stop, enable, params or inject, got {what!r}")
@@ -74,7 +74,7 @@ class Orders:
         return {"ok": True, "request": what, **answer}
 
     def adopt(self, leader: Leader) -> None:
-        """Take over what a leader's description says."""
+        """Take over the parameters in the leader's description."""
         try:
             version = self._params.version
             self._params.adopt(leader.parameters["version"], dict(leader.parameters["changes"]))

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Parameters of a running controller: weights, and bounds inside those of its file.
+Parameters of a running controller: weights, and bounds within those of its file.
 
-A change is a transaction. It is checked as the file is, tried on a copy of the
-present sample, and then taken over between two samples, all of it or nothing.
-Keys are those of the file. What is compiled in, such as the horizon and which
-bounds there are, is refused, and so is every bound wider than the file's: the
-guard and the robot hold to their own files.
+A change is a transaction: it is checked as the file is, tried on a copy of the
+present sample, and then taken over between two samples, completely or not at all.
+Keys are those of the file. Changes of compiled values, such as the horizon or which
+bounds exist, are refused. So is every bound wider than the file's, because the
+guard and the robot enforce the bounds of their own files.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ class Params:
     The parameters of one controller.
 
     Attributes:
-        ocp: The problem with what was asked for last.
-        version: Counts changes; 0 for the file's values.
-        changes: What differs from the file, by key.
+        ocp: The problem with the present parameters.
+        version: Number of changes; 0 for the file's values.
+        changes: Values that differ from the file's, by key.
     """
 
     def __init__(self, config: Config, controller: Controller, rti: Rti, lock: Condition) -> None:
@@ -53,7 +53,7 @@ class Params:
         self._values = parameter_values(config)
         self._controller = controller
         self._rti = rti
-        self._lock = lock  # held while a sample is made; notified when one has been
+        self._lock = lock  # held during a sample; notified at its end
         self._trial = build_rti(config) if config.params.live else None
 
     def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
@@ -77,10 +77,10 @@ class Params:
 
     def adopt(self, version: int, changes: Mapping[str, Any]) -> None:
         """
-        Take over what the leader has been told.
+        Take over the leader's changes.
 
         Raises:
-            ConfigError: It does not fit.
+            ConfigError: A change does not fit this controller's file.
         """
         if type(version) is not int or not 0 <= version < VERSION_COUNT:
             raise ConfigError(f"version of parameters must be an integer from 0 to {VERSION_COUNT - 1}, got {version!r}")
@@ -94,9 +94,9 @@ class Params:
         return seq
 
     def _try(self, trial: Rti, ocp: Ocp) -> None:
-        """Solve the QP that is prepared now with other weights and bounds, on a copy."""
+        """Solve the present QP with new weights and bounds, on a copy."""
         with self._lock:
-            self._lock.wait(SAMPLE_TIMEOUT_PERIODS * self.ocp.dt)  # for a sample to end: what follows then falls into the slack before the next
+            self._lock.wait(SAMPLE_TIMEOUT_PERIODS * self.ocp.dt)  # for the end of a sample, so that the trial runs in the slack
             sample = {name: getattr(self._rti, name).copy() for name in SAMPLE_ARRAYS}
         trial.reset(sample["x"][0], sample["u_prev"])
         for name, value in sample.items():
@@ -112,7 +112,7 @@ class Params:
 
 
 def parameter_values(config: Config) -> dict[str, Any]:
-    """Return what may be changed, by key."""
+    """Return the values that may be changed, by key."""
     document = config.model_dump(by_alias=True)
     tables = {key: entry_at(document, key) for key in (*WEIGHT_KEYS, *BOUND_KEYS)}
     return {
@@ -123,7 +123,7 @@ def parameter_values(config: Config) -> dict[str, Any]:
 
 
 def entry_at(document: Mapping[str, Any], key: str) -> Any:
-    """Return what a dotted key leads to."""
+    """Return the entry at a dotted key."""
     for step in key.split("."):
         document = document[step]
     return document
@@ -131,13 +131,13 @@ def entry_at(document: Mapping[str, Any], key: str) -> Any:
 
 def changed_problem(file: Config, ocp: Ocp, changes: Mapping[str, Any]) -> tuple[Config, Ocp]:
     """
-    Return a configuration with other values, and its problem, made of one that was built of the file.
+    Return the configuration with changed values, and its problem, derived from the problem of the file.
 
-    No expression is built, which would take ten times as long: whatever is done
-    here, the interpreter's lock is shared with the thread that controls.
+    No expression is built, which would take ten times as long: the interpreter's lock
+    is shared with the control thread.
 
     Raises:
-        ConfigError: A key may not change, a value does not fit.
+        ConfigError: A key may not change, or a value does not fit.
     """
     document = file.model_dump(by_alias=True)
     for key, value in changes.items():
@@ -161,7 +161,7 @@ def changed_problem(file: Config, ocp: Ocp, changes: Mapping[str, Any]) -> tuple
 
 
 def why_fixed(key: str) -> str:
-    """Say why a key is none that may change."""
+    """Return the reason why a key may not change."""
     known = dict(entries(Config))
     table = key.rpartition(".")[0]
     named = known.get(table, "") if not any(other.startswith(f"{table}.") for other in known) else ""  # a table of names
@@ -174,7 +174,7 @@ def why_fixed(key: str) -> str:
 
 
 def wider_bounds(file: Config, config: Config, changes: Mapping[str, Any]) -> Iterator[str]:
-    """Say which bounds are new, gone, or wider than the file's."""
+    """Yield a complaint for each bound that is new or wider than the file's."""
     now, before = parameter_values(config), parameter_values(file)
     for key in changes:
         if key.rpartition(".")[0] not in BOUND_KEYS:
