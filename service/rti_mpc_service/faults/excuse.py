@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Excuses: the part of an incident that the host alone explains, by its witness.
+Excuses: the part of an incident that delays of the host alone explain, by its witness.
 
-A time may be longer by what the processes were held up for meanwhile. A sample
-that was missed is explained where they were held up, about when it was due, for a
-share of a period that a host which is on time never takes.
+A time may be longer by the time for which the host held the processes up meanwhile. A
+missed sample is explained if they were held up, around the time at which it was due,
+for a share of a period that a host which is on time never takes.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ def excuses(measured: Measured, missed_ns: NDArray[np.int64], incident: Incident
     Return by how much the host excuses each number that it may have made larger.
 
     Args:
-        measured: What the robot did.
-        missed_ns: When the samples were due that were missed, shape ``(n,)``.
-        incident: When it happened.
-        period_ns: Of the controller.
-        held_up_ms: For how long the host held the processes up between two instants, ms. All instants are in robot time.
+        measured: The robot's reaction.
+        missed_ns: Times at which the missed samples were due, shape ``(n,)``.
+        incident: Times of the incident.
+        period_ns: Period of the controller.
+        held_up_ms: Returns for how long the host held the processes up between two instants, ms. All instants are in robot time.
     """
     excused = {"missed": float(sum(held_up_ms(at - period_ns, at + period_ns) > 1e-6 * HELD_UP_SHARE * period_ns for at in missed_ns.tolist()))}
     for name, begin in START_OF_TIME.items():
@@ -42,6 +42,6 @@ def excuses(measured: Measured, missed_ns: NDArray[np.int64], incident: Incident
 
 
 def explained(promise: Promise, measured: Measured, excused: Mapping[str, float]) -> list[str]:
-    """Return what would not be within a promise without the excuses, in words; nothing of what is not within it with them."""
+    """Return, in words, what breaks a promise without the excuses but not with them."""
     broken = promise.broken(measured, excused)
     return [f"{words}, of which the host explains {excused[words.split()[0]]:.3g}" for words in promise.broken(measured) if words not in broken]

@@ -2,7 +2,7 @@
 r"""
 Measurement of a robot's reaction to a fault, from its own record alone.
 
-Inputs come as they acted and positions as they truly were, both in robot time. A
+The record has the inputs that acted and the true positions, in robot time. A
 ramp to rest that begins at :math:`t_0` inside the slew limits :math:`\dot u_{max}`
 ends at
 
@@ -40,12 +40,12 @@ Mask = NDArray[np.bool_]
 @dataclass(frozen=True)
 class Incident:
     """
-    When something was broken, mended and no longer looked at, in robot time.
+    Times of a fault in robot time.
 
     Attributes:
-        fault_ns: Just before it was broken.
+        fault_ns: Just before the fault was injected.
         mend_ns: Just before it was mended.
-        end_ns: Where the look at it ends.
+        end_ns: End of the observation.
     """
 
     fault_ns: int
@@ -56,18 +56,18 @@ class Incident:
 @dataclass(frozen=True)
 class Measured:
     """
-    What a robot did; None for what it did not.
+    Reaction of a robot to a fault; None for what did not happen.
 
     Attributes:
         speed_m_s: Speed at the fault.
         brake_s: From the fault to the first braking command.
         zero_s: From the fault to the command that is zero, and stays so until mended.
-        still_s: From the fault to a true speed below 1 mm/s, that stays so until mended.
-        distance_m: Way from the fault to the standstill, or until mended.
-        stale: Instants at which an input acted, once at rest, that answers no state fresh when mended.
+        still_s: From the fault to a true speed below 1 mm/s that stays so until mended.
+        distance_m: Distance driven from the fault to the standstill, or until mended.
+        stale: Number of rows in which, after rest, an input acted that answers no state that was fresh when mended.
         step_share: Largest step of an input, as a share of what it may change in a period; while braking, in any period.
-        recovery_s: From mended to the first input other than rest, or motion, whichever had ended; else to the first state that is answered.
-        missed: Samples of the controller that the robot had no command for, until mended.
+        recovery_s: From mending to the first input other than rest, or to motion, whichever had ended; else to the first answered state.
+        missed: Number of the controller's samples without a command for the robot, until mended.
         error_m: Largest distance from the reference until mended.
         final_error_m: Distance from the reference when mended.
     """
@@ -93,8 +93,8 @@ def measure(log: RobotLog, place: tuple[int, int], reference: Array, incident: I
         log: The robot's record. It has a row between fault and mending.
         place: Indices of the states that are the position, in m.
         reference: Where the robot was to be at each stamp, shape ``(M, 2)``, in m.
-        incident: When it happened.
-        limits: What inputs may do.
+        incident: Times of the incident.
+        limits: Limits of the inputs.
     """
     t = log.stamp_ns
     broken = (t >= incident.fault_ns) & (t <= incident.mend_ns)
@@ -130,7 +130,7 @@ def measure(log: RobotLog, place: tuple[int, int], reference: Array, incident: I
 
 
 def positions(reference: Reference | None, columns: tuple[int, int], stamp_ns: NDArray[np.int64]) -> Array:
-    """Return where a reference wants the robot at stamps, of its columns x and y, shape ``(..., 2)``, m: at its ends beyond them; NaN without one."""
+    """Return the reference's position, columns x and y, at stamps, shape ``(..., 2)``, m; its first or last row outside of it; NaN if None."""
     if reference is None:
         return np.full((*stamp_ns.shape, 2), np.nan)
     rows = (stamp_ns - reference.stamp_ns) / reference.period_ns
@@ -152,7 +152,7 @@ def settled(condition: Mask, window: Mask) -> int | None:
 
 
 def braking(log: RobotLog, limits: Limits, first: int, zero: int) -> int:
-    """Return the row at which the ramp to rest, which ends at row `zero`, has begun; see above."""
+    """Return the row at which the ramp to rest that ends at row `zero` begins; see the module's docstring."""
     t_s = 1e-9 * (log.stamp_ns - log.stamp_ns[zero])
     left_s = (np.abs(log.u - limits.u_rest) / step(limits)).max(axis=1) * limits.dt_s
     way = np.abs(log.u - limits.u_rest)
@@ -164,22 +164,22 @@ def braking(log: RobotLog, limits: Limits, first: int, zero: int) -> int:
 
 
 def fresh_ns(log: RobotLog, incident: Incident) -> int:
-    """Return the first stamp, of states fresh when mended, that was answered after that; the end if none was."""
+    """Return the first stamp of a state that was fresh when mended and answered afterwards; `end_ns` if there is none."""
     arrival_ns = log.stamp_ns + 1e3 * log.latency_us
     answered = log.stamp_ns[(log.stamp_ns >= incident.mend_ns - round(1e9 * MAX_FRESH_AGE_S)) & (arrival_ns >= incident.mend_ns)]
     return int(answered[0]) if answered.size else incident.end_ns
 
 
 def step_share(u: Array, limits: Limits) -> float:
-    """Return the largest change from row to row, as a share of what it may be."""
+    """Return the largest change from row to row, as a share of the largest allowed change in a period."""
     return float((np.abs(np.diff(u, axis=0)) / step(limits)).max()) if len(u) > 1 else 0.0
 
 
 def ramp_share(log: RobotLog, limits: Limits, brake: int, zero: int) -> float:
     """
-    Return the largest change in any period of a ramp to rest, as a share of what it may be.
+    Return the largest change in any period of a ramp to rest, as a share of the largest allowed change in a period.
 
-    One step less than a period, for a ramp that is told over a bus begins with the step that was due meanwhile.
+    The window is one step shorter than a period: a ramp sent over the bus begins with the step that became due meanwhile.
     """
     t, share = log.stamp_ns[: zero + 1], 0.0
     for row in range(max(brake - 1, 0), zero):
@@ -189,11 +189,11 @@ def ramp_share(log: RobotLog, limits: Limits, brake: int, zero: int) -> float:
 
 
 def missed_ns(log: RobotLog, incident: Incident, dt_s: float) -> NDArray[np.int64]:
-    """Return when the samples were due that were left out between states that were answered, in robot time, shape ``(n,)``."""
+    """Return the robot times at which missed samples were due, between answered states, shape ``(n,)``."""
     period_ns = 1e9 * dt_s
     near = (log.stamp_ns >= incident.fault_ns - 2 * period_ns) & (log.stamp_ns <= incident.mend_ns)
     stamps = log.stamp_ns[near & np.isfinite(log.latency_us)]
-    silent_ns = incident.mend_ns - (stamps[-1] if stamps.size else incident.fault_ns)  # the last sample need not be over
+    silent_ns = incident.mend_ns - (stamps[-1] if stamps.size else incident.fault_ns)  # the last sample may still be in progress
     gaps = np.append(np.round(np.diff(stamps) / period_ns), silent_ns // period_ns)
     before = stamps if stamps.size else [incident.fault_ns]
     return np.concatenate([stamp + period_ns * np.arange(1, gap) for stamp, gap in zip(before, gaps, strict=True)]).astype(np.int64)

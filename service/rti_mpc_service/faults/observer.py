@@ -24,12 +24,12 @@ class RunObserver:
     Follows the states of a robot at speed 1, and the commands for them.
 
     Args:
-        bus: Ours.
-        robot: Where the robot's streams are.
+        bus: Bus of this process.
+        robot: Keys of the robot's streams.
         place: Indices of the states that are its position.
 
     Attributes:
-        epoch: Of the robot's present life, 0 before the first state.
+        epoch: Epoch of the robot's present life, 0 before the first state.
         answered: Sequence numbers of states of that life that a controller has answered.
     """
 
@@ -64,7 +64,7 @@ class RunObserver:
         return stamp_ns + time.monotonic_ns() - arrival_ns
 
     def arrival_ns(self, stamp_ns: int) -> int:
-        """Return when, by the monotonic clock, the first state of a time or later has come; if none has, when the last one has."""
+        """Return the arrival, by the monotonic clock, of the first state stamped at or after a time; of the last state if there is none."""
         return next((arrival_ns for stamp, arrival_ns, _ in self._states.copy() if stamp >= stamp_ns), self._states[-1][1])
 
     def speed_m_s(self) -> float:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Promises under a fault: limits on what is measured, and the words where one is broken."""
+"""Promises under a fault: limits on the measured reaction of the robot."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ RECOVERY = {"recovery_s": 20.0}  # includes the start of processes that were kil
 @dataclass(frozen=True)
 class Promise:
     """
-    A promise.
+    A promise about the robot's reaction to a fault.
 
     Attributes:
-        text: What it says, in words.
-        at_most: Limits by names of `Measured`; what has a limit must have happened.
+        text: The promise in words.
+        at_most: Upper limits by field of `Measured`; a field with a limit must not be None.
     """
 
     text: str
@@ -34,7 +34,7 @@ class Promise:
         return not {"error_m", "final_error_m"}.isdisjoint(self.at_most)
 
     def broken(self, measured: Measured, excused: Mapping[str, float] = NO_EXCUSE) -> list[str]:
-        """Return what is not within the promise, nor excused: by how much each number may be more than its limit."""
+        """Return the broken limits, in words; `excused` says by how much each value may exceed its limit."""
         values = {name: getattr(measured, name) for name in self.at_most}
         return [
             f"{name} must be at most {limit:g}, got {'none' if values[name] is None else f'{values[name]:.4g}'}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A link that can be cut: TCP forwarded on loopback, where nothing passes while it is cut and nothing is lost."""
+"""Link that can be cut: a TCP proxy on loopback that holds all data back while it is cut, and loses none."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ CHUNK_BYTES = 65536
 
 class Proxy:
     """
-    Forwards connections to a port.
+    Forwards connections to an endpoint.
 
-    While it is cut, connections stay open and what was sent waits, as in the
-    buffers of a network: what comes out when the link is back is old.
+    While the link is cut, connections stay open and sent data wait, as in the
+    buffers of a network: the data that arrive after the cut are old.
 
     Attributes:
-        endpoint: Where to connect instead.
+        endpoint: Endpoint of the proxy.
     """
 
     def __init__(self, endpoint: str) -> None:
@@ -54,7 +54,7 @@ class Proxy:
                 near, _ = self._listener.accept()
                 try:
                     far = socket.create_connection(self._target)
-                except OSError:  # nobody is there: neither are we
+                except OSError:  # the target refuses, so the proxy does
                     near.close()
                     continue
                 self._open += near, far

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A link or a sensor gone wrong: the robot's states pass through a process that changes them on request, or that loses what is commanded.
+Faulty link or sensor: a process between robot and controller that changes states on request, or drops commands.
 
-The robot lives under one prefix, whoever hears the changed states under another.
-What is commanded passes back as it is, but for a clock that has jumped: its stamps
-are told in the time of the clock that they are for. `python -m rti_mpc_service.faults.relay ENDPOINT PREFIX_OF_ROBOT PREFIX ROBOT`.
+The robot has one prefix, the receivers of the changed states another. Commands pass
+back unchanged, except that after a jump of the clock their stamps are converted to
+the robot's own time. `python -m rti_mpc_service.faults.relay ENDPOINT PREFIX_OF_ROBOT PREFIX ROBOT`.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ COMMAND_STAMPS = ("stamp_ns", "state_stamp_ns", "valid_until_ns")  # fields of a
 
 
 def frozen(state: State, held: deque[State]) -> Iterable[State]:
-    """The last state again and again, with new sequence numbers."""
+    """Return the first state after the fault's start again and again, with new sequence numbers."""
     held.append(state)
     return [replace(held[0], seq=state.seq)]
 
 
 def late(state: State, held: deque[State]) -> Iterable[State]:
-    """Every state so much later."""
+    """Delay every state by `STATE_DELAY_NS`."""
     held.append(state)
     while state.stamp_ns - held[0].stamp_ns >= STATE_DELAY_NS:
         yield held.popleft()
 
 
 def reordered(state: State, held: deque[State]) -> Iterable[State]:
-    """Every two states in the wrong order."""
+    """Swap every two states."""
     held.append(state)
     return [held.pop(), held.pop()] if len(held) == 2 else []
 
@@ -78,16 +78,16 @@ class Relay:
 
     def __init__(self, robot: Bus, bus: Bus) -> None:
         """
-        Begin.
+        Start forwarding.
 
         Args:
-            robot: Where the robot is.
-            bus: Where those are who hear of it.
+            robot: Bus with the robot's prefix.
+            bus: Bus with the prefix of the controller and the others.
         """
         self._offset_ns = 0
         self._losing = False  # whether commands are lost
-        self._stamp_ns = 0  # of the last state, as the robot sent it
-        self._fault: tuple[str, int, deque[State]] = ("none", 0, deque())  # what, for how many states, those it holds back
+        self._stamp_ns = 0  # stamp of the last state, as the robot sent it
+        self._fault: tuple[str, int, deque[State]] = ("none", 0, deque())  # name, number of states it lasts for, states held back
         self._states = bus.publisher(bus.keys.state)
         self._follow(robot.subscriber(robot.keys.state, capacity=RING_MESSAGES), bus.intake(State, STALE_S), self._change)
         for stream in (COMMAND, ACTUATION):
@@ -95,7 +95,7 @@ class Relay:
             self._follow(commands, bus.intake(Command, STALE_S), partial(self._pass, publisher))
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Change the states from now on: ``{"fault": NAME, "states": HOW_MANY}``, all of them without a number; answer since when, robot time."""
+        """Answer ``{"fault": NAME, "states": COUNT}`` by changing that many states, all if left out; the answer has the last stamp before."""
         name = request["fault"]
         if name in CLOCK_JUMPS_NS:
             self._offset_ns += CLOCK_JUMPS_NS[name]
@@ -107,7 +107,7 @@ class Relay:
         return {"ok": True, "stamp_ns": self._stamp_ns}
 
     def _change(self, state: State) -> None:
-        """Pass a state on, or what becomes of it."""
+        """Publish the messages that replace a state."""
         name, states, held = self._fault
         self._stamp_ns = state.stamp_ns
         for changed in STATE_CHANGES[name](state, held):
@@ -116,7 +116,7 @@ class Relay:
             self._fault = (name, states - 1, held) if states > 1 else ("none", 0, deque())
 
     def _pass(self, publisher: Publisher[Command], command: Command) -> None:
-        """Pass a command back, if the link does."""
+        """Pass a command back to the robot, unless commands are lost."""
         if self._losing:
             return
         publisher.put(replace(command, **{name: getattr(command, name) - self._offset_ns for name in COMMAND_STAMPS}))

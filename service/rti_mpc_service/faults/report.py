@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fault matrix as it grows on a terminal, and as a whole at the end."""
+"""Report of the fault matrix: a growing table on a terminal, and the whole table at the end."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ MATRIX_WIDTH_COLUMNS = 130
 @dataclass(frozen=True)
 class MatrixRow:
     """
-    One fault and what came of it.
+    Result of one fault.
 
     Attributes:
-        fault: What was done.
-        measured: What the robot did; None if nothing could be measured.
-        broken: What is not within the promise.
-        excused: What is not, either, but the host alone explains it.
+        fault: The fault.
+        measured: The robot's reaction; None if nothing could be measured.
+        broken: Broken limits of the promise, in words.
+        excused: Exceeded limits that delays of the host alone explain, in words.
     """
 
     fault: Fault
@@ -88,7 +88,7 @@ class MatrixRow:
 
 
 def number_text(value: float | None, factor: float, digits: int) -> str:
-    """Return a number as it is shown."""
+    """Return a number as text, multiplied by a factor; `NO_VALUE` for None."""
     return NO_VALUE if value is None else f"{factor * value:.{digits}f}"
 
 
@@ -117,7 +117,7 @@ class MatrixReport(Redrawn):
         return not any(row.broken for row in self.rows)
 
     def say(self, fault: Fault, text: str) -> None:
-        """Tell what is going on."""
+        """Show what happens now."""
         if self.live:
             head = Table.grid(padding=(0, 2))
             head.add_row(f"{len(self.rows)} of {self._count}", ProgressBar(total=self._count, completed=len(self.rows), width=32), fault.name, text)
@@ -131,7 +131,7 @@ class MatrixReport(Redrawn):
             self.console.print(f"{len(self.rows)} of {self._count}: {row.fault.name}, the robot {row.did}: {said}", soft_wrap=True, markup=False)
 
     def conclude(self) -> None:
-        """Print the whole, and what was not kept, or is excused."""
+        """Print the whole table, and the broken or excused limits."""
         self.console.print(self._table())
         for row in self.rows:
             if words := [*row.broken, *row.excused]:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Injects faults into real processes, one after another, and holds what the robot did against what is promised.
+Fault injection into real processes, one fault after another; the robot's reaction is compared with a promise.
 
-Systems start as `demo` starts them, at real speed. Faults of one wiring follow one
-another in one system, each once the robot is driven again; a system that breaks a
-promise ends with it.
+Systems start as `demo` starts them, at real speed. The faults of one wiring are
+injected into one system, each after the robot is driven again; after a broken promise
+a new system is started.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ def main(config_path: Path, only: Sequence[str], path: Path | None) -> int:
 
     Args:
         config_path: The robot's TOML file.
-        only: Names of faults; none: all.
+        only: Names of faults; empty: all.
         path: JSON file to write.
 
     Returns:
         Exit status: 0 if every promise was kept.
 
     Raises:
-        ConfigError: A name is none, or the robot cannot be guarded or has no pose to start from.
+        ConfigError: A name is unknown, or the robot cannot be guarded or has no pose to start from.
     """
     faults = chosen(only)
     config = prepared(load(config_path))
@@ -89,7 +89,7 @@ def chosen(only: Sequence[str]) -> list[Fault]:
 
     Raises:
         ConfigError: There is no fault of a name.
-        ModuleNotFoundError: It wants a viewer, and there is none; of all faults, those are left out.
+        ModuleNotFoundError: A named fault needs a viewer, which is not installed; without names, such faults are left out.
     """
     names = [fault.name for fault in FAULTS]
     if unknown := [name for name in only if name not in names]:
@@ -116,7 +116,7 @@ def prepared(config: Config) -> Config:
 
 
 def inject(config: Config, faults: Sequence[Fault], folder: Path, report: MatrixReport, stop: Event, host: Host) -> None:
-    """Inject faults until there are none left, or we are stopped."""
+    """Inject all faults one after the other, or until stopped."""
     limits = guard_limits(config)
     system: System | None = None
     with ExitStack() as stack:
@@ -142,10 +142,10 @@ def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Matrix
 
 def make_ready(system: System, fault: Fault, report: MatrixReport) -> None:
     """
-    Wait until the robot is driven, as well as the fault wants it.
+    Wait until the robot is driven, and on its path if the fault's promise is about the distance from it.
 
     Raises:
-        Failed: It is not.
+        Failed: The robot is not driven in time.
     """
     report.say(fault, "waiting for the robot to be driven")
     system.ensure(*ROLES_OF_WIRING[fault.wiring], *(("viewer",) if fault.viewer else ()))
@@ -158,7 +158,7 @@ def make_ready(system: System, fault: Fault, report: MatrixReport) -> None:
 
 def suffer(system: System, fault: Fault, limits: Limits, report: MatrixReport, host: Host) -> MatrixRow:
     """
-    Break, wait, mend, wait, measure, and ask the host's witness.
+    Inject a fault, mend it, wait for recovery, and measure the reaction, with the excuses of the host.
 
     Raises:
         Failed: Nothing can be measured.

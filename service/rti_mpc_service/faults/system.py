@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot and everybody around it, as the processes a user runs, with what it takes to break them and to see what comes of it."""
+"""System under test: a robot and all processes around it, as a user runs them, with ways to break and to observe them."""
 
 from __future__ import annotations
 
@@ -65,10 +65,10 @@ def measured_places(model: Model) -> tuple[tuple[int, int], tuple[int, int]]:
 class Wiring(Enum):
     """How the processes are linked."""
 
-    PEERS = "peers"  # each directly with each
-    ROUTER = "router"  # clients of a router, the controller through a link that can be cut
-    LINK = "link"  # peers, what the controller hears of the robot through a process that can change it
-    SENSOR = "sensor"  # the same for everybody, the guard, too
+    PEERS = "peers"  # every process is linked directly with every other one
+    ROUTER = "router"  # all are clients of a router, the controller through a link that can be cut
+    LINK = "link"  # peers; the controller receives the robot's states through a relay that can change them
+    SENSOR = "sensor"  # peers; all processes, also the guard, receive the states through the relay
 
 
 RELAYED = (Wiring.LINK, Wiring.SENSOR)
@@ -80,16 +80,16 @@ class System:
 
     Attributes:
         wiring: How they are linked.
-        keys: Where everybody's streams are.
-        period_ns: Of the controller.
+        keys: Keys of all processes except those behind a relay.
+        period_ns: Period of the controller.
         children: The processes.
-        bus: Ours, a peer among them.
-        witness: Hears the controller.
-        observer: Hears the robot.
-        link: Between controller and router, with that wiring.
-        robots: How many robots were started.
+        bus: Bus of this process.
+        witness: Collects the controller's messages.
+        observer: Follows the robot's states.
+        link: Link between controller and router, used with wiring `ROUTER`.
+        robots: Number of robots started so far.
         place: Indices of the states that are the position.
-        columns: Indices of the outputs that are.
+        columns: Indices of the outputs that are the position.
     """
 
     def __init__(self, config: Config, wiring: Wiring, folder: Path, stop: Event) -> None:
@@ -136,7 +136,7 @@ class System:
     # Processes.
 
     def start(self, *roles: str) -> None:
-        """Start processes; a robot has a new life, with a record of its own."""
+        """Start processes; each start of the robot is a new life with its own record."""
         for role in roles:
             if role == "robot":
                 self.robots += 1
@@ -145,18 +145,18 @@ class System:
             self.children.start(role, str(module), *arguments, nice=WATCHER_NICENESS if role == "viewer" else 0)
 
     def kill(self, *roles: str) -> None:
-        """SIGKILL."""
+        """Kill processes by SIGKILL."""
         for role in roles:
             self.children.kill(role)
 
     def suspend(self, *roles: str) -> None:
-        """SIGSTOP."""
+        """Suspend processes by SIGSTOP."""
         for role in roles:
             self.children.signal(role, signal.SIGSTOP)
             self._suspended.add(role)
 
     def resume(self, *roles: str) -> None:
-        """SIGCONT."""
+        """Resume processes by SIGCONT."""
         for role in roles:
             self._suspended.discard(role)
             self.children.signal(role, signal.SIGCONT)
@@ -175,7 +175,7 @@ class System:
                 resource.prlimit(pid, resource.RLIMIT_FSIZE, (hard if size is None else size, hard))
 
     def _keys_of(self, role: str) -> Keys:
-        """Return where the streams of a process are: before or behind the relay, if there is one."""
+        """Return the keys of a process: those behind the relay for the robot, and for its guard with wiring `LINK`."""
         return self._robot_keys if role == "robot" or (role == "guard" and self.wiring is Wiring.LINK) else self.keys
 
     def _command(self, role: str) -> tuple[object, ...]:
@@ -195,7 +195,7 @@ class System:
         }
         return commands[role]
 
-    # What is seen.
+    # Observation.
 
     @property
     def log_path(self) -> Path:
@@ -213,7 +213,7 @@ class System:
         return next((int(line.partition(b",")[0]) for line in reversed(lines) if line.endswith(b"\n")), -1)
 
     def now_ns(self) -> int:
-        """Robot time; a robot that is suspended or dead has none but that of its last state."""
+        """Return robot time now; for a suspended or dead robot, the stamp of its last state."""
         alive = self.children.pid("robot") is not None and "robot" not in self._suspended
         return self.observer.now_ns() if alive else self.observer.stamp_ns
 
@@ -231,7 +231,7 @@ class System:
         return 1e-9 * (reference.stamp_ns + (len(reference.y) - 1) * reference.period_ns - self.now_ns())
 
     def driven(self, error_m: float = np.inf) -> bool:
-        """Whether the robot is driven, and as near to its reference as told."""
+        """Whether the robot is driven, and nearer to its reference than `error_m`."""
         self.witness.listen()
         return self.witness.begun and self.observer.speed_m_s() > MIN_DRIVEN_SPEED_M_S and self.error_m() < error_m
 
@@ -246,23 +246,23 @@ class System:
 
     @property
     def stopped(self) -> bool:
-        """Whether we are to stop."""
+        """Whether the run is to stop."""
         return self._stop.is_set()
 
     def pause(self, duration_s: float) -> None:
-        """Wait for so long, or until stopped."""
+        """Wait for a duration, or until stopped."""
         self._stop.wait(duration_s)
 
     def ensure(self, *roles: str) -> None:
-        """Start those that are not there, and wait until all are present."""
+        """Start the processes that do not run, and wait until all are present."""
         self.start(*(role for role in roles if self.children.pid(role) is None))
         others = [role for role in roles if self._keys_of(role) is self.keys]  # a relay passes no presence on, and the robot's states tell
         self.wait(lambda: self.witness.listen().met(set(others)), f"{', '.join(others)} to be there")
 
-    # What is said.
+    # Messages to the system.
 
     def refer(self, reference: Reference) -> None:
-        """Publish a reference, as another planner that takes over."""
+        """Publish a reference as a new planner that takes over."""
         reference = replace(reference, epoch=max(time.time_ns() // 1_000_000_000, self.reference.epoch + 1), seq=1)
         self._references.put(reference)
         self.witness.reference = reference
@@ -275,10 +275,10 @@ class System:
 
     def ask(self, key: Key[Any], **request: Any) -> dict[str, Any]:
         """
-        Ask a process for something that it grants, and return its answer.
+        Send a request, and return the answer that grants it.
 
         Raises:
-            Failed: It refuses, or does not answer.
+            Failed: The request is refused, or nobody answers.
         """
         try:
             answer = self.bus.request(key, request, timeout_s=REQUEST_TIMEOUT_S)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The faults: what is broken and how it is mended, and which promise must hold.
+Table of faults: how each is injected and mended, and which promise must hold.
 
-Those that share a wiring share a system; within one, those that the robot drives
-through come before those that stop it.
+Faults with the same wiring share a system; in each, the faults through which the
+robot keeps driving come before those that stop it.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ class Fault:
     One row of the matrix.
 
     Attributes:
-        name: As `--only` takes it.
-        text: What is done to whom.
-        wiring: Among which processes.
-        promise: What must hold.
-        inject: Breaks it; returns when, in robot time, where that is not at once.
-        mend: Undoes it.
-        hold_s: How long it lasts.
-        viewer: Whether somebody is watching.
+        name: Name, as `--only` takes it.
+        text: Description for people.
+        wiring: How the processes of its system are linked.
+        promise: The promise that must hold.
+        inject: Injects the fault; returns its robot time, None if it takes effect at once.
+        mend: Ends the fault.
+        hold_s: How long it lasts, s.
+        viewer: Whether a viewer is part of the system.
     """
 
     name: str
@@ -61,31 +61,31 @@ class Fault:
 
 
 def do_nothing(system: System) -> None:
-    """Leave it as it is."""
+    """Do nothing: the fault ends by itself."""
 
 
 def kill(*roles: str) -> Act:
-    """SIGKILL."""
+    """Return an act that kills processes by SIGKILL."""
     return lambda system: system.kill(*roles)
 
 
 def start(*roles: str) -> Act:
-    """Start what was killed."""
+    """Return an act that starts killed processes."""
     return lambda system: system.start(*roles)
 
 
 def suspend(*roles: str) -> Act:
-    """SIGSTOP."""
+    """Return an act that suspends processes by SIGSTOP."""
     return lambda system: system.suspend(*roles)
 
 
 def resume(*roles: str) -> Act:
-    """SIGCONT."""
+    """Return an act that resumes processes by SIGCONT."""
     return lambda system: system.resume(*roles)
 
 
 def slow_viewer(system: System) -> None:
-    """Leave the viewer a twentieth of its time, for as long as a fault lasts."""
+    """Let the viewer run for `VIEWER_SHARE` of the time, for `HOLD_S`."""
     deadline_s = time.monotonic() + HOLD_S
     while time.monotonic() < deadline_s:
         system.suspend("viewer")
@@ -95,13 +95,13 @@ def slow_viewer(system: System) -> None:
 
 
 def states(change: str, count: int | None = None) -> Act:
-    """Change so many states, or all from now on; the fault is after the last one that passed as it was."""
+    """Return an act that changes `count` states, or all from now on; the fault begins at the last unchanged state."""
     request = {"fault": change} | ({} if count is None else {"states": count})
     return lambda system: int(system.ask(system.keys.of(RELAY), **request)["stamp_ns"])
 
 
 def stop_and_kill(*roles: str) -> Act:
-    """Say stop as an operator does, then SIGKILL, and start again what was killed, as a supervisor does."""
+    """Return an act that stops the robot as an operator does, kills processes, and starts them again as a supervisor does."""
 
     def act(system: System) -> None:
         system.ask(system.keys.stop, request="stop")
@@ -112,12 +112,12 @@ def stop_and_kill(*roles: str) -> Act:
 
 
 def enable(system: System) -> None:
-    """Release what an operator has stopped."""
+    """Release the robot as an operator does."""
     system.ask(system.keys.stop, request="enable")
 
 
 def solver(failure: str, samples: int) -> Act:
-    """Let the solver fail so many times in a row; the fault is when the second sample from now is due, for one is prepared already."""
+    """Return an act that lets the solver fail in `samples` samples; the first one is the second from now, as one is prepared already."""
 
     def act(system: System) -> int:
         system.ask(system.keys.request, request="inject", failure=failure, samples=samples)
@@ -129,12 +129,12 @@ def solver(failure: str, samples: int) -> Act:
 
 
 def solver_works(system: System) -> None:
-    """Let the solver find something again, after one more sample."""
+    """Let the solver work again, after one more failing sample."""
     system.ask(system.keys.request, request="inject", failure="solver", samples=1)
 
 
 def flood(system: System) -> None:
-    """Publish what is no message on every key that somebody acts on, as fast as it goes."""
+    """Publish malformed messages on every key that a process acts on, as fast as possible."""
     keys = system.keys
     ends: list[Any] = [system.bus.publisher(key) for key in (keys.state, keys.reference, keys.command, keys.actuation)]
     for number in range(MALFORMED_MESSAGES):
@@ -147,7 +147,7 @@ def restart(*roles: str) -> Act:
 
 
 def clock_in_ns(system: System) -> None:
-    """Let the robot's stamps be nanoseconds again; a reference on its clock is to be sent anew, for that has gone back."""
+    """Change the robot's stamps back to nanoseconds, and restart the reference, whose stamps are in the changed clock."""
     states("none")(system)
     system.restart("reference")
 
@@ -163,7 +163,7 @@ def free_disk(system: System) -> None:
 
 
 def reference_part(system: System, from_s: float, duration_s: float) -> Reference:
-    """Return rows of the followed reference, from some time after now on, stamped as they are: few enough for one packet."""
+    """Return a part of the followed reference that starts `from_s` after now, with its own stamps; short enough for one packet."""
     followed, period_ns = system.reference, system.reference.period_ns
     first = (system.now_ns() + round(1e9 * from_s) - followed.stamp_ns) // period_ns
     rows = slice(first, first + round(1e9 * duration_s) // period_ns)
@@ -171,7 +171,7 @@ def reference_part(system: System, from_s: float, duration_s: float) -> Referenc
 
 
 def reference_ends(end: End) -> Act:
-    """Let the reference end in a moment; the fault is its last row."""
+    """Return an act that shortens the reference to `REFERENCE_ENDS_S`; the fault begins at its last row."""
 
     def act(system: System) -> int:
         short = replace(reference_part(system, 0.0, REFERENCE_ENDS_S), end=end)
@@ -188,7 +188,7 @@ def reference_in_the_past(system: System) -> None:
 
 
 def reference_jumps(system: System) -> None:
-    """Follow the same path some seconds further on."""
+    """Publish the reference as it is `REFERENCE_JUMP_S` later, from now on."""
     later = reference_part(system, REFERENCE_JUMP_S, 10 * REFERENCE_JUMP_S)
     system.refer(replace(later, stamp_ns=later.stamp_ns - round(1e9 * REFERENCE_JUMP_S)))
 
