@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Terminal output of a run: a live table, lines where there is no terminal, and the summary at the end."""
+"""Terminal output of a run: a live table, or lines where there is no terminal, and the summary at the end."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ class Board(Redrawn):
         self._said = 0
 
     def wait(self, text: str) -> None:
-        """Tell what is waited for."""
+        """Show what the run waits for."""
         if self.live:
             self.draw(Text(f"{self._title}: {text}"))
         else:
             self.console.print(text)
 
     def show(self, time_s: float, error_mm: float | None, telemetry: Sequence[Telemetry], events: Sequence[Event]) -> None:
-        """Show where the robot is and how the controller fares; at least one sample is there."""
+        """Show progress, error and phase times; needs at least one sample."""
         rows = self._rows(error_mm, telemetry)
         if self.live:
             table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
@@ -72,7 +72,7 @@ class Board(Redrawn):
 
 
 def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
-    """Print the sum of a run."""
+    """Print the summary of a run."""
     table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
     rows = [
         (f"error after {summary['transient_s']:g} s", "max {} mm, rms {} mm".format(*number_texts(summary, "max_error_mm", "rms_error_mm"))),
@@ -103,7 +103,7 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
 
 
 def number_texts(summary: Mapping[str, Any], *names: str) -> list[str]:
-    """Return numbers in words, `MISSING_TEXT` for what the run was too short for."""
+    """Return values as text, `MISSING_TEXT` for those that the run was too short for."""
     return [MISSING_TEXT if summary[name] is None else f"{summary[name]:.3g}" for name in names]
 
 

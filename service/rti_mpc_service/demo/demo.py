@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The whole system on this machine: robot, controller, reference and recorder, each its own process, judged at the end.
+Demo: the whole system on this machine, with robot, controller, reference and recorder as processes, and a summary.
 
-The demo is one more peer. It listens on a free loopback port where all the
-others meet, so that several demos run side by side; it starts the robot when all
-who are to follow it are there, listens, and stops everybody when the robot has
-been driven for long enough. Robot and controller go before everything else.
+The demo is one more peer. It listens on a free loopback port to which all others
+connect, so that several demos can run side by side. It starts the robot when all
+other processes are present, listens, and stops them when the robot has been driven
+for long enough. Robot and controller have priority over all others.
 """
 
 from __future__ import annotations
@@ -61,17 +61,17 @@ END_ORDER = (*(("recorder",) if find_spec("rerun") else ()), "controller", "guar
 @dataclass(frozen=True)
 class DemoPlan:
     """
-    What is to be run.
+    Settings of a demo.
 
     Attributes:
-        config: The robot, as its processes load it.
-        scenario: As on the command line.
-        heading: What the reference says of it.
-        trajectory: What to follow.
-        duration_s: For how long, robot time.
-        speed: Robot seconds in a second.
-        folder: Where everything goes.
-        viewer: Whether to watch live.
+        config: Configuration that all processes load.
+        scenario: Scenario, as on the command line.
+        heading: Heading of the reference.
+        trajectory: Trajectory to follow.
+        duration_s: Duration of the run in robot time.
+        speed: Seconds of robot time per second.
+        folder: Folder of all results.
+        viewer: Whether to show the run in a Rerun viewer.
     """
 
     config: Config
@@ -93,7 +93,7 @@ def plan(
     config: Config, scenario: str, *, heading: Heading | None, speed: float, duration_s: float | None, folder: Path | None, viewer: bool, guard: bool
 ) -> DemoPlan:
     """
-    Fill in what the scenario decides.
+    Return the settings of a demo; what is None is decided by the scenario.
 
     Raises:
         ConfigError: There is no such scenario, or the model has outputs that no path fills.
@@ -114,7 +114,7 @@ def plan(
 
 def main(config: Config, scenario: str, **options: Any) -> int:
     """
-    Run a demo, leave its folder, print its sum.
+    Run a demo, write its folder, and print its summary.
 
     Returns:
         Exit status: 0 if the robot was driven to the end.
@@ -141,10 +141,10 @@ def main(config: Config, scenario: str, **options: Any) -> int:
 
 def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:
     """
-    Start everybody, listen until the end, stop everybody.
+    Start all processes, listen until the end, and stop them.
 
     Raises:
-        Failed: Somebody has ended, or nobody came.
+        Failed: A process has ended by itself, or not all came up.
     """
     ocp = build_ocp(run.config)
     endpoint = free_endpoint()
@@ -191,7 +191,7 @@ def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:
 
 
 def start(run: DemoPlan, children: Children, endpoint: str, size: int) -> None:
-    """Start everybody but the robot."""
+    """Start all processes except the robot."""
     keys, config = run.config.keys(), run.folder / "config.toml"
     scenario = ("--scenario", run.scenario, "--heading", run.heading, "--duration", run.reference_s)
     children.start("controller", CLI_MODULE, "run", config, "-e", endpoint)
@@ -206,10 +206,10 @@ def start(run: DemoPlan, children: Children, endpoint: str, size: int) -> None:
 
 def follow(run: DemoPlan, witness: Witness, board: Board, children: Children, stop: Event) -> None:
     """
-    Listen until the robot was driven for long enough, the controller fell silent, or we are stopped.
+    Listen until the robot was driven for long enough, the controller fell silent, or the demo is stopped.
 
     Raises:
-        Failed: A process has ended by itself, or nothing was ever driven.
+        Failed: A process has ended by itself, or the robot was never driven.
     """
     wait(lambda: witness.listen().begun, children, stop, START_TIMEOUT_S, "the first sample")
     heard, heard_s, shown_s = 0, time.monotonic(), 0.0
@@ -229,7 +229,7 @@ def follow(run: DemoPlan, witness: Witness, board: Board, children: Children, st
 
 
 def error_mm(run: DemoPlan, info: Info | None, sample: Telemetry, reference: Reference) -> float | None:
-    """Return how far from the path the robot is in a sample; None: the model has no position."""
+    """Return the distance of the robot from the path in a sample, mm; None if the model has no position."""
     if info is None or info.position is None:
         return None
     at_s = np.array(1e-9 * (sample.stamp_ns - reference.stamp_ns))
@@ -237,7 +237,7 @@ def error_mm(run: DemoPlan, info: Info | None, sample: Telemetry, reference: Ref
 
 
 def conclude(run: DemoPlan, outcome: Outcome, console: Console) -> int:
-    """Write and print the sum of a run, draw it, and tell how to look at it; return the exit status."""
+    """Write and print the summary of a run, draw it, and print how to view it; return the exit status."""
     summary = {**summarize(outcome), "heading": run.heading, "machine": machine.machine_info()}
     (run.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     if not summary["samples"]:
@@ -267,10 +267,10 @@ def guards(run: DemoPlan) -> tuple[str, ...]:
 
 
 def recorded() -> bool:
-    """Whether Rerun is there to record with."""
+    """Whether Rerun is installed, so that the run is recorded."""
     return find_spec("rerun") is not None
 
 
 def path_as_typed(path: Path) -> Path:
-    """Return a path as it would be typed here."""
+    """Return a path relative to the current folder, if it is below it."""
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Processes of ours, each in a group of its own, what they say in files, and none left behind."""
+"""Child processes: each in a process group of its own, with its output in a file, and none left behind."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ END_TIMEOUT_S = 3.0  # between Ctrl-C and SIGKILL
 
 class Children:
     """
-    Starts processes and ends them by their ids, all of them at the end.
+    Starts processes and ends them by their ids, at the latest when its context ends.
 
-    Ctrl-C reaches us alone, and so does a closed terminal: we end the others, in
-    the order that is right. Where we cannot, killed ourselves, the kernel presses
-    Ctrl-C for each of them (`rti_mpc_service.rig.leash`). What they are to remember lies in our
-    folder: a stop of a real robot of the same name is neither obeyed nor released.
+    Ctrl-C and a closed terminal reach only this process, which ends the others in the
+    right order. If it is killed itself, the kernel sends each of them SIGINT
+    (`rti_mpc_service.rig.leash`). Their stored state lies in this folder, so that the
+    stop of a real robot of the same name is neither obeyed nor released.
 
     Attributes:
-        folder: Where their output goes, a file each.
+        folder: Folder of their output, one file each.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._running: dict[str, subprocess.Popen[bytes]] = {}
-        self._logged: set[str] = set()  # those that were started before, whose output goes on
+        self._logged: set[str] = set()  # names that were started before, whose output is appended
 
     def __enter__(self) -> Children:
         return self
@@ -40,13 +40,13 @@ class Children:
 
     def start(self, name: str, module: str, *arguments: object, nice: int = 0) -> int:
         """
-        Start a module of ours as a process. It lives no longer than the thread that calls this: call it in the main thread.
+        Start a module as a process. It lives no longer than the calling thread, so call it in the main thread.
 
         Args:
-            name: For its output and for `end`.
-            module: As after ``python -m``.
-            arguments: Of its command line.
-            nice: By how much others go before it.
+            name: Name for its output and for `end`.
+            module: Module, as after ``python -m``.
+            arguments: Arguments of the module.
+            nice: Niceness added to that of this process.
 
         Returns:
             Its process id.
@@ -63,7 +63,7 @@ class Children:
         return child.pid
 
     def log(self, name: str) -> Path:
-        """Return the file that holds what a process said."""
+        """Return the file that holds the output of a process."""
         return self.folder / f"{name}.log"
 
     def ended(self) -> str | None:
@@ -85,7 +85,7 @@ class Children:
         return self._running[name].pid if name in self._running else None
 
     def end(self, name: str, patience_s: float = END_TIMEOUT_S) -> int:
-        """Ask a process to end as Ctrl-C does, insist after a while, and return its exit status."""
+        """End a process by SIGINT, after `patience_s` by SIGKILL, and return its exit status."""
         child = self._running.pop(name)
         if child.poll() is None:
             child.send_signal(signal.SIGINT)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Supervision of the processes of a run: waiting for them, and noticing that one has ended by itself."""
+"""Supervision of the processes of a run: waits for conditions, and notices a process that has ended by itself."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ POLL_PERIOD_S = 0.05  # period at which a condition is checked
 
 
 class Failed(Exception):
-    """The run cannot go on; says why."""
+    """The run cannot go on; the text gives the reason."""
 
 
 def wait(condition: Callable[[], object], children: Children, stop: Event, patience_s: float, what: str) -> None:
@@ -35,7 +35,7 @@ def wait(condition: Callable[[], object], children: Children, stop: Event, patie
 
 def check_children(children: Children) -> None:
     """
-    Look after everybody.
+    Check that all processes still run.
 
     Raises:
         Failed: A process has ended by itself.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The record a simulated robot keeps of itself, as arrays: the truth a controller is judged by."""
+"""Record of a simulated robot as arrays: the true states, by which a controller is judged."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ COUNTERS = ("lost", "late", "expired", "refused", "starved")
 @dataclass(frozen=True, eq=False)
 class RobotLog:
     """
-    One row a state of the robot.
+    Record with one row per state of the robot.
 
     Attributes:
         stamp_ns: Stamps, robot time, shape ``(M,)``.
         seq: Sequence numbers, shape ``(M,)``.
         x: True states, shape ``(M, nx)``.
         u: Inputs that acted up to the stamps, shape ``(M, nu)``.
-        latency_us: From a state sent to the first command answering it received, NaN where none came, shape ``(M,)``.
-        counters: What became of commands, at the last row.
+        latency_us: Time from sending a state to receiving the first command that answers it, NaN where none came, shape ``(M,)``.
+        counters: Counters of commands at the last row.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -39,7 +39,7 @@ class RobotLog:
     counters: dict[str, int]
 
     def part(self, rows: NDArray[np.bool_]) -> RobotLog:
-        """Return some of the rows, with the counters of the whole."""
+        """Return the selected rows, with the counters of the whole record."""
         return RobotLog(self.stamp_ns[rows], self.seq[rows], self.x[rows], self.u[rows], self.latency_us[rows], self.counters)
 
 

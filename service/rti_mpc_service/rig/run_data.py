@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One run of a robot along a reference, as arrays: what figures are drawn from."""
+"""One run of a robot along a reference, as arrays for drawing figures."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from rti_mpc.wire.info import Info
 @dataclass(frozen=True, eq=False)
 class Run:
     """
-    A run, one row a state of the robot and one row a sample of the controller.
+    A run, with one row per state of the robot and one row per sample of the controller.
 
     Attributes:
-        info: The controller's: names, units, limits, period.
+        info: The controller's description: names, units, limits, period.
         scenario: Name of the reference.
         stamp_ns: Stamps of the states, robot time, shape ``(M,)``.
         x: True states, shape ``(M, nx)``.
         u_applied: Inputs acting at the stamps, shape ``(M, nu)``.
         reference: Position the reference asks for at the stamps, in m, shape ``(M, 2)``.
         sample_stamp_ns: Stamps of the samples' telemetry, shape ``(K,)``.
-        prepare_us: Preparation phases, shape ``(K,)``.
-        feedback_us: Feedback phases, shape ``(K,)``.
-        latency_us: State in to command out, shape ``(K,)``.
-        speed: Robot seconds in a second.
-        transient_s: How long the robot may take to get to the reference.
+        prepare_us: Times of the preparation phases, shape ``(K,)``.
+        feedback_us: Times of the feedback phases, shape ``(K,)``.
+        latency_us: Time from a state sent to its command received, shape ``(K,)``.
+        speed: Seconds of robot time per second.
+        transient_s: Time that the robot may take to reach the reference.
     """
 
     info: Info
@@ -73,5 +73,5 @@ class Run:
 
     @property
     def period_us(self) -> float:
-        """Wall time there is for a sample."""
+        """Wall time available for a sample."""
         return 1e6 * self.info.dt_s / self.speed

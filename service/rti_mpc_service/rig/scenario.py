@@ -13,7 +13,7 @@ BEST_HEADINGS: dict[str, Heading] = {"circle": "none", "positioning": "none"}  #
 
 def configured(config: Config, trajectory: Trajectory, heading: Heading, guard: bool) -> Config:
     """
-    Return the configuration of a run: on loopback, from the scenario's pose, guarded if asked for, without weight on a heading that is none.
+    Return the configuration of a run: on loopback, from the scenario's pose, with a guard if `guard`, without weight on heading ``"none"``.
 
     Raises:
         ConfigError: The model has outputs that no path fills.

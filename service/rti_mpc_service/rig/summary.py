@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Summary of a run in numbers, and whether it kept its promises.
+Summary of a run in numbers: tracking errors, bounds, times and events.
 
 Errors are distances of the plant's true position from the analytic trajectory at
-the same stamp, at every state after the transient. Bounds are compared here, with
-what was commanded and what acted, by code that shares nothing with the solver.
+the same stamp, at every state after the transient. Commanded and applied inputs are
+compared with the bounds by code that shares nothing with the solver.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ INCREMENT_ROUNDING = 1e-9  # rounding of a difference of two inputs, in the inpu
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """
-    All that is known of a run.
+    All results of a run.
 
     Attributes:
-        trajectory: What was to be followed.
-        anchor_ns: When it began, robot time.
+        trajectory: The trajectory to follow.
+        anchor_ns: Robot time at which it began.
         duration_s: How long it was to be followed.
-        speed: Robot seconds in a second.
+        speed: Seconds of robot time per second.
         ocp: The controller's problem, with its bounds.
         info: Names of its vectors.
         log: The robot's record.
-        telemetry: One a sample.
-        unheard: Samples whose telemetry was lost.
-        events: What went wrong, and mode changes.
+        telemetry: One message per sample.
+        unheard: Number of samples whose telemetry was lost.
+        events: Faults and mode changes.
         echo_us: Round trips of the bare echo.
     """
 
@@ -63,7 +63,7 @@ class Outcome:
 
     @property
     def end_ns(self) -> int:
-        """When it was to end, robot time."""
+        """Robot time at which the run was to end."""
         return self.anchor_ns + round(1e9 * self.duration_s)
 
     @property
@@ -78,11 +78,11 @@ class Outcome:
         return bool(reached and self.samples and self.samples[-1].mode in DRIVING_MODES and self._until_the_end())
 
     def _until_the_end(self) -> bool:
-        """Whether the last sample is about the end."""
+        """Whether the last sample lies less than 2.5 periods before the end."""
         return self.end_ns - self.samples[-1].state_stamp_ns < 2.5e9 * self.ocp.dt
 
     def run(self) -> Run:
-        """Return the part between anchor and end, as figures are drawn from; samples whose command never arrived are left out."""
+        """Return the run between anchor and end for figures; samples whose command never arrived are left out."""
         log = self.log.part((self.anchor_ns <= self.log.stamp_ns) & (self.log.stamp_ns <= self.end_ns))
         latency_us = dict(zip(log.seq.tolist(), log.latency_us.tolist(), strict=True))
         answered = [sample for sample in self.samples if np.isfinite(latency_us.get(sample.state_seq, np.nan))]
@@ -104,10 +104,10 @@ class Outcome:
 
 def summarize(outcome: Outcome) -> dict[str, Any]:
     """
-    Sum a run up, in JSON.
+    Return the summary of a run, in JSON.
 
-    Lengths in mm, times in the unit of the name. Of a share of the period, the
-    samples the controller skipped are part.
+    Lengths are in mm, times in the unit of the name. Skipped samples count in
+    ``in_period_share`` as not in period.
     """
     run, samples, counters = outcome.run(), outcome.samples, outcome.log.counters
     if not run.stamp_ns.size or not samples:
@@ -148,7 +148,7 @@ def summarize(outcome: Outcome) -> dict[str, Any]:
 
 
 def errors(run: Run, lap_s: float | None) -> dict[str, float | None]:
-    """Sum up the distance from the reference, and the speed in the end; null where the run did not get so far, or the model has no position."""
+    """Return errors and the speed at the end; null where the run was too short, or the model has no position."""
     if run.info.position is None:
         return dict.fromkeys(ERROR_KEYS)
     settled = run.error_mm[run.settled]
@@ -165,7 +165,7 @@ def errors(run: Run, lap_s: float | None) -> dict[str, float | None]:
 
 
 def limits(outcome: Outcome, samples: Sequence[Telemetry]) -> dict[str, Any]:
-    """Compare every row commanded, the steps between them, every input that acted and every true state with the bounds."""
+    """Compare every commanded row, the steps between rows, every applied input and every true state with the bounds."""
     ocp, log = outcome.ocp, outcome.log
     commanded = np.vstack([sample.u for sample in samples])
     steps = np.vstack([np.diff(sample.u, axis=0) for sample in samples])
@@ -183,7 +183,7 @@ def excess(values: Array, lower: Array, upper: Array) -> Array:
 
 
 def excess_share(values: Array, lower: Array, upper: Array) -> Array:
-    """Return the same as a share of the bound that is broken; of the other one where that is 0."""
+    """Return the same as a share of the violated bound; of the opposite bound where the violated one is 0."""
     above, below = np.maximum(values - upper, 0.0), np.maximum(lower - values, 0.0)
     size = np.where(above > 0.0, np.abs(upper), np.abs(lower))
     other = np.where(above > 0.0, np.abs(lower), np.abs(upper))
@@ -192,14 +192,14 @@ def excess_share(values: Array, lower: Array, upper: Array) -> Array:
 
 
 def quantiles(values: Array) -> dict[str, float | None]:
-    """Return median, 99th percentile and maximum; null where there is nothing."""
+    """Return median, 99th percentile and maximum; null if there are no values."""
     if not values.size:
         return {"p50": None, "p99": None, "max": None}
     return {name: round(float(np.percentile(values, share)), 1) for name, share in (("p50", 50), ("p99", 99), ("max", 100))}
 
 
 def fault_events(events: Sequence[Event]) -> list[dict[str, Any]]:
-    """Return the events that are not news only."""
+    """Return the warnings and errors among the events."""
     return [
         {"at_s": 1e-9 * event.stamp_ns, "source": event.source, "severity": event.severity.name, "code": event.code, "text": event.text}
         for event in events

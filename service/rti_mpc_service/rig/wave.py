@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A reference for any model: a wave in every output, from the outputs of a state."""
+"""Reference for any model: a sine wave in every output, starting at the outputs of a state."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WAVE_PERIOD_S = 40.0
 
 
 def wave(ocp: Ocp, x: Array, rng: np.random.Generator) -> Callable[[NDArray[np.int64]], Array]:
-    """Return a reference that leaves a state, shape ``(nx,)``, in a wave of every output: stages, shape ``(M,)``, to rows, ``(M, ny)``."""
+    """Return a reference that starts at state `x`, shape ``(nx,)``: a function of sample indices, shape ``(M,)``, to rows, shape ``(M, ny)``."""
     model = ocp.model
     phases = rng.uniform(-np.pi, np.pi, model.ny)
     start = np.array([x[[state.name for state in model.states].index(y.name)] if y in model.states else 0.0 for y in model.outputs])

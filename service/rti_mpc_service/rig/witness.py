@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Somebody who listens to a run and remembers it: what was said about every sample, and what went wrong."""
+"""Listener that collects the messages of a run: telemetry, events, reference and the controller's description."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class Witness:
     Collects telemetry, events and the reference.
 
     Attributes:
-        telemetry: One a sample.
-        events: In the order they came.
-        reference: The last one, with its real stamp.
+        telemetry: One message per sample.
+        events: Events in the order of arrival.
+        reference: The last reference, with its real stamp.
         info: The controller's description of itself.
         lives: Roles that are present now.
     """
@@ -44,7 +44,7 @@ class Witness:
 
     @property
     def lost(self) -> int:
-        """Samples nobody told us about."""
+        """Number of samples whose telemetry was lost."""
         return self._samples_in.source.lost
 
     @property
@@ -53,11 +53,11 @@ class Witness:
         return bool(self.telemetry) and self.reference is not None
 
     def met(self, roles: set[str]) -> bool:
-        """Whether these are present, and the controller has told who it is."""
+        """Whether all roles are present, and the controller's description has been received."""
         return roles <= self.lives and self.info is not None
 
     def listen(self) -> Witness:
-        """Take in what has come since the last call."""
+        """Process the messages received since the last call."""
         now_ns = time.monotonic_ns()
         for received in self._samples.drain():
             if (sample := self._samples_in.accept(received, now_ns)) is not None:
@@ -76,6 +76,6 @@ class Witness:
         return self
 
     def _notice(self, role: str, present: bool) -> None:
-        """Note who comes and goes; called in a thread of the bus."""
+        """Note which roles appear and disappear; called in a thread of the bus."""
         if admitted(role, self.lives):
             (self.lives.add if present else self.lives.discard)(role)
