@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The robot's side of the command contract: what is taken, what is refused, and what became of it.
+The robot's side of the command contract: it accepts or refuses commands, counts them, and plays their plans.
 
-What was taken acts as `rti_mpc.contract.schedule` says, approached inside the slew limits
-from what really acts, whatever was lost before. No clock: time is told.
+Accepted commands act as `rti_mpc.contract.schedule` says. They are approached within the slew
+limits from the input that really acts, whatever was lost before. Times are arguments; there is no clock.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ class Clock:
             time.sleep(min(MAX_SLEEP_S, 1e-9 * max(0, left_ns - UNSLEPT_END_NS)))
 
     def set_back(self, robot_ns: int) -> int:
-        """Make it a past robot time now; return by how much wall time, in ns."""
+        """Set the clock back to a past robot time; return by how much wall time, in ns."""
         late_ns = time.monotonic_ns() - self._start_ns - math.ceil(robot_ns / self.speed)
         self._start_ns += late_ns
         return late_ns

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The robot without clock and network: plant, actuators and sensors, advanced when told.
+Robot without clock and network: plant, actuators and sensors, advanced by the caller.
 
-Closed loops are tested with it step by step; the process `rti_mpc_sim.robot` is this
-robot with a clock and the bus::
+It serves to test closed loops step by step; the process `rti_mpc_sim.robot` adds a
+clock and the bus::
 
     robot = Lockstep(settings)
     while robot.now_ns < duration_ns:
@@ -69,17 +69,17 @@ class Lockstep:
         return min(self._next_ns, self.sensor.due_ns)
 
     def accept(self, command: Command, arrival_ns: int | None = None) -> str:
-        """Receive a command, now unless told otherwise; return the reason if it is refused."""
+        """Receive a command at `arrival_ns`, now if None; return the reason if it is refused, else an empty string."""
         return self.actuator.accept(command, self.now_ns if arrival_ns is None else arrival_ns)
 
     def advance(self, to_ns: int) -> None:
-        """Integrate up to a time, exactly over the intervals in which each input acts."""
+        """Integrate up to a time, separately over each interval of constant input."""
         for until_ns, u in self.actuator.play(self.now_ns, to_ns):
             self._plant.advance(u, 1e-9 * (until_ns - self.now_ns))
             self.now_ns = until_ns
 
     def measure(self) -> int | None:
-        """Measure the state if it is time to, and return its sequence number; times that were missed are skipped."""
+        """Measure the state if it is due, and return its sequence number; missed times are skipped."""
         if self.now_ns < self._next_ns:
             return None
         self._next_ns = (self.now_ns // self.period_ns + 1) * self.period_ns

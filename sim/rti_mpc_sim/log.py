@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The robot's own record, as CSV: one line a state, written once its answer is known.
+The robot's own record as CSV: one line per state, written once its answer is known.
 
 Columns: ``stamp_ns, seq``, the true state by name, the inputs that acted up to
 that instant by name, ``command_seq, latency_us`` of the first command answering
@@ -27,7 +27,7 @@ ANSWER_TIMEOUT_NS = 1_000_000_000  # by the monotonic clock: later answers to a 
 
 @dataclass(slots=True)
 class Line:
-    """One state: the cells before and after those of its answer."""
+    """Line of one state: the cells before and after those of its answer."""
 
     measured_ns: int
     before: list[Any]
@@ -39,7 +39,7 @@ class Line:
 
 class Log:
     """
-    Writes the record; to nowhere if it has no path.
+    Writes the record; without a path, nothing is written.
 
     Raises:
         ConfigError: The file cannot be written.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Plant: the simulated robot's own model, integrated finer than the controller's.
+Plant: the simulated robot's own model, integrated in finer steps than the controller's.
 
 A first-order lag of the actuators, :math:`T \dot v = u - v`, is part of the
 plant: `v` joins its state, so that inputs that lag are integrated as exactly as

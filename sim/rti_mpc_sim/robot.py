@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The simulated robot as a process: the lockstep robot with a clock, on the bus.
+Simulated robot as a process: the lockstep robot with a clock, on the bus.
 
-It measures and sends states on an absolute grid of wall time over speed, and
-advances over exactly the intervals in which each received row acted. Where this
-process itself is held up for a whole period, the robot's clock waits with it: a
-busy machine is no fault of the robot. When it is stopped its inputs ramp to
-rest, and the last state it sends is the one in which it stands.
+It measures and sends states on an absolute grid of robot time, and integrates over
+exactly the intervals in which each received row acts. If the process itself is held
+up for a whole period, the robot's clock waits with it, so that a busy machine is not
+taken for a fault of the controller. When the robot is stopped, its inputs ramp to
+rest, and the last state that it sends is the one in which it stands.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ logger = logging.getLogger(ROLE)
 @dataclass(frozen=True)
 class RobotSummary:
     """
-    What a robot did in its life.
+    Summary of one life of the robot.
 
     Attributes:
         states: States sent.
@@ -107,7 +107,7 @@ def main(
 
 
 def wait_for_another(bus: Bus, stop: Event) -> None:
-    """Wait until no other robot of this name is present, for one lease at most: either it was killed and is about to vanish, or it lives."""
+    """Wait until no other robot of this name is present, for one lease at most: a killed robot vanishes within it, a living one stays."""
     if not bus.is_alive(ROLE, LISTEN_BEFORE_START_S):
         return
     logger.warning("another robot is present as %s: waiting for at most %g s until it is gone", bus.keys.robot, PRESENCE_LEASE_S)
@@ -121,7 +121,7 @@ def wait_for_another(bus: Bus, stop: Event) -> None:
 
 
 def model_info(model: Model) -> dict[str, Any]:
-    """Describe a model for ``info``."""
+    """Return the description of the robot's model for ``info``."""
     return {
         "version": rti_mpc.__version__,
         "model": model.name,
@@ -149,19 +149,19 @@ class Robot:
         nu, epoch = settings.model.nu, self.body.epoch
         self._intake = bus.intake(Command, 1e-9 * STALE_NS / speed, {"u": nu}, unfit=lambda command: unfit(command, nu, epoch))
         bus.expect("command", lambda: self._intake.source.epoch is not None)
-        self._refused = 0  # by the door, so far
+        self._refused = 0  # by the intake, so far
         self._sent = 0
         self._held_up_ns = 0
         Thread(target=self._receive, args=(bus.subscriber(key, capacity=RING_MESSAGES),), daemon=True).start()
         self.clock = Clock(speed)
 
     def run(self, stop: Event, until_ns: int | None = None) -> None:
-        """Live until stopped."""
+        """Run the robot until stopped, or until a robot time."""
         body = self.body
-        self.clock.set_back(body.now_ns)  # what came before was birth
+        self.clock.set_back(body.now_ns)  # the time that construction took does not count
         while not stop.is_set() and (until_ns is None or body.now_ns < until_ns):
             due_ns = body.due_ns
-            self.clock.wait(due_ns - body.period_ns // 2, stop)  # after a state the cores are for those who answer it
+            self.clock.wait(due_ns - body.period_ns // 2, stop)  # just after a state, the controller needs the cores
             self._log.write(time.monotonic_ns())
             self.clock.wait(due_ns, stop)
             if self.clock.now_ns() - due_ns >= body.period_ns:
@@ -186,7 +186,7 @@ class Robot:
         return RobotSummary(self._sent, 1e-9 * self._held_up_ns, body.counters)
 
     def _receive(self, subscriber: Subscriber) -> None:
-        """Note every command from our source with the time of its arrival; a thread of its own. What is not for us takes nobody's place."""
+        """Queue every accepted command with its time of arrival; a thread of its own. Refused commands take no place in the queue."""
         for received in iter(subscriber.recv, None):
             arrival_ns = time.monotonic_ns()
             if (command := self._intake.accept(received, arrival_ns)) is not None:
@@ -200,7 +200,7 @@ class Robot:
         self._announcer.say(Notice(Severity.WARNING, "simulation_held_up", text), due_ns)
 
     def _live(self, to_ns: int) -> None:
-        """Advance to a time with the commands that arrived by then, measure, send."""
+        """Advance to a time with the commands that arrived by then; measure and send states that are due."""
         while self._inbox and self.clock.at_ns(self._inbox[0][1]) <= to_ns:
             self._take(*self._inbox.popleft())
         for notice in self._intake.notices(time.monotonic_ns()):
@@ -227,7 +227,7 @@ class Robot:
             self._log.answered(command.state_seq, command.seq, monotonic_ns)
 
     def _advance(self, to_ns: int) -> None:
-        """Advance, and measure if it is time to."""
+        """Advance to a time, and measure a state if it is due."""
         body = self.body
         body.advance(to_ns)
         if (seq := body.measure()) is not None:

@@ -49,14 +49,14 @@ class Sensor:
 
     def measure(self, x: Array, stamp_ns: int, u: Array = UNREPORTED[0], command_epoch: int = 0, command_seq: int = 0) -> int:
         """
-        Measure.
+        Measure a state and put it on its way, unless it drops out.
 
         Args:
             x: True state, shape ``(nx,)``.
-            stamp_ns: The time now.
-            u: Input that the actuators are asked for, before any lag of theirs, shape ``(nu,)``; empty: not to be told.
-            command_epoch: Epoch of the command it comes from.
-            command_seq: Its sequence number; 0: the ramp of the robot itself.
+            stamp_ns: Robot time of the measurement.
+            u: Input demanded from the actuators, before their lag, shape ``(nu,)``; empty: not reported.
+            command_epoch: Epoch of the command that the input comes from.
+            command_seq: Sequence number of that command; 0: the robot's own ramp.
 
         Returns:
             The sequence number of the state.
