@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The command line: options in, one call out. Everything physical is in the configuration.
+Command line: each command turns its options into one call. Everything physical is in the configuration.
 
-Each command imports what it runs when it runs: `rti-mpc --help` loads no solver,
-no bus and no viewer, and this file alone knows both `service` and `sim`.
+A command imports its modules when it runs, so that `rti-mpc --help` loads no solver,
+no bus and no viewer. This is the only file that knows both `service` and `sim`.
 """
 
 from __future__ import annotations
@@ -32,11 +32,12 @@ if TYPE_CHECKING:
     from rti_mpc.wire.bus import BusSettings
 
 HERE = Path(__file__).parent
-SHIPPED = (HERE / "deploy" if (HERE / "deploy").is_dir() else HERE.parents[1] / "deploy") / "pioneer_3dx.toml"  # in the wheel, in a clone
+# A wheel has deploy/ inside the package, a clone at its top.
+SHIPPED = (HERE / "deploy" if (HERE / "deploy").is_dir() else HERE.parents[1] / "deploy") / "pioneer_3dx.toml"
 
 
 class Commands(TyperGroup):
-    """Group whose list of commands holds whole sentences, wrapped where the terminal is narrow; Click cuts them off."""
+    """Group that lists its commands with whole sentences, wrapped where the terminal is narrow; Click would cut them off."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the list of commands."""
@@ -76,7 +77,7 @@ def top(
 
 
 def claimed(path: Path | None) -> Path | None:
-    """Make sure that a file can be written, before minutes are spent on what it is to hold."""
+    """Check that a file can be written, before minutes are spent on computing its content."""
     try:
         if path is not None:
             path.touch()
@@ -107,8 +108,8 @@ def process(command: Callable[..., int | None], *, with_model: bool = True) -> C
     Register a process of a robot: a command with CONFIG and Zenoh's options besides its own.
 
     Args:
-        command: Takes the configuration, how to join the bus, and its own options; returns an exit status, None for 0. CONFIG is the
-            first TOML file among its `words`, if it takes any.
+        command: Takes the configuration, the settings of the bus, and its own options; returns an exit status, None for 0. If it
+            takes `words`, CONFIG is the first TOML file among them.
         with_model: Whether the configuration is checked against the model.
     """
     shared = inspect.signature(options, eval_str=True).parameters
@@ -127,7 +128,7 @@ def process(command: Callable[..., int | None], *, with_model: bool = True) -> C
     path = inspect.Parameter("config", inspect.Parameter.POSITIONAL_OR_KEYWORD, default=SHIPPED, annotation=ConfigPath)
     run.__signature__ = inspect.Signature([path, *own, *shared.values()])  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in (path, *own, *shared.values())}
-    del run.__wrapped__  # or its signature would be read instead
+    del run.__wrapped__  # otherwise inspect would read the signature of `command`
     return app.command()(run)
 
 
@@ -371,7 +372,7 @@ def doctor(
 
 
 def main() -> NoReturn:
-    """Run the command line; what it refuses is one line, with exit status 2."""
+    """Run the command line; bad input is refused in one line, with exit status 2."""
     entry.enter(log.start, app)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Console of commands that print tables: wide enough for every number, also in a pipe or a narrow terminal."""
+"""Console for tables: wide enough for every number, also in a pipe or a narrow terminal."""
 
 from __future__ import annotations
 

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The frame around every process: standard streams that take anything, one line for what is refused, and a bounded end.
+Entry of every process: robust standard streams, one line for each refusal, and an end within bounded time.
 
-The interpreter is never finalized. It would unwind every thread that is inside a
-native call, and Zenoh answers that with SIGABRT; and it would drop sessions whose
-links are closed for as long as a hung peer lingers. Whatever has to be closed has
-been closed by then: the end only writes what still waits to be written.
+The interpreter is never finalized. Finalization would unwind threads inside native
+calls, to which Zenoh responds with SIGABRT, and would drop sessions, which waits
+for hung peers. All sessions are closed before; the end only writes buffered output.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ EXTRA_OF_MODULE = {"rerun": "view", "rerun_cli": "view", "matplotlib": "figure"}
 
 
 class OutputError(Exception):
-    """Standard output does not take what is printed; `errno` is the system's."""
+    """Standard output cannot be written; `errno` is the system's."""
 
     def __init__(self, error: OSError) -> None:
         self.errno = error.errno
@@ -45,10 +44,10 @@ class OutputError(Exception):
 
 
 class Output(io.FileIO):
-    """Standard output whose failure cannot be taken for any other file's."""
+    """Standard output whose errors are told apart from those of other files."""
 
     def write(self, data: Any) -> int | None:  # type: ignore[override]
-        """Write bytes; `OutputError` if they are not taken."""
+        """Write bytes; raise `OutputError` if that fails."""
         try:
             return super().write(data)
         except OSError as error:
@@ -56,17 +55,17 @@ class Output(io.FileIO):
 
 
 def enter(*steps: Callable[[], object]) -> NoReturn:
-    """Run the steps of a process and end it: with the status that one exits with, 2 for what one refuses, 0 otherwise."""
+    """Run the steps of a process and end it: with a step's own exit status, 2 if a step refuses its input, 0 otherwise."""
     open_standard_streams()
     end(status_of(steps))
 
 
 def open_standard_streams() -> None:
     """
-    Make sure that standard streams are there, and take every character.
+    Make sure that the standard streams are open and accept every character.
 
-    A closed one would otherwise be None here, and its number the next file's or
-    socket's. A character that the terminal lacks is written as `escape` says.
+    A closed stream would otherwise be None here, and the next file or socket would
+    get its number. A character that the terminal lacks is written as `escape` says.
     """
     codecs.register_error("rti_mpc.escape", escape)
     for descriptor in range(3):
@@ -82,7 +81,7 @@ def open_standard_streams() -> None:
 
 
 def escape(error: UnicodeError) -> tuple[str | bytes, int]:
-    """Write the bytes of a path as they are, whatever they mean, and other characters that cannot be written as escapes."""
+    """Replace characters that cannot be encoded: undecodable bytes of a path are written unchanged, all others as escapes."""
     try:
         return codecs.lookup_error("surrogateescape")(error)
     except UnicodeError:
@@ -90,7 +89,7 @@ def escape(error: UnicodeError) -> tuple[str | bytes, int]:
 
 
 def status_of(steps: Iterable[Callable[[], object]]) -> int:
-    """Run the steps and return the exit status; say in one line what was refused."""
+    """Run the steps and return the exit status; print a refusal as one line."""
     try:
         status = 0
         try:
@@ -100,12 +99,12 @@ def status_of(steps: Iterable[Callable[[], object]]) -> int:
             status = asked.code if isinstance(asked.code, int) else EXIT_FAILED if asked.code else 0
         sys.stdout.flush()
         return status
-    except KeyboardInterrupt:  # before it could be answered
+    except KeyboardInterrupt:  # Ctrl-C before a handler was installed
         return EXIT_BY_SIGNAL + signal.SIGINT
     except Stopped:
         return 0
     except OutputError as error:
-        if error.errno == errno.EPIPE:  # whoever reads has read enough
+        if error.errno == errno.EPIPE:  # the reader of the pipe has closed it
             return EXIT_BY_SIGNAL + signal.SIGPIPE
         say(str(error))
         return EXIT_FAILED
@@ -125,14 +124,14 @@ def status_of(steps: Iterable[Callable[[], object]]) -> int:
 
 
 def say(text: str) -> None:
-    """Print one line to standard error, if anybody takes it; characters that steer a terminal are written as escapes."""
+    """Print one line to standard error, ignoring failure; control characters are written as escapes."""
     line = CONTROL_CHARACTER.sub(lambda match: ascii(match[0])[1:-1], text[:MAX_LINE_CHARACTERS])
     with suppress(OSError):
         print(f"rti-mpc: {line}", file=sys.stderr, flush=True)
 
 
 def end(status: int) -> NoReturn:
-    """End the process, once what still waits is written; within `END_TIMEOUT_S`, whoever may not take it."""
+    """End the process after writing all buffered output, or after `END_TIMEOUT_S` if somebody does not accept it."""
     writing = Thread(target=write_all, daemon=True)
     writing.start()
     writing.join(END_TIMEOUT_S)
@@ -140,7 +139,7 @@ def end(status: int) -> NoReturn:
 
 
 def write_all() -> None:
-    """Do what was left for the end: of others' first, then ours."""
+    """Run the exit functions of other modules, then write buffered output."""
     for write in (atexit._run_exitfuncs, logging.shutdown, sys.stdout.flush, sys.stderr.flush):
         with suppress(Exception):
             write()

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The guard as a process: no model, no solver, nothing of CasADi, OSQP or SciPy.
+Guard process: loads no model and no solver, neither CasADi, OSQP nor SciPy.
 
-One thread waits for commands and passes them on, one waits for states, the main
-one ticks. Each holds a lock for microseconds. What the guard decides is
-`rti_mpc.contract.guard`'s.
+One thread receives commands and passes them on, one receives states, and the main
+thread ticks. Each holds the lock for microseconds. The decisions are made by
+`rti_mpc.contract.guard`.
 """
 
 from __future__ import annotations
@@ -47,16 +47,16 @@ def main(config: Config, bus_settings: BusSettings, *, state: Path | None = None
     Guard one robot until stopped.
 
     Args:
-        config: The robot, of whose model no more is known than its inputs' bounds.
+        config: The robot's configuration; of the model only the bounds of the inputs are used.
         bus_settings: How to join the bus.
-        state: Folder that remembers an operator's stop; None: the user's, or the service's.
-        stop: Stops the guard when set; SIGINT and SIGTERM if there is none.
+        state: Folder in which an operator's stop is stored; None: the folder of the user or of the service.
+        stop: Event that stops the guard; None: SIGINT and SIGTERM do.
 
     Returns:
-        Exit status: 0 when stopped, 1 when another guard is there or an unforeseen error ended this one.
+        Exit status: 0 when stopped, 1 when another guard is present or an unforeseen error ended this one.
 
     Raises:
-        ConfigError: The configuration has no guard, or an endpoint cannot be had.
+        ConfigError: The configuration has no guard, or an endpoint is not available.
     """
     if not config.guard.enabled:
         raise ConfigError("guard.enabled must be true for the robot to take what a guard passes on, got false")
@@ -75,7 +75,7 @@ def main(config: Config, bus_settings: BusSettings, *, state: Path | None = None
 
 
 def guard_info(config: Config) -> dict[str, object]:
-    """Describe a guard for ``info``: what it lets pass, per input; null where there is no limit."""
+    """Return the guard's message for ``info``: its limits per input, null where there is none."""
     limits, bounds = guard_limits(config), config.ocp.bounds
     return {
         "role": ROLE,
@@ -134,7 +134,7 @@ class Process:
         return int(self._crashed.is_set())
 
     def _obey(self, latch: Latch) -> None:
-        """Do what an operator has asked for last."""
+        """Stop or release the robot, as the latch says."""
         with self._lock:
             if latch.stopped:
                 self._guard.latch(latch.reason, time.monotonic_ns())
@@ -142,19 +142,19 @@ class Process:
                 self._guard.enable()
 
     def _publish_info(self) -> None:
-        """Publish what this guard is."""
+        """Publish the description of this guard on ``info``."""
         with self._telling:
             self._bus.publish_json(self._bus.keys.info(ROLE), {**self._about, **self._operator_stop.latch_info()})
 
     def _state(self, received: Received) -> None:
-        """Take a state in."""
+        """Process a received state."""
         with self._lock:
             local_ns = time.monotonic_ns()
             if (state := self._states.read(received)) is not None:
                 self._guard.receive_state(state, local_ns)
 
     def _command(self, received: Received) -> None:
-        """Pass a command on at once, if it is in order."""
+        """Check a received command, and pass it on at once if it is accepted."""
         command = self._commands.read(received, known=self._guard.epoch)
         if command is None:
             return
@@ -164,7 +164,7 @@ class Process:
                 self._actuation.put(passed)
 
     def _tick(self) -> None:
-        """Look after the time, and say what there is to say."""
+        """Brake if nothing fresh has come, and announce what has happened."""
         with self._lock:
             local_ns = time.monotonic_ns()
             told = self._guard.tick(local_ns)
@@ -179,12 +179,12 @@ class Process:
                 announce(log, self._announcer, refusal, stamp_ns)
 
     def _follow(self, act: Callable[[Received], None], subscriber: Subscriber) -> None:
-        """Run a loop; what nobody foresaw ends in a ramp to rest and a non-zero exit, for the supervisor to restart."""
+        """Run a receiving loop; an unforeseen error leads to a ramp to rest and exit status 1, so that a supervisor restarts the guard."""
         try:
             for received in iter(subscriber.recv, None):
                 act(received)
         except Exception:
             if self._bus.closed:
-                return  # under our hands: nothing of it was wanted any more
+                return  # by another thread, at the end of the process: the error does not matter
             log.exception("stopping after an unforeseen error")
             self._crashed.set()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Failures on request, so that each rung of the ladder can be seen at work: ``debug.inject`` of the configuration.
+Failures on request, for testing each rung of the fallback ladder; enabled by ``debug.inject`` of the configuration.
 
-They happen where real ones do, inside the real-time iteration; the controller knows nothing of them.
+They happen inside the real-time iteration, as real failures do; the controller does not know of them.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ MAX_FAILING_SAMPLES = 10_000  # per request
 
 
 class FaultyRti(Rti):
-    """A real-time iteration that fails when it is told to."""
+    """A real-time iteration that fails on request."""
 
     _failure = ""
-    _left = 0  # samples that are still to fail
-    _failing = ""  # how the present sample does
+    _left = 0  # remaining samples that fail
+    _failing = ""  # failure of the present sample; empty: none
 
     def inject(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Let the next samples fail, as a request says; answer it."""
+        """Let the next samples fail as a request says, and return the answer."""
         failure, samples = request.get("failure"), request.get("samples", 1)
         if failure not in FAILURES:
             return {"ok": False, "error": f"failure must be one of {', '.join(FAILURES)}, got {failure!r}"}

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-File of one robot's latch: read at the start of a process, written at each change, never half.
+File of one robot's latch: read at the start of a process, and written atomically at each change.
 
-One file per prefix and robot, in a folder that outlives processes. Several
-processes of a host may share it: whoever writes holds the folder's lock and
-writes the greater of what is there and what it knows.
+There is one file per prefix and robot, in a folder that outlives processes. Several
+processes of a host may share it: a writer holds the folder's lock and writes the
+greater of the stored latch and its own.
 """
 
 from __future__ import annotations
@@ -42,25 +42,25 @@ def state_folder() -> Path | None:
 
 class LatchFile:
     """
-    The file of one robot.
+    The latch file of one robot.
 
     Attributes:
-        path: Where it is; None if no folder is known.
+        path: Path of the file; None if no folder is known.
     """
 
     def __init__(self, keys: Keys, folder: Path | None = None) -> None:
         """
-        Name the file.
+        Determine the path of the file.
 
         Args:
-            keys: Which robot.
-            folder: Where it lies; None: in the `state_folder`.
+            keys: The robot's keys.
+            folder: Folder of the file; None: `state_folder`.
         """
         folder = folder or state_folder()
         self.path = None if folder is None else folder / f"{quote(f'{keys.prefix}/{keys.robot}', safe='')}.json"
 
     def read(self) -> tuple[Latch, str]:
-        """Return the latch, and what is wrong with the file, empty if nothing is: one that cannot be understood stops, and exceeds no other latch."""
+        """Return the latch and the fault of the file, empty if there is none; an unreadable file counts as a stop with the lowest counter."""
         try:
             return self._read(), ""
         except (FileNotFoundError, NotADirectoryError):
@@ -73,10 +73,10 @@ class LatchFile:
 
     def write(self, latch: Latch) -> None:
         """
-        Store a latch, unless a greater one is there.
+        Store a latch, unless a greater one is stored already.
 
         Raises:
-            OSError: It cannot be stored.
+            OSError: The latch cannot be stored.
         """
         if self.path is None:
             raise OSError(0, NO_FOLDER)
@@ -86,7 +86,7 @@ class LatchFile:
             lock(folder)
             content = json.dumps({"version": FILE_VERSION, **asdict(max(latch, self.read()[0]))})
             beside = self.path.with_name(f"{self.path.name}.tmp")
-            beside.unlink(missing_ok=True)  # of a process that was killed while it wrote
+            beside.unlink(missing_ok=True)  # left by a process that was killed while writing
             with beside.open("xb") as file:
                 file.write(content.encode() + b"\n")
                 file.flush()
@@ -97,7 +97,7 @@ class LatchFile:
             os.close(folder)
 
     def obstacle(self) -> str:
-        """Return why nothing can be stored, as far as it is known without trying; empty if it is not."""
+        """Return why a latch cannot be stored, as far as that is known without trying; empty if nothing is known to prevent it."""
         if self.path is None:
             return NO_FOLDER
         there = next(folder for folder in self.path.parents if folder.exists())
@@ -108,7 +108,7 @@ class LatchFile:
     def _read(self) -> Latch:
         if self.path is None:
             return Latch()
-        descriptor = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)  # a pipe of that name holds nobody up
+        descriptor = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)  # does not block on a pipe of that name
         try:
             payload = os.read(descriptor, MAX_FILE_BYTES + 1)
         finally:
@@ -121,10 +121,10 @@ class LatchFile:
 
 def lock(folder: int) -> None:
     """
-    Wait until nobody else writes in an open folder; closing it releases it.
+    Lock an open folder against other writers; closing the folder releases the lock.
 
     Raises:
-        TimeoutError: Somebody else does for too long.
+        TimeoutError: Another process has held the lock for too long.
     """
     deadline_s = time.monotonic() + LOCK_TIMEOUT_S
     while True:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Log of a process on standard output: for people on a terminal, otherwise one JSON object per line."""
+"""Log of a process on standard output: readable text on a terminal, otherwise one JSON object per line."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ CLOSE_TIMEOUT_S = 0.5  # for writing the waiting lines at the end
 
 
 class JsonLines(logging.Formatter):
-    """One JSON object a record, for journals."""
+    """Formatter that writes one JSON object per record, for journals."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Write level, logger and text, and the traceback if there is one."""
+        """Return level, logger, text and the traceback, if there is one."""
         line = {"level": record.levelname, "logger": record.name, "text": record.getMessage()}
         if record.exc_info:
             line["traceback"] = self.formatException(record.exc_info)
@@ -29,40 +29,40 @@ class JsonLines(logging.Formatter):
 
 class Aside(logging.Handler):
     """
-    Writes in a thread of its own, and drops what waits in vain.
+    Handler that writes in a thread of its own, and drops lines when too many wait.
 
     A terminal that hangs, as with Ctrl-S or a lost connection, or a pipe that nobody
-    reads, would otherwise hold up whoever has something to say: a controller, or
-    its guard. (`logging.handlers.QueueListener` waits for it without limit at the end.)
+    reads, would otherwise block the logging process: a controller or its guard.
+    (`logging.handlers.QueueListener` waits without limit at the end.)
     """
 
     def __init__(self, descriptor: int) -> None:
         super().__init__()
         self._descriptor = descriptor
-        self._lines: Queue[tuple[int, str] | None] = Queue(MAX_WAITING_LINES)  # each with how many before it were dropped
-        self._dropped = 0  # since the last one that was not
+        self._lines: Queue[tuple[int, str] | None] = Queue(MAX_WAITING_LINES)  # number of lines dropped before each line, and the line
+        self._dropped = 0  # lines dropped since the last accepted one
         self._thread = Thread(target=self._write, name="log", daemon=True)
         self._thread.start()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Leave a record to be written."""
+        """Queue a record for writing."""
         try:
             self._lines.put_nowait((self._dropped, self.format(record)))
             self._dropped = 0
         except Full:
             self._dropped += 1
-        except Exception:  # as every handler does: a record that cannot be formatted ends nobody's loop
+        except Exception:  # as every handler does: a record that cannot be formatted must not end the caller
             self.handleError(record)
 
     def close(self) -> None:
-        """Wait until all is written, within a bounded time."""
+        """Wait until all queued lines are written, for at most twice `CLOSE_TIMEOUT_S`."""
         with suppress(Full):
             self._lines.put(None, timeout=CLOSE_TIMEOUT_S)
             self._thread.join(CLOSE_TIMEOUT_S)
         super().close()
 
     def _write(self) -> None:
-        """Write what there is, past the buffers of `sys.stdout`, which a process cannot end without."""
+        """Write queued lines directly to the descriptor: a process could not end while the buffer of `sys.stdout` is not accepted."""
         for dropped, line in iter(self._lines.get, None):
             if dropped:
                 text = f"{dropped} lines are lost: standard output did not take them"
@@ -80,4 +80,4 @@ def start() -> None:
     warnings.showwarning = lambda message, *_, **__: logging.getLogger("rti_mpc").warning(
         "%s", message
     )  # the library's: one line, not where it is from
-    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it tells of fonts it has found, in the middle of a first demo's sum
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it would log its search for fonts into the summary of a first demo

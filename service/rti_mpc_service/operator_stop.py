@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-An operator's stop in one process: obeyed, told, stored, and answered on a key of its own.
+Operator's stop in one process: obeyed, published, stored, and answered on a key of its own.
 
-Controllers, those that stand by, and guards each have one. It takes requests,
-hears in the descriptions of the others what it has missed, and obeys at once;
-a thread of its own stores each change, since a disk may be slow or full.
+Controllers, standbys and guards each have one. It answers requests, learns missed
+ones from the descriptions of the other processes, and obeys at once. A separate
+thread stores each change, since a disk may be slow or full.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ class OperatorStop:
     The latch of one process.
 
     Attributes:
-        latch: What holds now.
+        latch: The present latch.
     """
 
     def __init__(self, file: LatchFile, obey: Callable[[Latch], None], say: Callable[[Notice], None]) -> None:
         """
-        Read the file, obey, and say what it says.
+        Read the file, and obey a stored stop.
 
         Args:
-            file: Where the latch outlives the process.
-            obey: Stops or releases; must not block.
+            file: File in which the latch outlives the process.
+            obey: Stops or releases the robot; must not block.
             say: Publishes a notice.
         """
         self._file = file
@@ -56,7 +56,7 @@ class OperatorStop:
         self._tell: Callable[[], None] = lambda: None
         self._changing = Lock()
         self._storing = Condition()
-        self._attempted, self._fault = Latch(), ""  # the last latch that was to be stored, and why it could not be
+        self._attempted, self._fault = Latch(), ""  # latch of the last attempt to store, and the error of that attempt
         self.latch, complaint = file.read()
         if complaint:
             log.warning("%s: taken as a stop", complaint)
@@ -73,14 +73,14 @@ class OperatorStop:
         return info.latch(asdict(self.latch))
 
     def listen(self, bus: Bus) -> None:
-        """Take over from now on what others describe."""
+        """Take over greater latches from the descriptions of other processes, from now on."""
         subscriber = bus.subscriber(bus.keys.infos, capacity=RING_MESSAGES)
 
         def follow() -> None:
             for received in iter(subscriber.recv, None):
                 try:
                     self._overhear(received)
-                except Exception:  # of whatever a change sets in motion: a bus that refuses to tell it, say
+                except Exception:  # from anything that a change triggers, such as publishing on a failing bus
                     if bus.closed:
                         return
                     log.exception("%s: what it says was obeyed, and then an unforeseen error", received.key)
@@ -89,11 +89,11 @@ class OperatorStop:
 
     def serve(self, bus: Bus, role: Callable[[], str], tell: Callable[[], None]) -> None:
         """
-        Answer on the bus from now on.
+        Answer requests on the bus from now on.
 
         Args:
             bus: The bus.
-            role: Returns which role this process plays.
+            role: Returns the present role of this process.
             tell: Publishes the description of this process.
         """
         self._role, self._tell = role, tell
@@ -101,11 +101,11 @@ class OperatorStop:
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """
-        Stop or release the robot, or hear that somebody else has been asked to; then store it, as far as that does not take long.
+        Stop or release the robot, or take over the latch in the request; then wait up to `STORE_TIMEOUT_S` until it is stored.
 
         Raises:
-            ConfigError: It is no such request.
-            MessageError: Its latch is none.
+            ConfigError: The request is not valid.
+            MessageError: The latch in the request is not valid.
         """
         what = request.get("request")
         if what not in STOP_REQUESTS:
@@ -125,15 +125,15 @@ class OperatorStop:
         return answer | ({"not_stored": fault} if fault else {})
 
     def hear(self, heard: Latch) -> None:
-        """Take over another's latch, if it is greater."""
+        """Take over the latch of another process, if it is greater."""
         self._take(lambda known: merge(known, heard))
 
     def close(self) -> None:
-        """Give the disk the time it needs, up to a limit."""
+        """Wait until the latch is stored, up to `STORE_TIMEOUT_S`."""
         self._stored(STORE_TIMEOUT_S)
 
     def _take(self, change: Callable[[Latch], Latch]) -> None:
-        """Obey a change, then tell it, then have it stored."""
+        """Obey a change, publish it, and wake the thread that stores it."""
         with self._changing:
             latch = change(self.latch)
             if latch == self.latch:
@@ -142,16 +142,16 @@ class OperatorStop:
             self.latch = latch
             try:
                 self._tell()
-            finally:  # it is stored though it cannot be told
+            finally:  # it is stored even if publishing fails
                 with self._storing:
                     self._storing.notify_all()
 
     def _overhear(self, received: Received) -> None:
-        """Look at a description of anybody's; in a thread of its own, which nothing that is heard may end."""
+        """Take over the latches in a received description; called in a thread that no message may end."""
         try:
             told = info.latches(received)
         except MessageError:
-            return  # others say so, who want more of it
+            return  # announced by those who read more of it
         try:
             for latch in told:
                 self.hear(read_latch(latch))
@@ -159,14 +159,14 @@ class OperatorStop:
             self._say(Notice(Severity.WARNING, "latch_refused", f"{received.key}: {error}"))
 
     def _stored(self, patience_s: float) -> str:
-        """Wait until the latch was to be stored, and return why it could not be; empty if it was."""
+        """Wait for the attempt to store the present latch, and return its error; empty if it is stored."""
         with self._storing:
             if not self._storing.wait_for(lambda: self._attempted >= self.latch, patience_s):
                 return f"it was not yet after {patience_s:g} s"
             return self._fault
 
     def _store(self) -> None:
-        """Store what changes, and try again what could not be."""
+        """Store each change, and repeat failed attempts; a thread of its own."""
         while True:
             with self._storing:
                 self._storing.wait_for(lambda: self._attempted < self.latch, STORE_RETRY_S if self._fault else None)
@@ -185,5 +185,5 @@ class OperatorStop:
 
 
 def utc_now() -> str:
-    """Return UTC time as a latch holds it."""
+    """Return the UTC time in the format of a latch."""
     return f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}"

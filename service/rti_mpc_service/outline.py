@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robots as seen from above, to be drawn at the point their model calls x, y."""
+"""Outlines of robots from above, relative to the point x, y of their model."""
 
 from __future__ import annotations
 

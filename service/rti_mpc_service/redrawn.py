@@ -11,11 +11,11 @@ from rich.live import Live
 
 class Redrawn:
     """
-    A part of the terminal, gone when left.
+    An area of the terminal that disappears when its context ends.
 
     Attributes:
-        console: Where it is.
-        live: Whether it is: where there is no terminal, nothing is drawn.
+        console: The console.
+        live: Whether the console is a terminal; otherwise nothing is drawn.
     """
 
     def __init__(self, console: Console) -> None:
@@ -32,5 +32,5 @@ class Redrawn:
         self._area.stop()
 
     def draw(self, what: RenderableType) -> None:
-        """Draw it anew."""
+        """Replace the content of the area."""
         self._area.update(what, refresh=True)

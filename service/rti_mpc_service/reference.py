@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A reference source as a process: one trajectory, anchored to the robot's clock.
+Reference source as a process: one trajectory, anchored to the robot's clock.
 
-It waits for a state, publishes the whole reference from that state's stamp on,
-and again for every robot that starts anew. Whoever joins late gets the last
-one, for as long as the source lives. A second robot of the name, or a forged
-state, gets none while the first one lives.
+It waits for a state, publishes the whole reference from that state's stamp on, and
+publishes it again whenever the robot restarts. Processes that join late get the
+last reference while the source lives. A second robot of the same name, or a forged
+state, gets no reference while the first robot lives.
 """
 
 from __future__ import annotations
@@ -56,12 +56,12 @@ def main(
         bus_settings: How to join the bus.
         keys: Where its streams are.
         heading: ``"tangent"``, ``"consistent"``, or ``"none"`` for a controller without weight on it.
-        a: Distance of the reference point ahead of the axle, in m; None: on it.
+        a: Distance of the reference point ahead of the axle, in m; None: it lies on the axle.
         psi0: Initial consistent heading of an open path, in rad.
-        roles: Of the model's outputs, in their order.
+        roles: Roles of the model's outputs, in their order.
         period_s: Time between rows; the receiver interpolates, on the eight within 0.02 mm.
         parameters: Stage parameters at times since the start, in s: of shape ``(M,)`` to ``(M, np)``; the model's nominal ones if left out.
-        stop: Stops the source when set; SIGINT and SIGTERM if there is none.
+        stop: Event that stops the source; None: SIGINT and SIGTERM do.
 
     Returns:
         How many robots the reference was anchored to.
@@ -84,10 +84,10 @@ def main(
 
 class ReferenceSource:
     """
-    Anchors rows to every new life of the robot.
+    Publishes the reference for every new life of the robot.
 
     Attributes:
-        anchored: How many robots the reference was anchored to.
+        anchored: How often the reference was anchored to a life of the robot.
     """
 
     def __init__(self, bus: Bus, trajectory: Trajectory, y: Array, p: Array, period_ns: int) -> None:
@@ -107,11 +107,11 @@ class ReferenceSource:
 
     def look(self) -> None:
         """
-        Publish if a robot has started since the last look.
+        Publish the reference if a robot has started since the last look.
 
-        One state now and then tells, and more where there may be more than one
-        robot. A subscription in between would wake this process at every state,
-        while robot and controller want the processor.
+        An occasional state is enough to tell, more where there may be more than one
+        robot. A permanent subscription would wake this process at every state, when
+        robot and controller need the processor.
         """
         now_ns = time.monotonic_ns()
         if self._states is None:
@@ -129,7 +129,7 @@ class ReferenceSource:
             self._announcer.say(notice, 0 if state is None else state.stamp_ns)
 
     def _anchor(self, stamp_ns: int) -> None:
-        """Publish the reference from a time on."""
+        """Publish the reference with a stamp in robot time."""
         self.anchored += 1
         self._publisher.put(Reference(self._epoch, self.anchored, stamp_ns, self._period_ns, self._trajectory.end, self._y, self._p))
         text = f"{self._trajectory.name} for {self._trajectory.duration_s:.1f} s from {1e-9 * stamp_ns:.3f} s of the robot on"

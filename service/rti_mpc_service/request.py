@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An operator's request to the processes of one robot, the answer printed."""
+"""Requests of an operator to the processes of one robot; the answers are printed."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ GUARD, LEADER = "guard", "controller"  # roles that can act on a stop
 
 def main(bus_settings: BusSettings, keys: Keys, request: str, timeout_s: float, **details: Any) -> int:
     """
-    Ask, and print the acknowledgement.
+    Send a request, and print the answer.
 
     Args:
         bus_settings: How to join the bus.
-        keys: Which robot.
-        request: What is asked for, such as ``"params"``.
+        keys: The robot's keys.
+        request: Name of the request, such as ``"params"``.
         timeout_s: How long to wait for an answer.
-        details: The rest of the request.
+        details: Further entries of the request.
 
     Returns:
-        Exit status: 0 if it was granted, 1 if it was refused or nobody answered.
+        Exit status: 0 if the request was granted, 1 if it was refused or nobody answered.
     """
     answer = ask(bus_settings, keys, {"request": request, **details}, timeout_s)
     if answer is not None:
@@ -48,7 +48,7 @@ def main(bus_settings: BusSettings, keys: Keys, request: str, timeout_s: float, 
 
 
 def ask(bus_settings: BusSettings, keys: Keys, request: dict[str, Any], timeout_s: float) -> dict[str, Any] | None:
-    """Return the answer if the request was granted; otherwise say why not, and return None."""
+    """Send a request and return its answer; if it is not granted, print the reason and return None."""
     with Bus.join(bus_settings, keys, timeout_s=timeout_s) as bus:
         try:
             answer = bus.request(keys.request, request, timeout_s)
@@ -62,18 +62,18 @@ def ask(bus_settings: BusSettings, keys: Keys, request: dict[str, Any], timeout_
 
 def stop_or_enable(bus_settings: BusSettings, keys: Keys, what: str, timeout_s: float, *, guarded: bool, state: Path | None) -> int:
     """
-    Stop or release a robot, and print the answer of whoever acts: the guard of one that is guarded, else the controller that leads.
+    Stop or release a robot, and print the answer of the acting process: the guard if there is one, else the leading controller.
 
     Args:
         bus_settings: How to join the bus.
-        keys: Which robot.
+        keys: The robot's keys.
         what: ``"stop"`` or ``"enable"``.
-        timeout_s: How long to wait for that answer.
-        guarded: Whether the robot takes what a guard passes on.
-        state: Folder in which it is noted where nobody answers; None: the user's.
+        timeout_s: How long to wait for the answer of the acting process.
+        guarded: Whether the robot takes its commands from a guard.
+        state: Folder in which the request is stored if nobody answers; None: the user's.
 
     Returns:
-        Exit status: 0 if whoever acts has confirmed, else 1.
+        Exit status: 0 if the acting process has confirmed, else 1.
 
     Raises:
         ConfigError: The bus cannot be joined.
@@ -86,7 +86,7 @@ def stop_or_enable(bus_settings: BusSettings, keys: Keys, what: str, timeout_s: 
                 answers[str(answer.get("role", "somebody"))] = answer
                 if answers.get(acting, {}).get("ok") is True:
                     break
-    except ConfigError as error:  # no router, for one
+    except ConfigError as error:  # for example, there is no router
         raise ConfigError(f"{error}; nobody was asked to {what}; {note_for_later(LatchFile(keys, state), what)}") from error
     confirmed = [role for role, answer in answers.items() if answer.get("ok") is True]
     if acting in confirmed:
@@ -105,7 +105,7 @@ def stop_or_enable(bus_settings: BusSettings, keys: Keys, what: str, timeout_s: 
 
 
 def ask_repeatedly(bus: Bus, request: dict[str, Any], timeout_s: float) -> Iterator[dict[str, Any]]:
-    """Yield answers to one request, which is asked again until the time is over; those who know of it by then are not to do it twice."""
+    """Yield the answers to a request that is repeated until the timeout; repetitions carry its latch, so that nobody acts on it twice."""
     deadline_s = time.monotonic() + timeout_s
     latch = Latch()
     while (left_s := deadline_s - time.monotonic()) > 0.0:
@@ -118,7 +118,7 @@ def ask_repeatedly(bus: Bus, request: dict[str, Any], timeout_s: float) -> Itera
 
 
 def note_for_later(file: LatchFile, what: str) -> str:
-    """Note what nobody has confirmed for those who are started later, and say so."""
+    """Store a request that nobody has confirmed for processes that start later; return a text that says so."""
     latch, _ = file.read()
     changed = latch.change(stopped=what == "stop", reason=f"asked for by {operator()}", when=utc_now())
     try:
@@ -130,7 +130,7 @@ def note_for_later(file: LatchFile, what: str) -> str:
 
 
 def operator() -> str:
-    """Return who asks."""
+    """Return user and host, as the name of the operator."""
     try:
         name = getpass.getuser()
     except (KeyError, OSError):  # no name for this user
@@ -144,15 +144,15 @@ def params(bus_settings: BusSettings, keys: Keys, words: Sequence[str], timeout_
 
     Args:
         bus_settings: How to join the bus.
-        keys: Which robot.
-        words: ``get`` and keys, or what they begin with, all if there are none; or ``set`` and ``KEY=VALUE`` each.
+        keys: The robot's keys.
+        words: ``get`` and keys or tables of keys, all keys if none are given; or ``set`` and any number of ``KEY=VALUE``.
         timeout_s: How long to wait for an answer.
 
     Returns:
-        Exit status: 0 if it was granted, 1 if it was refused or nobody answered.
+        Exit status: 0 if the request was granted, 1 if it was refused or nobody answered.
 
     Raises:
-        ConfigError: The words are none of these.
+        ConfigError: The words are not valid.
     """
     action, *wanted = words
     if action == "set":
@@ -174,10 +174,10 @@ def params(bus_settings: BusSettings, keys: Keys, words: Sequence[str], timeout_
 
 def parse_assignments(assignments: Sequence[str]) -> dict[str, Any]:
     """
-    Read ``KEY=VALUE`` as a line of TOML each.
+    Parse assignments ``KEY=VALUE`` whose values are TOML.
 
     Raises:
-        ConfigError: One is none.
+        ConfigError: An assignment is not valid.
     """
     values = {}
     for assignment in assignments:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The router: a Zenoh router in Python, for hosts without zenohd. It forwards between clients and keeps nothing."""
+"""Zenoh router in Python, for hosts without zenohd. It forwards between clients and stores nothing."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def main(settings: BusSettings, keys: Keys, *, stop: Event | None = None) -> Non
     Args:
         settings: How to join the bus; the mode is the router's, and without an endpoint to listen on it takes the rendezvous.
         keys: Where to show presence, as `router`.
-        stop: Stops the router when set; SIGINT, SIGTERM and SIGHUP if there is none.
+        stop: Event that stops the router; None: SIGINT, SIGTERM and SIGHUP do.
 
     Raises:
         ConfigError: If an endpoint is taken, or Zenoh refuses a setting.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Warm-up of a real-time iteration: caches and branch predictors are filled before the first sample counts."""
+"""Warm-up of a real-time iteration: fills caches and branch predictors before the first real sample."""
 
 from __future__ import annotations
 
