@@ -57,11 +57,11 @@ LANE_COLORS: dict[str, dict[Any, str]] = {"guard": MODE_COLORS, "mode": MODE_COL
 @dataclass(frozen=True)
 class Frame:
     """
-    What is seen of the plane.
+    The visible part of the plane.
 
     Attributes:
-        center: In m.
-        half: Half of its sides, in m.
+        center: Center, in m.
+        half: Half of each side, in m.
     """
 
     center: tuple[float, float] = (0.0, 0.0)
@@ -69,24 +69,24 @@ class Frame:
 
     @classmethod
     def around(cls, xy: Array) -> Frame:
-        """Frame points, shape ``(M, 2)``, to a tenth of a metre, so that it does not follow every change of them."""
+        """Return the frame of points, shape ``(M, 2)``, rounded to 0.1 m so that small changes do not move it."""
         low, high = xy.min(axis=0), xy.max(axis=0)
         (x, y), (w, h) = (0.5 * (low + high)).round(1).tolist(), (0.5 * (high - low)).round(1).tolist()
         return cls((x, y), (w, h))
 
     @property
     def eye_height(self) -> float:
-        """How far above the plane to look from, in m, for a view wider than high."""
+        """Height of the eye above the plane, in m, for a view that is wider than high."""
         return (max(self.half[1], self.half[0] / 1.3) + MARGIN_M) / HALF_FIELD_TANGENT
 
 
 def blueprint(info: Info, frame: Frame | None = None) -> rrb.Blueprint:
     """
-    Lay the views out.
+    Return the layout of all views.
 
     Args:
-        info: Names: which state belongs beside which command, whether there is a plane to look at.
-        frame: What to see of the plane.
+        info: Description of the robot: signals, which state a command drives, whether there is a position.
+        frame: Visible part of the plane.
     """
     series: list[rrb.View | rrb.Container] = [
         *(_commands(info, i) for i in range(len(info.inputs))),
@@ -113,7 +113,7 @@ def blueprint(info: Info, frame: Frame | None = None) -> rrb.Blueprint:
 
 
 def _world(frame: Frame) -> rrb.Spatial3DView:
-    """Look from above, y up: a plain 2D view would draw y down."""
+    """Return the view of the plane from above, y up; Rerun's 2D view draws y down."""
     x, y = frame.center
     start = rrb.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S)
     trail = rrb.VisibleTimeRanges([rrb.VisibleTimeRange(TIMELINE, start=start, end=rrb.TimeRangeBoundary.cursor_relative())])
@@ -147,7 +147,7 @@ def _series(
 
 
 def _commands(info: Info, i: int) -> rrb.TimeSeriesView:
-    """Show a command between its limits, what a guard let through, and the measured state it is about."""
+    """Return the view of a command with its limits, the command that a guard let through, and the measured state that it drives."""
     name, k = info.inputs[i].name, info.measured(i)
     measured = {} if k is None else {f"state/{info.states[k].name}": _line("measured", "measured")}
     return _series(f"Command {info.inputs[i]}", [f"actuation/{name}", f"command/{name}/**", *measured], overrides=measured)
@@ -160,7 +160,7 @@ def _errors(info: Info) -> rrb.TimeSeriesView:
 
 
 def _times(info: Info) -> rrb.Container:
-    """Show what a sample costs, and what it leaves of the period."""
+    """Return the views of the phase times and of the rest of the period."""
     period_ms = 1e3 * info.dt_s
     axis = rrb.ScalarAxis(range=(-0.1 * period_ms, 1.2 * period_ms)) if period_ms > 0 else None
     return rrb.Horizontal(
@@ -170,7 +170,7 @@ def _times(info: Info) -> rrb.Container:
 
 
 def _troubles() -> rrb.Container:
-    """Show what was sent instead of a plan, and how long a state takes to act."""
+    """Return the views of the fallbacks and of the delay from a state to its command."""
     return rrb.Vertical(
         _series("Samples since start, softened or without a plan of their own", [f"telemetry/{rung}" for rung in RUNG_COLORS]),
         _series("From a state to the act of its command [s]", ["telemetry/delay_s", "telemetry/state_age_s"]),
@@ -185,7 +185,7 @@ def _events() -> rrb.TextLogView:
 
 
 class Strip(NamedTuple):
-    """How a polyline in the plane looks; heights, in m, say what lies on top of what."""
+    """Style of a polyline in the plane; the height `z`, in m, decides what lies on top."""
 
     color: str
     width: float
@@ -205,12 +205,12 @@ ROBOT_Z_M = 0.008  # [m], between trail and horizon
 
 
 def looks(info: Info) -> dict[str, rr.AsComponents]:
-    """Return what does not change about a recording, by entity."""
+    """Return the constant components of a recording, by entity."""
     return _series_looks(info) | _lane_looks() | ({} if info.position is None else _world_looks(info))
 
 
 def legend(frame: Frame) -> rr.Points3D:
-    """Return what tells the lines in the plane apart, at the bottom of what is seen."""
+    """Return the legend of the lines in the plane, at the bottom of the frame."""
     (x, y), reach = frame.center, HALF_FIELD_TANGENT * frame.eye_height
     xy = np.array([(x + shift * reach, y - 0.88 * reach) for shift in (-0.6, 0.0, 0.6)])
     return rr.Points3D(
@@ -223,7 +223,7 @@ def legend(frame: Frame) -> rr.Points3D:
 
 
 def lifted(xy: Array, z: float) -> Array:
-    """Return points in the plane, shape ``(..., 2)``, at a height, shape ``(..., 3)``; those beyond single precision where that ends."""
+    """Return points of the plane, shape ``(..., 2)``, at height `z`, shape ``(..., 3)``, clipped to `MAX_COORDINATE_M`."""
     return np.concatenate([np.clip(xy, -MAX_COORDINATE_M, MAX_COORDINATE_M), np.full((*xy.shape[:-1], 1), z)], axis=-1)
 
 
@@ -274,6 +274,6 @@ def _line(name: str, color: str, width: float = 1.5, interpolation: rr.component
 
 
 def _filled(polygon: Array, z: float, color: tuple[int, int, int]) -> rr.Mesh3D:
-    """Return a polygon that its first corner sees whole as a fan of triangles."""
+    """Return a filled polygon as a fan of triangles around its first corner, which must see all of it."""
     fan = [(0, k, k + 1) for k in range(1, len(polygon) - 1)]
     return rr.Mesh3D(vertex_positions=lifted(polygon, z), triangle_indices=fan, vertex_colors=[color] * len(polygon))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All streams of one robot, drained together and placed on its timeline."""
+"""Listener to all streams of one robot, which are drained together and placed on its timeline."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ Door = Intake[Any]
 
 class Listener:
     """
-    Subscriptions to everything a viewer draws.
+    Subscriptions to all streams that a viewer draws.
 
-    What waits to be drained waits in rings that drop the oldest; the holes this
-    leaves in the sequence numbers are counted. Nothing a peer sends raises.
+    Messages wait in rings that drop the oldest ones; missing sequence numbers are
+    counted. No message of a peer can raise an exception.
 
     Attributes:
-        received: Messages accepted.
+        received: Number of accepted messages.
     """
 
     def __init__(self, bus: Bus, capacity: int = MAX_WAITING_MESSAGES) -> None:
@@ -52,32 +52,32 @@ class Listener:
 
     @property
     def lost(self) -> int:
-        """Messages that never came, or that our rings dropped."""
+        """Number of messages that never came or that the rings dropped."""
         return sum(door.source.lost for door in self._doors.values())
 
     @property
     def refused(self) -> int:
-        """Payloads that were no message of ours."""
+        """Number of refused payloads."""
         return self._bad_infos + sum(door.refused.total() for door in self._doors.values())
 
     @property
     def now_ns(self) -> int:
-        """Where the newest state lies on the robot's timeline."""
+        """Time of the newest state on the robot's timeline."""
         return self._timeline.now_ns
 
     def own(self, notice: Notice) -> Entry:
-        """Return an event of our own, as of now."""
+        """Return a notice of the viewer as an event at `now_ns`."""
         return Entry(self.now_ns, Event(0, 0, self.now_ns, "viewer", notice.severity, notice.code, notice.text))
 
     def drain(self) -> list[Entry]:
-        """Everything received since the last call, states first, for they move the timeline."""
+        """Return the messages received since the last call, states before other streams because they advance the timeline."""
         now_ns = time.monotonic_ns()
         entries = [*self._descriptions(), *self._messages(now_ns)]
         self.received += len(entries)
         return [*entries, *self._notices(now_ns)]
 
     def _descriptions(self) -> Iterator[Entry]:
-        """Yield the last one of every role."""
+        """Yield the last description of each role."""
         infos: dict[str, Info] = {}
         for received in self._infos.drain():
             try:
@@ -106,7 +106,7 @@ class Listener:
                     yield Entry(self._timeline.place(message.stamp_ns), message)
 
     def _door(self, stream: Stream[Any], received: Received) -> Door | None:
-        """Return the door of a key; None for one role too many of those that send events."""
+        """Return the intake of a key; None for events of a role beyond the limit of roles."""
         key, cls = received.key, stream.message
         if cls is not None and key not in self._doors and (not stream.by_role or admitted(key, self._events)):
             self._doors[key] = self._bus.intake(cls, STALE_S, unfit=partial(_foreign, role_of(key)))
@@ -115,12 +115,12 @@ class Listener:
         return self._doors.get(key)
 
     def _notices(self, now_ns: int) -> Iterator[Entry]:
-        """Show what the doors have to say as events of our own."""
+        """Yield the notices of the intakes as events of the viewer."""
         for door in self._doors.values():
             for notice in door.notices(now_ns):
                 yield self.own(notice)
 
 
 def _foreign(role: str, message: Any) -> str:
-    """Say that an event tells another source than its key does."""
+    """Return a complaint if an event names another source than its key does, else an empty string."""
     return "foreign_source" if isinstance(message, Event) and message.source != role else ""

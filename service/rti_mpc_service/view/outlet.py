@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Outlets of the viewer process: a file or a viewer, each with a queue and a thread of its own, so that a hung one delays nobody."""
+"""Outlets of the viewer process: a file or a Rerun viewer, each with its own queue and thread, so that a hung outlet delays no other."""
 
 from __future__ import annotations
 
@@ -34,21 +34,21 @@ log = logging.getLogger(__name__)
 
 
 class Unavailable(Exception):
-    """There is nobody to connect to, for now."""
+    """No viewer is listening now."""
 
 
 class Outlet:
     """
     Drop-oldest queue in front of one Rerun stream, and the thread that empties it.
 
-    A stream that fails is given up and opened again; the new one is told the
-    present info and reference first, then what the queue still holds.
+    A failed stream is closed and opened again; the new stream first gets the
+    present info and reference, then the queued entries.
 
     Attributes:
-        name: For the log.
-        dropped: Entries the queue had no room for.
-        failures: Streams given up.
-        notices: What went wrong since the owner last emptied it.
+        name: Name for the log.
+        dropped: Number of entries that the queue had no room for.
+        failures: Number of failed streams.
+        notices: Faults since the owner last emptied it.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Outlet:
         self._period_s = period_s
         self._flush_s = flush_s
         self._close_s = close_s
-        self._epitaph = epitaph  # of a stream that failed
+        self._epitaph = epitaph  # returns the text for a failed stream
         self._queue: deque[Entry] = deque(maxlen=capacity)
         self._context: dict[str, Entry] = {}
         self._missed = 0
@@ -82,11 +82,11 @@ class Outlet:
 
     @property
     def connected(self) -> bool:
-        """Whether there is a stream."""
+        """Whether a stream is open."""
         return self._recording is not None
 
     def offer(self, entries: Iterable[Entry]) -> None:
-        """Queue entries, at the expense of the oldest. Never waits for the stream."""
+        """Queue entries; a full queue drops its oldest ones. Never waits for the stream."""
         with self._lock:
             missed = self._missed
             for entry in entries:
@@ -97,7 +97,7 @@ class Outlet:
             self.dropped += self._missed - missed
 
     def close(self) -> bool:
-        """Write what is queued and end the stream, within a bounded time; return whether nothing was lost on the way."""
+        """Write the queued entries and end the stream within a bounded time; return whether no entry was lost."""
         self._closing.set()
         self._thread.join(min(self._close_s, VIEWER_CLOSE_TIMEOUT_S) if self.failures else self._close_s)
         return not (self._thread.is_alive() or self._queue or self.dropped or self.failures)
@@ -111,7 +111,7 @@ class Outlet:
             self._recording.stream.disconnect()
 
     def _pump(self) -> None:
-        """Send what is queued, through a new stream if the last one failed."""
+        """Send the queued entries, through a new stream if the last one failed."""
         try:
             new = self._recording is None
             if self._recording is None:
@@ -127,7 +127,7 @@ class Outlet:
             self._give_up()
 
     def _take(self, new: bool) -> list[Entry]:
-        """Empty the queue, behind the context where this is news to the stream or was dropped."""
+        """Empty the queue; return its entries, after the context if the stream is new or entries were dropped."""
         with self._lock:
             entries, missed = list(self._queue), self._missed
             self._queue.clear()
@@ -142,7 +142,7 @@ class Outlet:
         self.notices.append(Notice(Severity.ERROR, code, f"{self.name}: {text}"))
 
     def _give_up(self) -> None:
-        """Leave a stream; waits for as long as its receiver hangs, in which there is nobody to connect to anyway."""
+        """Close a failed stream; this waits while its receiver hangs, when no other connection would succeed either."""
         recording, self._recording = self._recording, None
         if recording is not None:
             recording.stream.disconnect()
@@ -150,7 +150,7 @@ class Outlet:
 
 def file_outlet(path: Path, name: str) -> Outlet:
     """
-    Record to a file, overwriting it. A recording that fails, on a full disk say, ends there.
+    Return an outlet that overwrites a file. If the recording fails, for example on a full disk, it ends there.
 
     Raises:
         ConfigError: The file cannot be written.
@@ -159,7 +159,7 @@ def file_outlet(path: Path, name: str) -> Outlet:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"")
-        stream.save(path, write_footer=False)  # or Rerun keeps the particulars of every chunk until the end
+        stream.save(path, write_footer=False)  # a footer would make Rerun keep data of every chunk in memory until the end
     except (OSError, RuntimeError) as error:
         raise ConfigError(f"rerun-save must be a file that can be written, got {str(path)!r} ({error})") from error
     once = iter([stream])
@@ -176,10 +176,10 @@ def file_outlet(path: Path, name: str) -> Outlet:
 
 
 def viewer_outlet(url: str, name: str) -> Outlet:
-    """Show in the viewer that listens at a URL, whenever one does."""
+    """Return an outlet to the viewer at a URL, which connects whenever a viewer listens there."""
     address = urlsplit(url)
     where = (address.hostname or "127.0.0.1", address.port or 9876)
-    recording_id = uuid.uuid4()  # one, so that a viewer which only hung goes on with the recording it has
+    recording_id = uuid.uuid4()  # the same for each connection, so that a viewer that only hung continues its recording
 
     def open_stream() -> rr.RecordingStream:
         try:
@@ -194,7 +194,7 @@ def viewer_outlet(url: str, name: str) -> Outlet:
 
 
 def _stream(name: str, recording_id: uuid.UUID | None = None) -> rr.RecordingStream:
-    rr.unregister_shutdown()  # at exit it would wait without limit for a viewer that hangs; `Outlet.close` is bounded
+    rr.unregister_shutdown()  # Rerun's exit function would wait without limit for a hung viewer; `Outlet.close` is bounded
     stream = rr.RecordingStream(RERUN_APPLICATION_ID, recording_id=recording_id)
     stream.send_recording_name(name)
     return stream

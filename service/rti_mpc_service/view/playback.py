@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Playback of the commands that a robot was given, row by row, from the plans that its guard passed on."""
+"""Playback of the inputs that a robot was sent, row by row, from the plans that its guard passed on."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from rti_mpc_service.view.timeline import MAX_AHEAD_NS
 @dataclass(frozen=True, slots=True)
 class Actuation:
     """
-    What a guard tells the robot: a plan it let through, or a piece of its own ramp to rest.
+    A guard's message to the robot: a plan that it passed on, or a part of its own ramp to rest.
 
     Attributes:
-        command: As on the wire, numbered by the guard.
+        command: The command, numbered by the guard.
     """
 
     command: Command
@@ -33,12 +33,12 @@ class Actuation:
 
 class PlayedRow(NamedTuple):
     """
-    An input that the robot was told.
+    Inputs that the robot was sent, and that act from a time on.
 
     Attributes:
-        time_ns: When it begins to act, on the robot's timeline.
+        time_ns: When they begin to act, on the robot's timeline.
         u: Inputs, shape ``(nu,)``.
-        mode: Of the plan it is from.
+        mode: Mode of their plan.
     """
 
     time_ns: int
@@ -50,29 +50,29 @@ class Playback:
     """
     Plays plans as the robot does: each until the next one begins, or until it has expired.
 
-    So each is known to its end only when the next one is there, and a ramp that
-    was told in time but not needed leaves no row.
+    A plan is therefore played only when the next one has come. A ramp that was sent
+    in time but not needed leaves no row.
     """
 
     def __init__(self) -> None:
-        self._last: list[tuple[int, Command]] = []  # where it lies, and the plan; none before the first
-        self._played_ns = -1  # where the last row lies
+        self._last: list[tuple[int, Command]] = []  # the last plan and its time; empty before the first one
+        self._played_ns = -1  # time of the last played row
 
     def add(self, times: Sequence[int], actuations: Sequence[Actuation]) -> list[PlayedRow]:
-        """Take plans, and return what was played before the last of them begins."""
+        """Add plans, and return the rows that were played before the last of them begins."""
         plans = [*self._last, *zip(times, (actuation.command for actuation in actuations), strict=True)]
         self._last = plans[-1:]
         return [row for (time_ns, command), (end_ns, _) in pairwise(plans) for row in self._play(time_ns, command, end_ns)]
 
     def end(self) -> list[PlayedRow]:
-        """Return what is played of the last plan if no other one follows."""
+        """Return the rows of the last plan, if no other one follows."""
         return [row for time_ns, command in self._last for row in self._play(time_ns, command, time_ns + MAX_AHEAD_NS)]
 
     def _play(self, time_ns: int, command: Command, end_ns: int) -> list[PlayedRow]:
         rows = []
         end_ns = min(end_ns, time_ns + command.valid_until_ns - command.stamp_ns)
         for begin_ns, u in zip(range(time_ns, end_ns, command.period_ns), command.u, strict=False):
-            if min(begin_ns + command.period_ns, end_ns) > self._played_ns:  # not over before the plan came
+            if min(begin_ns + command.period_ns, end_ns) > self._played_ns:  # skip rows that ended before the plan came
                 self._played_ns = max(begin_ns, self._played_ns + 1)
                 rows.append(PlayedRow(self._played_ns, u, command.mode))
         return rows

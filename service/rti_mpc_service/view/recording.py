@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages as columns of a Rerun recording."""
+"""Recording: messages as columns of a Rerun stream."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ MAX_DRAWN_ROWS = 5000  # per reference
 @dataclass(slots=True, eq=False)
 class Entry:
     """
-    A message and where it lies on the robot's timeline.
+    A message with its time on the robot's timeline.
 
     Attributes:
-        time_ns: From `rti_mpc_service.view.timeline.Timeline`.
-        message: What was received.
+        time_ns: Time from `rti_mpc_service.view.timeline.Timeline`.
+        message: The received message.
     """
 
     time_ns: int
@@ -52,10 +52,10 @@ class Entry:
 
 class Recording:
     """
-    One Rerun stream being written: a file, or a viewer that is connected.
+    Writer of one Rerun stream: a file, or a connected viewer.
 
-    Names and limits come from an `Info`. What arrives before any is held, and
-    written once there is one, or under numbers when the recording ends without.
+    Names and limits come from an `Info`. Messages that arrive before the first one are
+    held, and written when it comes, or with numbers for names if the recording ends without.
     """
 
     def __init__(self, stream: rr.RecordingStream) -> None:
@@ -66,7 +66,7 @@ class Recording:
         self._held: deque[Entry] = deque(maxlen=MAX_HELD_ENTRIES)
         self._last: State | None = None
         self._playback = Playback()
-        self._lanes: dict[str, tuple[str, int]] = {}  # the last change of each: to what, and where it lies
+        self._lanes: dict[str, tuple[str, int]] = {}  # value and time of the last change of each lane
         self._writers: dict[type, Callable[[Times, list[Any]], None]] = {
             Reference: self._references,
             State: self._states,
@@ -77,7 +77,7 @@ class Recording:
         }
 
     def send(self, entries: Iterable[Entry]) -> None:
-        """Write entries; one column an entity, whatever their number."""
+        """Write entries, as one column per entity for any number of entries."""
         groups: defaultdict[type, list[Any]] = defaultdict(list)
         for entry in entries:
             groups[type(entry.message)].append(entry)
@@ -92,20 +92,20 @@ class Recording:
                 write(np.array([entry.time_ns for entry in fitting], np.int64), [entry.message for entry in fitting])
 
     def finish(self) -> None:
-        """Write what was held for want of an info, or of what comes next."""
+        """Write the entries that were held for an info, and the rows of the last plan."""
         if self.info is None and self._held:
             widths = {name: width for entry in self._held for name, width in _widths(entry.message).items()}
             self._name(Info.unnamed(widths.get("x", 0), widths.get("u", 0), widths.get("y", widths.get("y_ref", 0))))
         self._told(self._playback.end())
 
     def _info(self, info: Info) -> None:
-        """Keep a description; take names from it, a controller's before a robot's."""
+        """Write a description, and take names from it; a controller's description overrides a robot's."""
         self.stream.log(f"info/{info.role}", rr.TextDocument(info.document, media_type="text/plain"), static=True)
         if info.states and info != self.info and (self.info is None or info.role == "controller"):
             self._name(info)
 
     def _name(self, info: Info) -> None:
-        """Take names from a description, and write what was held for want of them."""
+        """Take names from a description, and write the entries that were held for them."""
         if self.info is not None and _vectors(info) != _vectors(self.info):
             self._reference, self._last, self._playback = None, None, Playback()
         self.info = info
@@ -116,7 +116,7 @@ class Recording:
         self.send(held)
 
     def _fits(self, message: Message) -> bool:
-        """Whether the vectors of a message are as long as the info says: it may be about another model."""
+        """Whether the vectors of a message have the lengths of the info; it may come from another model."""
         return self.info is None or all(width == len(getattr(self.info, LABELS_OF_VECTOR[name])) for name, width in _widths(message).items())
 
     def _columns(self, path: str, times: Times, *columns: Columns) -> None:
@@ -124,7 +124,7 @@ class Recording:
         self.stream.send_columns(path, [index], [column for group in columns for column in group])
 
     def _strips(self, path: str, times: Times, lines: Iterable[Array]) -> None:
-        """Write one polyline a row, each of shape ``(M, 2)``, at the height of what it is."""
+        """Write one polyline per row, each of shape ``(M, 2)``, at the height of its entity."""
         strips = [lifted(line, STRIPS[path].z) for line in lines]
         self._columns(path, times, rr.LineStrips3D.columns(strips=strips))
 
@@ -160,7 +160,7 @@ class Recording:
         self._last = states[-1]
 
     def _motion(self, times: Times, states: list[State], x: Array) -> None:
-        """Write pose and trail: a segment a state, none across two lives of the robot."""
+        """Write pose and trail: one segment per state, none between two lives of the robot."""
         assert self.info is not None
         assert self.info.position is not None
         xy = x[:, self.info.position]
@@ -184,7 +184,7 @@ class Recording:
         self._told(self._playback.add(times.tolist(), actuations))
 
     def _told(self, rows: list[PlayedRow]) -> None:
-        """Write what a guard told the robot."""
+        """Write the inputs that a guard sent to the robot."""
         if rows:
             times = np.array([row.time_ns for row in rows], np.int64)
             self._inputs("actuation", times, np.array([row.u for row in rows]))
@@ -212,7 +212,7 @@ class Recording:
             self._strips("world/horizon", times, [sample.x[:, self.info.position] for sample in samples])
 
     def _obstacles(self, times: Times, stamps: NDArray[np.int64]) -> None:
-        """Write where obstacles are: where the reference says, or where they are by themselves."""
+        """Write the positions of obstacles: those of the reference, or the configured ones if it has none."""
         assert self.info is not None
         for i, obstacle in enumerate(self.info.obstacles):
             x, y, r = located(obstacle, self._reference, stamps)
@@ -220,7 +220,7 @@ class Recording:
             self._columns(f"world/obstacle_{i}", times, rr.Transform3D.columns(translation=np.column_stack([x, y, 0 * x]), scale=scale))
 
     def _lane(self, lane: str, times: Times, values: Sequence[str]) -> None:
-        """Write where a lane changes, in the order it was told: a sample that braked ahead of time may lie behind the next one."""
+        """Write the changes of a lane in the order received; times increase, even if a braking sample has a later stamp than the next one."""
         value, since_ns = self._lanes.get(lane, ("", -1))
         changes = []
         for time_ns, new in zip(times.tolist(), values, strict=True):
@@ -241,7 +241,7 @@ class Recording:
 
 
 def located(obstacle: Obstacle, reference: Reference | None, stamps: NDArray[np.int64]) -> tuple[Array, Array, Array]:
-    """Return x, y and radius of an obstacle at stamps, each of shape ``(n,)``, in m; held before and after the reference, as a controller does."""
+    """Return x, y and radius of an obstacle at stamps, each of shape ``(n,)``, in m; constant before and after the reference, as in a controller."""
     if reference is None or reference.p.shape[1] < obstacle.at + 3:
         x, y, r = (np.full(len(stamps), value) for value in (obstacle.x, obstacle.y, obstacle.r))
     else:
@@ -251,7 +251,7 @@ def located(obstacle: Obstacle, reference: Reference | None, stamps: NDArray[np.
 
 
 def _widths(message: Message) -> dict[str, int]:
-    """Return how many numbers the vectors of a message have, or the rows of its matrices; inputs that a state does not report are left out."""
+    """Return the lengths of the vectors of a message, or of the rows of its matrices, by name; unreported inputs of a state are left out."""
     arrays = {name: getattr(message, name) for name in LABELS_OF_VECTOR if hasattr(message, name)}
     return {name: array.shape[-1] for name, array in arrays.items() if array.ndim > 1 or array.size}
 

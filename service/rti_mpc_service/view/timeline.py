@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot's clock as one axis, through all lives of the robot."""
+"""Timeline: one time axis through all lives of a robot."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Timeline:
 
     @property
     def now_ns(self) -> int:
-        """Where the newest state lies."""
+        """Time of the newest state."""
         return self._offset_ns + self._latest_ns
 
     def place_state(self, epoch: int, stamp_ns: int) -> int:
-        """Return where a state lies, and let the axis advance to it."""
+        """Return the time of a state, and advance the axis to it."""
         if epoch != self._epoch:
             if self._epoch is not None and stamp_ns < self._latest_ns:
                 self._offset_ns += self._latest_ns + GAP_BETWEEN_LIVES_NS - stamp_ns
@@ -38,7 +38,7 @@ class Timeline:
         return self._offset_ns + stamp_ns
 
     def place(self, stamp_ns: int) -> int:
-        """Return where anything else lies: within the robot's present life, for a late message of a former one cannot be told."""
+        """Return the time of another message, within the robot's present life: a late message of a former life cannot be recognized."""
         if self._epoch is None:
             return max(stamp_ns, 0)
         return self._offset_ns + min(max(stamp_ns, self._first_ns), self._latest_ns + MAX_AHEAD_NS)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The live viewer: a process of its own that listens to one robot and draws it in Rerun."""
+"""Live viewer: a separate process that listens to one robot and draws it in Rerun."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ def main(
     stop: Event | None = None,
 ) -> int:
     """
-    Draw a robot until stopped; in a viewer of its own if nothing else is asked for.
+    Draw a robot until stopped; in a spawned viewer if neither a viewer nor a file is given.
 
     Args:
         bus_settings: How to join the bus.
         keys: Where the robot's streams are.
         rerun_spawn: Whether to start a viewer on this machine, listening on loopback; it stays open afterwards.
-        rerun_connect: Where a viewer listens, or will: ``HOST:PORT``, or a URL of Rerun's.
+        rerun_connect: Address of a viewer, which may start later: ``HOST:PORT``, or a URL of Rerun.
         rerun_save: File to record to, overwritten.
         rerun_memory_limit: Memory a spawned viewer may fill before it forgets the oldest.
-        stop: Stops the viewer process when set; SIGINT and SIGTERM if there is none.
+        stop: Event that stops the process; None: SIGINT and SIGTERM do.
 
     Returns:
-        Exit status: 1 if something received is not in the recording.
+        Exit status: 1 if a received message is missing in the recording, else 0.
 
     Raises:
-        ConfigError: An address or a file is not one.
+        ConfigError: An address or a file is not valid.
     """
     rerun_spawn |= rerun_connect is None and rerun_save is None
     url = viewer_url(rerun_connect or RERUN_ADDRESS)
@@ -78,7 +78,7 @@ def main(
 
 
 def pump(listener: Listener, outlets: Sequence[Outlet], spawned: subprocess.Popen[bytes] | None, announcer: Announcer, stop: Event) -> None:
-    """Pass on what is heard until told to stop, and then what is still there; say where an outlet or viewer failed, to the bus and to the others."""
+    """Pass messages on until stopped, then the remaining ones; announce failures of an outlet or viewer on the bus and to all outlets."""
     stopped = False
     while not stopped:
         stopped = stop.wait(DRAIN_PERIOD_S)
@@ -96,16 +96,16 @@ def pump(listener: Listener, outlets: Sequence[Outlet], spawned: subprocess.Pope
 
 
 def notices(outlets: Sequence[Outlet]) -> list[Notice]:
-    """Take what outlets have to say."""
+    """Return the outlets' notices, and remove them there."""
     return [outlet.notices.popleft() for outlet in outlets for _ in range(len(outlet.notices))]
 
 
 def viewer_url(address: str) -> str:
     """
-    Return Rerun's URL of an address, ``HOST:PORT`` or such a URL already.
+    Return Rerun's URL of an address, which is ``HOST:PORT`` or already such a URL.
 
     Raises:
-        ConfigError: It is neither.
+        ConfigError: The address is neither.
     """
     url = address if "://" in address else f"rerun+http://{address}/proxy"
     try:
@@ -120,7 +120,7 @@ def viewer_url(address: str) -> str:
 
 def spawn_viewer(url: str, memory_limit: str) -> subprocess.Popen[bytes]:
     """
-    Start a viewer on loopback that outlives us.
+    Start a viewer on loopback that outlives this process.
 
     Rerun's own `spawn` listens on all interfaces.
 
