@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Benchmark of a sample by horizon, solver and formulation, and of its parts: beside IPOPT, interleaved on the same states.
+Benchmark of a sample and its parts, by horizon, solver and formulation, interleaved with IPOPT on the same states.
 
-The problem is the paper's (Euler, bounds on inputs and on speeds), in closed
-loop with its robot on the eight and on positioning; every sample counts. The
-states are those of one driver; before each, all others are at random in turn,
-so that every one of them finds the caches as a service does. A quarter of the
-samples, at random, is timed in parts instead of whole.
+The problem is the paper's (Euler, bounds on inputs and on speeds), in closed loop
+with its robot on the eight and on positioning; every sample counts. One contender
+drives. At each state all contenders solve in random order, so that each finds the
+caches as cold as in a service. A random quarter of the samples is timed in parts
+instead of as a whole.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ EXACT_SETTINGS = SolverSettings(eps=1e-9, max_iter=20_000)
 
 @dataclass
 class Times:
-    """What one contender took, us a sample, as a whole or in parts, and how often it stopped at its iteration limit."""
+    """Times of one contender per sample, us, as a whole or in parts, and how often it stopped at its iteration limit."""
 
     prepare: list[float] = field(default_factory=list)
     feedback: list[float] = field(default_factory=list)
@@ -93,7 +93,7 @@ def samples(N: int, quick: bool) -> Iterator[tuple[str, int, Array, Array]]:
 
 
 def closed_loop_cost(N: int, quick: bool, contender: Rti | Ipopt) -> float:
-    """Return the cost of both scenarios when a contender drives: true state against reference at k + 1, increments from 0."""
+    """Return the closed-loop cost of a contender on both scenarios: true state against reference at k + 1, increments from 0."""
     model = pioneer_3dx()
     plant, p = integrator(model, "rk4", 20), np.array(model.p_nominal)
     total, x, u = 0.0, np.zeros(model.nx), np.zeros(model.nu)

@@ -2,8 +2,8 @@
 """
 Problem families of the benchmark: each a problem, its plant, references and starts in closed loop.
 
-They are chosen for what is hard in a QP: softened bounds that act most of the
-time, constraints that come and go, many states, large transients, cold starts.
+They are chosen for QPs that are hard to solve: softened bounds that are active most of
+the time, constraints that come and go, many states, large transients, cold starts.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ class Family:
 
     Attributes:
         ocp: The problem.
-        samples: How many are solved.
-        at: From a sample to reference rows at nodes 1 to N, shape ``(N, ny)``, and stage parameters, shape ``(N + 1, np)``, None for nominal ones.
-        start: From a sample to the state in which the loop begins anew there, shape ``(nx,)``; None where it goes on.
-        body: Model of the plant; that of the problem if left out.
+        samples: Number of samples.
+        at: Returns for a sample the reference rows at nodes 1 to N, shape ``(N, ny)``, and stage parameters, ``(N + 1, np)``; None: nominal ones.
+        start: Returns the state from which the loop restarts at a sample, shape ``(nx,)``; None: it continues.
+        body: Model of the plant; the model of the problem if left out.
         substeps: RK4 steps of the plant in a period.
         u0: Input before each start, shape ``(nu,)``; the model's rest.
     """
@@ -92,7 +92,7 @@ def paper(N: int) -> Family:
 
 
 def tight(N: int) -> Family:
-    """Return the eight where speeds are bounded below what it needs: most samples lie at softened bounds and at slew limits."""
+    """Return the eight with bounds on speeds below the needed ones: most samples are at softened bounds and at slew limits."""
     bounds: dict[str, Any] = {
         "lbx": [-INF, -INF, -INF, -0.02, -0.25],
         "ubx": [INF, INF, INF, 0.17, 0.25],
@@ -132,17 +132,17 @@ def discs(N: int, centres: list[tuple[float, float, float]], speeds: list[tuple[
 
 
 def discs_passed(N: int) -> Family:
-    """Return three discs that leave a way past them."""
+    """Return the line among three discs that leave a way past them."""
     return discs(N, [(1.0, 0.05, 0.3), (2.0, -0.1, 0.3), (3.0, 1.0, 0.3)], [(0, 0), (0, 0), (0, -0.07)], 4.0)
 
 
 def discs_blocked(N: int) -> Family:
-    """Return three discs side by side that leave none."""
+    """Return the line with three discs side by side that block it."""
     return discs(N, [(1.5, -0.6, 0.35), (1.5, 0.0, 0.35), (1.5, 0.6, 0.35)], [(0, 0)] * 3, 4.0)
 
 
 def slalom(N: int) -> Family:
-    """Return six discs, to be passed in turn on either side, one of which moves."""
+    """Return the line among six discs, one of them moving, to be passed on alternating sides."""
     centres = [(0.8, 0.1, 0.3), (1.6, -0.15, 0.3), (2.4, 0.15, 0.3), (3.2, -0.1, 0.3), (4.0, 0.1, 0.3), (2.4, -0.9, 0.3)]
     return discs(N, centres, [(0, 0)] * 5 + [(0, 0.05)], 5.0)
 

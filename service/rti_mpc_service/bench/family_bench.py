@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Benchmark over problem families: CPU time of a sample, who solved it, and closed-loop cost over converged NMPC.
+Benchmark over problem families: CPU time per sample, unsolved samples, and closed-loop cost relative to converged NMPC.
 
-Each solver drives a closed loop of its own. Five equal copies solve every
-sample in turn; its time is the least of the five, so that what the machine does
-beside them does not count. Times are CPU times of this thread.
+Each solver drives a closed loop of its own. Five equal copies solve every sample in
+turn, and the shortest of the five times counts, so that other programs on the machine
+do not matter. Times are CPU times of this thread.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def converge(family: Family, samples: int, tick: Callable[[], None]) -> dict[str
 
 
 def advance(family: Family, x: Array, u_prev: Array, u: Array, y_ref: Array, p: Array | None, cost: float) -> tuple[Array, Array, float]:
-    """Return the plant's next state, the input that led there, and the cost with that of the period."""
+    """Return the plant's next state, the applied input, and the cost including that of this period."""
     x = family.plant(x, u)
     return x, u, cost + family.cost(x, u, u_prev, y_ref[0], None if p is None else p[1])
 
@@ -117,7 +117,7 @@ def build(name: str, N: int, solver: str) -> tuple[float, float]:
 
 
 def build_alone(name: str, N: int, solver: str) -> tuple[float, float]:
-    """Do so in a process of its own."""
+    """Call `build` in a separate process, and return its result."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         return pool.submit(build, name, N, solver).result()
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of a step: its native calls, timed where they are made."""
+"""Parts of a step: timing of its native calls."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ PARTS = ("copies in", "evaluation", "matrix update", "vector update", "iteration
 
 class Parts:
     """
-    Stands between a controller and its native calls, when asked to.
+    Replaces the native calls of a controller by timed ones, on request.
 
     Attributes:
-        timed: Whether it does now.
+        timed: Whether the calls are timed now.
     """
 
     def __init__(self, rti: Rti) -> None:
         self.timed = False
         self._times: dict[str, int] = {}
-        self._swaps: list[tuple[Any, str, Any, Any]] = []  # object, attribute, as it is, timed
+        self._swaps: list[tuple[Any, str, Any, Any]] = []  # object, attribute, original call, timed call
         for name in ("y_ref", "p", "u_prev", "x0"):
             array = getattr(rti, name)
             self._swaps.append((rti, name, array, Memory(array, self._timing("copies in", array.__setitem__))))
@@ -47,11 +47,11 @@ class Parts:
             self._swaps.append((solver, "workspace", workspace, proxy))
 
     def _watch(self, owner: Any, part: str, *names: str) -> None:
-        """Time some calls of an object as one part."""
+        """Add calls of an object to one timed part."""
         self._swaps += [(owner, name, getattr(owner, name), self._timing(part, getattr(owner, name))) for name in names]
 
     def _timing(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the call with its time added to a part."""
+        """Return a call that adds its time to a part."""
 
         def timing(*args: Any, **kwargs: Any) -> Any:
             began = perf_counter_ns()
@@ -63,7 +63,7 @@ class Parts:
 
     @contextmanager
     def maybe(self, timed: bool) -> Iterator[dict[str, float]]:
-        """Time the parts of what happens inside, or not; filled at its end, in us."""
+        """Time the parts of the code in the context, if `timed`; the yielded dictionary is filled at its end, in us."""
         times_us: dict[str, float] = {}
         self.timed = timed
         if timed:
@@ -75,13 +75,13 @@ class Parts:
             times_us.update((part, 1e-3 * time) for part, time in self._times.items())
 
     def _swap(self, which: int) -> None:
-        """Put the calls as they are, or timed, in place."""
+        """Set the original calls (2) or the timed calls (3)."""
         for swap in self._swaps:
             setattr(swap[0], swap[1], swap[which])
 
 
 class Memory:
-    """An array of the controller's own, timed when something is copied into it."""
+    """Array of the controller that times copies into it."""
 
     def __init__(self, array: Array, write: Callable[[Any, Any], None]) -> None:
         self._array = array

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The yardstick that everybody can run: IPOPT from the CasADi wheel, warm, on the same problem to convergence.
+Yardstick: IPOPT from the CasADi wheel, warm-started, on the same problem, to convergence.
 
-Scalar expressions, not compiled, exact Hessian, hard bounds; primal and dual
-solutions shifted from sample to sample.
+It uses scalar expressions that are not compiled, the exact Hessian, and hard bounds
+unless softened; primal and dual solutions are shifted from sample to sample.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Ipopt:
         self.u: Array = np.zeros(model.nu)
 
     def reset(self, x0: Array, u0: Array | None = None) -> None:
-        """Start cold, where the robot is; the inputs at `u0`, shape ``(nu,)``, 0 if left out."""
+        """Start cold from the state `x0`, with the inputs at `u0`, shape ``(nu,)``, 0 if left out."""
         inputs = np.zeros(self._nu) if u0 is None else u0
         self._z = np.concatenate([np.tile(x0, self._N + 1), np.tile(inputs, self._N_u), np.zeros(self._N * self._ng)])
         self._lam_z, self._lam_g = np.zeros_like(self._z), np.zeros_like(self._lbg)
@@ -120,5 +120,5 @@ class Ipopt:
 
 
 def shifted(values: Array, width: int) -> Array:
-    """Return stages of a width moved on by one, the last repeated."""
+    """Return stages of `width` values each, shifted by one stage, with the last one repeated."""
     return np.concatenate([values[width:], values[-width:]]) if width else values
