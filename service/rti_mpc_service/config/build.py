@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The parts of a robot's processes, each built of its configuration.
+Builders of the parts of a robot's processes from its configuration.
 
-Each function imports what it builds when it is called, so that a guard or a viewer
-loads neither CasADi nor a solver.
+Each function imports the modules that it needs when it is called, so that a guard or a
+viewer loads neither CasADi nor a solver.
 """
 
 from __future__ import annotations
@@ -65,13 +65,13 @@ def build_ocp(config: Config) -> Ocp:
 
 
 def retuned(config: Config, problem: Ocp) -> Ocp:
-    """Return a problem, built of another configuration, with the weights and bounds of this one; all else is kept, not built again."""
+    """Return a problem with the weights and bounds of another configuration; everything else is kept and not built again."""
     other = problem.retuned(**weights_and_bounds(config, problem.model))
     return other if config.ocp.terminal.lqr is None else other.retuned(Q_e=regulator_weight(config, other))
 
 
 def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
-    """Return those of the problem that may change while it is solved, as `Ocp` names them."""
+    """Return the weights and bounds that may change at run time, by their names in `Ocp`."""
     from rti_mpc.rti.ocp import DEFAULT_SLACK_WEIGHT
 
     weights, limits = config.ocp.weights, config.ocp.bounds
@@ -110,7 +110,7 @@ def regulator_weight(config: Config, problem: Ocp) -> Array:
 
 def stage_parameters(config: Config, t_s: Array) -> Array:
     """
-    Return what a reference carries of moving obstacles.
+    Return the stage parameters of a reference: positions of moving obstacles.
 
     Args:
         config: The robot's configuration, with its obstacles.
@@ -150,7 +150,7 @@ def build_observer(config: Config) -> Observer | None:
 
 
 def robot_settings(config: Config) -> dict[str, Any]:
-    """Return what `rti_mpc_sim.settings.RobotSettings` is made from; the slew limits are those of the increments."""
+    """Return the arguments of `rti_mpc_sim.settings.RobotSettings`; the slew limits are those of the increments."""
     from rti_mpc.contract.approach import Increments
 
     model, sim = build_model(config).with_parameters(**config.sim.parameters), config.sim
@@ -171,7 +171,7 @@ def robot_settings(config: Config) -> dict[str, Any]:
 
 
 def guard_limits(config: Config) -> Limits:
-    """Return what the guard lets pass; its configuration is enough, no model is loaded."""
+    """Return the limits of the guard; no model is loaded."""
     from rti_mpc.contract.guard import Limits
     from rti_mpc.control.grid import MAX_DELAY_PERIODS
 
@@ -199,7 +199,7 @@ def with_initial_state(config: Config, assignments: Sequence[str]) -> Config:
         assignments: Each ``name=value``, in the state's unit.
 
     Raises:
-        ConfigError: An assignment is none, or the model has no such state.
+        ConfigError: An assignment is not valid, or the model has no such state.
     """
     try:
         given = {name: float(value) for name, _, value in (assignment.partition("=") for assignment in assignments)}
@@ -219,19 +219,19 @@ def solver_settings(config: Config) -> SolverSettings | None:
 
 
 def iterations(config: Config) -> dict[str, Any]:
-    """Return the limits of the iterations a sample, as `Rti` names them, that are given."""
+    """Return the given limits of the iterations per sample, by their names in `Rti`."""
     return config.solver.model_dump(exclude_none=True, include=ITERATION_KEYS)
 
 
 def bus_settings(config: Config) -> BusSettings:
-    """Return how a process other than the robot joins the bus: it connects, and listens on a free port."""
+    """Return the bus settings of a process other than the robot, which connects and listens on a free port."""
     from rti_mpc.wire.bus import BusSettings
 
     return BusSettings(**config.bus.model_dump(exclude_none=True, exclude={"listen"}))
 
 
 def as_sequence(values: tuple[float, ...], length: int) -> tuple[float, ...]:
-    """Return a sequence, or the constant that a single value stands for."""
+    """Return a sequence of `length` values; a single value is repeated."""
     return values if len(values) == length else values * length
 
 

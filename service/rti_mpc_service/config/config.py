@@ -2,7 +2,7 @@
 """
 Loading of a robot's configuration: a TOML file, read once into a frozen tree.
 
-Everything is checked here, so that nothing behind this door checks again: the
+Everything is checked here, so that no later code has to check again: the
 tree by itself (`rti_mpc_service.config.schema`), then its keys against each other and its names
 against the model (`rti_mpc_service.config.fit`), which ends with building the `Ocp`
 (`rti_mpc_service.config.build`). Each refusal is one line (`rti_mpc_service.config.refusal`).

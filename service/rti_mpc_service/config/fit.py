@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def check_tree(config: Config) -> None:
     """
-    Check what only the whole or the file system knows.
+    Check keys against each other and against the file system.
 
     Raises:
         ConfigError: A key does not fit the others.
@@ -44,7 +44,7 @@ def check_tree(config: Config) -> None:
 
 def check_model(config: Config) -> Ocp:
     """
-    Check what only the model knows, and return the problem.
+    Check the configuration against the model, and return the problem.
 
     Raises:
         ConfigError: A key does not fit the model.
@@ -79,7 +79,7 @@ def check_rest(ocp: Ocp) -> None:
     Check that every input can be brought to its rest.
 
     Raises:
-        ConfigError: Its bounds leave that out.
+        ConfigError: The bounds of an input exclude its rest.
     """
     from rti_mpc.rti.ocp import restless
 
@@ -89,10 +89,10 @@ def check_rest(ocp: Ocp) -> None:
 
 def check_stop(config: Config) -> None:
     """
-    Check that a stop brings the robot to rest, unless its file says that it does not.
+    Check that a stop brings the robot to rest, unless its file says that it coasts.
 
     Raises:
-        ConfigError: It coasts, or falls; what was seen of it is said.
+        ConfigError: The robot coasts or falls; the text gives the motion seen.
     """
     from rti_mpc.rti.rest import motion_at_rest
 
@@ -139,10 +139,10 @@ def check_names(config: Config, model: Model) -> None:
 
 def check_solver(config: Config) -> None:
     """
-    Check that the QP solver is there, and the settings are its own.
+    Check that the QP solver is installed, and that the given settings are its own.
 
     Raises:
-        ConfigError: They are not.
+        ConfigError: It is not installed, or a setting belongs to another solver.
     """
     if "name" not in config.solver.model_fields_set:
         return

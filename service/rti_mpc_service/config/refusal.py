@@ -30,7 +30,7 @@ REWORDINGS = (
 
 
 def explain(error: ValidationError, tree: type[BaseModel]) -> str:
-    """Word one complaint; an unknown key comes first, for it is often why another is missing."""
+    """Return one complaint as text; an unknown key comes first, since it is often the reason why another one is missing."""
     complaint = min(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden")
     loc, got, keys = complaint["loc"], complaint["input"], dict(entries(tree))
     key, what = dotted(loc), description_of(loc, keys)
@@ -52,13 +52,13 @@ def quoted(value: object) -> str:
 
 def unknown_name(key: str, table: Mapping[str, object], kind: str, signals: Sequence[Signal], *, complete: bool) -> str | None:
     """
-    Say what is wrong with the names of a table, if anything.
+    Return what is wrong with the names of a table, None if they are right.
 
     Args:
         key: The table's key.
         table: Values by name.
         kind: What the names stand for, such as ``"state"``.
-        signals: What the model has.
+        signals: Signals of the model.
         complete: Whether the table must name each of them.
     """
     units = {signal.name: f"{signal.name} [{signal.unit}]" for signal in signals}
@@ -87,7 +87,7 @@ def dotted(loc: Sequence[int | str]) -> str:
 
 
 def tree_key(loc: Sequence[int | str]) -> str:
-    """Write a location as the tree does, whichever table of a list it is in."""
+    """Return a location as a key of the tree, without indices of lists."""
     return ".".join(step for step in loc if isinstance(step, str))
 
 
@@ -97,7 +97,7 @@ def description_of(loc: Sequence[int | str], tree: dict[str, str]) -> str:
 
 
 def suggestion(key: str, tree: dict[str, str]) -> str:
-    """Return the same key elsewhere, or the nearest beside this one, or all that are beside it."""
+    """Return the same key in another table, else the most similar key of the same table, else all keys of that table."""
     section, _, name = key.rpartition(".")
     beside = {other.rpartition(".")[2]: other for other in tree if other.rpartition(".")[0] == section}
     near = [other for other in tree if other.rpartition(".")[2] == name]
@@ -106,5 +106,5 @@ def suggestion(key: str, tree: dict[str, str]) -> str:
 
 
 def list_known(names: Iterable[str]) -> str:
-    """List what there is."""
+    """Return a list of known names as text."""
     return f"known: {', '.join(names) or 'none'}"

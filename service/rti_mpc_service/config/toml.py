@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""TOML: read with a bound on its depth, and a configuration written again, so that a run leaves behind exactly what it was run with."""
+"""TOML: reading with a limit on nesting, and writing a configuration, so that a run can store its own."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def read(text: str) -> dict[str, Any]:
     Return the content of TOML.
 
     Raises:
-        ConfigError: It is none, or nested deeper than `MAX_NESTING`.
+        ConfigError: The text is not TOML, or nested deeper than `MAX_NESTING`.
     """
     try:
         content = tomllib.loads(text)
@@ -45,7 +45,7 @@ def too_deep(content: dict[str, Any]) -> bool:
 
 
 def write(config: Config) -> str:
-    """Return the text of a file that loads as this configuration; what was left out stays out."""
+    """Return the text of a file that loads as this configuration; keys that were left out stay out."""
     return "\n".join(_table("", config.model_dump(mode="python", by_alias=True, exclude_unset=True, exclude_none=True))).strip() + "\n"
 
 
@@ -65,7 +65,7 @@ def _key(name: str) -> str:
 
 
 def text(value: Any) -> str:
-    """Return a value; JSON's text is TOML's but for infinities and what JSON lacks."""
+    """Return a value as TOML; scalars are as in JSON, except infinities and types that JSON lacks."""
     if isinstance(value, dict):
         return f"{{ {', '.join(f'{_key(name)} = {text(inner)}' for name, inner in value.items())} }}"
     if isinstance(value, list | tuple):
