@@ -27,11 +27,11 @@ class Contender(Protocol):
 
 class RealTimeIteration:
     """
-    Both phases of the product's iteration, one after the other.
+    Both phases of the real-time iteration, one after the other.
 
     Attributes:
-        rti: The iteration.
-        unusable: How many QPs gave nothing; their sample is driven by the shifted plan.
+        rti: The real-time iteration.
+        unusable: Number of QPs without a usable solution; in these samples the shifted plan acts.
     """
 
     def __init__(self, ocp: Ocp, *, solver: str = "riccati", formulation: str = "auto") -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One closed loop but for its solver: what is followed, by which problem, with which robot. The defaults are what the paper prints."""
+"""Experiment: trajectory, problem and robot of one closed loop, without its solver. The defaults are the paper's values."""
 
 from __future__ import annotations
 

@@ -25,14 +25,14 @@ class Loop:
     An experiment in progress.
 
     Attributes:
-        experiment: What is being done.
-        contender: Who drives.
-        y: Reference rows, as of `Experiment.reference`.
+        experiment: The experiment.
+        contender: The driving contender.
+        y: Reference rows, from `Experiment.reference`.
         x: True states at samples, shape ``(samples + 1, 5)``.
         u: Commands, shape ``(samples, 2)``.
         between_mm: Largest distance from the trajectory in each sampling interval, its end included, shape ``(samples,)``.
-        wall_us: Time of each solve by the clock on the wall, shape ``(samples,)``.
-        cpu_us: Time of the processor it took, shape ``(samples,)``.
+        wall_us: Wall time of each solve, shape ``(samples,)``.
+        cpu_us: CPU time of each solve, shape ``(samples,)``.
     """
 
     def __init__(self, experiment: Experiment, contender: Contender, seed: int = 1) -> None:
@@ -96,7 +96,7 @@ class Loop:
         return float(DELTA * ((e**2) @ Q).sum() + 0.8 * ((du**2) @ R).sum())
 
     def summary(self) -> dict[str, Any]:
-        """Return what came of it, in JSON; the errors count after the transient."""
+        """Return the results in JSON; the errors count after the transient."""
         error, between, period_us = self.error_mm[self.settled], self.between_mm[self.settled], 1e6 * self.experiment.T0
         return {
             "max_mm": float(error.max()),

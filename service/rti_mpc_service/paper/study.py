@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole study in one go: drive, write what came of it as JSON, draw it, and write the report."""
+"""The whole study: drive all experiments, write the results as JSON, draw them, and write the report."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Study:
         self.run["solves"] = {"own": self._solves, "unusable": sum(iteration.unusable for iteration in self._iterations)}
 
     def _build(self, name: str, experiment: Experiment) -> Contender:
-        """Return a contender, and count what it will solve if it is ours."""
+        """Return a contender; the solves of a real-time iteration are counted."""
         contender = CONTENDERS[name](experiment.ocp())
         if isinstance(contender, RealTimeIteration):
             self._iterations.append(contender)
@@ -92,7 +92,7 @@ class Study:
         self.run["race"][name] = {contender: loop.experiment.settings() | loop.summary() for contender, loop in loops.items()}
 
     def _drive(self, title: str, experiments: Iterable[Experiment], contender: str = OWN_CONTENDER, *, whole: bool = False) -> list[dict[str, Any]]:
-        """Drive experiments one after the other; return their settings and what came of each."""
+        """Drive experiments one after the other; return the settings and the results of each."""
         experiments = list(experiments)
         if self._quick:
             experiments = [shortened(experiment) for experiment in (experiments if whole else experiments[::QUICK_STRIDE])]
@@ -107,7 +107,7 @@ class Study:
         return rows
 
     def _stage(self, title: str, samples: int) -> Callable[[], None]:
-        """Begin a bar of its own; return what advances it."""
+        """Begin a progress bar; return the function that advances it."""
         task = self._progress.add_task(title, total=samples)
         return lambda: self._progress.advance(task)
 
