@@ -49,7 +49,7 @@ def main() -> int:
     options, rest = parser.parse_known_args()
     named = any(Path(word.partition("::")[0]).exists() for word in rest)
     files = [] if named else sorted(str(path) for path in ROOT.glob("tests/**/test_*.py") if timed(path))
-    command = [sys.executable, "-m", "pytest", "-n", "2", "--dist", "loadfile", "--durations", "5", *rest, *files]
+    command = [sys.executable, "-m", "pytest", "-n", "auto", "--dist", "loadfile", "--durations", "5", *rest, *files]
     with ExitStack() as stack:
         for _ in range(options.loops):
             greedy = subprocess.Popen([sys.executable, "-c", GREEDY, str(os.getpid())], stdin=subprocess.DEVNULL)
