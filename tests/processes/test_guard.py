@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from rti_mpc.contract.message import Command, Event
-from rti_mpc.contract.schedule import STEP_NS
+from rti_mpc.contract.schedule import RAMP_STEP_NS
 from rti_mpc.contract.status import Mode
 from rti_mpc.wire.cdr import decode
 from rti_mpc_service.cli import SHIPPED
@@ -142,7 +142,7 @@ def test_ctrl_c_ends_the_guard_with_a_ramp_to_rest(driven: System, host: Host) -
     last = decode(Command, actuation.drain()[-1].payload)
     assert last.mode is Mode.BRAKING
     assert (
-        np.abs(last.u[-1]) <= SLEW * (STEP_NS / (100 * MS)) + 1e-9
+        np.abs(last.u[-1]) <= SLEW * (RAMP_STEP_NS / (100 * MS)) + 1e-9
     ).all()  # where the host holds up the link, the very last one, to stand, may be lost
     stopped_in_time(host, driven, recorded(driven, stopped_ns, 2700))
     assert "Traceback" not in driven.said("guard")

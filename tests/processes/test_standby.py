@@ -54,7 +54,7 @@ def test_standby_takes_over_in_time_and_the_old_leader_is_fenced(redundant: Watc
     epochs = [command.epoch for command in system.commands if command.epoch >= second.epoch or command.state_seq >= second.state_seq]
     assert epochs == sorted(epochs), "whoever has led once and was followed by another says nothing more"
     assert [seq for seq in system.samples_of_two_epochs() if seq >= second.state_seq] == []
-    within_limits(system)
+    within_limits(host, system)
 
 
 @pytest.mark.slow
