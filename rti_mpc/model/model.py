@@ -37,6 +37,8 @@ class Model:
         constraints: Names and units of `h_expr`.
         p_nominal: Values of `p`, unless a reference carries others.
         u_rest: Input at which the robot stands still; zeros by default.
+        stop_expr: Input to command next while coming to rest, of x, u (the last input that acted) and p, shape ``(nu, 1)``; derived by default
+            where inputs at rest do not stop the robot.
 
     Raises:
         OcpError: A dimension, a name or a free symbol does not fit.
@@ -56,11 +58,13 @@ class Model:
     h_expr: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
     constraints: tuple[Signal, ...] = ()
     u_rest: tuple[float, ...] = ()
+    stop_expr: ca.SX | None = None
 
     def __post_init__(self) -> None:
         """Check that names, dimensions and symbols fit together."""
         if not self.u_rest:
             object.__setattr__(self, "u_rest", (0.0,) * len(self.inputs))
+        stop_expr = ca.SX(0, 1) if self.stop_expr is None else self.stop_expr
         for label, expr, length in (
             ("states", self.x, len(self.states)),
             ("f_expl_expr", self.f_expl_expr, len(self.states)),
@@ -70,6 +74,7 @@ class Model:
             ("constraints", self.h_expr, len(self.constraints)),
             ("p_nominal", self.p, len(self.p_nominal)),
             ("u_rest", self.u, len(self.u_rest)),
+            ("stop_expr", stop_expr, 0 if self.stop_expr is None else len(self.inputs)),
         ):
             if expr.numel() != length or (length and expr.shape != (length, 1)):
                 raise OcpError(f"model {self.name}: {label} must have {expr.numel()} entries, in a column, got {length} for shape {expr.shape}")
@@ -84,6 +89,7 @@ class Model:
             ("f_expl_expr", self.f_expl_expr, (self.x, self.u, self.p)),
             ("y_expr", self.y_expr, (self.x, self.p)),
             ("h_expr", self.h_expr, (self.x, self.u, self.p)),
+            ("stop_expr", stop_expr, (self.x, self.u, self.p)),
         ):
             free = [str(s) for s in ca.symvar(expr) if not any(ca.depends_on(k, s) for k in known)]
             if free:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Rest of a robot: a check that it comes to rest when its inputs do.
+Rest of a robot: how it comes to a standstill, how long that takes, and whether it stays there.
 
-A stop commands the inputs at rest. That stops a robot that is driven by speeds. One
-that is driven by accelerations coasts on, one that is driven by torques falls.
-Which of them a model is, its own equations tell. From states of operation
+The inputs at rest stop a robot that is driven by speeds. One that is driven by
+accelerations coasts on, one that is driven by torques falls: those need a way to
+rest (`rti_mpc.rti.way_to_rest`). Which of them a model is, its own equations tell.
+From states of operation
 
 .. math::
 
@@ -14,24 +15,48 @@ is integrated for a while; then every state must stand still, compared with how 
 it changes in operation. And the robot must stay wherever it has stopped: a state
 whose derivative does not depend on itself, such as a position, a heading or a joint
 angle, is displaced, and nothing may begin to move.
+
+At the end of a way to rest a robot holds without feedback, or it drifts, or it is
+unstable (`RestClass`). The eigenvalues there tell, and roll-outs of a plant that
+answers its inputs by a little more or less, a little late.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.errors import OcpError
+from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model
 from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.operation import SEEDED, around, corners, derivative, states_of_operation
+from rti_mpc.rti.way_to_rest import StopLaw, WayToRest
 
 SETTLING_S = 10.0  # after which a robot must stand
 DRIVEN_S = 2.0  # for which inputs at their bounds drive the robot, to see which states it gets into
 STILL = 0.01  # of the rate in operation, below which a state stands still
-SEEDED = 6  # states, and combinations of bounds, beside those where all are low or all high
-UNBOUNDED = 1.0  # where there is no bound: the distance from rest that is tried, in the unit of the state or input
+AT_REST = 1e-3  # of the rate in operation, below which a way has come to rest when its rows are counted: what is not counted needs more
+DURATIONS_S = (1.0, 2.0, 5.0, 10.0, 20.0)  # of a way, the first of which is long enough
+MAX_REST_ROWS = 200  # of a way
+MAX_HORIZON = 100  # rows that the regulator looks ahead
+SPARE = 1.5  # times the rows that the seeded states need has a way
+PROBED = 4  # of these, before all
+FINDING = 24  # states of operation that a way is found with
+INPUT_WEIGHTS = (0.01, 0.1, 1.0, 10.0)  # beside the rates, tried for the soonest rest
+DELAY_S = 0.01  # from a state to the input that answers it, when the way is played
+MISMATCH = 0.02  # by which the plant answers its inputs more, or less, than its model
+STANDING_S = 5.0  # for which the last row is then played
+LINEARIZED = 50  # of the states at rest, at most
+FALLING = 0.1  # of the rate in operation, that a robot has then without feedback: more than a drift
+GROWTH = 0.05  # 1/s: slower than this is no instability but a drift
 
 Motion = Callable[[Array, Array, float], Array]
 
@@ -90,21 +115,227 @@ def motion(model: Model) -> Motion:
     return move
 
 
-def derivative(model: Model) -> Callable[[Array, Array], Array]:
-    """Build the rates of the states, shape ``(nx,)``."""
+class RestClass(Enum):
+    """What a robot does at the end of its way to rest, its inputs held."""
+
+    HOLDS = "holds without feedback"
+    DRIFTS = "drifts without feedback"
+    UNSTABLE = "falls without feedback"
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """
+    How a robot comes to rest from its states of operation.
+
+    Attributes:
+        kind: What it does there, its inputs held.
+        growth: Largest real part of the eigenvalues at rest, 1/s.
+        time_s: Longest time to rest.
+        moved: Largest change of each state on the way, shape ``(nx,)``; zero for a state that is the same wherever the robot rests.
+        states: How many states of operation were tried.
+    """
+
+    kind: RestClass
+    growth: float
+    time_s: float
+    moved: Array
+    states: int
+
+
+class Ways(NamedTuple):
+    """
+    Ways to rest of many states.
+
+    Attributes:
+        u: Inputs, shape ``(n, M, nu)``.
+        x: States, shape ``(n, M, nx)``.
+        K: Gains, shape ``(n, nu, nx)``.
+        period_s: Duration of a row, s.
+    """
+
+    u: Array
+    x: Array
+    K: Array
+    period_s: float
+
+
+def find_stop_law(ocp: Ocp) -> StopLaw | None:
+    """
+    Return what the way to rest of a problem is made with, None for a robot whose inputs need but ramp to rest.
+
+    Raises:
+        OcpError: It does not come to rest from where it operates, or does not stay there; the message says from where.
+    """
+    if ocp.model.stop_expr is None and not motion_at_rest(ocp):
+        return None
+    law = shaped(ocp)
+    return replace(law, holds=assess(ocp, law, FINDING, compile=False).kind is RestClass.HOLDS)
+
+
+def assess(ocp: Ocp, law: StopLaw | None, count: int, *, compile: bool = True) -> Rest:
+    """
+    Bring a robot to rest from many states of operation, and see what it does there.
+
+    Args:
+        ocp: Its problem: model, and the bounds inside which it is operated.
+        law: What its way to rest is made with; None: its inputs ramp to rest.
+        count: States of operation that are tried, corners of the bounds included.
+        compile: Whether its ways are made by machine code.
+
+    Raises:
+        OcpError: It does not come to rest from one of them, or does not stay there.
+    """
+    model = ocp.model
+    X, U = states_of_operation(ocp, count)
+    rates = rates_of_operation(model, X, U)
+    ways = ramps(ocp, X, U) if law is None else ways_to_rest(ocp, law, X, U, compile=compile)
+    moving = np.abs(rates_along(model, ways)) > STILL * rates
+    if moving[:, -1].any():
+        raise OcpError(unrested(model, X, moving[:, -1], ways))
+    time_s = ways.period_s * float((moving.any(axis=2) * np.arange(1, moving.shape[1] + 1)).max())
+    ends = ways.x[:, -1]
+    free = np.ptp(ends, axis=0) > STILL * np.ptp(X, axis=0)
+    moved = np.where(free, np.abs(ends - X).max(axis=0), 0.0)
+    A = ca.Function("A", [model.x, model.u, model.p], [ca.densify(ca.jacobian(model.f_expl_expr, model.x))])
+    at_rest = zip(ends[:LINEARIZED], ways.u[:LINEARIZED, -1], strict=True)
+    growth = max(float(np.linalg.eigvals(np.array(A(x, u, model.p_nominal))).real.max()) for x, u in at_rest)
+    if law is None:
+        return Rest(RestClass.HOLDS, growth, time_s, moved, count)
+
+    alone = in_the_end(ocp, law, ways, U, feedback=0.0) / rates
+    if growth <= GROWTH and alone.max() <= STILL:
+        return Rest(RestClass.HOLDS, growth, time_s, moved, count)
+    kept = in_the_end(ocp, law, ways, U, feedback=1.0) <= STILL * rates
+    if not kept.all():
+        raise OcpError(unkept(model, X, ~kept, ways))
+    falls = growth > GROWTH or alone.max() > FALLING
+    return Rest(RestClass.UNSTABLE if falls else RestClass.DRIFTS, growth, time_s, moved, count)
+
+
+def shaped(ocp: Ocp) -> StopLaw:
+    """
+    Find the rows of the way to rest and the weight of its regulator: those with which seeded states of operation are at rest soonest, and stay there.
+
+    Raises:
+        OcpError: From one of them no way leads to rest, or it does not stay there.
+    """
+    model = ocp.model
+    X, U = states_of_operation(ocp, FINDING)
+    rates = rates_of_operation(model, X, U)
+    scale_x, scale_u = (np.where((half := 0.5 * np.ptp(values, axis=0)) > 0.0, half, 1.0) for values in (X, U))
+    wrong = ""
+    for duration_s, still in (*((duration_s, AT_REST) for duration_s in DURATIONS_S), (DURATIONS_S[-1], STILL)):
+        substeps = max(1, math.ceil(duration_s / (MAX_REST_ROWS * ocp.dt)))
+        rows = max(3, math.ceil(duration_s / (substeps * ocp.dt)))
+        found = []
+        for weight in INPUT_WEIGHTS:
+            law = StopLaw(rows, min(rows, MAX_HORIZON), substeps * ocp.dt, substeps, weight, rates, scale_x, scale_u)
+            for count in (PROBED, FINDING):  # most laws that are too slow are so from the corners
+                ways = ways_to_rest(ocp, law, X[:count], U[:count], compile=False)
+                moving = np.abs(rates_along(model, ways)) > still * rates
+                if moving[:, -1].any():
+                    break
+            if moving[:, -1].any():
+                wrong = unrested(model, X, moving[:, -1], ways)
+            elif not (kept := in_the_end(ocp, law, ways, U, feedback=1.0) <= STILL * rates).all():
+                wrong = unkept(model, X, ~kept, ways)
+            else:
+                needed = int((moving.any(axis=2) * np.arange(1, rows)).max()) + 1
+                found.append(replace(law, rows=min(rows, math.ceil(SPARE * needed) + 1)))
+        if found:
+            return min(found, key=lambda law: law.rows)
+    raise OcpError(wrong)
+
+
+def ways_to_rest(ocp: Ocp, law: StopLaw, X: Array, U: Array, *, compile: bool) -> Ways:
+    """Return the ways to rest from states, shape ``(n, nx)``, at which inputs act, shape ``(n, nu)``."""
+    way = WayToRest(ocp, law, compile=compile)
+    found = []
+    for x, u in zip(X, U, strict=True):
+        way.find(x, u)
+        found.append((way.u.copy(), way.x.copy(), way.K.copy()))
+    u, x, K = (np.array(part) for part in zip(*found, strict=True))
+    return Ways(u, x, K, law.period_s)
+
+
+def ramps(ocp: Ocp, X: Array, U: Array) -> Ways:
+    """Return how states follow inputs that ramp to rest."""
+    model = ocp.model
+    rest, rows = np.array(model.u_rest), max(2, math.ceil(SETTLING_S / ocp.dt))
+    phi = integrator(model, "rk4", 4)
+    u, states, inputs, x = U, [], [], X
+    for _ in range(rows):
+        u = u + np.clip(rest - u, ocp.lbdu, ocp.ubdu)
+        states.append(x)
+        inputs.append(u)
+        x = np.array(phi(x.T, u.T, np.array(model.p_nominal), ocp.dt)).T
+    return Ways(np.stack(inputs, axis=1), np.stack(states, axis=1), np.zeros((len(X), model.nu, model.nx)), ocp.dt)
+
+
+def played(ocp: Ocp, law: StopLaw, ways: Ways, U: Array, feedback: float, answer: float) -> Array:
+    """
+    Play ways to rest on a plant that answers its inputs more or less than its model, and late; the last row for a while.
+
+    Args:
+        ocp: The problem.
+        law: What the ways are made with.
+        ways: The ways.
+        U: Inputs that act before them, shape ``(n, nu)``.
+        feedback: Share of the gain that is applied.
+        answer: Factor of the inputs.
+
+    Returns:
+        Rates of the states in the end, shape ``(n, nx)``.
+    """
+    model, p = ocp.model, np.array(ocp.model.p_nominal)
+    phi = integrator(model, "rk4", law.substeps)
+    rows_late, late_s = divmod(DELAY_S, law.period_s)
+    x, before = ways.x[:, 0], U
+    past = [U] * (int(rows_late) + 2)
+    for i in range(law.rows + math.ceil(STANDING_S / law.period_s)):
+        row = min(i, law.rows - 1)
+        u = ways.u[:, row] - feedback * np.einsum("nij,nj->ni", ways.K, x - ways.x[:, row])
+        u = np.clip(np.clip(u, ocp.lbu, ocp.ubu), before + ocp.lbdu, before + ocp.ubdu)
+        before, past = u, [*past[1:], u]
+        for acting, span_s in ((past[0], late_s), (past[1], law.period_s - late_s)):
+            x = np.array(phi(x.T, answer * acting.T, p, span_s)).T
+    return rates_at(model, x, answer * before)
+
+
+def in_the_end(ocp: Ocp, law: StopLaw, ways: Ways, U: Array, feedback: float) -> Array:
+    """Return how fast each state changes after each way, shape ``(n, nx)``: the faster of two plants that answer more, and less, than their model."""
+    ends = [played(ocp, law, ways, U, feedback, 1.0 + mismatch) for mismatch in (MISMATCH, -MISMATCH)]
+    return np.asarray(np.abs(ends).max(axis=0))
+
+
+def rates_of_operation(model: Model, X: Array, U: Array) -> Array:
+    """Return the fastest that each state changes in operation, shape ``(nx,)``, positive."""
+    rates = np.abs(rates_at(model, X, U)).max(axis=0, where=np.isfinite(X), initial=0.0)
+    return np.where(rates > 0.0, rates, 1.0)
+
+
+def rates_along(model: Model, ways: Ways) -> Array:
+    """Return the rates of the states along ways, shape ``(n, M - 1, nx)``; the last row is at rest by its making."""
+    x, u = ways.x[:, :-1], ways.u[:, :-1]
+    return rates_at(model, x.reshape(-1, model.nx), u.reshape(-1, model.nu)).reshape(x.shape)
+
+
+def rates_at(model: Model, X: Array, U: Array) -> Array:
+    """Return the rates of the states, shape ``(n, nx)``; infinite where there are none."""
     f = ca.Function("f", [model.x, model.u, model.p], [ca.densify(model.f_expl_expr)])
-    return lambda x, u: np.array(f(x, u, model.p_nominal)).ravel()
+    rates = np.array(f(X.T, U.T, np.array(model.p_nominal))).T
+    return np.where(np.isfinite(rates), rates, np.inf)
 
 
-def around(lower: Array, upper: Array, middle: Array) -> tuple[Array, Array]:
-    """Return bounds, and where there are none `UNBOUNDED` to that side of a middle; each of shape ``(n,)``."""
-    lowest = np.where(np.isfinite(lower), lower, np.minimum(middle, upper) - UNBOUNDED)
-    return lowest, np.where(np.isfinite(upper), upper, np.maximum(middle, lower) + UNBOUNDED)
+def unrested(model: Model, X: Array, moving: np.ndarray[Any, Any], ways: Ways) -> str:
+    """Say of the first state that does not come to rest, whose moving states are marked, which and how."""
+    i = int(np.flatnonzero(moving.any(axis=1))[0])
+    where = ", ".join(f"{signal.name} = {value:.3g} {signal.unit}" for signal, value in zip(model.states, X[i], strict=True))
+    names = ", ".join(signal.name for signal, moves in zip(model.states, moving[i], strict=True) if moves)
+    return f"{ways.period_s * ways.x.shape[1]:.3g} s after a stop at {where} it still moves: {names}"
 
 
-def corners(lowest: Array, highest: Array, rng: np.random.Generator) -> Iterator[Array]:
-    """Yield combinations of bounds, each of shape ``(n,)``."""
-    yield lowest
-    yield highest
-    for _ in range(SEEDED):
-        yield np.where(rng.random(len(lowest)) < 0.5, lowest, highest)
+def unkept(model: Model, X: Array, moving: np.ndarray[Any, Any], ways: Ways) -> str:
+    """Say the same of a way that is played, and where it ends."""
+    return f"{unrested(model, X, moving, ways)}, if its inputs do {100 * MISMATCH:g} % more or less than modelled, {DELAY_S:g} s late"

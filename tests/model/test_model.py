@@ -94,6 +94,8 @@ def test_parameters_change_by_name_and_the_original_stays() -> None:
         ({"u_rest": (0.0, 0.0)}, "u_rest must have 1 entries"),
         ({"states": (Signal("r", "m"), Signal("r", "m/s"))}, "names must be unique within a vector"),
         ({"f_expl_expr": ca.vertcat(ca.SX.sym("wind"), 0)}, "f_expl_expr must depend only on x, u, p, also has wind"),
+        ({"stop_expr": ca.SX(2, 1)}, "stop_expr must have 2 entries, in a column, got 1"),
+        ({"stop_expr": ca.SX.sym("wind")}, "stop_expr must depend only on x, u, p, also has wind"),
         ({"y_expr": ca.SX.sym("wind")}, "y_expr must depend only on x, p, also has wind"),
     ],
 )

@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+The way to rest: inputs that bring a robot to a standstill, and the states along it.
+
+Robots whose inputs command speeds need none: their inputs ramp to rest. For others a
+law gives the next input from the state and the last input that acted, inside bounds
+and slew limits. A model may give it (`Model.stop_expr`); otherwise it is derived. Near
+the state lies a rest equilibrium, :math:`f(x_e, u_e, p) = 0`, found by Newton steps of
+least length, in which what may rest anywhere, a position or a heading, does not move.
+About it, with :math:`A, B` the dynamics over a row,
+
+.. math::
+
+    u = u_e - K (x - x_e), \qquad
+    K = \arg\min \sum_{i=0}^{M} \| \dot x_i \|_W^2 + \rho \| u_i - u_e \|^2
+
+is the regulator of the rates: a Riccati recursion over a finite horizon, from nothing
+at its end, so that what cannot be controlled at rest, such as a car's heading, does no
+harm. A second one, `K`, also weighs the deviation from the way: with it,
+whoever plays the rows keeps a robot there that does not stay by itself,
+:math:`u = u_{rest} - K (x - x_{rest})`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.codegen import bind, compiled, function
+from rti_mpc.model.integrator import integrator
+from rti_mpc.model.model import Model
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.riccati import cholesky, cholesky_solve
+
+NEWTON_STEPS = 8  # to an equilibrium
+SETTLING_STEPS = 2  # to the equilibrium at the end of a way, which is near
+DAMPING = 1e-9  # of these steps, where the equilibria are more than the equations tell
+INPUT_FREEDOM = 10.0  # by which inputs may move farther to an equilibrium than states, each measured by its range in operation
+PASSES = 3  # of a way that is found anew, before the last one: equilibria of an arm depend on where it comes to rest
+HOLD_S = 1.0  # a deviation from the way weighs as much as a rate that undoes it in this time
+LIMITS = ("lbu", "ubu", "lbdu", "ubdu")
+
+
+@dataclass(frozen=True, eq=False)
+class StopLaw:
+    """
+    What the way to rest of a problem is made with, found once by `rti_mpc.rti.rest`.
+
+    Attributes:
+        rows: Rows of the way, M.
+        horizon: Rows that the regulator looks ahead.
+        period_s: Duration of a row, s: whole periods of the controller.
+        substeps: How many of them.
+        input_weight: Weight of the inputs beside the rates, each measured by its range: rho.
+        rates: How fast the states change in operation, shape ``(nx,)``, positive; weights are measured by it.
+        scale_x: Range of the states in operation, shape ``(nx,)``, positive.
+        scale_u: Range of the inputs, shape ``(nu,)``, positive.
+        holds: Whether the robot stays at rest without feedback: then its commands carry no gain.
+    """
+
+    rows: int
+    horizon: int
+    period_s: float
+    substeps: int
+    input_weight: float
+    rates: Array
+    scale_x: Array
+    scale_u: Array
+    holds: bool = False
+
+
+class WayToRest:
+    """
+    The way to rest from one state, in arrays that are owned and never move.
+
+    Attributes:
+        law: What it is made with.
+        u: Inputs, shape ``(M, nu)``; the last row holds the robot where it has come to rest.
+        x: States at the beginning of each row, shape ``(M, nx)``; the last one is an equilibrium.
+        K: Gain that keeps the robot on the way, shape ``(nu, nx)``.
+        x_e: Equilibrium aimed at, shape ``(nx,)``; `u_e`, the input there, shape ``(nu,)``.
+        p: Parameters of the model, shape ``(np,)``; nominal unless written.
+    """
+
+    def __init__(self, ocp: Ocp, law: StopLaw, limits: Mapping[str, Array] | None = None, *, p: Array | None = None, compile: bool = True) -> None:
+        """
+        Build and compile it.
+
+        Args:
+            ocp: The problem.
+            law: Its law.
+            limits: Bounds and slew limits by the names in `LIMITS`, owned by the caller; those of the problem if left out.
+            p: Parameters, owned by the caller; the model's nominal ones if left out.
+            compile: Whether to machine code.
+        """
+        model = ocp.model
+        nx, nu = model.nx, model.nu
+        self.law = law
+        self.p: Array = np.array(model.p_nominal) if p is None else p
+        self.u, self.x = np.zeros((law.rows, nu)), np.zeros((law.rows, nx))
+        self.K: Array = np.zeros((nu, nx))
+        self.x_e, self.u_e = np.zeros(nx), np.array(model.u_rest)
+        self._u_rest: Array = np.array(model.u_rest)
+        limits = {name: np.array(getattr(ocp, name)) for name in LIMITS} if limits is None else limits
+        self._limits = {name: limits[name] for name in LIMITS}
+        self._start, self._near = np.zeros(nx), (np.zeros(nx), np.zeros(nu))
+        self._reach = np.zeros((2, nu)), np.zeros((2, nu))
+        self._u_prev, self._shift = np.zeros(nu), np.arange(law.rows)
+        self._stop_K: Array = np.zeros((nu, nx))  # gain of the regulator of the rates
+        self._follow_K: Array = np.zeros((nu, nx))
+        self._follow = np.zeros((law.rows, nu)), np.zeros((law.rows, nx))  # rows that are followed now
+        self._way = np.zeros((law.rows, nu)), np.zeros((law.rows, nx))  # rows of the last way that has begun
+        self._end = np.zeros(nx), np.zeros(nu)
+        functions = [aiming(model, law), rolling(model, law), to_equilibrium(model, law, SETTLING_STEPS)]
+        if model.stop_expr is not None:
+            functions.append(stopping(model, law))
+        made = compiled(*functions) if compile else functions
+        near = {"x": self._near[0], "u": self._near[1], "p": self.p}
+        self._aim = bind(made[0], near, {"x_e": self.x_e, "u_e": self.u_e, "K_stop": self._stop_K, "K": self.K})
+        start = {"x0": self._start, "u_prev": self._u_prev, "p": self.p, "lowest": self._reach[0], "highest": self._reach[1], **self._limits}
+        rows = {"rows": self.u, "states": self.x}
+        followed = {"u_way": self._follow[0], "x_way": self._follow[1], "K": self._follow_K}
+        self._roll = bind(made[1], start | followed, rows)
+        self._settle = bind(made[2], near, {"x_e": self._end[0], "u_e": self._end[1]})
+        self._stop = bind(made[3], start, rows) if model.stop_expr is not None else self._roll
+
+    def aim(self, x: Array, u: Array) -> bool:
+        """
+        Find the equilibrium near a state and an input, and the gains about it; off the path from state to command.
+
+        Returns:
+            Whether they are finite; otherwise the last ones are kept.
+        """
+        kept = [array.copy() for array in (self.x_e, self.u_e, self._stop_K, self.K)]
+        self._near[0][:], self._near[1][:] = x, u
+        self._aim()
+        found = bool(np.isfinite(self._stop_K).all() and np.isfinite(self.K).all() and np.isfinite(self.x_e).all())
+        if not found:
+            for array, before in zip((self.x_e, self.u_e, self._stop_K, self.K), kept, strict=True):
+                array[:] = before
+        return found
+
+    def begin(self, x: Array, u_prev: Array, reach: tuple[Array, Array] | None = None) -> bool:
+        """
+        Roll a new way out, about the equilibrium that was aimed at.
+
+        Args:
+            x: State where it begins, shape ``(nx,)``.
+            u_prev: Last input that acts before it, shape ``(nu,)``.
+            reach: Lowest and highest first two rows, each of shape ``(2, nu)``; what the slew limits allow if left out.
+
+        Returns:
+            Whether it is finite.
+        """
+        self._from(x, u_prev, reach)
+        self._follow[0][:], self._follow[1][:], self._follow_K[:] = self.u_e, self.x_e, self._stop_K
+        self._stop()
+        self._near[0][:], self._near[1][:] = self.x[-1], self.u[-1]
+        self._settle()
+        self._finish(*self._end)
+        self._way[0][:], self._way[1][:] = self.u, self.x
+        return self.finite
+
+    def follow(self, x: Array, u_prev: Array, elapsed: int, reach: tuple[Array, Array] | None = None) -> bool:
+        """
+        Follow the last way that has begun, some rows later, from where the robot has really come to.
+
+        Args:
+            x: State where it begins, shape ``(nx,)``.
+            u_prev: Last input that acts before it, shape ``(nu,)``.
+            elapsed: Rows that are over.
+            reach: Lowest and highest first two rows.
+        """
+        left = np.minimum(self._shift + elapsed, len(self.u) - 1)
+        u, x_way = self._way
+        self._follow[0][:], self._follow[1][:], self._follow_K[:] = u[left], x_way[left], self.K
+        self._from(x, u_prev, reach)
+        self._roll()
+        self._finish(x_way[-1], u[-1])
+        return self.finite
+
+    def find(self, x: Array, u_prev: Array, reach: tuple[Array, Array] | None = None) -> bool:
+        """Roll a way out from a state nothing is known of before; as `begin`, aimed at the state itself, then at where that leads."""
+        self.aim(x, self._u_rest)
+        for _ in range(PASSES):
+            self.begin(x, u_prev, reach)
+            self.aim(self.x[-1], self.u[-1])
+        return self.begin(x, u_prev, reach)
+
+    @property
+    def finite(self) -> bool:
+        """Whether the way is."""
+        return bool(np.isfinite(self.x[-1]).all() and np.isfinite(self.u[-1]).all())
+
+    def _from(self, x: Array, u_prev: Array, reach: tuple[Array, Array] | None) -> None:
+        self._start[:], self._u_prev[:] = x, u_prev
+        if reach is None:
+            lowest, highest = self._reach
+            lowest[0], highest[0] = u_prev + self._limits["lbdu"], u_prev + self._limits["ubdu"]
+            lowest[1], highest[1] = lowest[0] + self._limits["lbdu"], highest[0] + self._limits["ubdu"]
+        else:
+            self._reach[0][:], self._reach[1][:] = reach
+
+    def _finish(self, x_end: Array, u_end: Array) -> None:
+        """Let the way end in an equilibrium."""
+        limits, before = self._limits, self.u[-2]
+        u = np.minimum(np.maximum(u_end, limits["lbu"]), limits["ubu"])
+        self.x[-1], self.u[-1] = x_end, np.minimum(np.maximum(u, before + limits["lbdu"]), before + limits["ubdu"])
+
+
+def to_equilibrium(model: Model, law: StopLaw, steps: int) -> ca.Function:
+    """Build ``(x, u, p) -> (x_e, u_e)``: Newton steps of least length to a state and an input at which the model rests."""
+    z = ca.vertcat(model.x, model.u)
+    size = ca.DM(np.concatenate([law.scale_x, INPUT_FREEDOM * law.scale_u]))
+    f = model.f_expl_expr / ca.DM(law.rates)
+    J = ca.densify(ca.jacobian(f, z) @ ca.diag(size))
+    step = size * (J.T @ cholesky_solve(cholesky(J @ J.T + DAMPING * ca.SX.eye(model.nx)), f))
+    nearer = ca.Function("nearer", [z, model.p], [ca.cse(ca.densify(z - step))])
+    x, u, p = ca.MX.sym("x", model.nx), ca.MX.sym("u", model.nu), ca.MX.sym("p", model.np_)
+    at = ca.vertcat(x, u)
+    for _ in range(steps):
+        at = nearer(at, p)
+    return function("equilibrium", {"x": x, "u": u, "p": p}, {"x_e": at[: model.nx], "u_e": at[model.nx :]})
+
+
+def aiming(model: Model, law: StopLaw) -> ca.Function:
+    """Build ``(x, u, p) -> (x_e, u_e, K_stop, K)``: the equilibrium near a state and an input, and the gains about it."""
+    x, u, p = ca.MX.sym("x", model.nx), ca.MX.sym("u", model.nu), ca.MX.sym("p", model.np_)
+    x_e, u_e = to_equilibrium(model, law, NEWTON_STEPS)(x, u, p)
+    K_stop, K = regulators(model, law)(x_e, u_e, p)
+    return function("aiming", {"x": x, "u": u, "p": p}, {"x_e": x_e, "u_e": u_e, "K_stop": ca.densify(K_stop.T), "K": ca.densify(K.T)})
+
+
+def regulators(model: Model, law: StopLaw) -> ca.Function:
+    """Build ``(x_e, u_e, p) -> (K_stop, K)``: gains of the regulator of the rates, and of the one that holds the state, too."""
+    nx, nu = model.nx, model.nu
+    phi = integrator(model, "rk4", law.substeps)(model.x, model.u, model.p, law.period_s)
+    A, B = ca.jacobian(phi, model.x), ca.jacobian(phi, model.u)
+    rates = [j for j in range(nx) if not ca.depends_on(model.f_expl_expr[j], model.u)]  # those that inputs change by themselves are theirs to choose
+    C = ca.densify(ca.jacobian(model.f_expl_expr[rates] / ca.DM(law.rates[rates]), model.x))
+    moving = C.T @ C
+    away = ca.diag(ca.DM(1.0 / (HOLD_S * law.rates) ** 2))
+    linear = ca.Function("linear", [model.x, model.u, model.p], [ca.densify(A), ca.densify(B), ca.densify(moving), ca.densify(moving + away)])
+
+    S, Q, As, Bs = (ca.SX.sym(name, *shape) for name, shape in (("S", (nx, nx)), ("Q", (nx, nx)), ("A", (nx, nx)), ("B", (nx, nu))))
+    A_s, B_s = (symbol * ca.DM(expr.sparsity(), 1.0) for symbol, expr in ((As, A), (Bs, B)))
+    SA, SB = S @ A_s, S @ B_s
+    K = cholesky_solve(cholesky(B_s.T @ SB + ca.diag(ca.DM(law.input_weight * law.scale_u**-2.0))), SB.T @ A_s)
+    before = Q + A_s.T @ SA - (SB.T @ A_s).T @ K
+    recursion = ca.Function("recursion", [S, Q, As, Bs], ca.cse([ca.densify((before + before.T) / 2), ca.densify(K)]))
+
+    x, u, p = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("p", model.np_)
+    A_e, B_e, *costs = linear(x, u, p)
+    gains = []
+    for cost in costs:
+        to_go, gain = cost, ca.MX(nu, nx)
+        for _ in range(law.horizon):
+            to_go, gain = recursion(to_go, cost, A_e, B_e)
+        gains.append(gain)
+    return ca.Function("regulators", [x, u, p], gains)
+
+
+def rolling(model: Model, law: StopLaw) -> ca.Function:
+    """Build ``(x0, u_prev, p, lowest, highest, *LIMITS, u_way, x_way, K) -> (rows, states)``: rows of a way followed; columns are rows."""
+    x, u_prev = ca.SX.sym("x", model.nx), ca.SX.sym("u_prev", model.nu)
+    u_way, x_way, K = ca.SX.sym("u_way", model.nu), ca.SX.sym("x_way", model.nx), ca.SX.sym("K", model.nu, model.nx)
+    wanted = ca.Function("wanted", [x, u_prev, model.p, u_way, x_way, K], [u_way - K @ (x - x_way)])
+    followed = {"u_way": ca.MX.sym("u_way", model.nu, law.rows), "x_way": ca.MX.sym("x_way", model.nx, law.rows)}
+    K_in = ca.MX.sym("K", model.nx, model.nu)  # its columns are rows of the array
+    rows = [[followed["u_way"][:, i], followed["x_way"][:, i], K_in.T] for i in range(law.rows)]
+    return rolled_out("rolling", model, law, wanted, rows, followed | {"K": K_in})
+
+
+def stopping(model: Model, law: StopLaw) -> ca.Function:
+    """Build ``(x0, u_prev, p, lowest, highest, *LIMITS) -> (rows, states)``: rows by the law that a model gives."""
+    assert model.stop_expr is not None
+    wanted = ca.Function("wanted", [model.x, model.u, model.p], [ca.densify(model.stop_expr)])
+    return rolled_out("stopping", model, law, wanted, [[]] * law.rows, {})
+
+
+def rolled_out(name: str, model: Model, law: StopLaw, wanted: ca.Function, rows: list[list[ca.MX]], more: dict[str, ca.MX]) -> ca.Function:
+    """Roll a law ``wanted(x, u_prev, p, *row)`` out, inside bounds and slew limits."""
+    nx, nu = model.nx, model.nu
+    u, lower, upper = ca.SX.sym("u", nu), ca.SX.sym("lower", nu), ca.SX.sym("upper", nu)
+    lbu, ubu = ca.SX.sym("lbu", nu), ca.SX.sym("ubu", nu)
+    clip = ca.Function("clip", [u, lbu, ubu, lower, upper], [ca.fmin(ca.fmax(ca.fmin(ca.fmax(u, lbu), ubu), lower), upper)])
+    phi = integrator(model, "rk4", law.substeps)
+    symbols = {"x0": (nx,), "u_prev": (nu,), "p": (model.np_,), "lowest": (nu, 2), "highest": (nu, 2), **dict.fromkeys(LIMITS, (nu,))}
+    inputs = {key: ca.MX.sym(key, *shape) for key, shape in symbols.items()}
+    x, before, p, lbdu, ubdu = (inputs[key] for key in ("x0", "u_prev", "p", "lbdu", "ubdu"))
+    found: list[ca.MX] = []
+    states: list[ca.MX] = []
+    for i, row in enumerate(rows):
+        low, high = (before + lbdu, before + ubdu) if i else (inputs["lowest"][:, 0], inputs["highest"][:, 0])
+        if i == 1:
+            low, high = ca.fmax(low, inputs["lowest"][:, 1]), ca.fmin(high, inputs["highest"][:, 1])
+        before = clip(wanted(x, before, p, *row), inputs["lbu"], inputs["ubu"], low, high)
+        states.append(x)
+        found.append(before)
+        x = phi(x, before, p, law.period_s)
+    return function(name, inputs | more, {"rows": ca.horzcat(*found), "states": ca.horzcat(*states)})

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The way to rest: from a state of motion to an equilibrium, inside bounds and slew limits, and what a robot does there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from rti_mpc.array import Array
+from rti_mpc.errors import OcpError
+from rti_mpc.rti.operation import states_of_operation
+from rti_mpc.rti.rest import RestClass, assess, find_stop_law
+from rti_mpc.rti.way_to_rest import WayToRest
+from tests.movers import car, law_of, mover, ocp_of
+
+CLASSES = {
+    "pioneer": RestClass.HOLDS,
+    "boat": RestClass.HOLDS,
+    "car": RestClass.DRIFTS,
+    "bicycle": RestClass.DRIFTS,
+    "arm": RestClass.UNSTABLE,
+    "quadrotor": RestClass.UNSTABLE,
+    "cart_pole": RestClass.UNSTABLE,
+}
+
+
+def way_of(name: str) -> WayToRest:
+    law = law_of(name)
+    assert law is not None
+    return WayToRest(ocp_of(name), law, compile=False)
+
+
+def rates(way: WayToRest, name: str, row: int) -> Array:
+    model = ocp_of(name).model
+    f = ca.Function("f", [model.x, model.u, model.p], [model.f_expl_expr])
+    return np.array(f(way.x[row], way.u[row], model.p_nominal)).ravel()
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_robot_is_classified_by_what_it_does_at_rest(name: str) -> None:
+    rest = assess(ocp_of(name), law_of(name), 40, compile=False)
+    assert rest.kind is CLASSES[name]
+    assert 0.0 < rest.time_s < 10.0
+    assert rest.states == 40
+
+
+@pytest.mark.parametrize("name", ["pioneer", "boat"])
+def test_robot_that_its_inputs_at_rest_stop_needs_no_way(name: str) -> None:
+    assert law_of(name) is None
+
+
+@pytest.mark.parametrize("name", ["car", "bicycle", "arm", "quadrotor", "cart_pole"])
+def test_way_ends_at_rest_and_is_inside_bounds_and_slew_limits(name: str) -> None:
+    ocp, way = ocp_of(name), way_of(name)
+    for x, u in zip(*states_of_operation(ocp, 8, seed=7), strict=True):
+        assert way.find(x, u)
+        assert np.array_equal(way.x[0], x)
+        assert np.abs(rates(way, name, -1)).max() < 1e-6, "its last row is an equilibrium"
+        assert np.abs(way.x[-1] - way.x[-2]).max() < 0.05, "which is where it has come to"
+        assert np.all((way.u >= ocp.lbu) & (way.u <= ocp.ubu))
+        steps = np.diff(way.u, axis=0, prepend=u[None])
+        assert np.all((steps >= ocp.lbdu - 1e-12) & (steps <= ocp.ubdu + 1e-12))
+
+
+def test_car_brakes_as_hard_as_it_may_and_keeps_its_heading_free() -> None:
+    way = way_of("car")
+    assert way.find(np.array([4.0, -1.0, 7.0, 3.0]), np.zeros(2))
+    assert way.u[0, 0] == -2.0
+    assert way.x[-1, 3] == pytest.approx(0.0, abs=1e-9), "of Newton steps"
+    assert way.x[-1, 0] - 4.0 == pytest.approx(np.cos(7.0) * 3.0**2 / 4.0, rel=0.1), "v^2 / 2a, and the end of it is slower"
+    assert np.allclose(way.K[1], 0.0), "at rest no curvature moves it"
+
+
+def test_arm_is_held_by_its_torques_wherever_it_stops() -> None:
+    way = way_of("arm")
+    for q_1 in (-1.5, 0.0, 1.5):
+        assert way.find(np.array([q_1, 0.5, 1.0, -1.0]), np.zeros(2))
+        weight = 0.25 * 9.81 * np.cos(way.x[-1, 0] + way.x[-1, 1])
+        assert way.u[-1] == pytest.approx([0.75 * 9.81 * np.cos(way.x[-1, 0]) + weight, weight], abs=1e-5)
+        assert abs(way.x[-1, 0] - q_1) < 0.5
+
+
+def test_way_that_is_followed_leads_back_to_where_it_ended_from_beside_it() -> None:
+    way = way_of("quadrotor")
+    assert way.find(np.array([0.0, 0.0, 0.2, 1.0, -0.5, 0.0]), np.full(2, 4.905))
+    end = way.x[-1].copy()
+    for elapsed in (5, len(way.u) + 10):
+        assert way.follow(way.x[min(elapsed, len(way.u) - 1)] + 0.05, way.u[0], elapsed)
+        assert way.x[-2] == pytest.approx(end, abs=0.05)
+        assert np.array_equal(way.x[-1], end)
+
+
+def test_gain_holds_what_does_not_stay_by_itself() -> None:
+    """Linear, over a row: what the gain leaves of the motion at rest decays; x and heading of a car's side do not move at all."""
+    for name in ("arm", "quadrotor", "cart_pole"):
+        way = way_of(name)
+        ocp = ocp_of(name)
+        assert way.find(np.zeros(ocp.model.nx), np.array(ocp.model.u_rest))
+        phi = ocp.phi()
+        z = [ocp.model.x, ocp.model.u, ocp.model.p]
+        A, B = (np.array(ca.Function("J", z, [ca.jacobian(phi(*z), wanted)])(way.x[-1], way.u[-1], [])) for wanted in z[:2])
+        assert np.abs(np.linalg.eigvals(A - B @ way.K)).max() < 1.0
+
+
+def test_law_that_a_model_gives_is_rolled_out_instead() -> None:
+    ocp = car()
+    model = ocp.model
+    given = car(lbdu=-0.5, ubdu=0.5)
+    object.__setattr__(given, "model", replace(model, stop_expr=ca.vertcat(-4.0 * model.x[3], 0.5 * model.u[1])))
+    law = find_stop_law(given)
+    assert law is not None
+    way = WayToRest(given, law, compile=False)
+    assert way.find(np.array([0.0, 0.0, 0.0, 2.0]), np.array([0.0, 0.4]))
+    assert way.u[:3, 0] == pytest.approx([-0.5, -1.0, -1.5]), "inside the slew limits"
+    assert way.u[:3, 1] == pytest.approx([0.2, 0.1, 0.05]), "of the last input that acted"
+    assert way.x[-1, 3] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_model_that_does_not_come_to_rest_from_where_it_operates_is_refused_with_where_that_is() -> None:
+    ocp = mover("undriven", "q:m w:m/s", "t:N", lambda x, u: (x[1], 0.0 * u[0]), lbu=-5, ubu=5, lbx=[-2, -2], ubx=[2, 2], dt=0.1)
+    with pytest.raises(OcpError, match=r"20 s after a stop at q = -2 m, w = -2 m/s it still moves: q$"):
+        find_stop_law(ocp)
+
+
+def test_arm_that_is_too_weak_for_where_it_is_comes_to_rest_where_it_is_not() -> None:
+    ocp = mover("weak", "q:rad w:rad/s", "t:Nm", lambda x, u: (x[1], u[0] - 9.81 * ca.sin(x[0])), lbu=-5, ubu=5, lbx=[-2, -2], ubx=[2, 2], dt=0.1)
+    law = find_stop_law(ocp)
+    assert law is not None
+    way = WayToRest(ocp, law, compile=False)
+    assert way.find(np.array([1.5, 0.0]), np.zeros(1))
+    assert abs(9.81 * np.sin(way.x[-1, 0])) <= 5.0
