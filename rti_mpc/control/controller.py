@@ -43,7 +43,7 @@ from rti_mpc.control.state_stream import Arrival, StateStream
 from rti_mpc.control.track import Track
 from rti_mpc.control.tuning import Tuning
 from rti_mpc.errors import OcpError
-from rti_mpc.rti.ocp import Ocp, restless
+from rti_mpc.rti.ocp import Ocp, rest_fault
 from rti_mpc.rti.rti import Rti
 
 INPUTS_UNREPORTED = (
@@ -80,7 +80,7 @@ class Controller:
         self, rti: Rti, timing: Timing, *, epoch: int = 1, config_hash: int = 0, observer: Observer | None = None, compile: bool = True
     ) -> None:
         ocp, model = rti.ocp, rti.ocp.model
-        if wrong := restless(ocp):
+        if wrong := rest_fault(ocp):
             raise OcpError(wrong)
         self._rti = rti
         self._stale_ns = round(1e9 * timing.stale_s)

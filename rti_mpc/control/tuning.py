@@ -18,7 +18,7 @@ from rti_mpc.array import Array
 from rti_mpc.control.envelope import INPUT_BOUNDS
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.linearization import WEIGHTS
-from rti_mpc.rti.ocp import Ocp, restless
+from rti_mpc.rti.ocp import Ocp, rest_fault
 from rti_mpc.rti.rti import Rti
 
 COMPILED_FIELDS = ("N", "N_u", "dt", "method")  # attributes of the Ocp that are compiled in
@@ -65,7 +65,7 @@ class Tuning:
         for name in COMPILED_BOUNDS:
             if not np.array_equal(np.isfinite(getattr(ocp, name)), np.isfinite(getattr(built, name))):
                 raise OcpError(f"{name} must be finite where it was built so, and only there, got {getattr(ocp, name)}: it is compiled in")
-        if wrong := restless(ocp):
+        if wrong := rest_fault(ocp):
             raise OcpError(wrong)
         self._wanted, self._wanted_version = ocp, version
         self._changed = True

@@ -168,7 +168,7 @@ class Ocp:
         for lower, upper in (("lbu", "ubu"), ("lbx", "ubx"), ("lh", "uh")):
             if not np.all(getattr(self, lower) < getattr(self, upper)):
                 raise OcpError(f"{lower} must lie below {upper}, got {getattr(self, lower)} and {getattr(self, upper)}")
-        if any(self.model.u_rest) and (wrong := restless(self)):
+        if any(self.model.u_rest) and (wrong := rest_fault(self)):
             raise OcpError(wrong)
         if np.any(self.lbdu > 0) or np.any(self.ubdu < 0):
             raise OcpError(f"lbdu <= 0 <= ubdu must hold, or no input could be kept, got {self.lbdu} and {self.ubdu}")
@@ -195,7 +195,7 @@ class Ocp:
         return ca.Function("phi", [model.x, model.u, model.p], [x_next], ["x", "u", "p"], ["x_next"])
 
 
-def restless(ocp: Ocp) -> str:
+def rest_fault(ocp: Ocp) -> str:
     """
     Return why a robot could not be brought to its rest input inside the bounds, empty if it can.
 

@@ -214,10 +214,10 @@ def softened_rows(ocp: Ocp, of: Stage, s: ca.SX, slip: ca.SX, du: ca.SX, slipped
     planned = value + of.G @ ca.vertcat(drift, slipped)
     found, paid = ca.SX(of.ng, 1), ca.SX(of.ng, 1)
     for j in range(of.ng):
-        over, under = exceeded(value[j], lg[j], ug[j], ocp.lg[j], ocp.ug[j])
-        exceeds = ca.fmax(*exceeded(planned[j], lg[j], ug[j], ocp.lg[j], ocp.ug[j]))
+        over, under = excess_of(value[j], lg[j], ug[j], ocp.lg[j], ocp.ug[j])
+        exceeds = ca.fmax(*excess_of(planned[j], lg[j], ug[j], ocp.lg[j], ocp.ug[j]))
         worst, share = ca.fmax(worst, exceeds), ca.fmax(share, exceeds / scale_g[j])
-        found[j] = belongs(place_g[j], stiff_g[j], scale_g[j], over, under, zg[j] / 2)
+        found[j] = new_place(place_g[j], stiff_g[j], scale_g[j], over, under, zg[j] / 2)
         changes += found[j] != place_g[j]
         by = ca.if_else(place_g[j] > 0, over, under)
         paid[j] = ca.sign(place_g[j]) * ca.if_else(ca.fabs(place_g[j]) == 2, (zg[j] + Zg[j] * by) / 2, stiff_g[j] * by)
@@ -248,11 +248,11 @@ def roll_free(ocp: Ocp, lin: Linearization) -> ca.Function:
     increment, u, before, place_u, place_du, lbu, ubu, lbdu, ubdu, stiff, scale = own = [ca.SX.sym(name, nu) for name in names]
     du = -(gain.K @ s + gain.kappa)
     # Clipping removes the small amount by which the penalty yields. States follow the clipped input, places do not: degenerate ones would cycle.
-    u_plan = met(u + du, before, lbu, ubu, lbdu, ubdu)
+    u_plan = clipped_input(u + du, before, lbu, ubu, lbdu, ubdu)
     symbols, outputs, verdict = softened_rows(ocp, of, s, slip, du, u_plan - u - du)
 
     def placed(value: ca.SX, place: ca.SX, lower: ca.SX, upper: ca.SX, lb: Any, ub: Any) -> ca.SX:
-        now = [belongs(place[j], stiff[j], scale[j], *exceeded(value[j], lower[j], upper[j], lb[j], ub[j]), INFINITY) for j in range(nu)]
+        now = [new_place(place[j], stiff[j], scale[j], *excess_of(value[j], lower[j], upper[j], lb[j], ub[j]), INFINITY) for j in range(nu)]
         return ca.densify(ca.vertcat(*now))
 
     planned = increment + du - s[of.nx :]
@@ -265,19 +265,19 @@ def roll_free(ocp: Ocp, lin: Linearization) -> ca.Function:
     return simplified("forward", inputs, {**outputs, "u_plan": u_plan, "verdict_after": ca.vertcat(*verdict)})
 
 
-def met(u: ca.SX, before: ca.SX, lbu: ca.SX, ubu: ca.SX, lbdu: ca.SX, ubdu: ca.SX) -> ca.SX:
+def clipped_input(u: ca.SX, before: ca.SX, lbu: ca.SX, ubu: ca.SX, lbdu: ca.SX, ubdu: ca.SX) -> ca.SX:
     """Return an input clipped exactly to its bounds, as an actuator needs it."""
     paced = ca.fmax(ca.fmin(u, before + ubdu), before + lbdu)
     return ca.fmax(ca.fmin(paced, ubu), lbu)
 
 
-def exceeded(value: ca.SX, lower: ca.SX, upper: ca.SX, lb: float, ub: float) -> tuple[ca.SX, ca.SX]:
+def excess_of(value: ca.SX, lower: ca.SX, upper: ca.SX, lb: float, ub: float) -> tuple[ca.SX, ca.SX]:
     """Return by how much a value is above its upper and below its lower bound; minus `INFINITY` where there is no bound."""
     absent = ca.SX(-INFINITY)
     return value - upper if np.isfinite(ub) else absent, lower - value if np.isfinite(lb) else absent
 
 
-def belongs(place: ca.SX, stiff: ca.SX, scale: ca.SX, over: ca.SX, under: ca.SX, most: ca.SX | float) -> ca.SX:
+def new_place(place: ca.SX, stiff: ca.SX, scale: ca.SX, over: ca.SX, under: ca.SX, most: ca.SX | float) -> ca.SX:
     """Return the new place of a value that exceeds its bounds by `over` and `under`; a pull above `most` places it beyond a softened bound."""
     tolerance = BOUND_TOLERANCE * scale
     side = ca.sign(place)
@@ -312,7 +312,7 @@ def refine(ocp: Ocp, recursion: Riccati, at: Sample, *, r: ca.MX, x_plan: ca.MX,
     beyond = side * (ca.repmat(lin.zg, 1, N) + ca.repmat(lin.Zg, 1, N) * by) / 2
     paid = ca.if_else(ca.fabs(place.g) == 2, beyond, (of_softened + weight * (excess + rows.g)) * (ca.fabs(place.g) == 1))
     force = of_increments + ca.repmat(stiff / lin.scale_u**2, 1, N_u) * (ca.fabs(place.du) == 1) * rows.du
-    clip, follow = met_function(nu), follow_function(lin)
+    clip, follow = clip_function(nu), follow_function(lin)
     last, change_k, inputs, states = lin.u_prev, ca.MX.zeros(of.nx), [], [x_plan[:, 0]]
     planned, A, B = columns(u_plan), columns(forms.A), columns(forms.B)
     for k in range(N):
@@ -331,7 +331,7 @@ def follow_function(lin: Linearization) -> ca.Function:
     return ca.Function("follow", [a, b, dx, du], [ca.densify(ca.SX(lin.A_k, a) @ dx + ca.SX(lin.B_k, b) @ du)])
 
 
-def met_function(nu: int) -> ca.Function:
-    """Return `met` as a function."""
+def clip_function(nu: int) -> ca.Function:
+    """Return `clipped_input` as a function."""
     symbols = [ca.SX.sym(name, nu) for name in ("u", "before", "lbu", "ubu", "lbdu", "ubdu")]
-    return ca.Function("met", symbols, [met(*symbols)])
+    return ca.Function("met", symbols, [clipped_input(*symbols)])

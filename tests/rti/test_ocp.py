@@ -12,7 +12,7 @@ import pytest
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.errors import OcpError
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
-from rti_mpc.rti.ocp import Ocp, restless
+from rti_mpc.rti.ocp import Ocp, rest_fault
 from rti_mpc.rti.rti import Rti
 from tests.problems import INF, PAPER, double_integrator, pioneer
 
@@ -86,9 +86,9 @@ def test_bounds_that_leave_out_a_declared_rest_are_refused_with_the_input_and_it
 def test_bounds_without_zero_are_a_problem_but_none_to_stop_a_robot_in() -> None:
     """The library may solve it; who stops robots refuses it."""
     ocp = pioneer(lbu=[0.2, -0.745])
-    assert "bounds of input u_c must hold its rest, 0 m/s" in restless(ocp)
-    assert "increments of input omega_c must hold lower < 0 < upper" in restless(pioneer(lbdu=[-0.25, 0.0]))
-    assert restless(pioneer()) == restless(pioneer(lbdu=-INF, ubdu=INF, lbu=-INF, ubu=INF)) == ""
+    assert "bounds of input u_c must hold its rest, 0 m/s" in rest_fault(ocp)
+    assert "increments of input omega_c must hold lower < 0 < upper" in rest_fault(pioneer(lbdu=[-0.25, 0.0]))
+    assert rest_fault(pioneer()) == rest_fault(pioneer(lbdu=-INF, ubdu=INF, lbu=-INF, ubu=INF)) == ""
     with pytest.raises(OcpError, match="u_c must hold its rest"):
         Controller(Rti(ocp, compile=False), Timing(), compile=False)
 

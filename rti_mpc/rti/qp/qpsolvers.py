@@ -66,10 +66,10 @@ class ForeignSolver:
         self._scaled = scaled = Scaled(qp)
         self._equal, self._above, self._below = scaled.sides()
         self._problem: Any = scaled.to_problem()
-        numbers = numbered(scaled)
+        numbers = indexed_problem(scaled)
         self._updates: list[Callable[[], None]] = []
         for matrix, data in (("P", scaled.P.data), ("G", scaled.A.data), ("A", scaled.A.data)):
-            made, update = following(getattr(numbers, matrix), data, dense)
+            made, update = updated_matrix(getattr(numbers, matrix), data, dense)
             setattr(self._problem, matrix, made)
             self._updates.append(update)
         self.call = partial(qpsolvers.solve_problem, self._problem, name, **SOLVER_TOLERANCES.get(name, {}))
@@ -160,7 +160,7 @@ def residuals(problem: Any, solution: qpsolvers.Solution) -> tuple[float, float]
     return float(primal), float(np.max(np.abs(problem.P @ x + problem.q + problem.G.T @ solution.z + problem.A.T @ solution.y)))
 
 
-def numbered(qp: QpData) -> qpsolvers.Problem:
+def indexed_problem(qp: QpData) -> qpsolvers.Problem:
     """Return the problem with, in its matrices, the index of the QP's nonzero that belongs there, counted from 1, negative where its sign changes."""
     kept = [(matrix, matrix.data.copy()) for matrix in (qp.P, qp.A)]
     for matrix, _ in kept:
@@ -171,8 +171,8 @@ def numbered(qp: QpData) -> qpsolvers.Problem:
     return problem
 
 
-def following(numbers: sp.csc_matrix[Any], data: Array, dense: bool) -> tuple[Any, Callable[[], None]]:
-    """Return a matrix, dense or sparse, for the indices that `numbered` gives, and the call that updates it in place from the data."""
+def updated_matrix(numbers: sp.csc_matrix[Any], data: Array, dense: bool) -> tuple[Any, Callable[[], None]]:
+    """Return a matrix, dense or sparse, for the indices that `indexed_problem` gives, and the call that updates it in place from the data."""
     matrix: Any = numbers.toarray(order="C") if dense else numbers.copy()
     values: Array = matrix.reshape(-1) if dense else matrix.data
     places = np.flatnonzero(values)

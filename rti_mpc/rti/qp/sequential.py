@@ -67,7 +67,7 @@ class Condensing:
 
         G, Phi, c = ca.MX(nx, 0), ca.MX(ca.DM.eye(nx)), ca.MX.zeros(nx)
         for k in range(N):
-            G = over(apply_A, min(k, N_u), [0])(lin.A[:, k], G) if k else G
+            G = over_blocks(apply_A, min(k, N_u), [0])(lin.A[:, k], G) if k else G
             B_k = dense_B(lin.B[:, k])
             G = ca.horzcat(G, B_k) if k < N_u else ca.horzcat(G[:, :-nu], G[:, -nu:] + B_k)
             Phi = on_state[0](lin.A[:, k], Phi)
@@ -84,10 +84,10 @@ class Condensing:
         for k in reversed(range(N)):
             blocks = min(k + 1, N_u)
             A_after = lin.A[:, k + 1] if k < N - 1 else ca.MX.zeros(lin.A_k.nnz())
-            W_G = over(apply_H_A, blocks, [0, 1])(lin.hessian[:, k], A_after, self.G[k], W_G[:, : nu * blocks])
+            W_G = over_blocks(apply_H_A, blocks, [0, 1])(lin.hessian[:, k], A_after, self.G[k], W_G[:, : nu * blocks])
             W_Phi = on_state[1](lin.hessian[:, k], A_after, self.Phi[k], W_Phi)
             W_c = on_defect[1](lin.hessian[:, k], A_after, self.c[k], W_c) + lin.gradient[:, k]
-            self.H[blocks - 1] += over(apply_B, blocks, [0])(lin.B[:, k], W_G)
+            self.H[blocks - 1] += over_blocks(apply_B, blocks, [0])(lin.B[:, k], W_G)
             M[blocks - 1] += on_state[2](lin.B[:, k], W_Phi)
             m[blocks - 1] += on_defect[2](lin.B[:, k], W_c)
         self.M, self.m = ca.vertcat(*M), ca.vertcat(*m)
@@ -106,7 +106,7 @@ def kernels(lin: Linearization, width: int) -> tuple[ca.Function, ca.Function, c
     )
 
 
-def over(function: ca.Function, blocks: int, shared: list[int]) -> ca.Function:
+def over_blocks(function: ca.Function, blocks: int, shared: list[int]) -> ca.Function:
     """Return a function mapped over blocks side by side; the arguments in `shared` are the same for all blocks."""
     return function if blocks == 1 else function.map(f"{function.name()}_{blocks}", "serial", blocks, shared, [], {})
 

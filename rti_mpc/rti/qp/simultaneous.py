@@ -29,12 +29,12 @@ from rti_mpc.rti.qp.transcription import (
     Transcription,
     clipped,
     data_functions,
-    each,
     finite,
     head,
     input_rows,
     measured_by,
     picked,
+    repeated_column,
 )
 
 
@@ -72,7 +72,7 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
     for bounds, limit, sign in ((ocp.ug, lin.ug, -1), (ocp.lg, lin.lg, 1)):
         at = finite(bounds) if ng else []
         if at:
-            side = each(limit[at], N)
+            side = repeated_column(limit[at], N)
             row = rows.add(None if sign < 0 else side, lin.g[at, :], side if sign < 0 else None, by_bound[at])
             places = [(row + i * len(at), nx + i * nx, to_du + min(i, N_u - 1) * nu) for i in range(N)]  # row, column of dx, column of du
             for column, values, sparsity in ((1, lin.g_x, lin.G_x), (2, lin.g_u, lin.G_u)):

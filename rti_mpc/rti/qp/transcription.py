@@ -150,7 +150,7 @@ def input_rows(ocp: Ocp, lin: Linearization, rows: BoundRows, A: Blocks, to_du: 
     for lb, value, ub, over in (("lbu", lin.u, "ubu", sp.eye_array(N_u)), ("lbdu", lin.increments, "ubdu", difference)):
         at = finite(getattr(ocp, lb), getattr(ocp, ub))
         if at:
-            row = rows.add(each(lin.w[lb][at], N_u), value[at, :], each(lin.w[ub][at], N_u), by_input[at])
+            row = rows.add(repeated_column(lin.w[lb][at], N_u), value[at, :], repeated_column(lin.w[ub][at], N_u), by_input[at])
             A.place(row, to_du, sp.kron(over, np.eye(nu)[at]))
 
 
@@ -173,7 +173,7 @@ def clipped(u: ca.MX, u_prev: ca.MX, w: dict[str, ca.MX]) -> ca.MX:
     clip = ca.Function("clip", [last, wanted, lbdu, ubdu, lbu, ubu], [met])
     if N_u > 1:
         clip = clip.mapaccum("clips", N_u)
-    return ca.MX(clip(u_prev, u, *(each(w[name], N_u) for name in ("lbdu", "ubdu", "lbu", "ubu"))))
+    return ca.MX(clip(u_prev, u, *(repeated_column(w[name], N_u) for name in ("lbdu", "ubdu", "lbu", "ubu"))))
 
 
 class Remembered:
@@ -213,7 +213,7 @@ class Remembered:
         worst = ca.Function("worst", [g, g_x, g_u, dx_i, du_i, lg, ug, scale], [ca.vertcat(*(ca.mmax(ca.vertcat(*of)) for of in (excess, shares)))])
         limits = (*softened_bounds(ocp, w), lin.scale_g)
         held = ca.horzcat(du, ca.repmat(du[:, -1], 1, N - ocp.N_u))
-        found = worst.map(N)(*self._parts, dx[:, 1:], held, *(each(limit, N) for limit in limits))
+        found = worst.map(N)(*self._parts, dx[:, 1:], held, *(repeated_column(limit, N) for limit in limits))
         return ca.vertcat(*(ca.mmax(row) for row in ca.vertsplit(found)))
 
 
@@ -239,7 +239,7 @@ def finite(*bounds: np.ndarray[Any, Any]) -> list[int]:
     return [int(j) for j in np.flatnonzero(np.any(np.isfinite(bounds), axis=0))]
 
 
-def each(column: ca.MX, times: int) -> ca.MX:
+def repeated_column(column: ca.MX, times: int) -> ca.MX:
     """Repeat a column for every stage."""
     return ca.repmat(column, 1, times)
 

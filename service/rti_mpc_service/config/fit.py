@@ -81,9 +81,9 @@ def check_rest(ocp: Ocp) -> None:
     Raises:
         ConfigError: The bounds of an input exclude its rest.
     """
-    from rti_mpc.rti.ocp import restless
+    from rti_mpc.rti.ocp import rest_fault
 
-    if wrong := restless(ocp):
+    if wrong := rest_fault(ocp):
         raise ConfigError(f"ocp.bounds: {wrong}")
 
 
