@@ -2,16 +2,19 @@
 r"""
 Blockage: obstacles or other softened bounds hold the robot, and its plans find no way round.
 
-A plan is blocked if it touches a softened bound and makes no progress over the whole
+A plan is blocked if something holds it and it makes no progress over the whole
 horizon, compared with the distance to the reference that remains at its end,
 
 .. math::
 
     \|y_N - y_0\|_Q < \epsilon \, \|y_{ref,N} - y_N\|_Q .
 
-The weight of the cost makes this a ratio without a unit. One such plan is a robot
-that hesitates. The robot is blocked after N such plans in a row, N being the horizon
-in stages, and free again after N plans in a row that are not blocked.
+The weight of the cost makes this a ratio without a unit. A plan is held by a general
+constraint that it touches, such as an obstacle's, or by the bound of a state that is an
+output, if the plan ends there and the reference lies beyond. Any other bound may be
+touched by standing alone, as v >= 0 is by a robot that cannot reverse. One such plan is
+a robot that hesitates. The robot is blocked after N such plans in a row, N being the
+horizon in stages, and free again after N plans in a row that are not blocked.
 """
 
 from __future__ import annotations
@@ -21,7 +24,9 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind, function
-from rti_mpc.rti.rti import Rti
+from rti_mpc.rti.linearization import constraints
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.rti import TOUCHING_DISTANCE, Rti
 
 MIN_PROGRESS_RATIO = 0.05  # epsilon, without a unit: a plan that passes an obstacle stays above 1, a blocked one is near 0.001
 
@@ -35,19 +40,32 @@ class Blockage:
     """
 
     def __init__(self, rti: Rti) -> None:
+        ocp = rti.ocp
         self.blocked = False
-        self._rti = rti
+        self._stages = ocp.N
         self._contrary = 0
         self._squares: Array = np.zeros(2)
-        self._measure = bind(progress(rti), {"x": rti.x, "y_ref": rti.y_ref, "p": rti.p}, {"squares": self._squares})
+        self._names = [ocp.model.states[j].name for _, j in bounded_outputs(ocp)] + [""] * ocp.h_expr.numel()
+        self._held: Array = np.zeros(len(self._names))
+        sample = {"x": rti.x, "u": rti.u, "y_ref": rti.y_ref, "p": rti.p, "scale": rti.scale}
+        weights = {name: rti.guess.weights[name] for name in ("lbx", "ubx", "lh", "uh")}
+        self._measure = bind(progress(ocp), sample | weights, {"squares": self._squares, "held": self._held})
+
+    @property
+    def cause(self) -> str:
+        """What holds the plan that was looked at last, in words."""
+        names = dict.fromkeys(name for name, held in zip(self._names, self._held, strict=True) if held > 0.0)
+        beyond = ", ".join(name for name in names if name)
+        reasons = (f"the reference lies beyond the bounds of {beyond}" if beyond else "", "an obstacle or constraint holds it" if "" in names else "")
+        return " and ".join(filter(None, reasons))
 
     def look(self) -> bool:
         """Judge the plan of a new sample, and return whether `blocked` has changed."""
         self._measure()
         moved, left = self._squares
-        standing = self._rti.touches and bool(moved < MIN_PROGRESS_RATIO**2 * left)
+        standing = bool(moved < MIN_PROGRESS_RATIO**2 * left and self._held.max(initial=0.0) > 0.0)
         self._contrary = self._contrary + 1 if standing is not self.blocked else 0
-        if self._contrary < self._rti.ocp.N:
+        if self._contrary < self._stages:
             return False
         self.blocked = standing
         self._contrary = 0
@@ -59,12 +77,40 @@ class Blockage:
         self._contrary = 0
 
 
-def progress(rti: Rti) -> ca.Function:
-    """Build ``(x, y_ref, p) -> [|y_N - y_0|^2, |y_ref,N - y_N|^2]``, both weighted by Q."""
-    model, N, Q = rti.ocp.model, rti.ocp.N, ca.DM(rti.ocp.Q)
-    x, y_ref, p = ca.MX.sym("x", model.nx, N + 1), ca.MX.sym("y_ref", model.ny, N), ca.MX.sym("p", model.np_, N + 1)
+def bounded_outputs(ocp: Ocp) -> list[tuple[int, int]]:
+    """Return pairs of an output and the state that it is, by index, of those states that are bounded."""
+    names = [state.name for state in ocp.model.states]
+    pairs = [(i, names.index(name)) for i, name in enumerate(ocp.model.counterparts()["outputs"]) if name]
+    return [(i, j) for i, j in pairs if j in ocp.soft]
+
+
+def progress(ocp: Ocp) -> ca.Function:
+    """
+    Build ``(x, u, y_ref, p, scale, lbx, ubx, lh, uh) -> (squares, held)``.
+
+    ``squares`` is ``[|y_N - y_0|^2, |y_ref,N - y_N|^2]``, both weighted by Q; ``held`` is above 0 where the plan is held: first the
+    bounds of `bounded_outputs`, then the general constraints.
+    """
+    model, N, Q, nh = ocp.model, ocp.N, ca.DM(ocp.Q), ocp.h_expr.numel()
+    x, u, y_ref = ca.MX.sym("x", model.nx, N + 1), ca.MX.sym("u", model.nu, ocp.N_u), ca.MX.sym("y_ref", model.ny, N)
+    p, scale = ca.MX.sym("p", model.np_, N + 1), ca.MX.sym("scale", model.nx + model.nu + len(ocp.lg))
+    lbx, ubx, lh, uh = (ca.MX.sym(name, size) for name, size in (("lbx", model.nx), ("ubx", model.nx), ("lh", nh), ("uh", nh)))
     output = model.h()
     start, end = output(x[:, 0], p[:, -1]), output(x[:, -1], p[:, -1])  # both outputs with the parameters of one time: a moving beacon is no progress
     moved, left = end - start, y_ref[:, -1] - end
     squares = ca.vertcat(ca.bilin(Q, moved, moved), ca.bilin(Q, left, left))
-    return function("progress", {"x": x, "y_ref": y_ref, "p": p}, {"squares": squares})
+    held = [
+        ca.fmax(
+            ca.fmin(x[j, -1] - ubx[j] + TOUCHING_DISTANCE * scale[j], y_ref[i, -1] - ubx[j]),
+            ca.fmin(lbx[j] - x[j, -1] + TOUCHING_DISTANCE * scale[j], lbx[j] - y_ref[i, -1]),
+        )
+        for i, j in bounded_outputs(ocp)
+    ]
+    if nh:
+        constraint, *_ = constraints(ocp)
+        u_held = ca.horzcat(u, ca.repmat(u[:, -1], 1, N - ocp.N_u))
+        g = constraint.map(N)(x[:, 1:], u_held, p[:, 1:])[len(ocp.soft) : len(ocp.lg), :]
+        near = TOUCHING_DISTANCE * scale[-nh:]
+        held += [ca.mmax(ca.fmax(g[k, :] - uh[k], lh[k] - g[k, :])) + near[k] for k in range(nh)]
+    inputs = {"x": x, "u": u, "y_ref": y_ref, "p": p, "scale": scale, "lbx": lbx, "ubx": ubx, "lh": lh, "uh": uh}
+    return function("progress", inputs, {"squares": squares, "held": ca.densify(ca.vertcat(*held))})

@@ -361,7 +361,8 @@ class Controller:
         if self.mode not in (Mode.TRACKING, Mode.HOLDING) or not self._blockage.look():
             return
         if self._blockage.blocked:
-            self._modes.say(Severity.WARNING, "blocked", "the way is blocked: the plan stands still at a softened bound, short of the reference")
+            text = f"the way is blocked: the plan stands still short of the reference, {self._blockage.cause}"
+            self._modes.say(Severity.WARNING, "blocked", text)
         else:
             self._modes.say(Severity.INFO, "free", "the way is free again")
 

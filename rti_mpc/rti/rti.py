@@ -386,11 +386,6 @@ class Rti:
         """Largest amount by which the plan exceeds a softened bound, in the unit of that bound; 0 if it exceeds none."""
         return max(0.0, float(self._violation[0]))
 
-    @property
-    def touches(self) -> bool:
-        """Whether the last plan is at a softened bound or beyond it."""
-        return bool(self._violation[1] > -TOUCHING_DISTANCE)
-
 
 def check_options(solver: str, settings: SolverSettings | None, iterations: int, tolerance: float) -> None:
     """
