@@ -12,9 +12,10 @@ WARM_UP_SOLVES = 20  # before the first command: the first real sample must not 
 
 
 def warm_up(rti: Rti) -> None:
-    """Solve a few samples at rest."""
+    """Solve a few samples of a robot that begins at rest and does what the plan says: one held in place would fall in its plans, out of all range."""
     x0: Array = np.zeros(rti.ocp.model.nx)
     rti.reset(x0, rti.u_prev.copy())
     for _ in range(WARM_UP_SOLVES):
         rti.prepare(rti.y_ref.copy())
         rti.feedback(x0)
+        x0[:] = rti.x[1]

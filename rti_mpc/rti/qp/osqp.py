@@ -32,6 +32,7 @@ STATUS_BY_OSQP_CODE = {
     8: QpStatus.TIME_LIMIT,
 }
 
+MAX_ENTRY = 1e7  # of a scaled matrix: beyond it the factorization is rounding alone, and OSQP prints a line on standard output
 ACTING_MULTIPLIER = 1e-6  # a softened bound with a larger multiplier acts; those of the others are exactly zero
 ACTING_ROW_SCALE = 30.0  # factor on the row of such a bound: its step size becomes that of an equation, about 1000 times that of others
 
@@ -114,6 +115,9 @@ class Solver:
         if not self._sound:  # OSQP would never recover from such numbers
             return
         scaled.matrices()
+        self._sound = all(matrix.data @ matrix.data < MAX_ENTRY**2 for matrix in (scaled.P, scaled.A))
+        if not self._sound:
+            return
         changed = qp.varies_A or self._P_x is not None
         if self._A_x is not scaled.A.data:
             changed |= self._weigh()

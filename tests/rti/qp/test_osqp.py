@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 import osqp
 import pytest
 
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
+from rti_mpc.model.model import Model, Signal
+from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.osqp import STATUS_BY_OSQP_CODE, SolverSettings
 from rti_mpc.rti.rti import FORMULATIONS, Rti
 from tests.problems import beacon, double_integrator, solve
@@ -122,6 +125,33 @@ def test_data_that_osqp_refuses_is_a_failure_not_a_solve_of_what_it_held_before(
     assert one.feedback(np.zeros(2)) is QpStatus.FAILED
     one.prepare(np.zeros((10, 2)), shift=False)
     assert one.feedback(np.zeros(2)) is QpStatus.SOLVED
+
+
+def test_matrix_that_cannot_be_factorized_is_a_failure_and_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    """OSQP would print a line of its own, in the middle of a log."""
+    x, u, p = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("p", 4)
+    states = (Signal("r", "m"), Signal("v", "m/s"))
+    any_linear = Model(
+        name="any_linear",
+        x=x,
+        u=u,
+        p=p,
+        f_expl_expr=ca.reshape(p, 2, 2) @ x + ca.vertcat(x[1], u),
+        y_expr=x[0],
+        states=states,
+        inputs=(Signal("a", "m/s^2"),),
+        outputs=states[:1],
+        parameters=tuple(Signal(f"p_{i}", "1/s") for i in range(4)),
+        p_nominal=(0.0,) * 4,
+    )
+    one = Rti(Ocp(any_linear, N=5, dt=0.1, Q=[1], R=[1], lbu=-1.0, ubu=1.0), solver="osqp", compile=False)
+    rng = np.random.default_rng(1)
+    for _ in range(60):
+        one.prepare(one.y_ref.copy(), rng.normal(size=(6, 4)) * 10 ** rng.uniform(1.0, 5.0, (6, 1)))
+        one.feedback(np.zeros(2))
+    one.prepare(one.y_ref.copy(), np.zeros((6, 4)))
+    assert one.feedback(np.zeros(2)) is QpStatus.SOLVED
+    assert capfd.readouterr() == ("", "")
 
 
 def test_iteration_limit_is_a_usable_status() -> None:
