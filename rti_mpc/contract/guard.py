@@ -121,7 +121,7 @@ class Guard:
         self._stopped = False
         self._latched = ""  # why an operator's stop is latched
         self._rest_by_ns = BEFORE_ALL_NS  # robot time from which a latched guard passes only commands at rest, and no way to rest any more
-        self._waiting = False  # whether the notice that commands wait for `_open_ns` was given
+        self._waits = ""  # what commands wait for, as the last notice said
 
     def robot_now_ns(self, local_ns: int) -> int:
         """Return robot time at a local monotonic time, 0 before the first state."""
@@ -181,6 +181,14 @@ class Guard:
             The command to publish at once; None if it is refused.
         """
         self._wake(local_ns)
+        if self._stopped:
+            return None
+        if self._state is None:
+            self._wait("a state of the robot is heard")
+            return None
+        if not (self._cadence.known or self._cadence.fault):
+            self._wait("two states have shown how fast the clock of the robot runs")
+            return None
         now_ns = self._clock.now_ns(local_ns)
         until_ns = min(end_ns(command), command.state_stamp_ns + self._delay_ns + MAX_VALID_NS)
         reason = self._objection(command, now_ns, until_ns)
@@ -188,9 +196,7 @@ class Guard:
             self._follow(command)
             self._led_ns = now_ns
             if now_ns < self._open_ns:
-                if not self._waiting:
-                    self._say(Severity.INFO, "guard_starting", "commands wait until what an earlier guard may have told the robot has run out")
-                self._waiting = True
+                self._wait("what an earlier guard may have told the robot has run out")
                 return None
         if reason:
             code, _, why = reason.partition(": ")
@@ -204,11 +210,18 @@ class Guard:
         if (np.abs(passed.u - u) > INPUT_ROUNDING).any():
             text = f"command {command.seq} of epoch {command.epoch} begins too far from what acts: approached inside the slew limits"
             self._say(Severity.WARNING, "slew_limited", text)
+        self._waits = ""
         if not self.passing:
             self.passing = True
             self._say(Severity.INFO, "guard_passing", f"commands of epoch {command.epoch} pass", change=True)
         self._engaged, self._told_ns = True, until_ns
         return passed
+
+    def _wait(self, until: str) -> None:
+        """Refuse a command while this guard starts, which is no fault: one notice per cause."""
+        if self._waits != until:
+            self._say(Severity.INFO, "guard_starting", f"commands wait until {until}")
+        self._waits = until
 
     def tick(self, local_ns: int) -> Command | None:
         """
@@ -305,14 +318,11 @@ class Guard:
     def _objection(self, command: Command, now_ns: int, until_ns: int) -> str:
         """Return what is wrong with a command, as a code that a reason may follow; empty if nothing is."""
         limits, epoch, seq = self._limits, *self._leader
-        if self._state is None:
-            return "no_state: no state of the robot was heard yet"
-        if self._stopped:
-            return "stopped: the guard is being stopped"
+        assert self._state is not None, "commands wait for the first state"
         if self._lives.disputed:
             return "two_robots: it is not known which robot it is for"
-        if not self._cadence.known:
-            return f"untimed: {self._cadence.fault or 'two states must have shown how fast the clock of the robot runs'}"
+        if self._cadence.fault:
+            return f"untimed: {self._cadence.fault}"
         if self._untold:
             return "held: the robot is told to brake first"
         if command.epoch < epoch:
@@ -395,7 +405,7 @@ class Guard:
     def _wake(self, local_ns: int) -> None:
         """Report if this process was held up; messages that have waited meanwhile are judged by their age as always."""
         held_up_ns = local_ns - self._awake_ns
-        if self._awake_ns and held_up_ns > HELD_UP_NS:
+        if self._engaged and held_up_ns > HELD_UP_NS:  # before, nobody depends on it
             self._say(Severity.WARNING, "guard_held_up", f"the guard was held up for {1e-9 * held_up_ns:.3f} s")
         self._awake_ns = local_ns
 

@@ -474,13 +474,31 @@ def test_starting_guard_waits_until_what_another_one_told_the_robot_has_run_out(
     scene.drive(1000)
     scene.send()
     scene.power_up()
-    codes = []
+    notices = []
     while not scene.send(np.zeros(2)):
-        codes += scene.said()
+        notices += scene.guard.notices
+        scene.guard.notices.clear()
         scene.wait(100)
-    assert set(codes) == {"command_no_state", "command_untimed", "guard_starting"}
+    assert {(notice.severity, notice.code) for notice in notices} == {(Severity.INFO, "guard_starting")}, "a start is no fault"
+    assert len({notice.text for notice in notices}) == len(notices) == 3, "each is said once: no state yet, one state yet, another guard's way"
     assert scene.actuator.at_rest
     assert scene.said() == ["guard_passing"]
+
+
+def test_guard_that_is_held_up_before_a_robot_depends_on_it_says_nothing(scene: Scene) -> None:
+    scene.power_up()
+    for _ in range(3):
+        scene.local_ns += 1000 * MS
+        scene.wait(100)
+    assert "guard_held_up" not in scene.said()
+
+
+def test_guard_that_is_being_stopped_passes_nothing_and_complains_of_nobody(scene: Scene) -> None:
+    scene.drive(1000)
+    scene.said()
+    scene.guard.stop(scene.local_ns)
+    assert scene.send() is None
+    assert scene.said() == []
 
 
 def test_starting_guard_learns_who_leads_before_anything_passes() -> None:
