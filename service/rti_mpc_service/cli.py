@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 import rti_mpc
 from rti_mpc.errors import ConfigError
@@ -44,6 +44,17 @@ class Commands(TyperGroup):
         rows = [(name, self.commands[name].get_short_help_str(limit=sys.maxsize)) for name in self.list_commands(ctx)]
         with formatter.section("Commands"):
             formatter.write_dl(rows)
+
+
+class FaultsCommand(TyperCommand):
+    """Command whose help lists the faults there are."""
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Write the list of faults, loaded only where it is asked for."""
+        from rti_mpc_service.faults.table import FAULTS
+
+        with formatter.section("Faults"):
+            formatter.write_dl([(fault.name, fault.text) for fault in FAULTS])
 
 
 app = typer.Typer(
@@ -294,10 +305,10 @@ def demo(
     raise typer.Exit(main(load(config), scenario, heading=heading, speed=speed, duration_s=duration, folder=out, viewer=viewer, guard=guard))
 
 
-@app.command()
+@app.command(cls=FaultsCommand)
 def faults(
     config: ConfigPath = SHIPPED,
-    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="One fault of the matrix; repeatable.", show_default="all")] = None,
+    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="One fault of those below; repeatable.", show_default="all")] = None,
     path: JsonPath = None,
 ) -> None:
     """Break every part of a running system in turn, and print what the robot did: the fault matrix."""

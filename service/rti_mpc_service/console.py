@@ -10,5 +10,10 @@ MIN_WIDTH_COLUMNS = 140  # a narrower terminal wraps lines, which loses nothing;
 
 def table_console() -> Console:
     """Return a console of at least `MIN_WIDTH_COLUMNS` columns."""
-    console = Console()
-    return console if console.width >= MIN_WIDTH_COLUMNS else Console(width=MIN_WIDTH_COLUMNS)
+    return widened(Console())
+
+
+def widened(console: Console) -> Console:
+    """Give a console at least `MIN_WIDTH_COLUMNS` columns from now on; not while something is redrawn on it, which must fit the terminal."""
+    console.width = max(console.width, MIN_WIDTH_COLUMNS)
+    return console

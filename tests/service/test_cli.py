@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.cli import SHIPPED, app
+from rti_mpc_service.faults.table import FAULTS
 from tests.in_time import awake_ms
 from tests.robots import toml
 
@@ -152,6 +153,12 @@ def test_list_of_commands_holds_whole_sentences_on_a_narrow_terminal() -> None:
     for command in typer.main.get_group(app).commands.values():
         assert command.get_short_help_str(limit=1000) in " ".join(done.stdout.split())
     assert max(len(line) for line in done.stdout.splitlines()) <= 80
+
+
+def test_help_of_faults_names_each_with_what_is_done_to_whom() -> None:
+    shown = " ".join(rti_mpc("faults", "--help", COLUMNS="80").stdout.split())
+    for fault in FAULTS:
+        assert f"{fault.name} {fault.text}" in shown
 
 
 def test_version_names_what_decides_what_a_command_does() -> None:

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
@@ -32,6 +31,7 @@ from rti_mpc_service.config.build import build_rti, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_stop
 from rti_mpc_service.config.schema import Config
+from rti_mpc_service.console import table_console
 from rti_mpc_service.rig.wave import wave
 
 WAVE_SAMPLES = 200
@@ -80,7 +80,7 @@ def main(path: Path) -> int:
     """Check a configuration, print what was found, and return the exit status: 0 if every sample was usable and both solvers agree."""
     config = load(path)
     check_stop(config)
-    console = Console()
+    console = table_console()
     report = check(config, track(range(WAVE_SAMPLES), "solving", console=console, transient=True, disable=not console.is_terminal))
     table = Table("phase, us", "p50", "p99", "max")
     for phase, times in (("preparation", report.prepare_us), ("feedback", report.feedback_us)):

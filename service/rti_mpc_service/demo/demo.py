@@ -35,6 +35,7 @@ from rti_mpc_service.config import toml
 from rti_mpc_service.config.build import build_ocp
 from rti_mpc_service.config.fit import check_stop
 from rti_mpc_service.config.schema import Config
+from rti_mpc_service.console import widened
 from rti_mpc_service.demo.board import Board, print_summary
 from rti_mpc_service.host import machine
 from rti_mpc_service.host.echo import ROLE as ECHO
@@ -136,7 +137,7 @@ def main(config: Config, scenario: str, **options: Any) -> int:
     except Failed as error:
         console.print(f"rti-mpc: {error}", soft_wrap=True, markup=False)
         return 1
-    return conclude(run, outcome, console)
+    return conclude(run, outcome, widened(console))
 
 
 def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:

@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from rti_mpc.array import Array
@@ -37,6 +36,7 @@ from rti_mpc.wire.cdr import encode
 from rti_mpc_service.config.build import build_model, build_rti, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
+from rti_mpc_service.console import table_console
 from rti_mpc_service.host import machine, realtime
 from rti_mpc_service.host.echo import ROLE as ECHO
 from rti_mpc_service.host.echo import Pinger
@@ -61,7 +61,7 @@ EXTRA_OF_PACKAGE = {"rerun-sdk": "view", "matplotlib": "figure"}
 def main(path: Path, json_path: Path | None = None) -> int:
     """Examine this host, print what was found, and return the exit status: 0 if the configuration's period can be kept."""
     config = load(path)
-    console = Console()
+    console = table_console()
     with console.status("measuring"):
         report = examine(config)
     if json_path is not None:

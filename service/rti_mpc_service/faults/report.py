@@ -11,6 +11,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from rti_mpc_service.console import widened
 from rti_mpc_service.faults.measure import Measured
 from rti_mpc_service.faults.table import Fault
 from rti_mpc_service.host import machine
@@ -18,7 +19,6 @@ from rti_mpc_service.redrawn import Redrawn
 
 COLUMNS = ("fault", "the robot", "speed\nm/s", "braking\nms", "zero\nms", "standstill\ns", "way\nm", "step\n%", "error\nmm", "recovery\ns", "kept")
 NO_VALUE = "-"
-MATRIX_WIDTH_COLUMNS = 130
 
 
 @dataclass(frozen=True)
@@ -92,12 +92,6 @@ def number_text(value: float | None, factor: float, digits: int) -> str:
     return NO_VALUE if value is None else f"{factor * value:.{digits}f}"
 
 
-def report_console() -> Console:
-    """Return a console, wide enough for the matrix where there is no terminal."""
-    console = Console()
-    return console if console.is_terminal else Console(width=MATRIX_WIDTH_COLUMNS)
-
-
 class MatrixReport(Redrawn):
     """
     Shows the matrix while it grows.
@@ -132,7 +126,7 @@ class MatrixReport(Redrawn):
 
     def conclude(self) -> None:
         """Print the whole table, and the broken or excused limits."""
-        self.console.print(self._table())
+        widened(self.console).print(self._table())
         for row in self.rows:
             if words := [*row.broken, *row.excused]:
                 self.console.print(f"{row.fault.name}: {row.fault.promise.text}: {'; '.join(words)}", soft_wrap=True, markup=False)

@@ -14,11 +14,13 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
+from difflib import get_close_matches
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Event
 
 import numpy as np
+from rich.console import Console
 
 from rti_mpc.contract.guard import Limits
 from rti_mpc.errors import ConfigError
@@ -31,7 +33,7 @@ from rti_mpc_service.config.schema import Config
 from rti_mpc_service.faults.excuse import excuses, explained
 from rti_mpc_service.faults.measure import Incident, measure, missed_ns, positions
 from rti_mpc_service.faults.relay import ROLE as RELAY
-from rti_mpc_service.faults.report import MatrixReport, MatrixRow, report_console
+from rti_mpc_service.faults.report import MatrixReport, MatrixRow
 from rti_mpc_service.faults.system import HEADING, SCENARIO, System, Wiring, measured_places
 from rti_mpc_service.faults.table import FAULTS, Fault
 from rti_mpc_service.host.hold_up import Host
@@ -71,7 +73,7 @@ def main(config_path: Path, only: Sequence[str], path: Path | None) -> int:
     config = prepared(load(config_path))
     stop = stop_on_signals()
     folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
-    with Host() as host, MatrixReport(console := report_console(), len(faults)) as report:
+    with Host() as host, MatrixReport(console := Console(), len(faults)) as report:
         inject(config, faults, folder, report, stop, host)
     report.conclude()
     if report.kept:
@@ -93,7 +95,9 @@ def chosen(only: Sequence[str]) -> list[Fault]:
     """
     names = [fault.name for fault in FAULTS]
     if unknown := [name for name in only if name not in names]:
-        raise ConfigError(f"--only must be one of {', '.join(names)}, got {unknown[0]!r}")
+        near = get_close_matches(unknown[0], names, n=1)
+        about = next((f"perhaps {fault.name} is meant ({fault.text})" for fault in FAULTS if fault.name in near), "")
+        raise ConfigError(f"--only must be the name of a fault, {about or 'the names are in: rti-mpc faults --help'}, got {unknown[0]!r}")
     faults = [fault for fault in FAULTS if fault.name in only or not only]
     if find_spec("rerun") is not None:
         return faults

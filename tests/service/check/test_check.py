@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from rti_mpc.contract.status import QpStatus
 from rti_mpc_service.check import check
+from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
 from tests.service.config.test_config import MINIMAL
 
@@ -66,3 +68,13 @@ def test_a_bound_that_gives_way_is_told(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr("rti_mpc.rti.active_set.PENALTY_PATH", (10.0,))
     report = check.check(load(path))
     assert not report.agree or sum(report.statuses.values()) > report.statuses[QpStatus.SOLVED]
+
+
+def test_no_number_is_cut_off_in_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    times = np.array([123456789.0])
+    report = check.CheckReport(times, times, Counter({QpStatus.SOLVED: 1}), "daqp", 1, 0.0, 0.0, 0, [])
+    monkeypatch.setenv("COLUMNS", "20")
+    monkeypatch.setattr(check, "check_stop", lambda config: None)
+    monkeypatch.setattr(check, "check", lambda config, samples: report)
+    assert check.main(SHIPPED) == 0
+    assert capsys.readouterr().out.count("123456789") == 6
