@@ -164,7 +164,7 @@ def goals(run: Row) -> str:
     rows = ({"name": name} | row for name, row in run["readings"]["goals"].items())
     columns: Sequence[Column] = (
         ("end", lambda row: {"continuous": "(-r √2, -r √2/2)", "jumping": "(-r √2, -r √2)"}[row["name"]]),
-        ("leap of the reference, mm", number_cell("jump_mm")),
+        ("jump of the reference, mm", number_cell("jump_mm")),
         ("error at the end, mm", number_cell("end_mm")),
     )
     return table(rows, columns)
