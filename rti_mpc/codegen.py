@@ -132,7 +132,7 @@ def bind(function: ca.Function, inputs: Mapping[str, Array], outputs: Mapping[st
         for i, name in enumerate(names):
             array = arrays[name]
             if array.dtype != np.float64 or not array.flags.c_contiguous or array.size != sparsity(i).nnz():
-                raise ShapeError(f"{function.name()}: {name}", sparsity(i).shape[::-1], array)
+                raise ShapeError(f"{function.name()}: {name}", sparsity(i).shape[::-1], array, "a C-contiguous float64 array")
             attach(i, array.data)
 
     evaluate.memory = (buffer, *inputs.values(), *outputs.values())  # type: ignore[attr-defined] # lives as long as the call

@@ -37,11 +37,11 @@ class ShapeError(OcpError):
         got: Shape received.
     """
 
-    def __init__(self, name: str, expected: tuple[int, ...], array: NDArray[np.generic]) -> None:
+    def __init__(self, name: str, expected: tuple[int, ...], array: NDArray[np.generic], kind: str = "an array") -> None:
         self.name = name
         self.expected = expected
         self.got = array.shape
-        super().__init__(f"{name} must be a C-contiguous float64 array of shape {expected}, got {array.dtype} of shape {array.shape}")
+        super().__init__(f"{name} must be {kind} of shape {expected}, got {array.dtype} of shape {array.shape}")
 
 
 class ConfigError(RtiMpcError):

@@ -9,9 +9,12 @@ for people: nothing is inferred from names, units or the order of signals.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
+
+from rti_mpc import given
+from rti_mpc.errors import OcpError
 
 Role = Literal["", "x", "y", "heading", "axle_offset", "disc_x", "disc_y", "disc_radius"]
 
@@ -39,6 +42,9 @@ class Signal:
         role: Of states and outputs ``"x"``, ``"y"`` (position in the plane, m) and ``"heading"`` (an angle, from the x axis to the left); of a
             parameter ``"axle_offset"``: distance in m from the axle ahead to the point whose position this is. Empty: none of these.
         commands: Of an input, the name of the state that follows it, a speed; empty: none.
+
+    Raises:
+        OcpError: A field is of the wrong type, or the name is empty.
     """
 
     name: str
@@ -46,6 +52,31 @@ class Signal:
     angle: bool = False
     role: Role = ""
     commands: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the types, which nothing behind this checks again."""
+        for field, right in (("name", str), ("unit", str), ("angle", bool), ("role", str), ("commands", str)):
+            if not isinstance(value := getattr(self, field), right):
+                words = "text" if right is str else "true or false"
+                raise OcpError(f"{field} of the signal {given.quoted(self.name)} must be {words}, got {given.quoted(value)}")
+        if not self.name.strip():
+            raise OcpError(f"name of a signal must not be empty, got {self.name!r}")
+
+
+def signals(vector: str, given_as: Any) -> tuple[Signal, ...]:
+    """
+    Return signals from these or from their names alone, of which nothing else is known then; from one of them for a vector of one.
+
+    Raises:
+        OcpError: One is neither.
+    """
+    entries = (given_as,) if isinstance(given_as, str | Signal) else given_as
+    if not isinstance(entries, Iterable):
+        raise OcpError(f"{vector} must be signals or their names, got {given.quoted(entries)}")
+    found = tuple(Signal(entry, "1") if isinstance(entry, str) else entry for entry in entries)
+    if wrong := [entry for entry in found if not isinstance(entry, Signal)]:
+        raise OcpError(f"{vector} must be signals or their names, got {given.quoted(wrong[0])} among them")
+    return found
 
 
 class HasRole(Protocol):

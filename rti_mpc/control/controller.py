@@ -21,6 +21,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.contract.guard import Limits
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Notice, Reference, Severity, State, Telemetry
@@ -79,7 +80,8 @@ class Controller:
     def __init__(
         self, rti: Rti, timing: Timing, *, epoch: int = 1, config_hash: int = 0, observer: Observer | None = None, compile: bool = True
     ) -> None:
-        ocp, model = rti.ocp, rti.ocp.model
+        given.instance("timing", timing, Timing)
+        ocp, model = given.instance("rti", rti, Rti).ocp, rti.ocp.model
         if wrong := rest_fault(ocp):
             raise OcpError(wrong)
         self._rti = rti
@@ -157,7 +159,14 @@ class Controller:
 
         Returns:
             The command to publish at once, as a proposal; None if no sample is due, and the state is only kept as the newest.
+
+        Raises:
+            OcpError: It is no `State`; one from the bus has been checked.
+            ShapeError: Its vectors are not the model's.
         """
+        given.array("state.x", given.instance("state", state, State).x, self._x0.shape)
+        if len(state.u):
+            given.array("state.u", state.u, self._u_rest.shape)
         arrival = self._states.receive(state, arrival_ns)
         if (notice := self._states.notice) is not None:
             self.say(notice)
@@ -201,7 +210,11 @@ class Controller:
 
         Returns:
             The reference with its real stamp, to be published, if it starts on arrival and a state has arrived; else None.
+
+        Raises:
+            OcpError: It is no `Reference`; one that does not fit is refused by a notice.
         """
+        given.instance("reference", reference, Reference)
         if misfit := self._track.misfit(reference, self.np_):
             self._modes.say(Severity.WARNING, "reference_refused", misfit)
             return None

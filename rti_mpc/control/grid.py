@@ -10,7 +10,11 @@ nor double a sample.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
+from rti_mpc import given
+from rti_mpc.errors import OcpError
 
 MAX_LATENESS_PERIODS = 0.75  # a command may leave this long after the time at which it acts; the rest of the period is left to its transport
 MAX_DELAY_PERIODS = 3  # the largest delay that is measured
@@ -27,11 +31,22 @@ class Timing:
         delay_s: Delay from a state to the time at which its command acts, s; None to measure it.
         stale_s: Age from which a state is not used, s.
         valid_s: Time after its state, and after the delay, for which a command is valid, s.
+
+    Raises:
+        OcpError: One is no number, or out of range.
     """
 
     delay_s: float | None = 0.0
     stale_s: float = 0.225
     valid_s: float = 0.25
+
+    def __post_init__(self) -> None:
+        """Check the times."""
+        if self.delay_s is not None and not 0.0 <= given.number("delay_s", self.delay_s) < math.inf:
+            raise OcpError(f"delay_s must be a time of at least 0 s, or None, got {self.delay_s}")
+        for name in ("stale_s", "valid_s"):
+            if not 0.0 < given.number(name, value := getattr(self, name)) < math.inf:
+                raise OcpError(f"{name} must be a time above 0 s, got {value}")
 
 
 class Grid:

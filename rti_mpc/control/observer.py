@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
+from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled, function
 from rti_mpc.errors import OcpError
@@ -50,7 +51,7 @@ class ObserverSettings:
 
     Attributes:
         disturbances: Settings of each disturbance, by the name of an input or a state.
-        measured: Names of the states that are measured; empty if all are.
+        measured: Names of the states that are measured, or of the only one; empty if all are.
         noise: Standard deviation of measured states by name, in the state's unit; `DEFAULT_NOISE` if left out.
         process: Standard deviation of the random walk that is added to states, by name, in the state's unit / sqrt(s);
             `DEFAULT_PROCESS_NOISE` if left out.
@@ -60,6 +61,11 @@ class ObserverSettings:
     measured: tuple[str, ...] = ()
     noise: Mapping[str, float] = field(default_factory=dict)
     process: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Take one name for a tuple of it."""
+        if isinstance(self.measured, str):
+            object.__setattr__(self, "measured", (self.measured,))
 
 
 class Observer:
@@ -77,13 +83,18 @@ class Observer:
     """
 
     def __init__(self, model: Model, settings: ObserverSettings, *, compile: bool = True) -> None:
-        states = [signal.name for signal in model.states]
+        states = [signal.name for signal in given.instance("model", model, Model).states]
+        given.instance("settings", settings, ObserverSettings)
         for what, names in (("measured", settings.measured), ("noise", settings.noise), ("process", settings.process)):
             if unknown := [name for name in names if name not in states]:
-                raise OcpError(f"{what} must be of states ({', '.join(states)}), got {', '.join(unknown)}")
+                raise OcpError(f"{what} must be of states ({', '.join(states)}), got {', '.join(map(str, unknown))}")
         for name, of in settings.disturbances.items():
-            if not (of.drift > 0.0 and of.limit > 0.0):
+            given.instance(f"the disturbance of {name}", of, Disturbance)
+            if not all(given.number(f"{field} of the disturbance of {name}", getattr(of, field)) > 0.0 for field in ("drift", "limit")):
                 raise OcpError(f"drift and limit of the disturbance of {name} must be positive, got {of.drift} and {of.limit}")
+        for what, table in (("noise", settings.noise), ("process", settings.process)):
+            for name, value in table.items():
+                given.number(f"{what} of {name}", value)
         self.model = with_disturbances(model, settings.disturbances)
         nx, nd = model.nx, len(settings.disturbances)
         self._limits: Array = np.array([of.limit for of in settings.disturbances.values()])

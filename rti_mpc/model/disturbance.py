@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import casadi as ca
 
+from rti_mpc import given
 from rti_mpc.errors import OcpError
 from rti_mpc.model.model import Model, Signal
 
@@ -32,14 +33,17 @@ def with_disturbances(model: Model, names: Iterable[str]) -> Model:
         The model with parameters ``d_<name>`` at the end, nominally zero.
 
     Raises:
-        OcpError: A name is neither an input nor a state.
+        OcpError: A name is neither an input nor a state, or there twice.
     """
-    names = tuple(names)
+    given.instance("model", model, Model)
+    names = (names,) if isinstance(names, str) else tuple(names)
     if not names:
         return model
     inputs, states = [s.name for s in model.inputs], [s.name for s in model.states]
-    if unknown := [name for name in names if name not in (*inputs, *states)]:
+    if unknown := [str(name) for name in names if name not in (*inputs, *states)]:
         raise OcpError(f"a disturbance must be of an input ({', '.join(inputs)}) or of a state ({', '.join(states)}), got {', '.join(unknown)}")
+    if len(set(names)) < len(names):
+        raise OcpError(f"names of disturbances must be there once each, got {', '.join(names)}")
     d = ca.SX.sym("d", len(names))
     by_name = dict(zip(names, ca.vertsplit(d), strict=True))
     zero = ca.SX(0)

@@ -43,7 +43,7 @@ def find_model(name: str, folder: Path | None = None) -> Model:
         OcpError: There is no such model, its module cannot be imported, or the function returns none. One line, which names the user's file and line.
     """
     wanted = f"a model must be one of {', '.join(SHIPPED_MODELS)} or an importable package.module:function of your own, got {name!r}"
-    match = MODEL_NAME_PATTERN.fullmatch(SHIPPED_MODELS.get(name, name))
+    match = MODEL_NAME_PATTERN.fullmatch(SHIPPED_MODELS.get(name, name)) if isinstance(name, str) else None
     if match is None:
         raise OcpError(wanted)
     module_name, function_name = match.groups()

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from rti_mpc.errors import OcpError
+from rti_mpc import given
 from rti_mpc.model.model import Model
 
 # Butcher tableaus (A, b) of the explicit schemes: Euler is equation (11) of [Rosales]_.
@@ -30,10 +30,9 @@ def integrator(model: Model, method: str = "rk4", substeps: int = 1) -> ca.Funct
     Raises:
         OcpError: The method is unknown, or `substeps` is below 1.
     """
-    if method not in TABLEAUS:
-        raise OcpError(f"integrator must be one of {', '.join(TABLEAUS)}, got {method!r}")
-    if substeps < 1:
-        raise OcpError(f"substeps must be at least 1, got {substeps}")
+    given.instance("model", model, Model)
+    given.one_of("integrator", method, TABLEAUS)
+    substeps = given.whole("substeps", substeps, 1)
     rows, weights = TABLEAUS[method]
     f = ca.Function("f", [model.x, model.u, model.p], [model.f_expl_expr])
     dt = ca.SX.sym("dt")

@@ -9,18 +9,27 @@ can be reused.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import casadi as ca
+import numpy as np
 
+from rti_mpc import given
 from rti_mpc.errors import OcpError
-from rti_mpc.signals import ROLES_OF_VECTOR, misplaced
+from rti_mpc.model.expressions import to_sx
+from rti_mpc.signals import ROLES_OF_VECTOR, misplaced, signals
 from rti_mpc.signals import Signal as Signal
+
+SYMBOLS, EXPRESSIONS, VALUES = ("x", "u", "p"), ("f_expl_expr", "y_expr", "h_expr"), ("p_nominal", "u_rest", "x_nominal")
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
     """
     A continuous-time model.
+
+    Expressions may also be given in MX or as lists of components, signals as names alone, and a vector of one entry as that entry. The attributes
+    are as documented all the same.
 
     Attributes:
         name: Name of the model, as in the configuration.
@@ -39,9 +48,11 @@ class Model:
         u_rest: Input at which the robot stands still; zeros by default.
         stop_expr: Input to command next while coming to rest, of x, u (the last input that acted) and p, shape ``(nu, 1)``; derived by default
             where inputs at rest do not stop the robot.
+        x_nominal: State around which the model is finite and differentiable, where solvers start and scales are found; if it is left out, zero or,
+            where the model is singular there, a state that is looked for.
 
     Raises:
-        OcpError: A dimension, a name or a free symbol does not fit.
+        OcpError: An argument, a dimension, a name or a free symbol does not fit.
     """
 
     name: str
@@ -59,9 +70,17 @@ class Model:
     constraints: tuple[Signal, ...] = ()
     u_rest: tuple[float, ...] = ()
     stop_expr: ca.SX | None = None
+    x_nominal: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that names, dimensions and symbols fit together."""
+        """Take what is given in other forms, and check that names, dimensions and symbols fit together."""
+        if not isinstance(self.name, str):
+            raise OcpError(f"name of a model must be text, got {given.quoted(self.name)}")
+        try:
+            for name, value in self._taken().items():
+                object.__setattr__(self, name, value)
+        except OcpError as error:
+            raise OcpError(f"model {self.name}: {error}") from None
         if not self.u_rest:
             object.__setattr__(self, "u_rest", (0.0,) * len(self.inputs))
         stop_expr = ca.SX(0, 1) if self.stop_expr is None else self.stop_expr
@@ -75,6 +94,7 @@ class Model:
             ("p_nominal", self.p, len(self.p_nominal)),
             ("u_rest", self.u, len(self.u_rest)),
             ("stop_expr", stop_expr, 0 if self.stop_expr is None else len(self.inputs)),
+            ("x_nominal", self.x, len(self.x_nominal) or self.nx),
         ):
             if expr.numel() != length or (length and expr.shape != (length, 1)):
                 raise OcpError(f"model {self.name}: {label} must have {expr.numel()} entries, in a column, got {length} for shape {expr.shape}")
@@ -94,6 +114,17 @@ class Model:
             free = [str(s) for s in ca.symvar(expr) if not any(ca.depends_on(k, s) for k in known)]
             if free:
                 raise OcpError(f"model {self.name}: {label} must depend only on x, {'' if label[0] == 'y' else 'u, '}p, also has {', '.join(free)}")
+
+    def _taken(self) -> dict[str, Any]:
+        """Return fields as they are documented, by name, from what was given."""
+        named = (*EXPRESSIONS, *(() if self.stop_expr is None else ("stop_expr",)))
+        symbols, expressions = ({name: getattr(self, name) for name in names} for names in (SYMBOLS, named))
+        vectors = {vector: signals(vector, getattr(self, vector)) for vector in ROLES_OF_VECTOR}
+        values = {name: given.numbers(name, getattr(self, name)).ravel() for name in VALUES}
+        for name, array in values.items():
+            if not np.isfinite(array).all():
+                raise OcpError(f"{name} must be finite, got {array.tolist()}")
+        return {**to_sx(symbols, expressions), **vectors, **{name: tuple(array.tolist()) for name, array in values.items()}}
 
     @property
     def nx(self) -> int:
@@ -139,4 +170,5 @@ class Model:
         for name in values:
             if name not in names:
                 raise OcpError(f"model {self.name} has parameters {', '.join(names) or 'none'}, got {name}")
+            given.number(f"parameter {name} of model {self.name}", values[name])
         return replace(self, p_nominal=tuple(values.get(n, v) for n, v in zip(names, self.p_nominal, strict=True)))

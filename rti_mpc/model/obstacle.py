@@ -12,7 +12,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import casadi as ca
+import numpy as np
 
+from rti_mpc import given
 from rti_mpc.errors import OcpError
 from rti_mpc.model.model import Model
 from rti_mpc.signals import Role, Signal, plane
@@ -36,10 +38,15 @@ def with_obstacles(model: Model, discs: Sequence[tuple[float, float, float]]) ->
         The model with parameters ``disc_i_x, disc_i_y, disc_i_r`` appended, and constraints ``disc_i``, in m: distance less radius, negative inside.
 
     Raises:
-        OcpError: The model has no position, or a radius is not positive.
+        OcpError: The model has no position, discs are no rows of three numbers, or a radius is not positive.
     """
-    if not discs:
+    given.instance("model", model, Model)
+    rows = given.numbers("discs", discs)
+    if not rows.size:
         return model
+    if rows.ndim != 2 or rows.shape[1] != 3 or not np.isfinite(rows).all():
+        raise OcpError(f"discs must be finite rows of x, y and radius, got {given.quoted(discs)}")
+    discs = [(x, y, radius) for x, y, radius in rows.tolist()]
     if (position := plane(model.outputs)) is None:
         raise OcpError(f"model {model.name}: two outputs must be a position, with role x and role y, got {[s.name for s in model.outputs]}")
     if any(radius <= 0 for _, _, radius in discs):

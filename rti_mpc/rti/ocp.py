@@ -34,8 +34,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
+from rti_mpc.model.expressions import column
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model
 
@@ -127,19 +129,22 @@ class Ocp:
         zh: ArrayLike = DEFAULT_SLACK_WEIGHT,
         Zh: ArrayLike = DEFAULT_SLACK_WEIGHT,
     ) -> None:
-        if N_u is None:
-            N_u = N
+        given.instance("model", model, Model)
+        N = given.whole("N", N, 0)
+        N_u = N if N_u is None else given.whole("N_u", N_u, 0)
         if not 1 <= N_u <= N:
             raise OcpError(f"N_u and N must satisfy 1 <= N_u <= N, got N_u = {N_u}, N = {N}")
-        if not (np.isfinite(dt) and dt > 0):
+        if not (np.isfinite(seconds := given.number("dt", dt)) and seconds > 0):
             raise OcpError(f"dt must be a positive number of seconds, got {dt}")
         integrator(model, method)  # raises for an unknown method
-        h_expr = model.h_expr if h_expr is None else h_expr
+        h_expr = model.h_expr if h_expr is None else column("h_expr", h_expr)
+        if isinstance(h_expr, ca.MX):
+            raise OcpError(f"h_expr must be SX, of the model's x, u, p, or be given to the Model, got {given.quoted(h_expr)}")
         nh = h_expr.numel()
         free = [s for s in ca.symvar(h_expr) if not ca.depends_on(ca.vertcat(model.x, model.u, model.p), s)]
         if free or (nh and h_expr.shape != (nh, 1)):
             raise OcpError(f"h_expr must be a column of the model's x, u, p, got shape {h_expr.shape} and {free or 'nothing'} besides")
-        fields: dict[str, Any] = {"model": model, "N": N, "N_u": N_u, "dt": float(dt), "method": method, "h_expr": h_expr}
+        fields: dict[str, Any] = {"model": model, "N": N, "N_u": N_u, "dt": seconds, "method": method, "h_expr": h_expr}
         for name, value in fields.items():
             object.__setattr__(self, name, value)
         values = {"Q": Q, "R": R, "delta": delta, "lambda_": lambda_, "lbu": lbu, "ubu": ubu, "lbdu": lbdu, "ubdu": ubdu, "lbx": lbx, "ubx": ubx}
@@ -161,7 +166,7 @@ class Ocp:
         """Check and copy weights and bounds; only for an object that nobody reads yet."""
         sizes = {"nx": self.model.nx, "nu": self.model.nu, "ny": self.model.ny, "nh": self.h_expr.numel(), "N": self.N, "N_u": self.N_u}
         for name, value in values.items():
-            check, size = WEIGHTS_AND_BOUNDS[name]
+            check, size = WEIGHTS_AND_BOUNDS[given.one_of("the name of a weight or bound", name, WEIGHTS_AND_BOUNDS)]
             array = check(name, value, sizes[size])
             array.setflags(write=False)
             object.__setattr__(self, name, array)
@@ -220,9 +225,9 @@ def weights(name: str, value: ArrayLike, length: int) -> Array:
 
 def weight_matrix(name: str, value: ArrayLike, size: int) -> Array:
     """Return a finite symmetric positive semidefinite matrix, given so or by its diagonal."""
-    array = np.array(value, dtype=np.float64)
-    if array.shape == (size,):
-        array = np.diag(array)
+    array = given.numbers(name, value)
+    if array.shape == (size,) or (size == 1 and array.shape == ()):
+        array = np.diag(np.atleast_1d(array))
     if array.shape != (size, size):
         raise OcpError(f"{name} must have shape ({size}, {size}) or be its diagonal ({size},), got shape {array.shape}")
     if (
@@ -231,7 +236,7 @@ def weight_matrix(name: str, value: ArrayLike, size: int) -> Array:
         or np.linalg.eigvalsh(array).min(initial=0.0) < -1e-12 * np.abs(array).max()
     ):
         raise OcpError(f"{name} must be finite, symmetric and positive semidefinite, got {array.tolist()}")
-    return array
+    return array.copy()
 
 
 def bound(name: str, value: ArrayLike, length: int) -> Array:
@@ -244,7 +249,9 @@ def bound(name: str, value: ArrayLike, length: int) -> Array:
 
 def vector(name: str, value: ArrayLike, length: int) -> Array:
     """Return a copy of shape ``(length,)`` of an array or a constant."""
-    array = np.array(value, dtype=np.float64)
+    array = given.numbers(name, value)
+    if hasattr(value, "full") and array.shape == (length, 1):  # a column of CasADi's
+        array = array[:, 0]
     if array.shape not in ((), (length,)):
         raise OcpError(f"{name} must be a number or have shape ({length},), got shape {array.shape}")
     return np.array(np.broadcast_to(array, (length,)))

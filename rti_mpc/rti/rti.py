@@ -23,13 +23,15 @@ from typing import Any
 
 import numpy as np
 
+from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled
 from rti_mpc.contract.status import QpStatus
-from rti_mpc.errors import OcpError, ShapeError
+from rti_mpc.errors import OcpError
 from rti_mpc.rti.active_set import ActiveSet
 from rti_mpc.rti.certificate import certificate
 from rti_mpc.rti.linearization import WEIGHTS, plan_cost, shift
+from rti_mpc.rti.nominal import check_stiffness, nominal_state
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.places import Places, places
 from rti_mpc.rti.qp.osqp import Solver, SolverSettings
@@ -72,6 +74,7 @@ class Rti:
         x0: Initial state of the current sample, shape ``(nx,)``, its angles in the turn of the plan.
         scale: Scales of states, inputs and softened bounds inside the solvers, see `rti_mpc.rti.scale`; shape ``(nx + nu + ng,)``.
         cost_scale: Factor of the cost inside the solvers.
+        x_nominal: State around which the model is regular, given or found, shape ``(nx,)``; the plan begins there before the first `reset`.
         guess: Arrays of the guess at which the current sample is linearized, which the solvers read and write.
         active_set: The solver that is tried first; None if another one was asked for.
         solvers: The QP solvers, each with its QP: without softened bounds and, if there are any, with them.
@@ -89,7 +92,7 @@ class Rti:
 
     Raises:
         OcpError: The formulation or the solver is unknown, the settings are not the solver's, a number of iterations or a tolerance makes no sense,
-            or the model is not finite where the robot rests.
+            the model is singular wherever it was looked at, or stiff.
     """
 
     solver: ActiveSet | Solver | ForeignSolver
@@ -106,6 +109,7 @@ class Rti:
         tolerance: float = STEP_TOLERANCE,
         compile: bool = True,
     ) -> None:
+        given.instance("ocp", ocp, Ocp)
         check_options(solver, settings, iterations, tolerance)
         model, N, N_u = ocp.model, ocp.N, ocp.N_u
         self.ocp = ocp
@@ -120,9 +124,10 @@ class Rti:
         self.u_prev: Array = np.array(model.u_rest, dtype=np.float64)
         self.y_ref: Array = np.zeros((N, model.ny))
         self.p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
-        self.x0: Array = np.zeros(model.nx)
+        self.x_nominal = nominal_state(ocp)
+        check_stiffness(ocp, self.x_nominal)
+        self.x0: Array = self.x_nominal.copy()
         self.status = QpStatus.NONE
-        self._rows = self.y_ref.shape
         self._pending = False  # whether a sample was prepared and has had no feedback
         self._violation: Array = np.zeros(2)  # of softened bounds, as it is and relative to their scales
         change: Array = np.zeros(1)
@@ -157,14 +162,20 @@ class Rti:
             self.solvers = [Solver(qp, settings or SolverSettings()) for qp in qps]
         else:
             self.solvers = [ForeignSolver(qp, solver) for qp in qps]
-        self.reset(np.zeros(model.nx), np.array(model.u_rest))
+        self.reset(self.x_nominal, np.array(model.u_rest))
 
     def _normalise(self, qps: Sequence[Qp]) -> None:
         """Compute the scales of the variables, and normalise the cost, so that one step size of ADMM and one tolerance fit every problem."""
         self._roll_out()
         qps[0].fill()
+        if not qps[0].sound:  # a motion out of where the model is regular, such as below the bottom of a tank
+            self._stand()
+            qps[0].fill()
         if not qps[0].sound:
-            raise OcpError(f"model {self.ocp.model.name} must be finite and differentiable around the zero state")
+            raise OcpError(
+                f"model {self.ocp.model.name} must be finite and differentiable along a stage of {self.ocp.dt:g} s from its nominal state, "
+                f"x_nominal, got {self.x_nominal.tolist()}"
+            )
         self.scale[:] = scale(self.ocp, self.x, self.u, self.y_ref, self.p)
         self.cost_scale = 1.0 / step_size(qps[0])
         for name in COST_WEIGHTS:
@@ -179,9 +190,20 @@ class Rti:
         return self._backup.qp if isinstance(self.solver, ActiveSet) else self.solver.qp
 
     def reset(self, x0: Array, u_prev: Array) -> None:
-        """Start cold: the guess is one state and one input at all stages, and no solver starts from an earlier solution."""
-        self.u_prev[:] = u_prev
-        self.u[:] = np.clip(u_prev, self.ocp.lbu, self.ocp.ubu)
+        """
+        Start cold: the guess is one state and one input at all stages, and no solver starts from an earlier solution.
+
+        Args:
+            x0: State, shape ``(nx,)``.
+            u_prev: Input that acts before the plan, shape ``(nu,)``.
+
+        Raises:
+            OcpError: One of them is no array of real numbers.
+            ShapeError: A shape does not fit.
+        """
+        x0 = given.array("x0", x0, self.x0.shape)
+        self.u_prev[:] = given.array("u_prev", u_prev, self.u_prev.shape)
+        self.u[:] = np.clip(self.u_prev, self.ocp.lbu, self.ocp.ubu)
         self.x[:] = x0
         self._pending = False
         self._turns.forget()
@@ -204,9 +226,15 @@ class Rti:
 
         Args:
             values: Weights and bounds by the names in `WEIGHTS`, shapes as in `Ocp`. The same bounds must be finite: which are is compiled in.
+
+        Raises:
+            OcpError: A name is none of them, or a value no array of real numbers.
+            ShapeError: A shape does not fit.
         """
-        for name, value in values.items():
-            self._weights[name][:] = np.clip(value, -INFINITY, INFINITY)
+        owned = {name: self._weights[given.one_of("the name of a weight or bound", name, self._weights)] for name in values}
+        taken = {name: given.array(name, value, owned[name].shape) for name, value in values.items()}
+        for name, value in taken.items():
+            np.clip(value, -INFINITY, INFINITY, out=owned[name])
             if name in COST_WEIGHTS:
                 self._weights[name] *= self.cost_scale
         for solver in self.solvers:
@@ -223,13 +251,13 @@ class Rti:
             u_prev: Input that acts before the plan, shape ``(nu,)``, if it is not the first input of the last plan.
 
         Raises:
+            OcpError: One of them is no array of real numbers; nothing has changed then, as for a wrong shape.
             ShapeError: A shape does not fit.
         """
-        if y_ref.shape != self._rows:
-            raise ShapeError("y_ref", self._rows, y_ref)
+        y_ref = given.array("y_ref", y_ref, self.y_ref.shape)
+        p = None if p is None else given.array("p", p, self.p.shape)
+        u_prev = None if u_prev is None else given.array("u_prev", u_prev, self.u_prev.shape)
         if p is not None:
-            if p.shape != self.p.shape:
-                raise ShapeError("p", self.p.shape, p)
             self.p[...] = p
         if self._pending:
             self.keep_guess()
@@ -283,10 +311,23 @@ class Rti:
         """Make a guess in motion, with inputs half way to their upper bounds, that is its own reference: scales are computed there, undamped."""
         ubu = self.ocp.ubu
         self.u[:] = np.where(np.isfinite(ubu), 0.5 * (np.clip(ubu, -INFINITY, INFINITY) + self.u_prev), self.u_prev)
-        self.x[:] = 0.0
+        self.x[:] = self.x_nominal
         for _ in range(self.ocp.N):
             self.shift()
         self.u_prev[:] = self.u[0]
+        self._meet_reference()
+
+    def _stand(self) -> None:
+        """Make a guess at the nominal state and the input at rest."""
+        self.u_prev[:] = self.ocp.model.u_rest
+        self.u[:] = np.clip(self.u_prev, self.ocp.lbu, self.ocp.ubu)
+        self.x[:] = self.x_nominal
+        for guess, plan in self._pairs:
+            guess[:] = plan
+        self._meet_reference()
+
+    def _meet_reference(self) -> None:
+        """Let the reference be the outputs of the guess."""
         self.y_ref[:] = np.array(self.ocp.model.h().map(self.ocp.N)(self.x[1:].T, self.p[1:].T)).T
 
     def shift(self) -> None:
@@ -309,8 +350,14 @@ class Rti:
 
         Args:
             x0: State at node 0, shape ``(nx,)``; angles may wrap, those of the plan continue the last plan's.
+
+        Raises:
+            OcpError: The sample has not been prepared, or `x0` is no array of real numbers.
+            ShapeError: Its shape does not fit.
         """
-        self.x0[...] = x0
+        if not self._pending:
+            raise OcpError("prepare must be called before each feedback, got feedback without a sample prepared")
+        self.x0[...] = given.array("x0", x0, self.x0.shape)
         self._pending = False
         if self._turns.settle():
             self._linearize()
@@ -398,16 +445,18 @@ def check_options(solver: str, settings: SolverSettings | None, iterations: int,
         check_name(solver)
         if settings is not None:
             raise OcpError(f"settings are OSQP's, they must be left out for another solver, got {settings} for {solver!r}")
-    if not (iterations >= 1 and tolerance >= 0.0):
-        raise OcpError(f"iterations must be at least 1 and tolerance not negative, got {iterations} and {tolerance}")
+    if settings is not None:
+        given.instance("settings", settings, SolverSettings)
+    given.whole("iterations", iterations, 1)
+    if not given.number("tolerance", tolerance) >= 0.0:
+        raise OcpError(f"tolerance must not be negative, got {tolerance}")
 
 
 def formulation_of(ocp: Ocp, formulation: str) -> str:
     """Return the name of the formulation, ``auto`` replaced by the faster one."""
+    given.one_of("formulation", formulation, ("auto", *FORMULATIONS))
     if formulation == "auto":
         return "sequential" if ocp.N_u <= MAX_SEQUENTIAL_N_U else "simultaneous"
-    if formulation not in FORMULATIONS:
-        raise OcpError(f"formulation must be auto, {' or '.join(FORMULATIONS)}, got {formulation!r}")
     return formulation
 
 

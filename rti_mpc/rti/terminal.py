@@ -22,6 +22,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import LinAlgError, solve_discrete_are
 
+from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.ocp import Ocp
@@ -40,9 +41,11 @@ def lqr_weight(ocp: Ocp, x: Array, u: Array) -> Array:
         The weight, shape ``(ny, ny)``, symmetric, without the last stage's own ``delta_N Q``.
 
     Raises:
-        OcpError: The linearization cannot be stabilized.
+        OcpError: The linearization cannot be stabilized, or an argument is none.
+        ShapeError: A shape does not fit.
     """
-    model = ocp.model
+    model = given.instance("ocp", ocp, Ocp).model
+    x, u = given.array("x", x, (model.nx,)), given.array("u", u, (model.nu,))
     phi, p = ocp.phi(), np.array(model.p_nominal)
     sensitivities = ca.Function(
         "sensitivities",

@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from rti_mpc.array import Array
 from rti_mpc.rti.rti import Rti
 
 WARM_UP_SOLVES = 20  # before the first command: the first real sample must not be the first call
@@ -13,7 +10,7 @@ WARM_UP_SOLVES = 20  # before the first command: the first real sample must not 
 
 def warm_up(rti: Rti) -> None:
     """Solve a few samples of a robot that begins at rest and does what the plan says: one held in place would fall in its plans, out of all range."""
-    x0: Array = np.zeros(rti.ocp.model.nx)
+    x0 = rti.x_nominal.copy()
     rti.reset(x0, rti.u_prev.copy())
     for _ in range(WARM_UP_SOLVES):
         rti.prepare(rti.y_ref.copy())

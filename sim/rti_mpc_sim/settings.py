@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
 from rti_mpc.errors import ConfigError
@@ -37,6 +38,7 @@ class RobotSettings:
 
     Raises:
         ConfigError: A size or a number does not fit.
+        OcpError: What must be numbers, or a model, is none.
     """
 
     model: Model
@@ -57,14 +59,16 @@ class RobotSettings:
 
     def __post_init__(self) -> None:
         """Fill in defaults that depend on the model, and check."""
-        nx, nu = self.model.nx, self.model.nu
+        nx, nu = given.instance("model", self.model, Model).nx, self.model.nu
         for name, length, default in (("x0", nx, 0.0), ("slew", nu, np.inf), ("lbu", nu, -np.inf), ("ubu", nu, np.inf), ("noise_std", nx, 0.0)):
-            given = np.array(getattr(self, name), dtype=np.float64)
-            value = given if given.size or name == "x0" else np.full(length, default)
+            values = np.array(given.numbers(name, getattr(self, name)))
+            value = values if values.size or name == "x0" else np.full(length, default)
             if value.shape != (length,) or np.isnan(value).any():
-                raise ConfigError(f"{name} must be {length} numbers, got {given.tolist()}")
+                raise ConfigError(f"{name} must be {length} numbers, got {values.tolist()}")
             value.setflags(write=False)
             object.__setattr__(self, name, value)
+        for name in ("state_period_s", "substeps", "sensor_delay_s", "dropout", "actuator_delay_s", "actuator_lag_s"):
+            given.number(name, getattr(self, name))
         for name, right, fits in (
             ("x0", "finite", bool(np.isfinite(self.x0).all())),
             ("slew", "above 0", bool((self.slew > 0.0).all())),

@@ -72,5 +72,5 @@ def test_rk4_is_exact_for_a_double_integrator() -> None:
 def test_unknown_method_and_no_steps_are_refused() -> None:
     with pytest.raises(OcpError, match="integrator must be one of euler, rk4, got 'rk5'"):
         integrator(MODEL, "rk5")
-    with pytest.raises(OcpError, match="substeps must be at least 1, got 0"):
+    with pytest.raises(OcpError, match="substeps must be a whole number of at least 1, got 0"):
         integrator(MODEL, "rk4", 0)

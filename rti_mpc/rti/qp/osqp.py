@@ -11,12 +11,15 @@ one copies and builds namespaces at every call, which costs more than the solve.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import osqp
 
+from rti_mpc import given
 from rti_mpc.contract.status import QpStatus
+from rti_mpc.errors import OcpError
 from rti_mpc.rti.qp.qp import Qp
 from rti_mpc.rti.scaled import Scaled
 
@@ -49,6 +52,9 @@ class SolverSettings:
         check_termination: Iterations between two checks of the residuals.
         scaling: Sweeps of Ruiz scaling; none by default, since they break the symmetry of the problem and cost more time than they save.
         alpha: Over-relaxation, between 0 and 2.
+
+    Raises:
+        OcpError: One is no number, or out of range.
     """
 
     eps: float = 1e-4
@@ -57,6 +63,14 @@ class SolverSettings:
     check_termination: int = 5
     scaling: int = 0
     alpha: float = 1.6
+
+    def __post_init__(self) -> None:
+        """Check the settings: OSQP itself says on standard output what it does not take."""
+        for name, least in (("max_iter", 1), ("check_termination", 0), ("scaling", 0)):
+            given.whole(name, getattr(self, name), least)
+        for name, most in (("eps", math.inf), ("rho", math.inf), ("alpha", 2.0)):
+            if not 0.0 < given.number(name, value := getattr(self, name)) < most:
+                raise OcpError(f"{name} must lie between 0 and {most:g}, got {value}")
 
 
 class Solver:

@@ -99,11 +99,12 @@ def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
 
 def regulator_weight(config: Config, problem: Ocp) -> Array:
     """Return the terminal weight that the problem's own weights lead to, in the motion that `ocp.terminal.lqr` says."""
+    from rti_mpc.rti.nominal import nominal_state
     from rti_mpc.rti.terminal import lqr_weight
 
     model, motion = problem.model, config.ocp.terminal.lqr
     assert motion is not None
-    x = [motion.states.get(state.name, 0.0) for state in model.states]
+    x = [motion.states.get(state.name, nominal) for state, nominal in zip(model.states, nominal_state(problem), strict=True)]
     u = [motion.inputs.get(input.name, rest) for input, rest in zip(model.inputs, model.u_rest, strict=True)]
     return lqr_weight(problem, np.array(x), np.array(u))
 
@@ -152,6 +153,7 @@ def build_observer(config: Config) -> Observer | None:
 def robot_settings(config: Config) -> dict[str, Any]:
     """Return the arguments of `rti_mpc_sim.settings.RobotSettings`; the slew limits are those of the increments."""
     from rti_mpc.contract.approach import Increments
+    from rti_mpc.rti.nominal import nominal_state
 
     model, sim = build_model(config).with_parameters(**config.sim.parameters), config.sim
     lbdu, ubdu = bounds(config.ocp.bounds.increments, names(model.inputs))
@@ -161,7 +163,7 @@ def robot_settings(config: Config) -> dict[str, Any]:
         "state_period_s": config.ocp.dt_s,
         **sim.model_dump(exclude_none=True, exclude={"parameters", "approaches"}),
         "model": model,
-        "x0": [sim.x0.get(state.name, 0.0) for state in model.states],
+        "x0": [sim.x0.get(state.name, float(nominal)) for state, nominal in zip(model.states, nominal_state(build_ocp(config)), strict=True)],
         "noise_std": [sim.noise_std.get(state.name, 0.0) for state in model.states],
         "lbu": lbu,
         "ubu": ubu,

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc_service.config.build import build_ocp, names
@@ -14,6 +14,9 @@ from rti_mpc_service.config.schema import ITERATION_KEYS, Config, RegulatorSecti
 if TYPE_CHECKING:
     from rti_mpc.model.model import Model, Signal
     from rti_mpc.rti.ocp import Ocp
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 def check_tree(config: Config) -> None:
@@ -52,11 +55,9 @@ def check_model(config: Config) -> Ocp:
     """
     from rti_mpc.model.find import find_model
     from rti_mpc.model.obstacle import with_obstacles
+    from rti_mpc.rti.nominal import check_stiffness, nominal_state
 
-    try:
-        model = find_model(config.model.name, config.model.folder)
-    except OcpError as error:
-        raise ConfigError(f"model.name: {error}") from error
+    model = named("model.name", find_model, config.model.name, config.model.folder)
     check_names(config, model)
     if config.guard.enabled:
         inputs, given = names(model.inputs), list(config.ocp.bounds.inputs)
@@ -65,13 +66,24 @@ def check_model(config: Config) -> Ocp:
         if tuple(config.guard.u_rest.get(name, 0.0) for name in inputs) != model.u_rest:
             raise ConfigError(f"guard.u_rest must be the model's {dict(zip(inputs, model.u_rest, strict=True))}, got {config.guard.u_rest}")
     check_solver(config)
-    try:
-        with_obstacles(model, [(0.0, 0.0, 1.0) for _ in config.ocp.obstacles])
-    except OcpError as error:
-        raise ConfigError(f"ocp.obstacles: {error}") from error
+    named("ocp.obstacles", with_obstacles, model, [(0.0, 0.0, 1.0) for _ in config.ocp.obstacles])
     ocp = build_ocp(config)
     check_rest(ocp)
+    named("ocp.dt_s", check_stiffness, ocp, named("model.name", nominal_state, ocp))
     return ocp
+
+
+def named(key: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """
+    Return what a call of the library returns.
+
+    Raises:
+        ConfigError: It refuses; the message begins with the key that is to blame.
+    """
+    try:
+        return call(*args, **kwargs)
+    except OcpError as error:
+        raise ConfigError(f"{key}: {error}") from error
 
 
 def check_rest(ocp: Ocp) -> None:
@@ -151,10 +163,7 @@ def check_solver(config: Config) -> None:
 
     if config.solver.name in BUILT_IN_SOLVERS:
         return
-    try:
-        check_name(config.solver.name)
-    except OcpError as error:
-        raise ConfigError(f"solver.name: {error}") from error
+    named("solver.name", check_name, config.solver.name)
     if foreign := config.solver.model_dump(exclude_none=True, exclude=ITERATION_KEYS | {"name"}):
         key, got = next(iter(foreign.items()))
         raise ConfigError(f"solver.{key} is a setting of osqp, it must be left out for solver.name = {config.solver.name!r}, got {got}")

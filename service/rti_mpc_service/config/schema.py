@@ -102,7 +102,7 @@ class BoundSection(Section):
 
 
 class RegulatorSection(Section):
-    """Where the linear-quadratic regulator is linearized; what is left out is zero, or an input's rest."""
+    """Where the linear-quadratic regulator is linearized; what is left out is as in the model's nominal state, mostly zero, or an input's rest."""
 
     states: dict[str, float] = Field(default={}, description="states by name, in the state's unit; a wheeled robot must be in motion")
     inputs: dict[str, float] = Field(default={}, description="inputs by name, in the input's unit")
@@ -227,7 +227,9 @@ class RealtimeSection(Section):
 class SimSection(Section):
     """The simulated robot, which may differ from the controller's model; what is left out is as `RobotSettings` has it."""
 
-    x0: dict[str, float] = Field(default={}, description="initial state by name, in the state's unit; zero if left out")
+    x0: dict[str, float] = Field(
+        default={}, description="initial state by name, in the state's unit; the model's nominal one, mostly zero, if left out"
+    )
     parameters: dict[str, float] = Field(default={}, description="parameters of the plant that differ from [model]'s by name, each in its own unit")
     state_period_s: Period | None = Field(default=None, description="period of the states, in seconds of the robot; dt_s if left out")
     substeps: int | None = Field(default=None, ge=1, le=1000, description="RK4 steps in each period of the states")
