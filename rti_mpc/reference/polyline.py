@@ -1,21 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Polylines with rounded corners, by arc length, and their CSV files."""
+"""Polylines with rounded corners, by arc length."""
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
+from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.errors import ConfigError
-from rti_mpc.text_file import read_text_file
 
-MAX_CSV_BYTES = 1 << 26
 REVERSAL_RAD = 3.1  # a corner that turns by more than this is a reversal, and has no arc
 
 
@@ -78,14 +74,9 @@ def polyline(points: Array, corner_m: float) -> Polyline:
     Raises:
         ConfigError: There are fewer than two distinct finite points, or the distance is negative.
     """
-    points = np.asarray(points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
-        raise ConfigError(f"waypoints must be finite, of shape (n, 2), got shape {points.shape}")
-    if not (math.isfinite(corner_m) and corner_m >= 0.0):
+    points = distinct(points)
+    if not (math.isfinite(given.number("corner_m", corner_m)) and corner_m >= 0.0):
         raise ConfigError(f"corner_m must be a distance of at least 0 m, got {corner_m}")
-    points = np.concatenate([points[:1], points[1:][np.any(np.diff(points, axis=0) != 0.0, axis=1)]])
-    if len(points) < 2:
-        raise ConfigError(f"waypoints must be at least two distinct points, got {len(points)}")
     closed = len(points) > 2 and bool(np.all(points[0] == points[-1]))
 
     edge = np.diff(points, axis=0)
@@ -120,65 +111,18 @@ def polyline(points: Array, corner_m: float) -> Polyline:
     )
 
 
-def read_csv(path: Path) -> Array:
+def distinct(points: Array) -> Array:
     """
-    Read waypoints: one line per point, columns ``x`` and ``y`` in m.
-
-    A header names the columns, in any order and among others; without a header the
-    first two columns are used. Empty lines and lines that begin with ``#`` are
-    skipped.
-
-    Returns:
-        Points, shape ``(n, 2)``.
+    Return waypoints, each unlike the one before, shape ``(n, 2)``, in m.
 
     Raises:
-        ConfigError: The file or a number in it cannot be read; the message names file, line and column.
+        ConfigError: There are fewer than two distinct finite points.
+        OcpError: They are no numbers.
     """
-    lines = read_text_file(path, "CSV with waypoints", MAX_CSV_BYTES).splitlines()
-    try:
-        return np.array(list(_points(path, csv.reader(lines))), dtype=np.float64).reshape(-1, 2)
-    except csv.Error as error:
-        raise ConfigError(f"{path}: must be CSV with waypoints, got {error}") from error
-
-
-def _points(path: Path, reader: Iterator[list[str]]) -> Iterator[tuple[float, float]]:
-    """Yield the points of a CSV file."""
-    columns = None
-    for cells in reader:
-        line = reader.line_num  # type: ignore[attr-defined]
-        cells = [cell.strip() for cell in cells]
-        if not any(cells) or cells[0].startswith("#"):
-            continue
-        if columns is None:
-            columns = _columns(path, line, cells)
-            if not _is_number(cells[0]):
-                continue
-        yield _number(path, line, "x", cells, columns[0]), _number(path, line, "y", cells, columns[1])
-
-
-def _columns(path: Path, line: int, cells: list[str]) -> tuple[int, int]:
-    """Find the columns of x and y from the first line."""
-    if _is_number(cells[0]):
-        return 0, 1
-    names = [cell.lower() for cell in cells]
-    for name in ("x", "y"):
-        if name not in names:
-            raise ConfigError(f"{path}, line {line}, column {name}: the header must name the columns x and y, got {', '.join(cells)}")
-    return names.index("x"), names.index("y")
-
-
-def _is_number(cell: str) -> bool:
-    """Whether a cell reads as a number."""
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _number(path: Path, line: int, name: str, cells: list[str], column: int) -> float:
-    """Read one finite number."""
-    cell = cells[column] if column < len(cells) else ""
-    if not _is_number(cell) or not math.isfinite(float(cell)):
-        raise ConfigError(f"{path}, line {line}, column {name}: must be a finite number in m, got {cell!r}")
-    return float(cell)
+    points = given.numbers("waypoints", points)
+    if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
+        raise ConfigError(f"waypoints must be finite, of shape (n, 2), got shape {points.shape}")
+    points = np.concatenate([points[:1], points[1:][np.any(np.diff(points, axis=0) != 0.0, axis=1)]])
+    if len(points) < 2:
+        raise ConfigError(f"waypoints must be at least two distinct points, got {len(points)}")
+    return points

@@ -16,11 +16,14 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.contract.message import End
 from rti_mpc.errors import ConfigError
 from rti_mpc.reference.heading import Curve, consistent, periodic, tangent
-from rti_mpc.reference.polyline import polyline, read_csv
+from rti_mpc.reference.polyline import distinct, polyline
+from rti_mpc.reference.smoothing import Smoothed, smoothed
+from rti_mpc.reference.waypoint_file import read_csv
 from rti_mpc.signals import POSE_ROLES, Role, Signal
 
 Heading = Literal["tangent", "consistent", "none"]
@@ -40,6 +43,7 @@ class Trajectory:
         end: What to do after its last row.
         pose0: Where the scenario's robot starts, at rest: x, y in m, psi in rad.
         lap_s: Time of one lap of a closed path; None if the path is open and rests at its end.
+        note: What its reader should know of how it was made; empty if nothing.
     """
 
     name: str
@@ -49,6 +53,7 @@ class Trajectory:
     end: End
     pose0: tuple[float, float, float]
     lap_s: float | None = None
+    note: str = ""
 
     def lasting(self, duration_s: float) -> Trajectory:
         """
@@ -62,6 +67,7 @@ class Trajectory:
 
 def circle(k: float = 10.0) -> Trajectory:
     """Build the curve that the paper prints, ``sin(t/k), cos(t/k)``, with the initial condition of its first simulation; two laps."""
+    _positive("k", k)
     return Trajectory(
         name="circle",
         position=lambda t: np.stack([np.sin(t / k), np.cos(t / k)], axis=-1),
@@ -88,6 +94,8 @@ def eight() -> Trajectory:
 
 def positioning(r: float = 0.4, omega_r: float = 0.1) -> Trajectory:
     """Build the paper's second reference: a path of size `r` in m, followed with `omega_r` in rad/s for 5 pi seconds, then rest where it ends."""
+    _positive("r", r)
+    _positive("omega_r", omega_r)
     stop = 5 * math.pi
 
     def position(t: Array) -> Array:
@@ -101,9 +109,11 @@ def positioning(r: float = 0.4, omega_r: float = 0.1) -> Trajectory:
     return Trajectory("positioning", position, velocity, duration_s=60.0, end=End.HOLD, pose0=(1.4, 0.9, 7 * math.pi / 6))
 
 
-def waypoints(points: Array, speed_m_s: float = 0.25, corner_m: float = 0.15, name: str = "waypoints") -> Trajectory:
+def waypoints(
+    points: Array, speed_m_s: float = 0.25, corner_m: float = 0.15, name: str = "waypoints", *, smooth_m: float | None = None
+) -> Trajectory:
     """
-    Follow a polyline at constant speed, with corners rounded so that they can be driven.
+    Follow a polyline at constant speed, with corners rounded so that they can be driven, and averaged first if it is a recorded one.
 
     An open polyline rests at its last point. A closed one (first point equal to the
     last) is repeated, two laps unless another duration is asked for. The robot starts
@@ -114,12 +124,16 @@ def waypoints(points: Array, speed_m_s: float = 0.25, corner_m: float = 0.15, na
         speed_m_s: Speed of the reference along the path.
         corner_m: Largest distance at which the path passes a waypoint; with 0 it has corners that no robot can follow.
         name: Name of the scenario.
+        smooth_m: Arc length to average over, see `rti_mpc.reference.smoothing`; 0: none, None: what the noise of a recorded path needs. The
+            trajectory's note says it.
 
     Raises:
         ConfigError: There are fewer than two distinct finite points, or a number is out of range.
+        OcpError: What must be numbers is none.
     """
     speed = _positive("speed_m_s", speed_m_s)
-    path = polyline(points, corner_m)
+    followed = smoothed(distinct(points), smooth_m)
+    path = polyline(followed.points, corner_m)
 
     def velocity(t: Array) -> Array:
         moving = path.closed | ((0.0 <= np.asarray(t)) & (speed * t < path.length))
@@ -135,13 +149,22 @@ def waypoints(points: Array, speed_m_s: float = 0.25, corner_m: float = 0.15, na
         end=End.STOP if path.closed else End.HOLD,
         pose0=(float(x), float(y), float(path.theta0[0])),
         lap_s=lap_s if path.closed else None,
+        note=note(followed),
     )
+
+
+def note(followed: Smoothed) -> str:
+    """Say what was done to waypoints."""
+    if not followed.window_m:
+        return ""
+    turning = f"waypoints turn to and fro by up to {math.degrees(followed.turn_rad):.0f} degrees from one to the next"
+    return f"{turning}: averaged over {followed.window_m:g} m of path, which moves it by at most {1e3 * followed.moved_m:.0f} mm"
 
 
 SCENARIOS = {"eight": eight, "circle": circle, "positioning": positioning}
 
 
-def find_trajectory(scenario: str, speed_m_s: float = 0.25, corner_m: float = 0.15) -> Trajectory:
+def find_trajectory(scenario: str | Path, speed_m_s: float = 0.25, corner_m: float = 0.15, *, smooth_m: float | None = None) -> Trajectory:
     """
     Find a trajectory by name, or read it from a CSV file of waypoints.
 
@@ -149,18 +172,20 @@ def find_trajectory(scenario: str, speed_m_s: float = 0.25, corner_m: float = 0.
         scenario: One of `SCENARIOS`, or a path that ends in ``.csv``.
         speed_m_s: Speed along waypoints; the paper's curves have their own.
         corner_m: Largest distance at which the path passes a waypoint.
+        smooth_m: Arc length to average waypoints over, as in `waypoints`.
 
     Raises:
         ConfigError: There is no such scenario, or the file is wrong: file, line and column are named.
     """
-    if scenario in SCENARIOS:
-        return SCENARIOS[scenario]()
-    path = Path(scenario)
+    named = scenario if isinstance(scenario, str | Path) else ""
+    if named in SCENARIOS:
+        return SCENARIOS[str(named)]()
+    path = Path(named)
     if path.suffix.lower() != ".csv":
         raise ConfigError(f"a scenario must be one of {', '.join(SCENARIOS)} or a FILE.csv of waypoints, got {scenario!r}")
     points = read_csv(path)
     try:
-        return waypoints(points, speed_m_s, corner_m, name=path.stem)
+        return waypoints(points, speed_m_s, corner_m, name=path.stem, smooth_m=smooth_m)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
 
@@ -191,8 +216,12 @@ def rows(
 
     Raises:
         ConfigError: The period, the heading or `a` is out of range.
+        OcpError: An argument is none, or a role unknown.
         OcpError: No consistent heading repeats on this closed path.
     """
+    given.instance("trajectory", trajectory, Trajectory)
+    for role in roles:
+        given.one_of("a role", role, POSE_ROLES)
     if heading not in HEADINGS:
         raise ConfigError(f"heading must be one of {', '.join(HEADINGS)}, got {heading!r}")
     periods = math.ceil(trajectory.duration_s / _positive("period_s", period_s) - 1e-9)  # the last period counts as a whole one
@@ -209,7 +238,7 @@ def headings(trajectory: Trajectory, t: Array, heading: Heading, a: float | None
     if heading != "consistent" or a is None:
         return psi
     _positive("a", a)
-    start = float(psi[0]) if psi0 is None else psi0
+    start = float(psi[0]) if psi0 is None else given.number("psi0", psi0)
     if trajectory.lap_s is not None:
         start = periodic(trajectory.velocity, trajectory.lap_s, a, start)
     return consistent(trajectory.velocity, t, a, start)
@@ -236,6 +265,6 @@ def followed_roles(model: str, outputs: Sequence[Signal]) -> tuple[Role, ...]:
 
 def _positive(name: str, value: float) -> float:
     """Return a number that must be finite and above zero."""
-    if not (math.isfinite(value) and value > 0.0):
+    if not (math.isfinite(given.number(name, value)) and value > 0.0):
         raise ConfigError(f"{name} must be finite and above 0, got {value}")
-    return value
+    return float(value)

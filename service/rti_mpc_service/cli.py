@@ -208,13 +208,17 @@ def reference(
         float | None, typer.Option(metavar="SECONDS", min=0.1, help="How long, in the robot's time; the scenario's own if not given.")
     ] = None,
     waypoint_speed: Annotated[float, typer.Option(metavar="M/S", min=0.001, help="Speed along waypoints.")] = 0.25,
+    waypoint_smoothing: Annotated[
+        float | None,
+        typer.Option(metavar="M", min=0.0, help="Path that waypoints are averaged over; 0: none.", show_default="as their noise needs"),
+    ] = None,
 ) -> None:
     """Publish a reference from the robot's present state on, and again when the robot restarts."""
     from rti_mpc.reference.trajectory import find_trajectory, followed_roles
     from rti_mpc.signals import place
     from rti_mpc_service.reference import main
 
-    trajectory = find_trajectory(scenario, waypoint_speed)
+    trajectory = find_trajectory(scenario, waypoint_speed, smooth_m=waypoint_smoothing)
     if duration is not None:
         trajectory = trajectory.lasting(duration)
     model = build_model(config)

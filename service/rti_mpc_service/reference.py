@@ -77,6 +77,8 @@ def main(
         source = ReferenceSource(bus, trajectory, y, p, round(1e9 * period_s))
         bus.alive(ROLE)
         logger.info("%s, heading %s, for %s", trajectory.name, heading, keys.robot)
+        if trajectory.note:
+            logger.warning("%s", trajectory.note)
         while not stop.wait(LOOK_PERIOD_S):
             source.look()
     return source.anchored

@@ -250,37 +250,6 @@ def test_points_that_make_no_path_are_refused(points, sentence: str) -> None:
         waypoints(np.array(points))
 
 
-def test_csv_with_a_header_finds_its_columns(tmp_path: Path) -> None:
-    file = tmp_path / "tour.csv"
-    file.write_text("# surveyed\nname, Y, X\na,0,1\n\nb,2,3\n")
-    trajectory = find_trajectory(str(file), speed_m_s=0.5)
-    assert trajectory.name == "tour"
-    np.testing.assert_allclose(trajectory.position(np.array([0.0, 1e3])), [[1, 0], [3, 2]])
-
-
-def test_csv_without_a_header_means_its_first_two_columns(tmp_path: Path) -> None:
-    file = tmp_path / "tour.csv"
-    file.write_text("0,0,9\n2,1,9\n")
-    np.testing.assert_allclose(find_trajectory(str(file)).position(np.array([0.0, 1e3])), [[0, 0], [2, 1]])
-
-
-@pytest.mark.parametrize(
-    ("text", "place"),
-    [
-        ("x,y\n0,0\n1,one\n", r"tour.csv, line 3, column y: must be a finite number in m, got 'one'"),
-        ("0,0\n1\n", r"tour.csv, line 2, column y: .* got ''"),
-        ("0,0\nnan,1\n", r"tour.csv, line 2, column x: .* got 'nan'"),
-        ("east,north\n0,0\n", r"tour.csv, line 1, column x: the header must name the columns x and y, got east, north"),
-        ("", r"tour.csv: .*two distinct points, got 0"),
-    ],
-)
-def test_csv_error_names_file_line_and_column(tmp_path: Path, text: str, place: str) -> None:
-    file = tmp_path / "tour.csv"
-    file.write_text(text)
-    with pytest.raises(ConfigError, match=place):
-        find_trajectory(str(file))
-
-
 def test_missing_csv_and_unknown_scenario_are_refused_with_what_would_be_right(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"nowhere\.csv"):
         find_trajectory(str(tmp_path / "nowhere.csv"))

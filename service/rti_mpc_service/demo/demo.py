@@ -131,6 +131,8 @@ def main(config: Config, scenario: str, **options: Any) -> int:
         (run.folder / "config.toml").write_text(toml.write(run.config), encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"--out must be a folder that can be written, got {run.folder}: {error.strerror}") from error
+    if run.trajectory.note:
+        console.print(run.trajectory.note, soft_wrap=True, markup=False)
     stop = stop_on_signals()
     try:
         outcome = drive(run, console, stop)
