@@ -98,6 +98,11 @@ def plane(signals: Sequence[HasRole]) -> tuple[int, int] | None:
     return None if x is None or y is None else (x, y)
 
 
+def in_plane(outputs: Sequence[HasRole]) -> bool:
+    """Whether outputs are a position in the plane, perhaps with a heading, and nothing else: what a path tells."""
+    return plane(outputs) is not None and all(output.role in POSE_ROLES for output in outputs)
+
+
 def misplaced(vector: str, signals: Sequence[Signal], states: Sequence[Signal]) -> str:
     """Return what is wrong with the roles in a vector, empty if nothing is."""
     roles = [signal.role for signal in signals if signal.role not in REPEATABLE_ROLES]

@@ -76,6 +76,21 @@ def arm() -> Model:
     )
 
 
+def polar() -> Model:
+    """A point whose direction, as seen from the origin, is none at the origin."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)
+    return Model(
+        name="polar",
+        x=x,
+        u=u,
+        f_expl_expr=u,
+        y_expr=ca.vertcat(x[0], x[1] / ca.norm_2(x)),
+        states=(Signal("east", "m"), Signal("north", "m")),
+        inputs=(Signal("v_east", "m/s"), Signal("v_north", "m/s")),
+        outputs=(Signal("east", "m"), Signal("direction", "1")),
+    )
+
+
 def toml(name: str) -> str:
     """A configuration of one of these; that of the shipped robot where it is the same one."""
     if name == "shuffled":

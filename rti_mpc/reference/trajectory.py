@@ -258,7 +258,7 @@ def followed_roles(model: str, outputs: Sequence[Signal]) -> tuple[Role, ...]:
     if unfilled := [output.name for output in outputs if output.role not in POSE_ROLES]:
         raise ConfigError(
             f"model {model}: a path in the plane fills outputs whose role is {', '.join(POSE_ROLES)}, not {', '.join(unfilled)}: "
-            "give each its role, or publish rows of your own"
+            f"give each its role, or follow sines, steps or a FILE.csv with the columns t, {', '.join(output.name for output in outputs)}"
         )
     return tuple(output.role for output in outputs)
 

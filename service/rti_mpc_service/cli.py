@@ -24,7 +24,7 @@ from typer.core import TyperCommand, TyperGroup
 import rti_mpc
 from rti_mpc.errors import ConfigError
 from rti_mpc_service import entry, log
-from rti_mpc_service.config.build import build_model, bus_settings, robot_settings, stage_parameters, with_initial_state
+from rti_mpc_service.config.build import bus_settings, robot_settings, stage_parameters, with_initial_state
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
 
@@ -143,6 +143,14 @@ def process(command: Callable[..., int | None], *, with_model: bool = True) -> C
     return app.command()(run)
 
 
+ScenarioName = Annotated[
+    str | None,
+    typer.Option(
+        metavar="circle|eight|positioning|sines|steps|FILE.csv",
+        help="What to follow; a file holds waypoints, or times t and all outputs by name.",
+        show_default="eight for a robot in the plane, sines of its outputs for any other",
+    ),
+]
 Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", min=0.1, help="How long to wait for an answer.")]
 
 
@@ -200,10 +208,11 @@ def sim(
 def reference(
     config: Config,
     bus: BusSettings,
-    scenario: Annotated[str, typer.Option(metavar="circle|eight|positioning|FILE.csv", help="What to follow; a file holds waypoints.")] = "eight",
+    scenario: ScenarioName = None,
     heading: Annotated[
-        Literal["tangent", "consistent", "none"], typer.Option(help="Of the path; what the point ahead of the axle can follow; 0.")
-    ] = "consistent",
+        Literal["tangent", "consistent", "none"] | None,
+        typer.Option(help="Of the path; what the point ahead of the axle can follow; 0.", show_default="consistent"),
+    ] = None,
     duration: Annotated[
         float | None, typer.Option(metavar="SECONDS", min=0.1, help="How long, in the robot's time; the scenario's own if not given.")
     ] = None,
@@ -214,18 +223,11 @@ def reference(
     ] = None,
 ) -> None:
     """Publish a reference from the robot's present state on, and again when the robot restarts."""
-    from rti_mpc.reference.trajectory import find_trajectory, followed_roles
-    from rti_mpc.signals import place
     from rti_mpc_service.reference import main
+    from rti_mpc_service.scenario import find_scenario
 
-    trajectory = find_trajectory(scenario, waypoint_speed, smooth_m=waypoint_smoothing)
-    if duration is not None:
-        trajectory = trajectory.lasting(duration)
-    model = build_model(config)
-    offset = place(model.parameters, "axle_offset")
-    a = None if offset is None else model.p_nominal[offset]
-    roles = followed_roles(model.name, model.outputs)
-    main(trajectory, bus, config.keys(), heading=heading, a=a, roles=roles, parameters=partial(stage_parameters, config))
+    followed = find_scenario(config, scenario, heading, duration, waypoint_speed, waypoint_smoothing)
+    main(followed, bus, config.keys(), parameters=partial(stage_parameters, config))
 
 
 @process
@@ -290,7 +292,7 @@ def params(
 @app.command()
 def demo(
     config: ConfigPath = SHIPPED,
-    scenario: Annotated[str, typer.Option(metavar="circle|eight|positioning|FILE.csv", help="What to follow; a file holds waypoints.")] = "eight",
+    scenario: ScenarioName = None,
     heading: Annotated[
         Literal["tangent", "consistent", "none"] | None,
         typer.Option(help="Of the path; what the point ahead of the axle can follow; without weight on it.", show_default="the scenario's best"),

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Reference source as a process: one trajectory, anchored to the robot's clock.
+Reference source as a process: one scenario, anchored to the robot's clock.
 
 It waits for a state, publishes the whole reference from that state's stamp on, and
 publishes it again whenever the robot restarts. Processes that join late get the
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from threading import Event
 
 import numpy as np
@@ -20,12 +20,11 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.lives import Heard, Lives
 from rti_mpc.contract.message import Notice, Reference, Severity, State
-from rti_mpc.reference.trajectory import Heading, Trajectory, rows
-from rti_mpc.signals import POSE_ROLES, Role
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
+from rti_mpc_service.scenario import Scenario
 
 ROLE = "reference"
 LOOK_PERIOD_S = 0.02  # period of reading states: waking at every state would take processor time from the controller
@@ -36,49 +35,28 @@ logger = logging.getLogger(ROLE)
 
 
 def main(
-    trajectory: Trajectory,
-    bus_settings: BusSettings,
-    keys: Keys,
-    *,
-    heading: Heading = "consistent",
-    a: float | None = 0.2,
-    psi0: float | None = None,
-    roles: Sequence[Role] = POSE_ROLES,
-    period_s: float = 0.05,
-    parameters: Callable[[Array], Array] | None = None,
-    stop: Event | None = None,
+    scenario: Scenario, bus_settings: BusSettings, keys: Keys, *, parameters: Callable[[Array], Array] | None = None, stop: Event | None = None
 ) -> int:
     """
     Publish a reference until stopped.
 
     Args:
-        trajectory: What to follow, see `rti_mpc.reference.trajectory.find_trajectory`.
+        scenario: What to follow, see `rti_mpc_service.scenario.find_scenario`.
         bus_settings: How to join the bus.
         keys: Where its streams are.
-        heading: ``"tangent"``, ``"consistent"``, or ``"none"`` for a controller without weight on it.
-        a: Distance of the reference point ahead of the axle, in m; None: it lies on the axle.
-        psi0: Initial consistent heading of an open path, in rad.
-        roles: Roles of the model's outputs, in their order.
-        period_s: Time between rows; the receiver interpolates, on the eight within 0.02 mm.
         parameters: Stage parameters at times since the start, in s: of shape ``(M,)`` to ``(M, np)``; the model's nominal ones if left out.
         stop: Event that stops the source; None: SIGINT and SIGTERM do.
 
     Returns:
         How many robots the reference was anchored to.
-
-    Raises:
-        ConfigError: The heading or a number is out of range.
-        OcpError: No consistent heading repeats on this closed path.
     """
-    y = rows(trajectory, period_s, heading, a, psi0, roles)
-    p: Array = np.empty((len(y), 0)) if parameters is None else parameters(period_s * np.arange(len(y), dtype=np.float64))
     stop = stop or stop_on_signals()
     with Bus.join(bus_settings, keys, stop=stop, say=logger.warning) as bus:
-        source = ReferenceSource(bus, trajectory, y, p, round(1e9 * period_s))
+        source = ReferenceSource(bus, scenario, parameters)
         bus.alive(ROLE)
-        logger.info("%s, heading %s, for %s", trajectory.name, heading, keys.robot)
-        if trajectory.note:
-            logger.warning("%s", trajectory.note)
+        logger.info("%s for %s", scenario.title, keys.robot)
+        if scenario.note:
+            logger.warning("%s", scenario.note)
         while not stop.wait(LOOK_PERIOD_S):
             source.look()
     return source.anchored
@@ -92,18 +70,16 @@ class ReferenceSource:
         anchored: How often the reference was anchored to a life of the robot.
     """
 
-    def __init__(self, bus: Bus, trajectory: Trajectory, y: Array, p: Array, period_ns: int) -> None:
+    def __init__(self, bus: Bus, scenario: Scenario, parameters: Callable[[Array], Array] | None = None) -> None:
         self.anchored = 0
-        self._trajectory = trajectory
-        self._y, self._p = y, p
-        self._period_ns = period_ns
+        self._scenario, self._parameters = scenario, parameters
         self._epoch = time.time_ns() // 1_000_000_000
         self._publisher = bus.publisher(bus.keys.reference)
         self._announcer = Announcer(bus, ROLE, self._epoch)
         self._bus = bus
         self._states: Subscriber | None = None
         self._look_again_ns = 0
-        self._intake = bus.intake(State, STALE_S)
+        self._intake = bus.intake(State, STALE_S, {"x": scenario.nx})
         self._lives = Lives(STALE_S, STALE_S)
         bus.expect("state", lambda: self.anchored)
 
@@ -123,17 +99,21 @@ class ReferenceSource:
         state = None
         for state in self._intake.newest_of_each(self._states.drain()):
             if self._lives.hear(state.epoch, now_ns) is Heard.BEGINS:
-                self._anchor(state.stamp_ns)
+                self._anchor(state)
         if state is not None and self._lives.rival is None:
             self._states = None
             self._look_again_ns = now_ns + RESTART_CHECK_NS
         for notice in self._intake.notices(now_ns):
             self._announcer.say(notice, 0 if state is None else state.stamp_ns)
 
-    def _anchor(self, stamp_ns: int) -> None:
-        """Publish the reference with a stamp in robot time."""
+    def _anchor(self, state: State) -> None:
+        """Publish the reference that starts at a state."""
         self.anchored += 1
-        self._publisher.put(Reference(self._epoch, self.anchored, stamp_ns, self._period_ns, self._trajectory.end, self._y, self._p))
-        text = f"{self._trajectory.name} for {self._trajectory.duration_s:.1f} s from {1e-9 * stamp_ns:.3f} s of the robot on"
+        scenario, stamp_ns = self._scenario, state.stamp_ns
+        y = scenario.y(state.x)
+        t: Array = np.float64(scenario.period_s) * np.arange(len(y))
+        p = np.empty((len(y), 0)) if self._parameters is None else self._parameters(t)
+        self._publisher.put(Reference(self._epoch, self.anchored, stamp_ns, round(1e9 * scenario.period_s), scenario.end, y, p))
+        text = f"{scenario.name} for {scenario.duration_s:.1f} s from {1e-9 * stamp_ns:.3f} s of the robot on"
         self._announcer.say(Notice(Severity.INFO, "reference_published", text), stamp_ns)
         logger.info("%s", text)

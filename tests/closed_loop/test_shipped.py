@@ -17,6 +17,7 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc_service.config.build import build_rti
 from rti_mpc_service.config.config import load
 from rti_mpc_service.rig.scenario import configured
+from rti_mpc_service.scenario import find_scenario
 from tests.loop import Run, drive, reference, robot
 
 CONFIG = load(Path(__file__).parents[2] / "deploy" / "pioneer_3dx.toml")
@@ -29,7 +30,7 @@ SCENARIOS: dict[str, tuple[Trajectory, Heading, float]] = {
 
 def controller_for(trajectory: Trajectory, heading: Heading) -> tuple[Controller, Ocp]:
     """The controller that `rti-mpc demo` runs."""
-    config = configured(CONFIG, trajectory, heading, guard=False)
+    config = configured(CONFIG, find_scenario(CONFIG, trajectory.name, heading))
     rti = build_rti(config)
     return Controller(rti, Timing(config.timing.delay_s, config.stale_s, config.timing.valid_s)), rti.ocp
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from rti_mpc.contract.message import State
-from rti_mpc.reference.trajectory import eight
 from rti_mpc.wire import bus as bus_module
 from rti_mpc.wire.bus import Bus, BusSettings, Received
 from rti_mpc.wire.info import Info, Leader, latches
@@ -25,6 +24,7 @@ from rti_mpc_service.config.config import load
 from rti_mpc_service.controller import daemon
 from rti_mpc_service.faults import relay
 from rti_mpc_service.host import echo
+from rti_mpc_service.scenario import find_scenario
 from rti_mpc_sim import robot
 from rti_mpc_sim.settings import RobotSettings
 from tests.wire.fake_session import FakeSession, Said
@@ -63,7 +63,7 @@ def controllers(folder: Path) -> None:
 
 PROCESSES: dict[tuple[str, ...], Callable[[Path], object]] = {
     ("robot",): lambda _: robot.main(RobotSettings(**robot_settings(CONFIG)), SETTINGS, KEYS, stop=STOPPED),
-    ("reference",): lambda _: source.main(eight(), SETTINGS, KEYS, stop=STOPPED),
+    ("reference",): lambda _: source.main(find_scenario(CONFIG), SETTINGS, KEYS, stop=STOPPED),
     ("controller", "standby"): controllers,
     ("guard",): lambda folder: guard.main(GUARDED, SETTINGS, state=folder, stop=STOPPED),
     ("router",): lambda _: router.main(SETTINGS, KEYS, stop=STOPPED),

@@ -50,12 +50,14 @@ robot.main(settings, BusSettings(listen=(endpoint,), connect=()), Keys("test", "
 
 SOURCE = """
 import sys
-from rti_mpc.reference.trajectory import eight
 from rti_mpc.wire.bus import BusSettings
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service import reference as source
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.config.config import load
+from rti_mpc_service.scenario import find_scenario
 
-source.main(eight(), BusSettings(connect=(sys.argv[1],)), Keys("test", "sim"), period_s=0.1)
+source.main(find_scenario(load(SHIPPED)), BusSettings(connect=(sys.argv[1],)), Keys("test", "sim"))
 """
 
 
@@ -206,6 +208,6 @@ def test_source_anchors_its_reference_to_every_new_robot_and_keeps_it_for_late_j
                 heard.append(decode(Reference, received.payload))
         assert heard[1].seq > heard[0].seq
         assert [reference.stamp_ns % (20 * MS) for reference in heard] == [0, 0]
-        assert (heard[0].period_ns, heard[0].end, heard[0].p.shape[1]) == (100 * MS, End.STOP, 0)
-        np.testing.assert_array_equal(heard[1].y, rows(eight(), 0.1, "consistent"))
+        assert (heard[0].period_ns, heard[0].end, heard[0].p.shape[1]) == (50 * MS, End.STOP, 0)
+        np.testing.assert_array_equal(heard[1].y, rows(eight(), 0.05, "consistent"))
         interrupted(source, host)

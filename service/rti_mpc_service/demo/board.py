@@ -39,9 +39,9 @@ class Board(Redrawn):
         else:
             self.console.print(text)
 
-    def show(self, time_s: float, error_mm: float | None, telemetry: Sequence[Telemetry], events: Sequence[Event]) -> None:
+    def show(self, time_s: float, error: str, telemetry: Sequence[Telemetry], events: Sequence[Event]) -> None:
         """Show progress, error and phase times; needs at least one sample."""
-        rows = self._rows(error_mm, telemetry)
+        rows = self._rows(error, telemetry)
         if self.live:
             table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
             for row in rows.items():
@@ -57,12 +57,12 @@ class Board(Redrawn):
                 f"{time_s:5.0f} of {self._duration_s:.0f} s: " + ", ".join(f"{name} {text}" for name, text in rows.items()), soft_wrap=True
             )
 
-    def _rows(self, error_mm: float | None, telemetry: Sequence[Telemetry]) -> dict[str, str]:
+    def _rows(self, error: str, telemetry: Sequence[Telemetry]) -> dict[str, str]:
         last, recent = telemetry[-1], telemetry[-MEDIAN_SAMPLES:]
         medians = {name: np.median([getattr(sample, name) for sample in recent]) for name in ("prepare_us", "feedback_us")}
         return {
             "mode": last.mode.name.lower(),
-            **({} if error_mm is None else {"error": f"{error_mm:.2f} mm"}),
+            "error": error,
             "command": "  ".join(f"{signal.name} {value:+.3f} {signal.unit}" for signal, value in zip(self._inputs, last.u[0], strict=True)),
             "preparation": f"{medians['prepare_us']:.0f} us",
             "feedback": f"{medians['feedback_us']:.0f} us",
@@ -79,6 +79,9 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
         ("error of the last lap", "max {} mm".format(*number_texts(summary, "last_lap_max_error_mm"))),
         ("at the end", "{} mm from the reference, at {} mm/s".format(*number_texts(summary, "final_error_mm", "final_speed_mm_s"))),
     ]
+    if summary["final_error_mm"] is None:  # no path in the plane
+        after = f"after {summary['transient_s']:g} s"
+        rows = [(f"error of {name} {after}", output_text(error)) for name, error in summary["outputs"].items()]
     rows = [row for row in rows if MISSING_TEXT not in row[1]]
     rows += [
         ("samples in period", f"{summary['in_period_share']:.2%} of {summary['samples']}, {summary['skipped']} skipped"),
@@ -100,6 +103,12 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
         )
     for fault in summary["events"]:
         console.print("{severity} of the {source} at {at_s:.1f} s: {text}".format(**fault), soft_wrap=True, markup=False)
+
+
+def output_text(error: Mapping[str, Any]) -> str:
+    """Return the errors of an output in words."""
+    unit = "" if error["unit"] == "1" else f" {error['unit']}"
+    return "max {}{unit}, rms {}{unit}".format(*number_texts(error, "max", "rms"), unit=unit)
 
 
 def number_texts(summary: Mapping[str, Any], *names: str) -> list[str]:

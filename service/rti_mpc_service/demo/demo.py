@@ -11,6 +11,7 @@ for long enough. Robot and controller have priority over all others.
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from dataclasses import dataclass
@@ -26,13 +27,14 @@ from rich.console import Console
 from rti_mpc.contract.message import Command, Reference, State, Telemetry
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.errors import ConfigError
-from rti_mpc.reference.trajectory import Heading, Trajectory, find_trajectory
+from rti_mpc.model.model import Model
+from rti_mpc.reference.trajectory import Heading
+from rti_mpc.signals import in_plane, plane
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import encode
-from rti_mpc.wire.info import Info
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc_service.config import toml
-from rti_mpc_service.config.build import build_ocp
+from rti_mpc_service.config.build import build_model, build_ocp, robot_settings
 from rti_mpc_service.config.fit import check_stop
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.console import widened
@@ -44,9 +46,11 @@ from rti_mpc_service.rig import robot_log
 from rti_mpc_service.rig.children import Children
 from rti_mpc_service.rig.company import CLI_MODULE, WATCHER_NICENESS, Failed, check_children, wait
 from rti_mpc_service.rig.endpoint import free_endpoint
+from rti_mpc_service.rig.run_data import wanted
 from rti_mpc_service.rig.scenario import BEST_HEADINGS, configured
 from rti_mpc_service.rig.summary import Outcome, summarize
 from rti_mpc_service.rig.witness import Witness
+from rti_mpc_service.scenario import Scenario, find_scenario
 
 START_TIMEOUT_S = 60.0  # for all processes to be present; the first controller on a machine compiles
 CONTROLLER_SILENCE_S = 5.0  # after which the run ends: the robot will not be driven any further
@@ -66,9 +70,8 @@ class DemoPlan:
 
     Attributes:
         config: Configuration that all processes load.
-        scenario: Scenario, as on the command line.
-        heading: Heading of the reference.
-        trajectory: Trajectory to follow.
+        name: Name of the scenario, as on the command line; empty: the robot's own.
+        scenario: Scenario to follow.
         duration_s: Duration of the run in robot time.
         speed: Seconds of robot time per second.
         folder: Folder of all results.
@@ -76,9 +79,8 @@ class DemoPlan:
     """
 
     config: Config
-    scenario: str
-    heading: Heading
-    trajectory: Trajectory
+    name: str
+    scenario: Scenario
     duration_s: float
     speed: float
     folder: Path
@@ -91,29 +93,51 @@ class DemoPlan:
 
 
 def plan(
-    config: Config, scenario: str, *, heading: Heading | None, speed: float, duration_s: float | None, folder: Path | None, viewer: bool, guard: bool
+    config: Config,
+    name: str | None,
+    *,
+    heading: Heading | None,
+    speed: float,
+    duration_s: float | None,
+    folder: Path | None,
+    viewer: bool,
+    guard: bool,
 ) -> DemoPlan:
     """
     Return the settings of a demo; what is None is decided by the scenario.
 
     Raises:
-        ConfigError: There is no such scenario, or the model has outputs that no path fills.
+        ConfigError: There is no such scenario, or it does not fit the robot.
+        OcpError: No consistent heading repeats on a closed path.
     """
-    trajectory = find_trajectory(scenario)
-    heading = heading or BEST_HEADINGS.get(scenario, "consistent")
+    scenario = find_scenario(config, name, heading or BEST_HEADINGS.get(name or ""))
+    config = configured(config, scenario, guard)
+    check_start(config, scenario)
     return DemoPlan(
-        config=configured(config, trajectory, heading, guard),
+        config=config,
+        name=name or "",
         scenario=scenario,
-        heading=heading,
-        trajectory=trajectory,
-        duration_s=duration_s or trajectory.duration_s,
+        duration_s=duration_s or scenario.duration_s,
         speed=speed,
-        folder=folder or Path("runs") / f"{trajectory.name}-{datetime.now():%Y%m%d-%H%M%S}",
+        folder=folder or Path("runs") / f"{scenario.name}-{datetime.now():%Y%m%d-%H%M%S}",
         viewer=viewer,
     )
 
 
-def main(config: Config, scenario: str, **options: Any) -> int:
+def check_start(config: Config, scenario: Scenario) -> None:
+    """
+    Check that the outputs are numbers where the simulated robot starts.
+
+    Raises:
+        ConfigError: One is not.
+    """
+    model = build_model(config)
+    y = scenario.y(np.array([config.sim.x0.get(state.name, 0.0) for state in model.states]))
+    if wrong := [output.name for output, column in zip(model.outputs, y.T, strict=True) if not np.isfinite(column).all()]:
+        raise ConfigError(f"sim.x0 must be a state whose outputs are finite, {wrong[0]} is not, got {config.sim.x0}")
+
+
+def main(config: Config, scenario: str | None, **options: Any) -> int:
     """
     Run a demo, write its folder, and print its summary.
 
@@ -131,8 +155,8 @@ def main(config: Config, scenario: str, **options: Any) -> int:
         (run.folder / "config.toml").write_text(toml.write(run.config), encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"--out must be a folder that can be written, got {run.folder}: {error.strerror}") from error
-    if run.trajectory.note:
-        console.print(run.trajectory.note, soft_wrap=True, markup=False)
+    if run.scenario.note:
+        console.print(run.scenario.note, soft_wrap=True, markup=False)
     stop = stop_on_signals()
     try:
         outcome = drive(run, console, stop)
@@ -151,7 +175,7 @@ def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:
     """
     ocp = build_ocp(run.config)
     endpoint = free_endpoint()
-    title = f"{run.trajectory.name}, heading {run.heading}, {run.speed:g} times real speed"
+    title = f"{run.scenario.title}, {run.speed:g} times real speed"
     logs = run.folder / "logs"
     logs.mkdir(exist_ok=True)
     keys = run.config.keys()
@@ -170,7 +194,7 @@ def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:
         meeting = ("-l", "tcp/127.0.0.1:0", "-e", endpoint)
         children.start("robot", CLI_MODULE, "sim", run.folder / "config.toml", *meeting, "--speed", run.speed, "--log", run.folder / "robot.csv")
         board.wait("starting the robot")
-        follow(run, witness, board, children, stop)
+        follow(run, ocp.model, witness, board, children, stop)
         board.wait("stopping all processes")
         for name in (name for name in END_ORDER if name != "guard" or guards(run)):
             if children.end(name, RECORDER_END_TIMEOUT_S if name == "recorder" else END_TIMEOUT_S):
@@ -179,7 +203,9 @@ def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:
     if witness.info is None or witness.reference is None:
         raise Failed("stopped before the robot had a reference")
     return Outcome(
-        trajectory=run.trajectory,
+        scenario=run.scenario,
+        reference=witness.reference,
+        plant=robot_settings(run.config)["model"],
         anchor_ns=witness.reference.stamp_ns,
         duration_s=run.duration_s,
         speed=run.speed,
@@ -196,7 +222,9 @@ def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:
 def start(run: DemoPlan, children: Children, endpoint: str, size: int) -> None:
     """Start all processes except the robot."""
     keys, config = run.config.keys(), run.folder / "config.toml"
-    scenario = ("--scenario", run.scenario, "--heading", run.heading, "--duration", run.reference_s)
+    scenario: list[object] = ["--duration", run.reference_s]
+    scenario += ["--scenario", run.name] if run.name else []
+    scenario += ["--heading", run.scenario.heading] if run.scenario.heading else []
     children.start("controller", CLI_MODULE, "run", config, "-e", endpoint)
     for name in guards(run):
         children.start(name, CLI_MODULE, "guard", config, "-e", endpoint)
@@ -207,7 +235,7 @@ def start(run: DemoPlan, children: Children, endpoint: str, size: int) -> None:
         children.start("recorder", CLI_MODULE, "view", config, "-e", endpoint, "--rerun-save", run.folder / "run.rrd", *live, nice=WATCHER_NICENESS)
 
 
-def follow(run: DemoPlan, witness: Witness, board: Board, children: Children, stop: Event) -> None:
+def follow(run: DemoPlan, model: Model, witness: Witness, board: Board, children: Children, stop: Event) -> None:
     """
     Listen until the robot was driven for long enough, the controller fell silent, or the demo is stopped.
 
@@ -225,30 +253,30 @@ def follow(run: DemoPlan, witness: Witness, board: Board, children: Children, st
             return
         if now_s - shown_s > DRAW_PERIOD_S:
             shown_s = now_s
-            board.show(time_s, error_mm(run, witness.info, last, witness.reference), witness.telemetry, witness.events)
+            board.show(time_s, error_text(model, last, witness.reference), witness.telemetry, witness.events)
         check_children(children)
         stop.wait(POLL_PERIOD_S)
         witness.listen()
 
 
-def error_mm(run: DemoPlan, info: Info | None, sample: Telemetry, reference: Reference) -> float | None:
-    """Return the distance of the robot from the path in a sample, mm; None if the model has no position."""
-    if info is None or info.position is None:
-        return None
-    at_s = np.array(1e-9 * (sample.stamp_ns - reference.stamp_ns))
-    return 1e3 * float(np.hypot(*(sample.x0[list(info.position)] - run.trajectory.position(at_s))))
+def error_text(model: Model, sample: Telemetry, reference: Reference) -> str:
+    """Return the error of a sample as text: the distance in the plane, or the error of each output."""
+    y = np.array(model.h()(sample.x0, model.p_nominal)).ravel()
+    error, columns = y - wanted(reference, np.array(sample.stamp_ns)), plane(model.outputs)
+    if in_plane(model.outputs) and columns is not None:
+        return f"{1e3 * float(np.hypot(*error[list(columns)])):.2f} mm"
+    errors = [math.remainder(value, math.tau) if output.angle else value for value, output in zip(error, model.outputs, strict=True)]
+    return "  ".join(f"{output.name} {value:+.3g} {output.unit}" for value, output in zip(errors, model.outputs, strict=True))
 
 
 def conclude(run: DemoPlan, outcome: Outcome, console: Console) -> int:
     """Write and print the summary of a run, draw it, and print how to view it; return the exit status."""
-    summary = {**summarize(outcome), "heading": run.heading, "machine": machine.machine_info()}
+    summary = {**summarize(outcome), "heading": run.scenario.heading, "machine": machine.machine_info()}
     (run.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     if not summary["samples"]:
         console.print(f"rti-mpc: nothing was driven, see {run.folder / 'logs'}", soft_wrap=True, markup=False)
         return 1
-    console.print(
-        f"{run.trajectory.name}, heading {run.heading}, {run.duration_s:.0f} s of the robot at {run.speed:g} times real speed", highlight=False
-    )
+    console.print(f"{run.scenario.title}, {run.duration_s:.0f} s of the robot at {run.speed:g} times real speed", highlight=False)
     print_summary(console, summary)
     if find_spec("matplotlib") is not None:
         from rti_mpc_service.rig.figure import figure

@@ -24,7 +24,6 @@ from rich.console import Console
 
 from rti_mpc.contract.guard import Limits
 from rti_mpc.errors import ConfigError
-from rti_mpc.reference.trajectory import find_trajectory
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc_service.config.build import build_model, guard_limits
 from rti_mpc_service.config.config import load
@@ -39,6 +38,7 @@ from rti_mpc_service.faults.table import FAULTS, Fault
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.company import Failed
 from rti_mpc_service.rig.scenario import configured
+from rti_mpc_service.scenario import find_scenario
 
 STATE_PERIOD_S = 0.01  # of the robot and of its record: the resolution of every measured time
 ROLES_OF_WIRING = {
@@ -108,7 +108,7 @@ def chosen(only: Sequence[str]) -> list[Fault]:
 
 def prepared(config: Config) -> Config:
     """Return the configuration of a run: from the scenario's pose, guarded, with states that come fast enough to measure by."""
-    config = configured(config, find_trajectory(SCENARIO), HEADING, guard=True)
+    config = configured(config, find_scenario(config, SCENARIO, HEADING), guard=True)
     measured_places(build_model(config))
     content = config.model_dump(by_alias=True, exclude_unset=True)
     content["debug"] = {"inject": True}

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run on one page: path, tracking error, commands against their limits, phase times against the period."""
+"""A run on one page: path and tracking error, or outputs against references; commands against their limits, phase times against the period."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.gridspec import SubplotSpec
 
 from rti_mpc_service.outline import outline, placed
 from rti_mpc_service.rig.run_data import Run
@@ -46,38 +47,44 @@ PLOT_STYLE: Any = {
 
 def figure(run: Run, path: Path) -> None:
     """
-    Draw a run; without path and error where the model has no position.
+    Draw a run: its path in the plane, or each output against its reference.
 
     Args:
         run: At least one state and one sample.
         path: Image to write; its suffix is the format.
     """
-    nu = len(run.info.inputs)
+    nu, ny = len(run.info.inputs), len(run.info.outputs)
+    panels: list[Callable[[Axes, Run], None]] = [*(partial(_command, i=i) for i in range(nu)), _phases]
+    if run.planar:
+        panels = [_error, *panels]
     with mpl.rc_context(PLOT_STYLE):
-        page = Figure(figsize=(13.0, 7.6), layout="constrained")
+        page = Figure(figsize=(13.0, max(7.6, 1.8 * len(panels), 0.0 if run.planar else 1.8 * ny)), layout="constrained")
         FigureCanvasAgg(page)
-        panels: list[Callable[[Axes, Run], None]] = [*(partial(_command, i=i) for i in range(nu)), _phases]
-        if run.info.position is None:
-            grid = page.add_gridspec(1 + nu, 1, height_ratios=[*[1.0] * nu, 1.3])
-            places = [grid[k, 0] for k in range(1 + nu)]
+        halves = page.add_gridspec(1, 2, width_ratios=[1.0, 1.15])
+        if run.planar:
+            _path(page.add_subplot(halves[0]), run)
         else:
-            grid = page.add_gridspec(2 + nu, 2, width_ratios=[1.0, 1.15], height_ratios=[1.3, *[1.0] * nu, 1.3])
-            _path(page.add_subplot(grid[:, 0]), run)
-            panels, places = [_error, *panels], [grid[k, 1] for k in range(2 + nu)]
-        first: Axes | None = None
-        for draw, place in zip(panels, places, strict=True):
-            axes = page.add_subplot(place, sharex=first)
-            first = first or axes
-            draw(axes, run)
-            axes.tick_params(labelbottom=draw is _phases)
-        axes.set_xlabel("robot time [s]")
-        axes.set_xlim(0.0, run.time_s[-1])
+            _stack(page, halves[0], run, [partial(_output, i=i) for i in range(ny)])
+        _stack(page, halves[1], run, panels)
         page.savefig(path, dpi=130)
+
+
+def _stack(page: Figure, place: SubplotSpec, run: Run, panels: Sequence[Callable[[Axes, Run], None]]) -> None:
+    """Draw panels over one axis of time, one below the other; a logarithmic one is higher."""
+    grid = place.subgridspec(len(panels), 1, height_ratios=[1.3 if draw in (_error, _phases) else 1.0 for draw in panels])
+    first: Axes | None = None
+    for k, draw in enumerate(panels):
+        axes = page.add_subplot(grid[k, 0], sharex=first)
+        first = first or axes
+        draw(axes, run)
+        axes.tick_params(labelbottom=k == len(panels) - 1)
+    axes.set_xlabel("robot time [s]")
+    axes.set_xlim(0.0, run.time_s[-1])
 
 
 def _path(axes: Axes, run: Run) -> None:
     """Draw the plane, equal axes, with the robot where it started and where it ended."""
-    axes.plot(*run.reference.T, color=REFERENCE_COLOR, linewidth=5.0, alpha=0.55, solid_capstyle="round", label="reference")
+    axes.plot(*run.path.T, color=REFERENCE_COLOR, linewidth=5.0, alpha=0.55, solid_capstyle="round", label="reference")
     axes.plot(*run.position.T, color=MEASURED_COLOR, label="robot, true position")
     if run.info.heading is not None:
         for row, alpha in ((0, 0.5), (-1, 1.0)):
@@ -101,6 +108,18 @@ def _error(axes: Axes, run: Run) -> None:
         label = f"after the transient: max {settled.max():.3g} mm, rms {np.sqrt((settled**2).mean()):.3g} mm"
         axes.axhline(settled.max(), color=ERROR_COLOR, linewidth=0.9, linestyle="--", label=label)
     axes.set(title="Tracking error", ylabel="distance [mm]")
+    _legend_above(axes)
+
+
+def _output(axes: Axes, run: Run, i: int) -> None:
+    """Draw an output against its reference, and say how far it is from it after the transient."""
+    label, settled = run.info.outputs[i], np.abs(run.output_error[run.settled, i])
+    axes.axvspan(0.0, min(run.transient_s, run.time_s[-1]), color=SHADE_COLOR)
+    axes.plot(run.time_s, run.reference[:, i], color=REFERENCE_COLOR, linewidth=5.0, alpha=0.55, solid_capstyle="round", label="reference")
+    said = f", error after the transient: max {settled.max():.3g}" if settled.size else ""
+    axes.plot(run.time_s, run.reference[:, i] + run.output_error[:, i], color=MEASURED_COLOR, label=f"true{said}")
+    axes.margins(y=0.12)
+    axes.set(title=f"Output {label.name}: {run.scenario}", ylabel=f"[{label.unit}]")
     _legend_above(axes)
 
 

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rti_mpc.array import Array
+from rti_mpc.contract.message import Reference
+from rti_mpc.signals import in_plane, plane
 from rti_mpc.wire.info import Info
 
 
@@ -23,7 +25,8 @@ class Run:
         stamp_ns: Stamps of the states, robot time, shape ``(M,)``.
         x: True states, shape ``(M, nx)``.
         u_applied: Inputs acting at the stamps, shape ``(M, nu)``.
-        reference: Position the reference asks for at the stamps, in m, shape ``(M, 2)``.
+        y: True outputs, shape ``(M, ny)``.
+        reference: Outputs the reference asks for at the stamps, shape ``(M, ny)``.
         sample_stamp_ns: Stamps of the samples' telemetry, shape ``(K,)``.
         prepare_us: Times of the preparation phases, shape ``(K,)``.
         feedback_us: Times of the feedback phases, shape ``(K,)``.
@@ -37,6 +40,7 @@ class Run:
     stamp_ns: NDArray[np.int64]
     x: Array
     u_applied: Array
+    y: Array
     reference: Array
     sample_stamp_ns: NDArray[np.int64]
     prepare_us: Array
@@ -56,15 +60,37 @@ class Run:
         return np.asarray(1e-9 * (self.sample_stamp_ns - self.stamp_ns[0]))
 
     @property
+    def planar(self) -> bool:
+        """Whether the outputs are a pose in the plane."""
+        return in_plane(self.info.outputs)
+
+    @property
     def position(self) -> Array:
-        """True positions in m, shape ``(M, 2)``; NaN where the model has none."""
-        return np.full((len(self.x), 2), np.nan) if self.info.position is None else self.x[:, self.info.position]
+        """True positions in m, shape ``(M, 2)``; NaN where the outputs are no pose in the plane."""
+        return self._position(self.y)
+
+    @property
+    def path(self) -> Array:
+        """Positions the reference asks for in m, shape ``(M, 2)``; NaN likewise."""
+        return self._position(self.reference)
 
     @property
     def error_mm(self) -> Array:
-        """Distance of the true position from the reference at the same stamp, shape ``(M,)``; NaN where the model has no position."""
-        dx, dy = (self.position - self.reference).T
+        """Distance of the true position from the reference at the same stamp, shape ``(M,)``; NaN likewise."""
+        dx, dy = (self.position - self.path).T
         return np.asarray(1e3 * np.hypot(dx, dy))
+
+    @property
+    def output_error(self) -> Array:
+        """True outputs less those asked for at the same stamp, angles within pi, each in its unit; shape ``(M, ny)``."""
+        error = self.y - self.reference
+        angles = [i for i, label in enumerate(self.info.outputs) if label.angle]
+        error[:, angles] = np.remainder(error[:, angles] + np.pi, 2 * np.pi) - np.pi
+        return np.asarray(error)
+
+    def _position(self, y: Array) -> Array:
+        columns = plane(self.info.outputs) if self.planar else None
+        return np.full((len(y), 2), np.nan) if columns is None else y[:, columns]
 
     @property
     def settled(self) -> NDArray[np.bool_]:
@@ -75,3 +101,9 @@ class Run:
     def period_us(self) -> float:
         """Wall time available for a sample."""
         return 1e6 * self.info.dt_s / self.speed
+
+
+def wanted(reference: Reference, stamp_ns: NDArray[np.int64]) -> Array:
+    """Return the outputs a reference asks for at stamps, shape ``(..., ny)``, interpolated between its rows; at its ends beyond them."""
+    rows = (stamp_ns - reference.stamp_ns) / reference.period_ns
+    return np.stack([np.interp(rows, np.arange(len(reference.y)), column) for column in reference.y.T], axis=-1)

@@ -3,28 +3,35 @@
 
 from __future__ import annotations
 
-from rti_mpc.reference.trajectory import Heading, Trajectory, followed_roles
+from rti_mpc.reference.trajectory import Heading
 from rti_mpc.signals import POSE_ROLES
 from rti_mpc_service.config.build import build_model, with_initial_state
+from rti_mpc_service.config.fit import check_tree
 from rti_mpc_service.config.schema import Config
+from rti_mpc_service.scenario import Scenario
 
 BEST_HEADINGS: dict[str, Heading] = {"circle": "none", "positioning": "none"}  # heading with the smallest error; "consistent" for all others
 
 
-def configured(config: Config, trajectory: Trajectory, heading: Heading, guard: bool) -> Config:
+def configured(config: Config, scenario: Scenario, guard: bool = False) -> Config:
     """
-    Return the configuration of a run: on loopback, from the scenario's pose, with a guard if `guard`, without weight on heading ``"none"``.
+    Return the configuration of a run: on loopback, from the start of a path, with a guard if `guard`, without weight on heading ``"none"``.
 
     Raises:
-        ConfigError: The model has outputs that no path fills.
+        ConfigError: An input has no bounds, which a guard needs.
     """
     model = build_model(config)
-    followed_roles(model.name, model.outputs)
-    pose = dict(zip(POSE_ROLES, trajectory.pose0, strict=True))
-    config = with_initial_state(config, [f"{state.name}={pose[state.role]!r}" for state in model.states if state.role in pose])
+    if scenario.path is not None:
+        pose = dict(zip(POSE_ROLES, scenario.path.pose0, strict=True))
+        config = with_initial_state(config, [f"{state.name}={pose[state.role]!r}" for state in model.states if state.role in pose])
     content = config.model_dump(by_alias=True, exclude_unset=True, exclude={"bus"})
-    if heading == "none":
+    if scenario.heading == "none":
         content["ocp"]["weights"]["Q"] |= {output.name: 0.0 for output in model.outputs if output.role == "heading"}
-    if guard:
-        content["guard"] = {**content.get("guard", {}), "enabled": True}
-    return Config.model_validate(content)
+    if guard:  # which knows no model: what it is to know of it is written for it
+        inputs = content["ocp"].get("bounds", {}).get("inputs", {})
+        inputs |= {input.name: inputs.pop(input.name) for input in model.inputs if input.name in inputs}
+        rest = {input.name: rest for input, rest in zip(model.inputs, model.u_rest, strict=True)}
+        content["guard"] = {"u_rest": rest, **content.get("guard", {}), "enabled": True}
+    config = Config.model_validate(content)
+    check_tree(config)
+    return config

@@ -2,9 +2,10 @@
 """
 Summary of a run in numbers: tracking errors, bounds, times and events.
 
-Errors are distances of the plant's true position from the analytic trajectory at
-the same stamp, at every state after the transient. Commanded and applied inputs are
-compared with the bounds by code that shares nothing with the solver.
+Errors are distances of the plant's true position from the analytic path at the same
+stamp, at every state after the transient, and differences of each true output from its
+reference. Commanded and applied inputs are compared with the bounds by code that shares
+nothing with the solver.
 """
 
 from __future__ import annotations
@@ -14,15 +15,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rti_mpc.array import Array
-from rti_mpc.contract.message import Event, Severity, Telemetry
+from rti_mpc.contract.message import Event, Reference, Severity, Telemetry
 from rti_mpc.contract.status import Mode
-from rti_mpc.reference.trajectory import Trajectory
+from rti_mpc.model.model import Model
 from rti_mpc.rti.ocp import Ocp
+from rti_mpc.signals import plane
 from rti_mpc.wire.info import Info
 from rti_mpc_service.rig.robot_log import RobotLog
-from rti_mpc_service.rig.run_data import Run
+from rti_mpc_service.rig.run_data import Run, wanted
+from rti_mpc_service.scenario import Scenario
 
 TRANSIENT_S = 20.0
 DRIVING_MODES = (Mode.TRACKING, Mode.HOLDING)
@@ -36,7 +40,9 @@ class Outcome:
     All results of a run.
 
     Attributes:
-        trajectory: The trajectory to follow.
+        scenario: The scenario to follow.
+        reference: Its rows, as published.
+        plant: Model of the robot itself.
         anchor_ns: Robot time at which it began.
         duration_s: How long it was to be followed.
         speed: Seconds of robot time per second.
@@ -49,7 +55,9 @@ class Outcome:
         echo_us: Round trips of the bare echo.
     """
 
-    trajectory: Trajectory
+    scenario: Scenario
+    reference: Reference
+    plant: Model
     anchor_ns: int
     duration_s: float
     speed: float
@@ -88,11 +96,12 @@ class Outcome:
         answered = [sample for sample in self.samples if np.isfinite(latency_us.get(sample.state_seq, np.nan))]
         return Run(
             info=self.info,
-            scenario=self.trajectory.name,
+            scenario=self.scenario.name,
             stamp_ns=log.stamp_ns,
             x=log.x,
             u_applied=log.u,
-            reference=self.trajectory.position(np.asarray(1e-9 * (log.stamp_ns - self.anchor_ns))),
+            y=np.array(self.plant.h()(log.x.T, self.plant.p_nominal)).reshape(-1, len(log.x)).T,
+            reference=self._wanted(log.stamp_ns),
             sample_stamp_ns=np.array([sample.stamp_ns for sample in answered], dtype=np.int64),
             prepare_us=np.array([sample.prepare_us for sample in answered]),
             feedback_us=np.array([sample.feedback_us for sample in answered]),
@@ -100,6 +109,13 @@ class Outcome:
             speed=self.speed,
             transient_s=min(TRANSIENT_S, self.duration_s / 2),
         )
+
+    def _wanted(self, stamp_ns: NDArray[np.int64]) -> Array:
+        """Return the outputs that were to be at stamps, shape ``(M, ny)``: of a path exactly, of all else as its rows say."""
+        y, columns = wanted(self.reference, stamp_ns), plane(self.plant.outputs)
+        if self.scenario.path is not None and columns is not None:
+            y[:, columns] = self.scenario.path.position(np.asarray(1e-9 * (stamp_ns - self.anchor_ns)))
+        return y
 
 
 def summarize(outcome: Outcome) -> dict[str, Any]:
@@ -122,7 +138,8 @@ def summarize(outcome: Outcome) -> dict[str, Any]:
         "speed": outcome.speed,
         "states": len(run.stamp_ns),
         "samples": len(samples),
-        **errors(run, outcome.trajectory.lap_s),
+        **errors(run, outcome.scenario.path.lap_s if outcome.scenario.path is not None else None),
+        "outputs": output_errors(run),
         "in_period_share": (len(samples) - len(misses)) / (len(samples) + skipped),
         "misses": [
             {
@@ -148,8 +165,8 @@ def summarize(outcome: Outcome) -> dict[str, Any]:
 
 
 def errors(run: Run, lap_s: float | None) -> dict[str, float | None]:
-    """Return errors and the speed at the end; null where the run was too short, or the model has no position."""
-    if run.info.position is None:
+    """Return errors and the speed at the end; null where the run was too short, or the outputs are no pose in the plane."""
+    if not run.planar:
         return dict.fromkeys(ERROR_KEYS)
     settled = run.error_mm[run.settled]
     last_lap = run.error_mm[run.time_s >= run.time_s[-1] - lap_s] if lap_s and run.time_s[-1] - lap_s >= run.transient_s else settled[:0]
@@ -162,6 +179,20 @@ def errors(run: Run, lap_s: float | None) -> dict[str, float | None]:
         float(steps_mm[-1] / steps_s[-1]) if steps_s.size else None,
     )
     return dict(zip(ERROR_KEYS, numbers, strict=True))
+
+
+def output_errors(run: Run) -> dict[str, dict[str, Any]]:
+    """Return the errors of each output, in its unit; null where the run was too short."""
+    settled, last = np.abs(run.output_error[run.settled]), np.abs(run.output_error[-1])
+    return {
+        label.name: {
+            "unit": label.unit,
+            "max": float(settled[:, i].max()) if len(settled) else None,
+            "rms": float(np.sqrt((settled[:, i] ** 2).mean())) if len(settled) else None,
+            "final": float(last[i]),
+        }
+        for i, label in enumerate(run.info.outputs)
+    }
 
 
 def limits(outcome: Outcome, samples: Sequence[Telemetry]) -> dict[str, Any]:

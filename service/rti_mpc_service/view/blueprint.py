@@ -13,6 +13,7 @@ import rerun.blueprint as rrb
 
 from rti_mpc.array import Array
 from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.signals import in_plane
 from rti_mpc.wire.info import Info
 from rti_mpc_service.outline import outline
 
@@ -154,7 +155,7 @@ def _commands(info: Info, i: int) -> rrb.TimeSeriesView:
 
 
 def _errors(info: Info) -> rrb.TimeSeriesView:
-    if info.tracked_position is not None:
+    if info.tracked_position is not None and in_plane(info.outputs):
         return _series("Tracking error [mm]", ["error/position"])
     return _series("Tracking error", [f"error/{info.outputs[i].name}" for i, _ in info.tracked])
 

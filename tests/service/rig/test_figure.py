@@ -22,6 +22,7 @@ PIONEER = Info(
     model="pioneer_3dx",
     states=(Label("x", "m", role="x"), Label("y", "m", role="y"), Label("psi", "rad", True, "heading"), Label("u", "m/s"), Label("omega", "rad/s")),
     inputs=(Label("u_c", "m/s", state="u"), Label("omega_c", "rad/s", state="omega")),
+    outputs=(Label("x", "m", role="x"), Label("y", "m", role="y")),
     dt_s=0.1,
     lbu=(-0.2, -np.inf),
     ubu=(0.5, np.inf),
@@ -41,6 +42,7 @@ def run() -> Run:
         stamp_ns=stamp_ns,
         x=np.column_stack([position, -t / 10, np.full_like(t, 0.1), np.full_like(t, -0.1)]),
         u_applied=np.column_stack([np.full_like(t, 0.1), np.full_like(t, -0.11)]),
+        y=position,
         reference=reference,
         sample_stamp_ns=stamp_ns[1:],
         prepare_us=np.linspace(100.0, 200.0, len(t) - 1),
@@ -92,7 +94,7 @@ def test_the_figure_is_an_image_of_a_legible_size(run: Run, tmp_path: Path) -> N
 
 
 def test_a_run_shorter_than_its_transient_and_without_error_is_drawn(run: Run, tmp_path: Path) -> None:
-    short = replace(run, stamp_ns=run.stamp_ns[:2], x=run.x[:2], u_applied=run.u_applied[:2], reference=run.position[:2])
+    short = replace(run, stamp_ns=run.stamp_ns[:2], x=run.x[:2], u_applied=run.u_applied[:2], y=run.y[:2], reference=run.y[:2])
     figure(short, tmp_path / "run.png")
     assert (tmp_path / "run.png").stat().st_size > 0
 
@@ -102,6 +104,7 @@ def test_a_model_with_one_input_and_no_heading_is_drawn(run: Run, tmp_path: Path
         role="controller",
         states=(Label("x", "m", role="x"), Label("y", "m", role="y")),
         inputs=(Label("f", "N"),),
+        outputs=(Label("x", "m", role="x"), Label("y", "m", role="y")),
         dt_s=0.1,
         lbu=(-np.inf,),
         ubu=(np.inf,),
@@ -110,15 +113,25 @@ def test_a_model_with_one_input_and_no_heading_is_drawn(run: Run, tmp_path: Path
     assert (tmp_path / "run.png").stat().st_size > 0
 
 
-def test_a_model_without_position_is_drawn_without_path_and_error(run: Run, tmp_path: Path) -> None:
-    arm = replace(run.info, states=tuple(replace(label, role="") for label in run.info.states))
+def test_a_model_without_position_is_drawn_by_its_outputs_against_their_references(run: Run, tmp_path: Path) -> None:
+    joints = (Label("q1", "rad", True), Label("z", "m"))
+    arm = replace(run.info, states=tuple(replace(label, role="") for label in run.info.states), outputs=joints)
+    turned = run.reference + np.array([2 * np.pi, 0.25])
     with mpl.rc_context({"svg.fonttype": "none"}):
-        figure(replace(run, info=arm), tmp_path / "run.svg")
+        figure(replace(run, info=arm, scenario="sines", y=turned), tmp_path / "run.svg")
     shown = words(tmp_path / "run.svg")
-    assert "Command u_c" in shown
     assert "Command omega_c" in shown
-    assert "Path: circle" not in shown
+    for expected in ("Output q1: sines", "Output z: sines", "[rad]", "[m]", "true, error after the transient: max 0.25"):
+        assert expected in shown
+    assert "Path:" not in shown
     assert "Tracking error" not in shown
+
+
+def test_an_angle_that_is_whole_turns_off_has_no_error(run: Run) -> None:
+    arm = replace(run.info, outputs=(Label("q1", "rad", True), Label("z", "m")))
+    error = replace(run, info=arm, y=run.reference + 2 * np.pi).output_error
+    assert np.abs(error[:, 0]).max() < 1e-9
+    assert error[:, 1] == pytest.approx(2 * np.pi)
 
 
 def test_drawing_leaves_the_callers_settings_alone(run: Run, tmp_path: Path) -> None:

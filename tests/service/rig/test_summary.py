@@ -7,18 +7,20 @@ import json
 from dataclasses import replace
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 
-from rti_mpc.contract.message import Event, Severity, Telemetry
+from rti_mpc.contract.message import End, Event, Reference, Severity, Telemetry
 from rti_mpc.contract.status import Mode, QpStatus
-from rti_mpc.reference.trajectory import circle, positioning
+from rti_mpc.reference.trajectory import circle
 from rti_mpc.wire.info import Info, Label
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.build import build_ocp
 from rti_mpc_service.config.config import load
 from rti_mpc_service.rig.robot_log import COUNTERS, RobotLog
 from rti_mpc_service.rig.summary import Outcome, excess, excess_share, summarize
+from rti_mpc_service.scenario import find_scenario
 
 MS = 1_000_000
 ANCHOR_NS = 700 * MS
@@ -28,6 +30,7 @@ INFO = Info(
     role="controller",
     states=(Label("x", "m", role="x"), Label("y", "m", role="y"), Label("psi", "rad", True, "heading"), Label("u", "m/s"), Label("omega", "rad/s")),
     inputs=(Label("u_c", "m/s", state="u"), Label("omega_c", "rad/s", state="omega")),
+    outputs=(Label("x", "m", role="x"), Label("y", "m", role="y"), Label("psi", "rad", True, "heading")),
     dt_s=0.1,
     lbu=(-0.5, -0.745),
     ubu=(0.5, 0.745),
@@ -54,7 +57,9 @@ def outcome() -> Outcome:
     position = circle().position(t) * (1.0 + beside)[:, None]
     seq = np.arange(1, len(stamp_ns) + 1) - 7
     return Outcome(
-        trajectory=circle(),
+        scenario=find_scenario(CONFIG, "circle", "none"),
+        reference=Reference(1, 1, ANCHOR_NS, 50 * MS, End.STOP, np.zeros((2, 3)), np.zeros((2, 0))),
+        plant=OCP.model,
         anchor_ns=ANCHOR_NS,
         duration_s=duration_s,
         speed=4.0,
@@ -83,6 +88,26 @@ def test_errors_are_of_the_true_position_at_the_same_stamp(outcome: Outcome) -> 
     assert summary["final_error_mm"] == pytest.approx(1.0)
     assert summary["final_speed_mm_s"] == pytest.approx(100.1, rel=1e-3)  # of a circle of 1.001 m, every 20 pi s
     assert (summary["scenario"], summary["driven"], summary["samples"], summary["states"]) == ("circle", True, 1257, 1257)
+
+
+def test_error_is_of_the_outputs_not_of_states_of_the_same_role(outcome: Outcome) -> None:
+    """A point a metre aside of the state that has the role of its y."""
+    model = OCP.model
+    aside = replace(model, y_expr=ca.vertcat(model.y_expr[0], model.y_expr[1] + 1.0, model.y_expr[2]))
+    assert summarize(replace(outcome, plant=aside))["max_error_mm"] == pytest.approx(1000.0, abs=3.0)
+
+
+def test_robot_that_follows_no_path_is_summed_up_by_its_outputs(outcome: Outcome) -> None:
+    """Angles within pi; the reference holds its last row."""
+    outputs = (Label("q1", "rad", True), Label("z", "m"), Label("q3", "rad", True))
+    reference = replace(outcome.reference, y=np.array([[0.0, 0.0, 0.0], [0.5, 0.25, 2 * np.pi]]))
+    log = replace(outcome.log, x=np.tile([0.5 - 2 * np.pi, 0.35, 0.1, 0.0, 0.0], (len(outcome.log.stamp_ns), 1)))
+    no_path = replace(outcome.scenario, path=None)
+    summary = summarize(replace(outcome, scenario=no_path, info=replace(INFO, outputs=outputs), reference=reference, log=log))
+    assert summary["final_error_mm"] is None
+    assert summary["outputs"]["q1"]["max"] == pytest.approx(0.0, abs=1e-9)
+    assert (summary["outputs"]["z"]["unit"], summary["outputs"]["z"]["rms"]) == ("m", pytest.approx(0.1))
+    assert summary["outputs"]["q3"]["final"] == pytest.approx(0.1)
 
 
 def test_reference_begins_where_it_is_anchored(outcome: Outcome) -> None:
@@ -163,5 +188,5 @@ def test_run_that_is_too_short_says_nothing_where_it_knows_nothing(outcome: Outc
 
 
 def test_summary_is_json_without_nan(outcome: Outcome) -> None:
-    for changed in (outcome, replace(outcome, echo_us=[]), replace(outcome, trajectory=positioning(), telemetry=[])):
+    for changed in (outcome, replace(outcome, echo_us=[]), replace(outcome, scenario=find_scenario(CONFIG, "positioning"), telemetry=[])):
         json.dumps(summarize(changed), allow_nan=False)

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Scenario of a robot: what its reference is, for any model.
+
+A robot whose outputs are position and heading follows a path in the plane; what a path
+says of each is found by roles. Any other robot follows references of its outputs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.contract.message import End
+from rti_mpc.errors import ConfigError
+from rti_mpc.reference.outputs import OUTPUT_SCENARIOS, OutputReference, names_outputs, recorded
+from rti_mpc.reference.trajectory import SCENARIOS, Heading, Trajectory, find_trajectory, followed_roles, rows
+from rti_mpc.signals import in_plane, place
+from rti_mpc_service.config.build import bounds, build_model
+from rti_mpc_service.config.schema import Config
+
+if TYPE_CHECKING:
+    from rti_mpc.model.model import Model
+
+ROW_PERIOD_S = 0.05  # between rows at most; the receiver interpolates, on the eight within 0.02 mm
+PERIOD_HORIZONS = 4  # horizons that a sine lasts at least, for robots that take longer than others
+MIN_PERIOD_S = 10.0
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """
+    What a robot is to follow.
+
+    Attributes:
+        name: As on the command line, or of a file.
+        nx: Number of states of the robot.
+        y: Of the robot's first state, shape ``(nx,)``, the rows of its reference, ``(M, ny)``.
+        period_s: Time between rows.
+        duration_s: How long it is followed.
+        end: What to do after its last row.
+        path: The path in the plane, if it is one.
+        heading: What the reference says of it; None where no output is a heading.
+    """
+
+    name: str
+    nx: int
+    y: Callable[[Array], Array]
+    period_s: float
+    duration_s: float
+    end: End
+    path: Trajectory | None = None
+    heading: Heading | None = None
+
+    @property
+    def title(self) -> str:
+        """Name, and what is said of the heading."""
+        return self.name if self.heading is None else f"{self.name}, heading {self.heading}"
+
+    @property
+    def note(self) -> str:
+        """What was done to the waypoints of a path; empty if nothing was."""
+        return "" if self.path is None else self.path.note
+
+
+def find_scenario(
+    config: Config,
+    name: str | None = None,
+    heading: Heading | None = None,
+    duration_s: float | None = None,
+    speed_m_s: float = 0.25,
+    smooth_m: float | None = None,
+) -> Scenario:
+    """
+    Find what a robot follows.
+
+    Args:
+        config: The robot's configuration.
+        name: A scenario or a CSV file; None: the eight for a robot in the plane, sines for any other.
+        heading: Of a path; None: consistent.
+        duration_s: How long it is followed; None: the scenario's own time.
+        speed_m_s: Along waypoints.
+        smooth_m: Path that waypoints are averaged over, see `rti_mpc.reference.trajectory.waypoints`.
+
+    Raises:
+        ConfigError: There is no such scenario, it says nothing of an output, or a file is wrong.
+        OcpError: No consistent heading repeats on a closed path.
+    """
+    model = build_model(config)
+    name = name or ("eight" if in_plane(model.outputs) else "sines")
+    if name not in (*SCENARIOS, *OUTPUT_SCENARIOS) and Path(name).suffix.lower() != ".csv":
+        known = ", ".join((*SCENARIOS, *OUTPUT_SCENARIOS))
+        raise ConfigError(f"a scenario must be one of {known} or a FILE.csv of waypoints or of outputs over time, got {name!r}")
+    if name not in SCENARIOS and (name in OUTPUT_SCENARIOS or not in_plane(model.outputs) or names_outputs(Path(name), model.outputs)):
+        if heading is not None:
+            raise ConfigError(f"--heading is of paths in the plane, it must be left out for {name}, got {heading}")
+        return of_outputs(config, model, name, duration_s)
+    trajectory = find_trajectory(name, speed_m_s, smooth_m=smooth_m)
+    return of_path(model, trajectory if duration_s is None else trajectory.lasting(duration_s), heading or "consistent")
+
+
+def of_path(model: Model, trajectory: Trajectory, heading: Heading) -> Scenario:
+    """Return a path in the plane as a scenario of a model."""
+    roles = followed_roles(model.name, model.outputs)
+    turns = "heading" in roles
+    y = rows(trajectory, ROW_PERIOD_S, heading, offset_ahead(model) if turns and heading == "consistent" else None, roles=roles)
+    return Scenario(
+        trajectory.name,
+        model.nx,
+        lambda x: y,
+        ROW_PERIOD_S,
+        trajectory.duration_s,
+        trajectory.end,
+        path=trajectory,
+        heading=heading if turns else None,
+    )
+
+
+def offset_ahead(model: Model) -> float | None:
+    """
+    Return how far a model's position is ahead of its axle, in m; None: on it.
+
+    Raises:
+        ConfigError: It is behind it, where no heading follows a path exactly.
+    """
+    if (i := place(model.parameters, "axle_offset")) is None:
+        return None
+    if (offset := model.p_nominal[i]) < 0.0:
+        raise ConfigError(
+            f"model {model.name}: {model.parameters[i].name}, the axle offset, must be at least 0 for a consistent heading, got {offset}: "
+            "choose --heading tangent"
+        )
+    return offset or None
+
+
+def of_outputs(config: Config, model: Model, name: str, duration_s: float | None) -> Scenario:
+    """Return references of outputs as a scenario of a model."""
+    reference: OutputReference
+    if name in OUTPUT_SCENARIOS:
+        lower, upper = bounds(config.ocp.bounds.states, model.counterparts()["outputs"])
+        weighted = [i for i, output in enumerate(model.outputs) if config.ocp.weights.Q[output.name] > 0.0]
+        period_s = max(MIN_PERIOD_S, PERIOD_HORIZONS * config.ocp.N * config.ocp.dt_s)
+        reference = OUTPUT_SCENARIOS[name](np.array(lower), np.array(upper), weighted[: model.nu], period_s)
+    else:
+        reference = recorded(Path(name), model.outputs)
+    if duration_s is not None:
+        reference = reference.lasting(duration_s)
+    period_s = min(ROW_PERIOD_S, config.ocp.dt_s)
+    t: Array = np.float64(period_s) * np.arange(int(np.ceil(reference.duration_s / period_s - 1e-9)) + 1)
+    h = model.h()
+
+    def y(x: Array) -> Array:
+        return reference.rows(np.array(h(x, model.p_nominal)).ravel(), t)
+
+    return Scenario(reference.name, model.nx, y, period_s, reference.duration_s, reference.end)
