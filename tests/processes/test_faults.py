@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from rti_mpc_service.faults.promise import BRAKING
-from rti_mpc_service.faults.table import FAULTS
 from tests.processes.system import rti_mpc
 
 
@@ -47,11 +46,11 @@ def test_robot_stops_in_time_and_drives_again(tmp_path: Path, names: tuple[str, 
         assert row["robot"] == "braked, stood, drove again"
 
 
-def test_unknown_fault_is_one_line_that_names_all_there_are() -> None:
+def test_unknown_fault_is_one_line_that_names_the_nearest() -> None:
     done = rti_mpc("faults", "--only", "controller_kiled")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert "perhaps controller_killed is meant" in done.stderr
     assert done.stderr.endswith("got 'controller_kiled'\n")
-    assert all(fault.name in done.stderr for fault in FAULTS)
 
 
 @pytest.mark.slow
