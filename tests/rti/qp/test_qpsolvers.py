@@ -12,7 +12,7 @@ import qpsolvers
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.qp.osqp import SolverSettings
-from rti_mpc.rti.qp.qpsolvers import numbered
+from rti_mpc.rti.qp.qpsolvers import indexed_problem
 from rti_mpc.rti.rti import FORMULATIONS, Rti
 from tests.problems import INF, beacon, double_integrator, fenced, solve
 
@@ -43,7 +43,7 @@ def test_numbering_the_matrices_leaves_them_as_they_were() -> None:
     one = rti()
     solve(one, 1)
     before = one.qp.P.toarray(), one.qp.A.toarray()
-    numbers = numbered(one.qp)
+    numbers = indexed_problem(one.qp)
     assert np.abs(numbers.A.data).max() <= one.qp.A.nnz
     np.testing.assert_array_equal(one.qp.P.toarray(), before[0])
     np.testing.assert_array_equal(one.qp.A.toarray(), before[1])
