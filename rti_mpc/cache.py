@@ -36,7 +36,7 @@ def cache_dir() -> Path:
         raise OSError("XDG_CACHE_HOME or HOME must name a folder for it") from None
 
 
-def own(folder: Path) -> None:
+def make_private(folder: Path) -> None:
     """
     Create a folder that no other user may write to, or check that it is one.
 
@@ -53,7 +53,7 @@ def own(folder: Path) -> None:
             raise OSError(f"{parent}, above {folder}, must belong to root or this user, and not be writable by all")
 
 
-def sealed(path: Path, key: str) -> bool:
+def is_intact(path: Path, key: str) -> bool:
     """Whether a file is complete, was kept under this key, and belongs to this user."""
     try:
         state = path.lstat()
@@ -65,7 +65,7 @@ def sealed(path: Path, key: str) -> bool:
     return content[-SEAL_BYTES:] == _seal(key, content[:-SEAL_BYTES])
 
 
-def keep(path: Path, key: str, content: bytes) -> None:
+def write_sealed(path: Path, key: str, content: bytes) -> None:
     """
     Write a sealed file, completely or not at all; a loader ignores the seal behind the end of a shared object.
 

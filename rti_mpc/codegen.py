@@ -23,7 +23,7 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.cache import cache_dir, keep, own, sealed
+from rti_mpc.cache import cache_dir, is_intact, make_private, write_sealed
 from rti_mpc.errors import ShapeError
 
 # No contraction into fused operations and no fast-math: a machine with a compiler and one without agree to rounding.
@@ -53,7 +53,7 @@ def compiled(*functions: ca.Function) -> list[ca.Function]:
     try:
         try:
             folder = cache_dir()
-            own(folder)
+            make_private(folder)
             return load(functions, folder / name, key, compiler, source)
         except OSError as error:
             warnings.warn(f"compiled code is not kept for the next start: {error}", stacklevel=2)
@@ -72,8 +72,8 @@ def load(functions: Sequence[ca.Function], library: Path, key: str, compiler: st
         OSError: The file cannot be written, or not be loaded.
         CalledProcessError: The compiler failed.
     """
-    if not sealed(library, key):
-        keep(library, key, build(compiler, source))
+    if not is_intact(library, key):
+        write_sealed(library, key, build(compiler, source))
     try:
         path = os.fsencode(library).decode()  # CasADi needs UTF-8 in any locale
         return [ca.external(function.name(), path) for function in functions]

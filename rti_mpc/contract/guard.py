@@ -142,7 +142,7 @@ class Guard:
     def receive_state(self, state: State, local_ns: int) -> None:
         """Follow the robot's clock by a state, and notice the beginning of another life."""
         self._wake(local_ns)
-        whose = self._lives.hear(state.epoch, local_ns, self._clock.rate)
+        whose = self._lives.judge(state.epoch, local_ns, self._clock.rate)
         if self._lives.notice is not None:
             self.notices.append(self._lives.notice)
             begin_ns = self._clock.now_ns(local_ns) + round(RAMP_LEAD_NS * self._clock.rate)  # the command to brake is sent before it is due

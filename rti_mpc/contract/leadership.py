@@ -118,7 +118,7 @@ class Leadership:
             self._company = self._company | {number}
         self._accompanied = True
 
-    def look(self, local_ns: int, rate: float) -> None:
+    def note_time(self, local_ns: int, rate: float) -> None:
         """
         Note the time; after a sleep the leader is in doubt.
 
@@ -160,7 +160,7 @@ class Leadership:
             self._quiet_ns = max(self._quiet_ns, command.state_stamp_ns)
         return True
 
-    def hear(self, state: State, local_ns: int, *, late_ns: int, ready: bool) -> None:
+    def receive_state(self, state: State, local_ns: int, *, late_ns: int, ready: bool) -> None:
         """
         Decide who answers a state. Called before the controller answers it, and after all commands of others were handed in.
 

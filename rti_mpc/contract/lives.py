@@ -72,7 +72,7 @@ class Lives:
         """Epoch of the life that may be believed next, None if there is none."""
         return None if self._rival is None else self._rival.epoch
 
-    def hear(self, epoch: int, local_ns: int, rate: float = 1.0) -> Heard:
+    def judge(self, epoch: int, local_ns: int, rate: float = 1.0) -> Heard:
         """
         Judge a state.
 

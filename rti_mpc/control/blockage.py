@@ -59,7 +59,7 @@ class Blockage:
         reasons = (f"the reference lies beyond the bounds of {beyond}" if beyond else "", "an obstacle or constraint holds it" if "" in names else "")
         return " and ".join(filter(None, reasons))
 
-    def look(self) -> bool:
+    def judge(self) -> bool:
         """Judge the plan of a new sample, and return whether `blocked` has changed."""
         self._measure()
         moved, left = self._squares

@@ -32,7 +32,7 @@ class Call(NamedTuple):
         return getattr(on, self.name)(*self.args, **self.kwargs)
 
 
-class Told(Protocol):
+class ReportsCalls(Protocol):
     """An object that reports its calls."""
 
     @property
@@ -40,12 +40,12 @@ class Told(Protocol):
         """Receiver of each call before it is made; None if nobody listens."""
 
 
-S = TypeVar("S", bound=Told)
+S = TypeVar("S", bound=ReportsCalls)
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def told(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
+def reported(method: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
     """Report each call of a method; the method must not call another such method of its object."""
     name = method.__name__
 

@@ -28,7 +28,7 @@ from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Notice, Ref
 from rti_mpc.contract.schedule import BEFORE_ALL_NS
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.blockage import Blockage
-from rti_mpc.control.call import Call, told
+from rti_mpc.control.call import Call, reported
 from rti_mpc.control.delay import DelayEstimator
 from rti_mpc.control.envelope import Envelope
 from rti_mpc.control.grid import Grid
@@ -62,7 +62,7 @@ class Controller:
     proposal that is not committed counts as never sent. After each sample the caller
     calls `prepare`, off the path from state to command.
 
-    Only the calls marked `told` change what commands depend on, and `on_call` receives
+    Only the calls marked `reported` change what commands depend on, and `on_call` receives
     each of them. The same calls on a second controller, built alike, give the same commands.
 
     Attributes:
@@ -90,7 +90,7 @@ class Controller:
         self._u_rest: Array = np.array(model.u_rest)
 
         self.on_call: Callable[[Call], object] | None = None
-        self._shadowing = False
+        self._standing_by = False
         self._modes = ModeMachine()
         self.skipped = 0
         self.ladder = Ladder()
@@ -129,9 +129,9 @@ class Controller:
         return self._modes.take()
 
     @property
-    def shadowing(self) -> bool:
+    def standing_by(self) -> bool:
         """Whether the commands of another controller act, those handed to `overhear`, and not those of this one."""
-        return self._shadowing
+        return self._standing_by
 
     # Incoming messages.
 
@@ -140,15 +140,12 @@ class Controller:
         """Whether a state of the robot has come."""
         return self._states.last is not None
 
-    def follows(self, state: State) -> bool:
-        """Whether a state belongs to the life of the robot that is followed, or may be the first one."""
-        return self._states.last is None or state.epoch == self._states.last.epoch
+    def continues(self, state: State) -> bool:
+        """Whether a state continues the last one, by life and sequence number, or is the first one."""
+        last = self._states.last
+        return (last is None or state.epoch == last.epoch) and self._states.cadence.counts(state.seq)
 
-    def awaits(self, state: State) -> bool:
-        """Whether a state continues the last one, by life and sequence number."""
-        return self.follows(state) and self._states.cadence.counts(state.seq)
-
-    @told
+    @reported
     def receive_state(self, state: State, arrival_ns: int) -> Command | None:
         """
         Act on a state, if its sample is due.
@@ -199,7 +196,7 @@ class Controller:
         """Do the part of `receive_reference` whose duration grows with the rows, in any thread; None if the reference will be refused."""
         return None if self._track.misfit(reference, self.np_) else self._track.lay_out(reference)
 
-    @told
+    @reported
     def receive_reference(self, reference: Reference, rows: Array | None = None) -> Reference | None:
         """
         Follow a reference from the next sample on.
@@ -223,14 +220,14 @@ class Controller:
         anchored = None if self._states.last is None else self._anchor(self._states.last)
         return anchored if reference.stamp_ns == STAMP_ON_ARRIVAL else None
 
-    @told
+    @reported
     def stop(self, reason: str) -> None:
         """Ramp to rest and stay there until `enable`."""
         if not self._stopped:
             self._stopped = reason
             self._modes.say(Severity.INFO, "stop", f"stop: {reason}")
 
-    @told
+    @reported
     def enable(self) -> None:
         """Release a `stop`, and start cold from the input that acts."""
         if self._stopped:
@@ -240,7 +237,7 @@ class Controller:
                 self.grid.running = False
                 self._modes.enter(Mode.WAITING, "enabled")
 
-    @told
+    @reported
     def retune(self, ocp: Ocp, version: int) -> int:
         """
         Plan with other weights and bounds, from the next sample that is not prepared yet. The ramp of a stop keeps the slew limits it was built with.
@@ -254,26 +251,26 @@ class Controller:
         self._tuning.change(ocp, version)
         return self._issued.seq + 1 + self._loaded
 
-    @told
+    @reported
     def overhear(self, command: Command) -> None:
-        """Take note of a command of the controller that this one shadows."""
+        """Record a command of another controller that acts while this one stands by."""
         self._sent.append(command)
         if self._delay is not None:
             self._delay.sent(command)
 
-    @told
-    def shadow(self) -> None:
-        """Compute commands that do not act; those handed to `overhear` do."""
-        self._shadowing = True
+    @reported
+    def stand_by(self) -> None:
+        """Stand by: compute commands that do not act, since those handed to `overhear` do."""
+        self._standing_by = True
 
-    @told
+    @reported
     def lead(self, epoch: int) -> None:
         """Let the commands of this controller act from the next one on; it continues from the inputs that have acted so far."""
-        self._issued.epoch, self._shadowing = epoch, False
+        self._issued.epoch, self._standing_by = epoch, False
         if self._loaded:
             self._load(shift=False)
 
-    @told
+    @reported
     def tick(self, local_ns: int) -> Command | None:
         """
         Watch for silence: propose a ramp to rest, once, when the last state has become stale.
@@ -293,7 +290,7 @@ class Controller:
         self._modes.enter(mode, f"no state for {1e-9 * age_ns:.3f} s", Severity.ERROR, "state_stale")
         return self._brake(state, now_ns + self.grid.delay_ns, QpStatus.NONE)
 
-    @told
+    @reported
     def in_time(self, command: Command, local_ns: int) -> Command | None:
         """
         Hold a sample to its budget: its command must be there before its first row is over.
@@ -324,27 +321,27 @@ class Controller:
         counted = command.mode in (Mode.BRAKING, Mode.STOPPED)
         return self._brake(self._states.last, now_ns + self.grid.delay_ns, command.status, wanted=counted)
 
-    @told
+    @reported
     def commit(self, command: Command, left_ns: int | None = None) -> None:
         """
-        Record a proposal as sent, once it has left; a shadow records it as one that would have been sent.
+        Record a proposal as sent, once it has left; a standby records the one that it would have sent.
 
         Args:
             command: The last proposal.
             left_ns: Earliest local monotonic time at which it left; None if it answers no state, so that robot time is a guess.
         """
         self._issued.commit(command)
-        if self._shadowing:
+        if self._standing_by:
             return
         clock = self._states.clock
         self._sent.append(command, BEFORE_ALL_NS if left_ns is None or self._states.cadence.fault else clock.latest_ns(left_ns))
 
     # The two phases.
 
-    @told
+    @reported
     def prepare(self) -> None:
         """Prepare the next sample: fix `t_k`, look the reference up, shift, linearize and load the QP."""
-        self._record.keep(self._issued.seq)
+        self._record.keep_plan(self._issued.seq)
         self._look_ahead()
         state = self._states.last
         if not self.grid.running or state is None:
@@ -362,16 +359,16 @@ class Controller:
 
     def _measure_delay(self, estimator: DelayEstimator, stamp_ns: int) -> None:
         """Learn from the state of the last sample, and let the grid follow."""
-        estimator.hear(self._sent.confirmed)
+        estimator.restore_if_lost(self._sent.confirmed)
         estimator.observe(self._states.x, stamp_ns)
-        if self._issued.last is not None and not self._shadowing:
+        if self._issued.last is not None and not self._standing_by:
             estimator.sent(self._issued.last)
         self._sent.delay_ns = estimator.delay_ns
         self.grid.adapt(estimator.delay_ns)
 
     def _look_ahead(self) -> None:
         """Report that the way is blocked, or free again."""
-        if self.mode not in (Mode.TRACKING, Mode.HOLDING) or not self._blockage.look():
+        if self.mode not in (Mode.TRACKING, Mode.HOLDING) or not self._blockage.judge():
             return
         if self._blockage.blocked:
             text = f"the way is blocked: the plan stands still short of the reference, {self._blockage.cause}"
@@ -493,7 +490,7 @@ class Controller:
         self._modes.enter(Mode.IDLE, self._states.cadence.fault)
         return command
 
-    @told
+    @reported
     def standstill(self, local_ns: int) -> Command | None:
         """Propose a last command, to rest as fast as the slew limits allow; None if nothing was ever commanded, or the stamps are no clock."""
         state = self._states.last

@@ -77,7 +77,7 @@ class DelayEstimator:
         self._commands.clear()
         self._last = None
 
-    def hear(self, confirmed: int) -> None:
+    def restore_if_lost(self, confirmed: int) -> None:
         """
         Restore the last good estimate after commands were lost: what was learnt meanwhile is wrong.
 

@@ -20,7 +20,7 @@ class Record:
         self._plan = (rti.x.copy(), rti.y_ref.copy(), 0.0)  # states, reference, cost
         self._version = 0  # of the parameters
 
-    def keep(self, seq: int) -> None:
+    def keep_plan(self, seq: int) -> None:
         """Keep the plan of a command, by its sequence number, unless it is kept already."""
         if self._seq != seq:
             self._plan = (self._rti.x.copy(), self._rti.y_ref.copy(), self._rti.cost)
@@ -41,7 +41,7 @@ class Record:
             skipped: Samples skipped since start.
             ladder: Samples without a plan of their own.
         """
-        self.keep(command.seq)
+        self.keep_plan(command.seq)
         solver = self._rti.solver
         prepare_us, feedback_us, latency_us, slack_s = times
         return Telemetry(

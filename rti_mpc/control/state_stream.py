@@ -125,7 +125,7 @@ class StateStream:
         """Return the verdict on a state, with the code and the text of its notice."""
         if not abs(state.x).max() <= MAX_STATE_MAGNITUDE:
             return Arrival.REFUSED, "state_refused", f"a state must be finite and at most {MAX_STATE_MAGNITUDE:g}, got {state.x.tolist()}"
-        heard = self.lives.hear(state.epoch, arrival_ns, self.clock.rate)
+        heard = self.lives.judge(state.epoch, arrival_ns, self.clock.rate)
         self.notice = self.lives.notice
         if heard is Heard.OTHER:
             return Arrival.FOREIGN, "", ""

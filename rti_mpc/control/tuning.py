@@ -17,8 +17,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.control.envelope import INPUT_BOUNDS
 from rti_mpc.errors import OcpError
-from rti_mpc.rti.linearization import WEIGHTS
-from rti_mpc.rti.ocp import Ocp, rest_fault
+from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp, rest_fault
 from rti_mpc.rti.rti import Rti
 
 COMPILED_FIELDS = ("N", "N_u", "dt", "method")  # attributes of the Ocp that are compiled in
@@ -91,7 +90,7 @@ class Tuning:
         bounds = dict(zip(INPUT_BOUNDS, (np.minimum(wanted.lbu, u_prev + ubdu), np.maximum(wanted.ubu, u_prev + lbdu), lbdu, ubdu), strict=True))
         fresh = self.version != self._written
         if fresh or any(not np.array_equal(bounds[name], self._acting[name]) for name in INPUT_BOUNDS):
-            self._rti.retune({**{name: getattr(wanted, name) for name in WEIGHTS if fresh}, **bounds})
+            self._rti.retune({**{name: getattr(wanted, name) for name in WEIGHTS_AND_BOUNDS if fresh}, **bounds})
             for name, limit in self._limits.items():
                 limit[:] = bounds[name]
         self._acting, self._written = bounds, self.version

@@ -84,7 +84,7 @@ class ActiveSet:
         """Start cold, with no bound acting."""
         self._places[:] = self._found[:] = 0.0
 
-    def keep(self) -> None:
+    def keep_guess(self) -> None:
         """Take the places of the guess as those found, because the guess is the plan."""
         self._found[:] = self._places
 

@@ -31,10 +31,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from rti_mpc.codegen import function
-from rti_mpc.rti.ocp import Ocp
-
-# Weights and bounds, by the attributes of the Ocp. They may change between samples; the compiled functions read them in this order.
-WEIGHTS = ("Q", "R", "delta", "lambda_", "lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx", "z", "Z", "Q_e", "lh", "uh", "zh", "Zh")
+from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 
 DAMPING_PER_COST = 0.005  # weight of half the square of a step, in half ranges of an input, per cost at the guess; see docs/engine.md
 
@@ -84,7 +81,7 @@ class Linearization:
         u_prev: Input before the plan, shape ``(nu, 1)``.
         y_ref: Reference, shape ``(ny, N)``.
         p: Stage parameters, shape ``(np, N + 1)``.
-        w: The weights and bounds, by the names in `WEIGHTS`.
+        w: The weights and bounds, by the names in `WEIGHTS_AND_BOUNDS`.
         scale_x: Scales of the states, see `rti_mpc.rti.scale`, shape ``(nx, 1)``; `scale_u` those of the inputs, `scale_g` those of g.
         A: Sensitivities to the state, nonzeros of `A_k` column by column, shape ``(nnz, N)``.
         B: Sensitivities to the input, nonzeros of `B_k`, shape ``(nnz, N)``.
@@ -118,7 +115,7 @@ class Linearization:
         self.u_prev = ca.MX.sym("u_prev", nu)
         self.y_ref = ca.MX.sym("y_ref", model.ny, N)
         self.p = ca.MX.sym("p", model.np_, N + 1)
-        self.w = {name: ca.MX.sym(name, *np.shape(getattr(ocp, name))) for name in WEIGHTS}
+        self.w = {name: ca.MX.sym(name, *np.shape(getattr(ocp, name))) for name in WEIGHTS_AND_BOUNDS}
         self._scale = ca.MX.sym("scale", nx + nu + len(ocp.lg))
         self.scale_x, self.scale_u, self.scale_g = self._scale[:nx], self._scale[nx : nx + nu], self._scale[nx + nu :]
 
@@ -174,7 +171,7 @@ class Linearization:
 
     @property
     def weights(self) -> dict[str, ca.MX]:
-        """Arguments that stay from sample to sample: weights and bounds, by the names in `WEIGHTS`, and the scale."""
+        """Arguments that stay from sample to sample: weights and bounds, by the names in `WEIGHTS_AND_BOUNDS`, and the scale."""
         return self.w | {"scale": self._scale}
 
     @property
@@ -289,7 +286,7 @@ def damping(ocp: Ocp) -> float:
 
 
 def plan_cost(ocp: Ocp) -> ca.Function:
-    """Build ``(x, u, u_prev, y_ref, p, *WEIGHTS, scale) -> cost``: the cost (4) of a plan and its penalties, nothing of it linearized."""
+    """Build ``(x, u, u_prev, y_ref, p, *WEIGHTS_AND_BOUNDS, scale) -> cost``: the cost (4) of a plan and its penalties, nothing of it linearized."""
     lin = Linearization(ocp)
     lg, ug, zg, Zg = (ca.repmat(e, 1, ocp.N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg))
     s = ca.fmax(0, ca.fmax(lin.g - ug, lg - lin.g))

@@ -257,7 +257,8 @@ def vector(name: str, value: ArrayLike, length: int) -> Array:
     return np.array(np.broadcast_to(array, (length,)))
 
 
-# The function that checks and copies each weight or bound, and the name of its length.
+# Weights and bounds by the attributes of the Ocp, with the function that checks and copies each, and the name of its length. They may
+# change between samples; the compiled functions read them in this order.
 WEIGHTS_AND_BOUNDS: dict[str, tuple[Callable[[str, ArrayLike, int], Array], str]] = {
     "Q": (weight_matrix, "ny"),
     "R": (weight_matrix, "nu"),

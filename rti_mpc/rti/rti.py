@@ -30,9 +30,9 @@ from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.active_set import ActiveSet
 from rti_mpc.rti.certificate import certificate
-from rti_mpc.rti.linearization import WEIGHTS, plan_cost, shift
+from rti_mpc.rti.linearization import plan_cost, shift
 from rti_mpc.rti.nominal import check_stiffness, nominal_state
-from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 from rti_mpc.rti.places import Places, places
 from rti_mpc.rti.qp.osqp import Solver, SolverSettings
 from rti_mpc.rti.qp.qp import Guess, Qp, Step, step_size
@@ -133,7 +133,7 @@ class Rti:
         change: Array = np.zeros(1)
         self._change = change.data
         # OSQP knows no infinity but its own.
-        self._weights = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS}
+        self._weights = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS_AND_BOUNDS}
         self.scale: Array = np.ones(model.nx + model.nu + len(ocp.lg))
         self.guess = Guess(
             sample={"x": x, "u": u, "u_prev": self.u_prev, "y_ref": self.y_ref, "p": self.p},
@@ -225,7 +225,7 @@ class Rti:
         Take other weights and bounds from the next `prepare` on; `ocp` keeps those it was built with.
 
         Args:
-            values: Weights and bounds by the names in `WEIGHTS`, shapes as in `Ocp`. The same bounds must be finite: which are is compiled in.
+            values: Weights and bounds by the names in `WEIGHTS_AND_BOUNDS`, shapes as in `Ocp`. Which bounds are finite is compiled in.
 
         Raises:
             OcpError: A name is none of them, or a value no array of real numbers.
@@ -305,7 +305,7 @@ class Rti:
         for guess, plan in self._pairs:
             plan[:] = guess
         if self.active_set is not None:
-            self.active_set.keep()
+            self.active_set.keep_guess()
 
     def _roll_out(self) -> None:
         """Make a guess in motion, with inputs half way to their upper bounds, that is its own reference: scales are computed there, undamped."""

@@ -90,7 +90,7 @@ class Keys:
         return self.of(streams.TELEMETRY)
 
     @property
-    def shadow_telemetry(self) -> Key[Telemetry]:
+    def standby_telemetry(self) -> Key[Telemetry]:
         """`Telemetry`, by a standby."""
         return self.of(streams.SHADOW_TELEMETRY)
 

@@ -111,7 +111,7 @@ class OperatorStop:
         if what not in STOP_REQUESTS:
             raise ConfigError(f"request must be stop or enable, got {shown(what)}")
         if "latch" in request:
-            self.hear(read_latch(request["latch"]))
+            self.take_over(read_latch(request["latch"]))
         else:
             by = request.get("by", UNNAMED_OPERATOR)
             if not (isinstance(by, str) and 0 < len(by) <= MAX_NAME_CHARACTERS and by.isprintable()):
@@ -124,7 +124,7 @@ class OperatorStop:
             answer["error"] = f"not any more: {latch}"
         return answer | ({"not_stored": fault} if fault else {})
 
-    def hear(self, heard: Latch) -> None:
+    def take_over(self, heard: Latch) -> None:
         """Take over the latch of another process, if it is greater."""
         self._take(lambda known: merge(known, heard))
 
@@ -154,7 +154,7 @@ class OperatorStop:
             return  # announced by those who read more of it
         try:
             for latch in told:
-                self.hear(read_latch(latch))
+                self.take_over(read_latch(latch))
         except MessageError as error:
             self._say(Notice(Severity.WARNING, "latch_refused", f"{received.key}: {error}"))
 

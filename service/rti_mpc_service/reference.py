@@ -58,7 +58,7 @@ def main(
         if scenario.note:
             logger.warning("%s", scenario.note)
         while not stop.wait(LOOK_PERIOD_S):
-            source.look()
+            source.publish_if_restarted()
     return source.anchored
 
 
@@ -83,7 +83,7 @@ class ReferenceSource:
         self._lives = Lives(STALE_S, STALE_S)
         bus.expect("state", lambda: self.anchored)
 
-    def look(self) -> None:
+    def publish_if_restarted(self) -> None:
         """
         Publish the reference if a robot has started since the last look.
 
@@ -98,7 +98,7 @@ class ReferenceSource:
             self._states = self._bus.subscriber(self._bus.keys.state, capacity=RING_MESSAGES)
         state = None
         for state in self._intake.newest_of_each(self._states.drain()):
-            if self._lives.hear(state.epoch, now_ns) is Heard.BEGINS:
+            if self._lives.judge(state.epoch, now_ns) is Heard.BEGINS:
                 self._anchor(state)
         if state is not None and self._lives.rival is None:
             self._states = None

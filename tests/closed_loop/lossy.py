@@ -42,7 +42,7 @@ class Lossy(Fuzz):
         self._ticked_ns = 0
         super().__init__(seed, compile=compile)
         self._standby = Controller(Rti(pioneer(N=6, N_u=4), compile=compile), Timing(), epoch=8, compile=compile)
-        self._standby.shadow()
+        self._standby.stand_by()
 
     def _begin(self, now_ns: int) -> None:
         super()._begin(now_ns)
@@ -146,7 +146,7 @@ class Lossy(Fuzz):
         self._guard.notices.clear()
         if self.rng.random() < 0.003:
             self.controller, self._standby = self._standby, self.controller
-            self._standby.shadow()
+            self._standby.stand_by()
             epoch = self._standby._issued.epoch + 1
             self.controller.lead(epoch)
             self._command_seq = self.controller._issued.seq

@@ -57,12 +57,12 @@ class One:
                 self.heard.append(command)
 
     def listen(self, local_ns: int) -> None:
-        self.leadership.look(local_ns, 1.0)
+        self.leadership.note_time(local_ns, 1.0)
         self.take_in()
 
     def hear(self, state: State, local_ns: int) -> None:
         self.listen(local_ns)
-        self.leadership.hear(state, local_ns, late_ns=local_ns - state.stamp_ns, ready=self.ready)
+        self.leadership.receive_state(state, local_ns, late_ns=local_ns - state.stamp_ns, ready=self.ready)
 
     def see(self, k: float, late_ns: int = 0) -> bool:
         """Be shown the state of a sample; return whether it was answered."""

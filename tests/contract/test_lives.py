@@ -26,7 +26,7 @@ class Scene:
 
     def hear(self, epoch: int, after_ms: float = 100.0) -> Heard:
         self.now_ms += after_ms
-        heard = self.lives.hear(epoch, round(self.now_ms * MS), self.rate)
+        heard = self.lives.judge(epoch, round(self.now_ms * MS), self.rate)
         if self.lives.notice is not None:
             self.told.append(self.lives.notice.text)
         return heard

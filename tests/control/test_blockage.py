@@ -25,7 +25,7 @@ def looked(rti: Rti, blockage: Blockage, target: float, samples: int) -> list[bo
     for _ in range(samples):
         rti.prepare(np.tile([target, 0.0], (N, 1)), shift=False)
         assert rti.feedback(np.zeros(2)).usable
-        changes.append(blockage.look())
+        changes.append(blockage.judge())
     return changes
 
 
@@ -75,7 +75,7 @@ def test_a_bicycle_that_cannot_reverse_and_stands_beside_its_goal_is_not_blocked
     for _ in range(2 * N):
         rti.prepare(np.tile([-0.5, 0.3, 0.0], (N, 1)), shift=False)
         assert rti.feedback(np.zeros(5)).usable
-        assert not blockage.look()
+        assert not blockage.judge()
     assert blockage._squares[0] < MIN_PROGRESS_RATIO**2 * blockage._squares[1], "it stands short of the reference"
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calls written down, and made again: what is told decides every command, to the last bit."""
+"""Reported calls, repeated on a second controller: they decide every command, to the last bit."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from rti_mpc.wire.cdr import encode
 from tests.loop import MS, reference, robot
 from tests.problems import pioneer
 
-TOLD = {
+REPORTED_CALLS = {
     *("commit", "enable", "in_time", "lead", "overhear", "prepare", "receive_reference"),
-    *("receive_state", "retune", "shadow", "standstill", "stop", "tick"),
+    *("receive_state", "retune", "stand_by", "standstill", "stop", "tick"),
 }
-READS = {  # change nothing that a command depends on
-    *("at_rest", "awaits", "follows", "heard", "lay_out", "mode", "notices", "robot_now_ns", "robot_rate"),
-    *("say", "shadowing", "slack_s", "telemetry"),
+READING_CALLS = {  # change nothing that a command depends on
+    *("at_rest", "continues", "heard", "lay_out", "mode", "notices", "robot_now_ns", "robot_rate"),
+    *("say", "standing_by", "slack_s", "telemetry"),
 }
 
 
@@ -35,10 +35,10 @@ def made() -> Controller:
     return Controller(Rti(pioneer(N=6, N_u=4), compile=False), Timing(), compile=False)
 
 
-def test_every_public_method_of_a_controller_is_told_or_reads() -> None:
+def test_every_public_method_of_a_controller_is_reported_or_only_reads() -> None:
     public = {name: member for name, member in vars(Controller).items() if not name.startswith("_")}
-    assert {name for name, member in public.items() if hasattr(member, "__wrapped__")} == TOLD
-    assert set(public) == TOLD | READS
+    assert {name for name, member in public.items() if hasattr(member, "__wrapped__")} == REPORTED_CALLS
+    assert set(public) == REPORTED_CALLS | READING_CALLS
 
 
 def test_no_call_that_is_told_makes_another_one() -> None:
@@ -46,7 +46,7 @@ def test_no_call_that_is_told_makes_another_one() -> None:
     calls = [node.func for node in ast.walk(ast.parse(inspect.getsource(Controller))) if isinstance(node, ast.Call)]
     own = {func.attr for func in calls if isinstance(func, ast.Attribute) and isinstance(func.value, ast.Name) and func.value.id == "self"}
     assert own
-    assert not own & TOLD
+    assert not own & REPORTED_CALLS
 
 
 def life(controller: Controller) -> tuple[list[Call], list[bytes]]:
@@ -69,7 +69,7 @@ def life(controller: Controller) -> tuple[list[Call], list[bytes]]:
         local_ns = body.now_ns + int(rng.integers(0, 3 * MS))
         if 60 <= k < 75:
             if k == 60:
-                controller.shadow()
+                controller.stand_by()
             if (theirs := answer(leader, state, local_ns)) is not None:
                 controller.overhear(theirs)
         elif k == 75:
@@ -91,7 +91,7 @@ def life(controller: Controller) -> tuple[list[Call], list[bytes]]:
             continue
         command = controller.in_time(command, left_ns := local_ns + (90 * MS if k in (30, 50, 51) else MS))
         if command is not None:
-            if controller.shadowing:
+            if controller.standing_by:
                 controller.commit(command, left_ns)
             else:
                 send(command, left_ns)
@@ -111,15 +111,15 @@ def answer(leader: Controller, state: State, local_ns: int) -> Command | None:
 
 
 def test_controller_that_is_told_the_same_calls_sends_the_same_commands_bit_for_bit() -> None:
-    """Late samples, a loss, a shadow that takes over, a stop, other weights and references: all is in the calls."""
+    """Late samples, a loss, a standby that takes over, a stop, other weights and references: all is in the calls."""
     calls, sent = life(made())
-    assert {call.name for call in calls} >= {"lead", "overhear", "retune", "shadow", "standstill", "stop", "tick"}
+    assert {call.name for call in calls} >= {"lead", "overhear", "retune", "stand_by", "standstill", "stop", "tick"}
     again, repeated = made(), []
     proposal: Any = None
     for call in calls:
         if call.name == "commit":
             assert encode(proposal) == encode(call.args[0])
-            if not again.shadowing:
+            if not again.standing_by:
                 repeated.append(encode(proposal))
             call = call._replace(args=(proposal, *call.args[1:]))
         result = call.repeat(again)

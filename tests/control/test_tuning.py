@@ -11,8 +11,7 @@ import pytest
 from rti_mpc.array import Array
 from rti_mpc.control.tuning import Tuning
 from rti_mpc.errors import OcpError
-from rti_mpc.rti.linearization import WEIGHTS
-from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import FORMULATIONS, Rti
 from tests.problems import INF, arc, double_integrator, fenced, pioneer
@@ -34,7 +33,7 @@ OTHER: dict[str, Any] = {
 
 
 def values(ocp: Ocp) -> dict[str, Array]:
-    return {name: getattr(ocp, name) for name in WEIGHTS}
+    return {name: getattr(ocp, name) for name in WEIGHTS_AND_BOUNDS}
 
 
 def plan(rti: Rti, samples: int = 12) -> tuple[Array, Array, float]:

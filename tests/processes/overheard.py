@@ -25,7 +25,7 @@ STREAMS: dict[str, tuple[str, type[Any], tuple[str, ...]]] = {
     "state": (KEYS.state, State, ("epoch", "seq", "stamp_ns")),
     "command": (KEYS.command, Command, ("epoch", "seq", "state_seq", "state_stamp_ns", "mode")),
     "actuation": (KEYS.actuation, Command, ("epoch", "seq", "state_seq", "state_stamp_ns", "mode")),
-    "shadow": (KEYS.shadow_telemetry, Telemetry, ("epoch", "seq", "state_seq", "mode")),
+    "standby": (KEYS.standby_telemetry, Telemetry, ("epoch", "seq", "state_seq", "mode")),
 }
 
 

@@ -89,7 +89,7 @@ class Partitioned:
         new = {state["seq"] for state in streams["state"][-400:] if state["at_ns"] > since_ns}
         told = streams["actuation" if self.guarded else "command"][-40:]
         follows = any(message["mode"] == Mode.TRACKING and message["state_seq"] in new for message in told)
-        ready = any(message["mode"] == Mode.TRACKING and message["state_seq"] in new for message in streams["shadow"][-40:])
+        ready = any(message["mode"] == Mode.TRACKING and message["state_seq"] in new for message in streams["standby"][-40:])
         return follows and ready and abs(streams["state"][-1]["x"][3]) > 0.05
 
     def leads(self) -> str:

@@ -64,11 +64,11 @@ def test_orders_hold_whoever_leads_and_of_two_that_stand_by_one_leads(tmp_path: 
         first = system.tracking()
         assert rti_mpc("params", "set", system.config, "ocp.weights.Q.psi=0.0", "-e", system.endpoint).returncode == 0
         system.start("standby", "third")  # that hear of the change from the leader
-        shadows = system.bus.subscriber(KEYS.shadow_telemetry, capacity=64)
+        standby_telemetry = system.bus.subscriber(KEYS.standby_telemetry, capacity=64)
         sources = set()
 
         def both() -> bool:
-            samples = [decode(Telemetry, received.payload) for received in shadows.drain()]
+            samples = [decode(Telemetry, received.payload) for received in standby_telemetry.drain()]
             sources.update(sample.seq for sample in samples if sample.parameter_version == 1 and sample.mode is Mode.TRACKING)
             return sum(role.startswith("standby.") for role in system.lives) == 2 and len(sources) > 20
 

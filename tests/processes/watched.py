@@ -65,7 +65,7 @@ class Watched(System):
         until(lambda: "controller" in self.lives, "a leader")
         self.start("standby", "reference")
         until(lambda: "standby" in self.lives, "a standby")
-        heard(self.bus.subscriber(KEYS.shadow_telemetry), Telemetry, lambda sample: sample.mode is Mode.TRACKING)
+        heard(self.bus.subscriber(KEYS.standby_telemetry), Telemetry, lambda sample: sample.mode is Mode.TRACKING)
         self.state(lambda state: abs(state.x[3]) > 0.05)
 
     def listen(self) -> list[Command]:

@@ -128,7 +128,7 @@ def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> Check
         status = rti.feedback(x)
         done_ns = time.perf_counter_ns()
         statuses[status] += 1
-        bounds.look()
+        bounds.note_plan()
         if asked and status.usable:
             mine, theirs = (solution(one, guess, y_ref, x) for one in (tight, judge))
             if mine is not None and theirs is not None:

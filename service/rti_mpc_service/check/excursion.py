@@ -56,7 +56,7 @@ class Bounds:
         self.reached = np.zeros(len(self.names), dtype=bool)
         self._softened = ca.Function("softened", [model.x, model.u, model.p], [ca.vertcat(model.x[list(ocp.soft), 0], ocp.h_expr)]).map(ocp.N)
 
-    def look(self) -> None:
+    def note_plan(self) -> None:
         """Note which bounds the last plan has reached."""
         rti, ocp = self._rti, self._rti.ocp
         held = rti.u[np.minimum(np.arange(ocp.N), ocp.N_u - 1)]

@@ -151,7 +151,7 @@ class Daemon:
         self._crashed = Event()
         self._announcer: Announcer | None = None
         self._commands = bus.publisher(keys.command)
-        self._telemetries = {role: bus.publisher(key) for role, key in ((LEADER, keys.telemetry), (STANDBY, keys.shadow_telemetry))}
+        self._telemetries = {role: bus.publisher(key) for role, key in ((LEADER, keys.telemetry), (STANDBY, keys.standby_telemetry))}
         self._states_in = bus.intake(State, config.stale_s, {"x": model.nx, "u": model.nu})
         bus.expect("state", lambda: controller.heard)
         self._references = References(bus, controller, model.ny)
@@ -202,7 +202,7 @@ class Daemon:
         """Answer states as they arrive: the control loop."""
         for received in iter(subscriber.recv, None):
             arrival_ns = time.monotonic_ns()
-            for state in self._states_in.newest_of_each((received, *subscriber.drain()), self._controller.awaits):
+            for state in self._states_in.newest_of_each((received, *subscriber.drain()), self._controller.continues):
                 self._sample(state, arrival_ns)
             self._announce()
 
@@ -212,8 +212,8 @@ class Daemon:
         with self._lock:
             if self._ending:
                 return
-            if controller.awaits(state):  # not for a repeated or outdated state
-                self._leadership.hear(state, arrival_ns)
+            if controller.continues(state):  # not for a repeated or outdated state
+                self._leadership.receive_state(state, arrival_ns)
             command = controller.receive_state(state, arrival_ns)
             acted_ns = time.monotonic_ns()
             if command is not None:

@@ -79,7 +79,7 @@ class Candidate:
         self._told = (0, -1)  # epoch and sequence number of the last description of a leader that was read
         self._commands = bus.subscriber(bus.keys.command, capacity=RING_MESSAGES)
         self._tokens: dict[str, Any] = {}
-        controller.shadow()
+        controller.stand_by()
         self._apply()
         bus.watch_alive(self._meet)
 
@@ -103,7 +103,7 @@ class Candidate:
         """Whether another controller takes over when this one ends."""
         return self._decision.relieved
 
-    def hear(self, state: State, local_ns: int) -> None:
+    def receive_state(self, state: State, local_ns: int) -> None:
         """
         Decide who answers a state; to be called before the controller receives it.
 
@@ -113,7 +113,7 @@ class Candidate:
         """
         self.listen(local_ns)
         late_ns = self._controller.robot_now_ns(local_ns) - state.stamp_ns
-        self._decision.hear(state, local_ns, late_ns=late_ns, ready=self._controller.mode not in UNREADY_MODES)
+        self._decision.receive_state(state, local_ns, late_ns=late_ns, ready=self._controller.mode not in UNREADY_MODES)
         self._apply()
 
     def sends(self, command: Command) -> bool:
@@ -129,7 +129,7 @@ class Candidate:
         Args:
             local_ns: Local monotonic time.
         """
-        self._decision.look(local_ns, self._controller.robot_rate)
+        self._decision.note_time(local_ns, self._controller.robot_rate)
         self._follow(self._decision.known)
 
     def leader(self) -> Leader | None:
@@ -178,12 +178,12 @@ class Candidate:
             yield received
 
     def _apply(self) -> None:
-        """Let the controller lead or shadow, as decided."""
+        """Let the controller lead or stand by, as decided."""
         if (acting := self._decision.acting) == self._acting:
             return
         self._acting = acting
         if acting is None:
-            self._controller.shadow()
+            self._controller.stand_by()
         else:
             self._controller.lead(acting)
 

@@ -27,7 +27,7 @@ import numpy as np
 from rich.table import Table
 
 from rti_mpc.array import Array
-from rti_mpc.cache import cache_dir, own
+from rti_mpc.cache import cache_dir, make_private
 from rti_mpc.contract.message import Command, End, Reference, State
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.controller import Controller, Timing
@@ -194,7 +194,7 @@ def cache_info() -> dict[str, Any]:
     """Return the folder of compiled code, or the error that prevents its use."""
     try:
         folder = cache_dir()
-        own(folder)
+        make_private(folder)
     except OSError as error:
         return {"path": None, "error": str(error)}
     return {"path": str(folder), "error": None}

@@ -139,10 +139,10 @@ class Threads:
         self._pid = pid
         self._open: dict[str, Waits] = {}  # by folder in proc
         self._looked_ns = time.monotonic_ns()
-        self.look()
+        self.find()
         self.waited_ns()
 
-    def look(self) -> None:
+    def find(self) -> None:
         """Find the threads that exist now."""
         pids = [str(self._pid)] if self._pid else []
         for pid in pids:
@@ -213,7 +213,7 @@ def main(path: str, core: int, pid: int) -> None:
                 if (lateness_ns := time.monotonic_ns() - due_ns) > MIN_COUNTED_LATENESS_NS:
                     late_ns += lateness_ns
             if (number := number + 1) % ROWS_PER_THREAD_SEARCH == 0:
-                threads.look()
+                threads.find()
             waited_ns, now_ns = threads.waited_ns(), time.monotonic_ns()
             file.write(ROW_LAYOUT.pack(since_ns, now_ns, late_ns, waited_ns))
             since_ns = now_ns

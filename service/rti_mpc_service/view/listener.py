@@ -65,7 +65,7 @@ class Listener:
         """Time of the newest state on the robot's timeline."""
         return self._timeline.now_ns
 
-    def own(self, notice: Notice) -> Entry:
+    def own_entry(self, notice: Notice) -> Entry:
         """Return a notice of the viewer as an event at `now_ns`."""
         return Entry(self.now_ns, Event(0, 0, self.now_ns, "viewer", notice.severity, notice.code, notice.text))
 
@@ -118,7 +118,7 @@ class Listener:
         """Yield the notices of the intakes as events of the viewer."""
         for door in self._doors.values():
             for notice in door.notices(now_ns):
-                yield self.own(notice)
+                yield self.own_entry(notice)
 
 
 def _foreign(role: str, message: Any) -> str:

@@ -90,7 +90,7 @@ def pump(listener: Listener, outlets: Sequence[Outlet], spawned: subprocess.Pope
             spawned = None
         for notice in said:
             announce(log, announcer, notice, listener.now_ns)
-            entries.append(listener.own(notice))
+            entries.append(listener.own_entry(notice))
         for outlet in outlets:
             outlet.offer(entries)
 

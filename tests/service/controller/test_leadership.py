@@ -84,7 +84,7 @@ class Puppet:
     """As much of a controller as a `Candidate` uses."""
 
     mode: Mode = Mode.TRACKING
-    shadowing: bool = False
+    standing_by: bool = False
     epoch: int = 0
     heard: list[Command] = field(default_factory=list)
     said: list[Notice] = field(default_factory=list)
@@ -93,14 +93,14 @@ class Puppet:
     def say(self, notice: Notice) -> None:
         self.said.append(notice)
 
-    def shadow(self) -> None:
-        self.shadowing = True
+    def stand_by(self) -> None:
+        self.standing_by = True
 
     def overhear(self, command: Command) -> None:
         self.heard.append(command)
 
     def lead(self, epoch: int) -> None:
-        self.epoch, self.shadowing = epoch, False
+        self.epoch, self.standing_by = epoch, False
 
     def robot_now_ns(self, local_ns: int) -> int:
         return local_ns
@@ -120,7 +120,7 @@ class One:
         """Be shown the state of a sample; return whether it was answered."""
         stamp_ns = round(k * DT_NS)
         state = State(1, round(10 * k), stamp_ns, np.zeros(1))
-        self.leadership.hear(state, stamp_ns + late_ns)
+        self.leadership.receive_state(state, stamp_ns + late_ns)
         command = self.made(k)
         sends = self.leadership.sends(command)
         if sends:
@@ -197,14 +197,14 @@ def test_what_is_no_command_for_this_robot_unseats_nobody_and_is_counted(pair: t
 
 def test_what_is_decided_reaches_the_controller_and_the_bus(pair: tuple[One, One]) -> None:
     leader, standby = pair
-    assert (standby.puppet.shadowing, standby.leadership.role, leader.leadership.relieved) == (True, "standby", True)
+    assert (standby.puppet.standing_by, standby.leadership.role, leader.leadership.relieved) == (True, "standby", True)
     assert [standby.see(k) for k in (5, 6)] == [False, True]
-    assert (standby.puppet.shadowing, standby.puppet.epoch) == (False, standby.leadership.epoch)
+    assert (standby.puppet.standing_by, standby.puppet.epoch) == (False, standby.leadership.epoch)
     assert standby.leadership.declare()
     assert not standby.leadership.declare(), "once a change"
     assert standby.leadership.role == "controller"
     assert not leader.see(7)
-    assert (leader.puppet.shadowing, codes(leader), codes(standby)) == (True, ["stepped_down"], ["took_over"])
+    assert (leader.puppet.standing_by, codes(leader), codes(standby)) == (True, ["stepped_down"], ["took_over"])
     assert [command.state_stamp_ns for command in leader.puppet.heard] == [6 * DT_NS]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A controller that shadows another and takes its place, and one that is retuned: in lockstep, sample by sample."""
+"""A controller that stands by and takes over, and one that is retuned: in lockstep, sample by sample."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ def take_over(
     samples: int, dies_at: int, delay_s: float = 0.0, *, hears: bool = True, late: bool = False, reports: bool = False
 ) -> tuple[Array, list[Command]]:
     """
-    Inputs that acted, one row a state, and the commands of who took over.
+    Return the inputs that acted, one row per state, and the commands of the standby that took over.
 
-    The shadow hears each command of the leader after it has prepared its own next sample, as it does over a bus, the
+    The standby receives each command of the leader after it has prepared its own next sample, as it does over a bus, the
     last one perhaps only after one more, and leads from the second state on that the leader does not answer.
     """
-    leader, shadow = controller("leader", delay_s), controller("shadow", delay_s)
-    shadow.shadow()
+    leader, standby = controller("leader", delay_s), controller("standby", delay_s)
+    standby.stand_by()
     body = robot(eight(), reports_inputs=reports)
     applied, taken = [], []
     for k in range(samples):
@@ -58,21 +58,21 @@ def take_over(
         applied.append(body.u.copy())
         command = leader.receive_state(state, body.now_ns) if k < dies_at else None
         if k == dies_at + 1:
-            shadow.lead(2)
-        own = shadow.receive_state(state, body.now_ns)
+            standby.lead(2)
+        own = standby.receive_state(state, body.now_ns)
         assert (own is None) == (k == 0), "the second state tells how fast the robot's clock runs"
         if own is not None:
-            shadow.commit(own)
-        shadow.prepare()
+            standby.commit(own)
+        standby.prepare()
         if command is not None:
             leader.commit(command)
             leader.prepare()
             assert not body.accept(command, body.now_ns)
             if hears and not (late and k == dies_at - 1):
-                shadow.overhear(command)
+                standby.overhear(command)
             last = command
         elif k == dies_at and late:
-            shadow.overhear(last)
+            standby.overhear(last)
         elif k > dies_at:
             assert own is not None
             assert not body.accept(own, body.now_ns)
@@ -100,13 +100,13 @@ def test_take_over_in_a_transient_keeps_the_slew_limits() -> None:
         assert np.all(np.abs(np.diff(applied, axis=0)) <= STEP + ROUNDING), dies_at
 
 
-def test_shadow_that_hears_nothing_would_jump() -> None:
+def test_standby_that_hears_nothing_would_jump() -> None:
     """What it hears is what keeps the limits: the test above could fail."""
     applied, _ = take_over(10, 6, hears=False)
     assert np.any(np.abs(np.diff(applied, axis=0)) > 2 * STEP)
 
 
-def test_shadow_that_hears_nothing_goes_on_from_what_the_robot_reports() -> None:
+def test_standby_that_hears_nothing_continues_from_what_the_robot_reports() -> None:
     applied, _ = take_over(10, 6, hears=False, reports=True)
     assert np.all(np.abs(np.diff(applied, axis=0)) <= STEP + ROUNDING)
 
