@@ -18,13 +18,13 @@ from contextlib import ExitStack
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-GREEDY = """
+ENDLESS_LOOP = """
 import os, sys
 while os.getppid() == int(sys.argv[1]):  # at ordinary priority, for as long as we live
     sum(range(100_000))
 """
-# What a test imports that starts processes, talks over a bus or reads a clock.
-TELLING = (
+# Imports of a test that starts processes, talks over a bus or reads a clock.
+TIMED_IMPORTS = (
     *("subprocess", "threading", "time", "socket", "zenoh"),
     *("rti_mpc_service.rig.children", "rti_mpc_service.host.hold_up", "rti_mpc.wire.bus", "tests.processes", "tests.guard_conformance"),
 )
@@ -38,7 +38,7 @@ def timed(path: Path) -> bool:
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             names.add(str(node.module))
-    return any(name == telling or name.startswith(f"{telling}.") for name in names for telling in TELLING)
+    return any(name == timed or name.startswith(f"{timed}.") for name in names for timed in TIMED_IMPORTS)
 
 
 def main() -> int:
@@ -52,7 +52,7 @@ def main() -> int:
     command = [sys.executable, "-m", "pytest", "-n", "auto", "--dist", "loadfile", "--durations", "5", *rest, *files]
     with ExitStack() as stack:
         for _ in range(options.loops):
-            greedy = subprocess.Popen([sys.executable, "-c", GREEDY, str(os.getpid())], stdin=subprocess.DEVNULL)
+            greedy = subprocess.Popen([sys.executable, "-c", ENDLESS_LOOP, str(os.getpid())], stdin=subprocess.DEVNULL)
             stack.callback(greedy.wait)
             stack.callback(greedy.kill)
         for run in range(1, options.runs + 1):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Promises in milliseconds, held on a host that may be busy with others: beyond one only by what its witness has seen."""
+"""Limits in milliseconds on a host that may be busy: a limit may be exceeded only by delays that the witness of the host has recorded."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The second opinion on a whole OCP: its nonlinear program, written down again by the book and solved by IPOPT."""
+"""Independent solution of a whole OCP: its nonlinear program, written anew from the equations and solved by IPOPT."""
 
 from __future__ import annotations
 

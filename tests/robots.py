@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robots that keep no convention: other orders, other names, and what others call something else; `tests.robots:NAME` in a configuration."""
+"""Robots with unusual orders and names of signals; `tests.robots:NAME` in a configuration."""
 
 from __future__ import annotations
 

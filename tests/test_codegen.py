@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled functions: the same numbers as the interpreted ones, cached, and never in the way."""
+"""Compiled functions: the same numbers as the interpreted ones, cached, and never an obstacle to a start."""
 
 from __future__ import annotations
 

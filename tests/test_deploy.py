@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What lies in deploy/ is used as it lies there."""
+"""Files of deploy/, used as they are."""
 
 from __future__ import annotations
 

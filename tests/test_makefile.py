@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `make` says on a machine that lacks something: which package to install, and nothing is left behind."""
+"""Messages of `make` on a machine that lacks something: they name the package to install, and nothing is left behind."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the README says is run here as it stands there."""
+"""Commands and statements of the README, run and checked as they stand there."""
 
 from __future__ import annotations
 

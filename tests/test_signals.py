@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Roles of signals: said by the model, found whatever names, units and places are."""
+"""Roles of signals: given by the model, and found whatever the names, units and places are."""
 
 from __future__ import annotations
 

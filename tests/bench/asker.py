@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Somebody who wants something of a controller again and again."""
+"""Client that sends requests to a controller again and again."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from tests.bench.driven import Driven
 from tests.processes.system import until
 
 PAUSE_S = 0.05  # between two requests, after the answer
-PATIENCE_S = 10.0  # for it
-FLOOD = 100  # requests at once
+ANSWER_TIMEOUT_S = 10.0
+FLOOD_REQUESTS = 100  # sent at once
 REQUESTS: dict[str, Callable[[int], dict[str, Any]]] = {
     "set": lambda k: {"request": "params", "set": {"ocp.weights.Q.psi": 0.05 + 0.001 * (k % 2)}},
     "refused set": lambda k: {"request": "params", "set": {"ocp.weights.Q.psi": -1.0 - k}},
@@ -71,15 +71,15 @@ class Asker:
             elif kind == "reference":
                 self._plan(now_ns)
             else:
-                answer = self._robot.bus.request(self._robot.bus.keys.request, REQUESTS[kind](k), PATIENCE_S)
+                answer = self._robot.bus.request(self._robot.bus.keys.request, REQUESTS[kind](k), ANSWER_TIMEOUT_S)
                 self.answers[kind, "error" not in answer] += 1
 
     def _flood(self) -> None:
         """Send what is no request, and wait for no answer."""
         session: Any = self._robot.bus._session
-        for _ in range(FLOOD):
+        for _ in range(FLOOD_REQUESTS):
             session._session.get(self._robot.bus.keys.request, lambda _: None, payload=b"{" * 1000, timeout=1.0)
-        self.answers["nonsense", False] += FLOOD
+        self.answers["nonsense", False] += FLOOD_REQUESTS
 
     def _plan(self, now_ns: int) -> None:
         """Send the reference again, from now on, as a planner does that has seen something new."""

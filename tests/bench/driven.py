@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shipped robot, sampled faster, driven along the eight in real time by the processes a user runs; and what is heard of it."""
+"""The shipped robot, sampled faster, driven along the eight in real time by the processes that a user runs, and the messages received from them."""
 
 from __future__ import annotations
 

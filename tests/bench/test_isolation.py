@@ -34,8 +34,8 @@ pytestmark = [
 DT_S = 0.01
 SHORT = "CI" in os.environ
 ROUNDS = 2 if SHORT else 10
-BLOCK = 400  # samples: Zenoh closes the link of a hung peer in the second second, in the block
-COLD = 300  # first samples, left out: the robot drives to its path
+BLOCK_SAMPLES = 400  # Zenoh closes the link of a hung peer in the second second, in the block
+COLD_SAMPLES = 300  # first samples, left out: the robot drives to its path
 REALTIME = "priority = 20"  # where it is granted, what else this machine does hides no delay
 TROUBLES: dict[str, Callable[[int], object]] = {
     "watched": lambda pid: None,
@@ -50,14 +50,14 @@ COMPARED = {"hung": "alone", "stopped": "alone", "full disk": "watched"}
 def block(robot: Driven, name: str) -> list[Telemetry]:
     """Samples from the beginning of a trouble on, or of a time without a viewer."""
     if name not in TROUBLES:
-        return robot.samples(BLOCK)
+        return robot.samples(BLOCK_SAMPLES)
     recording = robot.folder / "run.rrd"
     recording.unlink(missing_ok=True)
     pid = robot.children.start("viewer", "rti_mpc_service.cli", "view", robot.toml, "-e", robot.endpoint, "--rerun-save", recording, nice=10)
     until(lambda: "viewer" in robot.lives and recording.exists() and recording.stat().st_size, "the viewer records", patience_s=30.0)
     robot.listen()
     TROUBLES[name](pid)
-    samples = robot.samples(BLOCK)
+    samples = robot.samples(BLOCK_SAMPLES)
     if name == "hung":
         os.kill(pid, signal.SIGCONT)
     robot.children.end("viewer")
@@ -69,7 +69,7 @@ def test_no_trouble_of_a_viewer_can_be_told_from_the_noise_of_the_machine(tmp_pa
     rng = np.random.default_rng(1)
     blocks: dict[str, list[list[Telemetry]]] = {name: [] for name in BLOCKS}
     with driven(tmp_path, DT_S, duration_s=3600.0, realtime=REALTIME) as robot:
-        robot.samples(COLD)
+        robot.samples(COLD_SAMPLES)
         for _ in range(ROUNDS):
             for name in rng.permutation(BLOCKS).tolist():
                 blocks[name].append(block(robot, name))
@@ -81,7 +81,7 @@ def test_no_trouble_of_a_viewer_can_be_told_from_the_noise_of_the_machine(tmp_pa
     inside = {name: np.array([[sample.latency_us for sample in one] for one in blocks[name]]) for name in BLOCKS}
     outside = {name: np.array([[answered_us[sample.state_seq] for sample in one] for one in blocks[name]]) for name in BLOCKS}
     with capsys.disabled():
-        print(f"\n{machine.machine_info()}\n{ROUNDS} rounds of {len(BLOCKS)} blocks of {BLOCK} samples, {granted}")
+        print(f"\n{machine.machine_info()}\n{ROUNDS} rounds of {len(BLOCKS)} blocks of {BLOCK_SAMPLES} samples, {granted}")
         for what, times in {"state in to command out": inside, "state sent to command received, at the robot": outside}.items():
             p99, spread = compared(times)
             print(f"{what}; two equal blocks differ in p99 by {spread:.1%}")

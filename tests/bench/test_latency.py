@@ -41,7 +41,7 @@ pytestmark = pytest.mark.benchmark
 DT_S = 0.01
 SHORT = "CI" in os.environ
 SAMPLES = 600 if SHORT else 2000
-COLD = 200  # first samples, left out: the robot drives to its path
+COLD_SAMPLES = 200  # first samples, left out: the robot drives to its path
 QOS = {"priority": zenoh.Priority.REAL_TIME, "congestion_control": zenoh.CongestionControl.DROP, "express": True}
 ECHO = """
 import sys, zenoh
@@ -126,9 +126,9 @@ def test_command_takes_at_most_one_and_a_half_echoes_and_the_feedback(config: Co
             children.end(name)
     log = robot_log.read(tmp_path / "robot.csv", INFO)
     latency_us = dict(zip(log.seq.tolist(), log.latency_us.tolist(), strict=True))
-    rows = [(latency_us[sample.state_seq], sample.feedback_us, sample.prepare_us) for sample in telemetry[COLD:SAMPLES]]
+    rows = [(latency_us[sample.state_seq], sample.feedback_us, sample.prepare_us) for sample in telemetry[COLD_SAMPLES:SAMPLES]]
     latency, feedback, prepare = np.array(rows).T
-    latency, echo = latency[np.isfinite(latency)], np.array(pings.round_trip_us[COLD:])
+    latency, echo = latency[np.isfinite(latency)], np.array(pings.round_trip_us[COLD_SAMPLES:])
     allowed_us = 1.5 * np.median(echo) + np.median(feedback)
     with capsys.disabled():
         print(f"\n{machine.machine_info()}")
@@ -136,5 +136,5 @@ def test_command_takes_at_most_one_and_a_half_echoes_and_the_feedback(config: Co
             print(f"{name:16} {quantiles(values)}, {len(values)} samples")
         print(f"p50 of state to command is {np.median(latency) / allowed_us:.2f} of 1.5 echoes and the feedback, {allowed_us:.0f} us")
     if not SHORT:  # the figure is one of a quiet machine
-        assert len(latency) > 0.98 * (SAMPLES - COLD)
+        assert len(latency) > 0.98 * (SAMPLES - COLD_SAMPLES)
         assert np.median(latency) <= allowed_us

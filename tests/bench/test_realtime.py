@@ -28,20 +28,20 @@ DT_S = 0.01
 SHORT = "CI" in os.environ
 ROUNDS = 1 if SHORT else 4
 COLD, BLOCK = 100, 300  # samples
-LAST = realtime.available()[-1]
+LAST_CORE = realtime.available()[-1]
 SETTINGS = {
     "off": "",
     "priority": "priority = 20",
-    "cores": f"cores = [{LAST}]",
-    "all": f"priority = 20\ncores = [{LAST}]\nlock_memory = true",
+    "cores": f"cores = [{LAST_CORE}]",
+    "all": f"priority = 20\ncores = [{LAST_CORE}]\nlock_memory = true",
 }
-GREEDY = "while True: pass"
+ENDLESS_LOOP = "while True: pass"
 
 
 @contextmanager
 def company(number: int) -> Iterator[None]:
     """Processes that want a core each, always."""
-    greedy = [subprocess.Popen([sys.executable, "-c", GREEDY]) for _ in range(number)]
+    greedy = [subprocess.Popen([sys.executable, "-c", ENDLESS_LOOP]) for _ in range(number)]
     try:
         yield
     finally:

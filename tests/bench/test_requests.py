@@ -27,10 +27,10 @@ pytestmark = pytest.mark.benchmark
 DT_S = 0.005
 SHORT = "CI" in os.environ
 ROUNDS = 2 if SHORT else 5
-BLOCK = 400  # samples
-COLD = 600  # first samples, left out: the robot drives to its path
-SPARE = 0.01  # of the samples, which the machine takes from one block and not from another
-ROWS = 6000  # of a reference
+BLOCK_SAMPLES = 400
+COLD_SAMPLES = 600  # first samples, left out: the robot drives to its path
+LOSS_TOLERANCE_SHARE = 0.01  # of the samples: the machine may cost one block more samples than another
+REFERENCE_ROWS = 6000
 REALTIME = "priority = 20\n[debug]\ninject = true"
 BLOCKS = ("alone", "alone again", *KINDS)
 
@@ -38,9 +38,9 @@ BLOCKS = ("alone", "alone again", *KINDS)
 def block(robot: Driven, asker: Asker, name: str) -> list[Telemetry]:
     """Samples while somebody asks, or nobody."""
     if name not in KINDS:
-        return robot.samples(BLOCK)
+        return robot.samples(BLOCK_SAMPLES)
     with asker.asking([name]):
-        return robot.samples(BLOCK)
+        return robot.samples(BLOCK_SAMPLES)
 
 
 def lost(blocks: list[list[Telemetry]]) -> int:
@@ -52,8 +52,8 @@ def test_no_request_costs_samples(tmp_path: Path, capsys: pytest.CaptureFixture[
     rng = np.random.default_rng(1)
     blocks: dict[str, list[list[Telemetry]]] = {name: [] for name in BLOCKS}
     with driven(tmp_path, DT_S, duration_s=3600.0, realtime=REALTIME) as robot:
-        asker = Asker(robot, ROWS)
-        robot.samples(COLD)
+        asker = Asker(robot, REFERENCE_ROWS)
+        robot.samples(COLD_SAMPLES)
         for _ in range(ROUNDS):
             for name in rng.permutation(BLOCKS).tolist():
                 blocks[name].append(block(robot, asker, name))
@@ -63,11 +63,11 @@ def test_no_request_costs_samples(tmp_path: Path, capsys: pytest.CaptureFixture[
     granted = next(line for line in said.splitlines() if "real time: " in line)
     answered_us = dict(zip(log.seq.tolist(), log.latency_us.tolist(), strict=True))
     with capsys.disabled():
-        print(f"\n{machine.machine_info()}\n{ROUNDS} rounds of {len(BLOCKS)} blocks of {BLOCK} samples, {granted}\n{dict(asker.answers)}")
+        print(f"\n{machine.machine_info()}\n{ROUNDS} rounds of {len(BLOCKS)} blocks of {BLOCK_SAMPLES} samples, {granted}\n{dict(asker.answers)}")
         print("state sent to command received, at the robot; preparation")
         for name, each in blocks.items():
             times = np.array([[(answered_us[sample.state_seq], sample.prepare_us) for sample in one] for one in each])
             print(f"  {name:14} {quantiles(times[..., 0])}; {quantiles(times[..., 1])}; {lost(each)} samples lost")
     if not SHORT:
         for name in KINDS:
-            assert lost(blocks[name]) <= lost(blocks["alone"] + blocks["alone again"]) + SPARE * ROUNDS * BLOCK, name
+            assert lost(blocks[name]) <= lost(blocks["alone"] + blocks["alone again"]) + LOSS_TOLERANCE_SHARE * ROUNDS * BLOCK_SAMPLES, name

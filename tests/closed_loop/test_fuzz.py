@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of everything that may happen, by the thousand and by the million."""
+"""Random sequences of everything that may happen, over thousands and millions of samples."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import pytest
 from tests.closed_loop.fuzz import Fuzz
 from tests.closed_loop.lossy import Lossy
 
-SHORT = 5_000
-MILLION = 20_000 if "CI" in os.environ else 1_000_000
+SHORT_SAMPLES = 5_000
+MANY_SAMPLES = 20_000 if "CI" in os.environ else 1_000_000
 
 
 def resident_bytes() -> int:
@@ -29,7 +29,7 @@ def run(fuzz: Fuzz, samples: int) -> None:
 @pytest.mark.parametrize("measured", [False, True], ids=["no delay", "measured delay"])
 def test_no_fuzzed_sample_leaves_the_limits_or_raises(measured: bool) -> None:
     fuzz = Fuzz(seed=1, measured=measured)
-    run(fuzz, SHORT)
+    run(fuzz, SHORT_SAMPLES)
     happened = set(fuzz.seen)
     assert {"TRACKING", "HOLDING", "FALLBACK", "BRAKING", "STOPPED", "over budget", "reference", "jump", "refused at the door"} <= happened
     assert {"qp", "nan_model", "solver", "state_stale", "state_old", "state_refused", "robot_restarted", "clock_jumped", "gap"} <= happened
@@ -55,9 +55,9 @@ def test_no_fuzzed_sample_leaves_a_reference_cycle() -> None:
 def test_no_sample_of_a_million_leaves_the_limits_or_raises(seed: int) -> None:
     start_s = time.monotonic()
     fuzz = Fuzz(seed=seed)
-    run(fuzz, MILLION // 5)
+    run(fuzz, MANY_SAMPLES // 5)
     before = resident_bytes()
-    run(fuzz, MILLION)
+    run(fuzz, MANY_SAMPLES)
     grown = resident_bytes() - before
     print(f"\n{fuzz.samples} samples in {time.monotonic() - start_s:.0f} s, memory grown by {grown / 2**20:.2f} MiB: {dict(fuzz.seen)}")
     assert grown < 2**22  # bytes; of 800,000 samples
@@ -70,7 +70,7 @@ LOSSY_NAMES = ["no guard", "guard", "no guard, no reports", "guard, no reports"]
 @pytest.mark.parametrize(("guarded", "reports"), LOSSY, ids=LOSSY_NAMES)
 def test_no_input_leaves_its_limits_whatever_is_lost_late_repeated_or_reordered_on_any_link(guarded: bool, reports: bool) -> None:
     fuzz = Lossy(seed=1, guarded=guarded, reports=reports)
-    run(fuzz, SHORT // 2)
+    run(fuzz, SHORT_SAMPLES // 2)
     assert {"TRACKING", "BRAKING", "accepted", "lost to robot", "lost to standby", "lost to controller", "takeover", "jump"} <= set(fuzz.seen)
 
 
@@ -80,5 +80,5 @@ def test_no_input_leaves_its_limits_whatever_is_lost_late_repeated_or_reordered_
 def test_no_sample_of_a_million_leaves_its_limits_on_links_that_lose(seed: int, guarded: bool) -> None:
     start_s = time.monotonic()
     fuzz = Lossy(seed=seed, guarded=guarded)
-    run(fuzz, int(os.environ.get("FUZZ_SAMPLES", MILLION)))
+    run(fuzz, int(os.environ.get("FUZZ_SAMPLES", MANY_SAMPLES)))
     print(f"\n{fuzz.samples} samples in {time.monotonic() - start_s:.0f} s: {dict(fuzz.seen)}")

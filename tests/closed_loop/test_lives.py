@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robot, controller and guard in lockstep, where somebody else uses the robot's name, or its stamps are no nanoseconds."""
+"""Robot, controller and guard in lockstep, where another robot uses its name, or its stamps are not nanoseconds."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DT = 100 * MS
 STEP = np.array([0.25, 0.4])  # slew limit per dt
 BOUND = np.array([0.5, 0.745])
 SPEED_M_S = 0.4
-RAMP = 1.1  # of the slew limits, where a ramp goes in steps of 10 ms
+RAMP_SLEW_FACTOR = 1.1  # a ramp in steps of 10 ms may change by this factor times the slew limits
 LIMITS = Limits(np.zeros(2), -BOUND, BOUND, -STEP, STEP, dt_s=0.1)
 
 
@@ -125,7 +125,7 @@ class Scene:
         for i in range(1, len(t)):
             since = np.searchsorted(t, t[i] - DT + 10 * MS, side="right") - 1  # times are those of steps
             change = np.abs(u[max(0, since) : i] - u[i]).max(axis=0)
-            assert (change <= RAMP * STEP).all(), (1e-9 * t[i], change)
+            assert (change <= RAMP_SLEW_FACTOR * STEP).all(), (1e-9 * t[i], change)
 
     @property
     def error_m(self) -> float:

@@ -21,15 +21,15 @@ from tests.problems import pioneer
 DT = 100 * MS
 STEP = np.array([0.25, 0.4])  # slew limit per dt
 BOUND = np.array([0.5, 0.745])
-LOST_NS = 800 * MS
+LOSS_DURATION_NS = 800 * MS
 FIRST_NS, LAST_NS = 3_000 * MS, 17_000 * MS
-EACH_NS = 2_300 * MS  # from one loss to the next
+LOSS_PERIOD_NS = 2_300 * MS  # from one loss to the next
 ROUNDING = 1e-9
 
 
 def lost(t_ns: int) -> bool:
     """Whether a link loses messages now."""
-    return FIRST_NS <= t_ns < LAST_NS and (t_ns - FIRST_NS) % EACH_NS < LOST_NS
+    return FIRST_NS <= t_ns < LAST_NS and (t_ns - FIRST_NS) % LOSS_PERIOD_NS < LOSS_DURATION_NS
 
 
 class Scene:

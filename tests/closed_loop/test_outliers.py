@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Headings that are wrong by about half a turn for a moment, as compasses and scan matching have them every day: the robot goes on as before."""
+"""Headings that are wrong by about half a turn for a moment, as compasses and scan matching often give: the robot drives on as before."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.loop import drive, reference, robot
 from tests.problems import PAPER, SLEW, pioneer
 
 PATHS: dict[str, Heading] = {"circle": "tangent", "eight": "consistent"}
-LASTING_S = 16.0
+DURATION_S = 16.0
 DISTURBANCES = {"u_c": Disturbance(drift=0.1, limit=0.3), "omega_c": Disturbance(drift=0.1, limit=0.3)}
 
 
@@ -46,7 +46,7 @@ def followed(path: str) -> tuple[Trajectory, Reference]:
 
 
 def errors_mm(controller: Controller, path: str, flip: float, at_s: float, samples: int, period_s: float = 0.1) -> tuple[Array, float]:
-    """Tracking error of the plant at each state of `LASTING_S`, and its last heading; some states from a time on show another heading."""
+    """Tracking error of the plant at each state of `DURATION_S`, and its last heading; some states from a time on show another heading."""
     trajectory, message = followed(path)
     first = round(at_s / period_s)
 
@@ -57,7 +57,7 @@ def errors_mm(controller: Controller, path: str, flip: float, at_s: float, sampl
 
     body = robot(trajectory, state_period_s=period_s)
     controller.receive_reference(message)
-    run = drive(controller, body, LASTING_S, sees=seen)
+    run = drive(controller, body, DURATION_S, sees=seen)
     assert controller.mode is Mode.TRACKING
     return run.error_mm(trajectory), float(run.x[-1][2])
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robots that keep no convention, in lockstep: what they are to follow comes by role."""
+"""Robots with unusual names and orders of signals, in lockstep: their references are built by role."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plans approached inside the slew limits of what acted before, whatever that was."""
+"""Plans approached inside the slew limits from any inputs that acted before."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What its sender believes to act, held against what the robot reports."""
+"""Belief of a sender about the inputs that act, compared with the reports of the robot."""
 
 from __future__ import annotations
 

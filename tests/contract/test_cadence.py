@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a robot's states count, and its stamps are nanoseconds."""
+"""Cadence of a robot's states: increasing numbers, and stamps in nanoseconds."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which latch holds, by no more than two of them."""
+"""Latches: which of two holds, and how they are read."""
 
 from __future__ import annotations
 

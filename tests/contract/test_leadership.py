@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who leads, decided state by state: without processes, bus or clock."""
+"""Leader election, state by state: without processes, bus or clock."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which life of the robot is believed, by the epochs of its states alone."""
+"""Lives of the robot: which one is believed, by the epochs of its states alone."""
 
 from __future__ import annotations
 

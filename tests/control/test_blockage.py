@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When the way counts as blocked: which plans, and how many of them in a row."""
+"""Blockage: which plans count as blocked, and how many of them in a row."""
 
 from __future__ import annotations
 

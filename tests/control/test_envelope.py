@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The last gate of every plan."""
+"""Envelope of the inputs, the last check of every plan."""
 
 from __future__ import annotations
 

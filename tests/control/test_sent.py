@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the robot does with the commands already sent, against the robot itself."""
+"""Inputs already sent, as the controller computes them, compared with the simulated robot."""
 
 from __future__ import annotations
 

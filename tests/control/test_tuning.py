@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Other weights and bounds for a running real-time iteration: equal to one built with them, and reached without a bump."""
+"""Other weights and bounds for a running real-time iteration: equal to one built with them, and reached without a jump of the inputs."""
 
 from __future__ import annotations
 

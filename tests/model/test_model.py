@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models: what they say of themselves, and what is refused."""
+"""Models: their properties, and what is refused."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Somebody on the bus who means harm: a thousand messages a second over all keys, malformed, out of range or replayed."""
+"""Attacker on the bus: a thousand messages per second over all keys, malformed, out of range or replayed."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from rti_mpc.wire.cdr import decode, encode, encoding
 from rti_mpc.wire.keys import Keys
 
 RATE_HZ = 1000
-BATCH = 10  # messages at once
+BATCH_MESSAGES = 10  # sent at once
 CROWD_HZ = 2000  # on each of two keys
-CROWD = 10  # messages at once
-MEMORY = 500  # messages a key of which some are replayed
-REPLAYED_S = 1.0  # at least, since a message that is replayed was sent
+CROWD_MESSAGES = 10  # sent at once
+REMEMBERED_MESSAGES = 500  # per key, of which some are replayed
+MIN_REPLAY_AGE_S = 1.0  # age of a replayed message
 HUGE = {"info/controller": 50 << 20, "command": 60 << 20}  # bytes, once in a `run`
 
 CLASSES: dict[str, type[Any]] = {
@@ -76,7 +76,7 @@ class Attack:
         self._session = zenoh.open(config)
         self._keys = keys
         self._rng = np.random.default_rng(seed)
-        self._heard: defaultdict[str, deque[tuple[float, bytes, str]]] = defaultdict(lambda: deque(maxlen=MEMORY))
+        self._heard: defaultdict[str, deque[tuple[float, bytes, str]]] = defaultdict(lambda: deque(maxlen=REMEMBERED_MESSAGES))
         self._memory = self._session.declare_subscriber(keys.below("**"), zenoh.handlers.RingChannel(4096), allowed_origin=zenoh.Locality.REMOTE)
         self._tokens = [self._session.liveliness().declare_token(keys.alive(f"standby.{number}")) for number in range(100)]
         self._tokens += [self._session.liveliness().declare_token(keys.alive(name)) for name in ("standby.²", "standby.-1", "Ä", 200 * "x")]
@@ -94,10 +94,10 @@ class Attack:
             self._put(stream, bytes(size), "application/json", block=True)
         while self.sent < last:
             self.listen()
-            due = self.sent + BATCH
+            due = self.sent + BATCH_MESSAGES
             while self.sent < due:
                 self._send()
-            due_s += BATCH / RATE_HZ
+            due_s += BATCH_MESSAGES / RATE_HZ
             time.sleep(max(0.0, due_s - time.monotonic()))
 
     def crowd(self, seconds: float) -> None:
@@ -111,9 +111,9 @@ class Attack:
                 for _ in range(20):
                     self._put("state", self._rng.bytes(100), encoding(State))
             for stream, payload in others.items():
-                for _ in range(CROWD):
+                for _ in range(CROWD_MESSAGES):
                     self._put(stream, payload, encoding(CLASSES[stream]))
-            due_s += CROWD / CROWD_HZ
+            due_s += CROWD_MESSAGES / CROWD_HZ
             time.sleep(max(0.0, due_s - time.monotonic()))
         states.undeclare()
 
@@ -181,7 +181,7 @@ class Attack:
         """A message that was sent before, behind later ones."""
         stream = str(self._rng.choice(list(self._heard))) if self._heard else "state"
         sent_s, payload, kind = self._sample(stream)
-        if payload is not None and sent_s < time.monotonic() - REPLAYED_S and not stream.startswith(("info", "alive")):
+        if payload is not None and sent_s < time.monotonic() - MIN_REPLAY_AGE_S and not stream.startswith(("info", "alive")):
             self._put(stream, payload, kind)
 
     def _foreign(self) -> None:

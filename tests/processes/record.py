@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the robot did, by its own record."""
+"""The robot's own record of a run, and what it shows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from rti_mpc.array import Array
 from tests.processes.system import System, until
 
-STANDING = 1e-3  # m/s, rad/s
+STANDSTILL_SPEED = 1e-3  # m/s, rad/s
 SLEW = np.array([0.25, 0.40])  # of the shipped configuration, over 0.1 s
 MS = 1_000_000
 PERIOD_NS = 10 * MS  # of the states: the resolution of the record
@@ -39,7 +39,7 @@ class Record:
     @property
     def standing_ms(self) -> float:
         """From when on it stood, to the end."""
-        return float(self.times[(np.abs(self.speeds) >= STANDING).any(axis=1)][-1]) + 1e-6 * PERIOD_NS
+        return float(self.times[(np.abs(self.speeds) >= STANDSTILL_SPEED).any(axis=1)][-1]) + 1e-6 * PERIOD_NS
 
 
 def recorded(system: System, fault_ns: int, to_ms: int) -> Record:

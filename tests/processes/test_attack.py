@@ -24,12 +24,12 @@ from tests.in_time import on_time
 from tests.processes.attack import RATE_HZ, Attack
 from tests.processes.system import KEYS, System, until
 
-BLOCK = 10 * RATE_HZ  # messages
+BLOCK_MESSAGES = 10 * RATE_HZ
 BOUND, SLEW = np.array([0.5, 0.745]), np.array([0.25, 0.40])  # of the shipped configuration
 PERIOD_MS = 100.0
 CROWD_S = 10.0
-CHANCE = 3  # standard deviations by which two equal counts of what a busy host makes late may differ
-STATES = 3  # behind the end of a block, for the last answers to be written
+MAX_DEVIATIONS = 3  # standard deviations by which two equal counts of late samples on a busy host may differ
+STATES_AFTER_BLOCK = 3  # whose answers may not be written yet
 
 
 @pytest.fixture(params=["guarded", "alone"])
@@ -93,13 +93,13 @@ def equal_shares(system: System, blocks: int, seconds: float, act: Callable[[], 
             act()
         else:
             until(lambda from_ns=from_ns: stamp_ns(system) >= from_ns + 1e9 * seconds, "a block is over", pause_s=0.1)
-        sent, answers = answered(system, from_ns, stamp_ns(system) - STATES * round(1e6 * PERIOD_MS))
+        sent, answers = answered(system, from_ns, stamp_ns(system) - STATES_AFTER_BLOCK * round(1e6 * PERIOD_MS))
         states[name] += sent
         left[name] += sent - answers
         unharmed(system)
     share = {name: 100.0 * (1 - left[name] / states[name]) for name in states}
     print(f"\n{share['with']:.2f} % of {states['with']} samples answered, {share['without']:.2f} % of {states['without']} without")
-    assert left["with"] - left["without"] <= 1 + CHANCE * sum(left.values()) ** 0.5
+    assert left["with"] - left["without"] <= 1 + MAX_DEVIATIONS * sum(left.values()) ** 0.5
 
 
 @pytest.mark.slow
@@ -115,7 +115,7 @@ def test_foreign_messages_behind_and_between_those_that_count_displace_none(syst
 def test_a_thousand_hostile_messages_a_second_cost_no_sample_and_end_nobody(system: System, host: Host, request: pytest.FixtureRequest) -> None:
     messages = request.config.getoption("--attack")
     with Attack(system.endpoint, KEYS, seed=1) as attack:
-        equal_shares(system, max(1, messages // BLOCK), BLOCK / RATE_HZ, lambda: attack.run(min(BLOCK, messages)))
+        equal_shares(system, max(1, messages // BLOCK_MESSAGES), BLOCK_MESSAGES / RATE_HZ, lambda: attack.run(min(BLOCK_MESSAGES, messages)))
         print(f"{attack.sent} messages")
         within_limits(system)
 
@@ -139,6 +139,6 @@ def test_a_thousand_hostile_messages_a_second_cost_no_sample_and_end_nobody(syst
     system.tracking(life)
     from_ns, honest_ns = stamp_ns(system), time.monotonic_ns()
     until(lambda: stamp_ns(system) >= from_ns + 5e9, "five seconds later", pause_s=0.1)
-    states, answers = answered(system, from_ns, stamp_ns(system) - STATES * round(1e6 * PERIOD_MS))
+    states, answers = answered(system, from_ns, stamp_ns(system) - STATES_AFTER_BLOCK * round(1e6 * PERIOD_MS))
     assert answers >= states - 1 or not on_time(host, "an honest life", PERIOD_MS, honest_ns)
     assert system.interrupt("viewer") == 0, system.said("viewer")[-2000:]

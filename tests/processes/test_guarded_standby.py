@@ -20,7 +20,7 @@ from rti_mpc.contract.message import Command
 from rti_mpc.contract.status import Mode
 from rti_mpc_service.host.hold_up import Host
 from tests.in_time import in_time
-from tests.processes.record import GUARDED, MS, STANDING, recorded, within_slew
+from tests.processes.record import GUARDED, MS, STANDSTILL_SPEED, recorded, within_slew
 from tests.processes.system import KEYS, until
 from tests.processes.watched import Watched
 
@@ -110,7 +110,7 @@ def test_restarted_guard_passes_one_leader_and_none_has_taken_over_for_want_of_a
     system.tracking()
     killed_ns = system.fault(signal.SIGKILL, "guard")
     system.kill("guard")
-    system.state(lambda state: bool(np.abs(state.x[3:]).max() < STANDING))
+    system.state(lambda state: bool(np.abs(state.x[3:]).max() < STANDSTILL_SPEED))
     passed(system)
     before = len(system.actuation)
     system.start("guard")

@@ -15,7 +15,7 @@ from tests.processes.system import ROOT, command_line, environment, until
 
 pytestmark = pytest.mark.slow
 
-NOBODY = "tcp/127.0.0.1:9"
+UNUSED_ENDPOINT = "tcp/127.0.0.1:9"
 COMMANDS: dict[str, tuple[object, ...]] = {
     "run": (),
     "guard": (),
@@ -23,7 +23,7 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "sim": ("-l", "tcp/127.0.0.1:0"),
     **({"view": ("--rerun-save", "run.rrd")} if find_spec("rerun") else {}),
 }
-TOLD_MS = 5000.0
+MAX_REMINDER_MS = 5000.0
 
 
 @pytest.mark.parametrize("mode", ["peer", "client"])
@@ -36,11 +36,11 @@ def test_process_that_reaches_nobody_says_so_within_five_seconds_and_ends_well(c
         options = [option for option in options if option != "-l" and "127.0.0.1:0" not in str(option)]
     began_ns = time.monotonic_ns()
     with log.open("wb") as file:
-        line = command_line(command, config, "-e", NOBODY, "-m", mode, *options)
+        line = command_line(command, config, "-e", UNUSED_ENDPOINT, "-m", mode, *options)
         process = subprocess.Popen(line, cwd=ROOT, env=environment(), stdout=file, stderr=subprocess.STDOUT)
     try:
         until(lambda: "not connected" in log.read_text(errors="replace"), f"{command} says that it reaches nobody", pause_s=0.01, patience_s=60.0)
-        in_time(host, f"to say of {command} that it reaches nobody", (time.monotonic_ns() - began_ns) / MS, TOLD_MS, began_ns)
+        in_time(host, f"to say of {command} that it reaches nobody", (time.monotonic_ns() - began_ns) / MS, MAX_REMINDER_MS, began_ns)
         process.terminate()
         assert process.wait(30.0) == 0
         assert "Traceback" not in log.read_text(errors="replace")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The reference source, for robots that keep no convention: rows come in the order of the outputs."""
+"""The reference source, for robots with unusual orders of signals: rows come in the order of the outputs."""
 
 from __future__ import annotations
 

@@ -39,14 +39,14 @@ pytestmark = pytest.mark.slow
 DT_S = 0.005
 TICK_S = 0.002  # of the bare timers: whatever holds a core up for most of a period meets one
 HELD_UP_NS = 500_000  # lateness of a bare timer that explains missed periods
-AFTERMATH_NS = 50_000_000  # in which they may be: all that was held up is then done at once
+EXPLAINED_NS = 50_000_000  # after a late tick, in which missed periods are explained: all that was held up is then done at once
 FIRST, SOON_NS = 50, 10_000_000  # priority of the timers that see the host alone, and their aftermath: two periods
-COLD = 400  # first samples, left out: everybody starts
-LOOK_S = 1.0
+COLD_SAMPLES = 400  # first samples, left out: everybody starts
+MEMORY_PERIOD_S = 1.0
 ROLES = ("controller", "robot", "reference")
 WARM_UP_S = 600.0  # in which the arenas of the allocator meet their stalls; a quarter of a shorter run
-LONG_S = 900.0  # from which on a slope per hour can be told from a high-water mark that a stall has left
-BRIEFLY = 100.0  # MiB/h in a shorter run: a leak of a hundred bytes a sample
+MIN_SLOPE_RUN_S = 900.0  # in a shorter run, a growth per hour cannot be distinguished from the step that a stall leaves
+SHORT_RUN_GROWTH = 100.0  # MiB/h, limit in a shorter run: a leak of a hundred bytes per sample
 MIB = 2**20
 
 TIMER = """
@@ -169,13 +169,13 @@ def soak(folder: Path, duration_s: float) -> Soak:
     """Drive, and look at the memory."""
     looks = []
     with driven(folder, DT_S, duration_s + 60.0) as robot:
-        first = robot.samples(COLD)[-1]
+        first = robot.samples(COLD_SAMPLES)[-1]
         commands = Commands(robot)
         commands.start()
         samples = robot.bus.subscriber(robot.bus.keys.telemetry)
         until_s = time.monotonic() + duration_s
         while time.monotonic() < until_s:
-            time.sleep(LOOK_S)
+            time.sleep(MEMORY_PERIOD_S)
             looks.append((time.monotonic(), *(anonymous_bytes(robot.pids[role]) / MIB for role in ROLES)))
         last = decode(Telemetry, until(samples.try_recv, "a last sample").payload)
         for role in ("controller", "robot", "reference"):
@@ -188,7 +188,7 @@ def test_hours_of_samples_miss_no_period_lose_no_message_and_take_no_memory(
     tmp_path: Path, host: Host, pytestconfig: pytest.Config, capsys: pytest.CaptureFixture[str]
 ) -> None:
     duration_s = float(pytestconfig.getoption("--soak-s"))
-    timers, first = Timers(tmp_path, priority=0, aftermath_ns=AFTERMATH_NS), Timers(tmp_path, priority=FIRST, aftermath_ns=SOON_NS)
+    timers, first = Timers(tmp_path, priority=0, aftermath_ns=EXPLAINED_NS), Timers(tmp_path, priority=FIRST, aftermath_ns=SOON_NS)
     with timers.running(), first.running():
         seen = soak(tmp_path, duration_s)
     account, missed_ns = seen.account(), seen.missed_ns()
@@ -215,4 +215,4 @@ def test_hours_of_samples_miss_no_period_lose_no_message_and_take_no_memory(
     assert explained.all(), waited_ms[~explained]
     assert account["rest"] >= 0 if seen.silences else account["rest"] == 0
     for used in warm[:, 1:].T:
-        assert growth(warm[:, 0], used) < (1.0 if duration_s >= LONG_S else BRIEFLY)
+        assert growth(warm[:, 0], used) < (1.0 if duration_s >= MIN_SLOPE_RUN_S else SHORT_RUN_GROWTH)

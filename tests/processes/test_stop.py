@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An operator's stop among real processes: what outlives whom, and who confirms."""
+"""An operator's stop among real processes: which restarts it outlives, and who confirms it."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from rti_mpc_service.cli import SHIPPED
 from tests.processes.record import GUARDED
 from tests.processes.system import KEYS, System, heard, rti_mpc, until
 
-RATE = 300  # requests a second
-STANDING = 1e-3  # m/s, rad/s
+REQUESTS_PER_S = 300
+STANDSTILL_SPEED = 1e-3  # m/s, rad/s
 
 
 class Operated(System):
@@ -51,7 +51,7 @@ def moves(state: State) -> bool:
 
 
 def rests(state: State) -> bool:
-    return bool(np.abs(state.x[3:]).max() < STANDING)
+    return bool(np.abs(state.x[3:]).max() < STANDSTILL_SPEED)
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def test_stop_said_to_nobody_is_noted_and_outlives_every_restart_until_it_is_rel
 
 @contextmanager
 def flood(endpoint: str) -> Iterator[list[float]]:
-    """Ask a controller for its parameters `RATE` times a second, and wait for no answer; the times at which it was asked, s."""
+    """Ask a controller for its parameters `REQUESTS_PER_S` times a second, and wait for no answer; the times at which it was asked, s."""
     config = zenoh.Config()
     for key, value in (("mode", '"peer"'), ("connect/endpoints", json.dumps([endpoint])), ("scouting/multicast/enabled", "false")):
         config.insert_json5(key, value)
@@ -112,13 +112,13 @@ def flood(endpoint: str) -> Iterator[list[float]]:
         while not over.is_set():
             session.get(KEYS.request, lambda _: None, payload=b'{"request": "params", "get": true}', timeout=1.0)
             asked.append(time.monotonic())
-            over.wait(max(0.0, start_s + len(asked) / RATE - time.monotonic()))
+            over.wait(max(0.0, start_s + len(asked) / REQUESTS_PER_S - time.monotonic()))
 
     with zenoh.open(config) as session:
         thread = threading.Thread(target=ask)
         thread.start()
         try:
-            until(lambda: len(asked) > RATE, "a second of requests")
+            until(lambda: len(asked) > REQUESTS_PER_S, "a second of requests")
             yield asked
         finally:
             over.set()
@@ -136,7 +136,7 @@ def test_stop_is_answered_beside_300_requests_a_second(system: Operated) -> None
             answer = next(system.bus.answers(KEYS.stop, {"request": word}, 2.0))
             took_s.append(time.monotonic() - start_s)
             assert answer["ok"] is True
-            until(lambda: len(asked) > before + RATE // 5, "more requests")  # noqa: B023
+            until(lambda: len(asked) > before + REQUESTS_PER_S // 5, "more requests")  # noqa: B023
         print(f"\n{len(asked)} requests; stop and enable were answered within {1e3 * max(took_s):.0f} ms, median {1e3 * np.median(took_s):.1f}")
     system.tracking()
 

@@ -25,7 +25,7 @@ from rti_mpc_service.host.hold_up import Host
 from tests.in_time import MS, in_time
 from tests.processes.system import CONFIG, KEYS, SPEED, System, heard, interrupted_in_time, rti_mpc, until
 
-STANDING = 1e-3  # m/s, rad/s
+STANDSTILL_SPEED = 1e-3  # m/s, rad/s
 OTHER_VERSION = f"@{cdr.MESSAGE_VERSION + 1}"  # in a refusal
 
 
@@ -45,7 +45,7 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
 
 
 def rests(state: State) -> bool:
-    return bool(np.abs(state.x[3:]).max() < STANDING)
+    return bool(np.abs(state.x[3:]).max() < STANDSTILL_SPEED)
 
 
 def moves(state: State) -> bool:
@@ -113,7 +113,7 @@ def test_robot_brakes_and_stands_when_the_controller_is_killed_and_another_one_t
     system.kill("controller")
     standing = system.state(rests)
     slew_s = driving.x[3] / (0.25 / CONFIG.ocp.dt_s)
-    coast_s = 0.25 * np.log(0.5 / STANDING)  # the plant's time constant is below 0.25 s
+    coast_s = 0.25 * np.log(0.5 / STANDSTILL_SPEED)  # the plant's time constant is below 0.25 s
     limit_s = 0.25 + slew_s + coast_s + 2 * CONFIG.ocp.dt_s + 0.05 * SPEED
     in_time(host, "standing", (standing.stamp_ns - driving.stamp_ns) / MS / SPEED, 1e3 * limit_s / SPEED, killed_at_ns)
     system.start("controller")

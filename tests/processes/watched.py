@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot, a leader, and who stands by, as processes; every command on the bus is kept."""
+"""A robot, a leader and its standbys as processes; every command on the bus is kept."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The certificate of a plan: a bound on its cost above the optimum, from the problem's own data, that wrong plans do not pass."""
+"""The certificate of a plan: a bound on its cost above the optimum, from the problem's own data, which wrong plans do not pass."""
 
 from __future__ import annotations
 

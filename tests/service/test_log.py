@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a process says; to nobody, too."""
+"""Log of a process, also when nobody reads it."""
 
 from __future__ import annotations
 

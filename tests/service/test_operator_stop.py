@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An operator's stop in one process, on a bus of a queue."""
+"""An operator's stop in one process, on a bus made of a queue."""
 
 from __future__ import annotations
 

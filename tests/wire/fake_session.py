@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Session without a network, that notes what is declared on it. Nobody else is there."""
+"""Session without a network and without other processes, which records what is declared on it."""
 
 from __future__ import annotations
 

@@ -15,25 +15,25 @@ from rti_mpc_service.bench.yardstick import Ipopt
 from tests.problems import double_integrator
 from tests.processes.system import rti_mpc
 
-SMALL = 5  # stages: what is tested here holds at any horizon
+N = 5  # stages; what is tested here holds at any horizon
 
 
 @pytest.mark.parametrize("name", [name for name in FAMILIES if name != "chain_7"])  # which is chain_5 with more masses, and slow to differentiate
 def test_every_sample_of_a_family_has_a_reference_of_the_problems_shape(name: str) -> None:
-    family = FAMILIES[name][0](SMALL)
+    family = FAMILIES[name][0](N)
     model = family.ocp.model
     assert family.start(0) is not None, "a loop begins somewhere"
     for k in (0, 1, family.samples // 2, family.samples - 1):
         y_ref, p = family.at(k)
-        assert y_ref.shape == (SMALL, model.ny)
-        assert p is None or p.shape == (SMALL + 1, model.np_)
+        assert y_ref.shape == (N, model.ny)
+        assert p is None or p.shape == (N + 1, model.np_)
         start = family.start(k)
         assert start is None or start.shape == (model.nx,)
 
 
 @pytest.mark.parametrize("name", ["chain_3", "quadrotor"])
 def test_a_family_that_rests_stays_where_it_rests(name: str) -> None:
-    family = FAMILIES[name][0](SMALL)
+    family = FAMILIES[name][0](N)
     rest = np.zeros(family.ocp.model.nx) if name == "chain_3" else family.start(0)
     np.testing.assert_allclose(family.plant(rest, family.u0), rest, rtol=0, atol=1e-9, err_msg="an equilibrium, to the root finder's tolerance")
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files and values that no robot's configuration holds: each is one line that says what would be right, and status 2."""
+"""Files and values that no configuration may have: each is refused in one line that says what would be right, with status 2."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rti_mpc_service.request import parse_assignments
 from tests.processes.system import rti_mpc
 
 TEXT = SHIPPED.read_text()
-DEEP = 30_000
+NESTING_DEPTH = 30_000
 
 
 def pipe(path: Path) -> None:
@@ -49,8 +49,11 @@ FILES: dict[str, tuple[Callable[[Path], object], str]] = {
     "not UTF-8": (lambda path: path.write_bytes(TEXT.encode() + b"# J\xfcrgen"), "must be TOML in UTF-8, got byte 0xfc after"),
     "UTF-16": (lambda path: path.write_text(TEXT, encoding="utf-16"), "must be TOML in UTF-8, got byte 0xff after 0 others"),
     "zeros": (lambda path: path.write_bytes(bytes(4096)), "must be TOML, got Invalid statement"),
-    "deep list": (lambda path: path.write_text(f"a = {'[' * DEEP}{']' * DEEP}"), "must be TOML of at most 16 tables and lists inside each other"),
-    "open list": (lambda path: path.write_text(f"a = {'[' * DEEP}"), "must be TOML of at most 16 tables and lists inside each other"),
+    "deep list": (
+        lambda path: path.write_text(f"a = {'[' * NESTING_DEPTH}{']' * NESTING_DEPTH}"),
+        "must be TOML of at most 16 tables and lists inside each other",
+    ),
+    "open list": (lambda path: path.write_text(f"a = {'[' * NESTING_DEPTH}"), "must be TOML of at most 16 tables and lists inside each other"),
     "deep table": (lambda path: path.write_text("a" + ".a" * 2000 + " = 1"), "must be TOML of at most 16 tables and lists inside each other"),
     "deep inside": (lambda path: path.write_text(TEXT + "\n[sim]\nx0.x = " + "[" * 20 + "]" * 20), "at most 16 tables and lists"),
     "twice": (lambda path: path.write_text(TEXT + '\n[model]\nname = "pioneer_3dx"\n'), "must be TOML, got Cannot declare"),
@@ -121,7 +124,7 @@ def test_byte_order_mark_and_windows_lines_are_accepted(tmp_path: Path) -> None:
     ("text", "status", "told"),
     [
         (TEXT.replace('name = "pioneer_3dx"', 'name = "sys:exit"'), 2, "sys is Python's own"),
-        (f"a = {'[' * DEEP}", 2, "tables and lists inside each other"),
+        (f"a = {'[' * NESTING_DEPTH}", 2, "tables and lists inside each other"),
         ('"a\\nb\\u001b[2J" = 1\n' + TEXT, 2, "a\\nb\\x1b[2J is unknown"),
     ],
 )
@@ -153,7 +156,7 @@ def test_zenoh_file_of_many_brackets_is_refused_and_ends_no_process(tmp_path: Pa
         zenoh_config(BusSettings(config=path))
 
 
-@pytest.mark.parametrize("value", ["[" * DEEP, f"1{'0' * 5000}", "", "1\nb = 2", "{" * DEEP])
+@pytest.mark.parametrize("value", ["[" * NESTING_DEPTH, f"1{'0' * 5000}", "", "1\nb = 2", "{" * NESTING_DEPTH])
 def test_parameter_that_is_no_value_is_one_line(value: str) -> None:
     with pytest.raises(ConfigError, match="params must be set by KEY=VALUE"):
         parse_assignments([f"ocp.weights.Q.x={value}"])

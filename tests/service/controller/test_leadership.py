@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A controller among others, on a bus of lists: what it reads of what they send, and what it shows."""
+"""A controller among others, on a bus made of lists: which messages it reads, and what it publishes."""
 
 from __future__ import annotations
 

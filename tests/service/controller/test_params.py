@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of a running controller: what is granted, what is refused and why, and that nothing is granted by halves."""
+"""Parameters of a running controller: which changes are granted, which are refused and why, and that no change is granted in part."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a host that is busy with others excuses, and what it does not."""
+"""Excuses: which delays a busy host explains, and which it does not."""
 
 from __future__ import annotations
 

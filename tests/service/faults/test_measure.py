@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is measured of a fault, on records made up for it."""
+"""Measurement of a fault, on records made up for the tests."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the witness of the host sees. Whatever else the machine does, it can only see more."""
+"""Witness of the host: its record of delays, to which the load of the machine can only add."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.processes.system import until
 ROOT = Path(__file__).parents[3]
 pytestmark = pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="this kernel does not tell how long threads wait for a core")
 
-GREEDY = """
+ENDLESS_LOOP = """
 import os, sys, time
 os.sched_setaffinity(0, {int(sys.argv[1])})
 until_s = time.process_time() + float(sys.argv[2])
@@ -44,7 +44,7 @@ def host() -> Iterator[Host]:
 
 
 def greedy(core: int) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, "-c", GREEDY, str(core), str(COMPUTED_S)], stdout=subprocess.DEVNULL)
+    return subprocess.Popen([sys.executable, "-c", ENDLESS_LOOP, str(core), str(COMPUTED_S)], stdout=subprocess.DEVNULL)
 
 
 def test_processes_that_share_a_core_hold_each_other_up(host: Host) -> None:
@@ -57,7 +57,7 @@ def test_processes_that_share_a_core_hold_each_other_up(host: Host) -> None:
 def test_grandchildren_are_seen_too(host: Host) -> None:
     shell = f"'{sys.executable}' -c \"$1\" {available()[0]} {COMPUTED_S} & '{sys.executable}' -c \"$1\" {available()[0]} {COMPUTED_S} & wait"
     begin_ns = time.monotonic_ns()
-    subprocess.run(["sh", "-c", shell, "sh", GREEDY], stdout=subprocess.DEVNULL, check=True)
+    subprocess.run(["sh", "-c", shell, "sh", ENDLESS_LOOP], stdout=subprocess.DEVNULL, check=True)
     assert host.held_up_ms(begin_ns, time.monotonic_ns()) > 0.5 * 1e3 * COMPUTED_S
 
 

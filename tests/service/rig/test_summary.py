@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run made up by hand, whose sum is known."""
+"""Summary of a run made up by hand, whose figures are known."""
 
 from __future__ import annotations
 

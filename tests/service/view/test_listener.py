@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a viewer listens to, on a bus of lists: many may speak, and those who belong to the robot are heard."""
+"""Listener of a viewer, on a bus made of lists: of many senders, those that belong to the robot are heard."""
 
 from __future__ import annotations
 
