@@ -24,6 +24,7 @@ REWORDINGS = (
     (r"be a valid string", "be text"),
     (r"be a valid integer", "be a whole number"),
     (r"be a valid number", "be a number"),
+    (r"be a valid boolean", "be true or false"),
     (r"greater than or equal to", "at least"),
     (r"less than or equal to", "at most"),
 )
