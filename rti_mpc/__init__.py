@@ -9,8 +9,9 @@ are imported on first use, so that a process which only uses the wire contract l
 neither CasADi nor OSQP.
 
 Public names: `Model` and `Signal` describe a robot, `find_model` finds one that ships,
-`Ocp` is the problem, `Rti` solves one sample of it, `Controller` does so in the robot's
-time and handles everything that may go wrong.
+`Ocp` is the problem, `Rti` solves one sample of it, `simulate` closes the loop, `plot` and
+`compare` show what came of it, and `Controller` does so in the robot's time and handles
+everything that may go wrong.
 
 Example:
     >>> from rti_mpc import Ocp, Rti, find_model
@@ -55,7 +56,10 @@ if TYPE_CHECKING:
     from rti_mpc.model.model import Model as Model
     from rti_mpc.model.model import Signal as Signal
     from rti_mpc.rti.ocp import Ocp as Ocp
+    from rti_mpc.rti.plot import plot as plot
     from rti_mpc.rti.rti import Rti as Rti
+    from rti_mpc.rti.simulation import compare as compare
+    from rti_mpc.rti.simulation import simulate as simulate
 
 MODULE_OF_NAME = {
     "Controller": "rti_mpc.control.controller",
@@ -63,11 +67,14 @@ MODULE_OF_NAME = {
     "Ocp": "rti_mpc.rti.ocp",
     "Rti": "rti_mpc.rti.rti",
     "Signal": "rti_mpc.model.model",
+    "compare": "rti_mpc.rti.simulation",
     "find_model": "rti_mpc.model.find",
+    "plot": "rti_mpc.rti.plot",
+    "simulate": "rti_mpc.rti.simulation",
 }
 
 __version__ = "0.1.0"
-__all__ = ["Controller", "Model", "Ocp", "Rti", "Signal", "__version__", "find_model"]
+__all__ = ["Controller", "Model", "Ocp", "Rti", "Signal", "__version__", "compare", "find_model", "plot", "simulate"]
 
 
 def __getattr__(name: str) -> Any:

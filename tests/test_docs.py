@@ -24,9 +24,9 @@ def blocks(page: str, language: str) -> list[str]:
 
 
 def test_tutorial_of_your_robot_runs_word_by_word(tmp_path: Path) -> None:
-    module, script = blocks("your_robot.md", "python")
+    module, script, compared = blocks("your_robot.md", "python")
     (table,) = blocks("your_robot.md", "toml")
-    for name, text in {"my_robot.py": module, "script.py": script, "car.toml": table}.items():
+    for name, text in {"my_robot.py": module, "script.py": script, "compared.py": compared, "car.toml": table}.items():
         (tmp_path / name).write_text(text)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
 
@@ -35,6 +35,8 @@ def test_tutorial_of_your_robot_runs_word_by_word(tmp_path: Path) -> None:
         return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True, timeout=120).stdout
 
     assert run("script.py") == "off by 0.0 mm after 10 s\n"
+    assert [line.partition("  ")[0] for line in run("compared.py").splitlines()] == ["", "R = 0.1", "R = 1.0"]
+    assert (tmp_path / "run.png").stat().st_size > 10_000
     assert "solved" in run("-P", "-c", "from rti_mpc_service.cli import main; main()", "check", "car.toml")
 
 
