@@ -10,7 +10,8 @@ for people: nothing is inferred from names, units or the order of signals.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import zip_longest
 from typing import Any, Literal, Protocol
 
 from rti_mpc import given
@@ -63,9 +64,14 @@ class Signal:
             raise OcpError(f"name of a signal must not be empty, got {self.name!r}")
 
 
-def signals(vector: str, given_as: Any) -> tuple[Signal, ...]:
+def signals(vector: str, given_as: Any, alike: Sequence[Signal | None] = ()) -> tuple[Signal, ...]:
     """
-    Return signals from these or from their names alone, of which nothing else is known then; from one of them for a vector of one.
+    Return signals from these, or from their names alone; from one of them for a vector of one.
+
+    Args:
+        vector: Name of the vector.
+        given_as: Signals or names.
+        alike: Signals that those given by name alone are like in all else, in their order; without unit and meaning where there is none.
 
     Raises:
         OcpError: One is neither.
@@ -73,10 +79,12 @@ def signals(vector: str, given_as: Any) -> tuple[Signal, ...]:
     entries = (given_as,) if isinstance(given_as, str | Signal) else given_as
     if not isinstance(entries, Iterable):
         raise OcpError(f"{vector} must be signals or their names, got {given.quoted(entries)}")
-    found = tuple(Signal(entry, "1") if isinstance(entry, str) else entry for entry in entries)
-    if wrong := [entry for entry in found if not isinstance(entry, Signal)]:
-        raise OcpError(f"{vector} must be signals or their names, got {given.quoted(wrong[0])} among them")
-    return found
+    found: list[Signal] = []
+    for entry, like in zip_longest(entries := tuple(entries), alike[: len(entries)]):
+        if not isinstance(entry, str | Signal):
+            raise OcpError(f"{vector} must be signals or their names, got {given.quoted(entry)} among them")
+        found.append(entry if isinstance(entry, Signal) else Signal(entry, "1") if like is None else replace(like, name=entry))
+    return tuple(found)
 
 
 class HasRole(Protocol):

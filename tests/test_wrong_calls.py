@@ -67,6 +67,10 @@ MODEL = {
     "states that are a number": (lambda: mass(states=2), "model mass: states must be signals or their names, got 2"),
     "states with a number among them": (lambda: mass(states=["r", 2]), "model mass: states must be signals or their names, got 2 among them"),
     "states that are too few": (lambda: mass(states="r"), "model mass: states must have 2 entries"),
+    "output that is an angle of a state that is none": (
+        lambda: mass(outputs=Signal("psi", "rad", angle=True)),
+        "output psi is the state r, both or none must be an angle, got angle=True and angle=False",
+    ),
     "outputs named twice": (lambda: mass(y_expr=X, outputs=["r", "r"]), "names must be unique within a vector, got"),
     "u_rest that is text": (lambda: mass(u_rest="0"), "model mass: u_rest must be real numbers, got '0'"),
     "u_rest that is NaN": (lambda: mass(u_rest=np.nan), "model mass: u_rest must be finite"),
@@ -246,6 +250,14 @@ def test_names_alone_lists_and_mx_make_the_same_model_as_signals_columns_and_sx(
         assert model.u_rest == (0.0,)
         f = ca.Function("f", [model.x, model.u, model.p], [model.f_expl_expr, model.y_expr])
         np.testing.assert_array_equal(np.vstack([np.array(value) for value in f([1.0, 2.0], 3.0, [])]).ravel(), [2.0, 3.0, 1.0])
+
+
+def test_output_by_name_alone_is_like_the_state_that_it_is() -> None:
+    """Its angle above all: a heading that wraps must not spin the robot because the output forgot that it is one."""
+    states = (Signal("psi", "rad", angle=True, role="heading"), Signal("omega", "rad/s"))
+    model = mass(states=states, y_expr=ca.vertcat(X[1], X[0], X[0] + X[1]), outputs=("rate", "heading", "sum"))
+    assert model.outputs == (Signal("rate", "rad/s"), Signal("heading", "rad", angle=True, role="heading"), Signal("sum", "1"))
+    assert model.counterparts()["outputs"] == ["omega", "psi", ""]
 
 
 def test_mx_with_an_interpolant_drives_as_well() -> None:

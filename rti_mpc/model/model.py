@@ -8,6 +8,7 @@ can be reused.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -105,6 +106,10 @@ class Model:
                 raise OcpError(f"model {self.name}: names must be unique within a vector, got {names}")
             if wrong := misplaced(vector, signals, self.states):
                 raise OcpError(f"model {self.name}: {wrong}")
+        for output, state in zip(self.outputs, states_among(self.y_expr, self.x, self.states), strict=True):
+            if state is not None and state.angle is not output.angle:
+                told = f"output {output.name} is the state {state.name}, both or none must be an angle"
+                raise OcpError(f"model {self.name}: {told}, got angle={output.angle} and angle={state.angle}")
         for label, expr, known in (
             ("f_expl_expr", self.f_expl_expr, (self.x, self.u, self.p)),
             ("y_expr", self.y_expr, (self.x, self.p)),
@@ -119,12 +124,14 @@ class Model:
         """Return fields as they are documented, by name, from what was given."""
         named = (*EXPRESSIONS, *(() if self.stop_expr is None else ("stop_expr",)))
         symbols, expressions = ({name: getattr(self, name) for name in names} for names in (SYMBOLS, named))
-        vectors = {vector: signals(vector, getattr(self, vector)) for vector in ROLES_OF_VECTOR}
+        columns = to_sx(symbols, expressions)
+        vectors = {vector: signals(vector, getattr(self, vector)) for vector in ROLES_OF_VECTOR if vector != "outputs"}
+        vectors["outputs"] = signals("outputs", self.outputs, states_among(columns["y_expr"], columns["x"], vectors["states"]))
         values = {name: given.numbers(name, getattr(self, name)).ravel() for name in VALUES}
         for name, array in values.items():
             if not np.isfinite(array).all():
                 raise OcpError(f"{name} must be finite, got {array.tolist()}")
-        return {**to_sx(symbols, expressions), **vectors, **{name: tuple(array.tolist()) for name, array in values.items()}}
+        return {**columns, **vectors, **{name: tuple(array.tolist()) for name, array in values.items()}}
 
     @property
     def nx(self) -> int:
@@ -152,11 +159,9 @@ class Model:
 
     def counterparts(self) -> dict[str, list[str]]:
         """Return, for each of the ``inputs`` and ``outputs``, the name of the state that it commands or is; empty where there is none."""
-        x, y = ca.vertsplit(self.x), ca.vertsplit(ca.densify(self.y_expr))
-        named = [(state.name, x_j) for state, x_j in zip(self.states, x, strict=True)]
         return {
             "inputs": [signal.commands for signal in self.inputs],
-            "outputs": [next((name for name, x_j in named if ca.is_equal(y_i, x_j)), "") for y_i in y],
+            "outputs": ["" if state is None else state.name for state in states_among(self.y_expr, self.x, self.states)],
         }
 
     def with_parameters(self, **values: float) -> Model:
@@ -172,3 +177,11 @@ class Model:
                 raise OcpError(f"model {self.name} has parameters {', '.join(names) or 'none'}, got {name}")
             given.number(f"parameter {name} of model {self.name}", values[name])
         return replace(self, p_nominal=tuple(values.get(n, v) for n, v in zip(names, self.p_nominal, strict=True)))
+
+
+def states_among(y_expr: ca.SX, x: ca.SX, states: Sequence[Signal]) -> list[Signal | None]:
+    """Return for each output the state that it is, None for one that is something else; nothing where shapes do not fit."""
+    if not (x.is_column() and y_expr.is_column()):
+        return []
+    named = list(zip(ca.vertsplit(x), states, strict=False))
+    return [next((state for x_j, state in named if ca.is_equal(y_i, x_j)), None) for y_i in ca.vertsplit(ca.densify(y_expr))]
