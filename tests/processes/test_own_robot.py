@@ -50,15 +50,28 @@ bounds = {{ inputs = {{ {inputs} }}, increments = {{ {increments} }} }}
 """
 
 
-def driven(folder: Path, module: str, *options: str, **tables: str) -> Any:
-    """Drive a robot from another folder, without `PYTHONPATH`; return its summary."""
+ARM_TABLES = {
+    "Q": "shoulder = 1.0, elbow = 1.0",
+    "R": "w_1 = 1.0, w_2 = 1.0",
+    "inputs": "w_2 = [-1.0, 1.0], w_1 = [-1.0, 1.0]",
+    "increments": "w_1 = [-0.2, 0.2], w_2 = [-0.2, 0.2]",
+}
+
+
+def run(folder: Path, command: str, module: str, *options: str, **tables: str) -> subprocess.CompletedProcess[str]:
+    """Run a command with a robot, from another folder, without `PYTHONPATH`."""
     (folder / "own").mkdir()
     (folder / "elsewhere").mkdir()
     (folder / "own" / "my_robot.py").write_text(module)
     (folder / "own" / "robot.toml").write_text(TOML.format(**tables))
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | {"STATE_DIRECTORY": str(STATE)}
-    arguments = command_line("demo", "../own/robot.toml", "--out", "out", *options)
-    done = subprocess.run(arguments, cwd=folder / "elsewhere", env=environment, capture_output=True, text=True, timeout=240)
+    arguments = command_line(command, "../own/robot.toml", *options)
+    return subprocess.run(arguments, cwd=folder / "elsewhere", env=environment, capture_output=True, text=True, timeout=240)
+
+
+def driven(folder: Path, module: str, *options: str, **tables: str) -> Any:
+    """Run a demo of a robot; return its summary."""
+    done = run(folder, "demo", module, "--out", "out", *options, **tables)
     assert done.returncode == 0, done.stdout + done.stderr
     out = folder / "elsewhere" / "out"
     assert (out / "run.png").read_bytes().startswith(b"\x89PNG")
@@ -73,10 +86,7 @@ def test_arm_is_driven_along_references_of_its_outputs_behind_a_guard(tmp_path: 
         tmp_path,
         ARM,
         *("--guard", "--scenario", "../wave.csv", "--speed", "4", "--duration", "20"),
-        Q="shoulder = 1.0, elbow = 1.0",
-        R="w_1 = 1.0, w_2 = 1.0",
-        inputs="w_2 = [-1.0, 1.0], w_1 = [-1.0, 1.0]",
-        increments="w_1 = [-0.2, 0.2], w_2 = [-0.2, 0.2]",
+        **ARM_TABLES,
     )
     assert (summary["scenario"], summary["heading"], summary["driven"], summary["final_error_mm"]) == ("wave", None, True, None)
     assert {name: error["unit"] for name, error in summary["outputs"].items()} == {"shoulder": "rad", "elbow": "rad"}
@@ -102,3 +112,12 @@ def test_robot_whose_outputs_are_heading_x_and_y_is_driven_along_its_path(tmp_pa
     beside = y**2 - 4 * x**2 * (1 - x**2)  # zero on the eight
     assert np.median(np.abs(beside)) < 1e-3, "the host may hold processes up for a while, but never half of the time"
     assert summary["outputs"].keys() == {"psi", "x", "y"}
+
+
+@pytest.mark.slow
+def test_faults_of_an_arm_are_measured_by_its_outputs(tmp_path: Path) -> None:
+    done = run(tmp_path, "faults", ARM, "--only", "controller_killed", "--json", "faults.json", **ARM_TABLES)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (row,) = json.loads((tmp_path / "elsewhere" / "faults.json").read_text())
+    assert (row["unit"], row["kept"], row["robot"]) == ("rad", True, "braked, stood, drove again")
+    assert "rad/s" in done.stdout

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from rti_mpc.array import Array
 from rti_mpc.contract.guard import Limits
-from rti_mpc.contract.message import Reference
 from rti_mpc.contract.schedule import RAMP_STEP_NS
 from rti_mpc_service.rig.robot_log import RobotLog
 
@@ -56,7 +55,7 @@ class Incident:
 @dataclass(frozen=True)
 class Measured:
     """
-    Reaction of a robot to a fault; None for what did not happen.
+    Reaction of a robot to a fault; None for what did not happen. Of robots that follow no path, m stands for the unit of their outputs.
 
     Attributes:
         speed_m_s: Speed at the fault.
@@ -85,14 +84,14 @@ class Measured:
     final_error_m: float
 
 
-def measure(log: RobotLog, place: tuple[int, int], reference: Array, incident: Incident, limits: Limits) -> Measured:
+def measure(log: RobotLog, position: Array, error: Array, incident: Incident, limits: Limits) -> Measured:
     """
     Measure one incident.
 
     Args:
         log: The robot's record. It has a row between fault and mending.
-        place: Indices of the states that are the position, in m.
-        reference: Where the robot was to be at each stamp, shape ``(M, 2)``, in m.
+        position: Where the robot was at each stamp, shape ``(M, k)``: in the plane in m, or outputs as `rti_mpc_service.faults.motion` has them.
+        error: How far from its reference it was, shape ``(M,)``.
         incident: Times of the incident.
         limits: Limits of the inputs.
     """
@@ -100,10 +99,8 @@ def measure(log: RobotLog, place: tuple[int, int], reference: Array, incident: I
     broken = (t >= incident.fault_ns) & (t <= incident.mend_ns)
     seen = (t >= incident.fault_ns) & (t <= incident.end_ns)
     moving: Mask = np.abs(log.u - limits.u_rest).max(axis=1) > REST_TOLERANCE
-    position = log.x[:, list(place)]
-    way = np.hypot(*np.diff(position, axis=0, prepend=position[:1]).T)
+    way: Array = np.linalg.norm(np.diff(position, axis=0, prepend=position[:1]), axis=1)
     speed: Array = way / (1e-9 * np.diff(t, prepend=t[0] - 1))
-    error = np.hypot(*(position - reference).T)[broken]
 
     zero = settled(~moving, broken)
     brake = None if zero is None or zero == np.argmax(broken) else braking(log, limits, int(np.argmax(broken)), zero)
@@ -124,17 +121,9 @@ def measure(log: RobotLog, place: tuple[int, int], reference: Array, incident: I
         step_share=max(step_share(log.u[seen], limits), 0.0 if zero is None or brake is None else ramp_share(log, limits, brake, zero)),
         recovery_s=after(incident.mend_ns, int(driven[0])) if driven.size else None,
         missed=len(missed_ns(log, incident, limits.dt_s)),
-        error_m=float(error.max()),
-        final_error_m=float(error[-1]),
+        error_m=float(error[broken].max()),
+        final_error_m=float(error[broken][-1]),
     )
-
-
-def positions(reference: Reference | None, columns: tuple[int, int], stamp_ns: NDArray[np.int64]) -> Array:
-    """Return the reference's position, columns x and y, at stamps, shape ``(..., 2)``, m; its first or last row outside of it; NaN if None."""
-    if reference is None:
-        return np.full((*stamp_ns.shape, 2), np.nan)
-    rows = (stamp_ns - reference.stamp_ns) / reference.period_ns
-    return np.stack([np.interp(rows, np.arange(len(reference.y)), reference.y[:, j]) for j in columns], axis=-1)
 
 
 def step(limits: Limits) -> Array:

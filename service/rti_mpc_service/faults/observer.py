@@ -14,6 +14,7 @@ from rti_mpc.contract.message import Command, State
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, Subscriber
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
+from rti_mpc_service.faults.motion import Motion
 
 STALE_S = 0.25  # silence after which another life of the sender is accepted
 SPEED_WINDOW_NS = 200_000_000  # time over which the speed is measured
@@ -26,18 +27,18 @@ class RunObserver:
     Args:
         bus: Bus of this process.
         robot: Keys of the robot's streams.
-        place: Indices of the states that are its position.
+        motion: What its position is.
 
     Attributes:
         epoch: Epoch of the robot's present life, 0 before the first state.
         answered: Sequence numbers of states of that life that a controller has answered.
     """
 
-    def __init__(self, bus: Bus, robot: Keys, place: tuple[int, int]) -> None:
-        self._place = list(place)
+    def __init__(self, bus: Bus, robot: Keys, motion: Motion) -> None:
+        self._motion = motion
         self.epoch = 0
         self.answered: set[int] = set()
-        self._states: deque[tuple[int, int, Array]] = deque(maxlen=4096)  # stamp, local monotonic arrival, position
+        self._states: deque[tuple[int, int, Array]] = deque(maxlen=4096)  # stamp, local monotonic arrival, state
         states, commands = bus.subscriber(robot.state, capacity=RING_MESSAGES), bus.subscriber(bus.keys.command, capacity=RING_MESSAGES)
         Thread(target=self._receive, args=(states, bus.intake(State, STALE_S)), daemon=True).start()
         Thread(target=self._listen, args=(commands, bus.intake(Command, STALE_S)), daemon=True).start()
@@ -55,8 +56,8 @@ class RunObserver:
 
     @property
     def position(self) -> Array:
-        """Position in the last state, shape ``(2,)``."""
-        return self._states[-1][2]
+        """Measured outputs of the last state, shape ``(k,)``."""
+        return self._motion.position(self._states[-1][2])
 
     def now_ns(self) -> int:
         """Robot time now, whether its states still come or not."""
@@ -73,7 +74,8 @@ class RunObserver:
         if not states or self.now_ns() - states[-1][0] > SPEED_WINDOW_NS:
             return 0.0
         first = next(state for state in states if states[-1][0] - state[0] <= SPEED_WINDOW_NS)
-        return float(np.hypot(*(states[-1][2] - first[2]))) / max(1e-9 * (states[-1][0] - first[0]), 1e-3)
+        way = np.linalg.norm(self._motion.position(states[-1][2]) - self._motion.position(first[2]))
+        return float(way) / max(1e-9 * (states[-1][0] - first[0]), 1e-3)
 
     def _receive(self, subscriber: Subscriber, intake: Intake[State]) -> None:
         """Note every state with the time of its arrival; a thread of its own."""
@@ -82,7 +84,7 @@ class RunObserver:
             if (state := intake.read(received)) is None:
                 continue
             self.epoch = state.epoch
-            self._states.append((state.stamp_ns, arrival_ns, state.x[self._place]))
+            self._states.append((state.stamp_ns, arrival_ns, state.x))
 
     def _listen(self, subscriber: Subscriber, intake: Intake[Command]) -> None:
         """Note which states were answered; a thread of its own."""

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rti_mpc_service.faults.measure import Measured
 
@@ -32,6 +32,16 @@ class Promise:
     def on_path(self) -> bool:
         """Whether it is about the distance from the reference."""
         return not {"error_m", "final_error_m"}.isdisjoint(self.at_most)
+
+    def eased(self, error_m: float) -> Promise:
+        """Return the promise of a robot that is this far from its reference without any fault."""
+        limits = {name: limit + error_m if name in ("error_m", "final_error_m") else limit for name, limit in self.at_most.items()}
+        return replace(self, at_most=limits)
+
+    def without_standstill(self) -> Promise:
+        """Return the promise of a robot that coasts, or falls, with its inputs at rest: of the inputs, not of where the robot ends."""
+        coasts = {"still_s", "distance_m"} if "brake_s" in self.at_most or "distance_m" in self.at_most else set()
+        return replace(self, at_most={name: limit for name, limit in self.at_most.items() if name not in coasts})
 
     def broken(self, measured: Measured, excused: Mapping[str, float] = NO_EXCUSE) -> list[str]:
         """Return the broken limits, in words; `excused` says by how much each value may exceed its limit."""

@@ -17,7 +17,10 @@ from rti_mpc_service.faults.table import Fault
 from rti_mpc_service.host import machine
 from rti_mpc_service.redrawn import Redrawn
 
-COLUMNS = ("fault", "the robot", "speed\nm/s", "braking\nms", "zero\nms", "standstill\ns", "way\nm", "step\n%", "error\nmm", "recovery\ns", "kept")
+COLUMNS = (
+    *("fault", "the robot", "speed\nUNIT/s", "braking\nms", "zero\nms", "standstill\ns"),
+    *("way\nUNIT", "step\n%", "error\nmUNIT", "recovery\ns", "kept"),
+)
 NO_VALUE = "-"
 
 
@@ -31,12 +34,14 @@ class MatrixRow:
         measured: The robot's reaction; None if nothing could be measured.
         broken: Broken limits of the promise, in words.
         excused: Exceeded limits that delays of the host alone explain, in words.
+        unit: Unit of what is called m, see `rti_mpc_service.faults.motion`.
     """
 
     fault: Fault
     measured: Measured | None
     broken: list[str]
     excused: list[str] = field(default_factory=list)
+    unit: str = "m"
 
     @property
     def did(self) -> str:
@@ -63,6 +68,7 @@ class MatrixRow:
             "broken": self.broken,
             "excused": self.excused,
             "robot": self.did,
+            "unit": self.unit,
             **({} if self.measured is None else asdict(self.measured)),
         }
 
@@ -138,8 +144,10 @@ class MatrixReport(Redrawn):
 
     def _table(self) -> Table:
         table = Table(box=None, padding=(0, 1))
+        unit = next((row.unit for row in self.rows), "m")
         for name in COLUMNS:
-            table.add_column(name, justify="left" if name in COLUMNS[:2] else "right", no_wrap=True)
+            title = name.replace("mUNIT", "1e-3" if unit == "1" else f"m{unit}").replace("UNIT", unit)
+            table.add_column(title, justify="left" if name in COLUMNS[:2] else "right", no_wrap=True)
         for row in self.rows:
             table.add_row(*(Text(cell, "red" if row.broken else "") for cell in row.cells()))
         return table

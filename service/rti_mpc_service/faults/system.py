@@ -12,14 +12,11 @@ from enum import Enum
 from pathlib import Path
 from threading import Event
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from rti_mpc.contract.message import Reference
-from rti_mpc.errors import ConfigError
-from rti_mpc.reference.trajectory import Heading
-from rti_mpc.signals import plane
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.info import Info, Label
 from rti_mpc.wire.keys import Key, Keys
@@ -27,7 +24,7 @@ from rti_mpc.wire.session import BusSettings
 from rti_mpc_service.config import toml
 from rti_mpc_service.config.build import build_model
 from rti_mpc_service.config.schema import Config
-from rti_mpc_service.faults.measure import positions
+from rti_mpc_service.faults.motion import Motion
 from rti_mpc_service.faults.observer import RunObserver
 from rti_mpc_service.faults.proxy import Proxy
 from rti_mpc_service.faults.relay import ROLE as RELAY
@@ -38,28 +35,9 @@ from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.rig.robot_log import RobotLog
 from rti_mpc_service.rig.witness import Witness
 
-if TYPE_CHECKING:
-    from rti_mpc.model.model import Model
-
-SCENARIO = "eight"
-HEADING: Heading = "consistent"
 REFERENCE_DURATION_S = 120  # 58 kB fit into one packet, so that a busy host cannot drop a part of it
 START_TIMEOUT_S = 60.0  # for processes to start and the robot to be driven; the first controller on a machine compiles
-MIN_DRIVEN_SPEED_M_S = 0.1
 REQUEST_TIMEOUT_S = 2.0
-
-
-def measured_places(model: Model) -> tuple[tuple[int, int], tuple[int, int]]:
-    """
-    Return the indices of the states, and of the outputs, that are the position in the plane.
-
-    Raises:
-        ConfigError: The model has none, and what a robot does after a fault is measured by its way.
-    """
-    states, outputs = plane(model.states), plane(model.outputs)
-    if states is None or outputs is None:
-        raise ConfigError(f"model {model.name}: faults are measured by the robot's way, so states and outputs must have the roles x and y")
-    return states, outputs
 
 
 class Wiring(Enum):
@@ -88,8 +66,7 @@ class System:
         observer: Follows the robot's states.
         link: Link between controller and router, used with wiring `ROUTER`.
         robots: Number of robots started so far.
-        place: Indices of the states that are the position.
-        columns: Indices of the outputs that are the position.
+        motion: What the robot's reaction is measured by.
     """
 
     def __init__(self, config: Config, wiring: Wiring, folder: Path, stop: Event) -> None:
@@ -100,7 +77,7 @@ class System:
         self.wiring, self._folder, self._stop = wiring, folder, stop
         self._robot_keys = Keys(f"{self.keys.prefix}/behind", self.keys.robot) if wiring in RELAYED else self.keys
         model = build_model(config)
-        self.place, self.columns = measured_places(model)
+        self.motion = Motion(model)
         states, inputs = (tuple(Label(signal.name) for signal in signals) for signals in (model.states, model.inputs))
         self._info = Info("robot", states=states, inputs=inputs)
         self._suspended: set[str] = set()
@@ -118,7 +95,7 @@ class System:
             self.bus = Bus.join(settings, self.keys, timeout_s=START_TIMEOUT_S, stop=stop)
             self.witness = Witness(self.bus)
             self._references = self.bus.publisher(self.keys.reference)
-            self.observer = RunObserver(self.bus, self._robot_keys, self.place)
+            self.observer = RunObserver(self.bus, self._robot_keys, self.motion)
         except BaseException:
             self.children.__exit__(None, None, None)
             raise
@@ -183,11 +160,10 @@ class System:
         here = self._folder / ("config.toml" if self._keys_of(role) is self.keys else "robot.toml")
         through = self.link.endpoint if self.wiring is Wiring.ROUTER and role == "controller" else self._endpoint
         meeting: tuple[object, ...] = (here, *(("-m", "client") if self.wiring is Wiring.ROUTER else ()), "-e", through)
-        scenario = ("--scenario", SCENARIO, "--heading", HEADING, "--duration", REFERENCE_DURATION_S)
         commands: dict[str, tuple[object, ...]] = {
             "controller": (CLI_MODULE, "run", *meeting),
             "guard": (CLI_MODULE, "guard", *meeting),
-            "reference": (CLI_MODULE, "reference", *meeting, *scenario),
+            "reference": (CLI_MODULE, "reference", *meeting, "--duration", REFERENCE_DURATION_S),
             "robot": (CLI_MODULE, "sim", *meeting, *(() if "-m" in meeting else ("-l", "tcp/127.0.0.1:0")), "--log", self.log_path),
             "viewer": (CLI_MODULE, "view", *meeting, "--rerun-save", self._folder / "run.rrd"),
             "router": (CLI_MODULE, "router", here, "-l", self._endpoint),
@@ -223,7 +199,8 @@ class System:
 
     def error_m(self) -> float:
         """Return the distance from the reference now."""
-        return float(np.hypot(*(self.observer.position - positions(self.witness.reference, self.columns, np.array(self.observer.stamp_ns)))))
+        wanted = self.motion.wanted(self.witness.reference, np.array(self.observer.stamp_ns))
+        return float(self.motion.distance(self.observer.position, wanted))
 
     def reference_left_s(self) -> float:
         """Return how long the reference still lasts."""
@@ -233,7 +210,7 @@ class System:
     def driven(self, error_m: float = np.inf) -> bool:
         """Whether the robot is driven, and nearer to its reference than `error_m`."""
         self.witness.listen()
-        return self.witness.begun and self.observer.speed_m_s() > MIN_DRIVEN_SPEED_M_S and self.error_m() < error_m
+        return self.witness.begun and self.observer.speed_m_s() > self.motion.driven_speed and self.error_m() < error_m
 
     def wait(self, condition: Callable[[], object], what: str, patience_s: float = START_TIMEOUT_S) -> None:
         """

@@ -47,7 +47,7 @@ def answered_unless_broken(t: Array) -> Array:
 
 
 def measured(log: RobotLog) -> Measured:
-    return measure(log, (0, 1), log.x[:, :2] + [0.0, 0.001], INCIDENT, LIMITS)
+    return measure(log, log.x, np.full(len(log.x), 0.001), INCIDENT, LIMITS)
 
 
 def test_ramp_to_rest_is_timed_from_its_first_step_to_its_last_and_the_robot_to_its_standstill() -> None:

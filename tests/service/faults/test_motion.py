@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What faults of robots are measured by, whatever they are, and what robots promise that follow no path or coast."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rti_mpc.contract.message import End, Reference
+from rti_mpc_service.config.config import load
+from rti_mpc_service.faults.measure import Incident
+from rti_mpc_service.faults.motion import Motion
+from rti_mpc_service.faults.promise import HOLDS, KEEPS_ON, STOPS, WAITS
+from rti_mpc_service.faults.report import MatrixRow
+from rti_mpc_service.faults.run import error_before, prepared
+from rti_mpc_service.faults.table import FAULTS
+from rti_mpc_service.rig.robot_log import RobotLog
+from tests.robots import arm, polar, shuffled, toml
+
+X = np.arange(5.0)
+
+
+def test_robot_in_the_plane_is_measured_by_its_position_wherever_it_is_among_states_and_outputs() -> None:
+    motion = Motion(shuffled())
+    assert motion.unit == "m"
+    assert motion.position(X) == pytest.approx([3.0, 4.0])
+    assert motion.position(np.stack([X, X + 1])) == pytest.approx(np.array([[3.0, 4.0], [4.0, 5.0]]))
+    reference = Reference(1, 1, 0, 10, End.HOLD, np.array([[0.0, 1.0, 2.0], [0.0, 2.0, 4.0]]), np.zeros((2, 0)))
+    assert motion.wanted(reference, np.array([0, 5, 99])) == pytest.approx(np.array([[1.0, 2.0], [1.5, 3.0], [2.0, 4.0]]))
+    assert np.isnan(motion.wanted(None, np.array([0]))).all()
+    assert motion.distance(np.array([3.0, 4.0]), np.zeros(2)) == pytest.approx(5.0)
+
+
+def test_any_other_robot_is_measured_by_its_outputs_in_their_unit_angles_within_pi() -> None:
+    motion = Motion(arm())
+    assert motion.unit == "rad"
+    assert motion.position(np.array([0.1, 0.2])) == pytest.approx([0.1, 0.2])
+    assert motion.distance(np.array([0.3, 2 * np.pi]), np.array([0.0, 0.4])) == pytest.approx(0.5)
+    assert Motion(polar()).unit == "1"
+
+
+def test_error_that_a_robot_has_without_a_fault_is_not_held_against_it() -> None:
+    log = RobotLog(10**9 * np.arange(8), np.arange(8), np.zeros((8, 1)), np.zeros((8, 1)), np.zeros(8), {})
+    error = np.array([9.0, 0.1, 0.2, 0.3, 0.2, 0.1, 0.1, 5.0])
+    assert error_before(log, error, Incident(6 * 10**9, 7 * 10**9, 8 * 10**9)) == 0.3
+    assert KEEPS_ON.eased(0.3).at_most["error_m"] == pytest.approx(0.31)
+    assert KEEPS_ON.eased(0.3).at_most["missed"] == 0.0
+
+
+def test_robot_that_coasts_promises_nothing_of_its_standstill_but_where_it_is_held() -> None:
+    assert STOPS.without_standstill().at_most.keys() == STOPS.at_most.keys() - {"still_s"}
+    assert WAITS.without_standstill().at_most.keys() == WAITS.at_most.keys() - {"distance_m"}
+    assert HOLDS.without_standstill() == HOLDS
+
+
+def test_row_is_told_in_the_unit_of_the_robot() -> None:
+    assert MatrixRow(FAULTS[0], None, ["it was not there"], unit="rad").to_json()["unit"] == "rad"
+
+
+@pytest.mark.parametrize("name", ["arm", "glider", "rover", "shuffled"])
+def test_faults_are_prepared_for_any_robot_behind_a_guard(name: str, tmp_path: Path) -> None:
+    """The glider has a parameter `a` that is no axle's offset, the rover none at all, and the arm no position."""
+    path = tmp_path / "robot.toml"
+    path.write_text(toml(name))
+    config = prepared(load(path))
+    assert config.guard.enabled
+    assert config.debug.inject
