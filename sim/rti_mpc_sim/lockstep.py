@@ -18,7 +18,7 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, State
-from rti_mpc_sim.actuator import Actuator, Counters
+from rti_mpc.wire.actuator import Actuator, Counters
 from rti_mpc_sim.plant import Plant
 from rti_mpc_sim.sensor import UNREPORTED, Sensor
 from rti_mpc_sim.settings import RobotSettings

@@ -20,7 +20,7 @@ from typing import Any
 from rti_mpc.array import Array
 from rti_mpc.errors import ConfigError
 from rti_mpc.model.model import Model
-from rti_mpc_sim.actuator import Counters
+from rti_mpc.wire.actuator import Counters
 
 ANSWER_TIMEOUT_NS = 1_000_000_000  # by the monotonic clock: later answers to a state are not recorded
 

@@ -26,12 +26,12 @@ import rti_mpc
 from rti_mpc.contract.message import Command, Notice, Severity, State
 from rti_mpc.contract.schedule import unfit
 from rti_mpc.model.model import Model
+from rti_mpc.wire.actuator import STALE_NS, Counters
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
 from rti_mpc.wire.info import labels
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Key, Keys
-from rti_mpc_sim.actuator import STALE_NS, Counters
 from rti_mpc_sim.clock import MAX_SLEEP_S, Clock
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.log import Log

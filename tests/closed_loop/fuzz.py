@@ -17,10 +17,10 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Reference, State
 from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.wire.actuator import Actuator
 from rti_mpc.wire.cdr import decode, encode, encoding
 from rti_mpc.wire.intake import Intake
 from rti_mpc_service.injection import FAILURES, FaultyRti
-from rti_mpc_sim.actuator import Actuator
 from tests.problems import pioneer
 
 MS = 1_000_000

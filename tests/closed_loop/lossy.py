@@ -21,8 +21,8 @@ from rti_mpc.contract.guard import Guard, Limits
 from rti_mpc.contract.message import Command, State
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.rti.rti import Rti
+from rti_mpc.wire.actuator import Actuator
 from rti_mpc.wire.cdr import decode, encode
-from rti_mpc_sim.actuator import Actuator
 from tests.closed_loop.fuzz import BOUND, DT, MS, ROUNDING, STEP, WINDOW_NS, Fuzz, Payload
 from tests.problems import pioneer
 

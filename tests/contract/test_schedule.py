@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Schedule of the inputs that act; the single rules are tested with the actuators, `tests/sim/test_actuator.py`."""
+"""Schedule of the inputs that act; the single rules are tested with the actuators, `tests/wire/test_actuator.py`."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from rti_mpc.control.delay import DelayEstimator
 from rti_mpc.control.grid import DELAY_MARGIN_PERIODS, DELAY_SLEW_SAMPLES, MAX_DELAY_PERIODS, Grid
 from rti_mpc.reference.trajectory import eight
 from rti_mpc.rti.rti import Rti
-from rti_mpc_sim.actuator import Actuator
+from rti_mpc.wire.actuator import Actuator
 from tests.loop import MS, SLEW, Run, drive, reference, robot
 from tests.problems import double_integrator, pioneer
 

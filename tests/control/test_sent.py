@@ -10,7 +10,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.sent import Sent
-from rti_mpc_sim.actuator import Actuator
+from rti_mpc.wire.actuator import Actuator
 
 MS = 1_000_000
 DT = 100 * MS

@@ -17,6 +17,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, State
 from rti_mpc.contract.schedule import Schedule
 from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.wire.actuator import Actuator
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.session import BusSettings
@@ -25,7 +26,6 @@ from rti_mpc_service.config.build import guard_limits
 from rti_mpc_service.config.config import load
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
-from rti_mpc_sim.actuator import Actuator
 from tests.in_time import in_time, on_time
 
 ROOT = Path(__file__).parents[2]

@@ -11,7 +11,7 @@ import pytest
 
 from rti_mpc.errors import ConfigError
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
-from rti_mpc_sim.actuator import Counters
+from rti_mpc.wire.actuator import Counters
 from rti_mpc_sim.log import ANSWER_TIMEOUT_NS, Log
 
 X = np.array([1.0, 2.0, 0.1 + 0.2, 0.0, 0.0])

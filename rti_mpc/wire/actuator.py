@@ -133,6 +133,10 @@ class Actuator:
             t = self._now_ns = min(change_ns, to_ns)
             yield t, self.u
 
+    def acting(self, t_ns: int) -> tuple[Array, tuple[int, int]]:
+        """Return the input that acts at a time up to a period ago, shape ``(nu,)``, and epoch and sequence number of its command; see `source`."""
+        return self._schedule.at(t_ns)[0], self._schedule.source(t_ns)
+
     def switch_off(self) -> None:
         """Drop every plan and take no other: the inputs ramp to rest."""
         self._off = True

@@ -12,7 +12,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.schedule import RAMP_STEP_NS
 from rti_mpc.contract.status import Mode, QpStatus
-from rti_mpc_sim.actuator import Actuator
+from rti_mpc.wire.actuator import Actuator
 
 MS = 1_000_000
 SLEW = np.array([1.0, 2.0])
