@@ -26,6 +26,7 @@ LIBRARY = {
     "rti_mpc.rti.qp": {"rti_mpc.contract", "rti_mpc.rti"},
     "rti_mpc.control": {"rti_mpc.model", "rti_mpc.contract", "rti_mpc.rti"},
     "rti_mpc.wire": {"rti_mpc.contract"},
+    "rti_mpc.adapter": {"rti_mpc.contract", "rti_mpc.wire"},
 }
 
 # The commands of the service: none is a library of another. What they share is beside them, or in `config`, `host` and `rig`.
@@ -145,9 +146,9 @@ def test_no_file_imports_itself_by_way_of_others(package: str) -> None:
     assert not left, "each of these imports another of them, or itself"
 
 
-def test_library_has_no_clock_and_no_thread_but_on_the_wire() -> None:
+def test_library_has_no_clock_and_no_thread_but_on_the_bus() -> None:
     for path in files("rti_mpc"):
-        if folder_of_file(path) != "rti_mpc.wire":
+        if folder_of_file(path) not in ("rti_mpc.wire", "rti_mpc.adapter"):
             assert not roots(path) & CLOCKS, path
 
 
@@ -175,6 +176,7 @@ def test_what_peers_send_is_read_in_one_place(name: str) -> None:
     ("module", "absent"),
     [
         ("rti_mpc.wire.bus", {"casadi", "osqp", "scipy", "pydantic", "rerun"}),
+        ("rti_mpc.adapter", {"casadi", "osqp", "scipy", "pydantic", "rerun"}),
         ("rti_mpc.reference.trajectory", {"casadi", "osqp", "scipy", "zenoh"}),
         ("rti_mpc.contract.guard", {"casadi", "osqp", "scipy", "zenoh"}),
         ("rti_mpc.rti.rti", {"zenoh", "rerun", "qpsolvers", "pydantic"}),

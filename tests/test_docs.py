@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,8 @@ import pytest
 import typer
 
 from rti_mpc_service.cli import app
+from rti_mpc_service.rig.endpoint import free_endpoint
+from tests.processes.system import until
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -38,6 +41,39 @@ def test_tutorial_of_your_robot_runs_word_by_word(tmp_path: Path) -> None:
     assert [line.partition("  ")[0] for line in run("compared.py").splitlines()] == ["", "R = 0.1", "R = 1.0"]
     assert (tmp_path / "run.png").stat().st_size > 10_000
     assert "solved" in run("-P", "-c", "from rti_mpc_service.cli import main; main()", "check", "car.toml")
+
+
+@pytest.mark.slow
+def test_tutorial_of_the_adapter_drives_the_robot_word_by_word(tmp_path: Path) -> None:
+    """But for the endpoint: the usual one may be taken."""
+    endpoint = free_endpoint()
+    for name, text in zip(("robot.py", "planner.py"), blocks("adapter.md", "python"), strict=True):
+        assert len([line for line in text.splitlines() if line.strip()]) <= 30
+        listening = f"listen=('{endpoint}',), " if name == "robot.py" else ""
+        joined = text.replace('("my_robot"', f"(\"my_robot\", bus=BusSettings({listening}connect=('{endpoint}',))")
+        (tmp_path / name).write_text(f"from rti_mpc.wire.bus import BusSettings\n{joined}")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "STATE_DIRECTORY": str(tmp_path / "state")}
+    cli = ("-c", "from rti_mpc_service.cli import main; main()")
+    subprocess.run([sys.executable, *cli, "init", "my_robot"], cwd=tmp_path, env=environment, check=True, timeout=60)
+    processes: dict[str, subprocess.Popen[bytes]] = {}
+    try:
+        for name, line in {"robot": ("robot.py",), "run": (*cli, "run", "my_robot.toml", "-e", endpoint), "planner": ("planner.py",)}.items():
+            with (tmp_path / f"{name}.log").open("w") as log:
+                processes[name] = subprocess.Popen([sys.executable, *line], cwd=tmp_path, env=environment, stdout=log, stderr=log)
+            if name == "run":
+                until(lambda: "waiting: first state" in (tmp_path / "run.log").read_text(), "the controller hears the robot", pause_s=0.1)
+        assert processes["planner"].wait(60.0) == 0
+        for name in ("robot", "run"):
+            processes[name].send_signal(signal.SIGINT)
+            assert processes[name].wait(30.0) == 0
+    finally:
+        for process in processes.values():
+            process.kill()
+            process.wait()
+    said = re.search(r"stands at x = (\S+) m, y = (\S+) m", (tmp_path / "robot.log").read_text())
+    assert said is not None
+    assert abs(float(said[1]) - 1.0) < 0.1, "m: where a busy host holds up robot or controller, it overshoots"
+    assert abs(float(said[2])) < 0.05, "m"
 
 
 def test_every_page_of_the_site_exists_and_is_reached() -> None:

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Adapter of a planner: references of one's own, sent to the controller of a robot."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rti_mpc.contract.message import STAMP_ON_ARRIVAL, End, Reference
+from rti_mpc.errors import ConfigError
+from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.keys import Keys
+
+ROLE = "reference"
+
+
+class PlannerAdapter:
+    """
+    One life of a planner on the bus; leaves it at the end of a ``with`` block.
+
+    Controllers that join while it lives get the last reference, too.
+    """
+
+    def __init__(self, robot: str, *, prefix: str = "rti_mpc", bus: BusSettings | None = None) -> None:
+        """
+        Join the bus.
+
+        Args:
+            robot: Name of the robot, as in its TOML file.
+            prefix: What all keys begin with.
+            bus: How to join; None: a peer that connects to the usual endpoint.
+
+        Raises:
+            ConfigError: The name is none for a key, or Zenoh refuses a setting.
+        """
+        self._bus = Bus.join(bus or BusSettings(), Keys(prefix, robot), say=lambda line: print(f"{robot}: {line}", file=sys.stderr))
+        self._publisher = self._bus.publisher(self._bus.keys.reference)
+        self._epoch, self._seq = time.time_ns() // 1_000_000_000, 0
+        self._bus.alive(ROLE)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the bus; the robot follows the last reference to its end."""
+        self._bus.close()
+
+    def send(self, y: ArrayLike, period_s: float, *, stamp_ns: int = STAMP_ON_ARRIVAL, end: End = End.HOLD, p: ArrayLike | None = None) -> None:
+        """
+        Send a reference, which takes the place of the last one.
+
+        Args:
+            y: Rows of outputs in the order of the model, shape ``(M, ny)``; angles may wrap.
+            period_s: Time between rows.
+            stamp_ns: Time of row 0 on the robot's clock; by default that of the state which is current on arrival.
+            end: What happens after the last row: it is held, or the robot stops.
+            p: Stage parameters in the order of the model, shape ``(M, np)``; None: the model's nominal ones.
+
+        Raises:
+            ConfigError: The rows are no table of finite numbers, or the period is none.
+        """
+        rows = np.array(y, dtype=np.float64)
+        parameters = np.zeros((len(rows), 0)) if p is None else np.array(p, dtype=np.float64)
+        for name, table in (("y", rows), ("p", parameters)):
+            if table.ndim != 2 or len(table) != len(rows) or not len(table) or not np.isfinite(table).all():
+                raise ConfigError(f"{name} must be a table of finite numbers, as many rows as y has, got shape {table.shape}")
+        if not period_s > 0.0:
+            raise ConfigError(f"period_s must be above 0, got {period_s}")
+        self._seq += 1
+        self._publisher.put(Reference(self._epoch, self._seq, stamp_ns, round(1e9 * period_s), end, rows, parameters))

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Adapter of a robot: its states to the bus, and from there the inputs to apply.
+
+The robot's clock is the monotonic clock of this process. Commands are played as
+`rti_mpc.contract.schedule` says: each row from its time on, approached inside the slew
+limits from what was really applied before; without a valid command the inputs ramp to
+rest. What acts is reported in each state, so that the controller plans from there.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from threading import Event
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+import rti_mpc
+from rti_mpc.array import Array
+from rti_mpc.contract.approach import Increments
+from rti_mpc.contract.message import Command, Notice, Severity, State
+from rti_mpc.contract.schedule import unfit
+from rti_mpc.errors import ConfigError
+from rti_mpc.wire.actuator import STALE_NS, Actuator
+from rti_mpc.wire.announcer import Announcer
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings
+from rti_mpc.wire.info import Label, labels
+from rti_mpc.wire.interrupt import stop_on_signals
+from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.session import RENDEZVOUS_ENDPOINT
+
+ROLE = "robot"
+NO_LIMIT = (-np.inf, np.inf)
+
+
+class RobotAdapter:
+    """
+    One life of a robot on the bus; leaves it at the end of a ``with`` block. For one thread.
+
+    Attributes:
+        inputs: Names of the inputs, in the order of `act`.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        *,
+        dt_s: float,
+        inputs: Mapping[str, tuple[float, float]],
+        increments: Mapping[str, tuple[float, float]],
+        u_rest: Mapping[str, float] | None = None,
+        guarded: bool = False,
+        prefix: str = "rti_mpc",
+        bus: BusSettings | None = None,
+        stop: Event | None = None,
+    ) -> None:
+        """
+        Join the bus, with the inputs at rest. Call it in the main thread, unless `stop` is given.
+
+        Args:
+            robot: Name of the robot, as in its TOML file.
+            dt_s: Period of the controller, ``ocp.dt_s`` of that file.
+            inputs: Bounds of each input, ``ocp.bounds.inputs`` of that file, in the order of the model.
+            increments: Slew limits over `dt_s`, ``ocp.bounds.increments``; an input that is left out has none.
+            u_rest: Inputs at rest that are not 0.
+            guarded: Whether a guard runs: then only what it passes on is taken.
+            prefix: What all keys begin with.
+            bus: How to join; None: a peer that listens on the usual endpoint, where the others look for the robot.
+            stop: Ends `every` when set; None: SIGINT and SIGTERM do.
+
+        Raises:
+            ConfigError: A name or a number does not fit, or the endpoint is taken.
+        """
+        rest = u_rest or {}
+        check_limits(dt_s, inputs, increments, rest)
+        self.inputs = tuple(inputs)
+        lbu, ubu = np.array([inputs[name] for name in self.inputs], dtype=np.float64).T
+        lbdu, ubdu = np.array([increments.get(name, NO_LIMIT) for name in self.inputs], dtype=np.float64).T
+        dt_ns, nu, epoch = round(1e9 * dt_s), len(inputs), time.time_ns() // 1_000_000
+        self._epoch, self._seq = epoch, 0
+        self._stop = stop or stop_on_signals()
+        self._actuator = Actuator(
+            np.array([rest.get(name, 0.0) for name in self.inputs]),
+            np.minimum(-lbdu, ubdu) / dt_s,
+            epoch,
+            bounds=(lbu, ubu),
+            increments=Increments(lbdu, ubdu, dt_ns),
+        )
+        self._played_ns = time.monotonic_ns()
+        settings = bus or BusSettings(listen=(RENDEZVOUS_ENDPOINT,))
+        keys = Keys(prefix, robot)
+        self._bus = Bus.join(settings, keys, stop=self._stop, say=lambda line: print(f"{robot}: {line}", file=sys.stderr))
+        self._states = self._bus.publisher(keys.state)
+        self._announcer = Announcer(self._bus, ROLE, epoch)
+        self._intake = self._bus.intake(Command, 1e-9 * STALE_NS, {"u": nu}, unfit=lambda command: unfit(command, nu, epoch))
+        self._commands = self._bus.subscriber(keys.actuation if guarded else keys.command, capacity=RING_MESSAGES)
+        self._bus.expect("command", lambda: self._intake.source.epoch is not None)
+        about = {"role": ROLE, "version": rti_mpc.__version__, "epoch": epoch, "speed": 1.0, "reports_inputs": True, "approaches": True}
+        self._bus.publish_json(keys.info(ROLE), {**about, **labels(inputs=[Label(name) for name in self.inputs])})
+        self._bus.alive(ROLE)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.close()
+
+    def every(self, period_s: float) -> Iterator[int]:
+        """
+        Yield the robot's time, in ns, once per period, until the process is stopped and `act` has returned the inputs at rest.
+
+        The period is that in which the inputs are renewed: a fraction of `dt_s`, for a command acts from its time on, and comes soon
+        after its state. A period that was missed is skipped. Once stopped, no command is taken and the inputs ramp to rest.
+        """
+        period_ns = round(1e9 * period_s)
+        due_ns = time.monotonic_ns()
+        while not (self._stop.is_set() and self._actuator.at_rest):
+            if self._stop.is_set():
+                self._actuator.switch_off()
+            yield due_ns
+            now_ns = time.monotonic_ns()
+            due_ns += max(1, -((due_ns - now_ns) // period_ns)) * period_ns
+            time.sleep(max(0.0, 1e-9 * (due_ns - now_ns)))
+
+    def send(self, x: ArrayLike, age_s: float = 0.0) -> None:
+        """
+        Send a state, with the inputs that acted when it was measured.
+
+        Args:
+            x: State in the order of the model, shape ``(nx,)``; angles may wrap.
+            age_s: How long ago it was measured, at most `dt_s`.
+        """
+        stamp_ns = time.monotonic_ns() - round(1e9 * age_s)
+        u, source = self._actuator.acting(stamp_ns)
+        self._seq += 1
+        self._states.put(State(self._epoch, self._seq, stamp_ns, np.array(x, dtype=np.float64), u.copy(), *source))
+
+    def act(self) -> Array:
+        """Return the inputs to apply now, shape ``(nu,)``."""
+        now_ns = time.monotonic_ns()
+        for received in self._commands.drain():
+            command = self._intake.accept(received, now_ns)
+            if command is not None and (reason := self._actuator.accept(command, now_ns)):
+                text = f"command {command.seq} of epoch {command.epoch} was refused: {reason.replace('_', ' ')}"
+                self._announcer.say(Notice(Severity.WARNING, f"command_{reason}", text), now_ns)
+        starved = self._actuator.counters.starved
+        for _ in self._actuator.play(self._played_ns, now_ns + 1):
+            pass
+        self._played_ns = now_ns + 1
+        if self._actuator.counters.starved > starved:
+            ran_out = Notice(Severity.ERROR, "command_ran_out", "no valid command is left: the robot brakes to rest on its own")
+            self._announcer.say(ran_out, now_ns)
+        for notice in self._intake.notices(now_ns):
+            self._announcer.say(notice, now_ns)
+        return self._actuator.u.copy()
+
+
+def check_limits(
+    dt_s: float, inputs: Mapping[str, tuple[float, float]], increments: Mapping[str, tuple[float, float]], u_rest: Mapping[str, float]
+) -> None:
+    """
+    Check the limits of a robot.
+
+    Raises:
+        ConfigError: A name is none of an input, or a number does not fit.
+    """
+    if not 0.0 < dt_s <= 10.0:
+        raise ConfigError(f"dt_s must be above 0 and at most 10 s, got {dt_s}")
+    if not inputs:
+        raise ConfigError("inputs must name at least one input, got none")
+    for what, table in (("increments", increments), ("u_rest", u_rest)):
+        if unknown := [name for name in table if name not in inputs]:
+            raise ConfigError(f"{what}.{unknown[0]} must be one of the inputs {', '.join(inputs)}")
+    for name, (lower, upper) in inputs.items():
+        if not lower <= (rest := u_rest.get(name, 0.0)) <= upper:
+            raise ConfigError(f"inputs.{name} must hold the input at rest, {rest:g}, got {[lower, upper]}")
+    for name, (lower, upper) in increments.items():
+        if not lower < 0.0 < upper:
+            raise ConfigError(f"increments.{name} must go from below 0 to above 0, got {[lower, upper]}")

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Adapters of a robot and of a planner, on a clock and a bus that tests move."""
+
+from __future__ import annotations
+
+import time
+from threading import Event
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rti_mpc.adapter import PlannerAdapter, RobotAdapter, robot
+from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Reference, State
+from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.errors import ConfigError
+from rti_mpc.wire.bus import Bus, Received
+from rti_mpc.wire.cdr import decode, encode, encoding
+from rti_mpc.wire.keys import Keys
+from tests.wire.fake_session import FakeSession
+
+MS = 1_000_000
+KEYS = Keys(robot="car")
+LIMITS: dict[str, Any] = {"dt_s": 0.1, "inputs": {"v_c": [-1.0, 1.0], "kappa": [-0.5, 0.5]}, "increments": {"v_c": [-0.2, 0.2]}}
+
+
+class Session(FakeSession):
+    """Session that hands over what the test has sent."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waiting: list[Received] = []
+
+    def subscriber(self, key: Any, capacity: int, *, history: bool) -> Any:
+        return Waiting(self)
+
+
+class Waiting:
+    """Subscriber to that."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+
+    def drain(self) -> list[Received]:
+        waiting, self._session.waiting = self._session.waiting, []
+        return waiting
+
+
+class Scene:
+    """A robot that is adapted, and its clock."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, **limits: Any) -> None:
+        self.now_ns = 10**12
+        self.session, self.stop = Session(), Event()
+        monkeypatch.setattr(Bus, "join", lambda settings, keys, **_: Bus(self.session, keys))
+        clock = SimpleNamespace(monotonic_ns=lambda: self.now_ns, time_ns=time.time_ns, sleep=self.sleep)
+        monkeypatch.setattr(robot, "time", clock)
+        self.robot = RobotAdapter("car", stop=self.stop, **(LIMITS | limits))
+        self.seq = 0
+
+    def sleep(self, duration_s: float) -> None:
+        self.now_ns += round(1e9 * duration_s)
+
+    def state(self) -> State:
+        return decode(State, self.session.put[KEYS.state])
+
+    def command(self, u: list[list[float]], **change: Any) -> None:
+        """Answer the last state with rows of 0.1 s, valid for 250 ms."""
+        self.seq += 1
+        state = self.state()
+        about = {"epoch": 7, "seq": self.seq, "state_epoch": state.epoch, "valid_until_ns": state.stamp_ns + 250 * MS} | change
+        self.session.waiting.append(
+            Received(
+                encode(
+                    Command(
+                        stamp_ns=state.stamp_ns,
+                        state_seq=state.seq,
+                        state_stamp_ns=state.stamp_ns,
+                        config_hash=0,
+                        mode=Mode.TRACKING,
+                        status=QpStatus.SOLVED,
+                        period_ns=100 * MS,
+                        u=np.array(u),
+                        **about,
+                    )
+                ),
+                encoding(Command),
+                KEYS.command,
+            )
+        )
+
+    def acts(self, after_ms: int) -> list[float]:
+        self.now_ns += after_ms * MS
+        return [round(float(u), 6) for u in self.robot.act()]
+
+
+@pytest.fixture
+def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
+    scene = Scene(monkeypatch)
+    scene.robot.send(np.zeros(4))
+    return scene
+
+
+def test_rows_act_from_their_time_on_and_the_state_says_which_and_whose(scene: Scene) -> None:
+    scene.command([[0.2, 0.1], [0.4, 0.2], [0.6, 0.3]])
+    assert [scene.acts(10), scene.acts(80), scene.acts(10)] == [[0.2, 0.1], [0.2, 0.1], [0.4, 0.2]]
+    scene.robot.send([1.0, 2.0, 3.0, 4.0])
+    state = scene.state()
+    assert (state.seq, state.stamp_ns, state.x.tolist(), state.u.tolist()) == (2, scene.now_ns, [1.0, 2.0, 3.0, 4.0], [0.4, 0.2])
+    assert (state.command_epoch, state.command_seq) == (7, 1)
+
+
+def test_state_that_took_its_time_says_what_acted_when_it_was_measured(scene: Scene) -> None:
+    scene.command([[0.2, 0.1], [0.4, 0.2], [0.6, 0.3]])
+    assert [scene.acts(10), scene.acts(100)] == [[0.2, 0.1], [0.4, 0.2]]
+    scene.robot.send(np.zeros(4), age_s=0.02)
+    assert scene.state().stamp_ns == scene.now_ns - 20 * MS
+    assert scene.state().u.tolist() == [0.2, 0.1]
+
+
+def test_inputs_come_to_rest_inside_the_slew_limits_where_no_command_is_valid(scene: Scene) -> None:
+    scene.command([[0.2, 0.1], [0.4, 0.2], [0.6, 0.3]])
+    speeds = [scene.acts(10)[0] for _ in range(100)]
+    assert max(speeds) == 0.6
+    assert speeds[-1] == 0.0
+    assert np.diff(speeds[25:]).min() >= -0.02 - 1e-9, "0.2 over 100 ms"
+    scene.robot.send(np.zeros(4))
+    assert (scene.state().command_epoch, scene.state().command_seq) == (0, 0)
+
+
+def test_plan_that_begins_elsewhere_is_approached_inside_the_slew_limits(scene: Scene) -> None:
+    scene.command([[1.0, 0.0]] * 5, valid_until_ns=scene.now_ns + 500 * MS)
+    speeds = np.array([scene.acts(10)[0] for _ in range(48)])
+    assert max(np.ptp(speeds[k : k + 8]) for k in range(40)) <= 0.2 + 1e-9, "over three quarters of a period"
+    assert speeds[-1] >= 0.6
+
+
+def test_what_is_for_another_life_or_out_of_bounds_is_refused_or_clipped(scene: Scene) -> None:
+    scene.command([[0.2, 0.1]], state_epoch=1)
+    assert scene.acts(10) == [0.0, 0.0]
+    scene.command([[0.1, 9.0]])
+    assert scene.acts(10) == [0.1, 0.5]
+
+
+def test_loop_goes_on_after_ctrl_c_until_the_inputs_rest(scene: Scene) -> None:
+    scene.command([[0.2, 0.1], [0.4, 0.2], [0.6, 0.3]])
+    played = []
+    for tick, _ in enumerate(scene.robot.every(0.01)):
+        played.append(scene.robot.act()[0])
+        if tick == 15:
+            scene.stop.set()
+    assert played[15] == pytest.approx(0.4)
+    assert played[-1] == 0.0
+    assert np.diff(played[16:]).min() >= -0.02 - 1e-9
+
+
+def test_periods_lie_on_a_grid_and_missed_ones_are_skipped(scene: Scene) -> None:
+    times = []
+    for due_ns in scene.robot.every(0.01):
+        times.append(due_ns)
+        assert scene.now_ns >= due_ns
+        scene.now_ns += (35 if len(times) == 3 else 4) * MS
+        if len(times) == 6:
+            scene.stop.set()
+        scene.robot.act()
+    assert (np.diff(times) // MS).tolist() == [10, 10, 40, 10, 10]
+
+
+def test_robot_without_an_increment_has_no_slew_limit_and_one_at_rest_elsewhere_begins_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = Scene(monkeypatch, u_rest={"kappa": 0.1})
+    assert scene.acts(0) == [0.0, 0.1]
+
+
+@pytest.mark.parametrize(
+    ("limits", "refusal"),
+    [
+        ({"dt_s": 0.0}, "dt_s must be above 0 and at most 10 s, got 0.0"),
+        ({"inputs": {}}, "inputs must name at least one input, got none"),
+        ({"increments": {"v": [-1, 1]}}, "increments.v must be one of the inputs v_c, kappa"),
+        ({"u_rest": {"v": 1}}, "u_rest.v must be one of the inputs v_c, kappa"),
+        ({"u_rest": {"v_c": 2.0}}, "inputs.v_c must hold the input at rest, 2, got [-1.0, 1.0]"),
+        ({"increments": {"v_c": [0.1, 0.2]}}, "increments.v_c must go from below 0 to above 0, got [0.1, 0.2]"),
+    ],
+)
+def test_limits_that_do_not_fit_are_refused_in_one_line(limits: dict[str, Any], refusal: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ConfigError) as refused:
+        Scene(monkeypatch, **limits)
+    assert str(refused.value) == refusal
+
+
+def test_planner_sends_references_and_refuses_what_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = Session()
+    monkeypatch.setattr(Bus, "join", lambda settings, keys, **_: Bus(session, keys))
+    with PlannerAdapter("car") as planner:
+        planner.send([[0.0, 1.0], [2.0, 3.0]], 0.05, end=End.STOP)
+        reference = decode(Reference, session.put[KEYS.reference])
+        assert (reference.seq, reference.stamp_ns, reference.period_ns, reference.end) == (1, STAMP_ON_ARRIVAL, 50 * MS, End.STOP)
+        assert (reference.y.tolist(), reference.p.shape) == ([[0.0, 1.0], [2.0, 3.0]], (2, 0))
+        for y, period_s, p in (([1.0, 2.0], 0.1, None), ([[np.nan]], 0.1, None), ([[1.0]], 0.0, None), ([[1.0]], 0.1, [[1.0], [2.0]])):
+            with pytest.raises(ConfigError, match="must be"):
+                planner.send(y, period_s, p=p)
