@@ -121,3 +121,14 @@ def test_demo_runs_in_an_empty_folder_from_the_wheel_alone(python: Path, tmp_pat
     (tmp_path / "sim").mkdir()
     (tmp_path / "sim/__init__.py").write_text("raise ImportError('of the user')\n")
     assert "tracking" in run(python, tmp_path, "demo", "--duration", "5", "--out", "out").lower()
+
+
+@pytest.mark.slow
+def test_robot_of_one_s_own_is_driven_in_an_empty_folder_from_the_wheel_alone(python: Path, tmp_path: Path) -> None:
+    run(python, tmp_path, "init", "my_robot", "--deploy")
+    assert (tmp_path / "deploy/runbook.md").is_file()
+    assert "riccati and daqp agree" in run(python, tmp_path, "check", "my_robot.toml")
+    assert "fallbacks" in run(python, tmp_path, "demo", "my_robot.toml", "--duration", "10", "--out", "out")
+    assert "1 of 1 within their promise" in run(python, tmp_path, "faults", "my_robot.toml", "--only", "controller_killed")
+    done = subprocess.run([str(python), "-m", "pytest", "-q", "-p", "no:cacheprovider"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout

@@ -27,13 +27,13 @@ from rti_mpc_service import entry, log
 from rti_mpc_service.config.build import bus_settings, robot_settings, stage_parameters, with_initial_state
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
+from rti_mpc_service.shipped import DEPLOY
 
 if TYPE_CHECKING:
     from rti_mpc.wire.bus import BusSettings
 
-HERE = Path(__file__).parent
-# A wheel has deploy/ inside the package, a clone at its top.
-SHIPPED = (HERE / "deploy" if (HERE / "deploy").is_dir() else HERE.parents[1] / "deploy") / "pioneer_3dx.toml"
+
+SHIPPED = DEPLOY / "pioneer_3dx.toml"
 
 
 class Commands(TyperGroup):
@@ -367,6 +367,20 @@ def check(config: ConfigPath = SHIPPED) -> None:
     from rti_mpc_service.check.check import main
 
     raise typer.Exit(main(config))
+
+
+@app.command()
+def init(
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="The robot's name, which is that of its module, too.")] = None,
+    like: Annotated[str, typer.Option("--like", metavar="unicycle|bicycle", help="The robot to begin with.")] = "unicycle",
+    deploy: Annotated[bool, typer.Option("--deploy", help="Write systemd units, configurations of Zenoh and the runbook into deploy/.")] = False,
+) -> None:
+    """Write configuration, model, test and next steps of a robot of your own into this folder."""
+    from rti_mpc_service.init import main
+
+    for path in main(name, like, Path(), deploy=deploy):
+        typer.echo(path)
+    typer.echo(f"next: rti-mpc check {name}.toml, see {name}.md" if name else "next: see deploy/runbook.md")
 
 
 @app.command()
