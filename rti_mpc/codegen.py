@@ -16,6 +16,7 @@ import subprocess
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,6 +29,12 @@ from rti_mpc.errors import ShapeError
 
 # No contraction into fused operations and no fast-math: a machine with a compiler and one without agree to rounding.
 COMPILER_FLAGS = ("-O3", "-std=gnu89", "-fno-semantic-interposition", "-ffp-contract=off", "-shared", "-fPIC", "-w")
+
+
+COMPILER_RATE = 80_000  # characters of source per s, as measured on a virtual core
+
+# Entered while the compiler runs, with how long that should take, in s: whoever has a terminal or a log puts something here that tells of it.
+while_compiling: Callable[[float], AbstractContextManager[object]] = nullcontext
 
 
 def compiled(*functions: ca.Function) -> list[ca.Function]:
@@ -89,7 +96,9 @@ def build(compiler: str, source: str) -> bytes:
         code.write_text(source, encoding="utf-8")
         made = code.with_suffix(".so")
         environment = {"PATH": os.defpath, **os.environ}  # where the compiler was looked for, for its linker
-        subprocess.run([compiler, *COMPILER_FLAGS, "-o", str(made), str(code), "-lm"], check=True, capture_output=True, env=environment)
+        command = [compiler, *COMPILER_FLAGS, "-o", str(made), str(code), "-lm"]
+        with while_compiling(len(source) / COMPILER_RATE):
+            subprocess.run(command, check=True, capture_output=True, env=environment)
         return made.read_bytes()
 
 

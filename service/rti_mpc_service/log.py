@@ -9,6 +9,7 @@ import os
 import sys
 import warnings
 from contextlib import suppress
+from datetime import datetime
 from queue import Full, Queue
 from threading import Thread
 
@@ -20,11 +21,28 @@ class JsonLines(logging.Formatter):
     """Formatter that writes one JSON object per record, for journals."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return level, logger, text and the traceback, if there is one."""
-        line = {"level": record.levelname, "logger": record.name, "text": record.getMessage()}
+        """Return wall time, robot time where it is known, level, logger, text and the traceback, if there is one."""
+        wall = datetime.fromtimestamp(record.created).astimezone().isoformat(timespec="milliseconds")
+        line: dict[str, object] = {"time": wall, "level": record.levelname, "logger": record.name, "text": record.getMessage()}
+        if (stamp_ns := robot_ns(record)) is not None:
+            line["robot_s"] = round(1e-9 * stamp_ns, 3)
         if record.exc_info:
             line["traceback"] = self.formatException(record.exc_info)
         return json.dumps(line)
+
+
+class People(logging.Formatter):
+    """Formatter for a terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return wall time, level, logger and text, and robot time where it is known."""
+        stamp_ns = robot_ns(record)
+        return super().format(record) + ("" if stamp_ns is None else f"  (robot time {1e-9 * stamp_ns:.3f} s)")
+
+
+def robot_ns(record: logging.LogRecord) -> int | None:
+    """Return the robot time that a record was given as its extra ``robot_ns``, None if there is none."""
+    return getattr(record, "robot_ns", None)
 
 
 class Aside(logging.Handler):
@@ -74,7 +92,7 @@ class Aside(logging.Handler):
 def start() -> None:
     """Send all records from INFO on to standard output."""
     handler = Aside(sys.stdout.fileno())
-    people = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S")
+    people = People("%(asctime)s.%(msecs)03d %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S")
     handler.setFormatter(people if sys.stdout.isatty() else JsonLines())
     logging.basicConfig(level=logging.INFO, handlers=[handler])
     warnings.showwarning = lambda message, *_, **__: logging.getLogger("rti_mpc").warning(

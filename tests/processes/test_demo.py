@@ -17,6 +17,7 @@ import pytest
 
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
+from rti_mpc_service.demo.demo import compiling
 from rti_mpc_service.host.hold_up import Host
 from tests.in_time import explained
 from tests.processes.system import PATIENCE_S, ROOT, command_line, environment, rti_mpc, until
@@ -151,3 +152,9 @@ def test_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     done = rti_mpc("demo", "--out", tmp_path / "file" / "out")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"rti-mpc: --out must be a folder that can be written, got {tmp_path}/file/out: Not a directory\n"
+
+
+def test_board_is_told_that_the_controller_compiles(tmp_path: Path) -> None:
+    log = tmp_path / "controller.log"
+    log.write_text('{"level": "INFO", "logger": "controller", "text": "compiling the model, once, about 4 s"}\n{"level": "INFO", "text": "comp')
+    assert compiling(log) == {"compiling the model, once, about 4 s"}

@@ -8,11 +8,16 @@ import logging
 import subprocess
 import sys
 from collections.abc import Iterator
+from datetime import datetime
 from threading import Timer
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from rti_mpc_service.log import MAX_WAITING_LINES, Aside
+from rti_mpc.contract.message import Notice, Severity
+from rti_mpc_service.announce import announce
+from rti_mpc_service.log import MAX_WAITING_LINES, Aside, JsonLines, People, robot_ns
 from tests.processes.system import PATIENCE_S, ROOT, environment
 
 PIPE_BYTES = 4096
@@ -75,3 +80,21 @@ def test_record_that_cannot_be_formatted_ends_nobody(capfd: pytest.CaptureFixtur
     out, err = capfd.readouterr()
     assert out == "news\n"
     assert "Logging error" in err
+
+
+def test_line_holds_wall_time_and_robot_time_where_that_is_known() -> None:
+    record = logging.LogRecord("guard", logging.WARNING, "", 0, "news", (), None)
+    record.created, record.msecs = 1.0625, 62.5
+    line = json.loads(JsonLines().format(record))
+    assert (datetime.fromisoformat(line["time"]).timestamp(), line.get("robot_s")) == (1.062, None)
+    assert People("%(message)s").format(record) == "news"
+    record.robot_ns = 12_345_678_901
+    assert json.loads(JsonLines().format(record))["robot_s"] == 12.346
+    assert People("%(message)s").format(record) == "news  (robot time 12.346 s)"
+
+
+def test_mode_change_is_logged_with_the_robot_s_time(caplog: pytest.LogCaptureFixture) -> None:
+    announcer: Any = SimpleNamespace(say=lambda notice, stamp_ns: True)
+    with caplog.at_level(logging.INFO):
+        announce(logging.getLogger("guard"), announcer, Notice(Severity.INFO, "guard_passing", "commands pass"), 1_500_000_000)
+    assert robot_ns(caplog.records[0]) == 1_500_000_000

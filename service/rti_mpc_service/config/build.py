@@ -9,7 +9,8 @@ viewer loads neither CasADi nor a solver.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -129,11 +130,14 @@ def stage_parameters(config: Config, t_s: Array) -> Array:
     return np.column_stack(columns)
 
 
-def build_rti(config: Config) -> Rti:
-    """Return the real-time iteration, compiled."""
+def build_rti(config: Config, say: Callable[[str], object] = lambda _: None) -> Rti:
+    """Return the real-time iteration, compiled; `say` takes a line if that takes its time and no terminal shows it."""
+    from rti_mpc import codegen
     from rti_mpc.rti.rti import Rti
+    from rti_mpc_service.compiling import compilation_shown
     from rti_mpc_service.injection import FaultyRti
 
+    codegen.while_compiling = partial(compilation_shown, say=say)
     cls = FaultyRti if config.debug.inject else Rti
     settings = solver_settings(config)
     return cls(build_ocp(config), settings, formulation=config.ocp.formulation, solver=config.solver.name, **iterations(config))

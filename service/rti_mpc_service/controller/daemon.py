@@ -74,7 +74,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
     """
     check_stop(config)
     stop = stop or stop_on_signals()
-    rti = build_rti(config)
+    rti = build_rti(config, log.info)
     warm_up(rti)
     timing = Timing(config.delay_s, config.stale_s, config.timing.valid_s)
     controller = Controller(rti, timing, config_hash=config.config_hash, observer=build_observer(config))

@@ -189,7 +189,16 @@ def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:
         start(run, children, endpoint, len(encode(command)))
         company = {"controller", "reference", ECHO, *(["viewer"] if recorded() else []), *guards(run)}
         board.wait(f"starting {', '.join(sorted(company))}")
-        wait(lambda: witness.listen().met(company), children, stop, START_TIMEOUT_S, "all processes")
+        shown = set[str]()
+
+        def met() -> bool:
+            """Whether everybody is there; shows meanwhile that the controller compiles."""
+            for line in compiling(children.log("controller")) - shown:
+                shown.add(line)
+                board.wait(line)
+            return witness.listen().met(company)
+
+        wait(met, children, stop, START_TIMEOUT_S, "all processes")
         echo = Echo(bus, State(0, 0, 0, np.zeros(ocp.model.nx)), 0.5 * ocp.dt / run.speed)
         meeting = ("-l", "tcp/127.0.0.1:0", "-e", endpoint)
         children.start("robot", CLI_MODULE, "sim", run.folder / "config.toml", *meeting, "--speed", run.speed, "--log", run.folder / "robot.csv")
@@ -217,6 +226,11 @@ def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:
         events=witness.events,
         echo_us=echo.round_trip_us,
     )
+
+
+def compiling(log: Path) -> set[str]:
+    """Return what a controller has logged about its compilation."""
+    return set(re.findall(r'"text": "(compiling [^"]*)"', log.read_text(encoding="utf-8", errors="replace")))
 
 
 def start(run: DemoPlan, children: Children, endpoint: str, size: int) -> None:
