@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import json
+import shutil
 import subprocess
 import time
 from importlib.util import find_spec
@@ -10,6 +12,7 @@ import pytest
 
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.in_time import MS, in_time
 from tests.processes.system import ROOT, command_line, environment, until
 
@@ -47,3 +50,52 @@ def test_process_that_reaches_nobody_says_so_within_five_seconds_and_ends_well(c
     finally:
         process.kill()
         process.wait()
+
+
+def certificate(folder: Path, name: str, signer: str) -> None:
+    """Make a key and a certificate for this host, signed by an authority; by itself where it is one."""
+    key = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-keyout", f"{name}.key", "-subj", f"/CN={name}")
+    if name == signer:
+        lines = [("req", "-x509", *key, "-out", f"{name}.pem", "-days", "1")]
+    else:
+        (folder / "for").write_text("subjectAltName=IP:127.0.0.1\n")
+        signed = ("x509", "-req", "-in", "request", "-CA", f"{signer}.pem", "-CAkey", f"{signer}.key", "-CAcreateserial", "-days", "1")
+        lines = [("req", "-new", *key, "-out", "request"), (*signed, "-extfile", "for", "-out", f"{name}.pem")]
+    for line in lines:
+        subprocess.run(["openssl", *line], cwd=folder, check=True, capture_output=True)
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl is not installed: certificates were NOT tried")
+@pytest.mark.parametrize("mode", ["peer", "client"])
+@pytest.mark.parametrize(("own", "trusted"), [("stranger", "ours"), ("stranger", "theirs")], ids=["of a strange authority", "trusting a strange one"])
+def test_process_with_a_wrong_certificate_says_what_may_be_wrong_there(own: str, trusted: str, mode: str, tmp_path: Path, host: Host) -> None:
+    for name, signer in (("ours", "ours"), ("theirs", "theirs"), ("router", "ours"), ("stranger", "theirs")):
+        certificate(tmp_path, name, signer)
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+
+    def zenoh(name: str, role: str, about: dict[str, object], authority: str, prefix: str) -> Path:
+        files = {f"{prefix}_private_key": f"{name}.key", f"{prefix}_certificate": f"{name}.pem", "root_ca_certificate": f"{authority}.pem"}
+        tls = {key: str(tmp_path / file) for key, file in files.items()} | {"enable_mtls": True}
+        path = tmp_path / f"{name}.json5"
+        path.write_text(json.dumps({"mode": role, **about, "transport": {"link": {"tls": tls}}}))
+        return path
+
+    router = zenoh("router", "router", {"listen": {"endpoints": [endpoint]}}, "ours", "listen")
+    stranger = zenoh(own, mode, {"connect": {"endpoints": [endpoint]}}, trusted, "connect")
+    logs, processes = {}, []
+    try:
+        for command, config, word in (("router", router, "routing"), ("reference", stranger, "not connected")):
+            logs[command], began_ns = tmp_path / f"{command}.log", time.monotonic_ns()
+            with logs[command].open("wb") as file:
+                line = command_line(command, SHIPPED, "-c", config)
+                processes.append(subprocess.Popen(line, cwd=ROOT, env=environment(), stdout=file, stderr=subprocess.STDOUT))
+            until(lambda c=command, w=word: w in logs[c].read_text(errors="replace"), f"{command} says {word}", pause_s=0.01, patience_s=60.0)
+        in_time(host, "to say that nobody is reached", (time.monotonic_ns() - began_ns) / MS, TOLD_MS, began_ns)
+        assert f"{endpoint}: nobody is there, the address is wrong, or a certificate is" in logs["reference"].read_text()
+        for process in reversed(processes):
+            process.terminate()
+            assert process.wait(30.0) == 0
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
