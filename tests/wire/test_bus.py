@@ -36,7 +36,9 @@ FAST = ("transport/link/tx/lease:600",)  # ms, as in peer.py
 STATE = State(1, 1, 0, np.arange(5.0))
 EVENT = Event(1, 1, 0, "robot", Severity.INFO, "code", "text")
 REFERENCE = Reference(1, 1, 0, 10**8, End.HOLD, np.arange(6.0).reshape(2, 3), np.zeros((2, 0)))
-TIMEOUT_S = 60.0
+TIMEOUT_S = 60
+WAIT_BEFORE_DROP = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"  # us
+PATIENT = (*FAST, f"{WAIT_BEFORE_DROP}:{10**6 * TIMEOUT_S}")  # waits rather than drop a message where a busy host holds up the link
 T = TypeVar("T")
 
 
@@ -57,7 +59,13 @@ def received(subscriber: Subscriber) -> Received:
 def stranger(endpoint: str) -> zenoh.Session:
     """Session of a program that is not ours."""
     config = zenoh.Config()
-    for name, value in {"mode": '"client"', "connect/endpoints": f'["{endpoint}"]', "scouting/multicast/enabled": "false"}.items():
+    settings = {
+        "mode": '"client"',
+        "connect/endpoints": f'["{endpoint}"]',
+        "scouting/multicast/enabled": "false",
+        WAIT_BEFORE_DROP: f"{10**6 * TIMEOUT_S}",
+    }
+    for name, value in settings.items():
         config.insert_json5(name, value)
     return zenoh.open(config)
 
@@ -73,7 +81,7 @@ def join(endpoint: str) -> Iterator[Callable[..., Bus]]:
     with ExitStack() as stack:
 
         def join(*, robot: bool = False, **settings: Any) -> Bus:
-            settings = {"listen": (endpoint,) if robot else (), "connect": (endpoint,), "cfg": FAST, **settings}
+            settings = {"listen": (endpoint,) if robot else (), "connect": (endpoint,), "cfg": PATIENT, **settings}
             return stack.enter_context(Bus.join(BusSettings(**settings), KEYS))
 
         yield join
@@ -257,7 +265,7 @@ def test_a_ring_holds_fewer_of_what_may_be_long(join: Any) -> None:
 
 
 def test_an_unread_subscriber_stops_nobody_and_put_never_waits(join: Any, host: Host) -> None:
-    robot, other = join(robot=True), join()
+    robot, other = join(robot=True), join(cfg=FAST)
     unread, commands = robot.subscriber(KEYS.telemetry), robot.subscriber(KEYS.command)
     flood, marks = other.publisher(KEYS.telemetry), other.publisher(KEYS.command)
     eventually(lambda: flood.heard and marks.heard)
@@ -274,7 +282,7 @@ def test_an_unread_subscriber_stops_nobody_and_put_never_waits(join: Any, host: 
 
 
 def test_a_hung_viewer_does_not_cut_the_robot_from_the_controller(join: Any, start: Any, host: Host) -> None:
-    robot = join(robot=True)
+    robot = join(robot=True, cfg=FAST)
     changes: list[tuple[str, bool]] = []
     robot.watch_alive(lambda role, present: changes.append((role, present)))
     viewers = [start("watch") for _ in range(2)]
@@ -352,7 +360,7 @@ def test_one_session_speaks_for_two_robots(join: Any, endpoint: str) -> None:
 
 
 def test_close_is_bounded_while_a_peer_hangs(join: Any, start: Any, host: Host) -> None:
-    bus = join(robot=True)
+    bus = join(robot=True, cfg=FAST)
     viewer = start("watch")
     eventually(lambda: bus.is_alive("viewer"))
     viewer.send_signal(signal.SIGSTOP)
