@@ -50,7 +50,7 @@ class Demo:
 def demo(tmp_path_factory: pytest.TempPathFactory, host: Host) -> Demo:
     """Twenty-four seconds of the circle."""
     folder, from_ns = tmp_path_factory.mktemp("demo") / "out", time.monotonic_ns()
-    done = rti_mpc("demo", "--scenario", "circle", "--duration", 24, "--speed", SPEED, "--out", folder)
+    done = rti_mpc("demo", "--scenario", "circle", "--duration", 24, "--speed", SPEED, "--out", folder, timeout_s=600.0)
     assert done.returncode == 0, done.stdout + done.stderr
     return Demo(folder, done.stdout, from_ns, time.monotonic_ns())
 

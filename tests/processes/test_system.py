@@ -22,10 +22,11 @@ from rti_mpc.wire.cdr import decode, encode
 from rti_mpc.wire.session import BusSettings
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
-from tests.in_time import MS, in_time
+from tests.in_time import MS, in_time, on_time
 from tests.processes.system import CONFIG, KEYS, SPEED, System, heard, interrupted_in_time, rti_mpc, until
 
 STANDSTILL_SPEED = 1e-3  # m/s, rad/s
+PERIOD_MS = 1e3 * CONFIG.ocp.dt_s / SPEED
 OTHER_VERSION = f"@{cdr.MESSAGE_VERSION + 1}"  # in a refusal
 
 
@@ -211,7 +212,7 @@ def refuse_malformed(driven: System, ours: tuple[Publisher[State], Publisher[Com
     assert driven.tracking().epoch == before.epoch
 
 
-def test_second_publisher_takes_nothing_over(driven: System) -> None:
+def test_second_publisher_takes_nothing_over(driven: System, host: Host) -> None:
     """Neither a command of an older controller, nor a state of another life of the robot: while that is heard the robot stands, and then goes on."""
     states, commands = driven.bus.publisher(KEYS.state), driven.bus.publisher(KEYS.command)
     true, command = driven.state(lambda _: True), driven.tracking()
@@ -225,13 +226,15 @@ def test_second_publisher_takes_nothing_over(driven: System) -> None:
 
     assert str(command.epoch) in driven.event("source_refused", "robot", order).text
     before, telemetry = driven.sample(), driven.bus.subscriber(KEYS.telemetry, capacity=1024)
+    since_ns = time.monotonic_ns()
     text = driven.event("two_robots", "controller", live).text
     assert str(true.epoch) in text
     assert str(true.epoch + 1) in text
     heard(driven.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.seq > before.seq + 20 and sample.mode is Mode.TRACKING)
     samples = [decode(Telemetry, received.payload) for received in telemetry.drain()]
     assert any(sample.mode is Mode.BRAKING for sample in samples)
-    assert max(np.abs(sample.x0).max() for sample in samples) < 8.0
+    if on_time(host, "the true robot", PERIOD_MS, since_ns):  # one that is not heard in time may have been restarted
+        assert max(np.abs(sample.x0).max() for sample in samples) < 8.0
     assert driven.tracking().epoch == command.epoch
 
 
