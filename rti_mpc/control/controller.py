@@ -33,7 +33,7 @@ from rti_mpc.control.delay import DelayEstimator
 from rti_mpc.control.envelope import Envelope
 from rti_mpc.control.grid import Grid
 from rti_mpc.control.grid import Timing as Timing
-from rti_mpc.control.issued import Issued
+from rti_mpc.control.issued import ENDING, NO_ENDING, Issued
 from rti_mpc.control.ladder import Ladder
 from rti_mpc.control.mode import ModeMachine
 from rti_mpc.control.observer import Observer
@@ -41,11 +41,13 @@ from rti_mpc.control.prediction import Prediction
 from rti_mpc.control.record import Record
 from rti_mpc.control.sent import Sent
 from rti_mpc.control.state_stream import Arrival, StateStream
+from rti_mpc.control.stopping import Stopping
 from rti_mpc.control.track import Track
 from rti_mpc.control.tuning import Tuning
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.ocp import Ocp, rest_fault
 from rti_mpc.rti.rti import Rti
+from rti_mpc.rti.way_to_rest import StopLaw
 
 INPUTS_UNREPORTED = (
     "the robot does not report which inputs act: commands are believed to act, and only the robot itself or a guard can cover their loss"
@@ -78,7 +80,15 @@ class Controller:
     """
 
     def __init__(
-        self, rti: Rti, timing: Timing, *, epoch: int = 1, config_hash: int = 0, observer: Observer | None = None, compile: bool = True
+        self,
+        rti: Rti,
+        timing: Timing,
+        *,
+        epoch: int = 1,
+        config_hash: int = 0,
+        observer: Observer | None = None,
+        stop_law: StopLaw | None = None,
+        compile: bool = True,
     ) -> None:
         given.instance("timing", timing, Timing)
         ocp, model = given.instance("rti", rti, Rti).ocp, rti.ocp.model
@@ -98,12 +108,16 @@ class Controller:
         self._tuning = Tuning(rti, self.envelope.limits)
         self.grid = Grid(ocp.dt, timing)
         limits = Limits(self._u_rest, ocp.lbu, ocp.ubu, ocp.lbdu, ocp.ubdu, ocp.dt, 1e-9 * self.grid.most_ns)
-        self._states = StateStream(model, self._stale_ns, self.grid.dt_ns, limits.settling_s, observer)
+        settling_s = limits.settling_s + (0.0 if stop_law is None else stop_law.rows * stop_law.period_s)
+        self._states = StateStream(model, self._stale_ns, self.grid.dt_ns, settling_s, observer)
         self.np_ = model.np_ - len(self._states.d)
         self._track = Track(model, ocp.N, self.grid.dt_ns)
         self._sent = Sent(self._u_rest, ocp.lbdu, ocp.ubdu, self.grid.dt_ns)
         self._prediction = Prediction(model, self._sent, compile=compile)
         self._x0 = self._prediction.x
+        ways = None if stop_law is None else Stopping(ocp, stop_law, self.envelope.limits, self._prediction, self._valid_ns, compile=compile)
+        self._ways = ways  # to rest; None: its inputs ramp to rest
+        self._rows: Array = np.zeros((ocp.N, model.nu))  # all rows of the last plan, of which a command with a way to rest has the first ones
         self._loaded = False  # whether the QP of t_k is prepared
         self._reach: tuple[Array, Array] = (np.zeros((2, model.nu)), np.zeros((2, model.nu)))  # what the first rows at t_k may be
         self._overran = False  # whether the last sample was over its budget
@@ -356,6 +370,8 @@ class Controller:
             return  # the next sample starts cold
         self._tuning.begin()
         self._load(shift=True)
+        if self._ways is not None:
+            self._ways.prepare()
 
     def _measure_delay(self, estimator: DelayEstimator, stamp_ns: int) -> None:
         """Learn from the state of the last sample, and let the grid follow."""
@@ -402,6 +418,8 @@ class Controller:
             self._modes.say(Severity.WARNING, "gap", f"no sample for {behind} periods: starting cold")
         self._loaded = False
         self._issued.plan = None
+        if self._ways is not None:
+            self._ways.forget()
         self.ladder.failed = 0
         clock = self._states.clock
         if not self.grid.too_late(clock.late_ns + clock.doubt_ns):
@@ -427,7 +445,11 @@ class Controller:
         if not self._overran:
             self._modes.enter(mode, reason)
         valid_until_ns = min(act_ns + self._rti.ocp.N * self.grid.dt_ns, state.stamp_ns + self.grid.delay_ns + self._valid_ns)
-        return self._issued.propose(state, act_ns, valid_until_ns, mode, status, self.envelope.fit(self._rti.u, self._reach), plan=True)
+        self._rows = u = self.envelope.fit(self._rti.u, self._reach)
+        after = NO_ENDING
+        if self._ways is not None:
+            u, after = self._ways.after(u, act_ns, valid_until_ns)
+        return self._issued.propose(state, act_ns, valid_until_ns, mode, status, u, plan=True, ending=after)
 
     def _feedback_cold(self) -> QpStatus:
         """Solve the first sample: the guess is the present state at all stages, and is iterated on."""
@@ -453,7 +475,8 @@ class Controller:
         if self._plays_on(act_ns) and plan is not None:
             self._modes.enter(Mode.FALLBACK, f"{failure}: playing the previous plan", Severity.WARNING, "qp_failed")
             rows = self.envelope.refit(plan.u, round((act_ns - plan.stamp_ns) / plan.period_ns), self._reach)
-            return self._issued.propose(state, act_ns, plan.valid_until_ns, Mode.FALLBACK, status, rows)
+            ending = {name: getattr(plan, name) for name in ENDING}  # it begins when that plan ends, and so does this one
+            return self._issued.propose(state, act_ns, plan.valid_until_ns, Mode.FALLBACK, status, rows, ending=ending)
         self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "no_plan")
         return self._brake(state, act_ns, status)
 
@@ -461,15 +484,25 @@ class Controller:
         """
         Propose the brake law, because a stop is `wanted` or because there is no plan.
 
-        Its validity counts from its own time, not from its state's: it depends on past
-        commands only, and never leads further from rest than they do.
+        Its validity counts from its own time, not from its state's: a ramp depends on past
+        commands only, and never leads further from rest than they do; a way to rest goes
+        on from the state predicted with them.
         """
-        rows = self.envelope.ramp(self._sent.reach(act_ns))
+        reach, valid_ns, ending = self._sent.reach(act_ns), self._valid_ns, NO_ENDING
+        if self._ways is None:
+            rows = self.envelope.ramp(reach)
+            at_rest = bool((rows[0] == self._u_rest).all())
+        else:
+            u_prev = self._sent.at(act_ns - 1)[0]
+            rows, valid_ns, ending = self._ways.stop(self._states.x, state.stamp_ns, act_ns, u_prev, reach)
+            at_rest = self._ways.at_rest
+            whole = np.concatenate([rows, ending["u_rest"]])
+            self._rows = whole[np.minimum(np.arange(len(self._rows)), len(whole) - 1)]
         if not wanted:
-            self.ladder.brake(at_rest=bool((rows[0] == self._u_rest).all()))
+            self.ladder.brake(at_rest=at_rest)
         self._issued.plan = None
         self._loaded = False
-        return self._issued.propose(state, act_ns, act_ns + self._valid_ns, self.mode, status, rows)
+        return self._issued.propose(state, act_ns, act_ns + valid_ns, self.mode, status, rows, ending=ending)
 
     def _give_up(self, state: State) -> Command | None:
         """
@@ -480,7 +513,8 @@ class Controller:
         if self.mode is Mode.IDLE:
             return None
         act_ns, command = state.stamp_ns + self.grid.delay_ns, None
-        if self._issued.last is not None and (self._sent.at(state.stamp_ns)[0] != self._u_rest).any():
+        ramps = self._ways is None  # the way to rest of the last command is better than anything that is made without a clock
+        if ramps and self._issued.last is not None and (self._sent.at(state.stamp_ns)[0] != self._u_rest).any():
             self._modes.enter(Mode.STOPPED if self._stopped else Mode.BRAKING, self._states.cadence.fault)
             rows = self.envelope.ramp(self._sent.reach(act_ns))
             valid_ns = max(1, round(self._valid_ns * min(1.0, self._states.cadence.rate)))  # as long as it should act, in the unit of the stamps
@@ -504,7 +538,7 @@ class Controller:
     def at_rest(self) -> bool:
         """Whether the last command that was sent is rest from its first row on, or none was ever sent."""
         last = self._issued.last
-        return last is None or np.array_equal(last.u[0], self._u_rest)
+        return last is None or (np.array_equal(last.u[0], self._u_rest) if self._ways is None else self._ways.at_rest)
 
     def slack_s(self, local_ns: int) -> float:
         """Return robot time, s, from a local monotonic time to the state of the next sample."""
@@ -523,8 +557,10 @@ class Controller:
         """Return the telemetry of the last sample; the times come from the caller, who has a clock."""
         assert self._issued.last is not None
         times = prepare_us, feedback_us, latency_us, slack_s
+        last = self._issued.last
+        rows = last.u if self._ways is None else np.concatenate([last.u, self._rows[len(last.u) :]])
         return self._record.telemetry(
-            self._issued.last, self._x0, self._states.d, times, delay_s=1e-9 * self.grid.delay_ns, skipped=self.skipped, ladder=self.ladder
+            last, rows, self._x0, self._states.d, times, delay_s=1e-9 * self.grid.delay_ns, skipped=self.skipped, ladder=self.ladder
         )
 
     # Small parts.
@@ -558,5 +594,7 @@ class Controller:
             self._track.arriving = self._for_rival[1]  # this reference came when the new life was heard, but not believed yet
         if self._delay is not None:
             self._delay.clear()
+        if self._ways is not None:
+            self._ways.forget()
         self._issued.plan = None
         self._overran = self._loaded = self.grid.running = False

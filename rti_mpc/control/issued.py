@@ -3,9 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, State
 from rti_mpc.contract.status import Mode, QpStatus
+
+ENDING = ("rest_period_ns", "u_rest", "x_rest", "K")  # the fields of a command that hold its way to rest
+NO_ENDING: Mapping[str, Any] = {}  # of a robot whose inputs ramp to rest
 
 
 class Issued:
@@ -28,7 +34,18 @@ class Issued:
         self._period_ns = period_ns
         self._planned: Command | None = None  # the last one proposed, if it has a plan of its own
 
-    def propose(self, state: State, act_ns: int, valid_until_ns: int, mode: Mode, status: QpStatus, u: Array, *, plan: bool = False) -> Command:
+    def propose(
+        self,
+        state: State,
+        act_ns: int,
+        valid_until_ns: int,
+        mode: Mode,
+        status: QpStatus,
+        u: Array,
+        *,
+        plan: bool = False,
+        ending: Mapping[str, Any] = NO_ENDING,
+    ) -> Command:
         """
         Build the next command; nothing changes until it is committed.
 
@@ -40,7 +57,9 @@ class Issued:
             status: Outcome of the QP.
             u: Inputs, shape ``(N, nu)``.
             plan: Whether these are a plan of its own, not a fallback.
+            ending: Further fields of the command by name: its way to rest, and the period of its rows if it is another.
         """
+        fields: dict[str, Any] = {"period_ns": self._period_ns, **ending}
         command = Command(
             epoch=self.epoch,
             seq=self.seq + 1,
@@ -52,8 +71,8 @@ class Issued:
             config_hash=self._config_hash,
             mode=mode,
             status=status,
-            period_ns=self._period_ns,
             u=u,
+            **fields,
         )
         self._planned = command if plan else None
         return command

@@ -27,13 +27,23 @@ class Record:
             self._seq, self._version = seq, self._tuning.version
 
     def telemetry(
-        self, command: Command, x0: Array, d: Array, times: tuple[float, float, float, float], *, delay_s: float, skipped: int, ladder: Ladder
+        self,
+        command: Command,
+        rows: Array,
+        x0: Array,
+        d: Array,
+        times: tuple[float, float, float, float],
+        *,
+        delay_s: float,
+        skipped: int,
+        ladder: Ladder,
     ) -> Telemetry:
         """
         Return the telemetry of the last command's sample.
 
         Args:
             command: Command of the sample, as it was sent.
+            rows: All rows of its plan, shape ``(N, nu)``, also those that were not sent.
             x0: State embedded at stage 0, shape ``(nx,)``.
             d: Estimated disturbances, shape ``(nd,)``.
             times: Preparation, feedback and latency, us, and slack, s.
@@ -67,7 +77,7 @@ class Record:
             parameter_version=self._version,
             x0=x0.copy(),
             x=self._plan[0],
-            u=command.u,
+            u=rows,
             y_ref=self._plan[1],
             d=d.copy(),
             delay_s=delay_s,

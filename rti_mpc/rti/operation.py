@@ -34,7 +34,7 @@ def states_of_operation(ocp: Ocp, count: int, seed: int = 1) -> tuple[Array, Arr
         States, shape ``(count, nx)``, and inputs, shape ``(count, nu)``.
     """
     model, rng = ocp.model, np.random.default_rng(seed)
-    lowest, highest = around(ocp.lbx, ocp.ubx, np.zeros(model.nx))
+    lowest, highest = around(ocp.lbx, ocp.ubx, np.array(model.x_nominal or np.zeros(model.nx)))
     low_u, high_u = around(ocp.lbu, ocp.ubu, np.array(model.u_rest))
     ends = np.concatenate([lowest, low_u]), np.concatenate([highest, high_u])
     found = np.array([*corners(*ends, rng, count // 4), *rng.uniform(*ends, size=(count - count // 4 - 2, model.nx + model.nu))])

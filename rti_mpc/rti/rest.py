@@ -38,7 +38,7 @@ from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.operation import SEEDED, around, corners, derivative, states_of_operation
-from rti_mpc.rti.way_to_rest import StopLaw, WayToRest
+from rti_mpc.rti.way_to_rest import StopLaw, WayToRest, whole
 
 SETTLING_S = 10.0  # after which a robot must stand
 DRIVEN_S = 2.0  # for which inputs at their bounds drive the robot, to see which states it gets into
@@ -72,8 +72,9 @@ def motion_at_rest(ocp: Ocp) -> str:
     u_rest: Array = np.array(model.u_rest)
     move, rate = motion(model), derivative(model)
     inputs = list(corners(*around(ocp.lbu, ocp.ubu, u_rest), rng))
-    lowest, highest = around(ocp.lbx, ocp.ubx, np.zeros(model.nx))
-    start = np.clip(0.0, ocp.lbx, ocp.ubx)
+    middle = np.array(model.x_nominal or np.zeros(model.nx))
+    lowest, highest = around(ocp.lbx, ocp.ubx, middle)
+    start = np.clip(middle, ocp.lbx, ocp.ubx)
     states = [np.clip(move(start, u, DRIVEN_S), ocp.lbx, ocp.ubx) for u in inputs]
     states += [rng.uniform(lowest, highest) for _ in range(SEEDED)]
     states = [x for x in states if np.isfinite(x).all()]
@@ -191,15 +192,17 @@ def assess(ocp: Ocp, law: StopLaw | None, count: int, *, compile: bool = True) -
     rates = rates_of_operation(model, X, U)
     ways = ramps(ocp, X, U) if law is None else ways_to_rest(ocp, law, X, U, compile=compile)
     moving = np.abs(rates_along(model, ways)) > STILL * rates
-    if moving[:, -1].any():
+    if law is not None and moving[:, -1].any():  # `motion_at_rest` has judged a ramp, by an integrator for stiff models, too
         raise OcpError(unrested(model, X, moving[:, -1], ways))
     time_s = ways.period_s * float((moving.any(axis=2) * np.arange(1, moving.shape[1] + 1)).max())
     ends = ways.x[:, -1]
-    free = np.ptp(ends, axis=0) > STILL * np.ptp(X, axis=0)
-    moved = np.where(free, np.abs(ends - X).max(axis=0), 0.0)
+    with np.errstate(invalid="ignore"):
+        free = np.ptp(ends, axis=0) > STILL * np.ptp(X, axis=0)
+        moved = np.where(free, np.abs(ends - X).max(axis=0), 0.0)
     A = ca.Function("A", [model.x, model.u, model.p], [ca.densify(ca.jacobian(model.f_expl_expr, model.x))])
     at_rest = zip(ends[:LINEARIZED], ways.u[:LINEARIZED, -1], strict=True)
-    growth = max(float(np.linalg.eigvals(np.array(A(x, u, model.p_nominal))).real.max()) for x, u in at_rest)
+    jacobians = [np.array(A(x, u, model.p_nominal)) for x, u in at_rest]
+    growth = max((float(np.linalg.eigvals(J).real.max()) for J in jacobians if np.isfinite(J).all()), default=0.0)
     if law is None:
         return Rest(RestClass.HOLDS, growth, time_s, moved, count)
 
@@ -227,7 +230,7 @@ def shaped(ocp: Ocp) -> StopLaw:
     wrong = ""
     for duration_s, still in (*((duration_s, AT_REST) for duration_s in DURATIONS_S), (DURATIONS_S[-1], STILL)):
         substeps = max(1, math.ceil(duration_s / (MAX_REST_ROWS * ocp.dt)))
-        rows = max(3, math.ceil(duration_s / (substeps * ocp.dt)))
+        rows = whole(math.ceil(duration_s / (substeps * ocp.dt)))
         found = []
         for weight in INPUT_WEIGHTS:
             law = StopLaw(rows, min(rows, MAX_HORIZON), substeps * ocp.dt, substeps, weight, rates, scale_x, scale_u)
@@ -242,7 +245,7 @@ def shaped(ocp: Ocp) -> StopLaw:
                 wrong = unkept(model, X, ~kept, ways)
             else:
                 needed = int((moving.any(axis=2) * np.arange(1, rows)).max()) + 1
-                found.append(replace(law, rows=min(rows, math.ceil(SPARE * needed) + 1)))
+                found.append(replace(law, rows=min(rows, whole(math.ceil(SPARE * needed) + 1))))
         if found:
             return min(found, key=lambda law: law.rows)
     raise OcpError(wrong)

@@ -41,6 +41,8 @@ SETTLING_STEPS = 2  # to the equilibrium at the end of a way, which is near
 DAMPING = 1e-9  # of these steps, where the equilibria are more than the equations tell
 INPUT_FREEDOM = 10.0  # by which inputs may move farther to an equilibrium than states, each measured by its range in operation
 PASSES = 3  # of a way that is found anew, before the last one: equilibria of an arm depend on where it comes to rest
+FIRST = 2  # rows whose reach depends on what was sent before
+BLOCK = 10  # rows, and steps of the regulator, that are compiled once and called again: compilers take long for what is long
 HOLD_S = 1.0  # a deviation from the way weighs as much as a rate that undoes it in this time
 LIMITS = ("lbu", "ubu", "lbdu", "ubdu")
 
@@ -51,7 +53,7 @@ class StopLaw:
     What the way to rest of a problem is made with, found once by `rti_mpc.rti.rest`.
 
     Attributes:
-        rows: Rows of the way, M.
+        rows: Rows of the way, M, as `whole` says.
         horizon: Rows that the regulator looks ahead.
         period_s: Duration of a row, s: whole periods of the controller.
         substeps: How many of them.
@@ -183,6 +185,23 @@ class WayToRest:
         self._finish(x_way[-1], u[-1])
         return self.finite
 
+    def planned(self, elapsed: int) -> Array:
+        """Return the state in which the last way that has begun is some rows later, shape ``(nx,)``."""
+        x: Array = self._way[1][min(elapsed, len(self.x) - 1)]
+        return x
+
+    def hold(self, u_prev: Array, reach: tuple[Array, Array] | None = None) -> None:
+        """Go to the input at the equilibrium that was aimed at last, as fast as the limits allow: for want of a finite way."""
+        self._from(self.x_e, u_prev, reach)
+        lower, upper = self._reach[0][0], self._reach[1][0]
+        for i in range(len(self.u)):
+            row = np.minimum(np.maximum(self.u_e, self._limits["lbu"]), self._limits["ubu"])
+            self.u[i], self.x[i] = np.minimum(np.maximum(row, lower), upper), self.x_e
+            lower, upper = self.u[i] + self._limits["lbdu"], self.u[i] + self._limits["ubdu"]
+            if i == 0:
+                lower, upper = np.maximum(lower, self._reach[0][1]), np.minimum(upper, self._reach[1][1])
+        self._way[0][:], self._way[1][:] = self.u, self.x
+
     def find(self, x: Array, u_prev: Array, reach: tuple[Array, Array] | None = None) -> bool:
         """Roll a way out from a state nothing is known of before; as `begin`, aimed at the state itself, then at where that leads."""
         self.aim(x, self._u_rest)
@@ -194,7 +213,7 @@ class WayToRest:
     @property
     def finite(self) -> bool:
         """Whether the way is."""
-        return bool(np.isfinite(self.x[-1]).all() and np.isfinite(self.u[-1]).all())
+        return bool(np.isfinite(self.x).all() and np.isfinite(self.u).all())
 
     def _from(self, x: Array, u_prev: Array, reach: tuple[Array, Array] | None) -> None:
         self._start[:], self._u_prev[:] = x, u_prev
@@ -255,51 +274,92 @@ def regulators(model: Model, law: StopLaw) -> ca.Function:
 
     x, u, p = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("p", model.np_)
     A_e, B_e, *costs = linear(x, u, p)
+    to_go, cost, A_k, B_k = (ca.MX.sym(name, *shape) for name, shape in (("S", (nx, nx)), ("Q", (nx, nx)), ("A", (nx, nx)), ("B", (nx, nu))))
+    earlier, gain = to_go, ca.MX(nu, nx)
+    for _ in range(BLOCK):
+        earlier, gain = recursion(earlier, cost, A_k, B_k)
+    block = ca.Function("recursions", [to_go, cost, A_k, B_k], [earlier, gain])
     gains = []
     for cost in costs:
-        to_go, gain = cost, ca.MX(nu, nx)
-        for _ in range(law.horizon):
-            to_go, gain = recursion(to_go, cost, A_e, B_e)
+        to_go = cost
+        for _ in range(-(-law.horizon // BLOCK)):
+            to_go, gain = block(to_go, cost, A_e, B_e)
         gains.append(gain)
     return ca.Function("regulators", [x, u, p], gains)
 
 
 def rolling(model: Model, law: StopLaw) -> ca.Function:
     """Build ``(x0, u_prev, p, lowest, highest, *LIMITS, u_way, x_way, K) -> (rows, states)``: rows of a way followed; columns are rows."""
-    x, u_prev = ca.SX.sym("x", model.nx), ca.SX.sym("u_prev", model.nu)
-    u_way, x_way, K = ca.SX.sym("u_way", model.nu), ca.SX.sym("x_way", model.nx), ca.SX.sym("K", model.nu, model.nx)
-    wanted = ca.Function("wanted", [x, u_prev, model.p, u_way, x_way, K], [u_way - K @ (x - x_way)])
-    followed = {"u_way": ca.MX.sym("u_way", model.nu, law.rows), "x_way": ca.MX.sym("x_way", model.nx, law.rows)}
-    K_in = ca.MX.sym("K", model.nx, model.nu)  # its columns are rows of the array
-    rows = [[followed["u_way"][:, i], followed["x_way"][:, i], K_in.T] for i in range(law.rows)]
-    return rolled_out("rolling", model, law, wanted, rows, followed | {"K": K_in})
+    u_way, x_way = ca.SX.sym("u_way", model.nu), ca.SX.sym("x_way", model.nx)
+    K = ca.SX.sym("K", model.nx, model.nu)  # its columns are rows of the array
+    wanted = u_way - K.T @ (model.x - x_way)
+    return rolled_out("rolling", model, law, wanted, {"u_way": u_way, "x_way": x_way}, {"K": K})
 
 
 def stopping(model: Model, law: StopLaw) -> ca.Function:
     """Build ``(x0, u_prev, p, lowest, highest, *LIMITS) -> (rows, states)``: rows by the law that a model gives."""
     assert model.stop_expr is not None
-    wanted = ca.Function("wanted", [model.x, model.u, model.p], [ca.densify(model.stop_expr)])
-    return rolled_out("stopping", model, law, wanted, [[]] * law.rows, {})
+    return rolled_out("stopping", model, law, model.stop_expr, {}, {})
 
 
-def rolled_out(name: str, model: Model, law: StopLaw, wanted: ca.Function, rows: list[list[ca.MX]], more: dict[str, ca.MX]) -> ca.Function:
-    """Roll a law ``wanted(x, u_prev, p, *row)`` out, inside bounds and slew limits."""
-    nx, nu = model.nx, model.nu
-    u, lower, upper = ca.SX.sym("u", nu), ca.SX.sym("lower", nu), ca.SX.sym("upper", nu)
-    lbu, ubu = ca.SX.sym("lbu", nu), ca.SX.sym("ubu", nu)
-    clip = ca.Function("clip", [u, lbu, ubu, lower, upper], [ca.fmin(ca.fmax(ca.fmin(ca.fmax(u, lbu), ubu), lower), upper)])
-    phi = integrator(model, "rk4", law.substeps)
-    symbols = {"x0": (nx,), "u_prev": (nu,), "p": (model.np_,), "lowest": (nu, 2), "highest": (nu, 2), **dict.fromkeys(LIMITS, (nu,))}
-    inputs = {key: ca.MX.sym(key, *shape) for key, shape in symbols.items()}
-    x, before, p, lbdu, ubdu = (inputs[key] for key in ("x0", "u_prev", "p", "lbdu", "ubdu"))
-    found: list[ca.MX] = []
-    states: list[ca.MX] = []
-    for i, row in enumerate(rows):
-        low, high = (before + lbdu, before + ubdu) if i else (inputs["lowest"][:, 0], inputs["highest"][:, 0])
-        if i == 1:
-            low, high = ca.fmax(low, inputs["lowest"][:, 1]), ca.fmin(high, inputs["highest"][:, 1])
-        before = clip(wanted(x, before, p, *row), inputs["lbu"], inputs["ubu"], low, high)
-        states.append(x)
-        found.append(before)
-        x = phi(x, before, p, law.period_s)
-    return function(name, inputs | more, {"rows": ca.horzcat(*found), "states": ca.horzcat(*states)})
+def rolled_out(name: str, model: Model, law: StopLaw, wanted: ca.SX, along: dict[str, ca.SX], fixed: dict[str, ca.SX]) -> ca.Function:
+    """Roll a law out, inside bounds and slew limits: of the state, the last input, what each row has of its own, and what all have."""
+    nu, limits = model.nu, {limit: ca.SX.sym(limit, model.nu) for limit in LIMITS}
+    lowest, highest = ca.SX.sym("lowest", nu), ca.SX.sym("highest", nu)
+    u = ca.fmin(ca.fmax(ca.fmin(ca.fmax(wanted, limits["lbu"]), limits["ubu"]), lowest), highest)
+    x_next = integrator(model, "rk4", law.substeps)(model.x, u, model.p, law.period_s)
+    common = {"p": model.p, **limits, **fixed}
+    row_in = {"x": model.x, "u": model.u, "lowest": lowest, "highest": highest, **along, **common}
+    row = function("row", row_in, dict(zip(("x_next", "u_now"), ca.cse([ca.densify(x_next), ca.densify(u)]), strict=True)))
+
+    def roll(x: ca.MX, before: ca.MX, shared: dict[str, ca.MX], own: dict[str, ca.MX], rows: range) -> tuple[ca.MX, ca.MX, list[ca.MX], list[ca.MX]]:
+        """Roll some rows out; the first two keep what is lowest and highest there."""
+        inputs, states = [], []
+        for i in rows:
+            low, high = before + shared["lbdu"], before + shared["ubdu"]
+            if "lowest" in shared:
+                low, high = (
+                    (ca.fmax(low, shared["lowest"][:, 1]), ca.fmin(high, shared["highest"][:, 1]))
+                    if i
+                    else (
+                        shared["lowest"][:, 0],
+                        shared["highest"][:, 0],
+                    )
+                )
+            after = row(
+                x=x,
+                u=before,
+                lowest=low,
+                highest=high,
+                **{key: value[:, i] for key, value in own.items()},
+                **{key: value for key, value in shared.items() if key not in ("lowest", "highest")},
+            )
+            states.append(x)
+            x, before = after["x_next"], after["u_now"]
+            inputs.append(before)
+        return x, before, inputs, states
+
+    def symbols(rows: int) -> tuple[ca.MX, ca.MX, dict[str, ca.MX], dict[str, ca.MX]]:
+        shared = {key: ca.MX.sym(key, *symbol.shape) for key, symbol in common.items()}
+        return ca.MX.sym("x0", model.nx), ca.MX.sym("u_prev", nu), shared, {key: ca.MX.sym(key, e.numel(), rows) for key, e in along.items()}
+
+    x, before, shared, own = symbols(BLOCK)
+    x_end, u_end, inputs, states = roll(x, before, shared, own, range(BLOCK))
+    ends = {"x_end": x_end, "u_end": u_end, "rows": ca.horzcat(*inputs), "states": ca.horzcat(*states)}
+    block = function("block", {"x0": x, "u_prev": before, **shared, **own}, ends)
+
+    x, before, shared, own = symbols(law.rows)
+    reach = {"lowest": ca.MX.sym("lowest", nu, 2), "highest": ca.MX.sym("highest", nu, 2)}
+    whole_in = {"x0": x, "u_prev": before, **shared, **reach, **own}
+    x, before, inputs, states = roll(x, before, shared | reach, own, range(FIRST))
+    for start in range(FIRST, law.rows, BLOCK):
+        after = block(x0=x, u_prev=before, **shared, **{key: value[:, start : start + BLOCK] for key, value in own.items()})
+        x, before = after["x_end"], after["u_end"]
+        inputs.append(after["rows"])
+        states.append(after["states"])
+    return function(name, whole_in, {"rows": ca.horzcat(*inputs), "states": ca.horzcat(*states)})
+
+
+def whole(rows: int) -> int:
+    """Return how many rows a way has that needs some: those that are rolled out one by one, and whole blocks."""
+    return FIRST + BLOCK * max(1, -(-(rows - FIRST) // BLOCK))

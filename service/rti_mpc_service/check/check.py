@@ -24,12 +24,14 @@ from rich.table import Table
 
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
+from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import BUILT_IN_SOLVERS, FORMULATIONS, Rti
 from rti_mpc_service.check.excursion import Bounds, excursions
-from rti_mpc_service.config.build import build_rti, robot_settings
+from rti_mpc_service.check.rest import stop_from_everywhere
+from rti_mpc_service.config.build import build_ocp, build_rti, robot_settings
 from rti_mpc_service.config.config import load
-from rti_mpc_service.config.fit import check_stop
+from rti_mpc_service.config.fit import check_stop, unstopped
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.console import table_console
 from rti_mpc_service.rig.wave import wave
@@ -79,8 +81,12 @@ class CheckReport:
 def main(path: Path) -> int:
     """Check a configuration, print what was found, and return the exit status: 0 if every sample was usable and both solvers agree."""
     config = load(path)
-    check_stop(config)
+    law = check_stop(config)
     console = table_console()
+    try:
+        stopped = stop_from_everywhere(build_ocp(config), law) if config.model.stop == "rests" else 'a stop: it coasts, as stop = "coasts" says'
+    except OcpError as error:
+        raise ConfigError(unstopped(config, error)) from error
     report = check(config, track(range(WAVE_SAMPLES), "solving", console=console, transient=True, disable=not console.is_terminal))
     table = Table("phase, us", "p50", "p99", "max")
     for phase, times in (("preparation", report.prepare_us), ("feedback", report.feedback_us)):
@@ -98,6 +104,7 @@ def main(path: Path) -> int:
     console.print(f"the controller's own plans are within {report.deviation:.1e} of them, relative to half the range of each input", soft_wrap=True)
     reached = f"driven to {report.bounds - len(report.missed)} of {report.bounds} bounds"
     console.print(reached + (f", not to the {', the '.join(report.missed)}" if report.missed else ""), soft_wrap=True)
+    console.print(stopped, soft_wrap=True)
     return 0 if report.agree and all(status.usable for status in report.statuses) else 1
 
 

@@ -14,6 +14,7 @@ from rti_mpc_service.config.schema import ITERATION_KEYS, Config, RegulatorSecti
 if TYPE_CHECKING:
     from rti_mpc.model.model import Model, Signal
     from rti_mpc.rti.ocp import Ocp
+    from rti_mpc.rti.way_to_rest import StopLaw
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -99,20 +100,32 @@ def check_rest(ocp: Ocp) -> None:
         raise ConfigError(f"ocp.bounds: {wrong}")
 
 
-def check_stop(config: Config) -> None:
+def check_stop(config: Config) -> StopLaw | None:
     """
     Check that a stop brings the robot to rest, unless its file says that it coasts.
 
-    Raises:
-        ConfigError: The robot coasts or falls; the text gives the motion seen.
-    """
-    from rti_mpc.rti.rest import motion_at_rest
+    Returns:
+        What its way to rest is made with; None for a robot whose inputs ramp to rest.
 
-    if config.model.stop == "rests" and (seen := motion_at_rest(build_ocp(config))):
-        raise ConfigError(
-            f"model.name: a stop must bring {config.model.name} to rest: {seen}; let its inputs command speeds, "
-            f'or say that it is let go by stop = "coasts" in [model]'
-        )
+    Raises:
+        ConfigError: The robot does not come to rest from where it operates; the text says from where, and what still moves.
+    """
+    from rti_mpc.rti.rest import find_stop_law
+
+    if config.model.stop == "coasts":
+        return None
+    try:
+        return find_stop_law(build_ocp(config))
+    except OcpError as error:
+        raise ConfigError(unstopped(config, error)) from error
+
+
+def unstopped(config: Config, seen: object) -> str:
+    """Say that a stop does not bring the robot to rest, what was seen of it, and what to do."""
+    return (
+        f"model.name: a stop must bring {config.model.name} to rest: {seen}; bound in ocp.bounds.states where it operates, "
+        f'let the model say how it stops (stop_expr), or say that it is let go by stop = "coasts" in [model]'
+    )
 
 
 def check_names(config: Config, model: Model) -> None:

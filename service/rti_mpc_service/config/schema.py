@@ -75,7 +75,8 @@ class ModelSection(Section):
     )
     parameters: dict[str, float] = Field(default={}, description="parameters that differ from the model's by name, each in its own unit")
     stop: Literal["rests", "coasts"] = Field(
-        default="rests", description="what a stop, its inputs at rest, does to the robot: it rests, which is checked, or it coasts or falls"
+        default="rests",
+        description="what a stop does to the robot: it rests, which is checked; or it coasts or falls, its inputs at rest",
     )
 
 

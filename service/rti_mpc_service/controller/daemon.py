@@ -72,12 +72,12 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
     Raises:
         ConfigError: A stop would not bring the robot to rest, or the leader has another configuration than its standby.
     """
-    check_stop(config)
+    stop_law = check_stop(config)
     stop = stop or stop_on_signals()
     rti = build_rti(config, log.info)
     warm_up(rti)
     timing = Timing(config.delay_s, config.stale_s, config.timing.valid_s)
-    controller = Controller(rti, timing, config_hash=config.config_hash, observer=build_observer(config))
+    controller = Controller(rti, timing, config_hash=config.config_hash, observer=build_observer(config), stop_law=stop_law)
     lock = Condition()
     params = Params(config, controller, rti, lock)
 

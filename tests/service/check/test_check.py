@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 
 from rti_mpc.contract.status import QpStatus
+from rti_mpc.rti.rest import assess
 from rti_mpc_service.check import check
+from rti_mpc_service.check.rest import rest_line
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
+from tests.movers import law_of, ocp_of
+from tests.problems import pioneer
 from tests.service.config.test_config import MINIMAL
 
 
@@ -78,3 +82,16 @@ def test_no_number_is_cut_off_in_a_narrow_terminal(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(check, "check", lambda config, samples: report)
     assert check.main(SHIPPED) == 0
     assert capsys.readouterr().out.count("123456789") == 6
+
+
+def test_rest_is_described_in_one_line() -> None:
+    car = ocp_of("car")
+    line = rest_line(car.model, law_of("car"), assess(car, law_of("car"), 20, compile=False))
+    assert line.startswith("a stop: at rest it drifts without feedback (b); from 20 states within ")
+    assert "x by " in line
+    assert " v by " not in line, "it is zero wherever the car rests"
+    assert line.endswith("rows of 0.05 s to rest, and a gain that keeps it there")
+    robot = pioneer()
+    line = rest_line(robot.model, None, assess(robot, None, 20))
+    assert "holds without feedback (a)" in line
+    assert line.endswith("its inputs ramp to rest")

@@ -460,22 +460,51 @@ def test_limits_of_the_guard_are_those_of_the_problem(tmp_path: Path) -> None:
     assert config.config_hash == load(SHIPPED).config_hash
 
 
-def coasting() -> Model:
-    """The robot, its forward speed kept up by nothing but its input's acceleration."""
+def driven_by(forward: str) -> Model:
+    """The robot, its forward speed changed by its input's acceleration, or by nothing."""
     model = pioneer_3dx()
     rates = ca.vertsplit(model.f_expl_expr)
-    return replace(model, f_expl_expr=ca.vertcat(*rates[:3], model.u[0], rates[4]))
+    return replace(model, f_expl_expr=ca.vertcat(*rates[:3], model.u[0] if forward == "acceleration" else 0.0, rates[4]))
 
 
-def test_robot_that_a_stop_does_not_bring_to_rest_is_refused_unless_its_file_says_so(tmp_path: Path) -> None:
-    path = tmp_path / "robot.toml"
-    check_stop(load(SHIPPED))
-    path.write_text(SHIPPED.read_text().replace('"pioneer_3dx"', '"tests.service.config.test_config:coasting"'))
-    for refuse in (lambda: check.main(path), lambda: daemon.main(load(path), BusSettings()), lambda: demo.main(load(path), "eight")):
-        with pytest.raises(ConfigError) as refusal:
-            refuse()
-        assert "\n" not in str(refusal.value)
-        for words in ("tests.service.config.test_config:coasting", "10 s after its inputs have come to rest", "m per second", 'stop = "coasts"'):
-            assert words in str(refusal.value)
-    path.write_text(path.read_text().replace("[model]", '[model]\nstop = "coasts"'))
-    check_stop(load(path))
+def accelerated() -> Model:
+    return driven_by("acceleration")
+
+
+def coasting() -> Model:
+    return driven_by("nothing")
+
+
+def with_model(name: str, folder: Path, stop: str = "rests") -> Config:
+    path = folder / "robot.toml"
+    named = SHIPPED.read_text().replace('"pioneer_3dx"', f'"tests.service.config.test_config:{name}"')
+    path.write_text(named.replace("[model]", f'[model]\nstop = "{stop}"'))
+    return load(path)
+
+
+def test_stop_is_a_ramp_or_a_way_to_rest_that_the_model_leads_to(tmp_path: Path) -> None:
+    assert check_stop(load(SHIPPED)) is None
+    law = check_stop(with_model("accelerated", tmp_path))
+    assert law is not None
+    assert not law.holds
+    assert check_stop(with_model("coasting", tmp_path, stop="coasts")) is None
+
+
+def test_robot_that_a_stop_does_not_bring_to_rest_is_refused_with_where_that_is(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as refusal:
+        check_stop(with_model("coasting", tmp_path))
+    assert "\n" not in str(refusal.value)
+    for words in ("tests.service.config.test_config:coasting", " s after a stop at x = ", "still moves: x", 'stop = "coasts"'):
+        assert words in str(refusal.value)
+
+
+def test_nothing_is_done_with_a_robot_that_a_stop_does_not_bring_to_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(config: Config) -> None:
+        raise ConfigError("it coasts")
+
+    for module in (check, daemon, demo):
+        monkeypatch.setattr(module, "check_stop", refuse)
+    config = load(SHIPPED)
+    for act in (lambda: check.main(SHIPPED), lambda: daemon.main(config, BusSettings()), lambda: demo.main(config, "eight")):
+        with pytest.raises(ConfigError, match="it coasts"):
+            act()

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+End of every command: the way to rest that acts after its plan, and that a stop commands.
+
+A robot that its inputs at rest do not stop is given one with each command
+(`rti_mpc.rti.way_to_rest`). After a plan it begins in the state and with the input
+predicted for the plan's end. A stop begins one where the robot is, and each following
+command follows it from where the robot has come to, so that what pushes the robot aside
+does not carry it away. Its first rows are the plan, the others follow it in the command.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.codegen import bind, compiled
+from rti_mpc.control.prediction import Prediction
+from rti_mpc.model.integrator import integrator
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.way_to_rest import StopLaw, WayToRest
+
+MAX_PREDICTION_NS = 1_000_000_000  # that a state is predicted ahead; a robot that was not heard for longer is taken to be on its way
+RESTING = 0.01  # of its range in operation, to which each state and input has come at rest
+
+Ending = Mapping[str, Any]  # the fields of a command that hold its way to rest, by their names
+
+
+class Stopping:
+    """
+    Ways to rest of one robot.
+
+    Attributes:
+        duration_ns: How long a way to rest is; `period_ns`, each of its rows.
+        at_rest: Whether the last stop commands a robot that has come to rest.
+    """
+
+    def __init__(self, ocp: Ocp, law: StopLaw, limits: Mapping[str, Array], prediction: Prediction, valid_ns: int, *, compile: bool = True) -> None:
+        """
+        Begin with no way.
+
+        Args:
+            ocp: The controller's problem.
+            law: What the ways are made with.
+            limits: Bounds and slew limits of the inputs by name, owned by the caller, obeyed as they are.
+            prediction: What predicts the states in which plans and stops begin.
+            valid_ns: How long a command is valid, robot time.
+            compile: Whether to machine code.
+        """
+        nx, nu = ocp.model.nx, ocp.model.nu
+        self._law, self._prediction = law, prediction
+        self._dt_ns, self.period_ns = round(1e9 * ocp.dt), round(1e9 * law.period_s)
+        self._valid_ns, self._limits = valid_ns, limits
+        self._way = WayToRest(ocp, law, limits, p=prediction.p, compile=compile)
+        self.duration_ns = law.rows * self.period_ns
+        self.at_rest = False
+        self._aimed = False  # whether the equilibrium aimed at is near where plans lead
+        self._began_ns: int | None = None  # when the way that is followed began; None while none is
+        self._x, self._next, self._u, self._span = np.zeros(nx), np.zeros(nx), np.zeros(nu), np.zeros(1)
+        phi = integrator(ocp.model, "rk4")
+        step = {"x": self._x, "u": self._u, "p": prediction.p, "dt": self._span}
+        self._step = bind(compiled(phi)[0] if compile else phi, step, {"x_next": self._next})
+        self._ended: Ending = {}  # the last way that a plan ended with
+
+    def forget(self) -> None:
+        """Forget where the robot was: after a gap, or in another life of it."""
+        self._aimed, self._began_ns, self.at_rest = False, None, False
+
+    def prepare(self) -> None:
+        """Aim at where the last way leads; off the path from state to command."""
+        self._aimed = self._aimed and self._way.aim(self._way.x[-1], self._way.u[-1])
+
+    def after(self, rows: Array, act_ns: int, valid_until_ns: int) -> tuple[Array, Ending]:
+        """
+        Return the rows of a plan that act, shape ``(n, nu)``, and the way to rest after them.
+
+        Args:
+            rows: The plan, shape ``(N, nu)``; it begins in the state predicted last.
+            act_ns: When it begins to act, robot time.
+            valid_until_ns: When it ends.
+        """
+        count = min(max(1, -(-(valid_until_ns - act_ns) // self._dt_ns)), len(rows))
+        rows = rows[:count]
+        last_ns = min(valid_until_ns - act_ns - (count - 1) * self._dt_ns, self._dt_ns)
+        self._x[:] = self._prediction.x
+        for k, row in enumerate(rows):
+            self._u[:], self._span[0] = row, 1e-9 * (self._dt_ns if k < count - 1 else last_ns)
+            self._step()
+            self._x[:] = self._next
+        acted = rows[-2:] if last_ns < self._dt_ns else rows[-1:]  # less than a period before the way begins
+        falling, rising = self._limits["lbdu"], self._limits["ubdu"]
+        lowest, highest = acted.max(axis=0) + falling, acted.min(axis=0) + rising
+        reach = np.array([lowest, lowest + falling]), np.array([highest, highest + rising])
+        begun = (self._aimed and self._way.begin(self._x, rows[-1], reach)) or self._way.find(self._x, rows[-1], reach)
+        self._aimed, self._began_ns, self.at_rest = begun, None, False
+        if begun:
+            self._ended = self._ending(0)
+        return rows, self._ended
+
+    def stop(self, x: Array, state_ns: int, act_ns: int, u_prev: Array, reach: tuple[Array, Array]) -> tuple[Array, int, Ending]:
+        """
+        Return rows that bring the robot to rest, shape ``(n, nu)``, for how long they are valid, in ns, and the way to rest after them.
+
+        Args:
+            x: Last state, shape ``(nx,)``.
+            state_ns: Its time, robot time.
+            act_ns: When the first row acts, robot time.
+            u_prev: Input that acts before it, shape ``(nu,)``.
+            reach: Lowest and highest first two rows, each of shape ``(2, nu)``.
+        """
+        way = self._way
+        x0 = self._prediction.predict(x, state_ns, act_ns) if act_ns - state_ns <= MAX_PREDICTION_NS else x
+        if self._began_ns is None:
+            if (self._aimed and way.begin(x0, u_prev, reach)) or way.find(x0, u_prev, reach):
+                self._began_ns = act_ns
+        else:
+            elapsed = max(0, round((act_ns - self._began_ns) / self.period_ns))
+            if act_ns - state_ns > MAX_PREDICTION_NS:
+                x0 = way.planned(elapsed)
+            way.follow(x0, u_prev, elapsed, reach)
+        if not way.finite:
+            way.hold(u_prev, reach)
+            self.forget()
+        self._aimed = False
+        law = self._law
+        still_to_move = (way.x[0] - way.x[-1]) / law.scale_x, (way.u[0] - way.u[-1]) / law.scale_u
+        self.at_rest = bool(max(np.abs(part).max() for part in still_to_move) <= RESTING)
+        row = min(max(1, self._valid_ns // self.period_ns), len(way.u) - 1)
+        return way.u[:row].copy(), min(row * self.period_ns, self._valid_ns), self._ending(row)
+
+    def _ending(self, row: int) -> Ending:
+        """Return the fields of a command from a row of the way on."""
+        way = self._way
+        ending = {"rest_period_ns": self.period_ns, "u_rest": way.u[row:].copy()}
+        return ending if self._law.holds else {**ending, "x_rest": way.x[row:].copy(), "K": way.K.copy()}

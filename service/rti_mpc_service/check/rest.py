@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rest of a robot as `check` prints it: its class, and how long and how far a stop takes."""
+
+from __future__ import annotations
+
+from rti_mpc.model.model import Model
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.rest import Rest, RestClass, assess
+from rti_mpc.rti.way_to_rest import StopLaw
+
+STATES = 1000  # of operation from which a robot is stopped
+LETTERS = {RestClass.HOLDS: "a", RestClass.DRIFTS: "b", RestClass.UNSTABLE: "c"}
+
+
+def stop_from_everywhere(ocp: Ocp, law: StopLaw | None, count: int = STATES) -> str:
+    """
+    Return in one line what a stop does to a robot, from many states of operation.
+
+    Args:
+        ocp: Its problem.
+        law: What its way to rest is made with; None: its inputs ramp to rest.
+        count: How many states.
+
+    Raises:
+        OcpError: It does not come to rest from one of them.
+    """
+    return rest_line(ocp.model, law, assess(ocp, law, count))
+
+
+def rest_line(model: Model, law: StopLaw | None, rest: Rest) -> str:
+    """Return in one line what a stop does to a robot."""
+    moved = [f"{signal.name} by {value:.3g} {signal.unit}" for signal, value in zip(model.states, rest.moved, strict=True) if value > 0.0]
+    way = f", which moves {', '.join(moved)} at most" if moved else ""
+    carried = "its inputs ramp to rest"
+    if law is not None:
+        carried = f"its commands carry {law.rows} rows of {law.period_s:g} s to rest{'' if law.holds else ', and a gain that keeps it there'}"
+    letter = LETTERS[rest.kind]
+    return f"a stop: at rest it {rest.kind.value} ({letter}); from {rest.states} states within {rest.time_s:.3g} s{way}; {carried}"
