@@ -108,3 +108,10 @@ dt_s = 0.1
 weights = {{ Q = {{ {Q} }}, R = {{ {R} }}, lambda = 0.01 }}
 bounds = {{ inputs = {{ {limits} }}, increments = {{ {steps} }} }}
 """
+
+
+def pushed() -> Model:
+    """A mass that is pushed: an input of zero lets it coast."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 1)
+    signals = {"states": (Signal("p", "m"), Signal("v", "m/s")), "inputs": (Signal("a", "m/s^2"),), "outputs": (Signal("p", "m"),)}
+    return Model("pushed", x, u, ca.vertcat(x[1], u[0]), x[0], **signals)

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.contract.guard import Guard, Limits
+from rti_mpc.contract.guard import Guard
+from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Reference, State
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.controller import Controller, Timing

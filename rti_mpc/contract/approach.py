@@ -49,7 +49,9 @@ def segments(at: Callable[[int], tuple[Array, int, bool]], from_ns: int, to_ns: 
     return acted
 
 
-def approach(u: Array, stamp_ns: int, period_ns: int, start_ns: int, acted: list[tuple[int, Array]], limits: Increments) -> Array:
+def approach(
+    u: Array, stamp_ns: int, period_ns: int, start_ns: int, acted: list[tuple[int, Array]], limits: Increments, *, late: bool = True
+) -> Array:
     """
     Bring the rows of a plan inside the slew limits of what acted before it.
 
@@ -60,6 +62,7 @@ def approach(u: Array, stamp_ns: int, period_ns: int, start_ns: int, acted: list
         start_ns: When the plan begins to act, with its row for that time.
         acted: Inputs that acted in the period before `start_ns`, as `segments` returns them.
         limits: The slew limits.
+        late: Whether it may begin later, by up to a row: what acts until then may be what acted before.
 
     Returns:
         The rows, shape ``(n, nu)``: `u` itself if it is inside.
@@ -71,7 +74,7 @@ def approach(u: Array, stamp_ns: int, period_ns: int, start_ns: int, acted: list
     even = period_ns >= window_ns and bool((change >= lowest - INPUT_ROUNDING).all() and (change <= highest + INPUT_ROUNDING).all())
     first = max(0, (start_ns - stamp_ns) // period_ns)
     begins_ns = stamp_ns + (first + 1) * period_ns  # when a plan that comes late by less than a row begins
-    rows, near, limited = u, acted, False
+    rows, near, limited = u, list(acted), False
     for k in range(first, len(u)):
         row_ns = max(start_ns, stamp_ns + k * period_ns)
         if even and k > first and not limited and row_ns - window_ns >= start_ns:
@@ -81,13 +84,16 @@ def approach(u: Array, stamp_ns: int, period_ns: int, start_ns: int, acted: list
         if limited or was_limited:
             if rows is u:
                 rows = u.copy()
-                near = [(begins_ns, before) for _, before in near]  # if the plan comes late, the robot begins with the second row
+                if late:  # if the plan comes late, the robot begins with the second row
+                    near = [(begins_ns if until_ns <= start_ns + period_ns else until_ns, before) for until_ns, before in near]
             row = within(u[k], near, row_ns - limits.dt_ns, limits)
             if k > first:
                 row = np.minimum(np.maximum(row, rows[k - 1] + lowest), rows[k - 1] + highest)
             limited = bool((np.abs(row - u[k]) > INPUT_ROUNDING).any())
             rows[k] = row
-        near = [*near, (row_ns + period_ns, rows[k])]
+        if row_ns - limits.dt_ns >= begins_ns:
+            near = [(until_ns, before) for until_ns, before in near if until_ns > row_ns - limits.dt_ns]
+        near.append(((row_ns if late else stamp_ns + k * period_ns) + period_ns, rows[k]))
     return rows
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
-from rti_mpc.contract.schedule import BEFORE_ALL_NS, Plan, Schedule
+from rti_mpc.contract.schedule import BEFORE_ALL_NS, NO_ANGLES, Plan, Schedule
 
 START_TOLERANCE_PERIODS = 0.1  # a command may begin to act this much sooner or later than believed
 OVERDUE_PERIODS = 1.0  # a command that does not act this long after its time is missing; until then it is still expected
@@ -35,7 +35,14 @@ class Belief(Schedule):
         confirmed: Consecutive reports that have named the expected command.
     """
 
-    def __init__(self, u_rest: Array, slew: Array, increments: Increments) -> None:
+    def __init__(
+        self,
+        u_rest: Array,
+        slew: Array,
+        increments: Increments,
+        bounds: tuple[float | Array, float | Array] = (-np.inf, np.inf),
+        angles: Array = NO_ANGLES,
+    ) -> None:
         """Begin at rest; the arguments are those of `Schedule`."""
         self._missing: deque[Plan] = deque(maxlen=MAX_MISSING_PLANS)
         self.confirmed = 0
@@ -43,7 +50,7 @@ class Belief(Schedule):
         self._period_ns = increments.dt_ns
         self._overdue_ns = round(OVERDUE_PERIODS * increments.dt_ns)
         self._tolerance_ns = round(START_TOLERANCE_PERIODS * increments.dt_ns)
-        super().__init__(u_rest, slew, increments)
+        super().__init__(u_rest, slew, increments, bounds, angles)
 
     def brake(self, u: Array, t_ns: int) -> None:
         """Drop every plan: the inputs ramp to rest from `u`, shape ``(nu,)``, beginning at a time."""
@@ -122,7 +129,7 @@ class Belief(Schedule):
             missing.remove(late)
             while plans and plans[-1].start_ns > before_ns:
                 plans.pop()
-            plans.append(replace(late, start_ns=max(before_ns + 1, late.stamp_ns), u=late.asked, pause_ns=None))
+            plans.append(replace(late, start_ns=max(before_ns + 1, late.stamp_ns), u=late.asked, pause_ns=None, following=None))
         else:
             known = list(plans)
             while plans and not self._plays(u, t_ns):
@@ -132,12 +139,13 @@ class Belief(Schedule):
                 plans.extend(known)
 
     def _take(self, source: tuple[int, int], u: Array, t_ns: int, before_ns: int) -> None:
-        """Believe that an input has acted since the last report; from now on the newest plan continues, or the robot's own ramp."""
+        """Believe that an input has acted since the last report; from now on the newest plan continues, or its way to rest, or the ramp."""
         plans = self._plans
         newest = plans[-1] if plans else None
         while plans and plans[-1].start_ns > before_ns:
             plans.pop()
         u = u.copy()
-        plans.append(Plan(before_ns + 1, t_ns, before_ns + 1, self._period_ns, u[None], u[None], u))
+        way = newest.way if newest is not None and newest.end_ns <= t_ns else None
+        plans.append(Plan(before_ns + 1, t_ns, before_ns + 1, self._period_ns, u[None], u[None], u, way=way))
         if newest is not None and source[1] and newest.end_ns > t_ns:
             self._put(replace(newest, start_ns=t_ns), self._increments)

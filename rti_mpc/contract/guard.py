@@ -5,8 +5,10 @@ The guard of one robot: passes a controller's command only if it is fresh, for t
 It reads no clock: every time is a stamp of the robot or local monotonic time that the
 caller hands in. A healthy command passes at once and whole, so that the robot plays the
 rest of the plan if nothing follows, even after the guard itself has died. Before the
-last plan ends, the guard sends the ramp to rest, in short commands, and then commands to
-stand, until a controller commands again.
+last plan ends, the guard sends the plan's own way to rest, or the ramp if it has none, in
+short commands, and then commands to stand, until a controller commands again. Each of
+them carries what is left of the way. Where the way needs feedback, the guard plays
+:math:`u = u_i - K (x - x_i)` with every state that arrives.
 
 It trusts neither a controller that was stopped and continues where it was, nor an old
 leader, nor messages that have waited somewhere, nor a clock that jumps.
@@ -15,7 +17,8 @@ leader, nor messages that have waited somewhere, nor a clock that jumps.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -24,13 +27,14 @@ from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.belief import Belief
 from rti_mpc.contract.cadence import Cadence
 from rti_mpc.contract.epoch import MAX_SEQ_GAP, epoch_above
+from rti_mpc.contract.limits import INPUT_ROUNDING, MAX_VALID_NS, Limits
 from rti_mpc.contract.lives import Heard, Lives
 from rti_mpc.contract.message import Command, Notice, Severity, State
 from rti_mpc.contract.robot_clock import Backlog, RobotClock
 from rti_mpc.contract.schedule import BEFORE_ALL_NS, RAMP_STEP_NS, end_ns, unfit
 from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.contract.way import Way
 
-MAX_VALID_NS = 300_000_000  # robot time: a command ends at the latest this long after its state and the delay, whatever its own validity
 MAX_STATE_AHEAD_NS = 50_000_000  # local time: the state that a command answers may be this far ahead of our idea of the robot's clock
 MAX_STATE_LATE_NS = 50_000_000  # local time: a state that is later than this has waited on its way, and does not show the robot's clock
 CLOCK_JUMP_NS = 250_000_000  # robot time: a larger difference from the time expected is a jump of the robot's clock
@@ -38,46 +42,8 @@ LEADER_SILENCE_NS = 250_000_000  # robot time: after this long without a command
 HELD_UP_NS = 250_000_000  # local time: a longer pause between two calls means that this process was held up
 RAMP_LEAD_NS = 30_000_000  # local time: the ramp to rest is sent this long before it is due
 RAMP_STEPS_PER_COMMAND = 10  # steps of the ramp in one command of the guard
-INPUT_ROUNDING = 1e-6  # in the unit of the input: above any rounding, single precision included, and below what an actuator resolves
-
-
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """
-    Limits of the commands to a robot.
-
-    Attributes:
-        u_rest: Input at which the robot stands still, shape ``(nu,)``.
-        lbu: Lower bound of the inputs, shape ``(nu,)``.
-        ubu: Upper bound of the inputs.
-        lbdu: Lower bound of an input's change over `dt_s`, shape ``(nu,)``, below 0.
-        ubdu: Upper bound of an input's change, above 0.
-        dt_s: Period of the controller, s.
-        delay_s: Delay from a state to the time at which its command acts, s.
-        stale_s: Age from which neither a state nor a command that answers it is used, s of the robot.
-    """
-
-    u_rest: Array
-    lbu: Array
-    ubu: Array
-    lbdu: Array
-    ubdu: Array
-    dt_s: float
-    delay_s: float = 0.0
-    stale_s: float = 0.25
-
-    @property
-    def slew(self) -> Array:
-        """Rate of the ramp to rest, shape ``(nu,)``, per s."""
-        return np.minimum(-self.lbdu, self.ubdu) / self.dt_s
-
-    @property
-    def settling_s(self) -> float:
-        """Time in s for which any command may still move the robot after the state that it answers: to its end, and down the ramp."""
-        way = np.maximum(np.abs(self.lbu - self.u_rest), np.abs(self.ubu - self.u_rest))
-        limited = np.isfinite(self.slew)
-        ramp = np.where(limited, way / np.where(limited, self.slew, 1.0), 0.0)
-        return self.delay_s + 1e-9 * MAX_VALID_NS + float(np.minimum(ramp, 10.0).max(initial=0.0))
+MAX_STEPS_PER_COMMAND = 100  # steps of a way to rest in one command of the guard, which lasts until the next row of the way begins
+MIN_ROW_NS = 100_000  # shortest time between rows that a message may have
 
 
 class Guard:
@@ -107,7 +73,8 @@ class Guard:
         self._cadence = Cadence()
         self._clock = RobotClock()
         increments = Increments(limits.lbdu, limits.ubdu, self._dt_ns)
-        self._schedule = Belief(limits.u_rest, limits.slew, increments)  # the plans that were passed to the robot, and its ramp after them
+        # The plans that were passed to the robot, and its way to rest after them.
+        self._schedule = Belief(limits.u_rest, limits.slew, increments, (limits.lbu, limits.ubu), limits.angles)
         self._state: State | None = None  # the last one that came in time
         self._heard_ns = 0  # stamp of the last state
         self._late = Backlog()
@@ -118,6 +85,8 @@ class Guard:
         self._told_ns = BEFORE_ALL_NS  # end of the last command that the robot was sent
         self._engaged = False  # whether this robot was ever sent a command
         self._untold = False  # whether the command to brake has still to be sent
+        self._corrected = False  # whether the correction of its way to rest by the last state has still to be sent
+        self._passed: Command | None = None  # the last command that was passed
         self._stopped = False
         self._latched = ""  # why an operator's stop is latched
         self._rest_by_ns = BEFORE_ALL_NS  # robot time from which a latched guard passes only commands at rest, and no way to rest any more
@@ -135,7 +104,7 @@ class Guard:
     @property
     def at_rest(self) -> bool:
         """Whether the last command was to stand, or the robot was never commanded."""
-        return not self._engaged or bool(np.array_equal(self._schedule.at(self._told_ns - 1)[0], self._limits.u_rest))
+        return not self._engaged or self._schedule.rests(self._told_ns - 1)
 
     # Incoming messages.
 
@@ -172,6 +141,7 @@ class Guard:
         self._take(state, local_ns)
         if len(state.u) == len(self._limits.u_rest):
             self._schedule.correct(state.stamp_ns, np.clip(state.u, self._limits.lbu, self._limits.ubu), (state.command_epoch, state.command_seq))
+        self._feed_back(state.x, state.stamp_ns, self._clock.now_ns(local_ns))
 
     def receive_command(self, command: Command, local_ns: int) -> Command | None:
         """
@@ -205,7 +175,8 @@ class Guard:
             return None
         start_ns = max(command.stamp_ns, now_ns)
         u = np.clip(command.u, self._limits.lbu, self._limits.ubu)
-        passed = self._numbered(replace(command, valid_until_ns=min(command.valid_until_ns, until_ns), u=u))
+        u_rest = np.clip(command.u_rest, self._limits.lbu, self._limits.ubu) if len(command.u_rest) else command.u_rest
+        passed = self._numbered(replace(command, valid_until_ns=min(command.valid_until_ns, until_ns), u=u, u_rest=u_rest))
         passed.u = self._schedule.add(passed, start_ns, until_ns)
         if (np.abs(passed.u - u) > INPUT_ROUNDING).any():
             text = f"command {command.seq} of epoch {command.epoch} begins too far from what acts: approached inside the slew limits"
@@ -214,7 +185,7 @@ class Guard:
         if not self.passing:
             self.passing = True
             self._say(Severity.INFO, "guard_passing", f"commands of epoch {command.epoch} pass", change=True)
-        self._engaged, self._told_ns = True, until_ns
+        self._engaged, self._corrected, self._told_ns, self._passed = True, False, until_ns, passed
         return passed
 
     def _wait(self, until: str) -> None:
@@ -228,7 +199,7 @@ class Guard:
         Keep the robot commanded as time goes on.
 
         Returns:
-            The next piece of the ramp to rest, or of standing, for the caller to publish; None while the last command lasts long enough.
+            The next piece of the way to rest, or of standing, for the caller to publish; None while the last command lasts long enough.
         """
         self._wake(local_ns)
         if self._state is None or not self._engaged:
@@ -239,27 +210,41 @@ class Guard:
         self._schedule.forget(now_ns - 2 * self._dt_ns)
         if self.passing:
             self._watch(now_ns)
-        if self._told_ns - now_ns > RAMP_LEAD_NS * self._clock.rate:
+        if now_ns - self._state.stamp_ns > self._stale_ns:
+            self._feed_back(None, now_ns, now_ns)
+        if self._told_ns - now_ns > RAMP_LEAD_NS * self._clock.rate and not self._corrected:
             return None
-        start_ns = max(self._told_ns, now_ns)
-        u = np.array([self._schedule.at(start_ns + i * RAMP_STEP_NS)[0] for i in range(RAMP_STEPS_PER_COMMAND)])
+        start_ns = now_ns if self._corrected else max(self._told_ns, now_ns)
+        way = self._schedule.way(start_ns)
+        valid_ns = RAMP_STEPS_PER_COMMAND * RAMP_STEP_NS if way is None else piece_ns(way, start_ns)
+        u = np.array([self._schedule.at(start_ns + i * RAMP_STEP_NS)[0] for i in range(-(-valid_ns // RAMP_STEP_NS))])
         period_ns = RAMP_STEP_NS
-        if not (u - self._limits.u_rest).any():
+        if not (u - self._schedule.rest(start_ns)).any():
             if now_ns - self._state.stamp_ns > 10 * self._stale_ns:
                 return None  # no robot is there that could be told to stand
-            u, period_ns = u[:1], RAMP_STEPS_PER_COMMAND * RAMP_STEP_NS
-        return self._tell(start_ns, RAMP_STEPS_PER_COMMAND * RAMP_STEP_NS, period_ns, u, self._state)
+            u, period_ns = u[:1], valid_ns
+        return self._tell(start_ns, valid_ns, period_ns, u, self._state, None if way is None else way.ahead(start_ns + valid_ns))
+
+    def _feed_back(self, x: Array | None, stamp_ns: int, now_ns: int) -> None:
+        """Correct the way to rest by a state, or by none if the last one is stale; nothing is sent that would displace a plan about to begin."""
+        corrected = self._schedule.feed_back(x, stamp_ns, now_ns)
+        self._corrected |= corrected and not self._schedule.pending(now_ns)
 
     def _last_step(self, state: State) -> Command:
         """Return the last command to a robot whose stamps are no clock: each row is the next step to rest, whichever acts and for how long."""
-        t_ns = state.stamp_ns
-        u = np.tile(self._schedule.nearest(self._limits.u_rest, t_ns), (RAMP_STEPS_PER_COMMAND, 1))
-        valid_ns = max(1, round(MAX_VALID_NS * min(1.0, self._cadence.rate)))  # as long as it should act, in the unit of the stamps
-        return self._tell(t_ns, valid_ns, RAMP_STEP_NS, u, state)
+        t_ns, rate = state.stamp_ns, min(1.0, self._cadence.rate)
+        way = self._schedule.way(t_ns)
+        next_ = self._limits.u_rest if way is None else self._schedule.at(t_ns)[0]
+        u = np.tile(self._schedule.nearest(next_, t_ns), (RAMP_STEPS_PER_COMMAND, 1))
+        valid_ns = max(1, round(MAX_VALID_NS * rate))  # as long as it should act, in the unit of the stamps
+        if way is not None:
+            way = replace(way.ahead(t_ns), period_ns=max(MIN_ROW_NS, round(way.period_ns * rate)))
+        return self._tell(t_ns, valid_ns, RAMP_STEP_NS, u, state, way)
 
-    def _tell(self, start_ns: int, valid_ns: int, period_ns: int, u: Array, state: State) -> Command:
-        """Return a command of the guard's own, and note until when it lasts."""
-        self._told_ns, self._untold = start_ns + valid_ns, False
+    def _tell(self, start_ns: int, valid_ns: int, period_ns: int, u: Array, state: State, way: Way | None) -> Command:
+        """Return a command of the guard's own, with what is left of the way to rest after it, and note until when it lasts."""
+        self._told_ns, self._untold, self._corrected = start_ns + valid_ns, False, False
+        left: dict[str, Any] = {} if way is None else {"rest_period_ns": way.period_ns, "u_rest": way.u, "x_rest": way.x, "K": way.K}
         return self._numbered(
             Command(
                 epoch=0,
@@ -274,13 +259,14 @@ class Guard:
                 status=QpStatus.NONE,
                 period_ns=period_ns,
                 u=u,
+                **left,
             )
         )
 
     def _watch(self, now_ns: int) -> None:
         """Brake when the last plan has ended, or moves the robot for longer than a latched stop allows."""
-        u, _, ended = self._schedule.at(now_ns)
-        moving = not np.array_equal(u, self._limits.u_rest)
+        ended = self._schedule.at(now_ns)[2]
+        moving = not self._schedule.rests(now_ns, self._settled(now_ns))
         if ended:
             self.passing = False
             text = f"the last plan has ended: {'braking to rest' if moving else 'standing'}"
@@ -299,12 +285,18 @@ class Guard:
         """
         Pass only ways to rest until `enable`, and only rest once there was time to get there.
 
+        A command with a way to rest of its own passes if it reaches the last row of that no
+        later than the last plan would have, plus the time for which a command is valid. Whether
+        its rows bring the robot to rest, no guard can tell.
+
         The last plan continues meanwhile, up to its end. The controller is expected to
         ramp to rest; if it does not, the guard does.
         """
         if not self._latched:
             self._latched = reason
             self._rest_by_ns = self._clock.now_ns(local_ns) + round(1e9 * self._limits.settling_s)
+            if self._passed is not None:
+                self._rest_by_ns = max(self._rest_by_ns, self._limits.settles_ns(self._passed, BEFORE_ALL_NS) + self._delay_ns + MAX_VALID_NS)
             self._say(Severity.INFO, "stop", f"stop: {reason}", change=True)
 
     def enable(self) -> None:
@@ -331,7 +323,7 @@ class Guard:
             return "repeated"
         if command.epoch == epoch and now_ns - self._led_ns <= LEADER_SILENCE_NS and not seq < command.seq <= seq + MAX_SEQ_GAP:
             return f"old: {seq} has passed" if command.seq < seq else f"ahead: the last one was {seq}"
-        if reason := unfit(command, len(limits.u_rest), self._state.epoch):
+        if reason := unfit(command, len(limits.u_rest), self._state.epoch, len(self._state.x)):
             return reason
         if now_ns - self._clock.stamp_ns > max(self._stale_ns, 2.5 * self._clock.period_ns):
             return f"blind: no state for {1e-9 * (now_ns - self._clock.stamp_ns):.3f} s"
@@ -340,18 +332,25 @@ class Guard:
             return f"{'stale' if age_ns > 0 else 'early'}: it answers a state of {1e-9 * age_ns:.3f} s ago"
         if until_ns <= max(command.stamp_ns, now_ns):
             return "expired"
-        u = command.u
-        if (u < limits.lbu - INPUT_ROUNDING).any() or (u > limits.ubu + INPUT_ROUNDING).any():
-            return f"out_of_bounds: inputs reach from {u.min(axis=0).tolist()} to {u.max(axis=0).tolist()}"
-        change, share = np.diff(u, axis=0), self._share(command)
-        if (change < share * limits.lbdu - INPUT_ROUNDING).any() or (change > share * limits.ubdu + INPUT_ROUNDING).any():
-            return f"out_of_slew: rows change by up to {np.abs(change).max(axis=0).tolist()}"
+        if reason := limits.objection(command):
+            return reason
         if self._latched and not self._comes_to_rest(command, now_ns):
             return f"stopped: {self._latched}; only ways to rest pass"
         return ""
 
     def _comes_to_rest(self, command: Command, now_ns: int) -> bool:
-        """Whether the rows that would act only approach rest from the present input, and end there; long after a `latch`, whether all are rest."""
+        """
+        Whether the rows that would act only approach rest from the present input, and end there; long after a `latch`, whether all are rest.
+
+        A way to rest of the command's own need not approach it evenly: it has to reach its last row in time,
+        and, long after a `latch`, to be that row from now on, the one that the robot already has.
+        """
+        if len(command.u_rest):
+            settles_ns = self._limits.settles_ns(command, now_ns)
+            if now_ns < self._rest_by_ns:
+                return settles_ns <= self._rest_by_ns
+            here = np.abs(command.u_rest[-1] - self._schedule.rest(now_ns)) <= self._settled(now_ns) + INPUT_ROUNDING
+            return settles_ns <= now_ns and bool(here.all())
         start_ns = max(command.stamp_ns, now_ns)
         first = (start_ns - command.stamp_ns) // command.period_ns
         before = self._limits.u_rest if now_ns >= self._rest_by_ns else self._schedule.at(start_ns - 1)[0]
@@ -371,9 +370,9 @@ class Guard:
         """Return the rows of a command as they would act from a time on."""
         return self._schedule.approached(replace(command, u=np.clip(command.u, self._limits.lbu, self._limits.ubu)), start_ns)
 
-    def _share(self, command: Command) -> float:
-        """Return the share of the slew limits over `dt` that one row may use."""
-        return min(1.0, command.period_ns / self._dt_ns)
+    def _settled(self, now_ns: int) -> float | Array:
+        """Return how far from its last row a way to rest counts as rest, shape ``(nu,)``; the ramp counts only where it has ended."""
+        return 0.0 if self._schedule.way(now_ns) is None else self._limits.settled
 
     def _numbered(self, command: Command) -> Command:
         """Return a command with the guard's epoch and next number."""
@@ -421,7 +420,8 @@ class Guard:
         self._leader = 0, -1
         self._told_ns = BEFORE_ALL_NS
         self._rest_by_ns = BEFORE_ALL_NS  # the robot is at rest: a latch from before passes nothing but rest
-        self._engaged = self._untold = self.passing = False
+        self._engaged = self._untold = self._corrected = self.passing = False
+        self._passed = None
         self._late.clear()
 
     def _jump(self, state: State, local_ns: int, where: str) -> None:
@@ -442,3 +442,12 @@ class Guard:
 
     def _say(self, severity: Severity, code: str, text: str, *, change: bool = False) -> None:
         self.notices.append(Notice(severity, code, text, change))
+
+
+def piece_ns(way: Way, start_ns: int) -> int:
+    """Return how long a command with the way to rest lasts from a time on: some steps, and on to the next row, so that the rest stays in phase."""
+    least_ns = RAMP_STEPS_PER_COMMAND * RAMP_STEP_NS
+    rows = -((way.stamp_ns - start_ns - least_ns) // way.period_ns)  # that have begun by then
+    if rows >= len(way.u):
+        return least_ns
+    return min(way.stamp_ns + rows * way.period_ns - start_ns, MAX_STEPS_PER_COMMAND * RAMP_STEP_NS)

@@ -5,9 +5,10 @@ Schedule of inputs: the command contract as a function of time.
 Row ``i`` of the newest plan whose time has come acts from ``stamp_ns + i * period_ns``,
 but never before the plan has arrived. A plan ahead of its time waits while the previous
 one continues. A plan that does not begin at the present input is approached inside the
-slew limits (`rti_mpc.contract.approach`). When a plan has ended, the inputs ramp to rest
-inside the slew limits, and stay there. The robot plays the schedule; guard and
-controller compute from it what the robot does.
+slew limits (`rti_mpc.contract.approach`). When a plan has ended, its own way to rest acts
+(`rti_mpc.contract.way`), approached likewise, and the last row of that is held. If the plan
+came with none, the inputs ramp to rest inside the slew limits, and stay there. The robot
+plays the schedule; guard and controller compute from it what the robot does.
 """
 
 from __future__ import annotations
@@ -20,23 +21,44 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments, approach, segments, within
 from rti_mpc.contract.message import Command
+from rti_mpc.contract.way import Way
 
 RAMP_STEP_NS = 10_000_000  # the ramp to rest is a staircase of steps of this duration
 NEVER_NS = 2**63  # later than every time
 BEFORE_ALL_NS = -(2**62)  # earlier than every time
 MAX_PLANS = 64  # plans that are kept, those ahead of their time included
-MAX_ROWS = 1000  # rows of a plan, the longest horizon a configuration may have: the cost of `approach` grows faster than the rows
+MAX_ROWS = 1000  # rows of a plan, the longest horizon a configuration may have, and of a way to rest
+ROWS_AT_ONCE = 32  # rows of a way to rest that are approached at once; later ones wait until they are asked for
+MAX_CORRECTIONS = 16  # per period, of a way to rest by states: each is a plan that is kept
 WAY_ROUNDING = 1e-9  # relative: so that a way to rest of a whole number of steps takes no further one
 NO_COMMAND = (0, 0)  # epoch and sequence number of inputs that come from no command
+NO_ANGLES: Array = np.zeros(0)  # of a robot whose states are not known
 
 
-def unfit(command: Command, nu: int, robot_epoch: int) -> str:
-    """Return why a command cannot be a plan for this life of a robot with `nu` inputs; empty if it can."""
+def unfit(command: Command, nu: int, robot_epoch: int, nx: int | None = None) -> str:
+    """Return why a command cannot be a plan for this life of a robot with `nu` inputs and `nx` states, if those are known; empty if it can."""
     if command.state_epoch != robot_epoch:
         return "foreign_epoch"
     if command.u.ndim != 2 or not 1 <= len(command.u) <= MAX_ROWS or command.u.shape[1] != nu or command.period_ns <= 0:
         return "wrong_shape"
-    return "" if np.isfinite(command.u).all() else "not_finite"
+    rows, states, gain = command.u_rest, command.x_rest, command.K
+    if any(array.ndim != 2 for array in (rows, states, gain)) or not _fits(rows.shape, states, gain, nu, nx):
+        return "wrong_shape"
+    if len(rows) and command.rest_period_ns <= 0:
+        return "wrong_shape"
+    return "" if all(np.isfinite(array).all() for array in (command.u, rows, states, gain)) else "not_finite"
+
+
+def _fits(rows: tuple[int, ...], states: Array, gain: Array, nu: int, nx: int | None) -> bool:
+    """Whether the arrays of a way to rest belong together: none, rows alone, or rows with a state each and a gain."""
+    if not rows[0]:
+        return not len(states) and not len(gain)
+    if rows[0] > MAX_ROWS or rows[1] != nu:
+        return False
+    if not len(states) and not len(gain):
+        return True
+    width = states.shape[1]
+    return len(states) == rows[0] and width > 0 and nx in (None, width) and gain.shape == (nu, width)
 
 
 def end_ns(command: Command) -> int:
@@ -56,7 +78,10 @@ class Plan:
         u: Rows as they act, shape ``(n, nu)``.
         before: Input that acted before the plan, shape ``(nu,)``.
         source: Epoch and sequence number of the command it comes from; zeros for inputs that come from no command.
+        way: Way to rest after its end; None for the ramp.
+        rest: Input to which the ramp after its end leads, shape ``(nu,)``; None for the model's rest.
         pause_ns: Time from its end until the ramp to rest begins, shape ``(nu,)``; None until it is computed.
+        following: Next rows of its way to rest, as they act; None until they are computed.
     """
 
     start_ns: int
@@ -67,11 +92,29 @@ class Plan:
     u: Array
     before: Array
     source: tuple[int, int] = NO_COMMAND
+    way: Way | None = None
+    rest: Array | None = None
     pause_ns: Array | None = None
+    following: Plan | None = None
 
     def row(self, t_ns: int) -> int:
         """Return the row of a time."""
         return max(0, min((t_ns - self.stamp_ns) // self.period_ns, len(self.u) - 1))
+
+    def shift(self, by_ns: int) -> None:
+        """Move it in time, with what acts after its end as it was found: what that was found from may be forgotten."""
+        self.start_ns += by_ns
+        self.end_ns += by_ns
+        self.stamp_ns += by_ns
+        if self.way is not None:
+            self.way = self.way.moved(self.way.stamp_ns + by_ns)
+        if self.following is not None:
+            self.following = replace(self.following)
+            self.following.shift(by_ns)
+
+    def forget_end(self) -> None:
+        """Have what acts after its end found anew."""
+        self.pause_ns = self.following = None
 
 
 class Schedule:
@@ -82,7 +125,14 @@ class Schedule:
     rows have just used them: over any duration the change stays inside the limits.
     """
 
-    def __init__(self, u_rest: Array, slew: Array, increments: Increments | None = None) -> None:
+    def __init__(
+        self,
+        u_rest: Array,
+        slew: Array,
+        increments: Increments | None = None,
+        bounds: tuple[float | Array, float | Array] = (-np.inf, np.inf),
+        angles: Array = NO_ANGLES,
+    ) -> None:
         """
         Begin at rest.
 
@@ -90,10 +140,15 @@ class Schedule:
             u_rest: Input at rest, shape ``(nu,)``.
             slew: Largest rate of the ramp to rest, shape ``(nu,)``, in the input's unit per s; infinite where there is no limit.
             increments: Slew limits inside which plans are approached; None: their rows act as they are.
+            bounds: Of the inputs on a way to rest, with what feedback adds to them, shape ``(nu,)``.
+            angles: Which of the states that are fed back are angles, shape ``(nx,)``.
         """
         self.u_rest: Array = np.array(u_rest, dtype=np.float64)
         self._slew = 1e-9 * np.asarray(slew, dtype=np.float64)  # per ns
         self._increments = increments
+        self._bounds = bounds
+        self._angles = angles
+        self._spacing_ns = 0 if increments is None else increments.dt_ns // MAX_CORRECTIONS
         self._plans: deque[Plan] = deque()  # by start; those of the past as far as `forget` has left them
         self.brake(self.u_rest, BEFORE_ALL_NS)
 
@@ -111,15 +166,18 @@ class Schedule:
         """End the plan that acts at a time there, and drop later ones; the robot's clock has jumped since, and that time is now `now_ns`."""
         plans, shift_ns = self._plans, now_ns - t_ns
         while plans and plans[-1].start_ns > t_ns:
-            before = plans.pop().before
+            first = plans.pop()
         if not plans:  # a time that is forgotten
-            self.brake(before, now_ns)
+            self.brake(first.before, now_ns)
+            self._plans[-1].way = None if first.way is None else first.way.moved(now_ns)
             return
-        plans[-1].end_ns, plans[-1].pause_ns = min(plans[-1].end_ns, t_ns), None
+        last = plans[-1]
+        last.pause_ns = None
+        if last.end_ns > t_ns:
+            last.end_ns, last.way = t_ns, None if last.way is None else last.way.moved(t_ns)
+            last.forget_end()
         for plan in plans:
-            plan.start_ns += shift_ns
-            plan.end_ns += shift_ns
-            plan.stamp_ns += shift_ns
+            plan.shift(shift_ns)
 
     def add(self, command: Command, start_ns: int, end_ns: int, *, approached: bool = True) -> Array:
         """
@@ -135,16 +193,17 @@ class Schedule:
             Its rows as they will act, shape ``(n, nu)``.
         """
         u = command.u.copy()
-        plan = Plan(start_ns, end_ns, command.stamp_ns, command.period_ns, u, u, u[0], (command.epoch, command.seq))
+        source, way = (command.epoch, command.seq), Way.of(command, end_ns)
+        plan = Plan(start_ns, end_ns, command.stamp_ns, command.period_ns, u, u, u[0], source, way)
         return self._put(plan, self._increments if approached else None)
 
     def _put(self, plan: Plan, limits: Increments | None) -> Array:
         """Add a plan, approached inside the limits from the inputs that act before it."""
         plans, start_ns = self._plans, plan.start_ns
-        plan.u, plan.pause_ns = plan.asked, None
+        plan.u = plan.asked
+        plan.forget_end()
         if limits is not None:
-            acted = segments(self.at, start_ns - limits.dt_ns, start_ns)
-            plan.u = approach(plan.asked, plan.stamp_ns, plan.period_ns, start_ns, acted, limits)
+            plan.u = self._approach(plan.asked, plan.stamp_ns, plan.period_ns, start_ns, limits)
         plan.before = self.at(start_ns - 1)[0].copy()
         while plans and plans[-1].start_ns >= start_ns:
             plans.pop()
@@ -165,19 +224,73 @@ class Schedule:
 
     def approached(self, command: Command, start_ns: int) -> Array:
         """Return the rows of a command, shape ``(n, nu)``, as they would act from a time on."""
-        limits, u = self._increments, command.u
-        if limits is None:
-            return u
-        return approach(u, command.stamp_ns, command.period_ns, start_ns, segments(self.at, start_ns - limits.dt_ns, start_ns), limits)
+        return self._approach(command.u, command.stamp_ns, command.period_ns, start_ns, self._increments)
 
     def nearest(self, u: Array, t_ns: int) -> Array:
         """Return the input nearest to `u`, shape ``(nu,)``, that may begin to act at a time inside the slew limits."""
         limits = self._increments
         return u if limits is None else within(u, segments(self.at, t_ns - limits.dt_ns, t_ns), t_ns - limits.dt_ns, limits)
 
+    def feed_back(self, x: Array | None, stamp_ns: int, t_ns: int) -> bool:
+        """
+        Correct the way to rest that acts at a time, from then on, by a state; plans that come later are approached anew.
+
+        Args:
+            x: State, shape ``(nx,)``; None: none is known any more, and the way's rows act as they are.
+            stamp_ns: Its time.
+            t_ns: From when on the correction acts.
+
+        Returns:
+            Whether it changes what acts.
+        """
+        plan, plans = self.acting(t_ns), self._plans
+        if plan is None or plan.way is None or t_ns < plan.end_ns:
+            return False
+        way = plan.way.corrected(x, stamp_ns, self._angles)
+        if way is plan.way or (plan.start_ns == plan.end_ns > t_ns - self._spacing_ns and x is not None):
+            return False
+        u = self.at(t_ns - 1)[0]
+        later: list[Plan] = []
+        while plans[-1].start_ns > t_ns:
+            later.append(plans.pop())
+        self._put(Plan(t_ns, t_ns, t_ns, 1, u[None], u[None], u, plan.source, way), None)
+        for coming in reversed(later):
+            self._put(coming, self._increments)
+        return True
+
+    def way(self, t_ns: int) -> Way | None:
+        """Return the way to rest that acts at a time, or that will after the plan which does; None for the ramp."""
+        plan = self.acting(t_ns)
+        return None if plan is None else plan.way
+
+    def rest(self, t_ns: int) -> Array:
+        """Return what the inputs come to, shape ``(nu,)``, after what acts at a time."""
+        way = self.way(t_ns)
+        return self.u_rest if way is None else self._demanded(way)[-1]
+
+    def rests(self, t_ns: int, tolerance: float | Array = 0.0) -> bool:
+        """Return whether the inputs have come to their rest at a time, but for a tolerance, shape ``(nu,)``, and stay there after what acts."""
+        plan, rest = self.acting(t_ns), self.rest(t_ns)
+        rows = [self.at(t_ns)[0][None]]
+        while plan is not None and plan.way is not None:
+            if t_ns < plan.end_ns:
+                rows.append(plan.u[plan.row(t_ns) : plan.row(plan.end_ns - 1) + 1])
+            plan = self._following(plan)
+        if plan is not None and plan.rest is not None and t_ns < plan.end_ns:
+            rows.append(plan.u[plan.row(t_ns) :])
+        return bool((np.abs(np.vstack(rows) - rest) <= tolerance).all())
+
+    def pending(self, t_ns: int) -> bool:
+        """Return whether a plan is to begin after a time."""
+        return self._plans[-1].start_ns > t_ns
+
+    def acting(self, t_ns: int) -> Plan | None:
+        """Return the plan whose rows, or way to rest, act at a time; None for a time that is forgotten."""
+        return next((plan for plan in reversed(self._plans) if plan.start_ns <= t_ns), None)
+
     def source(self, t_ns: int) -> tuple[int, int]:
         """Return epoch and sequence number of the command whose plan acts at a time; zeros where none does."""
-        plan = next((plan for plan in reversed(self._plans) if plan.start_ns <= t_ns), None)
+        plan = self.acting(t_ns)
         return NO_COMMAND if plan is None or t_ns >= plan.end_ns else plan.source
 
     def at(self, t_ns: int) -> tuple[Array, int, bool]:
@@ -189,17 +302,48 @@ class Schedule:
             change_ns = plan.start_ns
         else:
             return plan.before, change_ns, True  # a time that is forgotten
-        if t_ns < plan.end_ns:
-            row = plan.row(t_ns)
-            row_end_ns = plan.stamp_ns + (row + 1) * plan.period_ns if row < len(plan.u) - 1 else plan.end_ns
-            return plan.u[row], min(change_ns, row_end_ns, plan.end_ns), False
-        u, step_ns = self._ramp(plan, t_ns)
-        return u, min(change_ns, step_ns), True
+        u, step_ns = self.after(plan, t_ns)
+        return u, min(change_ns, step_ns), t_ns >= plan.end_ns
+
+    def after(self, plan: Plan, t_ns: int) -> tuple[Array, int]:
+        """Return the input that acts at a time of a plan, or after it, if no other plan comes, and until when it does."""
+        while t_ns >= plan.end_ns and plan.way is not None:
+            plan = self._following(plan)
+        if t_ns >= plan.end_ns:
+            return self._ramp(plan, t_ns)
+        row = plan.row(t_ns)
+        row_end_ns = plan.stamp_ns + (row + 1) * plan.period_ns if row < len(plan.u) - 1 else plan.end_ns
+        return plan.u[row], min(row_end_ns, plan.end_ns)
+
+    def _following(self, plan: Plan) -> Plan:
+        """Return the next rows of a plan's way to rest, as they act; where slew limits do not let them come to the last one, the ramp does."""
+        if plan.following is None:
+            assert plan.way is not None
+            left, start_ns = plan.way.ahead(plan.end_ns), plan.end_ns
+            asked = self._demanded(left)[:ROWS_AT_ONCE]
+            u = self._approach(asked, left.stamp_ns, left.period_ns, start_ns, self._increments, late=False)
+            end_ns = left.stamp_ns + len(u) * left.period_ns
+            last = len(u) == len(left.u)
+            way, rest = (None, asked[-1]) if last else (left, None)
+            plan.following = Plan(start_ns, end_ns, left.stamp_ns, left.period_ns, asked, u, plan.before, NO_COMMAND, way, rest)
+        return plan.following
+
+    def _demanded(self, way: Way) -> Array:
+        """Return the rows of a way to rest with what feedback adds to them, inside the bounds, shape ``(M, nu)``."""
+        rows: Array = np.clip(way.u + way.correction, *self._bounds)
+        return rows
+
+    def _approach(self, u: Array, stamp_ns: int, period_ns: int, start_ns: int, limits: Increments | None, *, late: bool = True) -> Array:
+        """Return rows as they act from a time on, inside limits, if there are any, of what acts before it."""
+        if limits is None:
+            return u
+        return approach(u, stamp_ns, period_ns, start_ns, segments(self.at, start_ns - limits.dt_ns, start_ns), limits, late=late)
 
     def _ramp(self, plan: Plan, t_ns: int) -> tuple[Array, int]:
         """Return the input at a time after the end of a plan, and when the ramp steps next."""
         last = plan.u[plan.row(plan.end_ns - 1)]
-        way = self.u_rest - last
+        rest = self.u_rest if plan.rest is None else plan.rest
+        way = rest - last
         if plan.pause_ns is None:
             plan.pause_ns = self._pause_ns(plan, last, way)
         steps = np.floor((t_ns - plan.end_ns - plan.pause_ns) / RAMP_STEP_NS) + 1.0
@@ -207,9 +351,9 @@ class Schedule:
             reach = np.where(steps > 0.0, steps * (RAMP_STEP_NS * self._slew), 0.0)
         rests = np.abs(way) <= reach * (1.0 + WAY_ROUNDING)
         if rests.all():
-            return self.u_rest, NEVER_NS
+            return rest, NEVER_NS
         next_ns = plan.pause_ns + RAMP_STEP_NS * np.maximum(steps, 0.0)
-        return np.where(rests, self.u_rest, last + np.clip(way, -reach, reach)), plan.end_ns + int(np.ceil(next_ns[~rests].min()))
+        return np.where(rests, rest, last + np.clip(way, -reach, reach)), plan.end_ns + int(np.ceil(next_ns[~rests].min()))
 
     def _pause_ns(self, plan: Plan, last: Array, way: Array) -> Array:
         """

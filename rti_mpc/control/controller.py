@@ -23,7 +23,7 @@ import numpy as np
 
 from rti_mpc import given
 from rti_mpc.array import Array
-from rti_mpc.contract.guard import Limits
+from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Notice, Reference, Severity, State, Telemetry
 from rti_mpc.contract.schedule import BEFORE_ALL_NS
 from rti_mpc.contract.status import Mode, QpStatus
@@ -112,7 +112,8 @@ class Controller:
         self._states = StateStream(model, self._stale_ns, self.grid.dt_ns, settling_s, observer)
         self.np_ = model.np_ - len(self._states.d)
         self._track = Track(model, ocp.N, self.grid.dt_ns)
-        self._sent = Sent(self._u_rest, ocp.lbdu, ocp.ubdu, self.grid.dt_ns)
+        angles = np.array([signal.angle for signal in model.states])
+        self._sent = Sent(self._u_rest, ocp.lbdu, ocp.ubdu, self.grid.dt_ns, (ocp.lbu, ocp.ubu), angles)
         self._prediction = Prediction(model, self._sent, compile=compile)
         self._x0 = self._prediction.x
         ways = None if stop_law is None else Stopping(ocp, stop_law, self.envelope.limits, self._prediction, self._valid_ns, compile=compile)
@@ -566,9 +567,13 @@ class Controller:
     # Small parts.
 
     def _hear(self, state: State) -> bool:
-        """Learn which input acts from a robot that reports it; return whether it was another than believed."""
-        if not len(state.u):
-            return False
+        """Learn which input acts, from a report and, on a way to rest with feedback, from the state; return whether the report was not expected."""
+        surprised = len(state.u) > 0 and self._correct(state)
+        self._sent.feed_back(state.x, state.stamp_ns)
+        return surprised
+
+    def _correct(self, state: State) -> bool:
+        """Believe the input that a robot reports; return whether it was another than believed."""
         limits, believed = self.envelope.limits, self._sent.at(state.stamp_ns - 1)[0]  # the believed input may be outside bounds that were tightened
         u = np.minimum(np.maximum(state.u, np.minimum(limits["lbu"], believed)), np.maximum(limits["ubu"], believed))
         return self._sent.correct(state.stamp_ns, u, (state.command_epoch, state.command_seq))

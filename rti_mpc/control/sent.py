@@ -16,7 +16,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.belief import Belief
 from rti_mpc.contract.message import Command
-from rti_mpc.contract.schedule import BEFORE_ALL_NS, Schedule, end_ns
+from rti_mpc.contract.schedule import BEFORE_ALL_NS, NO_ANGLES, Plan, Schedule, end_ns
 
 TRANSIT_PERIODS = 0.1  # a command may take this long to arrive; the plan before it acts until then
 SLEW_WINDOW_PERIODS = 0.75  # a late command is held to the slew limits over this time: over a whole period no plan could reverse its direction
@@ -30,17 +30,26 @@ class Sent:
         delay_ns: A command acts no earlier than this long after the state that it answers, even if its own time is earlier.
     """
 
-    def __init__(self, u_rest: Array, lbdu: Array, ubdu: Array, dt_ns: int) -> None:
+    def __init__(
+        self,
+        u_rest: Array,
+        lbdu: Array,
+        ubdu: Array,
+        dt_ns: int,
+        bounds: tuple[float | Array, float | Array] = (-np.inf, np.inf),
+        angles: Array = NO_ANGLES,
+    ) -> None:
         self.delay_ns = 0
         self._left_ns = BEFORE_ALL_NS  # when the last command left at the earliest
         self._alone: tuple[int, Array] = (BEFORE_ALL_NS, u_rest)  # when the robot last stopped braking on its own, and from which input
+        self._went: Plan | None = None  # the plan whose way to rest it went until then, if it had one
         self._slew = (lbdu, ubdu)  # per dt
         self._dt_ns = dt_ns
         self._transit_ns, self._window_ns = round(TRANSIT_PERIODS * dt_ns), round(SLEW_WINDOW_PERIODS * dt_ns)
         slew = 1e9 * np.minimum(-lbdu, ubdu) / dt_ns
         increments = Increments(lbdu, ubdu, dt_ns)
-        self._schedule = Belief(u_rest, slew, increments)
-        self._slowest = Schedule(u_rest, slew, increments)  # the same if each command took the longest transit time
+        self._schedule = Belief(u_rest, slew, increments, bounds, angles)
+        self._slowest = Schedule(u_rest, slew, increments, bounds, angles)  # the same if each command took the longest transit time
 
     def append(self, command: Command, left_ns: int = BEFORE_ALL_NS) -> None:
         """
@@ -55,7 +64,7 @@ class Sent:
         if start_ns < end_ns(command):
             before, _, braking = self._schedule.at(start_ns - 1)
             if braking:
-                self._alone = start_ns, before.copy()
+                self._alone, self._went = (start_ns, before.copy()), self._schedule.acting(start_ns - 1)
             self._schedule.add(command, start_ns, end_ns(command), approached=False)
         start_ns = max(start_ns, self._left_ns + self._transit_ns)
         if start_ns < end_ns(command):
@@ -68,6 +77,11 @@ class Sent:
             self._slowest.copy(self._schedule)
             self._alone = BEFORE_ALL_NS, self._schedule.u_rest
         return changed
+
+    def feed_back(self, x: Array, t_ns: int) -> None:
+        """Take note of a state, shape ``(nx,)``: it corrects a way to rest that needs feedback, as whoever plays it does, from its time on."""
+        for schedule in (self._schedule, self._slowest):
+            schedule.feed_back(x, t_ns, t_ns)
 
     @property
     def confirmed(self) -> int:
@@ -118,7 +132,10 @@ class Sent:
         ended_ns, u = self._alone
         if abs(t_ns - ended_ns) < self._dt_ns:
             way, share = self._schedule.u_rest - u, (t_ns + self._dt_ns - ended_ns) / self._dt_ns
-            second = self._within(*second, u + np.clip(way, share * self._slew[0], share * self._slew[1]))
+            further = u + np.clip(way, share * self._slew[0], share * self._slew[1])
+            if self._went is not None and self._went.way is not None:
+                further = self._schedule.after(self._went, t_ns + self._dt_ns)[0]
+            second = self._within(*second, further)
         first = self._near(self._schedule, *second, t_ns - self._dt_ns + 1, t_ns)
         first = self._near(self._slowest, *first, t_ns - self._window_ns, t_ns + self._transit_ns)
         return np.array([first[0], second[0]]), np.array([first[1], second[1]])

@@ -3,7 +3,8 @@
 The robot's side of the command contract: it accepts or refuses commands, counts them, and plays their plans.
 
 Accepted commands act as `rti_mpc.contract.schedule` says. They are approached within the slew
-limits from the input that really acts, whatever was lost before. Times are arguments; there is no clock.
+limits from the input that really acts, whatever was lost before. A way to rest that needs
+feedback is corrected by the robot's own measurements. Times are arguments; there is no clock.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.message import Command
-from rti_mpc.contract.schedule import NO_COMMAND, Schedule, end_ns, unfit
+from rti_mpc.contract.schedule import NO_ANGLES, NO_COMMAND, Schedule, end_ns, unfit
 from rti_mpc.wire.source import Source
 
 MAX_EARLY_NS = 250_000_000  # how far the stamp of an answered state may be ahead of the robot's clock, which a guard knows no better
@@ -49,7 +50,7 @@ class Actuator:
 
     Attributes:
         u: Input demanded now, shape ``(nu,)``.
-        source: Epoch and sequence number of the command it comes from; zeros: the ramp of the robot itself.
+        source: Epoch and sequence number of the command it comes from; zeros: the robot itself, on its way to rest.
         counters: What became of commands.
         braking: Whether no plan acts.
     """
@@ -62,6 +63,7 @@ class Actuator:
         delay_ns: int = 0,
         bounds: tuple[float | Array, float | Array] = (-np.inf, np.inf),
         increments: Increments | None = None,
+        angles: Array = NO_ANGLES,
     ) -> None:
         """
         Begin at rest.
@@ -73,14 +75,16 @@ class Actuator:
             delay_ns: Time from the arrival of a command to the instant from which it can act.
             bounds: Of the inputs, shape ``(nu,)``: a drive does no more, whatever it is told.
             increments: Slew limits inside which plans are approached; None: their rows are played as they come.
+            angles: Which of the measured states are angles, shape ``(nx,)``; empty: none is measured.
         """
         self.u = np.array(u_rest, dtype=np.float64)
         self.source = NO_COMMAND
         self.counters = Counters()
         self.braking = True
-        self._schedule = Schedule(u_rest, slew, increments)
+        self._schedule = Schedule(u_rest, slew, increments, bounds, angles)
         self._now_ns = 0
         self._robot_epoch = epoch
+        self._nx = len(angles) or None
         self._delay_ns = delay_ns
         self._source = Source(STALE_NS)
         self._bounds = bounds  # of the inputs, shape (nu,): a drive does no more, whatever it is told
@@ -88,8 +92,8 @@ class Actuator:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the inputs have come to rest."""
-        return self.braking and bool(np.array_equal(self.u, self._schedule.u_rest))
+        """Whether the inputs have come to rest, and no plan acts."""
+        return self.braking and self._schedule.rests(self._now_ns - 1)
 
     def accept(self, command: Command, arrival_ns: int) -> str:
         """
@@ -100,7 +104,7 @@ class Actuator:
         """
         early = command.state_stamp_ns > arrival_ns + MAX_EARLY_NS
         arrival_ns += self._delay_ns
-        reason = "switched_off" if self._off else unfit(command, len(self.u), self._robot_epoch) or ("early" if early else "")
+        reason = "switched_off" if self._off else unfit(command, len(self.u), self._robot_epoch, self._nx) or ("early" if early else "")
         start_ns = max(command.stamp_ns, arrival_ns)
         expired = end_ns(command) <= start_ns
         if not reason and not (expired and command.epoch != self._source.epoch):  # what could not act locks nobody out
@@ -137,7 +141,11 @@ class Actuator:
         """Return the input that acts at a time up to a period ago, shape ``(nu,)``, and epoch and sequence number of its command; see `source`."""
         return self._schedule.at(t_ns)[0], self._schedule.source(t_ns)
 
+    def measure(self, x: Array, t_ns: int) -> None:
+        """Take what the robot measures, shape ``(nx,)``: it corrects a way to rest that needs it, after the delay of the actuators."""
+        self._schedule.feed_back(x, t_ns, t_ns + self._delay_ns)
+
     def switch_off(self) -> None:
-        """Drop every plan and take no other: the inputs ramp to rest."""
+        """Drop every plan and take no other: the inputs go their way to rest from what acts."""
         self._off = True
-        self._schedule.brake(self.u, self._now_ns)
+        self._schedule.cut(self._now_ns, self._now_ns)

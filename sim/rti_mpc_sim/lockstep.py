@@ -50,6 +50,7 @@ class Lockstep:
             round(1e9 * settings.actuator_delay_s),
             (settings.lbu, settings.ubu),
             settings.increments,
+            np.array([signal.angle for signal in model.states]),
         )
         self.sensor = Sensor(epoch, settings.noise_std, angles, round(1e9 * settings.sensor_delay_s), settings.dropout, settings.seed)
         self._plant = Plant(model, settings.x0, settings.state_period_s, settings.substeps, settings.actuator_lag_s)
@@ -85,7 +86,9 @@ class Lockstep:
         self._next_ns = (self.now_ns // self.period_ns + 1) * self.period_ns
         actuator = self.actuator
         acting = (actuator.u, *actuator.source) if self._reports_inputs else UNREPORTED
-        return self.sensor.measure(self.x, self.now_ns, *acting)
+        seq = self.sensor.measure(self.x, self.now_ns, *acting)
+        actuator.measure(self.sensor.x, self.now_ns)
+        return seq
 
     def tick(self) -> State:
         """Advance to the next state that is not lost, and return it."""

@@ -19,6 +19,9 @@ class Sensor:
 
     A state that drops out uses up its sequence number, as one lost on a real
     link would. Angles wrap to (-pi, pi], as a real robot's do.
+
+    Attributes:
+        x: What was measured last, shape ``(nx,)``; the robot itself has it at once, lost or not.
     """
 
     def __init__(self, epoch: int, noise_std: Array, angles: tuple[int, ...], delay_ns: int = 0, dropout: float = 0.0, seed: int = 1) -> None:
@@ -39,6 +42,7 @@ class Sensor:
         self._delay_ns = delay_ns
         self._dropout = dropout
         self._random = np.random.default_rng(seed)
+        self.x: Array = np.zeros(len(noise_std))
         self._seq = 0
         self._on_the_way: deque[State] = deque()
 
@@ -64,6 +68,7 @@ class Sensor:
         self._seq += 1
         measured = x + self._noise_std * self._random.standard_normal(len(x))
         measured[self._angles] = np.pi - np.remainder(np.pi - measured[self._angles], 2 * np.pi)
+        self.x = measured
         if self._random.random() >= self._dropout:
             self._on_the_way.append(State(self._epoch, self._seq, stamp_ns, measured, u.copy(), command_epoch, command_seq))
         return self._seq

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from rti_mpc.contract.approach import Increments
-from rti_mpc.contract.guard import Guard, Limits
+from rti_mpc.contract.guard import Guard
+from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command, State
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.rti.rti import Rti

@@ -10,7 +10,8 @@ import pytest
 
 from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
-from rti_mpc.contract.guard import Guard, Limits
+from rti_mpc.contract.guard import Guard
+from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.reference.trajectory import eight

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.contract.guard import MAX_VALID_NS, Guard, Limits
+from rti_mpc.contract.guard import Guard
+from rti_mpc.contract.limits import MAX_VALID_NS, Limits
 from rti_mpc.contract.message import Command, Severity, State
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.wire.actuator import Actuator

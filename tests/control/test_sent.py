@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -149,3 +152,47 @@ def test_it_tells_what_the_actuator_really_plays() -> None:
             np.testing.assert_allclose(u, expected, atol=1e-12)  # slew limits per sample, or per second: rounding
             assert until_ns == pytest.approx(min(change_ns, to_ns), abs=1)
             now_ns = until_ns
+
+
+# Ways to rest.
+
+WAY = np.array([[0.1, 0.0], [-0.1, -0.2], [-0.2, -0.2], [0.0, 0.1]])
+
+
+def resting(seq: int, stamp_ms: int, rows: Array, **change: Any) -> Command:
+    return replace(command(seq, stamp_ms, rows), rest_period_ns=DT, u_rest=WAY, **change)
+
+
+def test_robot_is_known_to_go_the_way_to_rest_of_its_last_command() -> None:
+    memory, robot = sent(resting(1, 0, np.full((4, 2), 0.2))), Actuator(np.zeros(2), SLEW / 0.1, 1)
+    robot.accept(resting(1, 0, np.full((4, 2), 0.2)), 0)
+    t = 0
+    for until_ns, u in robot.play(0, 1200 * MS):
+        np.testing.assert_allclose(memory.at(t)[0], u)
+        t = until_ns
+    np.testing.assert_array_equal(memory.at(5000 * MS)[0], WAY[-1])
+    spans = list(memory.spans(200 * MS, 400 * MS))
+    assert [round(span, 12) for _, span in spans] == [0.05, 0.1, 0.05]
+
+
+def test_state_that_is_fed_back_is_known_to_change_what_acts() -> None:
+    fed_back = {"x_rest": np.zeros((4, 1)), "K": np.array([[0.5], [0.0]])}
+    memory = Sent(np.zeros(2), -SLEW, SLEW, DT, (-np.ones(2), np.ones(2)), np.zeros(1))
+    memory.append(resting(1, 0, np.full((4, 2), 0.2), **fed_back))
+    memory.feed_back(np.array([1.0]), 200 * MS)
+    np.testing.assert_allclose(memory.at(300 * MS)[0], [0.1, 0.0])  # a plan acted
+    memory.feed_back(np.array([0.1]), 400 * MS)
+    np.testing.assert_allclose(memory.at(420 * MS)[0], [-0.1, -0.2])  # of -0.15: an increment from 0.1
+    np.testing.assert_allclose(memory.at(460 * MS)[0], [-0.25, -0.2])
+    np.testing.assert_allclose(memory.at(5000 * MS)[0], [-0.05, 0.1])
+
+
+def test_plan_after_one_that_has_ended_a_way_to_rest_may_find_the_robot_further_on_it() -> None:
+    """The one before may be late, or lost."""
+    memory = sent(resting(1, 0, np.full((4, 2), 0.2)))
+    lowest, highest = memory.reach(400 * MS)
+    memory.append(command(2, 400, np.vstack([np.clip(0.3, lowest, highest), np.full((2, 2), 0.3)])))
+    lowest, highest = memory.reach(480 * MS)
+    further = WAY[3]  # from 550 ms on
+    assert (lowest[1] >= further - SLEW - 1e-12).all()
+    assert (highest[1] <= further + SLEW + 1e-12).all()

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import tracemalloc
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.errors import ConfigError
@@ -16,6 +18,7 @@ from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.plant import Plant
 from rti_mpc_sim.settings import RobotSettings
+from tests.robots import pushed
 
 MS = 1_000_000
 X0 = np.array([0.5, 0.0, 3.0, 0.0, 0.0])
@@ -122,3 +125,28 @@ def test_robot_does_not_grow_the_heap() -> None:
 def test_settings_out_of_range_are_refused_by_name(change, sentence: str) -> None:
     with pytest.raises(ConfigError, match=sentence):
         replace(SETTINGS, **change)
+
+
+# Ways to rest.
+
+
+def stopped(robot: Lockstep) -> float:
+    """Speed after five seconds on a way to rest from 0.5 m/s."""
+    rows = np.array([-0.5, -1.0, -1.0, -1.0, -1.0, -0.5, 0.0])[:, None]
+    speeds = 0.5 + 0.1 * np.concatenate([[0.0], np.cumsum(rows[:-1, 0])])
+    plan = Command(1, 1, 0, 1, 1, 0, 250 * MS, 0, Mode.TRACKING, QpStatus.SOLVED, 100 * MS, np.zeros((3, 1)))
+    way = {"rest_period_ns": 100 * MS, "u_rest": rows, "x_rest": np.column_stack([np.zeros(7), speeds]), "K": np.array([[0.0, 2.0]])}
+    assert robot.accept(replace(plan, **way)) == ""  # type: ignore[arg-type]
+    while robot.now_ns < 5000 * MS:
+        robot.tick()
+    assert robot.actuator.at_rest or robot.u[0] != 0.0
+    return abs(float(robot.x[1]))
+
+
+@pytest.mark.parametrize("dropout", [0.0, 0.9])
+@pytest.mark.parametrize("change", [{}, {"actuator_delay_s": 0.02}, {"actuator_lag_s": 0.05}, {"noise_std": np.array([0.0, 1e-4])}])
+def test_robot_feeds_its_own_measurements_back_on_its_way_to_rest_lost_or_not(change: dict[str, Any], dropout: float) -> None:
+    x0, step = np.array([0.0, 0.5]), np.array([0.5])
+    increments = Increments(-step, step, 100 * MS)
+    settings = RobotSettings(pushed(), x0, lbu=-2 * step, ubu=2 * step, slew=10 * step, increments=increments, dropout=dropout, **change)
+    assert stopped(Lockstep(settings)) < 1e-3

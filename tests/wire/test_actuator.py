@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from rti_mpc.array import Array
+from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.schedule import RAMP_STEP_NS
 from rti_mpc.contract.status import Mode, QpStatus
@@ -237,6 +239,77 @@ def test_switched_off_robot_ramps_to_rest_and_takes_no_command() -> None:
     assert robot.accept(command(seq=2, stamp_ms=50), 50 * MS) == "switched_off"
     assert played(robot, 50, 300)[-1] == (140, 0.0)
     assert robot.counters.starved == 0
+
+
+def test_switched_off_robot_waits_with_its_ramp_for_a_row_that_has_just_braked() -> None:
+    """The row's own step counts against the slew limits, too."""
+    robot = Actuator(np.zeros(2), SLEW, 7, increments=Increments(-0.1 * SLEW, 0.1 * SLEW, 100 * MS))
+    robot.accept(replace(command(), u=np.array([[0.1, 0.2], [0.2, 0.4], [0.1, 0.2], [0.1, 0.2]])), 0)
+    played(robot, 0, 210)
+    robot.switch_off()
+    acted = dict(played(robot, 210, 600))
+    assert acted[210] == 0.1
+    assert min(t for t, u in acted.items() if u < 0.1) >= 275, "one increment within three quarters of a period"
+    assert robot.at_rest
+
+
+# Ways to rest.
+
+WAY = {"rest_period_ns": 100 * MS, "u_rest": np.array([[0.05, 0.0], [-0.1, 0.0], [0.02, 0.0]])}
+
+
+def test_way_to_rest_acts_when_the_plan_is_over_and_its_last_row_is_rest() -> None:
+    robot = actuator()
+    assert robot.accept(replace(command(), **WAY), 0) == ""
+    assert played(robot, 0, 440) == [(0, 0.1), (100, 0.11), (200, 0.12), (250, 0.05), (350, -0.1)]
+    assert (robot.source, robot.braking, robot.at_rest, robot.counters.starved) == ((0, 0), True, False, 1)
+    assert played(robot, 440, 9000) == [(440, -0.1), (450, 0.02)]
+    assert robot.at_rest
+
+
+def test_robot_that_stands_when_its_plan_is_over_has_not_starved() -> None:
+    robot = actuator()
+    u = np.full((4, 2), 0.02)
+    robot.accept(replace(command(), u=u, rest_period_ns=100 * MS, u_rest=u[:2]), 0)
+    played(robot, 0, 400)
+    assert robot.at_rest
+    assert robot.counters.starved == 0
+
+
+def test_switched_off_robot_goes_the_way_to_rest_of_the_plan_that_acted() -> None:
+    robot = actuator()
+    robot.accept(replace(command(), **WAY), 0)
+    played(robot, 0, 50)
+    robot.switch_off()
+    assert played(robot, 50, 1000) == [(50, 0.05), (150, -0.1), (250, 0.02)]
+
+
+def test_way_to_rest_that_was_interrupted_is_forgotten() -> None:
+    robot = actuator()
+    robot.accept(replace(command(), **WAY), 0)
+    played(robot, 0, 300)
+    robot.accept(command(seq=2, stamp_ms=300, first=0.2), 300 * MS)
+    assert played(robot, 300, 2000)[-1][1] == 0.0, "the ramp, to where the model rests"
+
+
+def test_measurements_correct_a_way_to_rest_after_the_delay_inside_the_bounds() -> None:
+    robot = Actuator(np.zeros(2), SLEW, 7, 20 * MS, (np.array([-0.3, -0.3]), np.array([0.3, 0.3])), angles=np.array([False, True]))
+    fed_back = WAY | {"x_rest": np.zeros((3, 2)), "K": np.array([[1.0, 0.0], [0.0, 0.2]])}
+    assert robot.accept(replace(command(), **fed_back), 0) == ""
+    robot.measure(np.array([9.0, 9.0]), 100 * MS)  # a plan acts
+    assert played(robot, 0, 270)[-1] == (250, 0.05)
+    robot.measure(np.array([-0.1, 0.5 + 4 * np.pi]), 270 * MS)
+    assert played(robot, 270, 350) == [(270, 0.05), (290, 0.15)]
+    assert robot.u[1] == pytest.approx(-0.1)
+    robot.measure(np.array([-5.0, 0.0]), 350 * MS)
+    assert played(robot, 350, 450) == [(350, 0.0), (370, 0.3)]
+
+
+@pytest.mark.parametrize("change", [{"K": np.zeros((2, 3)), "x_rest": np.zeros((3, 3))}, {"u_rest": np.zeros((3, 1))}, {"rest_period_ns": 0}])
+def test_way_to_rest_of_another_robot_is_refused(change: dict[str, Any]) -> None:
+    robot = Actuator(np.zeros(2), SLEW, 7, angles=np.array([False, True]))
+    assert robot.accept(replace(command(), **(WAY | change)), 0) == "wrong_shape"
+    assert played(robot, 0, 500) == [(0, 0.0)]
 
 
 def test_brake_steps_are_short_against_any_sample() -> None:

@@ -21,7 +21,7 @@ from rti_mpc_service.config.schema import ITERATION_KEYS, Config
 
 if TYPE_CHECKING:
     from rti_mpc.array import Array
-    from rti_mpc.contract.guard import Limits
+    from rti_mpc.contract.limits import Limits
     from rti_mpc.control.observer import Observer
     from rti_mpc.model.model import Model, Signal
     from rti_mpc.rti.ocp import Ocp
@@ -178,7 +178,7 @@ def robot_settings(config: Config) -> dict[str, Any]:
 
 def guard_limits(config: Config) -> Limits:
     """Return the limits of the guard; no model is loaded."""
-    from rti_mpc.contract.guard import Limits
+    from rti_mpc.contract.limits import Limits
     from rti_mpc.control.grid import MAX_DELAY_PERIODS
 
     inputs = tuple(config.ocp.bounds.inputs)

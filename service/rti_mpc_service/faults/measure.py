@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rti_mpc.array import Array
-from rti_mpc.contract.guard import Limits
+from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.schedule import RAMP_STEP_NS
 from rti_mpc_service.rig.robot_log import RobotLog
 

@@ -25,7 +25,7 @@ import numpy as np
 from rich.console import Console
 
 from rti_mpc.array import Array
-from rti_mpc.contract.guard import Limits
+from rti_mpc.contract.limits import Limits
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc_service.config.build import guard_limits

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.contract.guard import Limits
+from rti_mpc.contract.limits import Limits
 from rti_mpc_service.faults.measure import Incident, Measured, measure
 from rti_mpc_service.faults.promise import KEEPS_ON, STOPS
 from rti_mpc_service.rig.robot_log import RobotLog

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Limits of what a robot may be commanded, by which a guard judges the rows of a plan and of its way to rest.
+
+They hold no model: whether rows bring a robot to rest they cannot tell, only that the last
+of them is held, and from when on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.contract.message import Command
+from rti_mpc.contract.schedule import NO_ANGLES, end_ns
+
+MAX_VALID_NS = 300_000_000  # robot time: a command ends at the latest this long after its state and the delay, whatever its own validity
+INPUT_ROUNDING = 1e-6  # in the unit of the input: above any rounding, single precision included, and below what an actuator resolves
+SETTLED_SHARE = 0.01  # of the range of an input: a way to rest that is this close to its last row counts as rest
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """
+    Limits of the commands to a robot.
+
+    Attributes:
+        u_rest: Input at which the robot stands still, shape ``(nu,)``.
+        lbu: Lower bound of the inputs, shape ``(nu,)``.
+        ubu: Upper bound of the inputs.
+        lbdu: Lower bound of an input's change over `dt_s`, shape ``(nu,)``, below 0.
+        ubdu: Upper bound of an input's change, above 0.
+        dt_s: Period of the controller, s.
+        delay_s: Delay from a state to the time at which its command acts, s.
+        stale_s: Age from which neither a state nor a command that answers it is used, s of the robot.
+        angles: Which states are angles, shape ``(nx,)``, for ways to rest that need feedback; empty: none of those may pass.
+    """
+
+    u_rest: Array
+    lbu: Array
+    ubu: Array
+    lbdu: Array
+    ubdu: Array
+    dt_s: float
+    delay_s: float = 0.0
+    stale_s: float = 0.25
+    angles: Array = field(default_factory=lambda: NO_ANGLES)
+
+    @property
+    def slew(self) -> Array:
+        """Rate of the ramp to rest, shape ``(nu,)``, per s."""
+        return np.minimum(-self.lbdu, self.ubdu) / self.dt_s
+
+    @property
+    def settling_s(self) -> float:
+        """Time in s for which a command without a way to rest may still move the robot after its state: to its end, and down the ramp."""
+        way = np.maximum(np.abs(self.lbu - self.u_rest), np.abs(self.ubu - self.u_rest))
+        limited = np.isfinite(self.slew)
+        ramp = np.where(limited, way / np.where(limited, self.slew, 1.0), 0.0)
+        return self.delay_s + 1e-9 * MAX_VALID_NS + float(np.minimum(ramp, 10.0).max(initial=0.0))
+
+    @property
+    def settled(self) -> Array:
+        """How far from its last row a way to rest counts as rest, shape ``(nu,)``."""
+        span = self.ubu - self.lbu
+        return np.where(np.isfinite(span), SETTLED_SHARE * span, INPUT_ROUNDING)
+
+    def objection(self, command: Command) -> str:
+        """Return what is wrong with the rows of a command, as a code and a reason; empty if nothing is."""
+        if len(command.K) and len(self.angles) != command.K.shape[1]:
+            return f"wrong_shape: it feeds {command.K.shape[1]} states back on its way to rest, guard.states must name each, got {len(self.angles)}"
+        for u, period_ns, of in judged(command):
+            if (u < self.lbu - INPUT_ROUNDING).any() or (u > self.ubu + INPUT_ROUNDING).any():
+                return f"out_of_bounds: inputs{of} reach from {u.min(axis=0).tolist()} to {u.max(axis=0).tolist()}"
+            change, share = np.diff(u, axis=0), min(1.0, 1e-9 * period_ns / self.dt_s)
+            if (change < share * self.lbdu - INPUT_ROUNDING).any() or (change > share * self.ubdu + INPUT_ROUNDING).any():
+                return f"out_of_slew: rows{of} change by up to {np.abs(change).max(axis=0).tolist()}"
+        return ""
+
+    def settles_ns(self, command: Command, from_ns: int) -> int:
+        """Return from when on a command with a way to rest of its own stays at the last row of it; a time, if it does from then on or has none."""
+        if not len(command.u_rest):
+            return from_ns
+        ends_ns = end_ns(command)
+        times = [min(command.stamp_ns + (i + 1) * command.period_ns, ends_ns) for i in range(len(command.u))]
+        times += [ends_ns + (i + 1) * command.rest_period_ns for i in range(len(command.u_rest))]
+        away = (np.abs(np.vstack([command.u, command.u_rest]) - command.u_rest[-1]) > self.settled).any(axis=1)
+        return max((until_ns for until_ns, moves in zip(times, away, strict=True) if moves), default=from_ns)
+
+
+def judged(command: Command) -> Iterator[tuple[Array, int, str]]:
+    """Yield the rows of a command that are judged together, shape ``(n, nu)``, with the time between them and what they are."""
+    yield command.u, command.period_ns, ""
+    if len(command.u_rest):
+        last = min((end_ns(command) - 1 - command.stamp_ns) // command.period_ns, len(command.u) - 1)
+        yield np.vstack([command.u[last], command.u_rest[0]]), command.period_ns, " from the plan to its way to rest"
+        yield command.u_rest, command.rest_period_ns, " to rest"
