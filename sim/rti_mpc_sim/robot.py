@@ -5,8 +5,8 @@ Simulated robot as a process: the lockstep robot with a clock, on the bus.
 It measures and sends states on an absolute grid of robot time, and integrates over
 exactly the intervals in which each received row acts. If the process itself is held
 up for a whole period, the robot's clock waits with it, so that a busy machine is not
-taken for a fault of the controller. When the robot is stopped, its inputs ramp to
-rest, and the last state that it sends is the one in which it stands.
+taken for a fault of the controller. When the robot is stopped, its inputs go their way to
+rest, and the last state that it sends is the one in which it stands; if it still coasts, it says so.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 import rti_mpc
+from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, Notice, Severity, State
 from rti_mpc.contract.schedule import unfit
 from rti_mpc.model.model import Model
@@ -38,8 +39,10 @@ from rti_mpc_sim.log import Log
 from rti_mpc_sim.settings import RobotSettings
 
 ROLE = "robot"
-STANDSTILL_CHANGE = 1e-6  # the robot stands if no state changes by more in a period, in any unit
-MAX_COAST_NS = 10_000_000_000  # robot time after which it counts as standing in any case
+STANDSTILL_CHANGE = 1e-6  # nothing moves any more if no state changes by more in a period, in any unit
+STANDSTILL_RATE = 1e-3  # the robot stands if no state changes faster, in any unit per s
+MAX_COAST_NS = 10_000_000_000  # robot time with the inputs at rest after which it is decided whether the robot stands
+MAX_WAY_NS = 120_000_000_000  # robot time that the inputs may take to come to rest
 LISTEN_BEFORE_START_S = 0.5  # how long a starting robot listens for another one of its name
 PRESENCE_LEASE_S = 2.0  # time after which the presence of a process that was killed or hangs has ended
 
@@ -130,6 +133,15 @@ def model_info(model: Model) -> dict[str, Any]:
     }
 
 
+def standing(model: Model, rate: Array) -> str:
+    """Say whether a robot stands, whose states change at a rate, shape ``(nx,)``, per s; if it does not, which of them changes most."""
+    fastest = int(np.argmax(np.abs(rate)))
+    if abs(rate[fastest]) < STANDSTILL_RATE:
+        return "stands"
+    state = model.states[fastest]
+    return f"coasts with its inputs at rest: {state.name} changes by {rate[fastest]:.3g} {state.unit} per s"
+
+
 class Robot:
     """
     One life of the robot on the bus.
@@ -142,12 +154,13 @@ class Robot:
     def __init__(self, settings: RobotSettings, bus: Bus, key: Key[Command], speed: float, log: Path | None) -> None:
         # Milliseconds: a robot restarted within a second is another one.
         self.body = Lockstep(settings, epoch=time.time_ns() // 1_000_000)
+        self._model = settings.model
         self._log = Log(log, settings.model)
         self._states = bus.publisher(bus.keys.state)
         self._announcer = Announcer(bus, ROLE, self.body.epoch)
         self._inbox: deque[tuple[Command, int]] = deque(maxlen=64)  # with the monotonic time of arrival
-        nu, epoch = settings.model.nu, self.body.epoch
-        self._intake = bus.intake(Command, 1e-9 * STALE_NS / speed, {"u": nu}, unfit=lambda command: unfit(command, nu, epoch))
+        nx, nu, epoch = settings.model.nx, settings.model.nu, self.body.epoch
+        self._intake = bus.intake(Command, 1e-9 * STALE_NS / speed, {"u": nu}, unfit=lambda command: unfit(command, nu, epoch, nx))
         bus.expect("command", lambda: self._intake.source.epoch is not None)
         self._refused = 0  # by the intake, so far
         self._sent = 0
@@ -169,19 +182,24 @@ class Robot:
             self._live(due_ns)
 
     def finish(self) -> RobotSummary:
-        """Ramp to rest, coast until the robot stands, send that state, and sum up."""
+        """Go the way to rest, coast until the robot stands, send that state, and sum up."""
         body = self.body
         body.actuator.switch_off()
-        deadline_ns, x = body.now_ns + MAX_COAST_NS, np.full_like(body.x, np.inf)
-        last = None
-        while body.now_ns < deadline_ns and not (body.actuator.at_rest and np.abs(body.x - x).max() < STANDSTILL_CHANGE):
-            x[:] = body.x
+        x, moved, rate, last = body.x.copy(), np.inf, np.zeros_like(body.x), None
+        begun_ns = rested_ns = body.now_ns
+        while body.now_ns < min(begun_ns + MAX_WAY_NS, rested_ns + MAX_COAST_NS) and not (body.actuator.at_rest and moved < STANDSTILL_CHANGE):
+            x[:], before_ns = body.x, body.now_ns
             self._advance(body.due_ns)
+            moved = np.abs(body.x - x).max()
+            rate[:] = (body.x - x) / (1e-9 * max(1, body.now_ns - before_ns))
+            rested_ns = rested_ns if body.actuator.at_rest else body.now_ns
             last = body.sensor.take(body.now_ns) or last
         if last is not None:
             self._send(last)
-        self._announcer.say(Notice(Severity.INFO, "robot_stopped", "the robot was stopped and stands"), body.now_ns)
-        logger.info("stopped, and stands")
+        how = standing(self._model, rate)
+        stands = how == "stands"
+        self._announcer.say(Notice(Severity.INFO if stands else Severity.WARNING, "robot_stopped", f"the robot was stopped and {how}"), body.now_ns)
+        logger.log(logging.INFO if stands else logging.WARNING, "stopped, and %s", how)
         self._log.close()
         return RobotSummary(self._sent, 1e-9 * self._held_up_ns, body.counters)
 

@@ -27,7 +27,10 @@ from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
+from rti_mpc_sim import robot
+from rti_mpc_sim.settings import RobotSettings
 from tests.in_time import MS, explained, in_time
+from tests.robots import pushed
 
 ROOT = Path(__file__).parents[2]
 KEYS = Keys("test", "sim")
@@ -211,3 +214,14 @@ def test_source_anchors_its_reference_to_every_new_robot_and_keeps_it_for_late_j
         assert (heard[0].period_ns, heard[0].end, heard[0].p.shape[1]) == (50 * MS, End.STOP, 0)
         np.testing.assert_array_equal(heard[1].y, rows(eight(), 0.05, "consistent"))
         interrupted(source, host)
+
+
+@pytest.mark.parametrize(
+    ("speed", "said"), [(0.0, "stopped, and stands"), (0.5, "stopped, and coasts with its inputs at rest: p changes by 0.5 m per s")]
+)
+def test_robot_says_that_it_stands_only_if_it_does(endpoint: str, caplog: pytest.LogCaptureFixture, speed: float, said: str) -> None:
+    """Nothing brakes a mass whose input is an acceleration, and which was never commanded."""
+    settings = RobotSettings(pushed(), np.array([0.0, speed]))
+    with caplog.at_level("INFO", logger="robot"):
+        robot.main(settings, BusSettings(listen=(endpoint,), connect=()), KEYS, duration_s=0.1, stop=threading.Event())
+    assert caplog.messages[-1] == said
