@@ -192,6 +192,7 @@ def guard_limits(config: Config) -> Limits:
         ubdu=np.array(ubdu),
         dt_s=config.ocp.dt_s,
         delay_s=MAX_DELAY_PERIODS * config.ocp.dt_s if config.delay_s is None else config.delay_s,
+        angles=np.array([name in config.guard.angles for name in config.guard.states], dtype=bool),
         stale_s=config.timing.valid_s,  # of commands, too: a ramp answers a state that is stale
     )
 

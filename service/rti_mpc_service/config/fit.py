@@ -37,6 +37,9 @@ def check_tree(config: Config) -> None:
             raise ConfigError(f"ocp.weights.{key} must be a number or a list of {length}, one a stage, got {quoted(list(values))}")
     if config.bus.config is not None and not config.bus.config.is_file():
         raise ConfigError(f"bus.config must be a file, got {config.bus.config}")
+    for name in config.guard.angles:
+        if name not in config.guard.states:
+            raise ConfigError(f"guard.angles must be some of guard.states = {list(config.guard.states)}, got {quoted(name)}")
     if config.guard.enabled:
         for name in ocp.weights.R:
             if name not in ocp.bounds.inputs:
@@ -66,6 +69,12 @@ def check_model(config: Config) -> Ocp:
             raise ConfigError(f"ocp.bounds.inputs must be in the model's order {inputs} where a guard is enabled, got {given}")
         if tuple(config.guard.u_rest.get(name, 0.0) for name in inputs) != model.u_rest:
             raise ConfigError(f"guard.u_rest must be the model's {dict(zip(inputs, model.u_rest, strict=True))}, got {config.guard.u_rest}")
+    if config.guard.states:
+        states, angles = names(model.states), [state.name for state in model.states if state.angle]
+        if list(config.guard.states) != states:
+            raise ConfigError(f"guard.states must be the model's {states} in this order, got {list(config.guard.states)}")
+        if set(config.guard.angles) != set(angles):
+            raise ConfigError(f"guard.angles must be the model's {angles}, got {list(config.guard.angles)}")
     check_solver(config)
     named("ocp.obstacles", with_obstacles, model, [(0.0, 0.0, 1.0) for _ in config.ocp.obstacles])
     ocp = build_ocp(config)

@@ -190,6 +190,10 @@ class GuardSection(Section):
     enabled: bool = Field(default=False, description="whether the robot takes what the guard passes on, not what the controller commands")
     tick_s: float = Field(default=0.01, ge=1e-3, le=0.01, description="between two looks at the clock, in seconds of the wall")
     u_rest: dict[str, float] = Field(default={}, description="inputs at which the robot stands by name, in the input's unit; zero if left out")
+    states: Annotated[tuple[str, ...], Field(strict=False)] = Field(
+        default=(), description="the model's states in its order, for ways to rest that need feedback; none of those pass if left out"
+    )
+    angles: Annotated[tuple[str, ...], Field(strict=False)] = Field(default=(), description="those of the states that are angles")
 
 
 class DebugSection(Section):

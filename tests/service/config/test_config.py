@@ -93,6 +93,9 @@ WRONG = [
     ("[ocp]", "[observer]\nmeasured = ['x', 'z']\n[ocp]", ["observer.measured.z", "no state", "x [m]"]),
     ("[ocp]", "[guard]\ntick_s = 0.1\n[ocp]", ["guard.tick_s", "at most 0.01", "0.1"]),
     ("[ocp]", "[guard]\nu_rest = { v = 1.0 }\n[ocp]", ["guard.u_rest.v", "no input", "u_c [m/s]"]),
+    ("[ocp]", '[guard]\nstates = ["x", "y", "psi", "omega", "u"]\n[ocp]', ["guard.states", "must be the model's", "in this order"]),
+    ("[ocp]", '[guard]\nstates = ["x", "y", "psi", "u", "omega"]\n[ocp]', ["guard.angles must be the model's ['psi'], got []"]),
+    ("[ocp]", '[guard]\nangles = ["psi"]\n[ocp]', ["guard.angles must be some of guard.states = [], got 'psi'"]),
     ("[ocp]", "[guard]\nenabled = true\nu_rest = { u_c = 0.1 }\n[ocp]", ["guard.u_rest", "must be the model's", "'u_c': 0.0"]),
     ("[ocp]", "[solver]\nname = 'dapq'\n[ocp]", ["solver.name", "'dapq'", "riccati, osqp", "daqp", "pip install 'qpsolvers[NAME]'"]),
     ("[ocp]", "[solver]\nname = 'daqp'\nrho = 2.0\n[ocp]", ["solver.rho", "osqp", "'daqp'", "2.0"]),
@@ -457,6 +460,9 @@ def test_limits_of_the_guard_are_those_of_the_problem(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(limits, name), getattr(ocp, name))
     np.testing.assert_allclose(limits.slew, [2.5, 4.0])
     assert limits.settling_s == pytest.approx(0.3 + 0.2)
+    assert not len(limits.angles), "no state is named: no way to rest that needs feedback passes"
+    path.write_text(GUARDED + 'states = ["x", "y", "psi", "u", "omega"]\nangles = ["psi"]\n')
+    np.testing.assert_array_equal(guard_limits(load(path, with_model=False)).angles, [state.angle for state in ocp.model.states])
     assert config.config_hash == load(SHIPPED).config_hash
 
 
