@@ -18,8 +18,8 @@ from rti_mpc.contract.guard import Guard
 from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command, State
 from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.wire.actuator import Actuator
 from rti_mpc.wire.cdr import decode, encode
-from rti_mpc_sim.actuator import Actuator
 
 MS = 1_000_000
 DT = 100 * MS

@@ -15,7 +15,7 @@ from rti_mpc.contract.guard import Guard
 from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command, State
 from rti_mpc.contract.status import Mode, QpStatus
-from rti_mpc_sim.actuator import Actuator
+from rti_mpc.wire.actuator import Actuator
 
 MS = 1_000_000
 LOCAL_NS = 10**15  # local time when the robot's clock is 0
