@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import atexit
+import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -16,6 +18,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TypeVar
 
+from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.contract.message import Command, Event, State, Telemetry
 from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import M, decode
@@ -141,6 +144,13 @@ class System:
 
     def state(self, condition: Callable[[State], bool]) -> State:
         return heard(self.bus.subscriber(KEYS.state), State, condition)
+
+
+def owner(log: str) -> int:
+    """The number at the end of all epochs of a controller, from its log: ``epoch 123 controls``, ``123 stands by``."""
+    texts = (json.loads(line)["text"] for line in log.splitlines())
+    found = next(match for text in texts if (match := re.match(r"(?:epoch )?(\d+) (?:controls|stands by)", text)))
+    return int(found[1]) % (1 << NUMBER_BITS)
 
 
 def interrupted_in_time(host: Host, system: System, role: str, limit_ms: float = 1000.0) -> int:

@@ -10,7 +10,6 @@ at the router; what it did is its own record, at speed 1.
 from __future__ import annotations
 
 import csv
-import json
 import os
 import time
 from itertools import pairwise
@@ -33,7 +32,7 @@ from tests.in_time import MS, in_time
 from tests.processes.network import MIDDLE, MIDDLE_ADDRESS, Network, missing
 from tests.processes.overheard import Overheard
 from tests.processes.record import GUARDED, PERIOD_NS
-from tests.processes.system import CONFIG, until
+from tests.processes.system import CONFIG, owner, until
 
 pytestmark = pytest.mark.slow
 
@@ -95,8 +94,7 @@ class Partitioned:
     def leads(self) -> str:
         """Host of whoever has sent the last command."""
         number = self.streams()["command"][-1]["epoch"] % (1 << NUMBER_BITS)
-        firsts = {host: json.loads(self.said(host).splitlines()[0])["text"] for host in HOSTS[1:]}
-        return next(host for host, first in firsts.items() if int(first.removeprefix("epoch ").split()[0]) % (1 << NUMBER_BITS) == number)
+        return next(host for host in HOSTS[1:] if owner(self.said(host)) == number)
 
     def robot_ns(self, at_ns: int) -> int:
         """Robot time at an instant of the monotonic clock, by the last state heard before."""
@@ -154,7 +152,7 @@ def test_links_that_are_cut_never_make_two_leaders_act_in_turn_and_the_robot_goe
     limits = guard_limits(load(system.config))
     for lost, cut_ns, restored_ns, well_ns in cuts:
         incident = Incident(*map(system.robot_ns, (cut_ns, restored_ns, well_ns)))
-        found = measure(log, (0, 1), np.zeros((len(log.stamp_ns), 2)), incident, limits)
+        found = measure(log, log.x[:, :2], np.zeros(len(log.stamp_ns)), incident, limits)
         what = f"{lost} lost for {1e-9 * (restored_ns - cut_ns):.2f} s"
         print(f"\n{what}: braking {found.brake_s}, zero {found.zero_s}, well again {1e-9 * (well_ns - restored_ns):.2f} s after")
         assert found.step_share <= 1.0 + 1e-6, what

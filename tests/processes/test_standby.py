@@ -16,7 +16,7 @@ from rti_mpc.contract.status import Mode
 from rti_mpc.wire.cdr import decode
 from rti_mpc_service.host.hold_up import Host
 from tests.in_time import in_time
-from tests.processes.system import KEYS, heard, rti_mpc, until
+from tests.processes.system import KEYS, heard, owner, rti_mpc, until
 from tests.processes.watched import Watched, configuration, within_limits
 
 
@@ -79,7 +79,7 @@ def test_orders_hold_whoever_leads_and_of_two_that_stand_by_one_leads(tmp_path: 
         assert sample.parameter_version == 1
         system.answers(second, 10)
         assert {command.epoch for command in system.commands} == {first.epoch, second.epoch}
-        low, high = sorted(("standby", "third"), key=system.number)
+        low, high = sorted(("standby", "third"), key=lambda role: owner(system.said(role)))
         assert system.process(second.epoch) == low, "the lower number leads"
         assert "leads from now on" not in system.said(high)
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import time
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from rti_mpc.wire.cdr import decode
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
 from tests.in_time import on_time
-from tests.processes.system import KEYS, System, heard, until
+from tests.processes.system import KEYS, System, heard, owner, until
 
 ARGUMENTS: dict[str, tuple[object, ...]] = {
     "robot": ("sim", "--x0", "x=0.5"),  # at real speed: the promises are in the robot's time
@@ -73,14 +72,9 @@ class Watched(System):
             messages += [decode(Command, received.payload) for received in inbox.drain()]
         return self.commands
 
-    def number(self, role: str) -> int:
-        """The number at the end of all epochs of a controller, whose log begins with the first: ``epoch 123 controls``, ``123 stands by``."""
-        first = json.loads(self.said(role).splitlines()[0])["text"]
-        return int(first.removeprefix("epoch ").split()[0]) % (1 << NUMBER_BITS)
-
     def process(self, epoch: int) -> str:
         """Which controller an epoch is of."""
-        return next(role for role in CONTROLLERS & self.running.keys() if self.number(role) == epoch % (1 << NUMBER_BITS))
+        return next(role for role in CONTROLLERS & self.running.keys() if owner(self.said(role)) == epoch % (1 << NUMBER_BITS))
 
     def led_by_another(self, epoch: int) -> Command:
         """Wait for a command of a higher epoch."""
