@@ -100,6 +100,7 @@ def test_help_of_the_package_shows_its_public_names_and_an_example_that_runs() -
     assert (failed, tried > 4) == (0, True)
 
 
+@pytest.mark.slow
 def test_packages_of_the_user_s_own_called_service_and_sim_clash_with_nothing(python: Path, tmp_path: Path) -> None:
     """Beside ours, in front of ours on the path, and once they are removed from beside ours."""
     theirs = [root / name for root in (packages(python), tmp_path) for name in ("service", "sim")]

@@ -67,7 +67,7 @@ class Drive:
                     self.worst_m = min(self.worst_m, float(np.hypot(self.x[0] - x - vx * now, self.x[1] - y - vy * now) - r))
 
 
-@pytest.mark.parametrize("formulation", ["simultaneous", "sequential"])
+@pytest.mark.parametrize("formulation", [pytest.param("simultaneous", marks=pytest.mark.slow), "sequential"])
 def test_robot_passes_three_discs_one_of_them_moving_and_never_enters_one_by_more_than_a_millimetre(formulation: str) -> None:
     drive = Drive([(1.0, 0.05, 0.3), (2.0, -0.1, 0.3), (3.0, 1.0, 0.3)], [(0, 0), (0, 0), (0, -0.07)], formulation, duration_s=20.0)
     assert drive.worst_m > -1e-3

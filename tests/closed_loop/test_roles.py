@@ -22,7 +22,10 @@ from tests.loop import drive
 from tests.robots import toml
 
 
-@pytest.mark.parametrize(("name", "limit_mm"), [("shuffled", 1.0), ("glider", 1.0), ("rover", 10.0)])
+@pytest.mark.parametrize(
+    ("name", "limit_mm"),
+    [("shuffled", 1.0), pytest.param("glider", 1.0, marks=pytest.mark.slow), pytest.param("rover", 10.0, marks=pytest.mark.slow)],
+)
 def test_the_eight_is_followed_whatever_the_order_and_the_names(name: str, limit_mm: float, tmp_path: Path) -> None:
     """The rover's heading is the tangent, without an offset; it cuts where the eight bends."""
     path = tmp_path / "robot.toml"

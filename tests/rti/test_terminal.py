@@ -23,6 +23,7 @@ def first_input(ocp: Ocp) -> float:
     return float(rti.u[0, 0])
 
 
+@pytest.mark.slow
 def test_a_short_horizon_with_the_regulators_weight_commands_what_a_long_one_does() -> None:
     """All states are outputs, so that only the previous input is taken at its best: close, and far closer than without."""
     long, short = first_input(double_integrator(N=200)), double_integrator(N=8)

@@ -172,6 +172,7 @@ def test_log_that_nobody_takes_ends_nobody(output: str) -> None:
             os.killpg(process.pid, signal.SIGKILL) if process.poll() is None else None
 
 
+@pytest.mark.slow
 def test_path_with_an_umlaut_is_printed_as_it_is_where_only_ascii_is_known(tmp_path: Path) -> None:
     folder = tmp_path / "Jürgen"
     folder.mkdir()
