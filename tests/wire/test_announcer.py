@@ -15,6 +15,7 @@ from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.rig.endpoint import free_endpoint
+from tests.in_time import PATIENT
 from tests.processes.system import until
 
 FAULT = Notice(Severity.WARNING, "over_budget", "a sample was late")
@@ -27,7 +28,7 @@ END = Notice(Severity.INFO, "end", "that is all")
 def said(notices: list[tuple[float, Notice]], monkeypatch: pytest.MonkeyPatch) -> list[Event]:
     """Events that a peer hears of notices, each at a time in s."""
     endpoint, heard = free_endpoint(), dict[int, Event]()
-    with Bus.join(BusSettings(listen=(endpoint,)), Keys()) as bus, Bus.join(BusSettings(connect=(endpoint,)), Keys()) as peer:
+    with Bus.join(BusSettings(listen=(endpoint,), cfg=PATIENT), Keys()) as bus, Bus.join(BusSettings(connect=(endpoint,)), Keys()) as peer:
         subscriber = peer.subscriber(peer.keys.event("controller"), capacity=64)
         announcer = Announcer(bus, "controller", epoch=1)
 

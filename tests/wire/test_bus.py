@@ -28,7 +28,7 @@ from rti_mpc.wire.streams import MAX_RING_BYTES
 from rti_mpc.wire.zenoh_session import ZenohSession
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
-from tests.in_time import MS, explained, in_time
+from tests.in_time import MS, PATIENT, WAIT_BEFORE_DROP, explained, in_time
 
 ROOT = Path(__file__).parents[2]
 KEYS = Keys(robot="test")
@@ -37,8 +37,6 @@ STATE = State(1, 1, 0, np.arange(5.0))
 EVENT = Event(1, 1, 0, "robot", Severity.INFO, "code", "text")
 REFERENCE = Reference(1, 1, 0, 10**8, End.HOLD, np.arange(6.0).reshape(2, 3), np.zeros((2, 0)))
 TIMEOUT_S = 60
-WAIT_BEFORE_DROP = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"  # us
-PATIENT = (*FAST, f"{WAIT_BEFORE_DROP}:{10**6 * TIMEOUT_S}")  # waits rather than drop a message where a busy host holds up the link
 T = TypeVar("T")
 
 
@@ -81,7 +79,7 @@ def join(endpoint: str) -> Iterator[Callable[..., Bus]]:
     with ExitStack() as stack:
 
         def join(*, robot: bool = False, **settings: Any) -> Bus:
-            settings = {"listen": (endpoint,) if robot else (), "connect": (endpoint,), "cfg": PATIENT, **settings}
+            settings = {"listen": (endpoint,) if robot else (), "connect": (endpoint,), "cfg": (*FAST, *PATIENT), **settings}
             return stack.enter_context(Bus.join(BusSettings(**settings), KEYS))
 
         yield join

@@ -32,7 +32,7 @@ from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.view.listener import Listener
 from rti_mpc_service.view.outlet import file_outlet
 from rti_mpc_service.view.view import spawn_viewer, viewer_url
-from tests.in_time import MS, in_time
+from tests.in_time import MS, PATIENT, in_time
 from tests.processes.system import until
 from tests.service.view.test_view_outlet import Viewer as Screen
 
@@ -225,7 +225,7 @@ def test_a_disk_that_fills_up_ends_the_recording_but_neither_the_viewer_nor_what
 def test_a_listener_that_falls_behind_keeps_the_newest_and_counts_the_rest(port: int) -> None:
     keys = Keys(robot="r")
     endpoint = f"tcp/127.0.0.1:{port}"
-    with Bus.join(BusSettings(listen=(endpoint,)), keys) as robot, Bus.join(BusSettings(connect=(endpoint,)), keys) as bus:
+    with Bus.join(BusSettings(listen=(endpoint,), cfg=PATIENT), keys) as robot, Bus.join(BusSettings(connect=(endpoint,)), keys) as bus:
         listener = Listener(bus, capacity=10)
         publisher = robot.publisher(keys.state)
         seen = 0
@@ -254,7 +254,7 @@ def test_a_takeover_behind_a_guard_is_seen_in_the_recording(port: int, tmp_path:
     keys, endpoint, path = Keys(robot="r"), f"tcp/127.0.0.1:{port}", tmp_path / "run.rrd"
     label = {"name": "x", "unit": "m", "angle": False}
     outlet = file_outlet(path, "r")
-    with Bus.join(BusSettings(listen=(endpoint,)), keys) as robot, Bus.join(BusSettings(connect=(endpoint,)), keys) as bus:
+    with Bus.join(BusSettings(listen=(endpoint,), cfg=PATIENT), keys) as robot, Bus.join(BusSettings(connect=(endpoint,)), keys) as bus:
         listener = Listener(bus)
         robot.publish_json(keys.info("controller"), {"role": "controller", "states": [label], "inputs": [{**label, "name": "f"}]})
         state, telemetry = robot.publisher(keys.state), robot.publisher(keys.telemetry)
