@@ -59,7 +59,7 @@ def test_other_solver_takes_over_without_anybody_noticing(driven: System, host: 
     inject(driven, "solver", 10)
     heard(driven.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.softened > before.softened)
     after = recovered(driven)
-    assert 0 < after.softened - before.softened <= 10
+    assert after.softened > before.softened
     if on_time(host, "the other solver", PERIOD_MS, begun_ns):
         assert (after.softened - before.softened, after.fallbacks) == (10, before.fallbacks)
 

@@ -177,20 +177,28 @@ def malformed(message: State | Command, rows: str) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-def test_payload_of_every_malformed_kind_is_counted_and_published_while_control_goes_on(driven: System, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_payload_of_every_malformed_kind_is_counted_and_published_while_control_goes_on(
+    driven: System, host: Host, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """States to the controller and commands to the robot; of a flood of them each publishes one event a second."""
     ours = driven.bus.publisher(KEYS.state), driven.bus.publisher(KEYS.command)
+    before, since_ns = driven.sample(), time.monotonic_ns()
     with Bus.join(BusSettings(connect=(driven.endpoint,)), KEYS) as another:
         with monkeypatch.context() as later:
             later.setattr(cdr, "MESSAGE_VERSION", cdr.MESSAGE_VERSION + 1)
             foreign = another.publisher(KEYS.state), another.publisher(KEYS.command)
         refuse_malformed(driven, ours, foreign)
+    after = driven.sample()
+    assert after.seq > before.seq + 20
+    if on_time(host, "the controller", PERIOD_MS, since_ns):  # after a hold-up the robot is where no guess is near
+        assert after.softened == before.softened
+    assert driven.tracking().epoch == after.epoch == before.epoch
 
 
 def refuse_malformed(driven: System, ours: tuple[Publisher[State], Publisher[Command]], foreign: tuple[Publisher[State], Publisher[Command]]) -> None:
     """Send every malformed kind, by publishers of our version of the messages and of another, and look at what is published of it."""
     kinds = malformed(driven.state(lambda _: True), "x"), malformed(driven.tracking(), "u")
-    before, events, start_s = driven.sample(), driven.bus.subscriber(KEYS.events, capacity=1024, history=False), time.monotonic()
+    events, start_s = driven.bus.subscriber(KEYS.events, capacity=1024, history=False), time.monotonic()
 
     def send(words: str) -> None:
         for publisher, payloads in zip(foreign if words == OTHER_VERSION else ours, kinds, strict=True):
@@ -206,10 +214,6 @@ def refuse_malformed(driven: System, ours: tuple[Publisher[State], Publisher[Com
         assert len(kinds[0]) <= len(texts) <= took_s + 2.0
         counts = [int(text.rpartition("; ")[2].split()[0]) for text in texts]
         assert all(np.diff(counts) > 1), "each counts those of which nothing was published"
-    after = driven.sample()
-    assert after.seq > before.seq + 20
-    assert (after.epoch, after.softened) == (before.epoch, before.softened)
-    assert driven.tracking().epoch == before.epoch
 
 
 def test_second_publisher_takes_nothing_over(driven: System, host: Host) -> None:
