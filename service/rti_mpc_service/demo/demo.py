@@ -45,7 +45,7 @@ from rti_mpc_service.host.echo import ROLE as ECHO
 from rti_mpc_service.host.echo import Echo
 from rti_mpc_service.rig import robot_log
 from rti_mpc_service.rig.children import Children
-from rti_mpc_service.rig.company import CLI_MODULE, WATCHER_NICENESS, Failed, check_children, wait
+from rti_mpc_service.rig.company import CLI_MODULE, START_TIMEOUT_S, WATCHER_NICENESS, Failed, check_children, wait
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.rig.run_data import wanted
 from rti_mpc_service.rig.scenario import BEST_HEADINGS, configured
@@ -53,7 +53,6 @@ from rti_mpc_service.rig.summary import Outcome, summarize
 from rti_mpc_service.rig.witness import Witness
 from rti_mpc_service.scenario import Scenario, find_scenario
 
-START_TIMEOUT_S = 60.0  # for all processes to be present; the first controller on a machine compiles
 CONTROLLER_SILENCE_S = 5.0  # after which the run ends: the robot will not be driven any further
 END_TIMEOUT_S = 3.0
 POLL_PERIOD_S = 0.1
@@ -189,15 +188,16 @@ def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:
         command = Command(0, 0, 0, 0, 0, 0, 0, 0, Mode.TRACKING, QpStatus.SOLVED, 0, np.zeros((ocp.N, ocp.model.nu)))
         start(run, children, endpoint, len(encode(command)))
         company = {"controller", "reference", ECHO, *(["viewer"] if recorded() else []), *guards(run)}
-        board.wait(f"starting {', '.join(sorted(company))}")
         shown = set[str]()
 
         def met() -> bool:
-            """Whether everybody is there; shows meanwhile that the controller compiles."""
-            for line in compiling(children.log("controller")) - shown:
-                shown.add(line)
+            """Whether everybody is there; shows meanwhile who is missing, and that the controller compiles."""
+            missing = witness.listen().missing(company)
+            lines = {f"starting {', '.join(missing)}", *compiling(children.log("controller"))} if missing else set[str]()
+            for line in sorted(lines - shown, reverse=True):
                 board.wait(line)
-            return witness.listen().met(company)
+            shown.update(lines)
+            return not missing
 
         wait(met, children, stop, START_TIMEOUT_S, "all processes")
         echo = Echo(bus, State(0, 0, 0, np.zeros(ocp.model.nx)), 0.5 * ocp.dt / run.speed)

@@ -30,13 +30,12 @@ from rti_mpc_service.faults.proxy import Proxy
 from rti_mpc_service.faults.relay import ROLE as RELAY
 from rti_mpc_service.rig import robot_log
 from rti_mpc_service.rig.children import Children
-from rti_mpc_service.rig.company import CLI_MODULE, WATCHER_NICENESS, Failed, wait
+from rti_mpc_service.rig.company import CLI_MODULE, START_TIMEOUT_S, WATCHER_NICENESS, Failed, wait
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.rig.robot_log import RobotLog
 from rti_mpc_service.rig.witness import Witness
 
 REFERENCE_DURATION_S = 120  # 58 kB fit into one packet, so that a busy host cannot drop a part of it
-START_TIMEOUT_S = 60.0  # for processes to start and the robot to be driven; the first controller on a machine compiles
 REQUEST_TIMEOUT_S = 2.0
 
 
@@ -234,7 +233,7 @@ class System:
         """Start the processes that do not run, and wait until all are present."""
         self.start(*(role for role in roles if self.children.pid(role) is None))
         others = [role for role in roles if self._keys_of(role) is self.keys]  # a relay passes no presence on, and the robot's states tell
-        self.wait(lambda: self.witness.listen().met(set(others)), f"{', '.join(others)} to be there")
+        self.wait(lambda: not self.witness.listen().missing(set(others)), f"{', '.join(others)} to be there")
 
     # Messages to the system.
 

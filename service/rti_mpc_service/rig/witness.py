@@ -52,9 +52,9 @@ class Witness:
         """Whether the robot is being driven."""
         return bool(self.telemetry) and self.reference is not None
 
-    def met(self, roles: set[str]) -> bool:
-        """Whether all roles are present, and the controller's description has been received."""
-        return roles <= self.lives and self.info is not None
+    def missing(self, roles: set[str]) -> list[str]:
+        """Return the roles that are not present, sorted; the controller is missing until its description has been received."""
+        return sorted(role for role in roles if role not in self.lives or (role == "controller" and self.info is None))
 
     def listen(self) -> Witness:
         """Process the messages received since the last call."""
