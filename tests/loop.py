@@ -33,7 +33,7 @@ def reference(trajectory: Trajectory, heading: Heading = "none", *, period_ms: i
 
 @dataclass
 class Run:
-    """What happened, one row a state: true state and acting input; and each command."""
+    """What happened, one row per state: true state and acting input; and each command."""
 
     t_s: list[float] = field(default_factory=list)
     x: list[Array] = field(default_factory=list)

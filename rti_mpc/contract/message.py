@@ -3,8 +3,8 @@
 The messages between robot, planner, controller and viewer, as values.
 
 Every message starts with ``epoch, seq, stamp_ns``: `seq` increases within an
-epoch, an epoch is one life of its publisher, and `stamp_ns` is integer
-nanoseconds of the robot's clock. SI units unless a name says otherwise.
+epoch, the epoch is higher after every restart of the publisher, and `stamp_ns` is
+integer nanoseconds of the robot's clock. SI units unless a name says otherwise.
 `rti_mpc.wire.cdr` turns them into bytes.
 """
 
@@ -29,7 +29,7 @@ class End(IntEnum):
 
 
 class Severity(IntEnum):
-    """Severity of an event: WARNING if the process coped, ERROR if something was lost or stopped."""
+    """Severity of an event: WARNING for a fault that the system handled, ERROR if something was lost or stopped."""
 
     INFO = 0
     WARNING = 1
@@ -45,7 +45,7 @@ class State:
         x: State estimate, shape ``(nx,)``. Angles may wrap.
         u: Inputs that act at `stamp_ns`, shape ``(nu,)``; empty if the robot does not report them.
         command_epoch: Epoch of the command that `u` comes from; 0: the robot's own ramp, or not reported.
-        command_seq: Its sequence number.
+        command_seq: Sequence number of that command.
     """
 
     epoch: int
@@ -82,23 +82,23 @@ class Reference:
 @dataclass(slots=True)
 class Command:
     """
-    A plan of inputs: row ``i`` acts from ``stamp_ns + i * period_ns``, nothing acts from `valid_until_ns` on.
+    A plan of inputs: row ``i`` acts from ``stamp_ns + i * period_ns`` on. From `valid_until_ns` on, only the way to rest acts.
 
     Attributes:
-        stamp_ns: When row 0 acts.
-        state_epoch: Epoch of the state this command answers.
-        state_seq: Its sequence number.
-        state_stamp_ns: Its stamp, from which age and delay are computed.
-        valid_until_ns: The command is dropped from this stamp on.
-        config_hash: Configuration of the controller, as in `info`.
-        mode: What the controller was doing.
+        stamp_ns: Time from which row 0 acts.
+        state_epoch: Epoch of the state that this command answers.
+        state_seq: Sequence number of that state.
+        state_stamp_ns: Stamp of that state, from which age and delay are computed.
+        valid_until_ns: Time from which no row of `u` may act.
+        config_hash: Hash of the controller's configuration, as in `info`.
+        mode: Mode of the controller.
         status: Outcome of the QP behind this command.
         period_ns: Time between rows.
         u: Inputs, shape ``(N, nu)``, held inputs expanded.
-        rest_period_ns: Time between rows of the way to rest; 0 where there are none.
-        u_rest: Way to rest from `valid_until_ns` on, shape ``(M, nu)``; no rows: inside the slew limits to rest.
-        x_rest: States along it, shape ``(M, nx)``; no rows where no feedback is needed.
-        K: Gain on the way to rest, shape ``(nu, nx)``: :math:`u = u_{rest} - K (x - x_{rest})`; no rows where no feedback is needed.
+        rest_period_ns: Time between rows of the way to rest; 0: it has no rows.
+        u_rest: Inputs of the way to rest from `valid_until_ns` on, shape ``(M, nu)``; no rows: the robot ramps its inputs to rest.
+        x_rest: States along the way to rest, shape ``(M, nx)``; no rows where no feedback is needed.
+        K: Feedback gain along the way to rest, shape ``(nu, nx)``: :math:`u = u_{rest} - K (x - x_{rest})`; no rows where no feedback is needed.
     """
 
     epoch: int
@@ -122,24 +122,24 @@ class Command:
 @dataclass(slots=True)
 class Telemetry:
     """
-    Everything an engineer plots of one sample.
+    Measurements and results of one sample.
 
     Attributes:
-        stamp_ns: When the command of this sample acts.
-        state_seq: Sequence number of the state it answers.
+        stamp_ns: Time from which the command of this sample acts.
+        state_seq: Sequence number of the state that the command answers.
         state_stamp_ns: Stamp of that state.
         iterations: Iterations of the QP solver.
-        res_prim: Violation of dynamics, bounds and increments by the plan, relative to range; of another solver its primal residual.
-        res_dual: Bound on what the plan costs above the optimum, relative to 1 plus its cost, normalised; of another solver its dual residual.
+        res_prim: Violation of dynamics, bounds and increments by the plan, relative to range; from other QP solvers their primal residual.
+        res_dual: Bound on the plan's cost above the optimum, relative to 1 plus the cost, normalised; from other QP solvers their dual residual.
         cost: The cost (4) of the plan.
-        violation: Largest slack of a softened bound in the plan, in that state's unit.
+        violation: Largest slack of a softened bound in the plan, in the unit of the bounded state or constraint.
         prepare_us: Time of the preparation phase before this sample.
         feedback_us: Time of the feedback phase.
-        latency_us: From the state's arrival to the command's hand-over to the bus.
+        latency_us: Time from the state's arrival until the command was given to the bus.
         state_age_s: Stamp of the command minus stamp of the state, robot time.
-        slack_s: Time left to the next state when its sample was prepared, robot time; negative: the sample overran its period.
-        skipped: Samples skipped since start.
-        fallbacks: Samples without a plan of their own since start.
+        slack_s: Time left until the next state when the next sample was prepared, robot time; negative: this sample overran its period.
+        skipped: Samples skipped since the start.
+        fallbacks: Samples without a new plan since the start: the sum of shifted, braked and rested.
         parameter_version: Version of the controller's parameters.
         x0: State embedded at stage 0, shape ``(nx,)``.
         x: Predicted states, shape ``(N + 1, nx)``.
@@ -147,10 +147,10 @@ class Telemetry:
         y_ref: Reference rows used, shape ``(N, ny)``.
         d: Estimated disturbances, shape ``(nd,)``, those of ``info``; none without an observer.
         delay_s: Delay from a state to the time at which its command acts, configured or measured, robot time.
-        softened: Samples since start whose plan came from another solver than the first.
-        shifted: Samples since start, of the fallbacks, on which the previous plan was continued.
-        braked: Samples since start, of the fallbacks, that were answered by the ramp to rest.
-        rested: Samples since start, of the fallbacks, that were answered by a standstill.
+        softened: Samples since the start that a backup solver solved, because the first one did not.
+        shifted: Those of `fallbacks` on which the previous plan was continued.
+        braked: Those of `fallbacks` that were answered by the ramp to rest.
+        rested: Those of `fallbacks` that were answered by a standstill.
     """
 
     epoch: int
@@ -192,7 +192,7 @@ class Event:
 
     Attributes:
         source: Role of the publisher: controller, robot, reference, guard.
-        code: Stable word for machines, such as ``state_stale``.
+        code: Name of the event for programs, such as ``state_stale``.
         text: One sentence for people.
     """
 
@@ -211,7 +211,7 @@ class Notice:
     Content of an event; its publisher adds source, stamp and sequence number.
 
     Attributes:
-        code: Stable word for machines, such as ``state_stale``.
+        code: Name of the event for programs, such as ``state_stale``.
         text: One sentence for people.
         change: Whether it is a change of mode: each change is published, faults of one code at a limited rate.
     """

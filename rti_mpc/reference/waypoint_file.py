@@ -29,7 +29,7 @@ DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+")
 
 def read_csv(path: Path) -> Array:
     """
-    Read waypoints: a line a point.
+    Read waypoints: one point per line.
 
     Empty lines and lines that begin with ``#`` are skipped, but for the one that names the columns.
 

@@ -178,7 +178,7 @@ class Intake(Generic[M]):
     def _check_width(self, message: M, name: str, width: int) -> None:
         got = getattr(message, name).shape[-1]
         if got != width and not (got == 0 and (self._cls, name) in OPTIONAL_ARRAYS):
-            raise Refused("length", f"{name} must hold {width} numbers a row, got {got}")
+            raise Refused("length", f"{name} must hold {width} numbers per row, got {got}")
 
     def _check_epoch(self, epoch: int, known: int) -> None:
         limit = highest_believed(self._unix_s(), known, choosing=self._choosing)

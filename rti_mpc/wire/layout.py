@@ -34,7 +34,7 @@ class Field:
         member_of: Enumeration of which the number is a member.
         low: Least value of an integer, None without a limit.
         high: Largest value of an integer, or most bytes of a string with its final zero, None without a limit.
-        also: A value outside these limits that is allowed all the same.
+        also: A value outside these limits that is allowed as well.
         width: Name of the row width of a matrix; a vector has none.
         finite: Whether all numbers of an array must be finite, and at most `NUMBER_LIMIT`.
         filled: Whether an array must have numbers at all.
@@ -58,28 +58,28 @@ def _stamp(name: str, about: str, also: int | None = None) -> Field:
 
 def _head(stamp: str, also: int | None = None) -> tuple[Field, ...]:
     return (
-        Field("epoch", "uint64", "one life of the publisher; higher after every restart"),
-        Field("seq", "uint64", "increases within an epoch"),
+        Field("epoch", "uint64", "number of the publisher's current run; higher after every restart"),
+        Field("seq", "uint64", "sequence number; increases within an epoch"),
         _stamp("stamp_ns", stamp, also),
     )
 
 
 LAYOUTS: dict[type[Any], tuple[Field, ...]] = {
     State: (
-        *_head("when the state held, ns of the robot's clock"),
+        *_head("time at which the state was measured, ns of the robot's clock"),
         Field("x", "float64[]", "state, SI units in the order of the model; angles in rad, may wrap", finite=True, filled=True),
-        Field("u", "float64[]", "inputs that act at the stamp, in the order of the model; empty: not reported", finite=True),
-        Field("command_epoch", "uint64", "epoch of the command they come from; 0: the robot's own ramp, or not reported"),
-        Field("command_seq", "uint64", "its sequence number"),
+        Field("u", "float64[]", "inputs that act at that time, SI units in the order of the model; empty: not reported", finite=True),
+        Field("command_epoch", "uint64", "epoch of the command that set these inputs; 0: the robot's own ramp, or not reported"),
+        Field("command_seq", "uint64", "sequence number of that command"),
     ),
     Reference: (
-        *_head("time of row 0, ns of the robot's clock; STAMP_ON_ARRIVAL: the state current on arrival", STAMP_ON_ARRIVAL),
-        Field("period_ns", "int64", "ns between rows", low=1, high=MAX_PERIOD_NS),
-        Field("end", "uint8", "after the last row: HOLD it, or STOP", member_of=End),
+        *_head("time of row 0, ns of the robot's clock; STAMP_ON_ARRIVAL: time of the latest state when this message arrives", STAMP_ON_ARRIVAL),
+        Field("period_ns", "int64", "time between rows, ns", low=1, high=MAX_PERIOD_NS),
+        Field("end", "uint8", "what to do after the last row: HOLD it, or STOP", member_of=End),
         Field(
             "y",
             "float64[]",
-            "rows of ny, SI units in the order of the model's outputs; angles in rad, may wrap",
+            "reference outputs, rows of ny, SI units in the order of the model's outputs; angles in rad, may wrap",
             width="ny",
             finite=True,
             filled=True,
@@ -87,79 +87,101 @@ LAYOUTS: dict[type[Any], tuple[Field, ...]] = {
         Field(
             "p",
             "float64[]",
-            "rows of np, as many as y has: the model's parameters, then x, y and radius of each obstacle, m; np = 0: the model's nominal ones",
+            "stage parameters, rows of np, one for each row of y: the model's, then x, y and radius of each obstacle, m; np = 0: the nominal ones",
             width="np",
             finite=True,
         ),
     ),
     Command: (
-        *_head("when row 0 acts, ns of the robot's clock"),
-        Field("state_epoch", "uint64", "epoch of the state this command answers"),
-        Field("state_seq", "uint64", "its sequence number"),
-        _stamp("state_stamp_ns", "its stamp, ns of the robot's clock"),
-        _stamp("valid_until_ns", "dropped from this stamp on, ns of the robot's clock"),
-        Field("config_hash", "uint64", "configuration of the controller, as in info"),
-        Field("mode", "uint8", "what the controller was doing: IDLE ... STOPPED", member_of=Mode),
-        Field("status", "uint8", "outcome of the QP behind this command: SOLVED ... NONE", member_of=QpStatus),
-        Field("period_ns", "int64", "ns between rows", low=MIN_PERIOD_NS, high=MAX_PERIOD_NS),
-        Field("u", "float64[]", "rows of nu, SI units in the order of the model's inputs", width="nu", finite=True, filled=True),
-        Field("rest_period_ns", "int64", "ns between rows of the way to rest; 0 where there are none", low=0, high=MAX_PERIOD_NS),
+        *_head("time from which row 0 acts, ns of the robot's clock"),
+        Field("state_epoch", "uint64", "epoch of the state that this command answers"),
+        Field("state_seq", "uint64", "sequence number of that state"),
+        _stamp("state_stamp_ns", "stamp of that state, ns of the robot's clock"),
+        _stamp("valid_until_ns", "time from which no row of u may act, ns of the robot's clock"),
+        Field("config_hash", "uint64", "hash of the controller's configuration, as in its info"),
+        Field("mode", "uint8", "mode of the controller, IDLE to STOPPED", member_of=Mode),
+        Field("status", "uint8", "outcome of the QP behind this command, SOLVED to NONE", member_of=QpStatus),
+        Field("period_ns", "int64", "time between rows of u, ns", low=MIN_PERIOD_NS, high=MAX_PERIOD_NS),
+        Field("u", "float64[]", "planned inputs, rows of nu, SI units in the order of the model's inputs", width="nu", finite=True, filled=True),
+        Field("rest_period_ns", "int64", "time between rows of the way to rest, ns; 0: it has no rows", low=0, high=MAX_PERIOD_NS),
         Field(
-            "u_rest", "float64[]", "way to rest from valid_until_ns on, rows of nu; empty: inside the slew limits to rest", width="nu", finite=True
+            "u_rest",
+            "float64[]",
+            "inputs of the way to rest from valid_until_ns on, rows of nu; empty: the robot ramps its inputs to rest inside the slew limits",
+            width="nu",
+            finite=True,
         ),
-        Field("x_rest", "float64[]", "states along the way to rest, rows of nx; empty where no feedback is needed", width="nx", finite=True),
-        Field("K", "float64[]", "gain, nu rows of nx: u = u_rest - K (x - x_rest); empty where no feedback is needed", width="nx", finite=True),
+        Field("x_rest", "float64[]", "states along the way to rest, rows of nx, SI units; empty: no feedback needed", width="nx", finite=True),
+        Field(
+            "K",
+            "float64[]",
+            "feedback gain along the way to rest, nu rows of nx: u = u_rest - K (x - x_rest); empty: no feedback needed",
+            width="nx",
+            finite=True,
+        ),
     ),
     Telemetry: (
-        *_head("when the command of this sample acts, ns of the robot's clock"),
-        Field("state_seq", "uint64", "sequence number of the state it answers"),
+        *_head("time from which the command of this sample acts, ns of the robot's clock"),
+        Field("state_seq", "uint64", "sequence number of the state that the command answers"),
         _stamp("state_stamp_ns", "stamp of that state, ns of the robot's clock"),
         Field("mode", "uint8", "as in Command", member_of=Mode),
         Field("status", "uint8", "as in Command", member_of=QpStatus),
-        Field("iterations", "uint32", "of the QP solver"),
-        Field("res_prim", "float64", "primal residual of the QP, infinity norm"),
-        Field("res_dual", "float64", "dual residual of the QP, infinity norm"),
+        Field("iterations", "uint32", "iterations of the QP solver"),
+        Field(
+            "res_prim",
+            "float64",
+            "violation of dynamics, bounds and increments by the plan, relative to range; from other QP solvers than riccati their primal residual",
+        ),
+        Field(
+            "res_dual",
+            "float64",
+            "bound on the plan's cost above the optimum, relative to 1 + cost; from other QP solvers than riccati their dual residual",
+        ),
         Field("cost", "float64", "cost of the plan"),
-        Field("violation", "float64", "largest slack of a softened bound in the plan, unit of that state"),
-        Field("prepare_us", "float64", "preparation phase before this sample, us"),
-        Field("feedback_us", "float64", "feedback phase, us"),
-        Field("latency_us", "float64", "from the state's arrival to the command's hand-over to the bus, us"),
-        Field("state_age_s", "float64", "command's stamp minus state's stamp, s of the robot's clock"),
-        Field("slack_s", "float64", "left to the next state when its sample was prepared, s of the robot's clock; negative: the sample overran"),
-        Field("skipped", "uint64", "samples skipped since start"),
-        Field("fallbacks", "uint64", "samples without a plan of their own since start: shifted, braked and rested"),
-        Field("parameter_version", "uint32", "of the controller's parameters"),
-        Field("x0", "float64[]", "state embedded at stage 0, nx numbers, SI units"),
+        Field("violation", "float64", "largest slack of a softened bound in the plan, unit of the bounded state or constraint"),
+        Field("prepare_us", "float64", "duration of the preparation phase, before the state, us"),
+        Field("feedback_us", "float64", "duration of the feedback phase, after the state, us"),
+        Field("latency_us", "float64", "time from the state's arrival until the command was given to the bus, us"),
+        Field("state_age_s", "float64", "stamp of the command minus stamp of the state, s of the robot's clock"),
+        Field(
+            "slack_s",
+            "float64",
+            "time left until the next state when the next sample was prepared, s of the robot's clock; negative: this sample overran",
+        ),
+        Field("skipped", "uint64", "number of samples skipped since the start"),
+        Field("fallbacks", "uint64", "number of samples without a new plan since the start: the sum of shifted, braked and rested"),
+        Field("parameter_version", "uint32", "version of the controller's live parameters"),
+        Field("x0", "float64[]", "initial state, embedded at stage 0, nx numbers, SI units"),
         Field("x", "float64[]", "predicted states, N + 1 rows of nx, SI units", width="nx"),
         Field("u", "float64[]", "planned inputs, N rows of nu, SI units; row 0 is what was commanded", width="nu"),
-        Field("y_ref", "float64[]", "reference rows used, N rows of ny, SI units", width="ny"),
-        Field("d", "float64[]", "estimated disturbances, as info/controller names them; none without an observer"),
-        Field("delay_s", "float64", "from a state to the act of its command, configured or measured, s of the robot's clock"),
-        Field("softened", "uint64", "samples since start whose plan another solver had to find than the first"),
-        Field("shifted", "uint64", "samples since start on which the previous plan played on"),
-        Field("braked", "uint64", "samples since start that were answered by the ramp to rest"),
-        Field("rested", "uint64", "samples since start that were answered by a standstill"),
+        Field("y_ref", "float64[]", "reference outputs used, N rows of ny, SI units", width="ny"),
+        Field("d", "float64[]", "estimated disturbances, in the order and units of info/controller; empty without an observer"),
+        Field("delay_s", "float64", "delay from a state to the time at which its command acts, configured or measured, s of the robot's clock"),
+        Field("softened", "uint64", "number of samples since the start that a backup solver solved, because the first one did not"),
+        Field("shifted", "uint64", "number of samples since the start on which the previous plan was continued"),
+        Field("braked", "uint64", "number of samples since the start that were answered by the ramp to rest"),
+        Field("rested", "uint64", "number of samples since the start that were answered by a standstill"),
     ),
     Event: (
-        *_head("ns of the robot's clock"),
+        *_head("time of the event, ns of the robot's clock"),
         Field("source", "string", "role of the publisher: controller, robot, reference, guard", high=64),
-        Field("severity", "uint8", "INFO, WARNING: we coped, ERROR: something was lost or stopped", member_of=Severity),
-        Field("code", "string", "stable word for machines, such as state_stale", high=64),
-        Field("text", "string", "one sentence for people", high=4096),
+        Field("severity", "uint8", "INFO; WARNING: a fault that the system handled; ERROR: something was lost or stopped", member_of=Severity),
+        Field("code", "string", "name of the event for programs, never changed, such as state_stale", high=64),
+        Field("text", "string", "one sentence for people, with the numbers of this event", high=4096),
     ),
 }
 MAX_PAYLOAD_BYTES: dict[type[Any], int] = {
     State: 1 << 16,
-    Reference: 1 << 23,  # 349,000 rows of three outputs; a session reassembles no longer message on any key
+    Reference: 1 << 23,  # 349,000 rows of three outputs; also the longest message that a session reassembles on any key
     Command: 1 << 20,
     Telemetry: 1 << 21,
     Event: 1 << 13,
 }
 MESSAGE_DESCRIPTIONS: dict[type[Any], str] = {
     State: "The robot's state, published by the robot.",
-    Reference: "Output reference on a regular time grid. It ends with its last row: no heartbeat.",
-    Command: "A plan of inputs: row i acts from stamp_ns + i * period_ns on, nothing acts from valid_until_ns on but the way to rest.",
-    Telemetry: "Everything an engineer plots of one sample of the controller. Numbers may be NaN where nothing was computed.",
+    Reference: "Output reference on a regular time grid. It ends with its last row; it need not be repeated before.",
+    Command: "A plan of inputs: row i acts from stamp_ns + i * period_ns on. From valid_until_ns on, only the way to rest acts.",
+    Telemetry: "What the controller measured and computed at one sample. Numbers may be NaN where nothing was computed.",
     Event: "A mode change or a fault.",
 }
 WIDTH_DESCRIPTIONS: dict[str, str] = {"nx": "states per row", "nu": "inputs per row", "ny": "outputs per row", "np": "stage parameters per row"}

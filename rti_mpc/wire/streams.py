@@ -22,10 +22,10 @@ from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
 
 KNOWN_ROLES = ("controller", "standby", "guard", "robot", "reference", "viewer", "recorder", "router", "operator", "relay", "echo")
 ROLE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}(\.[0-9]{1,7})?", re.ASCII)  # where several processes share a role they are numbered: standby.17
-MAX_UNKNOWN_ROLES = 16  # other roles that are listened to: anybody can invent one
+MAX_UNKNOWN_ROLES = 16  # further roles whose messages are read; limited, since any peer can invent roles
 
 MAX_REQUEST_BYTES = 32_768  # parsing JSON holds the interpreter's lock for 30 ms per megabyte
-MAX_RING_BYTES = 1 << 30  # of one receiver's ring if peers send nothing but the longest payloads
+MAX_RING_BYTES = 1 << 30  # size of one receiver's ring filled with the longest payloads
 
 
 class Kind(Enum):
@@ -68,8 +68,8 @@ class Stream(Generic[M]):
 
     Attributes:
         name: Key below ``<prefix>/<robot>/``, without the role that some keys end with.
-        message: Class of the messages; None for a JSON object, or for nothing.
-        publishers: Roles that may publish, answer or show presence on it. A standby must be ready to lead, so it has both its roles.
+        message: Class of the messages; None for a JSON object, or for no content.
+        publishers: Roles that may publish, answer or show presence on it. A standby may become the leader, so it has both roles.
         qos: Quality of service; for a query that of the request.
         rate: Rate of the messages, in words.
         about: Purpose, in words.
@@ -101,24 +101,33 @@ class Stream(Generic[M]):
 
 
 def _query(name: str, servers: tuple[str, ...], qos: Qos, about: str) -> Stream[Any]:
-    return Stream(name, None, servers, qos, "as asked", about, kind=Kind.QUERY, askers=("operator",))
+    return Stream(name, None, servers, qos, "on request", about, kind=Kind.QUERY, askers=("operator",))
 
 
-CONTROLLER_ROLES = ("controller", "standby")  # of one program, which changes its role
+CONTROLLER_ROLES = ("controller", "standby")  # roles of one process, which changes between them
 
-STATE = Stream("state", State, ("robot", "relay"), QOS_FAST, "as the robot measures, up to 1 kHz", "state of the robot")
-REFERENCE = Stream("reference", Reference, ("reference",), QOS_CACHED, "now and then", "what to follow")
-ANCHORED = Stream("reference/anchored", Reference, ("controller",), QOS_CACHED, "as such come", "a reference that starts on arrival, with its stamp")
-COMMAND = Stream("command", Command, ("controller", "relay"), QOS_FAST, "each sample", "plan of inputs")
-ACTUATION = Stream("actuation", Command, ("guard", "relay"), QOS_FAST, "each command", "what the guard lets pass, or its own ramp to rest")
-TELEMETRY = Stream("telemetry", Telemetry, ("controller",), QOS_LOW, "each sample", "everything of one sample")
-SHADOW_TELEMETRY = Stream("telemetry/standby", Telemetry, ("standby",), QOS_LOW, "each sample", "the same of a controller that stands by")
+STATE = Stream("state", State, ("robot", "relay"), QOS_FAST, "once per measurement, up to 1 kHz", "state of the robot")
+REFERENCE = Stream("reference", Reference, ("reference",), QOS_CACHED, "whenever the planner has a new one", "reference to follow")
+ANCHORED = Stream(
+    "reference/anchored",
+    Reference,
+    ("controller",),
+    QOS_CACHED,
+    "once per reference with STAMP_ON_ARRIVAL",
+    "copy of a reference that starts on arrival, with the stamp of its start",
+)
+COMMAND = Stream("command", Command, ("controller", "relay"), QOS_FAST, "once per sample", "plan of inputs")
+ACTUATION = Stream(
+    "actuation", Command, ("guard", "relay"), QOS_FAST, "once per command", "command that the guard has passed, or the guard's own ramp to rest"
+)
+TELEMETRY = Stream("telemetry", Telemetry, ("controller",), QOS_LOW, "once per sample", "measurements and results of one sample")
+SHADOW_TELEMETRY = Stream("telemetry/standby", Telemetry, ("standby",), QOS_LOW, "once per sample", "telemetry of a standby controller")
 EVENT = Stream(
     "event",
     Event,
     (*CONTROLLER_ROLES, "guard", "robot", "reference", "viewer"),
     QOS_CACHED,
-    "each mode change, each fault at most once a second",
+    "once per mode change; faults of one code at most once per second",
     "mode changes and faults",
     by_role=True,
 )
@@ -127,26 +136,26 @@ INFO: Stream[Any] = Stream(
     None,
     (*CONTROLLER_ROLES, "guard", "robot"),
     QOS_CACHED,
-    "at the start, and as it changes",
-    "description in JSON: names, units, limits, versions",
+    "at the start, and at every change",
+    "description of the publisher in JSON: names, units, limits, versions",
     by_role=True,
 )
-REQUEST = _query("request", CONTROLLER_ROLES, QOS_QUERY, "parameters, and failures on request")
-STOP = _query("stop", (*CONTROLLER_ROLES, "guard"), QOS_FAST_QUERY, "an operator's stop and its release; what else is asked for does not delay it")
+REQUEST = _query("request", CONTROLLER_ROLES, QOS_QUERY, "reading and changing parameters, injecting failures")
+STOP = _query("stop", (*CONTROLLER_ROLES, "guard"), QOS_FAST_QUERY, "an operator's stop and its release, never delayed by other requests")
 ALIVE: Stream[Any] = Stream(
     "alive",
     None,
     (*CONTROLLER_ROLES, "guard", "robot", "reference", "viewer", "router", "relay", "echo"),
     Qos(),
-    "while it lives",
-    "presence, for people and fleets; never a safety signal",
+    "as long as the process runs",
+    "presence of a process, for people and fleet management; never a safety signal",
     kind=Kind.TOKEN,
     by_role=True,
 )
-# Streams of fault injection and of measurements only.
-RELAY = _query("relay", ("relay",), QOS_QUERY, "faults of a link or a sensor")
-PING = Stream("echo/ping", State, ("operator",), QOS_FAST, "each sample", "of a state's size, to measure the bus")
-PONG = Stream("echo/pong", Command, ("echo",), QOS_FAST, "each ping", "its answer, of a command's size")
+# Streams for fault injection and measurements only.
+RELAY = _query("relay", ("relay",), QOS_QUERY, "faults to inject into a link or a sensor")
+PING = Stream("echo/ping", State, ("operator",), QOS_FAST, "once per measurement", "message of a state's size, to measure the round trip on the bus")
+PONG = Stream("echo/pong", Command, ("echo",), QOS_FAST, "once per ping", "answer to a ping, of a command's size")
 
 STREAMS: tuple[Stream[Any], ...] = (
     *(STATE, REFERENCE, ANCHORED, COMMAND, ACTUATION, TELEMETRY, SHADOW_TELEMETRY),
@@ -155,14 +164,14 @@ STREAMS: tuple[Stream[Any], ...] = (
 
 
 def role_of(key: str) -> str:
-    """Return the role that a key of an event, a description or a token ends with; empty if that is not a role."""
+    """Return the role at the end of the key of an event, a description or a token; empty if it does not end with a role."""
     role = key.rpartition("/")[2]
     return role if ROLE_PATTERN.fullmatch(role) else ""
 
 
 def admitted(key: str, known: Collection[str]) -> bool:
     """
-    Return whether to listen to the role that a key ends with: to all in `KNOWN_ROLES`, and to `MAX_UNKNOWN_ROLES` others.
+    Return whether to read messages of the role at the end of a key: all of `KNOWN_ROLES`, and up to `MAX_UNKNOWN_ROLES` others.
 
     Args:
         key: Key of an event, a description or a token.

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Command line: each command turns its options into one call. Everything physical is in the configuration.
+Command line: each command turns its options into one call. All physical settings are in the configuration file.
 
 A command imports its modules when it runs, so that `rti-mpc --help` loads no solver,
 no bus and no viewer. This is the only file that knows both `service` and `sim`.
@@ -37,7 +37,7 @@ SHIPPED = DEPLOY / "pioneer_3dx.toml"
 
 
 class Commands(TyperGroup):
-    """Group that lists its commands with whole sentences, wrapped where the terminal is narrow; Click would cut them off."""
+    """Group whose list of commands shows whole sentences, wrapped on narrow terminals, where Click would cut them off."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the list of commands."""
@@ -47,10 +47,10 @@ class Commands(TyperGroup):
 
 
 class FaultsCommand(TyperCommand):
-    """Command whose help lists the faults there are."""
+    """Command whose help lists all faults."""
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Write the list of faults, loaded only where it is asked for."""
+        """Write the list of faults; its module is imported here only."""
         from rti_mpc_service.faults.table import FAULTS
 
         with formatter.section("Faults"):
@@ -68,7 +68,7 @@ app = typer.Typer(
 
 
 def print_version(wanted: bool) -> None:
-    """Print the versions that decide what a command does."""
+    """Print the versions of rti-mpc, its messages, Python and the packages it depends on."""
     if wanted:
         from rti_mpc.wire import cdr
         from rti_mpc_service.host import machine
@@ -81,14 +81,14 @@ def print_version(wanted: bool) -> None:
 @app.callback()
 def top(
     version: Annotated[
-        bool, typer.Option("--version", callback=print_version, is_eager=True, help="Print the version, and those it builds on.")
+        bool, typer.Option("--version", callback=print_version, is_eager=True, help="Print the versions of rti-mpc and its dependencies.")
     ] = False,
 ) -> None:
     """Real-time nonlinear model predictive control as a service, over Zenoh."""
 
 
 def claimed(path: Path | None) -> Path | None:
-    """Check that a file can be written, before minutes are spent on computing its content."""
+    """Check that a file can be written, before its content is computed for minutes."""
     try:
         if path is not None:
             path.touch()
@@ -98,7 +98,7 @@ def claimed(path: Path | None) -> Path | None:
 
 
 ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="The robot's TOML file.", show_default="the shipped pioneer_3dx.toml")]
-JsonPath = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write it as JSON, too.", callback=claimed)]
+JsonPath = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write the results as JSON.", callback=claimed)]
 
 
 def options(
@@ -106,8 +106,10 @@ def options(
     connect: Annotated[list[str] | None, typer.Option("--connect", "-e", metavar="ENDPOINT", help="Endpoint to connect to; repeatable.")] = None,
     listen: Annotated[list[str] | None, typer.Option("--listen", "-l", metavar="ENDPOINT", help="Endpoint to listen on; repeatable.")] = None,
     zenoh: Annotated[Path | None, typer.Option("--config", "-c", metavar="FILE", help="Zenoh's own configuration, JSON5.")] = None,
-    cfg: Annotated[list[str] | None, typer.Option("--cfg", metavar="KEY:VALUE", help="One setting of Zenoh, applied last; repeatable.")] = None,
-    multicast: Annotated[bool | None, typer.Option("--multicast-scouting/--no-multicast-scouting", help="Look for others by multicast; off.")] = None,
+    cfg: Annotated[list[str] | None, typer.Option("--cfg", metavar="KEY:VALUE", help="One Zenoh setting, applied last; repeatable.")] = None,
+    multicast: Annotated[
+        bool | None, typer.Option("--multicast-scouting/--no-multicast-scouting", help="Look for other processes by multicast; off by default.")
+    ] = None,
 ) -> dict[str, Any]:
     """Collect Zenoh's options, named as in Zenoh's own programs."""
     given = {"mode": mode, "connect": connect, "listen": listen, "config": zenoh, "cfg": cfg, "multicast": multicast}
@@ -116,7 +118,7 @@ def options(
 
 def process(command: Callable[..., int | None], *, with_model: bool = True) -> Callable[..., None]:
     """
-    Register a process of a robot: a command with CONFIG and Zenoh's options besides its own.
+    Register a command that runs a process on the bus: it takes CONFIG and Zenoh's options besides its own.
 
     Args:
         command: Takes the configuration, the settings of the bus, and its own options; returns an exit status, None for 0. If it
@@ -147,11 +149,11 @@ ScenarioName = Annotated[
     str | None,
     typer.Option(
         metavar="circle|eight|positioning|sines|steps|FILE.csv",
-        help="What to follow; a file holds waypoints, or times t and all outputs by name.",
+        help="Reference to follow; a file holds waypoints, or columns t and all outputs by name.",
         show_default="eight for a robot in the plane, sines of its outputs for any other",
     ),
 ]
-Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", min=0.1, help="How long to wait for an answer.")]
+Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", min=0.1, help="Longest time to wait for an answer.")]
 
 
 StatePath = Annotated[
@@ -159,7 +161,7 @@ StatePath = Annotated[
     typer.Option(
         "--state",
         metavar="DIR",
-        help="Folder that remembers an operator's stop.",
+        help="Folder in which an operator's stop is kept across restarts.",
         show_default="$STATE_DIRECTORY, $XDG_STATE_HOME/rti_mpc or ~/.local/state/rti_mpc",
     ),
 ]
@@ -169,10 +171,10 @@ StatePath = Annotated[
 def run(
     config: Config,
     bus: BusSettings,
-    standby: Annotated[bool, typer.Option("--standby", help="Stand by while another controller leads, and take over when it falls silent.")] = False,
+    standby: Annotated[bool, typer.Option("--standby", help="Stand by while another controller leads, and take over when it stops sending.")] = False,
     state: StatePath = None,
 ) -> int:
-    """Control the robot: wait for its states and a reference, answer each with a command."""
+    """Run the controller: answer each state of the robot with a command that follows the reference."""
     from rti_mpc_service.controller.daemon import main
 
     return main(config, bus, standby=standby, state=state)
@@ -180,7 +182,7 @@ def run(
 
 @partial(process, with_model=False)
 def guard(config: Config, bus: BusSettings, state: StatePath = None) -> int:
-    """Stand between controller and robot: pass on what is fresh and inside the limits, brake when nothing is."""
+    """Run the guard between controller and robot: pass on commands that are fresh and inside the limits, brake without them."""
     from rti_mpc_service.guard import main
 
     return main(config, bus, state=state)
@@ -190,12 +192,12 @@ def guard(config: Config, bus: BusSettings, state: StatePath = None) -> int:
 def sim(
     config: Config,
     bus: BusSettings,
-    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Seconds of the robot per second.")] = 1.0,
-    x0: Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE", help="Initial state, before the configuration's; repeatable.")] = None,
-    duration: Annotated[float | None, typer.Option(metavar="SECONDS", min=0.0, help="Stop after this long, in the robot's time.")] = None,
-    log: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Write every state, input and answer time.")] = None,
+    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Simulated seconds per second of real time.")] = 1.0,
+    x0: Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE", help="Initial state, instead of the configuration's; repeatable.")] = None,
+    duration: Annotated[float | None, typer.Option(metavar="SECONDS", min=0.0, help="Stop after this robot time.")] = None,
+    log: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Write each state with its input and the time of its answer.")] = None,
 ) -> None:
-    """Play the robot: a plant of its own model, that stops without valid commands."""
+    """Simulate the robot: a plant with its own parameters, which stops when it receives no valid commands."""
     from rti_mpc_sim.robot import main
     from rti_mpc_sim.settings import RobotSettings
 
@@ -211,18 +213,22 @@ def reference(
     scenario: ScenarioName = None,
     heading: Annotated[
         Literal["tangent", "consistent", "none"] | None,
-        typer.Option(help="Of the path; what the point ahead of the axle can follow; 0.", show_default="consistent"),
+        typer.Option(
+            help="Heading of the reference: along the path; as a point ahead of the axle can follow it; or zero.", show_default="consistent"
+        ),
     ] = None,
     duration: Annotated[
-        float | None, typer.Option(metavar="SECONDS", min=0.1, help="How long, in the robot's time; the scenario's own if not given.")
+        float | None, typer.Option(metavar="SECONDS", min=0.1, help="Duration of the reference, robot time.", show_default="the scenario's own")
     ] = None,
     waypoint_speed: Annotated[float, typer.Option(metavar="M/S", min=0.001, help="Speed along waypoints.")] = 0.25,
     waypoint_smoothing: Annotated[
         float | None,
-        typer.Option(metavar="M", min=0.0, help="Path that waypoints are averaged over; 0: none.", show_default="as their noise needs"),
+        typer.Option(
+            metavar="M", min=0.0, help="Length of path over which waypoints are averaged; 0: not averaged.", show_default="as their noise needs"
+        ),
     ] = None,
 ) -> None:
-    """Publish a reference from the robot's present state on, and again when the robot restarts."""
+    """Publish a reference that starts at the robot's current state, and again after each restart of the robot."""
     from rti_mpc_service.reference import main
     from rti_mpc_service.scenario import find_scenario
 
@@ -235,9 +241,13 @@ def view(
     config: Config,
     bus: BusSettings,
     rerun_spawn: Annotated[bool, typer.Option("--rerun-spawn", help="Start a Rerun viewer on this machine.")] = False,
-    rerun_connect: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Draw in a Rerun viewer that is there, or will be.")] = None,
+    rerun_connect: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Draw in a Rerun viewer at this address, also if it starts later.")
+    ] = None,
     rerun_save: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Record to a file.")] = None,
-    rerun_memory_limit: Annotated[str, typer.Option(metavar="SIZE", help="Memory a spawned viewer may fill before it forgets.")] = "25%",
+    rerun_memory_limit: Annotated[
+        str, typer.Option(metavar="SIZE", help="Memory of a spawned viewer, beyond which it drops the oldest data.")
+    ] = "25%",
 ) -> int:
     """Draw the robot live in Rerun, or record it."""
     from rti_mpc_service.view.view import main
@@ -254,7 +264,7 @@ def view(
 
 @process
 def router(config: Config, bus: BusSettings) -> None:
-    """Run a Zenoh router, for clients on several hosts or behind access control."""
+    """Run a Zenoh router, for clients on several hosts or with access control."""
     from rti_mpc_service.router import main
 
     main(bus, config.keys())
@@ -262,7 +272,7 @@ def router(config: Config, bus: BusSettings) -> None:
 
 @partial(process, with_model=False)
 def stop(config: Config, bus: BusSettings, timeout: Timeout = 2.0, state: StatePath = None) -> int:
-    """Bring the robot to a standstill, across every restart; only `enable` releases it."""
+    """Stop the robot; it stays stopped across every restart until `enable`."""
     from rti_mpc_service.request import stop_or_enable
 
     return stop_or_enable(bus, config.keys(), "stop", timeout, guarded=config.guard.enabled, state=state)
@@ -270,7 +280,7 @@ def stop(config: Config, bus: BusSettings, timeout: Timeout = 2.0, state: StateP
 
 @partial(process, with_model=False)
 def enable(config: Config, bus: BusSettings, timeout: Timeout = 2.0, state: StatePath = None) -> int:
-    """Release a robot that was stopped."""
+    """Release a robot that was stopped by `stop`."""
     from rti_mpc_service.request import stop_or_enable
 
     return stop_or_enable(bus, config.keys(), "enable", timeout, guarded=config.guard.enabled, state=state)
@@ -283,7 +293,7 @@ def params(
     words: Annotated[list[str] | None, typer.Argument(metavar="get [KEY]... | set KEY=VALUE...", help="Keys and values as in the file.")] = None,
     timeout: Timeout = 2.0,
 ) -> int:
-    """Print parameters of a controller that runs, or change them, all or none, between two samples."""
+    """Print parameters of the running controller, or change them, all or none, between two samples."""
     from rti_mpc_service.request import params
 
     return params(bus, config.keys(), words or ["get"], timeout)
@@ -295,17 +305,22 @@ def demo(
     scenario: ScenarioName = None,
     heading: Annotated[
         Literal["tangent", "consistent", "none"] | None,
-        typer.Option(help="Of the path; what the point ahead of the axle can follow; without weight on it.", show_default="the scenario's best"),
+        typer.Option(
+            help="Heading of the reference: along the path; as a point ahead of the axle can follow it; or zero, with no weight on it.",
+            show_default="the scenario's best",
+        ),
     ] = None,
-    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Seconds of the robot per second.")] = 4.0,
+    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Simulated seconds per second of real time.")] = 4.0,
     duration: Annotated[
-        float | None, typer.Option(metavar="SECONDS", min=1.0, help="How long, in the robot's time.", show_default="the scenario's own")
+        float | None, typer.Option(metavar="SECONDS", min=1.0, help="Duration of the drive, robot time.", show_default="the scenario's own")
     ] = None,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder to leave everything in.", show_default="runs/SCENARIO-TIME")] = None,
-    viewer: Annotated[bool, typer.Option("--viewer", help="Watch live in Rerun.")] = False,
-    guard: Annotated[bool, typer.Option("--guard", help="With a guard between controller and robot.")] = False,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for configuration, summary, figure and recording.", show_default="runs/SCENARIO-TIME")
+    ] = None,
+    viewer: Annotated[bool, typer.Option("--viewer", help="Show the drive live in Rerun.")] = False,
+    guard: Annotated[bool, typer.Option("--guard", help="Run a guard between controller and robot.")] = False,
 ) -> None:
-    """Run the whole system on this machine, and sum up how well the robot was driven."""
+    """Run the whole system on this machine, and print a summary of errors, limits and times."""
     from rti_mpc_service.demo.demo import main
 
     raise typer.Exit(main(load(config), scenario, heading=heading, speed=speed, duration_s=duration, folder=out, viewer=viewer, guard=guard))
@@ -314,10 +329,12 @@ def demo(
 @app.command(cls=FaultsCommand)
 def faults(
     config: ConfigPath = SHIPPED,
-    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="One fault of those below; repeatable.", show_default="all")] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Name of a fault from the list below; repeatable.", show_default="all")
+    ] = None,
     path: JsonPath = None,
 ) -> None:
-    """Break every part of a running system in turn, and print what the robot did: the fault matrix."""
+    """Inject faults into a running system, one after the other, and print what the robot did: the fault matrix."""
     from rti_mpc_service.faults.run import main
 
     raise typer.Exit(main(config, tuple(only or ()), path))
@@ -326,18 +343,20 @@ def faults(
 @app.command()
 def bench(
     horizon: Annotated[
-        list[int] | None, typer.Option("--horizon", "-n", min=2, help="Stages; repeatable.", show_default="7, 20, 50, 100, 200")
+        list[int] | None, typer.Option("--horizon", "-n", min=2, help="Horizon, in stages; repeatable.", show_default="7, 20, 50, 100, 200")
     ] = None,
-    solver: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Another QP solver of qpsolvers, such as daqp; repeatable.")] = None,
+    solver: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Further QP solver to measure, by its name in qpsolvers, such as daqp; repeatable.")
+    ] = None,
     problem: Annotated[
-        list[str] | None, typer.Option(metavar="FAMILY", help="Measure a problem family instead, such as slalom, or all of them; repeatable.")
+        list[str] | None, typer.Option(metavar="FAMILY", help="Problem family to measure instead, such as slalom, or all; repeatable.")
     ] = None,
-    interpreted: Annotated[bool, typer.Option("--interpreted", help="Also without a compiler.")] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="A first look: eight seconds of driving.")] = False,
-    costs: Annotated[bool, typer.Option("--costs", help="Also closed-loop costs against exact QPs and converged NMPC.")] = False,
+    interpreted: Annotated[bool, typer.Option("--interpreted", help="Also measure without a compiler.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="A short run: eight seconds of driving.")] = False,
+    costs: Annotated[bool, typer.Option("--costs", help="Also compare closed-loop costs with those of exact QPs and of converged NMPC.")] = False,
     path: JsonPath = None,
 ) -> None:
-    """Measure what a sample costs, by horizon and formulation, beside IPOPT on the same states."""
+    """Measure the computing time per sample by horizon, solver and formulation, and of IPOPT on the same states."""
     if problem:
         from rti_mpc_service.bench import family_bench
 
@@ -353,9 +372,9 @@ def paper(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for paper.md and its folder of figures and run.json.", show_default="runs/paper-TIME")
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="A first look: three seconds of every experiment, few of each sweep.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="A short run: three seconds of every experiment, few points of each sweep.")] = False,
 ) -> None:
-    """Do the paper's study again, and beyond: its algorithms beside this one's, what it leaves open, what each setting gains."""
+    """Reproduce the paper's study: its algorithms, real-time iteration and converged NMPC, and the effect of each setting."""
     from rti_mpc_service.paper.study import main
 
     raise typer.Exit(main(out, quick=quick))
@@ -363,7 +382,7 @@ def paper(
 
 @app.command()
 def check(config: ConfigPath = SHIPPED) -> None:
-    """Load a configuration, solve 200 times, print both phases and the verdict of a second solver."""
+    """Check a configuration: solve 200 samples, print the times of both phases, and compare with a second solver."""
     from rti_mpc_service.check.check import main
 
     raise typer.Exit(main(config))
@@ -371,11 +390,11 @@ def check(config: ConfigPath = SHIPPED) -> None:
 
 @app.command()
 def init(
-    name: Annotated[str | None, typer.Argument(metavar="NAME", help="The robot's name, which is that of its module, too.")] = None,
-    like: Annotated[str, typer.Option("--like", metavar="unicycle|bicycle", help="The robot to begin with.")] = "unicycle",
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="Name of the robot and of its Python module.")] = None,
+    like: Annotated[str, typer.Option("--like", metavar="unicycle|bicycle", help="Example to start from.")] = "unicycle",
     deploy: Annotated[bool, typer.Option("--deploy", help="Write systemd units, configurations of Zenoh and the runbook into deploy/.")] = False,
 ) -> None:
-    """Write configuration, model, test and next steps of a robot of your own into this folder."""
+    """Write configuration, model, test and a page of next steps for a robot of your own into this folder."""
     from rti_mpc_service.init import main
 
     for path in main(name, like, Path(), deploy=deploy):
@@ -385,7 +404,7 @@ def init(
 
 @app.command()
 def schema() -> None:
-    """Print the JSON schema of a robot's TOML file, by which editors complete and check it."""
+    """Print the JSON schema of a robot's TOML file, with which editors complete and check it."""
     typer.echo(
         json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "rti-mpc robot", **Config.model_json_schema()}, indent=1)
     )
@@ -396,7 +415,7 @@ def doctor(
     config: ConfigPath = SHIPPED,
     path: JsonPath = None,
 ) -> None:
-    """Examine this host: scheduler, clock, timers, bus, compiler, and which period the loop can keep here."""
+    """Examine this host: scheduler, clock, timers, bus, compiler, and the shortest period that the loop can keep."""
     from rti_mpc_service.doctor.doctor import main
 
     raise typer.Exit(main(config, path))

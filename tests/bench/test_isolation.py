@@ -2,7 +2,7 @@
 """
 Whoever only watches delays no sample: a viewer that hangs, one that stops, one whose disk is full.
 
-Real processes, 100 samples a second in real time, in rounds of blocks in random
+Real processes, 100 samples per second in real time, in rounds of blocks in random
 order. Each trouble begins with its block and is compared with the block of the
 same round in which it is not there: nobody watches, or, for a viewer that goes on
 without its recording, a viewer records. What two blocks in which nobody watches

@@ -2,7 +2,7 @@
 """
 From a state sent to its command received, against the floor: a bare echo over the same bus.
 
-Robot and controller are the real processes, 100 samples a second in real time.
+Robot and controller are the real processes, 100 samples per second in real time.
 The echo is Zenoh alone, in a process of its own on a link of its own: messages of
 a state's size out, of a command's size back, one in the middle between any two
 samples. Times are ratios within this one run: both sides meet the same machine.

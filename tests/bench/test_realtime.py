@@ -2,7 +2,7 @@
 """
 What `[realtime]` is worth here: from a state in to its command out, on a machine at rest and beside processes that never rest.
 
-Real processes, 100 samples a second. In every round each setting has a controller
+Real processes, 100 samples per second. In every round each setting has a controller
 of its own, the settings in random order. Nothing is demanded but that what was
 asked for was granted: what it is worth is the machine's business.
 """

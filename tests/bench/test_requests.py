@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Whoever asks delays nobody: parameters changed and asked for, failures asked for, nonsense, and long references, each twenty times a second.
+Whoever asks delays nobody: parameters changed and asked for, failures asked for, nonsense, and long references, each twenty times per second.
 
-Real processes, 200 samples a second in real time, in rounds of blocks in random
+Real processes, 200 samples per second in real time, in rounds of blocks in random
 order. All of it is answered by threads of the controller's own process, which
 share one interpreter lock with the thread that controls. What two blocks in which
 nobody asks differ by is the machine. Run it with a priority, below the

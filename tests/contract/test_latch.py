@@ -44,7 +44,7 @@ def test_counter_that_leaps_is_not_believed() -> None:
 
 
 def test_forged_counters_never_reach_the_last_one_that_is_read() -> None:
-    years = MAX_COUNTER / MAX_COUNTER_LEAP / (1000 * 86_400 * 365.0)  # at a thousand messages a second, each the greatest leap
+    years = MAX_COUNTER / MAX_COUNTER_LEAP / (1000 * 86_400 * 365.0)  # at a thousand messages per second, each the greatest leap
     assert years > 100.0
 
 

@@ -110,13 +110,13 @@ def test_standby_hears_the_leader_and_leads_from_the_second_state_without_an_ans
 
 
 def test_states_between_samples_are_no_silence(pair: tuple[One, One]) -> None:
-    """A robot that sends states five times a period: the leader answers each fifth, and has one period to do so."""
+    """A robot that sends states five times per period: the leader answers each fifth, and has one period to do so."""
     _, standby = pair
     assert [standby.see(4 + k / 5) for k in range(1, 9)] == [False] * 7 + [True]
 
 
 def test_one_that_takes_over_between_samples_answers_the_next_one(pair: tuple[One, One]) -> None:
-    """With ten states a period, and somebody else who stands by: the silence it ended is none of its own."""
+    """With ten states per period, and somebody else who stands by: the silence it ended is none of its own."""
     _, standby = pair
     One(standby.wire, standby=True, number=standby.leadership.number + 1)
     for i in range(41, 60):

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Real processes among a thousand hostile messages a second: nobody ends, and as many samples are answered as without.
+Real processes among a thousand hostile messages per second: nobody ends, and as many samples are answered as without.
 
 `make attack` sends a million, in blocks of ten seconds, each beside an equal one without.
 """

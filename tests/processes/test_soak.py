@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Hours in small: 200 samples a second in real time, by real processes, for as long as `--soak-s` says; `make soak` says half an hour.
+Hours in small: 200 samples per second in real time, by real processes, for as long as `--soak-s` says; `make soak` says half an hour.
 
 Beside them a bare timer runs on each core. It computes nothing, so what makes it
 late is the host, and a period missed at such a moment is the host's, as is one at

@@ -101,7 +101,7 @@ def test_stop_said_to_nobody_is_noted_and_outlives_every_restart_until_it_is_rel
 
 @contextmanager
 def flood(endpoint: str) -> Iterator[list[float]]:
-    """Ask a controller for its parameters `REQUESTS_PER_S` times a second, and wait for no answer; the times at which it was asked, s."""
+    """Ask a controller for its parameters `REQUESTS_PER_S` times per second, and wait for no answer; the times at which it was asked, s."""
     config = zenoh.Config()
     for key, value in (("mode", '"peer"'), ("connect/endpoints", json.dumps([endpoint])), ("scouting/multicast/enabled", "false")):
         config.insert_json5(key, value)

@@ -171,7 +171,7 @@ def malformed(message: State | Command, rows: str) -> dict[str, bytes]:
         "must end after": whole + bytes(4),
         "big-endian": b"\x00\x00" + whole[2:],
         "must be finite": encode(replace(message, **{rows: np.full_like(values, np.nan)})),
-        "numbers a row": encode(replace(message, **{rows: np.concatenate([values, values[..., :1]], axis=-1)})),
+        "numbers per row": encode(replace(message, **{rows: np.concatenate([values, values[..., :1]], axis=-1)})),
         OTHER_VERSION: whole,
     }
 

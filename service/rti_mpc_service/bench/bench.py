@@ -226,10 +226,10 @@ def main(
     Args:
         horizons: Stages.
         entries: Solver and formulation; the sequential one is left out beyond 20 stages, where it takes long to compile.
-        solvers: Others to compare them with, by their names in qpsolvers, in both formulations.
+        solvers: Further solvers to compare with, by their names in qpsolvers, in both formulations.
         interpreted: Whether to measure CasADi's virtual machine, too.
-        quick: Eight seconds of driving in all, for a first look.
-        costs: Whether to compare closed-loop costs, with exact QPs and with converged NMPC, too.
+        quick: A short run: eight seconds of driving in all.
+        costs: Whether to compare closed-loop costs with those of exact QPs and of converged NMPC, too.
         path: JSON file to write.
     """
     for solver in solvers:
@@ -260,7 +260,7 @@ def main(
 
 def print_tables(console: Console, result: list[dict[str, Any]], *, costs: bool) -> None:
     """Print the rows, and how the step grows with N."""
-    table = Table(title="us a sample: median / p99")
+    table = Table(title="time per sample, us: median / p99")
     for name in (
         "N",
         "solver",
@@ -292,7 +292,7 @@ def print_tables(console: Console, result: list[dict[str, Any]], *, costs: bool)
             *([f"{row['over_exact']:+.3%} exact, {row['over_converged']:+.3%} converged"] if costs else []),
         )
     console.print(table)
-    made = Table(title="of what parts, medians, us")
+    made = Table(title="parts of a step, medians, us")
     for name in ("N", "solver", "formulation", *PARTS, "Python around"):
         made.add_column(name, justify="right")
     for row in result:

@@ -167,7 +167,7 @@ def main(names: Sequence[str], horizons: Sequence[int], solvers: Sequence[str], 
 
 def print_table(console: Console, rows: list[dict[str, Any]]) -> None:
     """Print the rows."""
-    table = Table(title="CPU time of a sample, us: median / p99 / most")
+    table = Table(title="CPU time per sample, us: median / p99 / most")
     for heading in ("problem", "N", "solver", "step", "feedback", "IPOPT", "unsolved", "iterations", "cost", "compile"):
         table.add_column(heading, justify="left" if heading in ("problem", "solver") else "right", no_wrap=True)
     for row in rows:

@@ -34,7 +34,7 @@ def check_tree(config: Config) -> None:
         raise ConfigError(f"ocp.N_u must be at most ocp.N = {ocp.N}, got {ocp.N_u}")
     for key, values, length in (("delta", ocp.weights.delta, ocp.N), ("lambda", ocp.weights.lambda_, config.N_u)):
         if len(values) not in (1, length):
-            raise ConfigError(f"ocp.weights.{key} must be a number or a list of {length}, one a stage, got {quoted(list(values))}")
+            raise ConfigError(f"ocp.weights.{key} must be a number or a list of {length}, one per stage, got {quoted(list(values))}")
     if config.bus.config is not None and not config.bus.config.is_file():
         raise ConfigError(f"bus.config must be a file, got {config.bus.config}")
     for name in config.guard.angles:

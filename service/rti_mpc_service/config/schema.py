@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The tables of a robot's TOML file, each a frozen model whose fields say what they are and in which unit.
+Schema of a robot's TOML file: one frozen model per table, with meaning and unit of every key.
 
-What a table leaves out here as None, the library decides: a default stands in
-one place only.
+Keys that are None when left out have their default in the library, so that each
+default is written in one place only.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def interval(value: object) -> object:
 
 
 def around_zero(value: tuple[float, float]) -> tuple[float, float]:
-    """Accept an interval in which an input can be raised, kept and lowered."""
+    """Accept an interval with zero inside it: limits of an increment."""
     if not value[0] < 0.0 < value[1]:
         raise ValueError("must hold lower < 0 < upper, or the input could not be kept, or not brought to rest")
     return value
@@ -47,7 +47,7 @@ def sequence(value: object) -> object:
 Bound = Annotated[float, AllowInfNan(True)]
 Interval = Annotated[tuple[Bound, Bound], BeforeValidator(interval)]
 Increment = Annotated[Interval, AfterValidator(around_zero)]
-Weight = Annotated[float, Field(ge=0, le=1e15)]  # beyond it, numbers are no numbers any more
+Weight = Annotated[float, Field(ge=0, le=1e15)]  # limited so that sums with terms of order 1 keep their digits
 Positive = Annotated[float, Field(gt=0)]
 Weights = Annotated[tuple[Weight, ...], BeforeValidator(sequence)]
 Pair = Annotated[tuple[float, float], BeforeValidator(pair)]
@@ -57,72 +57,80 @@ Endpoint = Annotated[str, Field(pattern=r"^[a-z0-9_-]+/\S+$")]
 Endpoints = Annotated[tuple[Endpoint, ...], Field(strict=False)]
 
 ITERATION_KEYS = {"iterations", "tolerance"}  # keys of [solver] that are settings of `Rti`, not of OSQP
-RAMP_LEAD_S = 0.025  # time from a state going stale to the end of its plan, in which the ramp is computed and sent
+RAMP_LEAD_S = 0.025  # time left between a state becoming stale and the end of its plan, to compute and send the ramp
 
 
 class Section(BaseModel):
-    """A table of the file: frozen, nothing unknown, numbers finite, no text taken for a number."""
+    """A table of the file: frozen, unknown keys refused, numbers finite, no conversion of text to numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class ModelSection(Section):
-    """Which robot."""
+    """The robot's model."""
 
     name: str = Field(description="a shipped model, or one of your own: module:function or file.py:function, found beside this file first")
     folder: Annotated[Path, Field(strict=False)] | None = Field(
-        default=None, description="folder that your module or file is looked for in first; that of this file if left out"
+        default=None, description="folder in which your module or file is looked for first; the folder of this file if left out"
     )
-    parameters: dict[str, float] = Field(default={}, description="parameters that differ from the model's by name, each in its own unit")
+    parameters: dict[str, float] = Field(default={}, description="parameters that differ from the model's, by name, each in its own unit")
     stop: Literal["rests", "coasts"] = Field(
         default="rests",
-        description="what a stop does to the robot: it rests, which is checked; or it coasts or falls, its inputs at rest",
+        description="effect of a stop: rests if it brings the robot to rest, which is checked; coasts if it may coast or fall then",
     )
 
 
 class WeightSection(Section):
     """The cost (4) of [Rosales]_."""
 
-    Q: dict[str, Weight] = Field(description="weight of each output by name, in cost / unit of the output squared")
-    R: dict[str, Weight] = Field(description="weight of each input's increment by name, in cost / unit of the input squared")
-    delta: Weights = Field(default=(1.0,), description="factor of Q, without unit: a constant, or one for each of the N stages")
-    lambda_: Weights = Field(default=(1.0,), alias="lambda", description="factor of R, without unit: a constant, or one for each of the N_u stages")
+    Q: dict[str, Weight] = Field(description="weight of each output, by name, in cost / unit of the output squared")
+    R: dict[str, Weight] = Field(description="weight of the increment of each input, by name, in cost / unit of the input squared")
+    delta: Weights = Field(default=(1.0,), description="factor of Q, without unit: one number, or a list of N, one per stage")
+    lambda_: Weights = Field(default=(1.0,), alias="lambda", description="factor of R, without unit: one number, or a list of N_u, one per stage")
 
 
 class BoundSection(Section):
-    """What inputs, states and constraints may be; a name left out has no bound."""
+    """Bounds [lower, upper] of inputs, increments, states and constraints; a name left out has no bound."""
 
-    inputs: dict[str, Interval] = Field(default={}, description="bounds of inputs by name, in the input's unit")
-    increments: dict[str, Increment] = Field(default={}, description="bounds of an input's change from sample to sample by name, in its unit")
-    states: dict[str, Interval] = Field(default={}, description="softened bounds of states by name, in the state's unit")
-    constraints: dict[str, Interval] = Field(default={}, description="softened bounds of the model's constraints by name, in the constraint's unit")
-    soft_weight: Weight | None = Field(
-        default=None, description="L1 weight of a state or constraint outside its bounds, and of an obstacle entered, in cost / its unit"
+    inputs: dict[str, Interval] = Field(default={}, description="bounds of inputs, by name, in the input's unit")
+    increments: dict[str, Increment] = Field(
+        default={}, description="bounds of the change of an input from one sample to the next, by name, in the input's unit"
     )
-    soft_weight_L2: Weight | None = Field(default=None, description="L2 weight of the same, in cost / its unit squared")
+    states: dict[str, Interval] = Field(default={}, description="softened bounds of states, by name, in the state's unit")
+    constraints: dict[str, Interval] = Field(default={}, description="softened bounds of the model's constraints, by name, in the constraint's unit")
+    soft_weight: Weight | None = Field(
+        default=None, description="L1 weight on the violation of a softened bound or an obstacle, in cost / unit of what is bounded"
+    )
+    soft_weight_L2: Weight | None = Field(default=None, description="L2 weight on the same, in cost / that unit squared")
 
 
 class RegulatorSection(Section):
-    """Where the linear-quadratic regulator is linearized; what is left out is as in the model's nominal state, mostly zero, or an input's rest."""
+    """Point at which the linear-quadratic regulator is linearized; left out: the model's nominal state, mostly zero, and the inputs at rest."""
 
-    states: dict[str, float] = Field(default={}, description="states by name, in the state's unit; a wheeled robot must be in motion")
-    inputs: dict[str, float] = Field(default={}, description="inputs by name, in the input's unit")
+    states: dict[str, float] = Field(default={}, description="states, by name, in the state's unit; a wheeled robot must be in motion")
+    inputs: dict[str, float] = Field(default={}, description="inputs, by name, in the input's unit")
 
 
 class TerminalSection(Section):
-    """A weight on the last outputs of the horizon beside their Q: given, or from a regulator."""
+    """A terminal weight on the outputs, added to their Q: given, or from a regulator."""
 
-    Q: dict[str, Weight] | None = Field(default=None, description="weight of each output by name, in cost / unit of the output squared")
-    lqr: RegulatorSection | None = Field(default=None, description="instead: what the model's regulator would pay from there on for ever")
+    Q: dict[str, Weight] | None = Field(default=None, description="weight of each output, by name, in cost / unit of the output squared")
+    lqr: RegulatorSection | None = Field(
+        default=None, description="instead of Q: the infinite-horizon cost of the linear-quadratic regulator about this point"
+    )
 
 
 class ObstacleSection(Section):
-    """A disc that the robot's position keeps out of, at the price of `soft_weight`."""
+    """A disc that the robot's position stays out of; entering it costs `soft_weight`."""
 
-    centre_m: Pair = Field(description="its centre [x, y], in m")
-    radius_m: Positive = Field(description="its radius, in m")
-    margin_m: Weight = Field(default=0.0, description="kept from it, in m: the robot's own radius, and what it cuts short between two samples")
-    velocity_m_s: Pair = Field(default=(0.0, 0.0), description="[x, y] in m/s, at which `rti-mpc reference` moves it from the reference's start on")
+    centre_m: Pair = Field(description="centre of the disc [x, y], in m")
+    radius_m: Positive = Field(description="radius of the disc, in m")
+    margin_m: Weight = Field(
+        default=0.0, description="distance kept from the disc, in m: the robot's radius, and how far it cuts in between two samples"
+    )
+    velocity_m_s: Pair = Field(
+        default=(0.0, 0.0), description="velocity [x, y], in m/s, with which `rti-mpc reference` moves the disc from the start of the reference on"
+    )
 
 
 class OcpSection(Section):
@@ -132,137 +140,149 @@ class OcpSection(Section):
     N_u: int | None = Field(default=None, ge=1, description="control horizon, in stages; N if left out")
     dt_s: Period = Field(description="duration of a stage and period of the controller, in seconds")
     integrator: Literal["rk4", "euler"] = Field(default="rk4", description="integrator of a stage")
-    formulation: Literal["auto", "simultaneous", "sequential"] = Field(default="auto", description="of the QP; auto takes the faster one")
-    weights: WeightSection = Field(description="the cost")
+    formulation: Literal["auto", "simultaneous", "sequential"] = Field(default="auto", description="formulation of the QP; auto takes the faster one")
+    weights: WeightSection = Field(description="weights of the cost")
     bounds: BoundSection = Field(default=BoundSection(), description="bounds of inputs, increments, states and constraints")
-    terminal: TerminalSection = Field(default=TerminalSection(), description="weight on the end of the horizon; none if left out")
-    obstacles: Annotated[tuple[ObstacleSection, ...], Field(strict=False)] = Field(default=(), description="discs to keep out of; none if left out")
+    terminal: TerminalSection = Field(default=TerminalSection(), description="terminal weight; none if left out")
+    obstacles: Annotated[tuple[ObstacleSection, ...], Field(strict=False)] = Field(default=(), description="discs to stay out of; none if left out")
 
 
 class SolverSection(Section):
-    """The QP solver, iterations a sample, and OSQP's settings; what is left out is as `Rti` and `SolverSettings` have it."""
+    """The QP solver, iterations per sample, and OSQP's settings; defaults are those of `Rti` and `SolverSettings`."""
 
-    name: str = Field(default="riccati", description="riccati, with osqp behind it; osqp; or another one's name in qpsolvers, such as daqp")
-    eps: float | None = Field(default=None, ge=1e-12, le=1e-1, description="absolute and relative tolerance on the residuals, without unit")
-    max_iter: int | None = Field(default=None, ge=1, le=1_000_000, description="iterations at most; the iterate is then taken as it is")
-    rho: float | None = Field(default=None, ge=1e-6, le=1e6, description="step size of ADMM, without unit")
-    check_termination: int | None = Field(default=None, ge=1, le=1000, description="iterations between two looks at the residuals")
-    iterations: int | None = Field(default=None, ge=1, le=100, description="QPs a sample at most: 1 is the plain real-time iteration, many are SQP")
-    tolerance: float | None = Field(default=None, ge=0, le=2, description="step from which another follows, in shares of half an input's range")
+    name: str = Field(
+        default="riccati", description="riccati, with osqp as its backup; osqp; or the name of another solver in qpsolvers, such as daqp"
+    )
+    eps: float | None = Field(default=None, ge=1e-12, le=1e-1, description="OSQP: absolute and relative tolerance on the residuals, without unit")
+    max_iter: int | None = Field(default=None, ge=1, le=1_000_000, description="OSQP: most iterations; the last iterate is then taken as it is")
+    rho: float | None = Field(default=None, ge=1e-6, le=1e6, description="OSQP: step size of ADMM, without unit")
+    check_termination: int | None = Field(default=None, ge=1, le=1000, description="OSQP: iterations between two checks of the residuals")
+    iterations: int | None = Field(default=None, ge=1, le=100, description="most QPs per sample: 1 is the plain real-time iteration, many are SQP")
+    tolerance: float | None = Field(
+        default=None, ge=0, le=2, description="change of the inputs above which a further QP follows, as a share of half their range"
+    )
 
 
 class TimingSection(Section):
     """Delays and timeouts, in the robot's time."""
 
-    delay_s: Duration | Literal["measured"] = Field(default=0.0, description="delay from a state to the act of its command, in seconds, or measured")
+    delay_s: Duration | Literal["measured"] = Field(default=0.0, description="delay from a state until its command acts, in seconds; or measured")
     stale_s: Period | None = Field(
-        default=None, description="age from which a state is not used, in seconds; max(2.5 dt_s, 0.05) up to valid_s - 0.025 if left out"
+        default=None, description="age from which a state is no longer used, in seconds; if left out max(2.5 dt_s, 0.05), at most valid_s - 0.025"
     )
-    valid_s: float = Field(default=0.25, gt=0, le=0.3, description="how long after a state its command may act, in seconds")
+    valid_s: float = Field(default=0.25, gt=0, le=0.3, description="time after a state for which its command may act, in seconds")
 
 
 class DisturbanceSection(Section):
-    """What is known of one disturbance."""
+    """Assumptions about one disturbance."""
 
-    drift: Positive = Field(description="random walk, in the input's unit, or the state's / s, each / sqrt(s): larger follows faster, and noisier")
+    drift: Positive = Field(
+        description="intensity of its random walk, in (input's unit) / sqrt(s) or (state's unit / s) / sqrt(s); larger: faster, with more noise"
+    )
     limit: Positive = Field(description="largest magnitude of the estimate, in the input's unit, or the state's / s")
 
 
 class ObserverSection(Section):
-    """An estimator of disturbances and of unmeasured states; what is left out is as `ObserverSettings` has it."""
+    """An estimator of disturbances and of unmeasured states; defaults are those of `ObserverSettings`."""
 
     disturbances: dict[str, DisturbanceSection] = Field(
-        default={}, description="by the name of an input, or of a state whose derivative is disturbed"
+        default={}, description="disturbances to estimate, by name of the input, or of the state whose derivative they are added to"
     )
     measured: Annotated[tuple[str, ...], Field(strict=False)] = Field(default=(), description="states that are measured; all if left out")
-    noise: dict[str, Positive] = Field(default={}, description="standard deviation of measured states by name, in the state's unit")
-    process: dict[str, Weight] = Field(default={}, description="random walk of states beside the model by name, in the state's unit / sqrt(s)")
+    noise: dict[str, Positive] = Field(default={}, description="standard deviation of the measurement noise of states, by name, in the state's unit")
+    process: dict[str, Weight] = Field(default={}, description="intensity of the process noise of states, by name, in the state's unit / sqrt(s)")
 
 
 class GuardSection(Section):
     """
-    The guard, a process of its own between controller and robot.
+    The guard, a separate process between controller and robot.
 
     It loads no model: bounds and slew limits are those of ``ocp.bounds``, whose
     ``inputs`` must then name every input, in the model's order.
     """
 
-    enabled: bool = Field(default=False, description="whether the robot takes what the guard passes on, not what the controller commands")
-    tick_s: float = Field(default=0.01, ge=1e-3, le=0.01, description="between two looks at the clock, in seconds of the wall")
-    u_rest: dict[str, float] = Field(default={}, description="inputs at which the robot stands by name, in the input's unit; zero if left out")
+    enabled: bool = Field(default=False, description="whether the robot obeys the guard (key actuation) instead of the controller (key command)")
+    tick_s: float = Field(default=0.01, ge=1e-3, le=0.01, description="time between two checks of the clock, in seconds of wall time")
+    u_rest: dict[str, float] = Field(default={}, description="inputs at which the robot stands, by name, in the input's unit; zero if left out")
     states: Annotated[tuple[str, ...], Field(strict=False)] = Field(
-        default=(), description="the model's states in its order, for ways to rest that need feedback; none of those pass if left out"
+        default=(), description="the model's states in its order, to judge ways to rest that need feedback; if left out, none of these pass"
     )
-    angles: Annotated[tuple[str, ...], Field(strict=False)] = Field(default=(), description="those of the states that are angles")
+    angles: Annotated[tuple[str, ...], Field(strict=False)] = Field(default=(), description="those of guard.states that are angles")
 
 
 class DebugSection(Section):
-    """What is never wanted on a robot at work."""
+    """Failures on request, for tests; not for a robot in use."""
 
-    inject: bool = Field(default=False, description="whether requests may let samples fail, to see what the controller then does")
+    inject: bool = Field(default=False, description="whether requests may make samples fail, to test how the controller responds")
 
 
 class ParamsSection(Section):
-    """What `rti-mpc params` may do."""
+    """Parameters that `rti-mpc params` may change."""
 
     live: bool = Field(default=False, description="whether requests may change weights, and tighten bounds, while the controller runs")
 
 
 class BusSection(Section):
-    """The Zenoh session of each process; what is left out is as `BusSettings` has it, and the command line overrides it."""
+    """The Zenoh session of each process; defaults are those of `BusSettings`, and the command line overrides it."""
 
-    mode: Literal["peer", "client"] | None = Field(default=None, description="peer, or client of a router")
-    listen: Endpoints | None = Field(default=None, description="endpoints the robot listens on, such as tcp/127.0.0.1:7447; connect's if left out")
-    connect: Endpoints | None = Field(default=None, description="endpoints the others connect to, such as tcp/127.0.0.1:7447")
-    config: Annotated[Path, Field(strict=False)] | None = Field(default=None, description="Zenoh's own JSON5 file, beside this one")
+    mode: Literal["peer", "client"] | None = Field(default=None, description="Zenoh mode: peer, or client of a router")
+    listen: Endpoints | None = Field(
+        default=None, description="endpoints on which the robot listens, such as tcp/127.0.0.1:7447; those of connect if left out"
+    )
+    connect: Endpoints | None = Field(default=None, description="endpoints to which the other processes connect, such as tcp/127.0.0.1:7447")
+    config: Annotated[Path, Field(strict=False)] | None = Field(
+        default=None, description="Zenoh configuration file, JSON5, looked for beside this file"
+    )
 
 
 class RealtimeSection(Section):
-    """What the controller asks of the operating system; each is attempted, reported, and not required."""
+    """Scheduling of the controller by the operating system; each setting is attempted, reported, and not required."""
 
     priority: int | None = Field(
-        default=None, ge=1, le=99, description="of the controller among SCHED_FIFO's, 1 to 99; the usual scheduler if left out"
+        default=None, ge=1, le=99, description="SCHED_FIFO priority of the controller, 1 to 99; the default scheduler if left out"
     )
     cores: tuple[Annotated[int, Field(ge=0)], ...] = Field(
-        default=(), strict=False, description="to run the controller on, by number; any if left out"
+        default=(), strict=False, description="numbers of the cores on which the controller runs; any core if left out"
     )
-    lock_memory: bool = Field(default=False, description="whether the controller's memory may not be swapped out")
+    lock_memory: bool = Field(default=False, description="whether the controller's memory is locked, so that it is never swapped out")
 
 
 class SimSection(Section):
-    """The simulated robot, which may differ from the controller's model; what is left out is as `RobotSettings` has it."""
+    """The simulated robot, which may differ from the controller's model; defaults are those of `RobotSettings`."""
 
     x0: dict[str, float] = Field(
-        default={}, description="initial state by name, in the state's unit; the model's nominal one, mostly zero, if left out"
+        default={}, description="initial state, by name, in the state's unit; the model's nominal state, mostly zero, if left out"
     )
-    parameters: dict[str, float] = Field(default={}, description="parameters of the plant that differ from [model]'s by name, each in its own unit")
-    state_period_s: Period | None = Field(default=None, description="period of the states, in seconds of the robot; dt_s if left out")
-    substeps: int | None = Field(default=None, ge=1, le=1000, description="RK4 steps in each period of the states")
-    noise_std: dict[str, Weight] = Field(default={}, description="standard deviation of measured states by name, in the state's unit")
-    sensor_delay_s: Duration | None = Field(default=None, description="from measuring a state to sending it, in seconds of the robot")
-    dropout: float | None = Field(default=None, ge=0, lt=1, description="share of states lost on the way, without unit")
-    actuator_delay_s: Duration | None = Field(default=None, description="from a command being due to the input moving, in seconds of the robot")
-    actuator_lag_s: Duration | None = Field(default=None, description="time constant of the inputs, in seconds of the robot")
-    reports_inputs: bool | None = Field(default=None, description="whether states tell which inputs act; true if left out")
-    approaches: bool = Field(default=True, description="whether the robot itself approaches a command inside the slew limits, from what really acts")
+    parameters: dict[str, float] = Field(default={}, description="parameters of the plant that differ from [model]'s, by name, each in its own unit")
+    state_period_s: Period | None = Field(default=None, description="time between two states, in seconds of the robot; dt_s if left out")
+    substeps: int | None = Field(default=None, ge=1, le=1000, description="RK4 steps between two states")
+    noise_std: dict[str, Weight] = Field(default={}, description="standard deviation of the noise of measured states, by name, in the state's unit")
+    sensor_delay_s: Duration | None = Field(default=None, description="delay from measuring a state to sending it, in seconds of the robot")
+    dropout: float | None = Field(default=None, ge=0, lt=1, description="share of states that are lost, without unit")
+    actuator_delay_s: Duration | None = Field(default=None, description="delay of the actuators, in seconds of the robot")
+    actuator_lag_s: Duration | None = Field(default=None, description="time constant of the actuators, in seconds of the robot")
+    reports_inputs: bool | None = Field(default=None, description="whether states report the acting inputs; true if left out")
+    approaches: bool = Field(
+        default=True, description="whether the robot itself keeps to the slew limits while it approaches a command from the inputs that act"
+    )
     seed: int | None = Field(default=None, ge=0, description="seed of noise and dropout")
 
 
 class Config(Section):
-    """Everything physical about one robot."""
+    """Configuration of one robot."""
 
     robot: str = Field(pattern=r"^[A-Za-z0-9_.-]+$", description="the robot's name in keys: letters, digits, _ . -")
-    prefix: str = Field(default="rti_mpc", pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$", description="what all keys begin with")
-    model: ModelSection = Field(description="which robot")
+    prefix: str = Field(default="rti_mpc", pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$", description="first part of all keys")
+    model: ModelSection = Field(description="the robot's model")
     ocp: OcpSection = Field(description="the optimal control problem")
-    solver: SolverSection = Field(default=SolverSection(), description="the QP solver's settings")
+    solver: SolverSection = Field(default=SolverSection(), description="the QP solver and its settings")
     timing: TimingSection = Field(default=TimingSection(), description="delays and timeouts")
     observer: ObserverSection = Field(default=ObserverSection(), description="estimator of disturbances and of unmeasured states; none if left out")
     guard: GuardSection = Field(default=GuardSection(), description="the guard between controller and robot")
-    debug: DebugSection = Field(default=DebugSection(), description="failures on request")
-    params: ParamsSection = Field(default=ParamsSection(), description="what may change while the controller runs")
+    debug: DebugSection = Field(default=DebugSection(), description="failures on request, for tests")
+    params: ParamsSection = Field(default=ParamsSection(), description="changes while the controller runs")
     bus: BusSection = Field(default=BusSection(), description="the Zenoh session")
-    realtime: RealtimeSection = Field(default=RealtimeSection(), description="what the controller asks of the operating system")
+    realtime: RealtimeSection = Field(default=RealtimeSection(), description="scheduling of the controller by the operating system")
     sim: SimSection = Field(default=SimSection(), description="the simulated robot")
 
     @property
@@ -272,17 +292,17 @@ class Config(Section):
 
     @property
     def stale_s(self) -> float:
-        """Age from which a state is not used, s of the robot; early enough that the ramp is there before the last plan ends."""
+        """Age from which a state is no longer used, s of the robot; early enough for the ramp to arrive before the last plan ends."""
         return self.timing.stale_s or min(max(2.5 * self.ocp.dt_s, 0.05), max(self.timing.valid_s - RAMP_LEAD_S, self.ocp.dt_s))
 
     @property
     def delay_s(self) -> float | None:
-        """Delay from a state to the act of its command, s of the robot; None: measured."""
+        """Delay from a state until its command acts, s of the robot; None: measured."""
         return None if self.timing.delay_s == "measured" else self.timing.delay_s
 
     @property
     def config_hash(self) -> int:
-        """64 bits of everything that decides a command: not of the bus, the guard, the scheduler, the simulation, failures on request or folders."""
+        """Hash, 64 bits, of all keys on which commands depend: not bus, guard, scheduling, simulation, failures on request and folders."""
         content = self.model_dump(mode="json", exclude={**dict.fromkeys(("bus", "debug", "guard", "realtime", "sim"), True), "model": {"folder"}})
         return int.from_bytes(hashlib.sha256(json.dumps(content, sort_keys=True).encode()).digest()[:8], "little")
 

@@ -201,7 +201,7 @@ def test_what_is_decided_reaches_the_controller_and_the_bus(pair: tuple[One, One
     assert [standby.see(k) for k in (5, 6)] == [False, True]
     assert (standby.puppet.standing_by, standby.puppet.epoch) == (False, standby.leadership.epoch)
     assert standby.leadership.declare()
-    assert not standby.leadership.declare(), "once a change"
+    assert not standby.leadership.declare(), "once per change"
     assert standby.leadership.role == "controller"
     assert not leader.see(7)
     assert (leader.puppet.standing_by, codes(leader), codes(standby)) == (True, ["stepped_down"], ["took_over"])
