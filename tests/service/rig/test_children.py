@@ -29,7 +29,8 @@ print(os.getpid(), os.getpgid(0), os.getpriority(os.PRIO_PROCESS, 0), flush=True
 done = threading.Event()
 signal.signal(signal.SIGINT, signal.SIG_IGN if "deaf" in sys.argv else lambda *_: sys.exit(7))
 print("ready", flush=True)
-done.wait(60)
+while not done.wait(0.1):  # a signal that comes just before a wait begins is handled at its end
+    pass
 """
 
 
