@@ -113,6 +113,12 @@ def cart(newtons: float = 1.0) -> Model:
     )
 
 
+def tank() -> Model:
+    """A tank that flows out with the root of its level, which has no derivative at zero and is none below; 1 state, 1 input."""
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    return Model("tank", x, u, u - 0.5 * ca.sqrt(x), x, Signal("h", "m"), Signal("q", "m^2/s"), "h", x_nominal=1.0, u_rest=0.5)
+
+
 def solve(one: Rti, seed: int) -> QpStatus:
     """Solve at a guess that depends on nothing but the seed."""
     rng = np.random.default_rng(seed)

@@ -260,7 +260,7 @@ def regulators(model: Model, law: StopLaw) -> ca.Function:
     phi = integrator(model, "rk4", law.substeps)(model.x, model.u, model.p, law.period_s)
     A, B = ca.jacobian(phi, model.x), ca.jacobian(phi, model.u)
     rates = [j for j in range(nx) if not ca.depends_on(model.f_expl_expr[j], model.u)]  # those that inputs change by themselves are theirs to choose
-    C = ca.densify(ca.jacobian(model.f_expl_expr[rates] / ca.DM(law.rates[rates]), model.x))
+    C = ca.densify(ca.jacobian(model.f_expl_expr[rates, 0] / ca.DM(law.rates[rates]), model.x))
     moving = C.T @ C
     away = ca.diag(ca.DM(1.0 / (HOLD_S * law.rates) ** 2))
     linear = ca.Function("linear", [model.x, model.u, model.p], [ca.densify(A), ca.densify(B), ca.densify(moving), ca.densify(moving + away)])

@@ -11,10 +11,12 @@ import pytest
 
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
+from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.operation import states_of_operation
 from rti_mpc.rti.rest import RestClass, assess, find_stop_law
 from rti_mpc.rti.way_to_rest import WayToRest
 from tests.movers import car, law_of, mover, ocp_of
+from tests.problems import tank
 
 CLASSES = {
     "pioneer": RestClass.HOLDS,
@@ -117,6 +119,16 @@ def test_law_that_a_model_gives_is_rolled_out_instead() -> None:
     assert way.u[:3, 0] == pytest.approx([-0.5, -1.0, -1.5]), "inside the slew limits"
     assert way.u[:3, 1] == pytest.approx([0.2, 0.1, 0.05]), "of the last input that acted"
     assert way.x[-1, 3] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_tank_whose_one_state_its_input_changes_by_itself_is_held_at_its_level() -> None:
+    ocp = Ocp(tank(), N=10, dt=0.5, Q=1, R=0.01, lbu=0, ubu=2, lbx=0.2, ubx=3)
+    law = find_stop_law(ocp)
+    assert law is not None
+    way = WayToRest(ocp, law, compile=False)
+    assert way.find(np.array([2.0]), np.array([0.5]))
+    assert way.u[-1] == pytest.approx(0.5 * np.sqrt(way.x[-1]), abs=1e-6)
+    assert way.x[-1] == pytest.approx(2.0, abs=0.01), "what is lost in a row of 0.5 s at most"
 
 
 def test_model_that_does_not_come_to_rest_from_where_it_operates_is_refused_with_where_that_is() -> None:

@@ -42,7 +42,8 @@ EXCURSION_SAMPLES = 4  # per excursion to a bound; the second solver solves the 
 SECOND_SOLVER = "daqp"  # OSQP is the second solver where daqp is the first
 TIGHT_SETTINGS = SolverSettings(eps=1e-9, max_iter=100_000, scaling=10)  # Ruiz scaling helps where bounds are far exceeded
 AGREEMENT_TOLERANCE = 1e-5  # largest difference between two tight solutions of one QP, relative to half the range of each input
-DISTURBANCE_STD = 0.01  # standard deviation, in the unit of each state
+DISTURBANCE_SCALES = 0.01  # standard deviation of the disturbance, in scales of each state
+MAX_DISTURBANCE = 0.01  # of it, in the unit of each state: the scale of one without bounds, which grows by itself, says little
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,7 @@ class CheckReport:
         deviation: Largest difference of the controller's own inputs from those of the second solver, likewise.
         bounds: Number of bounds.
         missed: Names of the bounds that no plan has reached.
+        failed_at: State of the first sample without a usable plan, shape ``(nx,)``; None if all were usable.
     """
 
     prepare_us: Array
@@ -71,6 +73,7 @@ class CheckReport:
     deviation: float
     bounds: int
     missed: list[str]
+    failed_at: Array | None = None
 
     @property
     def agree(self) -> bool:
@@ -82,9 +85,9 @@ def main(path: Path) -> int:
     """Check a configuration, print what was found, and return the exit status: 0 if every sample was usable and both solvers agree."""
     config = load(path)
     law = check_stop(config)
-    console = table_console()
+    console, ocp = table_console(), build_ocp(config)
     try:
-        stopped = stop_from_everywhere(build_ocp(config), law) if config.model.stop == "rests" else 'a stop: it coasts, as stop = "coasts" says'
+        stopped = stop_from_everywhere(ocp, law) if config.model.stop == "rests" else 'a stop: it coasts, as stop = "coasts" says'
     except OcpError as error:
         raise ConfigError(unstopped(config, error)) from error
     report = check(config, track(range(WAVE_SAMPLES), "solving", console=console, transient=True, disable=not console.is_terminal))
@@ -98,6 +101,10 @@ def main(path: Path) -> int:
     console.print(
         f"{sum(report.statuses.values())} samples: " + ", ".join(f"{count} {status.name}" for status, count in sorted(report.statuses.items()))
     )
+    if report.failed_at is not None:
+        where = ", ".join(f"{state.name} = {value:.3g} {state.unit}" for state, value in zip(ocp.model.states, report.failed_at, strict=True))
+        advice = "if the model is not finite or not differentiable near it, bound in ocp.bounds.states where the robot operates"
+        console.print(f"the first sample without a plan began at {where}: {advice}", soft_wrap=True)
     verdict = "agree" if report.agree else "DISAGREE"
     difference = f"solved tightly they differ by at most {report.difference:.1e}, {AGREEMENT_TOLERANCE:.0e} allowed"
     console.print(f"{config.solver.name} and {report.second} {verdict}: on {report.opinions} QPs {difference}", soft_wrap=True)
@@ -117,6 +124,7 @@ def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> Check
     other = next(name for name in FORMULATIONS if name != rti.formulation)
     tight, judge = (tight_copy(rti, solver, formulation) for solver, formulation in ((first, rti.formulation), (second, other)))
     bounds, scale = Bounds(rti), rti.scale[model.nx : model.nx + model.nu]
+    disturbance = np.minimum(DISTURBANCE_SCALES * rti.scale[: model.nx], MAX_DISTURBANCE)
     rng = np.random.default_rng(1)
     x = np.array(robot_settings(config)["x0"])
     reference = wave(ocp, x, rng)
@@ -124,9 +132,11 @@ def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> Check
     statuses: Counter[QpStatus] = Counter()
     differences: list[float] = []
     deviations: list[float] = []
+    failed_at: Array | None = None
 
     def sample(x: Array, y_ref: Array, *, asked: bool) -> tuple[float, float]:
         """Solve one sample, and compare its QP if `asked`; return the times of both phases, us."""
+        nonlocal failed_at
         began_ns = time.perf_counter_ns()
         rti.prepare(y_ref)
         prepared_ns = time.perf_counter_ns()
@@ -135,6 +145,8 @@ def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> Check
         status = rti.feedback(x)
         done_ns = time.perf_counter_ns()
         statuses[status] += 1
+        if failed_at is None and not status.usable:
+            failed_at = x
         bounds.note_plan()
         if asked and status.usable:
             mine, theirs = (solution(one, guess, y_ref, x) for one in (tight, judge))
@@ -147,7 +159,7 @@ def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> Check
     rti.reset(x, np.array(model.u_rest))
     for k in samples:
         prepare_us[k], feedback_us[k] = sample(x, reference(k + 1 + np.arange(N)), asked=k % (WAVE_SAMPLES // COMPARED_WAVE_SAMPLES) == 0)
-        x = rti.x[1] + DISTURBANCE_STD * rng.standard_normal(model.nx)
+        x = rti.x[1] + disturbance * rng.standard_normal(model.nx)
     for excursion in excursions(rti, start):
         x = excursion.x0
         rti.reset(x, np.array(model.u_rest))
@@ -155,7 +167,8 @@ def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> Check
             sample(x, excursion.y_ref, asked=k in (0, EXCURSION_SAMPLES - 1))
             x = rti.x[1].copy()
     difference, deviation = (max(values, default=np.inf) for values in (differences, deviations))
-    return CheckReport(prepare_us, feedback_us, statuses, second, len(differences), difference, deviation, len(bounds.names), bounds.missed)
+    opinions = len(differences)
+    return CheckReport(prepare_us, feedback_us, statuses, second, opinions, difference, deviation, len(bounds.names), bounds.missed, failed_at)
 
 
 def tight_copy(rti: Rti, solver: str, formulation: str) -> Rti:

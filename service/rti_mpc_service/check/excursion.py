@@ -4,12 +4,14 @@ Excursions: starts and references that drive a controller to each of its bounds.
 
 A wave of moderate size reaches few bounds, so an error of a solver at a bound could
 stay hidden. Bounds of inputs and increments are reached by a reference ten times as far
-away as those inputs can drive the outputs, softened bounds by a start beyond them.
+away as those inputs can drive the outputs, softened bounds by a start beyond them. Both
+stay where the model is regular: a tank has no level below its bottom, and no input
+drives it there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import casadi as ca
@@ -21,6 +23,7 @@ from rti_mpc.rti.rti import Rti
 
 REFERENCE_DISTANCE_FACTOR = 10.0  # the reference is this factor farther away than the outputs that a bound can reach
 START_EXCESS_SCALES = 1.0  # the start exceeds a softened bound by this many scales of the bounded quantity
+SHARES = tuple(0.5**k for k in range(11))  # of an excess, or of an input's way to its bound, tried until the model is regular
 NEWTON_STEPS = 8  # to find such a start; a linear constraint takes one step
 AT_BOUND_SCALES = 1e-3  # a plan this close to a bound, in scales of the bounded quantity, counts as at it
 
@@ -85,23 +88,49 @@ def excursions(rti: Rti, x0: Array) -> Iterator[Excursion]:
     for lower, upper, reach in ((ocp.lbu, ocp.ubu, 1), (ocp.lbdu + rest, ocp.ubdu + rest, ocp.N_u)):
         for bounds in (lower, upper):
             for j in np.flatnonzero(np.isfinite(bounds)):
-                u = rest.copy()
-                u[j] += reach * (bounds[j] - rest[j])
-                yield Excursion(x0, nominal + REFERENCE_DISTANCE_FACTOR * (outputs(ocp, x0, u) - nominal))
+                way = np.zeros(len(rest))
+                way[j] = reach * (bounds[j] - rest[j])
+                yield Excursion(x0, held(nominal + REFERENCE_DISTANCE_FACTOR * displacement(ocp, x0, nominal, way), ocp.N))
+    regular = regular_at(ocp)
     scale_g = rti.scale[ocp.model.nx + ocp.model.nu :]
     for bounds, outward in ((ocp.lg, -START_EXCESS_SCALES), (ocp.ug, START_EXCESS_SCALES)):
         for j in np.flatnonzero(np.isfinite(bounds)):
-            yield Excursion(start_at(rti, x0, int(j), bounds[j] + outward * scale_g[j]), nominal)
+            starts = (start_at(rti, x0, int(j), bounds[j] + share * outward * scale_g[j]) for share in SHARES)
+            yield Excursion(next((x for x in starts if regular(x)), x0), held(nominal, ocp.N))
 
 
 def outputs(ocp: Ocp, x: Array, u: Array) -> Array:
-    """Return the outputs at nodes 1 to N under a constant input, shape ``(N, ny)``."""
+    """Return the outputs at nodes 1 to N under a constant input, shape ``(N, ny)``; fewer rows, at least that of node 0, where the model ends."""
     phi, h, p = ocp.phi(), ocp.model.h(), np.array(ocp.model.p_nominal)
-    rows = []
+    rows = [np.array(h(x, p)).ravel()]
     for _ in range(ocp.N):
         x = np.array(phi(x, u, p)).ravel()
         rows.append(np.array(h(x, p)).ravel())
-    return np.array(rows)
+        if not np.isfinite([*x, *rows[-1]]).all():
+            return np.array(rows[1:-1] or rows[:1])
+    return np.array(rows[1:])
+
+
+def displacement(ocp: Ocp, x0: Array, nominal: Array, way: Array) -> Array:
+    """Return how far inputs that leave their rest by `way`, shape ``(nu,)``, drive the outputs; where the model ends, extrapolated from a share of it."""
+    for share in SHARES:
+        driven = outputs(ocp, x0, ocp.model.u_rest + share * way)
+        if len(driven) >= len(nominal):
+            return np.asarray(driven[: len(nominal)] - nominal) / share
+    return np.zeros_like(nominal)
+
+
+def held(rows: Array, N: int) -> Array:
+    """Return N rows, the last one held."""
+    return rows[np.minimum(np.arange(N), len(rows) - 1)]
+
+
+def regular_at(ocp: Ocp) -> Callable[[Array], bool]:
+    """Build whether a stage from a state, shape ``(nx,)``, its inputs at rest, is finite and differentiable."""
+    model, phi = ocp.model, ocp.phi()
+    values = ca.vertcat(phi(model.x, model.u, model.p), model.y_expr, ocp.h_expr)
+    stage = ca.Function("stage", [model.x, model.u, model.p], [values, ca.jacobian(values, ca.vertcat(model.x, model.u))])
+    return lambda x: all(np.isfinite(np.array(part)).all() for part in stage(x, model.u_rest, model.p_nominal))
 
 
 def start_at(rti: Rti, x0: Array, j: int, wanted: float) -> Array:

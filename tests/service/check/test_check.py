@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -72,6 +73,41 @@ def test_a_bound_that_gives_way_is_told(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr("rti_mpc.rti.active_set.PENALTY_PATH", (10.0,))
     report = check.check(load(path))
     assert not report.agree or sum(report.statuses.values()) > report.statuses[QpStatus.SOLVED]
+
+
+TANK = """
+robot = "tank"
+model = { name = "tests.problems:tank" }
+ocp.N = 20
+ocp.dt_s = 0.5
+ocp.integrator = "rk4"
+ocp.weights = { Q = { h = 1 }, R = { q = 0.01 }, delta = 1, lambda = 1 }
+[ocp.bounds]
+inputs = { q = [0, 2] }
+"""
+
+
+def test_model_that_ends_near_its_bounds_is_driven_to_them_from_where_it_is_regular(tmp_path: Path) -> None:
+    """Half a range below the lower level there is none, and no inflow at all empties the tank within the horizon."""
+    path = tmp_path / "robot.toml"
+    path.write_text(TANK + "states = { h = [0.2, 3] }\n")
+    report = check.check(load(path))
+    assert report.statuses == Counter({QpStatus.SOLVED: 216})
+    assert (report.missed, report.failed_at) == ([], None)
+    assert report.agree
+
+
+def test_sample_without_a_plan_is_told_with_the_state_it_began_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing keeps the wave from the bottom of the tank."""
+    path = tmp_path / "robot.toml"
+    path.write_text(TANK)
+    monkeypatch.setattr(check, "check_stop", lambda config: None)
+    monkeypatch.setattr(check, "stop_from_everywhere", lambda ocp, law: "")
+    assert check.main(path) == 1
+    line = next(line for line in capsys.readouterr().out.splitlines() if "without a plan" in line)
+    assert re.match(r"the first sample without a plan began at h = [\d.]+ m: .*, bound in ocp.bounds.states where the robot operates$", line)
 
 
 def test_no_number_is_cut_off_in_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
