@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -17,6 +19,8 @@ from rti_mpc.rti.way_to_rest import StopLaw
 from tests.problems import INF, pioneer
 
 GRAVITY = 9.81  # m/s^2
+BOUNDS = ("lbx", "ubx", "lbu", "ubu")
+FOLLOWED = {"car": "x y", "bicycle": "x y", "floating": "x y", "arm": "q_1 q_2", "quadrotor": "x z"}  # outputs of a robot on a reference
 
 
 def mover(name: str, states: str, inputs: str, f: Callable[[Any, Any], tuple[Any, ...]], **options: Any) -> Ocp:
@@ -93,6 +97,13 @@ def boat(**changes: Any) -> Ocp:
     return mover("boat", "x:m y:m psi:rad v_x:m/s v_y:m/s r:rad/s", "X:N N:Nm", f, **(bounds | changes))
 
 
+def carried(model: Model) -> Model:
+    """The same on water that moves: its velocity is a parameter, nominally zero."""
+    c = ca.SX.sym("c", 2)
+    moved = model.f_expl_expr + ca.vertcat(c, ca.SX.zeros(model.nx - 2))
+    return replace(model, p=c, f_expl_expr=moved, parameters=(Signal("c_x", "m/s"), Signal("c_y", "m/s")), p_nominal=(0.0, 0.0))
+
+
 def cart_pole(**changes: Any) -> Ocp:
     """A pole of 0.8 m upright on a cart that is driven by a force."""
 
@@ -107,6 +118,13 @@ def cart_pole(**changes: Any) -> Ocp:
     return mover("cart_pole", "x:m theta:rad v:m/s omega:rad/s", "F:N", f, **(bounds | changes))
 
 
+def floating(**changes: Any) -> Ocp:
+    """The boat on water that moves."""
+    still = boat()
+    options = {"model": carried(still.model), "N": 10, "dt": 0.1, "Q": np.ones(6), "R": 0.01 * np.ones(2)}
+    return Ocp(**(options | {name: getattr(still, name) for name in BOUNDS} | changes))
+
+
 MOVERS: dict[str, Callable[..., Ocp]] = {
     "pioneer": pioneer,
     "car": car,
@@ -114,6 +132,7 @@ MOVERS: dict[str, Callable[..., Ocp]] = {
     "arm": arm,
     "quadrotor": quadrotor,
     "boat": boat,
+    "floating": floating,
     "cart_pole": cart_pole,
 }
 
@@ -128,3 +147,72 @@ def ocp_of(name: str) -> Ocp:
 def law_of(name: str) -> StopLaw | None:
     """The law of one of these, found once."""
     return find_stop_law(ocp_of(name))
+
+
+def following(name: str) -> Model:
+    """One of these as its user would drive it: outputs are what it follows, with their roles."""
+    model = ocp_of(name).model
+    roles = {"x": "x", "y": "y", "psi": "heading"} if "y" in FOLLOWED[name].split() else {}
+    states = tuple(replace(state, role=roles.get(state.name, "")) for state in model.states)
+    followed = [i for i, state in enumerate(states) if state.name in FOLLOWED[name].split()]
+    return replace(model, y_expr=model.x[followed], states=states, outputs=tuple(states[i] for i in followed))
+
+
+def car_model() -> Model:
+    return following("car")
+
+
+def bicycle_model() -> Model:
+    return following("bicycle")
+
+
+def arm_model() -> Model:
+    return following("arm")
+
+
+def quadrotor_model() -> Model:
+    return following("quadrotor")
+
+
+def floating_model() -> Model:
+    return following("floating")
+
+
+def toml(name: str, more: str = "") -> str:
+    """The configuration of one of these, driven behind a guard; `more` follows it."""
+    ocp, model = ocp_of(name), following(name)
+
+    def table(signals: tuple[Signal, ...], lower: Any, upper: Any) -> str:
+        bounded = [(each.name, low, high) for each, low, high in zip(signals, lower, upper, strict=True) if np.isfinite([low, high]).any()]
+        return ", ".join(f"{each} = [{low}, {high}]" for each, low, high in bounded)
+
+    states, angles = json.dumps([state.name for state in model.states]), json.dumps([state.name for state in model.states if state.angle])
+    rest = ", ".join(f"{signal.name} = {value}" for signal, value in zip(model.inputs, model.u_rest, strict=True))
+    return f"""
+robot = "{name}"
+model = {{ name = "tests.movers:{name}_model" }}
+[ocp]
+N = 20
+dt_s = {ocp.dt}
+[ocp.weights]
+Q = {{ {", ".join(f"{output.name} = 1.0" for output in model.outputs)} }}
+R = {{ {", ".join(f"{signal.name} = 0.01" for signal in model.inputs)} }}
+[ocp.bounds]
+inputs = {{ {table(model.inputs, ocp.lbu, ocp.ubu)} }}
+increments = {{ {table(model.inputs, ocp.lbdu, ocp.ubdu)} }}
+states = {{ {table(model.states, ocp.lbx, ocp.ubx)} }}
+[guard]
+enabled = true
+u_rest = {{ {rest} }}
+states = {states}
+angles = {angles}
+{more}"""
+
+
+CURRENT = """
+[observer]
+at_rest = true
+disturbances = { x = { drift = 0.02, limit = 0.5 }, y = { drift = 0.02, limit = 0.5 } }
+[sim]
+parameters = { c_x = 0.2, c_y = -0.15 }
+"""

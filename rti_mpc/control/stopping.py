@@ -6,7 +6,8 @@ A robot that its inputs at rest do not stop is given one with each command
 (`rti_mpc.rti.way_to_rest`). After a plan it begins in the state and with the input
 predicted for the plan's end. A stop begins one where the robot is, and each following
 command follows it from where the robot has come to, so that what pushes the robot aside
-does not carry it away. Its first rows are the plan, the others follow it in the command.
+does not carry it away; where it is another disturbance that is estimated now, a new way
+begins. Its first rows are the plan, the others follow it in the command.
 """
 
 from __future__ import annotations
@@ -18,12 +19,15 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled
+from rti_mpc.contract.schedule import BEFORE_ALL_NS
 from rti_mpc.control.prediction import Prediction
 from rti_mpc.model.integrator import integrator
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.way_to_rest import StopLaw, WayToRest
 
 MAX_PREDICTION_NS = 1_000_000_000  # that a state is predicted ahead; a robot that was not heard for longer is taken to be on its way
+CHANGED = 0.05  # of its largest magnitude, by which a disturbance has become another one, in which the robot rests elsewhere
+ESTIMATED_NS = 1_000_000_000  # after which the estimate of another disturbance has come to it
 RESTING = 0.01  # of its range in operation, to which each state and input has come at rest
 
 Ending = Mapping[str, Any]  # the fields of a command that hold its way to rest, by their names
@@ -64,10 +68,13 @@ class Stopping:
         step = {"x": self._x, "u": self._u, "p": prediction.p, "dt": self._span}
         self._step = bind(compiled(phi)[0] if compile else phi, step, {"x_next": self._next})
         self._ended: Ending = {}  # the last way that a plan ended with
+        self._d = prediction.p[ocp.model.np_ - len(law.disturbances) :]  # what disturbs the robot now
+        self._d_known: Array = np.array(self._d)  # the same when it last became another one
+        self._known_ns = BEFORE_ALL_NS  # when its estimate has come to it
 
     def forget(self) -> None:
         """Forget where the robot was: after a gap, or in another life of it."""
-        self._aimed, self._began_ns, self.at_rest = False, None, False
+        self._aimed, self._began_ns, self.at_rest, self._known_ns = False, None, False, BEFORE_ALL_NS
 
     def prepare(self) -> None:
         """Aim at where the last way leads; off the path from state to command."""
@@ -113,6 +120,10 @@ class Stopping:
         """
         way = self._way
         x0 = self._prediction.predict(x, state_ns, act_ns) if act_ns - state_ns <= MAX_PREDICTION_NS else x
+        if np.any(np.abs(self._d - self._d_known) > CHANGED * self._law.disturbances):
+            self._d_known[:], self._known_ns = self._d, act_ns + ESTIMATED_NS
+        if self._began_ns is not None and act_ns <= self._known_ns:
+            self._began_ns, self._aimed = None, way.aim(way.x[-1], way.u[-1])
         if self._began_ns is None:
             if (self._aimed and way.begin(x0, u_prev, reach)) or way.find(x0, u_prev, reach):
                 self._began_ns = act_ns

@@ -27,6 +27,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
+from itertools import compress
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -56,6 +57,7 @@ MISMATCH = 0.02  # by which the plant answers its inputs more, or less, than its
 STANDING_S = 5.0  # for which the last row is then played
 LINEARIZED = 50  # of the states at rest, at most
 FALLING = 0.1  # of the rate in operation, that a robot has then without feedback: more than a drift
+UNDISTURBED: Array = np.zeros(0)
 GROWTH = 0.05  # 1/s: slower than this is no instability but a drift
 
 Motion = Callable[[Array, Array, float], Array]
@@ -144,6 +146,21 @@ class Rest:
     states: int
 
 
+class Starts(NamedTuple):
+    """
+    States of operation from which a robot is stopped.
+
+    Attributes:
+        x: States, shape ``(n, nx)``.
+        u: Inputs that act there, shape ``(n, nu)``.
+        p: Parameters of the model, shape ``(n, np)``: what disturbs it differs.
+    """
+
+    x: Array
+    u: Array
+    p: Array
+
+
 class Ways(NamedTuple):
     """
     Ways to rest of many states.
@@ -161,16 +178,31 @@ class Ways(NamedTuple):
     period_s: float
 
 
-def find_stop_law(ocp: Ocp) -> StopLaw | None:
+def starts_of(ocp: Ocp, count: int, disturbances: Array) -> Starts:
+    """Return states of operation, the corners first; disturbed by all that is given, up or down, there, and by seeded shares of it elsewhere."""
+    model = ocp.model
+    p = np.tile(np.array(model.p_nominal), (count, 1))
+    rng, nd, few = np.random.default_rng(2), len(disturbances), count // 4
+    shares = np.concatenate([rng.choice((-1.0, 1.0), size=(few, nd)), rng.uniform(-1.0, 1.0, size=(count - few, nd))])
+    p[:, model.np_ - nd :] = disturbances * shares
+    return Starts(*states_of_operation(ocp, count), p)
+
+
+def find_stop_law(ocp: Ocp, disturbances: Array = UNDISTURBED) -> StopLaw | None:
     """
     Return what the way to rest of a problem is made with, None for a robot whose inputs need but ramp to rest.
+
+    Args:
+        ocp: The problem.
+        disturbances: Largest magnitudes of the last parameters of its model, shape ``(nd,)``: of what moves the robot also while
+            its inputs are at rest, as a current does, and is to be balanced then.
 
     Raises:
         OcpError: It does not come to rest from where it operates, or does not stay there; the message says from where.
     """
-    if ocp.model.stop_expr is None and not motion_at_rest(ocp):
+    if not disturbances.size and ocp.model.stop_expr is None and not motion_at_rest(ocp):
         return None
-    law = shaped(ocp)
+    law = shaped(ocp, disturbances)
     return replace(law, holds=assess(ocp, law, FINDING, compile=False).kind is RestClass.HOLDS)
 
 
@@ -187,62 +219,62 @@ def assess(ocp: Ocp, law: StopLaw | None, count: int, *, compile: bool = True) -
     Raises:
         OcpError: It does not come to rest from one of them, or does not stay there.
     """
-    model = ocp.model
-    X, U = states_of_operation(ocp, count)
-    rates = rates_of_operation(model, X, U)
-    ways = ramps(ocp, X, U) if law is None else ways_to_rest(ocp, law, X, U, compile=compile)
-    moving = np.abs(rates_along(model, ways)) > STILL * rates
+    model, starts = ocp.model, starts_of(ocp, count, UNDISTURBED if law is None else law.disturbances)
+    X = starts.x
+    rates = rates_of_operation(model, starts)
+    ways = ramps(ocp, starts) if law is None else ways_to_rest(ocp, law, starts, compile=compile)
+    moving = np.abs(rates_along(model, ways, starts)) > STILL * rates
     if law is not None and moving[:, -1].any():  # `motion_at_rest` has judged a ramp, by an integrator for stiff models, too
-        raise OcpError(unrested(model, X, moving[:, -1], ways))
+        raise OcpError(unrested(model, starts, moving[:, -1], ways))
     time_s = ways.period_s * float((moving.any(axis=2) * np.arange(1, moving.shape[1] + 1)).max())
     ends = ways.x[:, -1]
     with np.errstate(invalid="ignore"):
         free = np.ptp(ends, axis=0) > STILL * np.ptp(X, axis=0)
         moved = np.where(free, np.abs(ends - X).max(axis=0), 0.0)
     A = ca.Function("A", [model.x, model.u, model.p], [ca.densify(ca.jacobian(model.f_expl_expr, model.x))])
-    at_rest = zip(ends[:LINEARIZED], ways.u[:LINEARIZED, -1], strict=True)
-    jacobians = [np.array(A(x, u, model.p_nominal)) for x, u in at_rest]
+    at_rest = zip(ends[:LINEARIZED], ways.u[:LINEARIZED, -1], starts.p[:LINEARIZED], strict=True)
+    jacobians = [np.array(A(*where)) for where in at_rest]
     growth = max((float(np.linalg.eigvals(J).real.max()) for J in jacobians if np.isfinite(J).all()), default=0.0)
     if law is None:
         return Rest(RestClass.HOLDS, growth, time_s, moved, count)
 
-    alone = in_the_end(ocp, law, ways, U, feedback=0.0) / rates
-    if growth <= GROWTH and alone.max() <= STILL:
+    alone = in_the_end(ocp, law, ways, starts, feedback=0.0) / rates
+    if not law.disturbances.size and growth <= GROWTH and alone.max() <= STILL:
         return Rest(RestClass.HOLDS, growth, time_s, moved, count)
-    kept = in_the_end(ocp, law, ways, U, feedback=1.0) <= STILL * rates
+    kept = in_the_end(ocp, law, ways, starts, feedback=1.0) <= STILL * rates
     if not kept.all():
-        raise OcpError(unkept(model, X, ~kept, ways))
+        raise OcpError(unkept(model, starts, ~kept, ways))
     falls = growth > GROWTH or alone.max() > FALLING
     return Rest(RestClass.UNSTABLE if falls else RestClass.DRIFTS, growth, time_s, moved, count)
 
 
-def shaped(ocp: Ocp) -> StopLaw:
+def shaped(ocp: Ocp, disturbances: Array) -> StopLaw:
     """
     Find the rows of the way to rest and the weight of its regulator: those with which seeded states of operation are at rest soonest, and stay there.
 
     Raises:
         OcpError: From one of them no way leads to rest, or it does not stay there.
     """
-    model = ocp.model
-    X, U = states_of_operation(ocp, FINDING)
-    rates = rates_of_operation(model, X, U)
-    scale_x, scale_u = (np.where((half := 0.5 * np.ptp(values, axis=0)) > 0.0, half, 1.0) for values in (X, U))
+    model, starts = ocp.model, starts_of(ocp, FINDING, disturbances)
+    rates = rates_of_operation(model, starts)
+    scale_x, scale_u = (np.where((half := 0.5 * np.ptp(values, axis=0)) > 0.0, half, 1.0) for values in starts[:2])
     wrong = ""
     for duration_s, still in (*((duration_s, AT_REST) for duration_s in DURATIONS_S), (DURATIONS_S[-1], STILL)):
         substeps = max(1, math.ceil(duration_s / (MAX_REST_ROWS * ocp.dt)))
         rows = whole(math.ceil(duration_s / (substeps * ocp.dt)))
         found = []
         for weight in INPUT_WEIGHTS:
-            law = StopLaw(rows, min(rows, MAX_HORIZON), substeps * ocp.dt, substeps, weight, rates, scale_x, scale_u)
+            law = StopLaw(rows, min(rows, MAX_HORIZON), substeps * ocp.dt, substeps, weight, rates, scale_x, scale_u, disturbances=disturbances)
             for count in (PROBED, FINDING):  # most laws that are too slow are so from the corners
-                ways = ways_to_rest(ocp, law, X[:count], U[:count], compile=False)
-                moving = np.abs(rates_along(model, ways)) > still * rates
+                few = Starts(*(part[:count] for part in starts))
+                ways = ways_to_rest(ocp, law, few, compile=False)
+                moving = np.abs(rates_along(model, ways, few)) > still * rates
                 if moving[:, -1].any():
                     break
             if moving[:, -1].any():
-                wrong = unrested(model, X, moving[:, -1], ways)
-            elif not (kept := in_the_end(ocp, law, ways, U, feedback=1.0) <= STILL * rates).all():
-                wrong = unkept(model, X, ~kept, ways)
+                wrong = unrested(model, starts, moving[:, -1], ways)
+            elif not (kept := in_the_end(ocp, law, ways, starts, feedback=1.0) <= STILL * rates).all():
+                wrong = unkept(model, starts, ~kept, ways)
             else:
                 needed = int((moving.any(axis=2) * np.arange(1, rows)).max()) + 1
                 found.append(replace(law, rows=min(rows, whole(math.ceil(SPARE * needed) + 1))))
@@ -251,20 +283,21 @@ def shaped(ocp: Ocp) -> StopLaw:
     raise OcpError(wrong)
 
 
-def ways_to_rest(ocp: Ocp, law: StopLaw, X: Array, U: Array, *, compile: bool) -> Ways:
-    """Return the ways to rest from states, shape ``(n, nx)``, at which inputs act, shape ``(n, nu)``."""
+def ways_to_rest(ocp: Ocp, law: StopLaw, starts: Starts, *, compile: bool) -> Ways:
+    """Return the ways to rest from states of operation."""
     way = WayToRest(ocp, law, compile=compile)
     found = []
-    for x, u in zip(X, U, strict=True):
+    for x, u, p in zip(*starts, strict=True):
+        way.p[:] = p
         way.find(x, u)
         found.append((way.u.copy(), way.x.copy(), way.K.copy()))
     u, x, K = (np.array(part) for part in zip(*found, strict=True))
     return Ways(u, x, K, law.period_s)
 
 
-def ramps(ocp: Ocp, X: Array, U: Array) -> Ways:
+def ramps(ocp: Ocp, starts: Starts) -> Ways:
     """Return how states follow inputs that ramp to rest."""
-    model = ocp.model
+    model, (X, U, P) = ocp.model, starts
     rest, rows = np.array(model.u_rest), max(2, math.ceil(SETTLING_S / ocp.dt))
     phi = integrator(model, "rk4", 4)
     u, states, inputs, x = U, [], [], X
@@ -272,11 +305,11 @@ def ramps(ocp: Ocp, X: Array, U: Array) -> Ways:
         u = u + np.clip(rest - u, ocp.lbdu, ocp.ubdu)
         states.append(x)
         inputs.append(u)
-        x = np.array(phi(x.T, u.T, np.array(model.p_nominal), ocp.dt)).T
+        x = np.array(phi(x.T, u.T, P.T, ocp.dt)).T
     return Ways(np.stack(inputs, axis=1), np.stack(states, axis=1), np.zeros((len(X), model.nu, model.nx)), ocp.dt)
 
 
-def played(ocp: Ocp, law: StopLaw, ways: Ways, U: Array, feedback: float, answer: float) -> Array:
+def played(ocp: Ocp, law: StopLaw, ways: Ways, starts: Starts, feedback: float, answer: float) -> Array:
     """
     Play ways to rest on a plant that answers its inputs more or less than its model, and late; the last row for a while.
 
@@ -284,14 +317,14 @@ def played(ocp: Ocp, law: StopLaw, ways: Ways, U: Array, feedback: float, answer
         ocp: The problem.
         law: What the ways are made with.
         ways: The ways.
-        U: Inputs that act before them, shape ``(n, nu)``.
+        starts: Where they begin.
         feedback: Share of the gain that is applied.
         answer: Factor of the inputs.
 
     Returns:
         Rates of the states in the end, shape ``(n, nx)``.
     """
-    model, p = ocp.model, np.array(ocp.model.p_nominal)
+    model, U, p = ocp.model, starts.u, starts.p.T
     phi = integrator(model, "rk4", law.substeps)
     rows_late, late_s = divmod(DELAY_S, law.period_s)
     x, before = ways.x[:, 0], U
@@ -303,42 +336,45 @@ def played(ocp: Ocp, law: StopLaw, ways: Ways, U: Array, feedback: float, answer
         before, past = u, [*past[1:], u]
         for acting, span_s in ((past[0], late_s), (past[1], law.period_s - late_s)):
             x = np.array(phi(x.T, answer * acting.T, p, span_s)).T
-    return rates_at(model, x, answer * before)
+    return rates_at(model, x, answer * before, starts.p)
 
 
-def in_the_end(ocp: Ocp, law: StopLaw, ways: Ways, U: Array, feedback: float) -> Array:
+def in_the_end(ocp: Ocp, law: StopLaw, ways: Ways, starts: Starts, feedback: float) -> Array:
     """Return how fast each state changes after each way, shape ``(n, nx)``: the faster of two plants that answer more, and less, than their model."""
-    ends = [played(ocp, law, ways, U, feedback, 1.0 + mismatch) for mismatch in (MISMATCH, -MISMATCH)]
+    ends = [played(ocp, law, ways, starts, feedback, 1.0 + mismatch) for mismatch in (MISMATCH, -MISMATCH)]
     return np.asarray(np.abs(ends).max(axis=0))
 
 
-def rates_of_operation(model: Model, X: Array, U: Array) -> Array:
+def rates_of_operation(model: Model, starts: Starts) -> Array:
     """Return the fastest that each state changes in operation, shape ``(nx,)``, positive."""
-    rates = np.abs(rates_at(model, X, U)).max(axis=0, where=np.isfinite(X), initial=0.0)
+    rates = np.abs(rates_at(model, *starts)).max(axis=0, where=np.isfinite(starts.x), initial=0.0)
     return np.where(rates > 0.0, rates, 1.0)
 
 
-def rates_along(model: Model, ways: Ways) -> Array:
+def rates_along(model: Model, ways: Ways, starts: Starts) -> Array:
     """Return the rates of the states along ways, shape ``(n, M - 1, nx)``; the last row is at rest by its making."""
     x, u = ways.x[:, :-1], ways.u[:, :-1]
-    return rates_at(model, x.reshape(-1, model.nx), u.reshape(-1, model.nu)).reshape(x.shape)
+    p = np.repeat(starts.p, x.shape[1], axis=0)
+    return rates_at(model, x.reshape(-1, model.nx), u.reshape(-1, model.nu), p).reshape(x.shape)
 
 
-def rates_at(model: Model, X: Array, U: Array) -> Array:
+def rates_at(model: Model, X: Array, U: Array, P: Array) -> Array:
     """Return the rates of the states, shape ``(n, nx)``; infinite where there are none."""
     f = ca.Function("f", [model.x, model.u, model.p], [ca.densify(model.f_expl_expr)])
-    rates = np.array(f(X.T, U.T, np.array(model.p_nominal))).T
+    rates = np.array(f(X.T, U.T, P.T)).T
     return np.where(np.isfinite(rates), rates, np.inf)
 
 
-def unrested(model: Model, X: Array, moving: np.ndarray[Any, Any], ways: Ways) -> str:
+def unrested(model: Model, starts: Starts, moving: np.ndarray[Any, Any], ways: Ways) -> str:
     """Say of the first state that does not come to rest, whose moving states are marked, which and how."""
     i = int(np.flatnonzero(moving.any(axis=1))[0])
-    where = ", ".join(f"{signal.name} = {value:.3g} {signal.unit}" for signal, value in zip(model.states, X[i], strict=True))
+    disturbed = starts.p[i] != np.array(model.p_nominal)
+    values = *zip(model.states, starts.x[i], strict=True), *zip(compress(model.parameters, disturbed), starts.p[i][disturbed], strict=True)
+    where = ", ".join(f"{signal.name} = {value:.3g} {signal.unit}" for signal, value in values)
     names = ", ".join(signal.name for signal, moves in zip(model.states, moving[i], strict=True) if moves)
     return f"{ways.period_s * ways.x.shape[1]:.3g} s after a stop at {where} it still moves: {names}"
 
 
-def unkept(model: Model, X: Array, moving: np.ndarray[Any, Any], ways: Ways) -> str:
+def unkept(model: Model, starts: Starts, moving: np.ndarray[Any, Any], ways: Ways) -> str:
     """Say the same of a way that is played, and where it ends."""
-    return f"{unrested(model, X, moving, ways)}, if its inputs do {100 * MISMATCH:g} % more or less than modelled, {DELAY_S:g} s late"
+    return f"{unrested(model, starts, moving, ways)}, if its inputs do {100 * MISMATCH:g} % more or less than modelled, {DELAY_S:g} s late"

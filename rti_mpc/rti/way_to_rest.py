@@ -24,7 +24,7 @@ whoever plays the rows keeps a robot there that does not stay by itself,
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
@@ -43,6 +43,7 @@ INPUT_FREEDOM = 10.0  # by which inputs may move farther to an equilibrium than 
 PASSES = 3  # of a way that is found anew, before the last one: equilibria of an arm depend on where it comes to rest
 FIRST = 2  # rows whose reach depends on what was sent before
 BLOCK = 10  # rows, and steps of the regulator, that are compiled once and called again: compilers take long for what is long
+FREE = 0.01  # of its rate in operation, by which a state moves where another one is anywhere in its range: then that one is free at rest
 HOLD_S = 1.0  # a deviation from the way weighs as much as a rate that undoes it in this time
 LIMITS = ("lbu", "ubu", "lbdu", "ubdu")
 
@@ -62,6 +63,8 @@ class StopLaw:
         scale_x: Range of the states in operation, shape ``(nx,)``, positive.
         scale_u: Range of the inputs, shape ``(nu,)``, positive.
         holds: Whether the robot stays at rest without feedback: then its commands carry no gain.
+        disturbances: Largest magnitudes of the model's last parameters, shape ``(nd,)``, that move the robot while its inputs are at
+            rest; empty if none do. In them, not every heading is one to rest in.
     """
 
     rows: int
@@ -73,6 +76,7 @@ class StopLaw:
     scale_x: Array
     scale_u: Array
     holds: bool = False
+    disturbances: Array = field(default_factory=lambda: np.zeros(0))
 
 
 class WayToRest:
@@ -243,6 +247,8 @@ def to_equilibrium(model: Model, law: StopLaw, steps: int) -> ca.Function:
     at = ca.vertcat(x, u)
     for _ in range(steps):
         at = nearer(at, p)
+    turns = ca.DM([2.0 * np.pi if signal.angle else 0.0 for signal in (*model.states, *model.inputs)])
+    at -= turns * ca.floor((at - ca.vertcat(x, u)) / (2.0 * np.pi) + 0.5)
     return function("equilibrium", {"x": x, "u": u, "p": p}, {"x_e": at[: model.nx], "u_e": at[model.nx :]})
 
 
@@ -262,6 +268,8 @@ def regulators(model: Model, law: StopLaw) -> ca.Function:
     rates = [j for j in range(nx) if not ca.depends_on(model.f_expl_expr[j], model.u)]  # those that inputs change by themselves are theirs to choose
     C = ca.densify(ca.jacobian(model.f_expl_expr[rates, 0] / ca.DM(law.rates[rates]), model.x))
     moving = C.T @ C
+    if law.disturbances.size:
+        moving += unfree(C @ ca.diag(ca.DM(law.scale_x)), law)
     away = ca.diag(ca.DM(1.0 / (HOLD_S * law.rates) ** 2))
     linear = ca.Function("linear", [model.x, model.u, model.p], [ca.densify(A), ca.densify(B), ca.densify(moving), ca.densify(moving + away)])
 
@@ -286,6 +294,17 @@ def regulators(model: Model, law: StopLaw) -> ca.Function:
             to_go, gain = block(to_go, cost, A_e, B_e)
         gains.append(gain)
     return ca.Function("regulators", [x, u, p], gains)
+
+
+def unfree(C: ca.SX, law: StopLaw) -> ca.SX:
+    """
+    Build the weight of a deviation from the equilibrium in what the rates depend on, and may so not be as it likes at rest.
+
+    In a current that is weak, a boat's rates hardly depend on its heading, and yet it comes to rest in one heading only.
+    """
+    free = ca.densify(C.T @ cholesky_solve(cholesky(ca.densify(C @ C.T) + FREE**2 * ca.SX.eye(C.shape[0])), C))  # a projector, softly
+    away = free @ ca.diag(ca.DM(1.0 / law.scale_x))
+    return away.T @ ca.diag(ca.DM((law.scale_x / (HOLD_S * law.rates)) ** 2)) @ away
 
 
 def rolling(model: Model, law: StopLaw) -> ca.Function:

@@ -87,7 +87,9 @@ def main(path: Path) -> int:
     law = check_stop(config)
     console, ocp = table_console(), build_ocp(config)
     try:
-        stopped = stop_from_everywhere(ocp, law) if config.model.stop == "rests" else 'a stop: it coasts, as stop = "coasts" says'
+        stopped = 'a stop: it coasts, as stop = "coasts" says'
+        if config.model.stop == "rests":
+            stopped = stop_from_everywhere(ocp, law, disturbed=bool(config.observer.disturbances))
     except OcpError as error:
         raise ConfigError(unstopped(config, error)) from error
     report = check(config, track(range(WAVE_SAMPLES), "solving", console=console, transient=True, disable=not console.is_terminal))

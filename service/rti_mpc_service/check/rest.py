@@ -12,7 +12,7 @@ STATES = 1000  # of operation from which a robot is stopped
 LETTERS = {RestClass.HOLDS: "a", RestClass.DRIFTS: "b", RestClass.UNSTABLE: "c"}
 
 
-def stop_from_everywhere(ocp: Ocp, law: StopLaw | None, count: int = STATES) -> str:
+def stop_from_everywhere(ocp: Ocp, law: StopLaw | None, count: int = STATES, *, disturbed: bool = False) -> str:
     """
     Return in one line what a stop does to a robot, from many states of operation.
 
@@ -20,11 +20,13 @@ def stop_from_everywhere(ocp: Ocp, law: StopLaw | None, count: int = STATES) -> 
         ocp: Its problem.
         law: What its way to rest is made with; None: its inputs ramp to rest.
         count: How many states.
+        disturbed: Whether an observer estimates what disturbs it.
 
     Raises:
         OcpError: It does not come to rest from one of them.
     """
-    return rest_line(ocp.model, law, assess(ocp, law, count))
+    ends = "; its disturbances are taken to end where it stands: if they are wind or current, observer.at_rest must say so"
+    return rest_line(ocp.model, law, assess(ocp, law, count)) + (ends if disturbed and law is None else "")
 
 
 def rest_line(model: Model, law: StopLaw | None, rest: Rest) -> str:
@@ -34,5 +36,5 @@ def rest_line(model: Model, law: StopLaw | None, rest: Rest) -> str:
     carried = "its inputs ramp to rest"
     if law is not None:
         carried = f"its commands carry {law.rows} rows of {law.period_s:g} s to rest{'' if law.holds else ', and a gain that keeps it there'}"
-    letter = LETTERS[rest.kind]
-    return f"a stop: at rest it {rest.kind.value} ({letter}); from {rest.states} states within {rest.time_s:.3g} s{way}; {carried}"
+    states = f"{rest.states} states" + (", disturbed up to its observer's limits," if law is not None and law.disturbances.size else "")
+    return f"a stop: at rest it {rest.kind.value} ({LETTERS[rest.kind]}); from {states} within {rest.time_s:.3g} s{way}; {carried}"

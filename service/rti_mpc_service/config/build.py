@@ -154,6 +154,11 @@ def build_observer(config: Config) -> Observer | None:
     return Observer(build_model(config), settings)
 
 
+def disturbances_at_rest(config: Config) -> Array:
+    """Return the largest magnitudes of the disturbances that go on while the robot stands, shape ``(nd,)``; empty if none do."""
+    return np.array([of.limit for of in config.observer.disturbances.values()] if config.observer.at_rest else [])
+
+
 def robot_settings(config: Config) -> dict[str, Any]:
     """Return the arguments of `rti_mpc_sim.settings.RobotSettings`; the slew limits are those of the increments."""
     from rti_mpc.contract.approach import Increments

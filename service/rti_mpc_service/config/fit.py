@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 from rti_mpc.errors import ConfigError, OcpError
-from rti_mpc_service.config.build import build_ocp, names
+from rti_mpc_service.config.build import build_ocp, disturbances_at_rest, names
 from rti_mpc_service.config.refusal import quoted, unknown_name
 from rti_mpc_service.config.schema import ITERATION_KEYS, Config, RegulatorSection
 
@@ -30,6 +30,8 @@ def check_tree(config: Config) -> None:
     ocp, terminal = config.ocp, config.ocp.terminal
     if terminal.Q is not None and terminal.lqr is not None:
         raise ConfigError("ocp.terminal must have Q or lqr, not both")
+    if config.observer.at_rest and not config.observer.disturbances:
+        raise ConfigError("observer.at_rest says what observer.disturbances do while the robot stands, and there are none")
     if config.N_u > ocp.N:
         raise ConfigError(f"ocp.N_u must be at most ocp.N = {ocp.N}, got {ocp.N_u}")
     for key, values, length in (("delta", ocp.weights.delta, ocp.N), ("lambda", ocp.weights.lambda_, config.N_u)):
@@ -124,15 +126,16 @@ def check_stop(config: Config) -> StopLaw | None:
     if config.model.stop == "coasts":
         return None
     try:
-        return find_stop_law(build_ocp(config))
+        return find_stop_law(build_ocp(config), disturbances_at_rest(config))
     except OcpError as error:
         raise ConfigError(unstopped(config, error)) from error
 
 
 def unstopped(config: Config, seen: object) -> str:
     """Say that a stop does not bring the robot to rest, what was seen of it, and what to do."""
+    calmer = "lower limits in observer.disturbances to what its inputs can balance, " if config.observer.at_rest else ""
     return (
-        f"model.name: a stop must bring {config.model.name} to rest: {seen}; bound in ocp.bounds.states where it operates, "
+        f"model.name: a stop must bring {config.model.name} to rest: {seen}; {calmer}bound in ocp.bounds.states where it operates, "
         f'let the model say how it stops (stop_expr), or say that it is let go by stop = "coasts" in [model]'
     )
 

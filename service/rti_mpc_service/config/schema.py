@@ -188,6 +188,10 @@ class ObserverSection(Section):
     disturbances: dict[str, DisturbanceSection] = Field(
         default={}, description="disturbances to estimate, by name of the input, or of the state whose derivative they are added to"
     )
+    at_rest: bool = Field(
+        default=False,
+        description="whether disturbances go on while the robot stands, as wind and current do, slip and friction do not: a stop then balances them",
+    )
     measured: Annotated[tuple[str, ...], Field(strict=False)] = Field(default=(), description="states that are measured; all if left out")
     noise: dict[str, Positive] = Field(default={}, description="standard deviation of the measurement noise of states, by name, in the state's unit")
     process: dict[str, Weight] = Field(default={}, description="intensity of the process noise of states, by name, in the state's unit / sqrt(s)")

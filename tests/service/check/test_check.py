@@ -5,14 +5,15 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rti_mpc.contract.status import QpStatus
-from rti_mpc.rti.rest import assess
-from rti_mpc_service.check import check
+from rti_mpc.rti.rest import Rest, RestClass, assess
+from rti_mpc_service.check import check, rest
 from rti_mpc_service.check.rest import rest_line
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
@@ -131,3 +132,16 @@ def test_rest_is_described_in_one_line() -> None:
     line = rest_line(robot.model, None, assess(robot, None, 20))
     assert "holds without feedback (a)" in line
     assert line.endswith("its inputs ramp to rest")
+
+
+def test_robot_whose_observer_estimates_what_may_be_a_current_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rest, "assess", lambda *_: Rest(RestClass.HOLDS, 0.0, 1.0, np.zeros(5), 1000))
+    robot = pioneer()
+    assert rest.stop_from_everywhere(robot, None).endswith("its inputs ramp to rest")
+    told = "its disturbances are taken to end where it stands: if they are wind or current, observer.at_rest must say so"
+    assert rest.stop_from_everywhere(robot, None, disturbed=True).endswith(told)
+    law = law_of("car")
+    assert law is not None
+    line = rest.stop_from_everywhere(robot, replace(law, disturbances=np.ones(2)), disturbed=True)
+    assert "from 1000 states, disturbed up to its observer's limits, within 1 s" in line
+    assert told not in line

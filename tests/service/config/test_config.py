@@ -504,6 +504,23 @@ def test_robot_that_a_stop_does_not_bring_to_rest_is_refused_with_where_that_is(
         assert words in str(refusal.value)
 
 
+def test_disturbances_that_go_on_at_rest_are_balanced_by_a_way_to_rest(tmp_path: Path) -> None:
+    path, slip = tmp_path / "robot.toml", "disturbances = { u_c = { drift = 0.1, limit = 0.1 } }\n"
+    path.write_text(SHIPPED.read_text() + f"[observer]\n{slip}")
+    assert check_stop(load(path)) is None
+    path.write_text(SHIPPED.read_text() + f"[observer]\nat_rest = true\n{slip}")
+    law = check_stop(load(path))
+    assert law is not None
+    assert not law.holds
+    assert np.array_equal(law.disturbances, [0.1])
+    path.write_text(SHIPPED.read_text() + f"[observer]\nat_rest = true\n{slip.replace('0.1 }', '0.8 }')}")
+    with pytest.raises(ConfigError, match=r"d_u_c = -?0\.8 m/s it still moves.*lower limits in observer.disturbances to what its inputs can balance"):
+        check_stop(load(path))
+    path.write_text(SHIPPED.read_text() + "[observer]\nat_rest = true\n")
+    with pytest.raises(ConfigError, match=r"observer\.at_rest says what observer\.disturbances do while the robot stands, and there are none"):
+        load(path)
+
+
 def test_nothing_is_done_with_a_robot_that_a_stop_does_not_bring_to_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(config: Config) -> None:
         raise ConfigError("it coasts")
