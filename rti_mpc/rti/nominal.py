@@ -23,11 +23,11 @@ from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.ocp import Ocp
 
-TRIES = 40  # states at random, from a hundredth to ten thousand in size
-SETTLING_STAGES = 1000  # at most, from a state that was found to where the model takes it with its inputs at rest
+RANDOM_STATES = 40  # states at random, from a hundredth to ten thousand in size
+SETTLING_STAGES = 1000  # from a state that was found to where the model takes it with its inputs at rest
 GROWTH = {"euler": (1.0, 1.0), "rk4": (1 / 24, 1 / 6, 1 / 2, 1.0, 1.0)}  # R(z) of a scheme, highest power first
-FAST = 2.0  # times 1 / dt, from which on a motion is faster than a stage can follow
-EXPLODED = 10.0  # growth of an error over the horizon from which on a plan means nothing
+FAST_RATE_STAGES = 2.0  # |lambda| dt from which on a motion is faster than a stage can follow
+EXPLODED_GROWTH = 10.0  # growth of an error over the horizon from which on a plan means nothing
 
 
 def nominal_state(ocp: Ocp) -> Array:
@@ -51,7 +51,7 @@ def nominal_state(ocp: Ocp) -> Array:
     if regular(zero := np.clip(np.zeros(model.nx), ocp.lbx, ocp.ubx)):
         return np.asarray(zero)
     rng = np.random.default_rng(1)
-    candidates = [np.ones(model.nx), *(size * rng.normal(size=model.nx) for size in np.geomspace(1e-2, 1e4, TRIES))]
+    candidates = [np.ones(model.nx), *(size * rng.normal(size=model.nx) for size in np.geomspace(1e-2, 1e4, RANDOM_STATES))]
     for candidate in candidates:
         if regular(x := np.clip(candidate, ocp.lbx, ocp.ubx)):
             settled = np.array(ocp.phi().mapaccum(SETTLING_STAGES)(x, u_rest, model.p_nominal))[:, -1]
@@ -90,7 +90,7 @@ def check_stiffness(ocp: Ocp, x: Array) -> None:
     growth = GROWTH[ocp.method]
     for eigenvalue, mode in sorted(zip(eigenvalues, modes.T, strict=True), key=lambda pair: -abs(pair[0])):
         z = eigenvalue * ocp.dt
-        if z.real >= 0.0 or abs(z) <= FAST or ocp.N * np.log(abs(np.polyval(growth, z))) <= np.log(EXPLODED):
+        if z.real >= 0.0 or abs(z) <= FAST_RATE_STAGES or ocp.N * np.log(abs(np.polyval(growth, z))) <= np.log(EXPLODED_GROWTH):
             continue
         shares = np.geomspace(1.0, 1e-9, 20_000)
         longest = ocp.dt * next(share for share in shares if abs(np.polyval(growth, share * z)) <= 1.0)

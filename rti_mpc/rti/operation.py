@@ -15,30 +15,46 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.model.model import Model
+from rti_mpc.rti.nominal import model_and_derivatives, nominal_state
 from rti_mpc.rti.ocp import Ocp
 
-SEEDED = 6  # combinations of bounds, beside those where all are low or all high
-UNBOUNDED = 1.0  # where there is no bound: the distance from rest that is tried, in the unit of the state or input
+SEEDED_CORNERS = 6  # combinations of bounds, beside those where all are low or all high
+UNBOUNDED_DISTANCE = 1.0  # from the nominal state, or the input at rest, that is tried where there is no bound; in its unit
+MAX_DRAWS = 20  # of all states anew, where some are not regular
 
 
 def states_of_operation(ocp: Ocp, count: int, seed: int = 1) -> tuple[Array, Array]:
     """
-    Return states inside the bounds and the inputs that act there: corners of the bounds first, then seeded ones.
+    Return states inside the bounds and the inputs that act there: corners of the bounds first, then seeded ones; only where the model is regular.
 
     Args:
         ocp: The problem whose bounds they are.
-        count: How many, two or more.
+        count: How many, two or more; around the nominal state where there are no bounds.
         seed: Seed of all that is random.
 
     Returns:
-        States, shape ``(count, nx)``, and inputs, shape ``(count, nu)``.
+        States, shape ``(count, nx)``, and inputs, shape ``(count, nu)``. The nominal state, at rest, stands in for those that were not found.
     """
-    model, rng = ocp.model, np.random.default_rng(seed)
-    lowest, highest = around(ocp.lbx, ocp.ubx, np.array(model.x_nominal or np.zeros(model.nx)))
-    low_u, high_u = around(ocp.lbu, ocp.ubu, np.array(model.u_rest))
+    model, rng, is_regular = ocp.model, np.random.default_rng(seed), regular(ocp)
+    nominal, rest = nominal_state(ocp), np.array(model.u_rest)
+    lowest, highest = around(ocp.lbx, ocp.ubx, nominal)
+    low_u, high_u = around(ocp.lbu, ocp.ubu, rest)
     ends = np.concatenate([lowest, low_u]), np.concatenate([highest, high_u])
-    found = np.array([*corners(*ends, rng, count // 4), *rng.uniform(*ends, size=(count - count // 4 - 2, model.nx + model.nu))])
-    return found[:, : model.nx], found[:, model.nx :]
+    found: list[Array] = []
+    drawn = [*corners(*ends, rng, count // 4), *rng.uniform(*ends, size=(count - count // 4 - 2, model.nx + model.nu))]
+    for _ in range(MAX_DRAWS):
+        found += [z for z in drawn if is_regular(z[: model.nx], z[model.nx :])]
+        if len(found) >= count:
+            break
+        drawn = list(rng.uniform(*ends, size=(count - len(found), model.nx + model.nu)))
+    kept = np.array([*found, *[np.concatenate([nominal, rest])] * (count - len(found))])
+    return kept[:, : model.nx], kept[:, model.nx :]
+
+
+def regular(ocp: Ocp) -> Callable[[Array, Array], bool]:
+    """Build whether the model is finite and differentiable at a state, shape ``(nx,)``, and an input, shape ``(nu,)``."""
+    values = model_and_derivatives(ocp)
+    return lambda x, u: bool(np.isfinite(np.array(values(x, u, ocp.model.p_nominal))).all())
 
 
 def derivative(model: Model) -> Callable[[Array, Array], Array]:
@@ -48,12 +64,12 @@ def derivative(model: Model) -> Callable[[Array, Array], Array]:
 
 
 def around(lower: Array, upper: Array, middle: Array) -> tuple[Array, Array]:
-    """Return bounds, and where there are none `UNBOUNDED` to that side of a middle; each of shape ``(n,)``."""
-    lowest = np.where(np.isfinite(lower), lower, np.minimum(middle, upper) - UNBOUNDED)
-    return lowest, np.where(np.isfinite(upper), upper, np.maximum(middle, lower) + UNBOUNDED)
+    """Return bounds, and where there are none `UNBOUNDED_DISTANCE` to that side of a middle; each of shape ``(n,)``."""
+    lowest = np.where(np.isfinite(lower), lower, np.minimum(middle, upper) - UNBOUNDED_DISTANCE)
+    return lowest, np.where(np.isfinite(upper), upper, np.maximum(middle, lower) + UNBOUNDED_DISTANCE)
 
 
-def corners(lowest: Array, highest: Array, rng: np.random.Generator, seeded: int = SEEDED) -> Iterator[Array]:
+def corners(lowest: Array, highest: Array, rng: np.random.Generator, seeded: int = SEEDED_CORNERS) -> Iterator[Array]:
     """Yield combinations of bounds, each of shape ``(n,)``: all low, all high, and seeded ones."""
     yield lowest
     yield highest

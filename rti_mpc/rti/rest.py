@@ -37,28 +37,30 @@ from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model
+from rti_mpc.rti.nominal import nominal_state
 from rti_mpc.rti.ocp import Ocp
-from rti_mpc.rti.operation import SEEDED, around, corners, derivative, states_of_operation
+from rti_mpc.rti.operation import around, corners, derivative, regular, states_of_operation
 from rti_mpc.rti.way_to_rest import StopLaw, WayToRest, whole
 
-SETTLING_S = 10.0  # after which a robot must stand
+SETTLING_S = 10.0  # after its inputs have come to rest a robot must stand still
 DRIVEN_S = 2.0  # for which inputs at their bounds drive the robot, to see which states it gets into
-STILL = 0.01  # of the rate in operation, below which a state stands still
-AT_REST = 1e-3  # of the rate in operation, below which a way has come to rest when its rows are counted: what is not counted needs more
-DURATIONS_S = (1.0, 2.0, 5.0, 10.0, 20.0)  # of a way, the first of which is long enough
-MAX_REST_ROWS = 200  # of a way
-MAX_HORIZON = 100  # rows that the regulator looks ahead
-SPARE = 1.5  # times the rows that the seeded states need has a way
-PROBED = 4  # of these, before all
-FINDING = 24  # states of operation that a way is found with
-INPUT_WEIGHTS = (0.01, 0.1, 1.0, 10.0)  # beside the rates, tried for the soonest rest
-DELAY_S = 0.01  # from a state to the input that answers it, when the way is played
-MISMATCH = 0.02  # by which the plant answers its inputs more, or less, than its model
+STILL_SHARE = 0.01  # a state stands still that changes more slowly than this share of its fastest rate in operation
+COUNTED_STILL_SHARE = 1e-3  # the same, where the rows that a way needs are counted: in operation it may need more than in the states tried
+FALLING_SHARE = 0.1  # a robot falls, and does not only drift, if without feedback a state changes faster than this share of that rate
+MAX_DRIFT_GROWTH_PER_S = 0.05  # real part of an eigenvalue at rest up to which a robot drifts, and is not unstable
+SEEDED_STATES = 6  # from which the inputs are brought to rest, beside those that inputs at their bounds lead to
+TRIED_STATES = 24  # of operation, from which a way is to lead to rest
+FIRST_TRIED_STATES = 4  # of these, tried before the others: most laws that are too slow are so from the corners
+MAX_LINEARIZED_STATES = 50  # at rest, whose eigenvalues are computed
+WAY_DURATIONS_S = (1.0, 2.0, 5.0, 10.0, 20.0)  # tried in this order until one is long enough
+MAX_WAY_ROWS = 200
+MAX_HORIZON_ROWS = 100  # that the regulator looks ahead
+ROWS_FACTOR = 1.5  # a way has so many times the rows that the states tried need
+INPUT_WEIGHTS = (0.01, 0.1, 1.0, 10.0)  # relative to the weight of the rates; the one with the soonest rest is taken
+DELAY_S = 0.01  # from a state to the input that answers it, when a way is played
+INPUT_MISMATCH_SHARE = 0.02  # by which the plant answers its inputs more, or less, than its model
 STANDING_S = 5.0  # for which the last row is then played
-LINEARIZED = 50  # of the states at rest, at most
-FALLING = 0.1  # of the rate in operation, that a robot has then without feedback: more than a drift
 UNDISTURBED: Array = np.zeros(0)
-GROWTH = 0.05  # 1/s: slower than this is no instability but a drift
 
 Motion = Callable[[Array, Array, float], Array]
 
@@ -72,16 +74,15 @@ def motion_at_rest(ocp: Ocp) -> str:
     """
     model, rng = ocp.model, np.random.default_rng(1)
     u_rest: Array = np.array(model.u_rest)
-    move, rate = motion(model), derivative(model)
+    move, rate, is_regular = motion(model), derivative(model), regular(ocp)
     inputs = list(corners(*around(ocp.lbu, ocp.ubu, u_rest), rng))
-    middle = np.array(model.x_nominal or np.zeros(model.nx))
-    lowest, highest = around(ocp.lbx, ocp.ubx, middle)
-    start = np.clip(middle, ocp.lbx, ocp.ubx)
+    start = nominal_state(ocp)
+    lowest, highest = around(ocp.lbx, ocp.ubx, start)
     states = [np.clip(move(start, u, DRIVEN_S), ocp.lbx, ocp.ubx) for u in inputs]
-    states += [rng.uniform(lowest, highest) for _ in range(SEEDED)]
-    states = [x for x in states if np.isfinite(x).all()]
+    states += [rng.uniform(lowest, highest) for _ in range(SEEDED_STATES)]
+    states = [start, *(x for x in states if is_regular(x, u_rest))]
     rates = np.abs([rate(x, u) for x in states for u in (*inputs, u_rest)])
-    still = np.maximum(STILL * np.max(rates, axis=0, where=np.isfinite(rates), initial=0.0), 1e-9)
+    still = np.maximum(STILL_SHARE * np.max(rates, axis=0, where=np.isfinite(rates), initial=0.0), 1e-9)
     positions = [j for j in range(model.nx) if not ca.depends_on(model.f_expl_expr[j], model.x[j])]
     ends = [move(x, u_rest, SETTLING_S) for x in states]
     for settled in ends:
@@ -100,6 +101,8 @@ def moves(model: Model, rates: Array, still: Array) -> str:
     """Return which state moves fastest, compared with what is still, each of shape ``(nx,)``; empty if none does."""
     j = int(np.argmax(np.abs(np.where(np.isnan(rates), np.inf, rates)) / still))
     signal = model.states[j]
+    if np.isnan(rates[j]):
+        return f"{signal.name} has come to where the model is not finite"
     return "" if abs(rates[j]) <= still[j] else f"{signal.name} changes by {rates[j]:.3g} {signal.unit} per second"
 
 
@@ -203,7 +206,7 @@ def find_stop_law(ocp: Ocp, disturbances: Array = UNDISTURBED) -> StopLaw | None
     if not disturbances.size and ocp.model.stop_expr is None and not motion_at_rest(ocp):
         return None
     law = shaped(ocp, disturbances)
-    return replace(law, holds=assess(ocp, law, FINDING, compile=False).kind is RestClass.HOLDS)
+    return replace(law, holds=assess(ocp, law, TRIED_STATES, compile=False).kind is RestClass.HOLDS)
 
 
 def assess(ocp: Ocp, law: StopLaw | None, count: int, *, compile: bool = True) -> Rest:
@@ -223,28 +226,28 @@ def assess(ocp: Ocp, law: StopLaw | None, count: int, *, compile: bool = True) -
     X = starts.x
     rates = rates_of_operation(model, starts)
     ways = ramps(ocp, starts) if law is None else ways_to_rest(ocp, law, starts, compile=compile)
-    moving = np.abs(rates_along(model, ways, starts)) > STILL * rates
+    moving = np.abs(rates_along(model, ways, starts)) > STILL_SHARE * rates
     if law is not None and moving[:, -1].any():  # `motion_at_rest` has judged a ramp, by an integrator for stiff models, too
         raise OcpError(unrested(model, starts, moving[:, -1], ways))
     time_s = ways.period_s * float((moving.any(axis=2) * np.arange(1, moving.shape[1] + 1)).max())
     ends = ways.x[:, -1]
     with np.errstate(invalid="ignore"):
-        free = np.ptp(ends, axis=0) > STILL * np.ptp(X, axis=0)
+        free = np.ptp(ends, axis=0) > STILL_SHARE * np.ptp(X, axis=0)
         moved = np.where(free, np.abs(ends - X).max(axis=0), 0.0)
     A = ca.Function("A", [model.x, model.u, model.p], [ca.densify(ca.jacobian(model.f_expl_expr, model.x))])
-    at_rest = zip(ends[:LINEARIZED], ways.u[:LINEARIZED, -1], starts.p[:LINEARIZED], strict=True)
+    at_rest = zip(ends[:MAX_LINEARIZED_STATES], ways.u[:MAX_LINEARIZED_STATES, -1], starts.p[:MAX_LINEARIZED_STATES], strict=True)
     jacobians = [np.array(A(*where)) for where in at_rest]
     growth = max((float(np.linalg.eigvals(J).real.max()) for J in jacobians if np.isfinite(J).all()), default=0.0)
     if law is None:
         return Rest(RestClass.HOLDS, growth, time_s, moved, count)
 
     alone = in_the_end(ocp, law, ways, starts, feedback=0.0) / rates
-    if not law.disturbances.size and growth <= GROWTH and alone.max() <= STILL:
+    if not law.disturbances.size and growth <= MAX_DRIFT_GROWTH_PER_S and alone.max() <= STILL_SHARE:
         return Rest(RestClass.HOLDS, growth, time_s, moved, count)
-    kept = in_the_end(ocp, law, ways, starts, feedback=1.0) <= STILL * rates
+    kept = in_the_end(ocp, law, ways, starts, feedback=1.0) <= STILL_SHARE * rates
     if not kept.all():
         raise OcpError(unkept(model, starts, ~kept, ways))
-    falls = growth > GROWTH or alone.max() > FALLING
+    falls = growth > MAX_DRIFT_GROWTH_PER_S or alone.max() > FALLING_SHARE
     return Rest(RestClass.UNSTABLE if falls else RestClass.DRIFTS, growth, time_s, moved, count)
 
 
@@ -255,17 +258,17 @@ def shaped(ocp: Ocp, disturbances: Array) -> StopLaw:
     Raises:
         OcpError: From one of them no way leads to rest, or it does not stay there.
     """
-    model, starts = ocp.model, starts_of(ocp, FINDING, disturbances)
+    model, starts = ocp.model, starts_of(ocp, TRIED_STATES, disturbances)
     rates = rates_of_operation(model, starts)
     scale_x, scale_u = (np.where((half := 0.5 * np.ptp(values, axis=0)) > 0.0, half, 1.0) for values in starts[:2])
     wrong = ""
-    for duration_s, still in (*((duration_s, AT_REST) for duration_s in DURATIONS_S), (DURATIONS_S[-1], STILL)):
-        substeps = max(1, math.ceil(duration_s / (MAX_REST_ROWS * ocp.dt)))
+    for duration_s, still in (*((duration_s, COUNTED_STILL_SHARE) for duration_s in WAY_DURATIONS_S), (WAY_DURATIONS_S[-1], STILL_SHARE)):
+        substeps = max(1, math.ceil(duration_s / (MAX_WAY_ROWS * ocp.dt)))
         rows = whole(math.ceil(duration_s / (substeps * ocp.dt)))
         found = []
         for weight in INPUT_WEIGHTS:
-            law = StopLaw(rows, min(rows, MAX_HORIZON), substeps * ocp.dt, substeps, weight, rates, scale_x, scale_u, disturbances=disturbances)
-            for count in (PROBED, FINDING):  # most laws that are too slow are so from the corners
+            law = StopLaw(rows, min(rows, MAX_HORIZON_ROWS), substeps * ocp.dt, substeps, weight, rates, scale_x, scale_u, disturbances=disturbances)
+            for count in (FIRST_TRIED_STATES, TRIED_STATES):
                 few = Starts(*(part[:count] for part in starts))
                 ways = ways_to_rest(ocp, law, few, compile=False)
                 moving = np.abs(rates_along(model, ways, few)) > still * rates
@@ -273,11 +276,11 @@ def shaped(ocp: Ocp, disturbances: Array) -> StopLaw:
                     break
             if moving[:, -1].any():
                 wrong = unrested(model, starts, moving[:, -1], ways)
-            elif not (kept := in_the_end(ocp, law, ways, starts, feedback=1.0) <= STILL * rates).all():
+            elif not (kept := in_the_end(ocp, law, ways, starts, feedback=1.0) <= STILL_SHARE * rates).all():
                 wrong = unkept(model, starts, ~kept, ways)
             else:
                 needed = int((moving.any(axis=2) * np.arange(1, rows)).max()) + 1
-                found.append(replace(law, rows=min(rows, whole(math.ceil(SPARE * needed) + 1))))
+                found.append(replace(law, rows=min(rows, whole(math.ceil(ROWS_FACTOR * needed) + 1))))
         if found:
             return min(found, key=lambda law: law.rows)
     raise OcpError(wrong)
@@ -341,13 +344,14 @@ def played(ocp: Ocp, law: StopLaw, ways: Ways, starts: Starts, feedback: float, 
 
 def in_the_end(ocp: Ocp, law: StopLaw, ways: Ways, starts: Starts, feedback: float) -> Array:
     """Return how fast each state changes after each way, shape ``(n, nx)``: the faster of two plants that answer more, and less, than their model."""
-    ends = [played(ocp, law, ways, starts, feedback, 1.0 + mismatch) for mismatch in (MISMATCH, -MISMATCH)]
+    ends = [played(ocp, law, ways, starts, feedback, 1.0 + mismatch) for mismatch in (INPUT_MISMATCH_SHARE, -INPUT_MISMATCH_SHARE)]
     return np.asarray(np.abs(ends).max(axis=0))
 
 
 def rates_of_operation(model: Model, starts: Starts) -> Array:
     """Return the fastest that each state changes in operation, shape ``(nx,)``, positive."""
-    rates = np.abs(rates_at(model, *starts)).max(axis=0, where=np.isfinite(starts.x), initial=0.0)
+    rates = np.abs(rates_at(model, *starts))
+    rates = rates.max(axis=0, where=np.isfinite(rates), initial=0.0)
     return np.where(rates > 0.0, rates, 1.0)
 
 
@@ -377,4 +381,5 @@ def unrested(model: Model, starts: Starts, moving: np.ndarray[Any, Any], ways: W
 
 def unkept(model: Model, starts: Starts, moving: np.ndarray[Any, Any], ways: Ways) -> str:
     """Say the same of a way that is played, and where it ends."""
-    return f"{unrested(model, starts, moving, ways)}, if its inputs do {100 * MISMATCH:g} % more or less than modelled, {DELAY_S:g} s late"
+    mismatch = f"if its inputs do {100 * INPUT_MISMATCH_SHARE:g} % more or less than modelled, {DELAY_S:g} s late"
+    return f"{unrested(model, starts, moving, ways)}, {mismatch}"

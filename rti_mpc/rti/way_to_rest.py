@@ -38,12 +38,12 @@ from rti_mpc.rti.riccati import cholesky, cholesky_solve
 
 NEWTON_STEPS = 8  # to an equilibrium
 SETTLING_STEPS = 2  # to the equilibrium at the end of a way, which is near
-DAMPING = 1e-9  # of these steps, where the equilibria are more than the equations tell
-INPUT_FREEDOM = 10.0  # by which inputs may move farther to an equilibrium than states, each measured by its range in operation
-PASSES = 3  # of a way that is found anew, before the last one: equilibria of an arm depend on where it comes to rest
-FIRST = 2  # rows whose reach depends on what was sent before
-BLOCK = 10  # rows, and steps of the regulator, that are compiled once and called again: compilers take long for what is long
-FREE = 0.01  # of its rate in operation, by which a state moves where another one is anywhere in its range: then that one is free at rest
+DAMPING = 1e-9  # of these steps, relative to squared ranges, where the equilibria are more than the equations tell
+INPUT_FREEDOM_FACTOR = 10.0  # by which inputs may move farther to an equilibrium than states, each measured by its range in operation
+FINDING_PASSES = 3  # over a way that is found anew, before the last one: equilibria of an arm depend on where it comes to rest
+FIRST_ROWS = 2  # whose reach depends on what was sent before
+BLOCK_ROWS = 10  # that are compiled once and called again, as are steps of the regulator: compilers take long for what is long
+FREE_SHARE = 0.01  # of its rate in operation by which a state moves where another one is anywhere in its range: then that one is free at rest
 HOLD_S = 1.0  # a deviation from the way weighs as much as a rate that undoes it in this time
 LIMITS = ("lbu", "ubu", "lbdu", "ubdu")
 
@@ -209,7 +209,7 @@ class WayToRest:
     def find(self, x: Array, u_prev: Array, reach: tuple[Array, Array] | None = None) -> bool:
         """Roll a way out from a state nothing is known of before; as `begin`, aimed at the state itself, then at where that leads."""
         self.aim(x, self._u_rest)
-        for _ in range(PASSES):
+        for _ in range(FINDING_PASSES):
             self.begin(x, u_prev, reach)
             self.aim(self.x[-1], self.u[-1])
         return self.begin(x, u_prev, reach)
@@ -238,7 +238,7 @@ class WayToRest:
 def to_equilibrium(model: Model, law: StopLaw, steps: int) -> ca.Function:
     """Build ``(x, u, p) -> (x_e, u_e)``: Newton steps of least length to a state and an input at which the model rests."""
     z = ca.vertcat(model.x, model.u)
-    size = ca.DM(np.concatenate([law.scale_x, INPUT_FREEDOM * law.scale_u]))
+    size = ca.DM(np.concatenate([law.scale_x, INPUT_FREEDOM_FACTOR * law.scale_u]))
     f = model.f_expl_expr / ca.DM(law.rates)
     J = ca.densify(ca.jacobian(f, z) @ ca.diag(size))
     step = size * (J.T @ cholesky_solve(cholesky(J @ J.T + DAMPING * ca.SX.eye(model.nx)), f))
@@ -284,13 +284,13 @@ def regulators(model: Model, law: StopLaw) -> ca.Function:
     A_e, B_e, *costs = linear(x, u, p)
     to_go, cost, A_k, B_k = (ca.MX.sym(name, *shape) for name, shape in (("S", (nx, nx)), ("Q", (nx, nx)), ("A", (nx, nx)), ("B", (nx, nu))))
     earlier, gain = to_go, ca.MX(nu, nx)
-    for _ in range(BLOCK):
+    for _ in range(BLOCK_ROWS):
         earlier, gain = recursion(earlier, cost, A_k, B_k)
     block = ca.Function("recursions", [to_go, cost, A_k, B_k], [earlier, gain])
     gains = []
     for cost in costs:
         to_go = cost
-        for _ in range(-(-law.horizon // BLOCK)):
+        for _ in range(-(-law.horizon // BLOCK_ROWS)):
             to_go, gain = block(to_go, cost, A_e, B_e)
         gains.append(gain)
     return ca.Function("regulators", [x, u, p], gains)
@@ -302,7 +302,7 @@ def unfree(C: ca.SX, law: StopLaw) -> ca.SX:
 
     In a current that is weak, a boat's rates hardly depend on its heading, and yet it comes to rest in one heading only.
     """
-    free = ca.densify(C.T @ cholesky_solve(cholesky(ca.densify(C @ C.T) + FREE**2 * ca.SX.eye(C.shape[0])), C))  # a projector, softly
+    free = ca.densify(C.T @ cholesky_solve(cholesky(ca.densify(C @ C.T) + FREE_SHARE**2 * ca.SX.eye(C.shape[0])), C))  # a projector, softly
     away = free @ ca.diag(ca.DM(1.0 / law.scale_x))
     return away.T @ ca.diag(ca.DM((law.scale_x / (HOLD_S * law.rates)) ** 2)) @ away
 
@@ -362,17 +362,17 @@ def rolled_out(name: str, model: Model, law: StopLaw, wanted: ca.SX, along: dict
         shared = {key: ca.MX.sym(key, *symbol.shape) for key, symbol in common.items()}
         return ca.MX.sym("x0", model.nx), ca.MX.sym("u_prev", nu), shared, {key: ca.MX.sym(key, e.numel(), rows) for key, e in along.items()}
 
-    x, before, shared, own = symbols(BLOCK)
-    x_end, u_end, inputs, states = roll(x, before, shared, own, range(BLOCK))
+    x, before, shared, own = symbols(BLOCK_ROWS)
+    x_end, u_end, inputs, states = roll(x, before, shared, own, range(BLOCK_ROWS))
     ends = {"x_end": x_end, "u_end": u_end, "rows": ca.horzcat(*inputs), "states": ca.horzcat(*states)}
     block = function("block", {"x0": x, "u_prev": before, **shared, **own}, ends)
 
     x, before, shared, own = symbols(law.rows)
     reach = {"lowest": ca.MX.sym("lowest", nu, 2), "highest": ca.MX.sym("highest", nu, 2)}
     whole_in = {"x0": x, "u_prev": before, **shared, **reach, **own}
-    x, before, inputs, states = roll(x, before, shared | reach, own, range(FIRST))
-    for start in range(FIRST, law.rows, BLOCK):
-        after = block(x0=x, u_prev=before, **shared, **{key: value[:, start : start + BLOCK] for key, value in own.items()})
+    x, before, inputs, states = roll(x, before, shared | reach, own, range(FIRST_ROWS))
+    for start in range(FIRST_ROWS, law.rows, BLOCK_ROWS):
+        after = block(x0=x, u_prev=before, **shared, **{key: value[:, start : start + BLOCK_ROWS] for key, value in own.items()})
         x, before = after["x_end"], after["u_end"]
         inputs.append(after["rows"])
         states.append(after["states"])
@@ -381,4 +381,4 @@ def rolled_out(name: str, model: Model, law: StopLaw, wanted: ca.SX, along: dict
 
 def whole(rows: int) -> int:
     """Return how many rows a way has that needs some: those that are rolled out one by one, and whole blocks."""
-    return FIRST + BLOCK * max(1, -(-(rows - FIRST) // BLOCK))
+    return FIRST_ROWS + BLOCK_ROWS * max(1, -(-(rows - FIRST_ROWS) // BLOCK_ROWS))

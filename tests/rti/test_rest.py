@@ -11,8 +11,10 @@ import pytest
 
 from rti_mpc.model.model import Model, Signal
 from rti_mpc.rti.ocp import Ocp
-from rti_mpc.rti.rest import motion_at_rest
+from rti_mpc.rti.operation import states_of_operation
+from rti_mpc.rti.rest import RestClass, assess, find_stop_law, motion_at_rest
 from tests.problems import INF, PAPER, beacon, double_integrator, pioneer
+from tests.rti.test_nominal import PLANTS, problem
 
 
 def robot(names: str, units: str, f: Any, nu: int, **options: Any) -> Ocp:
@@ -85,6 +87,27 @@ def test_robot_that_coasts_or_falls_is_found_and_what_was_seen_is_said(name: str
     assert words in seen
     assert seen == motion_at_rest(ocp), "and the same each time"
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("given", [False, True], ids=["found", "given"])
+@pytest.mark.parametrize(("name", "rests"), [("reactor", True), ("bicycle", True), ("attitude", True), ("tank", False)])
+def test_model_that_is_singular_at_zero_is_judged_around_its_nominal_state(name: str, rests: bool, given: bool) -> None:
+    """A tank without inflow drains, and is held at its level instead; the rest need no way."""
+    plant = PLANTS[name]()
+    ocp = problem(PLANTS[name](x_nominal=plant.x0) if given else plant)
+    seen = motion_at_rest(ocp)
+    assert seen == ("" if rests else "10 s after its inputs have come to rest h has come to where the model is not finite")
+    rest = assess(ocp, find_stop_law(ocp), 24, compile=False)
+    assert (rest.kind, rest.states) == (RestClass.HOLDS, 24)
+    assert np.isfinite(rest.moved).all()
+
+
+def test_states_of_operation_are_those_where_the_model_is_regular() -> None:
+    ocp = problem(PLANTS["tank"](), lbx=-1.0, ubx=3.0)
+    X, U = states_of_operation(ocp, 40)
+    assert (X.shape, U.shape) == ((40, 1), (40, 1))
+    assert X.min() > 0.0
+    assert len(np.unique(X)) > 20
 
 
 def test_bounds_say_what_operation_is() -> None:

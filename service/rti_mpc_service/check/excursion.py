@@ -112,7 +112,7 @@ def outputs(ocp: Ocp, x: Array, u: Array) -> Array:
 
 
 def displacement(ocp: Ocp, x0: Array, nominal: Array, way: Array) -> Array:
-    """Return how far inputs that leave their rest by `way`, shape ``(nu,)``, drive the outputs; where the model ends, extrapolated from a share of it."""
+    """Return how far the outputs are driven by inputs a `way`, shape ``(nu,)``, from rest; by a share of it, extrapolated, where the model ends."""
     for share in SHARES:
         driven = outputs(ocp, x0, ocp.model.u_rest + share * way)
         if len(driven) >= len(nominal):
