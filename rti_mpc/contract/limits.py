@@ -36,7 +36,7 @@ class Limits:
         dt_s: Period of the controller, s.
         delay_s: Delay from a state to the time at which its command acts, s.
         stale_s: Age from which neither a state nor a command that answers it is used, s of the robot.
-        angles: Which states are angles, shape ``(nx,)``, for ways to rest that need feedback; empty: none of those may pass.
+        angles: Which states are angles, shape ``(nx,)``, for ways to rest that need feedback; empty: none is known, and none of those may pass.
     """
 
     u_rest: Array
@@ -71,7 +71,7 @@ class Limits:
     def objection(self, command: Command) -> str:
         """Return what is wrong with the rows of a command, as a code and a reason; empty if nothing is."""
         if len(command.K) and len(self.angles) != command.K.shape[1]:
-            return f"wrong_shape: it feeds {command.K.shape[1]} states back on its way to rest, guard.states must name each, got {len(self.angles)}"
+            return f"wrong_shape: it feeds {command.K.shape[1]} states back on its way to rest, of {len(self.angles)} known"
         for u, period_ns, of in judged(command):
             if (u < self.lbu - INPUT_ROUNDING).any() or (u > self.ubu + INPUT_ROUNDING).any():
                 return f"out_of_bounds: inputs{of} reach from {u.min(axis=0).tolist()} to {u.max(axis=0).tolist()}"

@@ -24,9 +24,10 @@ from typer.core import TyperCommand, TyperGroup
 import rti_mpc
 from rti_mpc.errors import ConfigError
 from rti_mpc_service import entry, log
-from rti_mpc_service.config.build import bus_settings, robot_settings, stage_parameters, with_initial_state
+from rti_mpc_service.config.build import build_signals, bus_settings, robot_settings, stage_parameters, with_initial_state
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
+from rti_mpc_service.config.signals_file import check_against
 from rti_mpc_service.shipped import DEPLOY
 
 if TYPE_CHECKING:
@@ -122,11 +123,13 @@ def process(command: Callable[..., int | None], *, with_model: bool = True) -> C
 
     Args:
         command: Takes the configuration, the settings of the bus, and its own options; returns an exit status, None for 0. If it
-            takes `words`, CONFIG is the first TOML file among them.
+            takes `words`, CONFIG is the first TOML file among them; if it takes `path`, it is told which file CONFIG is.
         with_model: Whether the configuration is checked against the model.
     """
     shared = inspect.signature(options, eval_str=True).parameters
-    own = list(inspect.signature(command, eval_str=True, locals={"BusSettings": Any}).parameters.values())[2:]
+    _, _, *own = inspect.signature(command, eval_str=True, locals={"BusSettings": Any}).parameters.values()
+    wants_path = any(parameter.name == "path" for parameter in own)
+    own = [parameter for parameter in own if parameter.name != "path"]
 
     @wraps(command)
     def run(config: Path = SHIPPED, **given: Any) -> None:
@@ -134,6 +137,8 @@ def process(command: Callable[..., int | None], *, with_model: bool = True) -> C
             words = [str(config), *(given["words"] or [])]
             file = next((word for word in words if word.endswith(".toml")), "")
             config, given["words"] = Path(file or SHIPPED), [word for word in words if word != file]
+        if wants_path:
+            given["path"] = config
         loaded = load(config, with_model=with_model)
         overrides = options(**{name: given.pop(name) for name in shared})
         raise typer.Exit(command(loaded, replace(bus_settings(loaded), **overrides), **given) or 0)
@@ -171,21 +176,24 @@ StatePath = Annotated[
 def run(
     config: Config,
     bus: BusSettings,
+    path: Path,
     standby: Annotated[bool, typer.Option("--standby", help="Stand by while another controller leads, and take over when it stops sending.")] = False,
     state: StatePath = None,
 ) -> int:
     """Run the controller: answer each state of the robot with a command that follows the reference."""
     from rti_mpc_service.controller.daemon import main
 
+    if config.guard.enabled:
+        check_against(path, build_signals(config))
     return main(config, bus, standby=standby, state=state)
 
 
 @partial(process, with_model=False)
-def guard(config: Config, bus: BusSettings, state: StatePath = None) -> int:
+def guard(config: Config, bus: BusSettings, path: Path, state: StatePath = None) -> int:
     """Run the guard between controller and robot: pass on commands that are fresh and inside the limits, brake without them."""
     from rti_mpc_service.guard import main
 
-    return main(config, bus, state=state)
+    return main(config, bus, path, state=state)
 
 
 @process

@@ -30,8 +30,10 @@ from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received, Subscriber, unix_s
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.session import BusSettings
 from rti_mpc_service.announce import announce
+from rti_mpc_service.config import signals_file
 from rti_mpc_service.config.build import guard_limits
 from rti_mpc_service.config.schema import Config
+from rti_mpc_service.config.signals_file import Signals
 from rti_mpc_service.latch_file import LatchFile
 from rti_mpc_service.operator_stop import OperatorStop
 
@@ -42,13 +44,14 @@ MAX_RAMP_S = 3.0  # how long a guard that is being stopped may take to bring the
 log = logging.getLogger(ROLE)
 
 
-def main(config: Config, bus_settings: BusSettings, *, state: Path | None = None, stop: Event | None = None) -> int:
+def main(config: Config, bus_settings: BusSettings, path: Path, *, state: Path | None = None, stop: Event | None = None) -> int:
     """
     Guard one robot until stopped.
 
     Args:
-        config: The robot's configuration; of the model only the bounds of the inputs are used.
+        config: The robot's configuration.
         bus_settings: How to join the bus.
+        path: Its file, beside which `check` has written the signals of the model.
         state: Folder in which an operator's stop is stored; None: the folder of the user or of the service.
         stop: Event that stops the guard; None: SIGINT and SIGTERM do.
 
@@ -56,10 +59,11 @@ def main(config: Config, bus_settings: BusSettings, *, state: Path | None = None
         Exit status: 0 when stopped, 1 when another guard is present or an unforeseen error ended this one.
 
     Raises:
-        ConfigError: The configuration has no guard, or an endpoint is not available.
+        ConfigError: The configuration has no guard, the signals do not fit it, or an endpoint is not available.
     """
     if not config.guard.enabled:
         raise ConfigError("guard.enabled must be true for the robot to take what a guard passes on, got false")
+    signals = signals_file.read(path, config)
     stop = stop or stop_on_signals()
     with Bus.join(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
         heard, intake = bus.subscriber(bus.keys.actuation, capacity=RING_MESSAGES), bus.intake(Command, LISTEN_BEFORE_START_S, choosing=True)
@@ -68,19 +72,20 @@ def main(config: Config, bus_settings: BusSettings, *, state: Path | None = None
             return 1
         known = max(unix_s() << NUMBER_BITS, intake.highest_epoch(heard.drain()))
         epoch = epoch_above(known, secrets.randbits(NUMBER_BITS))
-        process = Process(config, bus, epoch, LatchFile(bus.keys, state))
+        process = Process(config, signals, bus, epoch, LatchFile(bus.keys, state))
         bus.alive(ROLE)
         log.info("epoch %d guards %s", epoch, config.robot)
         return process.run(stop)
 
 
-def guard_info(config: Config) -> dict[str, object]:
+def guard_info(config: Config, signals: Signals) -> dict[str, object]:
     """Return the guard's message for ``info``: its limits per input, null where there is none."""
-    limits, bounds = guard_limits(config), config.ocp.bounds
+    limits = guard_limits(config, signals)
     return {
         "role": ROLE,
         "version": rti_mpc.__version__,
-        **info.labels(inputs=[info.Label(name) for name in bounds.inputs]),
+        "model": signals.model,
+        **info.labels(inputs=signals.inputs),
         **info.bounds(**{name: getattr(limits, name).tolist() for name in ("u_rest", "lbu", "ubu", "lbdu", "ubdu")}),
         "dt_s": limits.dt_s,
         "tick_s": config.guard.tick_s,
@@ -91,18 +96,18 @@ def guard_info(config: Config) -> dict[str, object]:
 class Process:
     """One life of the guard on the bus."""
 
-    def __init__(self, config: Config, bus: Bus, epoch: int, file: LatchFile) -> None:
-        limits, keys = guard_limits(config), bus.keys
+    def __init__(self, config: Config, signals: Signals, bus: Bus, epoch: int, file: LatchFile) -> None:
+        limits, keys = guard_limits(config, signals), bus.keys
         self._bus = bus
         self._telling = Lock()
-        self._about = {**guard_info(config), "epoch": epoch}
+        self._about = {**guard_info(config, signals), "epoch": epoch}
         self._guard = Guard(limits, epoch=epoch, config_hash=config.config_hash)
         self._tick_s = config.guard.tick_s
         self._lock = Lock()
         self._crashed = Event()
         self._announcer = Announcer(bus, ROLE, epoch)
         self._actuation = bus.publisher(keys.actuation)
-        self._states = bus.intake(State, config.stale_s, {"u": len(limits.u_rest)})
+        self._states = bus.intake(State, config.stale_s, {"x": len(limits.angles), "u": len(limits.u_rest)})
         bus.expect("state", lambda: self._guard.heard)
         self._commands = bus.intake(Command, config.stale_s, {"u": len(limits.u_rest)})
         self._operator_stop = OperatorStop(file, self._obey, self._guard.notices.append)

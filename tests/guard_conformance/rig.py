@@ -21,11 +21,11 @@ from rti_mpc.wire.actuator import Actuator
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.session import BusSettings
-from rti_mpc_service.cli import SHIPPED
-from rti_mpc_service.config.build import guard_limits
+from rti_mpc_service.config.build import build_signals, guard_limits
 from rti_mpc_service.config.config import load
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
+from tests.guarded import write_robot
 from tests.in_time import in_time, on_time
 
 ROOT = Path(__file__).parents[2]
@@ -54,10 +54,9 @@ class Rig:
 
     def __init__(self, guard: list[str], folder: Path, host: Host) -> None:
         self._host = host
-        self.config = folder / "robot.toml"
-        self.config.write_text(SHIPPED.read_text() + "\n[guard]\nenabled = true\n")
+        self.config = write_robot(folder / "robot.toml")
         loaded = load(self.config)
-        limits = guard_limits(loaded)
+        limits = guard_limits(loaded, build_signals(loaded))
         self.lbu, self.ubu, self.step = limits.lbu, limits.ubu, np.minimum(-limits.lbdu, limits.ubdu)
         self._slew, self._guard, self._folder = limits.slew, guard, folder
         self._endpoint = free_endpoint()

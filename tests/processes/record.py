@@ -16,7 +16,7 @@ STANDSTILL_SPEED = 1e-3  # m/s, rad/s
 SLEW = np.array([0.25, 0.40])  # of the shipped configuration, over 0.1 s
 MS = 1_000_000
 PERIOD_NS = 10 * MS  # of the states: the resolution of the record
-GUARDED = f"\n[guard]\nenabled = true\n[sim]\nstate_period_s = {1e-9 * PERIOD_NS}\n"  # what a configuration needs beside the shipped one
+FAST_STATES = f"[sim]\nstate_period_s = {1e-9 * PERIOD_NS}\n"  # what a configuration needs beside the shipped one
 
 
 @dataclass

@@ -20,6 +20,7 @@ from rti_mpc.contract.message import Command
 from rti_mpc.wire.bus import unix_s
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
+from tests.guarded import GUARDED, write_robot
 from tests.in_time import on_time
 from tests.processes.attack import RATE_HZ, Attack
 from tests.processes.system import KEYS, System, until
@@ -36,7 +37,7 @@ STATES_AFTER_BLOCK = 3  # whose answers may not be written yet
 def system(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[System]:
     """Robot, controller, standby, reference and viewer, and a guard or none."""
     guarded = request.param == "guarded"
-    (tmp_path / "robot.toml").write_text(SHIPPED.read_text() + ("\n[guard]\nenabled = true\n" if guarded else ""))
+    write_robot(tmp_path / "robot.toml", text=SHIPPED.read_text() + (GUARDED if guarded else ""))
     reference = ("reference", "--scenario", "eight", "--duration", 3600)  # longer than the longest attack
     roles = {
         "robot": ("sim", "--x0", "x=0.5"),

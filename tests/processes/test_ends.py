@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
+from tests.guarded import write_robot
 from tests.in_time import explained
 from tests.processes.network import ip, missing, name_of
 from tests.processes.system import ROOT, command_line, environment, until
@@ -106,7 +106,7 @@ class Round:
 
     def __enter__(self) -> Round:
         self.folder.mkdir()
-        (self.folder / "robot.toml").write_text(SHIPPED.read_text() + "\n[guard]\nenabled = true\n")
+        write_robot(self.folder / "robot.toml")
         with ExitStack() as stack:
             if self._namespace:
                 ip("netns", "add", self._namespace)

@@ -23,8 +23,9 @@ from rti_mpc.contract.status import Mode
 from rti_mpc.wire.cdr import decode
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
+from tests.guarded import write_robot
 from tests.in_time import in_time
-from tests.processes.record import GUARDED, MS, SLEW, Record, recorded, within_slew
+from tests.processes.record import FAST_STATES, MS, SLEW, Record, recorded, within_slew
 from tests.processes.system import CONFIG, KEYS, System, heard, interrupted_in_time, rti_mpc, until
 
 SPEED_M_S = 0.5
@@ -34,7 +35,7 @@ SPEED_M_S = 0.5
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
     """A robot on a long straight line at its full speed, and its guard."""
     folder = tmp_path_factory.mktemp("guarded")
-    (folder / "robot.toml").write_text(SHIPPED.read_text() + GUARDED)
+    write_robot(folder / "robot.toml", FAST_STATES)
     line = ("reference", "--scenario", folder / "line.csv", "--waypoint-speed", SPEED_M_S)
     with System(folder, folder / "robot.toml", robot=("sim",), reference=line) as system:
         system.start("robot", "guard", "controller")
@@ -152,7 +153,7 @@ def test_ctrl_c_ends_the_guard_with_a_ramp_to_rest(driven: System, host: Host) -
 @pytest.mark.slow
 def test_terminals_that_hang_keep_nobody_from_driving_the_robot(tmp_path: Path) -> None:
     """What they say is taken by nobody from the first line on, as after Ctrl-S, or where a connection was lost."""
-    (tmp_path / "robot.toml").write_text(SHIPPED.read_text() + GUARDED)
+    write_robot(tmp_path / "robot.toml", FAST_STATES)
     roles = ("robot", "guard", "controller", "reference")
     with System(tmp_path, tmp_path / "robot.toml") as system, ExitStack() as stack:
         for role in roles:

@@ -19,8 +19,9 @@ import pytest
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.status import Mode
 from rti_mpc_service.host.hold_up import Host
+from tests.guarded import GUARDED
 from tests.in_time import in_time
-from tests.processes.record import GUARDED, MS, STANDSTILL_SPEED, recorded, within_slew
+from tests.processes.record import FAST_STATES, MS, STANDSTILL_SPEED, recorded, within_slew
 from tests.processes.system import KEYS, until
 from tests.processes.watched import Watched
 
@@ -34,7 +35,7 @@ FORGED = 1  # configuration hash by which a command of this test is known again
 @pytest.fixture(scope="module")
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watched]:
     """A robot that is being driven through its guard by a leader, beside whom another stands by."""
-    with Watched(tmp_path_factory.mktemp("guarded"), DT_S, more=GUARDED) as system:
+    with Watched(tmp_path_factory.mktemp("guarded"), DT_S, more=GUARDED + FAST_STATES) as system:
         system.drive("guard")
         yield system
 

@@ -22,16 +22,17 @@ import pytest
 from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.contract.status import Mode
 from rti_mpc_service.cli import SHIPPED
-from rti_mpc_service.config.build import guard_limits
+from rti_mpc_service.config.build import build_signals, guard_limits
 from rti_mpc_service.config.config import load
 from rti_mpc_service.faults.measure import Incident, measure
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig import robot_log
 from tests.bench.driven import INFO
+from tests.guarded import GUARDED, write_robot
 from tests.in_time import MS, in_time
 from tests.processes.network import MIDDLE, MIDDLE_ADDRESS, Network, missing
 from tests.processes.overheard import Overheard
-from tests.processes.record import GUARDED, PERIOD_NS
+from tests.processes.record import FAST_STATES
 from tests.processes.system import CONFIG, owner, until
 
 pytestmark = pytest.mark.slow
@@ -41,7 +42,6 @@ SHORTEST_S, LONGEST_S = 0.2, 10.0
 ROBOT, HOSTS = "robot", ("robot", "leader", "standby")
 ENDPOINT = f"tcp/{MIDDLE_ADDRESS}:7447"
 MEETING = ("-m", "client", "-e", ENDPOINT)
-UNGUARDED = f"\n[sim]\nstate_period_s = {1e-9 * PERIOD_NS}\n"
 PROMISE_MS = 300.0  # from a cut to braking where nobody leads; without commands where somebody does
 DT_NS = round(1e9 * CONFIG.ocp.dt_s)
 
@@ -59,8 +59,7 @@ class Partitioned:
 
     def __init__(self, network: Network, folder: Path, guarded: bool) -> None:
         self.network, self.folder, self.guarded = network, folder, guarded
-        self.config = folder / "robot.toml"
-        self.config.write_text(SHIPPED.read_text() + (GUARDED if guarded else UNGUARDED))
+        self.config = write_robot(folder / "robot.toml", FAST_STATES, SHIPPED.read_text() + (GUARDED if guarded else "\n"))
         self.heard = Overheard(folder / "overheard.jsonl")
         self.heard.path.touch()
         self._start("router", MIDDLE, "router", "-l", ENDPOINT, meeting=())
@@ -149,7 +148,8 @@ def test_links_that_are_cut_never_make_two_leaders_act_in_turn_and_the_robot_goe
     log = robot_log.read(tmp_path / "robot.csv", INFO)
     epochs = system.acted()
     assert epochs == sorted(epochs), "whoever was relieved acts no more"
-    limits = guard_limits(load(system.config))
+    config = load(system.config)
+    limits = guard_limits(config, build_signals(config))
     for lost, cut_ns, restored_ns, well_ns in cuts:
         incident = Incident(*map(system.robot_ns, (cut_ns, restored_ns, well_ns)))
         found = measure(log, log.x[:, :2], np.zeros(len(log.stamp_ns)), incident, limits)

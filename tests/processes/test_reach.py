@@ -13,6 +13,7 @@ import pytest
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
+from tests.guarded import write_robot
 from tests.in_time import MS, in_time
 from tests.processes.system import ROOT, command_line, environment, until
 
@@ -32,8 +33,7 @@ MAX_REMINDER_MS = 5000.0
 @pytest.mark.parametrize("mode", ["peer", "client"])
 @pytest.mark.parametrize("command", COMMANDS)
 def test_process_that_reaches_nobody_says_so_within_five_seconds_and_ends_well(command: str, mode: str, tmp_path: Path, host: Host) -> None:
-    config, log = tmp_path / "robot.toml", tmp_path / "log"
-    config.write_text(SHIPPED.read_text() + "\n[guard]\nenabled = true\n")
+    config, log = write_robot(tmp_path / "robot.toml"), tmp_path / "log"
     options = [tmp_path / option if option == "run.rrd" else option for option in COMMANDS[command]]
     if mode == "client":
         options = [option for option in options if option != "-l" and "127.0.0.1:0" not in str(option)]

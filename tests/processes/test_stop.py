@@ -19,8 +19,8 @@ import zenoh
 
 from rti_mpc.contract.message import Command, State
 from rti_mpc.contract.status import Mode
-from rti_mpc_service.cli import SHIPPED
-from tests.processes.record import GUARDED
+from tests.guarded import write_robot
+from tests.processes.record import FAST_STATES
 from tests.processes.system import KEYS, System, heard, rti_mpc, until
 
 REQUESTS_PER_S = 300
@@ -62,8 +62,7 @@ def system(tmp_path: Path) -> Iterator[Operated]:
 
 @pytest.fixture
 def guarded(tmp_path: Path) -> Iterator[Operated]:
-    (tmp_path / "robot.toml").write_text(SHIPPED.read_text() + GUARDED)
-    with Operated(tmp_path, tmp_path / "robot.toml") as system:
+    with Operated(tmp_path, write_robot(tmp_path / "robot.toml", FAST_STATES)) as system:
         yield system
 
 

@@ -15,6 +15,7 @@ from rti_mpc.contract.status import Mode
 from rti_mpc.wire.cdr import decode
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
+from tests.guarded import write_robot
 from tests.in_time import on_time
 from tests.processes.system import KEYS, System, heard, owner, until
 
@@ -40,9 +41,7 @@ def configuration(folder: Path, dt_s: float, live: bool = False, more: str = "")
     ):
         assert old in text
         text = text.replace(old, new)
-    path = folder / "robot.toml"
-    path.write_text(text)
-    return path
+    return write_robot(folder / "robot.toml", text=text)
 
 
 class Watched(System):

@@ -27,13 +27,11 @@ from rti_mpc_service.host import echo
 from rti_mpc_service.scenario import find_scenario
 from rti_mpc_sim import robot
 from rti_mpc_sim.settings import RobotSettings
+from tests.guarded import write_robot
 from tests.wire.fake_session import FakeSession, Said
 
 CONFIG = load(Path(__file__).parents[2] / "deploy" / "pioneer_3dx.toml")
-GUARDED = CONFIG.model_copy(update={"guard": CONFIG.guard.model_copy(update={"enabled": True})})
 KEYS, SETTINGS = CONFIG.keys(), BusSettings()
-
-UNITS = dict.fromkeys(("robot", "controller", "standby"), ("m/s", "rad/s")) | {"guard": ("1", "1")}  # a guard knows no model
 
 STOPPED = Event()  # each runs once through, from its start to its end
 STOPPED.set()
@@ -61,11 +59,16 @@ def controllers(folder: Path) -> None:
         daemon.main(CONFIG, SETTINGS, standby=standby, state=folder, stop=STOPPED)
 
 
+def guards(folder: Path) -> None:
+    path = write_robot(folder / "robot.toml")
+    guard.main(load(path, with_model=False), SETTINGS, path, state=folder, stop=STOPPED)
+
+
 PROCESSES: dict[tuple[str, ...], Callable[[Path], object]] = {
     ("robot",): lambda _: robot.main(RobotSettings(**robot_settings(CONFIG)), SETTINGS, KEYS, stop=STOPPED),
     ("reference",): lambda _: source.main(find_scenario(CONFIG), SETTINGS, KEYS, stop=STOPPED),
     ("controller", "standby"): controllers,
-    ("guard",): lambda folder: guard.main(GUARDED, SETTINGS, state=folder, stop=STOPPED),
+    ("guard",): guards,
     ("router",): lambda _: router.main(SETTINGS, KEYS, stop=STOPPED),
     ("relay",): lambda _: relay.main(SETTINGS, Keys("behind", KEYS.robot), KEYS),
     ("echo",): lambda _: echo.main(SETTINGS, KEYS, 100),
@@ -95,7 +98,7 @@ def test_description_of_a_process_can_be_read(roles: tuple[str, ...], session: F
     for key, payload in infos.items():
         received = Received(payload, "application/json", key)
         info = Info.from_received(received)
-        assert [(label.name, label.unit) for label in info.inputs] == [("u_c", UNITS[info.role][0]), ("omega_c", UNITS[info.role][1])]
+        assert [(label.name, label.unit) for label in info.inputs] == [("u_c", "m/s"), ("omega_c", "rad/s")]
         assert len(latches(received)) == (info.role != "robot")
         leader = Leader.from_received(received, 2**63)
         assert (leader is not None and leader.parameters == {"version": 0, "changes": {}}) == (info.role in ("controller", "standby"))

@@ -11,10 +11,12 @@ import pytest
 from rti_mpc.errors import ConfigError
 from rti_mpc.reference.trajectory import eight, rows
 from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.config import signals_file
+from rti_mpc_service.config.build import build_signals
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.demo.demo import check_start
-from rti_mpc_service.rig.scenario import configured
+from rti_mpc_service.rig.scenario import configured, write_files
 from rti_mpc_service.scenario import find_scenario
 from tests.robots import toml
 
@@ -97,14 +99,12 @@ def test_robot_that_is_slow_follows_slow_references(tmp_path: Path) -> None:
     assert slow.duration_s == 6 * 4 * 20 * 10.0
 
 
-def test_guard_is_told_what_it_cannot_know_of_the_model(tmp_path: Path) -> None:
-    """Bounds in the model's order, and where its inputs rest: what the user never wrote is not asked for."""
-    inputs = "inputs = { w_1 = [-1.0, 1.0], w_2 = [-1.0, 1.0] }"
-    (tmp_path / "robot.toml").write_text(toml("arm").replace(inputs, "inputs = { w_2 = [-1, 1], w_1 = [-1, 1] }"))
-    config = load(tmp_path / "robot.toml")
+def test_run_with_a_guard_needs_every_bound_and_writes_what_the_guard_cannot_know_of_the_model(tmp_path: Path) -> None:
+    config = config_of(tmp_path, "arm")
     guarded = configured(config, find_scenario(config), guard=True)
-    assert list(guarded.ocp.bounds.inputs) == ["w_1", "w_2"]
-    assert guarded.guard.u_rest == {"w_1": 0.0, "w_2": 0.0}
+    write_files(tmp_path / "config.toml", guarded)
+    assert signals_file.read(tmp_path / "config.toml", guarded) == build_signals(config)
+    inputs = "inputs = { w_1 = [-1.0, 1.0], w_2 = [-1.0, 1.0] }"
     (tmp_path / "robot.toml").write_text(toml("arm").replace(inputs, "inputs = { w_2 = [-1, 1] }"))
     config = load(tmp_path / "robot.toml")
     with pytest.raises(ConfigError, match=r"ocp\.bounds\.inputs must bound every input where a guard is enabled, w_1 is missing"):

@@ -29,7 +29,8 @@ from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import BUILT_IN_SOLVERS, FORMULATIONS, Rti
 from rti_mpc_service.check.excursion import Bounds, excursions
 from rti_mpc_service.check.rest import stop_from_everywhere
-from rti_mpc_service.config.build import build_ocp, build_rti, robot_settings
+from rti_mpc_service.config import signals_file
+from rti_mpc_service.config.build import build_ocp, build_rti, build_signals, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_stop, unstopped
 from rti_mpc_service.config.schema import Config
@@ -114,6 +115,9 @@ def main(path: Path) -> int:
     reached = f"driven to {report.bounds - len(report.missed)} of {report.bounds} bounds"
     console.print(reached + (f", not to the {', the '.join(report.missed)}" if report.missed else ""), soft_wrap=True)
     console.print(stopped, soft_wrap=True)
+    if config.guard.enabled or (law is not None and not law.holds):
+        file = signals_file.write(path, build_signals(config))
+        console.print(f"the model's signals, for a guard or an adapter: {file}", soft_wrap=True)
     return 0 if report.agree and all(status.usable for status in report.statuses) else 1
 
 

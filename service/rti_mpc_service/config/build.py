@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from rti_mpc.rti.qp.osqp import SolverSettings
     from rti_mpc.rti.rti import Rti
     from rti_mpc.wire.bus import BusSettings
+    from rti_mpc.wire.info import Label
+    from rti_mpc_service.config.signals_file import Signals
 
 
 def build_model(config: Config) -> Model:
@@ -35,6 +37,13 @@ def build_model(config: Config) -> Model:
     from rti_mpc.model.find import find_model
 
     return find_model(config.model.name, config.model.folder).with_parameters(**config.model.parameters)
+
+
+def build_signals(config: Config) -> Signals:
+    """Return the signals of the model, for those who load none."""
+    from rti_mpc_service.config.signals_file import Signals
+
+    return Signals.of(config.model.name, build_model(config))
 
 
 def build_ocp(config: Config) -> Ocp:
@@ -181,23 +190,23 @@ def robot_settings(config: Config) -> dict[str, Any]:
     }
 
 
-def guard_limits(config: Config) -> Limits:
-    """Return the limits of the guard; no model is loaded."""
+def guard_limits(config: Config, signals: Signals) -> Limits:
+    """Return the limits of the guard, of a model with these signals; no model is loaded."""
     from rti_mpc.contract.limits import Limits
     from rti_mpc.control.grid import MAX_DELAY_PERIODS
 
-    inputs = tuple(config.ocp.bounds.inputs)
+    inputs = names(signals.inputs)
     lbu, ubu = bounds(config.ocp.bounds.inputs, inputs)
     lbdu, ubdu = bounds(config.ocp.bounds.increments, inputs)
     return Limits(
-        u_rest=np.array([config.guard.u_rest.get(name, 0.0) for name in inputs]),
+        u_rest=np.array(signals.u_rest),
         lbu=np.array(lbu),
         ubu=np.array(ubu),
         lbdu=np.array(lbdu),
         ubdu=np.array(ubdu),
         dt_s=config.ocp.dt_s,
         delay_s=MAX_DELAY_PERIODS * config.ocp.dt_s if config.delay_s is None else config.delay_s,
-        angles=np.array([name in config.guard.angles for name in config.guard.states], dtype=bool),
+        angles=np.array([state.angle for state in signals.states], dtype=bool),
         stale_s=config.timing.valid_s,  # of commands, too: a ramp answers a state that is stale
     )
 
@@ -253,6 +262,6 @@ def bounds(table: Mapping[str, tuple[float, float]], names: Iterable[str]) -> tu
     return [lower for lower, _ in pairs], [upper for _, upper in pairs]
 
 
-def names(signals: Iterable[Signal]) -> list[str]:
+def names(signals: Iterable[Signal | Label]) -> list[str]:
     """Return the names of signals."""
     return [signal.name for signal in signals]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 from rti_mpc.errors import ConfigError, OcpError
-from rti_mpc_service.config.build import build_ocp, disturbances_at_rest, names
+from rti_mpc_service.config.build import build_ocp, disturbances_at_rest
 from rti_mpc_service.config.refusal import quoted, unknown_name
 from rti_mpc_service.config.schema import ITERATION_KEYS, Config, RegulatorSection
 
@@ -39,16 +39,10 @@ def check_tree(config: Config) -> None:
             raise ConfigError(f"ocp.weights.{key} must be a number or a list of {length}, one per stage, got {quoted(list(values))}")
     if config.bus.config is not None and not config.bus.config.is_file():
         raise ConfigError(f"bus.config must be a file, got {config.bus.config}")
-    for name in config.guard.angles:
-        if name not in config.guard.states:
-            raise ConfigError(f"guard.angles must be some of guard.states = {list(config.guard.states)}, got {quoted(name)}")
     if config.guard.enabled:
         for name in ocp.weights.R:
             if name not in ocp.bounds.inputs:
                 raise ConfigError(f"ocp.bounds.inputs must bound every input where a guard is enabled, {name} is missing")
-        for name, (lower, upper) in ocp.bounds.inputs.items():
-            if not lower <= (rest := config.guard.u_rest.get(name, 0.0)) <= upper:
-                raise ConfigError(f"ocp.bounds.inputs.{name} must hold the input's rest, guard.u_rest = {rest:g}, got {[lower, upper]}")
 
 
 def check_model(config: Config) -> Ocp:
@@ -65,18 +59,6 @@ def check_model(config: Config) -> Ocp:
 
     model = named("model.name", find_model, config.model.name, config.model.folder)
     check_names(config, model)
-    if config.guard.enabled:
-        inputs, given = names(model.inputs), list(config.ocp.bounds.inputs)
-        if given != inputs:
-            raise ConfigError(f"ocp.bounds.inputs must be in the model's order {inputs} where a guard is enabled, got {given}")
-        if tuple(config.guard.u_rest.get(name, 0.0) for name in inputs) != model.u_rest:
-            raise ConfigError(f"guard.u_rest must be the model's {dict(zip(inputs, model.u_rest, strict=True))}, got {config.guard.u_rest}")
-    if config.guard.states:
-        states, angles = names(model.states), [state.name for state in model.states if state.angle]
-        if list(config.guard.states) != states:
-            raise ConfigError(f"guard.states must be the model's {states} in this order, got {list(config.guard.states)}")
-        if set(config.guard.angles) != set(angles):
-            raise ConfigError(f"guard.angles must be the model's {angles}, got {list(config.guard.angles)}")
     check_solver(config)
     named("ocp.obstacles", with_obstacles, model, [(0.0, 0.0, 1.0) for _ in config.ocp.obstacles])
     ocp = build_ocp(config)
@@ -164,7 +146,6 @@ def check_names(config: Config, model: Model) -> None:
         ("observer.measured", dict.fromkeys(observer.measured), "state", model.states),
         ("observer.noise", observer.noise, "state", model.states),
         ("observer.process", observer.process, "state", model.states),
-        ("guard.u_rest", config.guard.u_rest, "input", model.inputs),
         ("sim.x0", sim.x0, "state", model.states),
         ("sim.noise_std", sim.noise_std, "state", model.states),
         ("sim.parameters", sim.parameters, "parameter", model.parameters),

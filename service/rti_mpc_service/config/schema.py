@@ -202,16 +202,12 @@ class GuardSection(Section):
     The guard, a separate process between controller and robot.
 
     It loads no model: bounds and slew limits are those of ``ocp.bounds``, whose
-    ``inputs`` must then name every input, in the model's order.
+    ``inputs`` must then name every input. Order, angles and inputs at rest are in the
+    file of signals that `rti-mpc check` writes beside this one, to be copied with it.
     """
 
     enabled: bool = Field(default=False, description="whether the robot obeys the guard (key actuation) instead of the controller (key command)")
     tick_s: float = Field(default=0.01, ge=1e-3, le=0.01, description="time between two checks of the clock, in seconds of wall time")
-    u_rest: dict[str, float] = Field(default={}, description="inputs at which the robot stands, by name, in the input's unit; zero if left out")
-    states: Annotated[tuple[str, ...], Field(strict=False)] = Field(
-        default=(), description="the model's states in its order, to judge ways to rest that need feedback; if left out, none of these pass"
-    )
-    angles: Annotated[tuple[str, ...], Field(strict=False)] = Field(default=(), description="those of guard.states that are angles")
 
 
 class DebugSection(Section):

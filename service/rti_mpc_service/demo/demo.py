@@ -34,7 +34,6 @@ from rti_mpc.signals import in_plane, plane
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.interrupt import stop_on_signals
-from rti_mpc_service.config import toml
 from rti_mpc_service.config.build import build_model, build_ocp, robot_settings
 from rti_mpc_service.config.fit import check_stop
 from rti_mpc_service.config.schema import Config
@@ -48,7 +47,7 @@ from rti_mpc_service.rig.children import Children
 from rti_mpc_service.rig.company import CLI_MODULE, START_TIMEOUT_S, WATCHER_NICENESS, Failed, check_children, wait
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.rig.run_data import wanted
-from rti_mpc_service.rig.scenario import BEST_HEADINGS, configured
+from rti_mpc_service.rig.scenario import BEST_HEADINGS, configured, write_files
 from rti_mpc_service.rig.summary import Outcome, summarize
 from rti_mpc_service.rig.witness import Witness
 from rti_mpc_service.scenario import Scenario, find_scenario
@@ -152,7 +151,7 @@ def main(config: Config, scenario: str | None, **options: Any) -> int:
     run = plan(config, scenario, **options)
     try:
         run.folder.mkdir(parents=True, exist_ok=True)
-        (run.folder / "config.toml").write_text(toml.write(run.config), encoding="utf-8")
+        write_files(run.folder / "config.toml", run.config)
     except OSError as error:
         raise ConfigError(f"--out must be a folder that can be written, got {run.folder}: {error.strerror}") from error
     if run.scenario.note:

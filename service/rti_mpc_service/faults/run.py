@@ -28,7 +28,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.limits import Limits
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.interrupt import stop_on_signals
-from rti_mpc_service.config.build import guard_limits
+from rti_mpc_service.config.build import build_signals, guard_limits
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_model, check_stop, check_tree
 from rti_mpc_service.config.schema import Config
@@ -127,7 +127,7 @@ def prepared(config: Config) -> Config:
 
 def inject(config: Config, faults: Sequence[Fault], folder: Path, report: MatrixReport, stop: Event, host: Host) -> None:
     """Inject all faults one after the other, or until stopped."""
-    limits = guard_limits(config)
+    limits = guard_limits(config, build_signals(config))
     system: System | None = None
     with ExitStack() as stack:
         for number, fault in enumerate(faults):

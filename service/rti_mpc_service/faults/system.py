@@ -21,7 +21,6 @@ from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.info import Info, Label
 from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.session import BusSettings
-from rti_mpc_service.config import toml
 from rti_mpc_service.config.build import build_model
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.faults.motion import Motion
@@ -33,6 +32,7 @@ from rti_mpc_service.rig.children import Children
 from rti_mpc_service.rig.company import CLI_MODULE, START_TIMEOUT_S, WATCHER_NICENESS, Failed, wait
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.rig.robot_log import RobotLog
+from rti_mpc_service.rig.scenario import write_files
 from rti_mpc_service.rig.witness import Witness
 
 REFERENCE_DURATION_S = 120  # 58 kB fit into one packet, so that a busy host cannot drop a part of it
@@ -80,9 +80,8 @@ class System:
         states, inputs = (tuple(Label(signal.name) for signal in signals) for signals in (model.states, model.inputs))
         self._info = Info("robot", states=states, inputs=inputs)
         self._suspended: set[str] = set()
-        (folder / "config.toml").write_text(toml.write(config), encoding="utf-8")
-        behind = config.model_copy(update={"prefix": self._robot_keys.prefix})
-        (folder / "robot.toml").write_text(toml.write(behind), encoding="utf-8")
+        write_files(folder / "config.toml", config)
+        write_files(folder / "robot.toml", config.model_copy(update={"prefix": self._robot_keys.prefix}))
         self._endpoint = free_endpoint()
         self.children = Children(folder)
         try:

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configuration of a run on this machine: what a scenario changes in the robot's own."""
+"""Configuration of a run on this machine: what a scenario changes in the robot's own, and its files."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from rti_mpc.reference.trajectory import Heading
 from rti_mpc.signals import POSE_ROLES
-from rti_mpc_service.config.build import build_model, with_initial_state
+from rti_mpc_service.config import signals_file, toml
+from rti_mpc_service.config.build import build_model, build_signals, with_initial_state
 from rti_mpc_service.config.fit import check_tree
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.scenario import Scenario
@@ -27,11 +30,21 @@ def configured(config: Config, scenario: Scenario, guard: bool = False) -> Confi
     content = config.model_dump(by_alias=True, exclude_unset=True, exclude={"bus"})
     if scenario.heading == "none":
         content["ocp"]["weights"]["Q"] |= {output.name: 0.0 for output in model.outputs if output.role == "heading"}
-    if guard:  # which knows no model: what it is to know of it is written for it
-        inputs = content["ocp"].get("bounds", {}).get("inputs", {})
-        inputs |= {input.name: inputs.pop(input.name) for input in model.inputs if input.name in inputs}
-        rest = {input.name: rest for input, rest in zip(model.inputs, model.u_rest, strict=True)}
-        content["guard"] = {"u_rest": rest, **content.get("guard", {}), "enabled": True}
+    if guard:
+        content["guard"] = {**content.get("guard", {}), "enabled": True}
     config = Config.model_validate(content)
     check_tree(config)
     return config
+
+
+def write_files(path: Path, config: Config) -> None:
+    """
+    Write a run's configuration and, for its guard if it has one, the signals of its model.
+
+    Raises:
+        OSError: The configuration cannot be written.
+        ConfigError: The signals cannot be written.
+    """
+    path.write_text(toml.write(config), encoding="utf-8")
+    if config.guard.enabled:
+        signals_file.write(path, build_signals(config))
