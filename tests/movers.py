@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -186,8 +185,6 @@ def toml(name: str, more: str = "") -> str:
         bounded = [(each.name, low, high) for each, low, high in zip(signals, lower, upper, strict=True) if np.isfinite([low, high]).any()]
         return ", ".join(f"{each} = [{low}, {high}]" for each, low, high in bounded)
 
-    states, angles = json.dumps([state.name for state in model.states]), json.dumps([state.name for state in model.states if state.angle])
-    rest = ", ".join(f"{signal.name} = {value}" for signal, value in zip(model.inputs, model.u_rest, strict=True))
     return f"""
 robot = "{name}"
 model = {{ name = "tests.movers:{name}_model" }}
@@ -203,9 +200,6 @@ increments = {{ {table(model.inputs, ocp.lbdu, ocp.ubdu)} }}
 states = {{ {table(model.states, ocp.lbx, ocp.ubx)} }}
 [guard]
 enabled = true
-u_rest = {{ {rest} }}
-states = {states}
-angles = {angles}
 {more}"""
 
 
