@@ -151,6 +151,7 @@ class Telemetry:
         shifted: Those of `fallbacks` on which the previous plan was continued.
         braked: Those of `fallbacks` that were answered by the ramp to rest.
         rested: Those of `fallbacks` that were answered by a standstill.
+        y: Outputs at `x0`, shape ``(ny,)``; none where they were not computed.
     """
 
     epoch: int
@@ -183,6 +184,7 @@ class Telemetry:
     shifted: int = 0
     braked: int = 0
     rested: int = 0
+    y: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(slots=True)

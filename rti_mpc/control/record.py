@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from rti_mpc.array import Array
+from rti_mpc.codegen import bind
 from rti_mpc.contract.message import Command, Telemetry
 from rti_mpc.control.ladder import Ladder
 from rti_mpc.control.tuning import Tuning
@@ -19,12 +22,16 @@ class Record:
         self._seq = 0  # of the command whose plan is kept
         self._plan = (rti.x.copy(), rti.y_ref.copy(), 0.0)  # states, reference, cost
         self._version = 0  # of the parameters
+        model = rti.ocp.model
+        self._x0, self._p, self._y = np.zeros(model.nx), np.zeros(model.np_), np.zeros(model.ny)
+        self._outputs = bind(model.h(), {"x": self._x0, "p": self._p}, {"y": self._y})
 
     def keep_plan(self, seq: int) -> None:
         """Keep the plan of a command, by its sequence number, unless it is kept already."""
         if self._seq != seq:
             self._plan = (self._rti.x.copy(), self._rti.y_ref.copy(), self._rti.cost)
             self._seq, self._version = seq, self._tuning.version
+            self._p[:] = self._rti.p[0]
 
     def telemetry(
         self,
@@ -52,6 +59,8 @@ class Record:
             ladder: Samples without a plan of their own.
         """
         self.keep_plan(command.seq)
+        self._x0[:] = x0
+        self._outputs()
         solver = self._rti.solver
         prepare_us, feedback_us, latency_us, slack_s = times
         return Telemetry(
@@ -85,4 +94,5 @@ class Record:
             shifted=ladder.shifted,
             braked=ladder.braked,
             rested=ladder.rested,
+            y=self._y.copy(),
         )

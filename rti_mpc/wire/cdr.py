@@ -296,9 +296,9 @@ def _check_command(message: Command) -> None:
 
 
 def _check_telemetry(message: Telemetry) -> None:
-    width = message.x.shape[1]
-    if message.x0.size not in (0, width):
-        raise Refused("length", f"x0 must hold {width} numbers, got {message.x0.size}")
+    for name, vector, width in (("x0", message.x0, message.x.shape[1]), ("y", message.y, message.y_ref.shape[1])):
+        if vector.size not in (0, width):
+            raise Refused("length", f"{name} must hold {width} numbers, got {vector.size}")
 
 
 FIELD_RELATIONS: dict[type[Any], Callable[[Any], None]] = {Reference: _check_reference, Command: _check_command, Telemetry: _check_telemetry}

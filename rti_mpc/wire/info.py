@@ -161,10 +161,20 @@ class Info:
         return [(i, k) for i, label in enumerate(self.outputs) if (k := self._state(label)) is not None]
 
     @property
-    def tracked_position(self) -> tuple[int, int] | None:
-        """Indices of the outputs that are the position in the plane; None if there are none, or they are not states."""
-        position, tracked = plane(self.outputs), [i for i, _ in self.tracked]
-        return position if position is not None and set(position) <= set(tracked) else None
+    def computed(self) -> list[int]:
+        """Indices of the outputs that are no state, such as the tip of an arm: only the controller, who has the model, knows them."""
+        return [i for i, label in enumerate(self.outputs) if self._state(label) is None]
+
+    @property
+    def computed_position(self) -> tuple[int, int] | None:
+        """Indices of the outputs that are the position in the plane; None if there are none, or one of them is a state."""
+        position = plane(self.outputs)
+        return position if position is not None and set(position) <= set(self.computed) else None
+
+    @property
+    def planar(self) -> bool:
+        """Whether there is a position in the plane, of the robot or of its outputs."""
+        return self.position is not None or self.computed_position is not None
 
     def measured(self, i: int) -> int | None:
         """Index of the state that input `i` commands; None: there is none."""

@@ -161,6 +161,7 @@ LAYOUTS: dict[type[Any], tuple[Field, ...]] = {
         Field("shifted", "uint64", "number of samples since the start on which the previous plan was continued"),
         Field("braked", "uint64", "number of samples since the start that were answered by the ramp to rest"),
         Field("rested", "uint64", "number of samples since the start that were answered by a standstill"),
+        Field("y", "float64[]", "outputs at x0, ny numbers, SI units in the order of the model's outputs; empty: not computed"),
     ),
     Event: (
         *_head("time of the event, ns of the robot's clock"),

@@ -145,6 +145,7 @@ def test_telemetry_describes_the_sample_of_its_command(on_the_circle: tuple[Cont
     np.testing.assert_array_equal(after.u, command.u)
     np.testing.assert_allclose(after.x0[:2], state.x[:2])
     np.testing.assert_allclose(after.x[0], after.x0, atol=1e-5)
+    np.testing.assert_array_equal(after.y, after.x0[:3], "the outputs there")
     t = 1e-9 * command.stamp_ns + 0.1 * np.arange(1, 13)
     np.testing.assert_allclose(after.y_ref[:, :2], circle().position(t), atol=1e-4)  # rows of 20 ms, interpolated
     assert after.cost == pytest.approx(cost(after.x, after.u, after.y_ref, controller._sent.at(after.stamp_ns - 1)[0]), rel=1e-9)

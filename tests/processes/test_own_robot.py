@@ -39,6 +39,18 @@ def robot():
     x, y, psi = pioneer.outputs
     return replace(pioneer, name="turned", y_expr=pioneer.y_expr[[2, 0, 1]], outputs=(psi, x, y))
 """
+TIP = """
+import casadi as ca
+from rti_mpc import Model, Signal
+
+def robot():
+    q, w = ca.SX.sym("q", 2), ca.SX.sym("w", 2)
+    tip = ca.vertcat(ca.cos(q[0]) + ca.cos(q[0] + q[1]), ca.sin(q[0]) + ca.sin(q[0] + q[1]))
+    return Model(
+        name="tip", x=q, u=w, f_expl_expr=w, y_expr=tip, states=(Signal("q_1", "rad"), Signal("q_2", "rad")), inputs=("w_1", "w_2"),
+        outputs=(Signal("tip_x", "m", role="x"), Signal("tip_y", "m", role="y")), x_nominal=(0.0, 1.57),
+    )
+"""
 TOML = """
 robot = "own"
 model = {{ name = "my_robot:robot" }}
@@ -92,6 +104,27 @@ def test_arm_is_driven_along_references_of_its_outputs_behind_a_guard(tmp_path: 
     assert {name: error["unit"] for name, error in summary["outputs"].items()} == {"shoulder": "rad", "elbow": "rad"}
     assert max(error["rms"] for error in summary["outputs"].values()) < 0.1  # rad, of 0.5, also where the host holds processes up for a second
     assert summary["applied_inputs_in_bounds"]
+
+
+@pytest.mark.slow
+def test_tip_of_an_arm_which_is_no_state_is_driven_along_waypoints_and_recorded(tmp_path: Path) -> None:
+    reader = pytest.importorskip("rerun.chunk").RrdReader
+    (tmp_path / "line.csv").write_text("x,y\n1,1\n1.2,1\n1.2,0.8\n0.8,0.8\n")
+    tables = {"Q": "tip_x = 1.0, tip_y = 1.0", "R": "w_1 = 1.0, w_2 = 1.0", "inputs": "w_1 = [-1.0, 1.0], w_2 = [-1.0, 1.0]", "increments": ""}
+    summary = driven(tmp_path, TIP, *("--scenario", "../line.csv", "--speed", "2", "--duration", "6"), **tables)
+    assert (summary["driven"], summary["heading"]) == (True, None)
+    scalars: dict[str, list[float]] = {"/output/tip_x": [], "/error/position": []}
+    others = set()
+    for chunk in reader(tmp_path / "elsewhere" / "out" / "run.rrd").stream().to_chunks():
+        if chunk.entity_path in scalars and not chunk.is_static:
+            batch = chunk.to_record_batch()
+            scalars[chunk.entity_path] += [value for (value,) in batch.column(batch.num_columns - 1).to_pylist()]
+        others.add(chunk.entity_path)
+    assert {"/world/reference", "/world/output"} <= others
+    assert "/world/robot" not in others
+    assert len(scalars["/output/tip_x"]) > 20
+    assert 0.7 < min(scalars["/output/tip_x"]) <= max(scalars["/output/tip_x"]) < 1.3
+    assert np.median(scalars["/error/position"]) < 100.0, "mm, on a host that may hold processes up"
 
 
 @pytest.mark.slow

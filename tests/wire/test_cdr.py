@@ -30,7 +30,13 @@ WAY = {"rest_period_ns": 10**7, "u_rest": RNG.normal(size=(3, 2)), "x_rest": RNG
 NUMBERS = {"res_prim": 1e-3, "res_dual": np.nan, "cost": np.inf, "violation": 0.0}
 TIMES = {"prepare_us": 1.5, "feedback_us": 2.5, "latency_us": 3.5, "state_age_s": 0.1, "slack_s": -0.5, "delay_s": 0.05}
 COUNTS = {"skipped": 8, "fallbacks": 9, "softened": 11, "shifted": 2, "braked": 3, "rested": 4, "parameter_version": 10}
-ARRAYS = {"x0": RNG.normal(size=5), "x": RNG.normal(size=(8, 5)), "u": RNG.normal(size=(7, 2)), "y_ref": RNG.normal(size=(7, 3))}
+ARRAYS = {
+    "x0": RNG.normal(size=5),
+    "x": RNG.normal(size=(8, 5)),
+    "u": RNG.normal(size=(7, 2)),
+    "y_ref": RNG.normal(size=(7, 3)),
+    "y": RNG.normal(size=3),
+}
 TELEMETRY = Telemetry(1, 2, 3, 4, 5, Mode.FALLBACK, QpStatus.INFEASIBLE, 6, **NUMBERS, **TIMES, **COUNTS, **ARRAYS)
 EVENT = Event(1, 2, 3, "robot", Severity.ERROR, "command_expired", "Räder stehen")
 
@@ -46,7 +52,7 @@ MESSAGES: list[Message] = [
     replace(COMMAND, **WAY),
     replace(COMMAND, **(WAY | {"u": RNG.normal(size=(1, 1)), "u_rest": np.zeros((3, 1)), "K": np.zeros((1, 5))})),
     TELEMETRY,
-    replace(TELEMETRY, x0=np.zeros(0), x=np.zeros((0, 5)), u=np.zeros((0, 2)), y_ref=np.zeros((0, 3))),
+    replace(TELEMETRY, x0=np.zeros(0), x=np.zeros((0, 5)), u=np.zeros((0, 2)), y_ref=np.zeros((0, 3)), y=np.zeros(0)),
     replace(TELEMETRY, y_ref=np.zeros((0, 3))),
     EVENT,
     *(replace(EVENT, source="r" * n, code="c" * k, text="") for n in range(4) for k in range(4)),
@@ -191,6 +197,7 @@ MALFORMED = [
     (Telemetry, byte(TELEMETRY, 40, 99), "value"),
     (Telemetry, words(TELEMETRY, 184, 4), "length"),
     (Telemetry, encode(TELEMETRY)[:-8], "truncated"),
+    (Telemetry, encode(replace(TELEMETRY, y=np.zeros(2))), "length"),
     (Event, words(EVENT, 24, 2**32 - 1), "truncated"),
     (Event, words(EVENT, 24, 0), "text"),
     (Event, words(EVENT, 24, 5), "text"),

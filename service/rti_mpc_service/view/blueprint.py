@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 
 from rti_mpc.array import Array
 from rti_mpc.contract.status import Mode, QpStatus
-from rti_mpc.signals import in_plane
+from rti_mpc.signals import in_plane, plane
 from rti_mpc.wire.info import Info
 from rti_mpc_service.outline import outline
 
@@ -96,8 +96,9 @@ def blueprint(info: Info, frame: Frame | None = None) -> rrb.Blueprint:
     ]
     states = _series("States", ["state/**"])
     estimated = [_series("Disturbances", ["disturbance/**"])] if info.disturbances else []
-    tabs: list[rrb.View | rrb.Container] = [states, *estimated, _troubles()]
-    left = rrb.Vertical(*tabs) if info.position is None else rrb.Tabs(_world(frame or Frame()), *tabs)
+    computed = [_series("Outputs", [f"output/{info.outputs[i].name}" for i in info.computed])] if info.computed else []
+    tabs: list[rrb.View | rrb.Container] = [*computed, states, *estimated, _troubles()]
+    left = rrb.Tabs(_world(frame or Frame()), *tabs) if info.planar else rrb.Vertical(*tabs)
     lanes = rrb.StateTimelineView(origin="/lane", name="Modes, QP status and who leads", time_view=_time_axis())
     return rrb.Blueprint(
         rrb.Vertical(
@@ -124,7 +125,7 @@ def _world(frame: Frame) -> rrb.Spatial3DView:
         background=(16, 18, 22),
         line_grid=rrb.LineGrid3D(visible=True, spacing=GRID_M, stroke_width=0.5, color=(255, 255, 255, 28)),
         eye_controls=rrb.EyeControls3D(position=(x, y - 0.01, frame.eye_height), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)),
-        overrides={"world/trail": [trail]},
+        overrides={"world/trail": [trail], "world/output": [trail]},
     )
 
 
@@ -155,9 +156,11 @@ def _commands(info: Info, i: int) -> rrb.TimeSeriesView:
 
 
 def _errors(info: Info) -> rrb.TimeSeriesView:
-    if info.tracked_position is not None and in_plane(info.outputs):
+    """Return the view of the errors: of the distance in the plane, where outputs are nothing but a pose."""
+    tracked, pair = [i for i, _ in info.tracked], plane(info.outputs)
+    if pair is not None and in_plane(info.outputs) and (pair[0] in tracked) == (pair[1] in tracked):
         return _series("Tracking error [mm]", ["error/position"])
-    return _series("Tracking error", [f"error/{info.outputs[i].name}" for i, _ in info.tracked])
+    return _series("Tracking error", [f"error/{label.name}" for label in info.outputs])
 
 
 def _times(info: Info) -> rrb.Container:
@@ -196,6 +199,7 @@ class Strip(NamedTuple):
 STRIPS = {
     "world/reference": Strip("reference", 5.0, 0.0),
     "world/trail": Strip("measured", 2.0, 0.004),
+    "world/output": Strip("measured", 2.0, 0.004),
     "world/horizon": Strip("command", 4.0, 0.02),
 }
 LEGEND_COLORS = {"reference": "reference", "driven": "measured", "planned": "command"}
@@ -207,7 +211,7 @@ ROBOT_Z_M = 0.008  # [m], between trail and horizon
 
 def looks(info: Info) -> dict[str, rr.AsComponents]:
     """Return the constant components of a recording, by entity."""
-    return _series_looks(info) | _lane_looks() | ({} if info.position is None else _world_looks(info))
+    return _series_looks(info) | _lane_looks() | (_world_looks(info) if info.planar else {})
 
 
 def legend(frame: Frame) -> rr.Points3D:
@@ -237,7 +241,8 @@ def _series_looks(info: Info) -> dict[str, rr.AsComponents]:
         said = f"±{high:g}" if low == -high else f"{low:g} to {high:g}"
         limits = _line(f"limits {said}", "limit", 1.0)  # of one name: one entry of the legend, and the scale of a plot too low for ticks
         looks |= {f"command/{label.name}/{side}": limits for side in ("min", "max")}
-    looks |= {f"error/{info.outputs[i].name}": _line(str(info.outputs[i]), "error") for i, _ in info.tracked}
+    looks |= {f"error/{label.name}": _line(str(label), "error") for label in info.outputs}
+    looks |= {f"output/{info.outputs[i].name}": _line(str(info.outputs[i]), "measured") for i in info.computed}
     looks |= {f"telemetry/{phase}_us": _line(phase, phase) for phase in PHASES}
     looks |= {f"telemetry/{rung}": _line(rung, color) for rung, color in RUNG_COLORS.items()}
     looks |= {"telemetry/delay_s": _line("delay", "measured"), "telemetry/state_age_s": _line("age of the state", "idle")}
@@ -266,7 +271,8 @@ def _world_looks(info: Info) -> dict[str, rr.AsComponents]:
         looks[f"world/obstacle_{i}/edge"] = rr.LineStrips3D(
             [lifted(np.vstack([UNIT_CIRCLE, UNIT_CIRCLE[:1]]), OBSTACLE_Z_M)], colors=COLORS["limit"], radii=rr.Radius.ui_points(0.75)
         )
-    looks["world/robot/point"] = rr.Points3D([[0.0, 0.0, 0.02]], colors=COLORS["measured"], radii=rr.Radius.ui_points(3.0))
+    if info.position is not None:
+        looks["world/robot/point"] = rr.Points3D([[0.0, 0.0, 0.02]], colors=COLORS["measured"], radii=rr.Radius.ui_points(3.0))
     return looks
 
 

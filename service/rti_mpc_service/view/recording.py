@@ -65,6 +65,7 @@ class Recording:
         self._frame: Frame | None = None
         self._held: deque[Entry] = deque(maxlen=MAX_HELD_ENTRIES)
         self._last: State | None = None
+        self._last_output: Array | None = None  # position of the outputs, shape ``(1, 2)``
         self._playback = Playback()
         self._lanes: dict[str, tuple[str, int]] = {}  # value and time of the last change of each lane
         self._writers: dict[type, Callable[[Times, list[Any]], None]] = {
@@ -107,7 +108,7 @@ class Recording:
     def _name(self, info: Info) -> None:
         """Take names from a description, and write the entries that were held for them."""
         if self.info is not None and _vectors(info) != _vectors(self.info):
-            self._reference, self._last, self._playback = None, None, Playback()
+            self._reference, self._last, self._last_output, self._playback = None, None, None, Playback()
         self.info = info
         for path, archetype in looks(info).items():
             self.stream.log(path, archetype, static=True)
@@ -138,7 +139,7 @@ class Recording:
         assert self.info is not None
         self._reference = references[-1]
         pair = plane(self.info.outputs)
-        if pair is not None and self.info.position is not None:
+        if pair is not None and self.info.planar:
             frame = Frame.around(references[-1].y[:, pair])
             if frame != self._frame:
                 self._frame = frame
@@ -155,9 +156,15 @@ class Recording:
             self._motion(times, states, x)
         if self._reference is not None:
             stamps = np.array([state.stamp_ns for state in states], np.int64)
-            for name, values in tracking_error(self.info, self._reference, stamps, x).items():
-                self._scalars(f"error/{name}", times, values)
+            self._errors(times, stamps, {i: x[:, k] for i, k in self.info.tracked})
         self._last = states[-1]
+
+    def _errors(self, times: Times, stamps: NDArray[np.int64], y: dict[int, Array]) -> None:
+        """Write how far outputs, by their indices, are from the reference."""
+        assert self.info is not None
+        assert self._reference is not None
+        for name, values in tracking_error(self.info, self._reference, stamps, y).items():
+            self._scalars(f"error/{name}", times, values)
 
     def _motion(self, times: Times, states: list[State], x: Array) -> None:
         """Write pose and trail: one segment per state, none between two lives of the robot."""
@@ -207,9 +214,27 @@ class Recording:
         self._lane("mode", times, [sample.mode.name for sample in samples])
         self._lane("status", times, [sample.status.name for sample in samples])
         self._lane("leader", times, [f"epoch {sample.epoch}" for sample in samples])
+        stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
+        if self.info.planar:
+            self._obstacles(times, stamps)
         if self.info.position is not None:
-            self._obstacles(times, np.array([sample.stamp_ns for sample in samples], np.int64))
             self._strips("world/horizon", times, [sample.x[:, self.info.position] for sample in samples])
+        computed = np.array([sample.y.size > 0 for sample in samples])
+        if self.info.computed and computed.any():
+            self._outputs(times[computed], stamps[computed], np.array([sample.y for sample in samples if sample.y.size]))
+
+    def _outputs(self, times: Times, stamps: NDArray[np.int64], y: Array) -> None:
+        """Write the outputs that are no state, and where those that are a position have been; shape ``(n, ny)``."""
+        assert self.info is not None
+        for i in self.info.computed:
+            self._scalars(f"output/{self.info.outputs[i].name}", times, y[:, i])
+        if self._reference is not None:
+            self._errors(times, stamps, {i: y[:, i] for i in self.info.computed})
+        if (pair := self.info.computed_position) is not None:
+            xy = y[:, pair]
+            before = xy[:1] if self._last_output is None else self._last_output
+            self._strips("world/output", times, np.stack([np.concatenate([before, xy[:-1]]), xy], axis=1))
+            self._last_output = xy[-1:]
 
     def _obstacles(self, times: Times, stamps: NDArray[np.int64]) -> None:
         """Write the positions of obstacles: those of the reference, or the configured ones if it has none."""

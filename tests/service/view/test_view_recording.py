@@ -246,6 +246,30 @@ def test_a_model_without_position_has_time_series_only(writer: Writer) -> None:
     assert not any(path.startswith("world") for path in rows)
 
 
+def test_outputs_that_are_no_state_are_drawn_from_the_telemetry(writer: Writer) -> None:
+    """The tip of an arm: where it is, only the controller knows, who has the model."""
+    signals = {
+        "states": [{"name": name, "unit": "rad", "angle": True} for name in ("q_1", "q_2")],
+        "inputs": [{"name": name, "unit": "rad/s", "angle": False} for name in ("w_1", "w_2")],
+        "outputs": [
+            *({"name": f"tip_{role}", "unit": "m", "angle": False, "role": role} for role in "xy"),
+            {"name": "q_1", "unit": "rad", "angle": True, "state": "q_1"},
+        ],
+    }
+    writer.send(Info.from_json({"role": "controller", "model": "arm", "dt_s": 0.1, **signals}), reference([[1.0, 0.0, 0.0], [1.0, 1.0, 0.0]]))
+    writer.send(state(0, [0.1, 0.0]), *(replace(telemetry(k, nx=2), y=np.array([1.003, k - 0.004, 9.0])) for k in range(2)), telemetry(2, nx=2))
+    writer.send(replace(telemetry(3, nx=2), y=np.array([1.0, 0.5, 9.0])))
+    rows = writer.read()
+    assert rows["output/tip_y"] == [(0.0, [-0.004]), (1.0, [0.996]), (3.0, [0.5])], "and none where none was computed"
+    assert [(t, pytest.approx(v)) for t, v in rows["error/position"]] == [(0.0, [5.0]), (1.0, [5.0]), (3.0, [500.0])]
+    assert rows["error/q_1"] == [(0.0, [pytest.approx(0.1)])], "from the state"
+    assert [np.array(strip)[:, 1].tolist() for _, [strip] in rows["world/output"]] == [
+        pytest.approx(ends) for ends in ([-0.004, -0.004], [-0.004, 0.996], [0.996, 0.5])
+    ]
+    assert "world/reference" in rows
+    assert not {"output/q_1", "world/robot", "world/trail", "world/horizon"} & rows.keys()
+
+
 def test_the_recording_carries_a_blueprint_for_its_application(writer: Writer) -> None:
     writer.send(PIONEER, reference([[-3.0, 0.0, 0.0], [3.0, 1.0, 0.0]]), state(0, [0.0] * 5))
     writer.read()

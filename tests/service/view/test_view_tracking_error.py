@@ -18,7 +18,8 @@ def reference(y: list[list[float]]) -> Reference:
 
 
 def error(y: list[list[float]], offset_ns: int, x: list[float]) -> dict[str, float]:
-    errors = tracking_error(INFO, reference(y), np.array([UNIX_NS + offset_ns]), np.array([x]))
+    measured = {i: np.array([x[k]]) for i, k in INFO.tracked}
+    errors = tracking_error(INFO, reference(y), np.array([UNIX_NS + offset_ns]), measured)
     return {name: float(values[0]) for name, values in errors.items()}
 
 
