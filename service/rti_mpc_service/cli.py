@@ -158,6 +158,13 @@ ScenarioName = Annotated[
         show_default="eight for a robot in the plane, sines of its outputs for any other",
     ),
 ]
+WaypointSpeed = Annotated[float, typer.Option(metavar="M/S", min=0.001, help="Speed along waypoints.")]
+WaypointSmoothing = Annotated[
+    float | None,
+    typer.Option(
+        metavar="M", min=0.0, help="Length of path over which waypoints are averaged; 0: not averaged.", show_default="as their noise needs"
+    ),
+]
 Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", min=0.1, help="Longest time to wait for an answer.")]
 
 
@@ -228,13 +235,8 @@ def reference(
     duration: Annotated[
         float | None, typer.Option(metavar="SECONDS", min=0.1, help="Duration of the reference, robot time.", show_default="the scenario's own")
     ] = None,
-    waypoint_speed: Annotated[float, typer.Option(metavar="M/S", min=0.001, help="Speed along waypoints.")] = 0.25,
-    waypoint_smoothing: Annotated[
-        float | None,
-        typer.Option(
-            metavar="M", min=0.0, help="Length of path over which waypoints are averaged; 0: not averaged.", show_default="as their noise needs"
-        ),
-    ] = None,
+    waypoint_speed: WaypointSpeed = 0.25,
+    waypoint_smoothing: WaypointSmoothing = None,
 ) -> None:
     """Publish a reference that starts at the robot's current state, and again after each restart of the robot."""
     from rti_mpc_service.reference import main
@@ -327,11 +329,26 @@ def demo(
     ] = None,
     viewer: Annotated[bool, typer.Option("--viewer", help="Show the drive live in Rerun.")] = False,
     guard: Annotated[bool, typer.Option("--guard", help="Run a guard between controller and robot.")] = False,
+    waypoint_speed: WaypointSpeed = 0.25,
+    waypoint_smoothing: WaypointSmoothing = None,
 ) -> None:
     """Run the whole system on this machine, and print a summary of errors, limits and times."""
     from rti_mpc_service.demo.demo import main
 
-    raise typer.Exit(main(load(config), scenario, heading=heading, speed=speed, duration_s=duration, folder=out, viewer=viewer, guard=guard))
+    raise typer.Exit(
+        main(
+            load(config),
+            scenario,
+            heading=heading,
+            waypoint_speed_m_s=waypoint_speed,
+            waypoint_smoothing_m=waypoint_smoothing,
+            speed=speed,
+            duration_s=duration,
+            folder=out,
+            viewer=viewer,
+            guard=guard,
+        )
+    )
 
 
 @app.command(cls=FaultsCommand)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Console for tables: wide enough for every number, also in a pipe or a narrow terminal."""
+"""Console whose texts and tables lose nothing: wide enough for every number, also in a pipe or a narrow terminal, and without markup."""
 
 from __future__ import annotations
 
@@ -8,9 +8,14 @@ from rich.console import Console
 MIN_WIDTH_COLUMNS = 140  # a narrower terminal wraps lines, which loses nothing; a narrower table would cut numbers off
 
 
+def plain_console() -> Console:
+    """Return a console that prints texts as they are: what looks like markup, such as the extra in ``rti-mpc[view]``, is none."""
+    return Console(markup=False, emoji=False)
+
+
 def table_console() -> Console:
-    """Return a console of at least `MIN_WIDTH_COLUMNS` columns."""
-    return widened(Console())
+    """Return such a console of at least `MIN_WIDTH_COLUMNS` columns."""
+    return widened(plain_console())
 
 
 def widened(console: Console) -> Console:

@@ -37,7 +37,7 @@ class Board(Redrawn):
         if self.live:
             self.draw(Text(f"{self._title}: {text}"))
         else:
-            self.console.print(text)
+            self.console.print(text, soft_wrap=True)
 
     def show(self, time_s: float, error: str, telemetry: Sequence[Telemetry], events: Sequence[Event]) -> None:
         """Show progress, error and phase times; needs at least one sample."""
@@ -102,7 +102,7 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
             soft_wrap=True,
         )
     for fault in summary["events"]:
-        console.print("{severity} of the {source} at {at_s:.1f} s: {text}".format(**fault), soft_wrap=True, markup=False)
+        console.print("{severity} of the {source} at {at_s:.1f} s: {text}".format(**fault), soft_wrap=True)
 
 
 def output_text(error: Mapping[str, Any]) -> str:

@@ -37,7 +37,7 @@ from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc_service.config.build import build_model, build_ocp, robot_settings
 from rti_mpc_service.config.fit import check_stop
 from rti_mpc_service.config.schema import Config
-from rti_mpc_service.console import widened
+from rti_mpc_service.console import plain_console, widened
 from rti_mpc_service.demo.board import Board, print_summary
 from rti_mpc_service.host import machine
 from rti_mpc_service.host.echo import ROLE as ECHO
@@ -71,6 +71,8 @@ class DemoPlan:
         config: Configuration that all processes load.
         name: Name of the scenario, as on the command line; empty: the robot's own.
         scenario: Scenario to follow.
+        waypoint_speed_m_s: Speed along the waypoints of a file.
+        waypoint_smoothing_m: Length of path over which they are averaged; None: as their noise needs.
         duration_s: Duration of the run in robot time.
         speed: Seconds of robot time per second.
         folder: Folder of all results.
@@ -80,6 +82,8 @@ class DemoPlan:
     config: Config
     name: str
     scenario: Scenario
+    waypoint_speed_m_s: float
+    waypoint_smoothing_m: float | None
     duration_s: float
     speed: float
     folder: Path
@@ -96,6 +100,8 @@ def plan(
     name: str | None,
     *,
     heading: Heading | None,
+    waypoint_speed_m_s: float,
+    waypoint_smoothing_m: float | None,
     speed: float,
     duration_s: float | None,
     folder: Path | None,
@@ -109,13 +115,16 @@ def plan(
         ConfigError: There is no such scenario, or it does not fit the robot.
         OcpError: No consistent heading repeats on a closed path.
     """
-    scenario = find_scenario(config, name, heading or BEST_HEADINGS.get(name or ""))
+    best = heading or BEST_HEADINGS.get(name or "")
+    scenario = find_scenario(config, name, best, speed_m_s=waypoint_speed_m_s, smooth_m=waypoint_smoothing_m)
     config = configured(config, scenario, guard)
     check_start(config, scenario)
     return DemoPlan(
         config=config,
         name=name or "",
         scenario=scenario,
+        waypoint_speed_m_s=waypoint_speed_m_s,
+        waypoint_smoothing_m=waypoint_smoothing_m,
         duration_s=duration_s or scenario.duration_s,
         speed=speed,
         folder=folder or Path("runs") / f"{scenario.name}-{datetime.now():%Y%m%d-%H%M%S}",
@@ -130,10 +139,10 @@ def check_start(config: Config, scenario: Scenario) -> None:
     Raises:
         ConfigError: One is not.
     """
-    model = build_model(config)
-    y = scenario.y(np.array([config.sim.x0.get(state.name, 0.0) for state in model.states]))
+    model, x0 = build_model(config), robot_settings(config)["x0"]
+    y = scenario.y(np.array(x0))
     if wrong := [output.name for output, column in zip(model.outputs, y.T, strict=True) if not np.isfinite(column).all()]:
-        raise ConfigError(f"sim.x0 must be a state whose outputs are finite, {wrong[0]} is not, got {config.sim.x0}")
+        raise ConfigError(f"sim.x0 must be a state whose outputs are finite, {wrong[0]} is not, got {x0}")
 
 
 def main(config: Config, scenario: str | None, **options: Any) -> int:
@@ -147,7 +156,7 @@ def main(config: Config, scenario: str | None, **options: Any) -> int:
         ConfigError: A stop would not bring the robot to rest, the scenario is none, or does not fit the robot, or the folder cannot be written.
     """
     check_stop(config)
-    console = Console()
+    console = plain_console()
     run = plan(config, scenario, **options)
     try:
         run.folder.mkdir(parents=True, exist_ok=True)
@@ -155,12 +164,12 @@ def main(config: Config, scenario: str | None, **options: Any) -> int:
     except OSError as error:
         raise ConfigError(f"--out must be a folder that can be written, got {run.folder}: {error.strerror}") from error
     if run.scenario.note:
-        console.print(run.scenario.note, soft_wrap=True, markup=False)
+        console.print(run.scenario.note, soft_wrap=True)
     stop = stop_on_signals()
     try:
         outcome = drive(run, console, stop)
     except Failed as error:
-        console.print(f"rti-mpc: {error}", soft_wrap=True, markup=False)
+        console.print(f"rti-mpc: {error}", soft_wrap=True)
         return 1
     return conclude(run, outcome, widened(console))
 
@@ -207,7 +216,7 @@ def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:
         board.wait("stopping all processes")
         for name in (name for name in END_ORDER if name != "guard" or guards(run)):
             if children.end(name, RECORDER_END_TIMEOUT_S if name == "recorder" else END_TIMEOUT_S):
-                board.console.print(f"{name} did not end well, see {children.log(name)}", soft_wrap=True, markup=False)
+                board.console.print(f"{name} did not end well, see {children.log(name)}", soft_wrap=True)
         witness.listen()
     if witness.info is None or witness.reference is None:
         raise Failed("stopped before the robot had a reference")
@@ -239,6 +248,8 @@ def start(run: DemoPlan, children: Children, endpoint: str, size: int) -> None:
     scenario: list[object] = ["--duration", run.reference_s]
     scenario += ["--scenario", run.name] if run.name else []
     scenario += ["--heading", run.scenario.heading] if run.scenario.heading else []
+    scenario += ["--waypoint-speed", run.waypoint_speed_m_s]
+    scenario += [] if run.waypoint_smoothing_m is None else ["--waypoint-smoothing", run.waypoint_smoothing_m]
     children.start("controller", CLI_MODULE, "run", config, "-e", endpoint)
     for name in guards(run):
         children.start(name, CLI_MODULE, "guard", config, "-e", endpoint)
@@ -288,21 +299,22 @@ def conclude(run: DemoPlan, outcome: Outcome, console: Console) -> int:
     summary = {**summarize(outcome), "heading": run.scenario.heading, "machine": machine.machine_info()}
     (run.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     if not summary["samples"]:
-        console.print(f"rti-mpc: nothing was driven, see {run.folder / 'logs'}", soft_wrap=True, markup=False)
+        console.print(f"rti-mpc: nothing was driven, see {run.folder / 'logs'}", soft_wrap=True)
         return 1
-    console.print(f"{run.scenario.title}, {run.duration_s:.0f} s of the robot at {run.speed:g} times real speed", highlight=False)
+    title = f"{run.scenario.title}, {run.duration_s:.0f} s of the robot at {run.speed:g} times real speed"
+    console.print(title, soft_wrap=True, highlight=False)
     print_summary(console, summary)
     if find_spec("matplotlib") is not None:
         from rti_mpc_service.rig.figure import figure
 
         figure(outcome.run(), run.folder / "run.png")
-        console.print(f"figure     {run.folder / 'run.png'}", soft_wrap=True, markup=False)
+        console.print(f"figure     {run.folder / 'run.png'}", soft_wrap=True)
     if recorded():
         rerun = Path(sys.executable).with_name("rerun")
-        console.print(f"recording  {path_as_typed(rerun) if rerun.exists() else 'rerun'} {run.folder / 'run.rrd'}", soft_wrap=True, markup=False)
-    console.print(f"all of it  {run.folder}", soft_wrap=True, markup=False)
+        console.print(f"recording  {path_as_typed(rerun) if rerun.exists() else 'rerun'} {run.folder / 'run.rrd'}", soft_wrap=True)
+    console.print(f"all of it  {run.folder}", soft_wrap=True)
     if not summary["driven"]:
-        console.print("rti-mpc: the robot was not driven to the end", markup=False)
+        console.print("rti-mpc: the robot was not driven to the end")
     return 0 if summary["driven"] else 1
 
 

@@ -72,7 +72,7 @@ def main(path: Path, json_path: Path | None = None) -> int:
     console.print(table)
     loop = report["loop"]
     fits = "can be kept here" if loop["fits"] else "CANNOT be kept here"
-    console.print(f"{path}: a period of {1e3 * config.ocp.dt_s:g} ms {fits}, the shortest is {shortest_text(loop)}", soft_wrap=True, markup=False)
+    console.print(f"{path}: a period of {1e3 * config.ocp.dt_s:g} ms {fits}, the shortest is {shortest_text(loop)}", soft_wrap=True)
     return 0 if loop["fits"] else 1
 
 

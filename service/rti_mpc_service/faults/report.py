@@ -128,14 +128,14 @@ class MatrixReport(Redrawn):
         self.rows.append(row)
         if not self.live:
             said = "; ".join([*row.broken, *row.excused]) or "kept"
-            self.console.print(f"{len(self.rows)} of {self._count}: {row.fault.name}, the robot {row.did}: {said}", soft_wrap=True, markup=False)
+            self.console.print(f"{len(self.rows)} of {self._count}: {row.fault.name}, the robot {row.did}: {said}", soft_wrap=True)
 
     def conclude(self) -> None:
         """Print the whole table, and the broken or excused limits."""
         widened(self.console).print(self._table())
         for row in self.rows:
             if words := [*row.broken, *row.excused]:
-                self.console.print(f"{row.fault.name}: {row.fault.promise.text}: {'; '.join(words)}", soft_wrap=True, markup=False)
+                self.console.print(f"{row.fault.name}: {row.fault.promise.text}: {'; '.join(words)}", soft_wrap=True)
         kept = sum(not row.broken for row in self.rows)
         about = machine.machine_info()
         self.console.print(

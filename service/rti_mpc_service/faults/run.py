@@ -22,7 +22,6 @@ from pathlib import Path
 from threading import Event
 
 import numpy as np
-from rich.console import Console
 
 from rti_mpc.array import Array
 from rti_mpc.contract.limits import Limits
@@ -32,6 +31,7 @@ from rti_mpc_service.config.build import build_signals, guard_limits
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_model, check_stop, check_tree
 from rti_mpc_service.config.schema import Config
+from rti_mpc_service.console import plain_console
 from rti_mpc_service.faults.excuse import excuses, explained
 from rti_mpc_service.faults.measure import Incident, measure, missed_ns
 from rti_mpc_service.faults.relay import ROLE as RELAY
@@ -79,13 +79,13 @@ def main(config_path: Path, only: Sequence[str], path: Path | None) -> int:
     config = prepared(load(config_path))
     stop = stop_on_signals()
     folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
-    with Host() as host, MatrixReport(console := Console(), len(faults)) as report:
+    with Host() as host, MatrixReport(console := plain_console(), len(faults)) as report:
         inject(config, faults, folder, report, stop, host)
     report.conclude()
     if report.kept:
         shutil.rmtree(folder)
     else:
-        console.print(f"what the processes said and the robot recorded: {folder}", soft_wrap=True, markup=False)
+        console.print(f"what the processes said and the robot recorded: {folder}", soft_wrap=True)
     if path is not None:
         path.write_text(json.dumps([row.to_json() for row in report.rows], indent=1) + "\n", encoding="utf-8")
     return 0 if report.kept and not stop.is_set() else 1

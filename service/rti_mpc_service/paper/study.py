@@ -10,10 +10,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from rti_mpc import __version__
+from rti_mpc_service.console import plain_console
 from rti_mpc_service.host import machine
 from rti_mpc_service.paper import readings
 from rti_mpc_service.paper.contender import CONTENDERS, Contender, RealTimeIteration
@@ -121,7 +121,7 @@ def main(out: Path | None = None, *, quick: bool = False) -> int:
         quick: A first look: a few seconds of every experiment after its transient.
     """
     out = out or Path("runs") / f"paper-{datetime.now():%Y%m%d-%H%M%S}"
-    console = Console()
+    console = plain_console()
     began_ns = time.monotonic_ns()
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
     with Progress(*columns, console=console, refresh_per_second=4, disable=not console.is_terminal) as progress:

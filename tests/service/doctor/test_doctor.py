@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.doctor import doctor
 from rti_mpc_service.doctor.doctor import PERIOD_MARGIN_FACTOR, finding_rows, period_verdict
 from rti_mpc_service.host.jitter import bare_timer
 from tests.processes.system import rti_mpc
@@ -48,6 +49,31 @@ def test_doctor_tells_what_the_host_grants_and_has(examined: tuple[int, str, Any
 @pytest.mark.parametrize(("dt_s", "fits"), [(0.0061, True), (0.0059, False)])
 def test_a_period_fits_that_holds_one_and_a_half_times_all_parts_at_p99(dt_s: float, fits: bool) -> None:
     assert period_verdict({part: {"p99": 1000.0} for part in PARTS}, dt_s)["fits"] is fits
+
+
+def test_no_number_and_no_word_is_cut_off_in_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    times = dict.fromkeys(("p50", "p99", "max"), 123456789.0)
+    granted = {"text": "SCHED_FIFO 20", "granted": True}
+    report = {
+        "machine": {"processor": "a processor of a long name", "cores": 2, "load": 16.2, "governor": "unknown", "python": "3.11.7", "system": "Linux"}
+        | {"packages": {"numpy": "987654321.0"}},
+        "realtime": {"lock_memory": granted},
+        "clock": {"source": "tsc", "resolution_ns": 1.0, "reading_ns": 67.0, "timer_slack_us": 50.0},
+        **dict.fromkeys(PARTS, times),
+        "compiler": "cc",
+        "cache": {"path": "/a/folder", "error": None},
+        "extras": {"rerun-sdk": None},
+        "loop": {"margin": 1.5, "shortest_period_us": 987654321.0, "fits": True},
+    }
+    monkeypatch.setenv("COLUMNS", "20")
+    monkeypatch.setattr(doctor, "examine", lambda config: report)
+    assert doctor.main(SHIPPED) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("p50 123456789, p99 123456789, max 123456789 us") == len(PARTS)
+    assert printed.count("987654.3 ms") == 2
+    assert "pip install 'rti-mpc[view]'" in printed, "what is in brackets, too"
+    assert "1.5 times preparation, feedback, timer and round trip at p99" in printed
+    assert "…" not in printed
 
 
 def test_nothing_is_promised_where_a_part_could_not_be_measured() -> None:

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `rti-mpc demo` prints, on a narrow terminal and in a pipe."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rti_mpc.contract.message import Telemetry
+from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.model.model import Signal
+from rti_mpc_service.console import plain_console, widened
+from rti_mpc_service.demo.board import Board, print_summary
+
+LARGE = 123456789.0
+TIMES = {"p50": LARGE, "p99": LARGE, "max": LARGE}
+SUMMARY: dict[str, Any] = {
+    "transient_s": 15.0,
+    "final_error_mm": None,
+    "max_error_mm": None,
+    "rms_error_mm": None,
+    "last_lap_max_error_mm": None,
+    "final_speed_mm_s": None,
+    "outputs": {"force [left]": {"unit": "N", "max": 1.23, "rms": 0.456}},
+    "in_period_share": 1.0,
+    "samples": 987654321,
+    "skipped": 0,
+    **dict.fromkeys(("commanded_inputs_in_bounds", "commanded_increments_in_bounds", "applied_inputs_in_bounds"), True),
+    "states_over_share": 0.0,
+    "fallbacks": 192837465,
+    **dict.fromkeys(("lost", "late", "expired", "refused"), 918273645),
+    **dict.fromkeys(("prepare_us", "feedback_us", "latency_us", "echo_us"), TIMES),
+    "misses": [],
+    "events": [{"severity": "WARNING", "source": "robot", "at_s": 1.0, "text": "a sentence of many words [of the robot], on one line"}],
+}
+
+
+@pytest.mark.parametrize("columns", ["20", "80"])
+def test_summary_loses_no_number_and_no_word(columns: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    print_summary(widened(plain_console()), SUMMARY)
+    printed = capsys.readouterr().out
+    lines = [line.rstrip() for line in printed.splitlines()]
+    assert any(line.startswith("error of force [left] after 15 s ") and line.endswith(" max 1.23 N, rms 0.456 N") for line in lines)
+    assert printed.count("123456789") == 12
+    assert printed.count("918273645") == 4
+    assert "987654321, 0 skipped" in printed
+    assert "WARNING of the robot at 1.0 s: a sentence of many words [of the robot], on one line" in lines
+    assert "…" not in printed
+
+
+def test_progress_in_a_pipe_is_one_whole_line_each(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("COLUMNS", "20")
+    numbers = (5, 0.0, 0.0, 1.0, 0.0, LARGE, LARGE, 30.0, 0.0, 0.0, 0, 0, 1)
+    sample = Telemetry(1, 1, 1, 1, 1, Mode.TRACKING, QpStatus.SOLVED, *numbers, *np.zeros((2, 1, 1)), np.ones((2, 1)), np.zeros((2, 2)))
+    with Board(plain_console(), "sines", (Signal("torque [1]", "Nm"),), 126.0) as board:
+        board.wait("starting controller, echo, reference, viewer")
+        board.show(0.0, "q_1 +0.1 rad", [sample], [])
+    assert capsys.readouterr().out.splitlines() == [
+        "starting controller, echo, reference, viewer",
+        (
+            "    0 of 126 s: mode tracking, error q_1 +0.1 rad, command torque [1] +1.000 Nm, preparation 123456789 us, feedback 123456789 us, "
+            "in period 100.00%, fallbacks 0"
+        ),
+    ]
