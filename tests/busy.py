@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The tests that start processes or read clocks, again and again beside processes that never rest: `make test-busy`.
+Repeated runs, beside busy processes, of the tests that start processes or read clocks: `make test-busy`.
 
 Every run is made, so that a failure that is rare shows how rare; the exit status is 1 if any failed. Further arguments
 are pytest's: ``make test-busy ARGS="--runs 1 tests/wire"``.

@@ -18,13 +18,13 @@ BEFORE_NS = 50 * MS  # what has just been sent when something begins may be held
 
 
 def in_time(host: Host, what: str, took_ms: float, limit_ms: float, since_ns: int) -> None:
-    """Hold what began at an instant of the monotonic clock to its limit; what the host took of the time is shown, and not held against it."""
+    """Check a duration since an instant of the monotonic clock against its limit, less the delays caused by the host, which are printed."""
     late_ms = took_ms - limit_ms
     assert late_ms <= 0.0 or explained(host, f"{what} took {took_ms:.0f} ms of {limit_ms:.0f}", late_ms, since_ns, since_ns + round(took_ms * MS))
 
 
 def on_time(host: Host, what: str, period_ms: float, since_ns: int) -> bool:
-    """Whether the host has not held processes up for half a period within any two, since an instant of the monotonic clock; says so if it has."""
+    """Whether the host has held processes up for less than half a period in any two since an instant of the monotonic clock; prints it if not."""
     worst_ms = host.worst_ms(since_ns - BEFORE_NS, time.monotonic_ns(), round(2 * period_ms * MS))
     if late := worst_ms > 0.5 * period_ms:
         print(f"\n{what} is not held to its numbers: within {2 * period_ms:.0f} ms the host held processes up for {worst_ms:.0f} ms")
@@ -43,7 +43,7 @@ def explained(host: Host, what: str, by_ms: float, from_ns: int, to_ns: int) -> 
 
 
 def awake_ms(process: subprocess.Popen[str]) -> float:
-    """Wait for a process to end; return the time this took, without what its main thread stood in the queue for a core."""
+    """Wait for a process to end; return the time this took, less the time its main thread waited for a core, ms."""
     since_ns, queued_ns = time.monotonic_ns(), 0
     while process.poll() is None:
         with suppress(FileNotFoundError, ProcessLookupError):  # it has just ended

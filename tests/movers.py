@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robots that inputs at rest do not stop, or not hold: driven by accelerations, forces and torques."""
+"""Robots that inputs at rest neither stop nor hold: driven by accelerations, forces and torques."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def mover(name: str, states: str, inputs: str, f: Callable[[Any, Any], tuple[Any
 
 
 def car(**changes: Any) -> Ocp:
-    """README's: acceleration and curvature."""
+    """README's car, driven by acceleration and curvature."""
 
     def f(x: Any, u: Any) -> tuple[Any, ...]:
         return x[3] * ca.cos(x[2]), x[3] * ca.sin(x[2]), x[3] * u[1], u[0]

@@ -34,7 +34,7 @@ def shuffled() -> Model:
 
 
 def glider() -> Model:
-    """A point that is moved by its velocity: no heading; names that mean something else to others, and a parameter `a` that is no axle's offset."""
+    """A point moved by its velocity, without heading; its names usually mean something else, and its parameter `a` is not the axle's offset."""
     x, u, p = ca.SX.sym("x", 2), ca.SX.sym("u", 2), ca.SX.sym("a")
     return Model(
         name="glider",
@@ -77,7 +77,7 @@ def arm() -> Model:
 
 
 def polar() -> Model:
-    """A point whose direction, as seen from the origin, is none at the origin."""
+    """A point whose direction from the origin is an output, undefined at the origin."""
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u", 2)
     return Model(
         name="polar",

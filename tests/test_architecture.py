@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rules of the folders, held by what each file imports."""
+"""Rules of the folders, checked by the imports of each file."""
 
 from __future__ import annotations
 

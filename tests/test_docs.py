@@ -45,7 +45,7 @@ def test_tutorial_of_your_robot_runs_word_by_word(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_tutorial_of_the_adapter_drives_the_robot_word_by_word(tmp_path: Path) -> None:
-    """But for the endpoint: the usual one may be taken."""
+    """With another endpoint, since the default one may be in use."""
     endpoint = free_endpoint()
     for name, text in zip(("robot.py", "planner.py"), blocks("adapter.md", "python"), strict=True):
         assert len([line for line in text.splitlines() if line.strip()]) <= 30

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Whatever the door lets in: messages that are well-formed and absurd raise in nobody, and an honest life later all is as before.
+Well-formed messages with absurd values: they raise no exception in any process, and have no effect once the robot has restarted.
 
-Numpy's warnings are errors here. What the door keeps out is tested in `tests.wire`.
+NumPy's warnings are errors here. Messages that the receiver refuses are tested in `tests.wire`.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The wheel as its users get it, in an environment of its own, outside the clone."""
+"""Wheel as its users get it, in a separate environment, outside the clone."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calls of the library as they go wrong: each is one line of ours that names the argument, never NumPy's or CasADi's words, and never a guess."""
+"""Wrong calls of the library: each is refused in one line that names the argument, never in NumPy's or CasADi's words, and never guessed at."""
 
 from __future__ import annotations
 

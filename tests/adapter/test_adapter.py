@@ -37,7 +37,7 @@ class Session(FakeSession):
 
 
 class Waiting:
-    """Subscriber to that."""
+    """Subscriber to what the test has sent."""
 
     def __init__(self, session: Session) -> None:
         self._session = session

@@ -51,7 +51,7 @@ class Asker:
 
     @contextmanager
     def asking(self, kinds: Sequence[str]) -> Iterator[None]:
-        """Ask for these in turn meanwhile."""
+        """Send these requests in turn while the block runs."""
         now_ns = self._robot.telemetry[-1].state_stamp_ns
         self._over.clear()
         thread = threading.Thread(target=self._ask, args=(kinds, now_ns))
@@ -75,14 +75,14 @@ class Asker:
                 self.answers[kind, "error" not in answer] += 1
 
     def _flood(self) -> None:
-        """Send what is no request, and wait for no answer."""
+        """Send malformed requests, without waiting for answers."""
         session: Any = self._robot.bus._session
         for _ in range(FLOOD_REQUESTS):
             session._session.get(self._robot.bus.keys.request, lambda _: None, payload=b"{" * 1000, timeout=1.0)
         self.answers["nonsense", False] += FLOOD_REQUESTS
 
     def _plan(self, now_ns: int) -> None:
-        """Send the reference again, from now on, as a planner does that has seen something new."""
+        """Send the reference again, starting now, as a planner does after new measurements."""
         known = self._known
         at = (now_ns - known.stamp_ns) // known.period_ns
         y = known.y[at : at + self._rows]

@@ -43,19 +43,19 @@ class Driven:
         return self.folder / "robot.toml"
 
     def listen(self) -> int:
-        """Take in what was sampled since the last call; return how much there is by now."""
+        """Store the samples since the last call; return the number of all samples so far."""
         self.telemetry += [decode(Telemetry, received.payload) for received in self.subscriber.drain()]
         return len(self.telemetry)
 
     def samples(self, number: int) -> list[Telemetry]:
-        """Wait for so many samples from now on."""
+        """Wait for this number of new samples."""
         first = self.listen()
         period_s = 1e-9 * (self.telemetry[-1].state_stamp_ns - self.telemetry[-2].state_stamp_ns)
         until(lambda: self.listen() >= first + number, f"{number} samples", pause_s=0.2, patience_s=2 * number * period_s + 10.0)
         return self.telemetry[first : first + number]
 
     def log(self) -> RobotLog:
-        """What the robot wrote; only after it has ended."""
+        """Log written by the robot; complete only after the robot has ended."""
         return robot_log.read(self.folder / "robot.csv", INFO)
 
 
@@ -72,7 +72,7 @@ def sampled(folder: Path, dt_s: float, realtime: str = "") -> Path:
 
 @contextmanager
 def driven(folder: Path, dt_s: float, duration_s: float, realtime: str = "") -> Iterator[Driven]:
-    """Drive until left, at most for so long."""
+    """Drive until the block ends, at most for this duration."""
     endpoint, toml = free_endpoint(), sampled(folder, dt_s, realtime)
     keys = load(toml).keys()
     with Bus.join(BusSettings(listen=(endpoint,), connect=()), keys) as bus, Children(folder) as children:

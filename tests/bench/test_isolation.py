@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Whoever only watches delays no sample: a viewer that hangs, one that stops, one whose disk is full.
+Isolation of the controller from viewers: one that hangs, one that stops, or one whose disk is full delays no sample.
 
 Real processes, 100 samples per second in real time, in rounds of blocks in random
 order. Each trouble begins with its block and is compared with the block of the
 same round in which it is not there: nobody watches, or, for a viewer that goes on
-without its recording, a viewer records. What two blocks in which nobody watches
-differ by is the machine, and no trouble may be told from that.
+without its recording, a viewer records. Two blocks without a viewer
+differ because of the machine; no trouble may exceed this difference significantly.
 """
 
 from __future__ import annotations

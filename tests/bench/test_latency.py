@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-From a state sent to its command received, against the floor: a bare echo over the same bus.
+Latency from a state sent to its command received, compared with a bare echo over the same bus.
 
 Robot and controller are the real processes, 100 samples per second in real time.
 The echo is Zenoh alone, in a process of its own on a link of its own: messages of
@@ -67,7 +67,7 @@ def config(tmp_path: Path) -> Config:
 
 @contextmanager
 def bare_session(size: int) -> Iterator[zenoh.Session]:
-    """Link to a process that echoes so many bytes."""
+    """Link to a process that answers with messages of this size, in bytes."""
     endpoint = free_endpoint()
     config = zenoh.Config()
     for name, value in {"listen/endpoints": "[]", "connect/endpoints": f'["{endpoint}"]', "scouting/multicast/enabled": "false"}.items():

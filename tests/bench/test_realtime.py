@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What `[realtime]` is worth here: from a state in to its command out, on a machine at rest and beside processes that never rest.
+Effect of `[realtime]` on the latency from state to command, on an idle machine and beside busy processes.
 
 Real processes, 100 samples per second. In every round each setting has a controller
-of its own, the settings in random order. Nothing is demanded but that what was
-asked for was granted: what it is worth is the machine's business.
+of its own, the settings in random order. The test demands only that the settings
+were granted: their effect depends on the machine.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ ENDLESS_LOOP = "while True: pass"
 
 @contextmanager
 def company(number: int) -> Iterator[None]:
-    """Processes that want a core each, always."""
+    """Busy processes, each of which occupies a core."""
     greedy = [subprocess.Popen([sys.executable, "-c", ENDLESS_LOOP]) for _ in range(number)]
     try:
         yield

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Whoever asks delays nobody: parameters changed and asked for, failures asked for, nonsense, and long references, each twenty times per second.
+Load by requests: parameters changed and read, failures injected, malformed requests and long references, each twenty times per second.
 
 Real processes, 200 samples per second in real time, in rounds of blocks in random
 order. All of it is answered by threads of the controller's own process, which
-share one interpreter lock with the thread that controls. What two blocks in which
-nobody asks differ by is the machine. Run it with a priority, below the
+share one interpreter lock with the thread that controls. Two blocks without
+requests differ because of the machine. Run it with a priority below the
 controller's, or the robot measures what else the machine does: `chrt -f 15`.
 """
 
@@ -36,7 +36,7 @@ BLOCKS = ("alone", "alone again", *KINDS)
 
 
 def block(robot: Driven, asker: Asker, name: str) -> list[Telemetry]:
-    """Samples while somebody asks, or nobody."""
+    """Samples of a block, with requests or without."""
     if name not in KINDS:
         return robot.samples(BLOCK_SAMPLES)
     with asker.asking([name]):

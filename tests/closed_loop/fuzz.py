@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-A robot, a planner, an operator, a network and two clocks that do what they like, and a controller between them.
+Fuzzer of a controller: robot, planner, operator, network and two clocks behave at random.
 
-What the controller may rely on: messages are not lost on their way and take at most
+The controller may rely on this: messages are not lost on their way and take at most
 `LATENCY_NS`; what takes longer does so inside the controller, which sees it. Everything
 else may happen.
 """
@@ -92,7 +92,7 @@ class Fuzz:
     # What the robot plays.
 
     def _play(self, to_ns: int) -> None:
-        """Let the robot live until a time, and check every input that acts."""
+        """Advance the robot to a time, and check every input that acts."""
         while self._queue and self._queue[0][0] <= to_ns:
             arrival_ns, command = self._queue.popleft()
             self._advance(max(arrival_ns, self._now_ns))
@@ -122,7 +122,7 @@ class Fuzz:
     # One sample.
 
     def step(self) -> None:
-        """Let one period pass, with whatever happens in it."""
+        """Let one period pass, with random events in it."""
         rng, r = self.rng, self.rng.random()
         if r < 0.001:
             self._restart()
@@ -195,7 +195,7 @@ class Fuzz:
         self._queue.append((max(arrival_ns, self._queue[-1][0] if self._queue else 0), command))
 
     def _state(self, stamp_ns: int) -> State:
-        """The next state: the robot's as a rule, and now and then what no robot does."""
+        """Return the next state: mostly the robot's, sometimes an invalid one."""
         rng = self.rng
         self._seq += 1
         self.samples += 1
@@ -214,7 +214,7 @@ class Fuzz:
         return State(self._epoch, self._seq, stamp_ns, x)
 
     def _received(self, payload: bytes, kind: str) -> Payload:
-        """What is left of a message that arrives."""
+        """Return the payload of a message as received: cut, changed or of another encoding at times."""
         rng, r = self.rng, self.rng.random()
         if r < 0.005:
             payload = payload[: int(rng.integers(0, len(payload)))]
@@ -262,7 +262,7 @@ class Fuzz:
             self.seen[notice.code] += 1
 
     def _silence(self, duration_ns: int) -> None:
-        """Let no state come for a while: the controller looks at the clock."""
+        """Send no state for a while; the controller checks the clock."""
         if self._waiting is not None:
             self._receive(self._waiting, self._busy_ns)
         self._play(max(self._busy_ns, self._now_ns))
@@ -271,7 +271,7 @@ class Fuzz:
             self._publish(self._silent(self.local_ns(self._now_ns)), self._now_ns + self._latency_ns())
 
     def _stall(self, duration_ns: int) -> None:
-        """Stop the controller for a while: then it sees some of the states that have waited, all at once."""
+        """Stop the controller for a while; then it receives some of the waiting states at once."""
         first_ns, last_ns = self._now_ns + DT, self._now_ns + duration_ns
         self._play(last_ns)
         self._busy_ns, self._ordered_ns = last_ns, last_ns + 10 * DT
@@ -288,7 +288,7 @@ class Fuzz:
         self._begin(int(self.rng.integers(0, 10**12)))
 
     def _jump(self, by_ns: int) -> None:
-        """Let the robot's clock jump: what it was told of the future no longer holds, and it brakes."""
+        """Let the robot's clock jump: commands it holds for later are dropped, and it brakes."""
         u, local_ns = self._actuator.u.copy(), self.local_ns(self._now_ns)
         self._begin(max(0, self._now_ns + by_ns))
         self._offset_ns = local_ns

@@ -32,7 +32,7 @@ LIMITS = Limits(np.zeros(2), -BOUND, BOUND, -STEP, STEP, dt_s=0.1)
 
 
 class Lossy(Fuzz):
-    """One long life of everything, on links that lose."""
+    """A long random run of all processes, on links that lose messages."""
 
     def __init__(self, seed: int, *, guarded: bool, reports: bool = True, compile: bool = True) -> None:
         self._guarded, self._reports = guarded, reports

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robot, controller and guard in lockstep, where another robot uses its name, or its stamps are not nanoseconds."""
+"""Robot, controller and guard in lockstep, with a second robot of the same name, or stamps that are not nanoseconds."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Scene:
             self.body.accept(command)
 
     def wait(self, ms: float, beside: Iterable[State] = (), *, heard: bool = True) -> None:
-        """Let local time pass; the robot sends a state every tenth step, and perhaps somebody else one between."""
+        """Let local time pass; the robot sends a state every tenth step, and a second robot possibly one in between."""
         others = iter(beside)
         for i in range(round(ms / self.step_ms)):
             self.local_ns += round(self.step_ms * MS)
@@ -151,7 +151,7 @@ def scene(request: pytest.FixtureRequest, rti: Rti) -> Scene:
 
 
 def forged(scene: Scene, epoch: int, count: int) -> list[State]:
-    """States of somebody who stands where the robot was, on a clock of their own."""
+    """States of a second robot, which stands where the first was, on another clock."""
     return [State(epoch, i + 1, 10**15 + i * DT, np.zeros(5)) for i in range(count)]
 
 
@@ -172,7 +172,7 @@ def test_second_robot_of_the_name_brings_the_first_to_rest_inside_its_limits_and
 
 
 def test_robot_heard_again_right_after_a_second_one_is_told_of_too(scene: Scene) -> None:
-    """Its own states were lost for longer than the stale time, and the other one's state came in between."""
+    """The robot's own states were lost for longer than the stale time, and a state of the other robot came in between."""
     scene.wait(300, heard=False)
     scene.hear(forged(scene, 9, 1)[0])
     scene.wait(100)
@@ -183,7 +183,7 @@ def test_robot_heard_again_right_after_a_second_one_is_told_of_too(scene: Scene)
 
 @pytest.mark.parametrize("states", [1, 3])
 def test_standing_second_robot_while_the_planner_turns_round_gives_no_step(scene: Scene, states: int) -> None:
-    """From believing that it stands, a controller would begin to drive back at once."""
+    """A controller that believed the standing robot's states would drive back at once."""
     for i in range(5):
         scene.wait(100 * states, forged(scene, 2**60 + i, states))
         ahead = -1.0 if i % 2 == 0 else 1.0

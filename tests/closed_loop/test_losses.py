@@ -125,7 +125,7 @@ def test_robot_that_does_not_report_is_told_of_once() -> None:
 
 @pytest.mark.parametrize("drop", [lambda _: True, lambda k: k % 3 == 0], ids=["a burst", "every third"])
 def test_measured_delay_survives_losses(drop: Callable[[int], bool]) -> None:
-    """What would be learnt from responses to commands that never acted is taken back."""
+    """An estimate learnt from commands that never acted is taken back."""
     scene = Scene(guarded=False, at="none", delay_s=None)
     scene.body.actuator._delay_ns = 60 * MS
     scene.drive(12.0)

@@ -95,7 +95,7 @@ def configured(path: Path, discs: list[tuple[str, float, str]]) -> Config:
 
 
 def along_the_axis(config: Config, seq: int = 1) -> Reference:
-    """To 4 m, and 20 s there."""
+    """Reference along the axis to 4 m, and 20 s there."""
     t = DT * np.arange(500)
     y = np.stack([np.minimum(SPEED * t, 4.0), 0 * t, 0 * t], axis=-1)
     return Reference(1, seq, 0, round(1e9 * DT), End.HOLD, y, stage_parameters(config, t))

@@ -64,7 +64,7 @@ def errors_mm(controller: Controller, path: str, flip: float, at_s: float, sampl
 
 @pytest.mark.parametrize("path", PATHS)
 def test_one_wrong_heading_is_made_up_for_within_two_seconds(rti: Rti, path: str) -> None:
-    """While the start is still being made up for: an undisturbed error of 1 mm that falls."""
+    """During the initial transient: the undisturbed error is 1 mm and falling."""
     undisturbed, heading = errors_mm(Controller(rti, Timing()), path, 0.0, 10.0, 0)
     for flip in (3.1, 3.3, -3.1, -3.3, 2 * np.pi, -2 * np.pi):
         error, ended = errors_mm(Controller(rti, Timing()), path, flip, 9.9, 1)
@@ -84,7 +84,7 @@ def test_robot_never_turns_round_itself_after_wrong_headings(rti: Rti, path: str
 
 @pytest.mark.parametrize("flip", [3.1, 3.3, -3.1, -3.3])
 def test_observer_forgets_a_wrong_heading_too(observed: tuple[Rti, ObserverSettings], flip: float) -> None:
-    """What it believes of the inputs' disturbances takes longer than the heading."""
+    """Its estimate of the inputs' disturbances takes longer to recover than the heading."""
     rti, settings = observed
     observer = lambda: Observer(pioneer_3dx(), settings)  # noqa: E731
     _, heading = errors_mm(Controller(rti, Timing(), observer=observer()), "eight", 0.0, 9.9, 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stop of robots that their inputs at rest do not stop, and what their last command leaves when its controller has died, in lockstep."""
+"""Stop of robots that inputs at rest do not stop, and the effect of their last command after the controller has died, in lockstep."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_robot_that_is_pushed_while_it_is_stopped_comes_back() -> None:
 
 
 def test_robot_whose_inputs_ramp_to_rest_has_commands_as_ever() -> None:
-    """The law is all that makes a way: without one, nothing of it is on the wire."""
+    """Without a stop law, a command carries no way to rest."""
     ocp = ocp_of("car")
     assert law_of("boat") is None
     controller, body = tracking("car")

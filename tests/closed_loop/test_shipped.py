@@ -76,7 +76,7 @@ def test_inputs_are_exactly_inside_their_bounds_and_states_nearly(name: str) -> 
 
 
 def slew_excess(commands: list[Command], ocp: Ocp) -> float:
-    """By how much any input changes more than it may, from row to row and from command to command."""
+    """Return the largest change of an input beyond its slew limit, from row to row and from command to command."""
     acting = np.array([command.u[0] for command in commands])
     steps = np.concatenate([np.diff(acting, axis=0), *(np.diff(command.u, axis=0) for command in commands)])
     return float(np.maximum(steps - ocp.ubdu, ocp.lbdu - steps).max())

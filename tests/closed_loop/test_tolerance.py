@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The default tolerance of OSQP, judged by what it costs a robot and not by residuals."""
+"""Default tolerance of OSQP, judged by closed-loop cost and not by residuals."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def belief() -> Belief:
 
 
 def plan(seq: int) -> Array:
-    """Each of five rows another input: it tells number and row."""
+    """A plan of five different rows; each input tells the command's number and the row."""
     return np.array([(1.0 - 0.01 * seq - 0.001 * row) * FULL for row in range(5)])
 
 

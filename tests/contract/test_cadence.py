@@ -90,7 +90,7 @@ def test_rate_that_leaves_what_is_possible_is_told_within_three_states_and_forgi
 
 
 def test_robot_that_was_held_up_once_is_no_clock_that_has_stopped() -> None:
-    """Its clock waits with it; so it is if the queue between was."""
+    """Its clock waits with it; the same holds if the queue was held up."""
     robot = Robot()
     robot.live(3.0)
     robot.local_ms += 60_000.0
@@ -151,7 +151,7 @@ def test_number_that_never_counts_is_told_within_two_seconds_and_once() -> None:
 
 
 def test_state_that_is_sent_twice_is_no_number_that_never_counts() -> None:
-    """Nor is one that comes again and again, of a simulation that is far slower than we are."""
+    """The same holds for a state repeated by a simulation that is far slower than the receiver."""
     robot = Robot(rate=0.005, period_ms=20_000.0)
     for _ in range(10):
         assert robot.send()

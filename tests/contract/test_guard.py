@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The guard without clock and network, before the actuators of the simulated robot, judged by what acts there."""
+"""Guard without clock and network, in front of the actuators of the simulated robot, judged by the inputs that act there."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Scene:
             self.step()
 
     def restart(self) -> None:
-        """Let the robot be gone for a second, begin another life of it, and wait until that is believed."""
+        """Stop the robot for a second, restart it, and wait until the new epoch is accepted."""
         self.heard = False
         self.wait(1000)
         self.epoch += 1
@@ -204,7 +204,7 @@ def test_silence_is_answered_by_a_ramp_told_in_time_and_then_by_standing(scene: 
 
 
 def test_ramp_is_that_of_the_robot_itself(scene: Scene) -> None:
-    """So it is no matter who of the two begins."""
+    """So it does not matter which of the two begins."""
     alone = Scene().ready()
     for one in (scene, alone):
         one.drive(1000)
@@ -295,7 +295,7 @@ def test_higher_epoch_takes_over_and_the_old_leader_never_passes_again(scene: Sc
 
 
 def test_epoch_that_only_claims_fences_nobody(scene: Scene) -> None:
-    """What is not in order takes nothing over."""
+    """A command that is refused does not raise the epoch that passes."""
     scene.drive(500)
     for change in ({"state_stamp_ns": 0}, {"u": np.full((20, 2), 9.0)}, {"state_epoch": 1}):
         assert scene.send(epoch=10**6, **change) is None
@@ -340,7 +340,7 @@ def test_held_up_guard_publishes_nothing_stale_whatever_waited_for_it(scene: Sce
 
 
 def test_states_that_waited_on_the_way_make_no_old_command_young(scene: Scene) -> None:
-    """The link hangs, the guard does not: the first state that comes says nothing of the time now."""
+    """The link hangs, the guard does not: the first state to arrive does not tell the current time of the robot."""
     scene.drive(1000)
     scene.heard = False
     states, commands = [], []
@@ -471,7 +471,7 @@ def test_nothing_passes_after_a_jump_until_the_robot_was_told_to_brake(scene: Sc
 
 
 def test_starting_guard_waits_until_what_another_one_told_the_robot_has_run_out(scene: Scene) -> None:
-    """It knows nothing of that: 300 ms and the ramp from the bounds."""
+    """It does not know the commands of the earlier guard, so it waits 300 ms and the ramp from the bounds."""
     scene.drive(1000)
     scene.send()
     scene.power_up()
@@ -578,7 +578,7 @@ def test_latched_guard_passes_nothing_but_ways_to_rest_and_brakes_in_time_if_non
 
 
 def test_controller_that_ramps_down_anew_with_every_command_does_not_drive_on_against_a_latched_guard(scene: Scene) -> None:
-    """Each of its plans is a way to rest, whose first row alone would ever act."""
+    """Each of its plans leads to rest, but only the first row of each would act."""
     scene.drive(1000)
     scene.guard.latch(REASON, scene.local_ns)
     stubborn = np.vstack([FULL, FULL - [0.25, 0.3], WAY[1:]])

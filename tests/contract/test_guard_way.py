@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Guard and robot on ways to rest that commands carry: a mass that is pushed, so that an input of zero coasts, judged by how it stands."""
+"""Guard and robot on ways to rest that commands carry: a mass driven by a force, which coasts at zero input, judged by its standstill."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def test_robot_whose_inputs_coast_stands_after_the_last_command(guarded: bool, p
 
 
 def test_command_without_a_way_to_rest_leaves_such_a_robot_coasting() -> None:
-    """Zero is where its inputs rest: what this is about."""
+    """Its inputs rest at zero, where it coasts: the reason for ways to rest."""
     mass = Mass().drive(u_rest=np.zeros((0, 0)))
     mass.wait(3000)
     assert mass.x[1] == pytest.approx(0.5)

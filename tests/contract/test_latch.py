@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Latches: which of two holds, and how they are read."""
+"""Latches of a stop: precedence between two, and decoding."""
 
 from __future__ import annotations
 

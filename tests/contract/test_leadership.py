@@ -116,7 +116,7 @@ def test_states_between_samples_are_no_silence(pair: tuple[One, One]) -> None:
 
 
 def test_one_that_takes_over_between_samples_answers_the_next_one(pair: tuple[One, One]) -> None:
-    """With ten states per period, and somebody else who stands by: the silence it ended is none of its own."""
+    """With ten states per period, and a further standby: the silence that this takeover ended does not count against the new leader."""
     _, standby = pair
     One(standby.wire, standby=True, number=standby.leadership.number + 1)
     for i in range(41, 60):
@@ -138,7 +138,7 @@ def test_leader_that_has_slept_says_nothing_until_it_has_listened(pair: tuple[On
 
 
 def test_leader_that_nobody_has_replaced_goes_on_after_listening(pair: tuple[One, One]) -> None:
-    """No state reached anybody for a while: neither knows more than the other, and who led leads."""
+    """No state reached either controller for a while: the former leader continues."""
     leader, standby = pair
     epoch = leader.leadership.epoch
     assert [(leader.see(k), standby.see(k)) for k in (8, 9, 10)] == [(False, False), (True, False), (True, False)]
@@ -155,7 +155,7 @@ def test_late_look_at_the_clock_counts_as_sleep(pair: tuple[One, One]) -> None:
 
 
 def test_state_shown_a_period_late_is_not_answered() -> None:
-    """The next one is out, and whoever stands by may have answered that."""
+    """The next state has been sent, and a standby may have answered it."""
     for late_ns, answered in ((DT_NS - 1, True), (DT_NS, False)):
         leader, standby = One(wire := [], standby=False), One(wire, standby=True)
         assert leader.see(1)

@@ -33,14 +33,14 @@ def test_jitter_of_arrivals_is_averaged_out() -> None:
 
 
 def test_rate_is_assumed_low_until_it_is_known() -> None:
-    """Or the first states of a slow simulation would be taken for the last of a dead robot."""
+    """Otherwise the first states of a slow simulation would be taken for the last of a dead robot."""
     clock = ticking(1.0, count=2)
     assert clock.rate == 0.1
     assert clock.now_ns(clock.arrival_ns + 1000 * MS) - clock.stamp_ns == 100 * MS
 
 
 def test_rate_is_at_most_as_fast_as_states_have_come_until_it_is_known() -> None:
-    """Or a sample of a fast simulation would be sent long after its time."""
+    """Otherwise a sample of a fast simulation would be sent long after its time."""
     clock = ticking(4.0, count=1)
     assert clock.latest_ns(clock.arrival_ns + 10 * MS) - clock.stamp_ns == 100 * MS  # after one state it may be that of any
     clock = ticking(4.0, count=2)
@@ -95,7 +95,7 @@ def test_rate_does_not_follow_states_that_come_late_now_and_then() -> None:
 
 
 def test_states_that_were_held_up_together_show_no_faster_clock() -> None:
-    """Or all that come after them would look late, and no sample be answered in time until the rate is measured again."""
+    """Otherwise all later states would look late, and no sample would be answered until the rate is measured again."""
     clock = ticking(1.0)
     stamp_ns, arrival_ns = clock.stamp_ns, clock.arrival_ns + 300 * MS
     assert not clock.observe(31, stamp_ns + 100 * MS, arrival_ns + 100 * MS)

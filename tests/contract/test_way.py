@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What acts on a way to rest, and what a state makes of it."""
+"""Inputs that act on a way to rest, and the feedback from states to them."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reported calls, repeated on a second controller: they decide every command, to the last bit."""
+"""Reported calls of a controller: repeated on a second controller, they give the same commands, bit for bit."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_every_public_method_of_a_controller_is_reported_or_only_reads() -> None
 
 
 def test_no_call_that_is_told_makes_another_one() -> None:
-    """Or that would happen twice, when both are made again."""
+    """Otherwise it would happen twice, when both calls are repeated."""
     calls = [node.func for node in ast.walk(ast.parse(inspect.getsource(Controller))) if isinstance(node, ast.Call)]
     own = {func.attr for func in calls if isinstance(func, ast.Attribute) and isinstance(func.value, ast.Name) and func.value.id == "self"}
     assert own
@@ -131,7 +131,7 @@ def test_controller_that_is_told_the_same_calls_sends_the_same_commands_bit_for_
 
 
 def test_proposal_that_is_not_committed_was_never_sent() -> None:
-    """Nor is there a gap in the numbers; whoever plans on plans from what has left."""
+    """Sequence numbers have no gap, and the next plan starts from what was sent."""
     one, other, body = made(), made(), robot(circle())
     for controller in (one, other):
         controller.receive_reference(reference(circle()))

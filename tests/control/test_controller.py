@@ -335,7 +335,7 @@ def test_states_that_go_back_a_little_are_not_used(on_the_circle: tuple[Controll
 
 
 def test_robot_that_is_restarted_is_another_robot(on_the_circle: tuple[Controller, Lockstep]) -> None:
-    """Its clock begins anew: the reference on the old one's time is not followed."""
+    """Its clock starts again: a reference with stamps of the old clock is not followed."""
     controller, _ = on_the_circle
     controller.notices()
     again = Restarted(epoch=2)

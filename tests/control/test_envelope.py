@@ -20,7 +20,7 @@ def envelope() -> Envelope:
 
 
 def around(u: Array) -> tuple[Array, Array]:
-    """Where the first two rows may lie if an input acts before and until they do."""
+    """Return the limits of the first two rows after an input that acts until then."""
     return np.tile(u - STEP, (2, 1)), np.tile(u + STEP, (2, 1))
 
 

@@ -181,7 +181,7 @@ def test_sample_right_after_a_restart_is_held_to_its_budget_though_the_speed_of_
 
 
 def test_first_state_of_a_life_is_left_unanswered_without_a_word(rti: FaultyRti) -> None:
-    """Before a second state has come the robot's clock may run at any speed."""
+    """Before a second state has arrived, the rate of the robot's clock is unknown."""
     controller, body = Controller(rti, Timing(), compile=False), robot(circle())
     controller.receive_reference(reference(circle()))
     assert controller.receive_state(body.tick(), body.now_ns) is None

@@ -96,7 +96,7 @@ def test_cleared_memory_is_rest() -> None:
 
 
 def test_reach_keeps_to_all_inputs_of_the_period_before_and_after() -> None:
-    """Row 0 acts before, row 1 until the next command arrives: that is to be near to both."""
+    """Row 0 acts before, row 1 until the next command arrives, so the next input must be near both."""
     lowest, highest = sent(command(1, 0, np.array([[0.3, 0.0], [0.4, -0.2], [0.9, 0.9]]))).reach(DT)
     np.testing.assert_allclose(lowest, [[0.4 - 0.2, 0.0 - 0.3], [0.4 - 0.2, -0.2 - 0.3]])
     np.testing.assert_allclose(highest, [[0.3 + 0.2, -0.2 + 0.3], [0.4 + 0.2, -0.2 + 0.3]])

@@ -101,7 +101,7 @@ def test_take_over_in_a_transient_keeps_the_slew_limits() -> None:
 
 
 def test_standby_that_hears_nothing_would_jump() -> None:
-    """What it hears is what keeps the limits: the test above could fail."""
+    """Shows that the test above can fail: without the leader's commands the limits are exceeded."""
     applied, _ = take_over(10, 6, hears=False)
     assert np.any(np.abs(np.diff(applied, axis=0)) > 2 * STEP)
 

@@ -21,7 +21,7 @@ def reference(y: Array, p: Array | None = None, stamp_ms: int = 0, period_ms: in
 
 
 def turning(rows: int, wrapped: bool) -> Array:
-    """A heading that goes from 2.5 through pi on to 4, and positions that say the time."""
+    """A heading that goes from 2.5 through pi to 4, and positions equal to the time."""
     psi = np.linspace(2.5, 4.0, rows)
     y = np.column_stack([np.arange(rows), -np.arange(rows), psi])
     if wrapped:

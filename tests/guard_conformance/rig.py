@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A robot and a controller in front of and behind a guard, in one thread, in real time; all they have in common with it is the bus."""
+"""Test rig for a guard: robot and controller in one thread, in real time, connected with the guard by the bus alone."""
 
 from __future__ import annotations
 

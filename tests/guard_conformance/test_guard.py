@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What a guard promises, over nothing but the bus; `deploy/guard.md` is the contract in words.
+Conformance tests of a guard, over the bus alone; `deploy/guard.md` is the contract in words.
 
 ``pytest tests/guard_conformance --guard "my_guard --verbose"`` runs ``my_guard --verbose CONFIG.toml -e ENDPOINT``; ours without the option.
 """
@@ -234,7 +234,7 @@ def not_stored(answers: list[dict[str, Any]]) -> bool:
 
 
 def test_stopped_guard_passes_only_ways_to_rest_and_so_does_one_that_was_restarted(rig: Rig) -> None:
-    """Whatever a controller commands that has not heard of the stop."""
+    """Independent of the commands of a controller that has not received the stop."""
 
     def says(what: str) -> None:
         assert any(answer["ok"] is True for answer in rig.bus.answers(rig.bus.keys.stop, {"request": what}, 5.0))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models of the user's own: found beside his file first, by whatever name, and refused in one line that names his file and line."""
+"""User's models: found beside the configuration first, under any name, and refused in one line with file and line."""
 
 from __future__ import annotations
 

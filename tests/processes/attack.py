@@ -88,7 +88,7 @@ class Attack:
         self._session.close()
 
     def run(self, messages: int) -> None:
-        """Send so many, at `RATE_HZ`."""
+        """Send this number of messages, at `RATE_HZ`."""
         due_s, last = time.monotonic(), self.sent + messages
         for stream, size in HUGE.items():
             self._put(stream, bytes(size), "application/json", block=True)
@@ -101,7 +101,7 @@ class Attack:
             time.sleep(max(0.0, due_s - time.monotonic()))
 
     def crowd(self, seconds: float) -> None:
-        """Send twenty messages that are none behind each state, and 2000 a second of an old state and of somebody else's command."""
+        """Send twenty malformed messages after each state, and 2000 per second of an old state and of a foreign command."""
         states = self._session.declare_subscriber(self._keys.state, zenoh.handlers.RingChannel(16), allowed_origin=zenoh.Locality.REMOTE)
         others = {"state": encode(self.last(State, "state")), "command": encode(replace(self.last(Command, "command"), epoch=1, seq=1))}
         due_s = end_s = time.monotonic() + seconds
@@ -125,12 +125,12 @@ class Attack:
                 self._heard[stream].append((time.monotonic(), sample.payload.to_bytes(), str(sample.encoding)))
 
     def heard(self, stream: str) -> bool:
-        """Whether others have sent anything on a stream."""
+        """Whether other processes have sent a message on a stream."""
         self.listen()
         return bool(self._heard[stream])
 
     def forge(self, cls: type[Any], stream: str, **change: Any) -> None:
-        """Send the last message of a stream with some fields of another value: well-formed."""
+        """Send the last message of a stream with some fields changed, well-formed."""
         self.listen()
         self._put(stream, encode(replace(decode(cls, self._heard[stream][-1][1]), **change)), encoding(cls))
 
@@ -161,7 +161,7 @@ class Attack:
             self._put(stream, bytes(mutant), str(self._rng.choice(["", "application/json", kind.replace("@2", "@1"), 200 * "x"])))
 
     def _out_of_range(self) -> None:
-        """A message with a number that none has."""
+        """A message with a number out of range."""
         stream = self._stream()
         _, payload, kind = self._sample(stream)
         if payload is None:
@@ -185,7 +185,7 @@ class Attack:
             self._put(stream, payload, kind)
 
     def _foreign(self) -> None:
-        """Descriptions and events of anybody, and streams that nobody has."""
+        """Descriptions and events of unknown roles, and messages on unknown streams."""
         role = f"role_{self._rng.integers(1000)}"
         document = DOCUMENTS[self._rng.integers(len(DOCUMENTS))]
         what = self._rng.integers(4)
@@ -199,13 +199,13 @@ class Attack:
             self._put(role, self._rng.bytes(100), "zenoh/bytes")
 
     def _request(self) -> None:
-        """A request that is none."""
+        """A malformed request."""
         self.sent += 1
         payload = DOCUMENTS[self._rng.integers(len(DOCUMENTS))]
         self._session.get(self._keys.request, zenoh.handlers.RingChannel(1), payload=payload, timeout=0.5)
 
     def _presence(self) -> None:
-        """A name that comes and goes."""
+        """A presence that appears and disappears."""
         self.sent += 1
         self._session.liveliness().declare_token(self._keys.alive(f"standby.{self._rng.integers(10**6)}")).undeclare()
 

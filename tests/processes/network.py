@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hosts in small: a network namespace each, on a bridge in one of their own, and links that can be cut. Needs root and `ip`."""
+"""Network of hosts on one machine: a network namespace per host, joined by a bridge, with links that can be cut. Needs root and `ip`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def ip(*words: str) -> None:
 
 
 def missing() -> str | None:
-    """Return what keeps us from namespaces here; None: nothing."""
+    """Return why namespaces cannot be used here, or None if they can."""
     if os.getuid() != 0:
         return "root is needed for network namespaces: partitions of hosts are NOT tested"
     if shutil.which("ip") is None:

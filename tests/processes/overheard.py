@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Somebody in the middle of a network who writes down what passes: ``python -m tests.processes.overheard ENDPOINT FILE``, a line of JSON each.
+Recorder of all messages on the bus: ``python -m tests.processes.overheard ENDPOINT FILE``, one line of JSON per message.
 
-Read back by whoever cannot be there, because it lives on another host.
+Read by tests whose processes run on other hosts.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ STREAMS: dict[str, tuple[str, type[Any], tuple[str, ...]]] = {
 
 @dataclass
 class Overheard:
-    """What was written down so far, by stream: each message's fields, when it was heard (`at_ns`, monotonic), and `u`, the first row of inputs."""
+    """Messages recorded so far, by stream: each message's fields, when it was heard (`at_ns`, monotonic), and `u`, the first row of inputs."""
 
     path: Path
     streams: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: {name: [] for name in STREAMS})
     _offset: int = 0
 
     def listen(self) -> Overheard:
-        """Take in what was written since the last call."""
+        """Read the messages recorded since the last call."""
         with self.path.open("rb") as file:
             file.seek(self._offset)
             for line in file:
@@ -63,7 +63,7 @@ def write(name: str, cls: type[Any], fields: tuple[str, ...], subscriber: Subscr
 
 
 def main(endpoint: str, path: Path) -> None:
-    """Write down what passes until stopped."""
+    """Record messages until stopped."""
     stop = stop_on_signals()
     with Bus.join(BusSettings(mode="client", connect=(endpoint,)), KEYS, timeout_s=60.0, stop=stop) as bus, path.open("w", buffering=1) as file:
         for name, (key, cls, fields) in STREAMS.items():

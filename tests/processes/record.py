@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot's own record of a run, and what it shows."""
+"""Record of a run by the robot itself, and times read from it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Record:
 
     @property
     def braking_ms(self) -> float:
-        """When the first input had left what acted at the instant, towards rest."""
+        """Time at which the first input began to move towards rest, ms after the instant."""
         return float(self.times[self.inputs[:, 0] < self.inputs[0, 0] - 1e-3][0])
 
     @property
@@ -39,7 +39,7 @@ class Record:
 
     @property
     def standing_ms(self) -> float:
-        """From when on it stood, to the end."""
+        """Time from which the robot stood until the end, ms after the instant."""
         return float(self.times[(np.abs(self.speeds) >= STANDSTILL_SPEED).any(axis=1)][-1]) + 1e-6 * PERIOD_NS
 
 
@@ -58,7 +58,7 @@ def recorded(system: System, fault_ns: int, to_ms: int) -> Record:
 
 
 def within_slew(record: Record) -> None:
-    """Over any time for which it is promised: a command that is late and one that is not begin less than a period apart."""
+    """Whether inputs keep to the slew limits over three quarters of a period: late and punctual commands may begin less than a period apart."""
     for rows in range(1, round(SLEW_WINDOW_PERIODS * 100 * MS) // PERIOD_NS + 1):
         changes = np.abs(record.inputs[rows:] - record.inputs[:-rows])
         assert (changes <= SLEW + 1e-6).all(), (rows, changes.max(axis=0))

@@ -118,7 +118,7 @@ class System:
             process.kill()
 
     def opened(self, role: str) -> None:
-        """Wait until a process has joined the bus, whomever it may meet there."""
+        """Wait until a process has joined the bus, even without other processes."""
         until(lambda: listening(self.running[role].pid), f"{role} listens")
 
     def said(self, role: str) -> str:
@@ -133,7 +133,7 @@ class System:
         return heard(self.bus.subscriber(KEYS.telemetry), Telemetry, lambda _: True)
 
     def event(self, code: str, source: str, act: Callable[[], object] = lambda: None) -> Event:
-        """Wait for an event that comes after we act, again and again."""
+        """Repeat an action until an event follows it."""
         events = self.bus.subscriber(KEYS.event(source), capacity=64, history=False)
 
         def look() -> Event | None:
@@ -147,7 +147,7 @@ class System:
 
 
 def owner(log: str) -> int:
-    """The number at the end of all epochs of a controller, from its log: ``epoch 123 controls``, ``123 stands by``."""
+    """Return the digits that end all epochs of a controller, from its log: ``epoch 123 controls``, ``123 stands by``."""
     texts = (json.loads(line)["text"] for line in log.splitlines())
     found = next(match for text in texts if (match := re.match(r"(?:epoch )?(\d+) (?:controls|stands by)", text)))
     return int(found[1]) % (1 << NUMBER_BITS)

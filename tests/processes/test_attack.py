@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Real processes among a thousand hostile messages per second: nobody ends, and as many samples are answered as without.
+Attack with a thousand hostile messages per second on real processes: none ends, and no fewer samples are answered.
 
 `make attack` sends a million, in blocks of ten seconds, each beside an equal one without.
 """
@@ -86,7 +86,7 @@ def unharmed(system: System) -> None:
 
 
 def equal_shares(system: System, blocks: int, seconds: float, act: Callable[[], None]) -> None:
-    """Hold the share of samples answered in blocks of time to that of equal ones in between, without what is done."""
+    """Compare the share of samples answered in blocks with an action to that in equal blocks without it."""
     states, left = {"with": 0, "without": 0}, {"with": 0, "without": 0}
     for name in blocks * ("with", "without"):
         from_ns = stamp_ns(system)
@@ -105,7 +105,7 @@ def equal_shares(system: System, blocks: int, seconds: float, act: Callable[[], 
 
 @pytest.mark.slow
 def test_foreign_messages_behind_and_between_those_that_count_displace_none(system: System) -> None:
-    """At bursts of twenty behind each state, 62 % were answered once."""
+    """With bursts of twenty after each state, an early version answered 62 % of the samples."""
     with Attack(system.endpoint, KEYS, seed=2) as attack:
         until(lambda: attack.heard("command"), "it hears of commands")
         equal_shares(system, 2, CROWD_S, lambda: attack.crowd(CROWD_S))

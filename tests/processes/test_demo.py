@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo from end to end, as short as it makes sense, and what it leaves behind."""
+"""The demo from end to end, in a short run, with the files it writes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ ASKED_FOR = {
 
 @dataclass(frozen=True)
 class Demo:
-    """What a demo left, and when it ran, by the monotonic clock."""
+    """Files of a demo, and the times of its run by the monotonic clock."""
 
     folder: Path
     printed: str
@@ -76,7 +76,7 @@ def test_summary_holds_what_it_promises(summary: Any) -> None:
 
 
 def test_robot_is_driven_onto_its_path_at_every_sample_that_the_host_leaves_us(summary: Any, demo: Demo, host: Host) -> None:
-    """Twelve seconds after its start half a metre away; two laps are measured by the demo itself, on a machine that does nothing else."""
+    """Twelve seconds after its start half a metre away; the demo itself measures two laps, on an idle machine."""
     assert summary["transient_s"] == 12.0
     missed = 241 - 6 - summary["samples"] + summary["fallbacks"]  # before its first sample a controller has to hear of the robot
     if missed > 0 or summary["rms_error_mm"] >= 5.0:

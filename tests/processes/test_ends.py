@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Every kind of process, ended again and again just after somebody it talks to has left, hangs, or the network is gone.
+Ends of every kind of process, repeated: just after a peer has left or hangs, or the network has gone.
 
 `make ends` ends each kind 50 times, `--ends` says how often. A daemon thread that is inside Zenoh when the interpreter
 finalizes aborts the process (status 134); a link to somebody who hangs is closed for 10 s.
@@ -87,14 +87,14 @@ class Ending:
     said: str = field(repr=False)
 
     def clean(self, host: Host) -> bool:
-        """Whether it ended with status 0, nothing to complain about, and in time, but for what the host took of it."""
+        """Whether it ended with status 0, without complaints, and in time, less the delays caused by the host."""
         late_ms = 1e3 * (self.took_s - RAMP_S - END_S)
         in_time = late_ms <= 0.0 or explained(host, f"{self}", late_ms, self.signal_ns, self.signal_ns + round(1e9 * self.took_s))
         return self.status == 0 and in_time and "FATAL" not in self.said and "Traceback" not in self.said
 
 
 class Round:
-    """One robot that is driven by everybody there is, all of whom end at once."""
+    """One robot with every kind of process, all of which end at once."""
 
     def __init__(self, folder: Path, before: str) -> None:
         self.folder = folder
@@ -128,7 +128,7 @@ class Round:
         self._stack.close()
 
     def end(self, pause_s: float, number: signal.Signals) -> Iterator[Ending]:
-        """Let happen what happens before, and end all others, a while later."""
+        """Do what happens before the end, and end all other processes a while later."""
         if self._before.cut:
             ip("-n", self._namespace, "link", "set", "lo", "down")
         if self._before.victim:

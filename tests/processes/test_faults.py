@@ -15,7 +15,7 @@ from tests.processes.system import rti_mpc
 
 
 def matrix(path: Path, *names: str, timeout_s: float = 180.0) -> dict[str, dict[str, Any]]:
-    """Rows by name, as written to a file; the exit status is what they say."""
+    """Rows by name, as written to a file; the exit status agrees with them."""
     done = rti_mpc("faults", *(word for name in names for word in ("--only", name)), "--json", path, timeout_s=timeout_s)
     rows = json.loads(path.read_text())
     assert done.returncode == int(not all(row["kept"] for row in rows)), done.stdout + done.stderr

@@ -152,7 +152,7 @@ def test_ctrl_c_ends_the_guard_with_a_ramp_to_rest(driven: System, host: Host) -
 
 @pytest.mark.slow
 def test_terminals_that_hang_keep_nobody_from_driving_the_robot(tmp_path: Path) -> None:
-    """What they say is taken by nobody from the first line on, as after Ctrl-S, or where a connection was lost."""
+    """Nothing reads their output from the first line on, as after Ctrl-S or a lost connection."""
     write_robot(tmp_path / "robot.toml", FAST_STATES)
     roles = ("robot", "guard", "controller", "reference")
     with System(tmp_path, tmp_path / "robot.toml") as system, ExitStack() as stack:

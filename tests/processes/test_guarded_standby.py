@@ -2,8 +2,8 @@
 """
 Two controllers behind a guard: real processes, real signals, by the robot's own record, at 10 Hz and speed 1.
 
-Whoever leads, what the robot is told answers states that only the leader has
-answered, and it comes without a gap of more than three periods.
+Under each leader, the robot is sent answers to states that only this leader has
+answered, without a gap of more than three periods.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watched]:
 
 
 def passed(system: Watched, first: int = 0) -> list[Command]:
-    """What controllers have told the robot through the guard, from a message on."""
+    """Commands of controllers that the guard has passed, from a message on."""
     system.listen()
     return [command for command in system.actuation[first:] if command.mode is not Mode.BRAKING]
 
 
 def leader(system: Watched, passed: Command) -> int:
-    """Epoch that has answered the state which a command answers: the only one."""
+    """Epoch of the only controller that has answered the state which a command answers."""
     (epoch,) = {command.epoch for command in system.commands if command.state_seq == passed.state_seq}
     return epoch
 
 
 def passes(system: Watched, first: int, count: int) -> list[Command]:
-    """Wait until so many commands have passed the guard, from a message on."""
+    """Wait until this number of commands has passed the guard, from a message on."""
 
     def look() -> list[Command] | None:
         found = passed(system, first)
@@ -66,7 +66,7 @@ def passes(system: Watched, first: int, count: int) -> list[Command]:
 def test_commands_of_the_standby_pass_the_guard_in_time_and_none_of_the_old_leader_after_them(
     system: Watched, host: Host, number: signal.Signals
 ) -> None:
-    """A leader that was stopped goes on later; then the one who relieved it is killed, and it leads again."""
+    """A stopped leader continues later; then its successor is killed, and it leads again."""
     epoch = system.tracking().epoch
     dying = system.process(epoch)
     died_ns = system.fault(number, dying)
@@ -97,7 +97,7 @@ def test_commands_of_the_standby_pass_the_guard_in_time_and_none_of_the_old_lead
 
 
 def fence(system: Watched, epoch: int) -> None:
-    """Command as an old leader that does not notice that it is one: what the new one does, in the old epoch."""
+    """Command like an old leader that has not noticed its successor: the new leader's commands, in the old epoch."""
     forger = system.bus.publisher(KEYS.command)
 
     def forge() -> None:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Hosts that lose each other: the robot with its guard, a leader, and a standby, each on a host of its own, clients of a router between them.
+Network partition: robot with guard, leader and standby, each on a host of its own, as clients of a router between them.
 
-Again and again a link is cut for 0.2 to 10 s: that of whoever leads, and every
-fourth time the robot's, so that nobody leads. What was told to the robot is heard
-at the router; what it did is its own record, at speed 1.
+Repeatedly a link is cut for 0.2 to 10 s: that of the leader, and every
+fourth time the robot's, so that no controller leads. Commands to the robot are
+recorded at the router, its motion by the robot itself, at speed 1.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def network() -> Any:
 
 
 class Partitioned:
-    """The system on its hosts, and what is heard of it in the middle."""
+    """The system on its hosts, and the messages recorded at the router."""
 
     def __init__(self, network: Network, folder: Path, guarded: bool) -> None:
         self.network, self.folder, self.guarded = network, folder, guarded
@@ -91,7 +91,7 @@ class Partitioned:
         return follows and ready and abs(streams["state"][-1]["x"][3]) > 0.05
 
     def leads(self) -> str:
-        """Host of whoever has sent the last command."""
+        """Host of the controller that has sent the last command."""
         number = self.streams()["command"][-1]["epoch"] % (1 << NUMBER_BITS)
         return next(host for host in HOSTS[1:] if owner(self.said(host)) == number)
 
@@ -101,7 +101,7 @@ class Partitioned:
         return int(state["stamp_ns"] + at_ns - state["at_ns"])
 
     def suffer(self, host: str, duration_s: float) -> tuple[int, int, int]:
-        """Cut a host off for a while, wait until all is well again, and return when it was cut, restored and well, by the monotonic clock."""
+        """Cut a host off for a while, wait until the robot is driven again, and return the times of cut, restoration and recovery, monotonic."""
         cut_ns = time.monotonic_ns()
         self.network.cut(host)
         time.sleep(duration_s)  # the fault itself

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Hours in small: 200 samples per second in real time, by real processes, for as long as `--soak-s` says; `make soak` says half an hour.
+Soak test: 200 samples per second in real time, by real processes, for as long as `--soak-s` says; `make soak` says half an hour.
 
 Beside them a bare timer runs on each core. It computes nothing, so what makes it
-late is the host, and a period missed at such a moment is the host's, as is one at
+late is the host, and a period missed at such a moment is attributed to the host, as is one at
 which our processes waited for a core for half a period. A second bare timer
 goes before everybody else (SCHED_FIFO, where that is allowed): what it meets the
 host alone has done, and it tells how much is explained if nothing else counts.
@@ -122,7 +122,7 @@ def growth(times_s: np.ndarray, mib: np.ndarray) -> float:
 
 @dataclass
 class Soak:
-    """What was seen of a long drive, from a first sample to a last one."""
+    """Observations of a long drive, from a first sample to a last one."""
 
     first: Telemetry
     last: Telemetry
@@ -136,7 +136,7 @@ class Soak:
         return (self.log.seq > self.first.state_seq) & (self.log.seq <= self.last.state_seq)
 
     def account(self) -> dict[str, int]:
-        """Every state that was sent, by what became of it."""
+        """Count every state that was sent, by outcome."""
         seq, latency_us = self.log.seq[self.span], self.log.latency_us[self.span]
         assert np.all(np.diff(seq) == 1)
         answered = set(seq[np.isfinite(latency_us)].tolist())
@@ -166,7 +166,7 @@ def by_minute(seen: Soak, missed_ns: np.ndarray, timers: Timers) -> list[tuple[f
 
 
 def soak(folder: Path, duration_s: float) -> Soak:
-    """Drive, and look at the memory."""
+    """Drive, and record the memory of the processes."""
     looks = []
     with driven(folder, DT_S, duration_s + 60.0) as robot:
         first = robot.samples(COLD_SAMPLES)[-1]

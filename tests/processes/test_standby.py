@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Controllers that stand by, as processes: who leads when the leader is killed, stopped, resumed, or ended."""
+"""Standby controllers as processes: takeover when the leader is killed, stopped, resumed or ended."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An operator's stop among real processes: which restarts it outlives, and who confirms it."""
+"""Operator's stop among real processes: the restarts that it survives, and the processes that confirm it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Operated(System):
         return rti_mpc(word, self.config, "-e", self.endpoint, "--state", self.folder / "state", *options)
 
     def stands(self, samples: int = 20) -> None:
-        """Wait for so many states; no input is anything but rest from now on."""
+        """Wait for this number of states; from now on every input is at rest."""
         first = self.state(lambda _: True)
         last = self.state(lambda state: state.seq >= first.seq + samples)
         with (self.folder / "robot.csv").open(newline="") as file:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real processes, real Zenoh: what holds when they start, stop and die."""
+"""System of real processes over real Zenoh: behaviour when they start, stop and die."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_second_controller_refuses_to_start_beside_a_live_one(driven: System) ->
 
 
 def malformed(message: State | Command, rows: str) -> dict[str, bytes]:
-    """What is no message, by words of its refusal."""
+    """Malformed messages, by words of their refusal."""
     whole, values = encode(message), getattr(message, rows)
     return {
         "got no bytes": b"",
@@ -180,7 +180,7 @@ def malformed(message: State | Command, rows: str) -> dict[str, bytes]:
 def test_payload_of_every_malformed_kind_is_counted_and_published_while_control_goes_on(
     driven: System, host: Host, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """States to the controller and commands to the robot; of a flood of them each publishes one event a second."""
+    """States to the controller and commands to the robot; from a flood of them each process publishes one event per second."""
     ours = driven.bus.publisher(KEYS.state), driven.bus.publisher(KEYS.command)
     before, since_ns = driven.sample(), time.monotonic_ns()
     with Bus.join(BusSettings(connect=(driven.endpoint,)), KEYS) as another:

@@ -45,7 +45,7 @@ def configuration(folder: Path, dt_s: float, live: bool = False, more: str = "")
 
 
 class Watched(System):
-    """A system of which every command on the bus is kept, and all that a guard publishes."""
+    """A system with a record of every command on the bus and of everything that a guard publishes."""
 
     def __init__(self, folder: Path, dt_s: float, live: bool = False, more: str = "") -> None:
         super().__init__(folder, configuration(folder, dt_s, live, more), **ARGUMENTS)
@@ -72,7 +72,7 @@ class Watched(System):
         return self.commands
 
     def process(self, epoch: int) -> str:
-        """Which controller an epoch is of."""
+        """Return the controller that an epoch belongs to."""
         return next(role for role in CONTROLLERS & self.running.keys() if owner(self.said(role)) == epoch % (1 << NUMBER_BITS))
 
     def led_by_another(self, epoch: int) -> Command:
@@ -80,7 +80,7 @@ class Watched(System):
         return until(lambda: next((command for command in self.listen() if command.epoch > epoch), None), "another epoch")
 
     def answers(self, first: Command, count: int) -> None:
-        """Wait until a leader has sent so many commands more."""
+        """Wait until a leader has sent this number of further commands."""
         until(lambda: any(command.epoch == first.epoch and command.seq >= first.seq + count for command in self.listen()), "more commands")
 
     def samples_of_two_epochs(self) -> list[int]:
@@ -94,7 +94,7 @@ class Watched(System):
             return [row for row in csv.DictReader(file) if None not in row.values()]
 
     def answered_ns(self, command: Command) -> int:
-        """When the robot had taken a command at the latest, by its own log. It tells of the first answer to a state, a guard's ramp perhaps."""
+        """Latest time at which the robot took a command, by its log, which holds the first answer to each state, possibly a guard's ramp."""
 
         def look() -> int | None:
             answered = [row for row in self.log() if int(row["seq"]) >= command.state_seq and row["command_seq"]]
@@ -105,7 +105,7 @@ class Watched(System):
 
 
 def within_limits(host: Host, system: Watched) -> None:
-    """What acted never jumped, and never ran out, unless the host held up who is to answer."""
+    """Check that inputs never jumped, and commands never ran out, unless the host held up the process that had to answer."""
     rows = system.log()
     u = np.array([[float(row["u_c"]), float(row["omega_c"])] for row in rows])
     assert np.all(np.abs(np.diff(u, axis=0)) <= np.array([SPEED_LIMIT, TURN_LIMIT]) * system.dt_s + 1e-9)  # rounding

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""References of outputs: where they begin, where they end, and what of a file is refused."""
+"""References of outputs: start, end, and refused files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_outputs_begin_where_the_robot_is_and_those_that_do_not_move_stay_there(
 @pytest.mark.parametrize("name", OUTPUT_SCENARIOS)
 @pytest.mark.parametrize("start", [0.0, 0.05, 0.2, -3.0], ids=["at a bound", "near it", "between both", "beyond it"])
 def test_outputs_stay_inside_their_bounds_wherever_they_begin(name: str, start: float) -> None:
-    """Of one that begins beyond them, on the way back: it does not move farther away."""
+    """An output that begins outside its bounds does not move farther away."""
     y = OUTPUT_SCENARIOS[name](np.zeros(1), np.full(1, 0.4), [0]).rows(np.array([start]), T)
     assert y.min() >= min(start, 0.0)
     assert y.max() <= 0.4

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded paths: their headings can be followed; what was laid out stays as it is."""
+"""Smoothing of recorded paths: their headings can be followed, and paths without noise are not changed."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recursion over active bounds, against QPs that others solve to 1e-9 and better."""
+"""Active-set solver on the recursion, against QPs solved by other solvers to 1e-9 or better."""
 
 from __future__ import annotations
 

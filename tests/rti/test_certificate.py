@@ -34,7 +34,7 @@ def test_plan_that_is_solved_has_a_gap_below_a_millionth(name: str) -> None:
 
 @pytest.mark.parametrize("by", [1e-3, 1e-2])
 def test_gap_is_at_least_what_a_worse_plan_costs_more(by: float) -> None:
-    """Of a linear problem, its plan and states moved together; the multipliers are those of the optimum, or too large by half."""
+    """A linear problem whose plan and states are moved together; the multipliers are those of the optimum, or 1.5 times as large."""
     ocp = double_integrator(lbu=-1.0, ubu=1.0, lbdu=-0.5, ubdu=0.4)
     rti = Rti(ocp, iterations=1, compile=False)
     x0, y_ref = np.array([0.5, -0.3]), np.tile([2.0, 0.0], (ocp.N, 1))
@@ -69,7 +69,7 @@ def test_plan_that_breaks_dynamics_or_a_bound_is_not_certified() -> None:
 
 
 def test_a_penalty_that_gives_way_is_refined_or_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Held by next to nothing, a bound is exceeded without its price being paid: that is not SOLVED."""
+    """With far too small a penalty a hard bound is exceeded: the status must not be SOLVED."""
     ocp = double_integrator(N=20, lbu=-1.0, ubu=1.0, lbx=[-np.inf, -0.3], ubx=[np.inf, 0.3])
     monkeypatch.setattr("rti_mpc.rti.active_set.PENALTY_PATH", (10.0,))
     rti = Rti(ocp, iterations=1, compile=False)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models that are singular at zero, which they never see, are built and driven; stiff ones are refused as such."""
+"""Models that are singular at zero, outside their range of operation: built and driven. Stiff models: refused as such."""
 
 from __future__ import annotations
 

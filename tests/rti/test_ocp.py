@@ -84,7 +84,7 @@ def test_bounds_that_leave_out_a_declared_rest_are_refused_with_the_input_and_it
 
 
 def test_bounds_without_zero_are_a_problem_but_none_to_stop_a_robot_in() -> None:
-    """The library may solve it; who stops robots refuses it."""
+    """The library may solve it; the service, which must be able to stop the robot, refuses it."""
     ocp = pioneer(lbu=[0.2, -0.745])
     assert "bounds of input u_c must hold its rest, 0 m/s" in rest_fault(ocp)
     assert "increments of input omega_c must hold lower < 0 < upper" in rest_fault(pioneer(lbdu=[-0.25, 0.0]))

@@ -36,7 +36,7 @@ def robot(names: str, units: str, f: Any, nu: int, **options: Any) -> Ocp:
 
 
 def car(x: Any, u: Any) -> tuple[Any, ...]:
-    """README's: acceleration and curvature."""
+    """README's car, driven by acceleration and curvature."""
     return x[3] * ca.cos(x[2]), x[3] * ca.sin(x[2]), x[3] * u[1], u[0]
 
 

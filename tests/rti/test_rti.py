@@ -124,7 +124,7 @@ def test_inputs_are_held_after_the_control_horizon() -> None:
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_cost_and_violation_are_those_of_the_plan(formulation: str) -> None:
-    """Of one that is not converged, and from a state that lies beyond its bounds."""
+    """Checked on a plan that is not converged, and from a state outside its bounds."""
     ocp = pioneer(N=10, N_u=4, delta=np.linspace(1, 28, 10), lambda_=[0.8, 0.7, 0.6, 0.5], **NARROW)
     rti = Rti(ocp, TIGHT, formulation=formulation, compile=False)
     ((x0, y_ref, u_prev),) = near_the_eight(ocp, seed=4, count=1)
@@ -293,7 +293,7 @@ def test_state_and_reference_rotated_and_shifted_give_the_same_command(turn_rad:
 
 
 def test_headings_a_full_turn_on_change_nothing() -> None:
-    """Of state and reference alike: nobody wraps inside."""
+    """In state and reference alike: no angle is wrapped inside."""
     ocp = pioneer()
     rti = Rti(ocp, TIGHT)
     ((x0, y_ref, u_prev),) = near_the_eight(ocp, seed=7, count=1)
@@ -377,7 +377,7 @@ def test_shift_moves_the_guess_on_by_one_stage() -> None:
 
 
 def test_previous_input_may_be_another_than_the_plans() -> None:
-    """It is what increments are bounded against."""
+    """Increments are bounded relative to it."""
     ocp = pioneer()
     rti = Rti(ocp, TIGHT)
     ((x0, y_ref, _),) = near_the_eight(ocp, seed=13, count=1)
@@ -478,7 +478,7 @@ def test_state_that_is_not_finite_or_beyond_all_reason_fails_and_is_forgotten(fo
 
 
 def test_parameters_out_of_all_proportion_fail_without_a_word_on_stdout(capfd: pytest.CaptureFixture[str]) -> None:
-    """OSQP prints what it cannot factorize, and a pipe that nobody reads would hold the sample up."""
+    """OSQP prints a message if it cannot factorize, and a pipe without a reader would block the sample."""
     ocp = pioneer()
     ((x0, y_ref, _),) = near_the_eight(ocp, seed=21, count=1)
     huge = np.tile(1e200 * np.array(ocp.model.p_nominal), (ocp.N + 1, 1))
@@ -550,7 +550,7 @@ def test_infeasible_qp_leaves_the_plan_and_the_next_solve_is_right(formulation: 
 
 
 def test_failed_solve_never_seeds_the_next() -> None:
-    """What follows is bit for bit what follows a cold start."""
+    """The next samples are those after a cold start, bit for bit."""
     ocp = pioneer()
     ((x0, y_ref, _),) = near_the_eight(ocp, seed=16, count=1)
     failed, cold = Rti(ocp, solver="osqp"), Rti(ocp, solver="osqp")
@@ -597,7 +597,7 @@ def test_feedback_touches_only_the_initial_state_rows() -> None:
 
 
 def test_arrays_never_move() -> None:
-    """Compiled code holds their addresses."""
+    """Compiled code keeps their addresses."""
     ocp = pioneer()
     rti = Rti(ocp)
     arrays = (rti.x, rti.u, rti.u_prev, rti.y_ref, rti.p)
@@ -635,7 +635,7 @@ def test_prepare_and_feedback_do_not_grow_the_heap() -> None:
     ],
 )
 def test_resident_memory_stays_flat(solver: str, samples: int) -> None:
-    """What tracemalloc does not see: compiled code's and OSQP's own memory, failures and cold starts included."""
+    """Memory that tracemalloc does not see: that of compiled code and OSQP, with failures and cold starts."""
     ocp = pioneer()
     rti = Rti(ocp, SolverSettings(eps=1e-3, max_iter=50), solver=solver)
     known = list(near_the_eight(ocp, seed=20, count=50))

@@ -51,7 +51,7 @@ def test_a_speed_bound_that_can_be_kept_is_kept_in_any_unit_of_the_force(unit: s
 @pytest.mark.parametrize(("solver", "atol"), [("osqp", 1e-8), ("daqp", 1e-8), ("piqp", 1e-7)])
 @pytest.mark.parametrize("unit", ["N", "mN"])
 def test_other_solvers_are_given_the_same_numbers_in_any_unit(solver: str, atol: float, unit: str) -> None:
-    """So that OSQP's steps are the same, loose as its tolerance is."""
+    """So that OSQP takes the same steps, in spite of its loose tolerance."""
     commands, _, iterations, _ = driven(cart_ocp(NEWTONS[unit]), solver, samples=25)
     theirs, _, their_iterations, _ = driven(cart_ocp(1000.0), solver, samples=25)
     np.testing.assert_allclose(commands * NEWTONS[unit] / 5000, theirs * 1000 / 5000, rtol=0, atol=atol)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every solver in either formulation, on the same random problems: one plan."""
+"""Agreement of all solvers in both formulations on the same random problems."""
 
 from __future__ import annotations
 

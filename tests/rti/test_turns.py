@@ -113,7 +113,7 @@ def turned(request: pytest.FixtureRequest) -> Rti:
 @pytest.mark.parametrize("flip", [3.1, 3.3, -3.1, -3.3, TURN, -TURN, 2 * TURN])
 @pytest.mark.parametrize("samples", [1, 2, 5])
 def test_wrong_angles_are_forgotten_when_they_are_over(turned: Rti, flip: float, samples: int) -> None:
-    """Whichever way the robot turns meanwhile, and whichever turn the wrong samples have left it in."""
+    """For any direction of the robot's motion, and any turn that the wrong samples have led to."""
     rti = turned
     for speed in (0.5, -0.5):
         rti.reset(np.zeros(1), np.full(1, speed))
@@ -160,7 +160,7 @@ def test_reference_that_turns_on_and_on_is_followed_through_every_turn(turned: R
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("middle", [0.0, 3.0, -9.0])
 def test_angle_with_bounds_is_taken_in_the_turn_of_its_bounds(solver: str, middle: float) -> None:
-    """However it is measured; and a wrong sample leaves it there: a joint at its stop must not be sent through it."""
+    """For any measured turn, and after a wrong sample: a joint at its stop must not be driven through it."""
     rti = Rti(turret(lbx=middle - 1.5, ubx=middle + 1.5), solver=solver, compile=False)
     measured = wrap(middle + np.array([1.0] * 5 + [-2.2] + [1.0] * 25))
     rti.reset(measured[:1], np.zeros(1))

@@ -137,7 +137,7 @@ def test_missing_viewer_is_one_line_that_says_what_to_install(tmp_path: Path) ->
 
 
 def test_news_of_matplotlib_is_not_ours_to_tell() -> None:
-    """It tells of fonts it has found, once on a machine: in the middle of a newcomer's first demo."""
+    """Matplotlib logs the fonts it has found, once per machine, in the middle of the first demo."""
     say = """
 import logging
 from rti_mpc_service import log

@@ -75,7 +75,7 @@ def flooded(endpoint: str) -> Iterator[None]:
 
 
 def test_process_ends_well_while_its_threads_are_inside_zenoh() -> None:
-    """As they are where the bus could not be closed in time: what comes for them meets an interpreter that is going down."""
+    """As when the bus could not be closed in time: messages arrive while the interpreter is finalizing."""
     endpoint = free_endpoint()
     with flooded(endpoint):
         done = run(LISTENER, endpoint)

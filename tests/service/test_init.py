@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files of a robot of one's own: written once, never over others, and each a robot that fits."""
+"""Files written by `rti-mpc init`: existing files are never overwritten, and every robot is valid."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The file of a latch: what is read is what was written, whole, or a stop."""
+"""File of a latch: read as it was written, in full, or else as a stop."""
 
 from __future__ import annotations
 

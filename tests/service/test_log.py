@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Log of a process, also when nobody reads it."""
+"""Log of a process, also when its output is not read."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ news.info("the last news")
 
 @pytest.fixture
 def talker() -> Iterator[subprocess.Popen[str]]:
-    """A process that has said more than anybody listens to, and waits for the end of its input."""
+    """A process that has written more than its reader takes, and waits for the end of its input."""
     pipe = subprocess.PIPE
     command = [sys.executable, "-c", TALK]
     with subprocess.Popen(command, cwd=ROOT, env=environment(), stdin=pipe, stdout=pipe, stderr=pipe, pipesize=PIPE_BYTES, text=True) as talker:

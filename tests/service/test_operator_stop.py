@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An operator's stop in one process, on a bus made of a queue."""
+"""Operator's stop in one process, on a bus made of a queue."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PATIENCE_S = 10.0
 
 
 class Disk(LatchFile):
-    """A file whose writes wait until they may, and may fail."""
+    """A file whose writes wait until the test allows them, and may fail."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(Keys(), folder)
@@ -44,7 +44,7 @@ class Disk(LatchFile):
 
 
 class Process:
-    """A process that obeys, and all that it does about it."""
+    """A process that obeys stops, and a record of its actions."""
 
     def __init__(self, file: LatchFile) -> None:
         self.obeyed: list[Latch] = []
@@ -194,7 +194,7 @@ def test_nothing_that_is_heard_ends_the_thread_that_hears(disk: Disk) -> None:
 
 
 def test_request_that_was_asked_again_is_not_done_twice(disk: Disk) -> None:
-    """Asked to release with a latch that is known by now, a process that was stopped anew meanwhile stays stopped."""
+    """A process that was stopped again stays stopped if an earlier release is repeated."""
     process = Process(disk)
     process.ask("stop")
     released = process.ask("enable")["latch"]

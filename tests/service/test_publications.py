@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The column of the table of streams that says who may publish, against each process as it runs."""
+"""Column `publishers` of the table of streams, compared with what each process publishes."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_every_role_that_may_publish_has_a_process_here() -> None:
 
 
 def test_operator_asks_whom_the_table_lets_him(session: FakeSession, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """And in fault injection the relay, too."""
+    """In fault injection, also the relay."""
     assert request.main(SETTINGS, KEYS, "params", 0.05) == 1
     assert request.stop_or_enable(SETTINGS, KEYS, "stop", 0.05, guarded=False, state=tmp_path) == 1
     assert session.asked == {stream.name for stream in STREAMS if "operator" in stream.askers} - {RELAY.name}

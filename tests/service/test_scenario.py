@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What robots follow: by roles in the plane, by outputs else, and refused by the names that users wrote."""
+"""Scenarios: references by roles in the plane, by outputs elsewhere; refusals use the names that users wrote."""
 
 from __future__ import annotations
 

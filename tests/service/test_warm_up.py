@@ -20,7 +20,7 @@ class Watched(Rti):
 
 
 def test_robot_of_the_warm_up_does_what_the_plan_says() -> None:
-    """One held in place falls in its plans, further in each, until they are out of all range."""
+    """For a robot held in place, successive plans would fall further and further, out of all range."""
     rti = Watched(double_integrator(lbu=1.0, ubu=2.0), compile=False)
     warm_up(rti)
     assert len(rti.seen) == WARM_UP_SOLVES

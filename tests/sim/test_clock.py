@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The clock keeps an absolute grid."""
+"""Clock of the simulation: waits end on an absolute grid."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot's record: one line per state, with its answer."""
+"""Log of the robot: one line per state, with its answer."""
 
 from __future__ import annotations
 

@@ -220,7 +220,7 @@ def test_source_anchors_its_reference_to_every_new_robot_and_keeps_it_for_late_j
     ("speed", "said"), [(0.0, "stopped, and stands"), (0.5, "stopped, and coasts with its inputs at rest: p changes by 0.5 m per s")]
 )
 def test_robot_says_that_it_stands_only_if_it_does(endpoint: str, caplog: pytest.LogCaptureFixture, speed: float, said: str) -> None:
-    """Nothing brakes a mass whose input is an acceleration, and which was never commanded."""
+    """A mass whose input is an acceleration, and which was never commanded, does not brake."""
     settings = RobotSettings(pushed(), np.array([0.0, speed]))
     with caplog.at_level("INFO", logger="robot"):
         robot.main(settings, BusSettings(listen=(endpoint,), connect=()), KEYS, duration_s=0.1, stop=threading.Event())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise, delay and dropout repeat with their seed."""
+"""Sensor: noise, delay and dropout are reproduced by their seed."""
 
 from __future__ import annotations
 

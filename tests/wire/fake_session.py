@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Session without a network and without other processes, which records what is declared on it."""
+"""Fake session without network and other processes, which records all declarations."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The other process of the bus tests: ``python peer.py WHAT ENDPOINT [listen]``; runs until it is killed or its work is done."""
+"""Second process of the bus tests: ``python peer.py WHAT ENDPOINT [listen]``; runs until it is killed or its work is done."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FAST = ("transport/link/tx/lease:600",)  # ms: hangs are noticed soon
 
 
 def echo(bus: Bus) -> None:
-    """Answer every state with a command of its number; thousand telemetry events a second with ten states in ten milliseconds."""
+    """Answer every state with a command of its number, and with ten long events as load."""
     states = bus.subscriber(KEYS.state)
     commands = bus.publisher(KEYS.command)
     telemetry = bus.publisher(KEYS.telemetry)

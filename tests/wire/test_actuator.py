@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robot's side of the command contract, rule by rule."""
+"""Actuator: the robot's side of the command contract, rule by rule."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def command(seq: int = 1, stamp_ms: int = 0, first: float = 0.1, epoch: int = 10
 
 
 def played(robot: Actuator, from_ms: float, to_ms: float) -> list[tuple[float, float]]:
-    """When the first input changes to what, from an instant on."""
+    """Times and values of the changes of the first input, from an instant on."""
     changes: list[tuple[float, float]] = []
     start_ns = round(from_ms * MS)
     for until_ns, u in robot.play(start_ns, round(to_ms * MS)):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Events: which are published each time, and which at a limited rate."""
+"""Announcer of events: changes are published each time, faults at a limited rate."""
 
 from __future__ import annotations
 

@@ -194,7 +194,7 @@ def test_late_joiners_get_the_last_event_and_info_of_every_role(join: Any) -> No
 
 
 def test_nothing_grows_when_a_role_is_taken_again_and_again(join: Any) -> None:
-    """A late joiner gets one last event, not one for every time; and the bus holds one publisher and one token a role."""
+    """A late joiner gets one last event, not one for every time; and the bus holds one publisher and one token per role."""
     robot = join(robot=True)
     for epoch in range(1, 6):
         for role in ("controller", "standby"):
@@ -247,7 +247,7 @@ def test_a_ring_keeps_the_newest(join: Any) -> None:
 
 
 def test_a_ring_holds_fewer_of_what_may_be_long(join: Any) -> None:
-    """Bytes, not messages, are what a host runs out of: 1024 of the longest references would be 8 GiB."""
+    """A ring is limited in bytes as well: 1024 of the longest references would be 8 GiB."""
     robot, other = join(robot=True), join()
     references = robot.subscriber(KEYS.reference, capacity=RING_MESSAGES)
     marks = robot.subscriber(KEYS.event("planner"))  # of the same priority: what was sent before has come before
@@ -319,7 +319,7 @@ def test_close_unblocks_whoever_waits(join: Any) -> None:
 
 
 def test_one_session_speaks_for_two_robots(join: Any, endpoint: str) -> None:
-    """Each is met, asked and left as if it had a process of its own."""
+    """Each is found, queried and left as if it had a separate process."""
     keys = Keys(robot="first"), Keys(robot="second")
     with ZenohSession(BusSettings(listen=(endpoint,), connect=(endpoint,), cfg=FAST)) as session:
         robots = [Bus(session, mine) for mine in keys]

@@ -42,7 +42,7 @@ def test_other_names_are_none(name: str) -> None:
 
 
 def test_a_key_knows_its_stream_wherever_it_lies() -> None:
-    """No name of a robot, and no role, makes it another: an event of the role `state` has the size of an event."""
+    """Names of robots and roles do not confuse it: an event of the role `state` has the size of an event."""
     keys = Keys("state/fleet", "event")
     longest = {"state": 1 << 16, "anchored": 1 << 23, "actuation": 1 << 20, "standby_telemetry": 1 << 21, "events": 1 << 13, "infos": 1 << 16}
     assert {name: getattr(keys, name).stream.max_bytes for name in longest} == longest

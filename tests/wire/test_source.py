@@ -75,5 +75,5 @@ def test_foreign_messages_do_not_keep_a_source_alive_nor_disturb_it(source: Sour
 
 
 def test_every_verdict_is_a_word_that_an_event_s_code_can_end_with() -> None:
-    """As those of the robot do: a number far ahead was told as one with spaces."""
+    """Codes have no spaces, as those of the robot."""
     assert [verdict for verdict in Verdict if not re.fullmatch(r"[a-z]+(_[a-z]+)*", verdict.value)] == []

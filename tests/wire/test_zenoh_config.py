@@ -90,7 +90,7 @@ def test_an_endpoint_already_taken_is_refused() -> None:
 
 @pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1", "127.0.0.1:7447", "tcp/", "tls/robot.local", ""])
 def test_endpoint_that_is_none_is_refused_with_one_that_would_be(endpoint: str) -> None:
-    """Zenoh would look for it for ever."""
+    """Zenoh would try to reach it for ever."""
     for settings in (BusSettings(connect=(endpoint,)), BusSettings(listen=(endpoint,))):
         with pytest.raises(ConfigError, match=re.escape(f"such as {RENDEZVOUS_ENDPOINT}, got {endpoint!r}")):
             zenoh_config(settings)

@@ -24,7 +24,7 @@ def rti(settings: SolverSettings = TIGHT, formulation: str = "simultaneous") -> 
 
 
 def test_inner_object_of_osqp_offers_what_is_driven() -> None:
-    """It is not public: another minor version may move it, and this is where that shows."""
+    """It is not public: this test fails if another minor version of OSQP moves it."""
     assert osqp.__version__.startswith("1.1.")
     inner = rti().solver.workspace
     for name in ("update_data_vec", "update_data_mat", "solve", "warm_start"):
@@ -72,7 +72,7 @@ def test_second_solve_starts_from_the_first_and_a_cold_one_does_not() -> None:
 
 
 def test_nan_never_reaches_osqp() -> None:
-    """One would poison every later solve, and raise nothing."""
+    """OSQP raises no error for NaN, and every later solve fails."""
     one = rti()
     solve(one, 1)
     seen: list[Array] = []
@@ -128,7 +128,7 @@ def test_data_that_osqp_refuses_is_a_failure_not_a_solve_of_what_it_held_before(
 
 
 def test_matrix_that_cannot_be_factorized_is_a_failure_and_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
-    """OSQP would print a line of its own, in the middle of a log."""
+    """OSQP would print a line of its own into the log."""
     x, u, p = ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("p", 4)
     states = (Signal("r", "m"), Signal("v", "m/s"))
     any_linear = Model(

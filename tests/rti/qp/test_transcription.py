@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The QP of one sample: every number of it against finite differences of the OCP, every pattern against what is ever nonzero."""
+"""Transcription of the QP of one sample: every number against finite differences of the OCP, every pattern against all possible nonzero entries."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class ByHand:
         return v[: x.size].reshape(x.shape), v[x.size : x.size + u.size].reshape(u.shape), v[x.size + u.size :].reshape(self.ocp.N, -1)
 
     def residuals(self, v: Array) -> Array:
-        """What the normalised Gauss-Newton cost is the squared norm of, slacks apart."""
+        """Residuals whose squared norm is the normalised Gauss-Newton cost, without slacks."""
         ocp, rti = self.ocp, self._rti
         x, u, _ = self._split(v)
         root_Q, root_R = (np.linalg.cholesky(W).T for W in (ocp.Q, ocp.R))

@@ -39,7 +39,7 @@ def test_a_family_that_rests_stays_where_it_rests(name: str) -> None:
 
 
 def test_converged_and_real_time_iteration_agree_where_softened_bounds_and_slew_limits_act() -> None:
-    """The yardstick has the problem's own slacks, increments and parameters: iterated to convergence, both give one command."""
+    """IPOPT solves the problem with its slacks, increments and parameters: iterated to convergence, both give the same command."""
     family = FAMILIES["slalom"][0](10)
     x, u = np.array([0.3, 0.0, 0.0, 0.3, 0.0]), np.array([0.3, 0.0])
     y_ref, p = family.at(12)

@@ -68,7 +68,7 @@ def test_every_bound_is_driven_to(tmp_path: Path) -> None:
 
 
 def test_a_bound_that_gives_way_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The penalty that holds what is at its bound, too soft by far: the reference in a wave never touches one."""
+    """With far too small a penalty on bounds; samples along a wave of the reference alone never reach a bound."""
     path = tmp_path / "robot.toml"
     path.write_text(CART)
     monkeypatch.setattr("rti_mpc.rti.active_set.PENALTY_PATH", (10.0,))

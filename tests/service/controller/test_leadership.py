@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A controller among others, on a bus made of lists: which messages it reads, and what it publishes."""
+"""Controller among others, on a bus made of lists: messages that it reads and publishes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ HASH = 7
 
 @dataclass
 class Wire:
-    """What all hear of each other."""
+    """Messages that all controllers receive from each other."""
 
     buses: list[WireBus] = field(default_factory=list)
 
@@ -184,7 +184,7 @@ def test_a_hundred_names_keep_nobody_from_taking_over(pair: tuple[One, One]) -> 
 
 
 def test_what_is_no_command_for_this_robot_unseats_nobody_and_is_counted(pair: tuple[One, One]) -> None:
-    """Of a robot with more inputs, or of a version to come: it says that it leads, and it cannot be played."""
+    """Commands for more inputs, or of a later version: they claim to lead, but cannot be played."""
     leader, standby = pair
     command = replace(standby.made(5), epoch=leader.leadership.epoch + 1)
     leader.wire.put(standby.bus, encode(replace(command, u=np.zeros((1, 2)))))
@@ -210,7 +210,7 @@ def test_what_is_decided_reaches_the_controller_and_the_bus(pair: tuple[One, One
 
 @pytest.mark.parametrize(("rows", "most"), [(1, MAX_MESSAGES_PER_LOOK), (MAX_BYTES_PER_LOOK // 8, 1)], ids=["many", "long"])
 def test_one_look_reads_no_more_than_it_takes_whatever_waits(pair: tuple[One, One], rows: int, most: int) -> None:
-    """Each has a higher sequence number than all before: none is left out by what was read."""
+    """Each has a higher sequence number than all before, so none is dropped as old."""
     leader, standby = pair
     long = np.zeros((rows, 1))
     flood = [replace(leader.made(4), epoch=leader.leadership.epoch, state_seq=40, seq=100 + i, u=long) for i in range(3 * MAX_MESSAGES_PER_LOOK)]

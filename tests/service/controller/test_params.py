@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of a running controller: which changes are granted, which are refused and why, and that no change is granted in part."""
+"""Parameters of a running controller: changes that are granted, and those that are refused, with the reason; none is granted in part."""
 
 from __future__ import annotations
 

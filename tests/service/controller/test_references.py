@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""References on their way to a controller: which thread does what."""
+"""References on their way to a controller, through two threads."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from tests.problems import pioneer
 
 
 class Published(list[Reference]):
-    """What is published, and the newest of it last."""
+    """Published messages, the newest last."""
 
     def put(self, message: Reference) -> None:
         self.append(message)
 
 
 class Followed(SimpleNamespace):
-    """A controller that gives a stamp to what arrives, and remembers what it follows."""
+    """A controller that gives a stamp to each reference, and records which one it follows."""
 
     np_ = 7
     newest: Reference | None = None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Excuses: which delays a busy host explains, and which it does not."""
+"""Excuses of a busy host: the delays that it explains, and those that it does not."""
 
 from __future__ import annotations
 

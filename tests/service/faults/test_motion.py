@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What faults of robots are measured by, whatever they are, and what robots promise that follow no path or coast."""
+"""Measures of faults for any robot, and promises for robots that follow no path or that coast."""
 
 from __future__ import annotations
 

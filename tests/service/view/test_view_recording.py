@@ -277,7 +277,7 @@ def test_the_recording_carries_a_blueprint_for_its_application(writer: Writer) -
 
 
 def test_absurd_numbers_are_written_or_left_out_and_what_is_honest_stays(writer: Writer) -> None:
-    """What the door lets in: of telemetry any number, of the others magnitudes up to 1e18, and stamps up to 2^62."""
+    """Values that receivers accept: any number in telemetry, elsewhere magnitudes up to 1e18, and stamps up to 2^62."""
     largest, last_ns = 1e18, 2**62 - 1
     writer.send(PIONEER, state(1, [1.0, 2.0, 0.1, 0.2, 0.3]))
     for k, value in enumerate((np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324, -0.0)):
