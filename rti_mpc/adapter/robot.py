@@ -156,7 +156,7 @@ class RobotAdapter:
             pass
         self._played_ns = now_ns + 1
         if self._actuator.counters.starved > starved:
-            ran_out = Notice(Severity.ERROR, "command_ran_out", "no valid command is left: the robot brakes to rest on its own")
+            ran_out = Notice(Severity.ERROR, "command_ran_out", "no valid command is left: the robot goes to rest by itself")
             self._announcer.say(ran_out, now_ns)
         for notice in self._intake.notices(now_ns):
             self._announcer.say(notice, now_ns)

@@ -154,10 +154,10 @@ class Guard:
         if self._stopped:
             return None
         if self._state is None:
-            self._wait("a state of the robot is heard")
+            self._wait("a state of the robot has arrived")
             return None
         if not (self._cadence.known or self._cadence.fault):
-            self._wait("two states have shown how fast the clock of the robot runs")
+            self._wait("two states have shown the rate of the robot's clock")
             return None
         now_ns = self._clock.now_ns(local_ns)
         until_ns = min(end_ns(command), command.state_stamp_ns + self._delay_ns + MAX_VALID_NS)
@@ -166,7 +166,7 @@ class Guard:
             self._follow(command)
             self._led_ns = now_ns
             if now_ns < self._open_ns:
-                self._wait("what an earlier guard may have told the robot has run out")
+                self._wait("all commands of an earlier guard have expired")
                 return None
         if reason:
             code, _, why = reason.partition(": ")
@@ -179,7 +179,7 @@ class Guard:
         passed = self._numbered(replace(command, valid_until_ns=min(command.valid_until_ns, until_ns), u=u, u_rest=u_rest))
         passed.u = self._schedule.add(passed, start_ns, until_ns)
         if (np.abs(passed.u - u) > INPUT_ROUNDING).any():
-            text = f"command {command.seq} of epoch {command.epoch} begins too far from what acts: approached inside the slew limits"
+            text = f"command {command.seq} of epoch {command.epoch} begins too far from the acting inputs: it is approached inside the slew limits"
             self._say(Severity.WARNING, "slew_limited", text)
         self._waits = ""
         if not self.passing:
@@ -273,7 +273,7 @@ class Guard:
             self._say(Severity.ERROR if moving else Severity.WARNING, "guard_braking", text, change=True)
         elif moving and self._latched and now_ns >= self._rest_by_ns:
             self._brake(now_ns, now_ns)
-            self._say(Severity.ERROR, "guard_braking", "the robot was to stand by now: braking to rest", change=True)
+            self._say(Severity.ERROR, "guard_braking", "the robot should stand by now, but its inputs are not at rest: braking to rest", change=True)
 
     def stop(self, local_ns: int) -> None:
         """Refuse all further commands: from now on the robot is commanded to ramp to rest, and to stand."""
@@ -312,17 +312,17 @@ class Guard:
         limits, epoch, seq = self._limits, *self._leader
         assert self._state is not None, "commands wait for the first state"
         if self._lives.disputed:
-            return "two_robots: it is not known which robot it is for"
+            return "two_robots: it is not known which of two robots it is for"
         if self._cadence.fault:
             return f"untimed: {self._cadence.fault}"
         if self._untold:
-            return "held: the robot is told to brake first"
+            return "held: after a jump of the clock the robot must brake first"
         if command.epoch < epoch:
             return f"fenced: epoch {epoch} has taken over"
         if command.epoch == epoch and command.seq == seq:
             return "repeated"
         if command.epoch == epoch and now_ns - self._led_ns <= LEADER_SILENCE_NS and not seq < command.seq <= seq + MAX_SEQ_GAP:
-            return f"old: {seq} has passed" if command.seq < seq else f"ahead: the last one was {seq}"
+            return f"old: command {seq} has passed" if command.seq < seq else f"ahead: the last one was {seq}"
         if reason := unfit(command, len(limits.u_rest), self._state.epoch, len(self._state.x)):
             return reason
         if now_ns - self._clock.stamp_ns > max(self._stale_ns, 2.5 * self._clock.period_ns):
@@ -414,7 +414,7 @@ class Guard:
             self._open_ns = state.stamp_ns + round(1e9 * self._limits.settling_s)
         else:
             self._open_ns = BEFORE_ALL_NS
-            self._say(Severity.WARNING, "robot_restarted", "the robot was restarted: starting anew")
+            self._say(Severity.WARNING, "robot_restarted", "the robot was restarted: its inputs are taken to be at rest")
         self._clock.reset()
         self._schedule.brake(self._limits.u_rest, BEFORE_ALL_NS)
         self._leader = 0, -1

@@ -154,7 +154,7 @@ class Leadership:
         if self.leading:
             self._stand_by()
             whose = "" if command.config_hash == self._config_hash else f" of another configuration, {command.config_hash:016x},"
-            text = f"stands by: epoch {command.epoch}{whose} leads, ours was {self.epoch}"
+            text = f"stands by: epoch {command.epoch}{whose} leads, this controller's was {self.epoch}"
             self._say(Notice(Severity.WARNING, "stepped_down", text))
         if command.state_epoch == self._robot_epoch:
             self._quiet_ns = max(self._quiet_ns, command.state_stamp_ns)
@@ -203,7 +203,7 @@ class Leadership:
         self._belongs |= config_hash == self._config_hash
         misfit = "" if self._belongs else differ(config_hash, self._config_hash)
         if misfit and misfit != self.misfit:
-            self._say(Notice(Severity.ERROR, "misfit", f"{misfit}: it takes over from nobody"))
+            self._say(Notice(Severity.ERROR, "misfit", f"{misfit}: this standby does not take over"))
         self.misfit = misfit
 
     def _take_over(self, silent_ns: int) -> None:
@@ -211,7 +211,7 @@ class Leadership:
         self.epoch = epoch_above(max(self.epoch - 1, self._last[0]), self.number)
         self._last = self.epoch, ABOVE_EVERY_SEQ
         self.leading = self._belongs = True
-        text = f"leads from now on, with epoch {self.epoch}: nobody has answered a state for {1e-9 * silent_ns:.3f} s"
+        text = f"leads from now on, with epoch {self.epoch}: no controller has answered a state for {1e-9 * silent_ns:.3f} s"
         self._took_over = Notice(Severity.WARNING, "took_over", text)
 
     def _stand_by(self) -> None:
@@ -226,4 +226,4 @@ class Leadership:
 
 def differ(leader: int, ours: int) -> str:
     """Return the text that two configurations differ."""
-    return f"a standby needs the leader's configuration: its hash is {leader:016x}, ours {ours:016x}"
+    return f"a standby needs the leader's configuration: its hash is {leader:016x}, this standby's {ours:016x}"

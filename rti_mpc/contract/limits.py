@@ -71,7 +71,7 @@ class Limits:
     def objection(self, command: Command) -> str:
         """Return what is wrong with the rows of a command, as a code and a reason; empty if nothing is."""
         if len(command.K) and len(self.angles) != command.K.shape[1]:
-            return f"wrong_shape: it feeds {command.K.shape[1]} states back on its way to rest, of {len(self.angles)} known"
+            return f"wrong_shape: its way to rest feeds {command.K.shape[1]} states back, of {len(self.angles)} that are known"
         for u, period_ns, of in judged(command):
             if (u < self.lbu - INPUT_ROUNDING).any() or (u > self.ubu + INPUT_ROUNDING).any():
                 return f"out_of_bounds: inputs{of} reach from {u.min(axis=0).tolist()} to {u.max(axis=0).tolist()}"

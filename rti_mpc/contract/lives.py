@@ -111,7 +111,7 @@ class Lives:
     def _dispute(self, one: int, other: int) -> None:
         self.disputed = True
         text = (
-            f"two robots use this name, of epochs {one} and {other}: commands end in a ramp, "
-            f"and go on when only one was heard for {self._settling_s:g} s; stop one of them, or give it another name"
+            f"two robots use this name, of epochs {one} and {other}: commands are stopped, the inputs ramp to rest, "
+            f"and commands continue once only one was heard for {self._settling_s:g} s; stop one of them, or give it another name"
         )
         self.notice = Notice(Severity.ERROR, "two_robots", text)

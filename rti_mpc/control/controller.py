@@ -50,7 +50,7 @@ from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.way_to_rest import StopLaw
 
 INPUTS_UNREPORTED = (
-    "the robot does not report which inputs act: commands are believed to act, and only the robot itself or a guard can cover their loss"
+    "the robot does not report which inputs act: commands are assumed to act, and only the robot itself or a guard can handle lost ones"
 )
 KNOWN = {Mode.TRACKING, Mode.HOLDING}  # in which it is certain which inputs act
 ITERATIONS_COLD = 3  # iterations of the first sample, whose guess is one state and one input at all stages
@@ -326,12 +326,12 @@ class Controller:
         if not self.grid.too_late(now_ns - command.stamp_ns):
             if self._overran:
                 self._overran = False
-                self._modes.enter(command.mode, "samples are in time again")
+                self._modes.enter(command.mode, "commands are ready in time again")
             return command
         self._overran = True
-        failure = f"a sample was {1e-9 * (now_ns - command.stamp_ns):.3f} s late"
+        failure = f"a command was ready {1e-9 * (now_ns - command.stamp_ns):.3f} s too late"
         if self._plays_on(now_ns, counted=command.mode is Mode.FALLBACK):
-            self._modes.enter(Mode.FALLBACK, f"{failure}: the previous plan plays on", Severity.WARNING, "over_budget")
+            self._modes.enter(Mode.FALLBACK, f"{failure}: the previous plan is continued", Severity.WARNING, "over_budget")
             return None
         if not self._stopped:
             self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "over_budget")
@@ -391,7 +391,7 @@ class Controller:
         if self.mode not in (Mode.TRACKING, Mode.HOLDING) or not self._blockage.judge():
             return
         if self._blockage.blocked:
-            text = f"the way is blocked: the plan stands still short of the reference, {self._blockage.cause}"
+            text = f"the way is blocked: the plan stops short of the reference, {self._blockage.cause}"
             self._modes.say(Severity.WARNING, "blocked", text)
         else:
             self._modes.say(Severity.INFO, "free", "the way is free again")
@@ -477,7 +477,7 @@ class Controller:
         """Replace a plan that could not be computed."""
         act_ns, plan, failure = self.grid.act_ns, self._issued.plan, f"the QP is {status.name.lower()}"
         if self._plays_on(act_ns) and plan is not None:
-            self._modes.enter(Mode.FALLBACK, f"{failure}: playing the previous plan", Severity.WARNING, "qp_failed")
+            self._modes.enter(Mode.FALLBACK, f"{failure}: the previous plan is continued", Severity.WARNING, "qp_failed")
             rows = self.envelope.refit(plan.u, round((act_ns - plan.stamp_ns) / plan.period_ns), self._reach)
             ending = {name: getattr(plan, name) for name in ENDING}  # it begins when that plan ends, and so does this one
             return self._issued.propose(state, act_ns, plan.valid_until_ns, Mode.FALLBACK, status, rows, ending=ending)
@@ -595,7 +595,7 @@ class Controller:
         else:
             self._sent.brake(self._states.before_ns, state.stamp_ns)
         if arrival is not Arrival.JUMPED_AHEAD:
-            self._modes.enter(Mode.IDLE, "another life of the robot, or of its clock")
+            self._modes.enter(Mode.IDLE, "the robot was restarted, or its clock has jumped")
             self._track.clear()
             self._blockage.clear()
         if arrival is Arrival.NEW_LIFE and self._for_rival[0] == state.epoch:

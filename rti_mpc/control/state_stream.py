@@ -146,17 +146,17 @@ class StateStream:
             self.clock.observe(state.seq, state.stamp_ns, arrival_ns)
             return Arrival.JUMPED_AHEAD, "clock_known", "the robot's stamps advance as nanoseconds again: starting cold"
         last = self.last
-        judged = (Arrival.NEW_LIFE, "robot_restarted", "the robot was restarted: starting anew") if began else (Arrival.FRESH, "", "")
+        judged = (Arrival.NEW_LIFE, "robot_restarted", "the robot was restarted: starting cold") if began else (Arrival.FRESH, "", "")
         if last is not None and state.stamp_ns <= last.stamp_ns:
             back_ns = last.stamp_ns - state.stamp_ns
             if back_ns <= self._stale_ns:
                 return Arrival.REPEATED, "", ""
-            judged = Arrival.JUMPED_BACK, "clock_jumped", f"the robot's clock went back {1e-9 * back_ns:.3f} s: starting anew"
+            judged = Arrival.JUMPED_BACK, "clock_jumped", f"the robot's clock went back {1e-9 * back_ns:.3f} s: starting cold"
             self.last = None
             self.clock.jump()
             self.cadence.jump()
         if not self.clock.observe(state.seq, state.stamp_ns, arrival_ns):
-            return Arrival.OLD, "state_old", "states have waited on their way: they are not acted on"
+            return Arrival.OLD, "state_old", "states were delayed on their way: they are not answered"
         if self.clock.leapt:
             text = f"the robot's clock jumped ahead {1e-9 * (state.stamp_ns - self.before_ns):.3f} s: starting cold"
             return Arrival.JUMPED_AHEAD, "clock_jumped", text

@@ -60,10 +60,10 @@ class Tuning:
         built = self._rti.ocp
         for name in COMPILED_FIELDS:
             if getattr(ocp, name) != getattr(built, name):
-                raise OcpError(f"{name} must stay {getattr(built, name)}, got {getattr(ocp, name)}: it is compiled in")
+                raise OcpError(f"{name} must stay {getattr(built, name)}, got {getattr(ocp, name)}: it is part of the compiled code")
         for name in COMPILED_BOUNDS:
             if not np.array_equal(np.isfinite(getattr(ocp, name)), np.isfinite(getattr(built, name))):
-                raise OcpError(f"{name} must be finite where it was built so, and only there, got {getattr(ocp, name)}: it is compiled in")
+                raise OcpError(f"{name} must be finite exactly where it was when compiled, got {getattr(ocp, name)}")
         if wrong := rest_fault(ocp):
             raise OcpError(wrong)
         self._wanted, self._wanted_version = ocp, version

@@ -206,9 +206,9 @@ class Bus:
             if heard() or (links := self._session.links) is None:
                 return ""
             if links:
-                return f"no {what} of {self.keys.prefix}/{self.keys.robot} yet, from {links} others on the bus: is it running, and of this name?"
+                return f"no {what} of {self.keys.prefix}/{self.keys.robot} yet, from {links} others on the bus: is it running, under this name?"
             where = self._session.connects_to
-            return f"not connected, no {what} yet: " + (f"nobody answers at {where}" if where else "nobody has come to the endpoints listened on")
+            return f"not connected, no {what} yet: " + (f"no process answers at {where}" if where else "no process has connected yet")
 
         remind(self._say, wanted, self._over)
 

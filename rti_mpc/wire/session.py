@@ -128,9 +128,9 @@ def endpoints(config: zenoh.Config) -> str:
     given = json.loads(config.get_json("connect/endpoints"))
     text = ", ".join(given if isinstance(given, list) else [end for ends in given.values() for end in ends])
     wrong = (
-        "nobody is there, the address is wrong, or a certificate is"
+        "no process listens there, the address is wrong, or a certificate is"
         if "tls/" in text or "quic/" in text
-        else "nobody is there, or the address is wrong"
+        else "no process listens there, or the address is wrong"
     )
     return f"{text}: {wrong}" if text else ""
 

@@ -191,5 +191,5 @@ class Process:
         except Exception:
             if self._bus.closed:
                 return  # by another thread, at the end of the process: the error does not matter
-            log.exception("stopping after an unforeseen error")
+            log.exception("stopping after an unexpected error")
             self._crashed.set()

@@ -64,7 +64,7 @@ class OperatorStop:
             log.warning("%s; `rti-mpc enable` releases it", self.latch)
             obey(self.latch)
         if obstacle := file.obstacle():
-            say(Notice(Severity.WARNING, "stop_not_stored", f"a stop will be forgotten with the last process of this robot: {obstacle}"))
+            say(Notice(Severity.WARNING, "stop_not_stored", f"a stop is lost when the last process of this robot ends: {obstacle}"))
         self._attempted = self.latch
         Thread(target=self._store, name="stop_stored", daemon=True).start()
 
@@ -83,7 +83,7 @@ class OperatorStop:
                 except Exception:  # from anything that a change triggers, such as publishing on a failing bus
                     if bus.closed:
                         return
-                    log.exception("%s: what it says was obeyed, and then an unforeseen error", received.key)
+                    log.exception("%s: its stop or release was obeyed, then an unexpected error occurred", received.key)
 
         Thread(target=follow, name="stop_heard", daemon=True).start()
 
@@ -162,7 +162,7 @@ class OperatorStop:
         """Wait for the attempt to store the present latch, and return its error; empty if it is stored."""
         with self._storing:
             if not self._storing.wait_for(lambda: self._attempted >= self.latch, patience_s):
-                return f"it was not yet after {patience_s:g} s"
+                return f"not stored within {patience_s:g} s"
             return self._fault
 
     def _store(self) -> None:

@@ -92,7 +92,7 @@ def stop_or_enable(bus_settings: BusSettings, keys: Keys, what: str, timeout_s: 
     if acting in confirmed:
         print(json.dumps(answers[acting]))
         if fault := answers[acting].get("not_stored"):
-            print(f"rti-mpc: the {acting} obeys, but will have forgotten it after a restart: {fault}", file=sys.stderr)
+            print(f"rti-mpc: the {acting} obeys, but will not know of it after a restart: {fault}", file=sys.stderr)
         return 0
     print(
         f"rti-mpc: {keys.robot}: the {acting} has not confirmed {what} within {timeout_s:g} s; {' and '.join(confirmed) or 'nobody'} has",
@@ -125,8 +125,8 @@ def note_for_later(file: LatchFile, what: str) -> str:
         if changed != latch or file.path is None:
             file.write(changed)
     except OSError as error:
-        return f"it could not be noted either: {error.strerror}"
-    return f"what is started later with {file.path} is {changed}"
+        return f"it could not be stored for later either: {error.strerror}"
+    return f"processes started later read {file.path}: {changed}"
 
 
 def operator() -> str:

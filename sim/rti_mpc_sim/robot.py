@@ -229,7 +229,7 @@ class Robot:
         starved = self.body.counters.starved
         self._advance(to_ns)
         if self.body.counters.starved > starved:
-            ran_out = Notice(Severity.ERROR, "command_ran_out", "no valid command is left: the robot brakes to rest on its own")
+            ran_out = Notice(Severity.ERROR, "command_ran_out", "no valid command is left: the robot goes to rest by itself")
             self._announcer.say(ran_out, to_ns)
         while (state := self.body.sensor.take(to_ns)) is not None:
             self._send(state)

@@ -273,7 +273,7 @@ def test_way_to_rest_that_needs_feedback_passes_only_where_the_states_are_known(
     mass.guard = Guard(replace(LIMITS, angles=np.zeros(0)), epoch=10)
     mass.wait(1000)
     assert not mass.send(**mass.fed_back())
-    assert "it feeds 2 states back on its way to rest, of 0 known" in mass.refused
+    assert "its way to rest feeds 2 states back, of 0 that are known" in mass.refused
     assert mass.send()
 
 

@@ -91,7 +91,7 @@ def test_process_with_a_wrong_certificate_says_what_may_be_wrong_there(own: str,
                 processes.append(subprocess.Popen(line, cwd=ROOT, env=environment(), stdout=file, stderr=subprocess.STDOUT))
             until(lambda c=command, w=word: w in logs[c].read_text(errors="replace"), f"{command} says {word}", pause_s=0.01, patience_s=60.0)
         in_time(host, "to say that nobody is reached", (time.monotonic_ns() - began_ns) / MS, MAX_REMINDER_MS, began_ns)
-        assert f"{endpoint}: nobody is there, the address is wrong, or a certificate is" in logs["reference"].read_text()
+        assert f"{endpoint}: no process listens there, the address is wrong, or a certificate is" in logs["reference"].read_text()
         for process in reversed(processes):
             process.terminate()
             assert process.wait(30.0) == 0

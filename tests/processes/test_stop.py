@@ -87,7 +87,7 @@ def test_stop_said_to_nobody_is_noted_and_outlives_every_restart_until_it_is_rel
     system.start("robot", "reference")
     done = system.says("stop", "--timeout", 0.3)
     assert (done.returncode, done.stdout) == (1, "")
-    assert "the controller has not confirmed stop within 0.3 s; nobody has; what is started later with" in done.stderr
+    assert "the controller has not confirmed stop within 0.3 s; nobody has; processes started later read" in done.stderr
     for _ in range(2):
         system.start("controller")
         system.commanded_to_stand()

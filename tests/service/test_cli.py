@@ -104,7 +104,7 @@ def test_operator_is_told_in_one_line_that_nobody_has_confirmed_and_what_was_not
         done = rti_mpc(command, "--timeout", "0.3", "-e", "tcp/127.0.0.1:1", "--state", str(path.parent))
         assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
         assert done.stderr.startswith(f"rti-mpc: pioneer: the controller has not confirmed {command} within 0.3 s; nobody has; ")
-        assert f"what is started later with {path} is {'stopped since' if command == 'stop' else 'released'}" in done.stderr
+        assert f"processes started later read {path}: {'stopped since' if command == 'stop' else 'released'}" in done.stderr
         assert path.exists() == (counter > 0)
         assert not counter or json.loads(path.read_text())["counter"] == counter
 
@@ -112,14 +112,14 @@ def test_operator_is_told_in_one_line_that_nobody_has_confirmed_and_what_was_not
 def test_stop_that_meets_no_router_is_noted_all_the_same(tmp_path: Path) -> None:
     done = rti_mpc("stop", "--timeout", "0.3", "-m", "client", "-e", "tcp/127.0.0.1:1", "--state", str(tmp_path))
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-    assert "; nobody was asked to stop; what is started later with" in done.stderr
+    assert "; nobody was asked to stop; processes started later read" in done.stderr
     assert json.loads((tmp_path / "rti_mpc%2Fpioneer.json").read_text())["stopped"] is True
 
 
 def test_operator_is_told_in_one_line_that_nothing_could_be_noted_either() -> None:
     done = rti_mpc("stop", "--timeout", "0.3", "-e", "tcp/127.0.0.1:1", "--state", "/proc/none")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
-    assert "nobody has; it could not be noted either: " in done.stderr
+    assert "nobody has; it could not be stored for later either: " in done.stderr
 
 
 def test_check_of_the_shipped_configuration_prints_both_phases_and_the_verdict() -> None:

@@ -115,7 +115,7 @@ def test_slow_disk_holds_no_answer_up_and_is_told_of(disk: Disk, monkeypatch: py
     process = Process(disk)
     disk.works.clear()
     answer = process.ask("stop")
-    assert (answer["ok"], answer["not_stored"]) == (True, "it was not yet after 0.02 s")
+    assert (answer["ok"], answer["not_stored"]) == (True, "not stored within 0.02 s")
     disk.works.set()
 
 

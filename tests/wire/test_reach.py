@@ -46,7 +46,7 @@ def test_process_that_reaches_nobody_says_so_again_and_again(address: str) -> No
         expecting(bus)
         for _ in range(3):
             text = said.get(timeout=PATIENCE_S)
-            assert text.startswith(f"not connected, no state yet: nobody answers at {address}: nobody is there")
+            assert text.startswith(f"not connected, no state yet: no process answers at {address}: no process listens there")
             assert ("certificate" in text) is address.startswith("tls")
 
 
@@ -54,7 +54,7 @@ def test_process_that_waits_to_be_reached_says_that_nobody_has_come() -> None:
     said: Queue[str] = Queue()
     with Bus.join(BusSettings(listen=(free_endpoint(),), connect=()), KEYS, say=said.put) as bus:
         expecting(bus)
-        assert said.get(timeout=PATIENCE_S) == "not connected, no state yet: nobody has come to the endpoints listened on"
+        assert said.get(timeout=PATIENCE_S) == "not connected, no state yet: no process has connected yet"
 
 
 def test_process_that_is_linked_says_what_does_not_come_until_it_has_come() -> None:
@@ -64,7 +64,7 @@ def test_process_that_is_linked_says_what_does_not_come_until_it_has_come() -> N
         Bus.join(BusSettings(connect=(endpoint,)), KEYS, say=said.put) as bus,
     ):
         heard = expecting(bus)
-        text = "no state of rti_mpc/test yet, from 1 others on the bus: is it running, and of this name?"
+        text = "no state of rti_mpc/test yet, from 1 others on the bus: is it running, under this name?"
         while said.get(timeout=PATIENCE_S) != text:  # the link is made in its own time
             pass
         states, seq, deadline_s = robot.publisher(KEYS.state), 0, time.monotonic() + PATIENCE_S
@@ -88,4 +88,4 @@ def test_client_without_a_router_says_so_and_ends_well_when_it_is_stopped() -> N
 
     with pytest.raises(Stopped, match="stopped before a router was there"):
         Bus.join(BusSettings(mode="client", connect=("tcp/127.0.0.1:9",)), KEYS, stop=stop, say=say)
-    assert said.get() == "not connected: no router answers at tcp/127.0.0.1:9: nobody is there, or the address is wrong"
+    assert said.get() == "not connected: no router answers at tcp/127.0.0.1:9: no process listens there, or the address is wrong"

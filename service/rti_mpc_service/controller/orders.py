@@ -79,9 +79,9 @@ class Orders:
             version = self._params.version
             self._params.adopt(leader.parameters["version"], dict(leader.parameters["changes"]))
             if self._params.version != version:
-                self._say("parameters_changed", f"parameters of version {self._params.version}, as the leader has them")
+                self._say("parameters_changed", f"parameters of version {self._params.version}, taken over from the leader")
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RtiMpcError) as error:
-            self._say("leader_not_understood", f"the leader's description must hold its orders, got a fault at {error}", Severity.WARNING)
+            self._say("leader_not_understood", f"the leader's description must hold latch and parameters, got a fault at {error}", Severity.WARNING)
 
     def _say(self, code: str, text: str, severity: Severity = Severity.INFO) -> None:
         self._controller.say(Notice(severity, code, text))

@@ -180,8 +180,8 @@ def wider_bounds(file: Config, config: Config, changes: Mapping[str, Any]) -> It
         if key.rpartition(".")[0] not in BOUND_KEYS:
             continue
         if key not in before:
-            yield f"{key} is not in the controller's file, and which bounds there are is fixed while it runs, got {list(now[key])}"
+            yield f"{key} is not in the controller's file, and no bound can be added while it runs, got {list(now[key])}"
             return
         (lower, upper), (least, most) = now[key], before[key]
         if lower < least or upper > most or math.isinf(lower) != math.isinf(least) or math.isinf(upper) != math.isinf(most):
-            yield f"{key} must lie inside the file's {[least, most]}, to which guard and robot hold, and be finite where it is, got {[lower, upper]}"
+            yield f"{key} must lie inside the file's {[least, most]}, which guard and robot enforce, and finite where that is, got {[lower, upper]}"

@@ -60,7 +60,7 @@ class Outlet:
         flush_s: float = VIEWER_FLUSH_TIMEOUT_S,
         close_s: float = VIEWER_CLOSE_TIMEOUT_S,
         capacity: int = MAX_QUEUED_ENTRIES,
-        epitaph: Callable[[], str] = lambda: "given up, what it had not taken is lost",
+        epitaph: Callable[[], str] = lambda: "closed after a failure, entries not yet written are lost",
     ) -> None:
         self.name = name
         self.dropped = 0

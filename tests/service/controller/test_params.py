@@ -96,7 +96,7 @@ REFUSED: list[tuple[dict[str, Any], list[str]]] = [
     ({"ocp.bounds.inputs.u_c": [float("nan"), 0.3]}, ["ocp.bounds.inputs.u_c", "lower < upper"]),
     ({"ocp.bounds.inputs.u_c": [-0.5, float("inf")]}, ["ocp.bounds.inputs.u_c", "inside the file's [-0.5, 0.5]"]),
     ({"ocp.bounds.inputs.u_c": [-(10**400), 0.5]}, ["ocp.bounds.inputs.u_c"]),
-    ({"ocp.bounds.states.x": [-1.0, 1.0]}, ["ocp.bounds.states.x", "not in the controller's file", "which bounds there are is fixed"]),
+    ({"ocp.bounds.states.x": [-1.0, 1.0]}, ["ocp.bounds.states.x", "not in the controller's file", "no bound can be added"]),
     ({"ocp.bounds.states.u": [-float("inf"), 0.5]}, ["ocp.bounds.states.u", "inside the file's [-0.5, 0.5]"]),
     ({"ocp.weights.Q.x": 1e200}, ["ocp.weights.Q.x", "at most 1000000000000000", "1e+200"]),
     ({}, ["params", '"set"']),
