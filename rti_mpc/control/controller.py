@@ -329,7 +329,7 @@ class Controller:
                 self._modes.enter(command.mode, "commands are ready in time again")
             return command
         self._overran = True
-        failure = f"a command was ready {1e-9 * (now_ns - command.stamp_ns):.3f} s too late"
+        failure = f"a command was ready {1e-9 * (now_ns - command.stamp_ns):.3f} s late"
         if self._plays_on(now_ns, counted=command.mode is Mode.FALLBACK):
             self._modes.enter(Mode.FALLBACK, f"{failure}: the previous plan is continued", Severity.WARNING, "over_budget")
             return None

@@ -83,7 +83,7 @@ class Aside(logging.Handler):
         """Write queued lines directly to the descriptor: a process could not end while the buffer of `sys.stdout` is not accepted."""
         for dropped, line in iter(self._lines.get, None):
             if dropped:
-                text = f"{dropped} lines were dropped: standard output did not accept them"
+                text = f"{dropped} lines were lost: standard output did not accept them"
                 line = self.format(logging.makeLogRecord({"name": "log", "levelname": "WARNING", "msg": text})) + "\n" + line
             with suppress(OSError):  # nobody reads it any more, or its disk is full
                 os.write(self._descriptor, f"{line}\n".encode(errors="backslashreplace"))

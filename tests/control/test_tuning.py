@@ -140,8 +140,8 @@ def test_first_increment_keeps_the_old_slew_limits_and_the_next_the_new_ones() -
         ({"N": 8}, "N must stay 7, got 8"),
         ({"dt": 0.05}, "dt must stay 0.1"),
         ({"method": "euler"}, "method must stay rk4"),
-        ({"ubu": [0.5, INF]}, "ubu must be finite where it was built so"),
-        ({"ubx": [9.0, INF, INF, 0.5, 0.745]}, "ubx must be finite where it was built so, and only there"),
+        ({"ubu": [0.5, INF]}, "ubu must be finite exactly where it was when compiled"),
+        ({"ubx": [9.0, INF, INF, 0.5, 0.745]}, "ubx must be finite exactly where it was when compiled"),
     ],
     ids=["N", "dt", "integrator", "bound_gone", "bound_new"],
 )

@@ -149,7 +149,7 @@ def test_a_bound_on_one_side_stays_on_that_side(tmp_path: Any) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(MINIMAL + "ocp.bounds.inputs = { u_c = [-inf, 0.5] }\nparams.live = true\n")
     config = load(path)
-    with pytest.raises(ConfigError, match="be finite where it is"):
+    with pytest.raises(ConfigError, match="finite where that is"):
         changed_problem(config, build_ocp(config), {"ocp.bounds.inputs.u_c": [-1.0, 0.5]})
     assert changed_problem(config, build_ocp(config), {"ocp.bounds.inputs.u_c": [-float("inf"), 0.4]})[1].ubu[0] == 0.4
 
