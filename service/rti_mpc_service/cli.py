@@ -430,9 +430,8 @@ def init(
 @app.command()
 def schema() -> None:
     """Print the JSON schema of a robot's TOML file, with which editors complete and check it."""
-    typer.echo(
-        json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "rti-mpc robot", **Config.model_json_schema()}, indent=1)
-    )
+    head = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    typer.echo(json.dumps(head | Config.model_json_schema() | {"title": "rti-mpc robot"}, indent=1))
 
 
 @app.command()

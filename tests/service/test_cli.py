@@ -8,6 +8,7 @@ import sys
 import tomllib
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer.main
@@ -16,6 +17,7 @@ from typer.testing import CliRunner
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.cli import SHIPPED, app
 from rti_mpc_service.faults.table import FAULTS
+from rti_mpc_service.shipped import TEMPLATES
 from tests.in_time import awake_ms
 from tests.robots import toml
 
@@ -171,11 +173,48 @@ def test_version_names_what_decides_what_a_command_does() -> None:
         assert word in done.stdout
 
 
+TYPES: dict[str, Any] = {"number": (int, float), "integer": int, "string": str, "boolean": bool, "array": list, "object": dict, "null": type(None)}
+
+
+def refused(value: Any, schema: Any, root: Any) -> bool:
+    """Whether a JSON schema refuses a value, by the words of the language that ours is written in, limits of numbers and texts aside."""
+    if "$ref" in schema:
+        schema = root["$defs"][schema["$ref"].rpartition("/")[2]]
+    if "anyOf" in schema:
+        return all(refused(value, option, root) for option in schema["anyOf"])
+    if "type" in schema and not isinstance(value, TYPES[schema["type"]]):
+        return True
+    if value not in schema.get("enum", [value]) or value != schema.get("const", value):
+        return True
+    if isinstance(value, list):
+        fixed = schema.get("prefixItems", [])
+        too_few, too_many = len(value) < schema.get("minItems", 0), len(value) > schema.get("maxItems", len(value))
+        return too_few or too_many or any(refused(part, (*fixed, *[schema.get("items", {})] * len(value))[i], root) for i, part in enumerate(value))
+    if isinstance(value, dict):
+        known, rest = schema.get("properties", {}), schema.get("additionalProperties", {})
+        missing = not set(schema.get("required", ())) <= value.keys()
+        unknown = rest is False and not value.keys() <= known.keys()
+        return missing or unknown or any(refused(part, known.get(name, rest), root) for name, part in value.items())
+    return False
+
+
+@pytest.mark.parametrize("path", [SHIPPED, *sorted(TEMPLATES.glob("*.toml"))], ids=lambda path: path.stem)
+def test_schema_for_editors_takes_what_is_shipped_and_refuses_what_the_service_refuses(path: Path) -> None:
+    schema = json.loads(rti_mpc("schema").stdout)
+    document = tomllib.loads(path.read_text())
+    assert not refused(document, schema, schema)
+    weights = document["ocp"]["weights"]
+    assert not refused({**document, "ocp": {**document["ocp"], "weights": {**weights, "delta": 28.0, "lambda": [0.1, 0.2]}}}, schema, schema)
+    for wrong in ({"N": "20"}, {"M": 20}, {"weights": {**weights, "delta": "28"}}, {"bounds": {"inputs": {"v": [1.0]}}}):
+        assert refused({**document, "ocp": {**document["ocp"], **wrong}}, schema, schema), wrong
+
+
 def test_schema_for_editors_describes_every_table_and_refuses_unknown_keys() -> None:
     schema = json.loads(rti_mpc("schema").stdout)
     shipped = tomllib.loads(SHIPPED.read_text())
     assert shipped.keys() <= schema["properties"].keys()
     assert schema["additionalProperties"] is False
+    assert schema["title"] == "rti-mpc robot"
     for table in schema["$defs"].values():
         assert table["additionalProperties"] is False
         assert all("description" in field for field in table["properties"].values()), table["title"]

@@ -49,7 +49,7 @@ Interval = Annotated[tuple[Bound, Bound], BeforeValidator(interval)]
 Increment = Annotated[Interval, AfterValidator(around_zero)]
 Weight = Annotated[float, Field(ge=0, le=1e15)]  # limited so that sums with terms of order 1 keep their digits
 Positive = Annotated[float, Field(gt=0)]
-Weights = Annotated[tuple[Weight, ...], BeforeValidator(sequence)]
+Weights = Annotated[tuple[Weight, ...], BeforeValidator(sequence, json_schema_input_type=Weight | tuple[Weight, ...])]
 Pair = Annotated[tuple[float, float], BeforeValidator(pair)]
 Duration = Annotated[float, Field(ge=0, le=10)]
 Period = Annotated[float, Field(ge=1e-4, le=10)]

@@ -118,7 +118,7 @@ def plan(
     best = heading or BEST_HEADINGS.get(name or "")
     scenario = find_scenario(config, name, best, speed_m_s=waypoint_speed_m_s, smooth_m=waypoint_smoothing_m)
     config = configured(config, scenario, guard)
-    check_start(config, scenario)
+    check_start(config)
     return DemoPlan(
         config=config,
         name=name or "",
@@ -132,7 +132,7 @@ def plan(
     )
 
 
-def check_start(config: Config, scenario: Scenario) -> None:
+def check_start(config: Config) -> None:
     """
     Check that the outputs are numbers where the simulated robot starts.
 
@@ -140,8 +140,8 @@ def check_start(config: Config, scenario: Scenario) -> None:
         ConfigError: One is not.
     """
     model, x0 = build_model(config), robot_settings(config)["x0"]
-    y = scenario.y(np.array(x0))
-    if wrong := [output.name for output, column in zip(model.outputs, y.T, strict=True) if not np.isfinite(column).all()]:
+    y = np.array(model.h()(x0, model.p_nominal)).ravel()
+    if wrong := [output.name for output, value in zip(model.outputs, y, strict=True) if not np.isfinite(value)]:
         raise ConfigError(f"sim.x0 must be a state whose outputs are finite, {wrong[0]} is not, got {x0}")
 
 
