@@ -4,15 +4,15 @@ Adapter of a robot: its states to the bus, and from there the inputs to apply.
 
 The robot's clock is the monotonic clock of this process. Commands are played as
 `rti_mpc.contract.schedule` says: each row from its time on, approached inside the slew
-limits from what was really applied before; without a valid command the inputs ramp to
-rest. What acts is reported in each state, so that the controller plans from there.
+limits from what was really applied before; without a valid command the inputs go to rest.
+What acts is reported in each state, so that the controller plans from there.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from threading import Event
 from typing import Self
 
@@ -53,6 +53,7 @@ class RobotAdapter:
         inputs: Mapping[str, tuple[float, float]],
         increments: Mapping[str, tuple[float, float]],
         u_rest: Mapping[str, float] | None = None,
+        angles: Sequence[bool] = (),
         guarded: bool = False,
         prefix: str = "rti_mpc",
         bus: BusSettings | None = None,
@@ -67,6 +68,8 @@ class RobotAdapter:
             inputs: Bounds of each input, ``ocp.bounds.inputs`` of that file, in the order of the model.
             increments: Slew limits over `dt_s`, ``ocp.bounds.increments``; an input that is left out has none.
             u_rest: Inputs at rest that are not 0.
+            angles: Which states are angles, in the order of the model, for a robot that needs feedback to stay at rest: then the states
+                that are sent correct its way to rest. Left out: the rows of the way act as they are.
             guarded: Whether a guard runs: then only what it passes on is taken.
             prefix: What all keys begin with.
             bus: How to join; None: a peer that listens on the usual endpoint, where the others look for the robot.
@@ -76,7 +79,7 @@ class RobotAdapter:
             ConfigError: A name or a number does not fit, or the endpoint is taken.
         """
         rest = u_rest or {}
-        check_limits(dt_s, inputs, increments, rest)
+        check_limits(dt_s, inputs, increments, rest, angles)
         self.inputs = tuple(inputs)
         lbu, ubu = np.array([inputs[name] for name in self.inputs], dtype=np.float64).T
         lbdu, ubdu = np.array([increments.get(name, NO_LIMIT) for name in self.inputs], dtype=np.float64).T
@@ -89,7 +92,10 @@ class RobotAdapter:
             epoch,
             bounds=(lbu, ubu),
             increments=Increments(lbdu, ubdu, dt_ns),
+            angles=np.array(angles, dtype=bool),
         )
+        self._nx = len(angles)  # 0: no state corrects anything
+        self._measured_ns = 0  # time of the last state that does
         self._played_ns = time.monotonic_ns()
         settings = bus or BusSettings(listen=(RENDEZVOUS_ENDPOINT,))
         keys = Keys(prefix, robot)
@@ -137,11 +143,20 @@ class RobotAdapter:
         Args:
             x: State in the order of the model, shape ``(nx,)``; angles may wrap.
             age_s: How long ago it was measured, at most `dt_s`.
+
+        Raises:
+            ConfigError: It has not as many components as `angles`.
         """
-        stamp_ns = time.monotonic_ns() - round(1e9 * age_s)
+        now_ns, state = time.monotonic_ns(), np.array(x, dtype=np.float64)
+        stamp_ns = now_ns - round(1e9 * age_s)
+        if self._nx and state.shape != (self._nx,):
+            raise ConfigError(f"x must have as many components as angles, {self._nx}, got shape {state.shape}")
         u, source = self._actuator.acting(stamp_ns)
+        if self._nx and np.isfinite(state).all():
+            self._actuator.measure(state, stamp_ns, now_ns)
+            self._measured_ns = now_ns
         self._seq += 1
-        self._states.put(State(self._epoch, self._seq, stamp_ns, np.array(x, dtype=np.float64), u.copy(), *source))
+        self._states.put(State(self._epoch, self._seq, stamp_ns, state, u.copy(), *source))
 
     def act(self) -> Array:
         """Return the inputs to apply now, shape ``(nu,)``."""
@@ -151,6 +166,8 @@ class RobotAdapter:
             if command is not None and (reason := self._actuator.accept(command, now_ns)):
                 text = f"command {command.seq} of epoch {command.epoch} was refused: {reason.replace('_', ' ')}"
                 self._announcer.say(Notice(Severity.WARNING, f"command_{reason}", text), now_ns)
+        if self._nx and now_ns - self._measured_ns > STALE_NS:
+            self._actuator.measure(None, now_ns)
         starved = self._actuator.counters.starved
         for _ in self._actuator.play(self._played_ns, now_ns + 1):
             pass
@@ -164,7 +181,11 @@ class RobotAdapter:
 
 
 def check_limits(
-    dt_s: float, inputs: Mapping[str, tuple[float, float]], increments: Mapping[str, tuple[float, float]], u_rest: Mapping[str, float]
+    dt_s: float,
+    inputs: Mapping[str, tuple[float, float]],
+    increments: Mapping[str, tuple[float, float]],
+    u_rest: Mapping[str, float],
+    angles: Sequence[bool],
 ) -> None:
     """
     Check the limits of a robot.
@@ -179,6 +200,8 @@ def check_limits(
     for what, table in (("increments", increments), ("u_rest", u_rest)):
         if unknown := [name for name in table if name not in inputs]:
             raise ConfigError(f"{what}.{unknown[0]} must be one of the inputs {', '.join(inputs)}")
+    if not all(isinstance(angle, bool | np.bool_) for angle in angles):
+        raise ConfigError(f"angles must say of each state whether it is an angle, such as [False, True], got {list(angles)}")
     for name, (lower, upper) in inputs.items():
         if not lower <= (rest := u_rest.get(name, 0.0)) <= upper:
             raise ConfigError(f"inputs.{name} must hold the input at rest, {rest:g}, got {[lower, upper]}")

@@ -141,9 +141,16 @@ class Actuator:
         """Return the input that acts at a time up to a period ago, shape ``(nu,)``, and epoch and sequence number of its command; see `source`."""
         return self._schedule.at(t_ns)[0], self._schedule.source(t_ns)
 
-    def measure(self, x: Array, t_ns: int) -> None:
-        """Take what the robot measures, shape ``(nx,)``: it corrects a way to rest that needs it, after the delay of the actuators."""
-        self._schedule.feed_back(x, t_ns, t_ns + self._delay_ns)
+    def measure(self, x: Array | None, stamp_ns: int, now_ns: int | None = None) -> None:
+        """
+        Take what the robot measures: it corrects a way to rest that needs it, after the delay of the actuators.
+
+        Args:
+            x: State, shape ``(nx,)``; None: the last one is too old, and the way's rows act as they are.
+            stamp_ns: When it was measured.
+            now_ns: The present time; None: it was measured just now.
+        """
+        self._schedule.feed_back(x, stamp_ns, (stamp_ns if now_ns is None else now_ns) + self._delay_ns)
 
     def switch_off(self) -> None:
         """Drop every plan and take no other: the inputs go their way to rest from what acts."""

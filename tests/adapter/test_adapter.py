@@ -172,6 +172,50 @@ def test_robot_without_an_increment_has_no_slew_limit_and_one_at_rest_elsewhere_
     assert scene.acts(0) == [0.0, 0.1]
 
 
+def way(**change: Any) -> dict[str, Any]:
+    """A way to rest from the end of a plan of 0.1 s on, with a gain for two states."""
+    K = np.array([[0.5, 0.0], [0.0, 0.2]])
+    return {"rest_period_ns": 100 * MS, "u_rest": np.zeros((3, 2)), "x_rest": np.zeros((3, 2)), "K": K} | change
+
+
+def test_way_to_rest_with_a_gain_is_corrected_by_what_the_robot_measures_angles_modulo_a_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = Scene(monkeypatch, angles=[False, True])
+    scene.robot.send([0.0, 0.0])
+    scene.command([[0.1, 0.1]], valid_until_ns=scene.now_ns + 100 * MS, **way())
+    assert [scene.acts(50), scene.acts(150)] == [[0.1, 0.1], [0.0, 0.0]]
+    scene.robot.send([-0.2, 0.5 + 4 * np.pi])
+    assert scene.acts(10) == [0.1, -0.1]
+    scene.robot.send([-0.1, -0.5], age_s=0.05)
+    assert scene.acts(10) == [0.05, 0.1]
+    scene.robot.send([np.nan, 0.0])
+    assert scene.acts(10) == [0.05, 0.1], "the controller refuses such a state, and nothing is corrected by it"
+    assert scene.acts(300) == [0.0, 0.0], "the last state is too old"
+
+
+def test_robot_that_drifts_is_kept_where_it_rests_once_its_controller_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mass that something pushes, driven by its acceleration: with its states it stays within what the gain leaves, without them it is carried away."""
+    found = {}
+    for angles in ((), (False, False)):
+        scene = Scene(monkeypatch, inputs={"a": [-1.0, 1.0]}, increments={}, angles=angles)
+        x, v = 0.0, 0.0
+        scene.robot.send([x, v])
+        rest = way(u_rest=np.zeros((3, 1)), K=np.array([[1.0, 2.0]]))
+        scene.command([[0.0]], valid_until_ns=scene.now_ns + 100 * MS, **rest)
+        for _ in range(1000):
+            (a,) = scene.acts(10)
+            x, v = x + 0.01 * v, v + 0.01 * (a + 0.05)
+            scene.robot.send([x, v])
+        found[angles] = abs(x)
+    assert found[()] > 2.0  # m, after 10 s
+    assert found[False, False] < 0.06
+
+
+def test_state_of_another_size_than_its_angles_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = Scene(monkeypatch, angles=[False, True])
+    with pytest.raises(ConfigError, match=r"^x must have as many components as angles, 2, got shape \(3,\)$"):
+        scene.robot.send([0.0, 0.0, 0.0])
+
+
 @pytest.mark.parametrize(
     ("limits", "refusal"),
     [
@@ -180,6 +224,7 @@ def test_robot_without_an_increment_has_no_slew_limit_and_one_at_rest_elsewhere_
         ({"increments": {"v": [-1, 1]}}, "increments.v must be one of the inputs v_c, kappa"),
         ({"u_rest": {"v": 1}}, "u_rest.v must be one of the inputs v_c, kappa"),
         ({"u_rest": {"v_c": 2.0}}, "inputs.v_c must hold the input at rest, 2, got [-1.0, 1.0]"),
+        ({"angles": ["psi"]}, "angles must say of each state whether it is an angle, such as [False, True], got ['psi']"),
         ({"increments": {"v_c": [0.1, 0.2]}}, "increments.v_c must go from below 0 to above 0, got [0.1, 0.2]"),
     ],
 )
