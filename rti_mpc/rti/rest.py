@@ -140,6 +140,7 @@ class Rest:
         time_s: Longest time to rest.
         moved: Largest change of each state on the way, shape ``(nx,)``; zero for a state that is the same wherever the robot rests.
         states: How many states of operation were tried.
+        alone: How fast it moves in the end if its states are not fed back, in words; empty if it holds.
     """
 
     kind: RestClass
@@ -147,6 +148,7 @@ class Rest:
     time_s: float
     moved: Array
     states: int
+    alone: str = ""
 
 
 class Starts(NamedTuple):
@@ -206,7 +208,8 @@ def find_stop_law(ocp: Ocp, disturbances: Array = UNDISTURBED) -> StopLaw | None
     if not disturbances.size and ocp.model.stop_expr is None and not motion_at_rest(ocp):
         return None
     law = shaped(ocp, disturbances)
-    return replace(law, holds=assess(ocp, law, TRIED_STATES, compile=False).kind is RestClass.HOLDS)
+    rest = assess(ocp, law, TRIED_STATES, compile=False)
+    return replace(law, holds=rest.kind is RestClass.HOLDS, alone=rest.alone)
 
 
 def assess(ocp: Ocp, law: StopLaw | None, count: int, *, compile: bool = True) -> Rest:
@@ -248,7 +251,7 @@ def assess(ocp: Ocp, law: StopLaw | None, count: int, *, compile: bool = True) -
     if not kept.all():
         raise OcpError(unkept(model, starts, ~kept, ways))
     falls = growth > MAX_DRIFT_GROWTH_PER_S or alone.max() > FALLING_SHARE
-    return Rest(RestClass.UNSTABLE if falls else RestClass.DRIFTS, growth, time_s, moved, count)
+    return Rest(RestClass.UNSTABLE if falls else RestClass.DRIFTS, growth, time_s, moved, count, unaided(model, law, rates, alone.max(axis=0)))
 
 
 def shaped(ocp: Ocp, disturbances: Array) -> StopLaw:
@@ -367,6 +370,14 @@ def rates_at(model: Model, X: Array, U: Array, P: Array) -> Array:
     f = ca.Function("f", [model.x, model.u, model.p], [ca.densify(model.f_expl_expr)])
     rates = np.array(f(X.T, U.T, P.T)).T
     return np.where(np.isfinite(rates), rates, np.inf)
+
+
+def unaided(model: Model, law: StopLaw, rates: Array, shares: Array) -> str:
+    """Say how fast a robot moves after its way to rest, from the fastest rates of its states there as shares of those in operation."""
+    j = int(np.argmax(shares))
+    signal, rate = model.states[j], shares[j] * rates[j]
+    how = f"changes by up to {rate:.3g} {signal.unit} per second" if np.isfinite(rate) else "is beyond every bound"
+    return f"{law.rows * law.period_s + STANDING_S:.3g} s after a stop {signal.name} {how}"
 
 
 def unrested(model: Model, starts: Starts, moving: np.ndarray[Any, Any], ways: Ways) -> str:

@@ -65,6 +65,7 @@ class StopLaw:
         holds: Whether the robot stays at rest without feedback: then its commands carry no gain.
         disturbances: Largest magnitudes of the model's last parameters, shape ``(nd,)``, that move the robot while its inputs are at
             rest; empty if none do. In them, not every heading is one to rest in.
+        alone: How fast the robot moves in the end if its states are not fed back, in words; empty if it holds.
     """
 
     rows: int
@@ -77,6 +78,7 @@ class StopLaw:
     scale_u: Array
     holds: bool = False
     disturbances: Array = field(default_factory=lambda: np.zeros(0))
+    alone: str = ""
 
 
 class WayToRest:

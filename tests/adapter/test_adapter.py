@@ -193,7 +193,7 @@ def test_way_to_rest_with_a_gain_is_corrected_by_what_the_robot_measures_angles_
 
 
 def test_robot_that_drifts_is_kept_where_it_rests_once_its_controller_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A mass that something pushes, driven by its acceleration: with its states it stays within what the gain leaves, without them it is carried away."""
+    """A mass that something pushes, driven by its acceleration: only with its states does it stay, within what the gain leaves."""
     found = {}
     for angles in ((), (False, False)):
         scene = Scene(monkeypatch, inputs={"a": [-1.0, 1.0]}, increments={}, angles=angles)

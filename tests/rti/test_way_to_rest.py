@@ -47,6 +47,7 @@ def test_robot_is_classified_by_what_it_does_at_rest(name: str) -> None:
     assert rest.kind is CLASSES[name]
     assert 0.0 < rest.time_s < 10.0
     assert rest.states == 40
+    assert bool(rest.alone) is (CLASSES[name] is not RestClass.HOLDS), "only of one that does not hold it is said how fast it moves alone"
 
 
 @pytest.mark.parametrize("name", ["pioneer", "boat"])

@@ -36,5 +36,7 @@ def rest_line(model: Model, law: StopLaw | None, rest: Rest) -> str:
     carried = "its inputs ramp to rest"
     if law is not None:
         carried = f"its commands carry {law.rows} rows of {law.period_s:g} s to rest{'' if law.holds else ', and a gain that keeps it there'}"
+    if rest.alone:
+        carried += f": without it, {rest.alone}"
     states = f"{rest.states} states" + (", disturbed up to its observer's limits," if law is not None and law.disturbances.size else "")
     return f"a stop: at rest it {rest.kind.value} ({LETTERS[rest.kind]}); from {states} within {rest.time_s:.3g} s{way}; {carried}"

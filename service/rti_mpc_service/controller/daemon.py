@@ -28,10 +28,11 @@ from typing import Any
 
 from rti_mpc.contract.latch import Latch
 from rti_mpc.contract.leadership import differ
-from rti_mpc.contract.message import Command, State
+from rti_mpc.contract.message import Command, Notice, Severity, State
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.errors import ConfigError
 from rti_mpc.rti.rti import Rti
+from rti_mpc.rti.way_to_rest import StopLaw
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
 from rti_mpc.wire.interrupt import stop_on_signals
@@ -78,6 +79,8 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
     warm_up(rti)
     timing = Timing(config.delay_s, config.stale_s, config.timing.valid_s)
     controller = Controller(rti, timing, config_hash=config.config_hash, observer=build_observer(config), stop_law=stop_law)
+    if (notice := unguarded(config, stop_law)) is not None:
+        controller.say(notice)
     lock = Condition()
     params = Params(config, controller, rti, lock)
 
@@ -112,6 +115,14 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
             level = logging.INFO if all(outcome.granted for outcome in outcomes) else logging.WARNING
             log.log(level, "real time: %s", "; ".join(map(str, outcomes)))
         return daemon.run(stop)
+
+
+def unguarded(config: Config, stop_law: StopLaw | None) -> Notice | None:
+    """Return a notice of what a lost controller leaves, None for a robot that then stays at rest or has a guard."""
+    if stop_law is None or stop_law.holds or config.guard.enabled:
+        return None
+    left = "unless the robot itself feeds its states back it does not stay at rest"
+    return Notice(Severity.INFO, "unguarded", f"no guard: if this controller is lost, {left}: {stop_law.alone}")
 
 
 class Daemon:
