@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import gc
 import os
-import time
 from pathlib import Path
 
 import pytest
@@ -53,13 +52,12 @@ def test_no_fuzzed_sample_leaves_a_reference_cycle() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3])
 def test_no_sample_of_a_million_leaves_the_limits_or_raises(seed: int) -> None:
-    start_s = time.monotonic()
     fuzz = Fuzz(seed=seed)
     run(fuzz, MANY_SAMPLES // 5)
     before = resident_bytes()
     run(fuzz, MANY_SAMPLES)
     grown = resident_bytes() - before
-    print(f"\n{fuzz.samples} samples in {time.monotonic() - start_s:.0f} s, memory grown by {grown / 2**20:.2f} MiB: {dict(fuzz.seen)}")
+    print(f"\n{fuzz.samples} samples, memory grown by {grown / 2**20:.2f} MiB: {dict(fuzz.seen)}")
     assert grown < 2**22  # bytes; of 800,000 samples
 
 
@@ -78,7 +76,6 @@ def test_no_input_leaves_its_limits_whatever_is_lost_late_repeated_or_reordered_
 @pytest.mark.parametrize("guarded", [False, True], ids=["no guard", "guard"])
 @pytest.mark.parametrize("seed", [2, 3])
 def test_no_sample_of_a_million_leaves_its_limits_on_links_that_lose(seed: int, guarded: bool) -> None:
-    start_s = time.monotonic()
     fuzz = Lossy(seed=seed, guarded=guarded)
     run(fuzz, int(os.environ.get("FUZZ_SAMPLES", MANY_SAMPLES)))
-    print(f"\n{fuzz.samples} samples in {time.monotonic() - start_s:.0f} s: {dict(fuzz.seen)}")
+    print(f"\n{fuzz.samples} samples: {dict(fuzz.seen)}")

@@ -259,13 +259,10 @@ def test_a_takeover_behind_a_guard_is_seen_in_the_recording(port: int, tmp_path:
         robot.publish_json(keys.info("controller"), {"role": "controller", "states": [label], "inputs": [{**label, "name": "f"}]})
         state, telemetry = robot.publisher(keys.state), robot.publisher(keys.telemetry)
         command, actuation = robot.publisher(keys.command), robot.publisher(keys.actuation)
-        heard = {"rows": 0}
 
-        def hear(rows: int) -> bool:
-            entries = listener.drain()
-            outlet.offer(entries)
-            heard["rows"] += len(entries)
-            return heard["rows"] >= rows
+        def hear(messages: int) -> bool:
+            outlet.offer(listener.drain())
+            return listener.received >= messages
 
         until(lambda: hear(1), "the description")
         for k in range(1, 9):
