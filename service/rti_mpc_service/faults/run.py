@@ -32,13 +32,14 @@ from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_model, check_stop, check_tree
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.console import plain_console
+from rti_mpc_service.entry import EXIT_FAILED, say
 from rti_mpc_service.faults.excuse import excuses, explained
 from rti_mpc_service.faults.measure import Incident, measure, missed_ns
 from rti_mpc_service.faults.relay import ROLE as RELAY
 from rti_mpc_service.faults.report import MatrixReport, MatrixRow
 from rti_mpc_service.faults.system import System, Wiring
 from rti_mpc_service.faults.table import FAULTS, Fault
-from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.host.hold_up import Host, Unwitnessed
 from rti_mpc_service.rig.company import Failed
 from rti_mpc_service.rig.robot_log import RobotLog
 from rti_mpc_service.rig.scenario import configured
@@ -70,7 +71,7 @@ def main(config_path: Path, only: Sequence[str], path: Path | None) -> int:
         path: JSON file to write.
 
     Returns:
-        Exit status: 0 if every promise was kept.
+        Exit status: 0 if every promise was kept; 1 if one was not, or the host has no witness.
 
     Raises:
         ConfigError: A name is unknown, or the robot cannot be guarded or has no pose to start from.
@@ -79,8 +80,12 @@ def main(config_path: Path, only: Sequence[str], path: Path | None) -> int:
     config = prepared(load(config_path))
     stop = stop_on_signals()
     folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
-    with Host() as host, MatrixReport(console := plain_console(), len(faults)) as report:
-        inject(config, faults, folder, report, stop, host)
+    try:
+        with Host() as host, MatrixReport(console := plain_console(), len(faults)) as report:
+            inject(config, faults, folder, report, stop, host)
+    except Unwitnessed as error:  # from the start
+        say(str(error))
+        return EXIT_FAILED
     report.conclude()
     if report.kept:
         shutil.rmtree(folder)
@@ -142,7 +147,7 @@ def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Matrix
                     system = stack.enter_context(System(config, fault.wiring, folder / f"{number}", stop))
                 near = make_ready(system, fault, report)
                 row = suffer(system, fault, limits, report, host, near)
-            except (Failed, ConfigError) as error:
+            except (Failed, ConfigError, Unwitnessed) as error:
                 row = MatrixRow(fault, None, [str(error)])
             if stop.is_set():
                 return

@@ -35,6 +35,10 @@ ROW_LAYOUT = struct.Struct("<4q")  # the fields of `Row`
 ROW_TIMEOUT_S = 10.0  # how long to wait for the rows of a requested time
 
 
+class Unwitnessed(Exception):
+    """The witness has not told what the host did in a time."""
+
+
 class Row(NamedTuple):
     """Record of one timer between two instants of the monotonic clock: lateness of its ticks, and waiting time of the watched threads, ns."""
 
@@ -72,7 +76,7 @@ class Host:
             to_ns: End of the interval.
 
         Raises:
-            TimeoutError: A timer has not recorded the interval within ten seconds.
+            Unwitnessed: A timer has ended, or has not recorded the interval within ten seconds.
         """
         return 1e-6 * sum(row.held_up_ns for timer in self._timers for row in timer.rows(from_ns, to_ns))
 
@@ -86,7 +90,7 @@ class Host:
             within_ns: Length of the window.
 
         Raises:
-            TimeoutError: A timer has not recorded the interval within ten seconds.
+            Unwitnessed: A timer has ended, or has not recorded the interval within ten seconds.
         """
         rows = sorted(row for timer in self._timers for row in timer.rows(from_ns, to_ns))
         recent, held_up_ns, worst_ns = deque[Row](), 0, 0
@@ -111,13 +115,19 @@ class Timer:
         stack.callback(self.process.kill)
 
     def rows(self, from_ns: int, to_ns: int) -> Iterator[Row]:
-        """Wait until the timer has recorded an interval completely, and yield its rows, the last one first."""
+        """
+        Wait until the timer has recorded an interval completely, and yield its rows, the last one first.
+
+        Raises:
+            Unwitnessed: It has ended, or has not recorded the interval within ten seconds.
+        """
         deadline_s = time.monotonic() + ROW_TIMEOUT_S
         while not self._rows or self._rows[-1].until_ns < to_ns:
+            if (status := self.process.poll()) is not None:
+                raise Unwitnessed(f"the host's witness has ended with status {status}")
             if time.monotonic() > deadline_s:
-                raise TimeoutError(
-                    f"the host's witness must tell every {1e-6 * TICKS_PER_ROW * TICK_PERIOD_NS:g} ms, and was silent for {ROW_TIMEOUT_S:g} s"
-                )
+                told = f"{1e-6 * TICKS_PER_ROW * TICK_PERIOD_NS:g} ms"
+                raise Unwitnessed(f"the host's witness must tell every {told}, and was silent for {ROW_TIMEOUT_S:g} s")
             time.sleep(1e-9 * TICK_PERIOD_NS)
             self._rows += map(Row._make, ROW_LAYOUT.iter_unpack(self._file.read()))  # a row is written at once
         for row in reversed(self._rows):

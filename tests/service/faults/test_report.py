@@ -3,16 +3,22 @@ from __future__ import annotations
 
 import io
 import json
+from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
+from threading import Event
 
 import pytest
 from rich.console import Console
 
 from rti_mpc.errors import ConfigError
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.config.config import load
 from rti_mpc_service.faults import run
 from rti_mpc_service.faults.measure import Measured
 from rti_mpc_service.faults.report import MatrixReport, MatrixRow
 from rti_mpc_service.faults.table import FAULTS
+from rti_mpc_service.host.hold_up import Host, Unwitnessed
 
 BY_NAME = {fault.name: fault for fault in FAULTS}
 STOPPED = Measured(0.2, 0.21, 0.4, 1.8, 0.25, 0, 1.0, 2.5, 30, 0.5, 0.5)
@@ -52,6 +58,35 @@ def test_matrix_is_printed_with_what_was_not_kept() -> None:
     assert "1 of 2 within their promise" in printed
     for cell in (*report.rows[0].cells(), *report.rows[1].cells()):
         assert cell in printed, "no number is cut off where the terminal is narrow"
+    assert not report.kept
+
+
+class Dumb:
+    """A witness of the host that says nothing from the start."""
+
+    def __enter__(self) -> Dumb:
+        raise Unwitnessed("the host's witness has ended with status -9")
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+def test_run_without_a_witness_of_the_host_is_one_line_and_status_1(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(run, "Host", Dumb)
+    monkeypatch.setattr(run, "stop_on_signals", Event)
+    assert run.main(SHIPPED, (), None) == 1
+    assert capsys.readouterr() == ("", "rti-mpc: the host's witness has ended with status -9\n")
+
+
+def test_row_in_which_the_witness_falls_silent_is_not_kept_and_says_why(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def silent(*_: object) -> MatrixRow:
+        raise Unwitnessed("silent for 10 s")
+
+    monkeypatch.setattr(run, "System", lambda config, wiring, *_: ExitStack())
+    monkeypatch.setattr(run, "make_ready", silent)
+    report = MatrixReport(Console(file=io.StringIO()), 1)
+    run.inject(run.prepared(load(SHIPPED)), [BY_NAME["controller_killed"]], tmp_path, report, Event(), Host())
+    assert [row.broken for row in report.rows] == [["silent for 10 s"]]
     assert not report.kept
 
 

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from rti_mpc_service.host.hold_up import Host, Waits
+from rti_mpc_service.host import hold_up
+from rti_mpc_service.host.hold_up import Host, Unwitnessed, Waits
 from rti_mpc_service.host.realtime import available
 from tests.processes.system import until
 
@@ -80,6 +81,18 @@ def test_wait_that_lasts_is_told_before_the_kernel_adds_it_up_and_only_once(tmp_
     with pytest.raises(OSError, match="stat"):
         waits.since(10)
     waits.close()
+
+
+def test_witness_that_is_silent_or_has_ended_says_so(host: Host, monkeypatch: pytest.MonkeyPatch) -> None:
+    timer = host._timers[0]
+    timer.process.send_signal(signal.SIGSTOP)
+    monkeypatch.setattr(hold_up, "ROW_TIMEOUT_S", 0.1)
+    with pytest.raises(Unwitnessed, match=r"must tell every 10 ms, and was silent for 0\.1 s"):
+        host.held_up_ms(0, time.monotonic_ns())
+    timer.process.kill()
+    timer.process.wait()
+    with pytest.raises(Unwitnessed, match=r"the host's witness has ended with status -9"):
+        host.held_up_ms(0, time.monotonic_ns())
 
 
 def test_its_timers_end_with_it_and_with_whoever_started_it(host: Host) -> None:
