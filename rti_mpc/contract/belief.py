@@ -20,6 +20,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.schedule import BEFORE_ALL_NS, NO_ANGLES, Plan, Schedule
+from rti_mpc.contract.way import Way
 
 START_TOLERANCE_PERIODS = 0.1  # a command may begin to act this much sooner or later than believed
 OVERDUE_PERIODS = 1.0  # a command that does not act this long after its time is missing; until then it is still expected
@@ -88,7 +89,8 @@ class Belief(Schedule):
         self._find(source, u, t_ns, before_ns, coming)
         known = len(plans) > 0 and self._plays(u, t_ns, or_after=not coming)
         if not known:
-            self._take(source, u, t_ns, before_ns)
+            another = next((plan.way for plan in (*coming, *reversed(self._missing)) if plan.way is not None), None)
+            self._take(source, u, t_ns, before_ns, another)
         if not known or len(plans) < held:
             self.confirmed = 0
         for plan in coming:
@@ -138,14 +140,18 @@ class Belief(Schedule):
             if not plans:
                 plans.extend(known)
 
-    def _take(self, source: tuple[int, int], u: Array, t_ns: int, before_ns: int) -> None:
-        """Believe that an input has acted since the last report; from now on the newest plan continues, or its way to rest, or the ramp."""
+    def _take(self, source: tuple[int, int], u: Array, t_ns: int, before_ns: int, another: Way | None) -> None:
+        """
+        Believe that an input has acted since the last report; from now on the newest plan continues, or its way to rest, or the ramp.
+
+        Where all that was to act by then is forgotten, the robot goes `another` way to rest that is known: one that needs a way is never without.
+        """
         plans = self._plans
         newest = plans[-1] if plans else None
         while plans and plans[-1].start_ns > before_ns:
             plans.pop()
         u = u.copy()
-        way = newest.way if newest is not None and newest.end_ns <= t_ns else None
+        way = another if newest is None else newest.way if newest.end_ns <= t_ns else None
         plans.append(Plan(before_ns + 1, t_ns, before_ns + 1, self._period_ns, u[None], u[None], u, way=way))
         if newest is not None and source[1] and newest.end_ns > t_ns:
             self._put(replace(newest, start_ns=t_ns), self._increments)

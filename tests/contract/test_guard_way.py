@@ -42,7 +42,7 @@ class Mass:
         self.x = np.zeros(2)
         self.guard = Guard(LIMITS, epoch=10)
         self.actuator = Actuator(np.zeros(1), LIMITS.slew, 7, 0, (-BOUND, BOUND), Increments(-STEP, STEP, DT), LIMITS.angles)
-        self.now_ns = self.seq = self.sent = 0
+        self.now_ns = self.seq = self.sent = self.paused_ns = 0
         self.linked = True  # between guard and robot
         self.published: list[Command] = []
         self.refused = ""
@@ -51,7 +51,13 @@ class Mass:
 
     @property
     def local_ns(self) -> int:
-        return LOCAL_NS + self.now_ns
+        return LOCAL_NS + self.now_ns + self.paused_ns
+
+    def pause(self, ms: int) -> None:
+        """Let it stand still with its clock, as a simulation that is held up, while the guard goes on."""
+        for _ in range(ms // 10):
+            self.paused_ns += 10 * MS
+            self.tell(self.guard.tick(self.local_ns))
 
     def wait(self, ms: int) -> None:
         """Let it live in steps of 10 ms; states come every 20 ms."""
@@ -205,6 +211,20 @@ def test_feedback_holds_what_would_fall_over(guarded: bool, plays_ways: bool) ->
     assert dropped.send(u_rest=np.zeros((3, 1)))
     dropped.wait(6000)
     assert abs(dropped.x[0]) > 1.0
+
+
+@pytest.mark.parametrize("after_ms", range(0, 1200, 100))
+def test_guard_keeps_the_way_to_rest_when_the_robots_clock_has_waited(after_ms: int) -> None:
+    """What the robot reports is then from before all that the guard still knows to act."""
+    mass = Mass(push=0.9)
+    mass.drive(**mass.fed_back())
+    for _ in range(3):
+        mass.wait(after_ms)
+        mass.pause(500)
+        mass.wait(300)
+    mass.wait(3000)
+    assert len(mass.published[-1].K), "it still feeds back"
+    assert abs(mass.x[1]) < 1e-3
 
 
 def test_robot_holds_itself_when_its_guard_dies_and_the_guard_holds_a_robot_that_measures_nothing() -> None:
