@@ -63,13 +63,14 @@ class System:
     def __init__(self, folder: Path, config: Path = SHIPPED, **arguments: tuple[object, ...]) -> None:
         self.folder = folder
         self.config = config
+        self.keys = load(config).keys()
         self.arguments = ARGUMENTS | arguments
         self.endpoint = free_endpoint()
         self.running: dict[str, subprocess.Popen[bytes]] = {}
         self.lives: set[str] = set()
         self.fault_at_ns = 0  # when the last fault began, by the monotonic clock
         self._stack = ExitStack()
-        self.bus = self._stack.enter_context(Bus.join(BusSettings(connect=(self.endpoint,)), KEYS))
+        self.bus = self._stack.enter_context(Bus.join(BusSettings(connect=(self.endpoint,)), self.keys))
         self.bus.watch_alive(lambda role, present: (self.lives.add if present else self.lives.discard)(role))
 
     def __enter__(self) -> System:
@@ -126,15 +127,15 @@ class System:
 
     def tracking(self, epoch: int = 0) -> Command:
         """Wait for a command that follows the reference, for a robot of this epoch or a later one."""
-        commands = self.bus.subscriber(KEYS.command)
+        commands = self.bus.subscriber(self.keys.command)
         return heard(commands, Command, lambda command: command.mode.name == "TRACKING" and command.state_epoch >= epoch)
 
     def sample(self) -> Telemetry:
-        return heard(self.bus.subscriber(KEYS.telemetry), Telemetry, lambda _: True)
+        return heard(self.bus.subscriber(self.keys.telemetry), Telemetry, lambda _: True)
 
     def event(self, code: str, source: str, act: Callable[[], object] = lambda: None) -> Event:
         """Repeat an action until an event follows it."""
-        events = self.bus.subscriber(KEYS.event(source), capacity=64, history=False)
+        events = self.bus.subscriber(self.keys.event(source), capacity=64, history=False)
 
         def look() -> Event | None:
             act()
@@ -143,7 +144,7 @@ class System:
         return until(look, f"{source} says {code}", pause_s=0.05)
 
     def state(self, condition: Callable[[State], bool]) -> State:
-        return heard(self.bus.subscriber(KEYS.state), State, condition)
+        return heard(self.bus.subscriber(self.keys.state), State, condition)
 
 
 def owner(log: str) -> int:
