@@ -76,7 +76,7 @@ def motion_at_rest(ocp: Ocp) -> str:
     u_rest: Array = np.array(model.u_rest)
     move, rate, is_regular = motion(model), derivative(model), regular(ocp)
     inputs = list(corners(*around(ocp.lbu, ocp.ubu, u_rest), rng))
-    start = nominal_state(ocp)
+    start = np.clip(nominal_state(ocp), ocp.lbx, ocp.ubx)
     lowest, highest = around(ocp.lbx, ocp.ubx, start)
     states = [np.clip(move(start, u, DRIVEN_S), ocp.lbx, ocp.ubx) for u in inputs]
     states += [rng.uniform(lowest, highest) for _ in range(SEEDED_STATES)]

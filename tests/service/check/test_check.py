@@ -105,7 +105,7 @@ def test_sample_without_a_plan_is_told_with_the_state_it_began_at(
     path = tmp_path / "robot.toml"
     path.write_text(TANK)
     monkeypatch.setattr(check, "check_stop", lambda config: None)
-    monkeypatch.setattr(check, "stop_from_everywhere", lambda ocp, law: "")
+    monkeypatch.setattr(check, "stop_from_everywhere", lambda ocp, law, **options: "")
     assert check.main(path) == 1
     line = next(line for line in capsys.readouterr().out.splitlines() if "without a plan" in line)
     assert re.match(r"the first sample without a plan began at h = [\d.]+ m: .*, bound in ocp.bounds.states where the robot operates$", line)
