@@ -165,7 +165,9 @@ class Guard:
         if not reason:
             self._follow(command)
             self._led_ns = now_ns
-            if now_ns < self._open_ns:
+            # The way to rest of an earlier guard lasted as long as this one; a robot that reports its inputs says where it is on it.
+            unreported_s = 0.0 if len(self._state.u) else self._limits.outlasts_s(command)
+            if now_ns < self._open_ns + round(1e9 * unreported_s):
                 self._wait("all commands of an earlier guard have expired")
                 return None
         if reason:
@@ -186,6 +188,7 @@ class Guard:
             self.passing = True
             self._say(Severity.INFO, "guard_passing", f"commands of epoch {command.epoch} pass", change=True)
         self._engaged, self._corrected, self._told_ns, self._passed = True, False, until_ns, passed
+        self._lives.settling_s = self._limits.settling_s + self._limits.outlasts_s(passed)
         return passed
 
     def _wait(self, until: str) -> None:
@@ -422,6 +425,7 @@ class Guard:
         self._rest_by_ns = BEFORE_ALL_NS  # the robot is at rest: a latch from before passes nothing but rest
         self._engaged = self._untold = self._corrected = self.passing = False
         self._passed = None
+        self._lives.settling_s = self._limits.settling_s
         self._late.clear()
 
     def _jump(self, state: State, local_ns: int, where: str) -> None:

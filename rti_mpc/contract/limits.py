@@ -57,10 +57,19 @@ class Limits:
     @property
     def settling_s(self) -> float:
         """Time in s for which a command without a way to rest may still move the robot after its state: to its end, and down the ramp."""
+        return self.delay_s + 1e-9 * MAX_VALID_NS + self.ramp_s
+
+    @property
+    def ramp_s(self) -> float:
+        """Longest time of the ramp to rest, s."""
         way = np.maximum(np.abs(self.lbu - self.u_rest), np.abs(self.ubu - self.u_rest))
         limited = np.isfinite(self.slew)
         ramp = np.where(limited, way / np.where(limited, self.slew, 1.0), 0.0)
-        return self.delay_s + 1e-9 * MAX_VALID_NS + float(np.minimum(ramp, 10.0).max(initial=0.0))
+        return float(np.minimum(ramp, 10.0).max(initial=0.0))
+
+    def outlasts_s(self, command: Command) -> float:
+        """Return by how much the way to rest of a command lasts longer than the ramp, s; 0 if it has none."""
+        return max(0.0, 1e-9 * len(command.u_rest) * command.rest_period_ns - self.ramp_s)
 
     @property
     def settled(self) -> Array:

@@ -51,6 +51,7 @@ class Lives:
     Attributes:
         disputed: Whether two robots use the name, so that neither may move.
         notice: Notice about the last state; None for most states.
+        settling_s: Time for which any command may still move the robot after the state that it answers, s of the robot.
     """
 
     def __init__(self, stale_s: float, settling_s: float) -> None:
@@ -59,11 +60,11 @@ class Lives:
 
         Args:
             stale_s: Time without a state after which the robot counts as silent, s of the robot.
-            settling_s: Time for which any command may still move the robot after the state that it answers, s of the robot.
+            settling_s: As the attribute, at first.
         """
         self.disputed = False
         self.notice: Notice | None = None
-        self._stale_s, self._settling_s = stale_s, settling_s
+        self._stale_s, self.settling_s = stale_s, settling_s
         self._life: Life | None = None
         self._rival: Life | None = None
 
@@ -82,7 +83,7 @@ class Lives:
             rate: Seconds of the believed robot's clock per local second.
         """
         self.notice = None
-        stale_ns, settling_ns = 1e9 * self._stale_s / rate, 1e9 * self._settling_s / rate
+        stale_ns, settling_ns = 1e9 * self._stale_s / rate, 1e9 * self.settling_s / rate
         life, rival = self._life, self._rival
         if life is None:
             return self._believe(Life(epoch, local_ns, local_ns))
@@ -112,6 +113,6 @@ class Lives:
         self.disputed = True
         text = (
             f"two robots use this name, of epochs {one} and {other}: commands are stopped, the inputs ramp to rest, "
-            f"and commands continue once only one was heard for {self._settling_s:g} s; stop one of them, or give it another name"
+            f"and commands continue once only one was heard for {self.settling_s:g} s; stop one of them, or give it another name"
         )
         self.notice = Notice(Severity.ERROR, "two_robots", text)

@@ -37,6 +37,7 @@ class Mass:
     """
 
     def __init__(self, *, guarded: bool = True, plays_ways: bool = True, measures: bool = True, push: float = 1.0, fall: float = 0.0) -> None:
+        self.reports = True  # which inputs act
         self.guarded, self.plays_ways, self.measures = guarded, plays_ways, measures
         self.push, self.fall = push, fall  # what an input is worth, and how fast it falls over, in 1/s^2
         self.x = np.zeros(2)
@@ -70,7 +71,9 @@ class Mass:
             self.acted.append(float(self.actuator.u[0]))
             if self.now_ns % (20 * MS) == 0:
                 self.sent += 1
-                self.state = State(7, self.sent, self.now_ns, self.x.copy(), self.actuator.u.copy(), *self.actuator.source)
+                self.state = State(
+                    7, self.sent, self.now_ns, self.x.copy(), self.actuator.u.copy() if self.reports else np.zeros(0), *self.actuator.source
+                )
                 if self.measures:
                     self.actuator.measure(self.x, self.now_ns)
                 self.guard.receive_state(self.state, self.local_ns)
@@ -295,6 +298,38 @@ def test_way_to_rest_that_needs_feedback_passes_only_where_the_states_are_known(
     assert not mass.send(**mass.fed_back())
     assert "its way to rest feeds 2 states back, of 0 that are known" in mass.refused
     assert mass.send()
+
+
+SETTLED_MS = 1e3 * LIMITS.settling_s  # after a command without a way to rest: 300 ms, and the ramp of 200 ms
+WAY_MS = 100 * len(BRAKES) - 200  # by which the way lasts longer than the ramp
+
+
+def passes_ms(mass: Mass) -> int:
+    """Time until a command passes, each answering the last state."""
+    for waited_ms in range(0, 5000, 20):
+        if mass.send():
+            return waited_ms
+        mass.wait(20)
+    raise AssertionError(mass.refused)
+
+
+@pytest.mark.parametrize("reports", [True, False])
+def test_guard_that_starts_waits_for_the_end_of_a_way_to_rest_of_which_the_robot_says_nothing(reports: bool) -> None:
+    """The robot is still on the way of a command that an earlier guard has passed; if it reports its inputs, the guard knows where on it."""
+    mass = Mass().drive()
+    mass.reports, mass.guard = reports, Guard(LIMITS, epoch=20)
+    mass.wait(40)  # two states
+    assert SETTLED_MS + WAY_MS * (not reports) - 60 <= passes_ms(mass) <= SETTLED_MS + WAY_MS * (not reports)
+
+
+def test_commands_wait_after_two_robots_for_as_long_as_a_way_to_rest_moves_one_of_them() -> None:
+    mass = Mass().drive()
+    for _ in range(3):
+        mass.guard.receive_state(replace(mass.state, epoch=8, seq=mass.sent), mass.local_ns)
+        mass.wait(20)
+    assert not mass.send()
+    assert "two" in mass.refused
+    assert SETTLED_MS + WAY_MS - 60 <= passes_ms(mass) <= SETTLED_MS + WAY_MS + 20
 
 
 def test_way_to_rest_is_passed_on_whole_and_inside_the_bounds() -> None:
