@@ -53,7 +53,7 @@ from rti_mpc_service.rig.witness import Witness
 from rti_mpc_service.scenario import Scenario, find_scenario
 
 CONTROLLER_SILENCE_S = 5.0  # after which the run ends: the robot will not be driven any further
-END_TIMEOUT_S = 3.0
+END_TIMEOUT_S = 5.0  # a guard may take 3 s to bring the robot to rest
 POLL_PERIOD_S = 0.1
 DRAW_PERIOD_S = 0.25
 REFERENCE_MARGIN_S = 5.0  # reference beyond the last sample's horizon: near the last row a controller slows down
