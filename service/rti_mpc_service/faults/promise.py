@@ -43,6 +43,13 @@ class Promise:
         coasts = {"still_s", "distance_m"} if "brake_s" in self.at_most or "distance_m" in self.at_most else set()
         return replace(self, at_most={name: limit for name, limit in self.at_most.items() if name not in coasts})
 
+    def by_way(self, within_s: float) -> Promise:
+        """Return the promise of a robot that its inputs at rest do not stop: it stands once its way to rest is over, whatever its inputs do there."""
+        if "brake_s" not in self.at_most:
+            return self
+        stands = {"still_s": within_s} if "still_s" in self.at_most else {}
+        return replace(self, at_most={name: limit for name, limit in self.at_most.items() if name not in BRAKING} | stands)
+
     def broken(self, measured: Measured, excused: Mapping[str, float] = NO_EXCUSE) -> list[str]:
         """Return the broken limits, in words; `excused` says by how much each value may exceed its limit."""
         values = {name: getattr(measured, name) for name in self.at_most}

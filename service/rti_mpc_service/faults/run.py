@@ -20,6 +20,7 @@ from difflib import get_close_matches
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Event
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -45,6 +46,9 @@ from rti_mpc_service.rig.robot_log import RobotLog
 from rti_mpc_service.rig.scenario import configured
 from rti_mpc_service.scenario import find_scenario
 
+if TYPE_CHECKING:
+    from rti_mpc.rti.way_to_rest import StopLaw
+
 STATE_PERIOD_S = 0.01  # of the robot and of its record: the resolution of every measured time
 ROLES_OF_WIRING = {
     Wiring.PEERS: ("controller", "guard", "reference", "robot"),
@@ -58,6 +62,7 @@ BEFORE_NS = 5_000_000_000  # robot time before a fault in which that error is lo
 RECOVERY_TIMEOUT_S = 20.0
 MIN_REFERENCE_LEFT_S = 40.0  # duration of the reference that a fault may need
 AFTER_RECOVERY_S = 0.3  # how long the robot is recorded after it has recovered
+STANDING_S = 1.0  # how long a robot is seen to stand after its way to rest
 RECORD_TIMEOUT_S = 5.0  # for the robot to write its record; a line waits up to a second for an answer
 
 
@@ -78,11 +83,12 @@ def main(config_path: Path, only: Sequence[str], path: Path | None) -> int:
     """
     faults = chosen(only)
     config = prepared(load(config_path))
+    law = check_stop(config)
     stop = stop_on_signals()
     folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
     try:
         with Host() as host, MatrixReport(console := plain_console(), len(faults)) as report:
-            inject(config, faults, folder, report, stop, host)
+            inject(config, [of_robot(fault, config, law) for fault in faults], folder, report, stop, host)
     except Unwitnessed as error:  # from the start
         say(str(error))
         return EXIT_FAILED
@@ -130,6 +136,17 @@ def prepared(config: Config) -> Config:
     return config
 
 
+def of_robot(fault: Fault, config: Config, law: StopLaw | None) -> Fault:
+    """Return a fault as a robot must bear it that coasts, or goes a way to rest: it lasts until that is over, and is to stand then."""
+    if config.model.stop == "coasts":
+        return replace(fault, promise=fault.promise.without_standstill())
+    if law is None or "brake_s" not in fault.promise.at_most:
+        return fault
+    within_s = config.timing.valid_s + law.rows * law.period_s
+    stands = "still_s" in fault.promise.at_most
+    return replace(fault, promise=fault.promise.by_way(within_s), hold_s=max(fault.hold_s, within_s + STANDING_S) if stands else fault.hold_s)
+
+
 def inject(config: Config, faults: Sequence[Fault], folder: Path, report: MatrixReport, stop: Event, host: Host) -> None:
     """Inject all faults one after the other, or until stopped."""
     limits = guard_limits(config, build_signals(config))
@@ -138,8 +155,6 @@ def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Matrix
         for number, fault in enumerate(faults):
             if stop.is_set():
                 return
-            if config.model.stop == "coasts":
-                fault = replace(fault, promise=fault.promise.without_standstill())
             try:
                 if system is None or system.wiring is not fault.wiring:
                     stack.close()

@@ -12,12 +12,13 @@ from rti_mpc.contract.message import End, Reference
 from rti_mpc_service.config.config import load
 from rti_mpc_service.faults.measure import Incident
 from rti_mpc_service.faults.motion import Motion
-from rti_mpc_service.faults.promise import HOLDS, KEEPS_ON, STOPS, WAITS
+from rti_mpc_service.faults.promise import ALWAYS, HOLDS, KEEPS_ON, PAUSES, RECOVERY, STOPS, WAITS
 from rti_mpc_service.faults.report import MatrixRow
-from rti_mpc_service.faults.run import error_before, prepared
+from rti_mpc_service.faults.run import error_before, of_robot, prepared
 from rti_mpc_service.faults.table import FAULTS
 from rti_mpc_service.rig.robot_log import RobotLog
-from tests.robots import arm, polar, shuffled, toml
+from tests.movers import law_of
+from tests.robots import SHIPPED, arm, polar, shuffled, toml
 
 X = np.arange(5.0)
 
@@ -53,6 +54,18 @@ def test_robot_that_coasts_promises_nothing_of_its_standstill_but_where_it_is_he
     assert STOPS.without_standstill().at_most.keys() == STOPS.at_most.keys() - {"still_s"}
     assert WAITS.without_standstill().at_most.keys() == WAITS.at_most.keys() - {"distance_m"}
     assert HOLDS.without_standstill() == HOLDS
+
+
+def test_robot_with_a_way_to_rest_is_held_to_its_end_and_not_to_inputs_at_rest() -> None:
+    law = law_of("car")
+    assert law is not None
+    config, fault = load(SHIPPED), next(fault for fault in FAULTS if fault.name == "controller_killed")
+    borne = of_robot(fault, config, law)
+    assert borne.promise.at_most == {**ALWAYS, **RECOVERY, "still_s": pytest.approx(0.25 + law.rows * law.period_s)}
+    assert borne.hold_s > borne.promise.at_most["still_s"]
+    assert of_robot(fault, config, None) == fault
+    assert PAUSES.by_way(5.0).at_most == {**ALWAYS, **RECOVERY}
+    assert HOLDS.by_way(5.0) == HOLDS
 
 
 def test_row_is_told_in_the_unit_of_the_robot() -> None:
