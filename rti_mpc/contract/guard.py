@@ -213,12 +213,15 @@ class Guard:
         self._schedule.forget(now_ns - 2 * self._dt_ns)
         if self.passing:
             self._watch(now_ns)
-        if now_ns - self._state.stamp_ns > self._stale_ns:
+        blind = now_ns - self._state.stamp_ns > self._stale_ns
+        if blind:
             self._feed_back(None, now_ns, now_ns)
         if self._told_ns - now_ns > RAMP_LEAD_NS * self._clock.rate and not self._corrected:
             return None
         start_ns = now_ns if self._corrected else max(self._told_ns, now_ns)
         way = self._schedule.way(start_ns)
+        if blind and way is not None and way.feeds_back and not (self._corrected or self._untold):
+            return None  # the robot has this way, and may still know its state
         valid_ns = RAMP_STEPS_PER_COMMAND * RAMP_STEP_NS if way is None else piece_ns(way, start_ns)
         u = np.array([self._schedule.at(start_ns + i * RAMP_STEP_NS)[0] for i in range(-(-valid_ns // RAMP_STEP_NS))])
         period_ns = RAMP_STEP_NS

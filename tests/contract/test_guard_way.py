@@ -45,6 +45,7 @@ class Mass:
         self.actuator = Actuator(np.zeros(1), LIMITS.slew, 7, 0, (-BOUND, BOUND), Increments(-STEP, STEP, DT), LIMITS.angles)
         self.now_ns = self.seq = self.sent = self.paused_ns = 0
         self.linked = True  # between guard and robot
+        self.heard = True  # by the guard
         self.published: list[Command] = []
         self.refused = ""
         self.acted: list[float] = []  # every 10 ms
@@ -76,7 +77,8 @@ class Mass:
                 )
                 if self.measures:
                     self.actuator.measure(self.x, self.now_ns)
-                self.guard.receive_state(self.state, self.local_ns)
+                if self.heard:
+                    self.guard.receive_state(self.state, self.local_ns)
             if self.guarded:
                 self.tell(self.guard.tick(self.local_ns))
 
@@ -241,6 +243,17 @@ def test_robot_holds_itself_when_its_guard_dies_and_the_guard_holds_a_robot_that
             setattr(mass, name, value)
         mass.wait(6000)
         assert np.abs(mass.x).max() < 1e-3, change
+
+
+def test_robot_that_would_fall_over_holds_itself_while_its_guard_hears_no_state() -> None:
+    """As where every state comes with a NaN: rows that nobody corrects would take the place of the robot's own feedback."""
+    mass = Mass(fall=2.0)
+    gain = np.array([[4.0, 3.0]])
+    mass.drive(2, **{**mass.fed_back(), "x_rest": np.zeros((7, 2)), "u_rest": np.zeros((7, 1)), "K": gain, "u": np.zeros((5, 1))})
+    mass.x[:] = 0.02, 0.0
+    mass.heard = False
+    mass.wait(6000)
+    assert np.abs(mass.x).max() < 1e-2
 
 
 def test_feedback_takes_no_plan_from_the_robot_that_is_about_to_begin() -> None:
