@@ -105,8 +105,8 @@ class Partitioned:
         cut_ns = time.monotonic_ns()
         self.network.cut(host)
         time.sleep(duration_s)  # the fault itself
+        restored_ns = time.monotonic_ns()  # from here on the robot may be driven again
         self.network.restore(host)
-        restored_ns = time.monotonic_ns()
         until(lambda: self.driven(restored_ns), f"all is well again after {duration_s:.1f} s without the {host}", pause_s=0.1)
         return cut_ns, restored_ns, time.monotonic_ns()
 
