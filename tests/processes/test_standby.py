@@ -107,7 +107,7 @@ def test_standby_of_another_configuration_is_refused(tmp_path: Path) -> None:
         assert done.returncode == 2
         assert len(done.stderr.splitlines()) == 1
         assert f"{info['config_hash']:016x}" in done.stderr
-        assert "ours" in done.stderr
+        assert "this standby's" in done.stderr
 
 
 @pytest.mark.slow
