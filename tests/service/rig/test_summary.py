@@ -180,6 +180,13 @@ def test_robot_that_did_not_get_to_the_end_was_not_driven_there(outcome: Outcome
     assert summarize(changed)["driven"] is False
 
 
+def test_robot_that_brakes_at_the_end_while_the_host_is_held_up_was_driven_there(outcome: Outcome) -> None:
+    """For a second of the clock on the wall: four of the robot's, at four times real speed."""
+    held_up = [sample(k, mode=Mode.BRAKING if k > 1225 else Mode.TRACKING) for k in range(1, 1258)]
+    assert replace(outcome, telemetry=held_up, speed=4.0).driven
+    assert not replace(outcome, telemetry=held_up, speed=2.0).driven
+
+
 def test_run_that_is_too_short_says_nothing_where_it_knows_nothing(outcome: Outcome) -> None:
     summary = summarize(replace(outcome, log=outcome.log.part(outcome.log.stamp_ns < 5000 * MS), telemetry=outcome.telemetry[:30]))
     assert (summary["max_error_mm"], summary["last_lap_max_error_mm"], summary["driven"]) == (None, None, False)
