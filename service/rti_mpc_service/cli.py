@@ -358,11 +358,14 @@ def faults(
         list[str] | None, typer.Option(metavar="NAME", help="Name of a fault from the list below; repeatable.", show_default="all")
     ] = None,
     path: JsonPath = None,
+    scenario: ScenarioName = None,
+    waypoint_speed: WaypointSpeed = 0.25,
+    waypoint_smoothing: WaypointSmoothing = None,
 ) -> None:
     """Inject faults into a running system, one after the other, and print what the robot did: the fault matrix."""
     from rti_mpc_service.faults.run import main
 
-    raise typer.Exit(main(config, tuple(only or ()), path))
+    raise typer.Exit(main(config, tuple(only or ()), path, scenario, waypoint_speed, waypoint_smoothing))
 
 
 @app.command()

@@ -14,9 +14,9 @@ from rti_mpc_service.faults.promise import BRAKING
 from tests.processes.system import rti_mpc
 
 
-def matrix(path: Path, *names: str, timeout_s: float = 180.0) -> dict[str, dict[str, Any]]:
+def matrix(path: Path, *names: str, scenario: tuple[object, ...] = (), timeout_s: float = 180.0) -> dict[str, dict[str, Any]]:
     """Rows by name, as written to a file; the exit status agrees with them."""
-    done = rti_mpc("faults", *(word for name in names for word in ("--only", name)), "--json", path, timeout_s=timeout_s)
+    done = rti_mpc("faults", *scenario, *(word for name in names for word in ("--only", name)), "--json", path, timeout_s=timeout_s)
     rows = json.loads(path.read_text())
     assert done.returncode == int(not all(row["kept"] for row in rows)), done.stdout + done.stderr
     assert f"{sum(row['kept'] for row in rows)} of {len(rows)} within their promise" in done.stdout
@@ -51,6 +51,20 @@ def test_unknown_fault_is_one_line_that_names_the_nearest() -> None:
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert "perhaps controller_killed is meant" in done.stderr
     assert done.stderr.endswith("got 'controller_kiled'\n")
+
+
+def test_scenario_that_comes_to_rest_is_one_line_before_anything_is_started() -> None:
+    done = rti_mpc("faults", "--scenario", "positioning")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "rti-mpc: --scenario must move the robot for at least 60 s, positioning does for 15.8 s\n"
+
+
+@pytest.mark.slow
+def test_robot_is_tested_on_waypoints(tmp_path: Path) -> None:
+    (tmp_path / "line.csv").write_text("x,y\n0,0\n0,30\n")
+    rows = matrix(tmp_path / "faults.json", "controller_killed", scenario=("--scenario", tmp_path / "line.csv", "--waypoint-speed", 0.4))
+    assert rows["controller_killed"]["kept"], rows
+    assert rows["controller_killed"]["speed_m_s"] > 0.3
 
 
 @pytest.mark.slow

@@ -47,7 +47,7 @@ from rti_mpc_service.rig.children import Children
 from rti_mpc_service.rig.company import CLI_MODULE, START_TIMEOUT_S, WATCHER_NICENESS, Failed, check_children, wait
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.rig.run_data import wanted
-from rti_mpc_service.rig.scenario import BEST_HEADINGS, configured, write_files
+from rti_mpc_service.rig.scenario import BEST_HEADINGS, configured, reference_options, write_files
 from rti_mpc_service.rig.summary import Outcome, summarize
 from rti_mpc_service.rig.witness import Witness
 from rti_mpc_service.scenario import Scenario, find_scenario
@@ -69,7 +69,7 @@ class DemoPlan:
 
     Attributes:
         config: Configuration that all processes load.
-        name: Name of the scenario, as on the command line; empty: the robot's own.
+        name: Name of the scenario, as on the command line; None: the robot's own.
         scenario: Scenario to follow.
         waypoint_speed_m_s: Speed along the waypoints of a file.
         waypoint_smoothing_m: Length of path over which they are averaged; None: as their noise needs.
@@ -80,7 +80,7 @@ class DemoPlan:
     """
 
     config: Config
-    name: str
+    name: str | None
     scenario: Scenario
     waypoint_speed_m_s: float
     waypoint_smoothing_m: float | None
@@ -121,7 +121,7 @@ def plan(
     check_start(config)
     return DemoPlan(
         config=config,
-        name=name or "",
+        name=name,
         scenario=scenario,
         waypoint_speed_m_s=waypoint_speed_m_s,
         waypoint_smoothing_m=waypoint_smoothing_m,
@@ -245,11 +245,7 @@ def compiling(log: Path) -> set[str]:
 def start(run: DemoPlan, children: Children, endpoint: str, size: int) -> None:
     """Start all processes except the robot."""
     keys, config = run.config.keys(), run.folder / "config.toml"
-    scenario: list[object] = ["--duration", run.reference_s]
-    scenario += ["--scenario", run.name] if run.name else []
-    scenario += ["--heading", run.scenario.heading] if run.scenario.heading else []
-    scenario += ["--waypoint-speed", run.waypoint_speed_m_s]
-    scenario += [] if run.waypoint_smoothing_m is None else ["--waypoint-smoothing", run.waypoint_smoothing_m]
+    scenario = reference_options(run.name, run.scenario, run.reference_s, run.waypoint_speed_m_s, run.waypoint_smoothing_m)
     children.start("controller", CLI_MODULE, "run", config, "-e", endpoint)
     for name in guards(run):
         children.start(name, CLI_MODULE, "guard", config, "-e", endpoint)

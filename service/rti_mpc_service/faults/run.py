@@ -28,7 +28,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.limits import Limits
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.interrupt import stop_on_signals
-from rti_mpc_service.config.build import build_signals, guard_limits
+from rti_mpc_service.config.build import build_signals, guard_limits, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_model, check_stop, check_tree
 from rti_mpc_service.config.schema import Config
@@ -43,8 +43,8 @@ from rti_mpc_service.faults.table import FAULTS, Fault
 from rti_mpc_service.host.hold_up import Host, Unwitnessed
 from rti_mpc_service.rig.company import Failed
 from rti_mpc_service.rig.robot_log import RobotLog
-from rti_mpc_service.rig.scenario import configured
-from rti_mpc_service.scenario import find_scenario
+from rti_mpc_service.rig.scenario import BEST_HEADINGS, configured, reference_options
+from rti_mpc_service.scenario import Scenario, find_scenario
 
 if TYPE_CHECKING:
     from rti_mpc.rti.way_to_rest import StopLaw
@@ -60,13 +60,22 @@ MAX_SETTLED_ERROR_M = 0.001
 SETTLING_S = 20.0  # for a robot to come that near to its reference; one that does not is measured against its own error
 BEFORE_NS = 5_000_000_000  # robot time before a fault in which that error is looked for
 RECOVERY_TIMEOUT_S = 20.0
+REFERENCE_DURATION_S = 120.0  # at most: 58 kB fit into one packet, so that a busy host cannot drop a part of it
 MIN_REFERENCE_LEFT_S = 40.0  # duration of the reference that a fault may need
+MIN_REFERENCE_S = MIN_REFERENCE_LEFT_S + SETTLING_S
 AFTER_RECOVERY_S = 0.3  # how long the robot is recorded after it has recovered
 STANDING_S = 1.0  # how long a robot is seen to stand after its way to rest
 RECORD_TIMEOUT_S = 5.0  # for the robot to write its record; a line waits up to a second for an answer
 
 
-def main(config_path: Path, only: Sequence[str], path: Path | None) -> int:
+def main(
+    config_path: Path,
+    only: Sequence[str],
+    path: Path | None,
+    scenario: str | None = None,
+    waypoint_speed_m_s: float = 0.25,
+    waypoint_smoothing_m: float | None = None,
+) -> int:
     """
     Inject faults, print the matrix, and write it to a file if asked to.
 
@@ -74,21 +83,28 @@ def main(config_path: Path, only: Sequence[str], path: Path | None) -> int:
         config_path: The robot's TOML file.
         only: Names of faults; empty: all.
         path: JSON file to write.
+        scenario: What the robot follows, see `rti_mpc_service.scenario.find_scenario`; also of the other two.
+        waypoint_speed_m_s: Speed along waypoints.
+        waypoint_smoothing_m: Path that waypoints are averaged over.
 
     Returns:
         Exit status: 0 if every promise was kept; 1 if one was not, or the host has no witness.
 
     Raises:
-        ConfigError: A name is unknown, or the robot cannot be guarded or has no pose to start from.
+        ConfigError: A name is unknown, the robot cannot be guarded or has no pose to start from, or the scenario ends too early.
     """
     faults = chosen(only)
-    config = prepared(load(config_path))
+    config = load(config_path)
     law = check_stop(config)
+    heading = BEST_HEADINGS.get(scenario or "")
+    followed = find_scenario(config, scenario, heading, REFERENCE_DURATION_S, waypoint_speed_m_s, waypoint_smoothing_m)
+    config = prepared(config, followed)
+    reference = reference_options(scenario, followed, moving_s(config, followed), waypoint_speed_m_s, waypoint_smoothing_m)
     stop = stop_on_signals()
     folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
     try:
         with Host() as host, MatrixReport(console := plain_console(), len(faults)) as report:
-            inject(config, [of_robot(fault, config, law) for fault in faults], folder, report, stop, host)
+            inject(config, [of_robot(fault, config, law) for fault in faults], folder, report, stop, host, reference)
     except Unwitnessed as error:  # from the start
         say(str(error))
         return EXIT_FAILED
@@ -123,10 +139,9 @@ def chosen(only: Sequence[str]) -> list[Fault]:
     return [fault for fault in faults if not fault.viewer]
 
 
-def prepared(config: Config) -> Config:
+def prepared(config: Config, scenario: Scenario) -> Config:
     """Return the configuration of a run: from the scenario's pose, guarded, with states that come fast enough to measure by."""
-    check_stop(config)
-    config = configured(config, find_scenario(config), guard=True)
+    config = configured(config, scenario, guard=True)
     content = config.model_dump(by_alias=True, exclude_unset=True)
     content["debug"] = {"inject": True}
     content["sim"] = {**content.get("sim", {}), "state_period_s": min(STATE_PERIOD_S, config.ocp.dt_s)}
@@ -134,6 +149,21 @@ def prepared(config: Config) -> Config:
     check_tree(config)
     check_model(config)
     return config
+
+
+def moving_s(config: Config, scenario: Scenario) -> float:
+    """
+    Return how long a scenario moves the robot, in s.
+
+    Raises:
+        ConfigError: Not for as long as a fault may need.
+    """
+    y = scenario.y(robot_settings(config)["x0"])
+    rows = np.flatnonzero(np.diff(y, axis=0).any(axis=1))
+    duration_s = scenario.period_s * float(rows[-1] + 1) if rows.size else 0.0
+    if duration_s < MIN_REFERENCE_S:
+        raise ConfigError(f"--scenario must move the robot for at least {MIN_REFERENCE_S:g} s, {scenario.name} does for {duration_s:.3g} s")
+    return duration_s
 
 
 def of_robot(fault: Fault, config: Config, law: StopLaw | None) -> Fault:
@@ -147,8 +177,10 @@ def of_robot(fault: Fault, config: Config, law: StopLaw | None) -> Fault:
     return replace(fault, promise=fault.promise.by_way(within_s), hold_s=max(fault.hold_s, within_s + STANDING_S) if stands else fault.hold_s)
 
 
-def inject(config: Config, faults: Sequence[Fault], folder: Path, report: MatrixReport, stop: Event, host: Host) -> None:
-    """Inject all faults one after the other, or until stopped."""
+def inject(
+    config: Config, faults: Sequence[Fault], folder: Path, report: MatrixReport, stop: Event, host: Host, reference: Sequence[object] = ()
+) -> None:
+    """Inject all faults one after the other, or until stopped; `reference` are options of `rti-mpc reference`."""
     limits = guard_limits(config, build_signals(config))
     system: System | None = None
     with ExitStack() as stack:
@@ -159,7 +191,7 @@ def inject(config: Config, faults: Sequence[Fault], folder: Path, report: Matrix
                 if system is None or system.wiring is not fault.wiring:
                     stack.close()
                     report.say(fault, f"starting {fault.wiring.value}")
-                    system = stack.enter_context(System(config, fault.wiring, folder / f"{number}", stop))
+                    system = stack.enter_context(System(config, fault.wiring, folder / f"{number}", stop, reference))
                 near = make_ready(system, fault, report)
                 row = suffer(system, fault, limits, report, host, near)
             except (Failed, ConfigError, Unwitnessed) as error:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import resource
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import Enum
 from pathlib import Path
@@ -35,7 +35,6 @@ from rti_mpc_service.rig.robot_log import RobotLog
 from rti_mpc_service.rig.scenario import write_files
 from rti_mpc_service.rig.witness import Witness
 
-REFERENCE_DURATION_S = 120  # 58 kB fit into one packet, so that a busy host cannot drop a part of it
 REQUEST_TIMEOUT_S = 2.0
 
 
@@ -55,6 +54,13 @@ class System:
     """
     The processes of one robot, being driven.
 
+    Args:
+        config: Its configuration.
+        wiring: How they are linked.
+        folder: Folder of their files, to be made.
+        stop: Ends all waiting.
+        reference: Options of `rti-mpc reference`.
+
     Attributes:
         wiring: How they are linked.
         keys: Keys of all processes except those behind a relay.
@@ -68,12 +74,12 @@ class System:
         motion: What the robot's reaction is measured by.
     """
 
-    def __init__(self, config: Config, wiring: Wiring, folder: Path, stop: Event) -> None:
+    def __init__(self, config: Config, wiring: Wiring, folder: Path, stop: Event, reference: Sequence[object] = ()) -> None:
         folder.mkdir(parents=True)
         self.keys = config.keys()
         self.period_ns = round(1e9 * config.ocp.dt_s)
         self.robots = 0
-        self.wiring, self._folder, self._stop = wiring, folder, stop
+        self.wiring, self._folder, self._stop, self._reference = wiring, folder, stop, reference
         self._robot_keys = Keys(f"{self.keys.prefix}/behind", self.keys.robot) if wiring in RELAYED else self.keys
         model = build_model(config)
         self.motion = Motion(model)
@@ -161,7 +167,7 @@ class System:
         commands: dict[str, tuple[object, ...]] = {
             "controller": (CLI_MODULE, "run", *meeting),
             "guard": (CLI_MODULE, "guard", *meeting),
-            "reference": (CLI_MODULE, "reference", *meeting, "--duration", REFERENCE_DURATION_S),
+            "reference": (CLI_MODULE, "reference", *meeting, *self._reference),
             "robot": (CLI_MODULE, "sim", *meeting, *(() if "-m" in meeting else ("-l", "tcp/127.0.0.1:0")), "--log", self.log_path),
             "viewer": (CLI_MODULE, "view", *meeting, "--rerun-save", self._folder / "run.rrd"),
             "router": (CLI_MODULE, "router", here, "-l", self._endpoint),

@@ -37,6 +37,20 @@ def configured(config: Config, scenario: Scenario, guard: bool = False) -> Confi
     return config
 
 
+def reference_options(
+    name: str | None, scenario: Scenario, duration_s: float, waypoint_speed_m_s: float, waypoint_smoothing_m: float | None
+) -> tuple[object, ...]:
+    """Return the options with which `rti-mpc reference` follows for a time the scenario that was found by a name, or by none."""
+    options = {
+        "--scenario": name,
+        "--heading": scenario.heading,
+        "--duration": duration_s,
+        "--waypoint-speed": waypoint_speed_m_s,
+        "--waypoint-smoothing": waypoint_smoothing_m,
+    }
+    return tuple(word for option, value in options.items() if value is not None for word in (option, value))
+
+
 def write_files(path: Path, config: Config) -> None:
     """
     Write a run's configuration and, for its guard if it has one, the signals of its model.

@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 
 from rti_mpc.contract.message import End, Reference
+from rti_mpc.errors import ConfigError
 from rti_mpc_service.config.config import load
 from rti_mpc_service.faults.measure import Incident
 from rti_mpc_service.faults.motion import Motion
 from rti_mpc_service.faults.promise import ALWAYS, HOLDS, KEEPS_ON, PAUSES, RECOVERY, STOPS, WAITS
 from rti_mpc_service.faults.report import MatrixRow
-from rti_mpc_service.faults.run import error_before, of_robot, prepared
+from rti_mpc_service.faults.run import MIN_REFERENCE_S, error_before, moving_s, of_robot, prepared
 from rti_mpc_service.faults.table import FAULTS
 from rti_mpc_service.rig.robot_log import RobotLog
+from rti_mpc_service.scenario import find_scenario
 from tests.movers import law_of
 from tests.robots import SHIPPED, arm, polar, shuffled, toml
 
@@ -77,6 +79,23 @@ def test_faults_are_prepared_for_any_robot_behind_a_guard(name: str, tmp_path: P
     """The glider has a parameter `a` that is no axle's offset, the rover none at all, and the arm no position."""
     path = tmp_path / "robot.toml"
     path.write_text(toml(name))
-    config = prepared(load(path))
+    config = load(path)
+    config = prepared(config, find_scenario(config))
     assert config.guard.enabled
     assert config.debug.inject
+
+
+@pytest.mark.parametrize(("name", "lasts_s"), [(None, 120.0), ("circle", 120.0), ("waypoints.csv", 80.0)])
+def test_scenario_is_followed_for_as_long_as_it_moves_the_robot(
+    name: str | None, lasts_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("waypoints.csv").write_text("x,y\n0,0\n20,0\n")
+    config = load(SHIPPED)
+    assert moving_s(config, find_scenario(config, name, duration_s=120.0)) == pytest.approx(lasts_s, abs=0.1)
+
+
+def test_scenario_that_ends_before_a_fault_would_is_one_line() -> None:
+    config = load(SHIPPED)
+    with pytest.raises(ConfigError, match=rf"^--scenario must move the robot for at least {MIN_REFERENCE_S:g} s, positioning does for 15\.8 s$"):
+        moving_s(config, find_scenario(config, "positioning", duration_s=120.0))

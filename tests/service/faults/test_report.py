@@ -19,6 +19,7 @@ from rti_mpc_service.faults.measure import Measured
 from rti_mpc_service.faults.report import MatrixReport, MatrixRow
 from rti_mpc_service.faults.table import FAULTS
 from rti_mpc_service.host.hold_up import Host, Unwitnessed
+from rti_mpc_service.scenario import find_scenario
 
 BY_NAME = {fault.name: fault for fault in FAULTS}
 STOPPED = Measured(0.2, 0.21, 0.4, 1.8, 0.25, 0, 1.0, 2.5, 30, 0.5, 0.5)
@@ -85,7 +86,8 @@ def test_row_in_which_the_witness_falls_silent_is_not_kept_and_says_why(monkeypa
     monkeypatch.setattr(run, "System", lambda config, wiring, *_: ExitStack())
     monkeypatch.setattr(run, "make_ready", silent)
     report = MatrixReport(Console(file=io.StringIO()), 1)
-    run.inject(run.prepared(load(SHIPPED)), [BY_NAME["controller_killed"]], tmp_path, report, Event(), Host())
+    config = load(SHIPPED)
+    run.inject(run.prepared(config, find_scenario(config)), [BY_NAME["controller_killed"]], tmp_path, report, Event(), Host())
     assert [row.broken for row in report.rows] == [["silent for 10 s"]]
     assert not report.kept
 
