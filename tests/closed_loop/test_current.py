@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.contract.message import End, Reference
+from rti_mpc.contract.message import End, Reference, Telemetry
 from rti_mpc.contract.status import Mode
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.control.observer import Disturbance, Observer, ObserverSettings
@@ -18,6 +18,7 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rest import RestClass, assess, find_stop_law
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.way_to_rest import StopLaw
+from rti_mpc_service.faults.system import steady
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
 from tests.loop import MS, Run, drive
@@ -108,6 +109,22 @@ def test_last_command_keeps_the_boat_at_rest_in_the_current_it_was_made_in() -> 
         body.tick()
     assert np.hypot(*(body.x - where)[:2]) < STILL
     assert len(run.commands[-1].K) == 2
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_last_command_leads_to_rest_once_the_estimate_is_steady_and_not_before(known: bool) -> None:
+    """For which `rti-mpc faults` waits."""
+    controller, body = afloat(LAW, 0.0)
+    samples: list[Telemetry] = []
+    while len(samples) < (40 if known else 1) and not steady(samples, MOST):
+        drive(controller, body, 1e-9 * body.now_ns + 0.1)
+        samples.append(controller.telemetry(prepare_us=0.0, feedback_us=0.0, latency_us=0.0, slack_s=0.0))
+    assert steady(samples, MOST) == known
+    for _ in range(120):
+        body.tick()
+    where = body.x.copy()
+    body.tick()
+    assert (np.hypot(*(body.x - where)[:2]) / 0.1 < STILL) == known
 
 
 @pytest.mark.slow

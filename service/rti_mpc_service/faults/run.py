@@ -206,7 +206,7 @@ def inject(
 
 def make_ready(system: System, fault: Fault, report: MatrixReport) -> bool:
     """
-    Wait until the robot is driven, and on its path if the fault's promise is about the distance from it.
+    Wait until the robot is driven; on its path if the fault's promise is about the distance from it, and knowing what a stop is to balance.
 
     Returns:
         Whether it is as near to its reference as it should be; False after `SETTLING_S` of coming no nearer.
@@ -227,7 +227,7 @@ def make_ready(system: System, fault: Fault, report: MatrixReport) -> bool:
     def settled() -> bool:
         nonlocal near
         near = system.driven(error_m)
-        return near or (time.monotonic_ns() > deadline_ns and system.driven())
+        return (near and system.estimated()) or (time.monotonic_ns() > deadline_ns and system.driven())
 
     system.wait(settled, "the robot to be driven")
     return near

@@ -16,12 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from rti_mpc.contract.message import Reference
+from rti_mpc.array import Array
+from rti_mpc.contract.message import Reference, Telemetry
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.info import Info, Label
 from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.session import BusSettings
-from rti_mpc_service.config.build import build_model
+from rti_mpc_service.config.build import build_model, disturbances_at_rest
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.faults.motion import Motion
 from rti_mpc_service.faults.observer import RunObserver
@@ -36,6 +37,8 @@ from rti_mpc_service.rig.scenario import write_files
 from rti_mpc_service.rig.witness import Witness
 
 REQUEST_TIMEOUT_S = 2.0
+STEADY_NS = 1_000_000_000  # for which an estimate does not change any more that has come to what it estimates
+STEADY_SHARE = 1e-3  # of its largest magnitude, by which it may still
 
 
 class Wiring(Enum):
@@ -81,6 +84,7 @@ class System:
         self.robots = 0
         self.wiring, self._folder, self._stop, self._reference = wiring, folder, stop, reference
         self._robot_keys = Keys(f"{self.keys.prefix}/behind", self.keys.robot) if wiring in RELAYED else self.keys
+        self._balanced = disturbances_at_rest(config)
         model = build_model(config)
         self.motion = Motion(model)
         states, inputs = (tuple(Label(signal.name) for signal in signals) for signals in (model.states, model.inputs))
@@ -216,6 +220,10 @@ class System:
         self.witness.listen()
         return self.witness.begun and self.observer.speed_m_s() > self.motion.driven_speed and self.error_m() < error_m
 
+    def estimated(self) -> bool:
+        """Whether the controller knows what a stop is to balance, a current say: without it, its commands lead to no rest."""
+        return steady(self.witness.listen().telemetry, self._balanced)
+
     def wait(self, condition: Callable[[], object], what: str, patience_s: float = START_TIMEOUT_S) -> None:
         """
         Wait for a condition, or until stopped.
@@ -268,3 +276,17 @@ class System:
         if answer.get("ok") is not True:
             raise Failed(f"{key} was asked for {request}: {answer.get('error')}")
         return answer
+
+
+def steady(samples: Sequence[Telemetry], most: Array) -> bool:
+    """Return whether disturbances with largest magnitudes `most`, shape ``(nd,)``, were estimated for a while, and always alike; true of none."""
+    if not most.size:
+        return True
+    if not samples:
+        return False
+    last = samples[-1]
+    begin_ns = last.state_stamp_ns - STEADY_NS
+    before = next((i for i in reversed(range(len(samples))) if samples[i].state_stamp_ns <= begin_ns or samples[i].epoch != last.epoch), None)
+    if before is None or samples[before].epoch != last.epoch:
+        return False
+    return bool((np.ptp([sample.d for sample in samples[before:]], axis=0) <= STEADY_SHARE * most).all())
