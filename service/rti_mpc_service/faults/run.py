@@ -169,7 +169,8 @@ def moving_s(config: Config, scenario: Scenario) -> float:
 
 def of_robot(fault: Fault, config: Config, law: StopLaw | None) -> Fault:
     """Return a fault as a robot must bear it that coasts, or goes a way to rest: it lasts until that is over, and is to stand then."""
-    if config.model.stop == "coasts":
+    adrift = law is not None and law.disturbances.size > 0 and "brake_s" not in fault.promise.at_most  # until it is commanded
+    if config.model.stop == "coasts" or adrift:
         return replace(fault, promise=fault.promise.without_standstill())
     if law is None or "brake_s" not in fault.promise.at_most:
         return fault

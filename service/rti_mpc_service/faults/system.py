@@ -18,6 +18,7 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Reference, Telemetry
+from rti_mpc.contract.status import Mode
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.info import Info, Label
 from rti_mpc.wire.keys import Key, Keys
@@ -216,9 +217,14 @@ class System:
         return 1e-9 * (reference.stamp_ns + (len(reference.y) - 1) * reference.period_ns - self.now_ns())
 
     def driven(self, error_m: float = np.inf) -> bool:
-        """Whether the robot is driven, and nearer to its reference than `error_m`."""
-        self.witness.listen()
-        return self.witness.begun and self.observer.speed_m_s() > self.motion.driven_speed and self.error_m() < error_m
+        """Whether the robot is driven, not only adrift, and nearer to its reference than `error_m`."""
+        witness = self.witness.listen()
+        return (
+            witness.begun
+            and witness.telemetry[-1].mode is Mode.TRACKING
+            and self.observer.speed_m_s() > self.motion.driven_speed
+            and self.error_m() < error_m
+        )
 
     def estimated(self) -> bool:
         """Whether the controller knows what a stop is to balance, a current say: without it, its commands lead to no rest."""

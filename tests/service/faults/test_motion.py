@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,9 @@ def test_robot_with_a_way_to_rest_is_held_to_its_end_and_not_to_inputs_at_rest()
     assert borne.promise.at_most == {**ALWAYS, **RECOVERY, "still_s": pytest.approx(0.25 + law.rows * law.period_s)}
     assert borne.hold_s > borne.promise.at_most["still_s"]
     assert of_robot(fault, config, None) == fault
+    missing = next(fault for fault in FAULTS if fault.name == "reference_missing")
+    assert of_robot(missing, config, law) == missing
+    assert of_robot(missing, config, replace(law, disturbances=np.ones(2))).promise.at_most == {**ALWAYS, **RECOVERY}, "it drifts until then"
     assert PAUSES.by_way(5.0).at_most == {**ALWAYS, **RECOVERY}
     assert HOLDS.by_way(5.0) == HOLDS
 
