@@ -12,6 +12,7 @@ from rti_mpc_service.host.hold_up import Host
 
 MS = 1_000_000
 WAIT_BEFORE_DROP = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"  # us
+WAIT_BEFORE_CLOSE = "transport/link/tx/queue/congestion_control/block/wait_before_close"  # us
 PATIENT = (f"{WAIT_BEFORE_DROP}:60000000",)  # settings of a bus that waits rather than drop a message where a busy host holds up the link
 SEEN = 0.8  # share of a delay that the witness sees at least, where the host is the reason
 BEFORE_NS = 50 * MS  # what has just been sent when something begins may be held up already

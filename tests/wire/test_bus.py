@@ -28,7 +28,7 @@ from rti_mpc.wire.streams import MAX_RING_BYTES
 from rti_mpc.wire.zenoh_session import ZenohSession
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
-from tests.in_time import MS, PATIENT, WAIT_BEFORE_DROP, explained, in_time
+from tests.in_time import MS, PATIENT, WAIT_BEFORE_CLOSE, WAIT_BEFORE_DROP, explained, in_time
 
 ROOT = Path(__file__).parents[2]
 KEYS = Keys(robot="test")
@@ -62,6 +62,7 @@ def stranger(endpoint: str) -> zenoh.Session:
         "connect/endpoints": f'["{endpoint}"]',
         "scouting/multicast/enabled": "false",
         WAIT_BEFORE_DROP: f"{10**6 * TIMEOUT_S}",
+        WAIT_BEFORE_CLOSE: f"{10**6 * TIMEOUT_S}",
     }
     for name, value in settings.items():
         config.insert_json5(name, value)

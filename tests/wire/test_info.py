@@ -51,7 +51,8 @@ def test_position_heading_and_tracked_states_are_found_by_role_whatever_their_na
     assert info.position == (0, 1)
     assert info.heading == 3
     assert info.tracked == [(0, 3)]
-    assert info.tracked_position is None
+    assert info.computed == [1]
+    assert info.computed_position is None
 
 
 def test_a_description_without_roles_has_neither_position_nor_heading() -> None:
