@@ -221,6 +221,7 @@ class System:
         witness = self.witness.listen()
         return (
             witness.begun
+            and bool(self.observer.answered)  # the robot in its present life
             and witness.telemetry[-1].mode is Mode.TRACKING
             and self.observer.speed_m_s() > self.motion.driven_speed
             and self.error_m() < error_m

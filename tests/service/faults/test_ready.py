@@ -53,10 +53,15 @@ def test_robot_is_ready_when_it_stays_on_its_path_if_it_must_and_knows_what_to_b
     assert t[0] == pytest.approx(ready_s, abs=3 * POLL_S)
 
 
-@pytest.mark.parametrize(("mode", "speed_m_s", "driven"), [(Mode.TRACKING, 0.25, True), (Mode.BRAKING, 0.25, False), (Mode.TRACKING, 0.05, False)])
-def test_robot_that_drifts_at_speed_is_not_driven(mode: Mode, speed_m_s: float, driven: bool) -> None:
+@pytest.mark.parametrize(
+    ("mode", "answered", "speed_m_s", "driven"),
+    [(Mode.TRACKING, {7}, 0.25, True), (Mode.BRAKING, {7}, 0.25, False), (Mode.TRACKING, set(), 0.25, False), (Mode.TRACKING, {7}, 0.05, False)],
+)
+def test_robot_that_drifts_at_speed_is_not_driven_nor_one_that_was_before_it_was_restarted(
+    mode: Mode, answered: set[int], speed_m_s: float, driven: bool
+) -> None:
     witness = SimpleNamespace(begun=True, telemetry=[SimpleNamespace(mode=mode)])
     witness.listen = lambda: witness
-    observer, motion = SimpleNamespace(speed_m_s=lambda: speed_m_s), SimpleNamespace(driven_speed=0.1)
+    observer, motion = SimpleNamespace(speed_m_s=lambda: speed_m_s, answered=answered), SimpleNamespace(driven_speed=0.1)
     system = SimpleNamespace(witness=witness, observer=observer, motion=motion, error_m=lambda: 1.0)
     assert System.driven(cast("System", system)) == driven
