@@ -25,7 +25,7 @@ def run(fuzz: Fuzz, samples: int) -> None:
         fuzz.step()
 
 
-@pytest.mark.parametrize("measured", [False, True], ids=["no delay", "measured delay"])
+@pytest.mark.parametrize("measured", [pytest.param(False, marks=pytest.mark.slow, id="no delay"), pytest.param(True, id="measured delay")])
 def test_no_fuzzed_sample_leaves_the_limits_or_raises(measured: bool) -> None:
     fuzz = Fuzz(seed=1, measured=measured)
     run(fuzz, SHORT_SAMPLES)
