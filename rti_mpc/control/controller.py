@@ -52,7 +52,7 @@ from rti_mpc.rti.way_to_rest import StopLaw
 INPUTS_UNREPORTED = (
     "the robot does not report which inputs act: commands are assumed to act, and only the robot itself or a guard can handle lost ones"
 )
-KNOWN = {Mode.TRACKING, Mode.HOLDING}  # in which it is certain which inputs act
+KNOWN_INPUT_MODES = {Mode.TRACKING, Mode.HOLDING}  # in which it is certain which inputs act
 ITERATIONS_COLD = 3  # iterations of the first sample, whose guess is one state and one input at all stages
 
 
@@ -120,7 +120,7 @@ class Controller:
         ways = None if stop_law is None else Stopping(ocp, stop_law, self.envelope.limits, self._prediction, self._valid_ns, compile=compile)
         self._ways = ways  # to rest; None: its inputs ramp to rest
         balances = stop_law is not None and stop_law.disturbances.size > 0
-        self._known = KNOWN | ({Mode.STOPPED, Mode.BRAKING} if balances else set())  # modes in which disturbances are estimated
+        self._known = KNOWN_INPUT_MODES | ({Mode.STOPPED, Mode.BRAKING} if balances else set())  # modes in which disturbances are estimated
         self._rows: Array = np.zeros((ocp.N, model.nu))  # all rows of the last plan, of which a command with a way to rest has the first ones
         self._loaded = False  # whether the QP of t_k is prepared
         self._reach: tuple[Array, Array] = (np.zeros((2, model.nu)), np.zeros((2, model.nu)))  # what the first rows at t_k may be

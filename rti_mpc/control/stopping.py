@@ -26,9 +26,9 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.way_to_rest import StopLaw, WayToRest
 
 MAX_PREDICTION_NS = 1_000_000_000  # that a state is predicted ahead; a robot that was not heard for longer is taken to be on its way
-CHANGED = 0.05  # of its largest magnitude, by which a disturbance has become another one, in which the robot rests elsewhere
-ESTIMATED_NS = 1_000_000_000  # after which the estimate of another disturbance has come to it
-RESTING = 0.01  # of its range in operation, to which each state and input has come at rest
+CHANGED_SHARE = 0.05  # share of its largest magnitude by which a disturbance must have changed for the robot to rest elsewhere
+ESTIMATION_NS = 1_000_000_000  # time that the estimate of a changed disturbance needs to settle
+REST_SHARE = 0.01  # share of its range in operation within which a state or an input is at rest
 
 Ending = Mapping[str, Any]  # the fields of a command that hold its way to rest, by their names
 
@@ -120,8 +120,8 @@ class Stopping:
         """
         way = self._way
         x0 = self._prediction.predict(x, state_ns, act_ns) if act_ns - state_ns <= MAX_PREDICTION_NS else x
-        if np.any(np.abs(self._d - self._d_known) > CHANGED * self._law.disturbances):
-            self._d_known[:], self._known_ns = self._d, act_ns + ESTIMATED_NS
+        if np.any(np.abs(self._d - self._d_known) > CHANGED_SHARE * self._law.disturbances):
+            self._d_known[:], self._known_ns = self._d, act_ns + ESTIMATION_NS
         if self._began_ns is not None and act_ns <= self._known_ns:
             self._began_ns, self._aimed = None, way.aim(way.x[-1], way.u[-1])
         if self._began_ns is None:
@@ -138,7 +138,7 @@ class Stopping:
         self._aimed = False
         law = self._law
         still_to_move = (way.x[0] - way.x[-1]) / law.scale_x, (way.u[0] - way.u[-1]) / law.scale_u
-        self.at_rest = bool(max(np.abs(part).max() for part in still_to_move) <= RESTING)
+        self.at_rest = bool(max(np.abs(part).max() for part in still_to_move) <= REST_SHARE)
         row = min(max(1, self._valid_ns // self.period_ns), len(way.u) - 1)
         return way.u[:row].copy(), min(row * self.period_ns, self._valid_ns), self._ending(row)
 

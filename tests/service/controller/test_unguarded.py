@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `run` says at its start of a robot without a guard."""
+"""Event with which `run` says at its start what a lost controller leaves of a robot without a guard."""
 
 from __future__ import annotations
 

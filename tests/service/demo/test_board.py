@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `rti-mpc demo` prints, on a narrow terminal and in a pipe."""
+"""Output of `rti-mpc demo` on a narrow terminal and in a pipe."""
 
 from __future__ import annotations
 
