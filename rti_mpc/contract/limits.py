@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -49,17 +50,17 @@ class Limits:
     stale_s: float = 0.25
     angles: Array = field(default_factory=lambda: NO_ANGLES)
 
-    @property
+    @cached_property
     def slew(self) -> Array:
         """Rate of the ramp to rest, shape ``(nu,)``, per s."""
         return np.minimum(-self.lbdu, self.ubdu) / self.dt_s
 
-    @property
+    @cached_property
     def settling_s(self) -> float:
         """Time in s for which a command without a way to rest may still move the robot after its state: to its end, and down the ramp."""
         return self.delay_s + 1e-9 * MAX_VALID_NS + self.ramp_s
 
-    @property
+    @cached_property
     def ramp_s(self) -> float:
         """Longest time of the ramp to rest, s."""
         way = np.maximum(np.abs(self.lbu - self.u_rest), np.abs(self.ubu - self.u_rest))
@@ -71,7 +72,7 @@ class Limits:
         """Return by how much the way to rest of a command lasts longer than the ramp, s; 0 if it has none."""
         return max(0.0, 1e-9 * len(command.u_rest) * command.rest_period_ns - self.ramp_s)
 
-    @property
+    @cached_property
     def settled(self) -> Array:
         """How far from its last row a way to rest counts as rest, shape ``(nu,)``."""
         span = self.ubu - self.lbu
