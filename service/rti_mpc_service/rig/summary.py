@@ -83,9 +83,9 @@ class Outcome:
     @property
     def driven(self) -> bool:
         """Whether the robot was driven to the end: it got there, and shortly before a plan for the reference was acting."""
-        reached = self.log.stamp_ns.size > 0 and self.log.stamp_ns[-1] >= self.end_ns
-        last_ns = max((sample.state_stamp_ns for sample in self.samples if sample.mode in DRIVING_MODES), default=self.anchor_ns)
-        return bool(reached and self.end_ns - last_ns < 1e9 * max(MAX_HELD_UP_S * self.speed, 2.5 * self.ocp.dt))
+        reached = bool(self.log.stamp_ns.size and self.log.stamp_ns[-1] >= self.end_ns)
+        since_ns = self.end_ns - 1e9 * max(MAX_HELD_UP_S * self.speed, 2.5 * self.ocp.dt)
+        return reached and any(sample.state_stamp_ns > since_ns and sample.mode in DRIVING_MODES for sample in self.samples)
 
     def run(self) -> Run:
         """Return the run between anchor and end for figures; samples whose command never arrived are left out."""

@@ -185,6 +185,8 @@ def test_robot_that_brakes_at_the_end_while_the_host_is_held_up_was_driven_there
     held_up = [sample(k, mode=Mode.BRAKING if k > 1225 else Mode.TRACKING) for k in range(1, 1258)]
     assert replace(outcome, telemetry=held_up, speed=4.0).driven
     assert not replace(outcome, telemetry=held_up, speed=2.0).driven
+    braking = [sample(k, mode=Mode.BRAKING) for k in range(1, 1258)]
+    assert not replace(outcome, telemetry=braking, speed=4.0, duration_s=2.0).driven, "a run shorter than that in which nothing was driven"
 
 
 def test_run_that_is_too_short_says_nothing_where_it_knows_nothing(outcome: Outcome) -> None:
