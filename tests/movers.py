@@ -6,11 +6,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from rti_mpc.array import Array
 from rti_mpc.model.model import Model, Signal
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rest import find_stop_law
@@ -19,6 +21,13 @@ from tests.problems import INF, pioneer
 
 GRAVITY = 9.81  # m/s^2
 BOUNDS = ("lbx", "ubx", "lbu", "ubu")
+PATHS: dict[str, Callable[[Array], tuple[Array, Array]]] = {  # of the two outputs that a robot follows, over the time in s
+    "car": lambda t: (2.5 * np.sin(t / 2.5), 2.5 - 2.5 * np.cos(t / 2.5)),
+    "bicycle": lambda t: (8 * np.sin(t / 8), 8 - 8 * np.cos(t / 8)),
+    "arm": lambda t: (0.5 * np.sin(t), -0.5 * np.sin(t)),
+    "quadrotor": lambda t: (2 * np.sin(t / 3), 0.5 * np.sin(t / 3)),
+    "floating": lambda t: (4 * np.sin(t / 8), 4 - 4 * np.cos(t / 8)),
+}
 FOLLOWED = {"car": "x y", "bicycle": "x y", "floating": "x y", "arm": "q_1 q_2", "quadrotor": "x z"}  # outputs of a robot on a reference
 
 
@@ -210,3 +219,11 @@ disturbances = { x = { drift = 0.02, limit = 0.5 }, y = { drift = 0.02, limit = 
 [sim]
 parameters = { c_x = 0.2, c_y = -0.15 }
 """
+
+
+def path_file(name: str, folder: Path) -> Path:
+    """Write the path of one of these as a scenario of its outputs over ten minutes."""
+    t, path = np.arange(0.0, 600.0, 0.1), folder / "path.csv"
+    header = ",".join(("t", *(output.name for output in following(name).outputs)))
+    np.savetxt(path, np.column_stack([t, *PATHS[name](t)]), delimiter=",", header=header, comments="", fmt="%.5f")
+    return path

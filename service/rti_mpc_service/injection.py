@@ -57,7 +57,10 @@ class FaultyRti(Rti):
         """As `Rti.prepare`."""
         if shift:
             self._begin()
-        super().prepare(y_ref, np.full_like(self.p, np.nan) if self._failing == "nan_model" else p, shift=shift, u_prev=u_prev)
+        super().prepare(y_ref, p, shift=shift, u_prev=u_prev)
+        if self._failing == "nan_model":  # what it predicts, and whatever is linearized there, with parameters or without
+            self.guess.sample["x"][1:] = np.nan
+            self._linearize()
 
     def feedback(self, x0: Array) -> QpStatus:
         """As `Rti.feedback`."""

@@ -15,7 +15,8 @@ from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc_service.injection import FAILURES, MAX_FAILING_SAMPLES, FaultyRti, answer
 from rti_mpc_sim.lockstep import Lockstep
 from tests.loop import MS, Run, drive, reference, robot
-from tests.problems import pioneer
+from tests.movers import ocp_of
+from tests.problems import double_integrator, pioneer
 
 DT = 100 * MS
 STEP = np.array([0.25, 0.4])  # slew limit per dt
@@ -99,6 +100,23 @@ def test_model_that_gave_nan_is_forgotten_within_two_samples(driving: tuple[Cont
     for command in run.commands:
         assert np.isfinite(command.u).all()
     assert_applied_inside_slew(controller, body, run)
+
+
+@pytest.mark.parametrize("name", ["car", "quadrotor", "double_integrator"])
+@pytest.mark.parametrize("solver", ["riccati", "osqp"])
+def test_model_without_parameters_can_give_nan_too(name: str, solver: str) -> None:
+    ocp = double_integrator() if name == "double_integrator" else ocp_of(name)
+    rti = FaultyRti(ocp, solver=solver, compile=False)
+    x = rti.x_nominal.copy()
+    y_ref = np.tile(np.array(ocp.model.h()(x, ocp.model.p_nominal)).ravel(), (ocp.N, 1))
+    rti.prepare(y_ref)
+    assert rti.feedback(x).usable
+    fail(rti, "nan_model", 1)
+    rti.prepare(y_ref)
+    assert not rti.feedback(x).usable
+    rti.reset(x, np.array(ocp.model.u_rest))
+    rti.prepare(y_ref, shift=False)
+    assert rti.feedback(x).usable
 
 
 # Over budget.

@@ -11,12 +11,13 @@ from typing import Any
 import pytest
 
 from rti_mpc_service.faults.promise import BRAKING
+from tests.movers import CURRENT, path_file, toml
 from tests.processes.system import rti_mpc
 
 
-def matrix(path: Path, *names: str, scenario: tuple[object, ...] = (), timeout_s: float = 180.0) -> dict[str, dict[str, Any]]:
+def matrix(path: Path, *names: str, robot: tuple[object, ...] = (), timeout_s: float = 180.0) -> dict[str, dict[str, Any]]:
     """Rows by name, as written to a file; the exit status agrees with them."""
-    done = rti_mpc("faults", *scenario, *(word for name in names for word in ("--only", name)), "--json", path, timeout_s=timeout_s)
+    done = rti_mpc("faults", *robot, *(word for name in names for word in ("--only", name)), "--json", path, timeout_s=timeout_s)
     rows = json.loads(path.read_text())
     assert done.returncode == int(not all(row["kept"] for row in rows)), done.stdout + done.stderr
     assert f"{sum(row['kept'] for row in rows)} of {len(rows)} within their promise" in done.stdout
@@ -63,7 +64,7 @@ def test_scenario_that_comes_to_rest_is_one_line_before_anything_is_started() ->
 def test_robot_is_tested_on_waypoints(tmp_path: Path) -> None:
     """By a fault that waits for the robot to have come to its path, which it then follows at the speed that was asked for."""
     (tmp_path / "line.csv").write_text("x,y\n0,0\n0,30\n")
-    rows = matrix(tmp_path / "faults.json", "solver_fails", scenario=("--scenario", tmp_path / "line.csv", "--waypoint-speed", 0.4))
+    rows = matrix(tmp_path / "faults.json", "solver_fails", robot=("--scenario", tmp_path / "line.csv", "--waypoint-speed", 0.4))
     assert rows["solver_fails"]["kept"], rows
     assert rows["solver_fails"]["speed_m_s"] == pytest.approx(0.4, abs=0.02)  # the eight is followed at 0.23 at most
 
@@ -73,3 +74,12 @@ def test_robot_is_tested_on_waypoints(tmp_path: Path) -> None:
 def test_whole_matrix_is_within_its_promises(tmp_path: Path) -> None:
     rows = matrix(tmp_path / "faults.json", timeout_s=1800.0)
     assert {name: row["broken"] for name, row in rows.items() if not row["kept"]} == {}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("CI" in os.environ, reason="it takes half an hour; test_stops.py is the short form")
+@pytest.mark.parametrize(("name", "more"), [("car", ""), ("floating", CURRENT), ("quadrotor", "")])
+def test_whole_matrix_of_a_robot_with_a_way_to_rest_is_within_its_promises(name: str, more: str, tmp_path: Path) -> None:
+    (tmp_path / "robot.toml").write_text(toml(name, more))
+    rows = matrix(tmp_path / "faults.json", robot=(tmp_path / "robot.toml", "--scenario", path_file(name, tmp_path)), timeout_s=2400.0)
+    assert {fault: row["broken"] for fault, row in rows.items() if not row["kept"]} == {}

@@ -245,11 +245,8 @@ def suffer(system: System, fault: Fault, limits: Limits, report: MatrixReport, h
         Failed: Nothing can be measured.
     """
     report.say(fault, fault.text)
-    before_ns = system.now_ns()
-    injected_ns = fault.inject(system)
-    fault_ns = before_ns if injected_ns is None else injected_ns
-    system.pause(fault.hold_s)
-    mend_ns, robots = max(system.now_ns(), fault_ns + round(2e9 * STATE_PERIOD_S)), system.robots
+    fault_ns, mend_ns = endure(system, fault)
+    robots = system.robots
     reference = system.witness.reference
     report.say(fault, "waiting for the robot to recover")
     fault.mend(system)
@@ -273,6 +270,15 @@ def suffer(system: System, fault: Fault, limits: Limits, report: MatrixReport, h
 
     excused = excuses(measured, missed, incident, system.period_ns, held_up_ms)
     return MatrixRow(fault, measured, promise.broken(measured, excused), explained(promise, measured, excused), system.motion.unit)
+
+
+def endure(system: System, fault: Fault) -> tuple[int, int]:
+    """Inject a fault, and wait for as long as it is to last from its beginning on; return when that was and when it is to end, robot time."""
+    before_ns = system.now_ns()
+    injected_ns = fault.inject(system)
+    fault_ns = before_ns if injected_ns is None else injected_ns
+    system.pause(1e-9 * max(0, fault_ns - system.now_ns()) + fault.hold_s)
+    return fault_ns, max(system.now_ns(), fault_ns + round(2e9 * STATE_PERIOD_S))
 
 
 def error_before(log: RobotLog, error: Array, incident: Incident) -> float:

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a robot is ready for a fault, by an invented clock."""
+"""When a robot is ready for a fault, and how long it lasts, by an invented clock."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
@@ -65,3 +66,18 @@ def test_robot_that_drifts_at_speed_is_not_driven_nor_one_that_was_before_it_was
     observer, motion = SimpleNamespace(speed_m_s=lambda: speed_m_s, answered=answered), SimpleNamespace(driven_speed=0.1)
     system = SimpleNamespace(witness=witness, observer=observer, motion=motion, error_m=lambda: 1.0)
     assert System.driven(cast("System", system)) == driven
+
+
+@pytest.mark.parametrize("begins_s", [None, -0.1, 1.0])  # at once, at the last good state, with the last row of a reference
+def test_fault_lasts_as_long_as_it_should_from_its_beginning_on(begins_s: float | None) -> None:
+    t_ns = [10**9]
+
+    def pause(duration_s: float) -> None:
+        t_ns[0] += round(1e9 * duration_s)
+
+    system = SimpleNamespace(now_ns=lambda: t_ns[0], pause=pause)
+    begins_ns = t_ns[0] if begins_s is None else t_ns[0] + round(1e9 * begins_s)
+    fault = replace(BY_NAME["reference_ends_stop"], inject=lambda _: None if begins_s is None else begins_ns, hold_s=5.0)
+    fault_ns, mend_ns = run.endure(cast("System", system), fault)
+    assert fault_ns == begins_ns
+    assert mend_ns - max(fault_ns, 10**9) == 5 * 10**9
