@@ -44,7 +44,7 @@ FINDING_PASSES = 3  # over a way that is found anew, before the last one: equili
 FIRST_ROWS = 2  # whose reach depends on what was sent before
 BLOCK_ROWS = 10  # that are compiled once and called again, as are steps of the regulator: compilers take long for what is long
 FREE_SHARE = 0.01  # of its rate in operation by which a state moves where another one is anywhere in its range: then that one is free at rest
-HOLD_S = 1.0  # a deviation from the way weighs as much as a rate that undoes it in this time
+HOLD_S = 0.5  # a deviation from the way weighs as much as a rate that undoes it in this time
 LIMITS = ("lbu", "ubu", "lbdu", "ubdu")
 
 
@@ -272,7 +272,8 @@ def regulators(model: Model, law: StopLaw) -> ca.Function:
     moving = C.T @ C
     if law.disturbances.size:
         moving += unfree(C @ ca.diag(ca.DM(law.scale_x)), law)
-    away = ca.diag(ca.DM(1.0 / (HOLD_S * law.rates) ** 2))
+    seen = ca.sum1((C @ ca.diag(ca.DM(law.scale_x))) ** 2).T  # by the regulator of the rates: what it slows down is not to be held as well
+    away = ca.diag(ca.densify(FREE_SHARE**2 / (FREE_SHARE**2 + seen)) / ca.DM((HOLD_S * law.rates) ** 2))
     linear = ca.Function("linear", [model.x, model.u, model.p], [ca.densify(A), ca.densify(B), ca.densify(moving), ca.densify(moving + away)])
 
     S, Q, As, Bs = (ca.SX.sym(name, *shape) for name, shape in (("S", (nx, nx)), ("Q", (nx, nx)), ("A", (nx, nx)), ("B", (nx, nu))))

@@ -11,6 +11,7 @@ import pytest
 
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
+from rti_mpc.model.integrator import integrator
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.operation import states_of_operation
 from rti_mpc.rti.rest import RestClass, assess, find_stop_law
@@ -75,6 +76,23 @@ def test_car_brakes_as_hard_as_it_may_and_keeps_its_heading_free() -> None:
     assert way.x[-1, 3] == pytest.approx(0.0, abs=1e-9), "of Newton steps"
     assert way.x[-1, 0] - 4.0 == pytest.approx(np.cos(7.0) * 3.0**2 / 4.0, rel=0.1), "v^2 / 2a, and the end of it is slower"
     assert np.allclose(way.K[1], 0.0), "at rest no curvature moves it"
+
+
+@pytest.mark.parametrize("name", ["car", "bicycle", "arm", "quadrotor"])
+def test_robot_that_has_come_off_its_way_is_back_and_still_soon(name: str) -> None:
+    """As after a plan that could not be followed any more: 0.03 m, or rad, off in the first place that it may rest at."""
+    ocp, way = ocp_of(name), way_of(name)
+    model, period_s = ocp.model, way.law.period_s
+    x = np.array(model.x_nominal or np.zeros(model.nx))
+    assert way.find(x, np.array(model.u_rest))
+    phi, x = integrator(model, "rk4"), way.x[-1] + 0.03 * np.eye(model.nx)[0]
+    f = ca.Function("f", [model.x, model.u, model.p], [model.f_expl_expr])
+    rate = np.zeros(model.nx)
+    for _ in range(round(3.0 / period_s)):
+        u = np.clip(way.u[-1] - way.K @ (x - way.x[-1]), ocp.lbu, ocp.ubu)
+        rate, x = np.array(f(x, u, model.p_nominal)).ravel(), np.array(phi(x, u, model.p_nominal, period_s)).ravel()
+    assert np.abs(x - way.x[-1]).max() < 1e-3, "m, rad"
+    assert np.abs(rate[:2]).max() < 1e-3, "m/s, rad/s"
 
 
 def test_arm_is_held_by_its_torques_wherever_it_stops() -> None:
