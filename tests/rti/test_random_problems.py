@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Random linear problems in any units, against two oracles: `make problems` for 10,000 of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from rti_mpc.contract.status import QpStatus
+from rti_mpc.rti.rti import Rti
+from tests.rti.random_problems import Truth, in_units, parameters, problem, random_data, random_structure
+
+SEED = 1
+MAX_EXCESS = 1e-5  # of a plan that is SOLVED: cost above the least one, relative
+MAX_BROKEN = 1e-6  # by it: dynamics, and bounds on inputs and increments, as a share of their range
+MAX_DIFFERENCE = 1e-6  # of the oracles' costs, relative; otherwise the smaller one is the truth, and the problem is listed
+
+
+def test_no_plan_of_a_random_problem_that_is_solved_is_wrong(request: pytest.FixtureRequest) -> None:
+    structures, sets = request.config.getoption("--structures"), request.config.getoption("--sets")
+    seen: Counter[str] = Counter()
+    wrong, disputed = [], []
+    for number in range(structures):
+        rng = np.random.default_rng([SEED, number])
+        structure = random_structure(rng)
+        data = random_data(structure, rng)
+        rti = Rti(problem(structure, data), iterations=1, compile=False)
+        for which in range(sets):
+            if which:
+                data = random_data(structure, rng)
+                rti.retune({name: value for name, value in in_units(structure, data).items() if structure.nh or not name.endswith("h")})
+            x0 = data.x0 * structure.unit_x
+            rti.reset(x0, data.u_prev * structure.unit_u)
+            rti.prepare(data.y_ref * structure.unit_y, np.tile(parameters(structure, data), (structure.N + 1, 1)), shift=False)
+            status = rti.feedback(x0)
+            seen[status.name] += 1
+            if status is not QpStatus.SOLVED:
+                continue
+            truth, x, u = Truth(structure, data), rti.x / structure.unit_x, rti.u / structure.unit_u
+            costs = truth.costs()
+            least = min(costs)
+            if not max(costs) - least <= MAX_DIFFERENCE * least:
+                disputed.append((number, which, costs))
+            if truth.broken(x, u) > MAX_BROKEN or not truth.cost(x, u) <= (1.0 + MAX_EXCESS) * least:
+                wrong.append((number, which, truth.broken(x, u), truth.cost(x, u), costs))
+    print(f"\n{structures} structures of {sets} problems: {dict(seen)}; the oracles differ on {disputed}")
+    assert wrong == []
