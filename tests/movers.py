@@ -22,7 +22,7 @@ from tests.problems import INF, pioneer
 GRAVITY = 9.81  # m/s^2
 BOUNDS = ("lbx", "ubx", "lbu", "ubu")
 PATHS: dict[str, Callable[[Array], tuple[Array, Array]]] = {  # of the two outputs that a robot follows, over the time in s
-    "car": lambda t: (2.5 * np.sin(t / 2.5), 2.5 - 2.5 * np.cos(t / 2.5)),
+    "car": lambda t: (3 * np.sin(t / 3), 3 - 3 * np.cos(t / 3)),
     "bicycle": lambda t: (8 * np.sin(t / 8), 8 - 8 * np.cos(t / 8)),
     "arm": lambda t: (0.5 * np.sin(t), -0.5 * np.sin(t)),
     "quadrotor": lambda t: (2 * np.sin(t / 3), 0.5 * np.sin(t / 3)),

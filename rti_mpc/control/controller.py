@@ -318,7 +318,8 @@ class Controller:
             local_ns: Local monotonic time.
 
         Returns:
-            What to publish: the command itself; None if it is too late and the robot goes on with the previous plan; or a ramp to rest.
+            What to publish: the command itself; None if it is too late and the robot goes on with the previous plan, or with the way to rest
+            that it corrects by its states; or a ramp to rest.
         """
         if self._states.cadence.fault:
             return command  # its lateness is unknown, and no other command follows
@@ -335,6 +336,9 @@ class Controller:
             return None
         if not self._stopped:
             self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "over_budget")
+        if self._ways is not None and self._ways.feeds_back:  # the last command carries its way, which newer states correct than this sample's
+            self._issued.plan, self._loaded = None, False
+            return None
         assert self._states.last is not None
         counted = command.mode in (Mode.BRAKING, Mode.STOPPED)
         return self._brake(self._states.last, now_ns + self.grid.delay_ns, command.status, wanted=counted)

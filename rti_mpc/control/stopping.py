@@ -39,6 +39,7 @@ class Stopping:
 
     Attributes:
         duration_ns: How long a way to rest is; `period_ns`, each of its rows.
+        feeds_back: Whether the ways carry a gain, by which whoever plays them corrects them with every state.
         at_rest: Whether the last stop commands a robot that has come to rest.
     """
 
@@ -61,6 +62,7 @@ class Stopping:
         self._way = WayToRest(ocp, law, limits, p=prediction.p, compile=compile)
         self.duration_ns = law.rows * self.period_ns
         self.at_rest = False
+        self.feeds_back = not law.holds
         self._aimed = False  # whether the equilibrium aimed at is near where plans lead
         self._began_ns: int | None = None  # when the way that is followed began; None while none is
         self._x, self._next, self._u, self._span = np.zeros(nx), np.zeros(nx), np.zeros(nu), np.zeros(1)
@@ -146,4 +148,4 @@ class Stopping:
         """Return the fields of a command from a row of the way on."""
         way = self._way
         ending = {"rest_period_ns": self.period_ns, "u_rest": way.u[row:].copy()}
-        return ending if self._law.holds else {**ending, "x_rest": way.x[row:].copy(), "K": way.K.copy()}
+        return {**ending, "x_rest": way.x[row:].copy(), "K": way.K.copy()} if self.feeds_back else ending

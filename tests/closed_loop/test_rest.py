@@ -106,6 +106,24 @@ def test_last_command_of_a_controller_that_dies_brings_the_robot_to_rest(name: s
     assert np.abs(rates(name, x, 1.01 * u)).max() < STILL, "one that answers 1 % more is held as well"
 
 
+@pytest.mark.parametrize("name", MOTIONS)
+def test_controller_that_is_late_leaves_the_robot_on_the_way_that_its_states_correct(name: str) -> None:
+    """A way from a state of 0.2 s ago would replace one that newer states correct: a quadrotor tumbles then."""
+    controller, body, _ = driven(name)
+    sent = []
+    for _ in range(40):
+        command = controller.receive_state(body.tick(), body.now_ns)
+        assert command is not None
+        sent.append(controller.in_time(command, body.now_ns + 225 * MS))
+        controller.prepare()
+    assert sent == [None] * 40
+    assert controller.mode is Mode.BRAKING
+    after = controller.receive_state(body.tick(), body.now_ns)
+    assert after is not None
+    assert controller.in_time(after, body.now_ns) is after
+    assert controller.mode is Mode.TRACKING, "once it is in time again, it drives on"
+
+
 def test_failing_solver_ends_on_the_way_to_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     controller, body, run = driven("car")
     monkeypatch.setattr(Rti, "feedback", lambda self, x0: QpStatus.FAILED)

@@ -120,7 +120,8 @@ def random_structure(rng: np.random.Generator) -> Structure:
 def random_data(s: Structure, rng: np.random.Generator) -> Data:
     """Data of a structure: unstable ones, starts outside softened bounds, and slack weights from 1 to 1e9 among them."""
     A = rng.normal(size=(s.nx, s.nx))
-    A *= rng.uniform(0.4, 1.1) / max(1e-3, np.abs(np.linalg.eigvals(A)).max())
+    A *= rng.uniform(0.4, 1.1) / max(1e-3, np.abs(eigenvalues := np.linalg.eigvals(A)).max())
+    A /= max(1.0, np.abs(np.linalg.eigvals(A) * (eigenvalues.real < 0.0)).max())  # to grow in turns of sign is not for models of motion, and refused
     B, C = rng.normal(size=(s.nx, s.nu)) / np.sqrt(s.nu), rng.normal(size=(s.ny, s.nx)) / np.sqrt(s.nx)
     E, F = rng.normal(size=(s.nh, s.nx)) / np.sqrt(s.nx), rng.normal(size=(s.nh, s.nu)) * rng.choice((0.0, 0.3))
     root = rng.normal(size=(s.ny, int(rng.integers(1, s.ny + 1))))
