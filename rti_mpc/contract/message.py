@@ -130,7 +130,7 @@ class Telemetry:
         state_stamp_ns: Stamp of that state.
         iterations: Iterations of the QP solver.
         res_prim: Violation of dynamics, bounds and increments by the plan, relative to range; from other QP solvers their primal residual.
-        res_dual: Bound on the plan's cost above the optimum, relative to 1 plus the cost, normalised; from other QP solvers their dual residual.
+        res_dual: Bound on the plan's cost above the optimum, relative to 0.01 plus the cost, normalised; from other QP solvers their dual residual.
         cost: The cost (4) of the plan.
         violation: Largest slack of a softened bound in the plan, in the unit of the bounded state or constraint.
         prepare_us: Time of the preparation phase before this sample.

@@ -28,7 +28,8 @@ PENALTY_PATH = (*(10.0**k for k in range(1, 10)), 3e9)
 MAX_ROLL_OUTS_PER_PENALTY = 100
 MAX_REFINEMENTS = 2  # of a plan that is not certified yet
 MAX_VIOLATION = 1e-9  # of dynamics, bounds and increments by a certified plan, relative to their scales
-MAX_GAP = 1e-6  # by which a certified plan may cost more than the optimum, relative to 1 plus its normalised cost
+MAX_GAP = 1e-6  # by which a certified plan may cost more than the optimum, relative to its normalised cost and COST_FLOOR
+COST_FLOOR = 1e-2  # normalised cost, in half ranges squared, below which a plan is as good as its reference
 MAX_VIOLATION_INACCURATE, MAX_GAP_INACCURATE = 1e-6, 1e-2  # the same limits of a plan that may be commanded as inaccurate
 SOLVED, INACCURATE, FAILED = QpStatus.SOLVED, QpStatus.INACCURATE, QpStatus.FAILED  # read faster than a member of the enumeration
 MAX_STALLED_ROLL_OUTS = 3  # roll-outs without fewer changes before places change one at a time
@@ -45,7 +46,7 @@ class ActiveSet:
         roll_out: Call that makes the plan, and finds the places; `certify` judges that plan, `refine` improves it.
         iterations: Roll-outs of the last solve.
         res_prim: Largest violation of dynamics, bounds and increments by the plan that was judged last, relative to their scales.
-        res_dual: Bound on the cost of that plan above the optimum, relative to 1 plus its normalised cost.
+        res_dual: Bound on the cost of that plan above the optimum, relative to `COST_FLOOR` plus its normalised cost.
     """
 
     def __init__(self, functions: Places, certificate: ca.Function, guess: Guess, make: Callable[[ca.Function], ca.Function]) -> None:
@@ -107,7 +108,7 @@ class ActiveSet:
         """Certify the plan as it is."""
         self.certify()
         primal, gap, cost = (part[0] for part in self._verdict)
-        self.res_prim, self.res_dual = primal, gap / (1.0 + cost)
+        self.res_prim, self.res_dual = primal, gap / (COST_FLOOR + cost)
         if primal <= MAX_VIOLATION and self.res_dual <= MAX_GAP:
             return SOLVED
         return INACCURATE if primal <= MAX_VIOLATION_INACCURATE and self.res_dual <= MAX_GAP_INACCURATE else FAILED
