@@ -9,11 +9,13 @@ import shutil
 import subprocess
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer.main
 
 from rti_mpc.wire.session import BusSettings, zenoh_config
+from rti_mpc_service.certs.roles import ROLES_OF_COMMAND
 from rti_mpc_service.cli import app
 from rti_mpc_service.config.build import build_ocp
 from rti_mpc_service.config.config import load
@@ -21,6 +23,7 @@ from rti_mpc_service.config.config import load
 ROOT = Path(__file__).parents[1]
 DEPLOY = ROOT / "deploy"
 UNITS = {"run": DEPLOY / "systemd" / "rti-mpc@.service", "guard": DEPLOY / "systemd" / "rti-mpc-guard@.service"}
+UNITS["router"] = DEPLOY / "systemd" / "rti-mpc-router@.service"
 RUNBOOK = (DEPLOY / "runbook.md").read_text()
 SHELL = [line for block in re.findall(r"```sh\n(.*?)```", RUNBOOK, re.DOTALL) for line in block.splitlines()]
 
@@ -71,10 +74,20 @@ def test_drop_in_changes_the_unit_s_command_to_one_that_exists() -> None:
     assert context.params["standby"] is True
 
 
+@pytest.mark.parametrize(("file", "command"), [("rti-mpc-router@.service", "router"), ("tls-controller.conf", "run"), ("tls-guard.conf", "guard")])
+def test_unit_with_tls_loads_what_its_command_reads(file: str, command: str) -> None:
+    loaded = re.findall(r"^LoadCredential=(\S+):/etc/rti-mpc/tls/(\S+)$", (DEPLOY / "systemd" / file).read_text(), re.MULTILINE)
+    role = ROLES_OF_COMMAND[command][0]
+    assert loaded == [(name, name) for name in ("authority.pem", f"{role}.pem", f"{role}.key", f"{role}.json5")]
+
+
 @pytest.mark.parametrize("line", [line for line in SHELL if re.match(r"(\S*/)?rti-mpc ", line)])
 def test_command_in_the_runbook_exists_with_its_options(line: str) -> None:
     _, name, *words = line.split()
-    typer.main.get_group(app).commands[name].make_context(name, words)  # parses all, runs nothing
+    command: Any = typer.main.get_group(app).commands[name]
+    if name == "certs":
+        command, *words = command.commands[words[0]], *words[1:]
+    command.make_context(name, words)  # parses all, runs nothing
 
 
 def test_checks_that_the_contract_of_a_guard_names_exist() -> None:

@@ -33,6 +33,7 @@ from rti_mpc.wire.reach import remind
 RENDEZVOUS_ENDPOINT = "tcp/127.0.0.1:7447"
 # Protocols that need a port; whether an endpoint of another protocol is valid is left to Zenoh.
 ENDPOINT_PATTERN = re.compile(r"(tcp|tls|udp|quic|ws)/.+:\d+([?#].*)?$|(?!(tcp|tls|udp|quic|ws)/)[a-z_-]+/.+")
+OPEN_PATTERN = re.compile(r"(tcp|udp|ws)/(?!127\.|localhost:|\[::1\])")  # an endpoint beyond the loopback without TLS
 CLIENT_TIMEOUT_MS = 500  # of one attempt to reach a router
 MAX_CONFIG_BYTES = 1 << 16  # of Zenoh's configuration file: its parser recurses at every bracket
 RETRY_INTERVAL_S = 0.1  # between two attempts to reach a router
@@ -66,6 +67,10 @@ class BusSettings:
         connect: Endpoints to connect to, without those in `listen`; a router does not connect to the rendezvous endpoint.
         config: Configuration file of Zenoh, JSON5.
         multicast: Whether to look for others by multicast.
+        authority: Certificate of the authority, PEM, for TLS with certificates on both sides. Given together with `certificate` and `key`,
+            and then every endpoint must be ``tls/`` or ``quic/``, and links close when the other side's certificate expires.
+        certificate: Certificate of this process, PEM.
+        key: Private key of this process, PEM.
         cfg: Further settings of Zenoh, each ``KEY:VALUE``, applied last.
     """
 
@@ -74,6 +79,9 @@ class BusSettings:
     connect: tuple[str, ...] = (RENDEZVOUS_ENDPOINT,)
     config: Path | None = None
     multicast: bool = False
+    authority: Path | None = None
+    certificate: Path | None = None
+    key: Path | None = None
     cfg: tuple[str, ...] = ()
 
 
@@ -82,7 +90,7 @@ def zenoh_config(settings: BusSettings) -> zenoh.Config:
     Zenoh configuration of a process.
 
     Raises:
-        ConfigError: An endpoint is malformed, or Zenoh refuses a value or cannot read the file.
+        ConfigError: An endpoint is malformed, a file of TLS is missing, or Zenoh refuses a value or cannot read its file.
     """
     for endpoint in (*settings.listen, *settings.connect):
         if not ENDPOINT_PATTERN.match(endpoint):
@@ -100,6 +108,8 @@ def zenoh_config(settings: BusSettings) -> zenoh.Config:
                 config.insert_json5(name, json.dumps(value))
         name = "mode"
         config.insert_json5(name, json.dumps(mode))
+        for name, value in _tls(settings).items():
+            config.insert_json5(name, json.dumps(value))
         for name, _, text in (setting.partition(":") for setting in settings.cfg):
             config.insert_json5(name, text)
     except zenoh.ZError as error:
@@ -119,6 +129,20 @@ def _by_name(settings: BusSettings, mode: str) -> dict[str, Any]:
     }
 
 
+def _tls(settings: BusSettings) -> dict[str, Any]:
+    """Return the settings of TLS by their names in Zenoh; empty without a certificate."""
+    files = {name: getattr(settings, name) for name in ("authority", "certificate", "key")}
+    if not any(files.values()):
+        return {}
+    for name, path in files.items():
+        if path is None or not os.access(path, os.R_OK):
+            raise ConfigError(f"bus: TLS needs authority, certificate and key, each a file that can be read, got {name} {path}")
+    authority, certificate, key = (str(path.absolute()) for path in files.values())
+    own = {f"{side}_{part}": path for side in ("listen", "connect") for part, path in (("certificate", certificate), ("private_key", key))}
+    asked = {"root_ca_certificate": authority, **own, "enable_mtls": True, "verify_name_on_connect": True, "close_link_on_expiration": True}
+    return {"transport/link/protocols": ["tls", "quic"]} | {f"transport/link/tls/{name}": value for name, value in asked.items()}
+
+
 def _brief(error: Exception) -> str:
     return " ".join(str(error).split(" at /")[0].split())
 
@@ -133,6 +157,13 @@ def endpoints(config: zenoh.Config) -> str:
         else "no process listens there, or the address is wrong"
     )
     return f"{text}: {wrong}" if text else ""
+
+
+def open_endpoints(settings: BusSettings) -> list[str]:
+    """Return the endpoints beyond the loopback on which a process listens without TLS."""
+    given = json.loads(zenoh_config(settings).get_json("listen/endpoints"))
+    ends = given if isinstance(given, list) else given.get(settings.mode, [])
+    return [endpoint for endpoint in ends if OPEN_PATTERN.match(endpoint)]
 
 
 def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event | None, say: Callable[[str], object]) -> zenoh.Session:

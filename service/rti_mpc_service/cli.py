@@ -24,6 +24,8 @@ from typer.core import TyperCommand, TyperGroup
 import rti_mpc
 from rti_mpc.errors import ConfigError
 from rti_mpc_service import entry, log
+from rti_mpc_service.certs.folder import credentials, secured
+from rti_mpc_service.certs.roles import ROLES
 from rti_mpc_service.config.build import build_signals, bus_settings, robot_settings, stage_parameters, with_initial_state
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
@@ -107,13 +109,16 @@ def options(
     connect: Annotated[list[str] | None, typer.Option("--connect", "-e", metavar="ENDPOINT", help="Endpoint to connect to; repeatable.")] = None,
     listen: Annotated[list[str] | None, typer.Option("--listen", "-l", metavar="ENDPOINT", help="Endpoint to listen on; repeatable.")] = None,
     zenoh: Annotated[Path | None, typer.Option("--config", "-c", metavar="FILE", help="Zenoh's own configuration, JSON5.")] = None,
+    tls: Annotated[
+        Path | None, typer.Option("--tls", metavar="DIR", help="Folder of this host's certificates, see `rti-mpc certs`; the bus is TLS then.")
+    ] = None,
     cfg: Annotated[list[str] | None, typer.Option("--cfg", metavar="KEY:VALUE", help="One Zenoh setting, applied last; repeatable.")] = None,
     multicast: Annotated[
         bool | None, typer.Option("--multicast-scouting/--no-multicast-scouting", help="Look for other processes by multicast; off by default.")
     ] = None,
 ) -> dict[str, Any]:
     """Collect Zenoh's options, named as in Zenoh's own programs."""
-    given = {"mode": mode, "connect": connect, "listen": listen, "config": zenoh, "cfg": cfg, "multicast": multicast}
+    given = {"mode": mode, "connect": connect, "listen": listen, "config": zenoh, "tls": tls, "cfg": cfg, "multicast": multicast}
     return {name: tuple(value) if isinstance(value, list) else value for name, value in given.items() if value is not None}
 
 
@@ -141,7 +146,9 @@ def process(command: Callable[..., int | None], *, with_model: bool = True) -> C
             given["path"] = config
         loaded = load(config, with_model=with_model)
         overrides = options(**{name: given.pop(name) for name in shared})
-        raise typer.Exit(command(loaded, replace(bus_settings(loaded), **overrides), **given) or 0)
+        folder = overrides.pop("tls", None) or credentials() or loaded.bus.tls
+        settings = replace(bus_settings(loaded), **overrides)
+        raise typer.Exit(command(loaded, secured(settings, folder, command.__name__) if folder else settings, **given) or 0)
 
     path = inspect.Parameter("config", inspect.Parameter.POSITIONAL_OR_KEYWORD, default=SHIPPED, annotation=ConfigPath)
     run.__signature__ = inspect.Signature([path, *own, *shared.values()])  # type: ignore[attr-defined]
@@ -272,7 +279,7 @@ def view(
     )
 
 
-@process
+@partial(process, with_model=False)
 def router(config: Config, bus: BusSettings) -> None:
     """Run a Zenoh router, for clients on several hosts or with access control."""
     from rti_mpc_service.router import main
@@ -435,6 +442,73 @@ def schema() -> None:
     """Print the JSON schema of a robot's TOML file, with which editors complete and check it."""
     head = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     typer.echo(json.dumps(head | Config.model_json_schema() | {"title": "rti-mpc robot"}, indent=1))
+
+
+certs = typer.Typer(cls=Commands, help="Make an authority and certificates for the processes of a robot.", no_args_is_help=True)
+app.add_typer(certs, name="certs")
+
+AuthorityPath = Annotated[Path, typer.Option("--authority", metavar="DIR", help="Folder of the authority.")]
+Days = Annotated[float, typer.Option("--days", min=0.01, max=36_500.0, help="Time for which certificates are valid.")]
+
+
+@certs.command("authority")
+def certs_authority(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write, on a computer that is no robot.")] = Path("authority"),
+    days: Days = 3650.0,
+) -> None:
+    """Make an authority: its private key signs all certificates, and stays where it is."""
+    from rti_mpc_service.certs.issue import make_authority
+
+    for path in make_authority(folder, days):
+        typer.echo(path)
+
+
+@certs.command("issue")
+def certs_issue(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="The robot's TOML file.")],
+    roles: Annotated[list[str], typer.Argument(metavar="ROLE...", help=f"Roles that run on the host: {', '.join(ROLES)}.")],
+    router: Annotated[str, typer.Option(metavar="ENDPOINT", help="Endpoint of the robot's router, such as tls/robot.local:7447.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write: the bundle of one host.")],
+    authority: AuthorityPath = Path("authority"),
+    days: Days = 90.0,
+    at: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder of the bundle on its host, for programs that read Zenoh's configuration by themselves.")
+    ] = Path("/etc/rti-mpc/tls"),
+) -> None:
+    """Make the bundle of one host: certificates, private keys and Zenoh's configurations of its roles; the router's has the access control list."""
+    from rti_mpc_service.certs.authority import Authority
+    from rti_mpc_service.certs.issue import issue
+
+    for path in issue(Authority.read(authority), load(config, with_model=False).keys(), roles, router, out, at, days):
+        typer.echo(path)
+
+
+@certs.command("renew")
+def certs_renew(
+    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Folders with certificates; private keys need not be there.")],
+    authority: AuthorityPath = Path("authority"),
+    days: Days = 90.0,
+) -> None:
+    """Renew all certificates in folders; names and private keys stay."""
+    from rti_mpc_service.certs.authority import Authority
+    from rti_mpc_service.certs.issue import renew
+
+    signer = Authority.read(authority)
+    for path in (path for folder in folders for path in renew(signer, folder, days)):
+        typer.echo(path)
+
+
+@certs.command("show")
+def certs_show(folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Folders with certificates.")]) -> None:
+    """Print until when certificates are valid; the status is 1 if one of them ends within 30 days."""
+    from rti_mpc_service.certs.issue import lives
+
+    left_days = [float("inf")]
+    for folder in folders:
+        for file, name, days in lives(folder):
+            typer.echo(f"{folder / file}: {name}, " + (f"valid for {days:.1f} days" if days > 0.0 else "expired"))
+            left_days.append(days)
+    raise typer.Exit(int(min(left_days) < 30.0))
 
 
 @app.command()

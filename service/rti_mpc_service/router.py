@@ -10,6 +10,7 @@ from threading import Event
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.session import open_endpoints
 
 log = logging.getLogger("router")
 
@@ -27,7 +28,10 @@ def main(settings: BusSettings, keys: Keys, *, stop: Event | None = None) -> Non
         ConfigError: If an endpoint is taken, or Zenoh refuses a setting.
     """
     stop = stop or stop_on_signals()
-    with Bus.join(replace(settings, mode="router"), keys, stop=stop, say=log.warning) as bus:
+    settings = replace(settings, mode="router")
+    for endpoint in open_endpoints(settings):
+        log.warning(f"{endpoint} is open: whoever reaches it can command the robot; use TLS, see `rti-mpc certs`")
+    with Bus.join(settings, keys, stop=stop, say=log.warning) as bus:
         bus.alive("router")
         log.info("routing")
         stop.wait()

@@ -42,14 +42,14 @@ def test_help_of_every_command_explains_every_option(command: str) -> None:
     assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
 
 
-@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "check", "demo", "doctor", "faults", "init", "paper", "schema"}))
+@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "certs", "check", "demo", "doctor", "faults", "init", "paper", "schema"}))
 def test_every_process_takes_the_options_of_zenoh_programs(command: str) -> None:
     parameters = typer.main.get_group(app).commands[command].params
     options = {option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)}
     assert set(ZENOH) | {"-m", "-e", "-l", "-c"} <= options
 
 
-@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "demo", "init", "paper", "schema"}))
+@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "certs", "demo", "init", "paper", "schema"}))
 def test_bad_configuration_is_one_line_and_exit_status_2(command: str, tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(SHIPPED.read_text().replace("dt_s", "dt_ms"))
@@ -75,7 +75,9 @@ def test_outputs_that_no_path_fills_are_refused_by_name_in_the_terminal(command:
     assert stderr == f"{said}give each its role, or follow sines, steps or a FILE.csv with the columns t, x, elbow\n"
 
 
-@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "enable", "guard", "init", "paper", "params", "schema", "stop"}))
+@pytest.mark.parametrize(
+    "command", sorted(set(COMMANDS) - {"bench", "certs", "enable", "guard", "init", "paper", "params", "router", "schema", "stop"})
+)
 def test_model_that_cannot_be_imported_is_refused_by_every_process_that_loads_it_with_file_and_line(command: str, tmp_path: Path) -> None:
     (tmp_path / "my_robot.py").write_text("\n\ndef car(:\n")
     path = tmp_path / "robot.toml"

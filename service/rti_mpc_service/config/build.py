@@ -248,7 +248,7 @@ def bus_settings(config: Config) -> BusSettings:
     """Return the bus settings of a process other than the robot, which connects and listens on a free port."""
     from rti_mpc.wire.bus import BusSettings
 
-    return BusSettings(**config.bus.model_dump(exclude_none=True, exclude={"listen"}))
+    return BusSettings(**config.bus.model_dump(exclude_none=True, exclude={"listen", "tls"}))
 
 
 def as_sequence(values: tuple[float, ...], length: int) -> tuple[float, ...]:

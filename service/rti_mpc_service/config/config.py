@@ -37,8 +37,9 @@ def load(path: Path, *, with_model: bool = True) -> Config:
     content = read_text_file(path, "TOML")
     try:
         config = Config.model_validate(toml.read(content))
-        if config.bus.config is not None:
-            config = config.model_copy(update={"bus": config.bus.model_copy(update={"config": path.parent / config.bus.config})})
+        beside = {name: path.parent / value for name in ("config", "tls") if (value := getattr(config.bus, name)) is not None}
+        if beside:
+            config = config.model_copy(update={"bus": config.bus.model_copy(update=beside)})
         if ":" in config.model.name:  # a model of the user's own, which no process looks for anywhere else, wherever it is started
             folder = Path(os.path.abspath(path.parent / (config.model.folder or "")))
             config = config.model_copy(update={"model": config.model.model_copy(update={"folder": folder})})

@@ -233,6 +233,9 @@ class BusSection(Section):
     config: Annotated[Path, Field(strict=False)] | None = Field(
         default=None, description="Zenoh configuration file, JSON5, looked for beside this file"
     )
+    tls: Annotated[Path, Field(strict=False)] | None = Field(
+        default=None, description="folder with authority and certificates that `rti-mpc certs` has issued to this host, looked for beside this file"
+    )
 
 
 class RealtimeSection(Section):
