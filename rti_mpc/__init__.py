@@ -42,6 +42,7 @@ References, cited by key throughout:
   2003.
 * [Judice1994] J. J. Júdice, F. M. Pires, "A block principal pivoting algorithm for large-scale strictly monotone linear complementarity problems",
   Comput. Oper. Res. 21(5), 1994.
+* [Mehrotra1992] S. Mehrotra, "On the implementation of a primal-dual interior point method", SIAM J. Optim. 2(4), 1992.
 * [Pannocchia2003] G. Pannocchia, J. B. Rawlings, "Disturbance models for offset-free model-predictive control", AIChE J. 49(2), 2003.
 """
 

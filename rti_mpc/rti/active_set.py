@@ -4,8 +4,9 @@ Active-set solver on the Riccati recursion. Solves nearly every sample without a
 
 The places, which say what is at a bound, are kept from sample to sample and shifted
 with the plan, so that one roll-out is usually enough. When they do not settle, the
-penalty that holds values at their bounds is softened, and stiffened again in steps. A
-plan is certified from the problem's own data, and refined where the penalty has yielded.
+penalty that holds values at their bounds is softened, and stiffened again in a few
+steps; after that an interior point of bounded length finds the places. A plan is
+certified from the problem's own data, and refined where the penalty has yielded.
 """
 
 from __future__ import annotations
@@ -22,10 +23,15 @@ from rti_mpc.rti.places import Places
 from rti_mpc.rti.qp.qp import Guess
 
 MAX_ROLL_OUTS = 6  # from the places of the last sample; more are needed only when many places change at once
-# Weights of the penalty when that was not enough. With a soft penalty the places settle from any start, and those found are the
-# start for the next, stiffer one. A last weight above 3e9 would yield less at the bounds, and lose digits.
-PENALTY_PATH = (*(10.0**k for k in range(1, 10)), 3e9)
-MAX_ROLL_OUTS_PER_PENALTY = 100
+PENALTY = 3e9  # weight that holds values at their bounds; with a larger one digits are lost
+# Weights when that was not enough. With a soft penalty the places settle from most starts, and those found are the start for the next, stiffer one.
+PENALTY_PATH = (*(10.0**k for k in range(1, 10)), PENALTY)
+MAX_PATH_ROLL_OUTS = 30  # of the path for each QP: where it is longer, the interior point is faster
+MAX_STEPS = 30  # of the interior point, for each QP that a sample may have; all of its QPs share the sum
+STEP_TARGET = 1e-8  # mean product of distances and multipliers at which the interior point has converged, in normalised cost
+STEP_ROUNDING = 1e-4  # mean product below which one that grows shows that rounding has the upper hand
+# Limits of the product at the start, otherwise the duality gap per bounded value: with less, steps to large multipliers are short.
+START_RANGE = 1.0, 1e10
 MAX_REFINEMENTS = 2  # of a plan that is not certified yet
 MAX_VIOLATION = 1e-9  # of dynamics, bounds and increments by a certified plan, relative to their scales
 MAX_GAP = 1e-6  # by which a certified plan may cost more than the optimum, relative to its normalised cost and COST_FLOOR
@@ -44,7 +50,9 @@ class ActiveSet:
         linearize: Call that linearizes at the guess as it is.
         gain: Call that computes the gains; with it, after one of the former two, preparation is complete.
         roll_out: Call that makes the plan, and finds the places; `certify` judges that plan, `refine` improves it.
-        iterations: Roll-outs of the last solve.
+        enter: Call that starts the interior point at the plan; `step`, one step of it.
+        steps_left: Steps of the interior point that the sample may still take.
+        iterations: Roll-outs and steps of the interior point of the last solve.
         res_prim: Largest violation of dynamics, bounds and increments by the plan that was judged last, relative to their scales.
         res_dual: Bound on the cost of that plan above the optimum, relative to `COST_FLOOR` plus its normalised cost.
     """
@@ -57,7 +65,7 @@ class ActiveSet:
         self._found = np.zeros_like(self._places)
         changes: Array = np.zeros(1)
         self._changes = changes.data
-        self._stiff = np.full(1, PENALTY_PATH[-1])
+        self._stiff = np.full(1, PENALTY)
         multipliers: Array = np.zeros(functions.roll_out.numel_out("multipliers"))
         slopes = np.zeros_like(guess.plan.u)
         verdict: dict[str, Array] = {name: np.zeros(1) for name in ("primal", "gap", "cost")}
@@ -78,6 +86,20 @@ class ActiveSet:
         refined = {f"{name.removesuffix('_plan')}_refined": array for name, array in plan.items()}
         self.refine = bind(make(functions.refine), {**guess.start, **fixed, "r": slopes, **plan}, refined)
         self._refined = tuple(plan.values())
+
+        start: Array = np.zeros(1)
+        self._start = start
+        interior: Array = np.zeros(functions.enter.numel_out("interior"))
+        after, mean = np.zeros_like(interior), np.zeros(1)
+        interior_plan = {name: np.zeros_like(array) for name, array in found.items() if name != "changes"}
+        self._moved, self._product = (interior.data, after.data), mean.data
+        self._interior_places = interior_plan["places_found"]
+        self._interior_pairs = tuple((found[name], array) for name, array in interior_plan.items())
+        entered = {**guess.start, "stages": stages, **guess.weights}
+        self.enter = bind(make(functions.enter), {**entered, "x_plan": guess.plan.x, "u_plan": guess.plan.u, "start": start}, {"interior": interior})
+        stepped = {"interior_after": after, "product": mean, **interior_plan}
+        self.step = bind(make(functions.step), {**entered, "x0": guess.x0, "interior": interior}, stepped)
+        self.steps_left = 0
         self.iterations = 0
         self.res_prim = self.res_dual = 0.0
 
@@ -114,20 +136,67 @@ class ActiveSet:
         return INACCURATE if primal <= MAX_VIOLATION_INACCURATE and self.res_dual <= MAX_GAP_INACCURATE else FAILED
 
     def solve(self) -> bool:
-        """Find the places, and make the plan; return whether the places have settled and all numbers are finite."""
+        """Find the places, and make the plan; return whether there is one."""
         self.roll_out()
         self.iterations = 1
         if self._changes[0] == 0.0 or self._settle(MAX_ROLL_OUTS):
             return True
+        return self._stiffen() or self._step_inside()
+
+    def _stiffen(self) -> bool:
+        """Soften the penalty and stiffen it again, and return whether the places have settled after `MAX_PATH_ROLL_OUTS` at most."""
+        end = self.iterations + MAX_PATH_ROLL_OUTS
         for self._stiff[0] in PENALTY_PATH:
             self.gain()
             self.roll_out()
             self.iterations += 1
-            if not self._settle(MAX_ROLL_OUTS_PER_PENALTY):
-                self._stiff[0] = PENALTY_PATH[-1]
-                self.forget()
+            if not self._settle(end - self.iterations):
+                self._stiff[0] = PENALTY
                 return False
         return True
+
+    def _step_inside(self) -> bool:
+        """Find the places by the interior point, and make the plan; its own if its places do not settle either and it is good enough."""
+        self._places[:] = self._found
+        if self._changes[0] < 0.0:  # no plan to start at
+            self.forget()
+            self.gain()
+            self.roll_out()
+        if self._changes[0] < 0.0 or self.steps_left == 0:
+            self.forget()
+            return False
+        self._judged()
+        self._start[0] = min(max(START_RANGE[0], self._verdict[1][0] / self._places.size), START_RANGE[1])
+        self.enter()
+        self._take_steps()
+        self._places[:] = self._interior_places
+        self.gain()
+        self.roll_out()
+        self.iterations += 1
+        if self._changes[0] == 0.0 or self._settle(MAX_ROLL_OUTS):
+            return True
+        for array, inside in self._interior_pairs:
+            array[:] = inside
+        self._places[:] = self._found
+        self.gain()
+        if self._judged().usable:
+            return True
+        self.forget()
+        return False
+
+    def _take_steps(self) -> None:
+        """Take steps of the interior point until it has converged, rounding has the upper hand, or no step is left."""
+        interior, after = self._moved
+        last = np.inf
+        while self.steps_left > 0:
+            self.step()
+            self.steps_left -= 1
+            self.iterations += 1
+            interior[:] = after
+            product = self._product[0]
+            if not product > STEP_TARGET or last < product < STEP_ROUNDING:  # or not a number
+                break
+            last = product
 
     def _settle(self, most: int) -> bool:
         """

@@ -20,10 +20,11 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.codegen import function
+from rti_mpc.rti import interior_point
 from rti_mpc.rti.linearization import Forms, Linearization, change, divided, shift
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
-from rti_mpc.rti.riccati import Gain, Riccati, Rows, Stage, columns, stagewise
+from rti_mpc.rti.riccati import Gain, Riccati, Rows, Stage, columns, softened_steps, stagewise
 
 BOUND_TOLERANCE = 1e-9  # a bound acts when it is exceeded by more than this, relative to its scale, so that rounding does not decide
 RELEASE_MULTIPLIER = 1e-6  # a bound is released when its multiplier has the wrong sign and is larger, in normalised cost per scale of what is bounded
@@ -50,6 +51,8 @@ class Places:
         refine: ``(x, u, u_prev, stages, gains, *WEIGHTS_AND_BOUNDS, scale, places, stiff, r, x_plan, u_plan, multipliers) -> (x_refined,
             u_refined, multipliers_refined)``: plan and multipliers after a Newton step that removes the remaining gradient r of the Lagrangian,
             see `rti_mpc.rti.certificate`.
+        enter: The start of the interior point; see `rti_mpc.rti.interior_point`.
+        step: A step of the interior point.
     """
 
     linearize: ca.Function
@@ -57,6 +60,8 @@ class Places:
     gains: ca.Function
     roll_out: ca.Function
     refine: ca.Function
+    enter: ca.Function
+    step: ca.Function
 
 
 class Sample(NamedTuple):
@@ -95,7 +100,7 @@ def places(ocp: Ocp) -> Places:
     advance = {"x_next": x, "u_next": u, "places_next": moved, "stages": linearized}
 
     acting = {"places": flat, "stiff": stiff}
-    gains = recursion.gains(at.forms, *penalties(ocp, at))
+    gains = recursion.gains(stages, *penalties(ocp, at))
     guess = {"x": lin.x, "u": lin.u, "u_prev": lin.u_prev}
     fixed = {"stages": stages, "gains": found, **lin.weights, **acting}
     rolled = roll_out(ocp, at, x0)
@@ -106,7 +111,9 @@ def places(ocp: Ocp) -> Places:
         function("advance", {**lin.arguments, "places": flat}, advance),
         function("gains", {"stages": stages, "u": lin.u, **lin.weights, **acting}, {"gains": gains}),
         function("roll_out", {**guess, "x0": x0, **fixed}, rolled),
-        function("refine", {**guess, **fixed, **plan}, refine(ocp, recursion, at, **plan)),
+        function("refine", {**guess, **fixed, **plan}, refine(ocp, recursion, at, stages, **plan)),
+        interior_point.enter(ocp, lin, stages),
+        interior_point.step(ocp, lin, recursion, stages, x0),
     )
 
 
@@ -288,32 +295,29 @@ def new_place(place: ca.SX, stiff: ca.SX, scale: ca.SX, over: ca.SX, under: ca.S
     return ca.SX(ca.if_else(place == 0, free, ca.if_else(ca.fabs(place) == 1, held, beyond)))
 
 
-def refine(ocp: Ocp, recursion: Riccati, at: Sample, *, r: ca.MX, x_plan: ca.MX, u_plan: ca.MX, multipliers: ca.MX) -> dict[str, ca.MX]:
+def refine(
+    ocp: Ocp, recursion: Riccati, at: Sample, stages: ca.MX, *, r: ca.MX, x_plan: ca.MX, u_plan: ca.MX, multipliers: ca.MX
+) -> dict[str, ca.MX]:
     """Return the outputs of `Places.refine`, by name: a Newton step on the optimality conditions that brings held softened rows to their bounds."""
     lin, forms, place, stiff = at.lin, at.forms, at.place, at.stiff
     N, N_u, nu, w = ocp.N, ocp.N_u, ocp.model.nu, lin.w
     of_increments, of_softened = divided(multipliers, [lin.u, lin.g])
     du = u_plan - lin.u
     held = ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u))
-    of = Stage(ocp, lin)
-    dx_i, du_i, g_i = ca.SX.sym("dx", of.nx), ca.SX.sym("du", nu), ca.SX.sym("g", of.ng)
-    symbols = [g_i, *of.softened.values(), dx_i, du_i]
-    value = ca.Function("softened_value", symbols, [ca.densify(g_i + of.G @ ca.vertcat(dx_i, du_i))])
-    values = value.map(N)(forms.g, forms.g_x, forms.g_u, x_plan[:, 1:] - lin.x[:, 1:], held)
+    values = forms.g + softened_steps(ocp, lin).map(N)(forms.g_x, forms.g_u, x_plan[:, 1:] - lin.x[:, 1:], held)
     weight = ca.repmat(stiff / lin.scale_g**2, 1, N) * (ca.fabs(place.g) == 1)
     lower, upper = (ca.repmat(e, 1, N) for e in (lin.lg, lin.ug))
     excess = values - ca.if_else(place.g > 0, upper, lower)
     zero = ca.MX.zeros(nu, N_u)
-    corrected = recursion.corrected(forms, at.gains, Rows(r * (place.u == 0), zero, weight * excess))
-    start = ca.MX.zeros(of.n)
-    _, step, rows = recursion.rolled(forms, corrected, start, defects=False)
+    _, rows = recursion.response(stages, at.gains, Rows(r * (place.u == 0), zero, weight * excess))
+    step = rows.u
     side = ca.sign(place.g)
     by = side * (excess + rows.g)
     beyond = side * (ca.repmat(lin.zg, 1, N) + ca.repmat(lin.Zg, 1, N) * by) / 2
     paid = ca.if_else(ca.fabs(place.g) == 2, beyond, (of_softened + weight * (excess + rows.g)) * (ca.fabs(place.g) == 1))
     force = of_increments + ca.repmat(stiff / lin.scale_u**2, 1, N_u) * (ca.fabs(place.du) == 1) * rows.du
     clip, follow = clip_function(nu), follow_function(lin)
-    last, change_k, inputs, states = lin.u_prev, ca.MX.zeros(of.nx), [], [x_plan[:, 0]]
+    last, change_k, inputs, states = lin.u_prev, ca.MX.zeros(ocp.model.nx), [], [x_plan[:, 0]]
     planned, A, B = columns(u_plan), columns(forms.A), columns(forms.B)
     for k in range(N):
         if k < N_u:

@@ -66,6 +66,8 @@ class Riccati:
 
     Attributes:
         size: Entries of the gains of one stage: K and kappa of ``du = -K s - kappa``, and the Cholesky factor of ``Q_uu``.
+        factorize: ``(stages, R, lambda_, weight_u, weight_du, weight_g, pull_u, pull_du, pull_g) -> gains``; compiled once for all.
+        respond: ``(stages, gains, pull_u, pull_du, pull_g) -> (states, u, du, g)``: the change of states and rows that pulls alone cause.
     """
 
     def __init__(self, ocp: Ocp, lin: Linearization) -> None:
@@ -77,8 +79,17 @@ class Riccati:
         self._backward_free, self._backward_held = backward_free(ocp, lin), backward_held(ocp, lin)
         self._sweep_free, self._sweep_held = sweep_free(ocp, lin), sweep_held(ocp, lin)
         self._forward_free, self._forward_held = forward_free(ocp, lin), forward_held(ocp, lin)
+        stages, gains, start = ca.MX.sym("stages", lin.stages.numel()), ca.MX.sym("gains", self.size, ocp.N_u), ca.MX.zeros(n)
+        weight, pull = (
+            Rows(*(ca.MX.sym(f"{name}_{of}", *like.shape) for of, like in (("u", lin.u), ("du", lin.u), ("g", lin.g)))) for name in ("weight", "pull")
+        )
+        weights, pulls = ({f"{name}_{of}": number for of, number in vars(rows).items()} for name, rows in (("weight", weight), ("pull", pull)))
+        forms, matrices = lin.forms_in(stages), {name: lin.w[name] for name in ("R", "lambda_")}
+        self.factorize = function("factorize", {"stages": stages, **matrices, **weights, **pulls}, {"gains": self._gains(forms, weight, pull)})
+        states, _, rows = self.rolled(forms, self._corrected(forms, gains, pull), start, defects=False)
+        self.respond = function("respond", {"stages": stages, "gains": gains, **pulls}, {"states": states, **vars(rows)})
 
-    def gains(self, forms: Forms, weight: Rows, pull: Rows) -> ca.MX:
+    def _gains(self, forms: Forms, weight: Rows, pull: Rows) -> ca.MX:
         """Return the gains of all free stages, one column per stage, shape ``(size, N_u)``."""
         n = self._n
         stages = stagewise(A=forms.A, B=forms.B, b=forms.b, H=forms.H, h=forms.h, g_x=forms.g_x, g_u=forms.g_u, weight_g=weight.g, pull_g=pull.g)
@@ -96,7 +107,7 @@ class Riccati:
             P, p = before["P_before"], before["p_before"]
         return ca.horzcat(*reversed(found))
 
-    def corrected(self, forms: Forms, gains: ca.MX, pull: Rows) -> ca.MX:
+    def _corrected(self, forms: Forms, gains: ca.MX, pull: Rows) -> ca.MX:
         """Return gains whose kappa comes from pulls only: rolled out from s = 0 without defects, they give the change that these pulls cause."""
         stages = stagewise(A=forms.A, B=forms.B, g_x=forms.g_x, g_u=forms.g_u, pull_g=pull.g)
         inputs = stagewise(gain=gains, pull_u=pull.u, pull_du=pull.du)
@@ -111,6 +122,20 @@ class Riccati:
             p = before["p_before"]
         K, _, L = ca.vertsplit(gains, [0, *self._ends, self.size])
         return ca.vertcat(K, ca.horzcat(*reversed(kappas)), L)
+
+    def gains(self, stages: ca.MX, weight: Rows, pull: Rows) -> ca.MX:
+        """Return the gains of all free stages, one column per stage, shape ``(size, N_u)``."""
+        w = self._lin.w
+        weights = {"weight_u": weight.u, "weight_du": weight.du, "weight_g": weight.g}
+        found: ca.MX = self.factorize(stages=stages, R=w["R"], lambda_=w["lambda_"], **weights, pull_u=pull.u, pull_du=pull.du, pull_g=pull.g)[
+            "gains"
+        ]
+        return found
+
+    def response(self, stages: ca.MX, gains: ca.MX, pull: Rows) -> tuple[ca.MX, Rows]:
+        """Return the change of states, shape ``(nx, N + 1)``, and of rows, that pulls alone cause."""
+        found = self.respond(stages=stages, gains=gains, pull_u=pull.u, pull_du=pull.du, pull_g=pull.g)
+        return found["states"], Rows(found["u"], found["du"], found["g"])
 
     def rolled(self, forms: Forms, gains: ca.MX, s: ca.MX, *, defects: bool) -> tuple[ca.MX, ca.MX, Rows]:
         """Return the steps in states, shape ``(nx, N + 1)``, and in inputs, shape ``(nu, N_u)``, and the rows, all in deviations, from s on."""
@@ -261,6 +286,13 @@ def sweep_free(ocp: Ocp, lin: Linearization) -> ca.Function:
     p_before, kappa = ca.cse([ca.densify(p_before), ca.densify(cholesky_solve(gain.L, qu))])
     inputs = {**symbols, "gain": gain.column, "pull_u": pull_u, "pull_du": pull_du}
     return function("sweep_free", inputs, {"p_before": p_before, "kappa": kappa})
+
+
+def softened_steps(ocp: Ocp, lin: Linearization) -> ca.Function:
+    """Return ``(g_x, g_u, dx, du) -> steps of the expressions with softened bounds`` at one node."""
+    of = Stage(ocp, lin)
+    dx, du = ca.SX.sym("dx", of.nx), ca.SX.sym("du", of.nu)
+    return ca.Function("softened_steps", [*of.softened.values(), dx, du], [ca.densify(of.G @ ca.vertcat(dx, du))])
 
 
 def forward_held(ocp: Ocp, lin: Linearization) -> ca.Function:

@@ -28,7 +28,7 @@ from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import OcpError
-from rti_mpc.rti.active_set import ActiveSet
+from rti_mpc.rti.active_set import MAX_STEPS, ActiveSet
 from rti_mpc.rti.certificate import certificate
 from rti_mpc.rti.linearization import plan_cost, shift
 from rti_mpc.rti.nominal import check_stiffness, nominal_state
@@ -361,6 +361,8 @@ class Rti:
         self._pending = False
         if self._turns.settle():
             self._linearize()
+        if self.active_set is not None:
+            self.active_set.steps_left = MAX_STEPS * self.iterations
         self.status = self.solve()
         self.taken = 1
         if self._change[0] > self.tolerance:

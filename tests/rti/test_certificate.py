@@ -71,7 +71,7 @@ def test_plan_that_breaks_dynamics_or_a_bound_is_not_certified() -> None:
 def test_a_penalty_that_gives_way_is_refined_or_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """With far too small a penalty a hard bound is exceeded: the status must not be SOLVED."""
     ocp = double_integrator(N=20, lbu=-1.0, ubu=1.0, lbx=[-np.inf, -0.3], ubx=[np.inf, 0.3])
-    monkeypatch.setattr("rti_mpc.rti.active_set.PENALTY_PATH", (10.0,))
+    monkeypatch.setattr("rti_mpc.rti.active_set.PENALTY", 10.0)
     rti = Rti(ocp, iterations=1, compile=False)
     rti.reset(np.zeros(2), np.zeros(1))
     rti.prepare(np.tile([3.0, 0.0], (20, 1)), shift=False)

@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+Primal-dual interior point on the Riccati recursion, for QPs whose places do not settle.
+
+Each *side*, a lower or an upper bound of a row, has a distance t from its bound and a
+multiplier :math:`\lambda`. One of a softened row also has a slack s and the multiplier
+:math:`\nu` of its :math:`s \ge 0`. Linearized, the products :math:`t \lambda` and
+:math:`s \nu` are eliminated side by side. This leaves a weight and a pull on the row,
+so that a step is one recursion over matrices, and a sweep over vectors for the
+corrector of [Mehrotra1992]_.
+
+Distances and slacks are relative to the scale of what is bounded; multipliers are in
+normalised cost per scale. Every iterate satisfies the dynamics.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from rti_mpc.codegen import function
+from rti_mpc.rti.linearization import Forms, Linearization, change, divided
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.qp.transcription import INFINITY
+from rti_mpc.rti.riccati import Riccati, Rows, softened_steps
+
+START_DISTANCE = 1.0  # least distance from a bound, and least slack, at the start
+SHARE_OF_WAY = 0.995  # to the nearest bound, that a step may go
+
+
+class Point(NamedTuple):
+    """Numbers of all sides, or their steps: distances, multipliers, and of the softened sides slacks and multipliers of slacks."""
+
+    t: ca.MX
+    lam: ca.MX
+    s: ca.MX
+    nu: ca.MX
+
+
+class Sides:
+    """
+    The bounds that an OCP has: those of inputs and increments, which are hard, then the softened ones.
+
+    Attributes:
+        hard: Number of hard sides.
+        softened: Number of softened sides.
+        scale: Scale of each row, in the order of the places.
+        scale_side: Scale of each side.
+        z: Linear penalty on each slack; `Z`, the quadratic one.
+    """
+
+    def __init__(self, ocp: Ocp, lin: Linearization, forms: Forms) -> None:
+        N, N_u, w = ocp.N, ocp.N_u, lin.w
+        first = 2 * N_u * ocp.model.nu  # row with a softened bound
+
+        def along(inputs: ca.MX, increments: ca.MX, softened: ca.MX) -> ca.MX:
+            return ca.veccat(ca.repmat(inputs, 1, N_u), ca.repmat(increments, 1, N_u), ca.repmat(softened, 1, N))
+
+        tables = (ocp.lbu, ocp.lbdu, ocp.lg), (ocp.ubu, ocp.ubdu, ocp.ug)
+        finite = [np.flatnonzero(np.isfinite(np.concatenate([np.tile(u, N_u), np.tile(du, N_u), np.tile(g, N)]))) for u, du, g in tables]
+        sides = sorted(((int(row), sign) for sign, rows in zip((-1.0, 1.0), finite, strict=True) for row in rows), key=lambda side: side[0] >= first)
+        self._rows, self._sign = [row for row, _ in sides], ca.DM([sign for _, sign in sides])
+        self.hard = sum(row < first for row in self._rows)
+        self.softened = len(sides) - self.hard
+        self._onto = ca.DM(ca.Sparsity.triplet(first + len(ocp.lg) * N, len(sides), self._rows, [*range(len(sides))]), 1.0)
+        self.scale = along(lin.scale_u, lin.scale_u, lin.scale_g)
+        self.scale_side = self.scale[self._rows]
+        zero = ca.MX.zeros(lin.scale_u.shape)
+        soft, scale = self._rows[self.hard :], self.scale_side[self.hard :]
+        self.z, self.Z = along(zero, zero, lin.zg)[soft] * scale / 2, along(zero, zero, lin.Zg)[soft] * scale**2 / 2
+        lower, upper = along(w["lbu"], w["lbdu"], lin.lg)[self._rows], along(w["ubu"], w["ubdu"], lin.ug)[self._rows]
+        bound = ca.if_else(self._sign > 0, upper, lower)
+        self._room = self._sign * (bound - ca.veccat(lin.u, forms.increments, forms.g)[self._rows]) / self.scale_side
+
+    def change(self, d: ca.MX) -> ca.MX:
+        """Return how much nearer deviations of the rows bring each side to its bound."""
+        return self._sign * d[self._rows] / self.scale_side
+
+    def room(self, d: ca.MX) -> ca.MX:
+        """Return the room to each bound at deviations of the rows; negative where it is exceeded."""
+        return self._room - self.change(d)
+
+    def onto(self, sides: ca.MX) -> ca.MX:
+        """Return the sum over the sides of each row."""
+        return ca.densify(self._onto @ sides)
+
+    def directed(self, sides: ca.MX) -> ca.MX:
+        """Return the same with lower sides counted negative."""
+        return self.onto(self._sign * sides)
+
+    def split(self, sides: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """Return the hard and the softened part."""
+        return sides[: self.hard], sides[self.hard :]
+
+
+def enter(ocp: Ocp, lin: Linearization, stages: ca.MX) -> ca.Function:
+    """
+    Build ``(x, u, u_prev, stages, *WEIGHTS_AND_BOUNDS, scale, x_plan, u_plan, start) -> interior``: a plan pushed inside its bounds.
+
+    `start` is the product of distance and multiplier, and of slack and its multiplier, at every side.
+    """
+    N, N_u, nx, nu = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu
+    forms = lin.forms_in(stages)
+    sides = Sides(ocp, lin, forms)
+    x_plan, u_plan = ca.MX.sym("x_plan", nx, N + 1), ca.MX.sym("u_plan", nu, N_u)
+    dx, du = x_plan - lin.x, u_plan - lin.u
+    held = ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u))
+    d = ca.veccat(du, du - ca.horzcat(ca.MX.zeros(nu), du[:, :-1]), softened_steps(ocp, lin).map(N)(forms.g_x, forms.g_u, dx[:, 1:], held))
+    hard, room = sides.split(sides.room(d))
+    start = ca.MX.sym("start")
+    s = ca.fmax(-room, 0) + START_DISTANCE
+    t, t_hard = ca.fmax(room + s, START_DISTANCE), ca.fmax(hard, START_DISTANCE)
+    interior = ca.veccat(dx, d, t_hard, t, start / t_hard, start / t, s, start / s)
+    inputs = {"x": lin.x, "u": lin.u, "u_prev": lin.u_prev, "stages": stages, **lin.weights, "x_plan": x_plan, "u_plan": u_plan, "start": start}
+    return function("enter", inputs, {"interior": interior})
+
+
+def step(ocp: Ocp, lin: Linearization, recursion: Riccati, stages: ca.MX, x0: ca.MX) -> ca.Function:
+    """
+    Build one step of predictor and corrector.
+
+    It is ``(x, u, u_prev, x0, stages, *WEIGHTS_AND_BOUNDS, scale, interior) -> (interior_after, x_plan, u_plan, violation, change, places_found,
+    multipliers, product)``, with the plan after it as from a roll-out, and the mean product of distances and multipliers.
+    """
+    N, N_u, nx, nu = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu
+    forms = lin.forms_in(stages)
+    sides = Sides(ocp, lin, forms)
+    sizes = [nx * (N + 1), sides.scale.numel(), *[sides.hard + sides.softened] * 2, *[sides.softened] * 2]
+    interior = ca.MX.sym("interior", sum(sizes))
+    dx, d, *numbers = ca.vertsplit(interior, np.cumsum([0, *sizes]).tolist())
+    now = Point(*numbers)
+    stiff, (stiff_hard, stiff_soft), stiff_slack = now.lam / now.t, sides.split(now.lam / now.t), now.nu / now.s
+    divisor, slope = sides.Z + stiff_soft + stiff_slack, sides.z + sides.Z * now.s
+    padding = ca.MX.zeros(sides.hard)
+    residual = now.t - sides.room(d) - ca.vertcat(padding, now.s)
+
+    def rows(flat: ca.MX) -> Rows:
+        return Rows(*divided(flat, [lin.u, lin.u, lin.g]))
+
+    def force(wanted: ca.MX, slack: ca.MX) -> ca.MX:
+        """Return the multipliers at d, the slacks eliminated: `wanted` without slacks, `slack` what acts on them."""
+        hard, soft = sides.split(wanted)
+        return sides.directed(ca.vertcat(hard, soft - stiff_soft / divisor * (soft + slack))) / sides.scale
+
+    def toward(d_new: ca.MX, product_t: ca.MX, product_s: ca.MX) -> Point:
+        """Return the step to deviations at which the linearized products have these values."""
+        nearer = residual + sides.change(d_new - d)
+        pressed = sides.split(stiff * nearer + product_t / now.t)[1]
+        s = (pressed + product_s / now.s - slope) / divisor
+        t = ca.vertcat(padding, s) - nearer
+        return Point(t, product_t / now.t - now.lam - stiff * t, s, product_s / now.s - now.nu - stiff_slack * s)
+
+    def longest(by: Point) -> ca.MX:
+        return 1 / ca.mmax(ca.vertcat(1, *(-change / number for number, change in zip(now, by, strict=True))))
+
+    def moved(by: Point, length: ca.MX) -> Point:
+        return Point(*(number + length * change for number, change in zip(now, by, strict=True)))
+
+    def mean_product(at: Point) -> ca.MX:
+        return (ca.dot(at.t, at.lam) + ca.dot(at.s, at.nu)) / max(1, sides.hard + 2 * sides.softened)
+
+    weight = sides.onto(ca.vertcat(stiff_hard, stiff_soft * (sides.Z + stiff_slack) / divisor)) / sides.scale**2
+    gains = recursion.gains(stages, rows(weight), rows(force(stiff * residual, -slope) - weight * d))
+    states, _, predicted = recursion.rolled(forms, gains, ca.vertcat(x0 - lin.x[:, 0], ca.MX.zeros(nu)), defects=True)
+    d_predicted = ca.veccat(predicted.u, predicted.du, predicted.g)
+    affine = toward(d_predicted, ca.MX.zeros(sides.hard + sides.softened), ca.MX.zeros(sides.softened))
+
+    product = mean_product(now)
+    centre = product * ca.fmin(1, (mean_product(moved(affine, longest(affine))) / product) ** 3)
+    wanted_t, wanted_s = centre - affine.t * affine.lam, centre - affine.s * affine.nu
+    states_by, by = recursion.response(stages, gains, rows(force(wanted_t / now.t, wanted_s / now.s)))
+    d_corrected = d_predicted + ca.veccat(by.u, by.du, by.g)
+    full = toward(d_corrected, wanted_t, wanted_s)
+    length = ca.fmin(1, SHARE_OF_WAY * longest(full))
+
+    after = moved(full, length)
+    dx, d = dx + length * (ca.vec(states + states_by) - dx), d + length * (d_corrected - d)
+    u_plan = lin.u + ca.reshape(d[: nu * N_u], nu, N_u)
+    acts_hard, acts_soft = sides.split(after.lam > after.t)
+    exceeded = -sides.split(sides.room(d))[1]
+    outputs = {
+        "interior_after": ca.veccat(dx, d, *after),
+        "x_plan": lin.x + ca.reshape(dx, nx, N + 1),
+        "u_plan": u_plan,
+        "violation": ca.vertcat(*(ca.mmax(ca.vertcat(-INFINITY, e)) for e in (exceeded * sides.split(sides.scale_side)[1], exceeded))),
+        "change": change(lin, u_plan),
+        "places_found": sides.directed(ca.vertcat(acts_hard, acts_soft * (1 + (after.s > after.nu)))),
+        "multipliers": (sides.directed(after.lam) / sides.scale)[nu * N_u :],
+        "product": mean_product(after),
+    }
+    guess = {"x": lin.x, "u": lin.u, "u_prev": lin.u_prev, "x0": x0, "stages": stages}
+    return function("step", {**guess, **lin.weights, "interior": interior}, outputs)

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Interior point behind the active set: against QPs solved by DAQP, its limits, and the families whose places do not settle."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rti_mpc.contract.status import QpStatus
+from rti_mpc.rti import active_set
+from rti_mpc.rti.active_set import ActiveSet
+from rti_mpc.rti.rti import Rti
+from rti_mpc_service.bench.families import FAMILIES
+from tests.rti.test_active_set import PROBLEMS, samples
+
+# Roll-outs before, on the penalty's path and after, and the steps.
+MOST = 2 * active_set.MAX_ROLL_OUTS + active_set.MAX_PATH_ROLL_OUTS + 1 + active_set.MAX_STEPS * 3
+
+
+@pytest.fixture
+def no_roll_outs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave every QP whose first roll-out changes places to the interior point."""
+    monkeypatch.setattr(active_set, "MAX_ROLL_OUTS", 1)
+    monkeypatch.setattr(active_set, "MAX_PATH_ROLL_OUTS", 0)
+
+
+@pytest.mark.usefixtures("no_roll_outs")
+@pytest.mark.parametrize("name", [name for name in PROBLEMS if name != "beacon"])  # whose bounds do not act at the start
+def test_plan_is_that_of_the_qp_solved_by_another_solver(name: str) -> None:
+    ocp = PROBLEMS[name]()
+    rti, exact = (Rti(ocp, solver=solver, formulation="sequential", iterations=1, compile=False) for solver in ("riccati", "daqp"))
+    stepped = solved = 0
+    for x0, y_ref, u_prev in samples(ocp, 30):
+        for one in (rti, exact):
+            one.reset(x0, u_prev)
+            one.prepare(y_ref, shift=False)
+            assert one.feedback(x0).usable
+        if rti.solver is rti.active_set and rti.solver.iterations > 1:
+            stepped += 1
+            solved += rti.status is QpStatus.SOLVED
+            # A gap of 1e-6 of the cost leaves inputs open that hardly matter to it.
+            np.testing.assert_allclose(rti.u, exact.u, rtol=0, atol=1e-3)
+    assert stepped >= 10
+    assert solved >= 0.95 * stepped
+
+
+@pytest.mark.usefixtures("no_roll_outs")
+@pytest.mark.parametrize("limit", [0, 3])
+def test_without_enough_steps_no_plan_is_told_as_solved(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rti_mpc.rti.rti.MAX_STEPS", limit)
+    ocp = PROBLEMS["pioneer"]()
+    rti = Rti(ocp, compile=False)
+    one = rti.active_set
+    assert isinstance(one, ActiveSet)
+    limited = 0
+    for x0, y_ref, u_prev in samples(ocp, 10):
+        rti.reset(x0, u_prev)
+        rti.prepare(y_ref, shift=False)
+        status = rti.feedback(x0)
+        assert one.steps_left >= 0
+        if one.steps_left == 0 and rti.solver is not one:
+            limited += 1
+            assert status is not QpStatus.SOLVED
+        assert np.all(rti.u <= ocp.ubu + 1e-3)  # OSQP's tolerance
+    assert limited > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "N"), [("slalom", 20), ("tight", 50), ("restarts", 20)])
+def test_families_whose_places_do_not_settle_are_solved_in_a_bounded_number_of_roll_outs_and_steps(name: str, N: int) -> None:
+    family = FAMILIES[name][0](N)
+    rti = Rti(family.ocp, formulation="simultaneous")
+    x, u = np.zeros(family.ocp.model.nx), family.u0
+    most, stepped = 0, 0
+    for k in range(family.samples):
+        if (start := family.start(k)) is not None:
+            x, u = start, family.u0
+            rti.reset(x, u)
+        y_ref, p = family.at(k)
+        rti.prepare(y_ref, p, shift=start is None, u_prev=u)
+        assert rti.feedback(x) is QpStatus.SOLVED
+        assert rti.solver is rti.active_set
+        most = max(most, rti.solver.iterations)
+        stepped += rti.active_set.steps_left < rti.iterations * active_set.MAX_STEPS
+        u = rti.u[0].copy()
+        x = family.plant(x, u)
+    assert most <= MOST
+    assert stepped > 0
