@@ -14,6 +14,7 @@ import pytest
 import typer
 
 from rti_mpc_service.cli import app
+from rti_mpc_service.conformance import guard, robot
 from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.processes.system import until
 
@@ -102,6 +103,11 @@ def test_every_command_of_a_page_exists_with_its_options(line: str) -> None:
     known = known.commands[rest[0]] if command == "certs" else known
     options = {name for parameter in known.params for name in parameter.opts}
     assert {word for word in rest if word.startswith("--")} <= options
+
+
+def test_contract_says_what_conformance_judges_word_by_word() -> None:
+    told = re.findall(r"^\| `(\w+)` \| (.*) \|$", (DOCS / "contract.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert told == [(case.name, case.promise) for case in (*robot.CASES, *guard.CASES)]
 
 
 def test_readme_is_a_page_of_at_most_120_lines() -> None:

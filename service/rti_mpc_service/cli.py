@@ -375,6 +375,20 @@ def faults(
     raise typer.Exit(main(config, tuple(only or ()), path, scenario, waypoint_speed, waypoint_smoothing))
 
 
+@process
+def conformance(
+    config: Config,
+    bus: BusSettings,
+    words: Annotated[list[str] | None, typer.Argument(metavar="robot|guard", help="What is judged.")] = None,
+    json_path: JsonPath = None,
+    moves: Annotated[bool, typer.Option("--moves-the-robot", help="Consent to the motion: metres, at up to the bounds of the inputs.")] = False,
+) -> int:
+    """Judge a robot or a guard of any make against the contract, in the place of its controller; it moves the robot."""
+    from rti_mpc_service.conformance.run import main
+
+    return main(config, bus, words or (), json_path, moves=moves)
+
+
 @app.command()
 def bench(
     horizon: Annotated[

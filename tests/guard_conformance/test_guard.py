@@ -11,7 +11,7 @@ import os
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -20,6 +20,7 @@ import pytest
 
 from rti_mpc.contract.message import Command
 from rti_mpc.wire.cdr import encode
+from rti_mpc_service.conformance.wrong import WRONG, wrong
 from rti_mpc_service.host.hold_up import Host
 from tests.guard_conformance.rig import MS, PATIENCE_S, Rig
 
@@ -77,41 +78,14 @@ def test_actuation_is_numbered_upwards_in_epochs_no_lower_than_any_controllers(r
     assert numbers[-1][0] >= rig.leader or rig.heard[-1][1].epoch >= rig.leader
 
 
-WRONG: dict[str, Callable[[Rig, Command], dict[str, Any]]] = {
-    "of a robot's earlier life": lambda rig, command: {"state_epoch": rig.epoch - 1},
-    "of rows that are too wide": lambda rig, command: {"u": np.zeros((20, 3))},
-    "that answers a state of half a second ago": lambda rig, command: {"state_stamp_ns": command.state_stamp_ns - 500 * MS},
-    "that answers a state of the future": lambda rig, command: {
-        name: getattr(command, name) + 400 * MS for name in ("state_stamp_ns", "stamp_ns", "valid_until_ns")
-    },
-    "that has expired": lambda rig, command: {"valid_until_ns": command.stamp_ns - 1},
-    "whose number has passed": lambda rig, command: {"seq": 0},
-    "of a lower epoch": lambda rig, command: {"epoch": rig.leader - 1},
-    "beyond the bounds at once": lambda rig, command: {"u": np.tile(1.2 * rig.ubu, (20, 1))},
-    "beyond the bounds later": lambda rig, command: {"u": np.vstack([np.tile(rig.ubu, (10, 1)), 1.01 * rig.ubu])},
-    "beyond the slew limits from row to row": lambda rig, command: {"u": np.vstack([rig.ubu, rig.ubu - 1.2 * rig.step])},
-}
-
-
-@pytest.mark.parametrize("what", WRONG)
-def test_command_is_refused_as_a_whole(rig: Rig, what: str) -> None:
-    rig.drive()
-    healthy = rig.command(rig.ubu, config_hash=77)
-    wrong = replace(healthy, **WRONG[what](rig, healthy))
-    rig.send(wrong)
-    rig.run(50)
-    assert not any(told.config_hash == 77 for _, told in rig.heard)
+@pytest.mark.parametrize("case", sorted({way.case for way in WRONG}))
+def test_command_is_refused_as_a_whole(rig: Rig, case: str) -> None:
+    for way in wrong(case):
+        rig.drive()
+        rig.send(way.make(rig.command(rig.ubu, config_hash=77), rig.limits))
+        rig.run(50)
+        assert not any(told.config_hash == 77 for _, told in rig.heard), f"a command {way.what}"
     rig.drive()  # and the next healthy one passes
-
-
-def test_what_is_no_message_is_refused(rig: Rig) -> None:
-    rig.drive()
-    healthy = encode(rig.command(rig.ubu))
-    nan = encode(rig.command(np.full(2, np.nan)))
-    for payload in (b"", healthy[:40], healthy[:-1], b"\x00\x00" + healthy[2:], nan, healthy + b"\x00", b"\x00\x01\x00\x00" + b"\xff" * 400):
-        rig._commands.put_bytes(payload)
-    rig.run(50)
-    rig.drive()
 
 
 def test_plan_plays_on_while_a_message_is_late(rig: Rig) -> None:

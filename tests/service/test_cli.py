@@ -95,7 +95,7 @@ def test_bad_option_is_exit_status_2() -> None:
     assert "sim.x0.phi is no state of the model, perhaps psi [rad] is meant" in done.stderr
 
 
-@pytest.mark.parametrize("command", ["bench", "doctor", "faults"])
+@pytest.mark.parametrize("command", ["bench", "conformance", "doctor", "faults"])
 def test_file_that_cannot_be_written_is_refused_before_anything_is_measured(command: str, tmp_path: Path) -> None:
     done = rti_mpc(command, "--json", str(tmp_path / "nowhere" / "found.json"))
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
