@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,15 +12,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from rti_mpc.contract.message import State
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.session import BusSettings
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
 from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.guarded import write_robot
-from tests.processes.system import ROOT, environment, listening, rti_mpc, until
+from tests.processes.system import PATIENCE_S, ROOT, command_line, environment, heard, listening, rti_mpc, until
 
 CLI = "from rti_mpc_service.cli import main; main()"
 # A robot of a user's own with the adapter, at rest in one place: what it is told is seen by the inputs that it reports.
@@ -151,6 +154,24 @@ def test_broken_robot_fails_where_it_should_and_only_there(tmp_path: Path, what:
     change, expected = BROKEN_ROBOTS[what]
     with running(tmp_path, SHIPPED, change + ADAPTED) as endpoint:
         fails_in(judged(tmp_path, "robot", SHIPPED, endpoint), expected)
+
+
+@pytest.mark.slow
+def test_interrupted_test_leaves_even_a_robot_at_rest_that_plays_for_ever(tmp_path: Path) -> None:
+    change, _ = BROKEN_ROBOTS["plays expired rows for ever"]
+    with running(tmp_path, SHIPPED, change + ADAPTED) as endpoint, Bus.join(BusSettings(connect=(endpoint,)), load(SHIPPED).keys()) as bus:
+        states = bus.subscriber(bus.keys.state)
+        arguments = command_line("conformance", SHIPPED, "robot", "-e", endpoint, "--moves-the-robot")
+        process = subprocess.Popen(arguments, cwd=ROOT, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        try:
+            heard(states, State, lambda state: bool(np.abs(state.u).max() > 0.3))
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=PATIENCE_S)
+        finally:
+            process.kill()
+        assert (process.returncode, said) == (1, "rti-mpc: stopped before everything was judged\n")
+        seq = heard(states, State, lambda _: True).seq
+        assert not heard(states, State, lambda state: state.seq > seq).u.any()
 
 
 @pytest.mark.slow

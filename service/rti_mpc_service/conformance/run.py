@@ -20,7 +20,7 @@ from threading import Event
 from rti_mpc.contract.epoch import NUMBER_BITS, epoch_above
 from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command, State
-from rti_mpc.errors import ConfigError, Stopped
+from rti_mpc.errors import ConfigError
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, unix_s
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Key
@@ -40,11 +40,12 @@ LISTEN_BEFORE_START_S = 1.0  # how long a test listens for others before it move
 SILENCE_S = 10.0  # wall time after which a robot that sends no state is gone
 POLL_S = 1e-3
 STALE_S = 0.25
+STOPPED = "stopped before everything was judged"
 LEADING = {"robot": ("controller", "standby"), "guard": ("controller", "standby", "robot")}  # roles beside which no test begins
 
 
-class Gone(Exception):
-    """The robot sends no states."""
+class Ended(Exception):
+    """The test was stopped, or the robot sends no states."""
 
 
 def main(config: Config, bus_settings: BusSettings, words: Sequence[str], path: Path | None = None, *, moves: bool = False) -> int:
@@ -88,7 +89,9 @@ def main(config: Config, bus_settings: BusSettings, words: Sequence[str], path: 
             for judgement in judge(what, bus, config, limits, epoch, stop, host):
                 found.append(judgement)
                 progress(console, judgement, len(found), count)
-        except (Gone, Unwitnessed) as error:
+                if stop.is_set() and len(found) < count:
+                    raise Ended(STOPPED)
+        except (Ended, Unwitnessed) as error:
             say(str(error))
             if not found:
                 return EXIT_FAILED
@@ -103,7 +106,7 @@ def judge(what: str, bus: Bus, config: Config, limits: Limits, epoch: int, stop:
     Yield the judgements of a robot or a guard, which is left at rest.
 
     Raises:
-        Gone: No state comes.
+        Ended: No state comes, or this process was stopped.
     """
     bus.alive("controller")
     if what == "guard":
@@ -140,8 +143,7 @@ class BusLink:
     Connection to a robot on the bus.
 
     Raises:
-        Gone: It sends no states.
-        Stopped: This process was stopped.
+        Ended: It sends no states, or this process was stopped.
     """
 
     def __init__(self, bus: Bus, key: Key[Command], stop: Event) -> None:
@@ -153,11 +155,12 @@ class BusLink:
         deadline_s = time.monotonic() + SILENCE_S
         while time.monotonic() < deadline_s:
             if self._stop.is_set():
-                raise Stopped("stopped")
+                self._stop = Event()  # what follows brings the robot to rest, and is not stopped
+                raise Ended(STOPPED)
             if states := [state for received in self._heard.drain() if (state := self._intake.read(received)) is not None]:
                 return states
             time.sleep(POLL_S)
-        raise Gone(f"no state of {self._robot} has come for {SILENCE_S:g} s: is it running, under this name?")
+        raise Ended(f"no state of {self._robot} has come for {SILENCE_S:g} s: is it running, under this name?")
 
     def put(self, command: Command | bytes) -> None:
         """Send a command, or bytes that are none."""
