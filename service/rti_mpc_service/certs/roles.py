@@ -18,6 +18,7 @@ ROLES: dict[str, tuple[str, ...]] = {
 }
 # Roles whose certificate a command uses: the first one that the host's folder has.
 ROLES_OF_COMMAND: dict[str, tuple[str, ...]] = {
+    "conformance": ("controller",),  # it takes its place; a robot behind a guard, or a guard, is judged on an open bus
     "run": ("controller",),
     "guard": ("guard",),
     "sim": ("robot",),
