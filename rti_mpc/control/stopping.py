@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
@@ -27,6 +28,7 @@ from rti_mpc.rti.way_to_rest import StopLaw, WayToRest
 
 MAX_PREDICTION_NS = 1_000_000_000  # that a state is predicted ahead; a robot that was not heard for longer is taken to be on its way
 CHANGED_SHARE = 0.05  # share of its largest magnitude by which a disturbance must have changed for the robot to rest elsewhere
+NEARER_SHARE = 0.7  # of its distance from the plan's end, within which another rest is aimed at
 ESTIMATION_NS = 1_000_000_000  # time that the estimate of a changed disturbance needs to settle
 REST_SHARE = 0.01  # share of its range in operation within which a state or an input is at rest
 
@@ -69,6 +71,8 @@ class Stopping:
         phi = integrator(ocp.model, "rk4")
         step = {"x": self._x, "u": self._u, "p": prediction.p, "dt": self._span}
         self._step = bind(compiled(phi)[0] if compile else phi, step, {"x_next": self._next})
+        self._u_rest: Array = np.array(ocp.model.u_rest)
+        self._felt = [j for j in range(nx) if ca.depends_on(ocp.model.f_expl_expr, ocp.model.x[j])]
         self._ended: Ending = {}  # the last way that a plan ended with
         self._d = prediction.p[ocp.model.np_ - len(law.disturbances) :]  # what disturbs the robot now
         self._d_known: Array = np.array(self._d)  # the same when it last became another one
@@ -79,8 +83,24 @@ class Stopping:
         self._aimed, self._began_ns, self.at_rest, self._known_ns = False, None, False, BEFORE_ALL_NS
 
     def prepare(self) -> None:
-        """Aim at where the last way leads; off the path from state to command."""
-        self._aimed = self._aimed and self._way.aim(self._way.x[-1], self._way.u[-1])
+        """
+        Aim at where the last way leads, or at the rest near the plan's end if that is clearly nearer; off the path from state to command.
+
+        A boat that turns with its path would otherwise turn all the way back to the heading in which it was to rest first.
+        """
+        way = self._way
+        if not self._aimed:
+            return
+        if self._law.disturbances.size and self._began_ns is None:
+            ahead = self._away(way.x[-1])
+            found = way.aim(self._x, self._u_rest) and way.aim(way.x_e, way.u_e)  # from afar, one aim may not lead to a rest yet
+            if found and self._away(way.x_e) < NEARER_SHARE * ahead:
+                return
+        self._aimed = way.aim(way.x[-1], way.u[-1])
+
+    def _away(self, x_e: Array) -> float:
+        """Return how far a rest is from the plan's end, relative to ranges in operation, in the states that the dynamics depend on."""
+        return float(np.abs((x_e - self._x) / self._law.scale_x)[self._felt].max())
 
     def after(self, rows: Array, act_ns: int, valid_until_ns: int) -> tuple[Array, Ending]:
         """

@@ -58,6 +58,18 @@ def afloat(law: StopLaw | None, speed: float, noise: float = 0.0) -> tuple[Contr
     return controller, Lockstep(RobotSettings(plant, np.array([0, 0, 0, speed, 0, 0]), state_period_s=0.1, noise_std=np.full(6, noise)))
 
 
+def test_way_to_rest_turns_to_the_nearer_of_bow_and_stern_wherever_the_path_has_turned_to() -> None:
+    controller, body = afloat(LAW, 0.8)
+    t = 0.1 * np.arange(600)
+    heading = t / 8.0
+    y = np.column_stack([4 * np.sin(heading), 4 - 4 * np.cos(heading), heading, 0.5 + 0 * t, 0 * t, 0.125 + 0 * t])
+    controller.receive_reference(Reference(2, 1, 0, 100 * MS, End.HOLD, y, np.zeros((len(y), 0))))
+    run = drive(controller, body, 50.0)
+    assert controller.mode is Mode.TRACKING
+    turned = [abs(command.x_rest[-1, 2] - command.x_rest[0, 2]) for command in run.commands[50:]]
+    assert max(turned) < 2.2, "rad: a quarter turn, and what it turns at the plan's end and swings back"
+
+
 def ground_speed(run: Run) -> float:
     """Of the last period, m/s."""
     here, before = run.x[-1][:2], run.x[-2][:2]
