@@ -14,7 +14,7 @@ from rti_mpc_service.faults.promise import BRAKING
 from tests.movers import CURRENT, path_file, toml
 from tests.processes.system import rti_mpc
 
-BOAT = pytest.mark.xfail(reason="it comes back sideways too slowly, and two lost samples at 10 Hz outlast its plan, see docs/faults.md")
+BOAT = pytest.mark.xfail(reason="it swings where its reference ends, and two lost samples at 10 Hz outlast its plan, see docs/faults.md")
 
 
 def matrix(path: Path, *names: str, robot: tuple[object, ...] = (), timeout_s: float = 180.0) -> dict[str, dict[str, Any]]:
