@@ -336,11 +336,13 @@ class Controller:
             return None
         if not self._stopped:
             self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "over_budget")
+        counted = command.mode in (Mode.BRAKING, Mode.STOPPED)
         if self._ways is not None and self._ways.feeds_back:  # the last command carries its way, which newer states correct than this sample's
+            if not counted:
+                self.ladder.brake(at_rest=False)
             self._issued.plan, self._loaded = None, False
             return None
         assert self._states.last is not None
-        counted = command.mode in (Mode.BRAKING, Mode.STOPPED)
         return self._brake(self._states.last, now_ns + self.grid.delay_ns, command.status, wanted=counted)
 
     @reported

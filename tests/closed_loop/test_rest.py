@@ -117,6 +117,7 @@ def test_controller_that_is_late_leaves_the_robot_on_the_way_that_its_states_cor
         sent.append(controller.in_time(command, body.now_ns + 225 * MS))
         controller.prepare()
     assert sent == [None] * 40
+    assert controller.ladder.shifted + controller.ladder.braked == 40, "each is counted"
     assert controller.mode is Mode.BRAKING
     after = controller.receive_state(body.tick(), body.now_ns)
     assert after is not None

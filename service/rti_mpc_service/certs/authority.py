@@ -42,7 +42,7 @@ class Authority:
     @classmethod
     def make(cls, name: str, days: float, now: datetime | None = None) -> Authority:
         """Make a new authority that signs itself."""
-        key = ec.generate_private_key(ec.SECP256R1())
+        key = new_key()
         usage = dict.fromkeys(
             "digital_signature content_commitment key_encipherment data_encipherment key_agreement encipher_only decipher_only".split(), False
         )
