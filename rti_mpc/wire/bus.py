@@ -78,7 +78,7 @@ class Session(Protocol):
 
     @property
     def connects_to(self) -> str:
-        """Endpoints that it connects to, in words; empty if it waits for others to connect."""
+        """Endpoints that it connects to, and what is wrong there, in words; empty if it waits for others to connect."""
 
     @property
     def links(self) -> int | None:

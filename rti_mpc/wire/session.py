@@ -27,6 +27,7 @@ import zenoh
 from rti_mpc.contract.message import Reference
 from rti_mpc.errors import ConfigError, Stopped
 from rti_mpc.text_file import read_text_file
+from rti_mpc.wire.handshake import obstacle
 from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
 from rti_mpc.wire.reach import remind
 
@@ -148,22 +149,37 @@ def _brief(error: Exception) -> str:
 
 
 def endpoints(config: zenoh.Config) -> str:
-    """Return the endpoints that a process connects to, and what may be wrong there, in words; empty if it waits for others to connect."""
+    """Return the endpoints that a process connects to, and what is wrong there, in words; empty if it waits for others to connect."""
     given = json.loads(config.get_json("connect/endpoints"))
-    text = ", ".join(given if isinstance(given, list) else [end for ends in given.values() for end in ends])
-    wrong = (
-        "no process listens there, the address is wrong, or a certificate is"
-        if "tls/" in text or "quic/" in text
-        else "no process listens there, or the address is wrong"
+    ends = given if isinstance(given, list) else [end for ends in given.values() for end in ends]
+    tls = (
+        json.loads(config.get_json(f"transport/link/tls/{name}")) for name in ("root_ca_certificate", "connect_certificate", "connect_private_key")
     )
-    return f"{text}: {wrong}" if text else ""
+    files = [Path(name) if name else None for name in tls]
+    return "; ".join(f"{end}: {obstacle(end, *files) or _guess(end)}" for end in ends)
+
+
+def _guess(endpoint: str) -> str:
+    """Return what may be wrong at an endpoint."""
+    certificate = ", the address is wrong, or a certificate is" if endpoint.startswith(("tls/", "quic/")) else ", or the address is wrong"
+    return f"no process listens there{certificate}"
 
 
 def open_endpoints(settings: BusSettings) -> list[str]:
     """Return the endpoints beyond the loopback on which a process listens without TLS."""
-    given = json.loads(zenoh_config(settings).get_json("listen/endpoints"))
-    ends = given if isinstance(given, list) else given.get(settings.mode, [])
-    return [endpoint for endpoint in ends if OPEN_PATTERN.match(endpoint)]
+    return [endpoint for endpoint in listens(settings) if OPEN_PATTERN.match(endpoint)]
+
+
+def listens(settings: BusSettings) -> list[str]:
+    """Return the endpoints on which a process listens."""
+    given: list[str] | dict[str, list[str]] = json.loads(zenoh_config(settings).get_json("listen/endpoints"))
+    return given if isinstance(given, list) else given.get(settings.mode, [])
+
+
+def denies(settings: BusSettings) -> bool:
+    """Whether a process with these settings drops what no rule of its access control list allows."""
+    access = json.loads(zenoh_config(settings).get_json("access_control"))
+    return bool(access["enabled"]) and access["default_permission"] == "deny"
 
 
 def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event | None, say: Callable[[str], object]) -> zenoh.Session:

@@ -148,7 +148,7 @@ class ZenohSession:
             ConfigError: Zenoh refuses a setting, an endpoint is taken, or no router was there in time.
             Stopped: The wait was ended by `stop`.
         """
-        self.connects_to = endpoints(zenoh_config(settings))
+        self._config = zenoh_config(settings)
         self._session = open_session(settings, timeout_s, stop, say)
 
     def __enter__(self) -> ZenohSession:
@@ -162,6 +162,11 @@ class ZenohSession:
         closing = threading.Thread(target=self._session.close, daemon=True)
         closing.start()
         closing.join(CLOSE_TIMEOUT_S)
+
+    @property
+    def connects_to(self) -> str:
+        """Endpoints that it connects to, and what is wrong there, in words; empty if it waits for others to connect."""
+        return endpoints(self._config)
 
     @property
     def links(self) -> int | None:

@@ -515,6 +515,7 @@ def certs_renew(
 @certs.command("show")
 def certs_show(folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Folders with certificates.")]) -> None:
     """Print until when certificates are valid; the status is 1 if one of them ends within 30 days."""
+    from rti_mpc.wire.certificate import WARN_DAYS
     from rti_mpc_service.certs.issue import lives
 
     left_days = [float("inf")]
@@ -522,15 +523,24 @@ def certs_show(folders: Annotated[list[Path], typer.Argument(metavar="DIR...", h
         for file, name, days in lives(folder):
             typer.echo(f"{folder / file}: {name}, " + (f"valid for {days:.1f} days" if days > 0.0 else "expired"))
             left_days.append(days)
-    raise typer.Exit(int(min(left_days) < 30.0))
+    raise typer.Exit(int(min(left_days) < WARN_DAYS))
 
 
 @app.command()
 def doctor(
     config: ConfigPath = SHIPPED,
     path: JsonPath = None,
+    security: Annotated[
+        bool, typer.Option("--security", help="Say instead what is open here: listeners, missing TLS, certificates about to end, permissions.")
+    ] = False,
+    tls: Annotated[Path | None, typer.Option("--tls", metavar="DIR", help="With --security: folder of this host's certificates.")] = None,
+    state: StatePath = None,
 ) -> None:
-    """Examine this host: scheduler, clock, timers, bus, compiler, and the shortest period that the loop can keep."""
+    """Examine this host: scheduler, clock, timers, bus, compiler, and the shortest period that the loop can keep; or its security."""
+    if security:
+        from rti_mpc_service.doctor import security as examination
+
+        raise typer.Exit(examination.main(config, path, tls=tls, state=state))
     from rti_mpc_service.doctor.doctor import main
 
     raise typer.Exit(main(config, path))
