@@ -22,6 +22,7 @@ from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.contract.message import Command, Event, State, Telemetry
 from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import M, decode
+from rti_mpc_service.certs.folder import secured
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
 from rti_mpc_service.host.hold_up import Host
@@ -58,19 +59,21 @@ def environment(state: Path = STATE) -> dict[str, str]:
 
 
 class System:
-    """The processes of one robot, and a peer that listens to them."""
+    """The processes of one robot, and one that listens to them: peers, or clients of a router with TLS, which runs, by the bundle of a host."""
 
-    def __init__(self, folder: Path, config: Path = SHIPPED, **arguments: tuple[object, ...]) -> None:
+    def __init__(self, folder: Path, config: Path = SHIPPED, tls: Path | None = None, **arguments: tuple[object, ...]) -> None:
         self.folder = folder
         self.config = config
         self.keys = load(config).keys()
         self.arguments = ARGUMENTS | arguments
         self.endpoint = free_endpoint()
+        self.meeting: tuple[object, ...] = ("-e", self.endpoint) if tls is None else ("--tls", tls)
         self.running: dict[str, subprocess.Popen[bytes]] = {}
         self.lives: set[str] = set()
         self.fault_at_ns = 0  # when the last fault began, by the monotonic clock
         self._stack = ExitStack()
-        self.bus = self._stack.enter_context(Bus.join(BusSettings(connect=(self.endpoint,)), self.keys))
+        settings = BusSettings(connect=(self.endpoint,)) if tls is None else secured(BusSettings(), tls, "view")
+        self.bus = self._stack.enter_context(Bus.join(settings, self.keys))
         self.bus.watch_alive(lambda role, present: (self.lives.add if present else self.lives.discard)(role))
 
     def __enter__(self) -> System:
@@ -86,7 +89,7 @@ class System:
             command, *options = self.arguments[role]
             options += ["--log", self.folder / "robot.csv"] if role == "robot" else []
             with (self.folder / f"{role}.log").open("ab") as log:
-                arguments, state = command_line(command, self.config, "-e", self.endpoint, *options), self.folder / "state"
+                arguments, state = command_line(command, self.config, *self.meeting, *options), self.folder / "state"
                 self.running[role] = subprocess.Popen(arguments, cwd=ROOT, env=environment(state), stdout=log, stderr=subprocess.STDOUT)
 
     def kill(self, role: str) -> None:

@@ -4,11 +4,8 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -17,79 +14,26 @@ import pytest
 
 from rti_mpc.contract.message import Command, Reference, State, Telemetry
 from rti_mpc.errors import ConfigError
-from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.cdr import decode, encode
 from rti_mpc.wire.keys import Key, Keys
-from rti_mpc_service.certs.folder import secured
-from rti_mpc_service.certs.roles import ROLES, ROLES_OF_COMMAND
 from rti_mpc_service.rig.endpoint import free_endpoint
-from tests.guarded import write_robot
-from tests.processes.system import PATIENCE_S, ROOT, command_line, environment, heard, rti_mpc, until
+from tests.processes.system import PATIENCE_S, heard, rti_mpc, until
 
 pytest.importorskip("cryptography", reason="the extra certs is not installed: certificates were NOT tried")
 
-from rti_mpc_service.certs.authority import Authority, pem
-from rti_mpc_service.certs.issue import issue, make_authority
+from tests.processes.secured import PROGRAMS, Secured
 
 pytestmark = pytest.mark.slow
 
-PROGRAMS: dict[str, tuple[object, ...]] = {
-    "router": (),
-    "sim": ("--x0", "x=0.5"),
-    "guard": (),
-    "run": (),
-    "reference": ("--scenario", "eight", "--duration", 600),
-}
-COMMAND_OF = {role: command for command, roles in ROLES_OF_COMMAND.items() for role in roles}
 REFERENCE = Reference(epoch=1, seq=1, stamp_ns=1, period_ns=100_000_000, end=0, y=np.zeros((5, 3)), p=np.empty((5, 0)))
-
-
-class Secured:
-    """A router with TLS and its list for one robot, and certificates of all roles."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.config = write_robot(folder / "robot.toml")
-        self.keys = Keys()
-        self.endpoint = free_endpoint().replace("tcp/", "tls/")
-        make_authority(folder / "authority", 10.0)
-        self.authority = Authority.read(folder / "authority")
-        self.tls = folder / "tls"
-        issue(self.authority, self.keys, list(ROLES), self.endpoint, self.tls, self.tls, 1.0)
-        self.running: dict[str, subprocess.Popen[bytes]] = {}
-        self._stack = ExitStack()
-
-    def start(self, *commands: str) -> None:
-        for command in commands:
-            with (self.folder / f"{command}.log").open("ab") as log:
-                line = command_line(command, self.config, "--tls", self.tls, *PROGRAMS[command])
-                self.running[command] = subprocess.Popen(line, cwd=ROOT, env=environment(self.folder / "state"), stdout=log, stderr=subprocess.STDOUT)
-
-    def said(self, command: str) -> str:
-        return (self.folder / f"{command}.log").read_text(errors="replace")
-
-    def join(self, role: str, folder: Path | None = None, keys: Keys | None = None, **changes: Any) -> Bus:
-        """Join as a role, with the certificate of a folder."""
-        settings = replace(secured(BusSettings(), folder or self.tls, COMMAND_OF[role]), **changes)
-        return self._stack.enter_context(Bus.join(settings, keys or self.keys, timeout_s=3.0))
-
-    def close(self) -> None:
-        self._stack.close()
-        for process in self.running.values():
-            process.kill()
-            process.wait()
 
 
 @pytest.fixture
 def bus(tmp_path: Path) -> Iterator[Secured]:
     """A router that is up."""
-    system = Secured(tmp_path)
-    try:
-        system.start("router")
-        until(lambda: "routing" in system.said("router"), "the router routes")
-        yield system
-    finally:
-        system.close()
+    with Secured(tmp_path) as bus:
+        yield bus
 
 
 def state(seq: int) -> State:
@@ -155,52 +99,26 @@ def test_late_joiner_gets_a_reference_and_nobody_but_the_planner_gives_one(bus: 
     assert [decode(Reference, received.payload).epoch for received in late.drain()] in ([], [1])
 
 
-def test_certificate_of_no_or_of_another_authority_expired_or_plain_tcp_is_refused(bus: Secured, tmp_path: Path) -> None:
-    foreign = Authority.make("foreign", 10.0)
-    issue(foreign, bus.keys, ["robot"], bus.endpoint, tmp_path / "foreign", tmp_path, 1.0)
-    (tmp_path / "foreign" / "authority.pem").write_bytes((bus.tls / "authority.pem").read_bytes())
-    expired = tmp_path / "expired"
-    issue(bus.authority, bus.keys, ["robot"], bus.endpoint, expired, tmp_path, 1.0)
-    old = bus.authority.certify("robot@rti_mpc/pioneer", load_key(expired / "robot.key").public_key(), 1.0, now=datetime.now(UTC) - timedelta(days=3))
-    (expired / "robot.pem").write_bytes(pem(old))
-    for folder in (tmp_path / "foreign", expired):
+def test_certificate_of_no_or_of_another_authority_expired_or_plain_tcp_is_refused(bus: Secured) -> None:
+    for settings in bus.outsiders().values():
         with pytest.raises(ConfigError, match="none has answered"):
-            bus.join("robot", folder)
-    with pytest.raises(ConfigError, match="none has answered"):
-        bus.join("robot", connect=(bus.endpoint.replace("tls/", "tcp/"),), config=None, mode="client", authority=None, certificate=None, key=None)
-    anonymous = tmp_path / "anonymous.json5"
-    anonymous.write_text(json.dumps({"mode": "client", "transport": {"link": {"tls": {"root_ca_certificate": str(bus.tls / "authority.pem")}}}}))
-    with pytest.raises(ConfigError, match="none has answered"):
-        bus.join("robot", connect=(bus.endpoint,), config=anonymous, authority=None, certificate=None, key=None)
+            Bus.join(settings, bus.keys, timeout_s=3.0)
     assert bus.join("robot")  # the router lives, and takes a good one
-
-
-def load_key(path: Path) -> Any:
-    from cryptography.hazmat.primitives import serialization
-
-    return serialization.load_pem_private_key(path.read_bytes(), None)
 
 
 def test_client_does_not_take_another_process_of_the_same_authority_for_the_router(tmp_path: Path) -> None:
     system = Secured(tmp_path)
     for name in ("pem", "key"):
         (system.tls / f"router.{name}").write_bytes((system.tls / f"controller.{name}").read_bytes())
-    try:
-        system.start("router")
-        until(lambda: "routing" in system.said("router"), "the false router routes")
-        with pytest.raises(ConfigError, match="none has answered"):
-            system.join("robot")
-    finally:
-        system.close()
+    with system, pytest.raises(ConfigError, match="none has answered"):
+        system.join("robot")
 
 
 @pytest.fixture
 def crowd(bus: Secured) -> dict[str, Bus]:
     """All roles, and a controller of another robot."""
-    others = Keys(robot="other")
-    issue(bus.authority, others, ["controller"], bus.endpoint, bus.folder / "other", bus.folder, 1.0)
     joined = {role: bus.join(role) for role in ("robot", "controller", "guard", "planner", "operator", "viewer")}
-    return joined | {"other": bus.join("controller", bus.folder / "other", keys=Keys())}
+    return joined | {"other": bus.join("controller", bus.bundle("other", Keys(robot="other")))}
 
 
 WRITERS = {"state": "robot", "command": "controller", "actuation": "guard", "reference": "planner", "info": "robot", "event": "guard"}

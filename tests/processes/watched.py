@@ -47,8 +47,8 @@ def configuration(folder: Path, dt_s: float, live: bool = False, more: str = "")
 class Watched(System):
     """A system with a record of every command on the bus and of everything that a guard publishes."""
 
-    def __init__(self, folder: Path, dt_s: float, live: bool = False, more: str = "") -> None:
-        super().__init__(folder, configuration(folder, dt_s, live, more), **ARGUMENTS)
+    def __init__(self, folder: Path, dt_s: float, live: bool = False, more: str = "", tls: Path | None = None) -> None:
+        super().__init__(folder, configuration(folder, dt_s, live, more), tls, **ARGUMENTS)
         self.dt_s = dt_s
         self.began_ns = time.monotonic_ns()
         self.commands: list[Command] = []
