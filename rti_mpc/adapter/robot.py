@@ -99,7 +99,8 @@ class RobotAdapter:
         self._played_ns = time.monotonic_ns()
         settings = bus or BusSettings(listen=(RENDEZVOUS_ENDPOINT,))
         keys = Keys(prefix, robot)
-        self._bus = Bus.join(settings, keys, stop=self._stop, say=lambda line: print(f"{robot}: {line}", file=sys.stderr))
+        self._robot = robot
+        self._bus = Bus.join(settings, keys, stop=self._stop, say=self._say)
         self._states = self._bus.publisher(keys.state)
         self._announcer = Announcer(self._bus, ROLE, epoch)
         self._intake = self._bus.intake(Command, 1e-9 * STALE_NS, {"u": nu}, unfit=lambda command: unfit(command, nu, epoch))
@@ -108,6 +109,7 @@ class RobotAdapter:
         about = {"role": ROLE, "version": rti_mpc.__version__, "epoch": epoch, "speed": 1.0, "reports_inputs": True, "approaches": True}
         self._bus.publish_json(keys.info(ROLE), {**about, **labels(inputs=[Label(name) for name in self.inputs])})
         self._bus.alive(ROLE)
+        self._bus.watch_certificate(self._warn)
 
     def __enter__(self) -> Self:
         return self
@@ -178,6 +180,14 @@ class RobotAdapter:
         for notice in self._intake.notices(now_ns):
             self._announcer.say(notice, now_ns)
         return self._actuator.u.copy()
+
+    def _warn(self, notice: Notice) -> None:
+        """Announce and print what does not come from the control loop; in any thread."""
+        self._announcer.say(notice, time.monotonic_ns())
+        self._say(notice.text)
+
+    def _say(self, line: str) -> None:
+        print(f"{self._robot}: {line}", file=sys.stderr)
 
 
 def check_limits(

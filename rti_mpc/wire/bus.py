@@ -8,12 +8,15 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 from weakref import WeakSet
 
+from rti_mpc.contract.message import Notice
 from rti_mpc.errors import MessageError
 from rti_mpc.wire import document
 from rti_mpc.wire.cdr import M, Message
+from rti_mpc.wire.certificate import warn_of_end
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.reach import remind
@@ -79,6 +82,10 @@ class Session(Protocol):
     @property
     def connects_to(self) -> str:
         """Endpoints that it connects to, and what is wrong there, in words; empty if it waits for others to connect."""
+
+    @property
+    def certificate(self) -> Path | None:
+        """Certificate with which it has joined, PEM; None without TLS."""
 
     @property
     def links(self) -> int | None:
@@ -211,6 +218,11 @@ class Bus:
             return f"not connected, no {what} yet: " + (f"no process answers at {where}" if where else "no process has connected yet")
 
         remind(self._say, wanted, self._over)
+
+    def watch_certificate(self, tell: Callable[[Notice], object]) -> None:
+        """Warn from `rti_mpc.wire.certificate.WARN_DAYS` before the end of this process's certificate on, once a day, in a thread of its own."""
+        if (path := self._session.certificate) is not None:
+            warn_of_end(path, tell, self._over)
 
     def publisher(self, key: Key[M]) -> Publisher[M]:
         """Return the publisher of a stream; the same one for the same key."""

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-End of a certificate's life, read without a package for cryptography.
+End of a certificate's life, read without a package for cryptography, and the warning before it.
 
 Making certificates takes one (the extra ``certs``), but a robot only has to know when
 its own ends. The date is at a fixed place of the certificate (RFC 5280, 4.1).
@@ -8,15 +8,59 @@ its own ends. The date is at a fixed place of the certificate (RFC 5280, 4.1).
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from threading import Event, Thread
 
+from rti_mpc.contract.message import Notice, Severity
 from rti_mpc.errors import ConfigError
 from rti_mpc.text_file import read_text_file
 
 WARN_DAYS = 30.0  # before its end, from which on a certificate is to be renewed
+CHECK_INTERVAL_S = 86_400.0  # between two looks at the calendar, and two warnings
 EXPLICIT_VERSION = 0xA0  # tag that precedes the serial number in every certificate but those of version 1
 UTC_TIME = 0x17  # tag of a time with two digits for the year, which RFC 5280 takes to be 1950 to 2049
+
+
+def warn_of_end(path: Path, tell: Callable[[Notice], object], over: Event) -> None:
+    """
+    Warn at once and then every day, in a thread of its own, while a certificate that is in use has less than `WARN_DAYS` left.
+
+    The file is read once: a process uses the certificate with which it has joined, whatever is written there later.
+
+    Args:
+        path: The certificate, PEM.
+        tell: Receiver of the warning.
+        over: Ends the watch when set.
+    """
+
+    def watch() -> None:
+        with suppress(ConfigError):  # one that cannot be read joins no bus
+            end = ends(path)
+            while True:
+                if (notice := warning(path, end, now())) is not None:
+                    tell(notice)
+                if over.wait(CHECK_INTERVAL_S):
+                    return
+
+    Thread(target=watch, name="certificate", daemon=True).start()
+
+
+def warning(path: Path, end: datetime, at: datetime) -> Notice | None:
+    """Return the warning about a certificate that ends at a time, as it is due at another time; None before `WARN_DAYS`."""
+    left = end - at
+    if left >= timedelta(days=WARN_DAYS):
+        return None
+    when = f"ends in {left / timedelta(days=1):.1f} days" if left > timedelta() else "has ended"
+    text = f"{path} {when}, on {end:%Y-%m-%d} at {end:%H:%M} UTC, and links close then: `rti-mpc certs renew`, and restart this process"
+    return Notice(Severity.WARNING, "certificate_ends", text)
+
+
+def now() -> datetime:
+    """Return the present time, by the wall clock, as certificates are checked."""
+    return datetime.now(UTC)
 
 
 def ends(path: Path) -> datetime:

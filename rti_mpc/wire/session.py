@@ -152,11 +152,18 @@ def endpoints(config: zenoh.Config) -> str:
     """Return the endpoints that a process connects to, and what is wrong there, in words; empty if it waits for others to connect."""
     given = json.loads(config.get_json("connect/endpoints"))
     ends = given if isinstance(given, list) else [end for ends in given.values() for end in ends]
-    tls = (
-        json.loads(config.get_json(f"transport/link/tls/{name}")) for name in ("root_ca_certificate", "connect_certificate", "connect_private_key")
-    )
-    files = [Path(name) if name else None for name in tls]
+    files = [_tls_file(config, name) for name in ("root_ca_certificate", "connect_certificate", "connect_private_key")]
     return "; ".join(f"{end}: {obstacle(end, *files) or _guess(end)}" for end in ends)
+
+
+def certificate(config: zenoh.Config) -> Path | None:
+    """Return the certificate of a process; None without TLS."""
+    return _tls_file(config, "connect_certificate") or _tls_file(config, "listen_certificate")
+
+
+def _tls_file(config: zenoh.Config, name: str) -> Path | None:
+    path = json.loads(config.get_json(f"transport/link/tls/{name}"))
+    return Path(path) if path else None
 
 
 def _guess(endpoint: str) -> str:

@@ -16,6 +16,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from itertools import islice
+from pathlib import Path
 from typing import Any, Generic
 
 import zenoh
@@ -25,7 +26,7 @@ from rti_mpc.wire import document
 from rti_mpc.wire.cdr import M, encode, encoding
 from rti_mpc.wire.keys import Key
 from rti_mpc.wire.received import Received
-from rti_mpc.wire.session import BusSettings, endpoints, open_session, zenoh_config
+from rti_mpc.wire.session import BusSettings, certificate, endpoints, open_session, zenoh_config
 
 CLOSE_TIMEOUT_S = 0.5
 HEARTBEAT_S = 1.0  # period at which a cached publisher sends the number of its last message
@@ -162,6 +163,11 @@ class ZenohSession:
         closing = threading.Thread(target=self._session.close, daemon=True)
         closing.start()
         closing.join(CLOSE_TIMEOUT_S)
+
+    @property
+    def certificate(self) -> Path | None:
+        """Certificate with which it has joined, PEM; None without TLS."""
+        return certificate(self._config)
 
     @property
     def connects_to(self) -> str:

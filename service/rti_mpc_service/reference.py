@@ -79,9 +79,11 @@ class ReferenceSource:
         self._bus = bus
         self._states: Subscriber | None = None
         self._look_again_ns = 0
+        self._stamp_ns = 0  # of the last state; 0 before the first one
         self._intake = bus.intake(State, STALE_S, {"x": scenario.nx})
         self._lives = Lives(STALE_S, STALE_S)
         bus.expect("state", lambda: self.anchored)
+        bus.watch_certificate(self._warn)
 
     def publish_if_restarted(self) -> None:
         """
@@ -100,11 +102,18 @@ class ReferenceSource:
         for state in self._intake.newest_of_each(self._states.drain()):
             if self._lives.judge(state.epoch, now_ns) is Heard.BEGINS:
                 self._anchor(state)
-        if state is not None and self._lives.rival is None:
-            self._states = None
-            self._look_again_ns = now_ns + RESTART_CHECK_NS
+        if state is not None:
+            self._stamp_ns = state.stamp_ns
+            if self._lives.rival is None:
+                self._states = None
+                self._look_again_ns = now_ns + RESTART_CHECK_NS
         for notice in self._intake.notices(now_ns):
-            self._announcer.say(notice, 0 if state is None else state.stamp_ns)
+            self._announcer.say(notice, self._stamp_ns)
+
+    def _warn(self, notice: Notice) -> None:
+        """Announce and log what does not come from the robot; in any thread."""
+        self._announcer.say(notice, self._stamp_ns)
+        logger.warning("%s", notice.text)
 
     def _anchor(self, state: State) -> None:
         """Publish the reference that starts at a state."""

@@ -102,6 +102,7 @@ def main(
         life |= {"reports_inputs": settings.reports_inputs, "approaches": settings.increments is not None}
         bus.publish_json(keys.info(ROLE), {**model_info(settings.model), **(info or {}), **life})
         bus.alive(ROLE)
+        bus.watch_certificate(robot.warn)
         logger.info("epoch %d of %s, %s, at %g times real speed", robot.body.epoch, keys.robot, settings.model.name, speed)
         gc.collect()
         gc.freeze()
@@ -180,6 +181,11 @@ class Robot:
             if self.clock.now_ns() - due_ns >= body.period_ns:
                 self._hold(due_ns)
             self._live(due_ns)
+
+    def warn(self, notice: Notice) -> None:
+        """Announce and log what does not come from the robot's own loop; in any thread."""
+        self._announcer.say(notice, self.body.now_ns)
+        logger.warning("%s", notice.text)
 
     def finish(self) -> RobotSummary:
         """Go the way to rest, coast until the robot stands, send that state, and sum up."""

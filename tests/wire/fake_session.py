@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 from rti_mpc.wire.bus import Declared, Received
@@ -26,6 +27,7 @@ class FakeSession:
         asked: Names of the streams on which somebody was asked.
         links: As of a session.
         connects_to: As of a session.
+        certificate: As of a session.
     """
 
     def __init__(self) -> None:
@@ -35,6 +37,7 @@ class FakeSession:
         self.asked: set[str] = set()
         self.links: int | None = None
         self.connects_to = ""
+        self.certificate: Path | None = None
         self._closed = threading.Event()
 
     def __enter__(self) -> FakeSession:

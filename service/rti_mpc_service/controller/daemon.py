@@ -165,6 +165,7 @@ class Daemon:
         self._telemetries = {role: bus.publisher(key) for role, key in ((LEADER, keys.telemetry), (STANDBY, keys.standby_telemetry))}
         self._states_in = bus.intake(State, config.stale_s, {"x": model.nx, "u": model.nu})
         bus.expect("state", lambda: controller.heard)
+        bus.watch_certificate(controller.say)
         self._references = References(bus, controller, model.ny)
         self._prepare_us = 0.0
         self._ticked_ns = 0

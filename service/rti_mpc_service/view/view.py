@@ -69,7 +69,9 @@ def main(
             outlets.append(viewer_outlet(url, keys.robot))
         bus.alive(ROLE)
         log.info("listening to %s", keys.below("*"))
-        pump(listener, outlets, spawned, Announcer(bus, ROLE, time.time_ns() // 1_000_000_000), stop)
+        announcer = Announcer(bus, ROLE, time.time_ns() // 1_000_000_000)
+        bus.watch_certificate(lambda notice: announce(log, announcer, notice, listener.now_ns))
+        pump(listener, outlets, spawned, announcer, stop)
     log.info("%d messages, %d lost, %d refused", listener.received, listener.lost, listener.refused)
     complete = [outlet.close() for outlet in outlets]
     for notice in notices(outlets):
