@@ -2,7 +2,7 @@
 """
 Recorder of all messages on the bus: ``python -m tests.processes.overheard ENDPOINT FILE``, one line of JSON per message.
 
-Read by tests whose processes run on other hosts.
+On a bus with TLS the first argument is the folder of the host's certificates. Read by tests whose processes run on other hosts.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from rti_mpc.contract.message import Command, State, Telemetry
 from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.interrupt import stop_on_signals
+from rti_mpc_service.certs.folder import secured
 from tests.processes.system import KEYS
 
 STREAMS: dict[str, tuple[str, type[Any], tuple[str, ...]]] = {
@@ -62,10 +63,11 @@ def write(name: str, cls: type[Any], fields: tuple[str, ...], subscriber: Subscr
         file.write(json.dumps({"stream": name, "at_ns": at_ns, **values}) + "\n")
 
 
-def main(endpoint: str, path: Path) -> None:
+def main(where: str, path: Path) -> None:
     """Record messages until stopped."""
     stop = stop_on_signals()
-    with Bus.join(BusSettings(mode="client", connect=(endpoint,)), KEYS, timeout_s=60.0, stop=stop) as bus, path.open("w", buffering=1) as file:
+    settings = secured(BusSettings(), Path(where), "view") if Path(where).is_dir() else BusSettings(mode="client", connect=(where,))
+    with Bus.join(settings, KEYS, timeout_s=60.0, stop=stop) as bus, path.open("w", buffering=1) as file:
         for name, (key, cls, fields) in STREAMS.items():
             threading.Thread(target=write, args=(name, cls, fields, bus.subscriber(key, capacity=1024), file), daemon=True).start()
         stop.wait()
