@@ -28,6 +28,7 @@ PATHS: dict[str, Callable[[Array], tuple[Array, Array]]] = {  # of the two outpu
     "quadrotor": lambda t: (2 * np.sin(t / 3), 0.5 * np.sin(t / 3)),
     "floating": lambda t: (4 * np.sin(t / 8), 4 - 4 * np.cos(t / 8)),
 }
+SAMPLED = {"floating": (40, 0.05, 1e-4)}  # N, dt in s and R where others fit: thrusts of tens of newtons, without slew limits
 FOLLOWED = {"car": "x y", "bicycle": "x y", "floating": "x y", "arm": "q_1 q_2", "quadrotor": "x z"}  # outputs of a robot on a reference
 
 
@@ -189,6 +190,7 @@ def floating_model() -> Model:
 def toml(name: str, more: str = "") -> str:
     """The configuration of one of these, driven behind a guard; `more` follows it."""
     ocp, model = ocp_of(name), following(name)
+    N, dt, R = SAMPLED.get(name, (20, ocp.dt, 0.01))
 
     def table(signals: tuple[Signal, ...], lower: Any, upper: Any) -> str:
         bounded = [(each.name, low, high) for each, low, high in zip(signals, lower, upper, strict=True) if np.isfinite([low, high]).any()]
@@ -198,11 +200,11 @@ def toml(name: str, more: str = "") -> str:
 robot = "{name}"
 model = {{ name = "tests.movers:{name}_model" }}
 [ocp]
-N = 20
-dt_s = {ocp.dt}
+N = {N}
+dt_s = {dt}
 [ocp.weights]
 Q = {{ {", ".join(f"{output.name} = 1.0" for output in model.outputs)} }}
-R = {{ {", ".join(f"{signal.name} = 0.01" for signal in model.inputs)} }}
+R = {{ {", ".join(f"{signal.name} = {R}" for signal in model.inputs)} }}
 [ocp.bounds]
 inputs = {{ {table(model.inputs, ocp.lbu, ocp.ubu)} }}
 increments = {{ {table(model.inputs, ocp.lbdu, ocp.ubdu)} }}

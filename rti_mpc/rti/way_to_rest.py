@@ -45,6 +45,7 @@ FIRST_ROWS = 2  # whose reach depends on what was sent before
 BLOCK_ROWS = 10  # that are compiled once and called again, as are steps of the regulator: compilers take long for what is long
 FREE_SHARE = 0.01  # of its rate in operation by which a state moves where another one is anywhere in its range: then that one is free at rest
 HOLD_S = 0.5  # a deviation from the way weighs as much as a rate that undoes it in this time
+LEAN_S = 2.0  # the same for what is to give way where the state itself is held, too: a boat comes back sideways by leaning out of a current
 LIMITS = ("lbu", "ubu", "lbdu", "ubdu")
 
 
@@ -269,12 +270,13 @@ def regulators(model: Model, law: StopLaw) -> ca.Function:
     A, B = ca.jacobian(phi, model.x), ca.jacobian(phi, model.u)
     rates = [j for j in range(nx) if not ca.depends_on(model.f_expl_expr[j], model.u)]  # those that inputs change by themselves are theirs to choose
     C = ca.densify(ca.jacobian(model.f_expl_expr[rates, 0] / ca.DM(law.rates[rates]), model.x))
-    moving = C.T @ C
+    moving, found = C.T @ C, ca.SX(nx, nx)
     if law.disturbances.size:
-        moving += unfree(C @ ca.diag(ca.DM(law.scale_x)), law)
+        found = unfree(C @ ca.diag(ca.DM(law.scale_x)), law)
     seen = ca.sum1((C @ ca.diag(ca.DM(law.scale_x))) ** 2).T  # by the regulator of the rates: what it slows down is not to be held as well
     away = ca.diag(ca.densify(FREE_SHARE**2 / (FREE_SHARE**2 + seen)) / ca.DM((HOLD_S * law.rates) ** 2))
-    linear = ca.Function("linear", [model.x, model.u, model.p], [ca.densify(A), ca.densify(B), ca.densify(moving), ca.densify(moving + away)])
+    weights = moving + found, moving + (HOLD_S / LEAN_S) ** 2 * found + away
+    linear = ca.Function("linear", [model.x, model.u, model.p], [ca.densify(expr) for expr in (A, B, *weights)])
 
     S, Q, As, Bs = (ca.SX.sym(name, *shape) for name, shape in (("S", (nx, nx)), ("Q", (nx, nx)), ("A", (nx, nx)), ("B", (nx, nu))))
     A_s, B_s = (symbol * ca.DM(expr.sparsity(), 1.0) for symbol, expr in ((As, A), (Bs, B)))

@@ -123,6 +123,23 @@ def test_last_command_keeps_the_boat_at_rest_in_the_current_it_was_made_in() -> 
     assert len(run.commands[-1].K) == 2
 
 
+def test_last_command_brings_a_boat_back_that_was_pushed_off_its_way_and_it_stands_soon() -> None:
+    """Sideways by leaning out of the current, as nothing else moves it there."""
+    controller, body = afloat(LAW, 0.8)
+    drive(controller, body, 4.0)
+    for _ in range(150):
+        body.tick()
+    water = CURRENT / np.hypot(*CURRENT)
+    where = body.x[:2].copy()
+    body._plant.x[:2] += 0.03 * np.array([-water[1], water[0]])
+    for _ in range(100):
+        body.tick()
+    here = body.x[:2].copy()
+    body.tick()
+    assert np.hypot(*(here - where)) < 3e-3, "m: a tenth of it"
+    assert np.hypot(*(body.x[:2] - here)) / 0.1 < STILL
+
+
 @pytest.mark.parametrize("known", [False, True])
 def test_last_command_leads_to_rest_once_the_estimate_is_steady_and_not_before(known: bool) -> None:
     """For which `rti-mpc faults` waits."""

@@ -14,8 +14,6 @@ from rti_mpc_service.faults.promise import BRAKING
 from tests.movers import CURRENT, path_file, toml
 from tests.processes.system import rti_mpc
 
-BOAT = pytest.mark.xfail(reason="it swings where its reference ends, and two lost samples at 10 Hz outlast its plan, see docs/faults.md")
-
 
 def matrix(path: Path, *names: str, robot: tuple[object, ...] = (), timeout_s: float = 180.0) -> dict[str, dict[str, Any]]:
     """Rows by name, as written to a file; the exit status agrees with them."""
@@ -80,7 +78,7 @@ def test_whole_matrix_is_within_its_promises(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif("CI" in os.environ, reason="it takes half an hour; test_stops.py is the short form")
-@pytest.mark.parametrize(("name", "more"), [("car", ""), ("quadrotor", ""), pytest.param("floating", CURRENT, marks=BOAT)])
+@pytest.mark.parametrize(("name", "more"), [("car", ""), ("quadrotor", ""), ("floating", CURRENT)])
 def test_whole_matrix_of_a_robot_with_a_way_to_rest_is_within_its_promises(name: str, more: str, tmp_path: Path) -> None:
     (tmp_path / "robot.toml").write_text(toml(name, more))
     rows = matrix(tmp_path / "faults.json", robot=(tmp_path / "robot.toml", "--scenario", path_file(name, tmp_path)), timeout_s=2400.0)
