@@ -189,6 +189,11 @@ def denies(settings: BusSettings) -> bool:
     return bool(access["enabled"]) and access["default_permission"] == "deny"
 
 
+def start_zenoh_log(targets: str) -> None:
+    """Have Zenoh write its log to standard output, of the targets that are given, or those of ``RUST_LOG``; once in a process."""
+    zenoh.init_log_from_env_or(targets)
+
+
 def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event | None, say: Callable[[str], object]) -> zenoh.Session:
     """
     Open a session; a client waits for its router, and reports that.

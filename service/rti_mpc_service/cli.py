@@ -282,8 +282,10 @@ def view(
 @partial(process, with_model=False)
 def router(config: Config, bus: BusSettings) -> None:
     """Run a Zenoh router, for clients on several hosts or with access control."""
+    from rti_mpc_service import router_log
     from rti_mpc_service.router import main
 
+    router_log.follow()
     main(bus, config.keys())
 
 

@@ -52,11 +52,14 @@ class Aside(logging.Handler):
     A terminal that hangs, as with Ctrl-S or a lost connection, or a pipe that nobody
     reads, would otherwise block the logging process: a controller or its guard.
     (`logging.handlers.QueueListener` waits without limit at the end.)
+
+    Attributes:
+        descriptor: Where lines are written.
     """
 
     def __init__(self, descriptor: int) -> None:
         super().__init__()
-        self._descriptor = descriptor
+        self.descriptor = descriptor
         self._lines: Queue[tuple[int, str] | None] = Queue(MAX_WAITING_LINES)  # number of lines dropped before each line, and the line
         self._dropped = 0  # lines dropped since the last accepted one
         self._thread = Thread(target=self._write, name="log", daemon=True)
@@ -86,7 +89,24 @@ class Aside(logging.Handler):
                 text = f"{dropped} lines were lost: standard output did not accept them"
                 line = self.format(logging.makeLogRecord({"name": "log", "levelname": "WARNING", "msg": text})) + "\n" + line
             with suppress(OSError):  # nobody reads it any more, or its disk is full
-                os.write(self._descriptor, f"{line}\n".encode(errors="backslashreplace"))
+                os.write(self.descriptor, f"{line}\n".encode(errors="backslashreplace"))
+
+
+def divert() -> int:
+    """
+    Keep what else this process writes to standard output, such as native code, out of the log; return the descriptor to read that from.
+
+    What nobody reads in time is lost, so that its writers never wait.
+    """
+    ours = os.dup(sys.stdout.fileno())
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    os.dup2(writing, sys.stdout.fileno())
+    os.close(writing)
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, Aside):
+            handler.descriptor = ours
+    return reading
 
 
 def start() -> None:
