@@ -5,16 +5,18 @@ from __future__ import annotations
 
 import json
 import math
+import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 from weakref import WeakSet
 
 from rti_mpc.contract.message import Notice
 from rti_mpc.errors import MessageError
-from rti_mpc.wire import document
+from rti_mpc.wire import document, presence
 from rti_mpc.wire.cdr import M, Message
 from rti_mpc.wire.certificate import warn_of_end
 from rti_mpc.wire.intake import Intake
@@ -26,6 +28,7 @@ from rti_mpc.wire.streams import MAX_REQUEST_BYTES, role_of
 from rti_mpc.wire.zenoh_session import CLOSE_TIMEOUT_S, ZenohSession
 
 RING_MESSAGES = 1024  # messages that wait for a receiver: those of half a second at 2000 per second
+MAX_NUMBER = 10_000_000  # below it are the numbers of processes that share a role
 RETRY_INTERVAL_S = 0.1  # between two attempts to reach a process that is not there yet
 
 Sent = TypeVar("Sent", bound=Message, contravariant=True)
@@ -82,6 +85,19 @@ class Session(Protocol):
     @property
     def connects_to(self) -> str:
         """Endpoints that it connects to, and what is wrong there, in words; empty if it waits for others to connect."""
+
+    @property
+    def routers(self) -> frozenset[str]:
+        """Numbers of the routers that this process is linked to; empty for peers, and once it is closed."""
+
+    def again(self, timeout_s: float, stop: threading.Event) -> Session:
+        """
+        Open another session with the same settings, as a client.
+
+        Raises:
+            ConfigError: No router was there in time.
+            Stopped: The wait was ended by `stop`.
+        """
 
     @property
     def certificate(self) -> Path | None:
@@ -314,9 +330,19 @@ class Bus:
             yield _object(received, document.MAX_DOCUMENT_BYTES)
 
     def alive(self, role: str) -> Declared:
-        """Show presence in a role until the token is undeclared, the bus closed or the process gone."""
+        """
+        Show presence in a role until the token is undeclared, the bus closed or the process gone.
+
+        If a router with TLS passes it on to nobody, as its list denies what this process sends, that is reported once.
+        """
+        if not self._tokens and self._session.certificate is not None:
+            own = self.keys.alive(f"{role.partition('.')[0]}.{secrets.randbelow(MAX_NUMBER)}")
+            presence.watch(self._session, own, partial(self._unheard, role), self._over)
         self._tokens[role] = self._session.token(self.keys.alive(role))
         return self._tokens[role]
+
+    def _unheard(self, role: str) -> None:
+        self._say(f"connected, but not heard as {role}: see the router's log; is {self._session.certificate} for this role and this robot?")
 
     def is_alive(self, role: str, timeout_s: float = 0.5) -> bool:
         """Whether anybody shows presence in a role, this process included; it may take a moment after the start to meet the others."""

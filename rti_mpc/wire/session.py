@@ -213,9 +213,9 @@ def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event 
                 if "Unable to connect" not in str(error):
                     raise ConfigError(f"bus: endpoints must be free and valid, got: {_brief(error)}") from None
                 if stop is not None and stop.is_set():
-                    raise Stopped(f"stopped before a router was there at {', '.join(settings.connect)}") from None
+                    raise Stopped("stopped before a router was there") from None
                 if time.monotonic() > deadline_s:
-                    raise ConfigError(f"bus: a router must be reachable at {', '.join(settings.connect)}, none has answered") from None
+                    raise ConfigError(f"bus: a router must be reachable, none has answered at {endpoints(config)}") from None
                 if not told:
                     told = True
                     remind(say, lambda: f"not connected: no router answers at {endpoints(config)}", opened)

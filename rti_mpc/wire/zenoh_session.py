@@ -15,6 +15,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, Generic
@@ -149,6 +150,7 @@ class ZenohSession:
             ConfigError: Zenoh refuses a setting, an endpoint is taken, or no router was there in time.
             Stopped: The wait was ended by `stop`.
         """
+        self._settings = settings
         self._config = zenoh_config(settings)
         self._session = open_session(settings, timeout_s, stop, say)
 
@@ -163,6 +165,18 @@ class ZenohSession:
         closing = threading.Thread(target=self._session.close, daemon=True)
         closing.start()
         closing.join(CLOSE_TIMEOUT_S)
+
+    @property
+    def routers(self) -> frozenset[str]:
+        """Numbers of the routers that this process is linked to; empty for peers, and once it is closed."""
+        try:
+            return frozenset(str(router) for router in self._session.info.routers_zid())
+        except zenoh.ZError:
+            return frozenset()
+
+    def again(self, timeout_s: float, stop: threading.Event) -> ZenohSession:
+        """Open another session with the same settings, see `rti_mpc.wire.bus.Session.again`."""
+        return ZenohSession(replace(self._settings, mode="client", listen=()), timeout_s=timeout_s, stop=stop)
 
     @property
     def certificate(self) -> Path | None:

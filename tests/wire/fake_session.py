@@ -28,6 +28,7 @@ class FakeSession:
         links: As of a session.
         connects_to: As of a session.
         certificate: As of a session.
+        routers: As of a session.
     """
 
     def __init__(self) -> None:
@@ -38,6 +39,7 @@ class FakeSession:
         self.links: int | None = None
         self.connects_to = ""
         self.certificate: Path | None = None
+        self.routers: frozenset[str] = frozenset()
         self._closed = threading.Event()
 
     def __enter__(self) -> FakeSession:
@@ -48,6 +50,9 @@ class FakeSession:
 
     def close(self) -> None:
         self._closed.set()
+
+    def again(self, timeout_s: float, stop: threading.Event) -> FakeSession:
+        return self
 
     def publisher(self, key: Key[Any]) -> Any:
         return self._say(key)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rti_mpc.contract.message import State
-from rti_mpc.errors import Stopped
+from rti_mpc.errors import ConfigError, Stopped
 from rti_mpc.wire import reach
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.keys import Keys
@@ -83,6 +83,11 @@ def test_process_that_is_linked_says_what_does_not_come_until_it_has_come() -> N
         for thread in watching:
             thread.join(PATIENCE_S)
             assert not thread.is_alive(), "nothing more is said"
+
+
+def test_client_that_waits_for_a_while_only_is_refused_with_the_reason() -> None:
+    with pytest.raises(ConfigError, match=r"none has answered at tcp/127\.0\.0\.1:9: no process listens there"):
+        Bus.join(BusSettings(mode="client", connect=("tcp/127.0.0.1:9",)), KEYS, timeout_s=0.1)
 
 
 def test_client_without_a_router_says_so_and_ends_well_when_it_is_stopped() -> None:
