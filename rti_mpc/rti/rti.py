@@ -25,25 +25,19 @@ import numpy as np
 
 from rti_mpc import given
 from rti_mpc.array import Array
-from rti_mpc.codegen import bind, compiled
+from rti_mpc.codegen import bind
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.active_set import MAX_STEPS, ActiveSet
-from rti_mpc.rti.certificate import certificate
-from rti_mpc.rti.linearization import plan_cost, shift
-from rti_mpc.rti.nominal import check_stiffness, nominal_state
+from rti_mpc.rti.construction import FORMULATIONS, construction
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
-from rti_mpc.rti.places import Places, places
 from rti_mpc.rti.qp.osqp import Solver, SolverSettings
 from rti_mpc.rti.qp.qp import Guess, Qp, Step, step_size
 from rti_mpc.rti.qp.qpsolvers import ForeignSolver, check_name
-from rti_mpc.rti.qp.sequential import sequential
-from rti_mpc.rti.qp.simultaneous import simultaneous
-from rti_mpc.rti.qp.transcription import INFINITY, Transcription
+from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.scale import scale
 from rti_mpc.rti.turns import Turns
 
-FORMULATIONS = {"simultaneous": simultaneous, "sequential": sequential}
 BUILT_IN_SOLVERS = ("riccati", "osqp")  # any other solver is one of qpsolvers
 MAX_SEQUENTIAL_N_U = 10  # control horizon up to which the sequential formulation is the faster one, see docs/engine.md
 SOLVED, INACCURATE = QpStatus.SOLVED, QpStatus.INACCURATE  # read faster than a member of the enumeration
@@ -114,6 +108,7 @@ class Rti:
         model, N, N_u = ocp.model, ocp.N, ocp.N_u
         self.ocp = ocp
         self.formulation = formulation_of(ocp, formulation)
+        built = construction(ocp, self.formulation, structured=solver == "riccati", compile=compile)
         self.iterations, self.tolerance, self.taken = iterations, tolerance, 0
         # A step leads from a guess to a plan; the next guess is that plan, shifted by one stage. The two never share memory.
         self.x: Array = np.zeros((N + 1, model.nx))
@@ -124,8 +119,7 @@ class Rti:
         self.u_prev: Array = np.array(model.u_rest, dtype=np.float64)
         self.y_ref: Array = np.zeros((N, model.ny))
         self.p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
-        self.x_nominal = nominal_state(ocp)
-        check_stiffness(ocp, self.x_nominal)
+        self.x_nominal = built.x_nominal.copy()
         self.x0: Array = self.x_nominal.copy()
         self.status = QpStatus.NONE
         self._pending = False  # whether a sample was prepared and has had no feedback
@@ -142,47 +136,55 @@ class Rti:
             plan=Step(self.x, self.u, self._violation, change),
         )
 
-        transcriptions = [FORMULATIONS[self.formulation](ocp, softened=softened) for softened in (False, True)[: 2 if len(ocp.lg) else 1]]
-        structured = (places(ocp), certificate(ocp)) if solver == "riccati" else None
-        moves, cost = shift(ocp), plan_cost(ocp)
-        native = [moves, cost, *natives(transcriptions, structured)]
-        made = dict(zip((f.name() for f in native), compiled(*native) if compile else native, strict=True))
-
-        def make(function: Any) -> Any:
-            return made.get(function.name(), function)
-
-        self.advance = bind(make(moves), {"x": self.x, "u": self.u, "p": self.p}, {"x_next": x, "u_next": u})
-        self._turns = Turns(ocp, x, self.x0, self.y_ref, self.p, (self._weights["lbx"], self._weights["ubx"]))
+        make = built.make
+        self.advance = bind(make(built.shift), {"x": self.x, "u": self.u, "p": self.p}, {"x_next": x, "u_next": u})
+        self._turns = Turns(ocp, built.output, x, self.x0, self.y_ref, self.p, (self._weights["lbx"], self._weights["ubx"]))
         self._cost: Array = np.zeros(1)
-        self.evaluate = bind(make(cost), self.guess.arguments | {"x": self.x, "u": self.u}, {"cost": self._cost})
-        qps = [Qp(transcription, self.guess, make) for transcription in transcriptions]
-        self.active_set = None if structured is None else ActiveSet(*structured, self.guess, make)
-        self._normalise(qps)
+        self.evaluate = bind(make(built.cost), self.guess.arguments | {"x": self.x, "u": self.u}, {"cost": self._cost})
+        qps = [Qp(transcription, self.guess, make) for transcription in built.transcriptions]
+        self.active_set = None if built.structured is None else ActiveSet(*built.structured, self.guess, make)
+        self._normalise(qps, built.normalised)
         if solver in BUILT_IN_SOLVERS:
             self.solvers = [Solver(qp, settings or SolverSettings()) for qp in qps]
         else:
             self.solvers = [ForeignSolver(qp, solver) for qp in qps]
         self.reset(self.x_nominal, np.array(model.u_rest))
 
-    def _normalise(self, qps: Sequence[Qp]) -> None:
-        """Compute the scales of the variables, and normalise the cost, so that one step size of ADMM and one tolerance fit every problem."""
-        self._roll_out()
-        qps[0].fill()
-        if not qps[0].sound:  # a motion out of where the model is regular, such as below the bottom of a tank
-            self._stand()
-            qps[0].fill()
-        if not qps[0].sound:
-            raise OcpError(
-                f"model {self.ocp.model.name} must be finite and differentiable along a stage of {self.ocp.dt:g} s from its nominal state, "
-                f"x_nominal, got {self.x_nominal.tolist()}"
-            )
-        self.scale[:] = scale(self.ocp, self.x, self.u, self.y_ref, self.p)
-        self.cost_scale = 1.0 / step_size(qps[0])
+    def _normalise(self, qps: Sequence[Qp], known: dict[str, Any]) -> None:
+        """
+        Compute the scales of the variables, and normalise the cost, so that one step size of ADMM and one tolerance fit every problem.
+
+        Args:
+            qps: The QPs, to be filled.
+            known: The result by name, which the first `Rti` of the problem writes.
+        """
+        if not known:
+            self._move(qps[0])
+            self.scale[:] = scale(self.ocp, self.x, self.u, self.y_ref, self.p)
+            motion = {name: array.copy() for name, array in self.guess.start.items()}
+            known |= {"scale": self.scale.copy(), "cost_scale": 1.0 / step_size(qps[0]), "motion": motion}
+        self.scale[:] = known["scale"]
+        self.cost_scale: float = known["cost_scale"]
+        for name, array in known["motion"].items():
+            self.guess.sample[name][:] = array
         for name in COST_WEIGHTS:
             self._weights[name] *= self.cost_scale
         self.y_ref[:] = 0.0
         for qp in qps:
             qp.fill()
+
+    def _move(self, qp: Qp) -> None:
+        """Fill a QP along a motion, or at the nominal state if the motion leads out of where the model is regular, as below the bottom of a tank."""
+        self._roll_out()
+        qp.fill()
+        if not qp.sound:
+            self._stand()
+            qp.fill()
+        if not qp.sound:
+            raise OcpError(
+                f"model {self.ocp.model.name} must be finite and differentiable along a stage of {self.ocp.dt:g} s from its nominal state, "
+                f"x_nominal, got {self.x_nominal.tolist()}"
+            )
 
     @property
     def qp(self) -> Qp:
@@ -460,15 +462,3 @@ def formulation_of(ocp: Ocp, formulation: str) -> str:
     if formulation == "auto":
         return "sequential" if ocp.N_u <= MAX_SEQUENTIAL_N_U else "simultaneous"
     return formulation
-
-
-def natives(transcriptions: Sequence[Transcription], structured: tuple[Places, Any] | None) -> list[Any]:
-    """
-    Return the functions of a problem's solver that are worth compiling.
-
-    Behind the active set a QP solver is needed so rarely that its QP is left to CasADi's
-    virtual machine: compiling it would double the build time.
-    """
-    if structured is not None:
-        return [*vars(structured[0]).values(), structured[1]]
-    return [function for transcription in transcriptions for function in (transcription.data, transcription.embed, transcription.step)]

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from rti_mpc.angle import whole_turns
@@ -34,6 +35,7 @@ class Turns:
 
     Args:
         ocp: The problem; it repeats with each turn of a state that is an angle.
+        output: Outputs at a node, ``(x, p) -> y``.
         x: State guess, shape ``(N + 1, nx)``.
         x0: Initial state, shape ``(nx,)``.
         y_ref: Reference rows, shape ``(N, ny)``.
@@ -41,20 +43,20 @@ class Turns:
         bounds: Lower and upper bounds on states that act, each of shape ``(nx,)``; infinite or huge where there are none.
     """
 
-    def __init__(self, ocp: Ocp, x: Array, x0: Array, y_ref: Array, p: Array, bounds: tuple[Array, Array]) -> None:
+    def __init__(self, ocp: Ocp, output: ca.Function, x: Array, x0: Array, y_ref: Array, p: Array, bounds: tuple[Array, Array]) -> None:
         model = ocp.model
         y: Array = np.zeros(model.ny)
         self._x, self._y_ref = x, y_ref
         self._lbx, self._ubx = bounds
         views: list[Any] = [array.data for array in (x0, x[0], y, y_ref[0])]  # read faster than arrays
         self._x0, self._guess, self._y, self._y_first = views
-        self._output = bind(model.h(), {"x": x0, "p": p[0]}, {"y": y})
+        self._output = bind(output, {"x": x0, "p": p[0]}, {"y": y})
         self._states = [j for j, signal in enumerate(model.states) if signal.angle]
         self._outputs = [j for j, signal in enumerate(model.outputs) if signal.angle]
         self._bounded = [j for j in self._states if ocp.ubx[j] - ocp.lbx[j] <= math.tau]
         self._steps = [(y_ref[1:, j], y_ref[:-1, j]) for j in self._outputs]
         self._step: Array = np.zeros(ocp.N - 1)
-        self._added: Array = np.zeros(model.ny)  # whole turns added to the rows of the reference as they are given
+        self._added = [0.0] * model.ny  # whole turns added to the rows of the reference as they are given
         self._errors = [0.0] * model.ny
 
     def forget(self) -> None:
@@ -65,7 +67,7 @@ class Turns:
         """Unwrap the rows of the reference, and add the turns of the sample before."""
         for j, (later, earlier) in zip(self._outputs, self._steps, strict=True):
             np.subtract(later, earlier, out=self._step)
-            if np.dot(self._step, self._step) >= math.pi**2:  # one of the steps may exceed half a turn
+            if self._step.dot(self._step) >= math.pi**2:  # one of the steps may exceed half a turn
                 self._y_ref[:, j] = np.unwrap(self._y_ref[:, j])
             if self._added[j]:
                 self._y_ref[:, j] += self._added[j]

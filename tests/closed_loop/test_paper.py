@@ -10,8 +10,9 @@ from rti_mpc.array import Array
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.reference.trajectory import Trajectory, eight, positioning, rows
+from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.qp.osqp import SolverSettings
-from rti_mpc.rti.rti import FORMULATIONS, Rti
+from rti_mpc.rti.rti import Rti
 from tests.problems import INF, pioneer
 
 SETTINGS = SolverSettings(eps=1e-6, max_iter=4000)

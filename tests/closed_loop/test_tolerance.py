@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import pytest
 
+from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.qp.osqp import SolverSettings
-from rti_mpc.rti.rti import FORMULATIONS, Rti
+from rti_mpc.rti.rti import Rti
 from rti_mpc_service.bench.bench import closed_loop_cost, paper_ocp
 
 

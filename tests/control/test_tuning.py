@@ -11,9 +11,10 @@ import pytest
 from rti_mpc.array import Array
 from rti_mpc.control.tuning import Tuning
 from rti_mpc.errors import OcpError
+from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 from rti_mpc.rti.qp.osqp import SolverSettings
-from rti_mpc.rti.rti import FORMULATIONS, Rti
+from rti_mpc.rti.rti import Rti
 from tests.problems import INF, arc, double_integrator, fenced, pioneer
 
 TIGHT = SolverSettings(eps=1e-9, max_iter=200_000)

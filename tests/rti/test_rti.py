@@ -21,11 +21,12 @@ from rti_mpc.errors import OcpError, ShapeError
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model, Signal
 from rti_mpc.rti.certificate import certificate
+from rti_mpc.rti.construction import FORMULATIONS, natives
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.places import places
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.qp.simultaneous import simultaneous
-from rti_mpc.rti.rti import FORMULATIONS, Rti, natives
+from rti_mpc.rti.rti import Rti
 from tests.oracle import nlp
 from tests.problems import INF, arc, beacon, double_integrator, pioneer
 

@@ -11,9 +11,10 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.model.model import Model, Signal
+from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.osqp import SolverSettings
-from rti_mpc.rti.rti import FORMULATIONS, Rti
+from rti_mpc.rti.rti import Rti
 
 TIGHT = SolverSettings(eps=1e-9, max_iter=500_000, scaling=10)  # bounds that are far exceeded are slow without Ruiz scaling
 SOLVERS: dict[str, SolverSettings | None] = {"osqp": TIGHT, "daqp": None, "clarabel": None}  # the others are as exact by themselves

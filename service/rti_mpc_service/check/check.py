@@ -25,8 +25,9 @@ from rich.table import Table
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import ConfigError, OcpError
+from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.qp.osqp import SolverSettings
-from rti_mpc.rti.rti import BUILT_IN_SOLVERS, FORMULATIONS, Rti
+from rti_mpc.rti.rti import BUILT_IN_SOLVERS, Rti
 from rti_mpc_service.check.excursion import Bounds, excursions
 from rti_mpc_service.check.rest import stop_from_everywhere
 from rti_mpc_service.config import signals_file

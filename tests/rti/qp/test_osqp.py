@@ -11,9 +11,10 @@ import pytest
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.model.model import Model, Signal
+from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.osqp import STATUS_BY_OSQP_CODE, SolverSettings
-from rti_mpc.rti.rti import FORMULATIONS, Rti
+from rti_mpc.rti.rti import Rti
 from tests.problems import beacon, double_integrator, solve
 
 TIGHT = SolverSettings(eps=1e-9, max_iter=100_000)

@@ -11,9 +11,10 @@ import qpsolvers
 
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import OcpError
+from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.qp.qpsolvers import indexed_problem
-from rti_mpc.rti.rti import FORMULATIONS, Rti
+from rti_mpc.rti.rti import Rti
 from tests.problems import INF, beacon, double_integrator, fenced, solve
 
 NAMES = ("clarabel", "daqp", "piqp")
