@@ -150,10 +150,13 @@ def _brief(error: Exception) -> str:
 
 def endpoints(config: zenoh.Config) -> str:
     """Return the endpoints that a process connects to, and what is wrong there, in words; empty if it waits for others to connect."""
-    given = json.loads(config.get_json("connect/endpoints"))
-    ends = given if isinstance(given, list) else [end for ends in given.values() for end in ends]
     files = [_tls_file(config, name) for name in ("root_ca_certificate", "connect_certificate", "connect_private_key")]
-    return "; ".join(f"{end}: {obstacle(end, *files) or _guess(end)}" for end in ends)
+    return "; ".join(f"{end}: {obstacle(end, *files) or _guess(end)}" for end in _ends(config, "connect"))
+
+
+def _ends(config: zenoh.Config, side: str) -> list[str]:
+    given: list[str] | dict[str, list[str]] = json.loads(config.get_json(f"{side}/endpoints"))
+    return given if isinstance(given, list) else [end for ends in given.values() for end in ends]
 
 
 def certificate(config: zenoh.Config) -> Path | None:
@@ -174,13 +177,15 @@ def _guess(endpoint: str) -> str:
 
 def open_endpoints(settings: BusSettings) -> list[str]:
     """Return the endpoints beyond the loopback on which a process listens without TLS."""
-    return [endpoint for endpoint in listens(settings) if OPEN_PATTERN.match(endpoint)]
+    given = json.loads(zenoh_config(settings).get_json("listen/endpoints"))
+    ends = given if isinstance(given, list) else given.get(settings.mode, [])
+    return [endpoint for endpoint in ends if OPEN_PATTERN.match(endpoint)]
 
 
-def listens(settings: BusSettings) -> list[str]:
-    """Return the endpoints on which a process listens."""
-    given: list[str] | dict[str, list[str]] = json.loads(zenoh_config(settings).get_json("listen/endpoints"))
-    return given if isinstance(given, list) else given.get(settings.mode, [])
+def all_endpoints(settings: BusSettings) -> list[str]:
+    """Return all endpoints to which a process connects or on which it listens, in any mode."""
+    config = zenoh_config(settings)
+    return [*_ends(config, "connect"), *_ends(config, "listen")]
 
 
 def denies(settings: BusSettings) -> bool:

@@ -125,7 +125,7 @@ def judge(what: str, bus: Bus, config: Config, limits: Limits, epoch: int, stop:
 def company(bus: Bus, what: str, *, guarded: bool) -> tuple[str, int]:
     """Listen for others; return who leads, in words, empty if nobody does, and the highest epoch of a controller that was heard."""
     roles: set[str] = set()
-    bus.watch_alive(lambda role, present: (roles.add if present else roles.discard)(role.partition(".")[0]))
+    bus.watch_alive(lambda role, present: (roles.add if present else roles.discard)(role))
     keys, leading = bus.keys, {*LEADING[what], *(("guard",) if what == "robot" and guarded else ())}
     commanding = {"controller": keys.command, **({"guard": keys.actuation} if what == "robot" else {})}
     ears = {role: (bus.subscriber(key, capacity=RING_MESSAGES), bus.intake(Command, STALE_S, choosing=True)) for role, key in commanding.items()}
@@ -134,8 +134,8 @@ def company(bus: Bus, what: str, *, guarded: bool) -> tuple[str, int]:
     epochs = {role: intake.highest_epoch(heard.drain()) for role, (heard, intake) in ears.items()}
     if what == "guard" and reading.highest_epoch(states.drain()):
         roles.add("robot")
-    roles |= {role for role, epoch in epochs.items() if epoch}
-    return " and ".join(f"a live {role}" for role in sorted(roles & leading)), max(epochs.values())
+    live = {role.partition(".")[0] for role in set(roles)} | {role for role, epoch in epochs.items() if epoch}  # without the number of some
+    return " and ".join(f"a live {role}" for role in sorted(live & leading)), max(epochs.values())
 
 
 class BusLink:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime, timedelta
@@ -21,7 +22,7 @@ from rich.table import Table
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.certificate import WARN_DAYS, ends
 from rti_mpc.wire.handshake import ADDRESS, openness
-from rti_mpc.wire.session import BusSettings, denies, listens, open_endpoints
+from rti_mpc.wire.session import BusSettings, all_endpoints, denies, open_endpoints
 from rti_mpc_service.certs.folder import credentials
 from rti_mpc_service.config.build import bus_settings
 from rti_mpc_service.config.config import load
@@ -31,7 +32,7 @@ from rti_mpc_service.latch_file import state_folder
 
 LISTENING = "0A"  # state of a socket in /proc/net/tcp
 OURS = ("rti-mpc", "zenohd")  # names of programs that listen for a bus
-OUR_PACKAGES = ("rti_mpc_service", "rti_mpc_sim")  # in the command line of a process that a script starts
+OUR_PACKAGES = re.compile(r"(from )?(rti_mpc_service|rti_mpc_sim)\b")  # begin of an argument of Python, where a script starts a process
 CERTIFY = "make certificates, and start all processes with them: `rti-mpc certs`, docs/security.md"
 
 
@@ -110,8 +111,7 @@ def main(path: Path, json_path: Path | None = None, *, tls: Path | None = None, 
 
 def bus(subject: Examined) -> Iterator[Opening]:
     """Whether the bus is open, by configuration."""
-    ends_of_bus = (*subject.robot.connect, *listens(subject.robot))
-    if subject.tls is None and not any(end.startswith(("tls/", "quic/")) for end in ends_of_bus):
+    if subject.tls is None and not any(end.startswith(("tls/", "quic/")) for end in all_endpoints(subject.robot)):
         yield Opening("TLS", "none: whoever reaches the bus commands the robot", CERTIFY)
     for settings in (subject.robot, subject.router):
         for endpoint in open_endpoints(settings) if settings else ():
@@ -124,7 +124,7 @@ def bus(subject: Examined) -> Iterator[Opening]:
 def listeners(subject: Examined) -> Iterator[Opening]:
     """Which processes listen beyond the loopback on this host, and take everybody."""
     settings = (subject.robot, *((subject.router,) if subject.router else ()))
-    named = {int(match["port"]) for one in settings for end in (*one.connect, *listens(one)) if (match := ADDRESS.match(end))}
+    named = {int(match["port"]) for one in settings for end in all_endpoints(one) if (match := ADDRESS.match(end))}
     for address, port, program in listening():
         if (port in named or program) and not address.is_loopback and (how := openness(reachable(address), port)):
             who = program or "a process of another user"
@@ -199,7 +199,7 @@ def programs_by_socket() -> dict[str, str]:
         try:
             words = process.joinpath("cmdline").read_text(errors="replace").split("\0")
             name = next((name for word in words[:2] for name in OURS if Path(word).name == name), "")
-            name = name or next((name for word in words for name in OUR_PACKAGES if name in word), "")
+            name = name or next((match[2] for word in words if (match := OUR_PACKAGES.match(word))), "")
             for descriptor in process.joinpath("fd").iterdir() if name else ():
                 if (target := os.readlink(descriptor)).startswith("socket:["):
                     programs[target[8:-1]] = f"{name} ({process.name})"

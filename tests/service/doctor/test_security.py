@@ -87,6 +87,15 @@ def test_bus_without_certificates_is_open_also_on_the_loopback(secured: Path) ->
     assert list(opened(secured)) == ["TLS: none: whoever reaches the bus commands the robot"]
 
 
+def test_bus_with_a_configuration_of_zenoh_whose_endpoints_are_all_of_tls_is_not_called_open(secured: Path) -> None:
+    secured.write_text(SHIPPED.read_text() + '\n[bus]\nconfig = "zenoh.json5"\n')
+    client = secured.with_name("zenoh.json5")
+    client.write_text('{mode: "client", connect: {endpoints: ["tls/robot.local:7447"]}}')
+    assert list(opened(secured)) == []
+    client.write_text('{mode: "client", connect: {endpoints: ["tcp/robot.local:7447"]}}')
+    assert list(opened(secured)) == ["TLS: none: whoever reaches the bus commands the robot"]
+
+
 def test_certificate_that_has_ended_and_one_that_cannot_be_read_are_told(secured: Path) -> None:
     (secured.parent / "tls" / "guard.pem").write_text("-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n")
     issue(Authority.make("ours", 100.0), Keys(), ["viewer"], ROUTER, secured.parent / "ended", secured.parent, -0.01)
