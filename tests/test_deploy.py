@@ -42,13 +42,36 @@ def test_zenoh_takes_its_configuration_without_multicast(path: Path) -> None:
     assert config.get_json("scouting/multicast/enabled") == "false"
 
 
+DROP_INS = {"run": ["rti-mpc@.service.d/realtime.conf", "standby.conf", "tls-controller.conf"], "guard": ["tls-guard.conf"], "router": []}
+
+
+def verified(folder: Path, command: str, more: str = "") -> subprocess.CompletedProcess[str]:
+    """Let systemd verify a unit with all of its drop-ins, and a further one."""
+    unit = UNITS[command]
+    instance = folder / unit.name.replace("@", "@pioneer_3dx")
+    (drop_ins := folder / f"{instance.name}.d").mkdir()
+    texts = {Path(name).name: (DEPLOY / "systemd" / name).read_text() for name in DROP_INS[command]} | {"more.conf": more}
+    for path, text in {instance: unit.read_text(), **{drop_ins / name: text for name, text in texts.items()}}.items():
+        path.write_text(text.replace("/opt/rti-mpc/bin/rti-mpc", "/bin/true"))  # verify wants the program to be there
+    return subprocess.run(["systemd-analyze", "verify", "--man=no", instance], capture_output=True, text=True, timeout=60)
+
+
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed: the unit was NOT verified")
-@pytest.mark.parametrize("unit", UNITS.values(), ids=UNITS.keys())
-def test_systemd_finds_nothing_to_complain_about_in_the_unit(tmp_path: Path, unit: Path) -> None:
-    instance = tmp_path / unit.name.replace("@", "@pioneer_3dx")
-    instance.write_text(unit.read_text().replace("/opt/rti-mpc/bin/rti-mpc", "/bin/true"))  # verify wants the program to be there
-    done = subprocess.run(["systemd-analyze", "verify", "--man=no", instance], capture_output=True, text=True, timeout=60)
+@pytest.mark.parametrize("command", UNITS)
+def test_systemd_finds_nothing_to_complain_about_in_the_unit_with_its_drop_ins(tmp_path: Path, command: str) -> None:
+    done = verified(tmp_path, command)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed: the unit was NOT verified")
+def test_systemd_complains_about_a_drop_in_with_a_wrong_credential(tmp_path: Path) -> None:
+    done = verified(tmp_path, "router", "[Service]\nLoadCredential=a/b:/etc/x\n")
+    assert 'more.conf:2: Credential name "a/b" not valid' in done.stderr
+
+
+def test_every_file_of_systemd_is_verified() -> None:
+    files = {str(path.relative_to(DEPLOY / "systemd")) for path in (DEPLOY / "systemd").rglob("*") if path.is_file()}
+    assert files == {unit.name for unit in UNITS.values()} | {name for names in DROP_INS.values() for name in names}
 
 
 @pytest.mark.parametrize("expected", UNITS)
