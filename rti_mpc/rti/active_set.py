@@ -3,10 +3,10 @@
 Active-set solver on the Riccati recursion. Solves nearly every sample without a QP solver.
 
 The places, which say what is at a bound, are kept from sample to sample and shifted
-with the plan, so that one roll-out is usually enough. When they do not settle, the
-penalty that holds values at their bounds is softened, and stiffened again in a few
-steps; after that an interior point of bounded length finds the places. A plan is
-certified from the problem's own data, and refined where the penalty has yielded.
+with the plan, so that one roll-out is usually enough. A plan is certified from the
+problem's own data, and refined where the penalty that holds values at their bounds has
+yielded. When places do not settle, or the plan is not certified, an interior point of
+bounded length makes the plan, and the places of the next sample.
 """
 
 from __future__ import annotations
@@ -23,15 +23,12 @@ from rti_mpc.rti.places import Places
 from rti_mpc.rti.qp.qp import Guess
 
 MAX_ROLL_OUTS = 6  # from the places of the last sample; more are needed only when many places change at once
-PENALTY = 3e9  # weight that holds values at their bounds; with a larger one digits are lost
-# Weights when that was not enough. With a soft penalty the places settle from most starts, and those found are the start for the next, stiffer one.
-PENALTY_PATH = (*(10.0**k for k in range(1, 10)), PENALTY)
-MAX_PATH_ROLL_OUTS = 30  # of the path for each QP: where it is longer, the interior point is faster
-MAX_STEPS = 30  # of the interior point, for each QP that a sample may have; all of its QPs share the sum
-STEP_TARGET = 1e-8  # mean product of distances and multipliers at which the interior point has converged, in normalised cost
-STEP_ROUNDING = 1e-4  # mean product below which one that grows shows that rounding has the upper hand
-# Limits of the product at the start, otherwise the duality gap per bounded value: with less, steps to large multipliers are short.
-START_RANGE = 1.0, 1e10
+MAX_STEPS = 50  # of the interior point, for each QP that a sample may have; all of its QPs share the sum
+START_RANGE = 1.0, 1e16  # limits of the product of distance and multiplier at its start, otherwise the duality gap: with less, first steps are short
+START_FAR = 1e6  # the same of a second try, after one that gave no numbers
+GAP_SHARES = 1.0, 1e-3  # of MAX_GAP, at which it hands its places back
+LEAST_SHARE = 0.1  # sum of these products, relative to the largest gap of a certified plan, to which steps lead
+JUDGED_BELOW = 100.0  # times that, below which the plan of a step is judged
 MAX_REFINEMENTS = 2  # of a plan that is not certified yet
 MAX_VIOLATION = 1e-9  # of dynamics, bounds and increments by a certified plan, relative to their scales
 MAX_GAP = 1e-6  # by which a certified plan may cost more than the optimum, relative to its normalised cost and COST_FLOOR
@@ -65,7 +62,6 @@ class ActiveSet:
         self._found = np.zeros_like(self._places)
         changes: Array = np.zeros(1)
         self._changes = changes.data
-        self._stiff = np.full(1, PENALTY)
         multipliers: Array = np.zeros(functions.roll_out.numel_out("multipliers"))
         slopes = np.zeros_like(guess.plan.u)
         verdict: dict[str, Array] = {name: np.zeros(1) for name in ("primal", "gap", "cost")}
@@ -73,19 +69,20 @@ class ActiveSet:
 
         x, u = guess.sample["x"], guess.sample["u"]
         moved = guess.arguments | {"x": guess.plan.x, "u": guess.plan.u, "places": self._found}
-        acting = {"places": self._places, "stiff": self._stiff}
-        fixed = {"stages": stages, "gains": gains, **guess.weights, **acting}
+        fixed = {"stages": stages, "gains": gains, **guess.weights, "places": self._places}
         plan = {"x_plan": guess.plan.x, "u_plan": guess.plan.u, "multipliers": multipliers}
         found = {**guess.plan.outputs(), "changes": changes, "places_found": self._found, "multipliers": multipliers}
         self.advance = bind(make(functions.advance), moved, {"x_next": x, "u_next": u, "places_next": self._places, "stages": stages})
         self.linearize = bind(make(functions.linearize), guess.arguments, {"stages": stages})
-        self.gain = bind(make(functions.gains), {"stages": stages, "u": u, **guess.weights, **acting}, {"gains": gains})
+        self.gain = bind(make(functions.gains), {"stages": stages, "u": u, **guess.weights, "places": self._places}, {"gains": gains})
         self.roll_out = bind(make(functions.roll_out), {**guess.start, "x0": guess.x0, **fixed}, found)
         judged = {**guess.start, "x0": guess.x0, "stages": stages, **plan, **guess.weights}
         self.certify = bind(make(certificate), judged, {"r": slopes, **verdict})
         refined = {f"{name.removesuffix('_plan')}_refined": array for name, array in plan.items()}
         self.refine = bind(make(functions.refine), {**guess.start, **fixed, "r": slopes, **plan}, refined)
-        self._refined = tuple(plan.values())
+        self._best = tuple((np.zeros_like(array), array) for name, array in found.items() if name != "changes")
+        self._lowest = np.inf  # gap of the best plan, relative as `res_dual`
+        self._stepped = False  # whether the interior point has been used for this QP
 
         start: Array = np.zeros(1)
         self._start = start
@@ -93,12 +90,12 @@ class ActiveSet:
         after, mean = np.zeros_like(interior), np.zeros(1)
         interior_plan = {name: np.zeros_like(array) for name, array in found.items() if name != "changes"}
         self._moved, self._product = (interior.data, after.data), mean.data
-        self._interior_places = interior_plan["places_found"]
         self._interior_pairs = tuple((found[name], array) for name, array in interior_plan.items())
         entered = {**guess.start, "stages": stages, **guess.weights}
         self.enter = bind(make(functions.enter), {**entered, "x_plan": guess.plan.x, "u_plan": guess.plan.u, "start": start}, {"interior": interior})
+        self._least = np.zeros(1)
         stepped = {"interior_after": after, "product": mean, **interior_plan}
-        self.step = bind(make(functions.step), {**entered, "x0": guess.x0, "interior": interior}, stepped)
+        self.step = bind(make(functions.step), {**entered, "x0": guess.x0, "interior": interior, "least": self._least}, stepped)
         self.steps_left = 0
         self.iterations = 0
         self.res_prim = self.res_dual = 0.0
@@ -112,19 +109,18 @@ class ActiveSet:
         self._found[:] = self._places
 
     def certified(self) -> QpStatus:
-        """Refine the last plan until it is certified, and return its status; the certificate uses the problem's own data only."""
+        """Improve the last plan until it is certified, and return its status; the certificate uses the problem's own data only."""
         status = self._judged()
+        self._lowest = np.inf
+        if status is SOLVED or not self._keep_better():
+            return status
         for _ in range(MAX_REFINEMENTS):
-            if status is SOLVED:
-                break
-            gap, before = self.res_dual, [array.copy() for array in self._refined]
             self.refine()
-            status = self._judged()
-            if not self.res_dual < gap:  # with degenerate places a refinement may make the plan worse
-                for array, kept in zip(self._refined, before, strict=True):
-                    array[:] = kept
-                return self._judged()
-        return status
+            if self._judged() is SOLVED:
+                return SOLVED
+            if not self._keep_better():  # with degenerate places a refinement may make the plan worse
+                break
+        return self._restore_best() if self._stepped else self._step_inside()
 
     def _judged(self) -> QpStatus:
         """Certify the plan as it is."""
@@ -135,68 +131,85 @@ class ActiveSet:
             return SOLVED
         return INACCURATE if primal <= MAX_VIOLATION_INACCURATE and self.res_dual <= MAX_GAP_INACCURATE else FAILED
 
+    def _keep_better(self) -> bool:
+        """Keep the plan that was judged last if it can be used and its gap is the smallest one so far, and return whether that is so."""
+        better = self.res_prim <= MAX_VIOLATION_INACCURATE and self.res_dual < self._lowest
+        if better:
+            self._lowest = self.res_dual
+            for best, array in self._best:
+                best[:] = array
+        return better
+
+    def _restore_best(self) -> QpStatus:
+        """Take the best plan back, and judge it again."""
+        for best, array in self._best:
+            array[:] = best
+        return self._judged()
+
     def solve(self) -> bool:
         """Find the places, and make the plan; return whether there is one."""
         self.roll_out()
-        self.iterations = 1
+        self.iterations, self._stepped = 1, False
         if self._changes[0] == 0.0 or self._settle(MAX_ROLL_OUTS):
             return True
-        return self._stiffen() or self._step_inside()
-
-    def _stiffen(self) -> bool:
-        """Soften the penalty and stiffen it again, and return whether the places have settled after `MAX_PATH_ROLL_OUTS` at most."""
-        end = self.iterations + MAX_PATH_ROLL_OUTS
-        for self._stiff[0] in PENALTY_PATH:
-            self.gain()
-            self.roll_out()
-            self.iterations += 1
-            if not self._settle(end - self.iterations):
-                self._stiff[0] = PENALTY
-                return False
-        return True
-
-    def _step_inside(self) -> bool:
-        """Find the places by the interior point, and make the plan; its own if its places do not settle either and it is good enough."""
-        self._places[:] = self._found
-        if self._changes[0] < 0.0:  # no plan to start at
-            self.forget()
-            self.gain()
-            self.roll_out()
-        if self._changes[0] < 0.0 or self.steps_left == 0:
-            self.forget()
-            return False
+        self._lowest = np.inf
         self._judged()
-        self._start[0] = min(max(START_RANGE[0], self._verdict[1][0] / self._places.size), START_RANGE[1])
-        self.enter()
-        self._take_steps()
-        self._places[:] = self._interior_places
+        self._keep_better()
+        self._places[:] = 0.0  # a plan that heeds no bound is often nearer to the optimum than one that heeds wrong ones
         self.gain()
         self.roll_out()
         self.iterations += 1
-        if self._changes[0] == 0.0 or self._settle(MAX_ROLL_OUTS):
-            return True
-        for array, inside in self._interior_pairs:
-            array[:] = inside
-        self._places[:] = self._found
-        self.gain()
-        if self._judged().usable:
+        self._judged()
+        self._keep_better()
+        if self._lowest < np.inf and self._step_inside().usable:
+            self._places[:] = self._found
             return True
         self.forget()
         return False
 
-    def _take_steps(self) -> None:
-        """Take steps of the interior point until it has converged, rounding has the upper hand, or no step is left."""
+    def _step_inside(self) -> QpStatus:
+        """Improve the best plan by the interior point until it is certified or no step is left, and return its status."""
+        self._stepped = True
+        self._restore_best()
+        for start in (min(max(START_RANGE[0], self._verdict[1][0]), START_RANGE[1]), START_FAR):
+            self._start[0] = start
+            self.enter()
+            for share in GAP_SHARES:
+                if self._take_steps(share * MAX_GAP) and self._hand_back():
+                    return SOLVED
+            if self._product[0] < np.inf:
+                break  # otherwise it has begun so near to the bounds that rounding decided
+            self._restore_best()
+        return self._restore_best()
+
+    def _take_steps(self, gap: float) -> bool:
+        """Take steps of the interior point until the gap of its plan is below one, and return whether it is; the best plan is kept."""
         interior, after = self._moved
-        last = np.inf
         while self.steps_left > 0:
+            # To products that are small beside the cost, and no smaller: the stiffer the sides, the more digits are lost.
+            self._least[0] = LEAST_SHARE * gap * (COST_FLOOR + self._verdict[2][0]) / self._places.size
             self.step()
             self.steps_left -= 1
             self.iterations += 1
             interior[:] = after
-            product = self._product[0]
-            if not product > STEP_TARGET or last < product < STEP_ROUNDING:  # or not a number
+            if not self._product[0] < np.inf:
                 break
-            last = product
+            if self._product[0] > JUDGED_BELOW * self._least[0]:
+                continue
+            for array, inside in self._interior_pairs:
+                array[:] = inside
+            status, better = self._judged(), self._keep_better()
+            if status is SOLVED and (self.res_dual <= gap or not better):
+                return self.res_dual <= gap
+        return False
+
+    def _hand_back(self) -> bool:
+        """Roll out from the places of a certified plan, and return whether that is a better plan: it is exact, if they settle."""
+        self._places[:] = self._found
+        self.gain()
+        self.roll_out()
+        self.iterations += 1
+        return self._settle(MAX_ROLL_OUTS) and self._judged() is SOLVED and self.res_dual < self._lowest
 
     def _settle(self, most: int) -> bool:
         """

@@ -43,7 +43,9 @@ def certificate(ocp: Ocp) -> ca.Function:
     x_plan, u_plan, x0 = ca.MX.sym("x_plan", nx, N + 1), ca.MX.sym("u_plan", nu, N_u), ca.MX.sym("x0", nx)
     stages, multipliers = ca.MX.sym("stages", lin.stages.numel()), ca.MX.sym("multipliers", nu * N_u + ng * N)
     forms = lin.forms_in(stages)
-    of_increments, of_softened = divided(multipliers, [lin.u, lin.g])
+    given_increments, of_softened = divided(multipliers, [lin.u, lin.g])
+    towards = [ca.repmat(ca.DM(np.where(np.isfinite(bounds), np.inf, 0.0)), 1, N_u) for bounds in (ocp.lbdu, ocp.ubdu)]
+    of_increments = ca.fmax(-towards[0], ca.fmin(given_increments, towards[1]))  # none pushes where there is no bound
     w = lin.w
 
     dx, du = x_plan - lin.x, u_plan - lin.u
@@ -95,7 +97,7 @@ def node(ocp: Ocp, lin: Linearization) -> ca.Function:
                 beyond = sign * value[j] - bound
                 s = ca.fmax(0, beyond)
                 penalty = (zg[j] * s + Zg[j] * s**2 / 2) / 2
-                most = (zg[j] + Zg[j] * s) / 2  # slope of the penalty at this slack: no multiplier is larger
+                most = (zg[j] + Zg[j] * (s + scale_g[j])) / 2  # slope of the penalty beyond this slack: a larger multiplier is none
                 multiplier = ca.fmax(0, ca.fmin(sign * mu[j], most))
                 gap += penalty - multiplier * beyond + ca.fmax(0, multiplier - zg[j] / 2) ** 2 / ca.fmax(Zg[j], SMALLEST_DIVISOR)
                 cost += penalty
@@ -129,6 +131,4 @@ def of_inputs(ocp: Ocp) -> ca.Function:
                 left = pace - sign * increment[j]
                 violation = ca.fmax(violation, -left / scale[j])
                 gap += ca.fmax(0, sign * mu[j]) * ca.fmax(0, left)
-            else:
-                gap += ca.fmax(0, sign * mu[j]) / SMALLEST_DIVISOR
     return ca.Function("certify_input", symbols, [ca.cse(ca.densify(ca.vertcat(violation, gap, r)))])

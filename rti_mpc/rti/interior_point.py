@@ -7,7 +7,8 @@ multiplier :math:`\lambda`. One of a softened row also has a slack s and the mul
 :math:`\nu` of its :math:`s \ge 0`. Linearized, the products :math:`t \lambda` and
 :math:`s \nu` are eliminated side by side. This leaves a weight and a pull on the row,
 so that a step is one recursion over matrices, and a sweep over vectors for the
-corrector of [Mehrotra1992]_.
+corrector of [Mehrotra1992]_. Each step is computed in deviations from the iterate, not
+from the guess: weights of 1e15 and more would multiply the rounding of the latter.
 
 Distances and slacks are relative to the scale of what is bounded; multipliers are in
 normalised cost per scale. Every iterate satisfies the dynamics.
@@ -24,9 +25,9 @@ from rti_mpc.codegen import function
 from rti_mpc.rti.linearization import Forms, Linearization, change, divided
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
-from rti_mpc.rti.riccati import Riccati, Rows, softened_steps
+from rti_mpc.rti.riccati import Riccati, Rows, Stage, softened_steps
 
-START_DISTANCE = 1.0  # least distance from a bound, and least slack, at the start
+START_DISTANCE = 1.0  # least distance from a hard bound at the start
 SHARE_OF_WAY = 0.995  # to the nearest bound, that a step may go
 
 
@@ -99,7 +100,9 @@ def enter(ocp: Ocp, lin: Linearization, stages: ca.MX) -> ca.Function:
     """
     Build ``(x, u, u_prev, stages, *WEIGHTS_AND_BOUNDS, scale, x_plan, u_plan, start) -> interior``: a plan pushed inside its bounds.
 
-    `start` is the product of distance and multiplier, and of slack and its multiplier, at every side.
+    `start` is the product of distance and multiplier at every hard side, and about that at softened ones. There, distance and slack grow by the
+    same push, and the multipliers of both add up to the slope of the penalty, so that steps begin with all conditions on slacks met, whatever
+    their weights are.
     """
     N, N_u, nx, nu = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu
     forms = lin.forms_in(stages)
@@ -110,9 +113,12 @@ def enter(ocp: Ocp, lin: Linearization, stages: ca.MX) -> ca.Function:
     d = ca.veccat(du, du - ca.horzcat(ca.MX.zeros(nu), du[:, :-1]), softened_steps(ocp, lin).map(N)(forms.g_x, forms.g_u, dx[:, 1:], held))
     hard, room = sides.split(sides.room(d))
     start = ca.MX.sym("start")
-    s = ca.fmax(-room, 0) + START_DISTANCE
-    t, t_hard = ca.fmax(room + s, START_DISTANCE), ca.fmax(hard, START_DISTANCE)
-    interior = ca.veccat(dx, d, t_hard, t, start / t_hard, start / t, s, start / s)
+    t_hard, exceeded = ca.fmax(hard, START_DISTANCE), ca.fmax(-room, 0)
+    slope = sides.z + sides.Z * exceeded
+    push = 2 * start / (slope + ca.sqrt(slope**2 + 4 * sides.Z * start))  # with which (slope + Z push) push = start
+    t, s = ca.fmax(room, 0) + push, exceeded + push
+    share = (sides.z + sides.Z * s) / (t + s)
+    interior = ca.veccat(dx, d, t_hard, t, start / t_hard, share * s, s, share * t)
     inputs = {"x": lin.x, "u": lin.u, "u_prev": lin.u_prev, "stages": stages, **lin.weights, "x_plan": x_plan, "u_plan": u_plan, "start": start}
     return function("enter", inputs, {"interior": interior})
 
@@ -121,8 +127,9 @@ def step(ocp: Ocp, lin: Linearization, recursion: Riccati, stages: ca.MX, x0: ca
     """
     Build one step of predictor and corrector.
 
-    It is ``(x, u, u_prev, x0, stages, *WEIGHTS_AND_BOUNDS, scale, interior) -> (interior_after, x_plan, u_plan, violation, change, places_found,
-    multipliers, product)``, with the plan after it as from a roll-out, and the mean product of distances and multipliers.
+    It is ``(x, u, u_prev, x0, stages, *WEIGHTS_AND_BOUNDS, scale, interior, least) -> (interior_after, x_plan, u_plan, violation, change,
+    places_found, multipliers, product)``, with the plan after it as from a roll-out, and the mean product of distances and multipliers. No step
+    aims at products below `least`; at it, steps still remove what rounding has left in the gradient of the Lagrangian.
     """
     N, N_u, nx, nu = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu
     forms = lin.forms_in(stages)
@@ -144,9 +151,9 @@ def step(ocp: Ocp, lin: Linearization, recursion: Riccati, stages: ca.MX, x0: ca
         hard, soft = sides.split(wanted)
         return sides.directed(ca.vertcat(hard, soft - stiff_soft / divisor * (soft + slack))) / sides.scale
 
-    def toward(d_new: ca.MX, product_t: ca.MX, product_s: ca.MX) -> Point:
-        """Return the step to deviations at which the linearized products have these values."""
-        nearer = residual + sides.change(d_new - d)
+    def toward(by: ca.MX, product_t: ca.MX, product_s: ca.MX) -> Point:
+        """Return the step with which rows change by these amounts, and the linearized products have these values after it."""
+        nearer = residual + sides.change(by)
         pressed = sides.split(stiff * nearer + product_t / now.t)[1]
         s = (pressed + product_s / now.s - slope) / divisor
         t = ca.vertcat(padding, s) - nearer
@@ -162,21 +169,23 @@ def step(ocp: Ocp, lin: Linearization, recursion: Riccati, stages: ca.MX, x0: ca
         return (ca.dot(at.t, at.lam) + ca.dot(at.s, at.nu)) / max(1, sides.hard + 2 * sides.softened)
 
     weight = sides.onto(ca.vertcat(stiff_hard, stiff_soft * (sides.Z + stiff_slack) / divisor)) / sides.scale**2
-    gains = recursion.gains(stages, rows(weight), rows(force(stiff * residual, -slope) - weight * d))
-    states, _, predicted = recursion.rolled(forms, gains, ca.vertcat(x0 - lin.x[:, 0], ca.MX.zeros(nu)), defects=True)
-    d_predicted = ca.veccat(predicted.u, predicted.du, predicted.g)
-    affine = toward(d_predicted, ca.MX.zeros(sides.hard + sides.softened), ca.MX.zeros(sides.softened))
+    here, damped = moved_to(ocp, lin, forms, ca.reshape(dx, nx, N + 1), rows(d))
+    gains = recursion.gains(ca.veccat(*here), rows(weight), rows(force(stiff * residual, -slope) + damped))
+    states, _, predicted = recursion.rolled(here, gains, ca.vertcat(x0 - lin.x[:, 0] - dx[:nx], ca.MX.zeros(nu)), defects=True)
+    d_affine = ca.veccat(predicted.u, predicted.du, predicted.g)
+    affine = toward(d_affine, ca.MX.zeros(sides.hard + sides.softened), ca.MX.zeros(sides.softened))
 
     product = mean_product(now)
-    centre = product * ca.fmin(1, (mean_product(moved(affine, longest(affine))) / product) ** 3)
+    least = ca.MX.sym("least")
+    centre = ca.fmax(least, product * ca.fmin(1, (mean_product(moved(affine, longest(affine))) / product) ** 3))
     wanted_t, wanted_s = centre - affine.t * affine.lam, centre - affine.s * affine.nu
     states_by, by = recursion.response(stages, gains, rows(force(wanted_t / now.t, wanted_s / now.s)))
-    d_corrected = d_predicted + ca.veccat(by.u, by.du, by.g)
-    full = toward(d_corrected, wanted_t, wanted_s)
+    d_full = d_affine + ca.veccat(by.u, by.du, by.g)
+    full = toward(d_full, wanted_t, wanted_s)
     length = ca.fmin(1, SHARE_OF_WAY * longest(full))
 
     after = moved(full, length)
-    dx, d = dx + length * (ca.vec(states + states_by) - dx), d + length * (d_corrected - d)
+    dx, d = dx + length * ca.vec(states + states_by), d + length * d_full
     u_plan = lin.u + ca.reshape(d[: nu * N_u], nu, N_u)
     acts_hard, acts_soft = sides.split(after.lam > after.t)
     exceeded = -sides.split(sides.room(d))[1]
@@ -191,4 +200,18 @@ def step(ocp: Ocp, lin: Linearization, recursion: Riccati, stages: ca.MX, x0: ca
         "product": mean_product(after),
     }
     guess = {"x": lin.x, "u": lin.u, "u_prev": lin.u_prev, "x0": x0, "stages": stages}
-    return function("step", {**guess, **lin.weights, "interior": interior}, outputs)
+    return function("step", {**guess, **lin.weights, "interior": interior, "least": least}, outputs)
+
+
+def moved_to(ocp: Ocp, lin: Linearization, forms: Forms, dx: ca.MX, d: Rows) -> tuple[Forms, ca.MX]:
+    """Return the linearization in deviations from a plan, in which steps lose no digits near the optimum, and the pull of the damping there."""
+    N, N_u, nu = ocp.N, ocp.N_u, ocp.model.nu
+    of = Stage(ocp, lin)
+    before, du, after = ca.SX.sym("before", of.nx), ca.SX.sym("du", of.nu), ca.SX.sym("after", of.nx)
+    symbols = [*of.dynamics.values(), of.b, of.cost["H"], of.h, before, du, after]
+    node = ca.Function("moved", symbols, [ca.densify(of.A @ before + of.B @ du + of.b - after), ca.densify(of.h + of.H @ after)]).map(N)
+    held = ca.horzcat(d.u, ca.repmat(d.u[:, -1], 1, N - N_u))
+    b, h = node(forms.A, forms.B, forms.b, forms.H, forms.h, dx[:, :-1], held, dx[:, 1:])
+    force = forms.force + (lin.R @ d.du) * ca.repmat(lin.w["lambda_"].T, nu, 1)
+    damped = ca.veccat(ca.repmat(forms.damping, 1, N_u) * d.u, ca.MX.zeros(d.du.shape), ca.MX.zeros(d.g.shape))
+    return forms._replace(b=b, h=h, force=force), damped

@@ -26,6 +26,7 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.riccati import Gain, Riccati, Rows, Stage, columns, softened_steps, stagewise
 
+PENALTY = 3e9  # weight that holds values at their bounds, in units of their scale; with a larger one digits are lost
 BOUND_TOLERANCE = 1e-9  # a bound acts when it is exceeded by more than this, relative to its scale, so that rounding does not decide
 RELEASE_MULTIPLIER = 1e-6  # a bound is released when its multiplier has the wrong sign and is larger, in normalised cost per scale of what is bounded
 
@@ -43,12 +44,11 @@ class Places:
         linearize: ``(x, u, u_prev, y_ref, p, *WEIGHTS_AND_BOUNDS, scale) -> stages``.
         advance: ``(x, u, u_prev, y_ref, p, *WEIGHTS_AND_BOUNDS, scale, places) -> (x_next, u_next, places_next, stages)``: the same at
             the plan shifted by one stage.
-        gains: ``(stages, u, *WEIGHTS_AND_BOUNDS, scale, places, stiff) -> gains``; `stiff` is the weight of the penalty that holds values at their
-            bounds, for values in units of their scale.
-        roll_out: ``(x, u, u_prev, x0, stages, gains, *WEIGHTS_AND_BOUNDS, scale, places, stiff) -> (x_plan, u_plan, violation, change, changes,
+        gains: ``(stages, u, *WEIGHTS_AND_BOUNDS, scale, places) -> gains``.
+        roll_out: ``(x, u, u_prev, x0, stages, gains, *WEIGHTS_AND_BOUNDS, scale, places) -> (x_plan, u_plan, violation, change, changes,
             places_found, multipliers)``: the plan after the full step, its largest violation of softened bounds, in their unit and relative to
             their scale, the size of the step, and how many places change: -1 if data, gains or plan are not finite.
-        refine: ``(x, u, u_prev, stages, gains, *WEIGHTS_AND_BOUNDS, scale, places, stiff, r, x_plan, u_plan, multipliers) -> (x_refined,
+        refine: ``(x, u, u_prev, stages, gains, *WEIGHTS_AND_BOUNDS, scale, places, r, x_plan, u_plan, multipliers) -> (x_refined,
             u_refined, multipliers_refined)``: plan and multipliers after a Newton step that removes the remaining gradient r of the Lagrangian,
             see `rti_mpc.rti.certificate`.
         enter: The start of the interior point; see `rti_mpc.rti.interior_point`.
@@ -73,14 +73,12 @@ class Sample(NamedTuple):
         forms: Its linearization.
         gains: Gains of all stages, shape ``(size, N_u)``.
         place: Places of all rows.
-        stiff: Weight of the penalty that holds values at their bounds.
     """
 
     lin: Linearization
     forms: Forms
     gains: ca.MX
     place: Rows
-    stiff: ca.MX
 
 
 def places(ocp: Ocp) -> Places:
@@ -90,26 +88,25 @@ def places(ocp: Ocp) -> Places:
     recursion = Riccati(ocp, lin)
     stages = ca.MX.sym("stages", linearize.numel_out("stages"))
     kinds = [lin.u, lin.u, lin.g]
-    flat, stiff = ca.MX.sym("places", sum(kind.numel() for kind in kinds)), ca.MX.sym("stiff")
+    flat = ca.MX.sym("places", sum(kind.numel() for kind in kinds))
     x0, found = ca.MX.sym("x0", ocp.model.nx), ca.MX.sym("gains", recursion.size, ocp.N_u)
-    at = Sample(lin, lin.forms_in(stages), found, Rows(*divided(flat, kinds)), stiff)
+    at = Sample(lin, lin.forms_in(stages), found, Rows(*divided(flat, kinds)))
 
     x, u = shift(ocp)(lin.x, lin.u, lin.p)
     moved = ca.veccat(*(ca.horzcat(kind[:, 1:], kind[:, -1]) for kind in (at.place.u, at.place.du, at.place.g)))
     linearized = linearize(**(lin.arguments | {"x": x, "u": u}))["stages"]
     advance = {"x_next": x, "u_next": u, "places_next": moved, "stages": linearized}
 
-    acting = {"places": flat, "stiff": stiff}
     gains = recursion.gains(stages, *penalties(ocp, at))
     guess = {"x": lin.x, "u": lin.u, "u_prev": lin.u_prev}
-    fixed = {"stages": stages, "gains": found, **lin.weights, **acting}
+    fixed = {"stages": stages, "gains": found, **lin.weights, "places": flat}
     rolled = roll_out(ocp, at, x0)
     plan = {"r": lin.u, "x_plan": lin.x, "u_plan": lin.u, "multipliers": rolled["multipliers"]}
     plan = {name: ca.MX.sym(name, *like.shape) for name, like in plan.items()}
     return Places(
         linearize,
         function("advance", {**lin.arguments, "places": flat}, advance),
-        function("gains", {"stages": stages, "u": lin.u, **lin.weights, **acting}, {"gains": gains}),
+        function("gains", {"stages": stages, "u": lin.u, **lin.weights, "places": flat}, {"gains": gains}),
         function("roll_out", {**guess, "x0": x0, **fixed}, rolled),
         function("refine", {**guess, **fixed, **plan}, refine(ocp, recursion, at, stages, **plan)),
         interior_point.enter(ocp, lin, stages),
@@ -131,10 +128,10 @@ def penalties(ocp: Ocp, at: Sample) -> tuple[Rows, Rows]:
     def repeated(*rows: ca.MX, times: int) -> list[ca.MX]:
         return [ca.repmat(row, 1, times) for row in rows]
 
-    stiff_u = at.stiff / lin.scale_u**2
+    stiff_u = PENALTY / lin.scale_u**2
     weight_u, pull_u = held(at.place.u, lin.u, *repeated(w["lbu"], w["ubu"], stiff_u, times=ocp.N_u))
     weight_du, pull_du = held(at.place.du, at.forms.increments, *repeated(w["lbdu"], w["ubdu"], stiff_u, times=ocp.N_u))
-    limits = repeated(lin.lg, lin.ug, at.stiff / lin.scale_g**2, lin.zg, lin.Zg, times=ocp.N)
+    limits = repeated(lin.lg, lin.ug, PENALTY / lin.scale_g**2, lin.zg, lin.Zg, times=ocp.N)
     weight_g, pull_g = softened(at.place.g, at.forms.g, *limits)
     return Rows(weight_u, weight_du, weight_g), Rows(pull_u, pull_du, pull_g)
 
@@ -152,8 +149,8 @@ def roll_out(ocp: Ocp, at: Sample, x0: ca.MX) -> dict[str, ca.MX]:
     x_k = columns(lin.x)
     stages = stagewise(A=forms.A, B=forms.B, b=forms.b, g_x=forms.g_x, g_u=forms.g_u, g=forms.g, place_g=at.place.g)
     inputs = stagewise(u=lin.u, increment=forms.increments, gain=at.gains, place_u=at.place.u, place_du=at.place.du)
-    limits = {"lg": lin.lg, "ug": lin.ug, "zg": lin.zg, "Zg": lin.Zg, "stiff_g": at.stiff / lin.scale_g**2, "scale_g": lin.scale_g}
-    bounds = {name: w[name] for name in ("lbu", "ubu", "lbdu", "ubdu")} | {"stiff_u": at.stiff / lin.scale_u**2, "scale_u": lin.scale_u}
+    limits = {"lg": lin.lg, "ug": lin.ug, "zg": lin.zg, "Zg": lin.Zg, "stiff_g": PENALTY / lin.scale_g**2, "scale_g": lin.scale_g}
+    bounds = {name: w[name] for name in ("lbu", "ubu", "lbdu", "ubdu")} | {"stiff_u": PENALTY / lin.scale_u**2, "scale_u": lin.scale_u}
     s, slip = ca.vertcat(x0 - x_k[0], ca.MX.zeros(ocp.model.nu)), ca.MX.zeros(ocp.model.nx + ocp.model.nu)
     before = lin.u_prev
     verdict = ca.MX(ca.DM([0, -INFINITY, -INFINITY]))  # changes, violation, violation relative to scale
@@ -299,13 +296,13 @@ def refine(
     ocp: Ocp, recursion: Riccati, at: Sample, stages: ca.MX, *, r: ca.MX, x_plan: ca.MX, u_plan: ca.MX, multipliers: ca.MX
 ) -> dict[str, ca.MX]:
     """Return the outputs of `Places.refine`, by name: a Newton step on the optimality conditions that brings held softened rows to their bounds."""
-    lin, forms, place, stiff = at.lin, at.forms, at.place, at.stiff
+    lin, forms, place = at.lin, at.forms, at.place
     N, N_u, nu, w = ocp.N, ocp.N_u, ocp.model.nu, lin.w
     of_increments, of_softened = divided(multipliers, [lin.u, lin.g])
     du = u_plan - lin.u
     held = ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u))
     values = forms.g + softened_steps(ocp, lin).map(N)(forms.g_x, forms.g_u, x_plan[:, 1:] - lin.x[:, 1:], held)
-    weight = ca.repmat(stiff / lin.scale_g**2, 1, N) * (ca.fabs(place.g) == 1)
+    weight = ca.repmat(PENALTY / lin.scale_g**2, 1, N) * (ca.fabs(place.g) == 1)
     lower, upper = (ca.repmat(e, 1, N) for e in (lin.lg, lin.ug))
     excess = values - ca.if_else(place.g > 0, upper, lower)
     zero = ca.MX.zeros(nu, N_u)
@@ -315,7 +312,7 @@ def refine(
     by = side * (excess + rows.g)
     beyond = side * (ca.repmat(lin.zg, 1, N) + ca.repmat(lin.Zg, 1, N) * by) / 2
     paid = ca.if_else(ca.fabs(place.g) == 2, beyond, (of_softened + weight * (excess + rows.g)) * (ca.fabs(place.g) == 1))
-    force = of_increments + ca.repmat(stiff / lin.scale_u**2, 1, N_u) * (ca.fabs(place.du) == 1) * rows.du
+    force = of_increments + ca.repmat(PENALTY / lin.scale_u**2, 1, N_u) * (ca.fabs(place.du) == 1) * rows.du
     clip, follow = clip_function(nu), follow_function(lin)
     last, change_k, inputs, states = lin.u_prev, ca.MX.zeros(ocp.model.nx), [], [x_plan[:, 0]]
     planned, A, B = columns(u_plan), columns(forms.A), columns(forms.B)

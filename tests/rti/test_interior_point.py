@@ -13,15 +13,13 @@ from rti_mpc.rti.rti import Rti
 from rti_mpc_service.bench.families import FAMILIES
 from tests.rti.test_active_set import PROBLEMS, samples
 
-# Roll-outs before, on the penalty's path and after, and the steps.
-MOST = 2 * active_set.MAX_ROLL_OUTS + active_set.MAX_PATH_ROLL_OUTS + 1 + active_set.MAX_STEPS * 3
+MOST = 2 * active_set.MAX_ROLL_OUTS + 1 + active_set.MAX_STEPS * 3  # roll-outs and steps of a QP
 
 
 @pytest.fixture
 def no_roll_outs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave every QP whose first roll-out changes places to the interior point."""
     monkeypatch.setattr(active_set, "MAX_ROLL_OUTS", 1)
-    monkeypatch.setattr(active_set, "MAX_PATH_ROLL_OUTS", 0)
 
 
 @pytest.mark.usefixtures("no_roll_outs")
