@@ -65,19 +65,23 @@ class Sides:
         self._rows, self._sign = [row for row, _ in sides], ca.DM([sign for _, sign in sides])
         self.hard = sum(row < first for row in self._rows)
         self.softened = len(sides) - self.hard
-        self._onto = ca.DM(ca.Sparsity.triplet(first + len(ocp.lg) * N, len(sides), self._rows, [*range(len(sides))]), 1.0)
+        number = {side: count for count, side in enumerate(sides)}
+        rows = range(first + len(ocp.lg) * N)
+        self._lower, self._upper = ([number.get((row, sign), len(sides)) for row in rows] for sign in (-1.0, 1.0))  # beyond them: none
         self.scale = along(lin.scale_u, lin.scale_u, lin.scale_g)
         self.scale_side = self.scale[self._rows]
+        self.per_scale = 1 / self.scale
+        self._per_scale = self._sign * self.per_scale[self._rows]
         zero = ca.MX.zeros(lin.scale_u.shape)
         soft, scale = self._rows[self.hard :], self.scale_side[self.hard :]
         self.z, self.Z = along(zero, zero, lin.zg)[soft] * scale / 2, along(zero, zero, lin.Zg)[soft] * scale**2 / 2
         lower, upper = along(w["lbu"], w["lbdu"], lin.lg)[self._rows], along(w["ubu"], w["ubdu"], lin.ug)[self._rows]
         bound = ca.if_else(self._sign > 0, upper, lower)
-        self._room = self._sign * (bound - ca.veccat(lin.u, forms.increments, forms.g)[self._rows]) / self.scale_side
+        self._room = self._per_scale * (bound - ca.veccat(lin.u, forms.increments, forms.g)[self._rows])
 
     def change(self, d: ca.MX) -> ca.MX:
         """Return how much nearer deviations of the rows bring each side to its bound."""
-        return self._sign * d[self._rows] / self.scale_side
+        return self._per_scale * d[self._rows]
 
     def room(self, d: ca.MX) -> ca.MX:
         """Return the room to each bound at deviations of the rows; negative where it is exceeded."""
@@ -85,11 +89,18 @@ class Sides:
 
     def onto(self, sides: ca.MX) -> ca.MX:
         """Return the sum over the sides of each row."""
-        return ca.densify(self._onto @ sides)
+        lower, upper = self._of_rows(sides)
+        return lower + upper
 
     def directed(self, sides: ca.MX) -> ca.MX:
         """Return the same with lower sides counted negative."""
-        return self.onto(self._sign * sides)
+        lower, upper = self._of_rows(sides)
+        return upper - lower
+
+    def _of_rows(self, sides: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """Return the lower and the upper side of each row, zero where there is none."""
+        padded = ca.vertcat(sides, ca.MX.zeros(2))  # of a scalar, CasADi would make a row
+        return padded[self._lower], padded[self._upper]
 
     def split(self, sides: ca.MX) -> tuple[ca.MX, ca.MX]:
         """Return the hard and the softened part."""
@@ -138,8 +149,11 @@ def step(ocp: Ocp, lin: Linearization, recursion: Riccati, stages: ca.MX, x0: ca
     interior = ca.MX.sym("interior", sum(sizes))
     dx, d, *numbers = ca.vertsplit(interior, np.cumsum([0, *sizes]).tolist())
     now = Point(*numbers)
-    stiff, (stiff_hard, stiff_soft), stiff_slack = now.lam / now.t, sides.split(now.lam / now.t), now.nu / now.s
-    divisor, slope = sides.Z + stiff_soft + stiff_slack, sides.z + sides.Z * now.s
+    per = Point(*(1 / number for number in now))  # divisions take longest
+    stiff, stiff_slack = now.lam * per.t, now.nu * per.s
+    stiff_hard, stiff_soft = sides.split(stiff)
+    per_divisor, slope = 1 / (sides.Z + stiff_soft + stiff_slack), sides.z + sides.Z * now.s
+    share = stiff_soft * per_divisor  # of a push on a softened side that its slack takes
     padding = ca.MX.zeros(sides.hard)
     residual = now.t - sides.room(d) - ca.vertcat(padding, now.s)
 
@@ -149,18 +163,18 @@ def step(ocp: Ocp, lin: Linearization, recursion: Riccati, stages: ca.MX, x0: ca
     def force(wanted: ca.MX, slack: ca.MX) -> ca.MX:
         """Return the multipliers at d, the slacks eliminated: `wanted` without slacks, `slack` what acts on them."""
         hard, soft = sides.split(wanted)
-        return sides.directed(ca.vertcat(hard, soft - stiff_soft / divisor * (soft + slack))) / sides.scale
+        return sides.directed(ca.vertcat(hard, soft - share * (soft + slack))) * sides.per_scale
 
     def toward(by: ca.MX, product_t: ca.MX, product_s: ca.MX) -> Point:
         """Return the step with which rows change by these amounts, and the linearized products have these values after it."""
         nearer = residual + sides.change(by)
-        pressed = sides.split(stiff * nearer + product_t / now.t)[1]
-        s = (pressed + product_s / now.s - slope) / divisor
+        wanted_t, wanted_s = product_t * per.t, product_s * per.s
+        s = per_divisor * (sides.split(stiff * nearer + wanted_t)[1] + wanted_s - slope)
         t = ca.vertcat(padding, s) - nearer
-        return Point(t, product_t / now.t - now.lam - stiff * t, s, product_s / now.s - now.nu - stiff_slack * s)
+        return Point(t, wanted_t - now.lam - stiff * t, s, wanted_s - now.nu - stiff_slack * s)
 
     def longest(by: Point) -> ca.MX:
-        return 1 / ca.mmax(ca.vertcat(1, *(-change / number for number, change in zip(now, by, strict=True))))
+        return 1 / ca.mmax(ca.vertcat(1, *(-change * per_one for per_one, change in zip(per, by, strict=True))))
 
     def moved(by: Point, length: ca.MX) -> Point:
         return Point(*(number + length * change for number, change in zip(now, by, strict=True)))
@@ -168,7 +182,7 @@ def step(ocp: Ocp, lin: Linearization, recursion: Riccati, stages: ca.MX, x0: ca
     def mean_product(at: Point) -> ca.MX:
         return (ca.dot(at.t, at.lam) + ca.dot(at.s, at.nu)) / max(1, sides.hard + 2 * sides.softened)
 
-    weight = sides.onto(ca.vertcat(stiff_hard, stiff_soft * (sides.Z + stiff_slack) / divisor)) / sides.scale**2
+    weight = sides.onto(ca.vertcat(stiff_hard, share * (sides.Z + stiff_slack))) * sides.per_scale**2
     here, damped = moved_to(ocp, lin, forms, ca.reshape(dx, nx, N + 1), rows(d))
     gains = recursion.gains(ca.veccat(*here), rows(weight), rows(force(stiff * residual, -slope) + damped))
     states, _, predicted = recursion.rolled(here, gains, ca.vertcat(x0 - lin.x[:, 0] - dx[:nx], ca.MX.zeros(nu)), defects=True)
@@ -179,7 +193,7 @@ def step(ocp: Ocp, lin: Linearization, recursion: Riccati, stages: ca.MX, x0: ca
     least = ca.MX.sym("least")
     centre = ca.fmax(least, product * ca.fmin(1, (mean_product(moved(affine, longest(affine))) / product) ** 3))
     wanted_t, wanted_s = centre - affine.t * affine.lam, centre - affine.s * affine.nu
-    states_by, by = recursion.response(stages, gains, rows(force(wanted_t / now.t, wanted_s / now.s)))
+    states_by, by = recursion.response(stages, gains, rows(force(wanted_t * per.t, wanted_s * per.s)))
     d_full = d_affine + ca.veccat(by.u, by.du, by.g)
     full = toward(d_full, wanted_t, wanted_s)
     length = ca.fmin(1, SHARE_OF_WAY * longest(full))
@@ -196,7 +210,7 @@ def step(ocp: Ocp, lin: Linearization, recursion: Riccati, stages: ca.MX, x0: ca
         "violation": ca.vertcat(*(ca.mmax(ca.vertcat(-INFINITY, e)) for e in (exceeded * sides.split(sides.scale_side)[1], exceeded))),
         "change": change(lin, u_plan),
         "places_found": sides.directed(ca.vertcat(acts_hard, acts_soft * (1 + (after.s > after.nu)))),
-        "multipliers": (sides.directed(after.lam) / sides.scale)[nu * N_u :],
+        "multipliers": (sides.directed(after.lam) * sides.per_scale)[nu * N_u :],
         "product": mean_product(after),
     }
     guess = {"x": lin.x, "u": lin.u, "u_prev": lin.u_prev, "x0": x0, "stages": stages}
