@@ -24,7 +24,7 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind, function
-from rti_mpc.rti.linearization import constraints
+from rti_mpc.rti.linearization import all_inputs, constraints
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import TOUCHING_DISTANCE, Rti
 
@@ -108,7 +108,7 @@ def progress(ocp: Ocp) -> ca.Function:
     ]
     if nh:
         constraint, *_ = constraints(ocp)
-        u_held = ca.horzcat(u, ca.repmat(u[:, -1], 1, N - ocp.N_u))
+        u_held = all_inputs(u, N)
         g = constraint.map(N)(x[:, 1:], u_held, p[:, 1:])[len(ocp.soft) : len(ocp.lg), :]
         near = TOUCHING_DISTANCE * scale[-nh:]
         held += [ca.mmax(ca.fmax(g[k, :] - uh[k], lh[k] - g[k, :])) + near[k] for k in range(nh)]

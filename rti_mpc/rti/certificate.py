@@ -23,7 +23,7 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.codegen import function
-from rti_mpc.rti.linearization import Linearization, divided
+from rti_mpc.rti.linearization import Linearization, all_inputs, divided
 from rti_mpc.rti.ocp import Ocp
 
 SMALLEST_DIVISOR = 1e-300  # replaces a quadratic penalty of zero
@@ -49,10 +49,9 @@ def certificate(ocp: Ocp) -> ca.Function:
     w = lin.w
 
     dx, du = x_plan - lin.x, u_plan - lin.u
-    held = ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u))
     shared = [ca.repmat(e, 1, N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg, lin.scale_x, lin.scale_g)]
     data = (forms.A, forms.B, forms.b, forms.H, forms.h, forms.g, forms.g_x, forms.g_u)
-    nodes = node(ocp, lin).map(N)(*data, dx[:, :-1], held, dx[:, 1:], of_softened, *shared)
+    nodes = node(ocp, lin).map(N)(*data, dx[:, :-1], all_inputs(du, N), dx[:, 1:], of_softened, *shared)
     sums, by_x, by_u = nodes[:3, :], ca.horzsplit(nodes[3 : 3 + nx, :]), nodes[3 + nx :, :]
 
     sweep = adjoint(lin)

@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.codegen import function
-from rti_mpc.rti.linearization import Forms, Linearization, change, divided
+from rti_mpc.rti.linearization import Forms, Linearization, all_inputs, change, divided
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.riccati import Riccati, Rows, Stage, softened_steps
@@ -120,8 +120,8 @@ def enter(ocp: Ocp, lin: Linearization, stages: ca.MX) -> ca.Function:
     sides = Sides(ocp, lin, forms)
     x_plan, u_plan = ca.MX.sym("x_plan", nx, N + 1), ca.MX.sym("u_plan", nu, N_u)
     dx, du = x_plan - lin.x, u_plan - lin.u
-    held = ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u))
-    d = ca.veccat(du, du - ca.horzcat(ca.MX.zeros(nu), du[:, :-1]), softened_steps(ocp, lin).map(N)(forms.g_x, forms.g_u, dx[:, 1:], held))
+    softened = softened_steps(ocp, lin).map(N)(forms.g_x, forms.g_u, dx[:, 1:], all_inputs(du, N))
+    d = ca.veccat(du, du - ca.horzcat(ca.MX.zeros(nu), du[:, :-1]), softened)
     hard, room = sides.split(sides.room(d))
     start = ca.MX.sym("start")
     t_hard, exceeded = ca.fmax(hard, START_DISTANCE), ca.fmax(-room, 0)
@@ -224,8 +224,7 @@ def moved_to(ocp: Ocp, lin: Linearization, forms: Forms, dx: ca.MX, d: Rows) -> 
     before, du, after = ca.SX.sym("before", of.nx), ca.SX.sym("du", of.nu), ca.SX.sym("after", of.nx)
     symbols = [*of.dynamics.values(), of.b, of.cost["H"], of.h, before, du, after]
     node = ca.Function("moved", symbols, [ca.densify(of.A @ before + of.B @ du + of.b - after), ca.densify(of.h + of.H @ after)]).map(N)
-    held = ca.horzcat(d.u, ca.repmat(d.u[:, -1], 1, N - N_u))
-    b, h = node(forms.A, forms.B, forms.b, forms.H, forms.h, dx[:, :-1], held, dx[:, 1:])
+    b, h = node(forms.A, forms.B, forms.b, forms.H, forms.h, dx[:, :-1], all_inputs(d.u, N), dx[:, 1:])
     force = forms.force + (lin.R @ d.du) * ca.repmat(lin.w["lambda_"].T, nu, 1)
     damped = ca.veccat(ca.repmat(forms.damping, 1, N_u) * d.u, ca.MX.zeros(d.du.shape), ca.MX.zeros(d.g.shape))
     return forms._replace(b=b, h=h, force=force), damped

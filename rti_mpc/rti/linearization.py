@@ -120,8 +120,8 @@ class Linearization:
         self.scale_x, self.scale_u, self.scale_g = self._scale[:nx], self._scale[nx : nx + nu], self._scale[nx + nu :]
 
         stage, self.A_k, self.B_k = linearize(ocp)
-        held = ca.horzcat(self.u, ca.repmat(self.u[:, -1], 1, N - N_u))
-        stages = stage.map(N)(self.x[:, :-1], held, self.p[:, :-1])
+        inputs = all_inputs(self.u, N)
+        stages = stage.map(N)(self.x[:, :-1], inputs, self.p[:, :-1])
         to_B = nx + self.A_k.nnz()
         self.A, self.B = stages[nx:to_B, :], stages[to_B:, :]
         self.b = stages[:nx, :] - self.x[:, 1:]
@@ -134,7 +134,7 @@ class Linearization:
 
         soft, w = list(ocp.soft), self.w
         constraint, self.G_x, self.G_u = constraints(ocp)
-        bounded = constraint.map(N)(self.x[:, 1:], held, self.p[:, 1:])
+        bounded = constraint.map(N)(self.x[:, 1:], inputs, self.p[:, 1:])
         to_x, to_u = len(ocp.lg), len(ocp.lg) + self.G_x.nnz()
         self.g, self.g_x, self.g_u = bounded[:to_x, :], bounded[to_x:to_u, :], bounded[to_u:, :]
         self.lg, self.ug = ca.vertcat(w["lbx"][soft, 0], w["lh"]), ca.vertcat(w["ubx"][soft, 0], w["uh"])
@@ -192,6 +192,11 @@ class Linearization:
         last = k == self.u.shape[1] - 1
         following = 0 if last else self.w["lambda_"][k + 1]
         return self.R * (self.w["lambda_"][k] + following) + ca.diag(self.damping), None if last else -self.R * following
+
+
+def all_inputs(u: ca.MX, N: int) -> ca.MX:
+    """Return the inputs of all stages, shape ``(nu, N)``, the last one of the control horizon held after it."""
+    return ca.horzcat(u, ca.repmat(u[:, -1], 1, N - u.shape[1]))
 
 
 def divided(flat: ca.MX, like: Sequence[ca.MX]) -> list[ca.MX]:

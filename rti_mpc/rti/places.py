@@ -21,7 +21,7 @@ import numpy as np
 
 from rti_mpc.codegen import function
 from rti_mpc.rti import interior_point
-from rti_mpc.rti.linearization import Forms, Linearization, change, divided, shift
+from rti_mpc.rti.linearization import Forms, Linearization, all_inputs, change, divided, shift
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.riccati import Gain, Riccati, Rows, Stage, columns, softened_steps, stagewise
@@ -300,8 +300,7 @@ def refine(
     N, N_u, nu, w = ocp.N, ocp.N_u, ocp.model.nu, lin.w
     of_increments, of_softened = divided(multipliers, [lin.u, lin.g])
     du = u_plan - lin.u
-    held = ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u))
-    values = forms.g + softened_steps(ocp, lin).map(N)(forms.g_x, forms.g_u, x_plan[:, 1:] - lin.x[:, 1:], held)
+    values = forms.g + softened_steps(ocp, lin).map(N)(forms.g_x, forms.g_u, x_plan[:, 1:] - lin.x[:, 1:], all_inputs(du, N))
     weight = ca.repmat(PENALTY / lin.scale_g**2, 1, N) * (ca.fabs(place.g) == 1)
     lower, upper = (ca.repmat(e, 1, N) for e in (lin.lg, lin.ug))
     excess = values - ca.if_else(place.g > 0, upper, lower)

@@ -25,7 +25,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from rti_mpc.codegen import function
-from rti_mpc.rti.linearization import Linearization, change
+from rti_mpc.rti.linearization import Linearization, all_inputs, change
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import (
     KIND_NAMES,
@@ -216,7 +216,7 @@ def embed(ocp: Ocp, kind: str, remembered: int, start: int, soft_rows: int) -> c
 
 def full_step(ocp: Ocp, kind: str, lin: Linearization, n: int, remembered: int) -> ca.Function:
     """Read the inputs from the solution, and compute the states by the linearized dynamics."""
-    N, N_u, nx = ocp.N, ocp.N_u, ocp.model.nx
+    N, nx = ocp.N, ocp.model.nx
     z = ca.MX.sym("z", n)
     x0 = ca.MX.sym("x0", nx)
     known = Remembered(ocp, lin, remembered)
@@ -233,7 +233,7 @@ def full_step(ocp: Ocp, kind: str, lin: Linearization, n: int, remembered: int) 
     if N > 1:
         advance = advance.mapaccum("advances", N)
     deviation = x0 - x[:, 0]
-    dx = ca.horzcat(deviation, advance(deviation, A, B, ca.horzcat(du, ca.repmat(du[:, -1], 1, N - N_u)), b))
+    dx = ca.horzcat(deviation, advance(deviation, A, B, all_inputs(du, N), b))
     u_plan = clipped(u + du, u_prev, w)
     start = {"x": x, "u": u, "u_prev": u_prev, "solution": z, "x0": x0, "memory": known.memory}
     plan = {"x_plan": x + dx, "u_plan": u_plan, "violation": known.violation(dx, du, w), "change": change(lin, u_plan)}

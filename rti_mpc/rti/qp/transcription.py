@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from rti_mpc.codegen import function
-from rti_mpc.rti.linearization import Linearization
+from rti_mpc.rti.linearization import Linearization, all_inputs
 from rti_mpc.rti.ocp import Ocp
 
 KIND_NAMES = {False: "relaxed", True: "whole"}  # key: whether the QP has softened bounds; functions compiled together need different names
@@ -212,8 +212,7 @@ class Remembered:
         shares = [by / one for by, one in zip(excess, scales, strict=True)]
         worst = ca.Function("worst", [g, g_x, g_u, dx_i, du_i, lg, ug, scale], [ca.vertcat(*(ca.mmax(ca.vertcat(*of)) for of in (excess, shares)))])
         limits = (*softened_bounds(ocp, w), lin.scale_g)
-        held = ca.horzcat(du, ca.repmat(du[:, -1], 1, N - ocp.N_u))
-        found = worst.map(N)(*self._parts, dx[:, 1:], held, *(repeated_column(limit, N) for limit in limits))
+        found = worst.map(N)(*self._parts, dx[:, 1:], all_inputs(du, N), *(repeated_column(limit, N) for limit in limits))
         return ca.vertcat(*(ca.mmax(row) for row in ca.vertsplit(found)))
 
 
