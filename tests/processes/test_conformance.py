@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
 from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.guarded import write_robot
+from tests.movers import toml
 from tests.processes.system import PATIENCE_S, ROOT, command_line, environment, heard, listening, rti_mpc, until
 
 CLI = "from rti_mpc_service.cli import main; main()"
@@ -91,6 +93,13 @@ Guard._objection = _objection
 """,
         {"epochs"},
     ),
+    "plays a way to rest without its gain": (
+        """
+from rti_mpc.contract.way import Way
+Way.corrected = lambda self, *_: self
+""",
+        {"gain"},
+    ),
     "forgets a stop": (
         """
 from rti_mpc.contract.guard import Guard
@@ -117,10 +126,10 @@ def running(folder: Path, config: Path, *program: str) -> Iterator[str]:
         process.wait()
 
 
-def judged(folder: Path, what: str, config: Path, endpoint: str) -> dict[str, dict[str, Any]]:
+def judged(folder: Path, what: str, config: Path, *meeting: object) -> dict[str, dict[str, Any]]:
     """Rows by name, as written to a file; the exit status and the table agree with them."""
     path = folder / "found.json"
-    done = rti_mpc("conformance", config, what, "-e", endpoint, "--moves-the-robot", "--json", path, timeout_s=300.0)
+    done = rti_mpc("conformance", config, what, *meeting, "--moves-the-robot", "--json", path, timeout_s=300.0)
     rows = {row["name"]: row for row in json.loads(path.read_text())}
     assert done.returncode == int(any(row["verdict"] not in ("yes", "host") for row in rows.values())), done.stdout + done.stderr
     for name, row in rows.items():
@@ -139,13 +148,13 @@ def fails_in(rows: dict[str, dict[str, Any]], expected: set[str]) -> None:
 def test_simulated_robot_keeps_every_promise_at_four_times_real_speed(tmp_path: Path) -> None:
     """Judged in its own time."""
     with running(tmp_path, SHIPPED, "import sys; sys.argv.insert(1, 'sim'); sys.argv += ['--speed', '4']; " + CLI) as endpoint:
-        fails_in(judged(tmp_path, "robot", SHIPPED, endpoint), set())
+        fails_in(judged(tmp_path, "robot", SHIPPED, "-e", endpoint), set())
 
 
 @pytest.mark.slow
 def test_robot_with_the_adapter_keeps_every_promise(tmp_path: Path) -> None:
     with running(tmp_path, SHIPPED, ADAPTED) as endpoint:
-        fails_in(judged(tmp_path, "robot", SHIPPED, endpoint), set())
+        fails_in(judged(tmp_path, "robot", SHIPPED, "-e", endpoint), set())
 
 
 @pytest.mark.slow
@@ -153,7 +162,7 @@ def test_robot_with_the_adapter_keeps_every_promise(tmp_path: Path) -> None:
 def test_broken_robot_fails_where_it_should_and_only_there(tmp_path: Path, what: str) -> None:
     change, expected = BROKEN_ROBOTS[what]
     with running(tmp_path, SHIPPED, change + ADAPTED) as endpoint:
-        fails_in(judged(tmp_path, "robot", SHIPPED, endpoint), expected)
+        fails_in(judged(tmp_path, "robot", SHIPPED, "-e", endpoint), expected)
 
 
 @pytest.mark.slow
@@ -175,10 +184,24 @@ def test_interrupted_test_leaves_even_a_robot_at_rest_that_plays_for_ever(tmp_pa
 
 
 @pytest.mark.slow
-def test_guard_keeps_every_promise(tmp_path: Path) -> None:
-    config = write_robot(tmp_path / "robot.toml")
-    with running(tmp_path, config, CLI, "guard") as endpoint:
-        fails_in(judged(tmp_path, "guard", config, endpoint), set())
+def test_arm_that_falls_without_its_controller_keeps_every_promise(tmp_path: Path) -> None:
+    config = write_robot(tmp_path / "robot.toml", text=toml("arm"))
+    with running(tmp_path, config, "import sys; sys.argv.insert(1, 'sim'); sys.argv += ['--speed', '4']; " + CLI) as endpoint:
+        fails_in(judged(tmp_path, "robot", config, "-e", endpoint), set())
+
+
+@pytest.mark.slow
+def test_guard_keeps_every_promise_on_a_bus_with_tls(tmp_path: Path) -> None:
+    """By a certificate of the test's own."""
+    pytest.importorskip("cryptography", reason="the extra certs is not installed: conformance with TLS was NOT tried")
+    from tests.processes.secured import Secured
+
+    with Secured(tmp_path) as bus:
+        (judge := tmp_path / "judge").mkdir()
+        for file in ("authority.pem", "conformance.pem", "conformance.key", "conformance.json5"):
+            shutil.copy(bus.tls / file, judge)
+        bus.start("guard")
+        fails_in(judged(tmp_path, "guard", bus.config, "--tls", judge), set())
 
 
 @pytest.mark.slow
@@ -187,7 +210,7 @@ def test_broken_guard_fails_where_it_should_and_only_there(tmp_path: Path, what:
     change, expected = BROKEN_GUARDS[what]
     config = write_robot(tmp_path / "robot.toml")
     with running(tmp_path, config, change + CLI, "guard") as endpoint:
-        fails_in(judged(tmp_path, "guard", config, endpoint), expected)
+        fails_in(judged(tmp_path, "guard", config, "-e", endpoint), expected)
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,11 @@ ROLES: dict[str, tuple[str, ...]] = {
     "operator": ("operator",),
     "viewer": ("viewer",),
     "recorder": ("viewer", "recorder"),
+    "conformance": ("controller", "guard", "robot", "operator"),  # takes the place of all but the one that it judges
 }
 # Roles whose certificate a command uses: the first one that the host's folder has.
 ROLES_OF_COMMAND: dict[str, tuple[str, ...]] = {
-    "conformance": ("controller",),  # it takes its place; a robot behind a guard, or a guard, is judged on an open bus
+    "conformance": ("conformance",),
     "run": ("controller",),
     "guard": ("guard",),
     "sim": ("robot",),

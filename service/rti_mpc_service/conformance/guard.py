@@ -141,6 +141,30 @@ def way(stand: Stand) -> Finding:
     return Finding(True, "its rows acted after the plan's end")
 
 
+def gain(stand: Stand) -> Finding:
+    """Judge a way to rest whose rows alone are the ramp, and which by its gain and the robot's states first holds the inputs."""
+    ready(stand)
+    levels, period_ms, nx = stand.levels, stand.period_ns / MS, len(stand.limits.angles)
+    held, away = 8 + round(300.0 / period_ms), levels.high - levels.rest
+    ramp = np.linspace(1.0, 0.0, len(levels.way(levels.high, 0)) + 1)[1:]  # as shares of the way up from rest
+    alone, wanted = np.concatenate([ramp, np.zeros(held)]), np.concatenate([np.ones(held), ramp])
+    rows, x, K = levels.rest + np.outer(alone, away), np.zeros((len(alone), nx)), np.zeros((len(away), nx))
+    x[:, 0], K[:, 0] = wanted - alone, away  # the robot's states are zeros, so K x is added to the rows
+    pilot = stand.towards(levels.high, u_rest=rows, x_rest=x, K=K, rest_period_ns=stand.period_ns)
+    stand.run(3 * period_ms, pilot)
+    answered_ns = stand.state.stamp_ns
+    stand.run(VALID_NS / MS + len(rows) * period_ms + STANDS_MS)
+    times, inputs = stand.acting(answered_ns)
+    from_ms, until_ms = VALID_NS / MS + (len(ramp) + 4) * period_ms, VALID_NS / MS + (held - 2) * period_ms
+    judged = [u for t, u in zip(times, inputs, strict=True) if from_ms <= t < until_ms]
+    if (other := next((u for u in judged if not levels.at(u, levels.high)), None)) is not None:
+        text = f"its way to rest with its gain holds {shown(levels.high)} from {from_ms:.0f} to {until_ms:.0f} ms after the state, got {shown(other)}"
+        return Finding(False, text, period_ms)
+    if not levels.at(inputs[-1], levels.rest):
+        return Finding(False, f"the inputs did not come to its last row, {shown(levels.rest)}, but to {shown(inputs[-1])}", period_ms)
+    return Finding(True, "its gain went on with its rows")
+
+
 def stands(stand: Stand) -> Finding:
     """Judge what the guard says while the robot stands and nothing is commanded."""
     ready(stand)
@@ -298,6 +322,7 @@ CASES = (
     Case("validity", "nothing acts later than 300 ms after its state, and the configured delay, whatever a command says",
          "limit valid_until_ns of what passes", validity),
     Case("way", "a command's own way to rest acts from the end of its plan on", "pass u_rest on, and send what is left of it with each command", way),
+    Case("gain", "the gain of a way to rest goes on with its rows, and states correct it", "send x_rest and K on with what is left of u_rest", gain),
     Case("stands", "while the robot stands, commands to stand are repeated, each with a short validity",
          "send a command to stand at least every 500 ms, as long as states come", stands),
     Case("slew", "a plan that begins far from the inputs that act, after a gap or a loss, is approached inside the slew limits",

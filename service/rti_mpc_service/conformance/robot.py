@@ -183,12 +183,15 @@ def seconds(ns: float) -> str:
 
 def states(trial: Trial) -> Finding:
     """Judge the states that come while nothing is commanded."""
-    seen = trial.run(STANDS_NS)
+    return sound(trial.run(STANDS_NS), len(trial.limits.angles))
+
+
+def sound(seen: list[State], nx: int) -> Finding:
+    """Judge states of a robot whose model has `nx`, by their numbers, stamps, sizes and epochs."""
     numbers, stamps = [state.seq for state in seen], [state.stamp_ns for state in seen]
     for what, values in (("numbers", numbers), ("stamps", stamps)):
         if any(after <= before for before, after in pairwise(values)):
             return Finding(False, f"the {what} of its states did not increase")
-    nx = len(trial.limits.angles)
     if any(state.x.shape != (nx,) or not np.isfinite(state.x).all() for state in seen):
         return Finding(False, f"a state was not of {nx} finite numbers, the model's states")
     if len({state.epoch for state in seen}) > 1:

@@ -16,19 +16,22 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from threading import Event
+from typing import TypeVar
 
+from rti_mpc.array import Array
 from rti_mpc.contract.epoch import NUMBER_BITS, epoch_above
 from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command, State
+from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, unix_s
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Key
-from rti_mpc_service.config.build import build_signals, guard_limits
+from rti_mpc_service.config.build import build_observer, build_rti, build_signals, guard_limits
 from rti_mpc_service.config.fit import check_stop
 from rti_mpc_service.config.schema import Config
-from rti_mpc_service.conformance import guard, robot
-from rti_mpc_service.conformance.finding import Judgement, judgements
+from rti_mpc_service.conformance import guard, moving, robot
+from rti_mpc_service.conformance.finding import Case, Judgement, judgements
 from rti_mpc_service.conformance.report import conclude, progress
 from rti_mpc_service.conformance.stand import Stand
 from rti_mpc_service.console import plain_console
@@ -42,6 +45,8 @@ POLL_S = 1e-3
 STALE_S = 0.25
 STOPPED = "stopped before everything was judged"
 LEADING = {"robot": ("controller", "standby"), "guard": ("controller", "standby", "robot")}  # roles beside which no test begins
+
+T = TypeVar("T", robot.Trial, moving.MovingTrial)
 
 
 class Ended(Exception):
@@ -70,10 +75,11 @@ def main(config: Config, bus_settings: BusSettings, words: Sequence[str], path: 
     (what,) = words
     if what == "guard" and not config.guard.enabled:
         raise ConfigError("guard.enabled must be true for a robot to have a guard, got false")
-    if what == "robot" and (config.model.stop == "coasts" or check_stop(config) is not None):
-        raise ConfigError(f"model.name: {config.model.name} does not stop where its inputs rest, and a test has no controller that would stop it")
+    if what == "robot" and config.model.stop == "coasts":
+        raise ConfigError(f"model.name: {config.model.name} coasts, and a test cannot bring it to rest")
     if not moves:
         raise ConfigError("conformance moves the robot, by metres and without a view of it: clear its way, and give --moves-the-robot")
+    holder = hold(config) if what == "robot" else None
     limits, console, stop = guard_limits(config, build_signals(config)), plain_console(), stop_on_signals()
     found: list[Judgement] = []
     count = len(robot.CASES if what == "robot" else guard.CASES)
@@ -86,7 +92,7 @@ def main(config: Config, bus_settings: BusSettings, words: Sequence[str], path: 
         epoch = epoch_above(max(heard, unix_s() << NUMBER_BITS), secrets.randbits(NUMBER_BITS))
         try:
             host = stack.enter_context(Host())
-            for judgement in judge(what, bus, config, limits, epoch, stop, host):
+            for judgement in judge(what, bus, config, limits, epoch, stop, host, holder):
                 found.append(judgement)
                 progress(console, judgement, len(found), count)
                 if stop.is_set() and len(found) < count:
@@ -101,7 +107,17 @@ def main(config: Config, bus_settings: BusSettings, words: Sequence[str], path: 
     return 0 if len(found) == count and all(judgement.verdict in ("yes", "host") for judgement in found) else EXIT_FAILED
 
 
-def judge(what: str, bus: Bus, config: Config, limits: Limits, epoch: int, stop: Event, host: Host) -> Iterator[Judgement]:
+def hold(config: Config) -> tuple[Controller, Array] | None:
+    """Return a controller that stops and holds a robot, and how fast its states change in operation; None for one that inputs at rest stop."""
+    if (law := check_stop(config)) is None:
+        return None
+    timing = Timing(config.delay_s, config.stale_s, config.timing.valid_s)
+    return Controller(build_rti(config, say), timing, observer=build_observer(config), stop_law=law), law.rates
+
+
+def judge(
+    what: str, bus: Bus, config: Config, limits: Limits, epoch: int, stop: Event, host: Host, holder: tuple[Controller, Array] | None = None
+) -> Iterator[Judgement]:
     """
     Yield the judgements of a robot or a guard, which is left at rest.
 
@@ -115,9 +131,17 @@ def judge(what: str, bus: Bus, config: Config, limits: Limits, epoch: int, stop:
         return
     if config.guard.enabled:
         bus.alive("guard")
-    trial = robot.Trial(BusLink(bus, bus.keys.actuation if config.guard.enabled else bus.keys.command, stop), limits, config.timing.valid_s, epoch)
+    link = BusLink(bus, bus.keys.actuation if config.guard.enabled else bus.keys.command, stop)
+    if holder is None:
+        yield from left_at_rest(robot.CASES, robot.Trial(link, limits, config.timing.valid_s, epoch), host)
+    else:
+        yield from left_at_rest(moving.CASES, moving.MovingTrial(link, limits, *holder, epoch), host)
+
+
+def left_at_rest(cases: Sequence[Case[T]], trial: T, host: Host) -> Iterator[Judgement]:
+    """Yield the judgements of a robot, and leave it at rest."""
     try:
-        yield from judgements(robot.CASES, trial, host)
+        yield from judgements(cases, trial, host)
     finally:
         trial.leave()
 

@@ -102,6 +102,7 @@ class Stand:
             if self.now_ns >= self._due_ns:
                 self.state = State(self.epoch, self.state.seq + 1, self.now_ns, np.zeros(len(self.limits.angles)))
                 self._due_ns = max(self._due_ns + self.period_ns, self.now_ns)
+                self.actuator.measure(self.state.x, self.now_ns)
                 if not self.deaf:
                     self._states.put(self.state)
                 if (command := pilot(self.state)) is not None:
@@ -165,7 +166,7 @@ class Stand:
 
     def _standing(self) -> Actuator:
         """Return actuators at rest, which approach nothing: what the guard sends is what acts."""
-        return Actuator(self.limits.u_rest, self.limits.slew, self.epoch)
+        return Actuator(self.limits.u_rest, self.limits.slew, self.epoch, angles=self.limits.angles)
 
     def _play(self, to_ns: int) -> None:
         for until_ns, u in self.actuator.play(self._played_ns, to_ns):
