@@ -86,4 +86,6 @@ def drive(
                 run.refused.append(reason)
             controller.commit(command)
             controller.prepare()
+            while not controller.second_opinion():
+                pass
     return run

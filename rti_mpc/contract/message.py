@@ -10,6 +10,7 @@ integer nanoseconds of the robot's clock. SI units unless a name says otherwise.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 
@@ -152,6 +153,11 @@ class Telemetry:
         braked: Those of `fallbacks` that were answered by the ramp to rest.
         rested: Those of `fallbacks` that were answered by a standstill.
         y: Outputs at `x0`, shape ``(ny,)``; none where they were not computed.
+        second_seq: Sequence number of the command whose plan OSQP has judged since the sample before; 0: none.
+        second_status: SOLVED if OSQP has come to an opinion; NONE if there was none to come to, or this sample has cut it short.
+        second_difference: Largest difference of an input in OSQP's plan from the commanded one, relative to half its range; NaN without a plan.
+        second_iterations: Iterations of OSQP.
+        second_us: Time that OSQP took, in the slack.
     """
 
     epoch: int
@@ -185,6 +191,11 @@ class Telemetry:
     braked: int = 0
     rested: int = 0
     y: Array = field(default_factory=lambda: np.zeros(0))
+    second_seq: int = 0
+    second_status: QpStatus = QpStatus.NONE
+    second_difference: float = math.nan
+    second_iterations: int = 0
+    second_us: float = 0.0
 
 
 @dataclass(slots=True)

@@ -37,6 +37,7 @@ from rti_mpc.control.issued import ENDING, NO_ENDING, Issued
 from rti_mpc.control.ladder import Ladder
 from rti_mpc.control.mode import ModeMachine
 from rti_mpc.control.observer import Observer
+from rti_mpc.control.opinions import Opinion, second_opinions
 from rti_mpc.control.prediction import Prediction
 from rti_mpc.control.record import Record
 from rti_mpc.control.sent import Sent
@@ -76,6 +77,16 @@ class Controller:
         envelope: Limits of the inputs.
         grid: Times at which commands act.
 
+    Args:
+        rti: The real-time iteration.
+        timing: Delay and timeouts.
+        epoch: Epoch of the commands.
+        config_hash: Hash of the configuration, for the commands.
+        observer: Estimator of disturbances and unmeasured states, None for none.
+        stop_law: How the robot comes to rest where its inputs do not ramp to rest.
+        second_opinion: Plans of another solver from one that OSQP judges, in `second_opinion`, to the next; 0: none.
+        compile: Whether to compile the small functions around the real-time iteration.
+
     Raises:
         OcpError: The bounds exclude the input at which the robot rests.
     """
@@ -89,6 +100,7 @@ class Controller:
         config_hash: int = 0,
         observer: Observer | None = None,
         stop_law: StopLaw | None = None,
+        second_opinion: int = 0,
         compile: bool = True,
     ) -> None:
         given.instance("timing", timing, Timing)
@@ -131,6 +143,7 @@ class Controller:
         self._issued = Issued(epoch, config_hash, self.grid.dt_ns)
         self._record = Record(rti, self._tuning)
         self._blockage = Blockage(rti)
+        self._opinions = second_opinions(rti, second_opinion, self.say)
         self._delay = DelayEstimator(model, self.grid.dt_ns, self.grid.most_ns, compile=compile) if timing.delay_s is None else None
 
     @property
@@ -366,6 +379,8 @@ class Controller:
     def prepare(self) -> None:
         """Prepare the next sample: fix `t_k`, look the reference up, shift, linearize and load the QP."""
         self._record.keep_plan(self._issued.seq)
+        if self._opinions is not None:
+            self._opinions.keep(self._issued.seq, planned=self.mode in (Mode.TRACKING, Mode.HOLDING) and not self._standing_by)
         self._look_ahead()
         state = self._states.last
         if not self.grid.running or state is None:
@@ -382,6 +397,19 @@ class Controller:
         self._load(shift=True)
         if self._ways is not None:
             self._ways.prepare()
+
+    @reported
+    def second_opinion(self) -> bool:
+        """
+        Let OSQP solve the last QP of the last sample as well: one piece of it, between `prepare` and the next state.
+
+        The plan stays as it is, but a backup starts from the opinion. A state that comes
+        before all pieces are done is handed in at once; `prepare` begins the next opinion.
+
+        Returns:
+            Whether nothing is left to be done.
+        """
+        return self._opinions is None or self._opinions.step()
 
     def _measure_delay(self, estimator: DelayEstimator, stamp_ns: int) -> None:
         """Learn from the state of the last sample, and let the grid follow."""
@@ -563,14 +591,14 @@ class Controller:
         """Return robot time at a local monotonic time."""
         return self._states.clock.now_ns(local_ns)
 
-    def telemetry(self, *, prepare_us: float, feedback_us: float, latency_us: float, slack_s: float) -> Telemetry:
+    def telemetry(self, *, prepare_us: float, feedback_us: float, latency_us: float, slack_s: float, second_us: float = 0.0) -> Telemetry:
         """Return the telemetry of the last sample; the times come from the caller, who has a clock."""
         assert self._issued.last is not None
-        times = prepare_us, feedback_us, latency_us, slack_s
-        last = self._issued.last
+        times = prepare_us, feedback_us, latency_us, slack_s, second_us
+        last, opinion = self._issued.last, Opinion() if self._opinions is None else self._opinions.last
         rows = last.u if self._ways is None else np.concatenate([last.u, self._rows[len(last.u) :]])
         return self._record.telemetry(
-            last, rows, self._x0, self._states.d, times, delay_s=1e-9 * self.grid.delay_ns, skipped=self.skipped, ladder=self.ladder
+            last, rows, self._x0, self._states.d, times, opinion, delay_s=1e-9 * self.grid.delay_ns, skipped=self.skipped, ladder=self.ladder
         )
 
     # Small parts.

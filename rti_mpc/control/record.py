@@ -9,6 +9,7 @@ from rti_mpc.array import Array
 from rti_mpc.codegen import bind
 from rti_mpc.contract.message import Command, Telemetry
 from rti_mpc.control.ladder import Ladder
+from rti_mpc.control.opinions import Opinion
 from rti_mpc.control.tuning import Tuning
 from rti_mpc.rti.rti import Rti
 
@@ -39,7 +40,8 @@ class Record:
         rows: Array,
         x0: Array,
         d: Array,
-        times: tuple[float, float, float, float],
+        times: tuple[float, float, float, float, float],
+        opinion: Opinion,
         *,
         delay_s: float,
         skipped: int,
@@ -53,7 +55,8 @@ class Record:
             rows: All rows of its plan, shape ``(N, nu)``, also those that were not sent.
             x0: State embedded at stage 0, shape ``(nx,)``.
             d: Estimated disturbances, shape ``(nd,)``.
-            times: Preparation, feedback and latency, us, and slack, s.
+            times: Preparation, feedback and latency, us, slack, s, and second opinion, us.
+            opinion: Second opinion about the plan before.
             delay_s: Delay from a state to the time at which its command acts, s.
             skipped: Samples skipped since start.
             ladder: Samples without a plan of their own.
@@ -62,7 +65,7 @@ class Record:
         self._x0[:] = x0
         self._outputs()
         solver = self._rti.solver
-        prepare_us, feedback_us, latency_us, slack_s = times
+        prepare_us, feedback_us, latency_us, slack_s, second_us = times
         return Telemetry(
             epoch=command.epoch,
             seq=command.seq,
@@ -95,4 +98,9 @@ class Record:
             braked=ladder.braked,
             rested=ladder.rested,
             y=self._y.copy(),
+            second_seq=opinion.seq,
+            second_status=opinion.status,
+            second_difference=opinion.difference,
+            second_iterations=opinion.iterations,
+            second_us=second_us if opinion.seq else 0.0,
         )

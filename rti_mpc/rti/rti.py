@@ -74,6 +74,7 @@ class Rti:
         solvers: The QP solvers, each with its QP: without softened bounds and, if there are any, with them.
         solver: The solver that solved the current sample, or that is prepared for it.
         status: Outcome of the last feedback.
+        retuned: Changes of weights and bounds since the start.
         advance: Compiled call that shifts the plan by one stage into the guess.
         evaluate: Compiled call that computes the cost of the plan.
 
@@ -122,6 +123,7 @@ class Rti:
         self.x_nominal = built.x_nominal.copy()
         self.x0: Array = self.x_nominal.copy()
         self.status = QpStatus.NONE
+        self.retuned = 0
         self._pending = False  # whether a sample was prepared and has had no feedback
         self._violation: Array = np.zeros(2)  # of softened bounds, as it is and relative to their scales
         change: Array = np.zeros(1)
@@ -241,6 +243,7 @@ class Rti:
                 self._weights[name] *= self.cost_scale
         for solver in self.solvers:
             solver.refill()
+        self.retuned += 1
 
     def prepare(self, y_ref: Array, p: Array | None = None, *, shift: bool = True, u_prev: Array | None = None) -> None:
         """

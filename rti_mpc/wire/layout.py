@@ -162,6 +162,11 @@ LAYOUTS: dict[type[Any], tuple[Field, ...]] = {
         Field("braked", "uint64", "number of samples since the start that were answered by the ramp to rest"),
         Field("rested", "uint64", "number of samples since the start that were answered by a standstill"),
         Field("y", "float64[]", "outputs at x0, ny numbers, SI units in the order of the model's outputs; empty: not computed"),
+        Field("second_seq", "uint64", "sequence number of the command whose plan OSQP has judged since the sample before; 0: none"),
+        Field("second_status", "uint8", "as in Command; SOLVED: OSQP has solved the QP; NONE: nothing to judge, or no time", member_of=QpStatus),
+        Field("second_difference", "float64", "largest difference of an input in OSQP's plan from the commanded one, relative to half its range"),
+        Field("second_iterations", "uint32", "iterations of OSQP for this second opinion"),
+        Field("second_us", "float64", "time that OSQP took for it, in the slack of the sample before, us"),
     ),
     Event: (
         *_head("time of the event, ns of the robot's clock"),

@@ -23,7 +23,7 @@ from tests.problems import pioneer
 
 REPORTED_CALLS = {
     *("commit", "enable", "in_time", "lead", "overhear", "prepare", "receive_reference"),
-    *("receive_state", "retune", "stand_by", "standstill", "stop", "tick"),
+    *("receive_state", "retune", "second_opinion", "stand_by", "standstill", "stop", "tick"),
 }
 READING_CALLS = {  # change nothing that a command depends on
     *("at_rest", "continues", "heard", "lay_out", "mode", "notices", "robot_now_ns", "robot_rate"),
@@ -32,7 +32,7 @@ READING_CALLS = {  # change nothing that a command depends on
 
 
 def made() -> Controller:
-    return Controller(Rti(pioneer(N=6, N_u=4), compile=False), Timing(), compile=False)
+    return Controller(Rti(pioneer(N=6, N_u=4), compile=False), Timing(), second_opinion=1, compile=False)
 
 
 def test_every_public_method_of_a_controller_is_reported_or_only_reads() -> None:
@@ -54,7 +54,7 @@ def life(controller: Controller) -> tuple[list[Call], list[bytes]]:
     calls: list[Call] = []
     controller.on_call = lambda call: calls.append(copy.deepcopy(call, {id(problem): problem}))
     problem = replace(pioneer(N=6, N_u=4), R=np.array([0.3, 0.2]))
-    body, rng, sent = robot(circle()), np.random.default_rng(1), []
+    body, rng, pieces, sent = robot(circle()), np.random.default_rng(1), np.random.default_rng(2), []
     leader = made()  # of another's commands
     controller.receive_reference(reference(circle(), stamp_ns=STAMP_ON_ARRIVAL))
     leader.receive_reference(reference(circle()))
@@ -96,6 +96,8 @@ def life(controller: Controller) -> tuple[list[Call], list[bytes]]:
             else:
                 send(command, left_ns)
         controller.prepare()
+        for _ in range(int(pieces.integers(0, 5))):
+            controller.second_opinion()
     last = controller.standstill(body.now_ns)
     assert last is not None
     send(last)
@@ -113,7 +115,7 @@ def answer(leader: Controller, state: State, local_ns: int) -> Command | None:
 def test_controller_that_is_told_the_same_calls_sends_the_same_commands_bit_for_bit() -> None:
     """Late samples, a loss, a standby that takes over, a stop, other weights and references: all is in the calls."""
     calls, sent = life(made())
-    assert {call.name for call in calls} >= {"lead", "overhear", "retune", "stand_by", "standstill", "stop", "tick"}
+    assert {call.name for call in calls} >= {"lead", "overhear", "retune", "second_opinion", "stand_by", "standstill", "stop", "tick"}
     again, repeated = made(), []
     proposal: Any = None
     for call in calls:

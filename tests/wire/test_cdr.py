@@ -30,6 +30,7 @@ WAY = {"rest_period_ns": 10**7, "u_rest": RNG.normal(size=(3, 2)), "x_rest": RNG
 NUMBERS = {"res_prim": 1e-3, "res_dual": np.nan, "cost": np.inf, "violation": 0.0}
 TIMES = {"prepare_us": 1.5, "feedback_us": 2.5, "latency_us": 3.5, "state_age_s": 0.1, "slack_s": -0.5, "delay_s": 0.05}
 COUNTS = {"skipped": 8, "fallbacks": 9, "softened": 11, "shifted": 2, "braked": 3, "rested": 4, "parameter_version": 10}
+SECOND = {"second_seq": 2**63, "second_status": QpStatus.MAX_ITER, "second_difference": 1e-5, "second_iterations": 40, "second_us": 700.0}
 ARRAYS = {
     "x0": RNG.normal(size=5),
     "x": RNG.normal(size=(8, 5)),
@@ -37,7 +38,7 @@ ARRAYS = {
     "y_ref": RNG.normal(size=(7, 3)),
     "y": RNG.normal(size=3),
 }
-TELEMETRY = Telemetry(1, 2, 3, 4, 5, Mode.FALLBACK, QpStatus.INFEASIBLE, 6, **NUMBERS, **TIMES, **COUNTS, **ARRAYS)
+TELEMETRY = Telemetry(1, 2, 3, 4, 5, Mode.FALLBACK, QpStatus.INFEASIBLE, 6, **NUMBERS, **TIMES, **COUNTS, **SECOND, **ARRAYS)
 EVENT = Event(1, 2, 3, "robot", Severity.ERROR, "command_expired", "Räder stehen")
 
 MESSAGES: list[Message] = [
@@ -53,7 +54,7 @@ MESSAGES: list[Message] = [
     replace(COMMAND, **(WAY | {"u": RNG.normal(size=(1, 1)), "u_rest": np.zeros((3, 1)), "K": np.zeros((1, 5))})),
     TELEMETRY,
     replace(TELEMETRY, x0=np.zeros(0), x=np.zeros((0, 5)), u=np.zeros((0, 2)), y_ref=np.zeros((0, 3)), y=np.zeros(0)),
-    replace(TELEMETRY, y_ref=np.zeros((0, 3))),
+    replace(TELEMETRY, y_ref=np.zeros((0, 3)), second_seq=0, second_status=QpStatus.NONE, second_difference=np.nan),
     EVENT,
     *(replace(EVENT, source="r" * n, code="c" * k, text="") for n in range(4) for k in range(4)),
 ]

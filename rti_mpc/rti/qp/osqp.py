@@ -18,6 +18,7 @@ import numpy as np
 import osqp
 
 from rti_mpc import given
+from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.qp.qp import Qp
@@ -52,6 +53,7 @@ class SolverSettings:
         check_termination: Iterations between two checks of the residuals.
         scaling: Sweeps of Ruiz scaling; none by default, since they break the symmetry of the problem and cost more time than they save.
         alpha: Over-relaxation, between 0 and 2.
+        polish: Refinements of a solution on the bounds that it holds, once it has converged; 0: it is left as it is.
 
     Raises:
         OcpError: One is no number, or out of range.
@@ -63,10 +65,11 @@ class SolverSettings:
     check_termination: int = 5
     scaling: int = 0
     alpha: float = 1.6
+    polish: int = 0
 
     def __post_init__(self) -> None:
         """Check the settings: OSQP itself says on standard output what it does not take."""
-        for name, least in (("max_iter", 1), ("check_termination", 0), ("scaling", 0)):
+        for name, least in (("max_iter", 1), ("check_termination", 0), ("scaling", 0), ("polish", 0)):
             given.whole(name, getattr(self, name), least)
         for name, most in (("eps", math.inf), ("rho", math.inf), ("alpha", 2.0)):
             if not 0.0 < given.number(name, value := getattr(self, name)) < most:
@@ -87,6 +90,7 @@ class Solver:
         self.qp = qp
         self.cold = False
         self._sound = True
+        self._start: tuple[Array, Array] | None = None  # of the next `load`, its multipliers of rows as they are; None: the last solution
         self._scaled = scaled = Scaled(qp)
         self._zero = (np.zeros_like(qp.q), np.zeros_like(qp.l))
         public = osqp.OSQP(algebra="builtin")
@@ -106,7 +110,8 @@ class Solver:
             scaling=settings.scaling,
             alpha=settings.alpha,
             warm_starting=True,
-            polishing=False,
+            polishing=settings.polish > 0,
+            polish_refine_iter=settings.polish,
         )
         self.workspace = public._solver
         self._info = self.workspace.info
@@ -133,59 +138,109 @@ class Solver:
         if not self._sound:
             return
         changed = qp.varies_A or self._P_x is not None
+        start = self._zero if self.cold else self._start
         if self._A_x is not scaled.A.data:
-            changed |= self._weigh()
-            np.multiply(scaled.A.data, self._scale[qp.A.indices], out=self._A_x)
+            changed |= self._weigh(start)
         if changed:
-            self._sound = not self.workspace.update_data_mat(P_x=self._P_x, P_i=None, A_x=self._A_x, A_i=None)  # refused: no factorization
-        if self.cold:
-            self.workspace.warm_start(*self._zero)
-            self.cold = False
+            self._load_matrices()
+        if start is not None:
+            self.workspace.warm_start(start[0], start[1] / self._scale)
+        self.cold, self._start = False, None
+
+    def _load_matrices(self) -> None:
+        """Load the matrices, factorization included."""
+        if self._A_x is not self._scaled.A.data:
+            np.multiply(self._scaled.A.data, self._scale[self.qp.A.indices], out=self._A_x)
+        self._sound = not self.workspace.update_data_mat(P_x=self._P_x, P_i=None, A_x=self._A_x, A_i=None)  # refused: no factorization
 
     def refill(self) -> None:
         """After a change of weights: let the next `load` also update the data that no sample changes."""
         self.qp.fill()
         self._P_x = self._scaled.P.data
 
-    def _weigh(self) -> bool:
+    def _weigh(self, start: tuple[Array, Array] | None) -> bool:
         """
         Give softened rows that act the step size of equations, and return whether anything changed.
 
         One step size does not fit both: where such a bound acts, its multiplier must
         become large; where it does not, it must not slow the solution down. The last
-        multipliers, one stage earlier, show which bounds act.
+        multipliers, one stage earlier, or those of `start` show which bounds act.
         """
-        y = self._solution.y * self._scale
+        x, y = self.solution if start is None else start
         acts = np.abs(y[self._soft]) > ACTING_MULTIPLIER
-        active = np.zeros_like(acts) if self.cold else acts[self.qp.watched].any(axis=1)
+        active = acts[self.qp.watched].any(axis=1)
         if np.array_equal(active, self._active):
             return False
         self._active = active
         self._scale[self._soft] = np.where(active, ACTING_ROW_SCALE, 1.0)
-        self.workspace.warm_start(self._solution.x, y / self._scale)
+        self.workspace.warm_start(x, y / self._scale)
         return True
+
+    def start_from(self, x: Array, y: Array) -> None:
+        """
+        Let the next `load` start from the solution of another solver, of the same QP or of one with further slacks and rows at its end.
+
+        Args:
+            x: Scaled solution, shape ``(n,)`` or longer.
+            y: Its multipliers, shape ``(m,)`` or longer.
+        """
+        self._start = x[: len(self.qp.q)], y[: len(self.qp.l)]
+        self.cold = False
+
+    @property
+    def solution(self) -> tuple[Array, Array]:
+        """Copies of the last scaled solution, shape ``(n,)``, and of its multipliers, shape ``(m,)``."""
+        return self._solution.x, self._solution.y * self._scale
 
     def solve(self) -> QpStatus:
         """Embed the initial state, solve from the last solution, and make the plan."""
+        status = self.iterate() if self.embed() else QpStatus.FAILED
+        if status.usable:
+            self.plan()
+        return status
+
+    def embed(self) -> bool:
+        """Embed the initial state, and return whether there is a QP to be solved."""
         if not self._sound:
             self.cold = True
-            return QpStatus.FAILED
-        scaled, workspace = self._scaled, self.workspace
+            return False
         self.qp.embed()
-        scaled.vectors()
+        self._scaled.vectors()
+        return self._load_vectors()
+
+    def _load_vectors(self) -> bool:
+        """Load gradient and bounds, and return whether they were taken."""
+        scaled = self._scaled
         if self._l is not scaled.l:
             np.multiply(scaled.l, self._scale, out=self._l)
             np.multiply(scaled.u, self._scale, out=self._u)
-        if workspace.update_data_vec(q=scaled.q, l=self._l, u=self._u):  # refused: the workspace then holds another problem
+        if self.workspace.update_data_vec(q=scaled.q, l=self._l, u=self._u):  # refused: the workspace then holds another problem
             self.cold = True
-            return QpStatus.FAILED
-        workspace.solve()
+            return False
+        return True
+
+    def iterate(self) -> QpStatus:
+        """Iterate from the last iterate on, `max_iter` times at most."""
+        self.workspace.solve()
         status = STATUS_BY_OSQP_CODE.get(self._info.status_val, QpStatus.FAILED)
-        if status.usable:
-            scaled.plan(self._solution.x)
-        else:
+        if not status.usable:
             self.cold = True  # no solve starts from a failed one
         return status
+
+    def reweigh(self) -> bool:
+        """Between two calls of `iterate`, weigh the rows by the last iterate, and return whether there still is a QP to be solved."""
+        if not self._weigh(None):
+            return True
+        self._load_matrices()
+        return self._sound and self._load_vectors()
+
+    def set_step_size(self, rho: float) -> None:
+        """Change the step size of ADMM, which is relative to that of `rti_mpc.rti.qp.qp.step_size`."""
+        self.workspace.update_rho(rho)
+
+    def plan(self) -> None:
+        """Make the plan from the last iterate."""
+        self._scaled.plan(self._solution.x)
 
     @property
     def iterations(self) -> int:

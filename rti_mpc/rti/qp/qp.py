@@ -163,6 +163,12 @@ class Qp(QpData):
         self.embed = bind(make(transcription.embed), {"x0": guess.x0, "x": guess.sample["x"], "memory": memory}, embedded)
         step = {**guess.start, "solution": self.z, "x0": guess.x0, "memory": memory, **guess.weights}
         self.step = bind(make(transcription.step), step, guess.plan.outputs())
+        self._again = transcription, make
+
+    def on(self, guess: Guess) -> Qp:
+        """Return the same QP in other arrays, of another guess."""
+        transcription, make = self._again
+        return Qp(transcription, guess, make)
 
     @property
     def sound(self) -> bool:

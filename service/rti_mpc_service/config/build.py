@@ -17,7 +17,7 @@ import numpy as np
 
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.config.refusal import unknown_name
-from rti_mpc_service.config.schema import ITERATION_KEYS, Config
+from rti_mpc_service.config.schema import ITERATION_KEYS, OWN_KEYS, Config
 
 if TYPE_CHECKING:
     from rti_mpc.array import Array
@@ -235,7 +235,7 @@ def solver_settings(config: Config) -> SolverSettings | None:
     """Return the settings of OSQP, None if none are given."""
     from rti_mpc.rti.qp.osqp import SolverSettings
 
-    given = config.solver.model_dump(exclude_none=True, exclude=ITERATION_KEYS | {"name"})
+    given = config.solver.model_dump(exclude_none=True, exclude=OWN_KEYS)
     return SolverSettings(**given) if given else None
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ParamSpec, TypeVar
 from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc_service.config.build import build_ocp, disturbances_at_rest
 from rti_mpc_service.config.refusal import quoted, unknown_name
-from rti_mpc_service.config.schema import ITERATION_KEYS, Config, RegulatorSection
+from rti_mpc_service.config.schema import OWN_KEYS, Config, RegulatorSection
 
 if TYPE_CHECKING:
     from rti_mpc.model.model import Model, Signal
@@ -170,6 +170,6 @@ def check_solver(config: Config) -> None:
     if config.solver.name in BUILT_IN_SOLVERS:
         return
     named("solver.name", check_name, config.solver.name)
-    if foreign := config.solver.model_dump(exclude_none=True, exclude=ITERATION_KEYS | {"name"}):
+    if foreign := config.solver.model_dump(exclude_none=True, exclude=OWN_KEYS):
         key, got = next(iter(foreign.items()))
         raise ConfigError(f"solver.{key} is a setting of osqp, it must be left out for solver.name = {config.solver.name!r}, got {got}")

@@ -3,7 +3,8 @@
 Controller process: waits for a state, sends its command, and prepares the next sample in the slack.
 
 One thread receives states and does all of the control, so that only
-`Controller.receive_state` and one `put` lie between a state and its command. The
+`Controller.receive_state` and one `put` lie between a state and its command. In the
+slack it forms second opinions, piece by piece, until the next state is there. The
 other threads only hand things over: references through an inbox that is emptied in
 the slack, requests and the check for silence through a lock that is held for
 microseconds.
@@ -45,6 +46,7 @@ from rti_mpc_service.controller.leadership import LEADER, LISTEN_BEFORE_START_S,
 from rti_mpc_service.controller.orders import Orders
 from rti_mpc_service.controller.params import Params
 from rti_mpc_service.controller.references import References
+from rti_mpc_service.controller.slack import Slack
 from rti_mpc_service.host import realtime
 from rti_mpc_service.latch_file import LatchFile
 from rti_mpc_service.operator_stop import OperatorStop
@@ -78,7 +80,14 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
     rti = build_rti(config, log.info)
     warm_up(rti)
     timing = Timing(config.delay_s, config.stale_s, config.timing.valid_s)
-    controller = Controller(rti, timing, config_hash=config.config_hash, observer=build_observer(config), stop_law=stop_law)
+    controller = Controller(
+        rti,
+        timing,
+        config_hash=config.config_hash,
+        observer=build_observer(config),
+        stop_law=stop_law,
+        second_opinion=config.solver.second_opinion,
+    )
     if (notice := unguarded(config, stop_law)) is not None:
         controller.say(notice)
     lock = Condition()
@@ -168,6 +177,7 @@ class Daemon:
         bus.watch_certificate(controller.say)
         self._references = References(bus, controller, model.ny)
         self._prepare_us = 0.0
+        self._slack = Slack()
         self._ticked_ns = 0
         self._threads = [
             Thread(
@@ -212,11 +222,13 @@ class Daemon:
 
     def _control(self, subscriber: Subscriber) -> None:
         """Answer states as they arrive: the control loop."""
-        for received in iter(subscriber.recv, None):
+        received = subscriber.recv()
+        while received is not None:
             arrival_ns = time.monotonic_ns()
             for state in self._states_in.newest_of_each((received, *subscriber.drain()), self._controller.continues):
                 self._sample(state, arrival_ns)
             self._announce()
+            received = self._slack.fill(self._judge_piece, subscriber.try_recv) or subscriber.recv()
 
     def _sample(self, state: State, arrival_ns: int) -> None:
         """Answer one state: command, preparation of the next sample, telemetry."""
@@ -238,15 +250,23 @@ class Daemon:
                 self._lock.notify_all()
             self._references.hand_over(self._leadership.leading)
         if command is not None:
-            self._telemetries[self._leadership.role].put(
-                controller.telemetry(
-                    prepare_us=self._prepare_us,
-                    feedback_us=1e-3 * (acted_ns - arrival_ns),
-                    latency_us=1e-3 * (sent_ns - arrival_ns),
-                    slack_s=controller.slack_s(prepared_ns),
-                )
+            slack_s = controller.slack_s(prepared_ns)
+            telemetry = controller.telemetry(
+                prepare_us=self._prepare_us,
+                feedback_us=1e-3 * (acted_ns - arrival_ns),
+                latency_us=1e-3 * (sent_ns - arrival_ns),
+                slack_s=slack_s,
+                second_us=1e6 * self._slack.taken_s,
             )
+            self._telemetries[self._leadership.role].put(telemetry)
             self._prepare_us = 1e-3 * (prepared_ns - sent_ns)
+            if (notice := self._slack.begin(slack_s / controller.robot_rate, judged=telemetry.second_seq > 0)) is not None:
+                controller.say(notice)
+
+    def _judge_piece(self) -> bool:
+        """Let OSQP do a piece of its second opinion about the last plan, and return whether nothing is left to be done."""
+        with self._lock:
+            return self._ending or self._controller.second_opinion()
 
     def _send(self, command: Command, left_ns: int | None = None) -> None:
         """Send a command if this controller leads, and record it."""

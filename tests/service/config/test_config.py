@@ -150,6 +150,8 @@ WRONG = [
     ("u = [-0.5, 0.5]", "speed = [-0.5, 0.5]", ["ocp.bounds.states.speed", "no state", "u [m/s]"]),
     ("soft_weight = 1e3", "soft_weight = true", ["ocp.bounds.soft_weight", "must be a number", "True"]),
     ("[ocp.bounds]", "[ocp.terminal]\nlqr.inputs = { v = 0.2 }\n[ocp.bounds]", ["ocp.terminal.lqr.inputs.v", "no input", "u_c [m/s]"]),
+    ("[ocp]", "[solver]\nsecond_opinion = -1\n[ocp]", ["solver.second_opinion", "at least 0", "-1"]),
+    ("[ocp]", "[solver]\nsecond_opinion = true\n[ocp]", ["solver.second_opinion", "whole number", "True"]),
     ("[ocp]", "[solver]\neps = 0.0\n[ocp]", ["solver.eps", "at least 0.000000000001", "0.0"]),
     ("[ocp]", "[solver]\nmax_iter = 1.5\n[ocp]", ["solver.max_iter", "whole number", "1.5"]),
     ("[ocp]", "[solver]\niterations = 101\n[ocp]", ["solver.iterations", "at most 100", "101"]),
@@ -294,8 +296,10 @@ def test_moving_obstacles_are_parameters_that_a_reference_carries_row_by_row(tmp
 @pytest.mark.parametrize("name", ["riccati", "osqp", "daqp"])
 def test_solver_is_chosen_by_one_word(name: str, tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
-    path.write_text(MINIMAL + f'[solver]\nname = "{name}"\n')
-    rti = build_rti(load(path))
+    path.write_text(MINIMAL + f'[solver]\nname = "{name}"\nsecond_opinion = 3\n')
+    config = load(path)
+    assert config.solver.second_opinion == 3, "of every one, as a number of iterations is"
+    rti = build_rti(config)
     assert (rti.active_set is None) is (name != "riccati")
     assert isinstance(rti.solvers[0], Solver if name != "daqp" else ForeignSolver)
 
