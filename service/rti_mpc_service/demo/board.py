@@ -88,6 +88,7 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
         ("inputs in bounds", "always" if inputs_in_bounds(summary) else "NOT ALWAYS"),
         ("states over bounds", f"at most {summary['states_over_share']:.2%}"),
         ("fallbacks", str(summary["fallbacks"])),
+        ("second opinion", second_opinion_text(summary["second_opinion"])),
         ("commands", f"{summary['lost']} lost, {summary['late']} late, {summary['expired']} expired, {summary['refused']} refused"),
     ]
     names = {"prepare_us": "preparation", "feedback_us": "feedback", "latency_us": "state out to command in", "echo_us": "bare echo"}
@@ -103,6 +104,13 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
         )
     for fault in summary["events"]:
         console.print("{severity} of the {source} at {at_s:.1f} s: {text}".format(**fault), soft_wrap=True)
+
+
+def second_opinion_text(opinion: Mapping[str, Any]) -> str:
+    """Return how many samples OSQP has judged, and how far its plans are from those commanded."""
+    if opinion["max_difference"] is None:
+        return "none"
+    return "{share:.2%} of the samples, at most {max_difference:.1g} of half a range off, p50 {us[p50]}, p99 {us[p99]} us".format(**opinion)
 
 
 def output_text(error: Mapping[str, Any]) -> str:

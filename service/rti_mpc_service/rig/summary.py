@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Event, Reference, Severity, Telemetry
-from rti_mpc.contract.status import Mode
+from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.model.model import Model
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.signals import plane
@@ -158,6 +158,7 @@ def summarize(outcome: Outcome) -> dict[str, Any]:
         "feedback_us": quantiles(run.feedback_us),
         "latency_us": quantiles(run.latency_us),
         "echo_us": quantiles(np.array(outcome.echo_us)),
+        "second_opinion": second_opinions(samples),
         "events": fault_events(outcome.events),
     }
 
@@ -203,6 +204,16 @@ def limits(outcome: Outcome, samples: Sequence[Telemetry]) -> dict[str, Any]:
         "commanded_increments_in_bounds": not (excess(steps, ocp.lbdu, ocp.ubdu) > INCREMENT_ROUNDING).any(),
         "applied_inputs_in_bounds": not excess(log.u, ocp.lbu, ocp.ubu).any(),
         "states_over_share": float(excess_share(log.x, ocp.lbx, ocp.ubx).max()),
+    }
+
+
+def second_opinions(samples: Sequence[Telemetry]) -> dict[str, Any]:
+    """Return the share of samples that OSQP has solved, too, in the slack; the largest difference from them, null without any; and its times."""
+    solved = [sample for sample in samples if sample.second_status is QpStatus.SOLVED]
+    return {
+        "share": len(solved) / len(samples),
+        "max_difference": max((sample.second_difference for sample in solved), default=None),
+        "us": quantiles(np.array([sample.second_us for sample in solved])),
     }
 
 

@@ -174,11 +174,12 @@ def _times(info: Info) -> rrb.Container:
 
 
 def _troubles() -> rrb.Container:
-    """Return the views of the fallbacks and of the delay from a state to its command."""
+    """Return the views of the fallbacks, of the delay from a state to its command, and of the second opinions."""
     return rrb.Vertical(
         _series("Samples since start, softened or without a plan of their own", [f"telemetry/{rung}" for rung in RUNG_COLORS]),
         _series("From a state to the act of its command [s]", ["telemetry/delay_s", "telemetry/state_age_s"]),
-        name="Fallbacks and delay",
+        _series("OSQP's plan from the commanded one [half an input's range]", ["telemetry/second_difference"]),
+        name="Fallbacks, delay, second opinion",
     )
 
 
@@ -245,6 +246,7 @@ def _series_looks(info: Info) -> dict[str, rr.AsComponents]:
     looks |= {f"output/{info.outputs[i].name}": _line(str(info.outputs[i]), "measured") for i in info.computed}
     looks |= {f"telemetry/{phase}_us": _line(phase, phase) for phase in PHASES}
     looks |= {f"telemetry/{rung}": _line(rung, color) for rung, color in RUNG_COLORS.items()}
+    looks["telemetry/second_difference"] = _line("difference", "error")
     looks |= {"telemetry/delay_s": _line("delay", "measured"), "telemetry/state_age_s": _line("age of the state", "idle")}
     looks |= {"error/position": _line("position [mm]", "error"), "slack": _line("left", "feedback"), "slack/period": _line("period", "limit", 1.0)}
     return looks

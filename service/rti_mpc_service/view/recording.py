@@ -30,6 +30,7 @@ TELEMETRY_SCALARS = (
     *("prepare_us", "feedback_us", "latency_us"),
     *("iterations", "res_prim", "res_dual", "cost", "violation"),
     *("state_age_s", "slack_s", "delay_s", "skipped", "fallbacks", *RUNG_COLORS, "parameter_version"),
+    *("second_difference", "second_iterations", "second_us"),
 )
 RERUN_LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 EVENT_GRID_NS = 1_000_000  # times of events are rounded down to 1 ms, which keeps the time column narrow

@@ -32,6 +32,7 @@ SUMMARY: dict[str, Any] = {
     "fallbacks": 192837465,
     **dict.fromkeys(("lost", "late", "expired", "refused"), 918273645),
     **dict.fromkeys(("prepare_us", "feedback_us", "latency_us", "echo_us"), TIMES),
+    "second_opinion": {"share": 0.5, "max_difference": 2.1e-9, "us": {"p50": 918.0, "p99": 4321.0, "max": None}},
     "misses": [],
     "events": [{"severity": "WARNING", "source": "robot", "at_s": 1.0, "text": "a sentence of many words [of the robot], on one line"}],
 }
@@ -47,6 +48,7 @@ def test_summary_loses_no_number_and_no_word(columns: str, monkeypatch: pytest.M
     assert printed.count("123456789") == 12
     assert printed.count("918273645") == 4
     assert "987654321, 0 skipped" in printed
+    assert "50.00% of the samples, at most 2e-09 of half a range off, p50 918.0, p99 4321.0 us" in printed
     assert "WARNING of the robot at 1.0 s: a sentence of many words [of the robot], on one line" in lines
     assert "…" not in printed
 

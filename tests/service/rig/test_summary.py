@@ -123,6 +123,19 @@ def test_share_in_period_counts_what_was_missed_and_what_was_skipped(outcome: Ou
     assert summary["skipped"] == 3
 
 
+def test_second_opinions_that_came_to_an_end_are_summed_up(outcome: Outcome) -> None:
+    assert summarize(outcome)["second_opinion"] == {"share": 0.0, "max_difference": None, "us": {"p50": None, "p99": None, "max": None}}
+    solved = {"second_status": QpStatus.SOLVED, "second_us": 700.0}
+    kinds = [
+        solved | {"second_difference": 1e-9},
+        solved | {"second_difference": 2e-9},
+        {"second_status": QpStatus.MAX_ITER, "second_difference": 1.0},
+    ]
+    samples = [sample(k, **(kinds[k % 4] if k % 4 < 3 else {})) for k in range(1, 1257)]
+    opinion = summarize(replace(outcome, telemetry=samples))["second_opinion"]
+    assert (opinion["share"], opinion["max_difference"], opinion["us"]["p99"]) == (0.5, 2e-9, 700.0)
+
+
 @pytest.mark.parametrize(("value", "inside"), [(0.5, True), (np.nextafter(0.5, 1.0), False), (-0.5, True), (np.nextafter(-0.5, -1.0), False)])
 def test_inputs_are_compared_with_their_bounds_exactly(outcome: Outcome, value: float, inside: bool) -> None:
     applied = outcome.log.u.copy()
