@@ -97,8 +97,8 @@ def natives(transcriptions: tuple[Transcription, ...], structured: tuple[Places,
     """
     Return the functions of a problem's solver that are worth compiling.
 
-    Behind the active set a QP solver is needed so rarely that its QP is left to CasADi's
-    virtual machine: compiling it would double the build time.
+    Behind the active set a QP solver is needed so rarely, or has so much time in the slack, that
+    its QP is left to CasADi's virtual machine: compiling it would double the build time.
     """
     if structured is not None:
         return [*vars(structured[0]).values(), structured[1]]

@@ -17,10 +17,9 @@ from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.control.opinions import DISAGREEMENT, RELIABLE
 from rti_mpc.errors import OcpError
 from rti_mpc.reference.trajectory import eight
-from rti_mpc.rti import linearization
-from rti_mpc.rti import rti as rti_module
+from rti_mpc.rti import construction, linearization
 from rti_mpc.rti.ocp import Ocp
-from rti_mpc.rti.rti import FORMULATIONS, Rti
+from rti_mpc.rti.rti import Rti
 from rti_mpc.wire.cdr import encode
 from rti_mpc_service.controller.slack import Slack
 from tests.loop import MS, drive, reference, robot
@@ -123,10 +122,10 @@ def test_a_wrong_gradient_in_either_solver_is_told_within_three_samples(which: s
     drive(made(0), body, 3.0)
     if which == "active set":
         for name in ("places", "certificate"):
-            monkeypatch.setattr(rti_module, name, misled(getattr(rti_module, name)))
+            monkeypatch.setattr(construction, name, misled(getattr(construction, name)))
     else:
-        for name, build in FORMULATIONS.items():
-            monkeypatch.setitem(FORMULATIONS, name, misled(build))
+        for name, build in construction.FORMULATIONS.items():
+            monkeypatch.setitem(construction.FORMULATIONS, name, misled(build))
     controller = made(epoch=2)
     while not (events := [notice for notice in controller.notices() if notice.code == "solvers_disagree"]):
         assert controller._issued.seq < 3
