@@ -10,9 +10,8 @@ from typing import NamedTuple
 from rti_mpc import given
 from rti_mpc.contract.message import Notice, Severity
 from rti_mpc.contract.status import QpStatus
-from rti_mpc.rti.qp.osqp import Solver
 from rti_mpc.rti.rti import Rti
-from rti_mpc.rti.second_opinion import SecondOpinion
+from rti_mpc.rti.second_opinion import SecondOpinion, osqp_solved
 
 DISAGREEMENT = 1e-3  # difference of the plans from which on the solvers disagree, relative to half an input's range
 LASTING = 3  # opinions in a row that disagree before it is told
@@ -76,7 +75,7 @@ class Opinions:
         opinion = self._opinion
         self.last = Opinion(self._seq, opinion.status, opinion.difference, opinion.iterations) if self._seq else Opinion()
         self._seq = 0
-        if not planned or isinstance(self._rti.solver, Solver):
+        if not planned or osqp_solved(self._rti):
             return
         self._count += 1
         if self._count % self._every == 0:
@@ -109,4 +108,4 @@ class Opinions:
 def second_opinions(rti: Rti, every: int, say: Callable[[Notice], object]) -> Opinions | None:
     """Return the second opinions about every so many plans; None if that is 0, or if the plans are OSQP's own."""
     given.whole("second_opinion", every, 0)
-    return Opinions(rti, every, say) if every and not (rti.active_set is None and isinstance(rti.solvers[0], Solver)) else None
+    return Opinions(rti, every, say) if every and not (rti.active_set is None and osqp_solved(rti)) else None

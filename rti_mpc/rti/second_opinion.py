@@ -125,6 +125,11 @@ class SecondOpinion:
                     backup.start_from(*self._solver.solution)
 
 
+def osqp_solved(rti: Rti) -> bool:
+    """Return whether OSQP solved the last sample, or is prepared for the next one."""
+    return isinstance(rti.solver, Solver)
+
+
 def copy(pairs: Iterable[tuple[memoryview, memoryview]]) -> None:
     """Copy the second array of each pair into the first one."""
     for into, source in pairs:
