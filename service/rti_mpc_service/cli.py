@@ -11,7 +11,6 @@ from __future__ import annotations
 import inspect
 import json
 import platform
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial, wraps
@@ -19,13 +18,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperCommand
 
 import rti_mpc
 from rti_mpc.errors import ConfigError
 from rti_mpc_service import entry, log
+from rti_mpc_service.certs.commands import certs
 from rti_mpc_service.certs.folder import credentials, secured
-from rti_mpc_service.certs.roles import ROLES
+from rti_mpc_service.command_group import Commands
 from rti_mpc_service.config.build import build_signals, bus_settings, robot_settings, stage_parameters, with_initial_state
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
@@ -37,16 +37,6 @@ if TYPE_CHECKING:
 
 
 SHIPPED = DEPLOY / "pioneer_3dx.toml"
-
-
-class Commands(TyperGroup):
-    """Group whose list of commands shows whole sentences, wrapped on narrow terminals, where Click would cut them off."""
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the list of commands."""
-        rows = [(name, self.commands[name].get_short_help_str(limit=sys.maxsize)) for name in self.list_commands(ctx)]
-        with formatter.section("Commands"):
-            formatter.write_dl(rows)
 
 
 class FaultsCommand(TyperCommand):
@@ -68,6 +58,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+app.add_typer(certs, name="certs")
 
 
 def print_version(wanted: bool) -> None:
@@ -458,74 +449,6 @@ def schema() -> None:
     """Print the JSON schema of a robot's TOML file, with which editors complete and check it."""
     head = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     typer.echo(json.dumps(head | Config.model_json_schema() | {"title": "rti-mpc robot"}, indent=1))
-
-
-certs = typer.Typer(cls=Commands, help="Make an authority and certificates for the processes of a robot.", no_args_is_help=True)
-app.add_typer(certs, name="certs")
-
-AuthorityPath = Annotated[Path, typer.Option("--authority", metavar="DIR", help="Folder of the authority.")]
-Days = Annotated[float, typer.Option("--days", min=0.01, max=36_500.0, help="Time for which certificates are valid.")]
-
-
-@certs.command("authority")
-def certs_authority(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write, on a computer that is no robot.")] = Path("authority"),
-    days: Days = 3650.0,
-) -> None:
-    """Make an authority: its private key signs all certificates, and stays where it is."""
-    from rti_mpc_service.certs.issue import make_authority
-
-    for path in make_authority(folder, days):
-        typer.echo(path)
-
-
-@certs.command("issue")
-def certs_issue(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="The robot's TOML file.")],
-    roles: Annotated[list[str], typer.Argument(metavar="ROLE...", help=f"Roles that run on the host: {', '.join(ROLES)}.")],
-    router: Annotated[str, typer.Option(metavar="ENDPOINT", help="Endpoint of the robot's router, such as tls/robot.local:7447.")],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write: the bundle of one host.")],
-    authority: AuthorityPath = Path("authority"),
-    days: Days = 90.0,
-    at: Annotated[
-        Path, typer.Option(metavar="DIR", help="Folder of the bundle on its host, for programs that read Zenoh's configuration by themselves.")
-    ] = Path("/etc/rti-mpc/tls"),
-) -> None:
-    """Make the bundle of one host: certificates, private keys and Zenoh's configurations of its roles; the router's has the access control list."""
-    from rti_mpc_service.certs.authority import Authority
-    from rti_mpc_service.certs.issue import issue
-
-    for path in issue(Authority.read(authority), load(config, with_model=False).keys(), roles, router, out, at, days):
-        typer.echo(path)
-
-
-@certs.command("renew")
-def certs_renew(
-    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Folders with certificates; private keys need not be there.")],
-    authority: AuthorityPath = Path("authority"),
-    days: Days = 90.0,
-) -> None:
-    """Renew all certificates in folders; names and private keys stay."""
-    from rti_mpc_service.certs.authority import Authority
-    from rti_mpc_service.certs.issue import renew
-
-    signer = Authority.read(authority)
-    for path in (path for folder in folders for path in renew(signer, folder, days)):
-        typer.echo(path)
-
-
-@certs.command("show")
-def certs_show(folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Folders with certificates.")]) -> None:
-    """Print until when certificates are valid; the status is 1 if one of them ends within 30 days."""
-    from rti_mpc.wire.certificate import WARN_DAYS
-    from rti_mpc_service.certs.issue import lives
-
-    left_days = [float("inf")]
-    for folder in folders:
-        for file, name, days in lives(folder):
-            typer.echo(f"{folder / file}: {name}, " + (f"valid for {days:.1f} days" if days > 0.0 else "expired"))
-            left_days.append(days)
-    raise typer.Exit(int(min(left_days) < WARN_DAYS))
 
 
 @app.command()
