@@ -11,7 +11,7 @@ from rti_mpc.contract.message import Notice, Severity
 
 MARGIN = 2.0  # least slack over the p99 of the work: with less of it, the work is cut short too often, and others of the host wait
 JUDGED_SAMPLES = 100  # of which the p99 is taken
-PAUSED_SAMPLES = 1000  # without work, after which the slack is judged anew
+PAUSED_SAMPLES = 1000  # without work, after which the slack is judged anew; twice as many each further time
 
 M = TypeVar("M")
 
@@ -32,6 +32,7 @@ class Slack:
         self._left_s = 0.0
         self._samples: list[tuple[float, float]] = []  # time taken and slack of each, s
         self._paused = 0  # samples that still go without
+        self._pause = PAUSED_SAMPLES
         self._said = False
 
     def fill(self, piece: Callable[[], bool], poll: Callable[[], M | None]) -> M | None:
@@ -84,7 +85,8 @@ class Slack:
         """Pause if the median slack is too short for the p99 of the work."""
         if slack_s >= MARGIN * p99_s:
             return None
-        self.enough, self._paused = False, PAUSED_SAMPLES
+        self.enough, self._paused = False, self._pause
+        self._pause *= 2
         if self._said:
             return None
         self._said = True

@@ -85,7 +85,9 @@ def test_it_is_said_once_and_tried_again() -> None:
     assert slack.enough
     assert samples(slack, clock, [6] * JUDGED_SAMPLES, 10.0) == []
     assert not slack.enough
-    samples(slack, clock, [6] * PAUSED_SAMPLES, 100.0)
+    samples(slack, clock, [6] * (2 * PAUSED_SAMPLES - 1), 100.0)
+    assert not slack.enough, "it is tried more and more rarely"
+    samples(slack, clock, [6], 100.0)
     assert samples(slack, clock, [6] * JUDGED_SAMPLES, 100.0) == []
     assert slack.enough
 
