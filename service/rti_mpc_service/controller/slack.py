@@ -10,7 +10,7 @@ from typing import TypeVar
 from rti_mpc.contract.message import Notice, Severity
 
 MARGIN = 2.0  # least slack over the p99 of the work: with less of it, the work is cut short too often, and others of the host wait
-JUDGED_SAMPLES = 100  # of which the p99 is taken
+JUDGED_SAMPLES = 100  # of which the p99 is taken: it is the second longest time
 PAUSED_SAMPLES = 1000  # without work, after which the slack is judged anew; twice as many each further time
 
 M = TypeVar("M")
@@ -75,11 +75,13 @@ class Slack:
             self.enough = not self._paused
             return None
         self._samples.append(last)
-        if len(self._samples) < JUDGED_SAMPLES:
+        if len(self._samples) < 2:
             return None
         taken_s, slack_s = map(sorted, zip(*self._samples, strict=True))
-        self._samples.clear()
-        return self._judge(taken_s[JUDGED_SAMPLES * 99 // 100 - 1], slack_s[JUDGED_SAMPLES // 2])
+        notice = self._judge(taken_s[-2], slack_s[len(slack_s) // 2])  # the second longest time only grows: there is no need to wait for the others
+        if not self.enough or len(self._samples) == JUDGED_SAMPLES:
+            self._samples.clear()
+        return notice
 
     def _judge(self, p99_s: float, slack_s: float) -> Notice | None:
         """Pause if the median slack is too short for the p99 of the work."""
