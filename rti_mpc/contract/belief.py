@@ -109,9 +109,12 @@ class Belief(Schedule):
 
     def _plays(self, u: Array, t_ns: int, *, or_after: bool = True) -> bool:
         """Whether an input is believed to act at a time or shortly before it; with `or_after`, shortly after it as well."""
-        most = INPUT_TOLERANCE * (1.0 + np.abs(u))
         times = (t_ns - 1, t_ns, t_ns - self._tolerance_ns, t_ns + self._tolerance_ns) if or_after else (t_ns - 1, t_ns - self._tolerance_ns)
-        return any((np.abs(self.at(t)[0] - u) <= most).all() for t in times)
+        reported = u.tolist()
+        for t in times:
+            if alike(self.at(t)[0].tolist(), reported):
+                return True
+        return False
 
     def _find(self, source: tuple[int, int], u: Array, t_ns: int, before_ns: int, coming: deque[Plan]) -> None:
         """Remove the plans that are due after the one that acts: they are missing."""
@@ -155,3 +158,8 @@ class Belief(Schedule):
         plans.append(Plan(before_ns + 1, t_ns, before_ns + 1, self._period_ns, u[None], u[None], u, way=way))
         if newest is not None and source[1] and newest.end_ns > t_ns:
             self._put(replace(newest, start_ns=t_ns), self._increments)
+
+
+def alike(believed: list[float], reported: list[float]) -> bool:
+    """Return whether two inputs are equal but for rounding."""
+    return all(abs(one - other) <= INPUT_TOLERANCE * (1.0 + abs(other)) for one, other in zip(believed, reported, strict=True))

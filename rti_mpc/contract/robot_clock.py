@@ -153,7 +153,10 @@ class RobotClock:
 
     def _late_ns(self, stamp_ns: int, arrival_ns: int) -> int:
         """Return the lateness of a state compared with the least late of those before it, robot time."""
-        return max([0, *(stamp + round((arrival_ns - arrival) * self.rate) - stamp_ns for stamp, arrival in self._recent)])
+        late_ns, rate = 0, self.rate
+        for stamp, arrival in self._recent:
+            late_ns = max(late_ns, stamp + round((arrival_ns - arrival) * rate) - stamp_ns)
+        return late_ns
 
     def _rate(self, robot_ns: int, local_ns: int) -> float:
         return min(max(robot_ns / local_ns, 1e-3), 1e3)

@@ -286,7 +286,10 @@ class Schedule:
 
     def acting(self, t_ns: int) -> Plan | None:
         """Return the plan whose rows, or way to rest, act at a time; None for a time that is forgotten."""
-        return next((plan for plan in reversed(self._plans) if plan.start_ns <= t_ns), None)
+        for plan in reversed(self._plans):
+            if plan.start_ns <= t_ns:
+                return plan
+        return None
 
     def source(self, t_ns: int) -> tuple[int, int]:
         """Return epoch and sequence number of the command whose plan acts at a time; zeros where none does."""
@@ -303,17 +306,21 @@ class Schedule:
         else:
             return plan.before, change_ns, True  # a time that is forgotten
         u, step_ns = self.after(plan, t_ns)
-        return u, min(change_ns, step_ns), t_ns >= plan.end_ns
+        return u, step_ns if step_ns < change_ns else change_ns, t_ns >= plan.end_ns
 
     def after(self, plan: Plan, t_ns: int) -> tuple[Array, int]:
         """Return the input that acts at a time of a plan, or after it, if no other plan comes, and until when it does."""
-        while t_ns >= plan.end_ns and plan.way is not None:
+        while t_ns >= plan.end_ns:
+            if plan.way is None:
+                return self._ramp(plan, t_ns)
             plan = self._following(plan)
-        if t_ns >= plan.end_ns:
-            return self._ramp(plan, t_ns)
-        row = plan.row(t_ns)
-        row_end_ns = plan.stamp_ns + (row + 1) * plan.period_ns if row < len(plan.u) - 1 else plan.end_ns
-        return plan.u[row], min(row_end_ns, plan.end_ns)
+        row, last = (t_ns - plan.stamp_ns) // plan.period_ns, len(plan.u) - 1
+        if row >= last:
+            return plan.u[last], plan.end_ns
+        if row < 0:
+            row = 0
+        row_end_ns = plan.stamp_ns + (row + 1) * plan.period_ns
+        return plan.u[row], row_end_ns if row_end_ns < plan.end_ns else plan.end_ns
 
     def _following(self, plan: Plan) -> Plan:
         """Return the next rows of a plan's way to rest, as they act; where slew limits do not let them come to the last one, the ramp does."""

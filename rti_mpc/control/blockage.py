@@ -62,8 +62,8 @@ class Blockage:
     def judge(self) -> bool:
         """Judge the plan of a new sample, and return whether `blocked` has changed."""
         self._measure()
-        moved, left = self._squares
-        standing = bool(moved < MIN_PROGRESS_RATIO**2 * left and self._held.max(initial=0.0) > 0.0)
+        moved, left = self._squares.tolist()
+        standing = moved < MIN_PROGRESS_RATIO**2 * left and any(held > 0.0 for held in self._held.tolist())
         self._contrary = self._contrary + 1 if standing is not self.blocked else 0
         if self._contrary < self._stages:
             return False

@@ -18,6 +18,7 @@ first command acts late enough to arrive in time.
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import isfinite
 
 import numpy as np
 
@@ -53,7 +54,7 @@ from rti_mpc.rti.way_to_rest import StopLaw
 INPUTS_UNREPORTED = (
     "the robot does not report which inputs act: commands are assumed to act, and only the robot itself or a guard can handle lost ones"
 )
-KNOWN_INPUT_MODES = {Mode.TRACKING, Mode.HOLDING}  # in which it is certain which inputs act
+PLANNING_MODES = {Mode.TRACKING, Mode.HOLDING}  # in which each sample has a plan of its own, and it is certain which inputs act
 ITERATIONS_COLD = 3  # iterations of the first sample, whose guess is one state and one input at all stages
 
 
@@ -129,10 +130,11 @@ class Controller:
         self._sent = Sent(self._u_rest, ocp.lbdu, ocp.ubdu, self.grid.dt_ns, (ocp.lbu, ocp.ubu), angles)
         self._prediction = Prediction(model, self._sent, compile=compile)
         self._x0 = self._prediction.x
+        self._plan = rti.u.reshape(-1)
         ways = None if stop_law is None else Stopping(ocp, stop_law, self.envelope.limits, self._prediction, self._valid_ns, compile=compile)
         self._ways = ways  # to rest; None: its inputs ramp to rest
         balances = stop_law is not None and stop_law.disturbances.size > 0
-        self._known = KNOWN_INPUT_MODES | ({Mode.STOPPED, Mode.BRAKING} if balances else set())  # modes in which disturbances are estimated
+        self._known = PLANNING_MODES | ({Mode.STOPPED, Mode.BRAKING} if balances else set())  # modes in which disturbances are estimated
         self._rows: Array = np.zeros((ocp.N, model.nu))  # all rows of the last plan, of which a command with a way to rest has the first ones
         self._loaded = False  # whether the QP of t_k is prepared
         self._reach: tuple[Array, Array] = (np.zeros((2, model.nu)), np.zeros((2, model.nu)))  # what the first rows at t_k may be
@@ -206,7 +208,8 @@ class Controller:
             self._forget(arrival, state)
         surprised = self._hear(state)
         self._states.estimate(self._sent, known=self.mode in self._known and not surprised)
-        self._prediction.p[self.np_ :] = self._states.d
+        if len(self._states.d):
+            self._prediction.p[self.np_ :] = self._states.d
         if surprised and self._loaded and self.grid.running:
             self._load(shift=False)
         if self.mode is Mode.IDLE:
@@ -389,7 +392,7 @@ class Controller:
             self._measure_delay(self._delay, state.stamp_ns)
         self.grid.advance(state.stamp_ns, self._states.clock.period_ns)
         self._loaded = False
-        if self.mode in (Mode.TRACKING, Mode.HOLDING):
+        if self.mode in PLANNING_MODES:
             self.ladder.failed = 0
         elif self.mode is not Mode.FALLBACK or not np.isfinite(self._rti.x).all():
             return  # the next sample starts cold
@@ -422,7 +425,7 @@ class Controller:
 
     def _look_ahead(self) -> None:
         """Report that the way is blocked, or free again."""
-        if self.mode not in (Mode.TRACKING, Mode.HOLDING) or not self._blockage.judge():
+        if self.mode not in PLANNING_MODES or not self._blockage.judge():
             return
         if self._blockage.blocked:
             text = f"the way is blocked: the plan stops short of the reference, {self._blockage.cause}"
@@ -434,7 +437,8 @@ class Controller:
         """Load the QP of `t_k`."""
         act_ns = self.grid.act_ns
         self._track.look_up(act_ns)
-        self._track.p[:, self.np_ :] = self._states.d
+        if len(self._states.d):
+            self._track.p[:, self.np_ :] = self._states.d
         self._reach = self._sent.reach(act_ns)
         u_prev = self._sent.at(act_ns - 1)[0]
         self._tuning.follow(u_prev)
@@ -476,7 +480,7 @@ class Controller:
             return self._brake(state, act_ns, QpStatus.NONE, wanted=True)
         self._prediction.predict(self._states.x, state.stamp_ns, act_ns)
         status = self._rti.feedback(self._x0) if self._loaded else self._feedback_cold()
-        if not (status.usable and np.isfinite(self._rti.u).all()):
+        if not (status.usable and isfinite(self._plan.dot(self._plan))):
             return self._fall_back(state, status)
         self.ladder.softened += self._rti.solver is not (self._rti.active_set or self._rti.solvers[0])
         mode, reason = (Mode.TRACKING, "following the reference") if ending is None else (Mode.HOLDING, "the reference has ended")
@@ -611,8 +615,10 @@ class Controller:
 
     def _correct(self, state: State) -> bool:
         """Believe the input that a robot reports; return whether it was another than believed."""
-        limits, believed = self.envelope.limits, self._sent.at(state.stamp_ns - 1)[0]  # the believed input may be outside bounds that were tightened
-        u = np.minimum(np.maximum(state.u, np.minimum(limits["lbu"], believed)), np.maximum(limits["ubu"], believed))
+        u, lbu, ubu = state.u, self.envelope.limits["lbu"], self.envelope.limits["ubu"]
+        if not all(low <= value <= high for low, value, high in zip(lbu.tolist(), u.tolist(), ubu.tolist(), strict=True)):
+            believed = self._sent.at(state.stamp_ns - 1)[0]  # it may be outside bounds that were tightened
+            u = np.minimum(np.maximum(u, np.minimum(lbu, believed)), np.maximum(ubu, believed))
         return self._sent.correct(state.stamp_ns, u, (state.command_epoch, state.command_seq))
 
     def _anchor(self, state: State) -> Reference:

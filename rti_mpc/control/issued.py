@@ -6,12 +6,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, State
 from rti_mpc.contract.status import Mode, QpStatus
 
 ENDING = ("rest_period_ns", "u_rest", "x_rest", "K")  # the fields of a command that hold its way to rest
-NO_ENDING: Mapping[str, Any] = {}  # of a robot whose inputs ramp to rest
+NO_ENDING: Mapping[str, Any] = dict.fromkeys(ENDING[1:], np.zeros((0, 0)))  # of a robot whose inputs ramp to rest
 
 
 class Issued:

@@ -9,6 +9,7 @@ shows something else (`rti_mpc.contract.belief`).
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import inf
 
 import numpy as np
 
@@ -36,14 +37,16 @@ class Sent:
         lbdu: Array,
         ubdu: Array,
         dt_ns: int,
-        bounds: tuple[float | Array, float | Array] = (-np.inf, np.inf),
+        bounds: tuple[float | Array, float | Array] = (-inf, inf),
         angles: Array = NO_ANGLES,
     ) -> None:
         self.delay_ns = 0
         self._left_ns = BEFORE_ALL_NS  # when the last command left at the earliest
         self._alone: tuple[int, Array] = (BEFORE_ALL_NS, u_rest)  # when the robot last stopped braking on its own, and from which input
         self._went: Plan | None = None  # the plan whose way to rest it went until then, if it had one
-        self._slew = (lbdu, ubdu)  # per dt
+        # Per dt. Lists: for a few numbers, plain floats are several times faster than arrays.
+        self._falling, self._rising = lbdu.tolist(), ubdu.tolist()
+        self._nu = len(u_rest)
         self._dt_ns = dt_ns
         self._transit_ns, self._window_ns = round(TRANSIT_PERIODS * dt_ns), round(SLEW_WINDOW_PERIODS * dt_ns)
         slew = 1e9 * np.minimum(-lbdu, ubdu) / dt_ns
@@ -60,15 +63,15 @@ class Sent:
             left_ns: Earliest robot time at which it left, if that is known: the command before acts at least until then.
         """
         self._left_ns = max(self._left_ns + 1, left_ns)  # commands leave one after the other, whatever our idea of the robot's clock
-        start_ns = max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, self._left_ns)
-        if start_ns < end_ns(command):
+        start_ns, over_ns = max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, self._left_ns), end_ns(command)
+        if start_ns < over_ns:
             before, _, braking = self._schedule.at(start_ns - 1)
             if braking:
                 self._alone, self._went = (start_ns, before.copy()), self._schedule.acting(start_ns - 1)
-            self._schedule.add(command, start_ns, end_ns(command), approached=False)
+            self._schedule.add(command, start_ns, over_ns, approached=False)
         start_ns = max(start_ns, self._left_ns + self._transit_ns)
-        if start_ns < end_ns(command):
-            self._slowest.add(command, start_ns, end_ns(command), approached=False)
+        if start_ns < over_ns:
+            self._slowest.add(command, start_ns, over_ns, approached=False)
 
     def correct(self, t_ns: int, u: Array, source: tuple[int, int]) -> bool:
         """Correct the belief by the input that the robot reports, see `Belief.correct`; return whether it was another than believed."""
@@ -127,28 +130,32 @@ class Sent:
         Where the robot brakes on its own, this leaves it the speed that it has. The plan
         that ended the braking may itself be late, and the robot have braked further.
         """
-        acting = self.at(t_ns)[0]
-        second = self._near(self._schedule, acting + self._slew[0], acting + self._slew[1], t_ns, t_ns + self._dt_ns - 1)
+        lowest, highest = [-inf] * self._nu, [inf] * self._nu
+        self._narrow(lowest, highest, self._schedule, t_ns, t_ns + self._dt_ns)
         ended_ns, u = self._alone
         if abs(t_ns - ended_ns) < self._dt_ns:
             way, share = self._schedule.u_rest - u, (t_ns + self._dt_ns - ended_ns) / self._dt_ns
-            further = u + np.clip(way, share * self._slew[0], share * self._slew[1])
+            further = u + np.clip(way, share * np.array(self._falling), share * np.array(self._rising))
             if self._went is not None and self._went.way is not None:
                 further = self._schedule.after(self._went, t_ns + self._dt_ns)[0]
-            second = self._within(*second, further)
-        first = self._near(self._schedule, *second, t_ns - self._dt_ns + 1, t_ns)
-        first = self._near(self._slowest, *first, t_ns - self._window_ns, t_ns + self._transit_ns)
-        return np.array([first[0], second[0]]), np.array([first[1], second[1]])
+            self._near(lowest, highest, further)
+        second = lowest.copy(), highest.copy()
+        self._narrow(lowest, highest, self._schedule, t_ns - self._dt_ns + 1, t_ns)  # the input of `t_ns` has narrowed them already
+        self._narrow(lowest, highest, self._slowest, t_ns - self._window_ns, t_ns + self._transit_ns + 1)
+        rows = np.array([lowest, second[0], highest, second[1]])
+        return rows[:2], rows[2:]
 
-    def _near(self, schedule: Schedule, lowest: Array, highest: Array, at_ns: int, last_ns: int) -> tuple[Array, Array]:
-        """Narrow an interval to the slew limits of all inputs from one time to another; if that leaves nothing, to the nearest value."""
-        while at_ns <= last_ns:
-            u, change_ns, _ = schedule.at(at_ns)
-            lowest, highest = self._within(lowest, highest, u)
-            at_ns = change_ns if at_ns == last_ns else min(change_ns, last_ns)
-        return lowest, highest
+    def _narrow(self, lowest: list[float], highest: list[float], schedule: Schedule, from_ns: int, to_ns: int) -> None:
+        """Narrow intervals to the slew limits of all inputs that act before a time; where that leaves nothing, to the nearest value."""
+        while from_ns < to_ns:
+            u, from_ns, _ = schedule.at(from_ns)
+            self._near(lowest, highest, u)
 
-    def _within(self, lowest: Array, highest: Array, u: Array) -> tuple[Array, Array]:
-        """Narrow an interval to what is within the slew limits of an input."""
-        narrowed = np.minimum(np.maximum(lowest, u + self._slew[0]), highest)
-        return narrowed, np.maximum(np.minimum(highest, u + self._slew[1]), narrowed)
+    def _near(self, lowest: list[float], highest: list[float], u: Array) -> None:
+        """Narrow intervals to what is within the slew limits of an input."""
+        for j, value in enumerate(u.tolist()):
+            low, high = value + self._falling[j], value + self._rising[j]
+            if low > lowest[j]:
+                lowest[j] = min(low, highest[j])
+            if high < highest[j]:
+                highest[j] = max(high, lowest[j])

@@ -12,15 +12,16 @@ call it. Following its result takes the same time for any number of rows.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.codegen import bind, function
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, End, Reference
 from rti_mpc.model.model import Model
-
-MAX_OFFSET_NS = 2**62  # limit of the time since the start of a reference: longer than any reference
 
 
 class Track:
@@ -35,13 +36,23 @@ class Track:
 
     def __init__(self, model: Model, N: int, dt_ns: int) -> None:
         self.y_ref: Array = np.zeros((N, model.ny))
-        self.p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
-        self._nominal = self.p.copy()
+        self._nominal: Array = np.array(model.p_nominal)
+        self.p: Array = np.tile(self._nominal, (N + 1, 1))
         self._angles = [j for j, signal in enumerate(model.outputs) if signal.angle]
-        self._nodes_ns = np.arange(N + 1) * dt_ns
+        grid, at, below = np.zeros(3), np.zeros(N + 1), np.zeros(N + 1)
+        self._grid, self._below = grid.data, below
+        self._place = bind(placing(N, dt_ns), {"grid": grid}, {"at": at, "below": below})
+        # A reference gives no parameters, or has all of them in its rows.
+        self._found = {columns: np.zeros((N + 1, 2 * columns)) for columns in (model.ny, model.ny + model.np_)}
+        outputs = {"y_ref": self.y_ref, "p": self.p}
+        self._interpolate: dict[int, Callable[[], None]] = {}
+        for columns, found in self._found.items():
+            interpolate = interpolation(N, model.ny, columns)
+            written = {name: outputs[name] for name in interpolate.name_out()}
+            self._interpolate[columns] = bind(interpolate, {"found": found, "at": at, "below": below}, written)
         self.arriving: tuple[Reference, Array] | None = None
         self._reference: Reference | None = None
-        self._rows: Array = np.zeros((1, model.ny))
+        self._rows: Array = np.zeros((1, 2 * model.ny))
 
     def misfit(self, reference: Reference, right_np: int) -> str:
         """
@@ -61,15 +72,18 @@ class Track:
 
     def lay_out(self, reference: Reference) -> Array:
         """
-        Return the rows of a reference for `anchor`: outputs, with angles unwrapped along time, and the parameters given. Changes no attribute.
+        Return the rows of a reference for `anchor`: outputs, with angles unwrapped along time, the parameters if any are given, and after them by how
+        much each of these changes to the next row. Changes no attribute.
 
         Args:
             reference: A checked reference, with the model's `ny` and none or the first of its `np`; the other parameters are nominal.
         """
-        rows = np.hstack([reference.y, reference.p])
+        rows, given = np.hstack([reference.y, reference.p]), reference.p.shape[1]
+        if given:
+            rows = np.hstack([rows, np.tile(self._nominal[given:], (len(rows), 1))])
         for j in self._angles:
             rows[:, j] = np.unwrap(rows[:, j])
-        return rows
+        return np.hstack([rows, np.diff(rows, axis=0, append=rows[-1:])])
 
     def anchor(self, stamp_ns: int) -> Reference:
         """
@@ -83,6 +97,7 @@ class Track:
         if reference.stamp_ns == STAMP_ON_ARRIVAL:
             reference = replace(reference, stamp_ns=stamp_ns)
         self._reference, self._rows = reference, rows
+        self.p[:] = self._nominal
         return reference
 
     def clear(self) -> None:
@@ -104,13 +119,25 @@ class Track:
     def look_up(self, t_ns: int) -> None:
         """Write the reference from `t_ns` on, node 0 included for `p`, into `y_ref` and `p`."""
         assert self._reference is not None
-        rows = self._rows
-        since_ns = min(max(t_ns - self._reference.stamp_ns, -MAX_OFFSET_NS), MAX_OFFSET_NS)  # of two stamps that differ by more than an int64 holds
-        at = np.clip((self._nodes_ns + since_ns) / self._reference.period_ns, 0, len(rows) - 1)
-        below = np.minimum(at.astype(np.intp), max(len(rows) - 2, 0))
-        fraction = (at - below)[:, np.newaxis]
-        values = rows[below] + fraction * (rows[np.minimum(below + 1, len(rows) - 1)] - rows[below])
-        ny, given = self.y_ref.shape[1], rows.shape[1]
-        self.y_ref[:] = values[1:, :ny]
-        self.p[:, : given - ny] = values[:, ny:]
-        self.p[:, given - ny :] = self._nominal[:, given - ny :]
+        rows, grid = self._rows, self._grid
+        columns = rows.shape[1] // 2
+        grid[0], grid[1], grid[2] = t_ns - self._reference.stamp_ns, self._reference.period_ns, len(rows) - 1
+        self._place()
+        rows.take(self._below.astype(np.intp), axis=0, out=self._found[columns], mode="clip")
+        self._interpolate[columns]()
+
+
+def placing(N: int, dt_ns: int) -> ca.Function:
+    """Build ``grid -> (at, below)``: the place of each node among the rows, and the row before it; `grid` is offset, period and last row."""
+    grid = ca.SX.sym("grid", 3)
+    since_ns, period_ns, last = ca.vertsplit(grid)
+    at = ca.fmin(ca.fmax((ca.DM(range(N + 1)) * dt_ns + since_ns) / period_ns, 0), last)
+    return function("placing", {"grid": grid}, {"at": at, "below": ca.fmin(ca.floor(at), ca.fmax(last - 1, 0))})
+
+
+def interpolation(N: int, ny: int, columns: int) -> ca.Function:
+    """Build ``(found, at, below) -> (y_ref, p)``, the latter only if there are more columns than outputs; `found` holds rows and their changes."""
+    found, at, below = ca.SX.sym("found", 2 * columns, N + 1), ca.SX.sym("at", N + 1), ca.SX.sym("below", N + 1)
+    values = found[:columns, :] + ca.repmat((at - below).T, columns, 1) * found[columns:, :]
+    written = {"y_ref": values[:ny, 1:]} | ({"p": values[ny:, :]} if columns > ny else {})
+    return function("interpolation", {"found": found, "at": at, "below": below}, written)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import groupby
+from math import inf
 from operator import attrgetter
 from struct import Struct
 from typing import Any, TypeVar
@@ -36,6 +37,8 @@ HEADER = b"\x00\x01\x00\x00"
 HEADER_BYTES = len(HEADER)  # alignment is counted from the end of the header
 
 STRUCT_FORMATS = {"uint8": "B", "uint32": "I", "uint64": "Q", "int64": "q", "float64": "d"}  # key: type of a scalar in .msg files
+LITTLE_ENDIAN = np.dtype("<f8")
+FEW = 32  # numbers of an array, up to which a loop over floats is faster than NumPy
 UINT32 = Struct("<I")
 UINT32_PADDED = Struct("<I4x")  # followed by four bytes that align a float64
 
@@ -144,7 +147,11 @@ def _scalar_writer(fields: Sequence[Field]) -> Writer:
 def _scalar_reader(fields: Sequence[Field]) -> Reader:
     layouts = _layouts(fields)
     members = [(i, field.name, {int(member): member for member in enum}) for i, field in enumerate(fields) if (enum := field.member_of) is not None]
-    ranges = [(i, field) for i, field in enumerate(fields) if field.low is not None or field.high is not None]
+    ranges = [
+        (i, -inf if field.low is None else field.low, inf if field.high is None else field.high, field)
+        for i, field in enumerate(fields)
+        if field.low is not None or field.high is not None
+    ]
 
     def read(payload: bytes, offset: int, values: list[Any]) -> int:
         layout = layouts[offset % 8]
@@ -158,9 +165,8 @@ def _scalar_reader(fields: Sequence[Field]) -> Reader:
             if value not in known:
                 raise Refused("value", f"{name} must be one of {sorted(known)}, got {value}")
             values[first + i] = known[value]
-        for i, field in ranges:
-            value = values[first + i]
-            if ((field.low is not None and value < field.low) or (field.high is not None and value > field.high)) and value != field.also:
+        for i, low, high, field in ranges:
+            if not low <= (value := values[first + i]) <= high and value != field.also:
                 raise Refused("value", f"{field.name} must be from {field.low} to {field.high}, got {value}")
         return end
 
@@ -183,7 +189,7 @@ def _array_writer(field: Field, *, with_width: bool) -> Writer:
         offset += padding
         size = array.size
         length = (UINT32_PADDED if size and offset % 8 == 0 else UINT32).pack(size)
-        return head + bytes(padding) + length + array.astype("<f8", copy=False).tobytes()
+        return head + bytes(padding) + length + array.astype(LITTLE_ENDIAN, copy=False).tobytes()
 
     return write
 
@@ -210,15 +216,23 @@ def _array_reader(field: Field, *, width_at: int | None) -> Reader:
         end = offset + 8 * size
         if HEADER_BYTES + end > len(payload):
             raise Refused("truncated", f"{name} must hold the {size} numbers it declares, got {max(0, len(payload) - HEADER_BYTES - offset) // 8}")
-        array = np.frombuffer(payload, "<f8", size, HEADER_BYTES + offset).astype(np.float64)
+        array = np.frombuffer(payload, LITTLE_ENDIAN, size, HEADER_BYTES + offset).astype(np.float64)
         if field.filled and not size:
             raise Refused("length", f"{name} must hold at least one row, got none")
-        if field.finite and not (fits := np.abs(array) <= NUMBER_LIMIT).all():
-            raise Refused("not_finite", f"{name} must be finite and at most {NUMBER_LIMIT:g}, got {array[~fits][0]} among {size} numbers")
+        if field.finite and not _fits(array):
+            wrong = array[~(np.abs(array) <= NUMBER_LIMIT)][0]
+            raise Refused("not_finite", f"{name} must be finite and at most {NUMBER_LIMIT:g}, got {wrong} among {size} numbers")
         values.append(_rows(array, width, name) if field.width else array)
         return end
 
     return read
+
+
+def _fits(array: Array) -> bool:
+    """Whether all numbers are finite and inside the limit."""
+    if array.size <= FEW:
+        return all(abs(value) <= NUMBER_LIMIT for value in array.tolist())
+    return bool((np.abs(array) <= NUMBER_LIMIT).all())
 
 
 def _word(payload: bytes, offset: int, name: str) -> tuple[int, int]:
