@@ -3,21 +3,25 @@
 Reason for which an endpoint does not answer, from a connection of our own to it, as far as the handshake of TLS.
 
 Zenoh tells a client only that no router was reached in time. The system and TLS say why.
-Nothing is sent beyond the handshake, and each step ends within `TIMEOUT_S`.
+Nothing is sent beyond the handshake.
 """
 
 from __future__ import annotations
 
 import re
 import socket
+import time
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import ssl
 
 TIMEOUT_S = 1.0  # for a connection, for its handshake, and for what the other side then objects
+DEADLINE_S = 3.0  # for all endpoints together
 ADDRESS = re.compile(r"(?P<protocol>[a-z]+)/(?:\[(?P<v6>[^]]+)\]|(?P<host>[^:]+)):(?P<port>\d+)")
 
 # What OpenSSL calls it, as a pattern: what it means here. Errors about the router's certificate are those of our verification.
@@ -36,11 +40,28 @@ OURS = {
     "ALERT": "the router refuses {certificate}, with the alert {reason}",
 }
 NO_TLS = "what listens there does not speak TLS"
+MUTE = "what listens there does not answer"
+
+
+def obstacles(endpoints: Iterable[str], *files: Path | None) -> dict[str, str]:
+    """Return why no router answers, by endpoint, see `obstacle`; nothing of endpoints that take longer than `DEADLINE_S`, such as a name server."""
+    found: dict[str, str] = {}
+
+    def look(endpoint: str) -> None:
+        found[endpoint] = obstacle(endpoint, *files)
+
+    threads = [Thread(target=look, args=(endpoint,), daemon=True) for endpoint in dict.fromkeys(endpoints)]
+    deadline_s = time.monotonic() + DEADLINE_S
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(max(0.0, deadline_s - time.monotonic()))
+    return dict(found)
 
 
 def obstacle(endpoint: str, authority: Path | None = None, certificate: Path | None = None, key: Path | None = None) -> str:
     """
-    Return why a router at an endpoint does not answer; empty if nothing is found.
+    Return why a router at an endpoint does not answer; empty for protocols that are not tried.
 
     Args:
         endpoint: Endpoint of Zenoh, over TCP or TLS.
@@ -51,7 +72,11 @@ def obstacle(endpoint: str, authority: Path | None = None, certificate: Path | N
     match = ADDRESS.match(endpoint)
     if match is None or match["protocol"] not in ("tcp", "tls"):
         return ""
-    host = match["v6"] or match["host"]
+    host, tls = match["v6"] or match["host"], match["protocol"] == "tls"
+    try:
+        context = client(authority, certificate, key) if tls and authority is not None else stranger()
+    except OSError as error:
+        return f"the certificates of this process cannot be used: {error}"
     try:
         link = socket.create_connection((host, int(match["port"])), TIMEOUT_S)
     except socket.gaierror:
@@ -62,13 +87,10 @@ def obstacle(endpoint: str, authority: Path | None = None, certificate: Path | N
         return "nothing answers there: the address is wrong, or a firewall is closed"
     except OSError as error:
         return str(error.strerror).lower()
-    if match["protocol"] == "tcp":
-        return "" if _plain(shake(link, host, stranger())) else "what listens there speaks TLS: see --tls"
-    try:
-        context = stranger() if authority is None else client(authority, certificate, key)
-    except OSError as error:
-        return f"the certificates of this process cannot be used: {error}"
-    return _refusal(shake(link, host, context), {"authority": authority, "certificate": certificate})
+    verdict = shake(link, host, context)
+    if tls:
+        return _refusal(verdict, {"authority": authority, "certificate": certificate})
+    return MUTE if _plain(verdict) else "what listens there speaks TLS: see --tls"
 
 
 def openness(host: str, port: int) -> str:
@@ -126,7 +148,7 @@ def _refusal(error: OSError | None, words: dict[str, object]) -> str:
     import ssl
 
     if error is None:
-        return ""
+        return MUTE
     if isinstance(error, ssl.SSLCertVerificationError):
         return _first(ROUTERS, error.verify_message, words) or f"the router's certificate is not taken: {error.verify_message}"
     return NO_TLS if _plain(error) else _first(OURS, str(getattr(error, "reason", "")), words)

@@ -27,7 +27,7 @@ import zenoh
 from rti_mpc.contract.message import Reference
 from rti_mpc.errors import ConfigError, Stopped
 from rti_mpc.text_file import read_text_file
-from rti_mpc.wire.handshake import obstacle
+from rti_mpc.wire.handshake import obstacles
 from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
 from rti_mpc.wire.reach import remind
 
@@ -151,7 +151,9 @@ def _brief(error: Exception) -> str:
 def endpoints(config: zenoh.Config) -> str:
     """Return the endpoints that a process connects to, and what is wrong there, in words; empty if it waits for others to connect."""
     files = [_tls_file(config, name) for name in ("root_ca_certificate", "connect_certificate", "connect_private_key")]
-    return "; ".join(f"{end}: {obstacle(end, *files) or _guess(end)}" for end in _ends(config, "connect"))
+    ends = _ends(config, "connect")
+    found = obstacles(ends, *files)
+    return "; ".join(f"{end}: {found.get(end) or _guess(end)}" for end in ends)
 
 
 def _ends(config: zenoh.Config, side: str) -> list[str]:

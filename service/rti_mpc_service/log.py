@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import logging
 import os
@@ -94,19 +95,18 @@ class Aside(logging.Handler):
 
 def divert() -> int:
     """
-    Keep what else this process writes to standard output, such as native code, out of the log; return the descriptor to read that from.
+    Keep what else this process writes to standard output, such as native code, out of the log; return a file in memory where it goes.
 
-    What nobody reads in time is lost, so that its writers never wait.
+    Its writers never wait and never fail, as they would at a pipe. Whoever reads it cuts it off.
     """
     ours = os.dup(sys.stdout.fileno())
-    reading, writing = os.pipe()
-    os.set_blocking(writing, False)
-    os.dup2(writing, sys.stdout.fileno())
-    os.close(writing)
+    others = os.memfd_create("standard output of native code")
+    fcntl.fcntl(others, fcntl.F_SETFL, os.O_APPEND)
+    os.dup2(others, sys.stdout.fileno())
     for handler in logging.getLogger().handlers:
         if isinstance(handler, Aside):
             handler.descriptor = ours
-    return reading
+    return others
 
 
 def start() -> None:

@@ -16,7 +16,7 @@ import logging
 import os
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from threading import Thread
 from typing import Any
 
@@ -34,6 +34,9 @@ TARGETS = ",".join(
         "zenoh::net::routing::interceptor::access_control=info",  # that a certificate is in no list; more would be a line for each message
     )
 )
+CHUNK_BYTES = 1 << 16  # of Zenoh's log that are read at once
+PAUSE_S = 0.1  # when all is read
+MAX_FILE_BYTES = 1 << 22  # at which it is cut off
 REPEAT_S = 60.0  # between two lines of one kind about one name
 MAX_REMEMBERED = 256  # names, sessions and kinds of lines
 COLOUR = re.compile(r"\x1b\[\d*m")
@@ -52,23 +55,37 @@ REFUSALS = {
     "expired": "its certificate has ended",
     "BadSignature|UnknownIssuer": "its certificate is of another authority",
     "no certificates": "it has no certificate",
-    "InvalidContentType|InvalidMessage": "it does not speak TLS",
+    "corrupt message": "it does not speak TLS",
     "fatal alert: (\\w+)": "it does not take the router's certificate, with the alert {}",
 }
 
 
 def follow() -> None:
     """Have Zenoh write its log, and make lines of it; once, before the first session, in a process whose log is `rti_mpc_service.log`."""
-    lines = process_log.divert()
+    file = process_log.divert()
     start_zenoh_log(TARGETS)
     digest = Digest(logging.getLogger("router"))
 
     def read() -> None:
-        with os.fdopen(lines, errors="replace") as file:
-            for line in file:
-                digest.take(line)
+        for line in lines(file):
+            digest.take(line)
 
     Thread(target=read, name="zenoh log", daemon=True).start()
+
+
+def lines(file: int) -> Iterator[str]:
+    """Yield the lines that are appended to a file, without end; who appends faster than they are read loses some, and takes no more memory."""
+    begun, place = b"", 0
+    while True:
+        received = os.pread(file, CHUNK_BYTES, place)
+        place += len(received)
+        if os.fstat(file).st_size > MAX_FILE_BYTES:
+            os.ftruncate(file, 0)
+            place = 0
+        *whole, begun = (begun[-CHUNK_BYTES:] + received).split(b"\n")
+        yield from (line.decode(errors="replace") for line in whole)
+        if len(received) < CHUNK_BYTES:
+            time.sleep(PAUSE_S)
 
 
 class Digest:
@@ -80,6 +97,7 @@ class Digest:
         self._names: dict[str, str] = {}  # in the certificate, by address
         self._sessions: dict[str, tuple[str, str]] = {}  # name, empty if it is in no list, and address, by session
         self._unlisted = ""  # session whose name is in no list, until its address is known
+        self._early: dict[str, str] = {}  # what is denied, by session, that Zenoh's threads have told of before they told whose it is
         self._objections: dict[str, str] = {}  # what was said last about a message, by thread
         self._said: dict[str, tuple[float, int]] = {}  # when a line of a kind was written, and how many were left out since
 
@@ -99,18 +117,26 @@ class Digest:
             name, address = self._names.pop(opened["address"], "a process without a certificate"), opened["address"]
             listed = opened["session"] != self._unlisted
             remember(self._sessions, opened["session"][:SHORT], (name if listed else "", address))
+            early = self._early.pop(opened["session"][:SHORT], "")
             if not listed:
                 self._say(name, f"{name} at {address} is denied everything: the access control list does not have its name")
+            elif early:
+                self._deny(name, address, early)
         elif target.endswith("::access_control"):
             if denied := DENIED.search(text):
                 self._objections[match["thread"]] = f"{denied['act'].lower()} on {denied['key']}"
         elif target.endswith("::interceptor") and (sender := SENDER.search(match["span"])):
-            name, address = self._sessions.get(sender["session"], (f"session {sender['session']}", "an unknown address"))
             what = self._objections.pop(match["thread"], "what its role may not write")
-            if name:  # otherwise everything is denied, which was said when it came
-                self._say(f"{name} {what}", f"{name} at {address} is denied {what}")
+            name, address = self._sessions.get(sender["session"], ("", ""))
+            if name:
+                self._deny(name, address, what)
+            elif not address:  # otherwise everything is denied, which was said when it came
+                remember(self._early, sender["session"], what)
         elif match["level"] in ("WARN", "ERROR"):
             self._say(text, f"Zenoh: {text}")
+
+    def _deny(self, name: str, address: str, what: str) -> None:
+        self._say(f"{name} {what}", f"{name} at {address} is denied {what}")
 
     def _say(self, kind: str, text: str) -> None:
         """Write a line, unless one of its kind was written just before."""

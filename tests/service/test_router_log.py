@@ -2,10 +2,13 @@
 from __future__ import annotations
 
 import logging
+import os
+from pathlib import Path
 
 import pytest
 
-from rti_mpc_service.router_log import MAX_REMEMBERED, REPEAT_S, Digest
+from rti_mpc_service import router_log
+from rti_mpc_service.router_log import MAX_REMEMBERED, REPEAT_S, Digest, lines
 
 AT = "\x1b[2m2026-11-28T18:55:40.824281Z\x1b[0m"
 JOINED = f"{AT} DEBUG acc-0 ThreadId(05) zenoh_link_tls::unicast: Accepted TLS connection on 127.0.0.1:7447: {{address}}. Common Name: {{name}}."
@@ -54,6 +57,7 @@ REFUSALS = {
     "invalid peer certificate: UnknownIssuer": "its certificate is of another authority",
     "peer sent no certificates": "it has no certificate",
     "received corrupt message of type InvalidContentType": "it does not speak TLS",
+    "received corrupt message of type UnknownProtocolVersion": "it does not speak TLS",
     "received fatal alert: DecryptError": "it does not take the router's certificate, with the alert DecryptError",
     "Too many open files (os error 24)": "Too many open files (os error 24)",
 }
@@ -85,6 +89,12 @@ def test_denied_process_is_named_by_its_certificate_and_address(journal: Journal
     assert journal.after(*again, DROPPED.format(short="aa4811ba")) == [], "who joins again and again is told once a minute"
 
 
+def test_denial_that_is_told_before_whose_it_is_waits_for_the_name(journal: Journal) -> None:
+    accepted, opened = joined("viewer@rti_mpc/pioneer")
+    assert journal.after(accepted, *[DROPPED.format(short="c5a18c6e")] * 3) == []
+    assert journal.after(opened) == ["viewer@rti_mpc/pioneer at 127.0.0.1:42428 is denied what its role may not write"]
+
+
 def test_certificate_that_is_in_no_list_is_told_once_and_not_for_each_message(journal: Journal) -> None:
     accepted, opened = joined("controller@rti_mpc/other")
     said = journal.after(accepted, UNLISTED.format(session=SESSION), opened, *[DROPPED.format(short="c5a18c6e")] * 9)
@@ -99,6 +109,23 @@ def test_other_lines_of_zenoh_are_passed_on_from_warnings_up(journal: Journal) -
 def test_memory_is_bounded_whoever_comes(journal: Journal) -> None:
     for k in range(3 * MAX_REMEMBERED):
         journal.after(*joined(f"viewer@rti_mpc/{k}", f"10.0.0.1:{k}", f"{k:08d}"), DROPPED.format(short=f"{k:08d}"))
-        journal.after(JOINED.format(address=f"10.0.0.2:{k}", name="viewer"))  # and never opens a session
+        journal.after(JOINED.format(address=f"10.0.0.2:{k}", name="viewer"), DROPPED.format(short=f"f{k:07d}"))  # and never opens a session
     digest = journal.digest
-    assert max(len(memory) for memory in (digest._names, digest._sessions, digest._said)) == MAX_REMEMBERED
+    assert max(len(memory) for memory in (digest._names, digest._sessions, digest._said, digest._early)) == MAX_REMEMBERED
+
+
+def test_file_of_zenohs_lines_is_cut_off_and_read_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(router_log, "PAUSE_S", 0.0)
+    monkeypatch.setattr(router_log, "MAX_FILE_BYTES", 1000)
+    file = os.open(tmp_path / "log", os.O_RDWR | os.O_CREAT | os.O_APPEND)
+    try:
+        read = lines(file)
+        for k in range(100):
+            os.write(file, f"line {k} of".encode())
+            os.write(file, f" {100 * 'x'}\nbegun".encode())
+            assert next(read).startswith("line 0 of " if k == 0 else f"begunline {k} of ")
+            assert os.fstat(file).st_size <= 1000 + 300
+        os.write(file, b"\n" + 2000 * b"flood\n")
+        assert [next(read) for _ in range(2000)] == ["begun", *["flood"] * 1999]
+    finally:
+        os.close(file)

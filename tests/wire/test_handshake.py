@@ -6,11 +6,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from threading import Event
 
 import pytest
 
+from rti_mpc.wire import handshake
 from rti_mpc.wire.bus import Bus, BusSettings
-from rti_mpc.wire.handshake import obstacle, openness
+from rti_mpc.wire.handshake import obstacle, obstacles, openness
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.rig.endpoint import free_endpoint
 
@@ -65,7 +67,7 @@ def test_certificate_that_has_ended_or_is_of_another_authority_or_missing_is_nam
     strange = tmp_path / "strange" / "authority.pem"
     assert said(endpoint, tmp_path / "strange") == f"the router's certificate is of another authority than {strange}"
     assert obstacle(endpoint, folder / "authority.pem") == "the router wants a certificate, and got none: see --tls"
-    assert said(endpoint, folder) == "", "nothing is wrong with a good one"
+    assert said(endpoint, folder) == "what listens there does not answer", "nothing is wrong with a good certificate"
 
 
 def test_wrong_protocol_on_either_side_is_named_as_the_reason(ours: tuple[Authority, Path, str]) -> None:
@@ -74,7 +76,7 @@ def test_wrong_protocol_on_either_side_is_named_as_the_reason(ours: tuple[Author
     plain = free_endpoint()
     with Bus.join(BusSettings(mode="router", listen=(plain,)), KEYS):
         assert said(plain.replace("tcp/", "tls/"), folder) == "what listens there does not speak TLS"
-        assert obstacle(plain) == ""
+        assert obstacle(plain) == "what listens there does not answer"
         assert openness("127.0.0.1", int(plain.rpartition(":")[2])) == "without TLS"
     assert openness("127.0.0.1", int(endpoint.rpartition(":")[2])) == ""
 
@@ -87,3 +89,11 @@ def test_router_at_another_address_or_process_that_is_no_router_is_named_as_the_
     false = free_endpoint().replace("tcp/", "tls/")
     with listening(folder, "planner", false):
         assert said(false, folder) == "what listens there has no certificate of a router"
+
+
+def test_endpoints_are_tried_side_by_side_and_one_whose_name_server_hangs_keeps_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    hanging, going = "tcp/hangs.invalid:7447", Event()
+    monkeypatch.setattr(handshake, "DEADLINE_S", 0.5)
+    monkeypatch.setattr(handshake, "obstacle", lambda endpoint, *_: going.wait(60.0) and "" if endpoint == hanging else "closed")
+    assert obstacles([hanging, "tcp/127.0.0.1:9"]) == {"tcp/127.0.0.1:9": "closed"}
+    going.set()
