@@ -48,7 +48,7 @@ OPENED = re.compile(r"New transport link accepted from (?P<session>\w+) to .*? d
 UNLISTED = re.compile(r"(?P<session>\w+) did not match any configured ACL subject")
 DENIED = re.compile(r"is unauthorized to (?P<act>.+) \(ingress\) on (?P<key>.+?)(?:/@adv/\S*)?$")
 SENDER = re.compile(r"src=\S*/(?P<session>\w+)[:}]")
-SHORT = 8  # characters of a session's number in a span
+SHORT = 6  # characters by which a session is known: spans have the first eight, without zeros in front
 
 # What TLS calls it, as a pattern: what it means here.
 REFUSALS = {
@@ -127,11 +127,12 @@ class Digest:
                 self._objections[match["thread"]] = f"{denied['act'].lower()} on {denied['key']}"
         elif target.endswith("::interceptor") and (sender := SENDER.search(match["span"])):
             what = self._objections.pop(match["thread"], "what its role may not write")
-            name, address = self._sessions.get(sender["session"], ("", ""))
+            session = sender["session"][:SHORT]
+            name, address = self._sessions.get(session, ("", ""))
             if name:
                 self._deny(name, address, what)
             elif not address:  # otherwise everything is denied, which was said when it came
-                remember(self._early, sender["session"], what)
+                remember(self._early, session, what)
         elif match["level"] in ("WARN", "ERROR"):
             self._say(text, f"Zenoh: {text}")
 

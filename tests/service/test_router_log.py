@@ -89,6 +89,11 @@ def test_denied_process_is_named_by_its_certificate_and_address(journal: Journal
     assert journal.after(*again, DROPPED.format(short="aa4811ba")) == [], "who joins again and again is told once a minute"
 
 
+def test_session_whose_number_begins_with_a_zero_is_known_by_the_shorter_number_that_zenoh_writes(journal: Journal) -> None:
+    journal.after(*joined("viewer@rti_mpc/pioneer", session="23281df111b701e1ed591f703de0ce8"))
+    assert journal.after(DROPPED.format(short="23281df")) == ["viewer@rti_mpc/pioneer at 127.0.0.1:42428 is denied what its role may not write"]
+
+
 def test_denial_that_is_told_before_whose_it_is_waits_for_the_name(journal: Journal) -> None:
     accepted, opened = joined("viewer@rti_mpc/pioneer")
     assert journal.after(accepted, *[DROPPED.format(short="c5a18c6e")] * 3) == []
@@ -108,8 +113,8 @@ def test_other_lines_of_zenoh_are_passed_on_from_warnings_up(journal: Journal) -
 
 def test_memory_is_bounded_whoever_comes(journal: Journal) -> None:
     for k in range(3 * MAX_REMEMBERED):
-        journal.after(*joined(f"viewer@rti_mpc/{k}", f"10.0.0.1:{k}", f"{k:08d}"), DROPPED.format(short=f"{k:08d}"))
-        journal.after(JOINED.format(address=f"10.0.0.2:{k}", name="viewer"), DROPPED.format(short=f"f{k:07d}"))  # and never opens a session
+        journal.after(*joined(f"viewer@rti_mpc/{k}", f"10.0.0.1:{k}", f"{k:06d}00"), DROPPED.format(short=f"{k:06d}00"))
+        journal.after(JOINED.format(address=f"10.0.0.2:{k}", name="viewer"), DROPPED.format(short=f"f{k:05d}00"))  # and never opens a session
     digest = journal.digest
     assert max(len(memory) for memory in (digest._names, digest._sessions, digest._said, digest._early)) == MAX_REMEMBERED
 
