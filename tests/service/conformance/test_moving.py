@@ -13,44 +13,26 @@ import pytest
 from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.contract.limits import Limits
-from rti_mpc.contract.message import Command, State
-from rti_mpc.contract.schedule import unfit
+from rti_mpc.contract.message import Command
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.rti.rti import Rti
-from rti_mpc.wire.cdr import encode, encoding
-from rti_mpc.wire.intake import Intake
-from rti_mpc.wire.received import Received
 from rti_mpc_service.conformance.finding import judgements
 from rti_mpc_service.conformance.moving import CASES, MovingTrial
-from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
 from tests.movers import law_of, ocp_of
+from tests.service.conformance.link import EPOCH, as_it_is
+from tests.service.conformance.link import LockstepLink as Link
 
-MS = 1_000_000
-EPOCH = 7
 
+class LockstepLink(Link):
+    """One of the movers, inside its limits."""
 
-class LockstepLink:
-    """A robot without a clock, to which each command takes 2 ms; `take` may change it on its way to the actuators."""
-
-    def __init__(self, name: str, take: Callable[[Command], Command] = lambda command: command, fits: bool = True, **settings: Any) -> None:
+    def __init__(self, name: str, take: Callable[[Command], Command] = as_it_is, fits: bool = True, **settings: Any) -> None:
         ocp = ocp_of(name)
-        nx, nu = ocp.model.nx, ocp.model.nu
         limits = {"slew": np.minimum(-ocp.lbdu, ocp.ubdu) / ocp.dt, "lbu": ocp.lbu, "ubu": ocp.ubu}
         limits["increments"] = Increments(ocp.lbdu, ocp.ubdu, round(1e9 * ocp.dt))
         settings = limits | {"state_period_s": ocp.dt} | settings
-        self.robot = Lockstep(RobotSettings(ocp.model, np.zeros(nx), **settings), EPOCH)
-        self._take = take
-        self._intake = Intake(Command, 0.25, unfit=lambda command: unfit(command, nu, EPOCH, nx) if fits else "")
-
-    def states(self) -> list[State]:
-        return [self.robot.tick()]
-
-    def put(self, command: Command | bytes) -> None:
-        payload = command if isinstance(command, bytes) else encode(command)
-        taken = self._intake.accept(Received(payload, encoding(Command), "command"), self.robot.now_ns)
-        if taken is not None:
-            self.robot.accept(self._take(taken), self.robot.now_ns + 2 * MS)
+        super().__init__(RobotSettings(ocp.model, np.zeros(ocp.model.nx), **settings), take, fits)
 
 
 def verdicts(name: str, link: LockstepLink) -> dict[str, tuple[str, str]]:

@@ -12,43 +12,27 @@ import pytest
 
 from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.contract.limits import Limits
-from rti_mpc.contract.message import Command, State
-from rti_mpc.contract.schedule import unfit
+from rti_mpc.contract.message import Command
 from rti_mpc.wire.actuator import Actuator
-from rti_mpc.wire.cdr import encode, encoding
-from rti_mpc.wire.intake import Intake
-from rti_mpc.wire.received import Received
 from rti_mpc.wire.source import Source, Verdict
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.build import build_signals, guard_limits, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.conformance.finding import judgements
 from rti_mpc_service.conformance.robot import CASES, Trial
-from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
+from tests.service.conformance.link import EPOCH, MS, as_it_is
+from tests.service.conformance.link import LockstepLink as Link
 
-MS = 1_000_000
-EPOCH = 7
 CONFIG = load(SHIPPED)
 LIMITS = guard_limits(CONFIG, build_signals(CONFIG))
 
 
-class LockstepLink:
-    """A robot without a clock, to which each command takes 2 ms; `take` may change it on its way to the actuators."""
+class LockstepLink(Link):
+    """The shipped robot."""
 
-    def __init__(self, take: Callable[[Command], Command] = lambda command: command, fits: bool = True, **settings: Any) -> None:
-        self.robot = Lockstep(RobotSettings(**(robot_settings(CONFIG) | {"state_period_s": 0.05} | settings)), EPOCH)
-        self._take = take
-        self._intake = Intake(Command, 0.25, unfit=lambda command: unfit(command, 2, EPOCH, 5) if fits else "")
-
-    def states(self) -> list[State]:
-        return [self.robot.tick()]
-
-    def put(self, command: Command | bytes) -> None:
-        payload = command if isinstance(command, bytes) else encode(command)
-        taken = self._intake.accept(Received(payload, encoding(Command), "command"), self.robot.now_ns)
-        if taken is not None:
-            self.robot.accept(self._take(taken), self.robot.now_ns + 2 * MS)
+    def __init__(self, take: Callable[[Command], Command] = as_it_is, fits: bool = True, **settings: Any) -> None:
+        super().__init__(RobotSettings(**(robot_settings(CONFIG) | {"state_period_s": 0.05} | settings)), take, fits)
 
 
 def verdicts(link: LockstepLink, limits: Limits = LIMITS) -> dict[str, str]:
