@@ -59,7 +59,7 @@ msg: $(READY)
 lock:
 	$(if $(UV),,$(error make lock needs uv: pip install uv))
 	uv pip compile --quiet --no-config --upgrade --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate \
-		--custom-compile-command "make lock" --extra view --extra figure --extra certs --group dev --output-file constraints.txt pyproject.toml
+		--custom-compile-command "make lock" --extra view --extra figure --extra certs --extra record --extra tune --group dev --output-file constraints.txt pyproject.toml
 	uv pip compile --quiet --no-config --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate \
 		--custom-compile-command "make lock" --group docs --constraint constraints.txt --output-file docs/requirements.txt pyproject.toml
 
