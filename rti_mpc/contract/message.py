@@ -198,6 +198,36 @@ class Telemetry:
     second_us: float = 0.0
 
 
+class JournalKind(IntEnum):
+    """Content of a `Journal` message."""
+
+    CALLS = 0
+    SNAPSHOT = 1
+
+
+@dataclass(slots=True)
+class Journal:
+    """
+    Part of a controller's journal: a batch of consecutive entries, or a snapshot of its state, which is one entry.
+
+    Attributes:
+        epoch: Number of the controller's process; it does not change when a standby takes over.
+        seq: Number of the first entry; a number that no message has is an entry that was dropped.
+        stamp_ns: Stamp of the robot's last state when this was published; 0: none had come.
+        local_ns: Local monotonic time at which this was published.
+        dropped: Entries dropped since the start.
+        data: Entries or snapshot, in an encoding of their own.
+    """
+
+    epoch: int
+    seq: int
+    stamp_ns: int
+    local_ns: int
+    dropped: int
+    kind: JournalKind
+    data: bytes
+
+
 @dataclass(slots=True)
 class Event:
     """

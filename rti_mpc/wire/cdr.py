@@ -23,11 +23,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.contract.message import Command, Event, Reference, State, Telemetry
+from rti_mpc.contract.message import Command, Event, Journal, Reference, State, Telemetry
 from rti_mpc.errors import MessageError
 from rti_mpc.wire.layout import LAYOUTS, MIN_PERIOD_NS, NUMBER_LIMIT, Field
 
-Message = State | Reference | Command | Telemetry | Event
+Message = State | Reference | Command | Telemetry | Journal | Event
 M = TypeVar("M", bound=Message)
 
 MESSAGE_PACKAGE = "rti_mpc_msgs/msg"
@@ -288,6 +288,33 @@ def _string_reader(field: Field) -> Reader:
     return read
 
 
+# Bytes.
+
+
+def _bytes_writer(field: Field) -> Writer:
+    name = field.name
+
+    def write(message: Any, offset: int) -> bytes:
+        content: bytes = getattr(message, name)
+        return bytes(-offset % 4) + UINT32.pack(len(content)) + content
+
+    return write
+
+
+def _bytes_reader(field: Field) -> Reader:
+    name = field.name
+
+    def read(payload: bytes, offset: int, values: list[Any]) -> int:
+        size, offset = _word(payload, offset, name)
+        end = offset + size
+        if HEADER_BYTES + end > len(payload):
+            raise Refused("truncated", f"{name} must hold the {size} bytes it declares, got {len(payload) - HEADER_BYTES - offset}")
+        values.append(payload[HEADER_BYTES + offset : HEADER_BYTES + end])
+        return end
+
+    return read
+
+
 # Conditions on several fields of one message.
 
 
@@ -319,7 +346,7 @@ FIELD_RELATIONS: dict[type[Any], Callable[[Any], None]] = {Reference: _check_ref
 
 
 def _codec(fields: Sequence[Field]) -> tuple[tuple[Writer, ...], tuple[Reader, ...]]:
-    """Writers and readers of a message, one for each run of scalars, array and string."""
+    """Writers and readers of a message, one for each run of scalars, array, string and sequence of bytes."""
     writers: list[Writer] = []
     readers: list[Reader] = []
     first: dict[str, int] = {}  # position of the first array with each row width
@@ -335,6 +362,9 @@ def _codec(fields: Sequence[Field]) -> tuple[tuple[Writer, ...], tuple[Reader, .
             if field.kind == "string":
                 writers.append(_string_writer(field))
                 readers.append(_string_reader(field))
+            elif field.kind == "uint8[]":
+                writers.append(_bytes_writer(field))
+                readers.append(_bytes_reader(field))
             else:
                 writers.append(_array_writer(field, with_width=bool(field.width) and field.width not in first))
                 readers.append(_array_reader(field, width_at=first.get(field.width)))

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Generic
 
-from rti_mpc.contract.message import Command, Event, Reference, State, Telemetry
+from rti_mpc.contract.message import Command, Event, Journal, Reference, State, Telemetry
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire import streams
 from rti_mpc.wire.cdr import M
@@ -93,6 +93,11 @@ class Keys:
     def standby_telemetry(self) -> Key[Telemetry]:
         """`Telemetry`, by a standby."""
         return self.of(streams.SHADOW_TELEMETRY)
+
+    @property
+    def journal(self) -> Key[Journal]:
+        """`Journal`, by each controller, whatever its role."""
+        return self.of(streams.JOURNAL)
 
     @property
     def request(self) -> Key[Any]:

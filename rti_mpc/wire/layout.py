@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
-from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Event, Reference, Severity, State, Telemetry
+from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Event, Journal, JournalKind, Reference, Severity, State, Telemetry
 from rti_mpc.contract.status import Mode, QpStatus
 
 STAMP_LIMIT_NS = 2**62  # every time is smaller in magnitude: sums of two stamps, or of a stamp and a duration, fit an int64
@@ -29,7 +29,7 @@ class Field:
 
     Attributes:
         name: Name in the dataclass and in the ``.msg`` file.
-        kind: Type in the ``.msg`` file: an integer, ``float64``, ``string`` or ``float64[]``.
+        kind: Type in the ``.msg`` file: an integer, ``float64``, ``string``, ``float64[]`` or ``uint8[]``.
         about: Meaning and unit, the comment in the ``.msg`` file.
         member_of: Enumeration of which the number is a member.
         low: Least value of an integer, None without a limit.
@@ -168,6 +168,13 @@ LAYOUTS: dict[type[Any], tuple[Field, ...]] = {
         Field("second_iterations", "uint32", "iterations of OSQP for this second opinion"),
         Field("second_us", "float64", "time that OSQP took for it, in the slack of the sample before, us"),
     ),
+    Journal: (
+        *_head("stamp of the robot's last state when this was published, ns of the robot's clock; 0: none had come"),
+        Field("local_ns", "int64", "local monotonic time at which this was published, ns"),
+        Field("dropped", "uint64", "number of entries dropped since the start"),
+        Field("kind", "uint8", "content of data: CALLS, entries from seq on; SNAPSHOT, one entry", member_of=JournalKind),
+        Field("data", "uint8[]", "entries or snapshot, in a versioned encoding of their own"),
+    ),
     Event: (
         *_head("time of the event, ns of the robot's clock"),
         Field("source", "string", "role of the publisher: controller, robot, reference, guard", high=64),
@@ -181,6 +188,7 @@ MAX_PAYLOAD_BYTES: dict[type[Any], int] = {
     Reference: 1 << 23,  # 349,000 rows of three outputs; also the longest message that a session reassembles on any key
     Command: 1 << 20,
     Telemetry: 1 << 21,
+    Journal: (1 << 23) + (1 << 11),  # a reference of the longest, with its entry
     Event: 1 << 13,
 }
 MESSAGE_DESCRIPTIONS: dict[type[Any], str] = {
@@ -188,6 +196,7 @@ MESSAGE_DESCRIPTIONS: dict[type[Any], str] = {
     Reference: "Output reference on a regular time grid. It ends with its last row; it need not be repeated before.",
     Command: "A plan of inputs: row i acts from stamp_ns + i * period_ns on. From valid_until_ns on, only the way to rest acts.",
     Telemetry: "What the controller measured and computed at one sample. Numbers may be NaN where nothing was computed.",
+    Journal: "Part of a controller's journal: calls that its commands depend on, or a snapshot of its state.",
     Event: "A mode change or a fault.",
 }
 WIDTH_DESCRIPTIONS: dict[str, str] = {"nx": "states per row", "nu": "inputs per row", "ny": "outputs per row", "np": "stage parameters per row"}

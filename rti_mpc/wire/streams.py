@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Generic, Literal
 
-from rti_mpc.contract.message import Command, Event, Reference, State, Telemetry
+from rti_mpc.contract.message import Command, Event, Journal, Reference, State, Telemetry
 from rti_mpc.wire import document
 from rti_mpc.wire.cdr import M
 from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
@@ -122,6 +122,14 @@ ACTUATION = Stream(
 )
 TELEMETRY = Stream("telemetry", Telemetry, ("controller",), QOS_LOW, "once per sample", "measurements and results of one sample")
 SHADOW_TELEMETRY = Stream("telemetry/standby", Telemetry, ("standby",), QOS_LOW, "once per sample", "telemetry of a standby controller")
+JOURNAL = Stream(
+    "journal",
+    Journal,
+    CONTROLLER_ROLES,
+    QOS_LOW,
+    "a few times per second",
+    "calls that each controller's commands depend on, and snapshots of its state, to repeat them later",
+)
 EVENT = Stream(
     "event",
     Event,
@@ -159,7 +167,7 @@ PONG = Stream("echo/pong", Command, ("echo",), QOS_FAST, "once per ping", "answe
 
 STREAMS: tuple[Stream[Any], ...] = (
     *(STATE, REFERENCE, ANCHORED, COMMAND, ACTUATION, TELEMETRY, SHADOW_TELEMETRY),
-    *(EVENT, INFO, REQUEST, STOP, ALIVE, RELAY, PING, PONG),
+    *(JOURNAL, EVENT, INFO, REQUEST, STOP, ALIVE, RELAY, PING, PONG),
 )
 
 

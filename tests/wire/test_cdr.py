@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Event, Reference, Severity, State, Telemetry
+from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Event, Journal, JournalKind, Reference, Severity, State, Telemetry
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.errors import MessageError
 from rti_mpc.wire.cdr import MESSAGE_PACKAGE, REFUSAL_REASONS, Message, Refused, decode, encode, encoding, schema
@@ -39,6 +39,7 @@ ARRAYS = {
     "y": RNG.normal(size=3),
 }
 TELEMETRY = Telemetry(1, 2, 3, 4, 5, Mode.FALLBACK, QpStatus.INFEASIBLE, 6, **NUMBERS, **TIMES, **COUNTS, **SECOND, **ARRAYS)
+JOURNAL = Journal(HUGE, 2, 3, -4, 5, JournalKind.CALLS, b"\x00\xff\x80")
 EVENT = Event(1, 2, 3, "robot", Severity.ERROR, "command_expired", "Räder stehen")
 
 MESSAGES: list[Message] = [
@@ -55,6 +56,7 @@ MESSAGES: list[Message] = [
     TELEMETRY,
     replace(TELEMETRY, x0=np.zeros(0), x=np.zeros((0, 5)), u=np.zeros((0, 2)), y_ref=np.zeros((0, 3)), y=np.zeros(0)),
     replace(TELEMETRY, y_ref=np.zeros((0, 3)), second_seq=0, second_status=QpStatus.NONE, second_difference=np.nan),
+    *(replace(JOURNAL, data=bytes(range(n)), kind=JournalKind.SNAPSHOT) for n in range(5)),
     EVENT,
     *(replace(EVENT, source="r" * n, code="c" * k, text="") for n in range(4) for k in range(4)),
 ]
@@ -66,6 +68,8 @@ for path in sorted((ROOT / "deploy" / "msg").glob("*.msg")):
 
 def same(a: Any, b: Any) -> bool:
     """Equal values; of arrays the elements, as rows or flat."""
+    if isinstance(b, bytes):
+        return bytes(a) == b
     return a == b if isinstance(a, str) else np.array_equal(np.ravel(a), np.ravel(b), equal_nan=True)
 
 
@@ -95,7 +99,7 @@ def test_row_widths_on_the_wire_are_those_of_the_arrays() -> None:
 
 
 def test_msg_files_list_the_enumerations_we_use() -> None:
-    for cls, enums in {Reference: (End,), Command: (Mode, QpStatus), Event: (Severity,)}.items():
+    for cls, enums in {Reference: (End,), Command: (Mode, QpStatus), Journal: (JournalKind,), Event: (Severity,)}.items():
         text = (ROOT / "deploy" / "msg" / f"{cls.__name__}.msg").read_text()
         for member in (member for enum in enums for member in enum):
             assert f"uint8 {member.name}={int(member)}\n" in text
@@ -199,6 +203,9 @@ MALFORMED = [
     (Telemetry, words(TELEMETRY, 184, 4), "length"),
     (Telemetry, encode(TELEMETRY)[:-8], "truncated"),
     (Telemetry, encode(replace(TELEMETRY, y=np.zeros(2))), "length"),
+    (Journal, byte(JOURNAL, 40, 2), "value"),
+    (Journal, words(JOURNAL, 44, 4), "truncated"),
+    (Journal, words(JOURNAL, 44, 2), "oversized"),
     (Event, words(EVENT, 24, 2**32 - 1), "truncated"),
     (Event, words(EVENT, 24, 0), "text"),
     (Event, words(EVENT, 24, 5), "text"),
@@ -222,7 +229,7 @@ def test_malformed_bytes_are_refused_with_their_reason(cls: type[Message], paylo
     assert len(str(refusal.value)) < 200
 
 
-@pytest.mark.parametrize("message", [STATE, REFERENCE, COMMAND, TELEMETRY, EVENT])
+@pytest.mark.parametrize("message", [STATE, REFERENCE, COMMAND, TELEMETRY, JOURNAL, EVENT])
 def test_every_truncation_is_refused(message: Message) -> None:
     payload = encode(message)
     for size in range(len(payload)):

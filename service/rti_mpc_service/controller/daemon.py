@@ -172,6 +172,7 @@ class Daemon:
         self._announcer: Announcer | None = None
         self._commands = bus.publisher(keys.command)
         self._telemetries = {role: bus.publisher(key) for role, key in ((LEADER, keys.telemetry), (STANDBY, keys.standby_telemetry))}
+        self._journal = bus.publisher(keys.journal)
         self._states_in = bus.intake(State, config.stale_s, {"x": model.nx, "u": model.nu})
         bus.expect("state", lambda: controller.heard)
         bus.watch_certificate(controller.say)
