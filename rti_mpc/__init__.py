@@ -43,6 +43,7 @@ References, cited by key throughout:
 * [Judice1994] J. J. Júdice, F. M. Pires, "A block principal pivoting algorithm for large-scale strictly monotone linear complementarity problems",
   Comput. Oper. Res. 21(5), 1994.
 * [Mehrotra1992] S. Mehrotra, "On the implementation of a primal-dual interior point method", SIAM J. Optim. 2(4), 1992.
+* [Pacejka2012] H. B. Pacejka, "Tire and vehicle dynamics", 3rd ed., Butterworth-Heinemann, 2012.
 * [Pannocchia2003] G. Pannocchia, J. B. Rawlings, "Disturbance models for offset-free model-predictive control", AIChE J. 49(2), 2003.
 """
 

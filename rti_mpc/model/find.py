@@ -26,7 +26,8 @@ import rti_mpc
 from rti_mpc.errors import OcpError
 from rti_mpc.model.model import Model
 
-SHIPPED_MODELS = {"pioneer_3dx": "rti_mpc.model.robots.pioneer_3dx:pioneer_3dx"}
+SHIPPED = ("pioneer_3dx", "dynamic_bicycle")
+SHIPPED_MODELS = {name: f"rti_mpc.model.robots.{name}:{name}" for name in SHIPPED}
 MODEL_NAME_PATTERN = re.compile(r"([^\W\d]\w*(?:\.[^\W\d]\w*)*|.+\.py):([^\W\d]\w*)")  # package.module:function, file.py:function
 PACKAGE_PREFIX = "rti_mpc_beside_"  # of the package that stands for a folder
 
