@@ -4,9 +4,9 @@ Second opinion: the last QP of a sample that another solver has solved, solved b
 
 The QP is that of the problem's formulation, filled from copies of the sample's data by
 other code than the other solver's. OSQP starts from its last solution, in one workspace.
-Its step sizes change from time to time, and whenever it has roughly converged, it
-refines its solution on the bounds that hold there ("polishing" [Stellato2020]_): an
-opinion is as exact as the plan that it is compared with, or there is none.
+Whenever it has roughly converged, it refines its solution on the bounds that hold
+there ("polishing" [Stellato2020]_): an opinion is as exact as the plan that it is
+compared with, or there is none.
 """
 
 from __future__ import annotations
@@ -22,11 +22,9 @@ from rti_mpc.rti.qp.qp import Guess, Step
 from rti_mpc.rti.rti import Rti
 
 PIECE_ITERATIONS = 10
-SETTINGS = SolverSettings(eps=1e-3, max_iter=PIECE_ITERATIONS, check_termination=PIECE_ITERATIONS, rho=5.0, polish=50)
+SETTINGS = SolverSettings(max_iter=PIECE_ITERATIONS, check_termination=PIECE_ITERATIONS, polish=50, acting_scale=30.0)
 MAX_RESIDUAL = 1e-6  # of an opinion, relative to the scales: inputs that the cost hardly depends on are then found to 1e-3 of half their range
 MAX_ITERATIONS = 1000
-ADAPTATION_ITERATIONS = 100  # after so many iterations the rows are weighed anew, and the step size is the next one
-STEP_SIZES = tuple(SETTINGS.rho * factor for factor in (1.0, 0.1, 10.0))  # in turn: where OSQP is slow with one, it mostly converges with another
 
 
 class SecondOpinion:
@@ -61,7 +59,6 @@ class SecondOpinion:
         pairs = {name: (array.reshape(-1).data, theirs[name].reshape(-1).data) for name, array in ours.items()}
         self._weights = tuple(pairs.pop(name) for name in weights)
         self._sample = tuple(pairs.values())
-        self._turn = 0  # of the step sizes
         self._loaded = False
         self.done = True
         self.status = QpStatus.NONE
@@ -86,32 +83,21 @@ class SecondOpinion:
             self._loaded = self._load()
             return
         solver = self._solver
-        status = solver.iterate()
-        self.iterations += solver.iterations
+        status = solver.proceed()
+        self.iterations = solver.iterations
         if not status.usable:
             self._finish(status)
         elif max(solver.res_prim, solver.res_dual) < MAX_RESIDUAL:
             self._finish(QpStatus.SOLVED)
         elif self.iterations >= MAX_ITERATIONS:
             self._finish(QpStatus.MAX_ITER)
-        elif self.iterations % ADAPTATION_ITERATIONS == 0 and not self._adapt():
-            self._finish(QpStatus.FAILED)
 
     def _load(self) -> bool:
         """Load the QP, and return whether there is one."""
-        if self._turn:
-            self._turn = 0
-            self._solver.set_step_size(STEP_SIZES[0])
         self._solver.load()
         if not self._solver.embed():
             self._finish(QpStatus.FAILED)
         return not self.done
-
-    def _adapt(self) -> bool:
-        """Take the next step size, and return whether the QP can go on with it."""
-        self._turn = (self._turn + 1) % len(STEP_SIZES)
-        self._solver.set_step_size(STEP_SIZES[self._turn])
-        return self._solver.reweigh()
 
     def _finish(self, status: QpStatus) -> None:
         """End; the backup will start from an opinion, if there is one."""

@@ -180,17 +180,21 @@ def test_numbers_that_are_no_problem_give_no_opinion_and_spoil_no_later_one() ->
 
 
 def test_step_sizes_take_turns_while_osqp_does_not_converge(monkeypatch: pytest.MonkeyPatch) -> None:
-    taken: list[float] = []
-    monkeypatch.setattr(Solver, "set_step_size", lambda self, rho: taken.append(rho))
+    taken: list[int] = []
+    take = Solver._take_step_size
+
+    def taking(self: Solver, turn: int) -> None:
+        taken.append(turn)
+        take(self, turn)
+
+    monkeypatch.setattr(Solver, "_take_step_size", taking)
     monkeypatch.setattr(second_opinion, "MAX_RESIDUAL", 0.0)
     rti = Rti(pioneer(), compile=False)
     opinion = SecondOpinion(rti)
     solve(rti, seed=1)
     form(opinion)
     form(opinion)
-    rho = second_opinion.SETTINGS.rho
-    turns = [0.1 * rho, 10 * rho, rho] * 3
-    assert taken == [*turns, *turns], "the last turn is the first one again"
+    assert taken == [1, 2, 0, 1, 2, 0] * 2, "at 100, 200, 300, 500, 700 and 900 iterations"
 
 
 def test_plans_of_any_other_solver_are_judged() -> None:

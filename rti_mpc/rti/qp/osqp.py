@@ -38,7 +38,8 @@ STATUS_BY_OSQP_CODE = {
 
 MAX_ENTRY = 1e7  # of a scaled matrix: beyond it the factorization is rounding alone, and OSQP prints a line on standard output
 ACTING_MULTIPLIER = 1e-6  # a softened bound with a larger multiplier acts; those of the others are exactly zero
-ACTING_ROW_SCALE = 30.0  # factor on the row of such a bound: its step size becomes that of an equation, about 1000 times that of others
+ADAPTATION_ITERATIONS = 100  # after so many the step size is the next one, and rows are weighed anew; twice as many in each further round
+STEP_SIZES = 1.0, 0.1, 10.0  # in turn, relative to that of the settings: where OSQP is slow with one, it mostly converges with another
 
 
 @dataclass(frozen=True)
@@ -47,31 +48,34 @@ class SolverSettings:
     Settings of OSQP, as its documentation names them, for a problem whose cost is normalised.
 
     Attributes:
-        eps: Absolute and relative tolerance on the residuals; ten times tighter changes the closed-loop cost by less than 0.01 %.
+        eps: Absolute and relative tolerance on the residuals; with a tighter one the paper's trajectories cost no less.
         max_iter: Largest number of iterations; the last iterate is then used as it is.
         rho: Step size of ADMM, relative to that of `rti_mpc.rti.qp.qp.step_size`.
         check_termination: Iterations between two checks of the residuals.
         scaling: Sweeps of Ruiz scaling; none by default, since they break the symmetry of the problem and cost more time than they save.
         alpha: Over-relaxation, between 0 and 2.
         polish: Refinements of a solution on the bounds that it holds, once it has converged; 0: it is left as it is.
+        acting_scale: Factor on the row of a softened bound that acts, whose step size is larger by its square: more than 10 finds the multipliers of
+            obstacles sooner, and those of many bounds on states later.
 
     Raises:
         OcpError: One is no number, or out of range.
     """
 
-    eps: float = 1e-4
-    max_iter: int = 100
-    rho: float = 0.7
+    eps: float = 1e-3
+    max_iter: int = 400
+    rho: float = 5.0
     check_termination: int = 5
     scaling: int = 0
     alpha: float = 1.6
     polish: int = 0
+    acting_scale: float = 10.0
 
     def __post_init__(self) -> None:
         """Check the settings: OSQP itself says on standard output what it does not take."""
         for name, least in (("max_iter", 1), ("check_termination", 0), ("scaling", 0), ("polish", 0)):
             given.whole(name, getattr(self, name), least)
-        for name, most in (("eps", math.inf), ("rho", math.inf), ("alpha", 2.0)):
+        for name, most in (("eps", math.inf), ("rho", math.inf), ("alpha", 2.0), ("acting_scale", math.inf)):
             if not 0.0 < given.number(name, value := getattr(self, name)) < most:
                 raise OcpError(f"{name} must lie between 0 and {most:g}, got {value}")
 
@@ -84,11 +88,20 @@ class Solver:
         qp: The problem.
         workspace: OSQP's inner object, kept for ever and updated in place.
         cold: Whether the next `load` forgets the last solution.
+        iterations: Iterations since the initial state was embedded.
     """
 
     def __init__(self, qp: Qp, settings: SolverSettings) -> None:
         self.qp = qp
         self.cold = False
+        self.iterations = 0
+        self._settings = settings
+        self._piece = settings.max_iter // math.ceil(settings.max_iter / ADAPTATION_ITERATIONS)
+        self._turn = 0  # of the step sizes
+        self._changes, self._adapts_at = (
+            0,
+            ADAPTATION_ITERATIONS,
+        )  # changes of the step size for this QP, and the iterations at which the next one comes
         self._sound = True
         self._start: tuple[Array, Array] | None = None  # of the next `load`, its multipliers of rows as they are; None: the last solution
         self._scaled = scaled = Scaled(qp)
@@ -103,7 +116,7 @@ class Solver:
             verbose=False,
             eps_abs=settings.eps,
             eps_rel=settings.eps,
-            max_iter=settings.max_iter,
+            max_iter=self._piece,
             rho=settings.rho,
             adaptive_rho=0,
             check_termination=settings.check_termination,
@@ -129,6 +142,8 @@ class Solver:
     def load(self) -> None:
         """Linearize at the guess, and load the new matrices, factorization included; off the path from state to command."""
         qp, scaled = self.qp, self._scaled
+        if self._turn:
+            self._take_step_size(0)
         qp.linearize()
         self._sound = qp.sound
         if not self._sound:  # OSQP would never recover from such numbers
@@ -160,7 +175,7 @@ class Solver:
 
     def _weigh(self, start: tuple[Array, Array] | None) -> bool:
         """
-        Give softened rows that act the step size of equations, and return whether anything changed.
+        Give softened rows that act a larger step size, and return whether anything changed.
 
         One step size does not fit both: where such a bound acts, its multiplier must
         become large; where it does not, it must not slow the solution down. The last
@@ -172,7 +187,7 @@ class Solver:
         if np.array_equal(active, self._active):
             return False
         self._active = active
-        self._scale[self._soft] = np.where(active, ACTING_ROW_SCALE, 1.0)
+        self._scale[self._soft] = np.where(active, self._settings.acting_scale, 1.0)
         self.workspace.warm_start(x, y / self._scale)
         return True
 
@@ -201,6 +216,7 @@ class Solver:
 
     def embed(self) -> bool:
         """Embed the initial state, and return whether there is a QP to be solved."""
+        self.iterations, self._changes, self._adapts_at = 0, 0, ADAPTATION_ITERATIONS
         if not self._sound:
             self.cold = True
             return False
@@ -220,32 +236,43 @@ class Solver:
         return True
 
     def iterate(self) -> QpStatus:
-        """Iterate from the last iterate on, `max_iter` times at most."""
+        """Iterate from the last iterate on until it has converged, `max_iter` times at most."""
+        status = self.proceed()
+        while self.iterations + self._piece <= self._settings.max_iter and status in (QpStatus.MAX_ITER, QpStatus.INACCURATE):
+            status = self.proceed()
+        return status
+
+    def proceed(self) -> QpStatus:
+        """Iterate as `iterate`, but no further than to the next change of the step size."""
+        if self.iterations >= self._adapts_at:
+            self._changes += 1
+            self._adapts_at += ADAPTATION_ITERATIONS << self._changes // len(STEP_SIZES)
+            if not self._adapt():
+                self.cold = True
+                return QpStatus.FAILED
         self.workspace.solve()
+        self.iterations += int(self._info.iter)
         status = STATUS_BY_OSQP_CODE.get(self._info.status_val, QpStatus.FAILED)
         if not status.usable:
             self.cold = True  # no solve starts from a failed one
         return status
 
-    def reweigh(self) -> bool:
-        """Between two calls of `iterate`, weigh the rows by the last iterate, and return whether there still is a QP to be solved."""
+    def _adapt(self) -> bool:
+        """Take the next step size, weigh the rows by the last iterate, and return whether there still is a QP to be solved."""
+        self._take_step_size((self._turn + 1) % len(STEP_SIZES))
         if not self._weigh(None):
             return True
         self._load_matrices()
         return self._sound and self._load_vectors()
 
-    def set_step_size(self, rho: float) -> None:
-        """Change the step size of ADMM, which is relative to that of `rti_mpc.rti.qp.qp.step_size`."""
-        self.workspace.update_rho(rho)
+    def _take_step_size(self, turn: int) -> None:
+        """Take one of the step sizes."""
+        self._turn = turn
+        self.workspace.update_rho(self._settings.rho * STEP_SIZES[turn])
 
     def plan(self) -> None:
         """Make the plan from the last iterate."""
         self._scaled.plan(self._solution.x)
-
-    @property
-    def iterations(self) -> int:
-        """Iterations of the last solve."""
-        return int(self._info.iter)
 
     @property
     def res_prim(self) -> float:

@@ -15,6 +15,8 @@ from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.osqp import STATUS_BY_OSQP_CODE, SolverSettings
 from rti_mpc.rti.rti import Rti
+from rti_mpc_service.bench.families import FAMILIES
+from rti_mpc_service.bench.family_bench import drive_family
 from tests.problems import beacon, double_integrator, solve
 
 TIGHT = SolverSettings(eps=1e-9, max_iter=100_000)
@@ -28,7 +30,7 @@ def test_inner_object_of_osqp_offers_what_is_driven() -> None:
     """It is not public: this test fails if another minor version of OSQP moves it."""
     assert osqp.__version__.startswith("1.1.")
     inner = rti().solver.workspace
-    for name in ("update_data_vec", "update_data_mat", "solve", "warm_start"):
+    for name in ("update_data_vec", "update_data_mat", "update_rho", "solve", "warm_start"):
         assert callable(getattr(inner, name))
     codes = {"SOLVED": 1, "SOLVED_INACCURATE": 2, "PRIMAL_INFEASIBLE": 3, "DUAL_INFEASIBLE": 5, "MAX_ITER_REACHED": 7, "TIME_LIMIT_REACHED": 8}
     assert {name: int(osqp.SolverStatus[f"OSQP_{name}"]) for name in codes} == codes
@@ -81,7 +83,7 @@ def test_nan_never_reaches_osqp() -> None:
     class Spy:
         def __getattr__(self, name: str) -> object:
             def call(*args: Array, **arrays: Array | None) -> object:
-                seen.extend(array.copy() for array in (*args, *arrays.values()) if array is not None)
+                seen.extend(np.array(value) for value in (*args, *arrays.values()) if value is not None)
                 return getattr(inner, name)(*args, **arrays)
 
             return call
@@ -161,6 +163,21 @@ def test_iteration_limit_is_a_usable_status() -> None:
     assert one.status.usable
     assert one.solver.iterations == 5
     assert np.isfinite(one.u).all()
+
+
+@pytest.mark.parametrize("max_iter", [99, 150, 250])
+def test_no_more_iterations_are_made_than_the_limit_however_often_the_step_size_changes(max_iter: int) -> None:
+    one = rti(SolverSettings(eps=1e-300, max_iter=max_iter))
+    solve(one, 1)
+    assert max_iter - 3 <= one.solver.iterations <= max_iter
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "N"), [("paper", 20), ("paper", 50), ("tight", 20), ("tight", 50), ("discs_passed", 20), ("quadrotor", 20)])
+def test_commanding_osqp_stops_at_its_limit_in_at_most_two_percent_of_the_samples(name: str, N: int) -> None:
+    family = FAMILIES[name][0](N)
+    row = drive_family(family, "osqp", family.samples, lambda: None)
+    assert row["unsolved"] <= 0.02 * family.samples
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
