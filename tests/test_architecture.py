@@ -27,10 +27,11 @@ LIBRARY = {
     "rti_mpc.control": {"rti_mpc.model", "rti_mpc.contract", "rti_mpc.rti"},
     "rti_mpc.wire": {"rti_mpc.contract"},
     "rti_mpc.adapter": {"rti_mpc.contract", "rti_mpc.wire"},
+    "rti_mpc.recording": {"rti_mpc.contract", "rti_mpc.wire"},
 }
 
 # The commands of the service: none is a library of another. What they share is beside them, or in `config`, `host` and `rig`.
-COMMANDS = {f"rti_mpc_service.{name}" for name in ("bench", "check", "conformance", "controller", "demo", "doctor", "faults", "paper", "view")}
+COMMANDS = {f"rti_mpc_service.{name}" for name in ("bench", "check", "conformance", "controller", "demo", "doctor", "faults", "paper", "record", "view")}
 BORROWED = {"rti_mpc_service.paper": {"rti_mpc_service.bench"}}  # command: what it takes of another all the same
 
 # What no file of a package imports; the command line alone may start a simulation, lazily.
@@ -48,14 +49,15 @@ ALONE = {
     "qpsolvers": {"rti_mpc/rti/qp"},
     "zenoh": {"rti_mpc/wire"},
     "rerun": {"service/rti_mpc_service/view"},
+    "mcap": {"rti_mpc/recording"},
     "casadi": {
         *("rti_mpc/codegen.py", "rti_mpc/model", "rti_mpc/rti", "rti_mpc/control", "sim/rti_mpc_sim/plant.py"),
         *(f"service/rti_mpc_service/{name}" for name in ("bench", "check", "paper")),
     },
 }
 
-# Who reads what peers send. Zenoh's own configuration is no peer's.
-DOORS = {"decode": {"rti_mpc/wire/intake.py"}, "json.loads": {"rti_mpc/wire/document.py", "rti_mpc/wire/session.py"}}
+# Who reads what peers send, or have sent when it was recorded. Zenoh's own configuration is no peer's.
+DOORS = {"decode": {"rti_mpc/wire/intake.py", "rti_mpc/recording/reader.py"}, "json.loads": {"rti_mpc/wire/document.py", "rti_mpc/wire/session.py"}}
 
 
 def relative(path: Path) -> str:

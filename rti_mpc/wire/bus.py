@@ -24,7 +24,7 @@ from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.reach import remind
 from rti_mpc.wire.received import Received as Received
 from rti_mpc.wire.session import BusSettings as BusSettings
-from rti_mpc.wire.streams import MAX_REQUEST_BYTES, role_of
+from rti_mpc.wire.streams import ALIVE, MAX_REQUEST_BYTES, role_of
 from rti_mpc.wire.zenoh_session import CLOSE_TIMEOUT_S, ZenohSession
 
 RING_MESSAGES = 1024  # messages that wait for a receiver: those of half a second at 2000 per second
@@ -216,6 +216,10 @@ class Bus:
         leaving.start()
         leaving.join(CLOSE_TIMEOUT_S)
 
+    def beside(self, keys: Keys) -> Bus:
+        """Return the bus of another robot on the same session, which ends with this one."""
+        return Bus(self._session, keys, say=self._say)
+
     def expect(self, what: str, heard: Callable[[], object]) -> None:
         """
         Report from time to time that a message has not arrived yet, and how many processes this one is linked to, until it has.
@@ -363,6 +367,17 @@ class Bus:
                 callback(role, present)
 
         self._declared.append(self._session.watch(self.keys.lives, tell))
+
+    def watch_robots(self, callback: Callable[[str, str, bool], None]) -> None:
+        """Call back in a thread of its own, with robot, role and whether it is present, for all robots below this prefix."""
+        begin, end = f"{self.keys.prefix}/", f"/{ALIVE.name}/"
+
+        def tell(key: str, present: bool) -> None:
+            robot, _, role = key.removeprefix(begin).rpartition(end)
+            if robot and role_of(key) == role:
+                callback(robot, role, present)
+
+        self._declared.append(self._session.watch(Key(f"{begin}**{end}*", ALIVE), tell))
 
 
 def _object(received: Received, max_bytes: int) -> dict[str, Any]:

@@ -110,6 +110,11 @@ class Keys:
         return self.of(streams.STOP)
 
     @property
+    def origin(self) -> Key[Any]:
+        """Queryable of controllers for the files that a recording keeps of them, JSON."""
+        return self.of(streams.ORIGIN)
+
+    @property
     def events(self) -> Key[Event]:
         """All events, for subscribers."""
         return self.event("*")

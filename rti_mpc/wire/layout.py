@@ -28,7 +28,7 @@ class Field:
     One field of a message.
 
     Attributes:
-        name: Name in the dataclass and in the ``.msg`` file.
+        name: Name in the dataclass, and in small letters in the ``.msg`` file.
         kind: Type in the ``.msg`` file: an integer, ``float64``, ``string``, ``float64[]`` or ``uint8[]``.
         about: Meaning and unit, the comment in the ``.msg`` file.
         member_of: Enumeration of which the number is a member.
@@ -213,7 +213,7 @@ def msg_text(cls: type[Any]) -> str:
         if field.width and field.width not in widths:
             widths.add(field.width)
             lines.append(("uint32 " + field.width, WIDTH_DESCRIPTIONS[field.width]))
-        lines.append((f"{field.kind} {field.name}", field.about))
+        lines.append((f"{field.kind} {field.name.lower()}", field.about))  # ROS 2 refuses a message with capitals in its fields
     column = max(len(declaration) for declaration, _ in lines)
     body = [f"{declaration:<{column}}  # {about}" for declaration, about in lines]
     return "\n".join([f"# {MESSAGE_DESCRIPTIONS[cls]}", *constants, "", *body]) + "\n"

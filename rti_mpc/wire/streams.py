@@ -100,8 +100,8 @@ class Stream(Generic[M]):
         return min(messages, MAX_RING_BYTES // self.max_bytes)
 
 
-def _query(name: str, servers: tuple[str, ...], qos: Qos, about: str) -> Stream[Any]:
-    return Stream(name, None, servers, qos, "on request", about, kind=Kind.QUERY, askers=("operator",))
+def _query(name: str, servers: tuple[str, ...], qos: Qos, about: str, asker: str = "operator") -> Stream[Any]:
+    return Stream(name, None, servers, qos, "on request", about, kind=Kind.QUERY, askers=(asker,))
 
 
 CONTROLLER_ROLES = ("controller", "standby")  # roles of one process, which changes between them
@@ -133,7 +133,7 @@ JOURNAL = Stream(
 EVENT = Stream(
     "event",
     Event,
-    (*CONTROLLER_ROLES, "guard", "robot", "reference", "viewer"),
+    (*CONTROLLER_ROLES, "guard", "robot", "reference", "viewer", "recorder"),
     QOS_CACHED,
     "once per mode change; faults of one code at most once per second",
     "mode changes and faults",
@@ -150,10 +150,11 @@ INFO: Stream[Any] = Stream(
 )
 REQUEST = _query("request", CONTROLLER_ROLES, QOS_QUERY, "reading and changing parameters, injecting failures")
 STOP = _query("stop", (*CONTROLLER_ROLES, "guard"), QOS_FAST_QUERY, "an operator's stop and its release, never delayed by other requests")
+ORIGIN = _query("origin", CONTROLLER_ROLES, QOS_QUERY, "configuration, model, versions and host of a controller, for recordings", "recorder")
 ALIVE: Stream[Any] = Stream(
     "alive",
     None,
-    (*CONTROLLER_ROLES, "guard", "robot", "reference", "viewer", "router", "relay", "echo"),
+    (*CONTROLLER_ROLES, "guard", "robot", "reference", "viewer", "recorder", "router", "relay", "echo"),
     Qos(),
     "as long as the process runs",
     "presence of a process, for people and fleet management; never a safety signal",
@@ -167,7 +168,7 @@ PONG = Stream("echo/pong", Command, ("echo",), QOS_FAST, "once per ping", "answe
 
 STREAMS: tuple[Stream[Any], ...] = (
     *(STATE, REFERENCE, ANCHORED, COMMAND, ACTUATION, TELEMETRY, SHADOW_TELEMETRY),
-    *(JOURNAL, EVENT, INFO, REQUEST, STOP, ALIVE, RELAY, PING, PONG),
+    *(JOURNAL, EVENT, INFO, REQUEST, STOP, ORIGIN, ALIVE, RELAY, PING, PONG),
 )
 
 

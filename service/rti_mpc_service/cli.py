@@ -271,6 +271,31 @@ def view(
 
 
 @partial(process, with_model=False)
+def record(
+    config: Config,
+    bus: BusSettings,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE.mcap", help="File to write; with a limit, a folder.", show_default="runs/ROBOT-TIME.mcap")
+    ] = None,
+    robot: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Robot to record, or a pattern such as '*'; repeatable.", show_default="the robot of CONFIG"),
+    ] = None,
+    last: Annotated[str | None, typer.Option(metavar="TIME", help="Keep this time, such as 10min, and delete what is older.")] = None,
+    max_size: Annotated[str | None, typer.Option(metavar="SIZE", help="Keep this size, such as 2GB, and delete what is older.")] = None,
+    repair: Annotated[
+        Path | None, typer.Option(metavar="FILE.mcap", help="Instead, end a file whose recorder was killed, so that other tools read it.")
+    ] = None,
+) -> int:
+    """Record all streams of one or more robots into an MCAP file, which Foxglove, PlotJuggler, Rerun and ROS 2 open."""
+    from rti_mpc_service.record import record
+
+    if repair is not None:
+        return record.repaired(repair, out or repair)
+    return record.main(bus, config.keys(), out=out, robots=robot or (), limits=record.parse_limits(last, max_size))
+
+
+@partial(process, with_model=False)
 def router(config: Config, bus: BusSettings) -> None:
     """Run a Zenoh router, for clients on several hosts or with access control."""
     from rti_mpc_service import router_log

@@ -33,7 +33,12 @@ END_TIMEOUT_S = 1.0  # for writing buffered output at the end
 MAX_LINE_CHARACTERS = 2000  # of an error message
 CONTROL_CHARACTER = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 # Modules of optional dependencies, which a robot does not need.
-EXTRA_OF_MODULE = {"rerun": "view", "rerun_cli": "view", "matplotlib": "figure", "cryptography": "certs"}
+EXTRA_OF_MODULE = {
+    **dict.fromkeys(("rerun", "rerun_cli"), "view"),
+    **dict.fromkeys(("mcap", "pandas", "pyarrow"), "record"),
+    "matplotlib": "figure",
+    "cryptography": "certs",
+}
 
 
 class OutputError(Exception):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import re
 import struct
 import subprocess
 import sys
@@ -77,7 +78,7 @@ def same(a: Any, b: Any) -> bool:
 def test_rosbags_decodes_our_bytes_to_equal_values(message: Message) -> None:
     decoded = store.deserialize_cdr(encode(message), schema(type(message)).partition("@")[0])
     for field in fields(message):
-        assert same(getattr(decoded, field.name), getattr(message, field.name)), field.name
+        assert same(getattr(decoded, field.name.lower()), getattr(message, field.name)), field.name
 
 
 @pytest.mark.parametrize("message", MESSAGES)
@@ -109,6 +110,13 @@ def test_msg_files_list_the_enumerations_we_use() -> None:
 def test_msg_files_and_dataclasses_have_the_fields_of_the_table_in_its_order(cls: type[Message]) -> None:
     assert (ROOT / "deploy" / "msg" / f"{cls.__name__}.msg").read_text() == msg_text(cls), "run `make msg`"
     assert [field.name for field in fields(cls)] == [field.name for field in LAYOUTS[cls]]
+
+
+@pytest.mark.parametrize("cls", LAYOUTS)
+def test_fields_have_names_that_ros_2_accepts(cls: type[Message]) -> None:
+    names = re.findall(r"^\w+(?:\[\])? (\w+) ", msg_text(cls), re.MULTILINE)
+    assert len(names) >= len(LAYOUTS[cls])
+    assert [name for name in names if not re.fullmatch(r"[a-z](_?[a-z0-9])*", name)] == []
 
 
 @pytest.mark.parametrize("message", MESSAGES)

@@ -25,6 +25,7 @@ ROLES_OF_COMMAND: dict[str, tuple[str, ...]] = {
     "sim": ("robot",),
     "reference": ("planner",),
     "view": ("viewer", "recorder"),
+    "record": ("recorder",),
     "router": ("router",),
     "stop": ("operator",),
     "enable": ("operator",),

@@ -44,9 +44,10 @@ def too_deep(content: dict[str, Any]) -> bool:
     return any(isinstance(value, dict | list) for value in level)
 
 
-def write(config: Config) -> str:
-    """Return the text of a file that loads as this configuration; keys that were left out stay out."""
-    return "\n".join(_table("", config.model_dump(mode="python", by_alias=True, exclude_unset=True, exclude_none=True))).strip() + "\n"
+def write(config: Config, *, without: Mapping[str, Any] | None = None) -> str:
+    """Return the text of a file that loads as this configuration; keys that were left out stay out, and those of `without`, as pydantic has it."""
+    content = config.model_dump(mode="python", by_alias=True, exclude_unset=True, exclude_none=True, exclude=dict(without or {}))
+    return "\n".join(_table("", content)).strip() + "\n"
 
 
 def _table(path: str, values: Mapping[str, Any]) -> list[str]:

@@ -44,6 +44,7 @@ from rti_mpc_service.config.schema import Config
 from rti_mpc_service.controller.description import controller_info
 from rti_mpc_service.controller.leadership import LEADER, LISTEN_BEFORE_START_S, STANDBY, Candidate, hear_others
 from rti_mpc_service.controller.orders import Orders
+from rti_mpc_service.controller.origin import Origin
 from rti_mpc_service.controller.params import Params
 from rti_mpc_service.controller.references import References
 from rti_mpc_service.controller.slack import Slack
@@ -119,6 +120,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
         daemon = Daemon(config, controller, bus, leadership, params, lock, rti, outcomes, operator_stop)
         operator_stop.serve(bus, lambda: leadership.role, daemon.publish_info)
         bus.serve(bus.keys.request, daemon.orders.answer)
+        bus.serve(bus.keys.origin, Origin(config, ocp.model, lambda: leadership.epoch).answer)
         log.info("epoch %d controls %s every %g s" if leadership.leading else "%d stands by %s, every %g s", leadership.epoch, config.robot, ocp.dt)
         if outcomes:
             level = logging.INFO if all(outcome.granted for outcome in outcomes) else logging.WARNING

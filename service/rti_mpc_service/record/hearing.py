@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Hearing of one robot: its streams, each received by a thread of its own that notes the time of arrival.
+
+What waits for a thread waits in Zenoh's ring, which drops the oldest: a recorder that is
+held up delays nobody.
+"""
+
+from __future__ import annotations
+
+import base64
+import logging
+import time
+import zlib
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from threading import Thread
+from typing import Any
+
+from rti_mpc.errors import MessageError
+from rti_mpc.wire import document
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, Subscriber
+from rti_mpc.wire.streams import PING, PONG, STREAMS, Kind, Stream
+from rti_mpc_service.record.inbox import Arrived, Inbox
+
+HEARD: tuple[Stream[Any], ...] = tuple(stream for stream in STREAMS if stream.kind is Kind.MESSAGE and stream not in (PING, PONG))
+ASK_TIMEOUT_S = 2.0
+MAX_BUNDLE_BYTES = 1 << 24  # of a controller's files
+
+log = logging.getLogger(__name__)
+
+
+def hear(bus: Bus, inbox: Inbox) -> None:
+    """Put all messages of a robot into an inbox, until the bus is closed."""
+    robot = bus.keys.robot
+    for stream in HEARD:
+        subscriber = bus.subscriber(bus.keys.of(stream, "*"), capacity=RING_MESSAGES)
+
+        def follow(subscriber: Subscriber = subscriber, stream: Stream[Any] = stream) -> None:
+            while (received := subscriber.recv()) is not None:
+                inbox.put(Arrived(robot, stream, time.monotonic_ns(), received))
+
+        Thread(target=follow, name=f"{robot}/{stream.name}", daemon=True).start()
+
+
+def fetch_origin(bus: Bus, owner: int, give: Callable[[Mapping[str, str]], object]) -> None:
+    """Ask a controller for its files, in a thread of its own, and give them; a line in the log if it has none."""
+
+    def ask() -> None:
+        pieces: dict[int, str] = {}
+        size = 1
+        while (begin := sum(map(len, pieces.values()))) < size <= MAX_BUNDLE_BYTES:
+            answers = [answer for answer in bus.answers(bus.keys.origin, {"from": begin}, ASK_TIMEOUT_S) if answer.get("owner") == owner]
+            if not answers or not answers[0].get("piece"):
+                break
+            size, pieces[begin] = int(answers[0]["size"]), str(answers[0]["piece"])
+        else:
+            with suppress(ValueError, MessageError, zlib.error):
+                bundle = zlib.decompressobj().decompress(base64.b64decode("".join(pieces.values())), MAX_BUNDLE_BYTES)
+                give({name: str(text) for name, text in document.read(bundle, most=MAX_BUNDLE_BYTES).items()})
+                return
+        log.warning("%s: a controller has not sent its configuration and model: they are missing in the recording", bus.keys.robot)
+
+    Thread(target=ask, name=f"{bus.keys.robot}/origin", daemon=True).start()

@@ -1,0 +1,276 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Recorder: a process that listens to all streams of one or more robots and writes them into an MCAP file.
+
+A chunk is closed and written twice a second, so that the recorder may be killed at any
+instant. What it writes is checked before: a message that cannot be decoded is counted, not
+recorded, since readers would stop at it.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from functools import partial
+from pathlib import Path
+from threading import Event, Lock
+from typing import Any
+
+from rti_mpc.contract.epoch import MAX_SEQ_GAP, NUMBER_BITS
+from rti_mpc.contract.message import Notice, Severity
+from rti_mpc.errors import ConfigError, MessageError
+from rti_mpc.recording.repair import repair
+from rti_mpc.wire import document
+from rti_mpc.wire.announcer import Announcer
+from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.interrupt import stop_on_signals
+from rti_mpc.wire.keys import Key, Keys
+from rti_mpc.wire.streams import CONTROLLER_ROLES, INFO, JOURNAL, admitted, role_of
+from rti_mpc_service.announce import announce
+from rti_mpc_service.record.hearing import fetch_origin, hear
+from rti_mpc_service.record.inbox import Arrived, Inbox
+from rti_mpc_service.record.segments import Limits, Segments
+
+ROLE = "recorder"
+PERIOD_S = 0.5  # between two chunks
+MAX_NUMBERED = 4096  # publishers whose sequence numbers are followed
+MAX_ROBOTS = 100
+STALE_S = 2.0
+WILD = set("*?[")
+
+MEDIA_TYPES = {".toml": "application/toml", ".py": "text/x-python", ".json": "application/json"}
+UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
+UNITS_BYTES = {"KB": 10**3, "MB": 10**6, "GB": 10**9}
+
+log = logging.getLogger(__name__)
+
+
+def main(
+    bus_settings: BusSettings,
+    keys: Keys,
+    *,
+    out: Path | None = None,
+    robots: Sequence[str] = (),
+    limits: Limits = Limits(),  # noqa: B008
+    stop: Event | None = None,
+) -> int:
+    """
+    Record until stopped.
+
+    Args:
+        bus_settings: How to join the bus.
+        keys: Keys of a robot.
+        out: File, or folder if there are limits; None: in ``runs``, by robot and time.
+        robots: Names of the robots to record instead, or patterns such as ``"*"`` for those that show presence below the same prefix.
+        limits: Limits of time and size, beyond which the oldest segments are deleted.
+        stop: Event that stops the process; None: SIGINT and SIGTERM do.
+
+    Returns:
+        Exit status: 1 if the disk did not take everything, else 0.
+
+    Raises:
+        ConfigError: The file is there already, or cannot be written.
+    """
+    stop = stop or stop_on_signals()
+    names = list(robots) or [keys.robot]
+    end = "" if limits else ".mcap"
+    path = out or Path("runs") / f"{keys.robot if names == [keys.robot] else 'robots'}-{time.strftime('%Y%m%d-%H%M%S')}{end}"
+    with Bus.join(bus_settings, keys, stop=stop, say=log.warning) as bus:
+        now_ns = time.monotonic_ns()
+        recorder = Recorder(bus, Segments(path, limits, now_ns, time.time_ns() - now_ns))
+        log.info("recording %s to %s", ", ".join(f"{keys.prefix}/{name}" for name in names), path)
+        fixed = [name for name in names if not WILD & set(name)]
+        for name in fixed:
+            recorder.follow(name)
+        if fixed != names:
+
+            def meet(robot: str, _: str, present: bool) -> None:
+                if present and any(fnmatchcase(robot, name) for name in names):
+                    recorder.follow(robot)
+
+            bus.watch_robots(meet)
+        return recorder.run(stop)
+
+
+class Recorder:
+    """
+    One recording.
+
+    Attributes:
+        counts: Numbers of messages: recorded; missing, by their sequence numbers; refused, since they cannot be decoded.
+    """
+
+    def __init__(self, bus: Bus, segments: Segments) -> None:
+        self.counts: Counter[str] = Counter(recorded=0, missing=0, refused=0)
+        self._bus = bus
+        self._segments = segments
+        self._inbox = Inbox()
+        self._buses: dict[str, Bus] = {}
+        self._announcers: list[Announcer] = []
+        self._files: list[tuple[str, Mapping[str, str]]] = []  # of controllers, to be attached, with the beginning of their names
+        self._lock = Lock()
+        self._doors: dict[type[Any], Intake[Any]] = {}
+        self._keys: dict[str, Key[Any] | None] = {}  # None: of a role beyond the limit of roles
+        self._last: dict[tuple[str, int], int] = {}  # sequence numbers by key and epoch
+        self._owners: set[tuple[str, int]] = set()  # controllers whose files were asked for
+
+    def follow(self, robot: str) -> None:
+        """Record a robot from now on, too; in any thread."""
+        with self._lock:
+            if robot in self._buses or len(self._buses) >= MAX_ROBOTS:
+                return
+            try:
+                bus = self._bus if robot == self._bus.keys.robot else self._bus.beside(Keys(self._bus.keys.prefix, robot))
+            except ConfigError:
+                return
+            self._buses[robot] = bus
+            self._announcers.append(Announcer(bus, ROLE, time.time_ns() // 1_000_000_000))
+        hear(bus, self._inbox)
+        bus.alive(ROLE)
+        bus.expect("message", lambda: any(entry[0].startswith(f"{bus.keys.prefix}/{robot}/") for entry in list(self._last)))
+
+    def run(self, stop: Event) -> int:
+        """Record until stopped, and return the exit status."""
+        told = 0
+        try:
+            stopped = False
+            while not stopped:
+                stopped = stop.wait(PERIOD_S)
+                self._write()
+                if (lost := self.counts["missing"]) > told:
+                    text = f"{lost} messages are missing in the recording so far, {self._inbox.dropped} of them because the disk was too slow"
+                    self._tell(Notice(Severity.WARNING, "recording_incomplete", text))
+                    told = lost
+            self._segments.writer.finish(self._outcome())
+        except OSError as error:
+            self._segments.writer.abandon()
+            text = f"the recording ends here: {error.strerror}; its {1e-6 * self._segments.size:.1f} MB before are whole, see rti-mpc record --repair"
+            self._tell(Notice(Severity.ERROR, "recording_ended", text))
+            return 1
+        log.info("%s, %.1f MB", ", ".join(f"{count} {name}" for name, count in self.counts.items()), 1e-6 * self._segments.size)
+        return 0
+
+    def _write(self) -> None:
+        """
+        Write what has arrived as a chunk.
+
+        Raises:
+            OSError: The disk did not take it.
+        """
+        now_ns = time.monotonic_ns()
+        with self._lock:
+            files, self._files = self._files, []
+        for beginning, contents in files:
+            for name, text in contents.items():
+                media_type = MEDIA_TYPES.get(Path(name).suffix, "text/plain")
+                self._segments.attach(f"{beginning}/{name}", media_type, text.encode(errors="replace"), now_ns)
+        for entry in self._inbox.take():
+            self._record(entry)
+        self._segments.writer.flush()
+        for entry in self._segments.roll(now_ns, self._outcome()):
+            self._add(entry, self._keys[entry.received.key])
+
+    def _record(self, entry: Arrived) -> None:
+        """Check a message and add it to the chunk."""
+        received, stream = entry.received, entry.stream
+        if received.key not in self._keys:
+            heard = not stream.by_role or admitted(received.key, [key for key, other in self._keys.items() if other and other.stream is stream])
+            self._keys[received.key] = Key(received.key, stream) if heard else None
+        key = self._keys[received.key]
+        seq = 0
+        if key is None:
+            return
+        if stream.message is None:
+            try:
+                self._described(entry, document.read(received.payload, received.size))
+            except MessageError:
+                self.counts["refused"] += 1
+                return
+        else:
+            door = self._doors.setdefault(stream.message, self._bus.intake(stream.message, STALE_S))
+            if (message := door.read(received)) is None:
+                self.counts["refused"] += 1
+                return
+            seq = message.seq
+            if stream is not JOURNAL:  # whose numbers count entries
+                self._follow_numbers(received.key, message.epoch, seq)
+        self._add(entry, key, seq)
+        self._segments.keep(entry)
+        self.counts["recorded"] += 1
+
+    def _add(self, entry: Arrived, key: Key[Any] | None, seq: int = 0) -> None:
+        if key is not None:
+            self._segments.writer.add(entry.robot, key, entry.local_ns, entry.received.payload, seq)
+
+    def _follow_numbers(self, key: str, epoch: int, seq: int) -> None:
+        """Count the sequence numbers that were left out."""
+        last = self._last.get((key, epoch))
+        if last is None and len(self._last) >= MAX_NUMBERED:
+            self._last.clear()
+        if last is not None and 1 < seq - last <= MAX_SEQ_GAP:
+            self.counts["missing"] += seq - last - 1
+        self._last[key, epoch] = max(seq, last or 0)
+
+    def _described(self, entry: Arrived, info: Mapping[str, Any]) -> None:
+        """Ask a controller that has described itself for the first time for its files."""
+        role, epoch = role_of(entry.received.key).partition(".")[0], info.get("epoch")
+        if entry.stream is not INFO or role not in CONTROLLER_ROLES or type(epoch) is not int:
+            return
+        owner = epoch % (1 << NUMBER_BITS)
+        if (entry.robot, owner) in self._owners or len(self._owners) >= MAX_NUMBERED:
+            return
+        self._owners.add((entry.robot, owner))
+        fetch_origin(self._buses[entry.robot], owner, partial(self._give, f"{entry.robot}/{owner}"))
+
+    def _give(self, beginning: str, files: Mapping[str, str]) -> None:
+        with self._lock:
+            self._files.append((beginning, files))
+
+    def _outcome(self) -> dict[str, str]:
+        return {**{name: str(count) for name, count in self.counts.items()}, "dropped": str(self._inbox.dropped)}
+
+    def _tell(self, notice: Notice) -> None:
+        with self._lock:
+            announcers = list(self._announcers)
+        for announcer in announcers:
+            announce(log, announcer, notice, 0)
+
+
+def repaired(path: Path, to: Path) -> int:
+    """
+    Repair a file, say what it holds, and return the exit status.
+
+    Raises:
+        ConfigError: It is no recording, or cannot be read or written.
+    """
+    try:
+        count = repair(path, to)
+    except (OSError, MessageError) as error:
+        raise ConfigError(f"--repair must be a recording that can be read and written: {error}") from error
+    print(f"{to}: {count} messages")
+    return 0
+
+
+def parse_limits(last: str | None, max_size: str | None) -> Limits:
+    """
+    Return limits as they are written on the command line.
+
+    Raises:
+        ConfigError: They are not a time such as ``10min``, or a size such as ``2GB``.
+    """
+    size = _quantity("max-size", max_size, UNITS_BYTES, "2GB")
+    return Limits(_quantity("last", last, UNITS_S, "10min"), None if size is None else round(size))
+
+
+def _quantity(option: str, text: str | None, units: Mapping[str, float], example: str) -> float | None:
+    if text is None:
+        return None
+    match = re.fullmatch(rf"(\d+(?:\.\d+)?) ?({'|'.join(units)})", text)
+    if match is None or not float(match[1]):
+        raise ConfigError(f"--{option} must be a number above 0 and one of {', '.join(units)}, such as {example}, got {text!r}")
+    return float(match[1]) * units[match[2]]
