@@ -9,7 +9,7 @@ UV := $(shell command -v uv)
 FITS := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 PYTHON = $(shell for python in python3 python3.13 python3.12 python3.11 python3.14; do $$python -c '$(FITS)' 2>/dev/null && echo $$python && break; done)
 
-.PHONY: demo test test-busy test-slow soak attack ends problems bench lint format types docs msg lock clean
+.PHONY: demo test test-busy test-slow soak attack ends kills problems bench lint format types docs msg lock clean
 
 demo: $(READY)
 	$(BIN)/rti-mpc demo $(ARGS)
@@ -31,6 +31,9 @@ attack: $(READY)
 
 ends: $(READY)
 	$(BIN)/pytest -m slow -s tests/processes/test_ends.py --ends 50 $(ARGS)
+
+kills: $(READY)
+	$(BIN)/pytest -m slow -s tests/processes/test_record.py --kills 50 $(ARGS)
 
 problems: $(READY)
 	$(BIN)/pytest -s tests/rti/test_random_problems.py --structures 300 --sets 34 $(ARGS)

@@ -19,6 +19,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--soak-s", type=float, default=20.0, metavar="SECONDS", help="how long the soak test drives the robot (default: 20)")
     parser.addoption("--attack", type=int, default=20_000, metavar="MESSAGES", help="how many hostile messages processes bear (default: 20000)")
     parser.addoption("--ends", type=int, default=5, metavar="COUNT", help="how often each kind of process is ended (default: 5)")
+    parser.addoption("--kills", type=int, default=3, metavar="COUNT", help="how often the recorder is killed (default: 3)")
     parser.addoption("--structures", type=int, default=6, metavar="COUNT", help="how many structures random problems have (default: 6)")
     parser.addoption("--sets", type=int, default=20, metavar="COUNT", help="how many random problems there are of each structure (default: 20)")
 

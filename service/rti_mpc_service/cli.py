@@ -292,7 +292,7 @@ def record(
 
     if repair is not None:
         return record.repaired(repair, out or repair)
-    return record.main(bus, config.keys(), out=out, robots=robot or (), limits=record.parse_limits(last, max_size))
+    return record.main(bus, config.keys(), out=out, robots=robot or (), retention=record.parse_retention(last, max_size))
 
 
 @partial(process, with_model=False)

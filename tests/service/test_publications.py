@@ -90,6 +90,14 @@ def test_viewer_publishes_what_the_table_lets_it(session: FakeSession, tmp_path:
     assert session.said == may("viewer")
 
 
+def test_recorder_publishes_what_the_table_lets_it(session: FakeSession, tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    from rti_mpc_service.record import record
+
+    record.main(SETTINGS, KEYS, out=tmp_path / "run.mcap", stop=STOPPED)
+    assert session.said == may("recorder")
+
+
 @pytest.mark.parametrize("roles", [("robot",), ("guard",), ("controller", "standby")], ids="_".join)
 def test_description_of_a_process_can_be_read(roles: tuple[str, ...], session: FakeSession, tmp_path: Path) -> None:
     PROCESSES[roles](tmp_path)
@@ -105,7 +113,7 @@ def test_description_of_a_process_can_be_read(roles: tuple[str, ...], session: F
 
 
 def test_every_role_that_may_publish_has_a_process_here() -> None:
-    assert {role for stream in STREAMS for role in stream.publishers} == {"viewer", *(role for roles in PROCESSES for role in roles)}
+    assert {role for stream in STREAMS for role in stream.publishers} == {"viewer", "recorder", *(role for roles in PROCESSES for role in roles)}
 
 
 def test_operator_asks_whom_the_table_lets_him(session: FakeSession, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

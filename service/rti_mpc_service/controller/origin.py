@@ -3,7 +3,7 @@
 Origin of a controller's commands: configuration, model, versions and host, as files for recordings.
 
 A recorder asks for them piece by piece on the query ``origin``, which changes nothing. The
-section ``bus`` stays out: it may hold passwords of Zenoh and names of key files.
+section ``bus`` stays out: it names the files of keys and passwords.
 """
 
 from __future__ import annotations

@@ -34,14 +34,15 @@ from rti_mpc.wire.streams import CONTROLLER_ROLES, INFO, JOURNAL, admitted, role
 from rti_mpc_service.announce import announce
 from rti_mpc_service.record.hearing import fetch_origin, hear
 from rti_mpc_service.record.inbox import Arrived, Inbox
-from rti_mpc_service.record.segments import Limits, Segments
+from rti_mpc_service.record.segments import Retention, Segments
 
 ROLE = "recorder"
 PERIOD_S = 0.5  # between two chunks
 MAX_NUMBERED = 4096  # publishers whose sequence numbers are followed
 MAX_ROBOTS = 100
 STALE_S = 2.0
-WILD = set("*?[")
+WILD = set("*?[")  # characters of a pattern
+EVERYTHING = Retention()
 
 MEDIA_TYPES = {".toml": "application/toml", ".py": "text/x-python", ".json": "application/json"}
 UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
@@ -56,7 +57,7 @@ def main(
     *,
     out: Path | None = None,
     robots: Sequence[str] = (),
-    limits: Limits = Limits(),  # noqa: B008
+    retention: Retention = EVERYTHING,
     stop: Event | None = None,
 ) -> int:
     """
@@ -65,9 +66,9 @@ def main(
     Args:
         bus_settings: How to join the bus.
         keys: Keys of a robot.
-        out: File, or folder if there are limits; None: in ``runs``, by robot and time.
+        out: File, or folder if there is a limit; None: in ``runs``, by robot and time.
         robots: Names of the robots to record instead, or patterns such as ``"*"`` for those that show presence below the same prefix.
-        limits: Limits of time and size, beyond which the oldest segments are deleted.
+        retention: Limits of time and size, beyond which the oldest segments are deleted.
         stop: Event that stops the process; None: SIGINT and SIGTERM do.
 
     Returns:
@@ -78,11 +79,11 @@ def main(
     """
     stop = stop or stop_on_signals()
     names = list(robots) or [keys.robot]
-    end = "" if limits else ".mcap"
+    end = "" if retention else ".mcap"
     path = out or Path("runs") / f"{keys.robot if names == [keys.robot] else 'robots'}-{time.strftime('%Y%m%d-%H%M%S')}{end}"
     with Bus.join(bus_settings, keys, stop=stop, say=log.warning) as bus:
         now_ns = time.monotonic_ns()
-        recorder = Recorder(bus, Segments(path, limits, now_ns, time.time_ns() - now_ns))
+        recorder = Recorder(bus, Segments(path, retention, now_ns, time.time_ns() - now_ns))
         log.info("recording %s to %s", ", ".join(f"{keys.prefix}/{name}" for name in names), path)
         fixed = [name for name in names if not WILD & set(name)]
         for name in fixed:
@@ -141,7 +142,7 @@ class Recorder:
             stopped = False
             while not stopped:
                 stopped = stop.wait(PERIOD_S)
-                self._write()
+                self._write(time.monotonic_ns())
                 if (lost := self.counts["missing"]) > told:
                     text = f"{lost} messages are missing in the recording so far, {self._inbox.dropped} of them because the disk was too slow"
                     self._tell(Notice(Severity.WARNING, "recording_incomplete", text))
@@ -155,14 +156,13 @@ class Recorder:
         log.info("%s, %.1f MB", ", ".join(f"{count} {name}" for name, count in self.counts.items()), 1e-6 * self._segments.size)
         return 0
 
-    def _write(self) -> None:
+    def _write(self, now_ns: int) -> None:
         """
         Write what has arrived as a chunk.
 
         Raises:
             OSError: The disk did not take it.
         """
-        now_ns = time.monotonic_ns()
         with self._lock:
             files, self._files = self._files, []
         for beginning, contents in files:
@@ -256,15 +256,15 @@ def repaired(path: Path, to: Path) -> int:
     return 0
 
 
-def parse_limits(last: str | None, max_size: str | None) -> Limits:
+def parse_retention(last: str | None, max_size: str | None) -> Retention:
     """
     Return limits as they are written on the command line.
 
     Raises:
-        ConfigError: They are not a time such as ``10min``, or a size such as ``2GB``.
+        ConfigError: They are no time such as ``10min``, or no size such as ``2GB``.
     """
     size = _quantity("max-size", max_size, UNITS_BYTES, "2GB")
-    return Limits(_quantity("last", last, UNITS_S, "10min"), None if size is None else round(size))
+    return Retention(_quantity("last", last, UNITS_S, "10min"), None if size is None else round(size))
 
 
 def _quantity(option: str, text: str | None, units: Mapping[str, float], example: str) -> float | None:

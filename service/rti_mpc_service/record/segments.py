@@ -17,9 +17,9 @@ SEGMENTS = 8  # that a limit of time or size is divided into; one more is being 
 
 
 @dataclass(frozen=True)
-class Limits:
+class Retention:
     """
-    Limits of a recording, None where there is none.
+    What of a recording is kept, None where there is no limit.
 
     Attributes:
         last_s: Time that is kept at least, s.
@@ -30,7 +30,7 @@ class Limits:
     max_bytes: int | None = None
 
     def __bool__(self) -> bool:
-        return self != Limits()
+        return self != Retention()
 
 
 class Segments:
@@ -44,13 +44,13 @@ class Segments:
         written: Bytes in all files that are kept, but for that one.
     """
 
-    def __init__(self, path: Path, limits: Limits, start_ns: int, unix_offset_ns: int) -> None:
+    def __init__(self, path: Path, retention: Retention, start_ns: int, unix_offset_ns: int) -> None:
         """
         Create the first file.
 
         Args:
-            path: The file, or the folder if there are limits.
-            limits: Limits of time and size.
+            path: The file; the folder of the segments if there is a limit.
+            retention: Limits of time and size.
             start_ns: Local monotonic time.
             unix_offset_ns: Unix time minus local monotonic time.
 
@@ -58,7 +58,7 @@ class Segments:
             ConfigError: It is there already, or cannot be written.
         """
         self.written = 0
-        self._limits = limits
+        self._retention = retention
         self._path = path
         self._unix_offset_ns = unix_offset_ns
         self._number = 0
@@ -68,11 +68,11 @@ class Segments:
         self._latest: dict[str, Arrived] = {}  # of cached streams, by key
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            if limits:
+            if retention:
                 path.mkdir()
             self.writer = self._begin(start_ns)
         except OSError as error:
-            what = "folder" if limits else "file"
+            what = "folder" if retention else "file"
             raise ConfigError(f"--out must be a {what} that can be written and is not there yet, got {path}: {error.strerror}") from error
 
     @property
@@ -82,13 +82,13 @@ class Segments:
 
     def _begin(self, now_ns: int) -> RecordingWriter:
         self._number += 1
-        self._file = self._path / f"{self._number:06d}.mcap" if self._limits else self._path
+        self._file = self._path / f"{self._number:06d}.mcap" if self._retention else self._path
         self._begun_ns = now_ns
         return RecordingWriter(self._file, now_ns, self._unix_offset_ns, rti_mpc.__version__)
 
     def keep(self, entry: Arrived) -> None:
         """Remember a message for the beginning of later segments, if late joiners would receive it."""
-        if self._limits and entry.stream.qos.cached:
+        if self._retention and entry.stream.qos.cached:
             self._latest[entry.received.key] = entry
 
     def attach(self, name: str, media_type: str, data: bytes, now_ns: int) -> None:
@@ -99,14 +99,14 @@ class Segments:
 
     def roll(self, now_ns: int, outcome: dict[str, str]) -> Iterator[Arrived]:
         """
-        Begin the next segment if the present one has its share of the limits, delete the oldest, and yield what it has to begin with.
+        Begin the next segment if the present one has its share of a limit, delete the oldest, and yield what it has to begin with.
 
         Raises:
             OSError: The disk is full.
         """
-        limits = self._limits
-        due = limits.last_s is not None and now_ns - self._begun_ns >= 1e9 * limits.last_s / SEGMENTS
-        if not (due or (limits.max_bytes is not None and self.writer.size >= limits.max_bytes / (SEGMENTS + 1))):
+        retention = self._retention
+        due = retention.last_s is not None and now_ns - self._begun_ns >= 1e9 * retention.last_s / SEGMENTS
+        if not (due or (retention.max_bytes is not None and self.writer.size >= retention.max_bytes / (SEGMENTS + 1))):
             return
         self.writer.finish(outcome)
         self._kept.append((self._file, self.writer.size, now_ns))
@@ -124,6 +124,6 @@ class Segments:
         """Whether the oldest segment can be deleted."""
         if not self._kept:
             return False
-        limits = self._limits
-        old = limits.last_s is not None and now_ns - self._kept[0][2] > 1e9 * limits.last_s
-        return old or (limits.max_bytes is not None and self.written > limits.max_bytes * SEGMENTS / (SEGMENTS + 1))
+        retention = self._retention
+        old = retention.last_s is not None and now_ns - self._kept[0][2] > 1e9 * retention.last_s
+        return old or (retention.max_bytes is not None and self.written > retention.max_bytes * SEGMENTS / (SEGMENTS + 1))

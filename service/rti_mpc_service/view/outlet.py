@@ -18,7 +18,7 @@ import rerun as rr
 from rti_mpc.contract.message import Notice, Reference, Severity
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.info import Info
-from rti_mpc_service.view.recording import Entry, Recording
+from rti_mpc_service.view.recording import Entry, RerunRecording
 
 RERUN_APPLICATION_ID = "rti_mpc"
 MAX_QUEUED_ENTRIES = 8192  # about 50 MB with long horizons
@@ -75,7 +75,7 @@ class Outlet:
         self._context: dict[str, Entry] = {}
         self._missed = 0
         self._lock = threading.Lock()
-        self._recording: Recording | None = None
+        self._recording: RerunRecording | None = None
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"outlet {name}", daemon=True)
         self._thread.start()
@@ -115,7 +115,7 @@ class Outlet:
         try:
             new = self._recording is None
             if self._recording is None:
-                self._recording = Recording(self._open_stream())
+                self._recording = RerunRecording(self._open_stream())
                 log.info("%s: open", self.name)
             self._recording.send(self._take(new))
             self._recording.stream.flush(timeout_sec=self._flush_s)

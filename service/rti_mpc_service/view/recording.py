@@ -51,7 +51,7 @@ class Entry:
     message: Message
 
 
-class Recording:
+class RerunRecording:
     """
     Writer of one Rerun stream: a file, or a connected viewer.
 

@@ -18,7 +18,7 @@ from rti_mpc.contract.message import Command, End, Event, Reference, Severity, S
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.wire.info import Info
 from rti_mpc_service.view.playback import Actuation
-from rti_mpc_service.view.recording import Entry, Recording
+from rti_mpc_service.view.recording import Entry, RerunRecording
 
 SECOND = 1_000_000_000
 STATES = [("x", "m"), ("y", "m"), ("psi", "rad"), ("u", "m/s"), ("omega", "rad/s")]
@@ -70,7 +70,7 @@ class Writer:
         self.path = path
         self.stream = rr.RecordingStream("test", recording_id="test")
         self.stream.save(path)
-        self.recording = Recording(self.stream)
+        self.recording = RerunRecording(self.stream)
 
     def send(self, *messages: Any) -> None:
         stamped = [(getattr(message, "command", message), message) for message in messages]

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recorder without a bus: what it writes, counts, keeps and says."""
+
+from __future__ import annotations
+
+import base64
+import json
+import resource
+import zlib
+from pathlib import Path
+from threading import Event as Flag
+
+import pytest
+
+from rti_mpc.errors import ConfigError
+from rti_mpc.recording import Recording
+from rti_mpc.wire.bus import Bus
+from rti_mpc.wire.cdr import Message, encode, encoding
+from rti_mpc.wire.keys import Key
+from rti_mpc.wire.received import Received
+from rti_mpc_service.config.build import build_model
+from rti_mpc_service.config.config import load
+from rti_mpc_service.controller.origin import Origin
+from rti_mpc_service.record.inbox import ENTRY_BYTES, Arrived, Inbox
+from rti_mpc_service.record.record import EVERYTHING, Recorder, parse_retention
+from rti_mpc_service.record.segments import SEGMENTS, Retention, Segments
+from tests.recording.samples import INFO, KEYS, MS, REFERENCE, START_NS, UNIX_OFFSET_NS, state
+from tests.wire.fake_session import FakeSession
+
+STOPPED = Flag()
+STOPPED.set()
+
+
+class Bench:
+    """A recorder whose messages are handed to it."""
+
+    def __init__(self, path: Path, retention: Retention = EVERYTHING) -> None:
+        self.session = FakeSession()
+        self.segments = Segments(path, retention, START_NS, UNIX_OFFSET_NS)
+        self.recorder = Recorder(Bus(self.session, KEYS), self.segments)
+        self.recorder.follow(KEYS.robot)
+
+    def put(self, key: Key, message: Message | bytes, local_ns: int = START_NS, encoded: str = "") -> None:
+        payload = message if isinstance(message, bytes) else encode(message)
+        kind = encoded or ("application/json" if key.stream.message is None else encoding(key.stream.message))
+        self.recorder._inbox.put(Arrived(KEYS.robot, key.stream, local_ns, Received(payload, kind, key)))
+
+    def run(self) -> int:
+        return self.recorder.run(STOPPED)
+
+
+def test_recorder_writes_what_can_be_decoded_and_counts_the_rest(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "run.mcap")
+    bench.put(KEYS.info("controller"), json.dumps(INFO).encode())
+    for k in (1, 2, 5, 6):
+        bench.put(KEYS.state, state(k), START_NS + k * MS)
+    bench.put(KEYS.state, encode(state(7))[:-1])
+    bench.put(KEYS.state, state(8), encoded="application/cdr;rti_mpc_msgs/msg/State@1")
+    bench.put(KEYS.info("guard"), b"[]")
+    assert bench.run() == 0
+    assert bench.recorder.counts == {"recorded": 5, "missing": 2, "refused": 3}
+    recording = Recording(tmp_path / "run.mcap")
+    assert [recorded.local_ns for recorded in recording.messages(streams=("state",))] == [START_NS + k * MS for k in (1, 2, 5, 6)]
+    assert recording.outcome == {"recorded": "5", "missing": "2", "refused": "3", "dropped": "0"}
+    assert b"2 messages are missing" in bench.session.put[KEYS.event("recorder")]
+
+
+def test_file_that_is_there_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").write_text("precious")
+    with pytest.raises(ConfigError, match=r"--out must be a file .* not there yet, got .*run\.mcap: File exists"):
+        Bench(tmp_path / "run.mcap")
+    assert (tmp_path / "run.mcap").read_text() == "precious"
+
+
+def test_waiting_messages_are_limited_and_the_oldest_dropped() -> None:
+    inbox = Inbox(10 * (ENTRY_BYTES + 100))
+    for k in range(25):
+        inbox.put(Arrived("wheels", KEYS.state.stream, k, Received(bytes(100), "", KEYS.state)))
+    assert [entry.local_ns for entry in inbox.take()] == list(range(15, 25))
+    assert inbox.dropped == 15
+    assert not inbox.take()
+
+
+def test_full_disk_ends_the_recorder_with_a_line_and_what_was_written_is_whole(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bench = Bench(tmp_path / "run.mcap")
+    for k in range(1, 100):
+        bench.put(KEYS.state, state(k), START_NS + k * MS)
+    bench.recorder._write(START_NS + 100 * MS)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (bench.segments.size + 100, before[1]))
+    try:
+        for k in range(100, 1000):
+            bench.put(KEYS.state, state(k), START_NS + k * MS)
+        assert bench.run() == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    (line,) = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+    assert "the recording ends here: File too large" in line
+    assert [recorded.message.seq for recorded in Recording(tmp_path / "run.mcap").messages()] == list(range(1, 100))
+
+
+def test_oldest_segments_are_deleted_and_each_stands_for_itself(tmp_path: Path) -> None:
+    kept_s = 8.0
+    bench = Bench(tmp_path / "runs", Retention(last_s=kept_s))
+    bench.recorder._give("wheels/9", {"config.toml": "robot = 'wheels'\n"})
+    bench.put(KEYS.info("controller"), json.dumps(INFO).encode())
+    bench.put(KEYS.reference, REFERENCE)
+    for k in range(1, 61):
+        bench.put(KEYS.state, state(k), START_NS + k * 500 * MS)
+        bench.recorder._write(START_NS + k * 500 * MS)
+    bench.segments.writer.finish({})
+    files = sorted((tmp_path / "runs").iterdir())
+    assert SEGMENTS <= len(files) <= SEGMENTS + 2
+    whole = Recording(tmp_path / "runs")
+    seqs = [recorded.message.seq for recorded in whole.messages(streams=("state",))]
+    assert seqs == list(range(seqs[0], 61))
+    assert kept_s <= 0.5 * (60 - seqs[0]) <= kept_s * (1 + 2 / SEGMENTS)
+    for file in files[:-1]:
+        recording = Recording(file)
+        assert recording.attachments == {"wheels/9/config.toml": b"robot = 'wheels'\n"}
+        assert len(recording.infos()) == 1
+        assert sum(1 for _ in recording.messages(streams=("reference",))) == 1
+
+
+def test_size_of_all_segments_is_limited(tmp_path: Path) -> None:
+    limit = 60_000
+    bench = Bench(tmp_path / "runs", Retention(max_bytes=limit))
+    for k in range(1, 100):
+        for i in range(20):
+            bench.put(KEYS.state, state(20 * k + i), START_NS + k * MS)
+        bench.recorder._write(START_NS + k * MS)
+        assert sum(file.stat().st_size for file in (tmp_path / "runs").iterdir()) <= limit
+    bench.segments.writer.finish({})
+    assert sum(file.stat().st_size for file in (tmp_path / "runs").iterdir()) > limit // 2
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [(("10min", None), (600.0, None)), ((None, "2GB"), (None, 2 * 10**9)), (("1.5h", "300 MB"), (5400.0, 3 * 10**8)), ((None, None), (None, None))],
+)
+def test_limits_are_read(words: tuple[str | None, str | None], expected: tuple[float | None, int | None]) -> None:
+    retention = parse_retention(*words)
+    assert (retention.last_s, retention.max_bytes) == expected
+
+
+@pytest.mark.parametrize(("last", "size", "said"), [("10", None, "--last"), ("0s", None, "--last"), (None, "2", "--max-size"), (None, "-1GB", "2GB")])
+def test_limits_that_are_none_are_refused(last: str | None, size: str | None, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        parse_retention(last, size)
+
+
+def test_origin_of_commands_is_handed_out_in_pieces_without_what_is_private(tmp_path: Path) -> None:
+    (tmp_path / "wheels.py").write_text((Path(__file__).parents[3] / "rti_mpc/model/robots/pioneer_3dx.py").read_text() + f"\n# {'long ' * 20_000}\n")
+    shipped = (Path(__file__).parents[3] / "deploy/pioneer_3dx.toml").read_text().replace('"pioneer_3dx"', '"wheels:pioneer_3dx"')
+    (tmp_path / "secret.json5").write_text("{}")
+    (tmp_path / "robot.toml").write_text(shipped + '\n[bus]\nconfig = "secret.json5"\n')
+    config = load(tmp_path / "robot.toml")
+    origin = Origin(config, build_model(config), lambda: (5 << 20) + 42)
+    bundle, size = "", 1
+    while len(bundle) < size:
+        answer = origin.answer({"from": len(bundle)})
+        assert (answer["ok"], answer["owner"]) == (True, 42)
+        size = answer["size"]
+        bundle += answer["piece"]
+    files = json.loads(zlib.decompress(base64.b64decode(bundle)))
+    assert set(files) == {"config.toml", "wheels.py", "equations.txt", "versions.json"}
+    assert files["wheels.py"] == (tmp_path / "wheels.py").read_text()
+    assert not any("secret" in text or str(tmp_path) in text for text in files.values())
+    (tmp_path / "config.toml").write_text(files["config.toml"])
+    assert load(tmp_path / "config.toml").config_hash == config.config_hash == json.loads(files["versions.json"])["config_hash"]
+    for wrong in ({}, {"from": -1}, {"from": size}, {"from": True}):
+        with pytest.raises(ValueError, match="from must be a number"):
+            origin.answer(wrong)
