@@ -24,11 +24,13 @@ from rti_mpc.rti.qp.qp import Guess
 
 MAX_ROLL_OUTS = 6  # from the places of the last sample; more are needed only when many places change at once
 MAX_STEPS = 50  # of the interior point, for each QP that a sample may have; all of its QPs share the sum
+STEPS_BEFORE_ANOTHER_QP = 5  # for each QP that a sample may have: once its QPs have taken the sum of these, no further one follows
+MAX_ROLL_OUTS_HANDED_BACK = 2  # from places that the interior point has found
 START_RANGE = 1.0, 1e16  # limits of the product of distance and multiplier at its start, otherwise the duality gap: with less, first steps are short
 START_FAR = 1e6  # the same of a second try, after one that gave no numbers
 GAP_SHARES = 1.0, 1e-3  # of MAX_GAP, at which it hands its places back
-LEAST_SHARE = 0.1  # sum of these products, relative to the largest gap of a certified plan, to which steps lead
-JUDGED_BELOW = 100.0  # times that, below which the plan of a step is judged
+LEAST_SHARE = 0.1  # sum of products to which steps lead, relative to the largest gap of a certified plan; with less, digits are lost to stiffness
+JUDGED_BELOW = 100.0  # times the least product: the plan of a step with a larger one is not judged, because it would fail
 MAX_REFINEMENTS = 2  # of a plan that is not certified yet
 MAX_VIOLATION = 1e-9  # of dynamics, bounds and increments by a certified plan, relative to their scales
 MAX_GAP = 1e-6  # by which a certified plan may cost more than the optimum, relative to its normalised cost and COST_FLOOR
@@ -48,7 +50,7 @@ class ActiveSet:
         gain: Call that computes the gains; with it, after one of the former two, preparation is complete.
         roll_out: Call that makes the plan, and finds the places; `certify` judges that plan, `refine` improves it.
         enter: Call that starts the interior point at the plan; `step`, one step of it.
-        steps_left: Steps of the interior point that the sample may still take.
+        steps: Steps of the interior point that the sample has taken.
         iterations: Roll-outs and steps of the interior point of the last solve.
         res_prim: Largest violation of dynamics, bounds and increments by the plan that was judged last, relative to their scales.
         res_dual: Bound on the cost of that plan above the optimum, relative to `COST_FLOOR` plus its normalised cost.
@@ -96,9 +98,18 @@ class ActiveSet:
         self._least = np.zeros(1)
         stepped = {"interior_after": after, "product": mean, **interior_plan}
         self.step = bind(make(functions.step), {**entered, "x0": guess.x0, "interior": interior, "least": self._least}, stepped)
-        self.steps_left = 0
+        self._qps = self.steps = 0
         self.iterations = 0
         self.res_prim = self.res_dual = 0.0
+
+    def begin(self, qps: int) -> None:
+        """Begin a sample that may have so many QPs."""
+        self._qps, self.steps = qps, 0
+
+    @property
+    def affords_another_qp(self) -> bool:
+        """Whether the sample has taken so few steps of the interior point that another QP may follow."""
+        return self.steps < STEPS_BEFORE_ANOTHER_QP * self._qps
 
     def forget(self) -> None:
         """Start cold, with no bound acting."""
@@ -185,11 +196,11 @@ class ActiveSet:
     def _take_steps(self, gap: float) -> bool:
         """Take steps of the interior point until the gap of its plan is below one, and return whether it is; the best plan is kept."""
         interior, after = self._moved
-        while self.steps_left > 0:
+        while self.steps < MAX_STEPS * self._qps:
             # To products that are small beside the cost, and no smaller: the stiffer the sides, the more digits are lost.
             self._least[0] = LEAST_SHARE * gap * (COST_FLOOR + self._verdict[2][0]) / self._places.size
             self.step()
-            self.steps_left -= 1
+            self.steps += 1
             self.iterations += 1
             interior[:] = after
             if not self._product[0] < np.inf:
@@ -209,7 +220,7 @@ class ActiveSet:
         self.gain()
         self.roll_out()
         self.iterations += 1
-        return self._settle(MAX_ROLL_OUTS) and self._judged() is SOLVED and self.res_dual < self._lowest
+        return self._settle(MAX_ROLL_OUTS_HANDED_BACK) and self._judged() is SOLVED and self.res_dual < self._lowest
 
     def _settle(self, most: int) -> bool:
         """

@@ -28,7 +28,7 @@ from rti_mpc.array import Array
 from rti_mpc.codegen import bind
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import OcpError
-from rti_mpc.rti.active_set import MAX_STEPS, ActiveSet
+from rti_mpc.rti.active_set import ActiveSet
 from rti_mpc.rti.construction import FORMULATIONS, construction
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 from rti_mpc.rti.qp.osqp import Solver, SolverSettings
@@ -367,7 +367,7 @@ class Rti:
         if self._turns.settle():
             self._linearize()
         if self.active_set is not None:
-            self.active_set.steps_left = MAX_STEPS * self.iterations
+            self.active_set.begin(self.iterations)
         self.status = self.solve()
         self.taken = 1
         if self._change[0] > self.tolerance:
@@ -398,8 +398,10 @@ class Rti:
         return status
 
     def _iterate(self) -> None:
-        """Iterate at the plan while the step is large; an iteration that fails leaves the plan of the one before."""
+        """Iterate at the plan while the step is large, and there is time; an iteration that fails leaves the plan of the one before."""
         while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
+            if self.active_set is not None and not self.active_set.affords_another_qp:
+                break
             self._relinearize()
             if not (status := self.solve()).usable:
                 self.status = INACCURATE  # the plan comes from an earlier QP, which cannot be certified any more

@@ -45,7 +45,7 @@ def test_plan_is_that_of_the_qp_solved_by_another_solver(name: str) -> None:
 @pytest.mark.usefixtures("no_roll_outs")
 @pytest.mark.parametrize("limit", [0, 3])
 def test_without_enough_steps_no_plan_is_told_as_solved(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rti_mpc.rti.rti.MAX_STEPS", limit)
+    monkeypatch.setattr("rti_mpc.rti.active_set.MAX_STEPS", limit)
     ocp = PROBLEMS["pioneer"]()
     rti = Rti(ocp, compile=False)
     one = rti.active_set
@@ -55,12 +55,25 @@ def test_without_enough_steps_no_plan_is_told_as_solved(limit: int, monkeypatch:
         rti.reset(x0, u_prev)
         rti.prepare(y_ref, shift=False)
         status = rti.feedback(x0)
-        assert one.steps_left >= 0
-        if one.steps_left == 0 and rti.solver is not one:
+        assert one.steps <= limit * rti.iterations
+        if one.steps == limit * rti.iterations and rti.solver is not one:
             limited += 1
             assert status is not QpStatus.SOLVED
         assert np.all(rti.u <= ocp.ubu + 1e-3)  # OSQP's tolerance
     assert limited > 0
+
+
+@pytest.mark.usefixtures("no_roll_outs")
+@pytest.mark.parametrize(("steps", "taken"), [(0, 1), (active_set.MAX_STEPS, 3)])
+def test_no_further_qp_follows_once_a_sample_has_taken_many_steps(steps: int, taken: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(active_set, "STEPS_BEFORE_ANOTHER_QP", steps)
+    ocp = PROBLEMS["pioneer"]()
+    rti = Rti(ocp, iterations=3, tolerance=0.0, compile=False)
+    x0, y_ref, u_prev = next(iter(samples(ocp, 1)))
+    rti.reset(x0, u_prev)
+    rti.prepare(y_ref, shift=False)
+    assert rti.feedback(x0) is QpStatus.SOLVED
+    assert rti.taken == taken
 
 
 @pytest.mark.slow
@@ -79,7 +92,7 @@ def test_families_whose_places_do_not_settle_are_solved_in_a_bounded_number_of_r
         assert rti.feedback(x) is QpStatus.SOLVED
         assert rti.solver is rti.active_set
         most = max(most, rti.solver.iterations)
-        stepped += rti.active_set.steps_left < rti.iterations * active_set.MAX_STEPS
+        stepped += rti.active_set.steps > 0
         u = rti.u[0].copy()
         x = family.plant(x, u)
     assert most <= MOST

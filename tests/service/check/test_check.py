@@ -72,7 +72,7 @@ def test_a_bound_that_gives_way_is_told(tmp_path: Path, monkeypatch: pytest.Monk
     path = tmp_path / "robot.toml"
     path.write_text(CART)
     monkeypatch.setattr("rti_mpc.rti.places.PENALTY", 10.0)
-    monkeypatch.setattr("rti_mpc.rti.rti.MAX_STEPS", 0)  # of the interior point, which would hold them
+    monkeypatch.setattr("rti_mpc.rti.active_set.MAX_STEPS", 0)  # of the interior point, which would hold them
     report = check.check(load(path))
     assert not report.agree or sum(report.statuses.values()) > report.statuses[QpStatus.SOLVED]
 
