@@ -7,6 +7,7 @@ Errors raised on purpose.
     - ShapeError       an array has the wrong shape, dtype or layout
   + ConfigError        a configuration value is missing, unknown or out of range
   + MessageError       bytes from the wire are not a message of ours
+  + JournalError       a journal, or a snapshot in it, cannot be written, read or repeated
   + Stopped            the process was stopped while it waited for somebody
 
 A QP that does not converge is *not* an exception: it is a `QpStatus` in the
@@ -50,6 +51,10 @@ class ConfigError(RtiMpcError):
 
 class MessageError(RtiMpcError):
     """Bytes from the wire are not a message of ours."""
+
+
+class JournalError(RtiMpcError):
+    """A journal, or a snapshot in it, cannot be written, read or repeated."""
 
 
 class Stopped(RtiMpcError):

@@ -25,6 +25,7 @@ LIBRARY = {
     "rti_mpc.rti": {"rti_mpc.model", "rti_mpc.contract", "rti_mpc.rti.qp"},
     "rti_mpc.rti.qp": {"rti_mpc.contract", "rti_mpc.rti"},
     "rti_mpc.control": {"rti_mpc.model", "rti_mpc.contract", "rti_mpc.rti"},
+    "rti_mpc.journal": {"rti_mpc.contract", "rti_mpc.control", "rti_mpc.rti", "rti_mpc.rti.qp"},
     "rti_mpc.wire": {"rti_mpc.contract"},
     "rti_mpc.adapter": {"rti_mpc.contract", "rti_mpc.wire"},
     "rti_mpc.recording": {"rti_mpc.contract", "rti_mpc.wire"},

@@ -285,6 +285,11 @@ class Controller:
         self._tuning.change(ocp, version)
         return self._issued.seq + 1 + self._loaded
 
+    @property
+    def wanted(self) -> Ocp:
+        """The problem with the weights and bounds of the last `retune`."""
+        return self._tuning.wanted
+
     @reported
     def overhear(self, command: Command) -> None:
         """Record a command of another controller that acts while this one stands by."""
@@ -413,6 +418,13 @@ class Controller:
             Whether nothing is left to be done.
         """
         return self._opinions is None or self._opinions.step()
+
+    @reported
+    def rewarm(self) -> None:
+        """Let OSQP's workspaces depend on nothing but arrays that a snapshot can hold; between two samples, before each snapshot."""
+        self._rti.rewarm()
+        if self._opinions is not None:
+            self._opinions.rewarm()
 
     def _measure_delay(self, estimator: DelayEstimator, stamp_ns: int) -> None:
         """Learn from the state of the last sample, and let the grid follow."""

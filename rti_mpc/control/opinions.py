@@ -92,6 +92,10 @@ class Opinions:
             self._judge(opinion.difference)
         return opinion.done
 
+    def rewarm(self) -> None:
+        """Let OSQP's workspace depend on nothing but arrays, see `Solver.rewarm`."""
+        self._opinion.rewarm()
+
     def _judge(self, difference: float) -> None:
         """Tell when the solvers begin to disagree, and when they agree again."""
         self._contrary = self._contrary + 1 if (difference > DISAGREEMENT) is not self.disagree else 0

@@ -30,6 +30,7 @@ class Tuning:
 
     Attributes:
         version: Version of the weights and bounds that act; 0 for those that the `Rti` was built with.
+        wanted: Problem with the wanted weights and bounds.
     """
 
     def __init__(self, rti: Rti, limits: Mapping[str, Array] | None = None) -> None:
@@ -44,7 +45,7 @@ class Tuning:
         self._rti = rti
         self._limits = {} if limits is None else {name: limits[name] for name in ("lbu", "ubu")}
         self._changed = False
-        self._wanted = rti.ocp
+        self.wanted = rti.ocp
         self._wanted_version = 0
         self._slew = rti.ocp.lbdu, rti.ocp.ubdu  # of this sample
         self._acting = {name: getattr(rti.ocp, name) for name in INPUT_BOUNDS}
@@ -66,12 +67,12 @@ class Tuning:
                 raise OcpError(f"{name} must be finite exactly where it was when compiled, got {getattr(ocp, name)}")
         if wrong := rest_fault(ocp):
             raise OcpError(wrong)
-        self._wanted, self._wanted_version = ocp, version
+        self.wanted, self._wanted_version = ocp, version
         self._changed = True
 
     def begin(self) -> None:
         """Begin the preparation of the next sample."""
-        lbdu, ubdu = self._wanted.lbdu, self._wanted.ubdu
+        lbdu, ubdu = self.wanted.lbdu, self.wanted.ubdu
         if self.version != self._wanted_version:
             self.version = self._wanted_version
             lbdu, ubdu = np.maximum(lbdu, self._acting["lbdu"]), np.minimum(ubdu, self._acting["ubdu"])
@@ -86,7 +87,7 @@ class Tuning:
         """
         if not self._changed:
             return
-        wanted, (lbdu, ubdu) = self._wanted, self._slew
+        wanted, (lbdu, ubdu) = self.wanted, self._slew
         bounds = dict(zip(INPUT_BOUNDS, (np.minimum(wanted.lbu, u_prev + ubdu), np.maximum(wanted.ubu, u_prev + lbdu), lbdu, ubdu), strict=True))
         fresh = self.version != self._written
         if fresh or any(not np.array_equal(bounds[name], self._acting[name]) for name in INPUT_BOUNDS):

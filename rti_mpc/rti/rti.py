@@ -220,6 +220,12 @@ class Rti:
             self.solver = self.active_set
             self.active_set.forget()
 
+    def rewarm(self) -> None:
+        """Let the workspaces of OSQP depend on nothing but arrays, see `Solver.rewarm`."""
+        for solver in self.solvers:
+            if isinstance(solver, Solver):
+                solver.rewarm()
+
     def use_whole_qp(self) -> None:
         """Let the QP solver, if it is needed next, solve the QP with its softened bounds."""
         self._backup, self._loaded = self.solvers[-1], False

@@ -92,6 +92,10 @@ class SecondOpinion:
         elif self.iterations >= MAX_ITERATIONS:
             self._finish(QpStatus.MAX_ITER)
 
+    def rewarm(self) -> None:
+        """Let OSQP's workspace depend on nothing but arrays, see `Solver.rewarm`."""
+        self._solver.rewarm()
+
     def _load(self) -> bool:
         """Load the QP, and return whether there is one."""
         self._solver.load()

@@ -23,11 +23,11 @@ from tests.problems import pioneer
 
 REPORTED_CALLS = {
     *("commit", "enable", "in_time", "lead", "overhear", "prepare", "receive_reference"),
-    *("receive_state", "retune", "second_opinion", "stand_by", "standstill", "stop", "tick"),
+    *("receive_state", "retune", "rewarm", "second_opinion", "stand_by", "standstill", "stop", "tick"),
 }
 READING_CALLS = {  # change nothing that a command depends on
     *("at_rest", "continues", "heard", "lay_out", "mode", "notices", "robot_now_ns", "robot_rate"),
-    *("say", "standing_by", "slack_s", "telemetry"),
+    *("say", "standing_by", "slack_s", "telemetry", "wanted"),
 }
 
 

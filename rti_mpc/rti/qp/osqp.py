@@ -104,6 +104,7 @@ class Solver:
         )  # changes of the step size for this QP, and the iterations at which the next one comes
         self._sound = True
         self._start: tuple[Array, Array] | None = None  # of the next `load`, its multipliers of rows as they are; None: the last solution
+        self._held: tuple[Array, Array] | None = None  # iterate of the last `rewarm` until the next solve, as `solution`
         self._scaled = scaled = Scaled(qp)
         self._zero = (np.zeros_like(qp.q), np.zeros_like(qp.l))
         public = osqp.OSQP(algebra="builtin")
@@ -205,7 +206,33 @@ class Solver:
     @property
     def solution(self) -> tuple[Array, Array]:
         """Copies of the last scaled solution, shape ``(n,)``, and of its multipliers, shape ``(m,)``."""
+        if self._held is not None:
+            return self._held
         return self._solution.x, self._solution.y * self._scale
+
+    def rewarm(self) -> None:
+        """Let the workspace go on from the last solution as from that of another solver: from here on it depends on nothing but arrays."""
+        x, y = self.solution
+        usable = bool(np.isfinite(x).all() and np.isfinite(y).all())
+        self.cold |= not usable
+        self._held = (x, y) if usable else self._zero
+        self.revive()
+
+    def revive(self) -> None:
+        """Bring the workspace, which may be a new one, into the state that `rewarm` left it in."""
+        if self._held is None:  # never rewarmed
+            return
+        scaled, weighed = self._scaled, self._A_x is not self._scaled.A.data
+        if weighed:
+            np.multiply(scaled.l, self._scale, out=self._l)
+            np.multiply(scaled.u, self._scale, out=self._u)
+            np.multiply(scaled.A.data, self._scale[self.qp.A.indices], out=self._A_x)
+        self.workspace.update_rho(self._settings.rho * STEP_SIZES[self._turn])
+        refused = self.workspace.update_data_vec(q=scaled.q, l=self._l, u=self._u)
+        if refused or not self._sound or self.workspace.update_data_mat(P_x=scaled.P.data, P_i=None, A_x=self._A_x, A_i=None):
+            self.cold = True
+        x, y = self._held
+        self.workspace.warm_start(x, y / self._scale)
 
     def solve(self) -> QpStatus:
         """Embed the initial state, solve from the last solution, and make the plan."""
@@ -250,6 +277,7 @@ class Solver:
             if not self._adapt():
                 self.cold = True
                 return QpStatus.FAILED
+        self._held = None
         self.workspace.solve()
         self.iterations += int(self._info.iter)
         status = STATUS_BY_OSQP_CODE.get(self._info.status_val, QpStatus.FAILED)

@@ -22,11 +22,13 @@ from rti_mpc_service.config.schema import ITERATION_KEYS, OWN_KEYS, Config
 if TYPE_CHECKING:
     from rti_mpc.array import Array
     from rti_mpc.contract.limits import Limits
+    from rti_mpc.control.controller import Controller
     from rti_mpc.control.observer import Observer
     from rti_mpc.model.model import Model, Signal
     from rti_mpc.rti.ocp import Ocp
     from rti_mpc.rti.qp.osqp import SolverSettings
     from rti_mpc.rti.rti import Rti
+    from rti_mpc.rti.way_to_rest import StopLaw
     from rti_mpc.wire.bus import BusSettings
     from rti_mpc.wire.info import Label
     from rti_mpc_service.config.signals_file import Signals
@@ -150,6 +152,20 @@ def build_rti(config: Config, say: Callable[[str], object] = lambda _: None) -> 
     cls = FaultyRti if config.debug.inject else Rti
     settings = solver_settings(config)
     return cls(build_ocp(config), settings, formulation=config.ocp.formulation, solver=config.solver.name, **iterations(config))
+
+
+def build_controller(config: Config, rti: Rti, stop_law: StopLaw | None) -> Controller:
+    """Return the controller, whose epoch its leadership sets; a replay builds the same one."""
+    from rti_mpc.control.controller import Controller, Timing
+
+    return Controller(
+        rti,
+        Timing(config.delay_s, config.stale_s, config.timing.valid_s),
+        config_hash=config.config_hash,
+        observer=build_observer(config),
+        stop_law=stop_law,
+        second_opinion=config.solver.second_opinion,
+    )
 
 
 def build_observer(config: Config) -> Observer | None:

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import math
 import sys
 import time
 from collections.abc import Sequence
@@ -30,18 +31,20 @@ from typing import Any
 from rti_mpc.contract.latch import Latch
 from rti_mpc.contract.leadership import differ
 from rti_mpc.contract.message import Command, Notice, Severity, State
-from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.control.controller import Controller
 from rti_mpc.errors import ConfigError
+from rti_mpc.journal.book import Book
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.way_to_rest import StopLaw
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc_service.announce import announce
-from rti_mpc_service.config.build import build_observer, build_rti
+from rti_mpc_service.config.build import build_controller, build_rti
 from rti_mpc_service.config.fit import check_stop
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.controller.description import controller_info
+from rti_mpc_service.controller.journal import JournalPublisher
 from rti_mpc_service.controller.leadership import LEADER, LISTEN_BEFORE_START_S, STANDBY, Candidate, hear_others
 from rti_mpc_service.controller.orders import Orders
 from rti_mpc_service.controller.origin import Origin
@@ -80,15 +83,8 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
     stop = stop or stop_on_signals()
     rti = build_rti(config, log.info)
     warm_up(rti)
-    timing = Timing(config.delay_s, config.stale_s, config.timing.valid_s)
-    controller = Controller(
-        rti,
-        timing,
-        config_hash=config.config_hash,
-        observer=build_observer(config),
-        stop_law=stop_law,
-        second_opinion=config.solver.second_opinion,
-    )
+    controller = build_controller(config, rti, stop_law)
+    book = Book(controller)
     if (notice := unguarded(config, stop_law)) is not None:
         controller.say(notice)
     lock = Condition()
@@ -117,7 +113,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
             return 1
         ocp = rti.ocp
         leadership = Candidate(bus, controller, others, config_hash=config.config_hash, dt_s=ocp.dt, nu=ocp.model.nu, standby=standby)
-        daemon = Daemon(config, controller, bus, leadership, params, lock, rti, outcomes, operator_stop)
+        daemon = Daemon(config, controller, bus, leadership, params, lock, rti, outcomes, operator_stop, book)
         operator_stop.serve(bus, lambda: leadership.role, daemon.publish_info)
         bus.serve(bus.keys.request, daemon.orders.answer)
         bus.serve(bus.keys.origin, Origin(config, ocp.model, lambda: leadership.epoch).answer)
@@ -155,6 +151,7 @@ class Daemon:
         rti: Rti,
         outcomes: Sequence[realtime.RealtimeOutcome],
         operator_stop: OperatorStop,
+        book: Book,
     ) -> None:
         keys, model = bus.keys, rti.ocp.model
         self._config = config
@@ -164,7 +161,7 @@ class Daemon:
         self._bus = bus
         self._leadership = leadership
         self._params = params
-        self.orders = Orders(controller, rti, params, lock, operator_stop, lambda: leadership.leading, self.publish_info)
+        self.orders = Orders(controller, rti, params, lock, operator_stop, lambda: leadership.leading, self.publish_info, book.ask)
         self._operator_stop = operator_stop
         self._lock = lock
         self._telling = Lock()
@@ -174,7 +171,8 @@ class Daemon:
         self._announcer: Announcer | None = None
         self._commands = bus.publisher(keys.command)
         self._telemetries = {role: bus.publisher(key) for role, key in ((LEADER, keys.telemetry), (STANDBY, keys.standby_telemetry))}
-        self._journal = bus.publisher(keys.journal)
+        book.epoch = leadership.epoch
+        self._journal = JournalPublisher(bus, controller, book)
         self._states_in = bus.intake(State, config.stale_s, {"x": model.nx, "u": model.nu})
         bus.expect("state", lambda: controller.heard)
         bus.watch_certificate(controller.say)
@@ -198,6 +196,8 @@ class Daemon:
 
     def run(self, stop: Event) -> int:
         """Control until stopped; then bring the robot to rest and send rest as the last command, unless another controller takes over."""
+        with self._lock:
+            self._journal.start()
         gc.collect()
         gc.freeze()
         gc.disable()
@@ -218,6 +218,7 @@ class Daemon:
             if not relieved and (command := self._controller.standstill(time.monotonic_ns())) is not None:
                 self._commands.put(command)
                 self._controller.commit(command)
+        self._journal.close()
         self._announce()
         self._operator_stop.close()
         log.info("stopped")
@@ -231,7 +232,10 @@ class Daemon:
             for state in self._states_in.newest_of_each((received, *subscriber.drain()), self._controller.continues):
                 self._sample(state, arrival_ns)
             self._announce()
-            received = self._slack.fill(self._judge_piece, subscriber.try_recv) or subscriber.recv()
+            received = self._slack.fill(self._judge_piece, subscriber.try_recv)
+            if received is None:
+                self._photograph()
+                received = subscriber.recv()
 
     def _sample(self, state: State, arrival_ns: int) -> None:
         """Answer one state: command, preparation of the next sample, telemetry."""
@@ -271,6 +275,14 @@ class Daemon:
         with self._lock:
             return self._ending or self._controller.second_opinion()
 
+    def _photograph(self) -> None:
+        """Take a snapshot for the journal if one is due, and as long as no state is."""
+        controller, now_ns = self._controller, time.monotonic_ns()
+        slack_s = controller.slack_s(now_ns) / controller.robot_rate if controller.grid.running else math.inf
+        if self._journal.due(now_ns, slack_s):
+            with self._lock:
+                self._journal.photograph(now_ns)
+
     def _send(self, command: Command, left_ns: int | None = None) -> None:
         """Send a command if this controller leads, and record it."""
         if self._leadership.sends(command):
@@ -297,6 +309,8 @@ class Daemon:
             command = None if held_up else self._controller.tick(now_ns)
             if command is not None:
                 self._send(command)
+            if not self._controller.grid.running and self._journal.due(now_ns, math.inf):
+                self._journal.photograph(now_ns)
         if self._leadership.declare():
             self._introduce()
         if (leader := self._leadership.leader()) is not None:

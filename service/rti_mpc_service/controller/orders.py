@@ -14,6 +14,7 @@ from threading import Condition
 from typing import Any
 
 from rti_mpc.contract.message import Notice, Severity
+from rti_mpc.control.call import Call
 from rti_mpc.control.controller import Controller
 from rti_mpc.errors import ConfigError, RtiMpcError
 from rti_mpc.rti.rti import Rti
@@ -36,6 +37,7 @@ class Orders:
         stop: OperatorStop,
         leading: Callable[[], bool],
         tell: Callable[[], None],
+        photograph: Callable[[], None],
     ) -> None:
         self._rti = rti
         self._controller = controller
@@ -44,6 +46,7 @@ class Orders:
         self._stop = stop
         self._leading = leading
         self._tell = tell  # publishes the description
+        self._photograph = photograph  # asks for a snapshot in the journal
 
     def orders_info(self) -> dict[str, Any]:
         """Return the orders as a part of the controller's description."""
@@ -59,19 +62,29 @@ class Orders:
         what = request.get("request")
         if what in STOP_REQUESTS:  # also accepted here, from clients that do not know the stop's own key
             return self._stop.answer(request)
-        if what not in ("params", "inject"):
-            raise ConfigError(f"request must be stop, enable, params or inject, got {what!r}")
+        if what not in ("params", "inject", "snapshot"):
+            raise ConfigError(f"request must be stop, enable, params, inject or snapshot, got {what!r}")
         if not self._leading():
             return None
+        if what == "snapshot":
+            self._photograph()
+            return {"ok": True, "request": what}
         if what == "inject":
-            with self._lock:
-                return injection.answer(self._rti, request)
+            return self._inject(request)
         answer = self._params.answer(request)
         if "from_seq" in answer:
             text = ", ".join(f"{key} = {value}" for key, value in request["set"].items())
             self._say("parameters_changed", f"parameters of version {self._params.version}, from command {answer['from_seq']} on: {text}")
         self._tell()
         return {"ok": True, "request": what, **answer}
+
+    def _inject(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Let samples fail, and enter that into the journal, since the controller does not know of it."""
+        with self._lock:
+            answer = injection.answer(self._rti, request)
+            if answer["ok"] and (on_call := self._controller.on_call) is not None:
+                on_call(Call("inject", (answer["failure"], answer["samples"]), {}))
+        return answer
 
     def adopt(self, leader: Leader) -> None:
         """Take over the parameters in the leader's description."""

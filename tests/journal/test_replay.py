@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Replay of a journal: whatever a controller lives through, journal, snapshot and construction give every bit of its commands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Journal, JournalKind, Reference, State
+from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.control.observer import Disturbance, Observer, ObserverSettings
+from rti_mpc.journal.book import Book
+from rti_mpc.journal.replay import Replay, ReplayOutcome, replay
+from rti_mpc.journal.snapshot import ARRAY, PINNED, Snapshot
+from rti_mpc.model.disturbance import with_disturbances
+from rti_mpc.reference.trajectory import circle, eight
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.rti import Rti
+from tests.closed_loop.test_rest import MOTIONS, tracking
+from tests.loop import MS, drive, reference, robot
+from tests.movers import law_of, ocp_of
+from tests.problems import PAPER, SLEW, pioneer
+
+S = 1_000_000_000
+
+
+@dataclass
+class Kind:
+    """One way to build a controller."""
+
+    rti: dict[str, Any] = field(default_factory=dict)
+    delay_s: float | None = 0.0
+    observed: bool = False
+    second_opinion: int = 1
+
+    def build(self) -> tuple[Controller, Rti]:
+        problem, observer = pioneer(N=6, N_u=4), None
+        if self.observed:
+            settings = ObserverSettings({"u_c": Disturbance(0.1, 0.3)}, ())
+            observer = Observer(problem.model, settings, compile=False)
+            problem = Ocp(with_disturbances(problem.model, ["u_c"]), **(PAPER | SLEW | {"N": 6, "N_u": 4}))
+        rti = Rti(problem, compile=False, **self.rti)
+        timing = Timing(delay_s=self.delay_s)
+        return Controller(rti, timing, observer=observer, second_opinion=self.second_opinion, compile=False), rti
+
+
+KINDS = {
+    "riccati": Kind(),
+    "osqp": Kind({"solver": "osqp"}, second_opinion=0),
+    "sequential": Kind({"solver": "osqp", "formulation": "sequential"}, second_opinion=0),
+    "daqp": Kind({"solver": "daqp"}),
+    "delay": Kind(delay_s=None),
+    "observer": Kind(observed=True),
+}
+
+
+@dataclass
+class Life:
+    """All that a controller has lived through."""
+
+    messages: list[Journal]
+    commands: list[Command]
+
+
+def live(kind: Kind, samples: int = 160, snapshots: tuple[int, ...] = (0, 35, 51, 65, 95, 123, 140)) -> Life:
+    """Let a controller live through all that can happen: late samples, losses, a clock jump, standing by, a stop, other weights and references."""
+    controller, rti = kind.build()
+    book = Book(controller)
+    problem = rti.ocp.retuned(R=np.array([0.3, 0.2]))
+    leader, _ = kind.build()
+    body, rng, pieces = robot(circle()), np.random.default_rng(1), np.random.default_rng(2)
+    messages: list[Journal] = []
+    commands: list[Command] = []
+    book.photograph(0)
+    controller.receive_reference(reference(circle(), stamp_ns=STAMP_ON_ARRIVAL))
+    leader.receive_reference(reference(circle()))
+    jumped_ns = 0
+
+    def send(command: Command, left_ns: int | None = None) -> None:
+        if not jumped_ns:
+            body.accept(command, body.now_ns)
+        controller.commit(command, left_ns)
+        commands.append(command)
+
+    for k in range(samples):
+        if k in snapshots:
+            book.photograph(k * 100 * MS)
+        messages += book.messages(k * 100 * MS)
+        jumped_ns = 5 * S if k >= 145 else 0
+        seen = body.tick()
+        state = replace(seen, stamp_ns=seen.stamp_ns + jumped_ns)
+        local_ns = body.now_ns + int(rng.integers(0, 3 * MS))
+        if 60 <= k < 75:
+            if k == 60:
+                controller.stand_by()
+            if (theirs := answer(leader, state, local_ns)) is not None:
+                controller.overhear(theirs)
+        elif k == 75:
+            controller.lead(9)
+        if k == 40:
+            controller.retune(problem, 1)
+        if k == 90:
+            controller.stop("asked for")
+        if k == 110:
+            controller.enable()
+        if k == 115:
+            controller.receive_reference(reference(eight(), stamp_ns=body.now_ns, epoch=2))
+        if 120 <= k < 126:  # lost
+            if (ramp := controller.tick(local_ns)) is not None:
+                send(ramp)
+            continue
+        command = controller.receive_state(state, local_ns)
+        if command is None:
+            continue
+        command = controller.in_time(command, left_ns := local_ns + (90 * MS if k in (30, 50, 51) else MS))
+        if command is not None:
+            if controller.standing_by:
+                controller.commit(command, left_ns)
+            else:
+                send(command, left_ns)
+        controller.prepare()
+        for _ in range(int(pieces.integers(0, 5))):
+            controller.second_opinion()
+    last = controller.standstill(body.now_ns)
+    assert last is not None
+    send(last)
+    book.photograph(samples * 100 * MS)
+    messages += book.messages(samples * 100 * MS)
+    assert not book.failure
+    assert not book.dropped
+    return Life(messages, commands)
+
+
+def answer(leader: Controller, state: State, local_ns: int) -> Command | None:
+    if (command := leader.receive_state(state, local_ns)) is not None:
+        leader.commit(command)
+        leader.prepare()
+    return command
+
+
+def replayed(kind: Kind, messages: list[Journal], start_seq: int = 0, **override: Any) -> tuple[ReplayOutcome, Replay]:
+    on = Replay(*kind.build())
+    begun = False
+    for _ in replay(on, messages, start_seq):
+        if override and not begun:
+            begun = True
+            on.override(**override)
+    return on.outcome, on
+
+
+def contents(snapshot: Snapshot) -> Any:
+    """All that a snapshot holds, arrays by their bytes, without which of them are one."""
+
+    def of(node: Any) -> Any:
+        if isinstance(node, tuple | list) and node and node[0] in (ARRAY, PINNED) and isinstance(node, tuple):
+            return (snapshot.arrays if node[0] == ARRAY else snapshot.pinned)[node[1]].tobytes(), node[2]
+        if isinstance(node, tuple | list):
+            return [of(item) for item in node]
+        if isinstance(node, dict):
+            return {name: of(item) for name, item in node.items()}
+        if isinstance(node, np.ndarray):
+            return node.tobytes()
+        return repr(node)
+
+    return of(snapshot.tree)
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "riccati")) for name in KINDS])
+def test_journal_replays_with_no_differing_bit_from_every_snapshot(name: str) -> None:
+    """And the last snapshot, too, is that of the recorded controller, in all its bits: no attribute is left out that depends on another one."""
+    lived = live(KINDS[name])
+    assert len(lived.commands) > 110
+    starts = [message.seq for message in lived.messages if message.kind is JournalKind.SNAPSHOT]
+    assert len(starts) == 9
+    samples = []
+    for start in starts[:-1]:
+        outcome, on = replayed(KINDS[name], lived.messages, start)
+        assert not outcome.differences, str(outcome.differences[0])
+        assert not outcome.gaps
+        samples.append(outcome.samples)
+        assert contents(on._camera.take()) == contents(Snapshot.decode(lived.messages[-1].data))
+    assert samples == sorted(samples, reverse=True)
+    assert samples[0] >= len(lived.commands)
+    assert samples[-1] < samples[0] - 100
+
+
+@pytest.mark.parametrize("name", ["car", pytest.param("quadrotor", marks=pytest.mark.slow)])
+def test_robot_with_a_way_to_rest_replays_from_every_snapshot(name: str) -> None:
+    """A car follows its way on and on; a quadrotor feeds its states back to it."""
+
+    def build() -> tuple[Controller, Rti]:
+        rti = Rti(ocp_of(name), compile=False)
+        return Controller(rti, Timing(), stop_law=law_of(name), second_opinion=1, compile=False), rti
+
+    controller, _ = build()
+    _, body = tracking(name)
+    book, start = Book(controller), np.array(MOTIONS[name][0])
+    messages: list[Journal] = []
+    book.photograph(0)
+    y = start + 0.05 * np.arange(400)[:, None] * np.array(MOTIONS[name][1])
+    controller.receive_reference(Reference(1, 1, 0, 50 * MS, End.HOLD, y, np.zeros((len(y), 0))))
+    for until_s in (0.5, 1.0, 1.2, 2.0):
+        lost = until_s == 1.2
+        drive(controller, body, until_s, sees=lambda state, lost=lost: None if lost else state)
+        if until_s == 1.0:
+            controller.stop("asked for")
+        book.photograph(0)
+        messages += book.messages(0)
+    for start_seq in [message.seq for message in messages if message.kind is JournalKind.SNAPSHOT][:-1]:
+        on = Replay(*build())
+        for _ in replay(on, messages, start_seq):
+            pass
+        assert on.outcome.samples > 3
+        assert not on.outcome.differences, str(on.outcome.differences[0])
+
+
+def test_weight_changed_by_a_billionth_is_found_at_its_first_sample_and_open_loop_goes_on() -> None:
+    lived = live(KINDS["riccati"], samples=30, snapshots=(0, 12))
+    first = replayed(KINDS["riccati"], lived.messages, R=np.array([1.0 + 1e-9, 1.0]))[0].differences[0]
+    visible = replayed(KINDS["riccati"], lived.messages, R=np.array([1.05, 1.0]))[0].differences[0]
+    assert first.seq == visible.seq, "plans before that are at their limits, with either weight"
+    assert 0.0 < first.size < 1e-6
+    assert first.field.startswith("u[")
+    assert "was recorded as" in str(first)
+    outcome, _ = replayed(KINDS["riccati"], lived.messages, R=np.array([50.0, 1.0]))
+    assert outcome.samples == len(lived.commands)
+    assert outcome.differing > 20
+    assert outcome.size < 1.0, "each sample goes on from the recorded commands"
