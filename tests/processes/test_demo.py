@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from rti_mpc.recording import Recording
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
 from rti_mpc_service.demo.demo import compiling
@@ -104,12 +105,23 @@ def test_folder_holds_record_figure_and_recording(folder: Path) -> None:
     assert (folder / "run.png").read_bytes().startswith(b"\x89PNG")
     entities = {chunk.entity_path for chunk in RrdReader(folder / "run.rrd").stream().to_chunks()}
     assert {"/world/robot", "/world/reference", "/command/u_c"} <= entities
-    assert {path.stem for path in (folder / "logs").iterdir()} == {"controller", "robot", "reference", "recorder", "echo"}
+    assert {path.stem for path in (folder / "logs").iterdir()} == {"controller", "robot", "reference", "viewer", "recorder", "echo"}
     assert "Traceback" not in "".join(path.read_text() for path in (folder / "logs").iterdir())
 
 
+def test_recording_holds_every_sample_and_all_that_was_said(folder: Path, summary: Any) -> None:
+    recording = Recording(folder / "run.mcap")
+    assert recording.whole
+    assert {name.rpartition("/")[2] for name in recording.attachments} >= {"config.toml", "versions.json", "equations.txt"}
+    samples = [recorded.message.seq for recorded in recording.messages(streams=("telemetry",))]
+    assert len(set(samples)) >= summary["samples"]
+    codes = [(recorded.role, recorded.message.code) for recorded in recording.messages(streams=("event",))]
+    assert ("robot", "robot_stopped") in codes, "it listens to the end"
+
+
 def test_output_says_how_to_look_at_it(demo: Demo) -> None:
-    for words in ("of 24 s", "bare echo", "heading none", str(demo.folder / "run.png"), f"rerun {demo.folder / 'run.rrd'}"):
+    shown = (demo.folder / "run.png", f"rerun {demo.folder / 'run.rrd'}", demo.folder / "run.mcap")
+    for words in ("of 24 s", "bare echo", "heading none", *map(str, shown)):
         assert words in demo.printed, words
 
 
@@ -131,7 +143,7 @@ def test_demo_that_is_ended_leaves_no_process_behind(tmp_path: Path, number: sig
         try:
             until(lambda: "mode tracking" in (tmp_path / "demo.log").read_text(), "the robot is driven")
             children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
-            assert len(children) == 5
+            assert len(children) == 6
             demo.send_signal(number)
             assert demo.wait(PATIENCE_S) == status
         finally:

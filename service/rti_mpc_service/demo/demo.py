@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Demo: the whole system on this machine, with robot, controller, reference and recorder as processes, and a summary.
+Demo: the whole system on this machine, with robot, controller, reference, recorder and viewer as processes, and a summary.
 
 The demo is one more peer. It listens on a free loopback port to which all others
 connect, so that several demos can run side by side. It starts the robot when all
@@ -57,9 +57,10 @@ END_TIMEOUT_S = 5.0  # a guard may take 3 s to bring the robot to rest
 POLL_PERIOD_S = 0.1
 DRAW_PERIOD_S = 0.25
 REFERENCE_MARGIN_S = 5.0  # reference beyond the last sample's horizon: near the last row a controller slows down
-RECORDER_END_TIMEOUT_S = 8.0  # for the recorder to write what it has received
-# The recorder ends first, so that the recording ends while the robot is still driven.
-END_ORDER = (*(("recorder",) if find_spec("rerun") else ()), "controller", "guard", "robot", "reference", "echo")
+WATCHER_END_TIMEOUT_S = 8.0  # for viewer and recorder to write what they have received
+WATCHERS = {role: module for role, module in (("viewer", "rerun"), ("recorder", "mcap")) if find_spec(module)}
+# The viewer ends first, so that what it shows ends while the robot is still driven; the recorder ends when all others have said their last.
+END_ORDER = ("viewer", "controller", "guard", "robot", "reference", "echo", "recorder")
 
 
 @dataclass(frozen=True)
@@ -161,6 +162,7 @@ def main(config: Config, scenario: str | None, **options: Any) -> int:
     try:
         run.folder.mkdir(parents=True, exist_ok=True)
         write_files(run.folder / "config.toml", run.config)
+        (run.folder / "run.mcap").unlink(missing_ok=True)  # of an earlier run: a recorder overwrites none
     except OSError as error:
         raise ConfigError(f"--out must be a folder that can be written, got {run.folder}: {error.strerror}") from error
     if run.scenario.note:
@@ -195,7 +197,7 @@ def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:
         witness = Witness(bus)
         command = Command(0, 0, 0, 0, 0, 0, 0, 0, Mode.TRACKING, QpStatus.SOLVED, 0, np.zeros((ocp.N, ocp.model.nu)))
         start(run, children, endpoint, len(encode(command)))
-        company = {"controller", "reference", ECHO, *(["viewer"] if recorded() else []), *guards(run)}
+        company = {"controller", "reference", ECHO, *WATCHERS, *guards(run)}
         shown = set[str]()
 
         def met() -> bool:
@@ -214,8 +216,8 @@ def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:
         board.wait("starting the robot")
         follow(run, ocp.model, witness, board, children, stop)
         board.wait("stopping all processes")
-        for name in (name for name in END_ORDER if name != "guard" or guards(run)):
-            if children.end(name, RECORDER_END_TIMEOUT_S if name == "recorder" else END_TIMEOUT_S):
+        for name in (name for name in END_ORDER if name in {*company, "robot"}):
+            if children.end(name, WATCHER_END_TIMEOUT_S if name in WATCHERS else END_TIMEOUT_S):
                 board.console.print(f"{name} did not end well, see {children.log(name)}", soft_wrap=True)
         witness.listen()
     if witness.info is None or witness.reference is None:
@@ -251,9 +253,13 @@ def start(run: DemoPlan, children: Children, endpoint: str, size: int) -> None:
         children.start(name, CLI_MODULE, "guard", config, "-e", endpoint)
     children.start("reference", CLI_MODULE, "reference", config, "-e", endpoint, *scenario, nice=WATCHER_NICENESS)
     children.start("echo", "rti_mpc_service.host.echo", endpoint, keys.prefix, keys.robot, size)
-    if recorded():
-        live = ("--rerun-spawn",) if run.viewer else ()
-        children.start("recorder", CLI_MODULE, "view", config, "-e", endpoint, "--rerun-save", run.folder / "run.rrd", *live, nice=WATCHER_NICENESS)
+    live = ("--rerun-spawn",) if run.viewer else ()
+    commands = {
+        "viewer": ("view", config, "--rerun-save", run.folder / "run.rrd", *live),
+        "recorder": ("record", config, "--out", run.folder / "run.mcap"),
+    }
+    for name in WATCHERS:
+        children.start(name, CLI_MODULE, *commands[name], "-e", endpoint, nice=WATCHER_NICENESS)
 
 
 def follow(run: DemoPlan, model: Model, witness: Witness, board: Board, children: Children, stop: Event) -> None:
@@ -305,9 +311,11 @@ def conclude(run: DemoPlan, outcome: Outcome, console: Console) -> int:
 
         figure(outcome.run(), run.folder / "run.png")
         console.print(f"figure     {run.folder / 'run.png'}", soft_wrap=True)
-    if recorded():
+    if "viewer" in WATCHERS:
         rerun = Path(sys.executable).with_name("rerun")
-        console.print(f"recording  {path_as_typed(rerun) if rerun.exists() else 'rerun'} {run.folder / 'run.rrd'}", soft_wrap=True)
+        console.print(f"view it    {path_as_typed(rerun) if rerun.exists() else 'rerun'} {run.folder / 'run.rrd'}", soft_wrap=True)
+    if "recorder" in WATCHERS:
+        console.print(f"recording  {run.folder / 'run.mcap'}", soft_wrap=True)
     console.print(f"all of it  {run.folder}", soft_wrap=True)
     if not summary["driven"]:
         console.print("rti-mpc: the robot was not driven to the end")
@@ -317,11 +325,6 @@ def conclude(run: DemoPlan, outcome: Outcome, console: Console) -> int:
 def guards(run: DemoPlan) -> tuple[str, ...]:
     """Return the guard's role, if there is one."""
     return ("guard",) if run.config.guard.enabled else ()
-
-
-def recorded() -> bool:
-    """Whether Rerun is installed, so that the run is recorded."""
-    return find_spec("rerun") is not None
 
 
 def path_as_typed(path: Path) -> Path:
