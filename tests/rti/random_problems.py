@@ -35,6 +35,7 @@ ROOMS = {  # least and largest distance of each bound from zero
     "lh": (0.1, 1.0),
     "uh": (0.1, 1.0),
 }
+Solution = tuple[Array, Array] | None  # minimum and multipliers of the inequalities; None where a solver finds none
 SIGNS = {name: -1.0 if name.startswith("l") else 1.0 for name in ROOMS}
 
 
@@ -282,17 +283,69 @@ class Truth:
                 np.zeros(slack.shape[0]),
             ]
         )
-        kept = np.isfinite(h)
+        self._kept = kept = np.isfinite(h)
         return sp.csc_matrix(P), q, sp.csc_matrix(to_states), free, sp.csc_matrix(sp.csr_matrix(G)[kept]), h[kept]
 
-    def costs(self) -> list[float]:
-        """Least costs as clarabel and PIQP find them; infinite where one fails. Inputs are put inside their bounds, and states follow from them."""
-        P, q, A, b, G, h = self.program()
-        found = []
-        for solve in (by_clarabel, by_piqp):
-            z = solve(P, q, A, b, G, h)
-            found.append(np.inf if z is None else self._least(z))
-        return found
+    def solutions(self) -> list[Solution]:
+        """Minima as clarabel and PIQP find them."""
+        program = self.program()
+        return [solve(*program) for solve in (by_clarabel, by_piqp)]
+
+    def costs(self, solutions: list[Solution]) -> list[float]:
+        """Costs of solutions; infinite where there is none. Inputs are put inside their bounds, and states follow from them."""
+        return [np.inf if found is None else self._least(found[0]) for found in solutions]
+
+    def excess(self, u: Array, multipliers: Array) -> float:
+        """
+        Upper bound on the cost of inputs above the least one, by convexity, in extended precision.
+
+        Any multipliers give one; those of the optimum give zero there. An input without a bound is taken to be within one of the optimum's.
+
+        Args:
+            u: Inputs inside their bounds, shape ``(N_u, nu)``.
+            multipliers: Multipliers of the inequalities of `program`.
+        """
+        s, d, long = self._s, self._d, np.longdouble
+        v = {name: value.astype(long) for name, value in d.values.items()}
+        A, B, C, E, F, u = (matrix.astype(long) for matrix in (d.A, d.B, d.C, d.E, d.F, u))
+        all_multipliers = np.zeros(len(self._kept), dtype=long)
+        all_multipliers[self._kept] = np.maximum(multipliers, 0.0)
+        sizes = [s.N_u * s.nu] * 4 + [s.N * (s.nx + s.nh)] * 2
+        _, _, upper_du, lower_du, upper, lower = np.split(all_multipliers, np.cumsum(sizes))[:6]
+        upper_du, lower_du = upper_du.reshape(u.shape), lower_du.reshape(u.shape)
+        upper, lower = upper.reshape(s.N, -1), lower.reshape(s.N, -1)
+
+        held = self._held(u)
+        x = [d.x0.astype(long)]
+        for row in held:
+            x.append(A @ x[-1] + B @ row)
+        nodes = np.array(x[1:])
+        e, pull = nodes @ C.T - d.y_ref, upper - lower
+        by_x = 2.0 * v["delta"][:, None] * (e @ v["Q"] @ C) + pull[:, : s.nx] + pull[:, s.nx :] @ E
+        by_x[-1] += 2.0 * (e[-1] @ v["Q_e"] @ C)
+        by_u = pull[:, s.nx :] @ F
+        r, costate = np.zeros_like(u), np.zeros(s.nx, dtype=long)
+        for k in reversed(range(s.N)):
+            costate = A.T @ costate + by_x[k] if k < s.N - 1 else by_x[k]
+            r[min(k, s.N_u - 1)] += B.T @ costate + by_u[k]
+        du = np.diff(np.vstack([d.u_prev, u]), axis=0)
+        force = 2.0 * v["lambda_"][:, None] * (du @ v["R"]) + upper_du - lower_du
+        r += force
+        r[:-1] -= force[1:]
+
+        rooms = [np.where(np.isfinite(room), room, 1.0) for room in (u - v["lbu"], v["ubu"] - u)]
+        slopes = [np.where(r > 0.0, r, 0.0), np.where(r < 0.0, -r, 0.0)]
+        bound = sum(np.sum(slope * room) for slope, room in zip(slopes, rooms, strict=True))
+        for multiplier, room in ((upper_du, v["ubdu"] - du), (lower_du, du - v["lbdu"])):
+            bound += np.sum(multiplier * np.where(multiplier > 0.0, room, 0.0))
+        values = np.hstack([nodes, nodes @ E.T + held @ F.T])
+        over, under = values - np.concatenate([v["ubx"], v["uh"]]), np.concatenate([v["lbx"], v["lh"]]) - values
+        slack = np.maximum(0.0, np.maximum(over, under))
+        z, Z = (soft.reshape(slack.shape).astype(long) for soft in self._soft)
+        bound += np.sum(z * slack + Z * slack**2 / 2 + np.maximum(0.0, upper + lower - z) ** 2 / (2 * Z))
+        for multiplier, beyond in ((upper, over), (lower, under)):
+            bound -= np.sum(multiplier * np.where(multiplier > 0.0, beyond, 0.0))
+        return float(bound)
 
     def _least(self, z: Array) -> float:
         s, v = self._s, self._d.values
@@ -303,22 +356,22 @@ class Truth:
         return self.cost(self.rolled_out(u), u)
 
 
-def by_clarabel(P: sp.csc_matrix, q: Array, A: sp.csc_matrix, b: Array, G: sp.csc_matrix, h: Array) -> Array | None:
-    """The minimum by clarabel, None if it finds none."""
+def by_clarabel(P: sp.csc_matrix, q: Array, A: sp.csc_matrix, b: Array, G: sp.csc_matrix, h: Array) -> Solution:
+    """The minimum by clarabel."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-11
     settings.max_iter = 400
     cones = [clarabel.ZeroConeT(len(b)), clarabel.NonnegativeConeT(len(h))]
     found = clarabel.DefaultSolver(sp.triu(P, format="csc"), q, sp.csc_matrix(sp.vstack([A, G])), np.concatenate([b, h]), cones, settings).solve()
-    return np.array(found.x) if str(found.status) in ("Solved", "AlmostSolved", "InsufficientProgress") else None
+    return (np.array(found.x), np.array(found.z)[len(b) :]) if str(found.status) in ("Solved", "AlmostSolved", "InsufficientProgress") else None
 
 
-def by_piqp(P: sp.csc_matrix, q: Array, A: sp.csc_matrix, b: Array, G: sp.csc_matrix, h: Array) -> Array | None:
-    """The minimum by PIQP, None if it finds none."""
+def by_piqp(P: sp.csc_matrix, q: Array, A: sp.csc_matrix, b: Array, G: sp.csc_matrix, h: Array) -> Solution:
+    """The minimum by PIQP."""
     solver = piqp.SparseSolver()
     solver.settings.eps_abs = solver.settings.eps_rel = 1e-11
     solver.settings.max_iter = 400
     solver.setup(P, q, A, b, G, np.full(len(h), -np.inf), h)
     status = solver.solve()
-    return np.array(solver.result.x) if status in (piqp.PIQP_SOLVED, piqp.PIQP_MAX_ITER_REACHED) else None
+    return (np.array(solver.result.x), np.array(solver.result.z_u)) if status in (piqp.PIQP_SOLVED, piqp.PIQP_MAX_ITER_REACHED) else None
