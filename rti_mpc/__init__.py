@@ -43,6 +43,13 @@ References, cited by key throughout:
 * [Judice1994] J. J. Júdice, F. M. Pires, "A block principal pivoting algorithm for large-scale strictly monotone linear complementarity problems",
   Comput. Oper. Res. 21(5), 1994.
 * [Mehrotra1992] S. Mehrotra, "On the implementation of a primal-dual interior point method", SIAM J. Optim. 2(4), 1992.
+* [Kapania2016] N. Kapania, J. Subosits, J. C. Gerdes, "A sequential two-step algorithm for fast generation of vehicle racing trajectories",
+  J. Dyn. Sys. Meas. Control 138(9), 2016.
+* [Lam2010] D. Lam, C. Manzie, M. Good, "Model predictive contouring control", CDC 2010.
+* [Faulwasser2016] T. Faulwasser, R. Findeisen, "Nonlinear model predictive control for constrained output path following", IEEE Trans. Autom.
+  Control 61(4), 2016.
+* [Liniger2015] A. Liniger, A. Domahidi, M. Morari, "Optimization-based autonomous racing of 1:43 scale RC cars", Optim. Control Appl. Methods 36(5),
+  2015.
 * [Pacejka2012] H. B. Pacejka, "Tire and vehicle dynamics", 3rd ed., Butterworth-Heinemann, 2012.
 * [Pannocchia2003] G. Pannocchia, J. B. Rawlings, "Disturbance models for offset-free model-predictive control", AIChE J. 49(2), 2003.
 """

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-CSV files of waypoints, as people and tools write them: the columns x and y in m, wherever they stand.
+CSV files of waypoints, as people and tools write them: the columns x and y in m, wherever they stand; of tracks, also widths and speeds.
 
 Columns are separated by comma, semicolon, tab or spaces. Names are in the first line, or
 in a comment before the numbers, as racelines have them (``# s_m; x_m; y_m``). Without
@@ -24,6 +24,11 @@ from rti_mpc.text_file import read_text_file
 MAX_CSV_BYTES = 1 << 26
 SEPARATORS = (";", "\t", ",", " ")  # the first one that a line holds separates it
 NAME = re.compile(r"(?:pos(?:ition)?[ _]?)?([xy])(?:[ _]?[\[(]?m[\])]?)?")  # x, pos_x, x_m, x [m]
+TRACK_NAMES = {
+    "right": re.compile(r"(?:w(?:idth)?_)?(?:tr(?:ack)?_)?right(?:_m)?"),  # w_tr_right_m, as in the TUM's race track database
+    "left": re.compile(r"(?:w(?:idth)?_)?(?:tr(?:ack)?_)?left(?:_m)?"),
+    "speed": re.compile(r"v(?:x|el)?(?:_mps|_m_s)?|speed(?:_m_s)?"),  # vx_mps, as in the TUM's race lines
+}
 DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+")
 
 
@@ -39,11 +44,41 @@ def read_csv(path: Path) -> Array:
     Raises:
         ConfigError: The file cannot be read, a number in it, or its columns: file, line and column are named.
     """
+    cells, columns, _, separator = table(path)
+    return np.array([[number(path, i, name, row, columns[name], separator) for name in "xy"] for i, row in cells]).reshape(-1, 2)
+
+
+def read_track(path: Path) -> dict[str, Array]:
+    """
+    Read the centre line of a track with its widths, or a race line.
+
+    Returns:
+        Columns by name, each of shape ``(n,)``: ``x`` and ``y`` in m; where the file names them ``right`` and ``left``, from the line to the edges
+        of the track in m, and ``speed`` in m/s.
+
+    Raises:
+        ConfigError: As `read_csv`; or one width is there without the other, or a width or speed is negative.
+    """
+    cells, columns, names, separator = table(path)
+    for name, pattern in TRACK_NAMES.items():
+        if found := [i for i, cell in enumerate(names) if pattern.fullmatch(cell.strip().lower())]:
+            columns[name] = found[0]
+    if ("right" in columns) != ("left" in columns):
+        raise ConfigError(f"{path}: the header must name both widths, w_right and w_left, or none, got {', '.join(names)}")
+    values = {name: np.array([number(path, i, name, row, column, separator) for i, row in cells]) for name, column in columns.items()}
+    for name in TRACK_NAMES:
+        if name in values and (wrong := values[name] < 0.0).any():
+            raise ConfigError(f"{path}, line {cells[int(np.argmax(wrong))][0]}, column {name}: must be at least 0, got {values[name][wrong][0]:g}")
+    return values
+
+
+def table(path: Path) -> tuple[list[tuple[int, list[str]]], dict[str, int], list[str], str]:
+    """Return the cells of each line with its number, the columns of x and y, the names of all columns where they have names, and what separates."""
     text = read_text_file(path, "CSV with waypoints", MAX_CSV_BYTES)
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip(" \t,;")]
     rows = [(i, line) for i, line in lines if not is_comment(line)]
     if not rows:
-        return np.empty((0, 2))
+        return [], {"x": 0, "y": 1}, [], " "
     separator = next((mark for mark in SEPARATORS if mark in rows[0][1]), " ")
     try:
         cells = [(i, split(line, separator)) for i, line in rows]
@@ -53,12 +88,10 @@ def read_csv(path: Path) -> Array:
         raise ConfigError(f"{path}: must be CSV with waypoints, got {error}") from error
     if not is_number(cells[0][1][0]):
         (line, names), *cells = cells
-        columns = named(path, line, names)
-    elif header := next(((line, names) for line, names in reversed(comments) if {"x", "y"} <= {*map(axis, names)}), None):
-        columns = named(path, *header)
-    else:
-        columns = unnamed(path, cells)
-    return np.array([[number(path, i, name, row, columns[name], separator) for name in "xy"] for i, row in cells]).reshape(-1, 2)
+        return cells, named(path, line, names), names, separator
+    if header := next(((line, names) for line, names in reversed(comments) if {"x", "y"} <= {*map(axis, names)}), None):
+        return cells, named(path, *header), header[1], separator
+    return cells, unnamed(path, cells), [], separator
 
 
 def is_comment(line: str) -> bool:
