@@ -32,6 +32,9 @@ References, cited by key throughout:
 * [Gros2020] S. Gros, M. Zanon, R. Quirynen, A. Bemporad, M. Diehl, "From linear to nonlinear MPC: bridging the gap via the real-time iteration",
   Int. J. Control 93(1), 2020.
 * [Verschueren2022] R. Verschueren et al., "acados - a modular open-source framework for fast embedded optimal control", Math. Prog. Comp. 14, 2022.
+* [Wirsching2006] L. Wirsching, H. G. Bock, M. Diehl, "Fast NMPC of a chain of masses connected by springs", IEEE CCA, 2006.
+* [Altafini2001] C. Altafini, A. Speranzon, B. Wahlberg, "A feedback control scheme for reversing a truck and trailer vehicle", IEEE Trans. Robot.
+  Autom. 17(6), 2001.
 * [Andersson2013] J. Andersson, "A general-purpose software framework for dynamic optimization", PhD thesis, KU Leuven, 2013.
 * [Ghadimi2015] E. Ghadimi, A. Teixeira, I. Shames, M. Johansson, "Optimal parameter selection for the alternating direction method of
   multipliers (ADMM): quadratic problems", IEEE Trans. Autom. Control 60(3), 2015.

@@ -26,7 +26,20 @@ import rti_mpc
 from rti_mpc.errors import OcpError
 from rti_mpc.model.model import Model
 
-SHIPPED = ("pioneer_3dx", "dynamic_bicycle")
+SHIPPED = (
+    "pioneer_3dx",
+    "unicycle",
+    "differential_drive",
+    "kinematic_bicycle",
+    "dynamic_bicycle",
+    "truck_trailer",
+    "omnidirectional",
+    "boat",
+    "quadrotor",
+    "two_link_arm",
+    "cart_pole",
+    "chain",
+)
 SHIPPED_MODELS = {name: f"rti_mpc.model.robots.{name}:{name}" for name in SHIPPED}
 MODEL_NAME_PATTERN = re.compile(r"([^\W\d]\w*(?:\.[^\W\d]\w*)*|.+\.py):([^\W\d]\w*)")  # package.module:function, file.py:function
 PACKAGE_PREFIX = "rti_mpc_beside_"  # of the package that stands for a folder

@@ -30,13 +30,13 @@ from rti_mpc_service.config.build import build_signals, bus_settings, robot_sett
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.config.signals_file import check_against
-from rti_mpc_service.shipped import DEPLOY
+from rti_mpc_service.shipped import ROBOTS, robot_file
 
 if TYPE_CHECKING:
     from rti_mpc.wire.bus import BusSettings
 
 
-SHIPPED = DEPLOY / "pioneer_3dx.toml"
+SHIPPED = ROBOTS["pioneer_3dx"]
 
 
 class FaultsCommand(TyperCommand):
@@ -92,7 +92,20 @@ def claimed(path: Path | None) -> Path | None:
 
 
 ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="The robot's TOML file.", show_default="the shipped pioneer_3dx.toml")]
+RobotName = Annotated[str | None, typer.Option("--robot", metavar="NAME", help="A robot that ships, instead of CONFIG: see `rti-mpc robots`.")]
 JsonPath = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write the results as JSON.", callback=claimed)]
+
+
+def file_of(config: Path, robot: str | None) -> Path:
+    """
+    Return the TOML file that a command is about.
+
+    Raises:
+        ConfigError: There are two, or no robot of this name ships.
+    """
+    if robot is not None and config != SHIPPED:
+        raise ConfigError(f"CONFIG or --robot must be left out, got {config} and {robot}")
+    return config if robot is None else robot_file(robot)
 
 
 def options(
@@ -153,7 +166,7 @@ ScenarioName = Annotated[
     typer.Option(
         metavar="circle|eight|positioning|sines|steps|FILE.csv",
         help="Reference to follow; a file holds waypoints, or columns t and all outputs by name.",
-        show_default="eight for a robot in the plane, sines of its outputs for any other",
+        show_default="that of the file; or eight for a robot in the plane, sines of its outputs for any other",
     ),
 ]
 WaypointSpeed = Annotated[float, typer.Option(metavar="M/S", min=0.001, help="Speed along waypoints.")]
@@ -337,6 +350,7 @@ def params(
 @app.command()
 def demo(
     config: ConfigPath = SHIPPED,
+    robot: RobotName = None,
     scenario: ScenarioName = None,
     heading: Annotated[
         Literal["tangent", "consistent", "none"] | None,
@@ -362,7 +376,7 @@ def demo(
 
     raise typer.Exit(
         main(
-            load(config),
+            load(file_of(config, robot)),
             scenario,
             heading=heading,
             waypoint_speed_m_s=waypoint_speed,
@@ -379,6 +393,7 @@ def demo(
 @app.command(cls=FaultsCommand)
 def faults(
     config: ConfigPath = SHIPPED,
+    robot: RobotName = None,
     only: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Name of a fault from the list below; repeatable.", show_default="all")
     ] = None,
@@ -390,7 +405,7 @@ def faults(
     """Inject faults into a running system, one after the other, and print what the robot did: the fault matrix."""
     from rti_mpc_service.faults.run import main
 
-    raise typer.Exit(main(config, tuple(only or ()), path, scenario, waypoint_speed, waypoint_smoothing))
+    raise typer.Exit(main(file_of(config, robot), tuple(only or ()), path, scenario, waypoint_speed, waypoint_smoothing))
 
 
 @process
@@ -448,11 +463,19 @@ def paper(
 
 
 @app.command()
-def check(config: ConfigPath = SHIPPED) -> None:
+def check(config: ConfigPath = SHIPPED, robot: RobotName = None) -> None:
     """Check a configuration: solve 200 samples, print the times of both phases, and compare with a second solver."""
     from rti_mpc_service.check.check import main
 
-    raise typer.Exit(main(config))
+    raise typer.Exit(main(file_of(config, robot)))
+
+
+@app.command()
+def robots() -> None:
+    """List the robots that ship: size, period, horizon, what they do at rest, and where their parameters are from."""
+    from rti_mpc_service.robots import main
+
+    main()
 
 
 @app.command()

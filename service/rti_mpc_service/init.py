@@ -42,7 +42,7 @@ def main(name: str | None, kind: str, folder: Path, *, deploy: bool = False) -> 
         raise ConfigError("init must be given the name of a robot, such as my_robot, or --deploy")
     contents = {} if name is None else {folder / file: text for file, text in robot_files(name, kind).items()}
     if deploy:
-        shipped = [path for path in sorted(DEPLOY.rglob("*")) if path.is_file()]
+        shipped = [path for path in sorted(DEPLOY.rglob("*")) if path.is_file() and path.parent.name != "robots"]
         contents |= {folder / "deploy" / path.relative_to(DEPLOY): path.read_text(encoding="utf-8") for path in shipped}
     if existing := [path for path in contents if path.exists() or path.is_symlink()]:
         raise ConfigError(f"init must not overwrite a file, got {existing[0]}, which exists")

@@ -18,6 +18,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.message import End
 from rti_mpc.errors import ConfigError
+from rti_mpc.reference.manoeuvres import MANOEUVRES, fitting, manoeuvre
 from rti_mpc.reference.outputs import OUTPUT_SCENARIOS, OutputReference, names_outputs, recorded
 from rti_mpc.reference.trajectory import SCENARIOS, Heading, Trajectory, find_trajectory, followed_roles, rows
 from rti_mpc.signals import in_plane, place
@@ -81,9 +82,9 @@ def find_scenario(
 
     Args:
         config: The robot's configuration.
-        name: A scenario or a CSV file; None: the eight for a robot in the plane, sines for any other.
+        name: A scenario or a CSV file; None: that of the configuration, or else the eight for a robot in the plane, sines for any other.
         heading: Of a path; None: consistent.
-        duration_s: How long it is followed; None: the scenario's own time.
+        duration_s: How long it is followed; None: the time in the configuration, or else the scenario's own.
         speed_m_s: Along waypoints.
         smooth_m: Path that waypoints are averaged over, see `rti_mpc.reference.trajectory.waypoints`.
 
@@ -92,11 +93,14 @@ def find_scenario(
         OcpError: No consistent heading repeats on a closed path.
     """
     model = build_model(config)
+    if name is None or name == config.reference.scenario:
+        name, duration_s = config.reference.scenario, duration_s or config.reference.duration_s
     name = name or ("eight" if in_plane(model.outputs) else "sines")
-    if name not in (*SCENARIOS, *OUTPUT_SCENARIOS) and Path(name).suffix.lower() != ".csv":
-        known = ", ".join((*SCENARIOS, *OUTPUT_SCENARIOS))
+    timed = (*OUTPUT_SCENARIOS, *MANOEUVRES)
+    if name not in (*SCENARIOS, *timed) and Path(name).suffix.lower() != ".csv":
+        known = ", ".join((*SCENARIOS, *OUTPUT_SCENARIOS, *fitting(model.outputs)))
         raise ConfigError(f"a scenario must be one of {known} or a FILE.csv of waypoints or of outputs over time, got {name!r}")
-    if name not in SCENARIOS and (name in OUTPUT_SCENARIOS or not in_plane(model.outputs) or names_outputs(Path(name), model.outputs)):
+    if name not in SCENARIOS and (name in timed or not in_plane(model.outputs) or names_outputs(Path(name), model.outputs)):
         if heading is not None:
             raise ConfigError(f"--heading is of paths in the plane, it must be left out for {name}, got {heading}")
         return of_outputs(config, model, name, duration_s)
@@ -146,11 +150,13 @@ def of_outputs(config: Config, model: Model, name: str, duration_s: float | None
         weighted = [i for i, output in enumerate(model.outputs) if config.ocp.weights.Q[output.name] > 0.0]
         period_s = max(MIN_PERIOD_S, PERIOD_HORIZONS * config.ocp.N * config.ocp.dt_s)
         reference = OUTPUT_SCENARIOS[name](np.array(lower), np.array(upper), weighted[: model.nu], period_s)
+    elif name in MANOEUVRES:
+        reference = manoeuvre(name, model.outputs)
     else:
         reference = recorded(Path(name), model.outputs)
     if duration_s is not None:
         reference = reference.lasting(duration_s)
-    period_s = min(ROW_PERIOD_S, config.ocp.dt_s)
+    period_s = ROW_PERIOD_S if name in MANOEUVRES else min(ROW_PERIOD_S, config.ocp.dt_s)
     t: Array = np.float64(period_s) * np.arange(int(np.ceil(reference.duration_s / period_s - 1e-9)) + 1)
     h = model.h()
 

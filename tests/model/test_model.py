@@ -118,7 +118,7 @@ def test_model_of_ones_own_is_found_by_module_and_function() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("pioneer", "must be one of pioneer_3dx or an importable package.module:function of your own, got 'pioneer'"),
+        ("pioneer", "must be one of pioneer_3dx, .*, chain or an importable package.module:function of your own, got 'pioneer'"),
         ("rti_mpc.nowhere:model", "No module named"),
         ("rti_mpc.model.model:nothing", "has no function nothing"),
         ("numpy:zeros_like", r"numpy:zeros_like must return a model, it raised TypeError: "),

@@ -42,14 +42,16 @@ def test_help_of_every_command_explains_every_option(command: str) -> None:
     assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
 
 
-@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "certs", "check", "demo", "doctor", "faults", "init", "paper", "schema"}))
+@pytest.mark.parametrize(
+    "command", sorted(set(COMMANDS) - {"bench", "certs", "check", "demo", "doctor", "faults", "init", "paper", "robots", "schema"})
+)
 def test_every_process_takes_the_options_of_zenoh_programs(command: str) -> None:
     parameters = typer.main.get_group(app).commands[command].params
     options = {option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)}
     assert set(ZENOH) | {"-m", "-e", "-l", "-c"} <= options
 
 
-@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "certs", "demo", "init", "paper", "schema"}))
+@pytest.mark.parametrize("command", sorted(set(COMMANDS) - {"bench", "certs", "demo", "init", "paper", "robots", "schema"}))
 def test_bad_configuration_is_one_line_and_exit_status_2(command: str, tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(SHIPPED.read_text().replace("dt_s", "dt_ms"))
@@ -78,7 +80,8 @@ def test_outputs_that_no_path_fills_are_refused_by_name_in_the_terminal(command:
 @pytest.mark.parametrize(
     "command",
     sorted(
-        set(COMMANDS) - {"bench", "certs", "enable", "export", "guard", "init", "paper", "params", "record", "router", "schema", "status", "stop"}
+        set(COMMANDS)
+        - {"bench", "certs", "enable", "export", "guard", "init", "paper", "params", "record", "robots", "router", "schema", "status", "stop"}
     ),
 )
 def test_model_that_cannot_be_imported_is_refused_by_every_process_that_loads_it_with_file_and_line(command: str, tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ def test_deployment_is_the_shipped_one_word_by_word(tmp_path: Path) -> None:
     there, here = (
         {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()} for root in (DEPLOY, tmp_path / "deploy")
     )
-    assert here == there
+    assert here == {path: content for path, content in there.items() if path.parts[0] != "robots"}, "of robots, the user's own is deployed"
     assert len(here) > 10
 
 

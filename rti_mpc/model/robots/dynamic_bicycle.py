@@ -28,7 +28,10 @@ from __future__ import annotations
 import casadi as ca
 
 from rti_mpc.model.model import Model, Signal
+from rti_mpc.model.robots.pose import POSE_SIGNALS
 
+SOURCE = "f1tenth_gym, MIT"
+REST = "drifts"
 PARAMETERS = {  # name: nominal value, unit
     "m": (3.74, "kg"),
     "I_z": (0.04712, "kg m^2"),
@@ -60,7 +63,6 @@ def dynamic_bicycle() -> Model:
     front, cos, sin = v_y + l_f * r, ca.cos(delta), ca.sin(delta)
     alpha_f, alpha_r = slip_angle(v_x * cos + front * sin, front * cos - v_x * sin), slip_angle(v_x, v_y - l_r * r)
     F_f, F_r = lateral_force(l_r / (l_f + l_r), C_f, alpha_f), lateral_force(l_f / (l_f + l_r), C_r, alpha_r)
-    pose = (Signal("x", "m", role="x"), Signal("y", "m", role="y"), Signal("psi", "rad", angle=True, role="heading"))
     return Model(
         name="dynamic_bicycle",
         x=x,
@@ -78,9 +80,9 @@ def dynamic_bicycle() -> Model:
         y_expr=x[:3],
         h_expr=ca.vertcat(alpha_f, alpha_r),
         stop_expr=ca.vertcat(-STOP_GAIN * v_x, 0),
-        states=(*pose, Signal("v_x", "m/s"), Signal("v_y", "m/s"), Signal("r", "rad/s"), Signal("delta", "rad")),
+        states=(*POSE_SIGNALS, Signal("v_x", "m/s"), Signal("v_y", "m/s"), Signal("r", "rad/s"), Signal("delta", "rad")),
         inputs=(Signal("a", "m/s^2"), Signal("omega_delta", "rad/s")),
-        outputs=pose,
+        outputs=POSE_SIGNALS,
         parameters=tuple(Signal(name, unit) for name, (_, unit) in PARAMETERS.items()),
         constraints=(Signal("alpha_f", "rad"), Signal("alpha_r", "rad")),
         p_nominal=tuple(value for value, _ in PARAMETERS.values()),

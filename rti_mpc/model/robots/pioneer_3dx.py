@@ -18,7 +18,10 @@ from __future__ import annotations
 import casadi as ca
 
 from rti_mpc.model.model import Model, Signal
+from rti_mpc.model.robots.pose import POSE_SIGNALS
 
+SOURCE = "the paper"
+REST = "holds"
 NOMINAL_PARAMETERS = {
     "theta_1": 0.24089,
     "theta_2": 0.2424,
@@ -28,7 +31,6 @@ NOMINAL_PARAMETERS = {
     "theta_6": 1.0915,
     "a": 0.2,  # [m], not printed in the paper: the value that the authors of its robot use
 }
-POSE_SIGNALS = (Signal("x", "m", role="x"), Signal("y", "m", role="y"), Signal("psi", "rad", angle=True, role="heading"))
 
 
 def pioneer_3dx() -> Model:

@@ -40,6 +40,9 @@ def load(path: Path, *, with_model: bool = True) -> Config:
         beside = {name: path.parent / value for name in ("config", "tls") if (value := getattr(config.bus, name)) is not None}
         if beside:
             config = config.model_copy(update={"bus": config.bus.model_copy(update=beside)})
+        if (scenario := config.reference.scenario or "").lower().endswith(".csv"):
+            followed = config.reference.model_copy(update={"scenario": os.path.abspath(path.parent / scenario)})
+            config = config.model_copy(update={"reference": followed})
         if ":" in config.model.name:  # a model of the user's own, which no process looks for anywhere else, wherever it is started
             folder = Path(os.path.abspath(path.parent / (config.model.folder or "")))
             config = config.model_copy(update={"model": config.model.model_copy(update={"folder": folder})})

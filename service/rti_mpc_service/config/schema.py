@@ -254,6 +254,17 @@ class RealtimeSection(Section):
     lock_memory: bool = Field(default=False, description="whether the controller's memory is locked, so that it is never swapped out")
 
 
+class ReferenceSection(Section):
+    """What the robot follows where the command line names nothing else."""
+
+    scenario: str | None = Field(
+        default=None,
+        description="name of a scenario, as in --scenario, or a CSV file, looked for beside this file; "
+        "eight for a robot in the plane, and sines for any other, if left out",
+    )
+    duration_s: Positive | None = Field(default=None, description="how long it is followed, in seconds; the scenario's own time if left out")
+
+
 class SimSection(Section):
     """The simulated robot, which may differ from the controller's model; defaults are those of `RobotSettings`."""
 
@@ -290,6 +301,7 @@ class Config(Section):
     params: ParamsSection = Field(default=ParamsSection(), description="changes while the controller runs")
     bus: BusSection = Field(default=BusSection(), description="the Zenoh session")
     realtime: RealtimeSection = Field(default=RealtimeSection(), description="scheduling of the controller by the operating system")
+    reference: ReferenceSection = Field(default=ReferenceSection(), description="what the robot follows")
     sim: SimSection = Field(default=SimSection(), description="the simulated robot")
 
     @property
@@ -309,8 +321,9 @@ class Config(Section):
 
     @property
     def config_hash(self) -> int:
-        """Hash, 64 bits, of all keys on which commands depend: not bus, guard, scheduling, simulation, failures on request and folders."""
-        content = self.model_dump(mode="json", exclude={**dict.fromkeys(("bus", "debug", "guard", "realtime", "sim"), True), "model": {"folder"}})
+        """Hash, 64 bits, of all keys on which commands depend: not bus, guard, reference, scheduling, simulation, failures on request and folders."""
+        others = ("bus", "debug", "guard", "realtime", "reference", "sim")
+        content = self.model_dump(mode="json", exclude={**dict.fromkeys(others, True), "model": {"folder"}})
         return int.from_bytes(hashlib.sha256(json.dumps(content, sort_keys=True).encode()).digest()[:8], "little")
 
     def keys(self) -> Keys:
