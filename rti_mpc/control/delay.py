@@ -62,7 +62,7 @@ class DelayEstimator:
         self._next: Array = np.zeros(model.nx)
         self._u: Array = np.zeros(model.nu)
         self._span: Array = np.zeros(1)  # s
-        phi = integrator(model, "rk4")
+        phi = integrator(model)
         integrate = compiled(phi)[0] if compile else phi
         inputs = {"x": self._x, "u": self._u, "p": np.array(model.p_nominal), "dt": self._span}
         self._integrate = bind(integrate, inputs, {"x_next": self._next})

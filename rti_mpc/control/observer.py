@@ -23,7 +23,7 @@ from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled, function
 from rti_mpc.errors import OcpError
 from rti_mpc.model.disturbance import with_disturbances
-from rti_mpc.model.integrator import integrator
+from rti_mpc.model.integrator import sensitivities
 from rti_mpc.model.model import Model
 
 DEFAULT_NOISE = 1e-3  # standard deviation of a measured state, in its unit
@@ -144,11 +144,12 @@ class Observer:
 def predict(model: Model, nd: int, walks: Array) -> ca.Function:
     """Build ``(z, P, u, p, span) -> (z_next, P_next)``: one step of the dynamics and of the covariance."""
     nx, n = model.nx, model.nx + nd
-    z, P, span = ca.SX.sym("z", n), ca.SX.sym("P", n, n), ca.SX.sym("span")
-    p = ca.SX.sym("p", model.np_ - nd)
-    x_next = integrator(model)(z[:nx], model.u, ca.vertcat(p, z[nx:]), span)
-    z_next = ca.vertcat(x_next, z[nx:])
-    A = ca.jacobian(z_next, z)
+    P, span = ca.SX.sym("P", n, n), ca.SX.sym("span")
+    p, d = model.p[: model.np_ - nd], model.p[model.np_ - nd :]
+    z = ca.vertcat(model.x, d)
+    x_next, A_x, _, A_p = sensitivities(model, span)
+    z_next = ca.vertcat(x_next, d)
+    A = ca.blockcat([[A_x, A_p[:, model.np_ - nd :]], [ca.SX(nd, nx), ca.SX.eye(nd)]])
     P_next = ca.densify(A @ P @ A.T + span * ca.diag(ca.DM(walks)))
     inputs = {"z": z, "P": P, "u": model.u, "p": p, "span": span}
     return function("observer_predict", inputs, {"z_next": z_next, "P_next": P_next})

@@ -28,13 +28,13 @@ class Prediction:
         self._span: Array = np.zeros(1)  # s
         self._start: Array = np.zeros(model.nx)
         self._input: Array = np.zeros(model.nu)
-        phi = integrator(model, "rk4")
+        phi = integrator(model)
         integrate = compiled(phi)[0] if compile else phi
         self._integrate = bind(integrate, {"x": self._start, "u": self._input, "p": self.p, "dt": self._span}, {"x_next": self.x})
 
     def predict(self, x: Array, from_ns: int, to_ns: int) -> Array:
         """
-        Integrate from one time to another, with one RK4 step per input; `to_ns` may also be a little before `from_ns`.
+        Integrate from one time to another, with one step of the model's integrator per input; `to_ns` may also be a little before `from_ns`.
 
         Args:
             x: State at `from_ns`, shape ``(nx,)``.

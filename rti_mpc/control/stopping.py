@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
@@ -23,6 +22,7 @@ from rti_mpc.codegen import bind, compiled
 from rti_mpc.contract.schedule import BEFORE_ALL_NS
 from rti_mpc.control.prediction import Prediction
 from rti_mpc.model.integrator import integrator
+from rti_mpc.model.model import depends_on
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.way_to_rest import StopLaw, WayToRest
 
@@ -68,11 +68,11 @@ class Stopping:
         self._aimed = False  # whether the equilibrium aimed at is near where plans lead
         self._began_ns: int | None = None  # when the way that is followed began; None while none is
         self._x, self._next, self._u, self._span = np.zeros(nx), np.zeros(nx), np.zeros(nu), np.zeros(1)
-        phi = integrator(ocp.model, "rk4")
+        phi = integrator(ocp.model)
         step = {"x": self._x, "u": self._u, "p": prediction.p, "dt": self._span}
         self._step = bind(compiled(phi)[0] if compile else phi, step, {"x_next": self._next})
         self._u_rest: Array = np.array(ocp.model.u_rest)
-        self._felt = [j for j in range(nx) if ca.depends_on(ocp.model.f_expl_expr, ocp.model.x[j])]
+        self._felt = [j for j in range(nx) if depends_on(ocp.model.rate_expr, ocp.model.x[j])]
         self._ended: Ending = {}  # the last way that a plan ended with
         self._d = prediction.p[ocp.model.np_ - len(law.disturbances) :]  # what disturbs the robot now
         self._d_known: Array = np.array(self._d)  # the same when it last became another one

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 
@@ -48,12 +49,14 @@ def with_disturbances(model: Model, names: Iterable[str]) -> Model:
     by_name = dict(zip(names, ca.vertsplit(d), strict=True))
     zero = ca.SX(0)
     u = model.u + ca.vertcat(*(by_name.get(name, zero) for name in inputs))
-    f = ca.substitute(model.f_expl_expr, model.u, u) + ca.vertcat(*(by_name.get(name, zero) if name not in inputs else zero for name in states))
+    of_states = ca.vertcat(*(by_name.get(name, zero) if name not in inputs else zero for name in states))
+    span = 1.0 if model.dt is None else model.dt  # over which the disturbance of a rate adds up
+    dynamics: dict[str, Any] = {name: ca.substitute(expr, model.u, u) + span * of_states for name, expr in model.dynamics.items()}
     units = {s.name: f"{s.unit}/s" for s in model.states} | {s.name: s.unit for s in model.inputs}
     return replace(
         model,
         p=ca.vertcat(model.p, d),
-        f_expl_expr=f,
+        **dynamics,
         parameters=(*model.parameters, *(Signal(DISTURBANCE_PREFIX + name, units[name]) for name in names)),
         p_nominal=(*model.p_nominal, *(0.0 for _ in names)),
     )

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Model of a robot as CasADi expressions: :math:`\dot x = f(x, u, p)`, outputs and general constraints, with names and units.
+Model of a robot as CasADi expressions, with names and units: dynamics, outputs and general constraints.
+
+In continuous time the dynamics are :math:`\dot x = f(x, u, p)`, in discrete time :math:`x_{k+1} = F(x_k, u_k, p)`.
 
 The attributes have the names of acados (`f_expl_expr`), so that a model written for it
 can be reused.
@@ -21,13 +23,18 @@ from rti_mpc.model.expressions import to_sx
 from rti_mpc.signals import ROLES_OF_VECTOR, misplaced, signals
 from rti_mpc.signals import Signal as Signal
 
-SYMBOLS, EXPRESSIONS, VALUES = ("x", "u", "p"), ("f_expl_expr", "y_expr", "h_expr"), ("p_nominal", "u_rest", "x_nominal")
+SYMBOLS, EXPRESSIONS, VALUES = ("x", "u", "p"), ("y_expr", "h_expr"), ("p_nominal", "u_rest", "x_nominal")
+OPTIONAL_EXPRESSIONS = ("f_expl_expr", "disc_dyn_expr", "stop_expr")
+IRK = "irk"
+METHODS = ("rk4", IRK)  # by which a model is integrated; Euler is one for the stages of a problem only
+MAX_IMPLICIT_STAGES = 3
+LEFT_OUT: Any = None  # in place of an expression that a model does not have
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
     """
-    A continuous-time model.
+    A model in continuous time, or in discrete time.
 
     Expressions may also be given in MX or as lists of components, signals as names alone, and a vector of one entry as that entry. The attributes
     are as documented all the same.
@@ -37,7 +44,7 @@ class Model:
         x: State symbol, shape ``(nx, 1)``.
         u: Input symbol, shape ``(nu, 1)``.
         p: Parameter symbol, shape ``(np, 1)``.
-        f_expl_expr: Right-hand side f(x, u, p), shape ``(nx, 1)``.
+        f_expl_expr: Right-hand side f(x, u, p) in continuous time, shape ``(nx, 1)``; None in discrete time.
         y_expr: Output y(x, p), shape ``(ny, 1)``.
         states: Names and units of `x`.
         inputs: Names and units of `u`.
@@ -51,6 +58,11 @@ class Model:
             where inputs at rest do not stop the robot.
         x_nominal: State around which the model is finite and differentiable, where solvers start and scales are found; if it is left out, zero or,
             where the model is singular there, a state that is looked for.
+        disc_dyn_expr: State after one period, of x, u and p, shape ``(nx, 1)``, in discrete time; None in continuous time.
+        dt: The period of a model in discrete time, s; None in continuous time.
+        method: How the model is integrated by all who predict with it: ``"rk4"``, or ``"irk"`` for a stiff one, which is Radau IIA.
+        sim_method_num_stages: Stages of an implicit step, 1 to 3, of order 1, 3 and 5.
+        sim_method_num_steps: Steps into which the integrator divides what it integrates over.
 
     Raises:
         OcpError: An argument, a dimension, a name or a free symbol does not fit.
@@ -59,11 +71,11 @@ class Model:
     name: str
     x: ca.SX
     u: ca.SX
-    f_expl_expr: ca.SX
-    y_expr: ca.SX
-    states: tuple[Signal, ...]
-    inputs: tuple[Signal, ...]
-    outputs: tuple[Signal, ...]
+    f_expl_expr: ca.SX = LEFT_OUT
+    y_expr: ca.SX = LEFT_OUT  # this and the next three are needed; that f_expl_expr may be left out gives them defaults
+    states: tuple[Signal, ...] = ()
+    inputs: tuple[Signal, ...] = ()
+    outputs: tuple[Signal, ...] = ()
     p: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
     parameters: tuple[Signal, ...] = ()
     p_nominal: tuple[float, ...] = ()
@@ -72,13 +84,18 @@ class Model:
     u_rest: tuple[float, ...] = ()
     stop_expr: ca.SX | None = None
     x_nominal: tuple[float, ...] = ()
+    disc_dyn_expr: ca.SX = LEFT_OUT
+    dt: float | None = None
+    method: str = "rk4"
+    sim_method_num_stages: int = 2
+    sim_method_num_steps: int = 1
 
     def __post_init__(self) -> None:
         """Take what is given in other forms, and check that names, dimensions and symbols fit together."""
         if not isinstance(self.name, str):
             raise OcpError(f"name of a model must be text, got {given.quoted(self.name)}")
         try:
-            for name, value in self._taken().items():
+            for name, value in (self._taken() | self._checked_integration()).items():
                 object.__setattr__(self, name, value)
         except OcpError as error:
             raise OcpError(f"model {self.name}: {error}") from None
@@ -87,7 +104,7 @@ class Model:
         stop_expr = ca.SX(0, 1) if self.stop_expr is None else self.stop_expr
         for label, expr, length in (
             ("states", self.x, len(self.states)),
-            ("f_expl_expr", self.f_expl_expr, len(self.states)),
+            *((name, expr, len(self.states)) for name, expr in self.dynamics.items()),
             ("inputs", self.u, len(self.inputs)),
             ("outputs", self.y_expr, len(self.outputs)),
             ("parameters", self.p, len(self.parameters)),
@@ -111,7 +128,7 @@ class Model:
                 told = f"output {output.name} is the state {state.name}, both or none must be an angle"
                 raise OcpError(f"model {self.name}: {told}, got angle={output.angle} and angle={state.angle}")
         for label, expr, known in (
-            ("f_expl_expr", self.f_expl_expr, (self.x, self.u, self.p)),
+            *((name, expr, (self.x, self.u, self.p)) for name, expr in self.dynamics.items()),
             ("y_expr", self.y_expr, (self.x, self.p)),
             ("h_expr", self.h_expr, (self.x, self.u, self.p)),
             ("stop_expr", stop_expr, (self.x, self.u, self.p)),
@@ -122,7 +139,7 @@ class Model:
 
     def _taken(self) -> dict[str, Any]:
         """Return fields as they are documented, by name, from what was given."""
-        named = (*EXPRESSIONS, *(() if self.stop_expr is None else ("stop_expr",)))
+        named = (*EXPRESSIONS, *(name for name in OPTIONAL_EXPRESSIONS if getattr(self, name) is not None))
         symbols, expressions = ({name: getattr(self, name) for name in names} for names in (SYMBOLS, named))
         columns = to_sx(symbols, expressions)
         vectors = {vector: signals(vector, getattr(self, vector)) for vector in ROLES_OF_VECTOR if vector != "outputs"}
@@ -132,6 +149,32 @@ class Model:
             if not np.isfinite(array).all():
                 raise OcpError(f"{name} must be finite, got {array.tolist()}")
         return {**columns, **vectors, **{name: tuple(array.tolist()) for name, array in values.items()}}
+
+    def _checked_integration(self) -> dict[str, Any]:
+        """Return the fields that say how the model moves on in time, checked."""
+        if len(self.dynamics) != 1:
+            both = "both" if self.dynamics else "neither"
+            raise OcpError(f"f_expl_expr must be given in continuous time, or disc_dyn_expr and dt in discrete time, got {both}")
+        if (self.disc_dyn_expr is None) is not (self.dt is None):
+            raise OcpError(f"dt must be the period of disc_dyn_expr in s, given with it only, got {self.dt}")
+        dt = None if self.dt is None else given.number("dt", self.dt)
+        if dt is not None and not (np.isfinite(dt) and dt > 0):
+            raise OcpError(f"dt must be a positive number of seconds, got {dt}")
+        stages = given.whole("sim_method_num_stages", self.sim_method_num_stages, 1)
+        if stages > MAX_IMPLICIT_STAGES:
+            raise OcpError(f"sim_method_num_stages must be at most {MAX_IMPLICIT_STAGES}, got {stages}")
+        given.one_of("method", self.method, METHODS)
+        return {"dt": dt, "sim_method_num_steps": given.whole("sim_method_num_steps", self.sim_method_num_steps, 1)}
+
+    @property
+    def dynamics(self) -> dict[str, ca.SX]:
+        """The dynamics as they were given, by the name of the attribute."""
+        return {name: expr for name in ("f_expl_expr", "disc_dyn_expr") if (expr := getattr(self, name)) is not None}
+
+    @property
+    def rate_expr(self) -> ca.SX:
+        """Rates of the states: f(x, u, p), or in discrete time the mean rates over a period; shape ``(nx, 1)``."""
+        return self.f_expl_expr if self.dt is None else (self.disc_dyn_expr - self.x) / self.dt
 
     @property
     def nx(self) -> int:
@@ -177,6 +220,11 @@ class Model:
                 raise OcpError(f"model {self.name} has parameters {', '.join(names) or 'none'}, got {name}")
             given.number(f"parameter {name} of model {self.name}", values[name])
         return replace(self, p_nominal=tuple(values.get(n, v) for n, v in zip(names, self.p_nominal, strict=True)))
+
+
+def depends_on(expr: ca.SX, symbol: ca.SX) -> bool:
+    """Return whether an expression depends on a symbol; not if it cancels out, as in a mean rate ``(x + v - x) / dt``."""
+    return not ca.jacobian(expr, symbol).is_zero()
 
 
 def states_among(y_expr: ca.SX, x: ca.SX, states: Sequence[Signal]) -> list[Signal | None]:

@@ -31,6 +31,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from rti_mpc.codegen import function
+from rti_mpc.model.integrator import sensitivities
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 
 DAMPING_PER_COST = 0.005  # weight of half the square of a step, in half ranges of an input, per cost at the guess; see docs/engine.md
@@ -213,9 +214,7 @@ def linearize(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
         ``stage(x, u, p) -> [phi; nonzeros of A; nonzeros of B]``, with the patterns of A, shape ``(nx, nx)``, and of B, shape ``(nx, nu)``.
     """
     model = ocp.model
-    x_next = ocp.phi()(model.x, model.u, model.p)
-    A = ca.jacobian(x_next, model.x)
-    B = ca.jacobian(x_next, model.u)
+    x_next, A, B, _ = sensitivities(model, ocp.dt, ocp.method)
     out = ca.cse(ca.densify(ca.vertcat(x_next, nonzeros(A), nonzeros(B))))
     return ca.Function("stage", [model.x, model.u, model.p], [out]), A.sparsity(), B.sparsity()
 
@@ -285,7 +284,7 @@ def damping(ocp: Ocp) -> float:
     """Return the damping of a step as large as an input's scale, per cost: zero for a linear model, whose full step is exact."""
     model = ocp.model
     variables = ca.vertcat(model.x, model.u)
-    first = ca.jacobian(ca.vertcat(model.f_expl_expr, model.y_expr), variables)
+    first = ca.jacobian(ca.vertcat(model.rate_expr, model.y_expr), variables)
     linear = ca.jacobian(ca.vec(first), variables).nnz() == 0
     return 0.0 if linear else DAMPING_PER_COST
 

@@ -16,11 +16,14 @@ is longer than an explicit integrator can follow. With the model's eigenvalues
 
 from __future__ import annotations
 
+import math
+
 import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
+from rti_mpc.model.model import IRK
 from rti_mpc.rti.ocp import Ocp
 
 RANDOM_STATES = 40  # states at random, from a hundredth to ten thousand in size
@@ -63,7 +66,7 @@ def nominal_state(ocp: Ocp) -> Array:
 def named(ocp: Ocp, x: Array) -> str:
     """Write a state by names, with what is not finite there."""
     model = ocp.model
-    rates = np.array(ca.Function("f", [model.x, model.u, model.p], [ca.densify(model.f_expl_expr)])(x, model.u_rest, model.p_nominal)).ravel()
+    rates = np.array(ca.Function("f", [model.x, model.u, model.p], [ca.densify(model.rate_expr)])(x, model.u_rest, model.p_nominal)).ravel()
     where = ", ".join(f"{signal.name} = {value:g}" for signal, value in zip(model.states, x, strict=True))
     wrong = [signal.name for signal, rate in zip(model.states, rates, strict=True) if not np.isfinite(rate)]
     return f"{where}, where " + (f"the rate of {', '.join(wrong)} is not finite" if wrong else "a derivative is not finite")
@@ -72,7 +75,7 @@ def named(ocp: Ocp, x: Array) -> str:
 def model_and_derivatives(ocp: Ocp) -> ca.Function:
     """Build ``(x, u, p) -> values``: all that a problem needs of its model at a point, finite if and only if the model is regular there."""
     model = ocp.model
-    values = ca.vertcat(model.f_expl_expr, model.y_expr, ocp.h_expr)
+    values = ca.vertcat(model.rate_expr, model.y_expr, ocp.h_expr)
     derivatives = ca.jacobian(values, ca.vertcat(model.x, model.u))
     return ca.Function("regular", [model.x, model.u, model.p], [ca.veccat(values, derivatives.nz[:])])
 
@@ -85,17 +88,20 @@ def check_stiffness(ocp: Ocp, x: Array) -> None:
         OcpError: What must decay would grow; the message has the state, its time constant and the longest stage.
     """
     model = ocp.model
-    rates = ca.Function("rates", [model.x, model.u, model.p], [ca.densify(ca.jacobian(model.f_expl_expr, model.x))])
+    rates = ca.Function("rates", [model.x, model.u, model.p], [ca.densify(ca.jacobian(model.rate_expr, model.x))])
     eigenvalues, modes = np.linalg.eig(np.array(rates(x, np.clip(model.u_rest, ocp.lbu, ocp.ubu), model.p_nominal)))
-    growth = GROWTH[ocp.method]
+    if model.dt is not None or ocp.method == IRK:
+        return  # it follows any motion that decays
+    growth, steps = GROWTH[ocp.method], model.sim_method_num_steps
     for eigenvalue, mode in sorted(zip(eigenvalues, modes.T, strict=True), key=lambda pair: -abs(pair[0])):
-        z = eigenvalue * ocp.dt
-        if z.real >= 0.0 or abs(z) <= FAST_RATE_STAGES or ocp.N * np.log(abs(np.polyval(growth, z))) <= np.log(EXPLODED_GROWTH):
+        z = eigenvalue * ocp.dt / steps
+        if z.real >= 0.0 or abs(z) <= FAST_RATE_STAGES or ocp.N * steps * np.log(abs(np.polyval(growth, z))) <= np.log(EXPLODED_GROWTH):
             continue
         shares = np.geomspace(1.0, 1e-9, 20_000)
         longest = ocp.dt * next(share for share in shares if abs(np.polyval(growth, share * z)) <= 1.0)
         state = model.states[int(np.argmax(np.abs(mode)))].name
         raise OcpError(
             f"dt must be at most {longest:.3g} s for {ocp.method} and model {model.name}, which is stiff: {state} settles with a time constant of "
-            f"{-1.0 / eigenvalue.real:.3g} s; shorten dt or take {state} as settled, got dt = {ocp.dt:g} s"
+            f"{-1.0 / eigenvalue.real:.3g} s; take the implicit integrator, {IRK}, or "
+            f"sim_method_num_steps = {math.ceil(steps * ocp.dt / longest)}, or shorten dt, got dt = {ocp.dt:g} s"
         )

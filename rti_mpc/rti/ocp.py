@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -38,9 +38,10 @@ from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
 from rti_mpc.model.expressions import column
-from rti_mpc.model.integrator import integrator
-from rti_mpc.model.model import Model
+from rti_mpc.model.integrator import TABLEAUS, steps
+from rti_mpc.model.model import IRK, Model
 
+DISCRETE = "discrete"  # method of a problem whose model is in discrete time
 DEFAULT_SLACK_WEIGHT = 1e3  # L1 weight, in cost per unit of the state, and L2 weight, in cost per unit squared
 
 
@@ -54,7 +55,9 @@ class Ocp:
         N: Horizon, in stages.
         N_u: Control horizon, ``1 <= N_u <= N``; `N` by default.
         dt: Duration of a stage, s.
-        method: Integrator of a stage, ``"rk4"`` or ``"euler"``.
+        method: Integrator of a stage: ``"rk4"``, ``"irk"``, Radau IIA, for a stiff model, or ``"euler"``; the model's own by default. Any but
+            ``"euler"`` becomes the model's, as do the two below, so that all that predict with it have the same integrator. ``"discrete"`` for a
+            model in discrete time, whose period `dt` must be.
         Q: Output weight, shape ``(ny, ny)``, or given by its diagonal; cost / unit of the outputs squared.
         R: Increment weight, shape ``(nu, nu)``, or given by its diagonal; cost / unit of the inputs squared.
         delta: Penalty sequence on outputs, shape ``(N,)``, or given as a constant.
@@ -111,7 +114,9 @@ class Ocp:
         Q: ArrayLike,
         R: ArrayLike,
         N_u: int | None = None,
-        method: str = "rk4",
+        method: str | None = None,
+        sim_method_num_stages: int | None = None,
+        sim_method_num_steps: int | None = None,
         delta: ArrayLike = 1.0,
         lambda_: ArrayLike = 1.0,
         lbu: ArrayLike = -np.inf,
@@ -136,7 +141,8 @@ class Ocp:
             raise OcpError(f"N_u and N must satisfy 1 <= N_u <= N, got N_u = {N_u}, N = {N}")
         if not (np.isfinite(seconds := given.number("dt", dt)) and seconds > 0):
             raise OcpError(f"dt must be a positive number of seconds, got {dt}")
-        integrator(model, method)  # raises for an unknown method
+        model = integrated(model, method, sim_method_num_stages, sim_method_num_steps, seconds)
+        method = DISCRETE if model.dt is not None else model.method if method is None else method
         h_expr = model.h_expr if h_expr is None else column("h_expr", h_expr)
         if isinstance(h_expr, ca.MX):
             raise OcpError(f"h_expr must be SX, of the model's x, u, p, or be given to the Model, got {given.quoted(h_expr)}")
@@ -196,8 +202,27 @@ class Ocp:
     def phi(self) -> ca.Function:
         """One stage of the dynamics, ``phi(x, u, p) -> x_next``."""
         model = self.model
-        x_next = integrator(model, self.method)(model.x, model.u, model.p, self.dt)
+        x_next = steps(model, self.dt, self.method)[0]
         return ca.Function("phi", [model.x, model.u, model.p], [x_next], ["x", "u", "p"], ["x_next"])
+
+
+def integrated(model: Model, method: str | None, stages: int | None, steps: int | None, dt: float) -> Model:
+    """
+    Return a model with another integrator, None for its own.
+
+    Raises:
+        OcpError: The integrator is unknown, or the model is one in discrete time and has none, or another period.
+    """
+    own = {"sim_method_num_stages": stages, "sim_method_num_steps": steps, "method": None if method == "euler" else method}
+    changes: dict[str, Any] = {name: value for name, value in own.items() if value is not None}
+    if method is not None:
+        given.one_of("integrator", method, (*TABLEAUS, IRK))
+    if model.dt is not None:
+        if changes or method is not None:
+            raise OcpError(f"model {model.name} is in discrete time: integrator, stages and steps must be left out, got {method or changes}")
+        if not np.isclose(model.dt, dt, rtol=1e-9, atol=0.0):
+            raise OcpError(f"dt must be the period of model {model.name}, which is in discrete time, {model.dt:g} s, got {dt:g}")
+    return replace(model, **changes) if changes else model
 
 
 def rest_fault(ocp: Ocp) -> str:

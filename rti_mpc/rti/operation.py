@@ -59,7 +59,7 @@ def regular(ocp: Ocp) -> Callable[[Array, Array], bool]:
 
 def derivative(model: Model) -> Callable[[Array, Array], Array]:
     """Build the rates of the states, shape ``(nx,)``."""
-    f = ca.Function("f", [model.x, model.u, model.p], [ca.densify(model.f_expl_expr)])
+    f = ca.Function("f", [model.x, model.u, model.p], [ca.densify(model.rate_expr)])
     return lambda x, u: np.array(f(x, u, model.p_nominal)).ravel()
 
 

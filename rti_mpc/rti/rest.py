@@ -36,7 +36,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
 from rti_mpc.model.integrator import integrator
-from rti_mpc.model.model import Model
+from rti_mpc.model.model import Model, depends_on
 from rti_mpc.rti.nominal import nominal_state
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.operation import around, corners, derivative, regular, states_of_operation
@@ -83,7 +83,7 @@ def motion_at_rest(ocp: Ocp) -> str:
     states = [start, *(x for x in states if is_regular(x, u_rest))]
     rates = np.abs([rate(x, u) for x in states for u in (*inputs, u_rest)])
     still = np.maximum(STILL_SHARE * np.max(rates, axis=0, where=np.isfinite(rates), initial=0.0), 1e-9)
-    positions = [j for j in range(model.nx) if not ca.depends_on(model.f_expl_expr[j], model.x[j])]
+    positions = [j for j in range(model.nx) if not depends_on(model.rate_expr[j], model.x[j])]
     ends = [move(x, u_rest, SETTLING_S) for x in states]
     for settled in ends:
         if moving := moves(model, rate(settled, u_rest), still):
@@ -108,8 +108,19 @@ def moves(model: Model, rates: Array, still: Array) -> str:
 
 def motion(model: Model) -> Motion:
     """Build the state, shape ``(nx,)``, to which an input, shape ``(nu,)``, leads in a time in s; NaN where the model has none."""
+    if model.dt is not None:
+        after = ca.Function("after", [model.x, model.u, model.p], [ca.densify(model.disc_dyn_expr)])
+
+        def sampled(x: Array, u: Array, span_s: float) -> Array:
+            for _ in range(math.ceil(span_s / period_s - 1e-9)):
+                x = np.array(after(x, u, model.p_nominal)).ravel()
+            return x
+
+        period_s = model.dt
+        return sampled
+
     t = ca.SX.sym("t")  # as a parameter: of time 1, one integrator serves all
-    dae = {"x": model.x, "p": ca.vertcat(model.u, model.p, t), "ode": t * model.f_expl_expr}
+    dae = {"x": model.x, "p": ca.vertcat(model.u, model.p, t), "ode": t * model.rate_expr}
     integrate = ca.integrator("motion", "cvodes", dae, 0.0, 1.0, {"show_eval_warnings": False, "disable_internal_warnings": True})
 
     def move(x: Array, u: Array, span_s: float) -> Array:
@@ -237,10 +248,10 @@ def assess(ocp: Ocp, law: StopLaw | None, count: int, *, compile: bool = True) -
     with np.errstate(invalid="ignore"):
         free = np.ptp(ends, axis=0) > STILL_SHARE * np.ptp(X, axis=0)
         moved = np.where(free, np.abs(ends - X).max(axis=0), 0.0)
-    A = ca.Function("A", [model.x, model.u, model.p], [ca.densify(ca.jacobian(model.f_expl_expr, model.x))])
+    A = ca.Function("A", [model.x, model.u, model.p], [ca.densify(ca.jacobian(model.rate_expr, model.x))])
     at_rest = zip(ends[:MAX_LINEARIZED_STATES], ways.u[:MAX_LINEARIZED_STATES, -1], starts.p[:MAX_LINEARIZED_STATES], strict=True)
     jacobians = [np.array(A(*where)) for where in at_rest]
-    growth = max((float(np.linalg.eigvals(J).real.max()) for J in jacobians if np.isfinite(J).all()), default=0.0)
+    growth = max((growth_of(np.linalg.eigvals(J), model.dt) for J in jacobians if np.isfinite(J).all()), default=0.0)
     if law is None:
         return Rest(RestClass.HOLDS, growth, time_s, moved, count)
 
@@ -252,6 +263,13 @@ def assess(ocp: Ocp, law: StopLaw | None, count: int, *, compile: bool = True) -
         raise OcpError(unkept(model, starts, ~kept, ways))
     falls = growth > MAX_DRIFT_GROWTH_PER_S or alone.max() > FALLING_SHARE
     return Rest(RestClass.UNSTABLE if falls else RestClass.DRIFTS, growth, time_s, moved, count, unaided(model, law, rates, alone.max(axis=0)))
+
+
+def growth_of(eigenvalues: np.ndarray[Any, Any], period_s: float | None) -> float:
+    """Return the rate at which the fastest motion grows, 1/s, from eigenvalues of the rates: in discrete time, of the mean ones over a period."""
+    if period_s is None:
+        return float(eigenvalues.real.max())
+    return float(np.log(np.abs(1.0 + period_s * eigenvalues).max(initial=1e-300)) / period_s)
 
 
 def shaped(ocp: Ocp, disturbances: Array) -> StopLaw:
@@ -305,7 +323,7 @@ def ramps(ocp: Ocp, starts: Starts) -> Ways:
     """Return how states follow inputs that ramp to rest."""
     model, (X, U, P) = ocp.model, starts
     rest, rows = np.array(model.u_rest), max(2, math.ceil(SETTLING_S / ocp.dt))
-    phi = integrator(model, "rk4", 4)
+    phi = integrator(model, substeps=4 if model.dt is None else 1)
     u, states, inputs, x = U, [], [], X
     for _ in range(rows):
         u = u + np.clip(rest - u, ocp.lbdu, ocp.ubdu)
@@ -331,7 +349,7 @@ def played(ocp: Ocp, law: StopLaw, ways: Ways, starts: Starts, feedback: float, 
         Rates of the states in the end, shape ``(n, nx)``.
     """
     model, U, p = ocp.model, starts.u, starts.p.T
-    phi = integrator(model, "rk4", law.substeps)
+    phi = integrator(model, substeps=law.substeps)
     rows_late, late_s = divmod(DELAY_S, law.period_s)
     x, before = ways.x[:, 0], U
     past = [U] * (int(rows_late) + 2)
@@ -367,7 +385,7 @@ def rates_along(model: Model, ways: Ways, starts: Starts) -> Array:
 
 def rates_at(model: Model, X: Array, U: Array, P: Array) -> Array:
     """Return the rates of the states, shape ``(n, nx)``; infinite where there are none."""
-    f = ca.Function("f", [model.x, model.u, model.p], [ca.densify(model.f_expl_expr)])
+    f = ca.Function("f", [model.x, model.u, model.p], [ca.densify(model.rate_expr)])
     rates = np.array(f(X.T, U.T, P.T)).T
     return np.where(np.isfinite(rates), rates, np.inf)
 

@@ -144,7 +144,7 @@ def next_state(plant: Plant | Model, model: Model, dt: float) -> Plant:
         return plant
     if (plant.nx, plant.nu) != (model.nx, model.nu):
         raise OcpError(f"plant must have the {model.nx} states and {model.nu} inputs of the controller's model, got {plant.nx} and {plant.nu}")
-    phi, own = integrator(plant, "rk4", PLANT_SUBSTEPS), np.array(plant.p_nominal)
+    phi, own = integrator(plant, substeps=PLANT_SUBSTEPS if plant.dt is None else max(1, round(dt / plant.dt))), np.array(plant.p_nominal)
     return lambda x, u, _: phi(x, u, own, dt)
 
 

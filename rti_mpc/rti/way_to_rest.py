@@ -31,8 +31,8 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled, function
-from rti_mpc.model.integrator import integrator
-from rti_mpc.model.model import Model
+from rti_mpc.model.integrator import integrator, sensitivities
+from rti_mpc.model.model import Model, depends_on
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.riccati import cholesky, cholesky_solve
 
@@ -46,6 +46,8 @@ BLOCK_ROWS = 10  # that are compiled once and called again, as are steps of the 
 FREE_SHARE = 0.01  # of its rate in operation by which a state moves where another one is anywhere in its range: then that one is free at rest
 HOLD_S = 0.5  # a deviation from the way weighs as much as a rate that undoes it in this time
 LEAN_S = 2.0  # the same for what is to give way where the state itself is held, too: a boat comes back sideways by leaning out of a current
+DRIVEN_SHARE = 0.5  # of the range of a rate in operation: what inputs change by more of it within a period they drive, in discrete time
+OPERATING_STATES = 20  # at which that is looked at
 LIMITS = ("lbu", "ubu", "lbdu", "ubdu")
 
 
@@ -242,7 +244,7 @@ def to_equilibrium(model: Model, law: StopLaw, steps: int) -> ca.Function:
     """Build ``(x, u, p) -> (x_e, u_e)``: Newton steps of least length to a state and an input at which the model rests."""
     z = ca.vertcat(model.x, model.u)
     size = ca.DM(np.concatenate([law.scale_x, INPUT_FREEDOM_FACTOR * law.scale_u]))
-    f = model.f_expl_expr / ca.DM(law.rates)
+    f = model.rate_expr / ca.DM(law.rates)
     J = ca.densify(ca.jacobian(f, z) @ ca.diag(size))
     step = size * (J.T @ cholesky_solve(cholesky(J @ J.T + DAMPING * ca.SX.eye(model.nx)), f))
     nearer = ca.Function("nearer", [z, model.p], [ca.cse(ca.densify(z - step))])
@@ -266,10 +268,9 @@ def aiming(model: Model, law: StopLaw) -> ca.Function:
 def regulators(model: Model, law: StopLaw) -> ca.Function:
     """Build ``(x_e, u_e, p) -> (K_stop, K)``: gains of the regulator of the rates, and of the one that holds the state, too."""
     nx, nu = model.nx, model.nu
-    phi = integrator(model, "rk4", law.substeps)(model.x, model.u, model.p, law.period_s)
-    A, B = ca.jacobian(phi, model.x), ca.jacobian(phi, model.u)
-    rates = [j for j in range(nx) if not ca.depends_on(model.f_expl_expr[j], model.u)]  # those that inputs change by themselves are theirs to choose
-    C = ca.densify(ca.jacobian(model.f_expl_expr[rates, 0] / ca.DM(law.rates[rates]), model.x))
+    _, A, B, _ = sensitivities(model, law.period_s, substeps=law.substeps)
+    rates = [j for j, driven in enumerate(driven_by_inputs(model, law)) if not driven]  # the others are for the inputs to choose
+    C = ca.densify(ca.jacobian(initial_rates(model)[rates, 0] / ca.DM(law.rates[rates]), model.x))
     moving, found = C.T @ C, ca.SX(nx, nx)
     if law.disturbances.size:
         found = unfree(C @ ca.diag(ca.DM(law.scale_x)), law)
@@ -299,6 +300,34 @@ def regulators(model: Model, law: StopLaw) -> ca.Function:
             to_go, gain = block(to_go, cost, A_e, B_e)
         gains.append(gain)
     return ca.Function("regulators", [x, u, p], gains)
+
+
+def initial_rates(model: Model) -> ca.SX:
+    """
+    Return the rates of the states at once, shape ``(nx, 1)``: in discrete time estimated from two periods.
+
+    Over a period inputs change a position, too, by way of its speed. The mean rate would not tell one from the other.
+    """
+    if model.dt is None:
+        return model.rate_expr
+    after = ca.Function("after", [model.x, model.u, model.p], [model.disc_dyn_expr])
+    return (4 * model.disc_dyn_expr - after(model.disc_dyn_expr, model.u, model.p) - 3 * model.x) / (2 * model.dt)
+
+
+def driven_by_inputs(model: Model, law: StopLaw) -> list[bool]:
+    """
+    Return which rates inputs change by themselves.
+
+    In discrete time driven are those that the inputs change by most of their range in operation: the estimate of `initial_rates` leaves a rest.
+    """
+    rates = initial_rates(model)
+    if model.dt is None:
+        return [depends_on(rate, model.u) for rate in ca.vertsplit(rates)]
+    B = ca.Function("B", [model.x, model.u, model.p], [ca.densify(ca.jacobian(rates, model.u))])
+    rng, middle = np.random.default_rng(1), np.array(model.x_nominal or np.zeros(model.nx))
+    states = middle + law.scale_x * rng.uniform(-1.0, 1.0, size=(OPERATING_STATES, model.nx))
+    shares = np.array([np.abs(np.array(B(x, model.u_rest, model.p_nominal))) @ law.scale_u for x in states]) / law.rates
+    return [bool(share > DRIVEN_SHARE) for share in np.nan_to_num(shares).max(axis=0)]
 
 
 def unfree(C: ca.SX, law: StopLaw) -> ca.SX:
@@ -331,7 +360,7 @@ def rolled_out(name: str, model: Model, law: StopLaw, wanted: ca.SX, along: dict
     nu, limits = model.nu, {limit: ca.SX.sym(limit, model.nu) for limit in LIMITS}
     lowest, highest = ca.SX.sym("lowest", nu), ca.SX.sym("highest", nu)
     u = ca.fmin(ca.fmax(ca.fmin(ca.fmax(wanted, limits["lbu"]), limits["ubu"]), lowest), highest)
-    x_next = integrator(model, "rk4", law.substeps)(model.x, u, model.p, law.period_s)
+    x_next = integrator(model, substeps=law.substeps)(model.x, u, model.p, law.period_s)
     common = {"p": model.p, **limits, **fixed}
     row_in = {"x": model.x, "u": model.u, "lowest": lowest, "highest": highest, **along, **common}
     row = function("row", row_in, dict(zip(("x_next", "u_now"), ca.cse([ca.densify(x_next), ca.densify(u)]), strict=True)))

@@ -19,7 +19,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, State
 from rti_mpc.wire.actuator import Actuator, Counters
-from rti_mpc_sim.plant import Plant
+from rti_mpc_sim.plant import plant
 from rti_mpc_sim.sensor import UNREPORTED, Sensor
 from rti_mpc_sim.settings import RobotSettings
 
@@ -53,7 +53,7 @@ class Lockstep:
             np.array([signal.angle for signal in model.states]),
         )
         self.sensor = Sensor(epoch, settings.noise_std, angles, round(1e9 * settings.sensor_delay_s), settings.dropout, settings.seed)
-        self._plant = Plant(model, settings.x0, settings.state_period_s, settings.substeps, settings.actuator_lag_s)
+        self._plant = plant(model, settings.x0, settings.state_period_s, settings.substeps, settings.actuator_lag_s)
         self.x: Array = self._plant.x
         self.u: Array = self._plant.u
         self._reports_inputs = settings.reports_inputs

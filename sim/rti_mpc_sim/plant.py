@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Plant: the simulated robot's own model, integrated in finer steps than the controller's.
+Plant: the simulated robot's own model, integrated in finer steps than the controller's, or sampled if it is one in discrete time.
 
 A first-order lag of the actuators, :math:`T \dot v = u - v`, is part of the
 plant: `v` joins its state, so that inputs that lag are integrated as exactly as
@@ -37,7 +37,7 @@ class Plant:
     """
     The continuous plant, advanced over any interval of constant input.
 
-    One call into CasADi covers up to `max_step_s`, cut into equal RK4 steps;
+    One call into CasADi covers up to `max_step_s`, cut into equal steps of the model's integrator;
     nothing is allocated.
 
     Attributes:
@@ -56,7 +56,7 @@ class Plant:
         self._dt = np.zeros(1)
         self.x = self._state[: model.nx]
         self.u = self._state[model.nx :] if lag_s > 0.0 else self._input
-        phi = integrator(lagging(model, lag_s) if lag_s > 0.0 else model, "rk4", substeps)
+        phi = integrator(lagging(model, lag_s) if lag_s > 0.0 else model, substeps=substeps)
         self._evaluate = bind(phi, {"x": self._state, "u": self._input, "p": self._p, "dt": self._dt}, {"x_next": self._next})
 
     def advance(self, u: Array, duration_s: float) -> None:
@@ -67,3 +67,48 @@ class Plant:
         for _ in range(calls):
             self._evaluate()
             self._state[:] = self._next
+
+
+class SampledPlant:
+    """
+    The plant of a model in discrete time: exact after whole periods, interpolated within them.
+
+    An input that changes within a period counts by its mean over the period.
+
+    Attributes:
+        x: True state, shape ``(nx,)``; angles do not wrap.
+        u: Input acting on the plant now, after the lag, shape ``(nu,)``.
+    """
+
+    def __init__(self, model: Model, x0: Array, lag_s: float = 0.0) -> None:
+        assert model.dt is not None
+        self._period_s, self._lag_s = model.dt, lag_s
+        self.x = np.array(x0, dtype=np.float64)
+        self.u = np.array(model.u_rest, dtype=np.float64)
+        self._start, self._next = self.x.copy(), np.zeros_like(self.x)  # states at the beginning and at the end of the period, (nx,)
+        self._sum, self._mean = np.zeros_like(self.u), np.zeros_like(self.u)  # of the input in this period, (nu,)
+        self._elapsed_s = 0.0  # of the period
+        self._p = np.array(model.p_nominal, dtype=np.float64)  # (np,)
+        after = ca.Function("after", [model.x, model.u, model.p], [ca.densify(model.disc_dyn_expr)], ["x", "u", "p"], ["x_next"])
+        self._evaluate = bind(after, {"x": self._start, "u": self._mean, "p": self._p}, {"x_next": self._next})
+
+    def advance(self, u: Array, duration_s: float) -> None:
+        """Advance over an interval in which the input, shape ``(nu,)``, is held."""
+        while duration_s > 1e-9 * self._period_s:
+            span_s = min(duration_s, self._period_s - self._elapsed_s)
+            left = math.exp(-span_s / self._lag_s) if self._lag_s > 0.0 else 0.0  # of the difference between command and input, after the span
+            self._sum += span_s * u + self._lag_s * (1.0 - left) * (self.u - u)
+            self.u[:] = u + left * (self.u - u)
+            duration_s -= span_s
+            self._elapsed_s += span_s
+            self._mean[:] = self._sum / self._elapsed_s
+            self._evaluate()
+            self.x[:] = self._start + self._elapsed_s / self._period_s * (self._next - self._start)
+            if self._elapsed_s >= (1.0 - 1e-9) * self._period_s:
+                self.x[:] = self._start[:] = self._next
+                self._sum[:] = self._elapsed_s = 0.0
+
+
+def plant(model: Model, x0: Array, max_step_s: float, substeps: int, lag_s: float = 0.0) -> Plant | SampledPlant:
+    """Return the plant of a model."""
+    return Plant(model, x0, max_step_s, substeps, lag_s) if model.dt is None else SampledPlant(model, x0, lag_s)

@@ -28,7 +28,7 @@ class RobotSettings:
         increments: Slew limits inside which it approaches what is commanded, from what really acts; None: it plays rows as they come.
         reports_inputs: Whether its states tell which inputs act, and whose command they come from.
         state_period_s: Time between states.
-        substeps: RK4 steps a state period is cut into.
+        substeps: Steps of the model's integrator a state period is cut into.
         noise_std: Standard deviation of the measured states, shape ``(nx,)``; zero by default.
         sensor_delay_s: Time from measuring a state to sending it; its stamp is that of the measurement.
         dropout: Share of states that are lost on the way.

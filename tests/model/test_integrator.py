@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -10,7 +12,8 @@ from scipy.integrate import solve_ivp
 
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
-from rti_mpc.model.integrator import integrator
+from rti_mpc.model.integrator import integrator, sensitivities
+from rti_mpc.model.model import Model
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from tests.problems import double_integrator
 
@@ -46,6 +49,69 @@ def test_rk4_is_the_classical_scheme() -> None:
     np.testing.assert_allclose(step("rk4", h), X + h / 6 * (k_1 + 2 * k_2 + 2 * k_3 + k_4), atol=1e-15)
 
 
+def stiff(stages: int, tau: float = 0.01) -> Model:
+    """A mass whose force lags so far behind that a stage is ten of its time constants, with friction that is not linear."""
+    x, u = ca.SX.sym("x", 3), ca.SX.sym("u")
+    f = [x[1], x[2] - ca.tanh(3 * x[1]), (u - x[2]) / tau]
+    return Model("stiff", x, u, f, x[0], ("r", "v", "F"), "F_c", "r", method="irk", sim_method_num_stages=stages)
+
+
+@pytest.mark.parametrize(("stages", "order"), [(1, 1), (2, 3), (3, 5)])
+def test_error_of_radau_shrinks_with_its_order(stages: int, order: int) -> None:
+    model = replace(MODEL, method="irk", sim_method_num_stages=stages)
+    coarse, fine = (np.abs(np.array(integrator(model, substeps=n)(X, U, P, 0.2)).ravel() - truth(0.2)).max() for n in (2, 4))
+    assert coarse / fine == pytest.approx(2**order, rel=0.25)  # the leading term is not all of it
+
+
+@pytest.mark.parametrize(("stages", "error"), [(1, 0.03), (2, 6e-3), (3, 4e-4)])
+def test_radau_follows_a_stiff_model_over_ten_time_constants(stages: int, error: float) -> None:
+    model, x, u = stiff(stages), np.array([0.3, -0.2, 0.7]), np.array([1.0])
+    f = ca.Function("f", [model.x, model.u], [model.f_expl_expr])
+    true = solve_ivp(lambda _, x: np.array(f(x, u)).ravel(), (0.0, 0.1), x, method="Radau", rtol=1e-10, atol=1e-12).y[:, -1]
+    found = np.array(integrator(model, substeps=4)(x, u, [], 0.1)).ravel()
+    np.testing.assert_allclose(found, true, rtol=0, atol=error)  # four steps of 2.5 time constants each
+
+
+@pytest.mark.parametrize("method", ["rk4", "irk"])
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_sensitivities_are_those_of_finite_differences(method: str, substeps: int) -> None:
+    """Of the implicit function theorem, where they are implicit: Newton's steps are not differentiated."""
+    model = replace(MODEL, method=method)
+    linear = ca.Function("linear", [model.x, model.u, model.p], sensitivities(model, 0.1, substeps=substeps)[1:])
+    phi = integrator(model, substeps=substeps)
+    for found, i in zip(linear(X, U, P), range(3), strict=True):
+        at = [X, U, P]
+
+        def moved(z: Array, i: int = i, at: list[Array] = at) -> Array:
+            return np.array(phi(*at[:i], z, *at[i + 1 :], 0.1)).ravel()
+
+        differences = [(moved(at[i] + e) - moved(at[i] - e)) / 2e-5 for e in 1e-5 * np.eye(len(at[i]))]
+        np.testing.assert_allclose(np.array(found), np.array(differences).T, rtol=0, atol=1e-8)
+
+
+def test_model_that_newton_does_not_solve_is_not_finite() -> None:
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    model = Model("wild", x, u, 1e3 * ca.sin(1e3 * x) + u, x, "x", "u", "x", method="irk")
+    assert np.isnan(float(integrator(model)(0.3, 0.0, [], 0.1)))
+
+
+def test_implicit_step_back_does_not_blow_errors_up() -> None:
+    """To go back by three time constants of a lag would make 20 of each; the step forwards is mirrored instead."""
+    back = np.array(integrator(stiff(3))([0.0, 0.5, 1.0], [0.0], [], -0.036)).ravel()
+    assert np.abs(back - [0.0, 0.5, 1.0]).max() < 1.1
+
+
+def test_discrete_model_is_its_own_integrator_and_interpolated_within_a_period() -> None:
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    model = Model(
+        x=x, u=u, name="d", disc_dyn_expr=[x[0] + 0.1 * x[1], 0.5 * x[1] + u], dt=0.1, y_expr=x, states=("r", "v"), inputs="a", outputs=("r", "v")
+    )
+    phi = integrator(model)
+    np.testing.assert_allclose(np.array(phi([1.0, 2.0], 3.0, [], 0.1)).ravel(), [1.2, 4.0], atol=1e-15)
+    np.testing.assert_allclose(np.array(phi([1.0, 2.0], 3.0, [], 0.05)).ravel(), [1.1, 3.0], atol=1e-15)
+    np.testing.assert_allclose(np.array(integrator(model, substeps=2)([1.0, 2.0], 3.0, [], 0.2)).ravel(), [1.6, 5.0], atol=1e-15)
+
+
 @pytest.mark.parametrize(("method", "order"), [("euler", 1), ("rk4", 4)])
 def test_error_shrinks_with_the_order_of_the_scheme(method: str, order: int) -> None:
     coarse, fine = (np.abs(step(method, 0.2, substeps) - truth(0.2)).max() for substeps in (4, 8))
@@ -70,7 +136,7 @@ def test_rk4_is_exact_for_a_double_integrator() -> None:
 
 
 def test_unknown_method_and_no_steps_are_refused() -> None:
-    with pytest.raises(OcpError, match="integrator must be one of euler, rk4, got 'rk5'"):
+    with pytest.raises(OcpError, match="integrator must be one of euler, rk4, irk, got 'rk5'"):
         integrator(MODEL, "rk5")
     with pytest.raises(OcpError, match="substeps must be a whole number of at least 1, got 0"):
         integrator(MODEL, "rk4", 0)

@@ -129,3 +129,13 @@ def test_motion_that_swings_or_grows_by_itself_is_not_taken_for_stiff(rate: ca.S
     x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
     model = Model("spring", x, u, rate @ x + ca.vertcat(0, u), x[0], ("r", "v"), "F", "r")
     assert Rti(Ocp(model, N=5, dt=0.02, Q=1, R=0.1), compile=False)
+
+
+@pytest.mark.parametrize("changes", [{"method": "irk"}, {"sim_method_num_steps": 4}], ids=["implicit", "steps"])
+def test_stiff_model_is_built_with_the_integrator_that_its_refusal_names(changes: dict[str, Any]) -> None:
+    problem_of = {"N": 20, "dt": 0.1, "Q": 1, "R": 0.1, "lbu": -1, "ubu": 1}
+    with pytest.raises(OcpError, match="take the implicit integrator, irk, or sim_method_num_steps = 4, or shorten dt"):
+        Rti(Ocp(drive(0.01), **problem_of), compile=False)
+    ocp = Ocp(drive(0.01), **problem_of | changes)
+    assert Rti(ocp, compile=False)
+    assert ocp.model.method == ocp.method, "and all that predicts with the model has it"

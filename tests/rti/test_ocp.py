@@ -6,11 +6,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.errors import OcpError
+from rti_mpc.model.model import Model
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.rti.ocp import Ocp, rest_fault
 from rti_mpc.rti.rti import Rti
@@ -52,7 +54,7 @@ def test_arrays_are_owned_and_read_only() -> None:
         ({"N": 0}, "1 <= N_u <= N"),
         ({"dt": 0.0}, "dt must be a positive number of seconds, got 0.0"),
         ({"dt": INF}, "dt must be a positive"),
-        ({"method": "heun"}, "integrator must be one of euler, rk4, got 'heun'"),
+        ({"method": "heun"}, "integrator must be one of euler, rk4, irk, got 'heun'"),
         ({"Q": [1.0, 1.0]}, r"Q must have shape \(3, 3\) or be its diagonal \(3,\), got shape \(2,\)"),
         ({"Q": [1.0, 1.0, -0.05]}, "Q must be finite, symmetric and positive semidefinite"),
         ({"R": [[1.0, 0.1], [0.2, 1.0]]}, "R must be finite, symmetric and positive semidefinite"),
@@ -109,3 +111,13 @@ def test_retuned_problem_is_checked_alike_and_leaves_the_first_as_it_was() -> No
         ocp.retuned(Q=[1.0, 2.0, -3.0])
     with pytest.raises(OcpError, match="lbu must lie below ubu"):
         ocp.retuned(ubu=[-0.6, 0.7])
+
+
+def test_problem_of_a_model_in_discrete_time_has_its_period_and_no_integrator() -> None:
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    model = Model(name="d", x=x, u=u, disc_dyn_expr=0.5 * x + u, dt=0.1, y_expr=x, states="x", inputs="u", outputs="x")
+    with pytest.raises(OcpError, match="dt must be the period of model d, which is in discrete time"):
+        Ocp(model, N=5, dt=0.2, Q=1, R=1)
+    with pytest.raises(OcpError, match="model d is in discrete time: integrator, stages and steps must be left out, got rk4"):
+        Ocp(model, N=5, dt=0.1, Q=1, R=1, method="rk4")
+    assert float(Ocp(model, N=5, dt=0.1, Q=1, R=1).phi()(2.0, 3.0, [])) == 4.0

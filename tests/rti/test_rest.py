@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -13,6 +14,7 @@ from rti_mpc.model.model import Model, Signal
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.operation import states_of_operation
 from rti_mpc.rti.rest import RestClass, assess, find_stop_law, motion_at_rest
+from tests import movers
 from tests.problems import INF, PAPER, beacon, double_integrator, pioneer
 from tests.rti.test_nominal import PLANTS, problem
 
@@ -113,3 +115,20 @@ def test_states_of_operation_are_those_where_the_model_is_regular() -> None:
 def test_bounds_say_what_operation_is() -> None:
     """At 0.5 m/s at most the paper's robot is as still after a second as one of 50 m/s is after two."""
     assert motion_at_rest(Ocp(pioneer().model, **(PAPER | {"ubu": [50.0, 0.7]}))) == ""
+
+
+@pytest.mark.parametrize("name", ["car", "arm", "quadrotor"])
+def test_robot_in_discrete_time_comes_to_rest_as_the_same_in_continuous_time(name: str) -> None:
+    """Over a period its inputs change positions, too: the way to rest must tell which rates are theirs."""
+    continuous: Ocp = getattr(movers, name)()
+    model = continuous.model
+    same = replace(model, f_expl_expr=None, disc_dyn_expr=continuous.phi()(model.x, model.u, model.p), dt=continuous.dt)
+    bounds = {key: getattr(continuous, key) for key in ("lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx")}
+    sampled = Ocp(same, N=continuous.N, dt=continuous.dt, Q=continuous.Q, R=continuous.R, **bounds)
+    found = []
+    for ocp in (continuous, sampled):
+        law = find_stop_law(ocp)
+        assert law is not None
+        found.append(assess(ocp, law, 24, compile=False))
+    assert found[0].kind is found[1].kind
+    assert found[1].growth == pytest.approx(found[0].growth, abs=0.01)  # 1/s: of a period's mean rates

@@ -11,8 +11,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from rti_mpc.array import Array
+from rti_mpc.model.model import Model
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
-from rti_mpc_sim.plant import Plant, lagging
+from rti_mpc_sim.plant import Plant, SampledPlant, lagging, plant
 
 MODEL = pioneer_3dx().with_parameters(theta_1=0.3, a=0.15)
 X0 = np.array([0.5, -0.2, 0.3, 0.1, -0.4])
@@ -64,3 +65,37 @@ def test_plant_does_not_grow_the_heap() -> None:
     after, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert after - before < 1024
+
+
+def sampled(lag_s: float = 0.0) -> SampledPlant:
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    after = [x[0] + 0.1 * x[1], 0.5 * x[1] + u]
+    model = Model(name="d", x=x, u=u, disc_dyn_expr=after, dt=0.1, y_expr=x, states=("r", "v"), inputs="a", outputs=("r", "v"))
+    made = plant(model, np.array([1.0, 2.0]), 0.1, 20, lag_s)
+    assert isinstance(made, SampledPlant)
+    return made
+
+
+def test_plant_in_discrete_time_is_exact_after_periods_however_they_are_cut_and_interpolated_within() -> None:
+    one = sampled()
+    one.advance(np.array([3.0]), 0.05)
+    np.testing.assert_allclose(one.x, [1.1, 3.0], atol=1e-15)
+    for duration_s in (0.0137, 0.0363, 0.1):
+        one.advance(np.array([3.0]), duration_s)
+    np.testing.assert_allclose(one.x, [1.6, 5.0], atol=1e-14)
+
+
+def test_plant_in_discrete_time_takes_the_mean_of_inputs_that_change_within_a_period() -> None:
+    one = sampled()
+    for u, duration_s in ((3.0, 0.03), (-1.0, 0.07)):
+        one.advance(np.array([u]), duration_s)
+    np.testing.assert_allclose(one.x, [1.2, 1.0 + 0.3 * 3.0 - 0.7], atol=1e-14)
+
+
+def test_inputs_of_a_plant_in_discrete_time_lag_as_those_of_another() -> None:
+    one = sampled(lag_s=0.05)
+    one.advance(np.array([1.0]), 0.05)
+    np.testing.assert_allclose(one.u, 1 - np.exp(-1), atol=1e-14)
+    one.advance(np.array([1.0]), 0.05)
+    mean = 1 - 0.5 * (1 - np.exp(-2))  # of 1 - exp(-t / 0.05) over 0.1 s
+    np.testing.assert_allclose(one.x[1], 1.0 + mean, atol=1e-14)

@@ -37,8 +37,11 @@ if TYPE_CHECKING:
 def build_model(config: Config) -> Model:
     """Return the controller's model."""
     from rti_mpc.model.find import find_model
+    from rti_mpc.rti.ocp import integrated
 
-    return find_model(config.model.name, config.model.folder).with_parameters(**config.model.parameters)
+    model, ocp = find_model(config.model.name, config.model.folder), config.ocp
+    model = integrated(model, ocp.integrator, ocp.sim_method_num_stages, ocp.sim_method_num_steps, ocp.dt_s)
+    return model.with_parameters(**config.model.parameters)
 
 
 def build_signals(config: Config) -> Signals:
@@ -66,7 +69,7 @@ def build_ocp(config: Config) -> Ocp:
         N=config.ocp.N,
         N_u=config.N_u,
         dt=config.ocp.dt_s,
-        method=config.ocp.integrator,
+        method="euler" if config.ocp.integrator == "euler" else None,
         Q_e=None if terminal.Q is None else [terminal.Q[output.name] for output in model.outputs],
         h_expr=model.h_expr[bounded, 0],
         lh=lh,

@@ -140,7 +140,14 @@ class OcpSection(Section):
     N: int = Field(ge=1, le=1000, description="horizon, in stages")
     N_u: int | None = Field(default=None, ge=1, description="control horizon, in stages; N if left out")
     dt_s: Period = Field(description="duration of a stage and period of the controller, in seconds")
-    integrator: Literal["rk4", "euler"] = Field(default="rk4", description="integrator of a stage")
+    integrator: Literal["rk4", "euler", "irk"] | None = Field(
+        default=None,
+        description="integrator of a stage: rk4; irk, implicit (Radau IIA), for stiff models; or euler; the model's own, mostly rk4, if left out",
+    )
+    sim_method_num_stages: int | None = Field(default=None, ge=1, le=3, description="stages of irk: 1, 2 or 3, of order 1, 3 or 5; 2 if left out")
+    sim_method_num_steps: int | None = Field(
+        default=None, ge=1, le=1000, description="steps into which the integrator divides a stage; the model's, mostly 1, if left out"
+    )
     formulation: Literal["auto", "simultaneous", "sequential"] = Field(default="auto", description="formulation of the QP; auto takes the faster one")
     weights: WeightSection = Field(description="weights of the cost")
     bounds: BoundSection = Field(default=BoundSection(), description="bounds of inputs, increments, states and constraints")
@@ -273,7 +280,7 @@ class SimSection(Section):
     )
     parameters: dict[str, float] = Field(default={}, description="parameters of the plant that differ from [model]'s, by name, each in its own unit")
     state_period_s: Period | None = Field(default=None, description="time between two states, in seconds of the robot; dt_s if left out")
-    substeps: int | None = Field(default=None, ge=1, le=1000, description="RK4 steps between two states")
+    substeps: int | None = Field(default=None, ge=1, le=1000, description="steps of the model's integrator between two states")
     noise_std: dict[str, Weight] = Field(default={}, description="standard deviation of the noise of measured states, by name, in the state's unit")
     sensor_delay_s: Duration | None = Field(default=None, description="delay from measuring a state to sending it, in seconds of the robot")
     dropout: float | None = Field(default=None, ge=0, lt=1, description="share of states that are lost, without unit")

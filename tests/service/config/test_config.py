@@ -21,6 +21,7 @@ from rti_mpc_service.check import check
 from rti_mpc_service.config import toml
 from rti_mpc_service.config.build import (
     build_model,
+    build_observer,
     build_ocp,
     build_rti,
     build_signals,
@@ -66,7 +67,7 @@ WRONG = [
     ("N = 20", "N = 20\nstale_s = 0.1", ["ocp.stale_s", "timing.stale_s"]),
     ("N = 20", "N = 20\nhorizon = 7", ["ocp.horizon", "N, N_u, dt_s"]),
     ("N = 20", "n = 20", ["ocp.n is unknown", "perhaps ocp.N is meant", "in stages", "20"]),
-    ('integrator = "rk4"', 'integrator = "rk5"', ["ocp.integrator", "'rk4' or 'euler'", "'rk5'"]),
+    ('integrator = "rk4"', 'integrator = "rk5"', ["ocp.integrator", "'rk4', 'euler' or 'irk'", "'rk5'"]),
     ("psi = 0.05", "psi = -0.05", ["ocp.weights.Q.psi", "at least 0", "-0.05"]),
     ("psi = 0.05", "phi = 0.05", ["ocp.weights.Q.phi", "no output", "psi [rad]"]),
     (", psi = 0.05", "", ["ocp.weights.Q", "psi [rad]", "missing"]),
@@ -245,6 +246,19 @@ def test_configuration_becomes_the_ocp_it_describes(tmp_path: Path) -> None:
     np.testing.assert_array_equal(ocp.delta, [1, 2, 3])
     np.testing.assert_array_equal(ocp.lambda_, [0.5, 0.5, 0.5])
     assert np.all(np.isinf(ocp.ubu)), "a bound left out is no bound"
+
+
+def test_integrator_of_the_file_is_that_of_problem_observer_and_simulated_robot(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    irk = 'ocp.integrator = "irk"\nocp.sim_method_num_stages = 3\nocp.sim_method_num_steps = 2\n'
+    disturbed = "[observer.disturbances.u_c]\ndrift = 0.1\nlimit = 0.1\n"
+    path.write_text(MINIMAL.replace('ocp.integrator = "euler"\n', irk) + disturbed)
+    config = load(path)
+    observer = build_observer(config)
+    assert observer is not None
+    assert build_ocp(config).method == "irk"
+    for model in (build_ocp(config).model, observer.model, robot_settings(config)["model"]):
+        assert (model.method, model.sim_method_num_stages, model.sim_method_num_steps) == ("irk", 3, 2)
 
 
 def test_softened_bounds_constraints_and_obstacles_become_those_of_the_ocp(tmp_path: Path) -> None:

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a problem may have beside bounds and a quadratic cost: each held against IPOPT on the same problem, in every formulation and built-in solver.
+
+Each problem is solved from states around its reference, with a cold start, until inputs
+change no more. With the recursion each plan is certified.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from rti_mpc.array import Array
+from rti_mpc.contract.status import QpStatus
+from rti_mpc.model.model import Model, Signal
+from rti_mpc.rti.construction import FORMULATIONS
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.qp.osqp import SolverSettings
+from rti_mpc.rti.rti import BUILT_IN_SOLVERS, Rti
+from tests.oracle import nlp
+
+TIGHT = SolverSettings(eps=1e-10, max_iter=200_000, scaling=10)
+POSE = (Signal("x", "m"), Signal("y", "m"), Signal("psi", "rad", angle=True))
+LIMITS: dict[str, Any] = {"N": 8, "dt": 0.1, "Q": [1.0, 1.0, 0.05], "R": [0.2, 0.1], "lbu": [-0.5, -0.8], "ubu": [0.5, 0.8]}
+LIMITS |= {"lbdu": [-0.25, -0.4], "ubdu": [0.25, 0.4]}
+
+
+def lagging_car(lag_s: float = 0.01, **changes: Any) -> Ocp:
+    """A car whose speeds follow within 10 ms, against friction: stiff at stages of 0.1 s."""
+    x, u = ca.SX.sym("x", 5), ca.SX.sym("u", 2)
+    v, w = x[3], x[4]
+    f = [v * ca.cos(x[2]), v * ca.sin(x[2]), w, (u[0] - v - 0.1 * ca.tanh(5 * v)) / lag_s, (u[1] - w - 0.2 * v * w) / lag_s]
+    model = Model("lagging_car", x, u, f, x[:3], (*POSE, Signal("v", "m/s"), Signal("w", "rad/s")), ("v_c", "w_c"), POSE)
+    narrow = {"lbx": [-np.inf] * 3 + [-0.35, -0.5], "ubx": [np.inf] * 3 + [0.35, 0.5]}
+    return Ocp(model, **LIMITS | narrow | changes)
+
+
+def sampled_car(**changes: Any) -> Ocp:
+    """A car in discrete time: it drives an arc in each period, and its speed follows by a half."""
+    x, u = ca.SX.sym("x", 4), ca.SX.sym("u", 2)
+    v, turn = 0.5 * (x[3] + u[0]), 0.1 * u[1]
+    after = [x[0] + 0.1 * v * ca.cos(x[2] + turn / 2), x[1] + 0.1 * v * ca.sin(x[2] + turn / 2), x[2] + turn, v]
+    signals = {"states": (*POSE, Signal("v", "m/s")), "inputs": ("v_c", "w_c"), "outputs": POSE}
+    model = Model(name="sampled_car", x=x, u=u, disc_dyn_expr=after, dt=0.1, y_expr=x[:3], **signals)
+    return Ocp(model, **LIMITS | {"lbx": [-np.inf] * 3 + [-0.35], "ubx": [np.inf] * 3 + [0.35]} | changes)
+
+
+PROBLEMS: dict[str, Callable[[], Ocp]] = {
+    "implicit integrator": lambda: lagging_car(method="irk"),
+    "implicit integrator of three stages in two steps": lambda: lagging_car(method="irk", sim_method_num_stages=3, sim_method_num_steps=2, N_u=3),
+    "explicit steps": lambda: lagging_car(sim_method_num_steps=8),
+    "discrete time": sampled_car,
+    "discrete time, held inputs": lambda: sampled_car(N_u=3),
+}
+
+
+def around_a_bend(ocp: Ocp, count: int) -> list[tuple[Array, Array, Array]]:
+    """States, references and previous inputs such that bounds of every kind act in some of them."""
+    rng, found = np.random.default_rng(5), []
+    t = ocp.dt * np.arange(1, ocp.N + 1)
+    for _ in range(count):
+        psi = rng.uniform(-3, 3) + 0.5 * t
+        y_ref = np.column_stack([0.4 * np.cumsum(np.cos(psi)) * ocp.dt, 0.4 * np.cumsum(np.sin(psi)) * ocp.dt, psi])
+        x0 = np.zeros(ocp.model.nx)
+        x0[:3] = y_ref[0] + rng.normal(size=3) * [0.2, 0.2, 0.5]
+        x0[3:] = rng.uniform(-0.3, 0.3, size=ocp.model.nx - 3)
+        found.append((x0, y_ref[:, : ocp.model.ny], rng.uniform(-0.4, 0.4, size=2)))
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", BUILT_IN_SOLVERS)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_problem_is_solved_as_by_ipopt(name: str, formulation: str, solver: str) -> None:
+    ocp = PROBLEMS[name]()
+    rti, solve = Rti(ocp, TIGHT, formulation=formulation, solver=solver, compile=False), nlp(ocp)
+    bound = 0
+    for x0, y_ref, u_prev in around_a_bend(ocp, 6):
+        rti.reset(x0, u_prev)
+        x, u, cost = solve(x0, u_prev, y_ref, rti.x, rti.u)
+        for _ in range(200):
+            before = rti.u.copy()
+            rti.prepare(y_ref, shift=False)
+            assert rti.feedback(x0) is QpStatus.SOLVED
+            if np.abs(rti.u - before).max() < 1e-9:
+                break
+        np.testing.assert_allclose(rti.u, u, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(rti.x, x, rtol=0, atol=1e-6)
+        assert rti.cost == pytest.approx(cost, rel=1e-6)
+        du = np.diff(np.vstack([u_prev, u]), axis=0)
+        pairs = ((u, ocp.lbu, ocp.ubu), (du, ocp.lbdu, ocp.ubdu), (x[1:], ocp.lbx, ocp.ubx))
+        bound += any(bool(np.any(np.isclose(z, lower, atol=1e-6) | np.isclose(z, upper, atol=1e-6))) for z, lower, upper in pairs)
+    assert bound >= 2  # in so many of them bounds act
