@@ -54,6 +54,7 @@ References, cited by key throughout:
 * [Liniger2015] A. Liniger, A. Domahidi, M. Morari, "Optimization-based autonomous racing of 1:43 scale RC cars", Optim. Control Appl. Methods 36(5),
   2015.
 * [Pacejka2012] H. B. Pacejka, "Tire and vehicle dynamics", 3rd ed., Butterworth-Heinemann, 2012.
+* [HairerWanner1996] E. Hairer, G. Wanner, *Solving Ordinary Differential Equations II: Stiff and Differential-Algebraic Problems*, Springer, 1996.
 * [Pannocchia2003] G. Pannocchia, J. B. Rawlings, "Disturbance models for offset-free model-predictive control", AIChE J. 49(2), 2003.
 """
 
