@@ -24,9 +24,33 @@ IPOPT = {
 }
 
 
+ROOT = 6**0.5
+RADAU = {  # Radau IIA as in the literature, by the number of stages
+    2: [[5 / 12, -1 / 12], [3 / 4, 1 / 4]],
+    3: [
+        [(88 - 7 * ROOT) / 360, (296 - 169 * ROOT) / 1800, (-2 + 3 * ROOT) / 225],
+        [(296 + 169 * ROOT) / 1800, (88 + 7 * ROOT) / 360, (-2 - 3 * ROOT) / 225],
+        [(16 - ROOT) / 36, (16 + ROOT) / 36, 1 / 9],
+    ],
+}
+
+
+def collocated(ocp: Ocp, x: ca.SX, u: ca.SX, K: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Return the state after a stage of an implicit integrator and the equations of the rates K of its steps, which are variables of the program."""
+    model, steps, stages = ocp.model, ocp.model.sim_method_num_steps, ocp.model.sim_method_num_stages
+    f, h, a = ca.Function("f", [model.x, model.u, model.p], [model.f_expl_expr]), ocp.dt / steps, RADAU[stages]
+    equations = []
+    for step in range(steps):
+        rates = ca.horzsplit(K)[step * stages : (step + 1) * stages]
+        ends = [x + h * sum((a_ij * rate for a_ij, rate in zip(row, rates, strict=True)), start=ca.SX(0)) for row in a]
+        equations += [rate - f(end, u, model.p_nominal) for rate, end in zip(rates, ends, strict=True)]
+        x = ends[-1]
+    return x, ca.vertcat(*equations)
+
+
 def nlp(ocp: Ocp) -> Callable[[Array, Array, Array, Array, Array], tuple[Array, Array, float]]:
     """
-    Build the nonlinear program of `rti_mpc.rti.ocp`, by multiple shooting.
+    Build the nonlinear program of `rti_mpc.rti.ocp`, by multiple shooting, or by collocation where the integrator is implicit.
 
     Returns:
         ``solve(x0, u_prev, y_ref, x, u) -> (x, u, cost)`` from the guess ``x, u``; it fails where IPOPT does not converge.
@@ -39,6 +63,8 @@ def nlp(ocp: Ocp) -> Callable[[Array, Array, Array, Array, Array], tuple[Array, 
     x = ca.SX.sym("x", nx, N + 1)
     u = ca.SX.sym("u", nu, N_u)
     s = ca.SX.sym("s", nx, N)
+    implicit = ocp.method == "irk"
+    K = [ca.SX.sym(f"K_{k}", nx, model.sim_method_num_steps * model.sim_method_num_stages if implicit else 0) for k in range(N)]
     x0 = ca.SX.sym("x0", nx)
     u_prev = ca.SX.sym("u_prev", nu)
     y_ref = ca.SX.sym("y_ref", model.ny, N)
@@ -49,7 +75,10 @@ def nlp(ocp: Ocp) -> Callable[[Array, Array, Array, Array, Array], tuple[Array, 
         e = h(x[:, k + 1], p) - y_ref[:, k]
         cost += ocp.delta[k] * ca.bilin(ca.DM(ocp.Q), e, e)
         cost += ca.dot(ca.DM(ocp.z), s[:, k]) + 0.5 * ca.dot(ca.DM(ocp.Z), s[:, k] ** 2)
-        rows.append((np.zeros(nx), phi(x[:, k], u[:, min(k, N_u - 1)], p) - x[:, k + 1], np.zeros(nx)))
+        held = u[:, min(k, N_u - 1)]
+        x_next, equations = collocated(ocp, x[:, k], held, K[k]) if implicit else (phi(x[:, k], held, p), ca.SX(0, 1))
+        equations = ca.vertcat(x_next - x[:, k + 1], equations)
+        rows.append((np.zeros(equations.numel()), equations, np.zeros(equations.numel())))
         rows.append((np.full(nx, -np.inf), x[:, k + 1] - s[:, k], ocp.ubx))
         rows.append((ocp.lbx, x[:, k + 1] + s[:, k], np.full(nx, np.inf)))
     last = u_prev
@@ -60,18 +89,18 @@ def nlp(ocp: Ocp) -> Callable[[Array, Array, Array, Array, Array], tuple[Array, 
         last = u[:, k]
 
     lbg, g, ubg = zip(*rows, strict=True)
-    program = {"x": ca.veccat(x, u, s), "f": cost, "g": ca.vertcat(*g), "p": ca.veccat(x0, u_prev, y_ref)}
+    program = {"x": ca.veccat(x, u, s, *K), "f": cost, "g": ca.vertcat(*g), "p": ca.veccat(x0, u_prev, y_ref)}
     solver = ca.nlpsol("nlp", "ipopt", program, IPOPT)
-    free = np.full(nx * (N + 1), np.inf)
+    free, rates = np.full(nx * (N + 1), np.inf), np.full(sum(each.numel() for each in K), np.inf)
     bounds = {
         "lbg": np.concatenate(lbg),
         "ubg": np.concatenate(ubg),
-        "lbx": np.concatenate([-free, np.tile(ocp.lbu, N_u), np.zeros(nx * N)]),
-        "ubx": np.concatenate([free, np.tile(ocp.ubu, N_u), np.full(nx * N, np.inf)]),
+        "lbx": np.concatenate([-free, np.tile(ocp.lbu, N_u), np.zeros(nx * N), -rates]),
+        "ubx": np.concatenate([free, np.tile(ocp.ubu, N_u), np.full(nx * N, np.inf), rates]),
     }
 
     def solve(x0: Array, u_prev: Array, y_ref: Array, x: Array, u: Array) -> tuple[Array, Array, float]:
-        guess = np.concatenate([x.ravel(), u.ravel(), np.zeros(nx * N)])
+        guess = np.concatenate([x.ravel(), u.ravel(), np.zeros(nx * N + len(rates))])
         answer = solver(x0=guess, p=np.concatenate([x0, u_prev, y_ref.ravel()]), **bounds)
         assert solver.stats()["success"], solver.stats()["return_status"]
         z = np.array(answer["x"]).ravel()

@@ -33,7 +33,7 @@ TABLEAUS: dict[str, tuple[list[list[float]], list[float]]] = {
     "euler": ([[]], [1.0]),
     "rk4": ([[], [1 / 2], [0, 1 / 2], [0, 0, 1]], [1 / 6, 1 / 3, 1 / 3, 1 / 6]),
 }
-NEWTON_STEPS = 3  # of an implicit step
+NEWTON_STEPS = 5  # of an implicit step
 NEWTON_TOLERANCE = 1e-6  # on what a stage's rates do not fulfil of its equations over the step, relative to the state, or to 1 in its unit
 
 
