@@ -109,6 +109,15 @@ class Recording:
                 channels[content.id] = content, stream
         self.whole &= file.whole
 
+    @property
+    def streams(self) -> dict[str, list[str]]:
+        """Names of the streams of each robot that have messages, sorted."""
+        found: dict[str, set[str]] = {robot: set() for robot in self.robots}
+        for channels in self._channels.values():
+            for channel, stream in channels.values():
+                found[channel.metadata["robot"]].add(stream.name)
+        return {robot: sorted(names) for robot, names in found.items()}
+
     def messages(self, robot: str | None = None, streams: Collection[str] | None = None) -> Iterator[Recorded]:
         """
         Yield messages in the order in which they were recorded: by arrival, within milliseconds.

@@ -308,6 +308,18 @@ def record(
     return record.main(bus, config.keys(), out=out, robots=robot or (), retention=record.parse_retention(last, max_size))
 
 
+@app.command()
+def export(
+    recording: Annotated[Path, typer.Argument(metavar="RUN.mcap", help="Recording, or the folder of its segments.")],
+    parquet: Annotated[Path, typer.Option(metavar="DIR", help="Folder for a Parquet file a stream, in a folder a robot.")],
+    horizon: Annotated[bool, typer.Option("--horizon", help="Also all rows of plans and references used, as lists.")] = False,
+) -> None:
+    """Write a recording as tables, with columns named by signal, and units in their metadata."""
+    from rti_mpc_service.record.export import main
+
+    raise typer.Exit(main(recording, parquet, horizon=horizon))
+
+
 @partial(process, with_model=False)
 def router(config: Config, bus: BusSettings) -> None:
     """Run a Zenoh router, for clients on several hosts or with access control."""

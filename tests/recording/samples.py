@@ -51,14 +51,15 @@ REFERENCE = Reference(2, 1, 0, 100 * MS, End.HOLD, RNG.normal(size=(30, 1)), np.
 EVENT = Event(7, 1, 0, "controller", Severity.INFO, "mode", "waiting to tracking: driving")
 
 
-def write(path: Path, count: int, *, chunk: int = 50, keys: Keys = KEYS, finish: bool = True) -> list[tuple[Key, Message]]:
-    """Write a recording of so many states, each answered, a chunk every so many; return its messages."""
+def write(path: Path, count: int, *, chunk: int = 50, keys: Keys = KEYS, finish: bool = True, states: int = 1) -> list[tuple[Key, Message]]:
+    """Write a recording of so many commands, each after so many states, a chunk every so many messages; return its messages."""
     writer = RecordingWriter(path, START_NS, UNIX_OFFSET_NS, "0.0")
     writer.attach(f"{keys.robot}/9/config.toml", "application/toml", b"robot = 'wheels'\n", START_NS)
     writer.add(keys.robot, keys.info("controller"), START_NS, json.dumps(INFO).encode())
     written: list[tuple[Key, Message]] = [(keys.reference, REFERENCE), (keys.event("controller"), EVENT)]
     for k in range(1, count + 1):
-        written += [(keys.state, state(k)), (keys.command, command(k)), (keys.telemetry, telemetry(k))]
+        written += [(keys.state, state(states * k + i)) for i in range(states)]
+        written += [(keys.command, command(k)), (keys.telemetry, telemetry(k))]
     for i, (key, message) in enumerate(written):
         writer.add(keys.robot, key, START_NS + i * MS, encode(message), message.seq)
         if i % chunk == chunk - 1:

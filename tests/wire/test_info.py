@@ -140,7 +140,7 @@ def test_a_controller_lists_what_a_planner_sends_and_where_obstacles_are_in_it(t
     path.write_text(MINIMAL + DISC + "radius_m = 0.3\nmargin_m = 0.1\n" + "[observer.disturbances]\nu_c = { drift = 0.1, limit = 0.2 }\n")
     model = (ocp := build_ocp(load(path))).model
     document = json.loads(json.dumps({"role": "controller", **controller_info(ocp, model.np_ - 1)}))
-    assert [parameter["name"] for parameter in document["parameters"][-4:]] == ["a", "disc_0_x", "disc_0_y", "disc_0_r"]
+    assert [parameter["name"] for parameter in document["stage_parameters"][-4:]] == ["a", "disc_0_x", "disc_0_y", "disc_0_r"]
     assert document["p_nominal"] == list(model.p_nominal[:-1])
     info = Info.from_json(document)
     assert info.obstacles == (Obstacle(7, 1.0, 0.5, 0.4),)

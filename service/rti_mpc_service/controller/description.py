@@ -15,7 +15,7 @@ def controller_info(ocp: Ocp, np_: int) -> dict[str, Any]:
     """Return names, units and limits, null where there is no limit. Parameters from index `np_` on are disturbances."""
     model = ocp.model
     vectors = {"states": model.states, "inputs": model.inputs, "outputs": model.outputs}
-    vectors |= {"parameters": model.parameters[:np_], "disturbances": model.parameters[np_:]}
+    vectors |= {"stage_parameters": model.parameters[:np_], "disturbances": model.parameters[np_:]}
     limits = ("lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx")
     return {
         "version": rti_mpc.__version__,

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Export of a recording as Parquet files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rti_mpc.errors import ConfigError, MessageError
+from rti_mpc.recording import Recording, export
+
+
+def main(path: Path, folder: Path, *, horizon: bool) -> int:
+    """
+    Write a recording as Parquet files, print their names and rows, and return the exit status.
+
+    Raises:
+        ConfigError: It is no recording, or the files cannot be written.
+    """
+    try:
+        recording = Recording(path)
+    except (OSError, MessageError) as error:
+        raise ConfigError(f"export needs a recording: {error}") from error
+    try:
+        written = export(recording, folder, horizon=horizon)
+    except OSError as error:
+        raise ConfigError(f"--parquet must be a folder that can be written, got {folder}: {error.strerror}") from error
+    for file, rows in written:
+        print(f"{file}: {rows} rows")
+    return 0
