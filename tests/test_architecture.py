@@ -32,9 +32,8 @@ LIBRARY = {
 }
 
 # The commands of the service: none is a library of another. What they share is beside them, or in `config`, `host` and `rig`.
-COMMANDS = {
-    f"rti_mpc_service.{name}" for name in ("bench", "check", "conformance", "controller", "demo", "doctor", "faults", "paper", "record", "view")
-}
+NAMES = ("bench", "check", "conformance", "controller", "demo", "doctor", "faults", "paper", "record", "status", "view")
+COMMANDS = {f"rti_mpc_service.{name}" for name in NAMES}
 BORROWED = {"rti_mpc_service.paper": {"rti_mpc_service.bench"}}  # command: what it takes of another all the same
 
 # What no file of a package imports; the command line alone may start a simulation, lazily.

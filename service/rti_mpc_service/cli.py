@@ -347,6 +347,20 @@ def enable(config: Config, bus: BusSettings, timeout: Timeout = 2.0, state: Stat
 
 
 @partial(process, with_model=False)
+def status(
+    config: Config,
+    bus: BusSettings,
+    once: Annotated[bool, typer.Option("--once", help="Print the table once; without a terminal it always is.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, once, for scripts.")] = False,
+    timeout: Timeout = 3.0,
+) -> int:
+    """Show all robots on the bus: mode, error, ages, times, who leads, whether the solvers agree, versions, the last event."""
+    from rti_mpc_service.status.status import main
+
+    return main(bus, config.keys(), once=once, as_json=as_json, timeout_s=timeout)
+
+
+@partial(process, with_model=False)
 def params(
     config: Config,
     bus: BusSettings,

@@ -26,6 +26,7 @@ ROLES_OF_COMMAND: dict[str, tuple[str, ...]] = {
     "reference": ("planner",),
     "view": ("viewer", "recorder"),
     "record": ("recorder",),
+    "status": ("operator", "viewer", "recorder"),
     "router": ("router",),
     "stop": ("operator",),
     "enable": ("operator",),
