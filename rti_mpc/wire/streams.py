@@ -44,19 +44,20 @@ class Qos:
     Attributes:
         priority: Zenoh's name of the priority.
         express: Whether messages are sent at once, without batching.
-        cached: Whether late joiners receive the last message of each publisher.
+        cached: Messages of each publisher that those who have missed them receive a second later; late joiners receive the last one. 0: none.
         congestion: Whether messages are dropped or wait where a link is congested.
     """
 
     priority: Literal["REAL_TIME", "DATA", "DATA_LOW"] = "DATA"
     express: bool = False
-    cached: bool = False
+    cached: int = 0
     congestion: Literal["DROP", "BLOCK"] = "DROP"
 
 
 QOS_FAST = Qos("REAL_TIME", express=True)  # overtakes all other messages
-QOS_CACHED = Qos(cached=True)
+QOS_CACHED = Qos(cached=1)
 QOS_LOW = Qos("DATA_LOW")
+QOS_LOW_CACHED = Qos("DATA_LOW", cached=128)  # some seconds: low priority is dropped where a link is busy
 QOS_QUERY = Qos(congestion="BLOCK")
 QOS_FAST_QUERY = Qos("REAL_TIME", express=True, congestion="BLOCK")
 
@@ -126,7 +127,7 @@ JOURNAL = Stream(
     "journal",
     Journal,
     CONTROLLER_ROLES,
-    QOS_LOW,
+    QOS_LOW_CACHED,
     "a few times per second",
     "calls that each controller's commands depend on, and snapshots of its state, to repeat them later",
 )

@@ -210,7 +210,9 @@ class ZenohSession:
             return ZenohPublisher(self._session.declare_publisher(key, **options), realtime=qos.express)
         # Without heartbeats a subscriber would not notice that the last message was dropped.
         options["sample_miss_detection"] = ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None)
-        return ZenohPublisher(ext.declare_advanced_publisher(self._session, key, cache=ext.CacheConfig(1), publisher_detection=True, **options))
+        return ZenohPublisher(
+            ext.declare_advanced_publisher(self._session, key, cache=ext.CacheConfig(qos.cached), publisher_detection=True, **options)
+        )
 
     def subscriber(self, key: Key[Any], capacity: int, *, history: bool) -> ZenohSubscriber:
         """Subscriber to a stream, see `rti_mpc.wire.bus.Bus.subscriber`."""

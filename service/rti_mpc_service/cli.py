@@ -320,6 +320,35 @@ def export(
     raise typer.Exit(main(recording, parquet, horizon=horizon))
 
 
+RecordingPath = Annotated[Path, typer.Argument(metavar="RUN.mcap", help="Recording, or folder of its segments.", show_default=False)]
+RobotName = Annotated[str | None, typer.Option("--robot", metavar="NAME", help="Robot of the recording.", show_default="all")]
+Owner = Annotated[int | None, typer.Option("--controller", metavar="NUMBER", help="Controller of the recording.", show_default="all")]
+ModelFolder = Annotated[Path, typer.Option("--folder", metavar="DIR", help="Folder of a model of your own.", show_default="this folder")]
+Trust = Annotated[bool, typer.Option("--trust", help="Run the attached source of the model, which is code of whoever made the recording.")]
+
+
+@app.command()
+def replay(
+    recording: RecordingPath,
+    start: Annotated[str | None, typer.Option("--from", metavar="TIME", help="Time after the first state from which on to replay.")] = None,
+    assignments: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Another weight or bound: what would have been commanded in the same states; repeatable."),
+    ] = None,
+    robot: RobotName = None,
+    owner: Owner = None,
+    folder: ModelFolder = Path(),
+    trust: Trust = False,
+    tolerance: Annotated[float, typer.Option(min=0.0, help="Largest relative difference on another machine or other versions.")] = 1e-6,
+    path: JsonPath = None,
+) -> None:
+    """Repeat what a recorded controller did, from its journal, and compare each command bit by bit."""
+    from rti_mpc_service.replay.replay import main, parse_start
+
+    choice: dict[str, Any] = {"robot": robot, "owner": owner, "folder": folder, "trust": trust}
+    raise typer.Exit(main(recording, start_s=parse_start(start), assignments=assignments or (), tolerance=tolerance, json_path=path, **choice))
+
+
 @partial(process, with_model=False)
 def router(config: Config, bus: BusSettings) -> None:
     """Run a Zenoh router, for clients on several hosts or with access control."""

@@ -3,51 +3,21 @@
 
 from __future__ import annotations
 
+import json
+import re
 import signal
-from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from rti_mpc.contract.message import Command, Journal, JournalKind, Telemetry
+from rti_mpc.contract.message import Command, Telemetry
 from rti_mpc.contract.status import Mode
-from rti_mpc.journal.replay import Replay, ReplayOutcome, replay
-from rti_mpc.wire.bus import Subscriber
 from rti_mpc.wire.cdr import decode
 from rti_mpc_service.cli import SHIPPED
-from rti_mpc_service.config.build import build_controller, build_rti
-from rti_mpc_service.config.config import load
-from rti_mpc_service.config.fit import check_stop
-from tests.processes.system import System, handles, heard, rti_mpc, until
+from tests.guarded import write_robot
+from tests.processes.system import System, heard, rti_mpc
 
 pytestmark = pytest.mark.slow
-
-
-class Catch:
-    """Messages of a journal, as they come."""
-
-    def __init__(self, subscriber: Subscriber) -> None:
-        self._subscriber = subscriber
-        self.messages: list[Journal] = []
-
-    def snapshots(self) -> int:
-        self.messages += [decode(Journal, received.payload) for received in self._subscriber.drain()]
-        return sum(message.kind is JournalKind.SNAPSHOT for message in self.messages)
-
-
-def replayed(config_path: Path, messages: list[Journal], **override: Any) -> ReplayOutcome:
-    config = load(config_path)
-    rti = build_rti(config)
-    on = Replay(build_controller(config, rti, check_stop(config)), rti)
-    steps = replay(on, messages)
-    if override:
-        first = next(steps)
-        on.override(**override)
-        steps = chain([first], steps)
-    for _ in steps:
-        pass
-    return on.outcome
 
 
 def ask(system: System, **request: object) -> None:
@@ -62,9 +32,11 @@ def asked(system: System, *request: object) -> None:
 def test_journal_of_a_run_with_whatever_an_operator_and_a_link_do_replays_without_a_differing_bit_twice(tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(SHIPPED.read_text().replace("live = false", "live = true") + "\n[debug]\ninject = true\n")
-    with System(tmp_path, path) as system:
-        caught = Catch(system.bus.subscriber(system.keys.journal, capacity=1024))
+    run = tmp_path / "run.mcap"
+    with System(tmp_path, path, recorder=("record", "--out", run)) as system:
         commands = system.bus.subscriber(system.keys.command, capacity=4096)
+        system.start("recorder")
+        system.opened("recorder")
         system.start("robot", "controller", "reference")
         system.tracking()
         asked(system, "stop")
@@ -80,23 +52,52 @@ def test_journal_of_a_run_with_whatever_an_operator_and_a_link_do_replays_withou
         heard(system.bus.subscriber(system.keys.command), Command, lambda command: command.mode is Mode.BRAKING)
         system.running["robot"].send_signal(signal.SIGCONT)
         system.tracking()
-        before = caught.snapshots()
         ask(system, request="snapshot")
-        until(lambda: caught.snapshots() > before, "a snapshot on request")
+        system.kill("robot")
+        system.start("robot")
+        system.tracking()
         heard(telemetry, Telemetry, lambda sample: sample.mode is Mode.TRACKING)
-        assert handles(system.running["controller"].pid, signal.SIGTERM)
         system.interrupt("controller")
         last = [decode(Command, received.payload) for received in commands.drain()][-1]
-        until(lambda: caught.snapshots() and caught.messages[-1].seq > 0, "the end of the journal")
-        sent = last.seq
+        system.interrupt("recorder")
     for _ in range(2):
-        outcome = replayed(path, caught.messages)
-        assert outcome.samples >= sent
-        assert not outcome.gaps
-        assert not outcome.differences, str(outcome.differences[0])
-    print(f"{outcome.samples} samples, {outcome.entries} entries, {len(outcome.snapshots)} snapshots, 0 differing bits, twice")
-    problem = load(path)
-    weight = problem.ocp.weights.R["u_c"]
-    nudged = replayed(path, caught.messages, R=[weight * (1 + 1e-9), problem.ocp.weights.R["omega_c"]])
-    assert nudged.differences
-    print(nudged.differences[0])
+        done = rti_mpc("replay", run)
+        print(done.stdout)
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "0 bits differ" in done.stdout
+        assert "not covered" not in done.stdout
+        assert int(done.stdout.partition(" commands of")[0].split()[-1]) >= last.seq
+    done = rti_mpc("replay", run, "--set", "ocp.weights.Q.psi=0", "--set", "ocp.weights.R.u_c=2.000000002")
+    print(done.stdout)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"omega_c: \S+ rad/s away on average", done.stdout)
+    done = rti_mpc("replay", run, "--from", "10s", "--json", tmp_path / "replay.json")
+    (told,) = json.loads((tmp_path / "replay.json").read_text())
+    assert (told["differing"], told["not_covered"]) == (0, [])
+    assert 0 < told["commands"] < last.seq
+
+
+def test_both_controllers_of_a_takeover_behind_a_guard_replay_without_a_differing_bit(tmp_path: Path) -> None:
+    """The leader is killed: its journal ends within the second before that, and its standby's goes on through the takeover."""
+    path, run = write_robot(tmp_path / "robot.toml"), tmp_path / "run.mcap"
+    with System(tmp_path, path, recorder=("record", "--out", run), standby=("run", "--standby")) as system:
+        system.start("recorder")
+        system.opened("recorder")
+        system.start("robot", "guard", "controller", "reference")
+        first = system.tracking()
+        system.start("standby")
+        shadow = system.bus.subscriber(system.keys.standby_telemetry)
+        heard(shadow, Telemetry, lambda sample: sample.mode is Mode.TRACKING)
+        system.kill("controller")
+        commands = system.bus.subscriber(system.keys.command, capacity=4096)
+        heard(commands, Command, lambda command: command.epoch > first.epoch and command.mode is Mode.TRACKING)
+        system.interrupt("standby")
+        system.interrupt("recorder")
+    done = rti_mpc("replay", run, "--json", tmp_path / "replay.json")
+    print(done.stdout)
+    assert done.returncode == 0, done.stdout + done.stderr
+    accounts = json.loads((tmp_path / "replay.json").read_text())
+    assert len(accounts) == 2
+    for account in accounts:
+        assert (account["differing"], account["not_covered"], account["other"]) == (0, [], [])
+        assert account["commands"] > 3

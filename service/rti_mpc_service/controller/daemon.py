@@ -47,13 +47,13 @@ from rti_mpc_service.controller.description import controller_info
 from rti_mpc_service.controller.journal import JournalPublisher
 from rti_mpc_service.controller.leadership import LEADER, LISTEN_BEFORE_START_S, STANDBY, Candidate, hear_others
 from rti_mpc_service.controller.orders import Orders
-from rti_mpc_service.controller.origin import Origin
 from rti_mpc_service.controller.params import Params
 from rti_mpc_service.controller.references import References
 from rti_mpc_service.controller.slack import Slack
 from rti_mpc_service.host import realtime
 from rti_mpc_service.latch_file import LatchFile
 from rti_mpc_service.operator_stop import OperatorStop
+from rti_mpc_service.origin import Origin
 from rti_mpc_service.warm_up import warm_up
 
 TICK_PERIOD_S = 0.01  # period of the check for silence

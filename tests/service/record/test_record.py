@@ -20,7 +20,7 @@ from rti_mpc.wire.keys import Key
 from rti_mpc.wire.received import Received
 from rti_mpc_service.config.build import build_model
 from rti_mpc_service.config.config import load
-from rti_mpc_service.controller.origin import Origin
+from rti_mpc_service.origin import Origin
 from rti_mpc_service.record.inbox import ENTRY_BYTES, Arrived, Inbox
 from rti_mpc_service.record.record import EVERYTHING, Recorder, parse_retention
 from rti_mpc_service.record.segments import SEGMENTS, Retention, Segments

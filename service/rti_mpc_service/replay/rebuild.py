@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Rebuilding of a recorded controller from the files that are attached to the recording.
+
+Its configuration is the attached one. Its model is the one that is installed here, if
+that has the same source and the same equations. The attached source is somebody else's
+code, and runs only if it is trusted.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import rti_mpc
+from rti_mpc.codegen import COMPILER_FLAGS
+from rti_mpc.contract.epoch import NUMBER_BITS
+from rti_mpc.contract.message import Journal
+from rti_mpc.control.controller import Controller
+from rti_mpc.errors import ConfigError
+from rti_mpc.recording.reader import Recording
+from rti_mpc.rti.rti import Rti
+from rti_mpc.wire import document
+from rti_mpc_service.config.build import build_controller, build_model, build_rti
+from rti_mpc_service.config.config import load
+from rti_mpc_service.config.fit import check_model, check_stop
+from rti_mpc_service.config.schema import Config
+from rti_mpc_service.host import machine
+from rti_mpc_service.origin import code_hash, model_equations, model_source
+
+MAX_VERSIONS_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class Journaled:
+    """
+    One controller of a recording.
+
+    Attributes:
+        robot: Name of its robot.
+        owner: Number of the controller, the low bits of its epochs.
+        messages: Its journal, in the order of its numbers.
+        files: Text of each file attached for it, by name.
+    """
+
+    robot: str
+    owner: int
+    messages: list[Journal]
+    files: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Rebuilt:
+    """
+    A controller built like a recorded one.
+
+    Attributes:
+        config: Its configuration.
+        controller: The controller, before its first call.
+        rti: Its real-time iteration.
+        others: What is not as it was when it was recorded, a line each: with nothing, every bit must be the same.
+    """
+
+    config: Config
+    controller: Controller
+    rti: Rti
+    others: list[str]
+
+
+def journals(path: Path, robot: str | None = None, owner: int | None = None) -> list[Journaled]:
+    """
+    Return the controllers of a recording, in the order in which they appear.
+
+    Args:
+        path: The recording.
+        robot: Name of a robot; None: all.
+        owner: Number of a controller; None: all.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    recording = Recording(path)
+    found: dict[tuple[str, int], list[Journal]] = {}
+    for recorded in recording.messages(robot, ("journal",)):
+        message = recorded.message
+        found.setdefault((recorded.robot, message.epoch % (1 << NUMBER_BITS)), []).append(message)
+    chosen = {key: messages for key, messages in found.items() if owner in (None, key[1])}
+    if not chosen:
+        known = ", ".join(f"{name} {number}" for name, number in found) or "none"
+        raise ConfigError(f"{path} must hold the journal of {robot or 'a robot'}{'' if owner is None else f', controller {owner}'}, got {known}")
+    return [
+        Journaled(name, number, in_order(messages), files_of(recording.attachments, f"{name}/{number}/"))
+        for (name, number), messages in chosen.items()
+    ]
+
+
+def in_order(messages: list[Journal]) -> list[Journal]:
+    """Return messages by their numbers, each once: a recorder with a limit repeats some at the beginning of a segment."""
+    return [message for _, message in sorted({message.seq: message for message in messages}.items())]
+
+
+def files_of(attachments: Mapping[str, bytes], beginning: str) -> dict[str, str]:
+    """Return the attached texts below a name."""
+    return {name.removeprefix(beginning): content.decode(errors="replace") for name, content in attachments.items() if name.startswith(beginning)}
+
+
+def rebuild(journal: Journaled, *, folder: Path, trust: bool = False) -> Rebuilt:
+    """
+    Build a controller like the recorded one.
+
+    Args:
+        journal: Controller of a recording.
+        folder: Where a model of the user's own is looked for.
+        trust: Whether to run the attached source of the model instead.
+
+    Raises:
+        ConfigError: Nothing is attached, or the model here is another one.
+    """
+    if "config.toml" not in journal.files:
+        owner = f"controller {journal.owner} of {journal.robot}"
+        raise ConfigError(f"the configuration of {owner} must be attached to the recording, got {[*journal.files]}")
+    recorded = document.read(journal.files.get("versions.json", "{}").encode(), most=MAX_VERSIONS_BYTES)
+    with tempfile.TemporaryDirectory(prefix="rti-mpc-replay-") as temporary:
+        config = configuration(journal.files, Path(temporary), folder=folder, trust=trust)
+        equations = sha256(model_equations(build_model(config)).encode()).hexdigest()
+        if recorded.get("model_sha256", equations) != equations:
+            raise ConfigError(f"model {config.model.name} must have the equations that were recorded, got others: use the rti-mpc that recorded it")
+        rti = build_rti(config)
+        controller = build_controller(config, rti, check_stop(config))
+    return Rebuilt(config, controller, rti, list(changes(recorded)))
+
+
+def configuration(files: Mapping[str, str], temporary: Path, *, folder: Path, trust: bool) -> Config:
+    """
+    Return the attached configuration, with the folder of its model.
+
+    Args:
+        files: Attached files.
+        temporary: Folder for them.
+        folder: Where a model of the user's own is looked for.
+        trust: Whether to run the attached source of the model instead.
+
+    Raises:
+        ConfigError: It is not valid, or the source of its model here is not the attached one.
+    """
+    path = temporary / "config.toml"
+    path.write_text(files["config.toml"], encoding="utf-8")
+    config = load(path, with_model=False)
+    module, _, function = config.model.name.partition(":")
+    if function:
+        own = Path(module).stem if module.endswith(".py") else module
+        attached = next((text for name, text in files.items() if name == f"{own.rpartition('.')[2]}.py"), None)
+        if trust and attached is not None:
+            source = temporary / f"{own.replace('.', '/')}.py"
+            source.parent.mkdir(parents=True, exist_ok=True)
+            source.write_text(attached, encoding="utf-8")
+            folder = temporary
+        config = config.model_copy(update={"model": config.model.model_copy(update={"folder": folder})})
+        found = model_source(config)
+        if found is None or found.read_text(encoding="utf-8", errors="replace") != attached:
+            raise ConfigError(
+                f"model {config.model.name} must be here as it was recorded, got {found or 'no file'}: --folder names the folder of its module, "
+                "--trust runs the attached source, which is code of whoever made the recording"
+            )
+    check_model(config)
+    return config
+
+
+def changes(recorded: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what was another when a controller was recorded, a line each."""
+    if not recorded:
+        yield "the recording does not say with what it was made"
+        return
+    if recorded.get("code_sha256") != code_hash():
+        yield f"recorded with other code of rti-mpc than that of this {rti_mpc.__version__}: {recorded.get('rti_mpc')}"
+    if recorded.get("build") != [shutil.which("cc") or "CasADi's virtual machine", *COMPILER_FLAGS]:
+        yield f"recorded with another build: {recorded.get('build')}"
+    then, here = recorded.get("machine") or {}, machine.machine_info()
+    for what in ("processor", "system", "python", "packages"):
+        if then.get(what) != here[what]:
+            yield f"recorded with another {what.removesuffix('s')}: {then.get(what)}, here {here[what]}"

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Replay of a recording: each recorded controller, built again, repeats its journal, and each command is compared with the recorded one.
+
+On the same code, packages and processor every bit must be the same. Otherwise that is
+said first, and commands are compared within a tolerance.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from rti_mpc.array import Array
+from rti_mpc.errors import ConfigError, OcpError
+from rti_mpc.journal.entry import JournalEntry
+from rti_mpc.journal.replay import Difference, Gap, Replay, replay
+from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
+from rti_mpc_service.config import toml
+from rti_mpc_service.config.build import retuned
+from rti_mpc_service.config.fit import check_names, check_tree
+from rti_mpc_service.config.refusal import explain
+from rti_mpc_service.config.schema import Config
+from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, journals, rebuild
+
+TOLERANCE = 1e-6  # of commands on another machine, relative to 1 + their magnitude
+TUNABLE = ("ocp.weights.", "ocp.bounds.")  # beginnings of the keys that `--set` takes
+
+
+@dataclass
+class Account:
+    """
+    What a replay of one controller has shown.
+
+    Attributes:
+        journal: The recorded controller.
+        built: The one that repeats.
+        on: The replay.
+        wanted: Time of each command, s of the robot, and its first row as it would be with other weights, and as it was; only with such.
+    """
+
+    journal: Journaled
+    built: Rebuilt
+    on: Replay
+    wanted: list[tuple[float, Array, Array]]
+
+
+def main(
+    path: Path,
+    *,
+    robot: str | None = None,
+    owner: int | None = None,
+    start_s: float = 0.0,
+    assignments: Sequence[str] = (),
+    folder: Path = Path(),
+    trust: bool = False,
+    tolerance: float = TOLERANCE,
+    json_path: Path | None = None,
+) -> int:
+    """
+    Replay a recording, and print what it shows.
+
+    Args:
+        path: The recording.
+        robot: Name of a robot; None: all.
+        owner: Number of a controller; None: all.
+        start_s: Robot time after the first command from which on it is replayed, from the last snapshot before it.
+        assignments: Other weights and bounds, each ``key=value`` as in the TOML file.
+        folder: Where a model of the user's own is looked for.
+        trust: Whether to run the attached source of a model.
+        tolerance: Largest difference on another machine, relative to 1 + the magnitude.
+        json_path: File for the results.
+
+    Returns:
+        Exit status: 0 if every command was repeated, else 1; with `assignments` always 0.
+
+    Raises:
+        ConfigError: The recording cannot be replayed here.
+    """
+    accounts = []
+    status = 0
+    for journal in journals(path, robot, owner):
+        built = rebuild(journal, folder=folder, trust=trust)
+        print(f"{journal.robot}, controller {journal.owner}")
+        for line in built.others:
+            print(f"  {line}")
+        if built.others and not assignments:
+            print(f"  so commands are compared within {tolerance:g}, relative to 1 + their magnitude, not bit by bit")
+        account = play(journal, built, start_s, assignments)
+        accounts.append(account)
+        limit = tolerance if built.others else 0.0
+        for line in lines(account, limit, assignments):
+            print(f"  {line}")
+        outcome = account.on.outcome
+        if not assignments and (not outcome.samples or outcome.size > limit or (outcome.differing and not built.others)):
+            status = 1
+    if json_path is not None:
+        json_path.write_text(json.dumps([summary(account) for account in accounts], indent=1))
+    return status
+
+
+def play(journal: Journaled, built: Rebuilt, start_s: float = 0.0, assignments: Sequence[str] = ()) -> Account:
+    """Replay one controller."""
+    on = Replay(built.controller, built.rti)
+    account = Account(journal, built, on, [])
+    override = overridden(built.config, built.rti.ocp, assignments) if assignments else {}
+    steps: Iterator[tuple[JournalEntry, Difference | None]] = replay(on, journal.messages, snapshot_before(journal, start_s))
+    if override and (first := next(steps, None)) is not None:
+        on.override(**override)
+        steps = chain([first], steps)
+    for entry, _ in steps:
+        if override and entry.name == "commit" and on.wanted is not None:
+            wanted, recorded = on.wanted
+            account.wanted.append((1e-9 * recorded.stamp_ns, wanted.u[0].copy(), recorded.u[0].copy()))
+    return account
+
+
+def snapshot_before(journal: Journaled, start_s: float) -> int:
+    """Return the number from which on snapshots are used, so that the replay covers a robot time after the first state."""
+    first_ns = next((message.stamp_ns for message in journal.messages if message.stamp_ns), 0)
+    before = [message.seq for message in journal.messages if message.stamp_ns and message.stamp_ns - first_ns <= 1e9 * start_s]
+    snapshots = [message.seq for message in journal.messages if message.kind.name == "SNAPSHOT"]
+    return max((seq for seq in snapshots if before and seq <= before[-1]), default=0) if start_s > 0.0 else 0
+
+
+def overridden(config: Config, ocp: Ocp, assignments: Sequence[str]) -> dict[str, Array]:
+    """
+    Return the weights and bounds that differ, by their names in `Ocp`.
+
+    Raises:
+        ConfigError: A key is none of a weight or a bound, or its value does not fit.
+    """
+    document = config.model_dump(by_alias=True)
+    for assignment in assignments:
+        key, equals, value = assignment.partition("=")
+        if not equals or not key.startswith(TUNABLE):
+            raise ConfigError(f"--set must be KEY=VALUE with a key below {' or '.join(TUNABLE)}, whose values are not compiled in, got {assignment}")
+        table: Any = document
+        *steps, name = key.strip().split(".")
+        for step in steps:
+            table = table.get(step) if isinstance(table, dict) else None
+        if not isinstance(table, dict):
+            raise ConfigError(f"--set must name a key of the configuration, got {key}")
+        table[name] = toml.read(f"value = {value}")["value"]
+    try:
+        changed = Config.model_validate(document)
+        check_tree(changed)
+        check_names(changed, ocp.model)
+        other = retuned(changed, ocp)
+    except ValidationError as error:
+        raise ConfigError(f"--set: {explain(error, Config)}") from error
+    except OcpError as error:
+        raise ConfigError(f"--set: {error}") from error
+    return {name: getattr(other, name) for name in WEIGHTS_AND_BOUNDS if not np.array_equal(getattr(other, name), getattr(ocp, name))}
+
+
+def lines(account: Account, limit: float, assignments: Sequence[str]) -> Iterator[str]:
+    """Yield what a replay has shown."""
+    outcome = account.on.outcome
+    times = [message.local_ns for message in account.journal.messages]
+    yield f"{outcome.samples} commands of {1e-9 * (times[-1] - times[0]):.1f} s, {outcome.entries} entries, {len(outcome.snapshots)} snapshots"
+    for gap in outcome.gaps:
+        yield f"not covered: {told(gap)}"
+    if assignments:
+        yield from open_loop(account, assignments)
+    elif not outcome.samples:
+        yield "nothing could be compared"
+    elif not outcome.differing:
+        yield "0 bits differ"
+    elif outcome.size <= limit:
+        yield f"{outcome.differing} commands differ, by {outcome.size:.1e} at most"
+    else:
+        yield f"{outcome.differing} commands differ; the first is {outcome.differences[0]}"
+
+
+def told(gap: Gap) -> str:
+    """Return a gap in words."""
+    return f"entries {gap.first} to {gap.last}: {gap.why}"
+
+
+def open_loop(account: Account, assignments: Sequence[str]) -> Iterator[str]:
+    """Yield how far the commands would have been from those that were sent, in the same states."""
+    yield f"with {', '.join(assignments)}, in the same states, its first inputs would have been"
+    if not account.wanted:
+        return
+    times = np.array([t for t, _, _ in account.wanted])
+    other, was = (np.array([row[i] for row in account.wanted]) for i in (1, 2))
+    for j, signal in enumerate(account.built.rti.ocp.model.inputs):
+        apart = np.abs(other[:, j] - was[:, j])
+        rms, most = float(np.sqrt((apart**2).mean())), int(apart.argmax())
+        yield f"  {signal.name}: {rms:.3g} {signal.unit} away on average (rms), at most {apart[most]:.3g} {signal.unit}, at {times[most]:.1f} s"
+
+
+def summary(account: Account) -> dict[str, Any]:
+    """Return the results of one controller, for JSON."""
+    outcome = account.on.outcome
+    first = outcome.differences[0] if outcome.differences else None
+    return {
+        "robot": account.journal.robot,
+        "controller": account.journal.owner,
+        "other": account.built.others,
+        "commands": outcome.samples,
+        "entries": outcome.entries,
+        "differing": outcome.differing,
+        "largest_difference": outcome.size if np.isfinite(outcome.size) else None,
+        "first_difference": None if first is None else {"seq": first.seq, "field": first.field, "text": str(first)},
+        "not_covered": [{"first": gap.first, "last": gap.last, "why": gap.why} for gap in outcome.gaps],
+        "snapshots": outcome.snapshots,
+    }
+
+
+def parse_start(text: str | None) -> float:
+    """
+    Return a time such as ``72.5s`` in s.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    try:
+        return 0.0 if text is None else float(text.removesuffix("s"))
+    except ValueError:
+        raise ConfigError(f"a time must be in seconds after the first command, such as 72.5s, got {text}") from None

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recorded controller, built again from what is attached: it repeats every bit, and what is not as it was is said first."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rti_mpc.errors import ConfigError
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.config.config import load
+from rti_mpc_service.init import main as init
+from rti_mpc_service.replay.rebuild import Journaled, rebuild
+from rti_mpc_service.replay.replay import lines, overridden, play
+from tests.service.replay.driven import journal_of
+
+
+@pytest.fixture(scope="module")
+def journal() -> Journaled:
+    return journal_of(SHIPPED)
+
+
+def test_controller_built_from_the_attached_files_repeats_every_bit(journal: Journaled, tmp_path: Path) -> None:
+    built = rebuild(journal, folder=tmp_path)
+    assert built.others == []
+    account = play(journal, built)
+    assert account.on.outcome.samples == 59
+    assert not account.on.outcome.differences
+    assert "0 bits differ" in list(lines(account, 0.0, ()))
+
+
+def test_replay_from_a_time_begins_at_the_last_snapshot_before_it(journal: Journaled, tmp_path: Path) -> None:
+    whole = play(journal, rebuild(journal, folder=tmp_path)).on.outcome
+    late = play(journal, rebuild(journal, folder=tmp_path), start_s=5.5).on.outcome
+    assert whole.snapshots == late.snapshots
+    assert late.samples == 10
+    assert not late.differing
+
+
+def test_what_is_not_as_it_was_is_said_and_the_first_difference_told(journal: Journaled, tmp_path: Path) -> None:
+    versions = json.loads(journal.files["versions.json"])
+    versions["machine"]["packages"]["numpy"] = "1.0"
+    versions["code_sha256"] = "0"
+    files = journal.files | {"versions.json": json.dumps(versions)}
+    built = rebuild(replace(journal, files=files), folder=tmp_path)
+    assert len(built.others) == 2
+    assert "other code of rti-mpc" in built.others[0]
+    assert "'numpy': '1.0'" in built.others[1]
+    account = play(journal, built, assignments=["ocp.weights.R.u_c=5"])
+    assert account.wanted
+    text = "\n".join(lines(account, 0.0, ["ocp.weights.R.u_c=5"]))
+    assert "with ocp.weights.R.u_c=5, in the same states" in text
+    assert "u_c: " in text
+    assert "command 1, at 0.1" in str(account.on.outcome.differences[0]) or account.on.outcome.differences[0].seq <= 5
+
+
+@pytest.mark.parametrize(
+    ("assignment", "words"),
+    [
+        ("ocp.N=5", "a key below ocp.weights. or ocp.bounds."),
+        ("ocp.weights.Q.psi", "must be KEY=VALUE"),
+        ("ocp.weights.Q.phi=1", "phi"),
+        ("ocp.weights.R.u_c=-1", "u_c"),
+        ("ocp.weights.R.u_c=fast", "TOML"),
+        ("ocp.weights.S.u_c=1", "a key of the configuration"),
+    ],
+)
+def test_value_that_cannot_be_set_is_refused_in_one_line(assignment: str, words: str) -> None:
+    from rti_mpc_service.config.fit import check_model
+
+    config = load(SHIPPED)
+    with pytest.raises(ConfigError, match=words) as refusal:
+        overridden(config, check_model(config), [assignment])
+    assert "\n" not in str(refusal.value)
+
+
+def test_only_what_is_set_differs() -> None:
+    from rti_mpc_service.config.fit import check_model
+
+    config = load(SHIPPED)
+    changed = overridden(config, check_model(config), ["ocp.weights.Q.psi=0", "ocp.bounds.increments.u_c=[-0.1, 0.1]"])
+    assert set(changed) == {"Q", "lbdu", "ubdu"}
+    assert changed["Q"][2, 2] == 0.0
+    np.testing.assert_array_equal(changed["ubdu"][0], 0.1)
+
+
+def test_source_of_a_model_of_ones_own_runs_only_if_it_is_here_or_trusted(tmp_path: Path) -> None:
+    home, elsewhere = tmp_path / "home", tmp_path / "elsewhere"
+    home.mkdir()
+    elsewhere.mkdir()
+    init("cart", "unicycle", home)
+    journal = journal_of(home / "cart.toml", samples=8)
+    assert rebuild(journal, folder=home).others == []
+    for folder in (elsewhere, home):
+        if folder is home:
+            source = home / "cart.py"
+            source.write_text(source.read_text() + "\nprint('another one')\n")
+        with pytest.raises(ConfigError, match="--trust runs the attached source"):
+            rebuild(journal, folder=folder)
+    account = play(journal, rebuild(journal, folder=elsewhere, trust=True))
+    assert account.on.outcome.samples > 5
+    assert not account.on.outcome.differing
+
+
+def test_recording_without_a_configuration_is_refused(journal: Journaled, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="configuration of controller 5 of pioneer must be attached"):
+        rebuild(replace(journal, files={}), folder=tmp_path)
