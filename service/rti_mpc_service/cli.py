@@ -321,7 +321,7 @@ def export(
 
 
 RecordingPath = Annotated[Path, typer.Argument(metavar="RUN.mcap", help="Recording, or folder of its segments.", show_default=False)]
-RobotName = Annotated[str | None, typer.Option("--robot", metavar="NAME", help="Robot of the recording.", show_default="all")]
+RecordedRobot = Annotated[str | None, typer.Option("--robot", metavar="NAME", help="Robot of the recording.", show_default="all")]
 Owner = Annotated[int | None, typer.Option("--controller", metavar="NUMBER", help="Controller of the recording.", show_default="all")]
 ModelFolder = Annotated[Path, typer.Option("--folder", metavar="DIR", help="Folder of a model of your own.", show_default="this folder")]
 Trust = Annotated[bool, typer.Option("--trust", help="Run the attached source of the model, which is code of whoever made the recording.")]
@@ -335,7 +335,7 @@ def replay(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Another weight or bound: what would have been commanded in the same states; repeatable."),
     ] = None,
-    robot: RobotName = None,
+    robot: RecordedRobot = None,
     owner: Owner = None,
     folder: ModelFolder = Path(),
     trust: Trust = False,
