@@ -48,9 +48,13 @@ def collocated(ocp: Ocp, x: ca.SX, u: ca.SX, K: ca.SX) -> tuple[ca.SX, ca.SX]:
     return x, ca.vertcat(*equations)
 
 
-def nlp(ocp: Ocp) -> Callable[[Array, Array, Array, Array, Array], tuple[Array, Array, float]]:
+def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Array, Array], tuple[Array, Array, float]]:
     """
     Build the nonlinear program of `rti_mpc.rti.ocp`, by multiple shooting, or by collocation where the integrator is implicit.
+
+    Args:
+        ocp: The problem.
+        slacks: Whether bounds on states are softened; hard ones if not.
 
     Returns:
         ``solve(x0, u_prev, y_ref, x, u) -> (x, u, cost)`` from the guess ``x, u``; it fails where IPOPT does not converge.
@@ -63,6 +67,7 @@ def nlp(ocp: Ocp) -> Callable[[Array, Array, Array, Array, Array], tuple[Array, 
     x = ca.SX.sym("x", nx, N + 1)
     u = ca.SX.sym("u", nu, N_u)
     s = ca.SX.sym("s", nx, N)
+    s_e = ca.SX.sym("s_e", nx)
     implicit = ocp.method == "irk"
     K = [ca.SX.sym(f"K_{k}", nx, model.sim_method_num_steps * model.sim_method_num_stages if implicit else 0) for k in range(N)]
     x0 = ca.SX.sym("x0", nx)
@@ -81,6 +86,9 @@ def nlp(ocp: Ocp) -> Callable[[Array, Array, Array, Array, Array], tuple[Array, 
         rows.append((np.zeros(equations.numel()), equations, np.zeros(equations.numel())))
         rows.append((np.full(nx, -np.inf), x[:, k + 1] - s[:, k], ocp.ubx))
         rows.append((ocp.lbx, x[:, k + 1] + s[:, k], np.full(nx, np.inf)))
+    cost += ca.dot(ca.DM(ocp.z), s_e) + 0.5 * ca.dot(ca.DM(ocp.Z), s_e**2)
+    rows.append((np.full(nx, -np.inf), x[:, N] - s_e, ocp.ubx_e))
+    rows.append((ocp.lbx_e, x[:, N] + s_e, np.full(nx, np.inf)))
     last = u_prev
     for k in range(N_u):
         du = u[:, k] - last
@@ -89,18 +97,19 @@ def nlp(ocp: Ocp) -> Callable[[Array, Array, Array, Array, Array], tuple[Array, 
         last = u[:, k]
 
     lbg, g, ubg = zip(*rows, strict=True)
-    program = {"x": ca.veccat(x, u, s, *K), "f": cost, "g": ca.vertcat(*g), "p": ca.veccat(x0, u_prev, y_ref)}
+    program = {"x": ca.veccat(x, u, s, s_e, *K), "f": cost, "g": ca.vertcat(*g), "p": ca.veccat(x0, u_prev, y_ref)}
     solver = ca.nlpsol("nlp", "ipopt", program, IPOPT)
     free, rates = np.full(nx * (N + 1), np.inf), np.full(sum(each.numel() for each in K), np.inf)
+    most = np.full(nx * (N + 1), np.inf if slacks else 0.0)
     bounds = {
         "lbg": np.concatenate(lbg),
         "ubg": np.concatenate(ubg),
-        "lbx": np.concatenate([-free, np.tile(ocp.lbu, N_u), np.zeros(nx * N), -rates]),
-        "ubx": np.concatenate([free, np.tile(ocp.ubu, N_u), np.full(nx * N, np.inf), rates]),
+        "lbx": np.concatenate([-free, np.tile(ocp.lbu, N_u), np.zeros(nx * (N + 1)), -rates]),
+        "ubx": np.concatenate([free, np.tile(ocp.ubu, N_u), most, rates]),
     }
 
     def solve(x0: Array, u_prev: Array, y_ref: Array, x: Array, u: Array) -> tuple[Array, Array, float]:
-        guess = np.concatenate([x.ravel(), u.ravel(), np.zeros(nx * N + len(rates))])
+        guess = np.concatenate([x.ravel(), u.ravel(), np.zeros(nx * (N + 1) + len(rates))])
         answer = solver(x0=guess, p=np.concatenate([x0, u_prev, y_ref.ravel()]), **bounds)
         assert solver.stats()["success"], solver.stats()["return_status"]
         z = np.array(answer["x"]).ravel()

@@ -109,8 +109,8 @@ def progress(ocp: Ocp) -> ca.Function:
     if nh:
         constraint, *_ = constraints(ocp)
         u_held = all_inputs(u, N)
-        g = constraint.map(N)(x[:, 1:], u_held, p[:, 1:])[len(ocp.soft) : len(ocp.lg), :]
-        near = TOUCHING_DISTANCE * scale[-nh:]
+        g = constraint.map(N)(x[:, 1:], u_held, p[:, 1:])[len(ocp.soft) : ocp.ng_path, :]
+        near = TOUCHING_DISTANCE * scale[model.nx + model.nu + len(ocp.soft) :][:nh]
         held += [ca.mmax(ca.fmax(g[k, :] - uh[k], lh[k] - g[k, :])) + near[k] for k in range(nh)]
     inputs = {"x": x, "u": u, "y_ref": y_ref, "p": p, "scale": scale, "lbx": lbx, "ubx": ubx, "lh": lh, "uh": uh}
     return function("progress", inputs, {"squares": squares, "held": ca.densify(ca.vertcat(*held))})

@@ -92,7 +92,7 @@ class Linearization:
         gradient: Gradient of half the output cost in the states at nodes 1 to N, shape ``(nx, N)``.
         hessian: Gauss-Newton Hessian of half the output cost, nonzeros of `H_i`, shape ``(nnz, N)``.
         H_i: Sparsity of the Hessian at one node, symmetric, shape ``(nx, nx)``.
-        g: Expressions with softened bounds at nodes 1 to N: states, then general constraints; shape ``(ng, N)``.
+        g: Expressions with softened bounds at nodes 1 to N: states, general constraints, then states bounded at node N alone; shape ``(ng, N)``.
         g_x: Sensitivities of g to the state of the node, nonzeros of `G_x`, shape ``(nnz, N)``.
         g_u: Sensitivities of g to the input of the stage before the node, nonzeros of `G_u`, shape ``(nnz, N)``.
         G_x: Sparsity of the sensitivities to the state at one node, shape ``(ng, nx)``.
@@ -133,13 +133,15 @@ class Linearization:
         nodes = node.map(N)(self.x[:, 1:], self.p[:, 1:], self.y_ref, W)
         self.gradient, self.hessian = nodes[:nx, :], nodes[nx + 1 :, :]
 
-        soft, w = list(ocp.soft), self.w
+        w = self.w
         constraint, self.G_x, self.G_u = constraints(ocp)
         bounded = constraint.map(N)(self.x[:, 1:], inputs, self.p[:, 1:])
         to_x, to_u = len(ocp.lg), len(ocp.lg) + self.G_x.nnz()
         self.g, self.g_x, self.g_u = bounded[:to_x, :], bounded[to_x:to_u, :], bounded[to_u:, :]
-        self.lg, self.ug = ca.vertcat(w["lbx"][soft, 0], w["lh"]), ca.vertcat(w["ubx"][soft, 0], w["uh"])
-        self.zg, self.Zg = ca.vertcat(w["z"][soft, 0], w["zh"]), ca.vertcat(w["Z"][soft, 0], w["Zh"])
+        self.lg, self.ug = softened(ocp, w, "lbx", "lh", "lbx_e"), softened(ocp, w, "ubx", "uh", "ubx_e")
+        self.zg, self.Zg = softened(ocp, w, "z", "zh", "z"), softened(ocp, w, "Z", "Zh", "Z")
+        if ocp.soft_e:
+            self._bound_at_the_end_alone(ocp)
 
         self.increments = self.u - ca.horzcat(self.u_prev, self.u[:, :-1])
         self.R = self.w["R"] * pattern(ocp.R)
@@ -164,6 +166,18 @@ class Linearization:
             cost=self.cost,
         )
         self.stages = ca.veccat(*self.forms)
+
+    def _bound_at_the_end_alone(self, ocp: Ocp) -> None:
+        """Let the rows of `soft_e` be inside their bounds, whatever the state is, at all nodes but the last."""
+        rows = slice(ocp.ng_path, len(ocp.lg))
+        above, below = np.isfinite(ocp.lg[rows]).astype(float), np.isfinite(ocp.ug[rows]).astype(float)  # 1 where there is such a bound
+        inside = self.lg[rows] * above + self.ug[rows] * below + self.scale_g[rows] * (above - below)
+        inside = inside / (above + below)  # halfway between two bounds, or one scale from the only one
+        early = ca.repmat(inside, 1, ocp.N - 1)
+        self.g = ca.vertcat(self.g[: ocp.ng_path, :], ca.horzcat(early, self.g[rows, -1]))
+        acts = np.ones((self.G_x.nnz(), ocp.N))
+        acts[np.array(self.G_x.get_triplet()[0]) >= ocp.ng_path, :-1] = 0.0
+        self.g_x = self.g_x * ca.DM(acts)
 
     @property
     def arguments(self) -> dict[str, ca.MX]:
@@ -239,16 +253,21 @@ def gauss_newton(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity]:
 
 def constraints(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
     """
-    Linearize the expressions with softened bounds: the bounded states, then the general constraints.
+    Linearize the expressions with softened bounds: the bounded states, the general constraints, then the states bounded at the last node.
 
     Returns:
         ``constraint(x, u, p) -> [g; nonzeros of G_x; nonzeros of G_u]``, with their patterns.
     """
     model = ocp.model
-    g = ca.vertcat(model.x[list(ocp.soft), 0], ocp.h_expr)
+    g = ca.vertcat(model.x[list(ocp.soft), 0], ocp.h_expr, model.x[list(ocp.soft_e), 0])
     G_x, G_u = ca.jacobian(g, model.x), ca.jacobian(g, model.u)
     out = ca.cse(ca.densify(ca.vertcat(g, nonzeros(G_x), nonzeros(G_u))))
     return ca.Function("constraint", [model.x, model.u, model.p], [out]), G_x.sparsity(), G_u.sparsity()
+
+
+def softened(ocp: Ocp, w: dict[str, Any], of_states: str, of_constraints: str, of_end: str) -> Any:
+    """Return what the rows of `constraints` have by these names of weights or bounds, shape ``(ng, 1)``."""
+    return ca.vertcat(w[of_states][list(ocp.soft), 0], w[of_constraints], w[of_end][list(ocp.soft_e), 0])
 
 
 def nonzeros(matrix: Any) -> Any:

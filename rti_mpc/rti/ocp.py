@@ -15,7 +15,8 @@ inputs held after the control horizon,
     \text{s.t.} \; & x_{k+1} = \phi(x_k, u_k, p_k), \quad x_0 \text{ given}, \\
     & lbu \le u_k \le ubu, \quad lbdu \le u_k - u_{k-1} \le ubdu, \\
     & lbx - s_i \le x_i \le ubx + s_i, \quad
-      lh - s_i \le h(x_i, u_{i-1}, p_i) \le uh + s_i, \quad s_i \ge 0 .
+      lh - s_i \le h(x_i, u_{i-1}, p_i) \le uh + s_i, \quad s_i \ge 0 , \\
+    & lbx_e - s_e \le x_N \le ubx_e + s_e, \quad s_e \ge 0 .
 
 This is the cost (4) of [Rosales]_ in full, with an additional terminal weight.
 Bounds on states and general constraints, each with its own slacks, are softened
@@ -70,6 +71,8 @@ class Ocp:
         ubx: Softened upper bound on states, shape ``(nx,)``.
         z: L1 weight of the slacks, shape ``(nx,)``, or given as a constant; cost / unit of the state.
         Z: L2 weight of the slacks, shape ``(nx,)``, or given as a constant; cost / unit of the state squared.
+        lbx_e: Softened lower bound on states at node N alone, besides `lbx`, shape ``(nx,)``: a terminal set. Its slacks have the weights `z`, `Z`.
+        ubx_e: Softened upper bound on states at node N alone, shape ``(nx,)``.
         Q_e: Terminal weight, added to ``delta_N Q``, shape ``(ny, ny)``, or given by its diagonal; none by default.
         h_expr: General constraints h(x, u, p) in the model's symbols, shape ``(nh, 1)``; the model's by default.
         lh: Softened lower bound on h, shape ``(nh,)``.
@@ -104,6 +107,8 @@ class Ocp:
     uh: Array
     zh: Array
     Zh: Array
+    lbx_e: Array
+    ubx_e: Array
 
     def __init__(
         self,
@@ -133,6 +138,8 @@ class Ocp:
         uh: ArrayLike = np.inf,
         zh: ArrayLike = DEFAULT_SLACK_WEIGHT,
         Zh: ArrayLike = DEFAULT_SLACK_WEIGHT,
+        lbx_e: ArrayLike = -np.inf,
+        ubx_e: ArrayLike = np.inf,
     ) -> None:
         given.instance("model", model, Model)
         N = given.whole("N", N, 0)
@@ -155,6 +162,7 @@ class Ocp:
             object.__setattr__(self, name, value)
         values = {"Q": Q, "R": R, "delta": delta, "lambda_": lambda_, "lbu": lbu, "ubu": ubu, "lbdu": lbdu, "ubdu": ubdu, "lbx": lbx, "ubx": ubx}
         values |= {"z": z, "Z": Z, "Q_e": np.zeros(model.ny) if Q_e is None else Q_e, "lh": lh, "uh": uh, "zh": zh, "Zh": Zh}
+        values |= {"lbx_e": lbx_e, "ubx_e": ubx_e}
         self._take(values)
 
     def retuned(self, **values: ArrayLike) -> Ocp:
@@ -176,7 +184,9 @@ class Ocp:
             array = check(name, value, sizes[size])
             array.setflags(write=False)
             object.__setattr__(self, name, array)
-        for lower, upper in (("lbu", "ubu"), ("lbx", "ubx"), ("lh", "uh")):
+        if not np.all(self.lbu <= self.ubu):
+            raise OcpError(f"lbu must not lie above ubu, got {self.lbu} and {self.ubu}")
+        for lower, upper in (("lbx", "ubx"), ("lh", "uh"), ("lbx_e", "ubx_e")):
             if not np.all(getattr(self, lower) < getattr(self, upper)):
                 raise OcpError(f"{lower} must lie below {upper}, got {getattr(self, lower)} and {getattr(self, upper)}")
         if any(self.model.u_rest) and (wrong := rest_fault(self)):
@@ -190,14 +200,24 @@ class Ocp:
         return tuple(int(j) for j in np.flatnonzero(np.isfinite(self.lbx) | np.isfinite(self.ubx)))
 
     @property
+    def soft_e(self) -> tuple[int, ...]:
+        """Indices of the states with a bound at node N alone, each of which has one slack more."""
+        return tuple(int(j) for j in np.flatnonzero(np.isfinite(self.lbx_e) | np.isfinite(self.ubx_e)))
+
+    @property
+    def ng_path(self) -> int:
+        """Number of softened bounds that act at every node; those of `soft_e` follow them."""
+        return len(self.soft) + self.h_expr.numel()
+
+    @property
     def lg(self) -> Array:
-        """Softened lower bounds: of the states in `soft`, then of `h_expr`; shape ``(ng,)``."""
-        return np.concatenate([self.lbx[list(self.soft)], self.lh])
+        """Softened lower bounds: of the states in `soft`, of `h_expr`, then of the states in `soft_e`; shape ``(ng,)``."""
+        return np.concatenate([self.lbx[list(self.soft)], self.lh, self.lbx_e[list(self.soft_e)]])
 
     @property
     def ug(self) -> Array:
         """Softened upper bounds, as `lg`."""
-        return np.concatenate([self.ubx[list(self.soft)], self.uh])
+        return np.concatenate([self.ubx[list(self.soft)], self.uh, self.ubx_e[list(self.soft_e)]])
 
     def phi(self) -> ca.Function:
         """One stage of the dynamics, ``phi(x, u, p) -> x_next``."""
@@ -302,4 +322,6 @@ WEIGHTS_AND_BOUNDS: dict[str, tuple[Callable[[str, ArrayLike, int], Array], str]
     "uh": (bound, "nh"),
     "zh": (weights, "nh"),
     "Zh": (weights, "nh"),
+    "lbx_e": (bound, "nx"),
+    "ubx_e": (bound, "nx"),
 }

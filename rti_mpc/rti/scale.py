@@ -60,7 +60,7 @@ def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
     by_x, by_u = dense(G_x, columns[: G_x.nnz()]), dense(G_u, columns[G_x.nnz() :])
     reach_g = np.abs((by_x @ response + by_u) * reach_u).sum(axis=2).max(axis=0, initial=0.0)
     scale_g = first(half(ocp.lg, ocp.ug), reach_g, beyond(ocp.lg, ocp.ug, np.zeros(ng)))
-    scale_g[: len(ocp.soft)] = scale_x[list(ocp.soft)]
+    scale_g[: len(ocp.soft)], scale_g[ocp.ng_path :] = scale_x[list(ocp.soft)], scale_x[list(ocp.soft_e)]
     return np.concatenate([scale_x, reach_u, scale_g])
 
 

@@ -63,7 +63,7 @@ def test_arrays_are_owned_and_read_only() -> None:
         ({"N_u": 3, "lambda_": [1.0] * 7}, r"lambda_ must be a number or have shape \(3,\)"),
         ({"lambda_": -1.0}, "lambda_ must be finite and not negative"),
         ({"z": INF}, "z must be finite and not negative"),
-        ({"lbu": [0.5, -0.745]}, "lbu must lie below ubu"),
+        ({"lbu": [0.6, -0.745]}, "lbu must not lie above ubu"),
         ({"ubx": [INF, INF, INF, -0.5, 0.745]}, "lbx must lie below ubx"),
         ({"ubu": [np.nan, 1.0]}, "ubu must not be NaN"),
         ({"lbdu": 0.1}, "lbdu <= 0 <= ubdu must hold, or no input could be kept"),
@@ -109,7 +109,7 @@ def test_retuned_problem_is_checked_alike_and_leaves_the_first_as_it_was() -> No
     assert not other.Q.flags.writeable
     with pytest.raises(OcpError, match="Q must be finite, symmetric and positive semidefinite"):
         ocp.retuned(Q=[1.0, 2.0, -3.0])
-    with pytest.raises(OcpError, match="lbu must lie below ubu"):
+    with pytest.raises(OcpError, match="lbu must not lie above ubu"):
         ocp.retuned(ubu=[-0.6, 0.7])
 
 

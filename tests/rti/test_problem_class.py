@@ -56,6 +56,9 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "explicit steps": lambda: lagging_car(sim_method_num_steps=8),
     "discrete time": sampled_car,
     "discrete time, held inputs": lambda: sampled_car(N_u=3),
+    "fixed input": lambda: sampled_car(lbu=[-0.5, 0.3], ubu=[0.5, 0.3], lbdu=-np.inf, ubdu=np.inf),
+    "terminal set": lambda: sampled_car(lbx_e=[-np.inf] * 3 + [-0.05], ubx_e=[np.inf] * 3 + [0.02]),
+    "terminal set, from above alone, held inputs": lambda: sampled_car(ubx_e=[np.inf] * 3 + [0.05], N_u=3, z=[1.0] * 4, Z=[0.0] * 4),
 }
 
 
@@ -97,3 +100,41 @@ def test_problem_is_solved_as_by_ipopt(name: str, formulation: str, solver: str)
         pairs = ((u, ocp.lbu, ocp.ubu), (du, ocp.lbdu, ocp.ubdu), (x[1:], ocp.lbx, ocp.ubx))
         bound += any(bool(np.any(np.isclose(z, lower, atol=1e-6) | np.isclose(z, upper, atol=1e-6))) for z, lower, upper in pairs)
     assert bound >= 2  # in so many of them bounds act
+
+
+@pytest.mark.parametrize("solver", BUILT_IN_SOLVERS)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_state_bound_with_a_large_penalty_is_hard_in_effect_and_what_exceeds_it_is_told(formulation: str, solver: str) -> None:
+    """IPOPT has the bound as such, no slack. From outside it, where IPOPT finds no plan at all, the plan comes back as fast as inputs can."""
+    ocp = sampled_car(z=1e5 if solver == "riccati" else 1e2, Z=0.0)  # OSQP takes long where a penalty is far larger than the multiplier
+    rti = Rti(ocp, TIGHT, formulation=formulation, solver=solver, compile=False)
+    hard = nlp(ocp, slacks=False)
+    bound = 0
+    for x0, y_ref, u_prev in around_a_bend(ocp, 4):
+        rti.reset(x0, u_prev)
+        x, u, _ = hard(x0, u_prev, y_ref, rti.x, rti.u)
+        for _ in range(60):
+            rti.prepare(y_ref, shift=False)
+            assert rti.feedback(x0) is QpStatus.SOLVED
+        np.testing.assert_allclose(rti.u, u, rtol=0, atol=1e-6)
+        assert rti.violation < 1e-6
+        bound += bool(np.any(np.abs(x[1:, 3]) > 0.35 - 1e-6))
+    assert bound >= 2
+    x0[3] = 1.5  # m/s, a measurement: the bound is 0.35
+    rti.reset(x0, u_prev)
+    rti.prepare(y_ref, shift=False)
+    assert rti.feedback(x0).usable
+    np.testing.assert_allclose(rti.violation, 0.5 * (1.5 + rti.u[0, 0]) - 0.35, rtol=0, atol=1e-6)
+
+
+def test_bounds_at_the_end_alone_do_not_act_before_it() -> None:
+    """A mass that must stand at the end of its horizon, and nowhere else."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    model = Model("mass", x, u, [x[1], u], x[0], ("r", "v"), "a", "r")
+    rti = Rti(Ocp(model, N=10, dt=0.1, Q=1, R=1e-3, lbu=-2, ubu=2, lbx_e=[-np.inf, -1e-3], ubx_e=[np.inf, 1e-3]), compile=False)
+    rti.reset(np.zeros(2), np.zeros(1))
+    rti.prepare(np.ones((10, 1)))
+    assert rti.feedback(np.zeros(2)) is QpStatus.SOLVED
+    assert abs(rti.x[-1, 1]) < 1.1e-3
+    assert rti.x[:-1, 1].max() > 0.5
+    assert rti.violation < 1e-6

@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from rti_mpc.codegen import function
-from rti_mpc.rti.linearization import Linearization, all_inputs
+from rti_mpc.rti.linearization import Linearization, all_inputs, softened
 from rti_mpc.rti.ocp import Ocp
 
 KIND_NAMES = {False: "relaxed", True: "whole"}  # key: whether the QP has softened bounds; functions compiled together need different names
@@ -218,8 +218,7 @@ class Remembered:
 
 def softened_bounds(ocp: Ocp, w: dict[str, Any]) -> tuple[Any, Any]:
     """Return the softened lower and upper bounds as expressions, each of shape ``(ng, 1)``."""
-    soft = list(ocp.soft)
-    return ca.vertcat(w["lbx"][soft, 0], w["lh"]), ca.vertcat(w["ubx"][soft, 0], w["uh"])
+    return softened(ocp, w, "lbx", "lh", "lbx_e"), softened(ocp, w, "ubx", "uh", "ubx_e")
 
 
 def head(lin: Linearization) -> list[ca.MX]:

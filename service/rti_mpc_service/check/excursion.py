@@ -48,11 +48,12 @@ class Bounds:
     def __init__(self, rti: Rti) -> None:
         self._rti, ocp = rti, rti.ocp
         model = ocp.model
-        self._scale_u, self._scale_g = rti.scale[model.nx : model.nx + model.nu], rti.scale[model.nx + model.nu :]
+        self._scale_u, self._scale_g = rti.scale[model.nx : model.nx + model.nu], rti.scale[model.nx + model.nu :][: ocp.ng_path]
+        lg, ug = ocp.lg[: ocp.ng_path], ocp.ug[: ocp.ng_path]
         inputs = [signal.name for signal in model.inputs]
         softened = [model.states[j].name for j in ocp.soft] + [signal.name for signal in model.constraints[: ocp.h_expr.numel()]]
         softened += [f"constraint {j}" for j in range(len(softened) - len(ocp.soft), ocp.h_expr.numel())]
-        kinds = (("", inputs, ocp.lbu, ocp.ubu), ("increment of ", inputs, ocp.lbdu, ocp.ubdu), ("", softened, ocp.lg, ocp.ug))
+        kinds = (("", inputs, ocp.lbu, ocp.ubu), ("increment of ", inputs, ocp.lbdu, ocp.ubdu), ("", softened, lg, ug))
         self._there = np.concatenate([np.isfinite(bounds) for _, _, lower, upper in kinds for bounds in (lower, upper)])
         every = [f"{side} bound of {kind}{name}" for kind, names, _, _ in kinds for side in ("lower", "upper") for name in names]
         self.names = [name for name, there in zip(every, self._there, strict=True) if there]
@@ -69,7 +70,7 @@ class Bounds:
         for values, lower, upper, scale in (
             (rti.u, ocp.lbu, ocp.ubu, self._scale_u),
             (increments, ocp.lbdu, ocp.ubdu, self._scale_u),
-            (softened, ocp.lg, ocp.ug, self._scale_g),
+            (softened, ocp.lg[: ocp.ng_path], ocp.ug[: ocp.ng_path], self._scale_g),
         ):
             found += [(values <= lower + AT_BOUND_SCALES * scale).any(axis=0), (values >= upper - AT_BOUND_SCALES * scale).any(axis=0)]
         self.reached |= np.concatenate(found)[self._there]
@@ -93,7 +94,7 @@ def excursions(rti: Rti, x0: Array) -> Iterator[Excursion]:
                 yield Excursion(x0, held(nominal + REFERENCE_DISTANCE_FACTOR * displacement(ocp, x0, nominal, way), ocp.N))
     regular = regular_at(ocp)
     scale_g = rti.scale[ocp.model.nx + ocp.model.nu :]
-    for bounds, outward in ((ocp.lg, -START_EXCESS_SCALES), (ocp.ug, START_EXCESS_SCALES)):
+    for bounds, outward in ((ocp.lg[: ocp.ng_path], -START_EXCESS_SCALES), (ocp.ug[: ocp.ng_path], START_EXCESS_SCALES)):
         for j in np.flatnonzero(np.isfinite(bounds)):
             starts = (start_at(rti, x0, int(j), bounds[j] + share * outward * scale_g[j]) for share in SHARES)
             yield Excursion(next((x for x in starts if regular(x)), x0), held(nominal, ocp.N))

@@ -94,6 +94,7 @@ def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
     lbu, ubu = bounds(limits.inputs, names(model.inputs))
     lbdu, ubdu = bounds(limits.increments, names(model.inputs))
     lbx, ubx = bounds(limits.states, names(model.states))
+    lbx_e, ubx_e = bounds(limits.terminal, names(model.states))
     return {
         "Q": [weights.Q[output.name] for output in model.outputs],
         "R": [weights.R[input.name] for input in model.inputs],
@@ -109,6 +110,8 @@ def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
         "Z": Z,
         "zh": z,
         "Zh": Z,
+        "lbx_e": lbx_e,
+        "ubx_e": ubx_e,
     }
 
 

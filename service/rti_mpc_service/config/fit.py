@@ -138,6 +138,7 @@ def check_names(config: Config, model: Model) -> None:
         ("ocp.bounds.inputs", ocp.bounds.inputs, "input", model.inputs),
         ("ocp.bounds.increments", ocp.bounds.increments, "input", model.inputs),
         ("ocp.bounds.states", ocp.bounds.states, "state", model.states),
+        ("ocp.bounds.terminal", ocp.bounds.terminal, "state", model.states),
         ("ocp.bounds.constraints", ocp.bounds.constraints, "constraint", model.constraints),
         *((("ocp.terminal.Q", terminal.Q, "output", model.outputs),) if terminal.Q is not None else ()),
         ("ocp.terminal.lqr.states", regulator.states, "state", model.states),

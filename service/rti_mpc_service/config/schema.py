@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -23,6 +24,14 @@ def interval(value: object) -> object:
     if not (isinstance(value, list | tuple) and len(value) == 2 and all(type(v) in (int, float) for v in value) and value[0] < value[1]):
         raise ValueError("must be [lower, upper], two numbers with lower < upper")
     return tuple(value)
+
+
+def input_interval(value: object) -> object:
+    """Accept ``[lower, upper]``, or ``[value, value]`` for an input that is fixed."""
+    fixed = (
+        isinstance(value, list | tuple) and len(value) == 2 and type(value[0]) in (int, float) and abs(value[0]) < math.inf and value[0] == value[1]
+    )
+    return tuple(value) if fixed else interval(value)  # type: ignore[arg-type]
 
 
 def around_zero(value: tuple[float, float]) -> tuple[float, float]:
@@ -46,6 +55,7 @@ def sequence(value: object) -> object:
 
 Bound = Annotated[float, AllowInfNan(True)]
 Interval = Annotated[tuple[Bound, Bound], BeforeValidator(interval)]
+InputInterval = Annotated[tuple[Bound, Bound], BeforeValidator(input_interval)]
 Increment = Annotated[Interval, AfterValidator(around_zero)]
 Weight = Annotated[float, Field(ge=0, le=1e15)]  # limited so that sums with terms of order 1 keep their digits
 Positive = Annotated[float, Field(gt=0)]
@@ -93,11 +103,14 @@ class WeightSection(Section):
 class BoundSection(Section):
     """Bounds [lower, upper] of inputs, increments, states and constraints; a name left out has no bound."""
 
-    inputs: dict[str, Interval] = Field(default={}, description="bounds of inputs, by name, in the input's unit")
+    inputs: dict[str, InputInterval] = Field(default={}, description="bounds of inputs, by name, in the input's unit; equal ones fix the input")
     increments: dict[str, Increment] = Field(
         default={}, description="bounds of the change of an input from one sample to the next, by name, in the input's unit"
     )
     states: dict[str, Interval] = Field(default={}, description="softened bounds of states, by name, in the state's unit")
+    terminal: dict[str, Interval] = Field(
+        default={}, description="softened bounds of states at the end of the horizon alone, a terminal set, by name, in the state's unit"
+    )
     constraints: dict[str, Interval] = Field(default={}, description="softened bounds of the model's constraints, by name, in the constraint's unit")
     soft_weight: Weight | None = Field(
         default=None, description="L1 weight on the violation of a softened bound or an obstacle, in cost / unit of what is bounded"

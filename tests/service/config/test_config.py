@@ -261,6 +261,14 @@ def test_integrator_of_the_file_is_that_of_problem_observer_and_simulated_robot(
         assert (model.method, model.sim_method_num_stages, model.sim_method_num_steps) == ("irk", 3, 2)
 
 
+def test_equal_bounds_fix_an_input_and_a_terminal_set_bounds_the_end_alone(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + "[ocp.bounds]\ninputs = { u_c = [0, 0], omega_c = [-1, 1] }\nterminal = { omega = [-0.1, inf] }\n")
+    ocp = build_ocp(load(path))
+    assert (ocp.lbu.tolist(), ocp.ubu.tolist()) == ([0.0, -1.0], [0.0, 1.0])
+    assert (ocp.lbx_e.tolist(), ocp.ubx_e.tolist()) == ([-math.inf] * 4 + [-0.1], [math.inf] * 5)
+
+
 def test_softened_bounds_constraints_and_obstacles_become_those_of_the_ocp(tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     bounds = "[ocp.bounds]\nstates = { u = [-1, 1] }\nconstraints = { power = [-inf, 0.1] }\nsoft_weight = 5.0\nsoft_weight_L2 = 6.0\n"
