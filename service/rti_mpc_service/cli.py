@@ -261,6 +261,7 @@ def reference(
 def view(
     config: Config,
     bus: BusSettings,
+    words: Annotated[list[str] | None, typer.Argument(metavar="[RUN.mcap]", help="Recording to draw in place of the robot.")] = None,
     rerun_spawn: Annotated[bool, typer.Option("--rerun-spawn", help="Start a Rerun viewer on this machine.")] = False,
     rerun_connect: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Draw in a Rerun viewer at this address, also if it starts later.")
@@ -269,18 +270,25 @@ def view(
     rerun_memory_limit: Annotated[
         str, typer.Option(metavar="SIZE", help="Memory of a spawned viewer, beyond which it drops the oldest data.")
     ] = "25%",
+    web: Annotated[bool, typer.Option("--web", help="Serve Rerun's page for browsers from this machine, to this machine alone.")] = False,
+    rerun_web_port: Annotated[int, typer.Option(metavar="PORT", min=1, max=65535, help="Port of this page.")] = 9090,
 ) -> int:
-    """Draw the robot live in Rerun, or record it."""
-    from rti_mpc_service.view.view import main
+    """Draw the robot live in Rerun, or record it; or draw a recording."""
+    from rti_mpc_service.view.view import main, show
 
-    return main(
-        bus,
-        config.keys(),
+    drawn = partial(
+        main if not words else show,
         rerun_spawn=rerun_spawn,
         rerun_connect=rerun_connect,
         rerun_save=rerun_save,
         rerun_memory_limit=rerun_memory_limit,
+        web_port=rerun_web_port if web else None,
     )
+    if not words:
+        return drawn(bus, config.keys())
+    if len(words) > 1:
+        raise ConfigError(f"view draws one recording, got {' '.join(words)}")
+    return drawn(Path(words[0]))
 
 
 @partial(process, with_model=False)

@@ -4,16 +4,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Event, Notice, State
 from rti_mpc.errors import MessageError
-from rti_mpc.wire.bus import RING_MESSAGES, Bus, Received
+from rti_mpc.wire.bus import RING_MESSAGES, Received
 from rti_mpc.wire.info import Info
 from rti_mpc.wire.intake import Intake
-from rti_mpc.wire.keys import Key
+from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.streams import Stream, admitted, role_of
 from rti_mpc_service.view.playback import Actuation
 from rti_mpc_service.view.recording import Entry
@@ -23,6 +23,27 @@ MAX_WAITING_MESSAGES = 2048  # per stream: 2 s at 1 kHz
 STALE_S = 2.0
 
 Door = Intake[Any]
+
+
+class Ring(Protocol):
+    """Messages of a stream that wait."""
+
+    def drain(self) -> list[Received]:
+        """Return and remove all messages, oldest first."""
+
+
+class Heard(Protocol):
+    """As much of a `rti_mpc.wire.bus.Bus` as a listener needs; a recording has it, too."""
+
+    @property
+    def keys(self) -> Keys:
+        """Keys of the robot."""
+
+    def subscriber(self, key: Key[Any], *, capacity: int) -> Ring:
+        """Return the subscriber to a stream."""
+
+    def intake(self, cls: type[Any], stale_s: float, *, unfit: Callable[[Any], str]) -> Door:
+        """Return an intake for messages of a class."""
 
 
 class Listener:
@@ -36,7 +57,7 @@ class Listener:
         received: Number of accepted messages.
     """
 
-    def __init__(self, bus: Bus, capacity: int = MAX_WAITING_MESSAGES) -> None:
+    def __init__(self, bus: Heard, capacity: int = MAX_WAITING_MESSAGES) -> None:
         keys = bus.keys
         self._actuation = keys.actuation
         self.received = 0
@@ -69,9 +90,14 @@ class Listener:
         """Return a notice of the viewer as an event at `now_ns`."""
         return Entry(self.now_ns, Event(0, 0, self.now_ns, "viewer", notice.severity, notice.code, notice.text))
 
-    def drain(self) -> list[Entry]:
-        """Return the messages received since the last call, states before other streams because they advance the timeline."""
-        now_ns = time.monotonic_ns()
+    def drain(self, now_ns: int | None = None) -> list[Entry]:
+        """
+        Return the messages received since the last call, states before other streams because they advance the timeline.
+
+        Args:
+            now_ns: Local monotonic time; None: the present.
+        """
+        now_ns = time.monotonic_ns() if now_ns is None else now_ns
         entries = [*self._descriptions(), *self._messages(now_ns)]
         self.received += len(entries)
         return [*entries, *self._notices(now_ns)]

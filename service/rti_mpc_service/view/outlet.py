@@ -155,7 +155,7 @@ def file_outlet(path: Path, name: str) -> Outlet:
     Raises:
         ConfigError: The file cannot be written.
     """
-    stream = _stream(name)
+    stream = new_stream(name)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"")
@@ -186,14 +186,15 @@ def viewer_outlet(url: str, name: str) -> Outlet:
             socket.create_connection(where, PROBE_TIMEOUT_S).close()
         except OSError as error:
             raise Unavailable from error
-        stream = _stream(name, recording_id)
+        stream = new_stream(name, recording_id)
         stream.connect_grpc(url)
         return stream
 
     return Outlet(url, open_stream)
 
 
-def _stream(name: str, recording_id: uuid.UUID | None = None) -> rr.RecordingStream:
+def new_stream(name: str, recording_id: uuid.UUID | None = None) -> rr.RecordingStream:
+    """Return a stream that is not connected yet, named for viewers."""
     rr.unregister_shutdown()  # Rerun's exit function would wait without limit for a hung viewer; `Outlet.close` is bounded
     stream = rr.RecordingStream(RERUN_APPLICATION_ID, recording_id=recording_id)
     stream.send_recording_name(name)

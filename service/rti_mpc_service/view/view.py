@@ -5,15 +5,12 @@ from __future__ import annotations
 
 import logging
 import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from threading import Event
-from urllib.parse import urlsplit
 
 from rti_mpc.contract.message import Notice, Severity
-from rti_mpc.errors import ConfigError
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.interrupt import stop_on_signals
@@ -21,9 +18,9 @@ from rti_mpc.wire.keys import Keys
 from rti_mpc_service.announce import announce
 from rti_mpc_service.view.listener import Listener
 from rti_mpc_service.view.outlet import Outlet, file_outlet, viewer_outlet
+from rti_mpc_service.view.screen import RERUN_ADDRESS, end_page, page, reached, serve_page, spawn_viewer, viewer_url
 
 ROLE = "viewer"
-RERUN_ADDRESS = "127.0.0.1:9876"
 DRAIN_PERIOD_S = 0.05
 
 log = logging.getLogger(__name__)
@@ -37,6 +34,7 @@ def main(
     rerun_connect: str | None = None,
     rerun_save: Path | None = None,
     rerun_memory_limit: str = "25%",
+    web_port: int | None = None,
     stop: Event | None = None,
 ) -> int:
     """
@@ -49,6 +47,7 @@ def main(
         rerun_connect: Address of a viewer, which may start later: ``HOST:PORT``, or a URL of Rerun.
         rerun_save: File to record to, overwritten.
         rerun_memory_limit: Memory a spawned viewer may fill before it forgets the oldest.
+        web_port: Port at which to serve a page for browsers, on loopback; None: none is served.
         stop: Event that stops the process; None: SIGINT and SIGTERM do.
 
     Returns:
@@ -57,7 +56,7 @@ def main(
     Raises:
         ConfigError: An address or a file is not valid.
     """
-    rerun_spawn |= rerun_connect is None and rerun_save is None
+    rerun_spawn |= rerun_connect is None and rerun_save is None and web_port is None
     url = viewer_url(rerun_connect or RERUN_ADDRESS)
     stop = stop or stop_on_signals()
     with Bus.join(bus_settings, keys, stop=stop, say=log.warning) as bus:
@@ -65,7 +64,10 @@ def main(
         bus.expect("message", lambda: listener.received)
         outlets = [file_outlet(rerun_save, keys.robot)] if rerun_save is not None else []
         spawned = spawn_viewer(url, rerun_memory_limit) if rerun_spawn else None
-        if rerun_spawn or rerun_connect is not None:
+        server = None if web_port is None else serve_page(url, web_port, rerun_memory_limit)
+        if web_port is not None:
+            log.info("open %s", page(url, web_port))
+        if rerun_spawn or rerun_connect is not None or server is not None:
             outlets.append(viewer_outlet(url, keys.robot))
         bus.alive(ROLE)
         log.info("listening to %s", keys.below("*"))
@@ -74,6 +76,8 @@ def main(
         pump(listener, outlets, spawned, announcer, stop)
     log.info("%d messages, %d lost, %d refused", listener.received, listener.lost, listener.refused)
     complete = [outlet.close() for outlet in outlets]
+    if server is not None:
+        end_page(server)
     for notice in notices(outlets):
         log.error("%s", notice.text)
     return 0 if rerun_save is None or complete[0] else 1
@@ -102,35 +106,49 @@ def notices(outlets: Sequence[Outlet]) -> list[Notice]:
     return [outlet.notices.popleft() for outlet in outlets for _ in range(len(outlet.notices))]
 
 
-def viewer_url(address: str) -> str:
+def show(
+    path: Path,
+    *,
+    rerun_spawn: bool = False,
+    rerun_connect: str | None = None,
+    rerun_save: Path | None = None,
+    rerun_memory_limit: str = "25%",
+    web_port: int | None = None,
+    stop: Event | None = None,
+) -> int:
     """
-    Return Rerun's URL of an address, which is ``HOST:PORT`` or already such a URL.
+    Draw a recording whole, where `main` draws a robot live, and return the exit status; serve a page until stopped.
+
+    Args:
+        path: The recording, or the folder of its segments.
+        rerun_spawn: As in `main`.
+        rerun_connect: As in `main`.
+        rerun_save: As in `main`.
+        rerun_memory_limit: As in `main`.
+        web_port: As in `main`.
+        stop: As in `main`.
 
     Raises:
-        ConfigError: The address is neither.
+        ConfigError: It is no recording, an address or a file is not valid, or no viewer answers.
     """
-    url = address if "://" in address else f"rerun+http://{address}/proxy"
+    from rti_mpc_service.view.show import draw_in_viewer, draw_into_file, opened  # needs the extra `record`
+
+    recording, url = opened(path), viewer_url(rerun_connect or RERUN_ADDRESS)
+    if rerun_save is not None:
+        draw_into_file(recording, rerun_save)
+    if rerun_save is not None and not rerun_spawn and rerun_connect is None and web_port is None:
+        return 0
+    stop = stop or stop_on_signals()
+    server = None if web_port is None else serve_page(url, web_port, rerun_memory_limit)
+    if server is None and rerun_connect is None:
+        spawn_viewer(url, rerun_memory_limit)
     try:
-        parts = urlsplit(url)
-        valid = parts.scheme.startswith("rerun") and bool(parts.hostname) and bool(parts.port)
-    except ValueError:
-        valid = False
-    if not valid:
-        raise ConfigError(f"rerun-connect must be HOST:PORT or rerun+http://HOST:PORT/proxy, got {address!r}")
-    return url
-
-
-def spawn_viewer(url: str, memory_limit: str) -> subprocess.Popen[bytes]:
-    """
-    Start a viewer on loopback that outlives this process.
-
-    Rerun's own `spawn` listens on all interfaces.
-
-    Raises:
-        ConfigError: The URL is not one of this machine.
-    """
-    address = urlsplit(url)
-    if address.hostname not in ("127.0.0.1", "localhost"):
-        raise ConfigError(f"rerun-spawn must be on 127.0.0.1, got {url!r}")
-    options = ["--bind", "127.0.0.1", "--port", str(address.port), "--memory-limit", memory_limit, "--expect-data-soon"]
-    return subprocess.Popen([sys.executable, "-m", "rerun_cli", *options], start_new_session=True, stdin=subprocess.DEVNULL)
+        reached(url, stop)
+        draw_in_viewer(recording, path.stem, url)
+        if web_port is not None:
+            log.info("open %s", page(url, web_port))
+            stop.wait()
+    finally:
+        if server is not None:
+            end_page(server)
+    return 0

@@ -31,7 +31,7 @@ from rti_mpc.wire.keys import Keys
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.view.listener import Listener
 from rti_mpc_service.view.outlet import file_outlet
-from rti_mpc_service.view.view import spawn_viewer, viewer_url
+from rti_mpc_service.view.screen import spawn_viewer, viewer_url
 from tests.in_time import MS, PATIENT, in_time
 from tests.processes.system import until
 from tests.service.view.test_view_outlet import Viewer as Screen

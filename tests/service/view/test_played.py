@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings in the viewer: drawn like the live robot, into a file or on a page for browsers that this machine serves."""
+
+from __future__ import annotations
+
+import subprocess
+import urllib.request
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rerun")
+from rerun.chunk import RrdReader
+
+from rti_mpc.recording import Recording
+from rti_mpc_service.rig.endpoint import free_port
+from rti_mpc_service.view.played import played
+from rti_mpc_service.view.screen import page
+from tests.processes.system import ROOT, command_line, environment, rti_mpc, until
+from tests.recording.samples import write
+
+COUNT = 300
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recording") / "run.mcap"
+    write(path, COUNT)
+    return path
+
+
+def test_recording_is_played_whole_in_the_robot_s_time(run: Path) -> None:
+    steps = list(played(Recording(run), "wheels"))
+    kinds = Counter(type(entry.message).__name__ for entries in steps for entry in entries)
+    assert kinds == {"State": COUNT, "Command": COUNT, "Telemetry": COUNT, "Reference": 1, "Event": 1, "Info": 1}
+    times = [entry.time_ns for entries in steps for entry in entries if type(entry.message).__name__ == "State"]
+    assert times == [10_000_000 * k for k in range(1, COUNT + 1)]
+    assert len(steps) > 10, "not all at once: states advance the axis for what follows them"
+
+
+def test_recording_is_drawn_into_a_file(run: Path, tmp_path: Path) -> None:
+    done = rti_mpc("view", run, "--rerun-save", tmp_path / "run.rrd")
+    assert done.returncode == 0, done.stderr
+    rows: Counter[str] = Counter()
+    for chunk in RrdReader(tmp_path / "run.rrd").stream().to_chunks():
+        rows[chunk.entity_path] += chunk.num_rows
+    assert rows["/state/x"] == rows["/command/v"] == COUNT + 1, "and its look"
+    assert rows["/event/controller"] == 1
+
+
+def test_what_is_no_recording_is_refused_in_a_line(tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").write_text("nothing")
+    for words in ((tmp_path / "run.mcap",), (tmp_path / "none.mcap",), ("a.mcap", "b.mcap")):
+        done = rti_mpc("view", *words, "--rerun-save", tmp_path / "run.rrd")
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+
+
+@pytest.mark.slow
+def test_page_for_browsers_comes_from_this_machine_on_loopback_alone(run: Path, tmp_path: Path) -> None:
+    web, port = free_port(), free_port()
+    command = command_line("view", run, "--web", "--rerun-web-port", web, "--rerun-connect", f"127.0.0.1:{port}")
+    with (tmp_path / "log").open("wb") as log:
+        process = subprocess.Popen(command, cwd=ROOT, env=environment(tmp_path), stdout=log, stderr=subprocess.STDOUT)
+    try:
+        address = page(f"rerun+http://127.0.0.1:{port}/proxy", web)
+        until(lambda: address in (tmp_path / "log").read_text(), "the page is served", pause_s=0.05)
+        assert b"rerun" in urllib.request.urlopen(address, timeout=10).read().lower()
+        assert len(urllib.request.urlopen(f"http://127.0.0.1:{web}/re_viewer_bg.wasm", timeout=30).read()) > 1_000_000
+        listening = [line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines()[1:] if line.split()[3] == "0A"]
+        ours = [local for local in listening if int(local.partition(":")[2], 16) in (web, port)]
+        assert sorted(local.partition(":")[0] for local in ours) == ["0100007F", "0100007F"]
+    finally:
+        process.terminate()
+        assert process.wait(30) == 0
+    until(lambda: not _listens(web), "the server has ended with it")
+
+
+def _listens(port: int) -> bool:
+    return any(int(line.split()[1].partition(":")[2], 16) == port for line in Path("/proc/net/tcp").read_text().splitlines()[1:] if " 0A " in line)
