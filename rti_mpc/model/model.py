@@ -139,7 +139,7 @@ class Model:
 
     def _taken(self) -> dict[str, Any]:
         """Return fields as they are documented, by name, from what was given."""
-        named = (*EXPRESSIONS, *(name for name in OPTIONAL_EXPRESSIONS if getattr(self, name) is not None))
+        named = (*(name for name in OPTIONAL_EXPRESSIONS if getattr(self, name) is not None), *EXPRESSIONS)
         symbols, expressions = ({name: getattr(self, name) for name in names} for names in (SYMBOLS, named))
         columns = to_sx(symbols, expressions)
         vectors = {vector: signals(vector, getattr(self, vector)) for vector in ROLES_OF_VECTOR if vector != "outputs"}
