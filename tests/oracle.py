@@ -62,7 +62,7 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Arra
     model, N, N_u = ocp.model, ocp.N, ocp.N_u
     nx, nu = model.nx, model.nu
     p = ca.DM(model.p_nominal)
-    phi = ocp.phi()
+    phi, u_ref = ocp.phi(), ca.Function("u_ref", [model.p], [ocp.u_ref])(p)
     h = ca.Function("h", [model.x, model.p], [model.y_expr])
     x = ca.SX.sym("x", nx, N + 1)
     u = ca.SX.sym("u", nu, N_u)
@@ -94,6 +94,7 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Arra
         du = u[:, k] - last
         cost += ocp.lambda_[k] * ca.bilin(ca.DM(ocp.R), du, du)
         rows.append((ocp.lbdu, du, ocp.ubdu))
+        cost += ca.dot(ca.DM(ocp.R_u), (u[:, k] - u_ref) ** 2)
         last = u[:, k]
 
     lbg, g, ubg = zip(*rows, strict=True)

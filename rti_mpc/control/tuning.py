@@ -65,6 +65,8 @@ class Tuning:
         for name in COMPILED_BOUNDS:
             if not np.array_equal(np.isfinite(getattr(ocp, name)), np.isfinite(getattr(built, name))):
                 raise OcpError(f"{name} must be finite exactly where it was when compiled, got {getattr(ocp, name)}")
+        if ocp.R_u.any() and not built.R_u.any():
+            raise OcpError(f"R_u must stay zero, as it was when compiled, got {ocp.R_u}")
         if wrong := rest_fault(ocp):
             raise OcpError(wrong)
         self.wanted, self._wanted_version = ocp, version

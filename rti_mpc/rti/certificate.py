@@ -64,14 +64,18 @@ def certificate(ocp: Ocp) -> ca.Function:
 
     planned = u_plan - ca.horzcat(lin.u_prev, u_plan[:, :-1])
     forces = (lin.R @ planned) * ca.repmat(w["lambda_"].T, nu, 1)
-    push = forces + of_increments
+    push, at_guess, of_steps = forces + of_increments, forms.force, ca.MX(0)
+    if ocp.R_u.any():  # the force has the gradient of the cost of inputs, summed up
+        at_guess = (lin.R @ forms.increments) * ca.repmat(w["lambda_"].T, nu, 1)
+        push += forms.force - at_guess
+        of_steps = ca.dot(forms.force - at_guess, planned - forms.increments) + ca.dot(ca.repmat(w["R_u"], 1, N_u) * du, du) / 2
     push = push - ca.horzcat(push[:, 1:], ca.MX.zeros(nu)) + ca.repmat(forms.damping, 1, N_u) * du
     shared = [ca.repmat(e, 1, N_u) for e in (w["lbu"], w["ubu"], w["lbdu"], w["ubdu"], lin.scale_u)]
     inputs = of_inputs(ocp).map(N_u)(ca.horzcat(*reduced) + push, u_plan, planned, of_increments, *shared)
 
     primal = ca.fmax(ca.fmax(ca.mmax(sums[0, :]), ca.mmax(inputs[0, :])), ca.mmax(ca.fabs(x_plan[:, 0] - x0) / lin.scale_x))
     gap = ca.sum2(sums[1, :]) + ca.sum2(inputs[1, :])
-    total = (forms.cost - ca.dot(forms.increments, forms.force) + ca.dot(planned, forces)) / 2 + ca.sum2(sums[2, :])
+    total = (forms.cost - ca.dot(forms.increments, at_guess) + ca.dot(planned, forces)) / 2 + of_steps + ca.sum2(sums[2, :])
     guess = {"x": lin.x, "u": lin.u, "u_prev": lin.u_prev, "x0": x0, "stages": stages}
     plan = {"x_plan": x_plan, "u_plan": u_plan, "multipliers": multipliers}
     return function("certificate", {**guess, **plan, **lin.weights}, {"r": inputs[2:, :], "primal": primal, "gap": gap, "cost": total})

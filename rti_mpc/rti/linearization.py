@@ -99,8 +99,9 @@ class Linearization:
         G_u: Sparsity of the sensitivities to the input at one node, shape ``(ng, nu)``.
         lg: Lower bounds on g, shape ``(ng, 1)``; `ug`, upper bounds; `zg` and `Zg`, weights of the slacks.
         increments: ``u_k - u_{k-1}``, shape ``(nu, N_u)``.
-        force: ``lambda_k R (u_k - u_{k-1})``, shape ``(nu, N_u)``.
-        damping: Weight of half the square of a step in each input, shape ``(nu, 1)``; zero for a linear model.
+        force: ``lambda_k R (u_k - u_{k-1})``, shape ``(nu, N_u)``, and the gradient of half the cost of inputs, summed from the last stage on: force
+            acts on increments.
+        damping: Weight of half the square of a step in each input, shape ``(nu, 1)``: that of inputs, and a damping, zero for a linear model.
         R: Increment weight, sparse, shape ``(nu, nu)``.
         cost: The cost (4) at the guess.
         checksum: A number that is finite if and only if all of the above is.
@@ -147,7 +148,14 @@ class Linearization:
         self.R = self.w["R"] * pattern(ocp.R)
         self.force = (self.R @ self.increments) * ca.repmat(self.w["lambda_"].T, nu, 1)
         self.cost = ca.sum2(nodes[nx, :]) + ca.dot(self.increments, self.force)
+        if ocp.R_u.any():
+            off = self.u - input_reference(ocp)(self.p[:, :N_u])
+            gradient = ca.repmat(w["R_u"], 1, N_u) * off
+            self.force += running_sum(gradient)
+            self.cost += ca.dot(off, gradient)
         self.damping = damping(ocp) * self.cost / self.scale_u**2
+        if ocp.R_u.any():
+            self.damping += w["R_u"]
         self.checksum = ca.sum1(ca.vec(stages)) + ca.sum1(ca.vec(nodes)) + self.cost + ca.sum1(ca.vec(self.b))
         self.checksum += ca.sum1(ca.vec(bounded))
         self.forms = Forms(
@@ -207,6 +215,17 @@ class Linearization:
         last = k == self.u.shape[1] - 1
         following = 0 if last else self.w["lambda_"][k + 1]
         return self.R * (self.w["lambda_"][k] + following) + ca.diag(self.damping), None if last else -self.R * following
+
+
+def input_reference(ocp: Ocp) -> ca.Function:
+    """Build ``p -> u_ref`` for the stages of the control horizon, columns are stages."""
+    return ca.Function("u_ref", [ocp.model.p], [ca.densify(ocp.u_ref)]).map(ocp.N_u)
+
+
+def running_sum(columns: ca.MX) -> ca.MX:
+    """Return the sum of each column and of all after it."""
+    backwards = ca.cumsum(columns[:, ::-1], 1)
+    return ca.MX(backwards[:, ::-1])
 
 
 def all_inputs(u: ca.MX, N: int) -> ca.MX:

@@ -10,6 +10,7 @@ inputs held after the control horizon,
 
     \min \; & \sum_{i=1}^{N} \delta_i \|y_i - y_{ref,i}\|_Q^2
             + \sum_{i=1}^{N_u} \lambda_i \|u_{i-1} - u_{i-2}\|_R^2
+            + \sum_{i=1}^{N_u} \|u_{i-1} - u_{ref,i-1}\|_{R_u}^2
             + \|y_N - y_{ref,N}\|_{Q_e}^2
             + \sum_{i=1}^{N} \left( z^T s_i + \tfrac12 s_i^T Z s_i \right) \\
     \text{s.t.} \; & x_{k+1} = \phi(x_k, u_k, p_k), \quad x_0 \text{ given}, \\
@@ -74,6 +75,8 @@ class Ocp:
         lbx_e: Softened lower bound on states at node N alone, besides `lbx`, shape ``(nx,)``: a terminal set. Its slacks have the weights `z`, `Z`.
         ubx_e: Softened upper bound on states at node N alone, shape ``(nx,)``.
         Q_e: Terminal weight, added to ``delta_N Q``, shape ``(ny, ny)``, or given by its diagonal; none by default.
+        R_u: Weights of inputs themselves, beside those of their increments, shape ``(nu,)``; none by default; cost / unit of the inputs squared.
+        u_ref: Inputs from which `R_u` counts, an expression in the model's p, shape ``(nu, 1)``, or given by numbers; those at rest by default.
         h_expr: General constraints h(x, u, p) in the model's symbols, shape ``(nh, 1)``; the model's by default.
         lh: Softened lower bound on h, shape ``(nh,)``.
         uh: Softened upper bound on h, shape ``(nh,)``.
@@ -109,6 +112,8 @@ class Ocp:
     Zh: Array
     lbx_e: Array
     ubx_e: Array
+    R_u: Array
+    u_ref: ca.SX
 
     def __init__(
         self,
@@ -140,6 +145,8 @@ class Ocp:
         Zh: ArrayLike = DEFAULT_SLACK_WEIGHT,
         lbx_e: ArrayLike = -np.inf,
         ubx_e: ArrayLike = np.inf,
+        R_u: ArrayLike = 0.0,
+        u_ref: ca.SX | ArrayLike | None = None,
     ) -> None:
         given.instance("model", model, Model)
         N = given.whole("N", N, 0)
@@ -157,12 +164,15 @@ class Ocp:
         free = [s for s in ca.symvar(h_expr) if not ca.depends_on(ca.vertcat(model.x, model.u, model.p), s)]
         if free or (nh and h_expr.shape != (nh, 1)):
             raise OcpError(f"h_expr must be a column of the model's x, u, p, got shape {h_expr.shape} and {free or 'nothing'} besides")
-        fields: dict[str, Any] = {"model": model, "N": N, "N_u": N_u, "dt": seconds, "method": method, "h_expr": h_expr}
+        inputs = column("u_ref", model.u_rest if u_ref is None else u_ref)
+        if isinstance(inputs, ca.MX) or inputs.shape != (model.nu, 1) or [s for s in ca.symvar(inputs) if not ca.depends_on(model.p, s)]:
+            raise OcpError(f"u_ref must be {model.nu} numbers, or SX of the model's p, in a column, got {given.quoted(inputs)}")
+        fields: dict[str, Any] = {"model": model, "N": N, "N_u": N_u, "dt": seconds, "method": method, "h_expr": h_expr, "u_ref": inputs}
         for name, value in fields.items():
             object.__setattr__(self, name, value)
         values = {"Q": Q, "R": R, "delta": delta, "lambda_": lambda_, "lbu": lbu, "ubu": ubu, "lbdu": lbdu, "ubdu": ubdu, "lbx": lbx, "ubx": ubx}
         values |= {"z": z, "Z": Z, "Q_e": np.zeros(model.ny) if Q_e is None else Q_e, "lh": lh, "uh": uh, "zh": zh, "Zh": Zh}
-        values |= {"lbx_e": lbx_e, "ubx_e": ubx_e}
+        values |= {"lbx_e": lbx_e, "ubx_e": ubx_e, "R_u": R_u}
         self._take(values)
 
     def retuned(self, **values: ArrayLike) -> Ocp:
@@ -324,4 +334,5 @@ WEIGHTS_AND_BOUNDS: dict[str, tuple[Callable[[str, ArrayLike, int], Array], str]
     "Zh": (weights, "nh"),
     "lbx_e": (bound, "nx"),
     "ubx_e": (bound, "nx"),
+    "R_u": (weights, "nu"),
 }

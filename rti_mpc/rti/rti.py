@@ -43,7 +43,7 @@ MAX_SEQUENTIAL_N_U = 10  # control horizon up to which the sequential formulatio
 SOLVED, INACCURATE = QpStatus.SOLVED, QpStatus.INACCURATE  # read faster than a member of the enumeration
 MAX_ITERATIONS = 3  # per sample
 STEP_TOLERANCE = 0.015  # a larger step is followed by another iteration: closed-loop costs within 0.5 % of converged NMPC, see docs/engine.md
-COST_WEIGHTS = ("delta", "lambda_", "z", "Z", "Q_e", "zh", "Zh")  # weights that are multiplied by the scale of the cost
+COST_WEIGHTS = ("delta", "lambda_", "z", "Z", "Q_e", "zh", "Zh", "R_u")  # weights that are multiplied by the scale of the cost
 TOUCHING_DISTANCE = 2e-3  # relative to the scale of a softened bound: a plan further away than this has left the bound
 
 

@@ -43,7 +43,7 @@ def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
     node, H_i = gauss_newton(ocp)
     W = np.hstack([ocp.delta[k] * ocp.Q + (ocp.Q_e if k == N - 1 else 0.0) for k in range(N)])
     H = dense(H_i, np.array(node.map(N)(x[1:].T, p[1:].T, y_ref.T, W))[model.nx + 1 :])
-    curvature = np.einsum("kai,kab,kbi->i", response, H, response) + ocp.lambda_.sum() * np.diag(ocp.R)
+    curvature = np.einsum("kai,kab,kbi->i", response, H, response) + ocp.lambda_.sum() * np.diag(ocp.R) + ocp.N_u * ocp.R_u
 
     reach_u = first(
         half(ocp.lbu, ocp.ubu),

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -65,10 +66,12 @@ class Simulation:
 
     @property
     def cost(self) -> float:
-        """Closed-loop cost: that of the OCP, each sample's output after it and its increment weighted as in the first stage."""
+        """Closed-loop cost: that of the OCP, each sample's output after it, its increment and its input weighted as in the first stage."""
         e, du = self.error[1:], np.diff(self.u, axis=0, prepend=self.u0[None])
         ocp = self.ocp
-        return float(ocp.delta[0] * np.einsum("ki,ij,kj->", e, ocp.Q, e) + ocp.lambda_[0] * np.einsum("ki,ij,kj->", du, ocp.R, du))
+        off = self.u - np.array(ca.Function("u_ref", [ocp.model.p], [ocp.u_ref])(ocp.model.p_nominal)).ravel()
+        of_inputs = ocp.lambda_[0] * np.einsum("ki,ij,kj->", du, ocp.R, du) + np.einsum("ki,i,ki->", off, ocp.R_u, off)
+        return float(ocp.delta[0] * np.einsum("ki,ij,kj->", e, ocp.Q, e) + of_inputs)
 
     def summary(self) -> dict[str, float]:
         """Return closed-loop cost, largest error of each output in the second half, largest excess of a bound on states, and unusable samples."""

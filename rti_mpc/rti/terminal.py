@@ -58,7 +58,8 @@ def lqr_weight(ocp: Ocp, x: Array, u: Array) -> Array:
     G = np.vstack([B, np.eye(nu)])
     C = np.hstack([C, np.zeros((len(C), nu))])
     try:
-        S = solve_discrete_are(F, G, ocp.delta[-1] * C.T @ ocp.Q @ C, ocp.lambda_[-1] * ocp.R)
+        of_inputs = np.diag([*np.zeros(nx), *ocp.R_u])
+        S = solve_discrete_are(F, G, ocp.delta[-1] * C.T @ ocp.Q @ C + of_inputs, ocp.lambda_[-1] * ocp.R)
     except (LinAlgError, ValueError) as error:
         raise OcpError(f"model {model.name} must be stabilizable where a terminal weight is wanted, at x = {x}, u = {u}: {error}") from error
     # The least of xi' S xi over all xi of one output y is y' (C S^-1 C')^-1 y.

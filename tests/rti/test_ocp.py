@@ -121,3 +121,10 @@ def test_problem_of_a_model_in_discrete_time_has_its_period_and_no_integrator() 
     with pytest.raises(OcpError, match="model d is in discrete time: integrator, stages and steps must be left out, got rk4"):
         Ocp(model, N=5, dt=0.1, Q=1, R=1, method="rk4")
     assert float(Ocp(model, N=5, dt=0.1, Q=1, R=1).phi()(2.0, 3.0, [])) == 4.0
+
+
+def test_reference_of_inputs_is_of_the_parameters_alone() -> None:
+    with pytest.raises(OcpError, match="u_ref must be 1 numbers, or SX of the model's p, in a column"):
+        double_integrator(u_ref=double_integrator().model.x[0])
+    with pytest.raises(OcpError, match="R_u must be finite and not negative"):
+        double_integrator(R_u=-1.0)

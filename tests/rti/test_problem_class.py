@@ -56,6 +56,9 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "explicit steps": lambda: lagging_car(sim_method_num_steps=8),
     "discrete time": sampled_car,
     "discrete time, held inputs": lambda: sampled_car(N_u=3),
+    "weights of inputs": lambda: sampled_car(R_u=[0.8, 0.3], u_ref=[0.1, -0.2]),
+    "weights of inputs, held inputs": lambda: sampled_car(R_u=[0.8, 0.0], N_u=3),
+    "weights of inputs alone": lambda: lagging_car(method="irk", R_u=[0.05, 0.2], R=[0.0, 0.0]),
     "fixed input": lambda: sampled_car(lbu=[-0.5, 0.3], ubu=[0.5, 0.3], lbdu=-np.inf, ubdu=np.inf),
     "terminal set": lambda: sampled_car(lbx_e=[-np.inf] * 3 + [-0.05], ubx_e=[np.inf] * 3 + [0.02]),
     "terminal set, from above alone, held inputs": lambda: sampled_car(ubx_e=[np.inf] * 3 + [0.05], N_u=3, z=[1.0] * 4, Z=[0.0] * 4),
@@ -138,3 +141,16 @@ def test_bounds_at_the_end_alone_do_not_act_before_it() -> None:
     assert abs(rti.x[-1, 1]) < 1.1e-3
     assert rti.x[:-1, 1].max() > 0.5
     assert rti.violation < 1e-6
+
+
+def test_reference_of_inputs_moves_with_the_parameters_of_the_stages() -> None:
+    """A mass of one input, weighed alone: each stage's input is that stage's parameter."""
+    x, u, p = ca.SX.sym("x"), ca.SX.sym("u"), ca.SX.sym("p")
+    model = Model("mass", x, u, u, x, "v", "a", "v", p=p, parameters="wanted", p_nominal=0.0)
+    rti = Rti(Ocp(model, N=5, dt=0.1, Q=0, R=0, R_u=2.0, u_ref=p), compile=False)
+    rti.reset(np.zeros(1), np.zeros(1))
+    wanted = np.array([0.3, -0.2, 0.5, 0.1, 0.4, 9.0])
+    rti.prepare(np.zeros((5, 1)), wanted[:, None])
+    assert rti.feedback(np.zeros(1)) is QpStatus.SOLVED
+    np.testing.assert_allclose(rti.u[:, 0], wanted[:5], rtol=0, atol=1e-9)
+    assert rti.cost == pytest.approx(0.0, abs=1e-12)

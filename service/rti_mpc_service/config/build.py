@@ -70,6 +70,7 @@ def build_ocp(config: Config) -> Ocp:
         N_u=config.N_u,
         dt=config.ocp.dt_s,
         method="euler" if config.ocp.integrator == "euler" else None,
+        u_ref=[config.ocp.weights.u_ref.get(input.name, rest) for input, rest in zip(model.inputs, model.u_rest, strict=True)],
         Q_e=None if terminal.Q is None else [terminal.Q[output.name] for output in model.outputs],
         h_expr=model.h_expr[bounded, 0],
         lh=lh,
@@ -98,6 +99,7 @@ def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
     return {
         "Q": [weights.Q[output.name] for output in model.outputs],
         "R": [weights.R[input.name] for input in model.inputs],
+        "R_u": [weights.R_u.get(input.name, 0.0) for input in model.inputs],
         "delta": as_sequence(weights.delta, config.ocp.N),
         "lambda_": as_sequence(weights.lambda_, config.N_u),
         "lbu": lbu,

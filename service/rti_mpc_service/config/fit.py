@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rti_mpc.rti.ocp import Ocp
     from rti_mpc.rti.way_to_rest import StopLaw
 
+COMPLETE_TABLES = ("ocp.weights.Q", "ocp.weights.R", "ocp.terminal.Q")  # that must have every name
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -135,6 +136,8 @@ def check_names(config: Config, model: Model) -> None:
         ("model.parameters", config.model.parameters, "parameter", model.parameters),
         ("ocp.weights.Q", ocp.weights.Q, "output", model.outputs),
         ("ocp.weights.R", ocp.weights.R, "input", model.inputs),
+        ("ocp.weights.R_u", ocp.weights.R_u, "input", model.inputs),
+        ("ocp.weights.u_ref", ocp.weights.u_ref, "input", model.inputs),
         ("ocp.bounds.inputs", ocp.bounds.inputs, "input", model.inputs),
         ("ocp.bounds.increments", ocp.bounds.increments, "input", model.inputs),
         ("ocp.bounds.states", ocp.bounds.states, "state", model.states),
@@ -152,7 +155,7 @@ def check_names(config: Config, model: Model) -> None:
         ("sim.parameters", sim.parameters, "parameter", model.parameters),
     )
     for key, table, kind, signals in tables:
-        if wrong := unknown_name(key, table, kind, signals, complete=key.startswith("ocp.weights") or key == "ocp.terminal.Q"):
+        if wrong := unknown_name(key, table, kind, signals, complete=key in COMPLETE_TABLES):
             raise ConfigError(wrong)
 
 

@@ -96,6 +96,10 @@ class WeightSection(Section):
 
     Q: dict[str, Weight] = Field(description="weight of each output, by name, in cost / unit of the output squared")
     R: dict[str, Weight] = Field(description="weight of the increment of each input, by name, in cost / unit of the input squared")
+    R_u: dict[str, Weight] = Field(
+        default={}, description="weight of inputs themselves, by name, in cost / unit of the input squared, beside that of their increments"
+    )
+    u_ref: dict[str, float] = Field(default={}, description="inputs from which R_u counts, by name, in the input's unit; that at rest if left out")
     delta: Weights = Field(default=(1.0,), description="factor of Q, without unit: one number, or a list of N, one per stage")
     lambda_: Weights = Field(default=(1.0,), alias="lambda", description="factor of R, without unit: one number, or a list of N_u, one per stage")
 

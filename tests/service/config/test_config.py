@@ -269,6 +269,14 @@ def test_equal_bounds_fix_an_input_and_a_terminal_set_bounds_the_end_alone(tmp_p
     assert (ocp.lbx_e.tolist(), ocp.ubx_e.tolist()) == ([-math.inf] * 4 + [-0.1], [math.inf] * 5)
 
 
+def test_weights_of_inputs_count_from_their_references(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL.replace("delta =", "R_u = { u_c = 0.5 }, u_ref = { u_c = 0.2 }, delta ="))
+    ocp = build_ocp(load(path))
+    assert ocp.R_u.tolist() == [0.5, 0.0]
+    np.testing.assert_array_equal(np.array(ca.DM(ocp.u_ref)).ravel(), [0.2, 0.0])
+
+
 def test_softened_bounds_constraints_and_obstacles_become_those_of_the_ocp(tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     bounds = "[ocp.bounds]\nstates = { u = [-1, 1] }\nconstraints = { power = [-inf, 0.1] }\nsoft_weight = 5.0\nsoft_weight_L2 = 6.0\n"
