@@ -270,6 +270,9 @@ def view(
     rerun_memory_limit: Annotated[
         str, typer.Option(metavar="SIZE", help="Memory of a spawned viewer, beyond which it drops the oldest data.")
     ] = "25%",
+    robot: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Robot to draw; repeat it for several in one view.", show_default="the robot of CONFIG")
+    ] = None,
     web: Annotated[bool, typer.Option("--web", help="Serve Rerun's page for browsers from this machine, to this machine alone.")] = False,
     rerun_web_port: Annotated[int, typer.Option(metavar="PORT", min=1, max=65535, help="Port of this page.")] = 9090,
 ) -> int:
@@ -285,9 +288,11 @@ def view(
         web_port=rerun_web_port if web else None,
     )
     if not words:
-        return drawn(bus, config.keys())
+        return drawn(bus, config.keys(), robots=robot or ())
     if len(words) > 1:
         raise ConfigError(f"view draws one recording, got {' '.join(words)}")
+    if robot:
+        raise ConfigError("--robot is for live robots: all those of a recording are drawn")
     return drawn(Path(words[0]))
 
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -81,29 +81,39 @@ class Frame:
         return (max(self.half[1], self.half[0] / 1.3) + MARGIN_M) / HALF_FIELD_TANGENT
 
 
+def below(root: str, path: str) -> str:
+    """Return an entity of the robot that is drawn below a root; empty for the only one."""
+    return f"{rr.escape_entity_path_part(root)}/{path}" if root else path
+
+
 def blueprint(info: Info, frame: Frame | None = None) -> rrb.Blueprint:
     """
-    Return the layout of all views.
+    Return the layout of all views of a robot.
 
     Args:
         info: Description of the robot: signals, which state a command drives, whether there is a position.
         frame: Visible part of the plane.
     """
-    series: list[rrb.View | rrb.Container] = [
-        *(_commands(info, i) for i in range(len(info.inputs))),
-        _errors(info),
-        _times(info),
-    ]
-    states = _series("States", ["state/**"])
-    estimated = [_series("Disturbances", ["disturbance/**"])] if info.disturbances else []
-    computed = [_series("Outputs", [f"output/{info.outputs[i].name}" for i in info.computed])] if info.computed else []
-    tabs: list[rrb.View | rrb.Container] = [*computed, states, *estimated, _troubles()]
-    left = rrb.Tabs(_world(frame or Frame()), *tabs) if info.planar else rrb.Vertical(*tabs)
-    lanes = rrb.StateTimelineView(origin="/lane", name="Modes, QP status and who leads", time_view=_time_axis())
+    tabs = _tabs(info, "")
+    left = rrb.Tabs(_world(frame or Frame(), [""]), *tabs) if info.planar else rrb.Vertical(*tabs)
+    return _laid_out(left, _series_of(info, ""), [""])
+
+
+def common_blueprint(robots: Mapping[str, tuple[Info, Frame | None]]) -> rrb.Blueprint:
+    """Return the layout of several robots, by their roots: one plane, and a tab for each robot."""
+    planar = {root: frame for root, (info, frame) in robots.items() if info.planar}
+    frames = [frame for frame in planar.values() if frame is not None]
+    corners = [np.add(frame.center, np.multiply(sign, frame.half)) for frame in frames for sign in (-1, 1)]
+    world = [_world(Frame.around(np.array(corners)) if corners else Frame(), [*planar])] if planar else []
+    left = rrb.Tabs(*world, *(rrb.Tabs(*_tabs(info, root), name=root) for root, (info, _) in robots.items()))
+    return _laid_out(left, rrb.Tabs(*(_series_of(info, root) for root, (info, _) in robots.items())), [*robots])
+
+
+def _laid_out(left: rrb.Container, right: rrb.Container, roots: Sequence[str]) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Vertical(
-            rrb.Horizontal(left, rrb.Vertical(*series, row_shares=[4] * len(info.inputs) + [3, 3]), column_shares=[1, 1]),
-            rrb.Horizontal(lanes, _events(), column_shares=[1, 2]),
+            rrb.Horizontal(left, right, column_shares=[1, 1]),
+            rrb.Horizontal(_lanes(roots), _events(roots), column_shares=[1, 2]),
             row_shares=[8, 3],
         ),
         rrb.BlueprintPanel(state="collapsed"),
@@ -114,18 +124,32 @@ def blueprint(info: Info, frame: Frame | None = None) -> rrb.Blueprint:
     )
 
 
-def _world(frame: Frame) -> rrb.Spatial3DView:
+def _series_of(info: Info, root: str) -> rrb.Vertical:
+    """Return the views of commands, errors and times of a robot."""
+    series: list[rrb.View | rrb.Container] = [*(_commands(info, i, root) for i in range(len(info.inputs))), _errors(info, root), _times(info, root)]
+    return rrb.Vertical(*series, row_shares=[4] * len(info.inputs) + [3, 3], name=root or None)
+
+
+def _tabs(info: Info, root: str) -> list[rrb.View | rrb.Container]:
+    """Return what is beside the plane, for a robot."""
+    estimated = [_series("Disturbances", ["disturbance/**"], root)] if info.disturbances else []
+    computed = [_series("Outputs", [f"output/{info.outputs[i].name}" for i in info.computed], root)] if info.computed else []
+    return [*computed, _series("States", ["state/**"], root), *estimated, _troubles(root)]
+
+
+def _world(frame: Frame, roots: Sequence[str]) -> rrb.Spatial3DView:
     """Return the view of the plane from above, y up; Rerun's 2D view draws y down."""
     x, y = frame.center
     start = rrb.TimeRangeBoundary.cursor_relative(seconds=-TRAIL_S)
     trail = rrb.VisibleTimeRanges([rrb.VisibleTimeRange(TIMELINE, start=start, end=rrb.TimeRangeBoundary.cursor_relative())])
     return rrb.Spatial3DView(
-        origin="/world",
+        origin="/world" if list(roots) == [""] else "/",
+        contents=[f"+ /{below(root, 'world')}/**" for root in roots],
         name=f"From above, y up, grid {GRID_M:g} m",
         background=(16, 18, 22),
         line_grid=rrb.LineGrid3D(visible=True, spacing=GRID_M, stroke_width=0.5, color=(255, 255, 255, 28)),
         eye_controls=rrb.EyeControls3D(position=(x, y - 0.01, frame.eye_height), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)),
-        overrides={"world/trail": [trail], "world/output": [trail]},
+        overrides={below(root, path): [trail] for root in roots for path in ("world/trail", "world/output")},
     )
 
 
@@ -135,58 +159,65 @@ def _time_axis() -> rrb.TimeAxis:
 
 
 def _series(
-    name: str, contents: list[str], axis_y: rrb.ScalarAxis | None = None, overrides: Mapping[Any, rr.SeriesLines] | None = None
+    name: str, contents: list[str], root: str, axis_y: rrb.ScalarAxis | None = None, overrides: Mapping[str, rr.SeriesLines] | None = None
 ) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin="/",
-        contents=[f"+ /{path}" for path in contents],
+        contents=[f"+ /{below(root, path)}" for path in contents],
         name=name,
         axis_x=_time_axis(),
         axis_y=axis_y,
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightBottom),
-        overrides=overrides,
+        overrides=None if overrides is None else {below(root, path): lines for path, lines in overrides.items()},
     )
 
 
-def _commands(info: Info, i: int) -> rrb.TimeSeriesView:
+def _commands(info: Info, i: int, root: str) -> rrb.TimeSeriesView:
     """Return the view of a command with its limits, the command that a guard let through, and the measured state that it drives."""
     name, k = info.inputs[i].name, info.measured(i)
     measured = {} if k is None else {f"state/{info.states[k].name}": _line("measured", "measured")}
-    return _series(f"Command {info.inputs[i]}", [f"actuation/{name}", f"command/{name}/**", *measured], overrides=measured)
+    return _series(f"Command {info.inputs[i]}", [f"actuation/{name}", f"command/{name}/**", *measured], root, overrides=measured)
 
 
-def _errors(info: Info) -> rrb.TimeSeriesView:
+def _errors(info: Info, root: str) -> rrb.TimeSeriesView:
     """Return the view of the errors: of the distance in the plane, where outputs are nothing but a pose."""
     tracked, pair = [i for i, _ in info.tracked], plane(info.outputs)
     if pair is not None and in_plane(info.outputs) and (pair[0] in tracked) == (pair[1] in tracked):
-        return _series("Tracking error [mm]", ["error/position"])
-    return _series("Tracking error", [f"error/{label.name}" for label in info.outputs])
+        return _series("Tracking error [mm]", ["error/position"], root)
+    return _series("Tracking error", [f"error/{label.name}" for label in info.outputs], root)
 
 
-def _times(info: Info) -> rrb.Container:
+def _times(info: Info, root: str) -> rrb.Container:
     """Return the views of the phase times and of the rest of the period."""
     period_ms = 1e3 * info.dt_s
     axis = rrb.ScalarAxis(range=(-0.1 * period_ms, 1.2 * period_ms)) if period_ms > 0 else None
     return rrb.Horizontal(
-        _series("Phase times [us]", [f"telemetry/{name}_us" for name in PHASES]),
-        _series(f"Left of the {period_ms:g} ms period [ms]" if axis else "Left of the period [ms]", ["slack/**"], axis),
+        _series("Phase times [us]", [f"telemetry/{name}_us" for name in PHASES], root),
+        _series(f"Left of the {period_ms:g} ms period [ms]" if axis else "Left of the period [ms]", ["slack/**"], root, axis),
     )
 
 
-def _troubles() -> rrb.Container:
+def _troubles(root: str) -> rrb.Container:
     """Return the views of the fallbacks, of the delay from a state to its command, and of the second opinions."""
     return rrb.Vertical(
-        _series("Samples since start, softened or without a plan of their own", [f"telemetry/{rung}" for rung in RUNG_COLORS]),
-        _series("From a state to the act of its command [s]", ["telemetry/delay_s", "telemetry/state_age_s"]),
-        _series("OSQP's plan from the commanded one [half an input's range]", ["telemetry/second_difference"]),
+        _series("Samples since start, softened or without a plan of their own", [f"telemetry/{rung}" for rung in RUNG_COLORS], root),
+        _series("From a state to the act of its command [s]", ["telemetry/delay_s", "telemetry/state_age_s"], root),
+        _series("OSQP's plan from the commanded one [half an input's range]", ["telemetry/second_difference"], root),
         name="Fallbacks, delay, second opinion",
     )
 
 
-def _events() -> rrb.TextLogView:
-    kinds = rrb.encodings.TextLogColumnKind
-    columns = [rrb.encodings.TextLogColumn(kind, visible=kind is not kinds.EntityPath) for kind in kinds]
-    return rrb.TextLogView(origin="/event", name="Events", columns=rrb.TextLogColumns(text_log_columns=columns))
+def _lanes(roots: Sequence[str]) -> rrb.StateTimelineView:
+    alone = list(roots) == [""]
+    contents = [f"+ /{below(root, 'lane')}/**" for root in roots]
+    return rrb.StateTimelineView(origin="/lane" if alone else "/", contents=contents, name="Modes, QP status and who leads", time_view=_time_axis())
+
+
+def _events(roots: Sequence[str]) -> rrb.TextLogView:
+    kinds, alone = rrb.encodings.TextLogColumnKind, list(roots) == [""]
+    columns = [rrb.encodings.TextLogColumn(kind, visible=kind is not kinds.EntityPath or not alone) for kind in kinds]
+    contents = [f"+ /{below(root, 'event')}/**" for root in roots]
+    return rrb.TextLogView(origin="/event" if alone else "/", contents=contents, name="Events", columns=rrb.TextLogColumns(text_log_columns=columns))
 
 
 class Strip(NamedTuple):
@@ -210,9 +241,9 @@ UNIT_CIRCLE: Array = np.column_stack([np.cos(angles := np.linspace(0, 2 * np.pi,
 ROBOT_Z_M = 0.008  # [m], between trail and horizon
 
 
-def looks(info: Info) -> dict[str, rr.AsComponents]:
-    """Return the constant components of a recording, by entity."""
-    return _series_looks(info) | _lane_looks() | (_world_looks(info) if info.planar else {})
+def looks(info: Info, name: str = "") -> dict[str, rr.AsComponents]:
+    """Return the constant components of a recording, by entity; a robot is called by its name where there are several."""
+    return _series_looks(info) | _lane_looks() | (_world_looks(info, name) if info.planar else {})
 
 
 def legend(frame: Frame) -> rr.Points3D:
@@ -260,7 +291,7 @@ def _lane_looks() -> dict[str, rr.AsComponents]:
     return looks
 
 
-def _world_looks(info: Info) -> dict[str, rr.AsComponents]:
+def _world_looks(info: Info, name: str) -> dict[str, rr.AsComponents]:
     looks: dict[str, rr.AsComponents] = {"world": rr.ViewCoordinates.RIGHT_HAND_Z_UP}
     for path, strip in STRIPS.items():
         looks[path] = rr.LineStrips3D.from_fields(colors=COLORS[strip.color], radii=rr.Radius.ui_points(strip.width / 2))
@@ -274,7 +305,9 @@ def _world_looks(info: Info) -> dict[str, rr.AsComponents]:
             [lifted(np.vstack([UNIT_CIRCLE, UNIT_CIRCLE[:1]]), OBSTACLE_Z_M)], colors=COLORS["limit"], radii=rr.Radius.ui_points(0.75)
         )
     if info.position is not None:
-        looks["world/robot/point"] = rr.Points3D([[0.0, 0.0, 0.02]], colors=COLORS["measured"], radii=rr.Radius.ui_points(3.0))
+        looks["world/robot/point"] = rr.Points3D(
+            [[0.0, 0.0, 0.02]], labels=[name] if name else None, show_labels=True, colors=COLORS["measured"], radii=rr.Radius.ui_points(3.0)
+        )
     return looks
 
 

@@ -16,7 +16,7 @@ from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.streams import Stream, admitted, role_of
 from rti_mpc_service.view.playback import Actuation
-from rti_mpc_service.view.recording import Entry
+from rti_mpc_service.view.recording import Entry, Message
 from rti_mpc_service.view.timeline import Timeline
 
 MAX_WAITING_MESSAGES = 2048  # per stream: 2 s at 1 kHz
@@ -32,7 +32,7 @@ class Ring(Protocol):
         """Return and remove all messages, oldest first."""
 
 
-class Heard(Protocol):
+class Listened(Protocol):
     """As much of a `rti_mpc.wire.bus.Bus` as a listener needs; a recording has it, too."""
 
     @property
@@ -57,12 +57,22 @@ class Listener:
         received: Number of accepted messages.
     """
 
-    def __init__(self, bus: Heard, capacity: int = MAX_WAITING_MESSAGES) -> None:
+    def __init__(self, bus: Listened, capacity: int = MAX_WAITING_MESSAGES, *, root: str = "", begun_ns: int | None = None) -> None:
+        """
+        Subscribe.
+
+        Args:
+            bus: Bus of the robot.
+            capacity: Messages of a stream that wait.
+            root: Entity below which the robot is drawn; empty for the only one.
+            begun_ns: See `rti_mpc_service.view.timeline.Timeline`.
+        """
         keys = bus.keys
         self._actuation = keys.actuation
         self.received = 0
         self._bad_infos = 0
-        self._timeline = Timeline()
+        self._root = root
+        self._timeline = Timeline(begun_ns)
         self._bus = bus
         self._doors: dict[str, Door] = {}
         self._events: set[str] = set()  # keys of events
@@ -86,9 +96,12 @@ class Listener:
         """Time of the newest state on the robot's timeline."""
         return self._timeline.now_ns
 
+    def _entry(self, time_ns: int, message: Message) -> Entry:
+        return Entry(time_ns, message, self._root)
+
     def own_entry(self, notice: Notice) -> Entry:
         """Return a notice of the viewer as an event at `now_ns`."""
-        return Entry(self.now_ns, Event(0, 0, self.now_ns, "viewer", notice.severity, notice.code, notice.text))
+        return self._entry(self.now_ns, Event(0, 0, self.now_ns, "viewer", notice.severity, notice.code, notice.text))
 
     def drain(self, now_ns: int | None = None) -> list[Entry]:
         """
@@ -115,7 +128,7 @@ class Listener:
                 self._described.add(received.key)
                 infos[received.key] = info
         for info in infos.values():
-            yield Entry(self._timeline.now_ns, info)
+            yield self._entry(self._timeline.now_ns, info)
 
     def _messages(self, now_ns: int) -> Iterator[Entry]:
         for stream, subscriber in self._streams:
@@ -125,11 +138,11 @@ class Listener:
                 if message is None:
                     continue
                 if isinstance(message, State):
-                    yield Entry(self._timeline.place_state(message.epoch, message.stamp_ns), message)
+                    yield self._entry(self._timeline.place_state(message.epoch, message.stamp_ns, now_ns), message)
                 elif received.key == self._actuation:
-                    yield Entry(self._timeline.place(message.stamp_ns), Actuation(message))
+                    yield self._entry(self._timeline.place(message.stamp_ns), Actuation(message))
                 elif message.stamp_ns != STAMP_ON_ARRIVAL:  # such a reference follows with its real stamp
-                    yield Entry(self._timeline.place(message.stamp_ns), message)
+                    yield self._entry(self._timeline.place(message.stamp_ns), message)
 
     def _door(self, stream: Stream[Any], received: Received) -> Door | None:
         """Return the intake of a key; None for events of a role beyond the limit of roles."""

@@ -9,7 +9,7 @@ import socket
 import threading
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -18,7 +18,8 @@ import rerun as rr
 from rti_mpc.contract.message import Notice, Reference, Severity
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.info import Info
-from rti_mpc_service.view.recording import Entry, RerunRecording
+from rti_mpc_service.view.recording import Entry
+from rti_mpc_service.view.scene import Scene
 
 RERUN_APPLICATION_ID = "rti_mpc"
 MAX_QUEUED_ENTRIES = 8192  # about 50 MB with long horizons
@@ -60,6 +61,7 @@ class Outlet:
         flush_s: float = VIEWER_FLUSH_TIMEOUT_S,
         close_s: float = VIEWER_CLOSE_TIMEOUT_S,
         capacity: int = MAX_QUEUED_ENTRIES,
+        roots: Sequence[str] = (),
         epitaph: Callable[[], str] = lambda: "closed after a failure, entries not yet written are lost",
     ) -> None:
         self.name = name
@@ -72,10 +74,11 @@ class Outlet:
         self._close_s = close_s
         self._epitaph = epitaph  # returns the text for a failed stream
         self._queue: deque[Entry] = deque(maxlen=capacity)
-        self._context: dict[str, Entry] = {}
+        self._context: dict[tuple[str, str], Entry] = {}  # by root and role, which a reference has none of
         self._missed = 0
         self._lock = threading.Lock()
-        self._recording: RerunRecording | None = None
+        self._roots = roots
+        self._recording: Scene | None = None
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"outlet {name}", daemon=True)
         self._thread.start()
@@ -91,7 +94,7 @@ class Outlet:
             missed = self._missed
             for entry in entries:
                 if isinstance(entry.message, Info | Reference):
-                    self._context[entry.message.role if isinstance(entry.message, Info) else ""] = entry
+                    self._context[entry.root, entry.message.role if isinstance(entry.message, Info) else ""] = entry
                 self._missed += len(self._queue) == self._queue.maxlen
                 self._queue.append(entry)
             self.dropped += self._missed - missed
@@ -115,7 +118,7 @@ class Outlet:
         try:
             new = self._recording is None
             if self._recording is None:
-                self._recording = RerunRecording(self._open_stream())
+                self._recording = Scene(self._open_stream(), self._roots)
                 log.info("%s: open", self.name)
             self._recording.send(self._take(new))
             self._recording.stream.flush(timeout_sec=self._flush_s)
@@ -148,7 +151,7 @@ class Outlet:
             recording.stream.disconnect()
 
 
-def file_outlet(path: Path, name: str) -> Outlet:
+def file_outlet(path: Path, name: str, roots: Sequence[str] = ()) -> Outlet:
     """
     Return an outlet that overwrites a file. If the recording fails, for example on a full disk, it ends there.
 
@@ -172,10 +175,18 @@ def file_outlet(path: Path, name: str) -> Outlet:
     def epitaph() -> str:
         return f"the recording ends here, with {1e-6 * shutil.disk_usage(path.parent).free:.1f} MB free on its disk"
 
-    return Outlet(str(path), open_stream, period_s=FILE_PERIOD_S, flush_s=FILE_FLUSH_TIMEOUT_S, close_s=FILE_CLOSE_TIMEOUT_S, epitaph=epitaph)
+    return Outlet(
+        str(path),
+        open_stream,
+        period_s=FILE_PERIOD_S,
+        flush_s=FILE_FLUSH_TIMEOUT_S,
+        close_s=FILE_CLOSE_TIMEOUT_S,
+        roots=roots,
+        epitaph=epitaph,
+    )
 
 
-def viewer_outlet(url: str, name: str) -> Outlet:
+def viewer_outlet(url: str, name: str, roots: Sequence[str] = ()) -> Outlet:
     """Return an outlet to the viewer at a URL, which connects whenever a viewer listens there."""
     address = urlsplit(url)
     where = (address.hostname or "127.0.0.1", address.port or 9876)
@@ -190,7 +201,7 @@ def viewer_outlet(url: str, name: str) -> Outlet:
         stream.connect_grpc(url)
         return stream
 
-    return Outlet(url, open_stream)
+    return Outlet(url, open_stream, roots=roots)
 
 
 def new_stream(name: str, recording_id: uuid.UUID | None = None) -> rr.RecordingStream:

@@ -57,14 +57,14 @@ class PlayedBus:
             self._rings[stream].waiting.append(received)
 
 
-def played(recording: Recording, robot: str) -> Iterator[list[Entry]]:
-    """Yield what a listener makes of the messages of one robot, a list a step of their arrival."""
+def played(recording: Recording, robot: str, *, root: str = "", begun_ns: int | None = None) -> Iterator[list[Entry]]:
+    """Yield what a listener makes of the messages of one robot, a list a step of their arrival; `root` and `begun_ns` are those of the listener."""
     bus: PlayedBus | None = None
     end_ns = 0
     for recorded in recording.messages(robot):
         if bus is None:
             bus = PlayedBus(Keys(recorded.received.key.partition(f"/{robot}/")[0], robot))
-            listener, end_ns = Listener(bus), recorded.local_ns + STEP_NS
+            listener, end_ns = Listener(bus, root=root, begun_ns=begun_ns), recorded.local_ns + STEP_NS
         if recorded.local_ns >= end_ns:
             yield listener.drain(end_ns)
             end_ns = recorded.local_ns + STEP_NS

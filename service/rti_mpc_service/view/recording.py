@@ -16,7 +16,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, Event, Reference, Severity, State, Telemetry
 from rti_mpc.signals import plane
 from rti_mpc.wire.info import Info, Label, Obstacle
-from rti_mpc_service.view.blueprint import RUNG_COLORS, STRIPS, TIMELINE, Frame, blueprint, legend, lifted, looks
+from rti_mpc_service.view.blueprint import RUNG_COLORS, STRIPS, TIMELINE, Frame, below, blueprint, legend, lifted, looks
 from rti_mpc_service.view.playback import Actuation, Playback, PlayedRow
 from rti_mpc_service.view.tracking_error import tracking_error
 
@@ -45,10 +45,12 @@ class Entry:
     Attributes:
         time_ns: Time from `rti_mpc_service.view.timeline.Timeline`.
         message: The received message.
+        root: Entity below which its robot is drawn; empty for the only one.
     """
 
     time_ns: int
     message: Message
+    root: str = ""
 
 
 class RerunRecording:
@@ -59,8 +61,18 @@ class RerunRecording:
     held, and written when it comes, or with numbers for names if the recording ends without.
     """
 
-    def __init__(self, stream: rr.RecordingStream) -> None:
+    def __init__(self, stream: rr.RecordingStream, root: str = "", lay_out: Callable[[Info, Frame | None], object] | None = None) -> None:
+        """
+        Write to a stream.
+
+        Args:
+            stream: Stream of Rerun.
+            root: Entity below which everything is written; empty for the only robot.
+            lay_out: Takes what a layout depends on, whenever it changes; None: the layout of the only robot is sent.
+        """
         self.stream = stream
+        self._root = root
+        self._lay_out = lay_out or (lambda info, frame: stream.send_blueprint(blueprint(info, frame)))
         self.info: Info | None = None
         self._reference: Reference | None = None
         self._frame: Frame | None = None
@@ -102,7 +114,7 @@ class RerunRecording:
 
     def _info(self, info: Info) -> None:
         """Write a description, and take names from it; a controller's description overrides a robot's."""
-        self.stream.log(f"info/{info.role}", rr.TextDocument(info.document, media_type="text/plain"), static=True)
+        self._log(f"info/{info.role}", rr.TextDocument(info.document, media_type="text/plain"))
         if info.states and info != self.info and (self.info is None or info.role == "controller"):
             self._name(info)
 
@@ -111,9 +123,9 @@ class RerunRecording:
         if self.info is not None and _vectors(info) != _vectors(self.info):
             self._reference, self._last, self._last_output, self._playback = None, None, None, Playback()
         self.info = info
-        for path, archetype in looks(info).items():
-            self.stream.log(path, archetype, static=True)
-        self.stream.send_blueprint(blueprint(info, self._frame))
+        for path, archetype in looks(info, self._root).items():
+            self._log(path, archetype)
+        self._lay_out(info, self._frame)
         held, self._held = list(self._held), deque(maxlen=MAX_HELD_ENTRIES)
         self.send(held)
 
@@ -121,9 +133,12 @@ class RerunRecording:
         """Whether the vectors of a message have the lengths of the info; it may come from another model."""
         return self.info is None or all(width == len(getattr(self.info, LABELS_OF_VECTOR[name])) for name, width in _widths(message).items())
 
+    def _log(self, path: str, archetype: rr.AsComponents) -> None:
+        self.stream.log(below(self._root, path), archetype, static=True)
+
     def _columns(self, path: str, times: Times, *columns: Columns) -> None:
         index = rr.TimeColumn(TIMELINE, duration=times.astype("timedelta64[ns]"))
-        self.stream.send_columns(path, [index], [column for group in columns for column in group])
+        self.stream.send_columns(below(self._root, path), [index], [column for group in columns for column in group])
 
     def _strips(self, path: str, times: Times, lines: Iterable[Array]) -> None:
         """Write one polyline per row, each of shape ``(M, 2)``, at the height of its entity."""
@@ -144,8 +159,9 @@ class RerunRecording:
             frame = Frame.around(references[-1].y[:, pair])
             if frame != self._frame:
                 self._frame = frame
-                self.stream.log("world/legend", legend(frame), static=True)
-                self.stream.send_blueprint(blueprint(self.info, frame))
+                if not self._root:  # several would lie on top of each other
+                    self._log("world/legend", legend(frame))
+                self._lay_out(self.info, frame)
             self._strips("world/reference", times, [r.y[:: 1 + len(r.y) // MAX_DRAWN_ROWS, pair] for r in references])
 
     def _states(self, times: Times, states: list[State]) -> None:

@@ -11,7 +11,8 @@ from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.recording import Recording
 from rti_mpc_service.view.outlet import new_stream
 from rti_mpc_service.view.played import played
-from rti_mpc_service.view.recording import Entry, RerunRecording
+from rti_mpc_service.view.recording import Entry
+from rti_mpc_service.view.scene import Scene
 
 FLUSH_TIMEOUT_S = 60.0
 SEND_NS = 1_000_000_000  # of the robot's time that is sent together: larger chunks open fast
@@ -56,14 +57,17 @@ def draw_in_viewer(recording: Recording, name: str, url: str) -> None:
 
 def draw(recording: Recording, stream: rr.RecordingStream) -> None:
     """Send a whole recording to a stream, and end the stream."""
-    for robot in recording.robots:
-        drawn, waiting = RerunRecording(stream), list[Entry]()
-        for entries in played(recording, robot):
+    robots = recording.robots
+    several = len(robots) > 1
+    scene = Scene(stream, robots if several else ())
+    for robot in robots:
+        waiting = list[Entry]()
+        for entries in played(recording, robot, root=robot if several else "", begun_ns=recording.start_ns if several else None):
             waiting += entries
             if waiting and waiting[-1].time_ns - waiting[0].time_ns > SEND_NS:
-                drawn.send(waiting)
+                scene.send(waiting)
                 waiting = []
-        drawn.send(waiting)
-        drawn.finish()
+        scene.send(waiting)
+    scene.finish()
     stream.flush(timeout_sec=FLUSH_TIMEOUT_S)
     stream.disconnect()

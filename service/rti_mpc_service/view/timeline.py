@@ -14,9 +14,19 @@ class Timeline:
 
     The axis is the robot's clock itself. Where a restarted robot's clock begins
     again, its new life is appended, so that nothing is drawn over the old one.
+
+    For several robots, whose clocks have nothing in common, it is the local time since a
+    common instant: each life of a robot is shifted to when its first state has arrived.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, begun_ns: int | None = None) -> None:
+        """
+        Begin an axis.
+
+        Args:
+            begun_ns: Local monotonic time of the common instant; None: the axis is the robot's own clock.
+        """
+        self._begun_ns = begun_ns
         self._epoch: int | None = None
         self._first_ns = 0
         self._latest_ns = 0
@@ -27,10 +37,12 @@ class Timeline:
         """Time of the newest state."""
         return self._offset_ns + self._latest_ns
 
-    def place_state(self, epoch: int, stamp_ns: int) -> int:
-        """Return the time of a state, and advance the axis to it."""
+    def place_state(self, epoch: int, stamp_ns: int, local_ns: int = 0) -> int:
+        """Return the time of a state that has arrived at a local time, and advance the axis to it."""
         if epoch != self._epoch:
-            if self._epoch is not None and stamp_ns < self._latest_ns:
+            if self._begun_ns is not None:
+                self._offset_ns = max(local_ns - self._begun_ns, 0) - stamp_ns
+            elif self._epoch is not None and stamp_ns < self._latest_ns:
                 self._offset_ns += self._latest_ns + GAP_BETWEEN_LIVES_NS - stamp_ns
                 self._offset_ns *= self._offset_ns + stamp_ns < MAX_TIME_NS
             self._epoch, self._first_ns, self._latest_ns = epoch, stamp_ns, stamp_ns

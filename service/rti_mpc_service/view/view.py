@@ -7,6 +7,7 @@ import logging
 import subprocess
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from threading import Event
 
@@ -30,6 +31,7 @@ def main(
     bus_settings: BusSettings,
     keys: Keys,
     *,
+    robots: Sequence[str] = (),
     rerun_spawn: bool = False,
     rerun_connect: str | None = None,
     rerun_save: Path | None = None,
@@ -43,6 +45,7 @@ def main(
     Args:
         bus_settings: How to join the bus.
         keys: Where the robot's streams are.
+        robots: Names of several robots below the same prefix, to draw in one view instead.
         rerun_spawn: Whether to start a viewer on this machine, listening on loopback; it stays open afterwards.
         rerun_connect: Address of a viewer, which may start later: ``HOST:PORT``, or a URL of Rerun.
         rerun_save: File to record to, overwritten.
@@ -60,21 +63,27 @@ def main(
     url = viewer_url(rerun_connect or RERUN_ADDRESS)
     stop = stop or stop_on_signals()
     with Bus.join(bus_settings, keys, stop=stop, say=log.warning) as bus:
-        listener = Listener(bus)
-        bus.expect("message", lambda: listener.received)
-        outlets = [file_outlet(rerun_save, keys.robot)] if rerun_save is not None else []
+        names = [*robots] or [keys.robot]
+        roots, begun_ns = (names, time.monotonic_ns()) if len(names) > 1 else ((), None)
+        buses = [bus if name == keys.robot else bus.beside(Keys(keys.prefix, name)) for name in names]
+        listeners = [Listener(one, root=one.keys.robot if roots else "", begun_ns=begun_ns) for one in buses]
+        for one, listener in zip(buses, listeners, strict=True):
+            one.expect("message", partial(getattr, listener, "received"))
+            one.alive(ROLE)
+        title = " and ".join(names)
+        outlets = [file_outlet(rerun_save, title, roots)] if rerun_save is not None else []
         spawned = spawn_viewer(url, rerun_memory_limit) if rerun_spawn else None
         server = None if web_port is None else serve_page(url, web_port, rerun_memory_limit)
         if web_port is not None:
             log.info("open %s", page(url, web_port))
         if rerun_spawn or rerun_connect is not None or server is not None:
-            outlets.append(viewer_outlet(url, keys.robot))
-        bus.alive(ROLE)
-        log.info("listening to %s", keys.below("*"))
-        announcer = Announcer(bus, ROLE, time.time_ns() // 1_000_000_000)
-        bus.watch_certificate(lambda notice: announce(log, announcer, notice, listener.now_ns))
-        pump(listener, outlets, spawned, announcer, stop)
-    log.info("%d messages, %d lost, %d refused", listener.received, listener.lost, listener.refused)
+            outlets.append(viewer_outlet(url, title, roots))
+        log.info("listening to %s", " and ".join(one.keys.below("*") for one in buses))
+        announcer = Announcer(buses[0], ROLE, time.time_ns() // 1_000_000_000)
+        bus.watch_certificate(lambda notice: announce(log, announcer, notice, listeners[0].now_ns))
+        pump(listeners, outlets, spawned, announcer, stop)
+    counts = (sum(getattr(listener, name) for listener in listeners) for name in ("received", "lost", "refused"))
+    log.info("%d messages, %d lost, %d refused", *counts)
     complete = [outlet.close() for outlet in outlets]
     if server is not None:
         end_page(server)
@@ -83,20 +92,26 @@ def main(
     return 0 if rerun_save is None or complete[0] else 1
 
 
-def pump(listener: Listener, outlets: Sequence[Outlet], spawned: subprocess.Popen[bytes] | None, announcer: Announcer, stop: Event) -> None:
+def pump(
+    listeners: Sequence[Listener],
+    outlets: Sequence[Outlet],
+    spawned: subprocess.Popen[bytes] | None,
+    announcer: Announcer,
+    stop: Event,
+) -> None:
     """Pass messages on until stopped, then the remaining ones; announce failures of an outlet or viewer on the bus and to all outlets."""
     stopped = False
     while not stopped:
         stopped = stop.wait(DRAIN_PERIOD_S)
-        entries = listener.drain()
+        entries = [entry for listener in listeners for entry in listener.drain()]
         said = notices(outlets)
         if spawned is not None and spawned.poll() is not None:
             text = "the Rerun viewer has ended; where there is no screen, --rerun-save records to a file"
             said.append(Notice(Severity.WARNING, "viewer_ended", text))
             spawned = None
         for notice in said:
-            announce(log, announcer, notice, listener.now_ns)
-            entries.append(listener.own_entry(notice))
+            announce(log, announcer, notice, listeners[0].now_ns)
+            entries.append(listeners[0].own_entry(notice))
         for outlet in outlets:
             outlet.offer(entries)
 

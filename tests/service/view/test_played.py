@@ -14,6 +14,7 @@ pytest.importorskip("rerun")
 from rerun.chunk import RrdReader
 
 from rti_mpc.recording import Recording
+from rti_mpc.wire.keys import Keys
 from rti_mpc_service.rig.endpoint import free_port
 from rti_mpc_service.view.played import played
 from rti_mpc_service.view.screen import page
@@ -47,6 +48,23 @@ def test_recording_is_drawn_into_a_file(run: Path, tmp_path: Path) -> None:
         rows[chunk.entity_path] += chunk.num_rows
     assert rows["/state/x"] == rows["/command/v"] == COUNT + 1, "and its look"
     assert rows["/event/controller"] == 1
+
+
+def test_several_robots_are_drawn_in_one_view_by_the_time_of_arrival(tmp_path: Path) -> None:
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    write(folder / "1.mcap", COUNT)
+    write(folder / "2.mcap", COUNT, keys=Keys(robot="other"))
+    done = rti_mpc("view", folder, "--rerun-save", tmp_path / "run.rrd")
+    assert done.returncode == 0, done.stderr
+    chunks = RrdReader(tmp_path / "run.rrd").stream().to_chunks()
+    drawn = {chunk.entity_path for chunk in chunks}
+    for robot in ("wheels", "other"):
+        assert {f"/{robot}/state/x", f"/{robot}/command/v", f"/{robot}/event/controller", f"/{robot}/lane/mode"} <= drawn
+    assert not any(path.startswith(("/state", "/world", "/lane")) for path in drawn)
+    (states, *_) = [chunk for chunk in chunks if chunk.entity_path == "/wheels/state/x" and not chunk.is_static]
+    first = states.to_record_batch().column("robot_time").to_numpy(zero_copy_only=False).astype("timedelta64[ms]").astype(int)[0]
+    assert 0 <= first <= 60, "since the beginning of the recording, to a step; its own clock is at 10 ms"
 
 
 def test_what_is_no_recording_is_refused_in_a_line(tmp_path: Path) -> None:

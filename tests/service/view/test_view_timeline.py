@@ -45,3 +45,12 @@ def test_the_axis_stays_within_int64_whatever_lives_of_a_robot_say() -> None:
     for epoch, stamp_ns in enumerate(20 * [2**62 - 1, 1 - 2**62, 0, 2**62 - 1, 5]):
         for placed in (timeline.place_state(epoch, stamp_ns), timeline.place(2**62 - 1), timeline.place(1 - 2**62), timeline.now_ns):
             assert abs(placed) < 2**63
+
+
+def test_several_robots_share_the_local_time_of_their_first_states() -> None:
+    early, late = Timeline(begun_ns=100), Timeline(begun_ns=100)
+    assert early.place_state(1, 7_000, 150) == 50
+    assert late.place_state(9, 5, 400) == 300
+    assert early.place_state(1, 7_250, 999) == 300, "from then on by the robot's own clock"
+    assert early.place(7_260) == 310
+    assert early.place_state(2, 0, 900) == 800, "a restarted robot is placed anew"
