@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Smooth paths by arc length, with the widths of a track and a speed profile, for path following.
+Smooth paths by arc length, with the widths of a track and a speed profile, for path following [Lam2010]_ [Faulwasser2016]_ [Liniger2015]_.
 
 A path is a cubic B-spline whose knots lie at equal steps of arc length,
 
