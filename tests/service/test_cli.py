@@ -35,6 +35,9 @@ def rti_mpc(*arguments: str, **environment: str) -> subprocess.CompletedProcess[
     )
 
 
+OF_RECORDINGS = {"export", "replay", "why"}  # commands that read a recording, and no bus
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_of_every_command_explains_every_option(command: str) -> None:
     parameters = typer.main.get_group(app).commands[command].params
@@ -44,7 +47,8 @@ def test_help_of_every_command_explains_every_option(command: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "command", sorted(set(COMMANDS) - OF_RECORDINGS - {"bench", "certs", "check", "demo", "doctor", "faults", "init", "paper", "robots", "schema"})
+    "command",
+    sorted(set(COMMANDS) - OF_RECORDINGS - {"bench", "certs", "check", "demo", "doctor", "faults", "init", "paper", "robots", "schema", "tune"}),
 )
 def test_every_process_takes_the_options_of_zenoh_programs(command: str) -> None:
     parameters = typer.main.get_group(app).commands[command].params

@@ -156,7 +156,7 @@ def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> Check
             failed_at = x
         bounds.note_plan()
         if asked and status.usable:
-            mine, theirs = (solution(one, guess, y_ref, x) for one in (tight, judge))
+            mine, theirs = (solution(one, guess, y_ref, x, rti.taken) for one in (tight, judge))
             if mine is not None and theirs is not None:
                 differences.append(float(np.max(np.abs(mine - theirs) / scale)))
                 deviations.append(float(np.max(np.abs(rti.u - theirs) / scale)))
@@ -181,11 +181,14 @@ def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> Check
 def tight_copy(rti: Rti, solver: str, formulation: str) -> Rti:
     """Return a controller of the same problem with a tight tolerance; solvers of qpsolvers keep their own, which is tight."""
     settings = TIGHT_SETTINGS if solver in BUILT_IN_SOLVERS else None
-    return Rti(rti.ocp, settings, formulation=formulation, solver=solver, iterations=rti.iterations, tolerance=rti.tolerance, compile=False)
+    return Rti(rti.ocp, settings, formulation=formulation, solver=solver, iterations=1, compile=False)
 
 
-def solution(one: Rti, guess: tuple[Array, ...], y_ref: Array, x0: Array) -> Array | None:
-    """Return the inputs of one iteration from a guess of x, u and u_prev, shape ``(N_u, nu)``; None if the QP is not solved."""
+def solution(one: Rti, guess: tuple[Array, ...], y_ref: Array, x0: Array, qps: int) -> Array | None:
+    """Return the inputs after so many QPs from a guess of x, u and u_prev, shape ``(N_u, nu)``; None if one is not solved."""
     one.x[:], one.u[:], one.u_prev[:] = guess
-    one.prepare(y_ref, shift=False)
-    return one.u.copy() if one.feedback(x0) is QpStatus.SOLVED else None
+    for _ in range(qps):
+        one.prepare(y_ref, shift=False)
+        if one.feedback(x0) is not QpStatus.SOLVED:
+            return None
+    return one.u.copy()

@@ -32,7 +32,7 @@ class Ring(Protocol):
         """Return and remove all messages, oldest first."""
 
 
-class Listened(Protocol):
+class Hears(Protocol):
     """As much of a `rti_mpc.wire.bus.Bus` as a listener needs; a recording has it, too."""
 
     @property
@@ -57,7 +57,7 @@ class Listener:
         received: Number of accepted messages.
     """
 
-    def __init__(self, bus: Listened, capacity: int = MAX_WAITING_MESSAGES, *, root: str = "", begun_ns: int | None = None) -> None:
+    def __init__(self, bus: Hears, capacity: int = MAX_WAITING_MESSAGES, *, root: str = "", begun_ns: int | None = None) -> None:
         """
         Subscribe.
 
