@@ -24,7 +24,6 @@ from rti_mpc.rti.qp.qp import Guess
 
 MAX_ROLL_OUTS = 6  # from the places of the last sample; more are needed only when many places change at once
 MAX_STEPS = 50  # of the interior point, for each QP that a sample may have; all of its QPs share the sum
-STEPS_BEFORE_ANOTHER_QP = 5  # for each QP that a sample may have: once its QPs have taken the sum of these, no further one follows
 MAX_ROLL_OUTS_HANDED_BACK = 2  # from places that the interior point has found
 START_RANGE = 1.0, 1e16  # limits of the product of distance and multiplier at its start, otherwise the duality gap: with less, first steps are short
 START_FAR = 1e6  # the same of a second try, after one that gave no numbers
@@ -105,11 +104,6 @@ class ActiveSet:
     def begin(self, qps: int) -> None:
         """Begin a sample that may have so many QPs."""
         self._qps, self.steps = qps, 0
-
-    @property
-    def affords_another_qp(self) -> bool:
-        """Whether the sample has taken so few steps of the interior point that another QP may follow."""
-        return self.steps < STEPS_BEFORE_ANOTHER_QP * self._qps
 
     def forget(self) -> None:
         """Start cold, with no bound acting."""

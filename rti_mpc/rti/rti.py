@@ -404,10 +404,8 @@ class Rti:
         return status
 
     def _iterate(self) -> None:
-        """Iterate at the plan while the step is large, and there is time; an iteration that fails leaves the plan of the one before."""
+        """Iterate at the plan while the step is large; an iteration that fails leaves the plan of the one before."""
         while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
-            if self.active_set is not None and not self.active_set.affords_another_qp:
-                break
             self._relinearize()
             if not (status := self.solve()).usable:
                 self.status = INACCURATE  # the plan comes from an earlier QP, which cannot be certified any more

@@ -63,19 +63,6 @@ def test_without_enough_steps_no_plan_is_told_as_solved(limit: int, monkeypatch:
     assert limited > 0
 
 
-@pytest.mark.usefixtures("no_roll_outs")
-@pytest.mark.parametrize(("steps", "taken"), [(0, 1), (active_set.MAX_STEPS, 3)])
-def test_no_further_qp_follows_once_a_sample_has_taken_many_steps(steps: int, taken: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(active_set, "STEPS_BEFORE_ANOTHER_QP", steps)
-    ocp = PROBLEMS["pioneer"]()
-    rti = Rti(ocp, iterations=3, tolerance=0.0, compile=False)
-    x0, y_ref, u_prev = next(iter(samples(ocp, 1)))
-    rti.reset(x0, u_prev)
-    rti.prepare(y_ref, shift=False)
-    assert rti.feedback(x0) is QpStatus.SOLVED
-    assert rti.taken == taken
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "N"), [("slalom", 20), ("tight", 50), ("restarts", 20)])
 def test_families_whose_places_do_not_settle_are_solved_in_a_bounded_number_of_roll_outs_and_steps(name: str, N: int) -> None:
