@@ -17,18 +17,20 @@ from typing import Any, Literal, Protocol
 from rti_mpc import given
 from rti_mpc.errors import OcpError
 
-Role = Literal["", "x", "y", "heading", "axle_offset", "disc_x", "disc_y", "disc_radius"]
+Role = Literal["", "x", "y", "heading", "axle_offset", "disc_x", "disc_y", "disc_radius", "progress", "path_start", "path_x"]
 
 POSE_ROLES: tuple[Role, ...] = ("x", "y", "heading")  # roles that a path in the plane gives values for
-UNIT_OF_ROLE: dict[Role, str] = {"x": "m", "y": "m", "heading": "rad", "axle_offset": "m", "disc_x": "m", "disc_y": "m", "disc_radius": "m"}
+DISC_ROLES: tuple[Role, ...] = ("disc_x", "disc_y", "disc_radius")
+PATH_ROLES: tuple[Role, ...] = ("path_start", "path_x")  # of the path that a robot follows: where its knots begin, and each knot
+UNIT_OF_ROLE: dict[Role, str] = {"heading": "rad"}  # m for the others
 ROLES_OF_VECTOR: dict[str, tuple[Role, ...]] = {
-    "states": POSE_ROLES,
+    "states": (*POSE_ROLES, "progress"),
     "outputs": POSE_ROLES,
     "inputs": (),
-    "parameters": ("axle_offset", "disc_x", "disc_y", "disc_radius"),
+    "parameters": ("axle_offset", *DISC_ROLES, *PATH_ROLES),
     "constraints": (),
 }  # roles that the signals of each vector may have
-REPEATABLE_ROLES: tuple[Role, ...] = ("", "disc_x", "disc_y", "disc_radius")  # roles that several signals of one vector may have
+REPEATABLE_ROLES: tuple[Role, ...] = ("", *DISC_ROLES, "path_x")  # roles that several signals of one vector may have
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,8 @@ class Signal:
         unit: SI unit, ``"1"`` if none.
         angle: Whether it is an angle in rad whose whole turns do not matter: it may wrap at :math:`\pm\pi`, and the dynamics repeat with each turn.
         role: Of states and outputs ``"x"``, ``"y"`` (position in the plane, m) and ``"heading"`` (an angle, from the x axis to the left); of a
-            parameter ``"axle_offset"``: distance in m from the axle ahead to the point whose position this is. Empty: none of these.
+            parameter ``"axle_offset"``: distance in m from the axle ahead to the point whose position this is. Those of discs and of a followed
+            path are set by `rti_mpc.model.obstacle` and `rti_mpc.model.path_following`. Empty: none of these.
         commands: Of an input, the name of the state that follows it, a speed; empty: none.
 
     Raises:
@@ -117,8 +120,8 @@ def misplaced(vector: str, signals: Sequence[Signal], states: Sequence[Signal]) 
     for signal in signals:
         if signal.role and signal.role not in ROLES_OF_VECTOR[vector]:
             return f"the role of {vector} must be {' or '.join(ROLES_OF_VECTOR[vector]) or 'left out'}, got {signal.role} for {signal.name}"
-        if signal.role and signal.unit != UNIT_OF_ROLE[signal.role]:
-            return f"the role {signal.role} must be in {UNIT_OF_ROLE[signal.role]}, got {signal.name} in {signal.unit}"
+        if signal.role and signal.unit != UNIT_OF_ROLE.get(signal.role, "m"):
+            return f"the role {signal.role} must be in {UNIT_OF_ROLE.get(signal.role, 'm')}, got {signal.name} in {signal.unit}"
         if signal.role == "heading" and not signal.angle:
             return f"the role heading must be an angle, got {signal.name} without angle=True"
         if roles.count(signal.role) > 1:

@@ -33,7 +33,7 @@ def test_position_and_heading_are_found_wherever_they_are() -> None:
         ({"states": (Signal("psi", "rad", role="heading"), Signal("x", "m"))}, "the role heading must be an angle, got psi without angle=True"),
         (
             {"states": (Signal("psi", "m", role="axle_offset"), Signal("x", "m"))},
-            "the role of states must be x or y or heading, got axle_offset for psi",
+            "the role of states must be x or y or heading or progress, got axle_offset for psi",
         ),
         ({"inputs": (Signal("u", "m/s", role="x"), Signal("v", "m/s"))}, "the role of inputs must be left out, got x for u"),
         ({"inputs": (Signal("u", "m/s", commands="speed"), Signal("v", "m/s"))}, "commands must be an input's, and name a state, got speed for u"),

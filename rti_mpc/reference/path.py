@@ -40,7 +40,8 @@ MIN_STEPS, MAX_STEPS = 16, 4000  # of a path
 DENSE = 20  # points per given point at which arc length is measured
 GAP_STEPS = 3.0  # a track whose last point is within this many typical distances of its first is closed
 NEAR_STEPS = 8  # steps from the last projection within which the next one is looked for
-NEWTON_STEPS = 12
+NEWTON_STEPS = 4
+MIN_SHRINKING = 0.2  # of 1 - curvature times offset in a Newton step, which vanishes at the centre of curvature
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +112,10 @@ class Path:
         away = self.position(candidates) - xy
         s = float(candidates[np.argmin(np.sum(away**2, axis=-1))])
         for _ in range(NEWTON_STEPS):
-            s += float((xy - self.position(np.array(s))) @ self.tangent(np.array(s)))
+            at = np.array(s)
+            away, along = xy - self.position(at), self.tangent(at)
+            left = float(along[0] * away[1] - along[1] * away[0])
+            s += float(away @ along) / max(MIN_SHRINKING, 1.0 - float(self.curvature(at)) * left)
             s = s if self.closed else min(max(s, 0.0), self.length)
         return s
 

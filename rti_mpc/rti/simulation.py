@@ -85,7 +85,15 @@ class Simulation:
         }
 
 
-def simulate(rti: Rti, plant: Plant | Model, reference: Rows, *, x0: ArrayLike | None = None, samples: int | None = None) -> Simulation:
+def simulate(
+    rti: Rti,
+    plant: Plant | Model,
+    reference: Rows,
+    *,
+    x0: ArrayLike | None = None,
+    samples: int | None = None,
+    parameters: Callable[[Array], ArrayLike] | None = None,
+) -> Simulation:
     """
     Close the loop of a real-time iteration and a plant.
 
@@ -97,6 +105,8 @@ def simulate(rti: Rti, plant: Plant | Model, reference: Rows, *, x0: ArrayLike |
             apart, the first at the start, the last one held.
         x0: Initial state, shape ``(nx,)``; the nominal one by default.
         samples: How many to simulate; as far as the rows go by default.
+        parameters: Of the state of a sample, parameters of all its stages, shape ``(np,)``, such as the path around a robot that follows one; the
+            nominal ones by default.
 
     Raises:
         OcpError: An argument is none, or the plant leaves where it is finite.
@@ -110,7 +120,7 @@ def simulate(rti: Rti, plant: Plant | Model, reference: Rows, *, x0: ArrayLike |
     if samples is None and rows is None:
         raise OcpError("samples must be given where the reference is a function, got None")
     samples = given.whole("samples", len(rows) - 1 if samples is None and rows is not None else samples, 1)
-    step, p = next_state(plant, model, dt), np.array(model.p_nominal)
+    step, p = next_state(plant, model, dt), np.tile(np.array(model.p_nominal), (samples + 1, 1))
 
     def at(k: Any) -> Array:
         """Return the reference at samples k, shape ``(n,)``."""
@@ -125,13 +135,15 @@ def simulate(rti: Rti, plant: Plant | Model, reference: Rows, *, x0: ArrayLike |
     status = []
     rti.reset(x[0], u0)
     for k in range(samples):
-        rti.prepare(at(k + 1 + np.arange(N)))
+        if parameters is not None:
+            p[k:] = given.array("what parameters returns", parameters(x[k]), (model.np_,))
+        rti.prepare(at(k + 1 + np.arange(N)), np.tile(p[k], (N + 1, 1)))
         status.append(rti.feedback(x[k]))
         u[k] = rti.u[0]
-        x[k + 1] = given.array("what plant returns", step(x[k], u[k], p), (model.nx,))
+        x[k + 1] = given.array("what plant returns", step(x[k], u[k], p[k]), (model.nx,))
         if not np.isfinite(x[k + 1]).all():
             raise OcpError(f"plant must return finite states, got {x[k + 1].tolist()} after {dt * (k + 1):g} s")
-    y = np.array(model.h().map(samples + 1)(x.T, np.tile(p[:, None], samples + 1))).T.reshape(samples + 1, model.ny)
+    y = np.array(model.h().map(samples + 1)(x.T, p.T)).T.reshape(samples + 1, model.ny)
     y_ref = np.array(at(np.arange(samples + 1)), dtype=np.float64)
     for j, signal in enumerate(model.outputs):
         if signal.angle:

@@ -139,7 +139,8 @@ class BoundRows:
         for row in range(first, self.count):
             i, j = divmod(row - first, ng)
             watched = [start + i * len(at) + at.index(j) for start, at in sides if j in at]
-            self.watched[row] = [seen for bound in watched for seen in self.watched[bound][:2]] * (2 if len(watched) == 1 else 1)
+            seen = [seen for bound in watched for seen in self.watched[bound][:2]]
+            self.watched[row] = (seen * (2 if len(watched) == 1 else 1)) or [row] * 4  # a general constraint may have no bound
 
 
 def input_rows(ocp: Ocp, lin: Linearization, rows: BoundRows, A: Blocks, to_du: int) -> None:
