@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 import platform
 from collections.abc import Callable
 from dataclasses import replace
@@ -544,6 +545,79 @@ def robots() -> None:
     from rti_mpc_service.robots import main
 
     main()
+
+
+def lockstep_robot(settings: dict[str, Any]) -> Any:
+    """Make a simulated robot that its caller advances. Other processes find this function by its name."""
+    from rti_mpc_sim.lockstep import Lockstep
+    from rti_mpc_sim.settings import RobotSettings
+
+    return Lockstep(RobotSettings(**settings))
+
+
+@app.command()
+def tune(
+    config: ConfigPath = SHIPPED,
+    scenario: ScenarioName = None,
+    held_out: Annotated[
+        str | None,
+        typer.Option(
+            "--held-out",
+            metavar="SCENARIO",
+            help="Scenario that no trial sees, which decides whether the chosen values are better.",
+            show_default="circle, or steps of outputs; eight or sines if the study has that",
+        ),
+    ] = None,
+    heading: Annotated[
+        Literal["tangent", "consistent", "none"] | None, typer.Option(help="Heading of the references.", show_default="consistent")
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option(metavar="SECONDS", min=1.0, help="Duration of a drive, robot time.", show_default="the scenario's own")
+    ] = None,
+    vary: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY[=LOW:HIGH]",
+            help="Key of the file to vary, such as ocp.weights.Q.psi=0.001:1, ocp.N or timing.delay_s; repeatable.",
+            show_default="weights above 0 except those of the position, two decades up and down",
+        ),
+    ] = None,
+    trials: Annotated[int, typer.Option(metavar="N", min=1, max=100_000, help="Number of trials of the study, with those it has already.")] = 100,
+    effort: Annotated[float, typer.Option(metavar="FACTOR", min=0.01, max=100.0, help="Effort allowed, relative to today's.")] = 1.0,
+    jobs: Annotated[int | None, typer.Option(metavar="N", min=1, max=1000, help="Processes.", show_default="one per core")] = None,
+    storage: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL", help="Storage of Optuna, for several machines on one study.", show_default="sqlite, in a file beside the one written"
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE.toml", help="File to write; figure and study go beside it.", show_default="CONFIG.tuned.toml")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the proposals.")] = 1,
+    waypoint_speed: WaypointSpeed = 0.25,
+    waypoint_smoothing: WaypointSmoothing = None,
+) -> None:
+    """Tune weights by simulation: propose, drive, and write those that a held-out scenario finds better into a copy of the file."""
+    from rti_mpc_service.tune.closed_loop import Course
+    from rti_mpc_service.tune.tune import main
+
+    course = Course(scenario, heading, duration, waypoint_speed, waypoint_smoothing)
+    raise typer.Exit(
+        main(
+            config,
+            course,
+            held_out,
+            lockstep_robot,
+            vary=vary or (),
+            trials=trials,
+            jobs=jobs or os.cpu_count() or 1,
+            effort=effort,
+            seed=seed,
+            storage=storage,
+            out=out,
+        )
+    )
 
 
 @app.command()

@@ -38,6 +38,7 @@ EXTRA_OF_MODULE = {
     **dict.fromkeys(("mcap", "pandas", "pyarrow"), "record"),
     "matplotlib": "figure",
     "cryptography": "certs",
+    "optuna": "tune",
 }
 
 
