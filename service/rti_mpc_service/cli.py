@@ -558,6 +558,7 @@ def lockstep_robot(settings: dict[str, Any]) -> Any:
 @app.command()
 def tune(
     config: ConfigPath = SHIPPED,
+    robot: RobotName = None,
     scenario: ScenarioName = None,
     held_out: Annotated[
         str | None,
@@ -605,7 +606,7 @@ def tune(
     course = Course(scenario, heading, duration, waypoint_speed, waypoint_smoothing)
     raise typer.Exit(
         main(
-            config,
+            file_of(config, robot),
             course,
             held_out,
             lockstep_robot,

@@ -52,7 +52,8 @@ class Tried:
 
 def name_of(config: Config, course: Course, varied: Sequence[Varied]) -> str:
     """Return the name of a study, which is another one for another configuration, robot, scenario or range."""
-    content = [config.config_hash, config.sim.model_dump(mode="json"), asdict(course), [asdict(each) for each in varied]]
+    sections = [section.model_dump(mode="json") for section in (config.sim, config.reference)]
+    content = [config.config_hash, *sections, asdict(course), [asdict(each) for each in varied]]
     return f"{config.robot}-{hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]}"
 
 

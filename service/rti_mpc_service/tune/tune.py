@@ -76,6 +76,7 @@ def main(
     """
     config, console = load(path), table_console()
     out = written_to(path, config, out)
+    course = replace(course, name=course.name or config.reference.scenario)
     model = build_model(config)
     varied = find_varied(config, model, vary)
     other = replace(course, name=held_out or default_held_out(course.name, planar=in_plane(model.outputs)), seed=course.seed + 1)
@@ -146,7 +147,7 @@ def written_to(path: Path, config: Config, out: Path | None) -> Path:
         ConfigError: It is the robot's own, or what that finds beside itself would be missing beside this one.
     """
     tuned = f"{path.stem}.tuned.toml"
-    out = out or (Path(tuned) if path.resolve().parent == DEPLOY.resolve() else path.with_name(tuned))
+    out = out or (Path(tuned) if DEPLOY.resolve() in path.resolve().parents else path.with_name(tuned))
     if out.suffix != ".toml" or out.resolve() == path.resolve():
         raise ConfigError(f"--out must be a TOML file other than {path}, got {out}")
     if (":" in config.model.name or config.bus.config or config.bus.tls) and out.resolve().parent != path.resolve().parent:

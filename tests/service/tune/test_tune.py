@@ -89,6 +89,7 @@ def test_bad_weights_are_beaten_on_a_scenario_that_no_trial_has_seen(tmp_path: P
     assert len(trials_of(tmp_path / "robot.tuned.study.db")) == 12
 
 
+@pytest.mark.slow
 def test_nothing_is_written_where_nothing_is_gained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = nervous_robot(tmp_path)
     vary = ("ocp.bounds.soft_weight=999:1001",)  # no bound is exceeded
@@ -97,6 +98,7 @@ def test_nothing_is_written_where_nothing_is_gained(tmp_path: Path, capsys: pyte
     assert not (tmp_path / "robot.tuned.toml").exists()
 
 
+@pytest.mark.slow
 def test_interrupted_study_keeps_what_is_done_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, made = nervous_robot(tmp_path), 0
 
