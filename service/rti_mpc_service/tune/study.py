@@ -73,7 +73,8 @@ def open_study(storage: str, name: str, today: Driven) -> optuna.Study:
     try:
         study = optuna.create_study(storage=storage, study_name=name, directions=["minimize", "minimize"], load_if_exists=True)
     except Exception as error:  # SQLAlchemy's, a database driver's or Optuna's, by the kind of URL
-        raise ConfigError(f"--storage must be a storage of Optuna that can be used, got {storage}: {str(error).splitlines()[0]}") from error
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ConfigError(f"--storage must be a storage of Optuna that can be used: {reason}") from error
     known = study.user_attrs.get("today")
     if known is None:
         study.set_user_attr("today", [today.error, today.effort])

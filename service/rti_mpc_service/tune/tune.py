@@ -8,6 +8,7 @@ so the same command goes on with it, after Ctrl-C and after SIGKILL.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -93,7 +94,7 @@ def main(
     study_url = storage or f"sqlite:///{out.resolve().with_suffix('.study.db')}"
     study = open_study(study_url, study_name, today[STUDIED])
     ranges = ", ".join(f"{each.key} {each.low:g}:{each.high:g}" for each in varied)
-    console.print(f"study {study_name} in {study_url}, {len(finished(study))} of {trials} trials are there", soft_wrap=True)
+    console.print(f"study {study_name} in {without_password(study_url)}, {len(finished(study))} of {trials} trials are there", soft_wrap=True)
     console.print(f"{titles[STUDIED]}, held out {titles[HELD_OUT]}; varied: {ranges}", soft_wrap=True)
     columns = (TextColumn("trials"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     try:
@@ -137,6 +138,11 @@ def main(
     write(out, path, chosen.values, comment, config)
     console.print(f"written: {out}", soft_wrap=True)
     return 0
+
+
+def without_password(url: str) -> str:
+    """Return a URL that may be printed."""
+    return re.sub(r"(//[^/@:]*:)[^/]*@", r"\1***@", url)
 
 
 def written_to(path: Path, config: Config, out: Path | None) -> Path:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 HORIZON, DELAY = "ocp.N", "timing.delay_s"
 WEIGHTS = ("ocp.weights.delta", "ocp.weights.lambda", "ocp.bounds.soft_weight", "ocp.bounds.soft_weight_L2")
-TABLES = ("ocp.weights.Q", "ocp.weights.R", "ocp.terminal.Q")  # of weights, by name
+TABLES = ("ocp.weights.Q", "ocp.weights.R", "ocp.weights.R_u", "ocp.terminal.Q")  # of weights, by name
 WEIGHT_DECADES = 2.0  # above and below today's weight
 DELAY_PERIODS = 2.0  # from 0
 DIGITS = 3  # significant digits of a value that is tried, so that the file holds what was driven

@@ -83,7 +83,7 @@ def test_bad_weights_are_beaten_on_a_scenario_that_no_trial_has_seen(tmp_path: P
         assert f"# {line}" in text
     assert "# Before: ocp.weights.R.u_c = 0.003, ocp.weights.R.omega_c = 0.003" in text
     before, after = (loop_of(file, Course("circle", duration_s=30.0, seed=7)).drive({}) for file in (path, out))  # again other noise
-    assert after.error < before.error
+    assert max(after.outputs[:2]) < min(before.outputs[:2]), "m: the error is judged by each file's own Q, the position is not"
     assert after.effort < 0.5 * before.effort
     assert (tmp_path / "robot.tuned.png").stat().st_size > 10_000
     assert len(trials_of(tmp_path / "robot.tuned.study.db")) == 12
@@ -122,7 +122,7 @@ def test_interrupted_study_keeps_what_is_done_and_goes_on(tmp_path: Path, capsys
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        ({"storage": "nowhere://x"}, "--storage must be a storage of Optuna that can be used, got nowhere://x"),
+        ({"storage": "nowhere://x"}, "--storage must be a storage of Optuna that can be used: "),
         ({"held_out": "eight"}, "--held-out must be another scenario than that of the study, got eight, heading consistent for both"),
         ({"out": Path("robot.png")}, "--out must be a TOML file other than"),
         ({"out": Path("/nowhere/robot.toml")}, "--out must be in a folder that exists"),
