@@ -23,6 +23,8 @@ from rti_mpc_service.rig.summary import TRANSIENT_S
 from rti_mpc_service.scenario import find_scenario
 from rti_mpc_service.tune.varied import with_values
 
+DEFAULT_SEED = 1  # of noise and dropout, as of `rti_mpc_sim.settings.RobotSettings`
+
 
 class Body(Protocol):
     """The simulated robot, advanced by its caller."""
@@ -104,7 +106,8 @@ class ClosedLoop:
     def __init__(self, config: Config, course: Course, make_body: MakeBody) -> None:
         self.scenario = find_scenario(config, course.name, course.heading, course.duration_s, course.speed_m_s, course.smooth_m)
         placed = configured(config, self.scenario)
-        sim = placed.sim.model_copy(update={"seed": (placed.sim.seed or 1) + course.seed})
+        seed = DEFAULT_SEED if placed.sim.seed is None else placed.sim.seed
+        sim = placed.sim.model_copy(update={"seed": seed + course.seed})
         self.config = placed.model_copy(update={"sim": sim})
         self._make_body = make_body
         self._problems: dict[int, Ocp] = {}  # by horizon: each is built and compiled once
@@ -115,7 +118,7 @@ class ClosedLoop:
         if not self._Q.any():
             raise ConfigError(f"ocp.weights.Q must weight an output that {self.scenario.title} leads, got none above 0")
         half = 0.5 * (ocp.ubu - ocp.lbu)
-        self._range = np.where(np.isfinite(half), half, 1.0)
+        self._range = np.where(np.isfinite(half) & (half > 0.0), half, 1.0)
 
     def _problem(self, config: Config) -> Ocp:
         if (ocp := self._problems.get(config.ocp.N)) is None:
