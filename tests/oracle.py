@@ -77,7 +77,7 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Arra
     rows: list[tuple[Array, ca.SX, Array]] = [(np.zeros(nx), x[:, 0] - x0, np.zeros(nx))]
     cost = ca.SX(0)
     for k in range(N):
-        e = h(x[:, k + 1], p) - y_ref[:, k]
+        e = model.residual(h(x[:, k + 1], p), y_ref[:, k])
         cost += ocp.delta[k] * ca.bilin(ca.DM(ocp.Q), e, e)
         cost += ca.dot(ca.DM(ocp.z), s[:, k]) + 0.5 * ca.dot(ca.DM(ocp.Z), s[:, k] ** 2)
         held = u[:, min(k, N_u - 1)]

@@ -63,6 +63,8 @@ class Model:
         method: How the model is integrated by all who predict with it: ``"rk4"``, or ``"irk"`` for a stiff one, which is Radau IIA.
         sim_method_num_stages: Stages of an implicit step, 1 to 3, of order 1, 3 and 5.
         sim_method_num_steps: Steps into which the integrator divides what it integrates over.
+        quaternions: Names of four outputs each, w, x, y, z, that are an attitude. The cost weighs not their differences from the reference, but the
+            small angles between the two, see `residual`: w has no weight, x, y, z those of angles in rad about the axes of the body.
 
     Raises:
         OcpError: An argument, a dimension, a name or a free symbol does not fit.
@@ -89,6 +91,7 @@ class Model:
     method: str = "rk4"
     sim_method_num_stages: int = 2
     sim_method_num_steps: int = 1
+    quaternions: tuple[tuple[str, str, str, str], ...] = ()
 
     def __post_init__(self) -> None:
         """Take what is given in other forms, and check that names, dimensions and symbols fit together."""
@@ -101,6 +104,7 @@ class Model:
             raise OcpError(f"model {self.name}: {error}") from None
         if not self.u_rest:
             object.__setattr__(self, "u_rest", (0.0,) * len(self.inputs))
+        object.__setattr__(self, "quaternions", quaternions_of(self))
         stop_expr = ca.SX(0, 1) if self.stop_expr is None else self.stop_expr
         for label, expr, length in (
             ("states", self.x, len(self.states)),
@@ -200,6 +204,20 @@ class Model:
         """Return the outputs at a node, ``h(x, p) -> y``."""
         return ca.Function("h", [self.x, self.p], [ca.densify(self.y_expr)], ["x", "p"], ["y"])
 
+    def residual(self, y: Any, y_ref: Any) -> Any:
+        r"""
+        Return what the cost weighs of outputs beside their reference, each an expression of shape ``(ny, 1)``: their difference.
+
+        Of a quaternion q beside :math:`q_{ref}`, of any length and sign, it is :math:`(0, 2 \, \mathrm{vec}(\bar q_{ref} q))`: for small errors
+        the angles in rad about the axes of the body. It grows up to half a turn, and the shorter way round is taken.
+        """
+        e = ca.vertsplit(y - y_ref)
+        for names in self.quaternions:
+            at = [[output.name for output in self.outputs].index(name) for name in names]
+            for i, part in zip(at, ca.vertsplit(small_angles(y[at], y_ref[at])), strict=True):
+                e[i] = part
+        return ca.vertcat(*e)
+
     def counterparts(self) -> dict[str, list[str]]:
         """Return, for each of the ``inputs`` and ``outputs``, the name of the state that it commands or is; empty where there is none."""
         return {
@@ -220,6 +238,32 @@ class Model:
                 raise OcpError(f"model {self.name} has parameters {', '.join(names) or 'none'}, got {name}")
             given.number(f"parameter {name} of model {self.name}", values[name])
         return replace(self, p_nominal=tuple(values.get(n, v) for n, v in zip(names, self.p_nominal, strict=True)))
+
+
+def quaternions_of(model: Model) -> tuple[tuple[str, str, str, str], ...]:
+    """
+    Return the quaternions of a model, checked; one alone may be given without a tuple around it.
+
+    Raises:
+        OcpError: One is not the names of four outputs that are no angles.
+    """
+    listed: Any = model.quaternions
+    if isinstance(listed, tuple | list) and listed and all(isinstance(name, str) for name in listed):
+        listed = (listed,)
+    plain = [output.name for output in model.outputs if not output.angle]
+    for names in listed if isinstance(listed, tuple | list) else (listed,):
+        if not isinstance(names, tuple | list) or len(names) != 4 or len(set(names)) < 4 or not all(name in plain for name in names):
+            raise OcpError(f"model {model.name}: quaternions must be names of four outputs each, w, x, y, z, no angles, got {given.quoted(names)}")
+    return tuple(tuple(names) for names in listed)
+
+
+def small_angles(q: ca.SX, q_ref: ca.SX) -> ca.SX:
+    """Return zero and the small angles from one attitude to another, quaternions w, x, y, z of any length and sign; shape ``(4, 1)``."""
+    q_ref = q_ref + ca.vertcat(ca.sumsqr(q_ref) == 0, 0, 0, 0)  # none is given: as if it were 1
+    (w, x, y, z), (w_r, x_r, y_r, z_r) = ca.vertsplit(q), ca.vertsplit(q_ref)
+    real = w_r * w + x_r * x + y_r * y + z_r * z
+    vector = ca.vertcat(w_r * x - x_r * w - y_r * z + z_r * y, w_r * y - y_r * w - z_r * x + x_r * z, w_r * z - z_r * w - x_r * y + y_r * x)
+    return ca.vertcat(0, 2 * ca.if_else(real < 0, -1, 1) * vector / ca.sqrt(ca.sumsqr(q) * ca.sumsqr(q_ref)))
 
 
 def depends_on(expr: ca.SX, symbol: ca.SX) -> bool:

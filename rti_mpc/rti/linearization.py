@@ -254,7 +254,7 @@ def linearize(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
 
 def gauss_newton(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity]:
     r"""
-    Build the terms of :math:`\tfrac12 \|y(x, p) - y_{ref}\|_W^2` at one node.
+    Build the terms of :math:`\tfrac12 \|y(x, p) - y_{ref}\|_W^2` at one node, with the residual of the model for the difference.
 
     Returns:
         ``node(x, p, y_ref, W) -> [gradient in x; twice the term itself; nonzeros of C' W C]``, and the pattern of the last.
@@ -263,8 +263,8 @@ def gauss_newton(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity]:
     y_ref = ca.SX.sym("y_ref", model.ny)
     weight = ca.SX.sym("W", model.ny, model.ny)
     W = weight * output_pattern(ocp)
-    C = ca.jacobian(model.y_expr, model.x)
-    e = model.y_expr - y_ref
+    e = model.residual(model.y_expr, y_ref)
+    C = ca.jacobian(e, model.x)
     H = C.T @ W @ C
     out = ca.cse(ca.densify(ca.vertcat(C.T @ (W @ e), e.T @ (W @ e), nonzeros(H))))
     return ca.Function("node", [model.x, model.p, y_ref, weight], [out]), H.sparsity()

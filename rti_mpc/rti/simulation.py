@@ -67,11 +67,17 @@ class Simulation:
     @property
     def cost(self) -> float:
         """Closed-loop cost: that of the OCP, each sample's output after it, its increment and its input weighted as in the first stage."""
-        e, du = self.error[1:], np.diff(self.u, axis=0, prepend=self.u0[None])
+        e, du = self._residual()[1:], np.diff(self.u, axis=0, prepend=self.u0[None])
         ocp = self.ocp
         off = self.u - np.array(ca.Function("u_ref", [ocp.model.p], [ocp.u_ref])(ocp.model.p_nominal)).ravel()
         of_inputs = ocp.lambda_[0] * np.einsum("ki,ij,kj->", du, ocp.R, du) + np.einsum("ki,i,ki->", off, ocp.R_u, off)
         return float(ocp.delta[0] * np.einsum("ki,ij,kj->", e, ocp.Q, e) + of_inputs)
+
+    def _residual(self) -> Array:
+        """Return what the cost weighs of outputs and reference, shape ``(M + 1, ny)``."""
+        y, y_ref = (ca.SX.sym(name, self.ocp.model.ny) for name in ("y", "y_ref"))
+        residual = ca.Function("residual", [y, y_ref], [ca.densify(self.ocp.model.residual(y, y_ref))]).map(len(self.t))
+        return np.array(residual(self.y.T, self.y_ref.T)).T.reshape(self.y.shape)
 
     def summary(self) -> dict[str, float]:
         """Return closed-loop cost, largest error of each output in the second half, largest excess of a bound on states, and unusable samples."""

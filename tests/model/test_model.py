@@ -92,6 +92,8 @@ def test_parameters_change_by_name_and_the_original_stays() -> None:
         ({"f_expl_expr": None, "disc_dyn_expr": ca.SX(2, 1)}, "dt must be the period of disc_dyn_expr in s, given with it only, got None"),
         ({"f_expl_expr": None, "disc_dyn_expr": ca.SX(3, 1), "dt": 0.1}, "disc_dyn_expr must have 3 entries"),
         ({"f_expl_expr": None, "disc_dyn_expr": ca.SX(2, 1), "dt": -0.1}, "dt must be a positive number of seconds, got -0.1"),
+        ({"quaternions": ("r", "v", "w", "z")}, "quaternions must be names of four outputs each, w, x, y, z, no angles"),
+        ({"quaternions": "r"}, "quaternions must be names of four outputs each"),
         ({"method": "euler"}, "method must be one of rk4, irk, got 'euler'"),
         ({"sim_method_num_stages": 4}, "sim_method_num_stages must be at most 3, got 4"),
         ({"sim_method_num_steps": 0}, "sim_method_num_steps must be a whole number of at least 1, got 0"),

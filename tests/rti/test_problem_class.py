@@ -9,6 +9,7 @@ change no more. With the recursion each plan is certified.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -154,3 +155,64 @@ def test_reference_of_inputs_moves_with_the_parameters_of_the_stages() -> None:
     assert rti.feedback(np.zeros(1)) is QpStatus.SOLVED
     np.testing.assert_allclose(rti.u[:, 0], wanted[:5], rtol=0, atol=1e-9)
     assert rti.cost == pytest.approx(0.0, abs=1e-12)
+
+
+def attitude(**changes: Any) -> Ocp:
+    """A rigid body in space, turned by torques: a quaternion and body rates."""
+    x, u = ca.SX.sym("x", 7), ca.SX.sym("u", 3)
+    (w, i, j, k), rate = ca.vertsplit(x[:4]), x[4:]
+    turning = ca.vertcat(-i, w, k, -j), ca.vertcat(-j, -k, w, i), ca.vertcat(-k, j, -i, w)
+    f = ca.vertcat(0.5 * sum((turning[axis] * rate[axis] for axis in range(3)), ca.SX.zeros(4)), u - ca.cross(rate, ca.DM([1, 2, 3]) * rate))
+    names = ("w", "i", "j", "k", "p", "q", "r")
+    model = Model("attitude", x, u, f, x, names, ("t_p", "t_q", "t_r"), names, x_nominal=[1, 0, 0, 0, 0, 0, 0], quaternions=("w", "i", "j", "k"))
+    own = {"N": 15, "dt": 0.1, "Q": [0, 1, 1, 1, 0.1, 0.1, 0.1], "R": [0.1] * 3, "lbu": -2, "ubu": 2, "lbdu": -1, "ubdu": 1}
+    return Ocp(model, **own | changes)
+
+
+def turned(axis: list[float], angle: float) -> Array:
+    """The quaternion of a turn by an angle in rad."""
+    return np.array([np.cos(angle / 2), *(np.sin(angle / 2) * np.array(axis) / np.linalg.norm(axis))])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", BUILT_IN_SOLVERS)
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_quaternion_is_steered_by_its_small_angles_as_by_ipopt(formulation: str, solver: str) -> None:
+    ocp, settings = attitude(N=8), replace(TIGHT, eps=1e-9)  # at 1e-10, or N = 15, OSQP does not converge with states as variables
+    rti, solve = Rti(ocp, settings, formulation=formulation, solver=solver, compile=False), nlp(ocp)
+    for axis, angle in (([1.0, 0.5, 0.2], 0.8), ([0.0, 1.0, -1.0], -1.5)):
+        x0, y_ref = np.array([1.0, 0, 0, 0, 0.1, -0.2, 0.3]), np.tile([*turned(axis, angle), 0, 0, 0], (ocp.N, 1))
+        rti.reset(x0, np.zeros(3))
+        _, u, cost = solve(x0, np.zeros(3), y_ref, rti.x, rti.u)
+        for _ in range(200):
+            before = rti.u.copy()
+            rti.prepare(y_ref, shift=False)
+            assert rti.feedback(x0) is QpStatus.SOLVED
+            if np.abs(rti.u - before).max() < 1e-9:
+                break
+        np.testing.assert_allclose(rti.u, u, rtol=0, atol=1e-6)
+        assert rti.cost == pytest.approx(cost, rel=1e-6)
+
+
+def test_quaternion_and_its_negative_are_one_attitude_and_the_shorter_way_round_is_taken() -> None:
+    """By 2.5 rad, and by 2.5 rad less than a turn, from references and measurements of either sign; components themselves would go the long way."""
+    ocp = attitude(N=20)
+    phi = ocp.phi()
+    rti = Rti(ocp, compile=False)
+    for angle, shorter in ((2.5, 2.5), (2 * np.pi - 2.5, -2.5)):
+        final = []
+        for sign in (1.0, -1.0):
+            goal, x = turned([0, 0, 1], angle), np.array([1.0, 0, 0, 0, 0, 0, 0])
+            rti.reset(x, np.zeros(3))
+            rates = []
+            for sample in range(120):
+                rti.prepare(np.tile([*(sign * goal), 0, 0, 0], (ocp.N, 1)))
+                assert rti.feedback(x).usable
+                x = np.array(phi(x, rti.u[0], [])).ravel()
+                rates.append(x[6])
+                if sign < 0 and sample == 30:
+                    x[:4] *= -1.0
+            assert abs(goal @ x[:4]) == pytest.approx(1.0, abs=1e-4)
+            assert 0.1 * np.sum(rates) == pytest.approx(shorter, abs=0.1)
+            final.append(rates)
+        np.testing.assert_allclose(final[0][:30], final[1][:30], rtol=0, atol=1e-7)
