@@ -102,7 +102,8 @@ def model_equations(model: Model) -> str:
     """Return the model's equations as text."""
     parts = {"states": model.states, "inputs": model.inputs, "outputs": model.outputs, "parameters": model.parameters}
     names = [f"{name}: {', '.join(f'{signal.name} [{signal.unit}]' for signal in signals)}" for name, signals in parts.items()]
-    return "\n".join([f"model: {model.name}", *names, f"dx/dt: {model.f_expl_expr}", f"y: {model.y_expr}", f"p: {list(model.p_nominal)}", ""])
+    equations = [f"dx/dt: {model.f_expl_expr}"] if model.dt is None else [f"x after {model.dt:g} s: {model.disc_dyn_expr}"]
+    return "\n".join([f"model: {model.name}", *names, *equations, f"y: {model.y_expr}", f"p: {list(model.p_nominal)}", ""])
 
 
 def code_hash() -> str:

@@ -29,6 +29,7 @@ def lagging(model: Model, lag_s: float) -> Model:
         model,
         x=ca.vertcat(model.x, v),
         f_expl_expr=ca.vertcat(f(model.x, v, model.p), (model.u - v) / lag_s),
+        x_nominal=(*model.x_nominal, *model.u_rest) if model.x_nominal else (),
         states=(*model.states, *(Signal(f"{s.name}_applied", s.unit) for s in model.inputs)),
     )
 

@@ -47,6 +47,12 @@ def test_lagging_inputs_reach_63_percent_after_one_time_constant() -> None:
     np.testing.assert_allclose(plant.u, (1 - np.exp(-1)) * U, rtol=1e-6)
 
 
+def test_inputs_of_a_model_with_a_nominal_state_may_lag() -> None:
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    lagged = lagging(Model("tank", x, u, u - ca.sqrt(x), x, "h", "q", "h", x_nominal=1.0, u_rest=1.0), 0.1)
+    assert lagged.x_nominal == (1.0, 1.0)
+
+
 def test_cutting_an_interval_changes_nothing() -> None:
     whole, cut = Plant(MODEL, X0, 0.1, 20), Plant(MODEL, X0, 0.1, 20)
     whole.advance(U, 0.1)
