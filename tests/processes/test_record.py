@@ -25,7 +25,7 @@ from rti_mpc.wire.keys import Keys
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
-from tests.in_time import in_time
+from tests.in_time import PATIENT, in_time
 from tests.processes.system import KEYS, ROOT, System, command_line, environment, rti_mpc, until
 from tests.recording.test_recording import read_by_others
 
@@ -73,7 +73,7 @@ def recorder(folder: Path, endpoint: str, out: Path, *options: object) -> Iterat
 
 def test_recorder_killed_at_any_instant_leaves_all_but_the_last_second(tmp_path: Path, host: Host, pytestconfig: pytest.Config) -> None:
     rng, endpoint = np.random.default_rng(16), free_endpoint()
-    with Bus.join(BusSettings(listen=(endpoint,), connect=()), KEYS) as bus, Chatter(bus) as chatter:
+    with Bus.join(BusSettings(listen=(endpoint,), connect=(), cfg=PATIENT), KEYS) as bus, Chatter(bus) as chatter:
         for number in range(pytestconfig.getoption("--kills")):
             path = tmp_path / f"{number}.mcap"
             with recorder(tmp_path, endpoint, path) as process:
