@@ -64,6 +64,17 @@ class PathSource:
         """Whether nothing follows after the end of the present piece."""
         return self.piece == len(self.pieces) - 1 and not self.path.closed
 
+    def begin(self, point: Sequence[float] | Array, progress_m: float) -> None:
+        """
+        Begin the path where it is nearest to a robot.
+
+        Args:
+            point: x and y of the robot, in m.
+            progress_m: Its progress there, in m, whatever it counted before.
+        """
+        self.piece, self.passed_m = 0, 0.0
+        self.passed_m = progress_m - self.path.project(point)
+
     def arrived(self, progress_m: float, pace_m_s: float) -> bool:
         """Whether a robot rests at the end of the present piece."""
         return not self.path.closed and abs(progress_m - self.passed_m - self.path.length) < ARRIVED_M and abs(pace_m_s) < RESTING_M_S

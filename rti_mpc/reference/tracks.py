@@ -39,9 +39,9 @@ CONTROL_POINTS_M: dict[str, list[tuple[float, float]]] = {
 TRACKS = tuple(CONTROL_POINTS_M)
 
 
-def track(name: str) -> Path:
-    """Build one of `TRACKS`, driven to the left or to the right as it is; its speeds are to be limited by `Path.limited`."""
-    return smooth_path(centre_line(name), right=HALF_WIDTH_M, left=HALF_WIDTH_M)
+def track(name: str, speed_m_s: float = 1.0) -> Path:
+    """Build one of `TRACKS`, with one speed everywhere, in m/s, which `Path.limited` replaces by a profile."""
+    return smooth_path(centre_line(name), right=HALF_WIDTH_M, left=HALF_WIDTH_M, speed=speed_m_s)
 
 
 def centre_line(name: str) -> Array:

@@ -27,7 +27,7 @@ from rti_mpc_service import entry, log
 from rti_mpc_service.certs.commands import certs
 from rti_mpc_service.certs.folder import credentials, secured
 from rti_mpc_service.command_group import Commands
-from rti_mpc_service.config.build import build_signals, bus_settings, robot_settings, stage_parameters, with_initial_state
+from rti_mpc_service.config.build import build_model, build_signals, bus_settings, robot_settings, stage_parameters, with_initial_state
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.config.signals_file import check_against
@@ -249,11 +249,29 @@ def reference(
     ] = None,
     waypoint_speed: WaypointSpeed = 0.25,
     waypoint_smoothing: WaypointSmoothing = None,
+    track: Annotated[
+        str | None,
+        typer.Option("--path", metavar="FILE.csv", help="Path for a robot that follows one, in place of a scenario: a file, or a track that ships."),
+    ] = None,
+    path_limits: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(
+            metavar="V LATERAL ACCELERATION BRAKING", help="Limits of the speed along it, in m/s and m/s^2.", show_default="the speeds of the file"
+        ),
+    ] = None,
 ) -> None:
     """Publish a reference that starts at the robot's current state, and again after each restart of the robot."""
     from rti_mpc_service.reference import main
     from rti_mpc_service.scenario import find_scenario
 
+    if track is not None:
+        from rti_mpc.reference.speed_profile import SpeedLimits
+        from rti_mpc_service import path_reference
+
+        limits = None if path_limits is None else SpeedLimits(*path_limits)
+        pieces = path_reference.find_path(track, waypoint_speed if limits is None else limits.speed, limits, waypoint_smoothing)
+        path_reference.main(track, build_model(config), pieces, bus, config.keys())
+        return
     followed = find_scenario(config, scenario, heading, duration, waypoint_speed, waypoint_smoothing)
     main(followed, bus, config.keys(), parameters=partial(stage_parameters, config))
 

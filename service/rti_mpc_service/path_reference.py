@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Source of a path as a process: the part of it that lies around the robot, again and again.
+
+Each reference holds the path in its stage parameters, from the robot's position on for
+longer than its horizon. It lasts a second and ends with a stop, so that a robot whose
+path is sent no more comes to rest. A robot that is restarted begins the path anew, where
+it is nearest.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from pathlib import Path as File
+from threading import Event
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.contract.lives import Heard, Lives
+from rti_mpc.contract.message import End, Notice, Reference, Severity, State
+from rti_mpc.errors import ConfigError
+from rti_mpc.reference.path import Path, read_path
+from rti_mpc.reference.path_source import PathSource
+from rti_mpc.reference.speed_profile import SpeedLimits
+from rti_mpc.reference.tracks import TRACKS, track
+from rti_mpc.signals import place, plane
+from rti_mpc.wire.announcer import Announcer
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings
+from rti_mpc.wire.interrupt import stop_on_signals
+from rti_mpc.wire.keys import Keys
+from rti_mpc_service.reference import ROLE, STALE_S
+
+if TYPE_CHECKING:
+    from rti_mpc.model.model import Model
+
+LOOK_PERIOD_S = 0.02  # period of reading states
+PERIOD_NS = 100_000_000  # of the robot's time between two references
+LASTS_NS = 1_000_000_000  # of the robot's time, after which a robot without another reference stops
+
+logger = logging.getLogger(ROLE)
+
+
+def find_path(name: str, speed_m_s: float, limits: SpeedLimits | None, smooth_m: float | None = None) -> tuple[Path, ...]:
+    """
+    Find the path that a robot follows.
+
+    Args:
+        name: One of the tracks that ship, or a CSV file; see `rti_mpc.reference.path.read_path`.
+        speed_m_s: Speed where the file names none, in m/s.
+        limits: Limits of its speed profile, which also stays below the speeds of the file; None: those speeds as they are.
+        smooth_m: Arc length that waypoints are averaged over, in m.
+
+    Raises:
+        ConfigError: There is no such track, or the file is wrong.
+    """
+    if name not in TRACKS and File(name).suffix.lower() != ".csv":
+        raise ConfigError(f"--path must be one of {', '.join(TRACKS)} or a FILE.csv of a path, got {name!r}")
+    pieces = (track(name, speed_m_s),) if name in TRACKS else read_path(File(name), speed_m_s=speed_m_s, smooth_m=smooth_m)
+    return pieces if limits is None else tuple(piece.limited(limits, inside=True) for piece in pieces)
+
+
+class PathReferences:
+    """
+    References of a robot that follows a path, as its states come.
+
+    Args:
+        model: Model of the robot, which follows a path.
+        pieces: Pieces of the path.
+        epoch: Epoch of the references.
+
+    Raises:
+        ConfigError: The model follows no path.
+    """
+
+    def __init__(self, model: Model, pieces: Sequence[Path], epoch: int) -> None:
+        from rti_mpc.model.path_following import window_place
+
+        window, position, progress = window_place(model), plane(model.states), place(model.states, "progress")
+        if window is None or position is None or progress is None:
+            raise ConfigError(f"model {model.name} must be one of path_following for --path, it has no parameter whose role is path_start")
+        self._source = PathSource(pieces, model.p_nominal, *window)
+        self._position, self._progress = list(position), progress
+        self._epoch, self._seq = epoch, 0
+        self._y: Array = np.zeros((2, model.ny))
+        self._sent_ns: int | None = None
+
+    def begin(self, x: Array) -> None:
+        """Begin the path where it is nearest to a robot, with its first state."""
+        self._source.begin(x[self._position], float(x[self._progress]))
+        self._sent_ns = None
+
+    def answer(self, stamp_ns: int, x: Array) -> Reference | None:
+        """Return the next reference to be published, None if it is not due yet; of the stamp and the state, shape ``(nx,)``, of a robot."""
+        if self._sent_ns is not None and 0 <= stamp_ns - self._sent_ns < PERIOD_NS:
+            return None
+        self._sent_ns = stamp_ns
+        self._seq += 1
+        p = self._source.parameters(float(x[self._progress]), float(x[self._progress + 1]))
+        return Reference(self._epoch, self._seq, stamp_ns, LASTS_NS, End.STOP, self._y, np.tile(p, (2, 1)))
+
+
+def main(name: str, model: Model, pieces: Sequence[Path], bus_settings: BusSettings, keys: Keys, *, stop: Event | None = None) -> None:
+    """
+    Publish the path around the robot until stopped.
+
+    Args:
+        name: Name of the path.
+        model: Model of the robot, which follows a path.
+        pieces: Pieces of the path.
+        bus_settings: How to join the bus.
+        keys: Where the robot's streams are.
+        stop: Event that stops the source; None: SIGINT and SIGTERM do.
+
+    Raises:
+        ConfigError: The model follows no path.
+    """
+    epoch = time.time_ns() // 1_000_000_000
+    references = PathReferences(model, pieces, epoch)
+    stop = stop or stop_on_signals()
+    with Bus.join(bus_settings, keys, stop=stop, say=logger.warning) as bus:
+        publisher, states = bus.publisher(keys.reference), bus.subscriber(keys.state, capacity=RING_MESSAGES)
+        announcer, intake = Announcer(bus, ROLE, epoch), bus.intake(State, STALE_S, {"x": model.nx})
+        lives = Lives(STALE_S, STALE_S)
+        begun = 0
+        bus.expect("state", lambda: begun)
+        bus.alive(ROLE)
+        text = f"path {name} of {sum(piece.length for piece in pieces):.1f} m, {sum(piece.time_s for piece in pieces):.1f} s"
+        logger.info("%s for %s", text, keys.robot)
+        while not stop.wait(LOOK_PERIOD_S):
+            now_ns = time.monotonic_ns()
+            for state in intake.newest_of_each(states.drain()):
+                heard = lives.judge(state.epoch, now_ns)
+                if heard is Heard.BEGINS:
+                    begun += 1
+                    references.begin(state.x)
+                    announcer.say(Notice(Severity.INFO, "reference_published", text), state.stamp_ns)
+                if heard is not Heard.OTHER and (reference := references.answer(state.stamp_ns, state.x)) is not None:
+                    publisher.put(reference)
+            for notice in intake.notices(now_ns):
+                announcer.say(notice, 0)
