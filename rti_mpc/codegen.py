@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import subprocess
 import tempfile
@@ -33,6 +34,9 @@ COMPILER_FLAGS = ("-O3", "-std=gnu89", "-fno-semantic-interposition", "-ffp-cont
 
 COMPILER_RATE = 80_000  # characters of source per s, as measured on a virtual core
 
+BEFORE_BODY = "\f"  # divides what stands before a function in C from its body
+_bodies: dict[str, str] = {}  # what `function_in_c` was given, by the name of the function, which ends with a hash of it
+
 # Entered while the compiler runs, with how long that should take, in s: whoever has a terminal or a log puts something here that tells of it.
 while_compiling: Callable[[float], AbstractContextManager[object]] = nullcontext
 
@@ -54,7 +58,7 @@ def compiled(*functions: ca.Function) -> list[ca.Function]:
     generator = ca.CodeGenerator("functions", {"with_header": False})
     for function in functions:
         generator.add(function)
-    source = generator.dump()
+    source = with_bodies(generator.dump())
     key = hashlib.sha256("\0".join((source, compiler, *COMPILER_FLAGS, os.uname().machine)).encode()).hexdigest()[:32]
     name = f"{functions[0].name()}-{key}.so"
     try:
@@ -115,6 +119,54 @@ def _first_line(text: str) -> str:
 def function(name: str, inputs: Mapping[str, Any], outputs: Mapping[str, Any]) -> ca.Function:
     """Build a CasADi function from expressions by name; no output may have the name of an input."""
     return ca.Function(name, [*inputs.values()], [*outputs.values()], [*inputs], [*outputs])
+
+
+def function_in_c(name: str, inputs: Mapping[str, Any], outputs: Mapping[str, Any], body: str) -> ca.Function:
+    """
+    Build a function as `function`, and give the code that is compiled in place of the generated one.
+
+    Args:
+        name: Its name, to which a hash of the body is added: two functions with one name have the same body.
+        inputs: Its arguments by name.
+        outputs: Its results by name, as the virtual machine evaluates them.
+        body: The same function in C, from the arguments of a CasADi function, ``arg, res, iw, w``, of which it uses no more than the
+            expressions do. It calls a function that they call as ``$name(arg, res, iw, w, 0)``. What it declares outside comes first, before
+            `BEFORE_BODY`.
+    """
+    unique = f"{name}_{hashlib.sha256(body.encode()).hexdigest()[:16]}"
+    _bodies[unique] = body
+    return function(unique, inputs, outputs)
+
+
+FUNCTION = re.compile(r"^/\* (?P<name>\w+):\(.*\*/\nstatic int (?P<symbol>\w+)\(.*\{\n(?P<body>(?:.*\n)*?)\}\n", flags=re.MULTILINE)
+
+CALL = re.compile(r"\w+(?=\()")
+
+
+def with_bodies(source: str) -> str:
+    """Replace functions in generated code by what `function_in_c` has been given, and remove those that are not called then."""
+    found = list(FUNCTION.finditer(source))
+    symbols: dict[str, set[str]] = {}
+    for match in found:
+        symbols.setdefault(match["name"], set()).add(match["symbol"])
+
+    def called(match: re.Match[str]) -> str:
+        (symbol,) = symbols[match[1]]
+        return symbol
+
+    parts, rest = [], len(source)
+    needed = set(CALL.findall(FUNCTION.sub("", source)))
+    for match in reversed(found):  # a function stands before those that call it
+        text = match[0]
+        if match["name"] in _bodies:
+            before, _, body = re.sub(r"[$](\w+)", called, _bodies[match["name"]]).rpartition(BEFORE_BODY)
+            text = f"{before}{text[: match.start('body') - match.start()]}{body}\n}}\n"
+        if match["symbol"] not in needed:
+            text = ""
+        needed.update(CALL.findall(text))
+        parts += [source[match.end() : rest], text]
+        rest = match.start()
+    return "".join(reversed([*parts, source[:rest]]))
 
 
 def bind(function: ca.Function, inputs: Mapping[str, Array], outputs: Mapping[str, Array]) -> Callable[[], None]:

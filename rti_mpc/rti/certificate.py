@@ -25,6 +25,7 @@ import numpy as np
 from rti_mpc.codegen import function
 from rti_mpc.rti.linearization import Linearization, all_inputs, divided
 from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.recursion import recur
 
 SMALLEST_DIVISOR = 1e-300  # replaces a quadratic penalty of zero
 
@@ -52,15 +53,11 @@ def certificate(ocp: Ocp) -> ca.Function:
     shared = [ca.repmat(e, 1, N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg, lin.scale_x, lin.scale_g)]
     data = (forms.A, forms.B, forms.b, forms.H, forms.h, forms.g, forms.g_x, forms.g_u)
     nodes = node(ocp, lin).map(N)(*data, dx[:, :-1], all_inputs(du, N), dx[:, 1:], of_softened, *shared)
-    sums, by_x, by_u = nodes[:3, :], ca.horzsplit(nodes[3 : 3 + nx, :]), nodes[3 + nx :, :]
+    sums, by_x, by_u = nodes[:3, :], nodes[3 : 3 + nx, :], nodes[3 + nx :, :]
 
-    sweep = adjoint(lin)
-    A_k, B_k, by_u_k = (ca.horzsplit(e) for e in (forms.A, forms.B, by_u))
-    reduced: list[ca.MX] = [ca.MX.zeros(nu)] * N_u
-    pi = by_x[-1]
-    for k in reversed(range(N)):
-        gradient, pi = sweep(A_k[k], B_k[k], by_u_k[k], pi, by_x[k - 1] if k else ca.MX.zeros(nx))
-        reduced[min(k, N_u - 1)] += gradient
+    sweep = recur("adjoint", [(adjoint(lin), N)], {"pi": "pi_before"}, ["gradient"], backward=True)
+    gradient = sweep(A=forms.A, B=forms.B, by_u=by_u, by_x=by_x, pi=ca.MX.zeros(nx))["gradient"]
+    reduced = ca.horzcat(gradient[:, : N_u - 1], ca.sum2(gradient[:, N_u - 1 :]))
 
     planned = u_plan - ca.horzcat(lin.u_prev, u_plan[:, :-1])
     forces = (lin.R @ planned) * ca.repmat(w["lambda_"].T, nu, 1)
@@ -71,7 +68,7 @@ def certificate(ocp: Ocp) -> ca.Function:
         of_steps = ca.dot(forms.force - at_guess, planned - forms.increments) + ca.dot(ca.repmat(w["R_u"], 1, N_u) * du, du) / 2
     push = push - ca.horzcat(push[:, 1:], ca.MX.zeros(nu)) + ca.repmat(forms.damping, 1, N_u) * du
     shared = [ca.repmat(e, 1, N_u) for e in (w["lbu"], w["ubu"], w["lbdu"], w["ubdu"], lin.scale_u)]
-    inputs = of_inputs(ocp).map(N_u)(ca.horzcat(*reduced) + push, u_plan, planned, of_increments, *shared)
+    inputs = of_inputs(ocp).map(N_u)(reduced + push, u_plan, planned, of_increments, *shared)
 
     primal = ca.fmax(ca.fmax(ca.mmax(sums[0, :]), ca.mmax(inputs[0, :])), ca.mmax(ca.fabs(x_plan[:, 0] - x0) / lin.scale_x))
     gap = ca.sum2(sums[1, :]) + ca.sum2(inputs[1, :])
@@ -111,11 +108,13 @@ def node(ocp: Ocp, lin: Linearization) -> ca.Function:
 
 
 def adjoint(lin: Linearization) -> ca.Function:
-    """Build one stage of the adjoint sweep: ``(A, B, by_u, pi, by_x) -> (B' pi + by_u, A' pi + by_x)``."""
+    """Build one stage of the adjoint sweep, from the gradients in the state at its end and in its input."""
     a, b = ca.SX.sym("a", lin.A_k.nnz()), ca.SX.sym("b", lin.B_k.nnz())
     A, B = ca.SX(lin.A_k, a), ca.SX(lin.B_k, b)
     by_u, pi, by_x = ca.SX.sym("by_u", B.shape[1]), ca.SX.sym("pi", A.shape[0]), ca.SX.sym("by_x", A.shape[0])
-    return ca.Function("certify_back", [a, b, by_u, pi, by_x], [ca.densify(B.T @ pi + by_u), ca.densify(A.T @ pi + by_x)])
+    after = pi + by_x
+    inputs = {"A": a, "B": b, "by_u": by_u, "by_x": by_x, "pi": pi}
+    return function("certify_back", inputs, {"gradient": ca.densify(B.T @ after + by_u), "pi_before": ca.densify(A.T @ after)})
 
 
 def of_inputs(ocp: Ocp) -> ca.Function:

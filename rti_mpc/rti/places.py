@@ -24,7 +24,8 @@ from rti_mpc.rti import interior_point
 from rti_mpc.rti.linearization import Forms, Linearization, all_inputs, change, divided, shift
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
-from rti_mpc.rti.riccati import Gain, Riccati, Rows, Stage, columns, softened_steps, stagewise
+from rti_mpc.rti.recursion import recur
+from rti_mpc.rti.riccati import Gain, Riccati, Rows, Stage, softened_steps
 
 PENALTY = 3e9  # weight that holds values at their bounds, in units of their scale; with a larger one digits are lost
 BOUND_TOLERANCE = 1e-9  # a bound acts when it is exceeded by more than this, relative to its scale, so that rounding does not decide
@@ -145,28 +146,37 @@ def hold(place: ca.SX, value: ca.SX, lower: ca.SX, upper: ca.SX, weight: ca.SX) 
 def roll_out(ocp: Ocp, at: Sample, x0: ca.MX) -> dict[str, ca.MX]:
     """Return the outputs of `Places.roll_out`, by name."""
     lin, forms, w, N_u = at.lin, at.forms, at.lin.w, ocp.N_u
-    free, held = roll_free(ocp, lin), roll_held(ocp, lin)
-    x_k = columns(lin.x)
-    stages = stagewise(A=forms.A, B=forms.B, b=forms.b, g_x=forms.g_x, g_u=forms.g_u, g=forms.g, place_g=at.place.g)
-    inputs = stagewise(u=lin.u, increment=forms.increments, gain=at.gains, place_u=at.place.u, place_du=at.place.du)
+    nx, nu = ocp.model.nx, ocp.model.nu
     limits = {"lg": lin.lg, "ug": lin.ug, "zg": lin.zg, "Zg": lin.Zg, "stiff_g": PENALTY / lin.scale_g**2, "scale_g": lin.scale_g}
     bounds = {name: w[name] for name in ("lbu", "ubu", "lbdu", "ubdu")} | {"stiff_u": PENALTY / lin.scale_u**2, "scale_u": lin.scale_u}
-    s, slip = ca.vertcat(x0 - x_k[0], ca.MX.zeros(ocp.model.nu)), ca.MX.zeros(ocp.model.nx + ocp.model.nu)
-    before = lin.u_prev
-    verdict = ca.MX(ca.DM([0, -INFINITY, -INFINITY]))  # changes, violation, violation relative to scale
-    states, rolled = [x0], []
-    for k in range(ocp.N):
-        stage = {**stages[k], **limits, "x_next": x_k[k + 1], "s": s, "slip": slip, "verdict": verdict}
-        after = free(**stage, **inputs[k], before=before, **bounds) if k < N_u else held(**stage)
-        s, slip, verdict = after["s_after"], after["slip_after"], after["verdict_after"]
-        before = after.get("u_plan", before)
-        states.append(after["x_plan"])
-        rolled.append(after)
-
-    def along(name: str, count: int = ocp.N) -> ca.MX:
-        return ca.MX(ca.horzcat(*(after[name] for after in rolled[:count])))
-
-    x_plan, u_plan = ca.horzcat(*states), along("u_plan", N_u)
+    start = {
+        "s": ca.vertcat(x0 - lin.x[:, 0], ca.MX.zeros(nu)),
+        "slip": ca.MX.zeros(nx + nu),
+        "verdict": ca.MX(ca.DM([0, -INFINITY, -INFINITY])),  # changes, violation, violation relative to scale
+        "before": lin.u_prev,
+    }
+    carried = {"s": "s_after", "slip": "slip_after", "verdict": "verdict_after", "before": "u_plan"}
+    outputs = ["x_plan", "u_plan", "verdict_after", "place_u_found", "place_du_found", "place_g_found", "force", "paid"]
+    rolling = [(roll_free(ocp, lin), N_u), (roll_held(ocp, lin), ocp.N - N_u)]
+    along = recur("rolled_out", rolling, carried, outputs, shared=[*limits, *bounds])(
+        A=forms.A,
+        B=forms.B,
+        b=forms.b,
+        g_x=forms.g_x,
+        g_u=forms.g_u,
+        g=forms.g,
+        x_next=lin.x[:, 1:],
+        u=lin.u,
+        increment=forms.increments,
+        gain=at.gains,
+        place_u=at.place.u,
+        place_du=at.place.du,
+        place_g=at.place.g,
+        **limits,
+        **bounds,
+        **start,
+    )
+    x_plan, u_plan, verdict = ca.horzcat(x0, along["x_plan"]), along["u_plan"], along["verdict_after"][:, -1]
     finite = forms.checksum + ca.sum1(ca.vec(u_plan)) + ca.sumsqr(x_plan) ** 2  # overflows if a state is too large
     return {
         "x_plan": x_plan,
@@ -174,8 +184,8 @@ def roll_out(ocp: Ocp, at: Sample, x0: ca.MX) -> dict[str, ca.MX]:
         "violation": verdict[1:],
         "change": change(lin, u_plan),
         "changes": ca.if_else(ca.fabs(finite) < np.inf, verdict[0], -1),
-        "places_found": ca.veccat(along("place_u_found", N_u), along("place_du_found", N_u), along("place_g_found")),
-        "multipliers": ca.veccat(along("force", N_u), along("paid")),
+        "places_found": ca.veccat(along["place_u_found"], along["place_du_found"], along["place_g_found"]),
+        "multipliers": ca.veccat(along["force"], along["paid"]),
     }
 
 
@@ -312,26 +322,44 @@ def refine(
     beyond = side * (ca.repmat(lin.zg, 1, N) + ca.repmat(lin.Zg, 1, N) * by) / 2
     paid = ca.if_else(ca.fabs(place.g) == 2, beyond, (of_softened + weight * (excess + rows.g)) * (ca.fabs(place.g) == 1))
     force = of_increments + ca.repmat(PENALTY / lin.scale_u**2, 1, N_u) * (ca.fabs(place.du) == 1) * rows.du
-    clip, follow = clip_function(nu), follow_function(lin)
-    last, change_k, inputs, states = lin.u_prev, ca.MX.zeros(ocp.model.nx), [], [x_plan[:, 0]]
-    planned, A, B = columns(u_plan), columns(forms.A), columns(forms.B)
-    for k in range(N):
-        if k < N_u:
-            last = clip(planned[k] + step[:, k], last, w["lbu"], w["ubu"], w["lbdu"], w["ubdu"])
-            inputs.append(last)
-        change_k = follow(A[k], B[k], change_k, last - planned[min(k, N_u - 1)])
-        states.append(x_plan[:, k + 1] + change_k)
-    return {"x_refined": ca.horzcat(*states), "u_refined": ca.horzcat(*inputs), "multipliers_refined": ca.veccat(force, paid)}
+    amending = [(amend_free(lin, nu), N_u), (amend_held(lin, nu), N - N_u)]
+    carried = {"before": "u_refined", "du": "du_after", "dx": "dx_after"}
+    bounds = {name: w[name] for name in ("lbu", "ubu", "lbdu", "ubdu")}
+    amended = recur("amended", amending, carried, ["x_refined", "u_refined"], shared=[*bounds])(
+        A=forms.A,
+        B=forms.B,
+        x_plan=x_plan[:, 1:],
+        u_plan=u_plan,
+        step=step,
+        before=lin.u_prev,
+        du=ca.MX.zeros(nu),
+        dx=ca.MX.zeros(ocp.model.nx),
+        **bounds,
+    )
+    states = ca.horzcat(x_plan[:, 0], amended["x_refined"])
+    return {"x_refined": states, "u_refined": amended["u_refined"], "multipliers_refined": ca.veccat(force, paid)}
 
 
-def follow_function(lin: Linearization) -> ca.Function:
-    """Return ``(A, B, dx, du) -> dx`` at the end of a stage: the change of states that clipped inputs cause."""
+def amended_stage(lin: Linearization, du: ca.SX) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
+    """Return symbols and results of a stage of a plan whose input changes by du."""
     a, b = ca.SX.sym("a", lin.A_k.nnz()), ca.SX.sym("b", lin.B_k.nnz())
-    dx, du = ca.SX.sym("dx", lin.A_k.size1()), ca.SX.sym("du", lin.B_k.size2())
-    return ca.Function("follow", [a, b, dx, du], [ca.densify(ca.SX(lin.A_k, a) @ dx + ca.SX(lin.B_k, b) @ du)])
+    x_plan, dx = (ca.SX.sym(name, lin.A_k.size1()) for name in ("x_plan", "dx"))
+    after = ca.densify(ca.SX(lin.A_k, a) @ dx + ca.SX(lin.B_k, b) @ du)
+    return {"A": a, "B": b, "x_plan": x_plan, "dx": dx}, {"x_refined": x_plan + after, "dx_after": after}
 
 
-def clip_function(nu: int) -> ca.Function:
-    """Return `clipped_input` as a function."""
-    symbols = [ca.SX.sym(name, nu) for name in ("u", "before", "lbu", "ubu", "lbdu", "ubdu")]
-    return ca.Function("met", symbols, [clipped_input(*symbols)])
+def amend_held(lin: Linearization, nu: int) -> ca.Function:
+    """Build a stage of a plan whose input changes as that of the stage before."""
+    du = ca.SX.sym("du", nu)
+    symbols, outputs = amended_stage(lin, du)
+    return function("amend_held", {**symbols, "du": du}, outputs)
+
+
+def amend_free(lin: Linearization, nu: int) -> ca.Function:
+    """Build a stage of a plan whose input changes by a step, clipped to its bounds."""
+    names = ("u_plan", "step", "before", "lbu", "ubu", "lbdu", "ubdu", "du")
+    u_plan, step, before, lbu, ubu, lbdu, ubdu, _ = own = [ca.SX.sym(name, nu) for name in names]
+    u_refined = clipped_input(u_plan + step, before, lbu, ubu, lbdu, ubdu)
+    symbols, outputs = amended_stage(lin, u_refined - u_plan)
+    outputs |= {"u_refined": u_refined, "du_after": u_refined - u_plan}
+    return function("amend_free", {**symbols, **dict(zip(names, own, strict=True))}, outputs)

@@ -27,10 +27,10 @@ from typing import NamedTuple
 import casadi as ca
 
 from rti_mpc.codegen import function
+from rti_mpc.rti.dense import backward_in_c
 from rti_mpc.rti.linearization import Forms, Linearization, nonzeros
 from rti_mpc.rti.ocp import Ocp
-
-Columns = list[ca.MX]  # one expression per stage
+from rti_mpc.rti.recursion import recur
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,17 +49,6 @@ class Rows:
     g: ca.MX
 
 
-def columns(matrix: ca.MX) -> Columns:
-    """Return the columns of a matrix, which may have no rows."""
-    return list(ca.horzsplit(matrix)) if matrix.size1() else [ca.MX(0, 1)] * matrix.size2()
-
-
-def stagewise(**matrices: ca.MX) -> list[dict[str, ca.MX]]:
-    """Return the columns of matrices of the same width stage by stage, by name."""
-    split = {name: columns(matrix) for name, matrix in matrices.items()}
-    return [dict(zip(split, column, strict=True)) for column in zip(*split.values(), strict=True)]
-
-
 class Riccati:
     """
     The recursion of an OCP, in expressions.
@@ -76,9 +65,15 @@ class Riccati:
         self._n = n = nx + nu
         self._ends = (nu * n, nu * (n + 1))
         self.size = nu * (n + 1) + nu * (nu + 1) // 2
-        self._backward_free, self._backward_held = backward_free(ocp, lin), backward_held(ocp, lin)
-        self._sweep_free, self._sweep_held = sweep_free(ocp, lin), sweep_held(ocp, lin)
-        self._forward_free, self._forward_held = forward_free(ocp, lin), forward_held(ocp, lin)
+        repeated = ocp.N_u, ocp.N - ocp.N_u
+        backward, sweep, forward = (
+            [*zip((free(ocp, lin), held(ocp, lin)), repeated, strict=True)]
+            for free, held in ((backward_free, backward_held), (sweep_free, sweep_held), (forward_free, forward_held))
+        )
+        dense, costs = backward_in_c(ocp, lin, backward[0][0]), {"P": "P_before", "p": "p_before"}
+        self._backward = recur("backward", backward, costs, ["gain"], shared=["R", "damping"], backward=True, in_c=dense)
+        self._sweep = recur("sweep", sweep, {"p": "p_before"}, ["kappa"], backward=True)
+        self._forward = recur("forward", forward, {"s": "s_after"}, ["s_after", "g", "increment"])
         stages, gains, start = ca.MX.sym("stages", lin.stages.numel()), ca.MX.sym("gains", self.size, ocp.N_u), ca.MX.zeros(n)
         weight, pull = (
             Rows(*(ca.MX.sym(f"{name}_{of}", *like.shape) for of, like in (("u", lin.u), ("du", lin.u), ("g", lin.g)))) for name in ("weight", "pull")
@@ -91,37 +86,21 @@ class Riccati:
 
     def _gains(self, forms: Forms, weight: Rows, pull: Rows) -> ca.MX:
         """Return the gains of all free stages, one column per stage, shape ``(size, N_u)``."""
-        n = self._n
-        stages = stagewise(A=forms.A, B=forms.B, b=forms.b, H=forms.H, h=forms.h, g_x=forms.g_x, g_u=forms.g_u, weight_g=weight.g, pull_g=pull.g)
-        inputs = stagewise(force=forms.force, weight_u=weight.u, pull_u=pull.u, weight_du=weight.du, pull_du=pull.du)
-        lambda_ = ca.vertsplit(self._lin.w["lambda_"])
-        shared = {"R": nonzeros(self._lin.R), "damping": forms.damping}
-        P, p = ca.MX.zeros(n * (n + 1) // 2), ca.MX.zeros(n)
-        found: Columns = []
-        for k in reversed(range(self._ocp.N)):
-            if k < self._ocp.N_u:
-                before = self._backward_free(**stages[k], P=P, p=p, **inputs[k], lambda_k=lambda_[k], **shared)
-                found.append(before["gain"])
-            else:
-                before = self._backward_held(**stages[k], P=P, p=p)
-            P, p = before["P_before"], before["p_before"]
-        return ca.horzcat(*reversed(found))
+        n, lin = self._n, self._lin
+        data = {"A": forms.A, "B": forms.B, "b": forms.b, "H": forms.H, "h": forms.h, "g_x": forms.g_x, "g_u": forms.g_u}
+        rows = {"weight_u": weight.u, "pull_u": pull.u, "weight_du": weight.du, "pull_du": pull.du, "weight_g": weight.g, "pull_g": pull.g}
+        cost = {"R": nonzeros(lin.R), "lambda_k": lin.w["lambda_"].T, "damping": forms.damping, "force": forms.force}
+        end = {"P": ca.MX.zeros(n * (n + 1) // 2), "p": ca.MX.zeros(n)}
+        found: ca.MX = self._backward(**data, **rows, **cost, **end)["gain"]
+        return found
 
     def _corrected(self, forms: Forms, gains: ca.MX, pull: Rows) -> ca.MX:
         """Return gains whose kappa comes from pulls only: rolled out from s = 0 without defects, they give the change that these pulls cause."""
-        stages = stagewise(A=forms.A, B=forms.B, g_x=forms.g_x, g_u=forms.g_u, pull_g=pull.g)
-        inputs = stagewise(gain=gains, pull_u=pull.u, pull_du=pull.du)
-        p = ca.MX.zeros(self._n)
-        kappas = []
-        for k in reversed(range(self._ocp.N)):
-            if k < self._ocp.N_u:
-                before = self._sweep_free(**stages[k], p=p, **inputs[k])
-                kappas.append(before["kappa"])
-            else:
-                before = self._sweep_held(**stages[k], p=p)
-            p = before["p_before"]
+        data = {"A": forms.A, "B": forms.B, "g_x": forms.g_x, "g_u": forms.g_u}
+        pulls = {"pull_u": pull.u, "pull_du": pull.du, "pull_g": pull.g}
+        kappa = self._sweep(**data, **pulls, gain=gains, p=ca.MX.zeros(self._n))["kappa"]
         K, _, L = ca.vertsplit(gains, [0, *self._ends, self.size])
-        return ca.vertcat(K, ca.horzcat(*reversed(kappas)), L)
+        return ca.vertcat(K, kappa, L)
 
     def gains(self, stages: ca.MX, weight: Rows, pull: Rows) -> ca.MX:
         """Return the gains of all free stages, one column per stage, shape ``(size, N_u)``."""
@@ -139,21 +118,12 @@ class Riccati:
 
     def rolled(self, forms: Forms, gains: ca.MX, s: ca.MX, *, defects: bool) -> tuple[ca.MX, ca.MX, Rows]:
         """Return the steps in states, shape ``(nx, N + 1)``, and in inputs, shape ``(nu, N_u)``, and the rows, all in deviations, from s on."""
-        nx, b = self._ocp.model.nx, forms.b if defects else ca.MX.zeros(forms.b.shape)
-        stages, gain = stagewise(A=forms.A, B=forms.B, b=b, g_x=forms.g_x, g_u=forms.g_u), columns(gains)
-        states, inputs, increments, softened = [s[:nx]], [], [], []
-        for k in range(self._ocp.N):
-            if k < self._ocp.N_u:
-                after = self._forward_free(**stages[k], s=s, gain=gain[k])
-                increments.append(after["increment"])
-                inputs.append(after["s_after"][nx:])
-            else:
-                after = self._forward_held(**stages[k], s=s)
-            s = after["s_after"]
-            states.append(s[:nx])
-            softened.append(after["g"])
-        du = ca.horzcat(*inputs)
-        return ca.horzcat(*states), du, Rows(du, ca.horzcat(*increments), ca.horzcat(*softened))
+        nx, N_u, b = self._ocp.model.nx, self._ocp.N_u, forms.b if defects else ca.MX.zeros(forms.b.shape)
+        data = {"A": forms.A, "B": forms.B, "b": b, "g_x": forms.g_x, "g_u": forms.g_u}
+        after = self._forward(**data, gain=gains, s=s)
+        ends = after["s_after"]
+        du = ends[nx:, :N_u]
+        return ca.horzcat(s[:nx], ends[:nx, :]), du, Rows(du, after["increment"], after["g"])
 
 
 class Stage:

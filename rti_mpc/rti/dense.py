@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+The backward recursion of many states in C, as loops over dense columns that the compiler vectorizes.
+
+Unrolled into scalars, a stage of n states and inputs is some :math:`n^3` statements: slow from about 12 on, and at 36 a
+matter of minutes and of hundreds of MB for the compiler. Here, with one more coordinate that is always 1, cost-to-go M and
+stage :math:`\Phi = (1 \; 0 \; 0; \; b \; A \; B; \; 0 \; 0 \; I)` are single matrices, gradients and defects are columns of them, and the
+recursion is :math:`M \leftarrow (M \Phi)^T \Phi`, less :math:`S^T G` where an input is eliminated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+
+import casadi as ca
+
+from rti_mpc.codegen import BEFORE_BODY
+from rti_mpc.rti.linearization import Linearization
+from rti_mpc.rti.ocp import Ocp
+
+LEAST_SIZE = 12  # states and inputs from which on loops are faster
+PADDED = 4  # columns are padded to multiples of this, the numbers in the longest vector that is used
+SHORTEST = 2  # numbers in a vector of any processor
+MOST_VECTORS = 12  # sums that fit into its registers
+
+BODY = """
+  vector M_[SIZE][VECTORS], T_[SIZE][VECTORS], S_[NU][VECTORS], G_[NU][VECTORS], column_[VECTORS];
+  casadi_real (*M)[WIDTH] = (casadi_real (*)[WIDTH]) M_;  /* cost-to-go, symmetric; the linear terms are its first column and row */
+  casadi_real (*T)[WIDTH] = (casadi_real (*)[WIDTH]) T_;  /* M Phi, transposed */
+  casadi_real (*S)[WIDTH] = (casadi_real (*)[WIDTH]) S_;
+  casadi_real (*G)[WIDTH] = (casadi_real (*)[WIDTH]) G_;
+  casadi_real *column = (casadi_real *) column_;
+  casadi_real Phi[NONZEROS], g[NONZEROS_G + 1], L[NU][NU], per_L[NU], R_k[NU][NU], spare[GAIN];
+  int i, j, k, r, e, d;
+  casadi_clear((casadi_real *) M_, SIZE * WIDTH);
+  casadi_clear((casadi_real *) T_, SIZE * WIDTH);
+  casadi_clear((casadi_real *) S_, NU * WIDTH);
+  for (j = 0; j < NX + NU; ++j) {
+    for (i = 0; i <= j; ++i) M[i + 1][j + 1] = M[j + 1][i + 1] = *arg_P++;
+    M[0][j + 1] = arg_p[j];
+  }
+  for (k = STAGES - 1; k >= 0; --k) {
+    STAGE_ARGUMENTS
+    casadi_real *gain = res[0] ? res[0] + GAIN * k : spare;
+
+    /* the cost of the node at the end */
+    for (e = 0; e < NONZEROS_H; ++e) M[1 + column_H[e]][1 + row_H[e]] += H[e];
+    for (i = 0; i < NX; ++i) M[0][1 + i] += h[i];
+    if (g_x) casadi_copy(g_x, NONZEROS_G_X, g);
+    if (g_u) casadi_copy(g_u, NONZEROS_G - NONZEROS_G_X, g + NONZEROS_G_X);
+    for (r = 0; r < NG; ++r) {
+      for (e = first_G[r]; e < first_G[r + 1]; ++e) {
+        const casadi_real slope = g[nonzero_G[e]];
+        M[0][1 + column_G[e]] += pull_g[r] * slope;
+        for (d = first_G[r]; d < first_G[r + 1]; ++d) M[1 + column_G[d]][1 + column_G[e]] += weight_g[r] * slope * g[nonzero_G[d]];
+      }
+    }
+
+    /* over the stage */
+    Phi[0] = 1;
+    casadi_copy(b, NX, Phi + 1);
+    casadi_copy(A, NONZEROS_A, Phi + 1 + NX);
+    for (r = 0, e = 1 + NX + NONZEROS_A; r < NU; ++r) {
+      for (d = first_B[r]; d < first_B[r + 1]; ++d) Phi[e++] = B[d];
+      Phi[e++] = 1;
+    }
+    for (j = 0; j < SIZE; ++j) {
+      casadi_clear(column, WIDTH);
+      add(VECTORS, column_, Phi + first[j], row + first[j], first[j + 1] - first[j], M_[0]);
+      for (i = 0; i < SIZE; ++i) T[i][j] = column[i];
+    }
+    for (j = 1; j < SIZE; ++j) {
+      casadi_clear(M[j], j / LANES * LANES + LANES);
+      add(j / LANES + 1, M_[j], Phi + first[j], row + first[j], first[j + 1] - first[j], T_[0]);
+    }
+
+    if (k < FREE) {  /* its input is eliminated */
+      for (j = 0; j < NU; ++j) for (i = 0; i < NU; ++i) R_k[j][i] = 0;
+      for (e = 0; e < NONZEROS_R; ++e) R_k[column_R[e]][row_R[e]] = arg_R[e] * lambda_k[0];
+      for (r = 0; r < NU; ++r) {
+        casadi_real *of = M[1 + NX + r];
+        R_k[r][r] += weight_du[r];
+        for (i = 0; i <= NX; ++i) S[r][i] = of[i];
+        S[r][0] += force[r] + pull_du[r] + pull_u[r];
+        for (i = 0; i < NU; ++i) S[r][1 + NX + i] = -R_k[r][i];
+        for (i = 0; i <= r; ++i) L[r][i] = of[1 + NX + i] + R_k[r][i];
+        L[r][r] += weight_u[r] + arg_damping[r];
+        of[0] = -(force[r] + pull_du[r]);
+        for (i = 0; i < NX; ++i) of[1 + i] = 0;
+        for (i = 0; i < NU; ++i) of[1 + NX + i] = R_k[r][i];
+      }
+      for (i = 0; i < NU; ++i) {  /* Cholesky */
+        for (j = 0; j <= i; ++j) {
+          for (d = 0; d < j; ++d) L[i][j] -= L[i][d] * L[j][d];
+          L[i][j] = i == j ? sqrt(L[i][i]) : L[i][j] * per_L[j];
+        }
+        per_L[i] = 1 / L[i][i];
+      }
+      for (r = 0; r < NU; ++r) {
+        for (i = 0; i < WIDTH; ++i) G[r][i] = S[r][i];
+        for (d = 0; d < r; ++d) for (i = 0; i < WIDTH; ++i) G[r][i] -= L[r][d] * G[d][i];
+        for (i = 0; i < WIDTH; ++i) G[r][i] *= per_L[r];
+      }
+      for (r = NU - 1; r >= 0; --r) {
+        for (d = r + 1; d < NU; ++d) for (i = 0; i < WIDTH; ++i) G[r][i] -= L[d][r] * G[d][i];
+        for (i = 0; i < WIDTH; ++i) G[r][i] *= per_L[r];
+        for (i = 0; i < WIDTH; ++i) S[r][i] = -S[r][i];
+        for (j = 0; j < NX + NU; ++j) gain[NU * j + r] = G[r][1 + j];
+        gain[NU * (NX + NU) + r] = G[r][0];
+      }
+      for (e = NU * (NX + NU + 1), j = 0; j < NU; ++j) for (i = j; i < NU; ++i) gain[e++] = L[i][j];
+      for (j = 1; j < SIZE; ++j) add(j / LANES + 1, M_[j], gain + NU * (j - 1), in_order, NU, S_[0]);
+    }
+    for (j = 1; j < SIZE; ++j) for (i = 0; i < j; ++i) M[i][j] = M[j][i];
+  }
+  return 0;
+"""
+
+
+def backward_in_c(ocp: Ocp, lin: Linearization, free: ca.Function) -> str | None:
+    """
+    Return the recursion whose stages are `rti_mpc.rti.riccati.backward_free` and `backward_held` in C, see `function_in_c`; None for few states.
+
+    Args:
+        ocp: The problem.
+        lin: Its linearization.
+        free: A stage with an input, for its arguments.
+    """
+    nx, nu = ocp.model.nx, ocp.model.nu
+    if nx + nu < LEAST_SIZE:
+        return None
+    size = 1 + nx + nu
+    width = -(-size // PADDED) * PADDED
+    A, B, H, R, G = lin.A_k, lin.B_k, lin.H_i, lin.R.sparsity(), ca.horzcat(lin.G_x, lin.G_u)
+    Phi = [[*range(nx + 1)], *([1 + i for i in column] for column in rows_by_column(A))]
+    Phi += [[*(1 + i for i in column), 1 + nx + j] for j, column in enumerate(rows_by_column(B))]
+    by_row = [[(e, j) for e, (i, j) in enumerate(zip(*G.get_triplet(), strict=True)) if i == r] for r in range(G.size1())]
+    sizes = {"NX": nx, "NU": nu, "NG": len(ocp.lg), "SIZE": size}
+    sizes |= {"STAGES": ocp.N, "FREE": ocp.N_u, "NONZEROS": sum(map(len, Phi)), "GAIN": free.size1_out("gain")}
+    sizes |= {f"NONZEROS_{name}": pattern.nnz() for name, pattern in {"A": A, "H": H, "R": R, "G": G, "G_X": lin.G_x}.items()}
+    tables = {
+        "first": starts(Phi),
+        "row": [i for column in Phi for i in column],
+        "in_order": [*range(nu)],
+        "first_B": B.colind(),
+        "row_H": H.get_triplet()[0],
+        "column_H": H.get_triplet()[1],
+        "row_R": R.get_triplet()[0],
+        "column_R": R.get_triplet()[1],
+        "first_G": starts(by_row),
+        "nonzero_G": [e for row in by_row for e, _ in row],
+        "column_G": [j for row in by_row for _, j in row],
+    }
+    shared = ("P", "p", "R", "damping")
+    names = free.name_in()
+    once = [f"const casadi_real *arg_{name} = arg[{names.index(name)}];" for name in shared]
+    each = [f"const casadi_real *{name} = arg[{i}] + {free.size1_in(i)} * k;" for i, name in enumerate(names) if name not in shared]
+    lines = [f"enum {{ {', '.join(f'{name} = {number}' for name, number in sizes.items())} }};"]
+    lines += [f"static const int {name}[] = {{ {', '.join(map(str, numbers or [0]))} }};" for name, numbers in tables.items()]
+    body = BODY.strip("\n").replace("STAGE_ARGUMENTS", "\n    ".join(each))
+    return "\n".join([*additions(width), BEFORE_BODY, *(f"  {line}" for line in lines + once), body])
+
+
+def additions(width: int) -> Iterator[str]:
+    """Return functions that add multiples of columns to a column, its numbers in registers: one for each number of vectors."""
+    arguments = "vector *sum, const casadi_real *factor, const int *of, int count, const vector *columns"
+    yield "#ifdef __AVX__"
+    yield f"enum {{ LANES = {PADDED} }};"
+    yield "#else"
+    yield f"enum {{ LANES = {SHORTEST} }};"
+    yield "#endif"
+    yield f"enum {{ WIDTH = {width}, VECTORS = WIDTH / LANES }};"
+    yield "typedef casadi_real vector __attribute__((vector_size(sizeof(casadi_real) * LANES), may_alias));"
+    for vectors in range(1, min(width // SHORTEST, MOST_VECTORS) + 1):
+        yield f"static void add_{vectors}({arguments}) {{"
+        yield f"  vector {', '.join(f's{i} = sum[{i}]' for i in range(vectors))};"
+        yield "  int e;"
+        yield "  for (e = 0; e < count; ++e) {"
+        yield "    const vector *c = columns + VECTORS * of[e];"
+        yield from (f"    s{i} += factor[e] * c[{i}];" for i in range(vectors))
+        yield "  }"
+        yield from (f"  sum[{i}] = s{i};" for i in range(vectors))
+        yield "}"
+    yield f"static void add(int vectors, {arguments}) {{"
+    yield "  switch (vectors) {"
+    for vectors in range(1, width // SHORTEST + 1):
+        parts = -(-vectors // MOST_VECTORS)
+        ends = [vectors * part // parts for part in range(parts + 1)]
+        calls = [f"add_{b - a}(sum + {a}, factor, of, count, columns + {a});" for a, b in pairwise(ends)]
+        yield f"    case {vectors}: {' '.join(calls)} break;"
+    yield "  }"
+    yield "}"
+
+
+def rows_by_column(pattern: ca.Sparsity) -> list[list[int]]:
+    """Return the rows of the nonzeros of each column."""
+    ends = pattern.colind()
+    return [pattern.row()[a:b] for a, b in pairwise(ends)]
+
+
+def starts(parts: Sequence[Sequence[object]]) -> list[int]:
+    """Return where each part begins, and the last one ends."""
+    return [sum(map(len, parts[:i])) for i in range(len(parts) + 1)]

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recursions in C, loops and dense kernels, against the expressions that the virtual machine evaluates."""
+
+from __future__ import annotations
+
+import shutil
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from rti_mpc.codegen import compiled, function, with_bodies
+from rti_mpc.model.model import Model, Signal
+from rti_mpc.rti.certificate import certificate
+from rti_mpc.rti.dense import LEAST_SIZE
+from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
+from rti_mpc.rti.places import places
+from rti_mpc.rti.recursion import recur
+
+needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler on this machine")
+
+
+def problem(nx: int, nu: int, N: int, N_u: int, *, softened: bool = True) -> Ocp:
+    """A model with a sparse Jacobian, weights that are full matrices, and two states and an expression of states and inputs softly bounded."""
+    rng = np.random.default_rng(nx)
+    x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
+    A = rng.normal(size=(nx, nx)) * (rng.random((nx, nx)) < 0.4) - np.eye(nx)
+    B = rng.normal(size=(nx, nu)) * (rng.random((nx, nu)) < 0.7)
+    C = rng.normal(size=(3, nx)) * (rng.random((3, nx)) < 0.5)
+    f = ca.DM(A) @ x + ca.DM(B) @ u + 0.1 * ca.sin(x) * u[0]
+    signals = {name: tuple(Signal(f"{name}{i}", "1") for i in range(count)) for name, count in (("x", nx), ("u", nu), ("y", 3))}
+    model = Model(name="mixed", x=x, u=u, f_expl_expr=f, y_expr=ca.DM(C) @ x, states=signals["x"], inputs=signals["u"], outputs=signals["y"])
+    root, turn = rng.normal(size=(3, 3)), rng.normal(size=(nu, nu))
+    room = np.array([1.0, 1.0, *[np.inf] * (nx - 2)])
+    expression = x[0] * u[nu - 1] + x[nx - 1]
+    given: dict[str, Any] = {"lbx": -room, "ubx": room, "h_expr": expression, "lh": -0.5, "uh": 0.5} if softened else {}
+    weights: dict[str, Any] = {"Q": root @ root.T + np.eye(3), "R": turn @ turn.T + np.eye(nu), "lambda_": rng.uniform(0.5, 2.0, N_u)}
+    return Ocp(model, N=N, N_u=N_u, dt=0.05, method="euler", **weights, lbu=-1.0, ubu=1.0, lbdu=-0.3, ubdu=0.3, **given)
+
+
+def arguments(of: ca.Function, ocp: Ocp, rng: np.random.Generator, known: dict[str, ca.DM]) -> dict[str, ca.DM]:
+    """Numbers for a function of the solver: the problem's weights and bounds, what is known, and random ones."""
+    fixed = {name: getattr(ocp, name) for name in WEIGHTS_AND_BOUNDS} | {"scale": np.ones(of.size1_in("scale"))} | known
+    return {name: ca.DM(fixed[name]) if name in fixed else ca.DM(rng.normal(size=of.size_in(name))) for name in of.name_in()}
+
+
+def assert_equal(of: ca.Function, fast: ca.Function, given: dict[str, ca.DM]) -> dict[str, ca.DM]:
+    """Hold a compiled function against the interpreted one, and return its results."""
+    assert fast.class_name() == "External"
+    expected, got = of(**given), fast(**given)
+    for name in of.name_out():
+        value = np.array(expected[name])
+        largest = np.abs(value).max(initial=1.0)
+        np.testing.assert_allclose(np.array(got[name]), value, rtol=0, atol=1e-10 * largest, err_msg=f"{of.name()}: {name}")  # rounding, amplified
+    return dict(expected)
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("nx", "nu", "N", "N_u", "softened"),
+    [
+        (3, 2, 5, 2, True),
+        (LEAST_SIZE - 2, 2, 4, 3, True),
+        *(
+            pytest.param(*shape, marks=pytest.mark.slow)
+            for shape in ((3, 2, 5, 5, True), (2, 1, 1, 1, True), (13, 4, 3, 3, True), (21, 3, 2, 1, True), (30, 1, 2, 2, False))
+        ),
+    ],
+)
+def test_compiled_recursions_equal_the_expressions(nx: int, nu: int, N: int, N_u: int, softened: bool) -> None:
+    """Of few states as scalars, of many as dense columns; with held inputs, full weights, and no softened bounds at all."""
+    ocp = problem(nx, nu, N, N_u, softened=softened)
+    rng, functions, judged = np.random.default_rng(5), places(ocp), certificate(ocp)
+    fast = compiled(functions.gains, functions.roll_out, functions.refine, judged)
+    known = {"stages": functions.linearize(**arguments(functions.linearize, ocp, rng, {}))["stages"]}
+    known["places"] = ca.DM(rng.choice([0.0, 0.0, 1.0], functions.gains.numel_in("places")))
+    known |= assert_equal(functions.gains, fast[0], arguments(functions.gains, ocp, rng, known))
+    assert np.isfinite(np.array(known["gains"])).all()
+    for of, compiled_of in zip((functions.roll_out, functions.refine, judged), fast[1:], strict=True):
+        assert_equal(of, compiled_of, arguments(of, ocp, rng, known))
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_step_of_the_interior_point_is_the_same_compiled() -> None:
+    """It calls the recursions with data of its own, and does not take all of their results."""
+    ocp = problem(10, 2, 3, 2)
+    rng, functions = np.random.default_rng(6), places(ocp)
+    stages = functions.linearize(**arguments(functions.linearize, ocp, rng, {}))["stages"]
+    start = arguments(functions.enter, ocp, rng, {"stages": stages, "start": ca.DM(1.0)})
+    known = {"stages": stages, "least": ca.DM(1e-6), **functions.enter(**start)}
+    assert_equal(functions.step, compiled(functions.step)[0], arguments(functions.step, ocp, rng, known))
+
+
+@needs_compiler
+def test_code_of_a_recursion_does_not_grow_with_the_horizon() -> None:
+    generated = []
+    for N in (10, 100):
+        ocp = problem(3, 2, N, N)
+        generator = ca.CodeGenerator("functions", {"with_header": False})
+        generator.add(places(ocp).roll_out)
+        generated.append(len(with_bodies(generator.dump()).splitlines()))
+    assert generated[0] == generated[1]
+
+
+@needs_compiler
+def test_result_that_nobody_takes_is_still_carried_on() -> None:
+    """A carried result that is also returned has no column to lie in if the caller does not want it."""
+    s, a = ca.SX.sym("s", 2), ca.SX.sym("a", 2)
+    stage = function("turned", {"s": s, "a": a}, {"s_after": ca.vertcat(s[1] + a[0], s[0] * a[1]), "sum": s[0] + s[1]})
+    s_0, along = ca.MX.sym("s_0", 2), ca.MX.sym("along", 2, 5)
+    turned = recur("turning", [(stage, 5)], {"s": "s_after"}, ["s_after", "sum"])(s=s_0, a=along)
+    wanted = function("wanted", {"s_0": s_0, "along": along}, {"sums": turned["sum"]})
+    assert_equal(wanted, compiled(wanted)[0], {"s_0": ca.DM([1, 2]), "along": ca.DM(np.arange(10.0).reshape(2, 5))})
