@@ -18,6 +18,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -28,9 +29,11 @@ from rti_mpc.array import Array
 from rti_mpc.cache import cache_dir, is_intact, make_private, write_sealed
 from rti_mpc.errors import ShapeError
 
-# No contraction into fused operations and no fast-math: a machine with a compiler and one without agree to rounding.
-COMPILER_FLAGS = ("-O3", "-std=gnu89", "-fno-semantic-interposition", "-ffp-contract=off", "-shared", "-fPIC", "-w")
+COMPILER_FLAGS = ("-O3", "-std=gnu89", "-fno-semantic-interposition", "-shared", "-fPIC", "-w")  # no fast-math
 
+# What a build may use. A portable one has no contraction into fused operations: it agrees with CasADi's virtual machine as far as orders of sums do.
+# With longer vectors than 256 bits, GCC 12 mixes two lengths in a loop, and takes data for aligned that are not.
+BUILDS = {"portable": ("-ffp-contract=off",), "native": ("-march=native", "-mprefer-vector-width=256", "-ffp-contract=fast")}
 
 COMPILER_RATE = 80_000  # characters of source per s, as measured on a virtual core
 
@@ -41,7 +44,29 @@ _bodies: dict[str, str] = {}  # what `function_in_c` was given, by the name of t
 while_compiling: Callable[[float], AbstractContextManager[object]] = nullcontext
 
 
-def compiled(*functions: ca.Function) -> list[ca.Function]:
+def flags_of(build: str) -> tuple[str, ...]:
+    """Return the compiler's flags for a build, by its name in `BUILDS`."""
+    return tuple(flag for flag in (*BUILDS[build], *COMPILER_FLAGS) if os.uname().machine == "x86_64" or not flag.startswith("-mprefer-"))
+
+
+@cache
+def resolved(compiler: str, flags: tuple[str, ...]) -> str:
+    """Return what a compiler makes of its flags on this processor: of ``-march=native`` another list on another one; empty if it refuses them."""
+    asked = [compiler, *flags, "-v", "-E", "-x", "c", os.devnull, "-o", os.devnull]
+    said = subprocess.run(asked, capture_output=True, check=False, env={"PATH": os.defpath, **os.environ, "LC_ALL": "C"})
+    return "" if said.returncode else "\n".join(line for line in said.stderr.decode(errors="replace").splitlines() if "cc1" in line)
+
+
+def processor_flags() -> str:
+    """Return what this processor can do, as the system tells it; empty if it does not."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return ""
+    return next((line for line in lines if line.startswith(("flags", "Features"))), "")
+
+
+def compiled(*functions: ca.Function, build: str = "portable") -> list[ca.Function]:
     """
     Return functions as machine code, or themselves where there is no compiler.
 
@@ -51,6 +76,7 @@ def compiled(*functions: ca.Function) -> list[ca.Function]:
 
     Args:
         functions: Functions with different names.
+        build: ``"portable"`` for any processor of this kind, or ``"native"``, for this very one; see `BUILDS`.
     """
     compiler = shutil.which("cc")
     if compiler is None:
@@ -59,23 +85,25 @@ def compiled(*functions: ca.Function) -> list[ca.Function]:
     for function in functions:
         generator.add(function)
     source = with_bodies(generator.dump())
-    key = hashlib.sha256("\0".join((source, compiler, *COMPILER_FLAGS, os.uname().machine)).encode()).hexdigest()[:32]
+    flags = flags_of(build)
+    target = (resolved(compiler, flags), processor_flags()) if build == "native" else (os.uname().machine,)
+    key = hashlib.sha256("\0".join((source, compiler, *flags, *target)).encode()).hexdigest()[:32]
     name = f"{functions[0].name()}-{key}.so"
     try:
         try:
             folder = cache_dir()
             make_private(folder)
-            return load(functions, folder / name, key, compiler, source)
+            return load(functions, folder / name, key, [compiler, *flags], source)
         except OSError as error:
             warnings.warn(f"compiled code is not kept for the next start: {error}", stacklevel=2)
         with tempfile.TemporaryDirectory(prefix="rti_mpc-") as private:
-            return load(functions, Path(private) / name, key, compiler, source)
+            return load(functions, Path(private) / name, key, [compiler, *flags], source)
     except (OSError, subprocess.CalledProcessError) as error:
         warnings.warn(f"{functions[0].name()} is interpreted, several times slower than compiled: {_brief(error)}", stacklevel=2)
         return list(functions)
 
 
-def load(functions: Sequence[ca.Function], library: Path, key: str, compiler: str, source: str) -> list[ca.Function]:
+def load(functions: Sequence[ca.Function], library: Path, key: str, compiler: Sequence[str], source: str) -> list[ca.Function]:
     """
     Load functions from a file, which is built first if it is not there or fails a check, see `rti_mpc.cache`.
 
@@ -93,14 +121,14 @@ def load(functions: Sequence[ca.Function], library: Path, key: str, compiler: st
         raise OSError(f"{library} cannot be loaded: {_first_line(why)}") from None
 
 
-def build(compiler: str, source: str) -> bytes:
-    """Compile, and return the shared object."""
+def build(compiler: Sequence[str], source: str) -> bytes:
+    """Compile by a compiler with its flags, and return the shared object."""
     with tempfile.TemporaryDirectory(prefix="rti_mpc-") as folder:
         code = Path(folder) / "function.c"
         code.write_text(source, encoding="utf-8")
         made = code.with_suffix(".so")
         environment = {"PATH": os.defpath, **os.environ}  # where the compiler was looked for, for its linker
-        command = [compiler, *COMPILER_FLAGS, "-o", str(made), str(code), "-lm"]
+        command = [*compiler, "-o", str(made), str(code), "-lm"]
         with while_compiling(len(source) / COMPILER_RATE):
             subprocess.run(command, check=True, capture_output=True, env=environment)
         return made.read_bytes()

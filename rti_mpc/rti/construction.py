@@ -58,10 +58,10 @@ class Construction:
         return self.made.get(function.name(), function)
 
 
-_constructions: WeakKeyDictionary[Ocp, dict[tuple[str, bool, bool], Construction]] = WeakKeyDictionary()
+_constructions: WeakKeyDictionary[Ocp, dict[tuple[str, bool, str | None], Construction]] = WeakKeyDictionary()
 
 
-def construction(ocp: Ocp, formulation: str, *, structured: bool, compile: bool) -> Construction:
+def construction(ocp: Ocp, formulation: str, *, structured: bool, build: str | None) -> Construction:
     """
     Return the construction of a problem, built at the first call.
 
@@ -69,19 +69,19 @@ def construction(ocp: Ocp, formulation: str, *, structured: bool, compile: bool)
         ocp: The problem; one that is equal but another object is constructed again.
         formulation: ``"simultaneous"`` or ``"sequential"``.
         structured: Whether to build the functions of the active-set method.
-        compile: Whether to compile.
+        build: How to compile, see `rti_mpc.codegen.BUILDS`; None: not at all.
 
     Raises:
         OcpError: The model is singular wherever it was looked at, or stiff.
     """
     known = _constructions.setdefault(ocp, {})
-    key = formulation, structured, compile
+    key = formulation, structured, build
     if key not in known:
         known[key] = construct(ocp, *key)
     return known[key]
 
 
-def construct(ocp: Ocp, formulation: str, structured: bool, compile: bool) -> Construction:
+def construct(ocp: Ocp, formulation: str, structured: bool, build: str | None) -> Construction:
     """Build the construction of a problem, as `construction`."""
     x_nominal = nominal_state(ocp)
     check_stiffness(ocp, x_nominal)
@@ -89,7 +89,7 @@ def construct(ocp: Ocp, formulation: str, structured: bool, compile: bool) -> Co
     active_set = (places(ocp), certificate(ocp)) if structured else None
     moves, cost = shift(ocp), plan_cost(ocp)
     native = [moves, cost, *natives(transcriptions, active_set)]
-    made = dict(zip((f.name() for f in native), compiled(*native) if compile else native, strict=True))
+    made = dict(zip((f.name() for f in native), compiled(*native, build=build) if build else native, strict=True))
     return Construction(x_nominal, transcriptions, active_set, moves, cost, ocp.model.h(), made)
 
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from rti_mpc import given
 from rti_mpc.array import Array
-from rti_mpc.codegen import bind
+from rti_mpc.codegen import BUILDS, bind
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.active_set import ActiveSet
@@ -84,6 +84,7 @@ class Rti:
         formulation: ``"simultaneous"``, ``"sequential"``, or ``"auto"`` for the faster one.
         solver: ``"riccati"``, ``"osqp"``, or another one's name in qpsolvers.
         compile: Whether to compile the model.
+        build: ``"native"`` to compile for this very processor, which is faster; see `rti_mpc.codegen.BUILDS`.
 
     Raises:
         OcpError: The formulation or the solver is unknown, the settings are not the solver's, a number of iterations or a tolerance makes no sense,
@@ -103,13 +104,16 @@ class Rti:
         iterations: int = MAX_ITERATIONS,
         tolerance: float = STEP_TOLERANCE,
         compile: bool = True,
+        build: str = "portable",
     ) -> None:
         given.instance("ocp", ocp, Ocp)
         check_options(solver, settings, iterations, tolerance)
+        if build not in BUILDS:
+            raise OcpError(f"build must be one of {', '.join(BUILDS)}, got {build!r}")
         model, N, N_u = ocp.model, ocp.N, ocp.N_u
         self.ocp = ocp
         self.formulation = formulation_of(ocp, formulation)
-        built = construction(ocp, self.formulation, structured=solver == "riccati", compile=compile)
+        built = construction(ocp, self.formulation, structured=solver == "riccati", build=build if compile else None)
         self.iterations, self.tolerance, self.taken = iterations, tolerance, 0
         # A step leads from a guess to a plan; the next guess is that plan, shifted by one stage. The two never share memory.
         self.x: Array = np.zeros((N + 1, model.nx))

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import rti_mpc
-from rti_mpc.codegen import COMPILER_FLAGS
+from rti_mpc.codegen import flags_of
 from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.model.find import SHIPPED_MODELS
 from rti_mpc.model.model import Model
@@ -79,7 +79,7 @@ def origin_files(config: Config, model: Model) -> dict[str, str]:
         "code_sha256": code_hash(),
         "model_file": source.name if source is not None else None,
         "model_sha256": sha256(equations.encode()).hexdigest(),
-        "build": [shutil.which("cc") or "CasADi's virtual machine", *COMPILER_FLAGS],
+        "build": [shutil.which("cc") or "CasADi's virtual machine", *flags_of(config.solver.build)],
         "machine": machine.machine_info(),
     }
     return {**files, "versions.json": json.dumps(versions, indent=1)}

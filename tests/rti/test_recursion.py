@@ -4,19 +4,26 @@
 from __future__ import annotations
 
 import shutil
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
 
+from rti_mpc import codegen
 from rti_mpc.codegen import compiled, function, with_bodies
+from rti_mpc.contract.status import QpStatus
+from rti_mpc.errors import OcpError
 from rti_mpc.model.model import Model, Signal
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc.reference.trajectory import eight, rows
 from rti_mpc.rti.certificate import certificate
 from rti_mpc.rti.dense import LEAST_SIZE
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 from rti_mpc.rti.places import places
 from rti_mpc.rti.recursion import recur
+from rti_mpc.rti.rti import Rti
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler on this machine")
 
@@ -113,3 +120,45 @@ def test_result_that_nobody_takes_is_still_carried_on() -> None:
     turned = recur("turning", [(stage, 5)], {"s": "s_after"}, ["s_after", "sum"])(s=s_0, a=along)
     wanted = function("wanted", {"s_0": s_0, "along": along}, {"sums": turned["sum"]})
     assert_equal(wanted, compiled(wanted)[0], {"s_0": ca.DM([1, 2]), "along": ca.DM(np.arange(10.0).reshape(2, 5))})
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_native_portable_and_interpreted_solvers_command_the_same_on_1000_samples_each_certified() -> None:
+    """On one closed loop, each from its own last plan."""
+    model = pioneer_3dx()
+    bounds: dict[str, Any] = {"lbu": [-0.5, -0.745], "ubu": [0.5, 0.745], "lbdu": [-0.25, -0.4], "ubdu": [0.25, 0.4]}
+    ocp = Ocp(model, N=10, dt=0.1, method="euler", Q=[1, 1, 0.05], R=[1.0, 1.0], delta=28.0, lambda_=0.8, **bounds)
+    phi, reference = ocp.phi(), eight()
+    y = rows(reference.lasting(0.1 * (1000 + 12)), 0.1, "tangent")
+    y[:, 2] = np.unwrap(y[:, 2])
+    x, u = np.array([*reference.pose0, 0.0, 0.0]), np.zeros(2)
+    solvers = [Rti(ocp, build="portable"), Rti(ocp, build="native"), Rti(ocp, compile=False)]
+    for rti in solvers:
+        rti.reset(x, u)
+    for k in range(1000):
+        for rti in solvers:
+            rti.prepare(y[k + 1 : k + 1 + ocp.N], shift=k > 0, u_prev=u)
+            assert rti.feedback(x) is QpStatus.SOLVED, (k, rti)
+        for rti in solvers[:2]:
+            np.testing.assert_allclose(rti.u / ocp.ubu, solvers[2].u / ocp.ubu, rtol=0, atol=1e-9, err_msg=f"sample {k}")  # of half their range
+        u = solvers[0].u[0].copy()
+        x = np.array(phi(x, u, model.p_nominal)).ravel()
+
+
+@needs_compiler
+def test_native_code_is_kept_by_what_compiler_and_processor_make_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    x = ca.SX.sym("x")
+    twice = ca.Function("twice", [x], [2 * x])
+    for processor in ("flags: fma", "flags: fma avx2", "flags: fma"):
+        monkeypatch.setattr(codegen, "processor_flags", lambda processor=processor: processor)
+        compiled(twice, build="native")
+    compiled(twice)
+    assert len(list((tmp_path / "rti_mpc").iterdir())) == 3
+    assert "march" in codegen.resolved(shutil.which("cc") or "cc", codegen.flags_of("native"))
+
+
+def test_unknown_build_is_refused() -> None:
+    with pytest.raises(OcpError, match="build must be one of portable, native, got 'fast'"):
+        Rti(problem(3, 2, 3, 3), build="fast")

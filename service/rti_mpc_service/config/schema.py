@@ -66,7 +66,7 @@ Period = Annotated[float, Field(ge=1e-4, le=10)]
 Endpoint = Annotated[str, Field(pattern=r"^[a-z0-9_-]+/\S+$")]
 Endpoints = Annotated[tuple[Endpoint, ...], Field(strict=False)]
 
-ITERATION_KEYS = {"iterations", "tolerance"}  # keys of [solver] that are settings of `Rti`, not of OSQP
+ITERATION_KEYS = {"iterations", "tolerance", "build"}  # keys of [solver] that are settings of `Rti`, not of OSQP
 OWN_KEYS = ITERATION_KEYS | {"name", "second_opinion"}  # all keys of [solver] that are no settings of OSQP
 RAMP_LEAD_S = 0.025  # time left between a state becoming stale and the end of its plan, to compute and send the ramp
 
@@ -185,6 +185,9 @@ class SolverSection(Section):
     iterations: int | None = Field(default=None, ge=1, le=100, description="most QPs per sample: 1 is the plain real-time iteration, many are SQP")
     tolerance: float | None = Field(
         default=None, ge=0, le=2, description="change of the inputs above which a further QP follows, as a share of half their range"
+    )
+    build: Literal["portable", "native"] = Field(
+        default="portable", description="code of the solver for any processor of this kind, or, faster, for this very one"
     )
     second_opinion: int = Field(
         default=1, ge=0, le=1_000_000, description="every how many samples osqp solves the QP of another solver, too, in the slack; 0: never"

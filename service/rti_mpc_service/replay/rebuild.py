@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import rti_mpc
-from rti_mpc.codegen import COMPILER_FLAGS
+from rti_mpc.codegen import BUILDS, flags_of
 from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.contract.message import Journal
 from rti_mpc.control.controller import Controller
@@ -178,7 +178,8 @@ def changes(recorded: Mapping[str, Any]) -> Iterator[str]:
         return
     if recorded.get("code_sha256") != code_hash():
         yield f"recorded with other code of rti-mpc than that of this {rti_mpc.__version__}: {recorded.get('rti_mpc')}"
-    if recorded.get("build") != [shutil.which("cc") or "CasADi's virtual machine", *COMPILER_FLAGS]:
+    compiler = shutil.which("cc") or "CasADi's virtual machine"
+    if recorded.get("build") not in [[compiler, *flags_of(build)] for build in BUILDS]:  # which of them, the configuration says
         yield f"recorded with another build: {recorded.get('build')}"
     then, here = recorded.get("machine") or {}, machine.machine_info()
     for what in ("processor", "system", "python", "packages"):
