@@ -9,7 +9,7 @@ UV := $(shell command -v uv)
 FITS := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 PYTHON = $(shell for python in python3 python3.13 python3.12 python3.11 python3.14; do $$python -c '$(FITS)' 2>/dev/null && echo $$python && break; done)
 
-.PHONY: demo test test-busy test-slow soak attack ends kills problems bench lint format types docs msg lock clean
+.PHONY: demo test test-busy test-slow soak attack ends kills problems bench lint format types docs gallery msg lock clean
 
 demo: $(READY)
 	$(BIN)/rti-mpc demo $(ARGS)
@@ -55,6 +55,9 @@ types: $(READY)
 docs: $(READY)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement docs/requirements.txt
 	NO_MKDOCS_2_WARNING=1 $(BIN)/properdocs build --quiet
+
+gallery: $(READY)
+	$(BIN)/python docs/gallery.py $(ARGS)
 
 msg: $(READY)
 	$(BIN)/python -m rti_mpc.wire.msg deploy/msg

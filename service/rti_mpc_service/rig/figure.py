@@ -15,12 +15,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 
+from rti_mpc.signals import plane
 from rti_mpc_service.outline import outline, placed
 from rti_mpc_service.rig.run_data import Run
 
 INK_COLOR, GRID_COLOR, SHADE_COLOR = "#2b303b", "#dfe3ea", "#e6eaf2"
 REFERENCE_COLOR, MEASURED_COLOR, COMMAND_COLOR, LIMIT_COLOR, ERROR_COLOR = "#9aa3b2", "#2f6fd0", "#e08a1e", "#c8404a", "#b8377e"
 PHASE_COLORS = {"prepare": "#4c9f6b", "feedback": "#e08a1e", "latency": "#7a5cc9"}
+PATH_PANELS = 3  # outputs over time whose height a path in the plane takes above them
 MIN_DRAWN_MM = 1e-4  # smaller errors are drawn as this: a logarithmic axis has no zero
 PLOT_STYLE: Any = {
     "font.size": 9.5,
@@ -58,13 +60,16 @@ def figure(run: Run, path: Path) -> None:
     if run.planar:
         panels = [_error, *panels]
     with mpl.rc_context(PLOT_STYLE):
-        page = Figure(figsize=(13.0, max(7.6, 1.8 * len(panels), 0.0 if run.planar else 1.8 * ny)), layout="constrained")
+        below = 0 if run.planar else ny
+        above = PATH_PANELS if not run.planar and plane(run.info.outputs) is not None else 0
+        page = Figure(figsize=(13.0, max(7.6, 1.8 * len(panels), 1.8 * (above + below))), layout="constrained")
         FigureCanvasAgg(page)
         halves = page.add_gridspec(1, 2, width_ratios=[1.0, 1.15])
-        if run.planar:
-            _path(page.add_subplot(halves[0]), run)
-        else:
-            _stack(page, halves[0], run, [partial(_output, i=i) for i in range(ny)])
+        left = halves[0].subgridspec(above + below, 1) if above else None
+        if run.planar or left is not None:
+            _path(page.add_subplot(halves[0] if left is None else left[:above, 0]), run)
+        if below:
+            _stack(page, halves[0] if left is None else left[above:, 0], run, [partial(_output, i=i) for i in range(ny)])
         _stack(page, halves[1], run, panels)
         page.savefig(path, dpi=130)
 
@@ -116,10 +121,10 @@ def _output(axes: Axes, run: Run, i: int) -> None:
     label, settled = run.info.outputs[i], np.abs(run.output_error[run.settled, i])
     axes.axvspan(0.0, min(run.transient_s, run.time_s[-1]), color=SHADE_COLOR)
     axes.plot(run.time_s, run.reference[:, i], color=REFERENCE_COLOR, linewidth=5.0, alpha=0.55, solid_capstyle="round", label="reference")
-    said = f", error after the transient: max {settled.max():.3g}" if settled.size else ""
+    said = f", then within {settled.max():.3g}" if settled.size else ""
     axes.plot(run.time_s, run.reference[:, i] + run.output_error[:, i], color=MEASURED_COLOR, label=f"true{said}")
     axes.margins(y=0.12)
-    axes.set(title=f"Output {label.name}: {run.scenario}", ylabel=f"[{label.unit}]")
+    axes.set(title=f"Output {label.name}", ylabel=f"[{label.unit}]")
     _legend_above(axes)
 
 

@@ -66,7 +66,7 @@ class Run:
 
     @property
     def position(self) -> Array:
-        """True positions in m, shape ``(M, 2)``; NaN where the outputs are no pose in the plane."""
+        """True positions in m, shape ``(M, 2)``; NaN where none of the outputs are."""
         return self._position(self.y)
 
     @property
@@ -89,7 +89,7 @@ class Run:
         return np.asarray(error)
 
     def _position(self, y: Array) -> Array:
-        columns = plane(self.info.outputs) if self.planar else None
+        columns = plane(self.info.outputs)
         return np.full((len(y), 2), np.nan) if columns is None else y[:, columns]
 
     @property
