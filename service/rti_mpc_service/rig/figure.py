@@ -124,7 +124,7 @@ def _output(axes: Axes, run: Run, i: int) -> None:
     said = f", then within {settled.max():.3g}" if settled.size else ""
     axes.plot(run.time_s, run.reference[:, i] + run.output_error[:, i], color=MEASURED_COLOR, label=f"true{said}")
     axes.margins(y=0.12)
-    axes.set(title=f"Output {label.name}", ylabel=f"[{label.unit}]")
+    axes.set(title=f"Output {label.name}" if i else f"Output {label.name}: {run.scenario}", ylabel=f"[{label.unit}]")
     _legend_above(axes)
 
 

@@ -121,7 +121,7 @@ def test_a_model_without_position_is_drawn_by_its_outputs_against_their_referenc
         figure(replace(run, info=arm, scenario="sines", y=turned), tmp_path / "run.svg")
     shown = words(tmp_path / "run.svg")
     assert "Command omega_c" in shown
-    for expected in ("Output q1: sines", "Output z: sines", "[rad]", "[m]", "true, error after the transient: max 0.25"):
+    for expected in ("Output q1: sines", "Output z", "[rad]", "[m]", "true, then within 0.25"):
         assert expected in shown
     assert "Path:" not in shown
     assert "Tracking error" not in shown
