@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Examples run as they are, and what they print is as good as it was."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+# The first number that each prints, or the one after a word, and what it must not exceed.
+MOST = {
+    "observer": (r"([\d.]+) mm with it", 5.0),
+    "obstacles": (r"([\d.]+) mm off in the end", 1.0),
+    "quadrotor": (r"([\d.]+) mm from where", 1.0),
+    "tuning": (r"R = 0\.0001 +[\d.]+ +([\d.]+)", 0.001),
+}
+
+
+def test_every_example_is_run() -> None:
+    assert set(MOST) == {path.stem for path in EXAMPLES.glob("*.py")}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MOST)
+def test_example_prints_a_small_error(name: str, tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(EXAMPLES.parent)}
+    command = [sys.executable, str(EXAMPLES / f"{name}.py")]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    pattern, most = MOST[name]
+    said = re.search(pattern, done.stdout)
+    assert said is not None, done.stdout
+    assert float(said[1]) <= most
