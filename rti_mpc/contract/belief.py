@@ -79,7 +79,7 @@ class Belief(Schedule):
         """
         before_ns, self._reported_ns = max(self._reported_ns, t_ns - self._period_ns), t_ns
         self.forget(before_ns - self._period_ns)
-        if self._expects(source, t_ns) and self._plays(u, t_ns):
+        if self.expects(t_ns, u, source):
             self.confirmed += source[1] > 0
             return False
         plans, coming = self._plans, deque[Plan]()
@@ -97,6 +97,10 @@ class Belief(Schedule):
             if (start_ns := max(plan.start_ns, t_ns)) < plan.end_ns:
                 self._put(replace(plan, start_ns=start_ns), self._increments)
         return True
+
+    def expects(self, t_ns: int, u: Array, source: tuple[int, int]) -> bool:
+        """Whether a report is what is believed; the arguments are those of `correct`."""
+        return self._expects(source, t_ns) and self._plays(u, t_ns)
 
     def _expects(self, source: tuple[int, int], t_ns: int) -> bool:
         """Whether a command, or the robot's ramp, is believed to act at a time; true for a command of an unknown epoch, whose number says nothing."""

@@ -47,6 +47,7 @@ from rti_mpc.control.stopping import Stopping
 from rti_mpc.control.track import Track
 from rti_mpc.control.tuning import Tuning
 from rti_mpc.errors import OcpError
+from rti_mpc.kept import Kept
 from rti_mpc.rti.ocp import Ocp, rest_fault
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.way_to_rest import StopLaw
@@ -147,6 +148,8 @@ class Controller:
         self._blockage = Blockage(rti)
         self._opinions = second_opinions(rti, second_opinion, self.say)
         self._delay = DelayEstimator(model, self.grid.dt_ns, self.grid.most_ns, compile=compile) if timing.delay_s is None else None
+        self._understudy = StateStream(model, self._stale_ns, self.grid.dt_ns, settling_s)  # judges states in rehearsals
+        self._kept = Kept((*rti.rehearsed, *self._prediction.written, *self.envelope.written))
 
     @property
     def mode(self) -> Mode:
@@ -194,9 +197,7 @@ class Controller:
             OcpError: It is no `State`; one from the bus has been checked.
             ShapeError: Its vectors are not the model's.
         """
-        given.array("state.x", given.instance("state", state, State).x, self._x0.shape)
-        if len(state.u):
-            given.array("state.u", state.u, self._u_rest.shape)
+        self._check(state)
         arrival = self._states.receive(state, arrival_ns)
         if (notice := self._states.notice) is not None:
             self.say(notice)
@@ -426,6 +427,36 @@ class Controller:
         if self._opinions is not None:
             self._opinions.rewarm()
 
+    def rehearse(self, local_ns: int) -> Command | None:
+        """
+        Go the way from state to command once more with the last state, shortly before the next one is due: that one then finds warm caches.
+
+        Nothing changes on which a later call depends, so it is not `reported`: what the way
+        overwrites is put back, and the state is judged by another judge.
+
+        Args:
+            local_ns: Local monotonic time.
+
+        Returns:
+            A command to be encoded and thrown away; None if the next sample does not begin with a feedback that is prepared.
+        """
+        state, grid = self._states.last, self.grid
+        if state is None or not self._loaded or self._standing_by or self.mode not in PLANNING_MODES:
+            return None
+        self._check(state)
+        self._understudy.receive(state, local_ns)
+        due_ns = grid.act_ns - min(grid.delay_ns, grid.dt_ns - 1)  # or the first time at which `prepare` has asked for the inputs
+        if len(state.u):
+            self._sent.expects(due_ns, self._within(state.u, due_ns), (state.command_epoch, state.command_seq))
+        if grid.early(due_ns, self._states.clock.period_ns) or self._track.ended(grid.act_ns):
+            return None
+        with self._kept:
+            self._prediction.predict(self._states.x, due_ns, grid.act_ns)
+            self._rti.rehearse(self._x0)
+            rows = self.envelope.fit(self._rti.u, self._reach)
+        self._modes.enter(self.mode, "nothing is said")
+        return self._issued.build(state, grid.act_ns, grid.act_ns + self._valid_ns, self.mode, self._rti.status, rows)
+
     def _measure_delay(self, estimator: DelayEstimator, stamp_ns: int) -> None:
         """Learn from the state of the last sample, and let the grid follow."""
         estimator.restore_if_lost(self._sent.confirmed)
@@ -619,6 +650,12 @@ class Controller:
 
     # Small parts.
 
+    def _check(self, state: State) -> None:
+        """Refuse what is no state of the model."""
+        given.array("state.x", given.instance("state", state, State).x, self._x0.shape)
+        if len(state.u):
+            given.array("state.u", state.u, self._u_rest.shape)
+
     def _hear(self, state: State) -> bool:
         """Learn which input acts, from a report and, on a way to rest with feedback, from the state; return whether the report was not expected."""
         surprised = len(state.u) > 0 and self._correct(state)
@@ -627,11 +664,16 @@ class Controller:
 
     def _correct(self, state: State) -> bool:
         """Believe the input that a robot reports; return whether it was another than believed."""
-        u, lbu, ubu = state.u, self.envelope.limits["lbu"], self.envelope.limits["ubu"]
-        if not all(low <= value <= high for low, value, high in zip(lbu.tolist(), u.tolist(), ubu.tolist(), strict=True)):
-            believed = self._sent.at(state.stamp_ns - 1)[0]  # it may be outside bounds that were tightened
-            u = np.minimum(np.maximum(u, np.minimum(lbu, believed)), np.maximum(ubu, believed))
-        return self._sent.correct(state.stamp_ns, u, (state.command_epoch, state.command_seq))
+        return self._sent.correct(state.stamp_ns, self._within(state.u, state.stamp_ns), (state.command_epoch, state.command_seq))
+
+    def _within(self, u: Array, t_ns: int) -> Array:
+        """Return an input that is reported at a time, inside its bounds, or those that were tightened since."""
+        lbu, ubu = self.envelope.limits["lbu"], self.envelope.limits["ubu"]
+        if all(low <= value <= high for low, value, high in zip(lbu.tolist(), u.tolist(), ubu.tolist(), strict=True)):
+            return u
+        believed = self._sent.at(t_ns - 1)[0]  # it may be outside bounds that were tightened
+        inside: Array = np.minimum(np.maximum(u, np.minimum(lbu, believed)), np.maximum(ubu, believed))
+        return inside
 
     def _anchor(self, state: State) -> Reference:
         """Follow the reference that has arrived, from the last state on if it is to start on arrival."""

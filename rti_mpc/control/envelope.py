@@ -25,6 +25,7 @@ class Envelope:
 
     Attributes:
         limits: Bounds by the names in `INPUT_BOUNDS`, each of shape ``(nu,)``; may be overwritten, and hold from the next plan on.
+        written: The arrays that `fit` writes.
     """
 
     def __init__(self, ocp: Ocp, *, compile: bool = True) -> None:
@@ -34,6 +35,7 @@ class Envelope:
         self._u: Array = np.zeros((ocp.N_u, nu))
         self._rows: Array = np.zeros((ocp.N, nu))
         self._reach: tuple[Array, Array] = (np.zeros((2, nu)), np.zeros((2, nu)))
+        self.written = (self._u, *self._reach, self._rows)
         fit = clipping(ocp)
         inputs = {"u": self._u, "lowest": self._reach[0], "highest": self._reach[1], **self.limits}
         self._fit = bind(compiled(fit)[0] if compile else fit, inputs, {"rows": self._rows})

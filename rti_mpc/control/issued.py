@@ -49,7 +49,7 @@ class Issued:
         ending: Mapping[str, Any] = NO_ENDING,
     ) -> Command:
         """
-        Build the next command; nothing changes until it is committed.
+        Propose the next command; nothing changes until it is committed.
 
         Args:
             state: The state it answers.
@@ -61,8 +61,16 @@ class Issued:
             plan: Whether these are a plan of its own, not a fallback.
             ending: Further fields of the command by name: its way to rest, and the period of its rows if it is another.
         """
+        command = self.build(state, act_ns, valid_until_ns, mode, status, u, ending)
+        self._planned = command if plan else None
+        return command
+
+    def build(
+        self, state: State, act_ns: int, valid_until_ns: int, mode: Mode, status: QpStatus, u: Array, ending: Mapping[str, Any] = NO_ENDING
+    ) -> Command:
+        """Return the command that `propose` would propose, and change nothing."""
         fields: dict[str, Any] = {"period_ns": self._period_ns, **ending}
-        command = Command(
+        return Command(
             epoch=self.epoch,
             seq=self.seq + 1,
             stamp_ns=act_ns,
@@ -76,8 +84,6 @@ class Issued:
             u=u,
             **fields,
         )
-        self._planned = command if plan else None
-        return command
 
     def commit(self, command: Command) -> None:
         """Record a proposal as the last command that has left; the next one has the next number."""

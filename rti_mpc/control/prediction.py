@@ -19,6 +19,7 @@ class Prediction:
     Attributes:
         x: The state predicted last, shape ``(nx,)``. Overwritten by the next prediction.
         p: Parameters of the prediction, shape ``(np,)``; the model's nominal ones unless set.
+        written: The arrays that `predict` writes.
     """
 
     def __init__(self, model: Model, sent: Sent, *, compile: bool = True) -> None:
@@ -30,6 +31,7 @@ class Prediction:
         self._input: Array = np.zeros(model.nu)
         phi = integrator(model)
         integrate = compiled(phi)[0] if compile else phi
+        self.written = (self._start, self._input, self._span, self.x)
         self._integrate = bind(integrate, {"x": self._start, "u": self._input, "p": self.p, "dt": self._span}, {"x_next": self.x})
 
     def predict(self, x: Array, from_ns: int, to_ns: int) -> Array:

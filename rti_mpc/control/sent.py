@@ -73,6 +73,10 @@ class Sent:
         if start_ns < over_ns:
             self._slowest.add(command, start_ns, over_ns, approached=False)
 
+    def expects(self, t_ns: int, u: Array, source: tuple[int, int]) -> bool:
+        """Whether `correct` would find what is believed."""
+        return self._schedule.expects(t_ns, u, source)
+
     def correct(self, t_ns: int, u: Array, source: tuple[int, int]) -> bool:
         """Correct the belief by the input that the robot reports, see `Belief.correct`; return whether it was another than believed."""
         changed = self._schedule.correct(t_ns, u, source)

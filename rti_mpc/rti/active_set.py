@@ -49,6 +49,7 @@ class ActiveSet:
         gain: Call that computes the gains; with it, after one of the former two, preparation is complete.
         roll_out: Call that makes the plan, and finds the places; `certify` judges that plan, `refine` improves it.
         enter: Call that starts the interior point at the plan; `step`, one step of it.
+        written: The arrays that `roll_out` and `certify` write.
         steps: Steps of the interior point that the sample has taken.
         iterations: Roll-outs and steps of the interior point of the last solve.
         res_prim: Largest violation of dynamics, bounds and increments by the plan that was judged last, relative to their scales.
@@ -82,6 +83,7 @@ class ActiveSet:
         refined = {f"{name.removesuffix('_plan')}_refined": array for name, array in plan.items()}
         self.refine = bind(make(functions.refine), {**guess.start, **fixed, "r": slopes, **plan}, refined)
         self._best = tuple((np.zeros_like(array), array) for name, array in found.items() if name != "changes")
+        self.written = (*found.values(), slopes, *verdict.values())
         self._lowest = np.inf  # gap of the best plan, relative as `res_dual`
         self._stepped = False  # whether the interior point has been used for this QP
 
@@ -126,6 +128,14 @@ class ActiveSet:
             if not self._keep_better():  # with degenerate places a refinement may make the plan worse
                 break
         return self._restore_best() if self._stepped else self._step_inside()
+
+    def rehearse(self) -> None:
+        """Make the plan once and judge it; the caller puts `written` back."""
+        kept = self.res_prim, self.res_dual
+        self.roll_out()
+        if self._changes[0] <= 0.0:
+            self._judged()
+        self.res_prim, self.res_dual = kept
 
     def _judged(self) -> QpStatus:
         """Certify the plan as it is."""

@@ -386,6 +386,26 @@ class Rti:
             self.status = self._certified(self.active_set)
         return self.status
 
+    @property
+    def rehearsed(self) -> Sequence[Array]:
+        """The arrays that `rehearse` overwrites."""
+        return self._turns.written if self.active_set is None else (*self._turns.written, *self.active_set.written)
+
+    def rehearse(self, x0: Array) -> None:
+        """
+        Do what `feedback` mostly does, so that the next one finds the processor's caches warm: make a plan by one roll-out, and judge it.
+
+        The caller puts the arrays that are `rehearsed` back, with `rti_mpc.kept.Kept`: then nothing has changed. A QP solver is not rehearsed, since
+        it starts from its last iterate.
+
+        Args:
+            x0: State at node 0, shape ``(nx,)``, of a sample that is prepared.
+        """
+        self.x0[...] = given.array("x0", x0, self.x0.shape)
+        self._turns.rehearse()
+        if self.active_set is not None:
+            self.active_set.rehearse()
+
     def _certified(self, active_set: ActiveSet) -> QpStatus:
         """Certify the plan of the last QP; if that fails, the plan is the guess at which the QP was linearized."""
         if self.solver is not active_set:

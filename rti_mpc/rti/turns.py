@@ -33,6 +33,9 @@ class Turns:
 
     A state with bounds no more than a turn apart stays in the turn of its bounds.
 
+    Attributes:
+        written: The arrays that `settle` writes.
+
     Args:
         ocp: The problem; it repeats with each turn of a state that is an angle.
         output: Outputs at a node, ``(x, p) -> y``.
@@ -47,6 +50,7 @@ class Turns:
         model = ocp.model
         y: Array = np.zeros(model.ny)
         self._x, self._y_ref = x, y_ref
+        self.written = (x, x0, y, y_ref)
         self._lbx, self._ubx = bounds
         views: list[Any] = [array.data for array in (x0, x[0], y, y_ref[0])]  # read faster than arrays
         self._x0, self._guess, self._y, self._y_first = views
@@ -71,6 +75,12 @@ class Turns:
                 self._y_ref[:, j] = np.unwrap(self._y_ref[:, j])
             if self._added[j]:
                 self._y_ref[:, j] += self._added[j]
+
+    def rehearse(self) -> None:
+        """Do what `settle` does; the caller puts `written` back."""
+        kept = self._errors.copy(), self._added.copy()
+        self.settle()
+        self._errors, self._added = kept
 
     def settle(self) -> bool:
         """Bring a new initial state, the guess and the reference into the same turn; return whether guess or reference have changed."""

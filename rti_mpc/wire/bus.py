@@ -22,6 +22,7 @@ from rti_mpc.wire.certificate import warn_of_end
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.reach import remind
+from rti_mpc.wire.received import WOKEN as WOKEN
 from rti_mpc.wire.received import Received as Received
 from rti_mpc.wire.session import BusSettings as BusSettings
 from rti_mpc.wire.streams import ALIVE, MAX_REQUEST_BYTES, role_of
@@ -67,13 +68,16 @@ class Subscriber(Protocol):
     """Receiver of a stream, see `rti_mpc.wire.zenoh_session.ZenohSubscriber`."""
 
     def recv(self) -> Received | None:
-        """Next sample, waiting for it; None once the session is closed."""
+        """Next sample, waiting for it; `WOKEN` if it was woken instead; None once the session is closed."""
 
     def try_recv(self) -> Received | None:
         """Next sample, None if there is none now."""
 
     def drain(self) -> list[Received]:
         """All samples there are now, oldest first."""
+
+    def wake(self) -> None:
+        """Have `recv`, in another thread, return `WOKEN`, now or when it is next called, unless messages are taken before by `try_recv`."""
 
     def undeclare(self) -> object:
         """Stop receiving."""
@@ -110,7 +114,7 @@ class Session(Protocol):
     def publisher(self, key: Key[M]) -> Publisher[M]:
         """Publisher of a stream."""
 
-    def subscriber(self, key: Key[Any], capacity: int, *, history: bool) -> Subscriber:
+    def subscriber(self, key: Key[Any], capacity: int, *, history: bool, wakes: bool = False) -> Subscriber:
         """Subscriber to a stream."""
 
     def serve(self, key: Key[Any], answer: Callable[[Received], bytes | None]) -> Declared:
@@ -250,7 +254,7 @@ class Bus:
             self._publishers[key] = self._session.publisher(key)
         return self._publishers[key]
 
-    def subscriber(self, key: Key[Any], *, capacity: int = 1, history: bool = True) -> Subscriber:
+    def subscriber(self, key: Key[Any], *, capacity: int = 1, history: bool = True, wakes: bool = False) -> Subscriber:
         """
         Return a subscriber to a stream.
 
@@ -260,8 +264,9 @@ class Bus:
                 `rti_mpc.wire.streams.MAX_RING_BYTES`. A receiver that needs only the last message should keep `RING_MESSAGES` as well, and take
                 the newest that is accepted: messages of others that follow it must not displace it.
             history: Whether to ask publishers for their last message, later ones included, if the stream is cached.
+            wakes: Whether `Subscriber.wake` is needed; not of a stream that is cached.
         """
-        subscriber = self._session.subscriber(key, capacity, history=history)
+        subscriber = self._session.subscriber(key, capacity, history=history, wakes=wakes)
         self._subscribers.add(subscriber)
         return subscriber
 

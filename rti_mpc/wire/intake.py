@@ -75,6 +75,7 @@ class Intake(Generic[M]):
         self._encoding = encoding(cls)
         self._widths = tuple((widths or {}).items())
         self._quiet_ns = round(1e9 * quiet_s)
+        self._last = b""  # the last payload that was a message
         self._pending: dict[str, Notice] = {}
         self._said_ns: dict[str, int] = {}
 
@@ -100,7 +101,13 @@ class Intake(Generic[M]):
             self.refused[error.reason] += 1
             self._note(Severity.WARNING, "message_refused", f"{error}; {self.refused.total()} refused so far")
             return None
+        self._last = received.payload
         return message
+
+    def rehearse(self) -> None:
+        """Decode the last message once more, and change nothing: the next one then finds warm caches."""
+        if self._last:
+            decode(self._cls, self._last)
 
     def accept(self, received: Payload, now_ns: int) -> M | None:
         """

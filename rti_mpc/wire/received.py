@@ -27,3 +27,6 @@ class Received:
     def size(self) -> int:
         """Number of bytes that were sent."""
         return self.withheld or len(self.payload)
+
+
+WOKEN = Received(b"", "", "")  # what a waiting receiver gets that was woken without a message

@@ -13,9 +13,12 @@ from __future__ import annotations
 
 import math
 import os
+import secrets
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, Generic
@@ -26,13 +29,14 @@ from zenoh import ext
 from rti_mpc.wire import document
 from rti_mpc.wire.cdr import M, encode, encoding
 from rti_mpc.wire.keys import Key
-from rti_mpc.wire.received import Received
+from rti_mpc.wire.received import WOKEN, Received
 from rti_mpc.wire.session import BusSettings, certificate, endpoints, open_session, zenoh_config
 
 CLOSE_TIMEOUT_S = 0.5
 HEARTBEAT_S = 1.0  # period at which a cached publisher sends the number of its last message
 MAX_ENCODING_CHARS = 256  # of an encoding that are read
 RING_TOKENS = 1024  # changes of presence that wait for their receiver
+WAKE_BYTES = 16  # of the message by which a process wakes its own receiver
 RING_QUERIES = 16  # requests that wait for their answer
 CLOSED_WORDS = ("closed", "Undeclared")  # in Zenoh's errors about a session that is closed or a publisher that is undeclared
 JSON_ENCODING = "application/json"  # of descriptions, requests and answers
@@ -78,8 +82,27 @@ class ZenohPublisher(Generic[M]):
 class ZenohSubscriber:
     """Subscriber to one key expression, with a ring of the newest samples, oldest first. It is empty after `ZenohSession.close`."""
 
-    def __init__(self, subscriber: zenoh.Subscriber[Any] | ext.AdvancedSubscriber[Any], key: Key[Any], capacity: int, own: str) -> None:
+    def __init__(
+        self,
+        subscriber: zenoh.Subscriber[Any] | ext.AdvancedSubscriber[Any],
+        key: Key[Any],
+        capacity: int,
+        own: str,
+        put_here: Callable[[bytes], object] | None = None,
+    ) -> None:
+        """
+        Take over a subscriber of Zenoh's.
+
+        Args:
+            subscriber: With a ring as its handler.
+            key: Its key expression.
+            capacity: Of the ring.
+            own: Number of the session, if its own messages may arrive.
+            put_here: Puts a payload into the ring, by a message that does not leave this process; None where `wake` is not needed.
+        """
         self._subscriber = subscriber
+        self._put_here = put_here
+        self._wake = b"" if put_here is None else secrets.token_bytes(WAKE_BYTES)  # known to nobody else
         self._capacity = capacity
         self._handler = subscriber.handler
         self._key = "" if "*" in key else str(key)
@@ -88,7 +111,7 @@ class ZenohSubscriber:
         self._encoding: tuple[zenoh.Encoding | None, str] = None, ""  # the last one, and its text: comparing costs a fifth of making the text
 
     def recv(self) -> Received | None:
-        """Next sample, waiting for it; None once the session is closed."""
+        """Next sample, waiting for it; `WOKEN` after `wake`; None once the session is closed."""
         try:
             while (received := self._received(self._handler.recv())) is None:
                 pass
@@ -97,10 +120,10 @@ class ZenohSubscriber:
         return received
 
     def try_recv(self) -> Received | None:
-        """Next sample, None if there is none now."""
+        """Next sample, None if there is none now; who asks is awake, so a `wake` is over."""
         try:
             while (sample := self._handler.try_recv()) is not None:
-                if (received := self._received(sample)) is not None:
+                if (received := self._received(sample)) is not None and received is not WOKEN:
                     return received
         except zenoh.ZError:
             return None
@@ -109,6 +132,12 @@ class ZenohSubscriber:
     def drain(self) -> list[Received]:
         """All samples there are now, oldest first; no more than the ring holds, even if others arrive meanwhile."""
         return list(islice(iter(self.try_recv, None), self._capacity))
+
+    def wake(self) -> None:
+        """Have `recv` return `WOKEN`, see `rti_mpc.wire.bus.Subscriber.wake`; nothing once the session is closed."""
+        assert self._put_here is not None, "a subscriber to be woken must be declared so"
+        with suppress(zenoh.ZError):
+            self._put_here(self._wake)
 
     def undeclare(self) -> None:
         """Stop receiving; a waiting `recv` returns None."""
@@ -123,7 +152,8 @@ class ZenohSubscriber:
         key, size = self._key or str(sample.key_expr), len(sample.payload)
         if size > self._max_bytes:
             return Received(b"", self._encoding[1], key, withheld=size)  # not even copied
-        return Received(sample.payload.to_bytes(), self._encoding[1], key)
+        payload = sample.payload.to_bytes()
+        return WOKEN if payload == self._wake and self._wake else Received(payload, self._encoding[1], key)
 
 
 class ZenohSession:
@@ -214,11 +244,15 @@ class ZenohSession:
             ext.declare_advanced_publisher(self._session, key, cache=ext.CacheConfig(qos.cached), publisher_detection=True, **options)
         )
 
-    def subscriber(self, key: Key[Any], capacity: int, *, history: bool) -> ZenohSubscriber:
+    def subscriber(self, key: Key[Any], capacity: int, *, history: bool, wakes: bool = False) -> ZenohSubscriber:
         """Subscriber to a stream, see `rti_mpc.wire.bus.Bus.subscriber`."""
         capacity = key.stream.capacity(capacity)
         ring: Any = zenoh.handlers.RingChannel(capacity)
         origin = zenoh.Locality.REMOTE
+        if wakes:
+            assert not key.stream.qos.cached
+            put_here = partial(self._session.put, key, allowed_destination=zenoh.Locality.SESSION_LOCAL)
+            return ZenohSubscriber(self._session.declare_subscriber(key, ring), key, capacity, "", put_here)
         if not (history and key.stream.qos.cached):
             return ZenohSubscriber(self._session.declare_subscriber(key, ring, allowed_origin=origin), key, capacity, own="")
         request = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)

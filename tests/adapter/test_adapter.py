@@ -32,7 +32,7 @@ class Session(FakeSession):
         super().__init__()
         self.waiting: list[Received] = []
 
-    def subscriber(self, key: Any, capacity: int, *, history: bool) -> Any:
+    def subscriber(self, key: Any, capacity: int, *, history: bool, wakes: bool = False) -> Any:
         return Waiting(self)
 
 

@@ -63,7 +63,7 @@ class FakeSession:
     def token(self, key: Key[Any]) -> Declared:
         return self._say(key)
 
-    def subscriber(self, key: Key[Any], capacity: int, *, history: bool) -> Any:
+    def subscriber(self, key: Key[Any], capacity: int, *, history: bool, wakes: bool = False) -> Any:
         return FakeSubscriber(self._closed)
 
     def watch(self, key: Key[Any], tell: Callable[[str, bool], None]) -> Declared:
@@ -115,6 +115,9 @@ class FakeSubscriber:
 
     def drain(self) -> list[Received]:
         return []
+
+    def wake(self) -> None:
+        pass
 
     def undeclare(self) -> None:
         pass

@@ -19,7 +19,7 @@ import pytest
 import zenoh
 
 from rti_mpc.contract.message import Command, End, Event, Reference, Severity, State
-from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Received, Subscriber
+from rti_mpc.wire.bus import RING_MESSAGES, WOKEN, Bus, BusSettings, Received, Subscriber
 from rti_mpc.wire.cdr import decode, encoding
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
@@ -231,6 +231,40 @@ def test_own_messages_do_not_come_back(join: Any) -> None:
     own.append(robot.subscriber(KEYS.events))
     received(seen)
     assert [subscriber.try_recv() for subscriber in own] == [None, None, None]
+
+
+def test_a_receiver_that_waits_is_woken_without_a_message_and_nobody_else_is(join: Any) -> None:
+    robot, other = join(robot=True), join()
+    states, another, elsewhere = robot.subscriber(KEYS.state, wakes=True), robot.subscriber(KEYS.state), other.subscriber(KEYS.state)
+    woken: list[Received | None] = []
+    waits = threading.Thread(target=lambda: woken.append(states.recv()))
+    waits.start()
+    states.wake()
+    waits.join(TIMEOUT_S)
+    assert woken == [WOKEN]
+    assert woken[0] is WOKEN
+    sender = other.publisher(KEYS.state)
+    eventually(lambda: sender.heard)
+    sender.put(STATE)
+    assert decode(State, received(another).payload).seq == STATE.seq
+    assert elsewhere.try_recv() is None
+
+
+def test_a_wake_is_over_for_who_looks_for_messages_and_displaces_none(join: Any) -> None:
+    robot, other = join(robot=True), join()
+    states = robot.subscriber(KEYS.state, capacity=RING_MESSAGES, wakes=True)
+    sender = other.publisher(KEYS.state)
+    eventually(lambda: sender.heard)
+    sender.put(STATE)
+    first = states.recv()
+    states.wake()
+    assert states.try_recv() is None
+    states.wake()
+    sender.put(STATE)
+    assert states.recv() is WOKEN
+    assert states.recv() == first
+    states.undeclare()
+    states.wake()
 
 
 def test_a_ring_keeps_the_newest(join: Any) -> None:

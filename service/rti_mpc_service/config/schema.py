@@ -279,6 +279,10 @@ class RealtimeSection(Section):
         default=(), strict=False, description="numbers of the cores on which the controller runs; any core if left out"
     )
     lock_memory: bool = Field(default=False, description="whether the controller's memory is locked, so that it is never swapped out")
+    rehearse: bool = Field(
+        default=True,
+        description="whether each sample is rehearsed shortly before its state is due, so that it finds warm caches; commands stay the same",
+    )
 
 
 class ReferenceSection(Section):

@@ -37,7 +37,8 @@ from rti_mpc.journal.book import Book
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.way_to_rest import StopLaw
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
+from rti_mpc.wire.bus import RING_MESSAGES, WOKEN, Bus, BusSettings, Subscriber
+from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc_service.announce import announce
 from rti_mpc_service.config.build import build_controller, build_rti
@@ -49,6 +50,7 @@ from rti_mpc_service.controller.leadership import LEADER, LISTEN_BEFORE_START_S,
 from rti_mpc_service.controller.orders import Orders
 from rti_mpc_service.controller.params import Params
 from rti_mpc_service.controller.references import References
+from rti_mpc_service.controller.rehearsal import Rehearsal
 from rti_mpc_service.controller.slack import Slack
 from rti_mpc_service.host import realtime
 from rti_mpc_service.latch_file import LatchFile
@@ -98,7 +100,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
                 controller.enable()
 
     # After compiling, and before any thread is started, so that all threads inherit the settings.
-    outcomes = realtime.attempt(**config.realtime.model_dump())
+    outcomes = realtime.attempt(**config.realtime.model_dump(exclude={"rehearse"}))
     with Bus.join(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
         operator_stop = OperatorStop(LatchFile(bus.keys, state), obey, controller.say)
         operator_stop.listen(bus)
@@ -155,7 +157,6 @@ class Daemon:
     ) -> None:
         keys, model = bus.keys, rti.ocp.model
         self._config = config
-        self._granted = {outcome.what: outcome.text for outcome in outcomes}
         self._formulation = rti.formulation
         self._controller = controller
         self._bus = bus
@@ -179,20 +180,20 @@ class Daemon:
         self._references = References(bus, controller, model.ny)
         self._prepare_us = 0.0
         self._slack = Slack()
+        states = bus.subscriber(keys.state, capacity=RING_MESSAGES, wakes=True)
+        self._rehearsal = Rehearsal(states.wake) if config.realtime.rehearse else None
+        self._granted = {outcome.what: outcome.text for outcome in outcomes} | {"rehearsal": self._rehearsal.text if self._rehearsal else "off"}
         self._ticked_ns = 0
         self._threads = [
-            Thread(
-                target=self._guarded,
-                args=(act, bus.subscriber(key, capacity=RING_MESSAGES)),
-                name=act.__name__,
-                daemon=True,
-            )
-            for act, key in (
-                (self._control, keys.state),
-                (self._references.from_planner, keys.reference),
-                (self._references.from_leader, keys.anchored),
+            Thread(target=self._guarded, args=(act, subscriber), name=act.__name__, daemon=True)
+            for act, subscriber in (
+                (self._control, states),
+                (self._references.from_planner, bus.subscriber(keys.reference, capacity=RING_MESSAGES)),
+                (self._references.from_leader, bus.subscriber(keys.anchored, capacity=RING_MESSAGES)),
             )
         ]
+        if self._rehearsal is not None:
+            self._threads.append(Thread(target=self._rehearsal.keep_time, name="rehearsal", daemon=True))
 
     def run(self, stop: Event) -> int:
         """Control until stopped; then bring the robot to rest and send rest as the last command, unless another controller takes over."""
@@ -228,6 +229,11 @@ class Daemon:
         """Answer states as they arrive: the control loop."""
         received = subscriber.recv()
         while received is not None:
+            if received is WOKEN:
+                if (received := subscriber.try_recv()) is None:
+                    self._rehearse()
+                    received = subscriber.recv()
+                continue
             arrival_ns = time.monotonic_ns()
             for state in self._states_in.newest_of_each((received, *subscriber.drain()), self._controller.continues):
                 self._sample(state, arrival_ns)
@@ -267,7 +273,10 @@ class Daemon:
             )
             self._telemetries[self._leadership.role].put(telemetry)
             self._prepare_us = 1e-3 * (prepared_ns - sent_ns)
-            if (notice := self._slack.begin(slack_s / controller.robot_rate, judged=telemetry.second_seq > 0)) is not None:
+            left_s = slack_s / controller.robot_rate
+            if (notice := self._slack.begin(left_s, judged=telemetry.second_seq > 0)) is not None:
+                controller.say(notice)
+            if self._rehearsal is not None and (notice := self._rehearsal.begin(left_s)) is not None:
                 controller.say(notice)
 
     def _judge_piece(self) -> bool:
@@ -282,6 +291,15 @@ class Daemon:
         if self._journal.due(now_ns, slack_s):
             with self._lock:
                 self._journal.photograph(now_ns)
+
+    def _rehearse(self) -> None:
+        """Go the way from a state to its command once more, so that the state that is due finds it in the caches; nothing else comes of it."""
+        with self._lock:
+            if self._rehearsal is None or self._ending or not self._rehearsal.timely:
+                return
+            self._states_in.rehearse()
+            if (command := self._controller.rehearse(time.monotonic_ns())) is not None:
+                encode(command)
 
     def _send(self, command: Command, left_ns: int | None = None) -> None:
         """Send a command if this controller leads, and record it."""

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arrays that a computation may overwrite, and that are put back as they were, bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from rti_mpc.array import Array
+
+
+class Kept:
+    """
+    A block, at the end of which arrays are as they were at its beginning; may be entered again and again.
+
+    Args:
+        arrays: The arrays, C-contiguous; their memory must stay in place.
+    """
+
+    def __init__(self, arrays: Iterable[Array]) -> None:
+        # Copied through memory views that are made once, as in `Rti`.
+        self._pairs = tuple((array.copy().reshape(-1).data, array.reshape(-1).data) for array in arrays)
+
+    def __enter__(self) -> None:
+        for kept, array in self._pairs:
+            kept[:] = array
+
+    def __exit__(self, *_: object) -> None:
+        for kept, array in self._pairs:
+            array[:] = kept
