@@ -620,6 +620,16 @@ class Controller:
     # Outgoing messages.
 
     @property
+    def blocked(self) -> str:
+        """What stops the plans short of the reference, in words; empty if nothing does."""
+        return self._blockage.cause if self._blockage.blocked else ""
+
+    @property
+    def followed(self) -> Reference | None:
+        """The reference that is followed, with its real stamp; None if there is none."""
+        return self._track.followed
+
+    @property
     def at_rest(self) -> bool:
         """Whether the last command that was sent is rest from its first row on, or none was ever sent."""
         last = self._issued.last

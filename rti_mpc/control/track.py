@@ -105,6 +105,11 @@ class Track:
         self._reference = None
 
     @property
+    def followed(self) -> Reference | None:
+        """The reference that is followed; None if there is none."""
+        return self._reference
+
+    @property
     def loaded(self) -> bool:
         """Whether there is a reference to follow."""
         return self._reference is not None

@@ -381,6 +381,25 @@ def replay(
     raise typer.Exit(main(recording, start_s=parse_start(start), assignments=assignments or (), tolerance=tolerance, json_path=path, **choice))
 
 
+@app.command()
+def why(
+    recording: RecordingPath,
+    at: Annotated[str | None, typer.Option("--at", metavar="TIME", help="Time after the first command, such as 72.5s.")] = None,
+    seq: Annotated[int | None, typer.Option("--seq", metavar="NUMBER", help="Number of the command instead.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    robot: RecordedRobot = None,
+    owner: Owner = None,
+    folder: ModelFolder = Path(),
+    trust: Trust = False,
+) -> None:
+    """Explain a recorded command: who solved it, which bounds act, what its plan costs, and the events that led there."""
+    from rti_mpc_service.replay.replay import parse_start
+    from rti_mpc_service.replay.why import main
+
+    at_s = None if at is None else parse_start(at)
+    raise typer.Exit(main(recording, at_s=at_s, seq=seq, robot=robot, owner=owner, folder=folder, trust=trust, as_json=as_json))
+
+
 @partial(process, with_model=False)
 def router(config: Config, bus: BusSettings) -> None:
     """Run a Zenoh router, for clients on several hosts or with access control."""

@@ -26,7 +26,7 @@ REPORTED_CALLS = {
     *("receive_state", "retune", "rewarm", "second_opinion", "stand_by", "standstill", "stop", "tick"),
 }
 READING_CALLS = {  # change nothing that a command depends on
-    *("at_rest", "continues", "heard", "lay_out", "mode", "notices", "rehearse", "robot_now_ns", "robot_rate"),
+    *("at_rest", "blocked", "continues", "followed", "heard", "lay_out", "mode", "notices", "rehearse", "robot_now_ns", "robot_rate"),
     *("say", "standing_by", "slack_s", "telemetry", "wanted"),
 }
 

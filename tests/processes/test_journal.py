@@ -71,6 +71,11 @@ def test_journal_of_a_run_with_whatever_an_operator_and_a_link_do_replays_withou
     print(done.stdout)
     assert done.returncode == 0, done.stderr
     assert re.search(r"omega_c: \S+ rad/s away on average", done.stdout)
+    why = rti_mpc("why", run, "--seq", 20)
+    print(why.stdout)
+    assert why.returncode == 0, why.stderr
+    assert why.stdout.startswith("command 20 of pioneer")
+    assert "times: preparation " in why.stdout
     done = rti_mpc("replay", run, "--from", "10s", "--json", tmp_path / "replay.json")
     (told,) = json.loads((tmp_path / "replay.json").read_text())
     assert (told["differing"], told["not_covered"]) == (0, [])
@@ -87,7 +92,7 @@ def test_both_controllers_of_a_takeover_behind_a_guard_replay_without_a_differin
         first = system.tracking()
         system.start("standby")
         shadow = system.bus.subscriber(system.keys.standby_telemetry)
-        heard(shadow, Telemetry, lambda sample: sample.mode is Mode.TRACKING)
+        heard(shadow, Telemetry, lambda sample: sample.mode is Mode.TRACKING and sample.seq > 60)  # the recorder has its files by then
         system.kill("controller")
         commands = system.bus.subscriber(system.keys.command, capacity=4096)
         heard(commands, Command, lambda command: command.epoch > first.epoch and command.mode is Mode.TRACKING)

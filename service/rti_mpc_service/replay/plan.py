@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Facts about a plan before the next one is prepared: which bounds act, and what its cost is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.rti.linearization import constraints, input_reference
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.rti import COST_WEIGHTS, TOUCHING_DISTANCE, Rti
+from rti_mpc_service.config.schema import Config
+
+ACTING_DISTANCE = 1e-6  # from a bound of an input, relative to the input's scale
+
+
+def acting_bounds(rti: Rti, config: Config) -> list[dict[str, Any]]:
+    """
+    Return the bounds that a plan touches, each with its name, its side, its value, and the stages at which it acts.
+
+    Stages of inputs and increments begin at 0, which acts next; those of states and constraints at 1.
+    """
+    model, weights = rti.ocp.model, rti.guess.weights
+    scale_u, scale_g = rti.scale[model.nx : model.nx + model.nu], rti.scale[model.nx + model.nu :]
+    increments = np.diff(rti.u, axis=0, prepend=rti.u_prev[None])
+    found: list[dict[str, Any]] = []
+    for kind, values, lower, upper in (("input", rti.u, "lbu", "ubu"), ("increment", increments, "lbdu", "ubdu")):
+        for j, signal in enumerate(model.inputs):
+            for side, name in (("lower", lower), ("upper", upper)):
+                bound = float(weights[name][j])
+                touching = np.abs(values[:, j] - bound) <= ACTING_DISTANCE * scale_u[j]
+                found += _acting(kind, signal.name, signal.unit, side, bound, touching, 0, 0.0)
+    for soft, scale in zip(softened(rti, config), scale_g, strict=True):
+        for side, bound, sign in (("lower", soft.lower, -1.0), ("upper", soft.upper, 1.0)):
+            over = sign * (soft.values - bound)
+            violation = max(0.0, float(over.max()))
+            found += _acting(soft.kind, soft.name, soft.unit, side, bound, over > -TOUCHING_DISTANCE * scale, soft.first, violation)
+    return found
+
+
+def _acting(kind: str, name: str, unit: str, side: str, bound: float, touching: Any, first: int, violation: float) -> Iterator[dict[str, Any]]:
+    """Yield a bound if it acts at any stage."""
+    if touching.any():
+        stages = [int(k) + first for k in np.flatnonzero(touching)]
+        yield {"kind": kind, "name": name, "unit": unit, "side": side, "bound": bound, "stages": stages, "violation": violation}
+
+
+class BoundAlongPlan(NamedTuple):
+    """
+    A softened bound along a plan.
+
+    Attributes:
+        kind: ``"state"``, ``"constraint"``, or ``"end"`` for a state that is bounded at the last node alone.
+        name: Name of the signal.
+        unit: Its unit.
+        lower: Lower bound.
+        upper: Upper bound.
+        values: Values along the plan.
+        first: Node of the first of them.
+    """
+
+    kind: str
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    values: Array
+    first: int
+
+
+def softened(rti: Rti, config: Config) -> list[BoundAlongPlan]:
+    """Return the softened bounds in the order of `Ocp.lg`."""
+    ocp, w = rti.ocp, rti.guess.weights
+    g = outputs_of(constraints(ocp)[0], rti)
+    rows = [("state", ocp.model.states[j], w["lbx"][j], w["ubx"][j]) for j in ocp.soft]
+    rows += [("constraint", signal, w["lh"][j], w["uh"][j]) for j, signal in enumerate(constraint_signals(rti, config))]
+    rows += [("end", ocp.model.states[j], w["lbx_e"][j], w["ubx_e"][j]) for j in ocp.soft_e]
+    return [
+        BoundAlongPlan(
+            kind, signal.name, signal.unit, float(low), float(high), g[-1:, j] if kind == "end" else g[:, j], ocp.N if kind == "end" else 1
+        )
+        for j, (kind, signal, low, high) in enumerate(rows)
+    ]
+
+
+def slack_weights(ocp: Ocp, w: Mapping[str, Array]) -> tuple[Array, Array]:
+    """Return L1 and L2 weights of the slacks, in the order of `Ocp.lg`."""
+    soft, soft_e = list(ocp.soft), list(ocp.soft_e)
+    linear, square = (np.concatenate([w[x][soft], w[h], w[x][soft_e]]) for x, h in (("z", "zh"), ("Z", "Zh")))
+    return linear, square
+
+
+def constraint_signals(rti: Rti, config: Config) -> Sequence[Any]:
+    """Return the signals of the general constraints that are bounded."""
+    signals = [signal for signal in rti.ocp.model.constraints if signal.name in config.ocp.bounds.constraints or signal.name.startswith("disc_")]
+    assert len(signals) == rti.ocp.h_expr.numel(), "those that `build_ocp` bounds"
+    return signals
+
+
+def outputs_of(function: Any, rti: Rti) -> Array:
+    """Evaluate a function of state, input and parameters at nodes 1 to N of the plan, shape ``(N, outputs)``."""
+    N, held = rti.ocp.N, rti.u[np.minimum(np.arange(rti.ocp.N), len(rti.u) - 1)]
+    arguments = (rti.x[1:].T, held.T, rti.p[1:].T)[: function.n_in()] if function.n_in() == 3 else (rti.x[1:].T, rti.p[1:].T)
+    return np.array(function.map(N)(*arguments)).T
+
+
+def cost_terms(rti: Rti, config: Config) -> dict[str, float]:
+    """Return the cost (4) of a plan by term: error of each output, changes of each input, terminal weight, and slacks of each bound."""
+    ocp, model = rti.ocp, rti.ocp.model
+    w = {name: array / rti.cost_scale if name in COST_WEIGHTS else array for name, array in rti.guess.weights.items()}
+    errors = outputs_of(model.h(), rti) - rti.y_ref
+    increments = np.diff(rti.u, axis=0, prepend=rti.u_prev[None])
+    by_output = (w["delta"][:, None] * errors * (errors @ w["Q"])).sum(axis=0)
+    by_input = (w["lambda_"][:, None] * increments * (increments @ w["R"])).sum(axis=0)
+    terms = {f"error of {signal.name}": float(value) for signal, value in zip(model.outputs, by_output, strict=True)}
+    terms |= {f"changes of {signal.name}": float(value) for signal, value in zip(model.inputs, by_input, strict=True)}
+    off = rti.u - np.array(input_reference(ocp)(rti.p[: len(rti.u)].T)).T
+    for signal, value in zip(model.inputs, (w["R_u"] * off**2).sum(axis=0), strict=True):
+        terms[f"{signal.name} itself"] = float(value)
+    terms["terminal weight"] = float(errors[-1] @ w["Q_e"] @ errors[-1])
+    for soft, linear, square in zip(softened(rti, config), *slack_weights(ocp, w), strict=True):
+        slack = np.maximum(0.0, np.maximum(soft.lower - soft.values, soft.values - soft.upper))
+        name = f"bounds of {soft.name}"
+        terms[name] = terms.get(name, 0.0) + float((linear * slack + 0.5 * square * slack**2).sum())
+    return {name: value for name, value in terms.items() if value}

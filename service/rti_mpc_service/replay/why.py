@@ -1,0 +1,345 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Explanation of one command of a recording, from the controller that repeats it.
+
+The recorded controller is built again and repeats its journal up to the command and the
+sample after it, in a process of its own. What it then holds is what the recorded one
+held, bit for bit.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rti_mpc.contract.message import Command, JournalKind, Telemetry
+from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.errors import ConfigError, MessageError
+from rti_mpc.journal.entry import JournalEntry, decode_entries
+from rti_mpc.journal.replay import Difference, Replay, replay
+from rti_mpc.recording.reader import Recording
+from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS
+from rti_mpc.rti.qp.osqp import Solver
+from rti_mpc_service.replay.plan import acting_bounds, cost_terms
+from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, journals, rebuild
+
+LOOK_BACK_S = 10.0  # of the robot's time, over which the events before a command are told
+MAX_EVENTS = 8  # of those, the last ones
+MIN_COST_SHARE = 0.005  # of the cost, below which a term is left out of the lines
+ROUNDING = 1e-6  # relative: a violation below this is none
+PLANNED = (Mode.TRACKING, Mode.HOLDING)
+RUNGS = {
+    Mode.TRACKING: "a plan of its own",
+    Mode.HOLDING: "a plan of its own",
+    Mode.FALLBACK: "rung 2 of the ladder: the previous plan, shifted",
+    Mode.BRAKING: "rung 3 of the ladder: a way to rest, from past commands",
+    Mode.STOPPED: "a way to rest, as long as the stop is latched",
+}
+
+
+@dataclass(frozen=True)
+class Place:
+    """
+    Place of a command in a journal.
+
+    Attributes:
+        entry: Number of the entry with which it was committed.
+        command: The command.
+    """
+
+    entry: int
+    command: Command
+
+
+def main(
+    path: Path,
+    *,
+    at_s: float | None = None,
+    seq: int | None = None,
+    robot: str | None = None,
+    owner: int | None = None,
+    folder: Path = Path(),
+    trust: bool = False,
+    as_json: bool = False,
+) -> int:
+    """
+    Explain one command of a recording.
+
+    Args:
+        path: The recording.
+        at_s: Robot time after the first command, from which on the first command is explained.
+        seq: Number of the command instead.
+        robot: Name of a robot; None: the first one.
+        owner: Number of a controller; None: the one that led then.
+        folder: Where a model of the user's own is looked for.
+        trust: Whether to run the attached source of a model.
+        as_json: Whether to print JSON.
+
+    Returns:
+        Exit status 0.
+
+    Raises:
+        ConfigError: There is no such command, or it cannot be repeated here.
+    """
+    if (at_s is None) == (seq is None):
+        raise ConfigError("why must be asked with --at TIME or with --seq NUMBER, one of the two")
+    for journal in journals(path, robot, owner):
+        place = find(journal, at_s, seq)
+        if place is not None:
+            facts = explain(journal, rebuild(journal, folder=folder, trust=trust), place)
+            facts["times"] = phase_times(path, journal, place.command)
+            print(json.dumps(facts, indent=1) if as_json else "\n".join(lines(facts)))
+            return 0
+    what = f"a command {seq}" if seq is not None else f"a command {at_s:g} s after its first one"
+    raise ConfigError(f"{path} must hold {what}, in the journal of a controller that led then")
+
+
+def find(journal: Journaled, at_s: float | None, seq: int | None) -> Place | None:
+    """Return the place of a command that acted, None if there is none."""
+    first_ns, standing_by = None, False
+    for message in journal.messages:
+        if message.kind is JournalKind.SNAPSHOT:
+            continue
+        for entry in decode_entries(message.data, message.seq):
+            standing_by = entry.name == "stand_by" or (standing_by and entry.name != "lead")
+            if entry.name != "commit" or standing_by:
+                continue
+            command: Command = entry.args[0]
+            first_ns = command.stamp_ns if first_ns is None else first_ns
+            if command.seq == seq or (at_s is not None and command.stamp_ns - first_ns >= 1e9 * at_s):
+                return Place(entry.seq, command)
+    return None
+
+
+def explain(journal: Journaled, built: Rebuilt, place: Place) -> dict[str, Any]:
+    """
+    Return the facts about a command.
+
+    Raises:
+        ConfigError: No replay reaches it.
+    """
+    controller, on = built.controller, Replay(built.controller, built.rti)
+    told: deque[dict[str, Any]] = deque(maxlen=64)
+    facts: dict[str, Any] = {}
+    stamp_ns, prepared = 0, 0
+    for entry, difference in replay(on, journal.messages, snapshot_for(journal, place)):
+        if entry.name == "receive_state":
+            stamp_ns = entry.args[0].stamp_ns
+        said = [*said_by(entry), *((notice.code, notice.text) for notice in controller.notices())]
+        told.extend(event(code, text, stamp_ns) for code, text in said)
+        if entry.seq == place.entry:
+            facts = facts_of(built, on, place, entry, difference)
+            facts["events"] = [one for one in told if place.command.stamp_ns - one["stamp_ns"] <= 1e9 * LOOK_BACK_S][-MAX_EVENTS:]
+        elif facts and entry.name == "prepare":
+            prepared += 1
+            if prepared == 2 or place.command.mode not in PLANNED:
+                break
+    if not facts:
+        raise ConfigError(f"command {place.command.seq} must follow a snapshot without a gap, got {[*map(str, on.outcome.gaps)] or 'none before it'}")
+    facts["second_opinion"] = second_opinion(controller.telemetry(**NO_TIMES), place.command.seq)
+    return facts
+
+
+NO_TIMES: dict[str, float] = {"prepare_us": 0.0, "feedback_us": 0.0, "latency_us": 0.0, "slack_s": 0.0}
+
+
+def snapshot_for(journal: Journaled, place: Place) -> int:
+    """Return the number of the snapshot to start from: before the events that are told, if there is one."""
+    numbers = [(message.seq, message.stamp_ns) for message in journal.messages if message.kind is JournalKind.SNAPSHOT and message.seq < place.entry]
+    early = [seq for seq, stamp_ns in numbers if place.command.stamp_ns - stamp_ns >= 1e9 * LOOK_BACK_S]
+    return max(early, default=min((seq for seq, _ in numbers), default=0))
+
+
+def said_by(entry: JournalEntry) -> Iterator[tuple[str, str]]:
+    """Yield what an entry means, a code and a text, where the controller itself says nothing."""
+    if entry.name == "retune":
+        yield ("parameters_changed", f"parameters of version {entry.args[1]}")
+    elif entry.name == "lead":
+        yield ("took_over", f"this controller leads, with epoch {entry.args[0]}")
+    elif entry.name == "stand_by":
+        yield ("stands_by", "this controller stands by")
+    elif entry.name == "inject":
+        yield ("injected", f"failure {entry.args[0]!r} was injected on request, for {entry.args[1]} samples")
+
+
+def event(code: str, text: str, stamp_ns: int) -> dict[str, Any]:
+    """Return what was said, with its time."""
+    return {"stamp_ns": stamp_ns, "code": code, "text": text}
+
+
+def facts_of(built: Rebuilt, on: Replay, place: Place, entry: JournalEntry, difference: Difference | None) -> dict[str, Any]:
+    """Return what is known of a command before the next sample is prepared."""
+    controller, rti, command = built.controller, built.rti, place.command
+    sample: Telemetry = controller.telemetry(**NO_TIMES)
+    planned = command.mode in PLANNED
+    changed = changed_weights(built)
+    terms = cost_terms(rti, built.config) if planned else {}
+    return {
+        "robot": built.config.robot,
+        "seq": command.seq,
+        "epoch": command.epoch,
+        "stamp_ns": command.stamp_ns,
+        "mode": command.mode.name,
+        "status": command.status.name,
+        "inputs": {signal.name: {"value": float(command.u[0, j]), "unit": signal.unit} for j, signal in enumerate(rti.ocp.model.inputs)},
+        "replayed": "0 bits differ" if difference is None else str(difference),
+        "rung": RUNGS.get(command.mode, "none"),
+        "fallbacks": {"softened": sample.softened, "shifted": sample.shifted, "braked": sample.braked, "rested": sample.rested},
+        "solver": solver_of(rti) if planned or command.status is not QpStatus.NONE else None,
+        "iterations": sample.iterations,
+        "qps": rti.taken,
+        "res_prim": sample.res_prim,
+        "res_dual": sample.res_dual,
+        "cost": sample.cost if planned else None,
+        "cost_terms": terms,
+        "bounds": acting_bounds(rti, built.config) if planned else [],
+        "blocked": controller.blocked,
+        "state": {"seq": command.state_seq, "age_s": 1e-9 * (command.stamp_ns - command.state_stamp_ns)},
+        "reference": reference_of(built, command),
+        "delay_s": sample.delay_s,
+        "parameters": {"version": sample.parameter_version, "changed": changed},
+        "disturbances": sample.d.tolist(),
+    }
+
+
+def solver_of(rti: Any) -> str:
+    """Return the name of the solver of the last QP."""
+    if rti.solver is rti.active_set:
+        return "riccati"
+    whole = " with softened bounds" if rti.solver is rti.solvers[-1] and len(rti.solvers) > 1 else ""
+    return ("osqp" if isinstance(rti.solver, Solver) else "another solver") + whole
+
+
+def reference_of(built: Rebuilt, command: Command) -> dict[str, Any] | None:
+    """Return age and rest of the reference at a command's time."""
+    followed = built.controller.followed
+    if followed is None:
+        return None
+    left_s = 1e-9 * (followed.stamp_ns + (len(followed.y) - 1) * followed.period_ns - command.stamp_ns)
+    return {"epoch": followed.epoch, "seq": followed.seq, "age_s": 1e-9 * (command.stamp_ns - followed.stamp_ns), "left_s": left_s}
+
+
+def changed_weights(built: Rebuilt) -> list[str]:
+    """Return the weights and bounds that differ from the file's, in words."""
+    file, now = built.rti.ocp, built.controller.wanted
+    if now is file:
+        return []
+    return [
+        f"{name} = {short(getattr(now, name))}, {short(getattr(file, name))} in the file" for name in WEIGHTS_AND_BOUNDS if not same(now, file, name)
+    ]
+
+
+def same(now: Any, file: Any, name: str) -> bool:
+    """Whether two problems have the same weight or bound."""
+    return np.array_equal(getattr(now, name), getattr(file, name))
+
+
+def short(values: Any) -> Any:
+    """Return a weight as it is given: its diagonal if it has no other numbers."""
+    return np.diag(values).tolist() if values.ndim == 2 and not (values - np.diag(np.diag(values))).any() else values.tolist()
+
+
+def second_opinion(sample: Telemetry, seq: int) -> dict[str, Any] | None:
+    """Return what OSQP thought of the plan of a command."""
+    if sample.second_seq != seq:
+        return None
+    difference = sample.second_difference
+    return {
+        "status": sample.second_status.name,
+        "difference": difference if np.isfinite(difference) else None,
+        "iterations": sample.second_iterations,
+    }
+
+
+def phase_times(path: Path, journal: Journaled, command: Command) -> dict[str, float] | None:
+    """Return the times of a sample from its recorded telemetry, None if there is none."""
+    for recorded in Recording(path).messages(journal.robot, ("telemetry", "telemetry/standby")):
+        try:
+            sample: Telemetry = recorded.message
+        except MessageError:
+            continue
+        if (sample.epoch, sample.seq) == (command.epoch, command.seq):
+            return {name: getattr(sample, name) for name in ("prepare_us", "feedback_us", "latency_us", "slack_s", "second_us")}
+    return None
+
+
+def lines(facts: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the facts in words."""
+    inputs = ", ".join(f"{name} = {of['value']:.4g} {of['unit']}" for name, of in facts["inputs"].items())
+    yield f"command {facts['seq']} of {facts['robot']}, at {1e-9 * facts['stamp_ns']:.3f} s: {facts['mode']}, {inputs}"
+    if facts["replayed"] != "0 bits differ":
+        yield f"the replay differs from it: {facts['replayed']}"
+    yield f"it is {facts['rung']}"
+    if facts["blocked"]:
+        yield f"the way is blocked: {facts['blocked']}"
+    yield from solved(facts)
+    state, reference = facts["state"], facts["reference"]
+    yield f"state {state['seq']} was {state['age_s']:.3f} s old when it began to act" + (
+        f", delay {facts['delay_s']:.3f} s" if facts["delay_s"] else ""
+    )
+    if reference is not None:
+        end = f"ends in {reference['left_s']:.1f} s" if reference["left_s"] >= 0 else f"ended {-reference['left_s']:.1f} s ago"
+        yield f"reference {reference['seq']} began {reference['age_s']:.1f} s ago and {end}"
+    if facts["parameters"]["changed"]:
+        yield f"parameters of version {facts['parameters']['version']}: {'; '.join(facts['parameters']['changed'])}"
+    if (times := facts.get("times")) is not None:
+        phases = ", ".join(
+            f"{name} {times[f'{key}_us']:.0f} us" for name, key in (("preparation", "prepare"), ("feedback", "feedback"), ("latency", "latency"))
+        )
+        yield f"times: {phases}; {1e3 * times['slack_s']:.1f} ms of slack"
+    if facts["events"]:
+        yield f"what led there, in the {LOOK_BACK_S:g} s before:"
+    for one in facts["events"]:
+        yield f"  {1e-9 * one['stamp_ns']:.3f} s  {one['code']}: {one['text']}"
+
+
+def solved(facts: Mapping[str, Any]) -> Iterator[str]:
+    """Yield how a plan was made, which bounds act in it, and what it costs."""
+    if facts["solver"] is None:
+        return
+    if facts["cost"] is None:
+        yield f"its QP was {facts['status'].lower()} for {facts['solver']}, after {count(facts['iterations'], 'iteration')}"
+        return
+    residuals = f"violation {facts['res_prim']:.0e}, gap {facts['res_dual']:.0e}"
+    yield f"{facts['solver']}: {facts['status']} in {count(facts['iterations'], 'iteration')}, {count(facts['qps'], 'QP')}, {residuals}"
+    if (second := facts["second_opinion"]) is not None and second["difference"] is not None:
+        worked = f"{second['status']} in {count(second['iterations'], 'iteration')}"
+        yield f"OSQP: {worked}, and differs by {second['difference']:.1e} of half an input's range"
+    else:
+        yield "OSQP: no opinion"
+    total = sum(facts["cost_terms"].values())
+    terms = sorted(facts["cost_terms"].items(), key=lambda term: -term[1])
+    shares = ", ".join(f"{name} {100 * value / total:.0f} %" for name, value in terms if total and value >= MIN_COST_SHARE * total)
+    yield f"cost {facts['cost']:.4g}" + (f": {shares}" if shares else "")
+    yield "bounds that act:" if facts["bounds"] else "no bound acts"
+    for bound in facts["bounds"]:
+        yield f"  {bound_text(bound)}"
+
+
+def count(number: int, what: str) -> str:
+    """Return a number of things in words."""
+    return f"{number} {what}{'s' * (number != 1)}"
+
+
+def bound_text(bound: Mapping[str, Any]) -> str:
+    """Return a bound in words."""
+    value, stages = f"{bound['bound']:.4g} {bound['unit']}", spans(bound["stages"])
+    if bound["kind"] == "increment":
+        way = "rises" if bound["side"] == "upper" else "falls"
+        return f"{bound['name']} {way} as fast as it may, {value} per sample: stages {stages}"
+    over = f", exceeded by {bound['violation']:.3g} {bound['unit']}" if bound["violation"] > ROUNDING * max(1.0, abs(bound["bound"])) else ""
+    return f"{bound['name']} at its {bound['side']} bound, {value}: stages {stages}{over}"
+
+
+def spans(stages: Sequence[int]) -> str:
+    """Return numbers as spans, such as ``0 to 3, 7``."""
+    ends = [k for k, (a, b) in enumerate(pairwise(stages)) if b != a + 1]
+    starts, stops = [0, *(k + 1 for k in ends)], [*ends, len(stages) - 1]
+    return ", ".join(f"{stages[i]}" if i == j else f"{stages[i]} to {stages[j]}" for i, j in zip(starts, stops, strict=True))

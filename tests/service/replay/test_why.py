@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Explanations of commands, by what they say: a bound, an obstacle, a fallback, a stale state, changed parameters, a takeover."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rti_mpc.contract.status import Mode
+from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.replay.rebuild import Journaled, rebuild
+from rti_mpc_service.replay.why import Place, explain, find, lines
+from tests.service.replay.driven import journal_of, straight
+
+INJECTED = SHIPPED.read_text() + "\n[debug]\ninject = true\n"
+
+
+def asked(journal: Journaled, place: Place | None, folder: Path) -> tuple[str, dict[str, Any]]:
+    assert place is not None
+    facts = json.loads(json.dumps(explain(journal, rebuild(journal, folder=folder), place)))
+    assert facts["replayed"] == "0 bits differ"
+    return "\n".join(lines(facts)), facts
+
+
+def first(journal: Journaled, wanted: Callable[[Any], bool]) -> Place:
+    """The first command as wanted."""
+    for seq in range(1, 400):
+        place = find(journal, None, seq)
+        if place is not None and wanted(place.command):
+            return place
+    raise AssertionError("no such command")
+
+
+def test_bound_that_acts_is_named_with_its_stages_and_the_cost_is_told_by_term(tmp_path: Path) -> None:
+    journal = journal_of(SHIPPED, samples=20, follows=straight(5.0, 0.45))
+    text, facts = asked(journal, find(journal, None, 1), tmp_path)
+    assert "command 1 of pioneer, at 0.100 s: TRACKING, u_c = 0.25 m/s" in text
+    assert "u_c rises as fast as it may, 0.25 m/s per sample: stages 0 to 1" in text
+    assert "u_c at its upper bound, 0.5 m/s: stages 1 to " in text
+    assert "riccati: SOLVED in 1 iteration, 1 QP" in text
+    assert "of half an input's range" in text
+    assert "error of x 99 %" in text
+    assert sum(facts["cost_terms"].values()) == pytest.approx(facts["cost"], rel=1e-6), "all terms are there"
+    assert facts["state"]["age_s"] == 0.0
+
+
+def test_command_is_found_by_its_time_as_by_its_number(tmp_path: Path) -> None:
+    journal = journal_of(SHIPPED, samples=20)
+    by_time, by_seq = find(journal, 1.0, None), find(journal, None, 11)
+    assert by_time is not None
+    assert by_seq is not None
+    assert by_time.entry == by_seq.entry
+    assert find(journal, 1000.0, None) is None
+
+
+def test_braking_for_a_stale_state_says_for_how_long_none_came(tmp_path: Path) -> None:
+    journal = journal_of(SHIPPED, samples=40, sees=lambda k, state: None if 20 <= k < 26 else state)
+    text, facts = asked(journal, first(journal, lambda command: command.mode is Mode.BRAKING), tmp_path)
+    assert "BRAKING" in text
+    assert "rung 3 of the ladder: a way to rest, from past commands" in text
+    assert "state_stale: tracking to braking: no state for 0." in text
+    assert facts["solver"] is None
+
+
+def test_fallback_says_which_plan_goes_on_and_what_failed(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(INJECTED)
+
+    def fail(controller: Any, rti: Any) -> None:
+        request = {"failure": "qp", "samples": 2}
+        rti.inject(request)
+        from rti_mpc.control.call import Call
+
+        controller.on_call(Call("inject", ("qp", 2), {}))
+
+    journal = journal_of(path, samples=40, acts={20: fail})
+    text, _ = asked(journal, first(journal, lambda command: command.mode is Mode.FALLBACK), tmp_path)
+    assert "rung 2 of the ladder: the previous plan, shifted" in text
+    assert "its QP was infeasible" in text
+    assert "qp_failed: tracking to fallback: the QP is infeasible: the previous plan is continued" in text
+    assert "injected: failure 'qp' was injected on request" in text
+
+
+@pytest.mark.slow  # compiles the problem with an obstacle
+def test_obstacle_that_blocks_is_named_with_the_nodes_at_which_it_acts(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(SHIPPED.read_text().replace("[ocp.weights]", "[[ocp.obstacles]]\ncentre_m = [0.6, 0.0]\nradius_m = 0.2\n\n[ocp.weights]"))
+    journal = journal_of(path, samples=90, follows=straight(0.6))
+    place = find(journal, None, 85)
+    text, facts = asked(journal, place, tmp_path)
+    assert facts["blocked"], text
+    assert "the way is blocked: an obstacle or constraint holds it" in text
+    assert "disc_0 at its lower bound, 0 m: stages" in text
+
+
+def test_changed_parameters_are_told_with_the_values_of_both(tmp_path: Path) -> None:
+    def retune(controller: Any, rti: Any) -> None:
+        controller.retune(rti.ocp.retuned(R=np.array([0.25, 1.0])), 3)
+
+    journal = journal_of(SHIPPED, samples=40, acts={20: retune})
+    text, facts = asked(journal, find(journal, 3.0, None), tmp_path)
+    assert "parameters of version 3: R = [0.25, 1.0], [" in text
+    assert "parameters_changed: parameters of version 3" in text
+    assert facts["parameters"]["version"] == 3
+
+
+def test_takeover_is_one_of_the_events(tmp_path: Path) -> None:
+    journal = journal_of(SHIPPED, samples=30, acts={10: lambda controller, _: controller.stand_by(), 15: lambda controller, _: controller.lead(6)})
+    place = first(journal, lambda command: command.epoch == 6)
+    text, facts = asked(journal, place, tmp_path)
+    assert "took_over: this controller leads, with epoch 6" in text
+    assert facts["epoch"] == 6
