@@ -17,6 +17,7 @@ MOST = {
     "observer": (r"([\d.]+) mm with it", 5.0),
     "obstacles": (r"([\d.]+) mm off in the end", 1.0),
     "quadrotor": (r"([\d.]+) mm from where", 1.0),
+    "race": (r"oval +([\d.]+) s", 13.5),
     "tuning": (r"R = 0\.0001 +[\d.]+ +([\d.]+)", 0.001),
 }
 
