@@ -218,7 +218,8 @@ every parameter, and one TOML file in `deploy/robots`, to begin with for a robot
 Here each follows its own scenario in lockstep, without clock and bus; errors are the largest after the first third.
 `make gallery` makes this page again.
 
-Short programs in `examples/` use them: `race.py` laps three tracks, `quadrotor.py` flies to a point and back, `tuning.py` compares weights in a table,
+Short programs in `examples/` use them: `race.py` laps three tracks, `quadrotor.py` flies to a point and back,
+`tuning.py` compares weights in a table,
 `obstacles.py` passes discs, `observer.py` estimates the current that the boat is in.
 
 | robot | states, inputs | period | horizon | at rest without feedback | error |
