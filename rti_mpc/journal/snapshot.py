@@ -179,7 +179,7 @@ class Camera:
         key = memory(array)
         if (pin := self._pins.get(key)) is not None and array.size:
             return PINNED, pin, array.shape
-        if array.base is not None and memory(root(array)) in self._pins:
+        if array.size and array.base is not None and memory(root(array)) in self._pins:
             raise JournalError(f"{path} must not be a part of an array that never moves, unless it was one from the start: a snapshot cannot tell")
         if key not in self._copied or not array.size:
             self._copied[key] = len(self._arrays)

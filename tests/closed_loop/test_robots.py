@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.contract.message import Reference
+from rti_mpc.contract.message import Journal, JournalKind, Reference
 from rti_mpc.contract.status import Mode
 from rti_mpc.control.controller import Controller, Timing
+from rti_mpc.journal.book import Book
+from rti_mpc.journal.replay import Replay, replay
 from rti_mpc.model.find import SHIPPED_MODELS, find_model
 from rti_mpc.model.model import Model
 from rti_mpc.rti.rest import RestClass, assess
@@ -88,6 +90,25 @@ def test_robot_comes_to_its_reference(name: str) -> None:
     assert controller.ladder.fallbacks == 0
     error = errors(find_model(name), run, reference, 0.75 * duration_s)
     assert np.abs(error[:, :2]).max() < tolerance
+
+
+@pytest.mark.parametrize("name", [name if name == "kinematic_bicycle" else pytest.param(name, marks=pytest.mark.slow) for name in ROBOTS])
+def test_journal_of_a_robot_is_replayed_with_no_differing_bit(name: str) -> None:
+    controller, body, _ = controlled(name, 1.0, stoppable=True)
+    book, messages = Book(controller), list[Journal]()
+    for until_s in (0.4, 0.8, 1.2):
+        book.photograph(0)
+        messages += book.messages(0)
+        drive(controller, body, until_s)
+    messages += book.messages(0)
+    assert not book.failure
+    for start_seq in [message.seq for message in messages if message.kind is JournalKind.SNAPSHOT]:
+        other, _, _ = controlled(name, 1.0, stoppable=True)
+        on = Replay(other, other._rti)
+        for _ in replay(on, messages, start_seq):
+            pass
+        assert on.outcome.samples > 0
+        assert not on.outcome.differences, str(on.outcome.differences[0])
 
 
 @pytest.mark.slow
