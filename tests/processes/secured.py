@@ -30,7 +30,7 @@ PROGRAMS: dict[str, tuple[object, ...]] = {
     "run": (),
     "reference": ("--scenario", "eight", "--duration", 600),
 }
-COMMAND_OF = {role: command for command, roles in ROLES_OF_COMMAND.items() for role in roles}
+COMMAND_OF = {roles[0]: command for command, roles in ROLES_OF_COMMAND.items()}  # which prefers that role to others in the same folder
 
 
 class Secured:
