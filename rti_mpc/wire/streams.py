@@ -57,7 +57,7 @@ class Qos:
 QOS_FAST = Qos("REAL_TIME", express=True)  # overtakes all other messages
 QOS_CACHED = Qos(cached=1)
 QOS_LOW = Qos("DATA_LOW")
-QOS_LOW_CACHED = Qos("DATA_LOW", cached=128)  # some seconds: low priority is dropped where a link is busy
+QOS_LOW_CACHED = Qos("DATA_LOW", cached=8)  # about two seconds, more would be memory: low priority is dropped where a link is busy
 QOS_QUERY = Qos(congestion="BLOCK")
 QOS_FAST_QUERY = Qos("REAL_TIME", express=True, congestion="BLOCK")
 

@@ -45,7 +45,9 @@ def loop_of(path: Path, course: Course = SHORT) -> ClosedLoop:
 
 def trials_of(path: Path) -> list[optuna.trial.FrozenTrial]:
     storage = optuna.storages.get_storage(f"sqlite:///{path}")
-    (study,) = optuna.get_all_study_summaries(storage)
+    if not (studies := optuna.get_all_study_summaries(storage)):
+        return []  # the file is made before the study
+    (study,) = studies
     return optuna.load_study(study_name=study.study_name, storage=storage).get_trials(states=(optuna.trial.TrialState.COMPLETE,))
 
 
