@@ -97,11 +97,8 @@ class Solver:
         self.iterations = 0
         self._settings = settings
         self._piece = settings.max_iter // math.ceil(settings.max_iter / ADAPTATION_ITERATIONS)
-        self._turn = 0  # of the step sizes
-        self._changes, self._adapts_at = (
-            0,
-            ADAPTATION_ITERATIONS,
-        )  # changes of the step size for this QP, and the iterations at which the next one comes
+        self._changes = 0  # of the step size for this QP
+        self._adapts_at = ADAPTATION_ITERATIONS  # iterations at which the next one comes
         self._sound = True
         self._start: tuple[Array, Array] | None = None  # of the next `load`, its multipliers of rows as they are; None: the last solution
         self._held: tuple[Array, Array] | None = None  # iterate of the last `rewarm` until the next solve, as `solution`
@@ -143,8 +140,9 @@ class Solver:
     def load(self) -> None:
         """Linearize at the guess, and load the new matrices, factorization included; off the path from state to command."""
         qp, scaled = self.qp, self._scaled
-        if self._turn:
-            self._take_step_size(0)
+        changed, self._changes, self._adapts_at = self._changes, 0, ADAPTATION_ITERATIONS
+        if changed:
+            self._take_step_size()
         qp.linearize()
         self._sound = qp.sound
         if not self._sound:  # OSQP would never recover from such numbers
@@ -227,7 +225,7 @@ class Solver:
             np.multiply(scaled.l, self._scale, out=self._l)
             np.multiply(scaled.u, self._scale, out=self._u)
             np.multiply(scaled.A.data, self._scale[self.qp.A.indices], out=self._A_x)
-        self.workspace.update_rho(self._settings.rho * STEP_SIZES[self._turn])
+        self._take_step_size()
         refused = self.workspace.update_data_vec(q=scaled.q, l=self._l, u=self._u)
         if refused or not self._sound or self.workspace.update_data_mat(P_x=scaled.P.data, P_i=None, A_x=self._A_x, A_i=None):
             self.cold = True
@@ -243,7 +241,7 @@ class Solver:
 
     def embed(self) -> bool:
         """Embed the initial state, and return whether there is a QP to be solved."""
-        self.iterations, self._changes, self._adapts_at = 0, 0, ADAPTATION_ITERATIONS
+        self.iterations = 0
         if not self._sound:
             self.cold = True
             return False
@@ -287,16 +285,15 @@ class Solver:
 
     def _adapt(self) -> bool:
         """Take the next step size, weigh the rows by the last iterate, and return whether there still is a QP to be solved."""
-        self._take_step_size((self._turn + 1) % len(STEP_SIZES))
+        self._take_step_size()
         if not self._weigh(None):
             return True
         self._load_matrices()
         return self._sound and self._load_vectors()
 
-    def _take_step_size(self, turn: int) -> None:
-        """Take one of the step sizes."""
-        self._turn = turn
-        self.workspace.update_rho(self._settings.rho * STEP_SIZES[turn])
+    def _take_step_size(self) -> None:
+        """Take the step size whose turn it is."""
+        self.workspace.update_rho(self._settings.rho * STEP_SIZES[self._changes % len(STEP_SIZES)])
 
     def plan(self) -> None:
         """Make the plan from the last iterate."""
