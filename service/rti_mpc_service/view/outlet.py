@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import pyarrow as pa
 import rerun as rr
 
 from rti_mpc.contract.message import Notice, Reference, Severity
@@ -202,6 +203,11 @@ def viewer_outlet(url: str, name: str, roots: Sequence[str] = ()) -> Outlet:
         return stream
 
     return Outlet(url, open_stream, roots=roots)
+
+
+def load_arrow() -> None:
+    """Make the first array of Arrow, which imports pandas where it is installed: seconds, that a recording's end must not be the first to spend."""
+    pa.array([])
 
 
 def new_stream(name: str, recording_id: uuid.UUID | None = None) -> rr.RecordingStream:

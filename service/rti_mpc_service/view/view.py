@@ -18,7 +18,7 @@ from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.announce import announce
 from rti_mpc_service.view.listener import Listener
-from rti_mpc_service.view.outlet import Outlet, file_outlet, viewer_outlet
+from rti_mpc_service.view.outlet import Outlet, file_outlet, load_arrow, viewer_outlet
 from rti_mpc_service.view.screen import RERUN_ADDRESS, end_page, page, reached, serve_page, spawn_viewer, viewer_url
 
 ROLE = "viewer"
@@ -62,6 +62,7 @@ def main(
     rerun_spawn |= rerun_connect is None and rerun_save is None and web_port is None
     url = viewer_url(rerun_connect or RERUN_ADDRESS)
     stop = stop or stop_on_signals()
+    load_arrow()
     with Bus.join(bus_settings, keys, stop=stop, say=log.warning) as bus:
         names = [*robots] or [keys.robot]
         roots, begun_ns = (names, time.monotonic_ns()) if len(names) > 1 else ((), None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -191,3 +192,30 @@ def test_a_hung_viewer_delays_neither_offers_nor_closing(viewer: Viewer, host: H
     in_time(host, "closing", (time.monotonic_ns() - since_ns) / MS, 1000.0, since_ns)
     in_time(host, "an offer", worst[0] / MS, 500.0, worst[1])
     os.kill(viewer.process.pid, signal.SIGCONT)
+
+
+LOADING = """
+import sys
+import numpy as np
+from rti_mpc.contract.message import State
+from rti_mpc_service.view.outlet import load_arrow, new_stream
+from rti_mpc_service.view.recording import Entry
+from rti_mpc_service.view.scene import Scene
+
+load_arrow()
+before = set(sys.modules)
+stream = new_stream("robot")
+stream.save(sys.argv[1])
+scene = Scene(stream, ())
+scene.send([Entry(k, State(1, k + 1, k, np.ones(2))) for k in range(3)])
+scene.finish()
+stream.flush(timeout_sec=30.0)
+stream.disconnect()
+print({name.partition(".")[0] for name in set(sys.modules) - before} & {"pandas"})
+"""
+
+
+def test_what_takes_seconds_to_import_is_imported_before_a_recording_begins(tmp_path: Path) -> None:
+    """Otherwise a viewer that is stopped on a busy host spends the time for its end on it, and what it has received is lost."""
+    done = subprocess.run([sys.executable, "-c", LOADING, tmp_path / "run.rrd"], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"
