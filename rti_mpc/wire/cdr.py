@@ -243,6 +243,15 @@ def _word(payload: bytes, offset: int, name: str) -> tuple[int, int]:
     return value, offset + 4
 
 
+def _counted(payload: bytes, offset: int, name: str) -> tuple[bytes, int]:
+    """Return the bytes whose number is at an offset, and the offset after them."""
+    size, offset = _word(payload, offset, name)
+    content = payload[HEADER_BYTES + offset : HEADER_BYTES + offset + size]
+    if len(content) < size:
+        raise Refused("truncated", f"{name} must hold the {size} bytes it declares, got {len(content)}")
+    return content, offset + size
+
+
 def _rows(flat: Array, width: int, name: str) -> Array:
     if flat.size % width if width else flat.size:
         raise Refused("length", f"{name} must hold whole rows of {width} numbers, got {flat.size}")
@@ -267,13 +276,9 @@ def _string_reader(field: Field) -> Reader:
     name = field.name
 
     def read(payload: bytes, offset: int, values: list[Any]) -> int:
-        size, offset = _word(payload, offset, name)
-        end = offset + size
-        if HEADER_BYTES + end > len(payload):
-            raise Refused("truncated", f"{name} must hold the {size} bytes it declares, got {len(payload) - HEADER_BYTES - offset}")
-        if field.high is not None and size > field.high:
-            raise Refused("text", f"{name} must have at most {field.high} bytes, got {size}")
-        encoded = payload[HEADER_BYTES + offset : HEADER_BYTES + end]
+        encoded, end = _counted(payload, offset, name)
+        if field.high is not None and len(encoded) > field.high:
+            raise Refused("text", f"{name} must have at most {field.high} bytes, got {len(encoded)}")
         if encoded[-1:] != b"\x00":
             raise Refused("text", f"{name} must end with a zero byte")
         try:
@@ -305,11 +310,8 @@ def _bytes_reader(field: Field) -> Reader:
     name = field.name
 
     def read(payload: bytes, offset: int, values: list[Any]) -> int:
-        size, offset = _word(payload, offset, name)
-        end = offset + size
-        if HEADER_BYTES + end > len(payload):
-            raise Refused("truncated", f"{name} must hold the {size} bytes it declares, got {len(payload) - HEADER_BYTES - offset}")
-        values.append(payload[HEADER_BYTES + offset : HEADER_BYTES + end])
+        content, end = _counted(payload, offset, name)
+        values.append(content)
         return end
 
     return read

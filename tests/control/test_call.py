@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, State
 from rti_mpc.contract.status import Mode
 from rti_mpc.control.call import Call
 from rti_mpc.control.controller import Controller, Timing
-from rti_mpc.reference.trajectory import circle, eight
+from rti_mpc.reference.trajectory import circle
 from rti_mpc.rti.rti import Rti
 from rti_mpc.wire.cdr import encode
-from tests.loop import MS, reference, robot
+from tests.life import live_through
+from tests.loop import reference, robot
 from tests.problems import pioneer
 
 REPORTED_CALLS = {
@@ -54,62 +54,9 @@ def life(controller: Controller) -> tuple[list[Call], list[bytes]]:
     calls: list[Call] = []
     controller.on_call = lambda call: calls.append(copy.deepcopy(call, {id(problem): problem}))
     problem = replace(pioneer(N=6, N_u=4), R=np.array([0.3, 0.2]))
-    body, rng, pieces, sent = robot(circle()), np.random.default_rng(1), np.random.default_rng(2), []
-    leader = made()  # of another's commands
-    controller.receive_reference(reference(circle(), stamp_ns=STAMP_ON_ARRIVAL))
-    leader.receive_reference(reference(circle()))
-
-    def send(command: Command, left_ns: int | None = None) -> None:
-        assert body.accept(command, body.now_ns) in ("", "expired")
-        controller.commit(command, left_ns)
-        sent.append(encode(command))
-
-    for k in range(160):
-        state = body.tick()
-        local_ns = body.now_ns + int(rng.integers(0, 3 * MS))
-        if 60 <= k < 75:
-            if k == 60:
-                controller.stand_by()
-            if (theirs := answer(leader, state, local_ns)) is not None:
-                controller.overhear(theirs)
-        elif k == 75:
-            controller.lead(9)
-        if k == 40:
-            controller.retune(problem, 1)
-        if k == 90:
-            controller.stop("asked for")
-        if k == 110:
-            controller.enable()
-        if k == 115:
-            controller.receive_reference(reference(eight(), stamp_ns=body.now_ns, epoch=2))
-        if 120 <= k < 126:  # lost
-            if (ramp := controller.tick(local_ns)) is not None:
-                send(ramp)
-            continue
-        command = controller.receive_state(state, local_ns)
-        if command is None:
-            continue
-        command = controller.in_time(command, left_ns := local_ns + (90 * MS if k in (30, 50, 51) else MS))
-        if command is not None:
-            if controller.standing_by:
-                controller.commit(command, left_ns)
-            else:
-                send(command, left_ns)
-        controller.prepare()
-        for _ in range(int(pieces.integers(0, 5))):
-            controller.second_opinion()
-    last = controller.standstill(body.now_ns)
-    assert last is not None
-    send(last)
+    sent = live_through(controller, made(), problem)
     assert controller.ladder.shifted == 2, "of three that were late; no plan was left for the third"
     return calls, sent
-
-
-def answer(leader: Controller, state: State, local_ns: int) -> Command | None:
-    if (command := leader.receive_state(state, local_ns)) is not None:
-        leader.commit(command)
-        leader.prepare()
-    return command
 
 
 def test_controller_that_is_told_the_same_calls_sends_the_same_commands_bit_for_bit() -> None:

@@ -3,24 +3,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pytest
 
-from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Journal, JournalKind, Reference, State
+from rti_mpc.contract.message import End, Journal, JournalKind, Reference
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.control.observer import Disturbance, Observer, ObserverSettings
 from rti_mpc.journal.book import Book
 from rti_mpc.journal.replay import Replay, ReplayOutcome, replay
 from rti_mpc.journal.snapshot import ARRAY, PINNED, Snapshot
 from rti_mpc.model.disturbance import with_disturbances
-from rti_mpc.reference.trajectory import circle, eight
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
 from tests.closed_loop.test_rest import MOTIONS, tracking
-from tests.loop import MS, drive, reference, robot
+from tests.life import live_through
+from tests.loop import MS, drive
 from tests.movers import law_of, ocp_of
 from tests.problems import PAPER, SLEW, pioneer
 
@@ -62,7 +62,7 @@ class Life:
     """All that a controller has lived through."""
 
     messages: list[Journal]
-    commands: list[Command]
+    commands: list[bytes]
 
 
 def live(kind: Kind, samples: int = 160, snapshots: tuple[int, ...] = (0, 35, 51, 65, 95, 123, 140)) -> Life:
@@ -71,74 +71,20 @@ def live(kind: Kind, samples: int = 160, snapshots: tuple[int, ...] = (0, 35, 51
     book = Book(controller)
     problem = rti.ocp.retuned(R=np.array([0.3, 0.2]))
     leader, _ = kind.build()
-    body, rng, pieces = robot(circle()), np.random.default_rng(1), np.random.default_rng(2)
     messages: list[Journal] = []
-    commands: list[Command] = []
     book.photograph(0)
-    controller.receive_reference(reference(circle(), stamp_ns=STAMP_ON_ARRIVAL))
-    leader.receive_reference(reference(circle()))
-    jumped_ns = 0
 
-    def send(command: Command, left_ns: int | None = None) -> None:
-        if not jumped_ns:
-            body.accept(command, body.now_ns)
-        controller.commit(command, left_ns)
-        commands.append(command)
-
-    for k in range(samples):
+    def before(k: int) -> None:
         if k in snapshots:
             book.photograph(k * 100 * MS)
-        messages += book.messages(k * 100 * MS)
-        jumped_ns = 5 * S if k >= 145 else 0
-        seen = body.tick()
-        state = replace(seen, stamp_ns=seen.stamp_ns + jumped_ns)
-        local_ns = body.now_ns + int(rng.integers(0, 3 * MS))
-        if 60 <= k < 75:
-            if k == 60:
-                controller.stand_by()
-            if (theirs := answer(leader, state, local_ns)) is not None:
-                controller.overhear(theirs)
-        elif k == 75:
-            controller.lead(9)
-        if k == 40:
-            controller.retune(problem, 1)
-        if k == 90:
-            controller.stop("asked for")
-        if k == 110:
-            controller.enable()
-        if k == 115:
-            controller.receive_reference(reference(eight(), stamp_ns=body.now_ns, epoch=2))
-        if 120 <= k < 126:  # lost
-            if (ramp := controller.tick(local_ns)) is not None:
-                send(ramp)
-            continue
-        command = controller.receive_state(state, local_ns)
-        if command is None:
-            continue
-        command = controller.in_time(command, left_ns := local_ns + (90 * MS if k in (30, 50, 51) else MS))
-        if command is not None:
-            if controller.standing_by:
-                controller.commit(command, left_ns)
-            else:
-                send(command, left_ns)
-        controller.prepare()
-        for _ in range(int(pieces.integers(0, 5))):
-            controller.second_opinion()
-    last = controller.standstill(body.now_ns)
-    assert last is not None
-    send(last)
+        messages.extend(book.messages(k * 100 * MS))
+
+    commands = live_through(controller, leader, problem, samples=samples, before=before, jumped_ns=lambda k: 5 * S if k >= 145 else 0)
     book.photograph(samples * 100 * MS)
     messages += book.messages(samples * 100 * MS)
     assert not book.failure
     assert not book.dropped
     return Life(messages, commands)
-
-
-def answer(leader: Controller, state: State, local_ns: int) -> Command | None:
-    if (command := leader.receive_state(state, local_ns)) is not None:
-        leader.commit(command)
-        leader.prepare()
-    return command
 
 
 def replayed(kind: Kind, messages: list[Journal], start_seq: int = 0, **override: Any) -> tuple[ReplayOutcome, Replay]:
