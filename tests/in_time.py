@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import time
 from contextlib import suppress
@@ -41,6 +42,12 @@ def explained(host: Host, what: str, by_ms: float, from_ns: int, to_ns: int) -> 
     held_up_ms = host.held_up_ms(from_ns - BEFORE_NS, to_ns)
     print(f"\n{what}, while the host held processes up for {held_up_ms:.0f} ms, where {by_ms:.0f} would explain it")
     return held_up_ms >= SEEN * by_ms
+
+
+def computed_ms(process: subprocess.Popen[bytes]) -> float:
+    """Return for how long a process and the children it has waited for have computed: what a start takes of it is the host's speed."""
+    fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+    return sum(map(int, fields[11:15])) * 1000.0 / os.sysconf("SC_CLK_TCK")
 
 
 def awake_ms(process: subprocess.Popen[str]) -> float:

@@ -15,7 +15,7 @@ from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.guarded import write_robot
-from tests.in_time import MS, in_time
+from tests.in_time import MS, computed_ms, in_time
 from tests.processes.system import ROOT, command_line, environment, until
 
 pytestmark = pytest.mark.slow
@@ -28,12 +28,14 @@ COMMANDS: dict[str, tuple[object, ...]] = {
     "sim": ("-l", "tcp/127.0.0.1:0"),
     **({"view": ("--rerun-save", "run.rrd")} if find_spec("rerun") else {}),
 }
-MAX_REMINDER_MS = 5000.0
+MAX_REMINDER_MS = 3000.0  # besides what the process computes: of the 5 s that an operator waits, an idle host of today starts one in 2
 
 
 @pytest.mark.parametrize("mode", ["peer", "client"])
 @pytest.mark.parametrize("command", COMMANDS)
-def test_process_that_reaches_nobody_says_so_within_five_seconds_and_ends_well(command: str, mode: str, tmp_path: Path, host: Host) -> None:
+def test_process_that_reaches_nobody_says_so_within_three_seconds_besides_its_start_and_ends_well(
+    command: str, mode: str, tmp_path: Path, host: Host
+) -> None:
     config, log = write_robot(tmp_path / "robot.toml"), tmp_path / "log"
     options = [tmp_path / option if option == "run.rrd" else option for option in COMMANDS[command]]
     if mode == "client":
@@ -44,7 +46,8 @@ def test_process_that_reaches_nobody_says_so_within_five_seconds_and_ends_well(c
         process = subprocess.Popen(line, cwd=ROOT, env=environment(), stdout=file, stderr=subprocess.STDOUT)
     try:
         until(lambda: "not connected" in log.read_text(errors="replace"), f"{command} says that it reaches nobody", pause_s=0.01, patience_s=60.0)
-        in_time(host, f"to say of {command} that it reaches nobody", (time.monotonic_ns() - began_ns) / MS, MAX_REMINDER_MS, began_ns)
+        took_ms, limit_ms = (time.monotonic_ns() - began_ns) / MS, MAX_REMINDER_MS + computed_ms(process)
+        in_time(host, f"to say of {command} that it reaches nobody", took_ms, limit_ms, began_ns)
         process.terminate()
         assert process.wait(30.0) == 0
         assert "Traceback" not in log.read_text(errors="replace")
@@ -95,7 +98,8 @@ def test_process_with_a_wrong_certificate_says_why_it_is_refused(trusted: str, r
                 line = command_line(command, SHIPPED, "-c", config)
                 processes.append(subprocess.Popen(line, cwd=ROOT, env=environment(), stdout=file, stderr=subprocess.STDOUT))
             until(lambda c=command, w=word: w in logs[c].read_text(errors="replace"), f"{command} says {word}", pause_s=0.01, patience_s=60.0)
-        in_time(host, "to say that nobody is reached", (time.monotonic_ns() - began_ns) / MS, MAX_REMINDER_MS, began_ns)
+        limit_ms = MAX_REMINDER_MS + computed_ms(processes[-1])
+        in_time(host, "to say that nobody is reached", (time.monotonic_ns() - began_ns) / MS, limit_ms, began_ns)
         assert re.search(f"{endpoint}: .*{reason.format(tmp_path)}", logs["reference"].read_text())
         for process in reversed(processes):
             process.terminate()

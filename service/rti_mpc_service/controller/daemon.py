@@ -102,6 +102,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
     # After compiling, and before any thread is started, so that all threads inherit the settings.
     outcomes = realtime.attempt(**config.realtime.model_dump(exclude={"rehearse"}))
     with Bus.join(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
+        bus.expect("state", lambda: controller.heard)
         operator_stop = OperatorStop(LatchFile(bus.keys, state), obey, controller.say)
         operator_stop.listen(bus)
         others = hear_others(bus, stop)
@@ -175,7 +176,6 @@ class Daemon:
         book.epoch = leadership.epoch
         self._journal = JournalPublisher(bus, controller, book)
         self._states_in = bus.intake(State, config.stale_s, {"x": model.nx, "u": model.nu})
-        bus.expect("state", lambda: controller.heard)
         bus.watch_certificate(controller.say)
         self._references = References(bus, controller, model.ny)
         self._prepare_us = 0.0

@@ -62,7 +62,6 @@ def main(
     rerun_spawn |= rerun_connect is None and rerun_save is None and web_port is None
     url = viewer_url(rerun_connect or RERUN_ADDRESS)
     stop = stop or stop_on_signals()
-    load_arrow()
     with Bus.join(bus_settings, keys, stop=stop, say=log.warning) as bus:
         names = [*robots] or [keys.robot]
         roots, begun_ns = (names, time.monotonic_ns()) if len(names) > 1 else ((), None)
@@ -71,6 +70,7 @@ def main(
         for one, listener in zip(buses, listeners, strict=True):
             one.expect("message", partial(getattr, listener, "received"))
             one.alive(ROLE)
+        load_arrow()
         title = " and ".join(names)
         outlets = [file_outlet(rerun_save, title, roots)] if rerun_save is not None else []
         spawned = spawn_viewer(url, rerun_memory_limit) if rerun_spawn else None
