@@ -4,6 +4,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 
 import pytest
@@ -12,6 +13,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # before NumPy is loaded: workers share
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 from rti_mpc_service.host.hold_up import Host
+
+SHORT_FORM = 3
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -28,6 +31,22 @@ def pytest_configure(config: pytest.Config) -> None:
     state = tempfile.mkdtemp(prefix="rti-mpc-state-")  # a test neither forgets a user's stop nor makes one
     config.add_cleanup(lambda: shutil.rmtree(state, ignore_errors=True))
     os.environ["STATE_DIRECTORY"] = state
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """In CI, run each slow test with every `SHORT_FORM`th of its sets of parameters; `make test-slow` runs them all."""
+    if "CI" not in os.environ:
+        return
+    seen: Counter[str] = Counter()
+    left = []
+    for item in items:
+        if item.get_closest_marker("slow") is not None:
+            name = item.nodeid.partition("[")[0]
+            if seen[name] % SHORT_FORM:
+                left.append(item)
+            seen[name] += 1
+    config.hook.pytest_deselected(items=left)
+    items[:] = [item for item in items if item not in left]
 
 
 def pytest_xdist_auto_num_workers() -> int:
