@@ -27,6 +27,8 @@ from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.ocp import Ocp
 
+MAX_RADIUS = 1.0 - 1e-9  # of the eigenvalues of a regulated robot: slower than 1e9 samples is not at all
+
 
 def lqr_weight(ocp: Ocp, x: Array, u: Array) -> Array:
     """
@@ -59,7 +61,12 @@ def lqr_weight(ocp: Ocp, x: Array, u: Array) -> Array:
     C = np.hstack([C, np.zeros((len(C), nu))])
     try:
         of_inputs = np.diag([*np.zeros(nx), *ocp.R_u])
-        S = solve_discrete_are(F, G, ocp.delta[-1] * C.T @ ocp.Q @ C + of_inputs, ocp.lambda_[-1] * ocp.R)
+        R = ocp.lambda_[-1] * ocp.R
+        S = solve_discrete_are(F, G, ocp.delta[-1] * C.T @ ocp.Q @ C + of_inputs, R)
+        # Whether an equation without a stabilizing solution is noticed above depends on rounding; its closed loop never contracts.
+        radius = abs(np.linalg.eigvals(F - G @ np.linalg.solve(R + G.T @ S @ G, G.T @ S @ F))).max()
+        if not radius < MAX_RADIUS:
+            raise LinAlgError(f"a motion is left that decays by {max(1.0 - radius, 0.0):.2g} per sample")
     except (LinAlgError, ValueError) as error:
         raise OcpError(f"model {model.name} must be stabilizable where a terminal weight is wanted, at x = {x}, u = {u}: {error}") from error
     # The least of xi' S xi over all xi of one output y is y' (C S^-1 C')^-1 y.
