@@ -9,6 +9,9 @@ UV := $(shell command -v uv)
 FITS := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 PYTHON = $(shell for python in python3 python3.13 python3.12 python3.11 python3.14; do $$python -c '$(FITS)' 2>/dev/null && echo $$python && break; done)
 
+# Tests start hundreds of processes: where an image forbids it, each would compile every module again.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test test-busy test-slow soak attack ends kills problems bench lint format types docs gallery msg lock clean
 
 demo: $(READY)

@@ -53,7 +53,7 @@ def pytest_xdist_auto_num_workers() -> int:
     return 2 * (os.cpu_count() or 1)  # tests of processes mostly wait; what they hold to times, they hold on a busy host
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # its timers take a tenth of a core
 def host() -> Iterator[Host]:
     """The witness of the host: a promise in milliseconds is held with `tests.in_time`."""
     with Host() as host:

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -75,10 +76,16 @@ def every_file() -> Iterator[Path]:
         yield from files(package)
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
 def imported(path: Path) -> set[str]:
     """Full names of all that a file imports, in functions too."""
     names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -166,7 +173,7 @@ def test_foreign_package_has_one_place(package: str) -> None:
 
 def called(path: Path) -> set[str]:
     """Names of all functions and methods a file calls, of what it imports or of a module: `decode(...)`, `json.loads(...)`."""
-    calls = [node.func for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+    calls = [node.func for node in ast.walk(parsed(path)) if isinstance(node, ast.Call)]
     names = {func.id for func in calls if isinstance(func, ast.Name)}
     return names | {f"{func.value.id}.{func.attr}" for func in calls if isinstance(func, ast.Attribute) and isinstance(func.value, ast.Name)}
 
@@ -209,10 +216,10 @@ def test_every_cited_reference_is_defined_and_every_defined_one_cited() -> None:
 
 def test_module_opens_with_what_it_is_and_not_with_a_question() -> None:
     for path in every_file():
-        first = (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").partition(" ")[0]
+        first = (ast.get_docstring(parsed(path)) or "").partition(" ")[0]
         assert first not in {"", "What", "Who", "Whose", "Whether", "How", "Where", "Which", "When", "Why", "That"}, path
 
 
 def test_no_two_classes_share_a_name() -> None:
-    names = [node.name for path in every_file() for node in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(node, ast.ClassDef)]
+    names = [node.name for path in every_file() for node in parsed(path).body if isinstance(node, ast.ClassDef)]
     assert sorted(name for name in set(names) if names.count(name) > 1) == []

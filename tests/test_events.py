@@ -6,14 +6,20 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "events.md").read_text(encoding="utf-8")
-TREES = [ast.parse(path.read_text(encoding="utf-8")) for folder in ("rti_mpc", "service", "sim") for path in sorted((ROOT / folder).rglob("*.py"))]
 CODE = re.compile(r"[a-z]+(_[a-z]+)*")
 SAYS = {"Notice", "say", "_say", "_note", "_tell", "enter"}  # every function that takes an event code
 REASONS = {"_objection", "unfit", "accept"}  # functions that return why a command is refused: the second half of `command_...`
+
+
+@cache
+def trees() -> list[ast.Module]:
+    """Return the sources, parsed."""
+    return [ast.parse(path.read_text(encoding="utf-8")) for folder in ("rti_mpc", "service", "sim") for path in sorted((ROOT / folder).rglob("*.py"))]
 
 
 def named(node: ast.expr) -> str:
@@ -28,7 +34,7 @@ def constants(node: ast.AST) -> Iterator[str]:
 
 def codes() -> Iterator[str]:
     """Codes that stand in the source as they are sent."""
-    for tree in TREES:
+    for tree in trees():
         for node in ast.walk(tree):
             if isinstance(node, ast.Call) and named(node.func) in SAYS:
                 arguments = node.args[3:] if named(node.func) == "enter" else node.args  # a mode, its reason and severity come first
@@ -46,7 +52,7 @@ def codes() -> Iterator[str]:
 
 def reasons() -> Iterator[str]:
     """Reasons for which guard and robot refuse a command."""
-    for tree in TREES:
+    for tree in trees():
         for function in ast.walk(tree):
             if isinstance(function, ast.FunctionDef) and function.name in REASONS:
                 for statement in function.body[1:]:
@@ -72,6 +78,6 @@ def test_every_reason_to_refuse_a_command_is_in_the_table_of_events() -> None:
 
 
 def test_the_table_of_events_names_no_code_that_the_source_has_not() -> None:
-    source = {text for tree in TREES for text in constants(tree)}
+    source = {text for tree in trees() for text in constants(tree)}
     for code in documented():
         assert code in source or any(text == code.partition("_")[2] or text.startswith(code.partition("_")[2] + ":") for text in source), code

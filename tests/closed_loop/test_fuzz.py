@@ -61,11 +61,15 @@ def test_no_sample_of_a_million_leaves_the_limits_or_raises(seed: int) -> None:
     assert grown < 2**22  # bytes; of 800,000 samples
 
 
-LOSSY = [(False, True), (True, True), (False, False), (True, False)]
-LOSSY_NAMES = ["no guard", "guard", "no guard, no reports", "guard, no reports"]
+LOSSY = [
+    pytest.param(False, True, id="no guard"),
+    pytest.param(True, True, id="guard"),
+    pytest.param(False, False, id="no guard, no reports", marks=pytest.mark.slow),
+    pytest.param(True, False, id="guard, no reports", marks=pytest.mark.slow),
+]
 
 
-@pytest.mark.parametrize(("guarded", "reports"), LOSSY, ids=LOSSY_NAMES)
+@pytest.mark.parametrize(("guarded", "reports"), LOSSY)
 def test_no_input_leaves_its_limits_whatever_is_lost_late_repeated_or_reordered_on_any_link(guarded: bool, reports: bool) -> None:
     fuzz = Lossy(seed=1, guarded=guarded, reports=reports)
     run(fuzz, SHORT_SAMPLES // 2)

@@ -92,7 +92,8 @@ def test_robot_comes_to_its_reference(name: str) -> None:
     assert np.abs(error[:, :2]).max() < tolerance
 
 
-@pytest.mark.parametrize("name", [name if name == "kinematic_bicycle" else pytest.param(name, marks=pytest.mark.slow) for name in ROBOTS])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ROBOTS)
 def test_journal_of_a_robot_is_replayed_with_no_differing_bit(name: str) -> None:
     controller, body, _ = controlled(name, 1.0, stoppable=True)
     book, messages = Book(controller), list[Journal]()

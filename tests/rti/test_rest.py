@@ -117,7 +117,7 @@ def test_bounds_say_what_operation_is() -> None:
     assert motion_at_rest(Ocp(pioneer().model, **(PAPER | {"ubu": [50.0, 0.7]}))) == ""
 
 
-@pytest.mark.parametrize("name", ["car", "arm", "quadrotor"])
+@pytest.mark.parametrize("name", ["car", *(pytest.param(name, marks=pytest.mark.slow) for name in ("arm", "quadrotor"))])
 def test_robot_in_discrete_time_comes_to_rest_as_the_same_in_continuous_time(name: str) -> None:
     """Over a period its inputs change positions, too: the way to rest must tell which rates are theirs."""
     continuous: Ocp = getattr(movers, name)()

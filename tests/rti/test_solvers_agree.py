@@ -7,6 +7,7 @@ from collections import Counter
 
 import casadi as ca
 import numpy as np
+import pytest
 
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
@@ -18,7 +19,7 @@ from rti_mpc.rti.rti import Rti
 
 TIGHT = SolverSettings(eps=1e-9, max_iter=500_000, scaling=10)  # bounds that are far exceeded are slow without Ruiz scaling
 SOLVERS: dict[str, SolverSettings | None] = {"osqp": TIGHT, "daqp": None, "clarabel": None}  # the others are as exact by themselves
-STRUCTURES, SAMPLES = 8, 25
+STRUCTURES = 8
 
 
 def random_ocp(rng: np.random.Generator) -> Ocp:
@@ -76,7 +77,8 @@ def at_bounds(ocp: Ocp, u: Array, u_prev: Array) -> dict[str, bool]:
     }
 
 
-def test_all_solvers_give_the_same_plan_in_either_formulation_on_200_random_problems() -> None:
+@pytest.mark.parametrize("samples", [5, pytest.param(25, marks=pytest.mark.slow)])
+def test_all_solvers_give_the_same_plan_in_either_formulation_on_random_problems(samples: int) -> None:
     rng = np.random.default_rng(3)
     seen: Counter[str] = Counter()
     for _ in range(STRUCTURES):
@@ -87,7 +89,7 @@ def test_all_solvers_give_the_same_plan_in_either_formulation_on_200_random_prob
             for solver, settings in SOLVERS.items()
             for formulation in FORMULATIONS
         }
-        for _ in range(SAMPLES):
+        for _ in range(samples):
             x0, u_prev = 0.7 * rng.normal(size=ocp.model.nx), rng.uniform(ocp.lbu, ocp.ubu)
             y_ref, defects = rng.normal(size=(ocp.N, ocp.model.ny)), 0.1 * rng.normal(size=recursion.x.shape)
             for rti in (recursion, *others.values()):
@@ -105,6 +107,7 @@ def test_all_solvers_give_the_same_plan_in_either_formulation_on_200_random_prob
             seen["recursion"] += recursion.solver is recursion.active_set
             seen["softened"] += recursion.violation > 1e-3
             seen.update(kind for kind, acts in at_bounds(ocp, recursion.u, u_prev).items() if acts)
-    assert seen["problems"] == seen["held inputs"] == 200
-    assert seen["recursion"] >= 180  # OSQP is there for the rest
-    assert min(seen["inputs"], seen["increments"], seen["softened"]) >= 100
+    problems = STRUCTURES * samples
+    assert seen["problems"] == seen["held inputs"] == problems
+    assert seen["recursion"] >= 0.9 * problems  # OSQP is there for the rest
+    assert min(seen["inputs"], seen["increments"], seen["softened"]) >= 0.5 * problems
