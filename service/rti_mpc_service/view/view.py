@@ -69,8 +69,9 @@ def main(
         listeners = [Listener(one, root=one.keys.robot if roots else "", begun_ns=begun_ns) for one in buses]
         for one, listener in zip(buses, listeners, strict=True):
             one.expect("message", partial(getattr, listener, "received"))
-            one.alive(ROLE)
         load_arrow()
+        for one in buses:
+            one.alive(ROLE)
         title = " and ".join(names)
         outlets = [file_outlet(rerun_save, title, roots)] if rerun_save is not None else []
         spawned = spawn_viewer(url, rerun_memory_limit) if rerun_spawn else None
