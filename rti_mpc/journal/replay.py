@@ -203,7 +203,7 @@ def replay(on: Replay, messages: Iterable[Journal], start_seq: int = 0) -> Itera
     """
     Repeat a journal from its first usable snapshot on, and yield each entry after it was repeated.
 
-    Entries that are missing end a span; it goes on with the next snapshot.
+    Entries that are missing end a span; it goes on with the next snapshot. Commands before the first snapshot are a span, too.
 
     Args:
         on: The controller that repeats.
@@ -211,29 +211,37 @@ def replay(on: Replay, messages: Iterable[Journal], start_seq: int = 0) -> Itera
         start_seq: Number from which on a snapshot is used.
     """
     outcome, next_seq = on.outcome, None
-    first_lost: int | None = None
+    lost: int | None = None  # first entry of a span that is not covered
+    why = "commands before the first snapshot"
     for message in messages:
         if message.kind is JournalKind.SNAPSHOT:
             outcome.snapshots.append(message.seq)
             if next_seq != message.seq and message.seq >= start_seq:
                 on.start(message)
-                if first_lost is not None:
-                    outcome.gaps.append(Gap(first_lost, message.seq - 1, "entries are missing"))
-                first_lost = None
+                if lost is not None:
+                    outcome.gaps.append(Gap(lost, message.seq - 1, why))
+                lost = None
                 next_seq = message.seq + 1
             elif next_seq is not None:
                 next_seq = message.seq + 1
             continue
         if next_seq is not None and message.seq != next_seq:
-            first_lost, next_seq = next_seq, None
+            lost, next_seq, why = next_seq, None, "entries are missing"
         if next_seq is None:
+            if lost is None and message.seq >= start_seq and holds_command(message):
+                lost = message.seq
             continue
         for entry in decode_entries(message.data, message.seq):
             found = on.repeat(entry)
             next_seq = entry.seq + 1
             yield entry, found
-    if first_lost is not None:
-        outcome.gaps.append(Gap(first_lost, message.seq, "entries are missing, and no snapshot follows"))
+    if lost is not None:
+        outcome.gaps.append(Gap(lost, message.seq, f"{why}, and no snapshot follows"))
+
+
+def holds_command(message: Journal) -> bool:
+    """Whether a command was sent in the span of a message."""
+    return any(entry.name == "commit" for entry in decode_entries(message.data, message.seq))
 
 
 def copy_of(command: Command) -> Command:

@@ -80,6 +80,17 @@ def test_missing_messages_are_a_gap_and_the_replay_goes_on_with_the_next_snapsho
     assert gap.last + 1 in [message.seq for message in lived.messages if message.kind is JournalKind.SNAPSHOT]
 
 
+def test_commands_before_the_first_snapshot_are_a_gap_but_not_those_that_were_left_out_on_purpose() -> None:
+    messages = live(KINDS["riccati"], samples=60, snapshots=(0, 35)).messages
+    starts = [message.seq for message in messages if message.kind is JournalKind.SNAPSHOT]
+    late, _ = replayed(KINDS["riccati"], messages[5:])
+    (gap,) = late.gaps
+    assert gap.last + 1 == min(start for start in starts if start >= messages[5].seq)
+    assert gap.why == "commands before the first snapshot"
+    chosen, _ = replayed(KINDS["riccati"], messages, starts[-2])
+    assert not chosen.gaps
+
+
 def test_attribute_that_is_added_is_part_of_the_snapshot_without_being_named() -> None:
     def grown() -> Any:
         controller: Any = made()

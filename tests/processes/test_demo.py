@@ -119,6 +119,18 @@ def test_recording_holds_every_sample_and_all_that_was_said(folder: Path, summar
     assert ("robot", "robot_stopped") in codes, "it listens to the end"
 
 
+@pytest.mark.slow
+def test_recording_replays_whole_without_a_differing_bit_twice(demo: Demo, summary: Any) -> None:
+    """Every command that the recorder has heard, from the first one on: the controller takes a snapshot when it meets the recorder."""
+    for number in range(2):
+        told = demo.folder / f"replay-{number}.json"
+        done = rti_mpc("replay", demo.folder / "run.mcap", "--json", told)
+        assert done.returncode == 0, done.stdout + done.stderr
+        (account,) = json.loads(told.read_text())
+        assert (account["differing"], account["not_covered"], account["commands_not_covered"], account["other"]) == (0, [], 0, [])
+        assert account["commands"] >= summary["samples"]
+
+
 def test_output_says_how_to_look_at_it(demo: Demo) -> None:
     shown = (demo.folder / "run.png", f"rerun {demo.folder / 'run.rrd'}", demo.folder / "run.mcap")
     for words in ("of 24 s", "bare echo", "heading none", *map(str, shown)):

@@ -14,6 +14,7 @@ from rti_mpc.wire.bus import Bus
 
 PUBLISHING_PERIOD_S = 0.1
 VALUES_AT_ONCE = 8  # values that are encoded before another thread may take the interpreter's lock
+RECORDER = "recorder"  # role
 SLACK_SHARE = 0.8  # of the slack that a snapshot may take
 UNFIT_SAMPLES = 100  # samples in a row with too little slack, after which that is said
 
@@ -29,6 +30,7 @@ class JournalPublisher:
     def __init__(self, bus: Bus, controller: Controller, book: Book) -> None:
         self.taken_s = 0.0
         self._unfit = 0  # samples in a row whose slack was too short for a snapshot that was due
+        self._bus = bus
         self._controller = controller
         self._book = book
         self._publisher = bus.publisher(bus.keys.journal)
@@ -43,6 +45,12 @@ class JournalPublisher:
         self._book.rehearse()
         self.photograph(time.monotonic_ns())
         self._thread.start()
+        self._bus.watch_alive(self._meet)
+
+    def _meet(self, role: str, present: bool) -> None:
+        """Ask for a snapshot when a recorder appears, so that a replay begins there and not up to ten seconds later."""
+        if present and role == RECORDER:
+            self._book.ask()
 
     def close(self) -> None:
         """Publish what is left."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from rti_mpc_service.config.fit import check_model, check_stop
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.host import machine
 from rti_mpc_service.origin import code_hash, model_equations, model_source
+from rti_mpc_service.replay.coverage import Heard, heard_commands
 
 MAX_VERSIONS_BYTES = 1 << 20
 
@@ -46,12 +47,14 @@ class Journaled:
         owner: Number of the controller, the low bits of its epochs.
         messages: Its journal, in the order of its numbers.
         files: Text of each file attached for it, by name.
+        heard: Its commands, as the recorder has heard them.
     """
 
     robot: str
     owner: int
     messages: list[Journal]
     files: dict[str, str]
+    heard: Heard = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -93,8 +96,9 @@ def journals(path: Path, robot: str | None = None, owner: int | None = None) -> 
     if not chosen:
         known = ", ".join(f"{name} {number}" for name, number in found) or "none"
         raise ConfigError(f"{path} must hold the journal of {robot or 'a robot'}{'' if owner is None else f', controller {owner}'}, got {known}")
+    heard = heard_commands(recording, robot)
     return [
-        Journaled(name, number, in_order(messages), files_of(recording.attachments, f"{name}/{number}/"))
+        Journaled(name, number, in_order(messages), files_of(recording.attachments, f"{name}/{number}/"), heard.get((name, number), {}))
         for (name, number), messages in chosen.items()
     ]
 

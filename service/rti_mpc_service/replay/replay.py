@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,8 @@ from rti_mpc_service.config.build import retuned
 from rti_mpc_service.config.fit import check_names, check_tree
 from rti_mpc_service.config.refusal import explain
 from rti_mpc_service.config.schema import Config
+from rti_mpc_service.replay import coverage
+from rti_mpc_service.replay.coverage import uncovered
 from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, journals, rebuild
 
 TOLERANCE = 1e-6  # of commands on another machine, relative to 1 + their magnitude
@@ -44,12 +46,21 @@ class Account:
         built: The one that repeats.
         on: The replay.
         wanted: Time of each command, s of the robot, and its first row as it would be with other weights, and as it was; only with such.
+        compared: Epoch and sequence number of each command that was compared.
+        start_s: Robot time from which on it was replayed.
     """
 
     journal: Journaled
     built: Rebuilt
     on: Replay
-    wanted: list[tuple[float, Array, Array]]
+    wanted: list[tuple[float, Array, Array]] = field(default_factory=list)
+    compared: set[tuple[int, int]] = field(default_factory=set)
+    start_s: float = 0.0
+
+    @property
+    def uncovered(self) -> list[int]:
+        """Stamps of the commands that the recorder has heard, and that were not compared."""
+        return uncovered(self.journal.heard, self.compared, self.start_s)
 
 
 def main(
@@ -109,15 +120,18 @@ def main(
 def play(journal: Journaled, built: Rebuilt, start_s: float = 0.0, assignments: Sequence[str] = ()) -> Account:
     """Replay one controller."""
     on = Replay(built.controller, built.rti)
-    account = Account(journal, built, on, [])
+    account = Account(journal, built, on, start_s=start_s)
     override = overridden(built.config, built.rti.ocp, assignments) if assignments else {}
     steps: Iterator[tuple[JournalEntry, Difference | None]] = replay(on, journal.messages, snapshot_before(journal, start_s))
     if override and (first := next(steps, None)) is not None:
         on.override(**override)
         steps = chain([first], steps)
     for entry, _ in steps:
-        if override and entry.name == "commit" and on.wanted is not None:
-            wanted, recorded = on.wanted
+        if entry.name != "commit" or on.wanted is None:
+            continue
+        wanted, recorded = on.wanted
+        account.compared.add((recorded.epoch, recorded.seq))
+        if override:
             account.wanted.append((1e-9 * recorded.stamp_ns, wanted.u[0].copy(), recorded.u[0].copy()))
     return account
 
@@ -168,6 +182,7 @@ def lines(account: Account, limit: float, assignments: Sequence[str]) -> Iterato
     yield f"{outcome.samples} commands of {1e-9 * (times[-1] - times[0]):.1f} s, {outcome.entries} entries, {len(outcome.snapshots)} snapshots"
     for gap in outcome.gaps:
         yield f"not covered: {told(gap)}"
+    yield from coverage.told(account.uncovered)
     if assignments:
         yield from open_loop(account, assignments)
     elif not outcome.samples:
@@ -212,6 +227,7 @@ def summary(account: Account) -> dict[str, Any]:
         "largest_difference": outcome.size if np.isfinite(outcome.size) else None,
         "first_difference": None if first is None else {"seq": first.seq, "field": first.field, "text": str(first)},
         "not_covered": [{"first": gap.first, "last": gap.last, "why": gap.why} for gap in outcome.gaps],
+        "commands_not_covered": len(account.uncovered),
         "snapshots": outcome.snapshots,
     }
 
