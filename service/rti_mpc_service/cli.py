@@ -265,6 +265,8 @@ def reference(
     from rti_mpc_service.scenario import find_scenario
 
     if track is not None:
+        if left_out := [f"--{name}" for name, value in {"scenario": scenario, "heading": heading, "duration": duration}.items() if value is not None]:
+            raise ConfigError(f"--path is followed in place of a scenario and says nothing of time: {', '.join(left_out)} must be left out")
         from rti_mpc.reference.speed_profile import SpeedLimits
         from rti_mpc_service import path_reference
 
@@ -272,6 +274,8 @@ def reference(
         pieces = path_reference.find_path(track, waypoint_speed if limits is None else limits.speed, limits, waypoint_smoothing)
         path_reference.main(track, build_model(config), pieces, bus, config.keys())
         return
+    if path_limits is not None:
+        raise ConfigError("--path-limits are those of a --path, which must be given as well")
     followed = find_scenario(config, scenario, heading, duration, waypoint_speed, waypoint_smoothing)
     main(followed, bus, config.keys(), parameters=partial(stage_parameters, config))
 

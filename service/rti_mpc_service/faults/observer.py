@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from itertools import takewhile
 from threading import Thread
 
 import numpy as np
@@ -17,6 +18,7 @@ from rti_mpc.wire.keys import Keys
 from rti_mpc_service.faults.motion import Motion
 
 STALE_S = 0.25  # silence after which another life of the sender is accepted
+MAX_STATES = 40_000  # for more than the longest wait, at 10 ms
 SPEED_WINDOW_NS = 200_000_000  # time over which the speed is measured
 
 
@@ -38,7 +40,7 @@ class RunObserver:
         self._motion = motion
         self.epoch = 0
         self.answered: set[int] = set()
-        self._states: deque[tuple[int, int, Array]] = deque(maxlen=4096)  # stamp, local monotonic arrival, state
+        self._states: deque[tuple[int, int, Array]] = deque(maxlen=MAX_STATES)  # stamp, local monotonic arrival, state
         states, commands = bus.subscriber(robot.state, capacity=RING_MESSAGES), bus.subscriber(bus.keys.command, capacity=RING_MESSAGES)
         Thread(target=self._receive, args=(states, bus.intake(State, STALE_S)), daemon=True).start()
         Thread(target=self._listen, args=(commands, bus.intake(Command, STALE_S)), daemon=True).start()
@@ -70,10 +72,10 @@ class RunObserver:
 
     def speed_m_s(self) -> float:
         """Speed over the last states; 0 if they do not come."""
-        states = list(self._states)
+        states = self._states.copy()
         if not states or self.now_ns() - states[-1][0] > SPEED_WINDOW_NS:
             return 0.0
-        first = next(state for state in states if states[-1][0] - state[0] <= SPEED_WINDOW_NS)
+        *_, first = takewhile(lambda state: states[-1][0] - state[0] <= SPEED_WINDOW_NS, reversed(states))
         way = np.linalg.norm(self._motion.position(states[-1][2]) - self._motion.position(first[2]))
         return float(way) / max(1e-9 * (states[-1][0] - first[0]), 1e-3)
 
@@ -83,8 +85,8 @@ class RunObserver:
             arrival_ns = time.monotonic_ns()
             if (state := intake.read(received)) is None:
                 continue
-            self.epoch = state.epoch
             self._states.append((state.stamp_ns, arrival_ns, state.x))
+            self.epoch = state.epoch  # whoever sees it finds the state
 
     def _listen(self, subscriber: Subscriber, intake: Intake[Command]) -> None:
         """Note which states were answered; a thread of its own."""

@@ -14,7 +14,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from difflib import get_close_matches
 from importlib.util import find_spec
@@ -62,8 +62,9 @@ SETTLING_S = 20.0  # for a robot to come that near to its reference; one that do
 BEFORE_NS = 5_000_000_000  # robot time before a fault in which that error is looked for
 RECOVERY_TIMEOUT_S = 20.0
 REFERENCE_DURATION_S = 120.0  # at most: 58 kB fit into one packet, so that a busy host cannot drop a part of it
-MIN_REFERENCE_LEFT_S = 40.0  # duration of the reference that a fault may need
-MIN_REFERENCE_S = MIN_REFERENCE_LEFT_S + SETTLING_S
+MAX_REFERENCE_LEFT_S = 35.0  # duration of the reference that a fault needs, at most
+MIN_REFERENCE_S = MAX_REFERENCE_LEFT_S + SETTLING_S + 5.0  # and to be driven at first
+HELD_UP = "not judged, the host held the processes up"
 AFTER_RECOVERY_S = 0.3  # how long the robot is recorded after it has recovered
 STANDING_S = 1.0  # how long a robot is seen to stand after its way to rest
 RECORD_TIMEOUT_S = 5.0  # for the robot to write its record; a line waits up to a second for an answer
@@ -189,6 +190,7 @@ def inject(
         for number, fault in enumerate(faults):
             if stop.is_set():
                 return
+            begun_ns = time.monotonic_ns()
             try:
                 if system is None or system.wiring is not fault.wiring:
                     stack.close()
@@ -196,7 +198,9 @@ def inject(
                     system = stack.enter_context(System(config, fault.wiring, folder / f"{number}", stop, reference))
                 near = make_ready(system, fault, report)
                 row = suffer(system, fault, limits, report, host, near)
-            except (Failed, ConfigError, Unwitnessed) as error:
+            except Failed as error:
+                row = MatrixRow(fault, None, [f"{error}{held_up(host, begun_ns)}"])
+            except (ConfigError, Unwitnessed) as error:
                 row = MatrixRow(fault, None, [str(error)])
             if stop.is_set():
                 return
@@ -204,6 +208,17 @@ def inject(
             if row.broken:
                 stack.close()
                 system = None
+
+
+def held_up(host: Host, since_ns: int) -> str:
+    """Return, in words, that the host has held the processes up for most of the time since an instant; else an empty string."""
+    until_ns = time.monotonic_ns()
+    took_s = 1e-9 * (until_ns - since_ns)
+    try:
+        held_up_s = 1e-3 * host.held_up_ms(since_ns, until_ns)
+    except Unwitnessed:
+        return ""
+    return f": {HELD_UP} for {held_up_s:.0f} s in {took_s:.0f} s" if held_up_s > 0.5 * took_s else ""
 
 
 def make_ready(system: System, fault: Fault, report: MatrixReport) -> bool:
@@ -218,23 +233,41 @@ def make_ready(system: System, fault: Fault, report: MatrixReport) -> bool:
     """
     report.say(fault, "waiting for the robot to be driven")
     system.ensure(*ROLES_OF_WIRING[fault.wiring], *(("viewer",) if fault.viewer else ()))
-    if system.witness.begun and system.reference_left_s() < MIN_REFERENCE_LEFT_S:
-        system.restart("reference")
-        system.wait(lambda: system.witness.listen() and system.reference_left_s() > MIN_REFERENCE_LEFT_S, "another reference")
     error_m, near_s = (MAX_SETTLED_ERROR_M, NEAR_S) if fault.promise.on_path else (np.inf, 0.0)
-    system.wait(system.driven, "the robot to be driven")
-    begun_ns = away_ns = time.monotonic_ns()
+    begun_ns: int | None = None  # since when it follows this reference
+    away_ns = 0
     near = False
 
-    def settled() -> bool:
-        nonlocal away_ns, near
-        now_ns, here = time.monotonic_ns(), system.driven(error_m)
+    def ready() -> bool:
+        nonlocal begun_ns, away_ns, near
+        if renewed(system, min(fault.hold_s + RECOVERY_TIMEOUT_S, MAX_REFERENCE_LEFT_S)):
+            begun_ns = None
+        now_ns = time.monotonic_ns()
+        if begun_ns is None:
+            if not system.driven():
+                return False
+            begun_ns = away_ns = now_ns
+        here = system.driven(error_m)
         away_ns = away_ns if here else now_ns
         near = here and now_ns - away_ns >= 1e9 * near_s
         return (near and system.estimated()) or (now_ns - begun_ns > 1e9 * SETTLING_S and system.driven())
 
-    system.wait(settled, "the robot to be driven")
+    system.wait(ready, "the robot to be driven")
     return near
+
+
+def renewed(system: System, lasts_s: float) -> bool:
+    """
+    Let the reference begin anew if it ends sooner than in `lasts_s`: a robot is waited for longer than it lasts where the host is slow.
+
+    Raises:
+        Failed: Its source does not send another one.
+    """
+    if not (system.witness.begun and system.observer.epoch) or system.reference_left_s() >= lasts_s:
+        return False
+    system.restart("reference")
+    system.wait(lambda: system.witness.listen() and system.reference_left_s() >= lasts_s, "another reference")
+    return True
 
 
 def suffer(system: System, fault: Fault, limits: Limits, report: MatrixReport, host: Host, near: bool) -> MatrixRow:
@@ -253,7 +286,7 @@ def suffer(system: System, fault: Fault, limits: Limits, report: MatrixReport, h
     if system.robots != robots:  # another life: nothing of the last one counts
         system.wait(lambda: system.observer.epoch, "the robot's first state")
         fault_ns = mend_ns = 0
-    recovered(system, mend_ns)
+    recovered(system, mend_ns, host)
     system.pause(AFTER_RECOVERY_S)
     end_ns = system.now_ns()
     system.wait(lambda: system.logged_ns() >= end_ns, "the robot's record", RECORD_TIMEOUT_S)
@@ -287,9 +320,24 @@ def error_before(log: RobotLog, error: Array, incident: Incident) -> float:
     return float(error[before].max(initial=0.0))
 
 
-def recovered(system: System, mend_ns: int) -> None:
-    """Wait until the robot is driven by answers to its present states; if it is not, the measurement says so."""
-    try:
-        system.wait(lambda: system.driven() and system.last_sample_ns() > mend_ns, "the robot to be driven", RECOVERY_TIMEOUT_S)
-    except Failed:
-        return
+def recovered(system: System, mend_ns: int, host: Host) -> None:
+    """
+    Wait until the robot is driven by answers to its present states; if it is not, the measurement says so.
+
+    The time for which the host holds the processes up does not count, nor does a reference that ends meanwhile.
+    """
+    begun_ns = time.monotonic_ns()
+    deadline_ns = begun_ns + round(1e9 * RECOVERY_TIMEOUT_S)
+
+    def over() -> bool:
+        nonlocal deadline_ns
+        now_ns = time.monotonic_ns()
+        if now_ns > deadline_ns:
+            patience_ns = 1e9 * RECOVERY_TIMEOUT_S + 1e6 * host.held_up_ms(begun_ns, now_ns)
+            deadline_ns = min(begun_ns + round(patience_ns), now_ns + round(1e9 * RECOVERY_TIMEOUT_S))
+            if now_ns < deadline_ns:
+                renewed(system, RECOVERY_TIMEOUT_S)
+        return now_ns > deadline_ns
+
+    with suppress(Failed):
+        system.wait(lambda: (system.driven() and system.last_sample_ns() > mend_ns) or over(), "the robot to be driven")

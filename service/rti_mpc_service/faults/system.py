@@ -148,9 +148,10 @@ class System:
             self.children.signal(role, signal.SIGCONT)
 
     def restart(self, *roles: str) -> None:
-        """End processes as Ctrl-C does, and start them again."""
+        """End processes as Ctrl-C does, those that run, and start them again."""
         for role in roles:
-            self.children.end(role)
+            if self.children.pid(role) is not None:
+                self.children.end(role)
             self.start(role)
 
     def limit_files(self, size: int | None, *roles: str) -> None:
