@@ -63,7 +63,7 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Arra
     nx, nu = model.nx, model.nu
     p = ca.DM(model.p_nominal)
     phi, u_ref = ocp.phi(), ca.Function("u_ref", [model.p], [ocp.u_ref])(p)
-    h = ca.Function("h", [model.x, model.p], [model.y_expr])
+    h = ca.Function("h", [model.x, model.u, model.p], [model.y_expr])
     x = ca.SX.sym("x", nx, N + 1)
     u = ca.SX.sym("u", nu, N_u)
     s = ca.SX.sym("s", nx, N)
@@ -77,10 +77,10 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Arra
     rows: list[tuple[Array, ca.SX, Array]] = [(np.zeros(nx), x[:, 0] - x0, np.zeros(nx))]
     cost = ca.SX(0)
     for k in range(N):
-        e = model.residual(h(x[:, k + 1], p), y_ref[:, k])
-        cost += ocp.delta[k] * ca.bilin(ca.DM(ocp.Q), e, e)
-        cost += ca.dot(ca.DM(ocp.z), s[:, k]) + 0.5 * ca.dot(ca.DM(ocp.Z), s[:, k] ** 2)
         held = u[:, min(k, N_u - 1)]
+        e = model.residual(h(x[:, k + 1], held, p), y_ref[:, k])
+        cost += ca.bilin(ca.DM(ocp.delta[k] * ocp.Q + (ocp.Q_e if k == N - 1 else 0.0)), e, e)
+        cost += ca.dot(ca.DM(ocp.z), s[:, k]) + 0.5 * ca.dot(ca.DM(ocp.Z), s[:, k] ** 2)
         x_next, equations = collocated(ocp, x[:, k], held, K[k]) if implicit else (phi(x[:, k], held, p), ca.SX(0, 1))
         equations = ca.vertcat(x_next - x[:, k + 1], equations)
         rows.append((np.zeros(equations.numel()), equations, np.zeros(equations.numel())))

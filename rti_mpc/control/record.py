@@ -24,15 +24,15 @@ class Record:
         self._plan = (rti.x.copy(), rti.y_ref.copy(), 0.0)  # states, reference, cost
         self._version = 0  # of the parameters
         model = rti.ocp.model
-        self._x0, self._p, self._y = np.zeros(model.nx), np.zeros(model.np_), np.zeros(model.ny)
-        self._outputs = bind(model.h(), {"x": self._x0, "p": self._p}, {"y": self._y})
+        self._x0, self._u_prev, self._p, self._y = np.zeros(model.nx), np.zeros(model.nu), np.zeros(model.np_), np.zeros(model.ny)
+        self._outputs = bind(model.outputs_at(), {"x": self._x0, "u": self._u_prev, "p": self._p}, {"y": self._y})
 
     def keep_plan(self, seq: int) -> None:
         """Keep the plan of a command, by its sequence number, unless it is kept already."""
         if self._seq != seq:
             self._plan = (self._rti.x.copy(), self._rti.y_ref.copy(), self._rti.cost)
             self._seq, self._version = seq, self._tuning.version
-            self._p[:] = self._rti.p[0]
+            self._p[:], self._u_prev[:] = self._rti.p[0], self._rti.u_prev
 
     def telemetry(
         self,

@@ -45,7 +45,7 @@ class Model:
         u: Input symbol, shape ``(nu, 1)``.
         p: Parameter symbol, shape ``(np, 1)``.
         f_expl_expr: Right-hand side f(x, u, p) in continuous time, shape ``(nx, 1)``; None in discrete time.
-        y_expr: Output y(x, p), shape ``(ny, 1)``.
+        y_expr: Output y(x, u, p), shape ``(ny, 1)``; in the cost, u is the input of the stage before the node. An angle must not depend on u.
         states: Names and units of `x`.
         inputs: Names and units of `u`.
         outputs: Names and units of `y_expr`.
@@ -131,15 +131,18 @@ class Model:
             if state is not None and state.angle is not output.angle:
                 told = f"output {output.name} is the state {state.name}, both or none must be an angle"
                 raise OcpError(f"model {self.name}: {told}, got angle={output.angle} and angle={state.angle}")
+        for output, y_i in zip(self.outputs, ca.vertsplit(self.y_expr), strict=True):
+            if output.angle and depends_on(y_i, self.u):
+                raise OcpError(f"model {self.name}: output {output.name} is an angle and must not depend on u, got {y_i}")
         for label, expr, known in (
             *((name, expr, (self.x, self.u, self.p)) for name, expr in self.dynamics.items()),
-            ("y_expr", self.y_expr, (self.x, self.p)),
+            ("y_expr", self.y_expr, (self.x, self.u, self.p)),
             ("h_expr", self.h_expr, (self.x, self.u, self.p)),
             ("stop_expr", stop_expr, (self.x, self.u, self.p)),
         ):
             free = [str(s) for s in ca.symvar(expr) if not any(ca.depends_on(k, s) for k in known)]
             if free:
-                raise OcpError(f"model {self.name}: {label} must depend only on x, {'' if label[0] == 'y' else 'u, '}p, also has {', '.join(free)}")
+                raise OcpError(f"model {self.name}: {label} must depend only on x, u, p, also has {', '.join(free)}")
 
     def _taken(self) -> dict[str, Any]:
         """Return fields as they are documented, by name, from what was given."""
@@ -200,9 +203,19 @@ class Model:
         """Number of parameters."""
         return len(self.parameters)
 
+    @property
+    def outputs_of_inputs(self) -> bool:
+        """Whether an output depends on inputs."""
+        return depends_on(self.y_expr, self.u)
+
     def h(self) -> ca.Function:
-        """Return the outputs at a node, ``h(x, p) -> y``."""
-        return ca.Function("h", [self.x, self.p], [ca.densify(self.y_expr)], ["x", "p"], ["y"])
+        """Return the outputs at a node, ``h(x, p) -> y``; of inputs at rest, where they depend on inputs."""
+        y_expr = ca.substitute(self.y_expr, self.u, ca.DM(self.u_rest)) if self.outputs_of_inputs else self.y_expr
+        return ca.Function("h", [self.x, self.p], [ca.densify(y_expr)], ["x", "p"], ["y"])
+
+    def outputs_at(self) -> ca.Function:
+        """Return the outputs at a node and the input before it, ``(x, u, p) -> y``."""
+        return ca.Function("outputs_at", [self.x, self.u, self.p], [ca.densify(self.y_expr)], ["x", "u", "p"], ["y"])
 
     def residual(self, y: Any, y_ref: Any) -> Any:
         r"""

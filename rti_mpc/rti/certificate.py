@@ -83,13 +83,15 @@ def node(ocp: Ocp, lin: Linearization) -> ca.Function:
     nx, nu, ng = ocp.model.nx, ocp.model.nu, len(ocp.lg)
     nz = [ca.SX.sym(name, pattern.nnz()) for name, pattern in zip("ABHXU", (lin.A_k, lin.B_k, lin.H_i, lin.G_x, lin.G_u), strict=True)]
     A, B, H, G_x, G_u = (ca.SX(pattern, values) for pattern, values in zip((lin.A_k, lin.B_k, lin.H_i, lin.G_x, lin.G_u), nz, strict=True))
-    b, h, before, after, scale_x = (ca.SX.sym(name, nx) for name in ("b", "h", "before", "after", "scale_x"))
+    b, before, after, scale_x = (ca.SX.sym(name, nx) for name in ("b", "before", "after", "scale_x"))
+    h = ca.SX.sym("h", H.shape[0])
     du = ca.SX.sym("du", nu)
     g, mu, lg, ug, zg, Zg, scale_g = (ca.SX.sym(name, ng) for name in ("g", "mu", "lg", "ug", "zg", "Zg", "scale_g"))
     violation = ca.mmax(ca.fabs(A @ before + B @ du + b - after) / scale_x)
     value = g + G_x @ after + G_u @ du
     gap = ca.SX(0)
-    cost = ca.dot(h, after) + ca.dot(after, H @ after) / 2
+    end = ca.vertcat(after, du)[: H.shape[0]]
+    cost = ca.dot(h, end) + ca.dot(end, H @ end) / 2
     taken = ca.SX(ng, 1)
     for j in range(ng):
         for sign, bound, there in ((1, ug[j], np.isfinite(ocp.ug[j])), (-1, -lg[j], np.isfinite(ocp.lg[j]))):
@@ -102,7 +104,8 @@ def node(ocp: Ocp, lin: Linearization) -> ca.Function:
                 gap += penalty - multiplier * beyond + ca.fmax(0, multiplier - zg[j] / 2) ** 2 / ca.fmax(Zg[j], SMALLEST_DIVISOR)
                 cost += penalty
                 taken[j] += sign * multiplier
-    by_x, by_u = H @ after + h + G_x.T @ taken, G_u.T @ taken
+    by_end = H @ end + h
+    by_x, by_u = by_end[:nx] + G_x.T @ taken, by_end[nx:] + G_u.T @ taken if H.shape[0] > nx else G_u.T @ taken
     inputs = [nz[0], nz[1], b, nz[2], h, g, nz[3], nz[4], before, du, after, mu, lg, ug, zg, Zg, scale_x, scale_g]
     return ca.Function("certify_node", inputs, [ca.cse(ca.densify(ca.vertcat(violation, gap, cost, by_x, by_u)))])
 

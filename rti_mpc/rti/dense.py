@@ -46,7 +46,7 @@ BODY = """
 
     /* the cost of the node at the end */
     for (e = 0; e < NONZEROS_H; ++e) M[1 + column_H[e]][1 + row_H[e]] += H[e];
-    for (i = 0; i < NX; ++i) M[0][1 + i] += h[i];
+    for (i = 0; i < OF_OUTPUTS; ++i) M[0][1 + i] += h[i];
     if (g_x) casadi_copy(g_x, NONZEROS_G_X, g);
     if (g_u) casadi_copy(g_u, NONZEROS_G - NONZEROS_G_X, g + NONZEROS_G_X);
     for (r = 0; r < NG; ++r) {
@@ -158,7 +158,7 @@ def backward_in_c(ocp: Ocp, lin: Linearization, free: ca.Function) -> str | None
     each = [f"const casadi_real *{name} = arg[{i}] + {free.size1_in(i)} * k;" for i, name in enumerate(names) if name not in shared]
     lines = [f"enum {{ {', '.join(f'{name} = {number}' for name, number in sizes.items())} }};"]
     lines += [f"static const int {name}[] = {{ {', '.join(map(str, numbers or [0]))} }};" for name, numbers in tables.items()]
-    body = BODY.strip("\n").replace("STAGE_ARGUMENTS", "\n    ".join(each))
+    body = BODY.strip("\n").replace("STAGE_ARGUMENTS", "\n    ".join(each)).replace("OF_OUTPUTS", "NX" if H.size1() == nx else "NX + NU")
     return "\n".join([*additions(width), BEFORE_BODY, *(f"  {line}" for line in lines + once), body])
 
 

@@ -223,7 +223,8 @@ def moved_to(ocp: Ocp, lin: Linearization, forms: Forms, dx: ca.MX, d: Rows) -> 
     of = Stage(ocp, lin)
     before, du, after = ca.SX.sym("before", of.nx), ca.SX.sym("du", of.nu), ca.SX.sym("after", of.nx)
     symbols = [*of.dynamics.values(), of.b, of.cost["H"], of.h, before, du, after]
-    node = ca.Function("moved", symbols, [ca.densify(of.A @ before + of.B @ du + of.b - after), ca.densify(of.h + of.H @ after)]).map(N)
+    end = ca.vertcat(after, du)[: of.H.shape[0]]
+    node = ca.Function("moved", symbols, [ca.densify(of.A @ before + of.B @ du + of.b - after), ca.densify(of.h + of.H @ end)]).map(N)
     b, h = node(forms.A, forms.B, forms.b, forms.H, forms.h, dx[:, :-1], all_inputs(d.u, N), dx[:, 1:])
     force = forms.force + (lin.R @ d.du) * ca.repmat(lin.w["lambda_"].T, nu, 1)
     damped = ca.veccat(ca.repmat(forms.damping, 1, N_u) * d.u, ca.MX.zeros(d.du.shape), ca.MX.zeros(d.g.shape))

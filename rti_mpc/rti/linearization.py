@@ -10,7 +10,7 @@ dynamics and outputs of `rti_mpc.rti.ocp` become
 
     \Delta x_0 &= \bar x_0 - x_0 \\
     \Delta x_{k+1} &= A_k \Delta x_k + B_k \Delta u_k + b_k, \qquad b_k = \phi(x_k, u_k, p_k) - x_{k+1} \\
-    y_i &\approx y(x_i, p_i) + C_i \Delta x_i
+    y_i &\approx y(x_i, u_{i-1}, p_i) + C_i \Delta v_i, \qquad v_i = x_i \text{, or } (x_i, u_{i-1}) \text{ where outputs depend on inputs,}
 
 and the cost becomes its Gauss-Newton approximation. It is halved, to have the form
 :math:`\tfrac12 z^T P z + q^T z` of a QP.
@@ -46,7 +46,7 @@ class Forms(NamedTuple):
         B: Nonzeros of the sensitivities to the input, shape ``(nnz, N)``.
         b: Defects, shape ``(nx, N)``.
         H: Nonzeros of the Hessian of half the output cost, shape ``(nnz, N)``.
-        h: Gradient of half the output cost, shape ``(nx, N)``.
+        h: Gradient of half the output cost, shape ``(nx, N)``, or ``(nx + nu, N)`` where outputs depend on inputs.
         force: Gradient of half the increment cost in the increments, shape ``(nu, N_u)``.
         increments: Increments, shape ``(nu, N_u)``.
         g: Expressions with softened bounds, shape ``(ng, N)``.
@@ -89,9 +89,10 @@ class Linearization:
         A_k: Sparsity of A at one stage, shape ``(nx, nx)``.
         B_k: Sparsity of B at one stage, shape ``(nx, nu)``.
         b: Defects, shape ``(nx, N)``.
-        gradient: Gradient of half the output cost in the states at nodes 1 to N, shape ``(nx, N)``.
+        gradient: Gradient of half the output cost in the states at nodes 1 to N, shape ``(nx, N)``; where outputs depend on inputs, those in the
+            inputs of the stages before follow, shape ``(nx + nu, N)``.
         hessian: Gauss-Newton Hessian of half the output cost, nonzeros of `H_i`, shape ``(nnz, N)``.
-        H_i: Sparsity of the Hessian at one node, symmetric, shape ``(nx, nx)``.
+        H_i: Sparsity of the Hessian at one node, symmetric, shape ``(nx, nx)`` or ``(nx + nu, nx + nu)``.
         g: Expressions with softened bounds at nodes 1 to N: states, general constraints, then states bounded at node N alone; shape ``(ng, N)``.
         g_x: Sensitivities of g to the state of the node, nonzeros of `G_x`, shape ``(nnz, N)``.
         g_u: Sensitivities of g to the input of the stage before the node, nonzeros of `G_u`, shape ``(nnz, N)``.
@@ -131,8 +132,9 @@ class Linearization:
         node, self.H_i = gauss_newton(ocp)
         W = ca.kron(self.w["delta"].T, self.w["Q"])
         W = ca.horzcat(W[:, : -model.ny], W[:, -model.ny :] + self.w["Q_e"])
-        nodes = node.map(N)(self.x[:, 1:], self.p[:, 1:], self.y_ref, W)
-        self.gradient, self.hessian = nodes[:nx, :], nodes[nx + 1 :, :]
+        nv = self.H_i.size1()
+        nodes = node.map(N)(self.x[:, 1:], *([inputs] if nv > nx else []), self.p[:, 1:], self.y_ref, W)
+        self.gradient, self.hessian = nodes[:nv, :], nodes[nv + 1 :, :]
 
         w = self.w
         constraint, self.G_x, self.G_u = constraints(ocp)
@@ -147,7 +149,7 @@ class Linearization:
         self.increments = self.u - ca.horzcat(self.u_prev, self.u[:, :-1])
         self.R = self.w["R"] * pattern(ocp.R)
         self.force = (self.R @ self.increments) * ca.repmat(self.w["lambda_"].T, nu, 1)
-        self.cost = ca.sum2(nodes[nx, :]) + ca.dot(self.increments, self.force)
+        self.cost = ca.sum2(nodes[nv, :]) + ca.dot(self.increments, self.force)
         if ocp.R_u.any():
             off = self.u - input_reference(ocp)(self.p[:, :N_u])
             gradient = ca.repmat(w["R_u"], 1, N_u) * off
@@ -207,14 +209,31 @@ class Linearization:
         return Forms(*divided(stages, self.forms))
 
     def increment_gradient(self) -> ca.MX:
-        """Return the gradient of half the increment cost in the inputs, shape ``(nu, N_u)``."""
-        return ca.MX(self.force - ca.horzcat(self.force[:, 1:], ca.MX.zeros(self.u_prev.numel())))
+        """Return the gradient of half the increment cost in the inputs, and of what outputs cost by their inputs, shape ``(nu, N_u)``."""
+        gradient = self.force - ca.horzcat(self.force[:, 1:], ca.MX.zeros(self.u_prev.numel()))
+        if self.gradient.shape[0] > self.x.shape[0]:
+            of_outputs, N_u = self.gradient[self.x.shape[0] :, :], self.u.shape[1]
+            gradient += ca.horzcat(of_outputs[:, : N_u - 1], ca.sum2(of_outputs[:, N_u - 1 :]))
+        return ca.MX(gradient)
+
+    def output_hessian(self, i: int) -> tuple[ca.MX, ca.MX]:
+        """Return the blocks of the Hessian of half the output cost at node ``i + 1`` in state and input, and in the input alone."""
+        H, nx = ca.MX(self.H_i, self.hessian[:, i]), self.x.shape[0]
+        return H[:nx, nx:], H[nx:, nx:]
 
     def increment_hessian(self, k: int) -> tuple[ca.MX, ca.MX | None]:
-        """Return the blocks ``(k, k)`` and ``(k, k + 1)`` of the Hessian of half the increment cost and the damping; None after the last stage."""
+        """
+        Return the blocks ``(k, k)`` and ``(k, k + 1)`` of the Hessian of half the increment cost and the damping; None after the last stage.
+
+        The former has what outputs cost by their inputs as well.
+        """
         last = k == self.u.shape[1] - 1
         following = 0 if last else self.w["lambda_"][k + 1]
-        return self.R * (self.w["lambda_"][k] + following) + ca.diag(self.damping), None if last else -self.R * following
+        diagonal = self.R * (self.w["lambda_"][k] + following) + ca.diag(self.damping)
+        if self.gradient.shape[0] > self.x.shape[0]:
+            for i in range(k, self.y_ref.shape[1] if last else k + 1):
+                diagonal += self.output_hessian(i)[1]
+        return diagonal, None if last else -self.R * following
 
 
 def input_reference(ocp: Ocp) -> ca.Function:
@@ -257,17 +276,19 @@ def gauss_newton(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity]:
     Build the terms of :math:`\tfrac12 \|y(x, p) - y_{ref}\|_W^2` at one node, with the residual of the model for the difference.
 
     Returns:
-        ``node(x, p, y_ref, W) -> [gradient in x; twice the term itself; nonzeros of C' W C]``, and the pattern of the last.
+        ``node(x, p, y_ref, W) -> [gradient in x; twice the term itself; nonzeros of C' W C]``, and the pattern of the last. Where outputs depend
+        on inputs it is ``node(x, u, p, y_ref, W)``, with the gradient in (x, u).
     """
     model = ocp.model
     y_ref = ca.SX.sym("y_ref", model.ny)
     weight = ca.SX.sym("W", model.ny, model.ny)
     W = weight * output_pattern(ocp)
     e = model.residual(model.y_expr, y_ref)
-    C = ca.jacobian(e, model.x)
+    at = [model.x, model.u] if model.outputs_of_inputs else [model.x]
+    C = ca.jacobian(e, ca.vertcat(*at))
     H = C.T @ W @ C
     out = ca.cse(ca.densify(ca.vertcat(C.T @ (W @ e), e.T @ (W @ e), nonzeros(H))))
-    return ca.Function("node", [model.x, model.p, y_ref, weight], [out]), H.sparsity()
+    return ca.Function("node", [*at, model.p, y_ref, weight], [out]), H.sparsity()
 
 
 def constraints(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:

@@ -2,7 +2,7 @@
 r"""
 The optimal control problem of one sample, frozen and validated.
 
-Over stages of `dt` seconds, with the outputs :math:`y_i = y(x_i, p_i)` (`y_expr`), the
+Over stages of `dt` seconds, with the outputs :math:`y_i = y(x_i, u_{i-1}, p_i)` (`y_expr`), the
 general constraints :math:`h(x, u, p)` (`h_expr`), the previous input :math:`u_{-1}`, and
 inputs held after the control horizon,
 

@@ -132,7 +132,7 @@ class Stage:
 
     Attributes:
         A: Sensitivities to the state; `B`, to the input; `b`, the defect.
-        H: Hessian of the outputs at the end; `h`, their gradient.
+        H: Hessian of the outputs at the end, in the state, or in s where outputs depend on inputs; `h`, their gradient.
         G: Sensitivities of what has softened bounds to s at the end, shape ``(ng, nx + nu)``.
         dynamics: Symbols of A and B, by the names in `rti_mpc.rti.linearization.Forms`.
         defect: That of b; `cost`, those of H and h; `softened`, those of G.
@@ -145,7 +145,7 @@ class Stage:
         nz = {name: ca.SX.sym(name, pattern.nnz()) for name, pattern in patterns.items()}
         self.A, self.B, self.H, G_x, G_u = (ca.SX(pattern, nz[name]) for name, pattern in patterns.items())
         self.G = ca.horzcat(G_x, G_u)
-        self.b, self.h = ca.SX.sym("b", nx), ca.SX.sym("h", nx)
+        self.b, self.h = ca.SX.sym("b", nx), ca.SX.sym("h", self.H.shape[0])
         self.dynamics = {"A": nz["A"], "B": nz["B"]}
         self.defect = {"b": self.b}
         self.cost = {"H": nz["H"], "h": self.h}
@@ -188,11 +188,16 @@ def behind(of: Stage) -> Behind:
     P = ca.triu2symm(ca.SX(upper, P_nz)) + of.G.T @ ca.diag(weight) @ of.G
     p_end = p + of.G.T @ pull
 
+    if of.H.shape[0] > nx:
+        P, p_end = P + of.H, p_end + of.h
+    else:
+        P[:nx, :nx] += of.H
+        p_end[:nx] += of.h
     A, B = of.A, of.B
-    Pxx, Pxu, Puu = P[:nx, :nx] + of.H, P[:nx, nx:], P[nx:, nx:]
+    Pxx, Pxu, Puu = P[:nx, :nx], P[:nx, nx:], P[nx:, nx:]
     PB = Pxx @ B + Pxu
     Qxx, Qux, Quu = A.T @ Pxx @ A, PB.T @ A, B.T @ PB + Pxu.T @ B + Puu
-    px = p_end[:nx] + of.h + Pxx @ of.b
+    px = p_end[:nx] + Pxx @ of.b
     qx, qu = A.T @ px, B.T @ px + p_end[nx:] + Pxu.T @ of.b
     symbols = {**of.dynamics, **of.defect, **of.cost, **of.softened, "weight_g": weight, "pull_g": pull, "P": P_nz, "p": p}
     return Behind(Qxx, Qux, Quu, qx, qu, symbols)

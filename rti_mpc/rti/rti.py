@@ -343,7 +343,9 @@ class Rti:
 
     def _meet_reference(self) -> None:
         """Let the reference be the outputs of the guess."""
-        self.y_ref[:] = np.array(self.ocp.model.h().map(self.ocp.N)(self.x[1:].T, self.p[1:].T)).T
+        N = self.ocp.N
+        held = self.u[np.minimum(np.arange(N), self.ocp.N_u - 1)]
+        self.y_ref[:] = np.array(self.ocp.model.outputs_at().map(N)(self.x[1:].T, held.T, self.p[1:].T)).T
 
     def shift(self) -> None:
         """Shift the plan by one stage: its first input becomes the previous one, its last is repeated, with the state that the model predicts."""

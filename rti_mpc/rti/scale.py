@@ -42,8 +42,11 @@ def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
 
     node, H_i = gauss_newton(ocp)
     W = np.hstack([ocp.delta[k] * ocp.Q + (ocp.Q_e if k == N - 1 else 0.0) for k in range(N)])
-    H = dense(H_i, np.array(node.map(N)(x[1:].T, p[1:].T, y_ref.T, W))[model.nx + 1 :])
-    curvature = np.einsum("kai,kab,kbi->i", response, H, response) + ocp.lambda_.sum() * np.diag(ocp.R) + ocp.N_u * ocp.R_u
+    nv = H_i.size1()
+    at = (x[1:].T, held.T) if nv > model.nx else (x[1:].T,)
+    H = dense(H_i, np.array(node.map(N)(*at, p[1:].T, y_ref.T, W))[nv + 1 :])
+    seen = np.concatenate([response, np.tile(np.eye(model.nu), (N, 1, 1))], axis=1)[:, :nv]
+    curvature = np.einsum("kai,kab,kbi->i", seen, H, seen) + ocp.lambda_.sum() * np.diag(ocp.R) + ocp.N_u * ocp.R_u
 
     reach_u = first(
         half(ocp.lbu, ocp.ubu),

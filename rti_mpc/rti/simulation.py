@@ -149,7 +149,8 @@ def simulate(
         x[k + 1] = given.array("what plant returns", step(x[k], u[k], p[k]), (model.nx,))
         if not np.isfinite(x[k + 1]).all():
             raise OcpError(f"plant must return finite states, got {x[k + 1].tolist()} after {dt * (k + 1):g} s")
-    y = np.array(model.h().map(samples + 1)(x.T, p.T)).T.reshape(samples + 1, model.ny)
+    acting = np.vstack([u0[None], u])  # the input before each state
+    y = np.array(model.outputs_at().map(samples + 1)(x.T, acting.T, p.T)).T.reshape(samples + 1, model.ny)
     y_ref = np.array(at(np.arange(samples + 1)), dtype=np.float64)
     for j, signal in enumerate(model.outputs):
         if signal.angle:

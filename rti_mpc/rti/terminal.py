@@ -3,7 +3,7 @@ r"""
 Terminal weight from the linear-quadratic regulator: the cost after the horizon, as if it went on for ever.
 
 Around a point of motion the dynamics are :math:`x^+ = A x + B u`, the outputs
-:math:`y = C x`. With the previous input as a further state, and the increments
+:math:`y = C x`, or :math:`y = C x + D u` where they depend on the input before. With the previous input as a further state, and the increments
 :math:`v` as inputs,
 
 .. math::
@@ -52,13 +52,13 @@ def lqr_weight(ocp: Ocp, x: Array, u: Array) -> Array:
     sensitivities = ca.Function(
         "sensitivities",
         [model.x, model.u, model.p],
-        [*(ca.jacobian(phi(model.x, model.u, model.p), z) for z in (model.x, model.u)), ca.jacobian(model.y_expr, model.x)],
+        [ca.jacobian(expr, z) for expr in (phi(model.x, model.u, model.p), model.y_expr) for z in (model.x, model.u)],
     )
-    A, B, C = (np.array(M) for M in sensitivities(x, u, p))
+    A, B, C, D = (np.array(M) for M in sensitivities(x, u, p))
     nx, nu = B.shape
     F = np.block([[A, B], [np.zeros((nu, nx)), np.eye(nu)]])
     G = np.vstack([B, np.eye(nu)])
-    C = np.hstack([C, np.zeros((len(C), nu))])
+    C = np.hstack([C, D])
     try:
         of_inputs = np.diag([*np.zeros(nx), *ocp.R_u])
         R = ocp.lambda_[-1] * ocp.R

@@ -106,7 +106,7 @@ def test_parameters_change_by_name_and_the_original_stays() -> None:
         ({"f_expl_expr": ca.vertcat(ca.SX.sym("wind"), 0)}, "f_expl_expr must depend only on x, u, p, also has wind"),
         ({"stop_expr": ca.SX(2, 1)}, "stop_expr must have 2 entries, in a column, got 1"),
         ({"stop_expr": ca.SX.sym("wind")}, "stop_expr must depend only on x, u, p, also has wind"),
-        ({"y_expr": ca.SX.sym("wind")}, "y_expr must depend only on x, p, also has wind"),
+        ({"y_expr": ca.SX.sym("wind")}, "y_expr must depend only on x, u, p, also has wind"),
     ],
 )
 def test_what_does_not_fit_together_is_refused_by_name(changes: dict[str, Any], message: str) -> None:
@@ -114,11 +114,17 @@ def test_what_does_not_fit_together_is_refused_by_name(changes: dict[str, Any], 
         mass(**changes)
 
 
-def test_outputs_must_not_depend_on_inputs() -> None:
-    """The cost has no output at node 0, where an input would act at once."""
+def test_outputs_may_depend_on_inputs_unless_they_are_angles() -> None:
+    """An angle is kept in one turn with the reference before an input is known."""
     model = mass()
-    with pytest.raises(OcpError, match="y_expr must depend only on x, p, also has u"):
-        mass(x=model.x, u=model.u, p=model.p, f_expl_expr=model.f_expl_expr, y_expr=model.x[0] + model.u)
+    of_inputs = {"x": model.x, "u": model.u, "p": model.p, "f_expl_expr": model.f_expl_expr, "y_expr": model.x[0] + 2 * model.u, "u_rest": 0.5}
+    taken = mass(**of_inputs)
+    assert (taken.outputs_of_inputs, model.outputs_of_inputs) == (True, False)
+    p = taken.p_nominal
+    assert float(taken.outputs_at()([1.0, 0.0], 0.2, p)) == pytest.approx(1.4)
+    assert float(taken.h()([1.0, 0.0], p)) == pytest.approx(2.0)  # at rest
+    with pytest.raises(OcpError, match="output bearing is an angle and must not depend on u"):
+        mass(**of_inputs, outputs=(Signal("bearing", "rad", angle=True),))
 
 
 def test_model_of_ones_own_is_found_by_module_and_function() -> None:

@@ -51,6 +51,17 @@ def sampled_car(**changes: Any) -> Ocp:
     return Ocp(model, **LIMITS | {"lbx": [-np.inf] * 3 + [-0.35], "ubx": [np.inf] * 3 + [0.35]} | changes)
 
 
+def felt_car(**changes: Any) -> Ocp:
+    """The same car, whose passengers feel what it does sideways, and whose battery what it draws: outputs of states and inputs together."""
+    model = sampled_car().model
+    (*_, v), (v_c, w_c) = ca.vertsplit(model.x), ca.vertsplit(model.u)
+    y_expr = ca.vertcat(model.y_expr, v * w_c + 0.3 * w_c**3, v_c * (v_c - 0.5 * v), w_c)
+    felt = replace(model, y_expr=y_expr, outputs=(*POSE, Signal("sideways", "m/s2"), Signal("drawn", "W"), Signal("turn", "rad/s")))
+    Q = np.diag([1.0, 1.0, 0.05, 2.0, 0.5, 0.1])
+    Q[3, 0] = Q[0, 3] = 0.3
+    return Ocp(felt, **LIMITS | {"Q": Q, "lbx": [-np.inf] * 3 + [-0.35], "ubx": [np.inf] * 3 + [0.35]} | changes)
+
+
 PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "implicit integrator": lambda: lagging_car(method="irk"),
     "implicit integrator of three stages in two steps": lambda: lagging_car(method="irk", sim_method_num_stages=3, sim_method_num_steps=2, N_u=3),
@@ -60,6 +71,9 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "weights of inputs": lambda: sampled_car(R_u=[0.8, 0.3], u_ref=[0.1, -0.2]),
     "weights of inputs, held inputs": lambda: sampled_car(R_u=[0.8, 0.0], N_u=3),
     "weights of inputs alone": lambda: lagging_car(method="irk", R_u=[0.05, 0.2], R=[0.0, 0.0]),
+    "outputs of inputs": felt_car,
+    "outputs of inputs, held inputs, weight at the end": lambda: felt_car(N_u=3, Q_e=[0.5, 0.5, 0.0, 1.0, 0.0, 0.5]),
+    "outputs of inputs beside weights of inputs": lambda: felt_car(R_u=[0.05, 0.2], u_ref=[0.1, -0.1], N_u=5),
     "fixed input": lambda: sampled_car(lbu=[-0.5, 0.3], ubu=[0.5, 0.3], lbdu=-np.inf, ubdu=np.inf),
     "terminal set": lambda: sampled_car(lbx_e=[-np.inf] * 3 + [-0.05], ubx_e=[np.inf] * 3 + [0.02]),
     "terminal set, from above alone, held inputs": lambda: sampled_car(ubx_e=[np.inf] * 3 + [0.05], N_u=3, z=[1.0] * 4, Z=[0.0] * 4),
@@ -76,7 +90,8 @@ def around_a_bend(ocp: Ocp, count: int) -> list[tuple[Array, Array, Array]]:
         x0 = np.zeros(ocp.model.nx)
         x0[:3] = y_ref[0] + rng.normal(size=3) * [0.2, 0.2, 0.5]
         x0[3:] = rng.uniform(-0.3, 0.3, size=ocp.model.nx - 3)
-        found.append((x0, y_ref[:, : ocp.model.ny], rng.uniform(-0.4, 0.4, size=2)))
+        y_ref = np.pad(y_ref, ((0, 0), (0, ocp.model.ny - 3)))  # nothing is to be felt
+        found.append((x0, y_ref, rng.uniform(-0.4, 0.4, size=2)))
     return found
 
 

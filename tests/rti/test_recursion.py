@@ -28,7 +28,7 @@ from rti_mpc.rti.rti import Rti
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler on this machine")
 
 
-def problem(nx: int, nu: int, N: int, N_u: int, *, softened: bool = True) -> Ocp:
+def problem(nx: int, nu: int, N: int, N_u: int, *, softened: bool = True, of_inputs: bool = False) -> Ocp:
     """A model with a sparse Jacobian, weights that are full matrices, and two states and an expression of states and inputs softly bounded."""
     rng = np.random.default_rng(nx)
     x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
@@ -37,7 +37,8 @@ def problem(nx: int, nu: int, N: int, N_u: int, *, softened: bool = True) -> Ocp
     C = rng.normal(size=(3, nx)) * (rng.random((3, nx)) < 0.5)
     f = ca.DM(A) @ x + ca.DM(B) @ u + 0.1 * ca.sin(x) * u[0]
     signals = {name: tuple(Signal(f"{name}{i}", "1") for i in range(count)) for name, count in (("x", nx), ("u", nu), ("y", 3))}
-    model = Model(name="mixed", x=x, u=u, f_expl_expr=f, y_expr=ca.DM(C) @ x, states=signals["x"], inputs=signals["u"], outputs=signals["y"])
+    y_expr = ca.DM(C) @ x + (u[0] * ca.DM([1, 0, 2]) * x[0] if of_inputs else 0)
+    model = Model(name="mixed", x=x, u=u, f_expl_expr=f, y_expr=y_expr, states=signals["x"], inputs=signals["u"], outputs=signals["y"])
     root, turn = rng.normal(size=(3, 3)), rng.normal(size=(nu, nu))
     room = np.array([1.0, 1.0, *[np.inf] * (nx - 2)])
     expression = x[0] * u[nu - 1] + x[nx - 1]
@@ -76,8 +77,8 @@ def assert_equal(of: ca.Function, fast: ca.Function, given: dict[str, ca.DM]) ->
     ],
 )
 def test_compiled_recursions_equal_the_expressions(nx: int, nu: int, N: int, N_u: int, softened: bool) -> None:
-    """Of few states as scalars, of many as dense columns; with held inputs, full weights, and no softened bounds at all."""
-    ocp = problem(nx, nu, N, N_u, softened=softened)
+    """Of few states as scalars, of many as dense columns; with held inputs, full weights, outputs of inputs, and no softened bounds at all."""
+    ocp = problem(nx, nu, N, N_u, softened=softened, of_inputs=nx >= LEAST_SIZE - 2)
     rng, functions, judged = np.random.default_rng(5), places(ocp), certificate(ocp)
     fast = compiled(functions.gains, functions.roll_out, functions.refine, judged)
     known = {"stages": functions.linearize(**arguments(functions.linearize, ocp, rng, {}))["stages"]}

@@ -22,8 +22,8 @@ SOLVERS: dict[str, SolverSettings | None] = {"osqp": TIGHT, "daqp": None, "clara
 STRUCTURES = 8
 
 
-def random_ocp(rng: np.random.Generator) -> Ocp:
-    """A random model, not linear, with outputs and a constraint that are not either; all weights and bounds random, the control horizon shorter."""
+def random_ocp(rng: np.random.Generator, *, of_inputs: bool) -> Ocp:
+    """A random model, not linear, with outputs and a constraint that are not either; weights and bounds random, the control horizon shorter."""
     nx, nu, ny = (int(n) for n in rng.integers([2, 1, 1], [5, 3, 4]))
     x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
     A, B, C = (ca.DM(0.5 * rng.normal(size=shape)) for shape in ((nx, nx), (nx, nu), (ny, nx)))
@@ -33,7 +33,7 @@ def random_ocp(rng: np.random.Generator) -> Ocp:
         x=x,
         u=u,
         f_expl_expr=A @ x + B @ u + 0.3 * ca.sin(E @ x),
-        y_expr=C @ x + 0.2 * ca.sin(C @ x),
+        y_expr=C @ x + 0.2 * ca.sin(C @ x) + (0.5 * x[0] * u[0] + 0.3 * u[0] if of_inputs else 0),
         states=tuple(Signal(f"x{i}", "1") for i in range(nx)),
         inputs=tuple(Signal(f"u{i}", "1") for i in range(nu)),
         outputs=tuple(Signal(f"y{i}", "1") for i in range(ny)),
@@ -81,8 +81,8 @@ def at_bounds(ocp: Ocp, u: Array, u_prev: Array) -> dict[str, bool]:
 def test_all_solvers_give_the_same_plan_in_either_formulation_on_random_problems(samples: int) -> None:
     rng = np.random.default_rng(3)
     seen: Counter[str] = Counter()
-    for _ in range(STRUCTURES):
-        ocp = random_ocp(rng)
+    for structure in range(STRUCTURES):
+        ocp = random_ocp(rng, of_inputs=structure % 2 == 1)
         recursion = Rti(ocp, TIGHT, iterations=1, compile=False)
         others = {
             (solver, formulation): Rti(ocp, settings, solver=solver, formulation=formulation, iterations=1, compile=False)

@@ -86,7 +86,13 @@ class Condensing:
             A_after = lin.A[:, k + 1] if k < N - 1 else ca.MX.zeros(lin.A_k.nnz())
             W_G = over_blocks(apply_H_A, blocks, [0, 1])(lin.hessian[:, k], A_after, self.G[k], W_G[:, : nu * blocks])
             W_Phi = on_state[1](lin.hessian[:, k], A_after, self.Phi[k], W_Phi)
-            W_c = on_defect[1](lin.hessian[:, k], A_after, self.c[k], W_c) + lin.gradient[:, k]
+            W_c = on_defect[1](lin.hessian[:, k], A_after, self.c[k], W_c) + lin.gradient[:nx, k]
+            if lin.H_i.size1() > nx:  # the input before the node acts on its outputs, too; `increment_hessian` has the block of the input alone
+                Hxu = ca.densify(lin.output_hessian(k)[0])
+                W_G = ca.horzcat(W_G[:, :-nu], W_G[:, -nu:] + Hxu)
+                self.H[blocks - 1] += Hxu.T @ self.G[k]
+                M[blocks - 1] += Hxu.T @ self.Phi[k]
+                m[blocks - 1] += Hxu.T @ self.c[k]
             self.H[blocks - 1] += over_blocks(apply_B, blocks, [0])(lin.B[:, k], W_G)
             M[blocks - 1] += on_state[2](lin.B[:, k], W_Phi)
             m[blocks - 1] += on_defect[2](lin.B[:, k], W_c)
@@ -97,6 +103,7 @@ def kernels(lin: Linearization, width: int) -> tuple[ca.Function, ca.Function, c
     """Return ``A X``, ``H X + A' W`` and ``B' W`` for `width` columns, and B; from nonzeros, with every structural zero left out."""
     a, b, h = (ca.SX.sym(name, pattern.nnz()) for name, pattern in (("a", lin.A_k), ("b", lin.B_k), ("h", lin.H_i)))
     A, B, H = ca.SX(lin.A_k, a), ca.SX(lin.B_k, b), ca.SX(lin.H_i, h)
+    H = H[: A.shape[0], : A.shape[0]]
     X, W = (ca.SX.sym(name, A.shape[0], width) for name in ("X", "W"))
     return (
         ca.Function(f"apply_A_{width}", [a, X], [ca.densify(A @ X)]),

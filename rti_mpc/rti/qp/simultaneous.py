@@ -89,9 +89,12 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
         A.place(row, to_s, sp.eye_array(N * ng))
 
     P = Blocks()
-    H_upper = ca.triu(lin.H_i)
-    in_upper = [i for i, (row, col) in enumerate(zip(*lin.H_i.get_triplet(), strict=True)) if row <= col]
+    in_upper = [i for i, (row, col) in enumerate(zip(*lin.H_i.get_triplet(), strict=True)) if row <= col < nx]
+    H_upper = ca.triu(ca.DM(lin.H_i, 1)[:nx, :nx]).sparsity()
     P.place_values(ca.vec(lin.hessian[in_upper, :]), [(nx + i * nx, nx + i * nx, H_upper) for i in range(N)])
+    for i in range(N) if lin.H_i.size1() > nx else ():
+        coupling, _ = lin.output_hessian(i)
+        P.place_values(nonzeros(coupling), [(nx + i * nx, to_du + min(i, N_u - 1) * nu, coupling.sparsity())])
     for k in range(N_u):
         at_k = to_du + k * nu
         diagonal, beside = lin.increment_hessian(k)
@@ -100,7 +103,7 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
             P.place_values(nonzeros(beside), [(at_k, at_k + nu, beside.sparsity())])
     if ng:
         P.place_values(ca.repmat(SLACK_UNIT**2 / 2 * lin.Zg, N), [(to_s, to_s, ca.Sparsity.diag(N * ng))])
-    q = ca.vertcat(zero, ca.vec(lin.gradient), ca.vec(lin.increment_gradient()), *([ca.repmat(SLACK_UNIT / 2 * lin.zg, N)] if ng else []))
+    q = ca.vertcat(zero, ca.vec(lin.gradient[:nx, :]), ca.vec(lin.increment_gradient()), *([ca.repmat(SLACK_UNIT / 2 * lin.zg, N)] if ng else []))
 
     A_pattern, A_data = A.finish(rows.count, n)
     P_pattern, P_data = P.finish(n, n)

@@ -102,11 +102,11 @@ def excursions(rti: Rti, x0: Array) -> Iterator[Excursion]:
 
 def outputs(ocp: Ocp, x: Array, u: Array) -> Array:
     """Return the outputs at nodes 1 to N under a constant input, shape ``(N, ny)``; fewer rows, at least that of node 0, where the model ends."""
-    phi, h, p = ocp.phi(), ocp.model.h(), np.array(ocp.model.p_nominal)
-    rows = [np.array(h(x, p)).ravel()]
+    phi, h, p = ocp.phi(), ocp.model.outputs_at(), np.array(ocp.model.p_nominal)
+    rows = [np.array(h(x, u, p)).ravel()]
     for _ in range(ocp.N):
         x = np.array(phi(x, u, p)).ravel()
-        rows.append(np.array(h(x, p)).ravel())
+        rows.append(np.array(h(x, u, p)).ravel())
         if not np.isfinite([*x, *rows[-1]]).all():
             return np.array(rows[1:-1] or rows[:1])
     return np.array(rows[1:])

@@ -111,7 +111,7 @@ def cost_terms(rti: Rti, config: Config) -> dict[str, float]:
     """Return the cost (4) of a plan by term: error of each output, changes of each input, terminal weight, and slacks of each bound."""
     ocp, model = rti.ocp, rti.ocp.model
     w = {name: array / rti.cost_scale if name in COST_WEIGHTS else array for name, array in rti.guess.weights.items()}
-    errors = outputs_of(model.h(), rti) - rti.y_ref
+    errors = outputs_of(model.outputs_at(), rti) - rti.y_ref
     increments = np.diff(rti.u, axis=0, prepend=rti.u_prev[None])
     by_output = (w["delta"][:, None] * errors * (errors @ w["Q"])).sum(axis=0)
     by_input = (w["lambda_"][:, None] * increments * (increments @ w["R"])).sum(axis=0)

@@ -98,7 +98,7 @@ class Outcome:
             stamp_ns=log.stamp_ns,
             x=log.x,
             u_applied=log.u,
-            y=np.array(self.plant.h()(log.x.T, self.plant.p_nominal)).reshape(-1, len(log.x)).T,
+            y=np.array(self.plant.outputs_at()(log.x.T, log.u.T, self.plant.p_nominal)).reshape(-1, len(log.x)).T,
             reference=self._wanted(log.stamp_ns),
             sample_stamp_ns=np.array([sample.stamp_ns for sample in answered], dtype=np.int64),
             prepare_us=np.array([sample.prepare_us for sample in answered]),
