@@ -67,6 +67,24 @@ class Obstacle:
 
 
 @dataclass(frozen=True)
+class Weights:
+    """
+    Weights of the cost, as they are now; see `rti_mpc.rti.ocp.Ocp`.
+
+    Attributes:
+        Q: Of outputs, ``ny`` rows.
+        R: Of increments, ``nu`` rows.
+        delta: Of each stage's outputs.
+        lambda_: Of each stage's increments, within the control horizon.
+    """
+
+    Q: tuple[tuple[float, ...], ...]
+    R: tuple[tuple[float, ...], ...]
+    delta: tuple[float, ...]
+    lambda_: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Info:
     """
     Description of a process on the bus; that of a controller labels every vector. Two are equal if all but role and document are.
@@ -79,12 +97,16 @@ class Info:
         inputs: Labels of ``u``.
         outputs: Labels of ``y``.
         disturbances: Labels of the disturbances that an observer estimates.
+        stage_parameters: Labels of a reference's ``p``.
         obstacles: Obstacles that the robot must stay out of.
         dt_s: Sample period; NaN if not said.
         lbu: Lower bounds of the inputs, infinite where there is none.
         ubu: Upper bounds of the inputs.
         lbx: Lower bounds of the states.
         ubx: Upper bounds of the states.
+        lbdu: Lower bounds of the increments of the inputs, per sample.
+        ubdu: Upper bounds of the increments.
+        weights: Weights of the cost; None if not said.
     """
 
     role: str = field(compare=False)
@@ -94,12 +116,16 @@ class Info:
     inputs: tuple[Label, ...] = ()
     outputs: tuple[Label, ...] = ()
     disturbances: tuple[Label, ...] = ()
+    stage_parameters: tuple[Label, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
     dt_s: float = math.nan
     lbu: tuple[float, ...] = ()
     ubu: tuple[float, ...] = ()
     lbx: tuple[float, ...] = ()
     ubx: tuple[float, ...] = ()
+    lbdu: tuple[float, ...] = ()
+    ubdu: tuple[float, ...] = ()
+    weights: Weights | None = None
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Info:
@@ -118,6 +144,7 @@ class Info:
                 model=str(document.get("model", "")),
                 obstacles=tuple(_obstacle(disc) for disc in _few(document.get("obstacles", ()))),
                 dt_s=float(document.get("dt_s", math.nan)),
+                weights=_weights(document["weights"], len(vectors["outputs"]), len(vectors["inputs"])) if "weights" in document else None,
                 **vectors,
                 **bounds,
             )
@@ -140,7 +167,7 @@ class Info:
     @classmethod
     def unnamed(cls, nx: int, nu: int, ny: int) -> Info:
         """Number the components of a robot whose description was never heard."""
-        sizes = zip(INFO_VECTORS, (nx, nu, ny, 0), strict=True)
+        sizes = zip(INFO_VECTORS, (nx, nu, ny, 0, 0), strict=True)
         vectors: dict[str, Any] = {name: tuple(Label(f"{name[:-1]}_{i}") for i in range(n)) for name, n in sizes}
         bounds: dict[str, Any] = {name: _bounds(None, sign, len(vectors[vector])) for name, (vector, sign) in INFO_BOUNDS.items()}
         return cls(role="unknown", **vectors, **bounds)
@@ -176,6 +203,12 @@ class Info:
         """Whether there is a position in the plane, of the robot or of its outputs."""
         return self.position is not None or self.computed_position is not None
 
+    @property
+    def path(self) -> tuple[int, int] | None:
+        """Where the followed path's parameters begin in a reference's `p`, and how many knots it has; None: the robot follows no path."""
+        first = place(self.stage_parameters, "path_start")
+        return None if first is None else (first, sum(label.role == "path_x" for label in self.stage_parameters))
+
     def measured(self, i: int) -> int | None:
         """Index of the state that input `i` commands; None: there is none."""
         return self._state(self.inputs[i])
@@ -184,9 +217,16 @@ class Info:
         return next((k for k, state in enumerate(self.states) if state.name == label.state), None)
 
 
-INFO_VECTORS = ("states", "inputs", "outputs", "disturbances")
+INFO_VECTORS = ("states", "inputs", "outputs", "disturbances", "stage_parameters")
 # Bounds, each with its vector and the sign of the infinity that stands for none.
-INFO_BOUNDS = {"lbu": ("inputs", -1), "ubu": ("inputs", 1), "lbx": ("states", -1), "ubx": ("states", 1)}
+INFO_BOUNDS = {
+    "lbu": ("inputs", -1),
+    "ubu": ("inputs", 1),
+    "lbx": ("states", -1),
+    "ubx": ("states", 1),
+    "lbdu": ("inputs", -1),
+    "ubdu": ("inputs", 1),
+}
 
 
 def labels(counterparts: Mapping[str, Sequence[str]] | None = None, /, **vectors: Sequence[Signal | Label]) -> dict[str, Any]:
@@ -209,6 +249,11 @@ def labels(counterparts: Mapping[str, Sequence[str]] | None = None, /, **vectors
 def bounds(**vectors: Iterable[float]) -> dict[str, Any]:
     """Write bounds, such as ``lbu``, as a part of a description: null where there is none."""
     return {name: [value if math.isfinite(value) else None for value in values] for name, values in vectors.items()}
+
+
+def weights(**values: Sequence[Any]) -> dict[str, Any]:
+    """Write weights, with the attributes of `Weights`, as a part of a description."""
+    return {"weights": values}
 
 
 def obstacles(discs: Iterable[tuple[int, float, float, float]]) -> dict[str, Any]:
@@ -281,6 +326,20 @@ def _label(signal: Mapping[str, Any]) -> Label:
         if not 0 < len(text) <= MAX_TEXT_CHARS or not text.isprintable():
             raise ValueError(f"names and units of 1 to {MAX_TEXT_CHARS} printable characters expected, got {text[:MAX_TEXT_CHARS]!r}")
     return label
+
+
+def _weights(values: Mapping[str, Any], ny: int, nu: int) -> Weights:
+    rows = {name: tuple(_numbers(row, size) for row in _few(values[name])) for name, size in (("Q", ny), ("R", nu))}
+    if (len(rows["Q"]), len(rows["R"])) != (ny, nu):
+        raise ValueError(f"weights of {ny} outputs and {nu} inputs expected, got {len(rows['Q'])} and {len(rows['R'])}")
+    return Weights(**rows, delta=_numbers(values["delta"]), lambda_=_numbers(values["lambda_"]))
+
+
+def _numbers(values: Sequence[Any], length: int | None = None) -> tuple[float, ...]:
+    numbers = tuple(map(float, values))
+    if length not in (None, len(numbers)) or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"{length or 'some'} finite numbers expected, got {numbers[:MAX_COMPONENTS]}")
+    return numbers
 
 
 def _obstacle(disc: Mapping[str, Any]) -> Obstacle:

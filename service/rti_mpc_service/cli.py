@@ -300,23 +300,16 @@ def view(
     rerun_web_port: Annotated[int, typer.Option(metavar="PORT", min=1, max=65535, help="Port of this page.")] = 9090,
 ) -> int:
     """Draw the robot live in Rerun, or record it; or draw a recording."""
-    from rti_mpc_service.view.view import main, show
+    from rti_mpc_service.view.view import Places, main, show
 
-    drawn = partial(
-        main if not words else show,
-        rerun_spawn=rerun_spawn,
-        rerun_connect=rerun_connect,
-        rerun_save=rerun_save,
-        rerun_memory_limit=rerun_memory_limit,
-        web_port=rerun_web_port if web else None,
-    )
+    places = Places(rerun_spawn, rerun_connect, rerun_save, rerun_memory_limit, rerun_web_port if web else None)
     if not words:
-        return drawn(bus, config.keys(), robots=robot or ())
+        return main(bus, config.keys(), places, robots=robot or ())
     if len(words) > 1:
         raise ConfigError(f"view draws one recording, got {' '.join(words)}")
     if robot:
         raise ConfigError("--robot is for live robots: all those of a recording are drawn")
-    return drawn(Path(words[0]))
+    return show(Path(words[0]), places)
 
 
 @partial(process, with_model=False)
@@ -607,7 +600,7 @@ def tune(
             "--held-out",
             metavar="SCENARIO",
             help="Scenario that no trial sees, which decides whether the chosen values are better.",
-            show_default="circle, or steps of outputs; eight or sines if the study has that",
+            show_default="circle, or steps of outputs; eight or sines if the study has that; the second half of a recording",
         ),
     ] = None,
     heading: Annotated[

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,12 +17,14 @@ from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.signals import in_plane, plane
 from rti_mpc.wire.info import Info
 from rti_mpc_service.outline import outline
+from rti_mpc_service.view.plan import ACTING, FREE, LATER
 
 TIMELINE = "robot_time"
 TRAIL_S = 90.0
 WINDOW_S = (-60.0, 15.0)  # shown time, relative to now; the legend covers the empty part after now
 HALF_FIELD_TANGENT = 0.52  # tangent of half the viewer's vertical field of view
-GRID_M = 0.5
+GRID_M, WIDE_GRID_M, WIDE_M = 0.5, 5.0, 10.0  # distance of the lines, and where more than WIDE_M are shown
+ROOM = 1.25  # shown of a path that is told part by part, relative to what is known of it
 MARGIN_M = 0.35  # space around the reference, enough for a robot
 
 COLORS = {
@@ -50,6 +53,7 @@ RUNG_COLORS = {
     "braked": "bad",
     "rested": "latency",
 }  # the fallbacks
+TERM_COLORS = ("measured", "command", "error", "prepare", "latency", "limit", "actuation", "edge")
 MODE_COLORS = dict(zip(Mode, ("idle", "idle", "good", "good", "warning", "warning", "bad"), strict=True))
 STATUS_COLORS = dict(zip(QpStatus, ("good", "warning", "warning", "warning", "bad", "bad", "idle"), strict=True))
 LANE_COLORS: dict[str, dict[Any, str]] = {"guard": MODE_COLORS, "mode": MODE_COLORS, "status": STATUS_COLORS}  # a leader is any epoch
@@ -74,6 +78,20 @@ class Frame:
         low, high = xy.min(axis=0), xy.max(axis=0)
         (x, y), (w, h) = (0.5 * (low + high)).round(1).tolist(), (0.5 * (high - low)).round(1).tolist()
         return cls((x, y), (w, h))
+
+    @classmethod
+    def with_room(cls, frame: Frame | None, xy: Array) -> Frame:
+        """Return a frame if points, shape ``(M, 2)``, are inside, else one around both, with room for what follows."""
+        corners = xy if frame is None else np.array([np.subtract(frame.center, frame.half), np.add(frame.center, frame.half)])
+        if frame is not None and np.all(np.abs(xy - frame.center) <= frame.half):
+            return frame
+        around = cls.around(np.vstack([corners, xy]))
+        return cls(around.center, (ROOM * around.half[0], ROOM * around.half[1]))
+
+    @property
+    def grid_m(self) -> float:
+        """Distance of the lines of the grid, in m."""
+        return WIDE_GRID_M if max(self.half) > 0.5 * WIDE_M else GRID_M
 
     @property
     def eye_height(self) -> float:
@@ -113,7 +131,7 @@ def _laid_out(left: rrb.Container, right: rrb.Container, roots: Sequence[str]) -
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(left, right, column_shares=[1, 1]),
-            rrb.Horizontal(_lanes(roots), _events(roots), column_shares=[1, 2]),
+            rrb.Horizontal(_lanes(roots), _bounds(roots), _events(roots), column_shares=[3, 3, 5]),
             row_shares=[8, 3],
         ),
         rrb.BlueprintPanel(state="collapsed"),
@@ -134,7 +152,8 @@ def _tabs(info: Info, root: str) -> list[rrb.View | rrb.Container]:
     """Return what is beside the plane, for a robot."""
     estimated = [_series("Disturbances", ["disturbance/**"], root)] if info.disturbances else []
     computed = [_series("Outputs", [f"output/{info.outputs[i].name}" for i in info.computed], root)] if info.computed else []
-    return [*computed, _series("States", ["state/**"], root), *estimated, _troubles(root)]
+    cost = [_series("Cost by term", ["cost/**"], root)] if info.weights is not None else []
+    return [*computed, _series("States", ["state/**"], root), *cost, *estimated, _troubles(root)]
 
 
 def _world(frame: Frame, roots: Sequence[str]) -> rrb.Spatial3DView:
@@ -145,11 +164,11 @@ def _world(frame: Frame, roots: Sequence[str]) -> rrb.Spatial3DView:
     return rrb.Spatial3DView(
         origin="/world" if list(roots) == [""] else "/",
         contents=[f"+ /{below(root, 'world')}/**" for root in roots],
-        name=f"From above, y up, grid {GRID_M:g} m",
+        name=f"From above, y up, grid {frame.grid_m:g} m",
         background=(16, 18, 22),
-        line_grid=rrb.LineGrid3D(visible=True, spacing=GRID_M, stroke_width=0.5, color=(255, 255, 255, 28)),
+        line_grid=rrb.LineGrid3D(visible=True, spacing=frame.grid_m, stroke_width=0.5, color=(255, 255, 255, 28)),
         eye_controls=rrb.EyeControls3D(position=(x, y - 0.01, frame.eye_height), look_target=(x, y, 0.0), eye_up=(0.0, 1.0, 0.0)),
-        overrides={below(root, path): [trail] for root in roots for path in ("world/trail", "world/output")},
+        overrides={below(root, path): [trail] for root in roots for path in REMAINING},
     )
 
 
@@ -213,6 +232,12 @@ def _lanes(roots: Sequence[str]) -> rrb.StateTimelineView:
     return rrb.StateTimelineView(origin="/lane" if alone else "/", contents=contents, name="Modes, QP status and who leads", time_view=_time_axis())
 
 
+def _bounds(roots: Sequence[str]) -> rrb.StateTimelineView:
+    alone = list(roots) == [""]
+    contents = [f"+ /{below(root, 'bound')}/**" for root in roots]
+    return rrb.StateTimelineView(origin="/bound" if alone else "/", contents=contents, name="Bounds that act in the plan", time_view=_time_axis())
+
+
 def _events(roots: Sequence[str]) -> rrb.TextLogView:
     kinds, alone = rrb.encodings.TextLogColumnKind, list(roots) == [""]
     columns = [rrb.encodings.TextLogColumn(kind, visible=kind is not kinds.EntityPath or not alone) for kind in kinds]
@@ -230,10 +255,14 @@ class Strip(NamedTuple):
 
 STRIPS = {
     "world/reference": Strip("reference", 5.0, 0.0),
+    "world/path": Strip("reference", 3.0, 0.0),
+    "world/path/right": Strip("limit", 2.0, 0.0),
+    "world/path/left": Strip("limit", 2.0, 0.0),
     "world/trail": Strip("measured", 2.0, 0.004),
     "world/output": Strip("measured", 2.0, 0.004),
     "world/horizon": Strip("command", 4.0, 0.02),
 }
+REMAINING = ("world/trail", "world/output", "world/path", "world/path/right", "world/path/left")  # strips that stay for TRAIL_S
 LEGEND_COLORS = {"reference": "reference", "driven": "measured", "planned": "command"}
 OBSTACLE_Z_M = -0.004  # [m], below everything
 MAX_COORDINATE_M = 1e38  # m, within single precision, in which Rerun draws
@@ -243,7 +272,7 @@ ROBOT_Z_M = 0.008  # [m], between trail and horizon
 
 def looks(info: Info, name: str = "") -> dict[str, rr.AsComponents]:
     """Return the constant components of a recording, by entity; a robot is called by its name where there are several."""
-    return _series_looks(info) | _lane_looks() | (_world_looks(info, name) if info.planar else {})
+    return _series_looks(info) | _cost_looks(info) | _lane_looks(info) | (_world_looks(info, name) if info.planar else {})
 
 
 def legend(frame: Frame) -> rr.Points3D:
@@ -283,11 +312,24 @@ def _series_looks(info: Info) -> dict[str, rr.AsComponents]:
     return looks
 
 
-def _lane_looks() -> dict[str, rr.AsComponents]:
+def _cost_looks(info: Info) -> dict[str, rr.AsComponents]:
+    names = {f"error/{label.name}": f"error of {label.name}" for label in info.outputs}
+    names |= {f"changes/{label.name}": f"changes of {label.name}" for label in info.inputs}
+    colors = dict(zip(names, cycle(TERM_COLORS), strict=False))
+    looks: dict[str, rr.AsComponents] = {f"cost/{path}": _line(name, colors[path]) for path, name in names.items()}
+    return looks | {"cost/rest": _line("rest", "reference")}
+
+
+def _lane_looks(info: Info) -> dict[str, rr.AsComponents]:
     looks: dict[str, rr.AsComponents] = {}
     for lane, values in LANE_COLORS.items():
         names, colors = [value.name for value in values], [COLORS[color] for color in values.values()]
         looks[f"lane/{lane}"] = rr.StateConfiguration(values=names, labels=names, colors=colors)
+    said = [FREE, *ACTING]
+    colors = [COLORS["body" if words == FREE else "warning" if words.endswith(LATER) else "bad"] for words in said]
+    obstacles = [f"obstacle_{i}" for i in range(len(info.obstacles))]
+    for name in (*(label.name for label in (*info.states, *info.inputs)), *obstacles):
+        looks[f"bound/{name}"] = rr.StateConfiguration(values=said, labels=said, colors=colors)
     return looks
 
 

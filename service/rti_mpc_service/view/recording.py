@@ -17,6 +17,8 @@ from rti_mpc.contract.message import Command, Event, Reference, Severity, State,
 from rti_mpc.signals import plane
 from rti_mpc.wire.info import Info, Label, Obstacle
 from rti_mpc_service.view.blueprint import RUNG_COLORS, STRIPS, TIMELINE, Frame, below, blueprint, legend, lifted, looks
+from rti_mpc_service.view.path_window import KNOT_PARTS, MIN_KNOTS, path_window
+from rti_mpc_service.view.plan import FREE, acting_bounds, cost_terms, is_plan
 from rti_mpc_service.view.playback import Actuation, Playback, PlayedRow
 from rti_mpc_service.view.tracking_error import tracking_error
 
@@ -79,6 +81,7 @@ class RerunRecording:
         self._held: deque[Entry] = deque(maxlen=MAX_HELD_ENTRIES)
         self._last: State | None = None
         self._last_output: Array | None = None  # position of the outputs, shape ``(1, 2)``
+        self._planned: Telemetry | None = None  # the last sample
         self._playback = Playback()
         self._lanes: dict[str, tuple[str, int]] = {}  # value and time of the last change of each lane
         self._writers: dict[type, Callable[[Times, list[Any]], None]] = {
@@ -121,7 +124,7 @@ class RerunRecording:
     def _name(self, info: Info) -> None:
         """Take names from a description, and write the entries that were held for them."""
         if self.info is not None and _vectors(info) != _vectors(self.info):
-            self._reference, self._last, self._last_output, self._playback = None, None, None, Playback()
+            self._reference, self._last, self._last_output, self._planned, self._playback = None, None, None, None, Playback()
         self.info = info
         for path, archetype in looks(info, self._root).items():
             self._log(path, archetype)
@@ -156,13 +159,29 @@ class RerunRecording:
         self._reference = references[-1]
         pair = plane(self.info.outputs)
         if pair is not None and self.info.planar:
-            frame = Frame.around(references[-1].y[:, pair])
-            if frame != self._frame:
-                self._frame = frame
-                if not self._root:  # several would lie on top of each other
-                    self._log("world/legend", legend(frame))
-                self._lay_out(self.info, frame)
+            self._look_at(Frame.around(references[-1].y[:, pair]))
             self._strips("world/reference", times, [r.y[:: 1 + len(r.y) // MAX_DRAWN_ROWS, pair] for r in references])
+        elif (path := self.info.path) is not None and self.info.planar:
+            self._paths(times, references, *path)
+
+    def _paths(self, times: Times, references: list[Reference], first: int, knots: int) -> None:
+        """Write the part of a followed path around the robot, and its edges; what was written before stays visible for a while."""
+        carried = [k for k, r in enumerate(references) if r.p.shape[1] >= first + 2 + KNOT_PARTS * knots]
+        if not carried or knots < MIN_KNOTS:
+            return
+        windows = [path_window(references[k].p[0], first, knots) for k in carried]
+        for path, lines in zip(("world/path", "world/path/right", "world/path/left"), zip(*windows, strict=True), strict=True):
+            self._strips(path, times[carried], lines)
+        self._look_at(Frame.with_room(self._frame, np.concatenate([edge for _, *edges in windows for edge in edges])))
+
+    def _look_at(self, frame: Frame) -> None:
+        """Show another part of the plane, if it is another."""
+        assert self.info is not None
+        if frame != self._frame:
+            self._frame = frame
+            if not self._root:  # several would lie on top of each other
+                self._log("world/legend", legend(frame))
+            self._lay_out(self.info, frame)
 
     def _states(self, times: Times, states: list[State]) -> None:
         assert self.info is not None
@@ -228,6 +247,10 @@ class RerunRecording:
             self._scalars(f"disturbance/{label.name}", times, np.array([sample.d[i] if i < len(sample.d) else np.nan for sample in samples]))
         self._scalars("slack", times, np.array([1e3 * sample.slack_s for sample in samples]))
         self._scalars("slack/period", times, np.full(len(times), 1e3 * self.info.dt_s))
+        self._plans(times, samples)
+        versions = [f"version {sample.parameter_version}" for sample in samples]
+        if "lane/parameters" in self._lanes or any(sample.parameter_version for sample in samples):  # what never changes needs no lane
+            self._lane("parameters", times, versions)
         self._lane("mode", times, [sample.mode.name for sample in samples])
         self._lane("status", times, [sample.status.name for sample in samples])
         self._lane("leader", times, [f"epoch {sample.epoch}" for sample in samples])
@@ -239,6 +262,36 @@ class RerunRecording:
         computed = np.array([sample.y.size > 0 for sample in samples])
         if self.info.computed and computed.any():
             self._outputs(times[computed], stamps[computed], np.array([sample.y for sample in samples if sample.y.size]))
+
+    def _plans(self, times: Times, samples: list[Telemetry]) -> None:
+        """Write what the cost of each plan is made of, and which bounds act in it."""
+        assert self.info is not None
+        terms: defaultdict[str, list[tuple[int, float]]] = defaultdict(list)
+        sides: defaultdict[str, list[tuple[int, str]]] = defaultdict(list)
+        for time_ns, sample in zip(times.tolist(), samples, strict=True):
+            before, self._planned = self._planned, sample
+            if is_plan(sample):
+                u_before = before.u[0] if before is not None and before.epoch == sample.epoch and len(before.u) else None
+                with np.errstate(all="ignore"):
+                    for name, value in cost_terms(self.info, sample, u_before).items():
+                        terms[name].append((time_ns, value))
+                    for name, side in acting_bounds(self.info, sample, u_before, self._distances(sample)).items():
+                        sides[name].append((time_ns, side))
+        for name, points in terms.items():
+            self._scalars(f"cost/{name}", np.array([t for t, _ in points], np.int64), np.array([value for _, value in points]))
+        for name, said in sides.items():
+            if f"bound/{name}" in self._lanes or any(side != FREE for _, side in said):  # what never acts needs no lane
+                self._lane(name, np.array([t for t, _ in said], np.int64), [side for _, side in said], "bound")
+
+    def _distances(self, sample: Telemetry) -> tuple[Array, ...]:
+        """Return how far a plan is from the edge of each obstacle at nodes 1 to N, each of shape ``(N,)``, in m."""
+        assert self.info is not None
+        if self.info.position is None or not np.isfinite(self.info.dt_s):
+            return ()
+        xy = sample.x[1:, self.info.position]
+        stamps = sample.stamp_ns + (1e9 * self.info.dt_s * np.arange(1, len(sample.x))).astype(np.int64)
+        discs = (located(obstacle, self._reference, stamps) for obstacle in self.info.obstacles)
+        return tuple(np.hypot(xy[:, 0] - x, xy[:, 1] - y) - r for x, y, r in discs)
 
     def _outputs(self, times: Times, stamps: NDArray[np.int64], y: Array) -> None:
         """Write the outputs that are no state, and where those that are a position have been; shape ``(n, ny)``."""
@@ -261,8 +314,9 @@ class RerunRecording:
             scale = np.column_stack([r, r, np.ones_like(r)])
             self._columns(f"world/obstacle_{i}", times, rr.Transform3D.columns(translation=np.column_stack([x, y, 0 * x]), scale=scale))
 
-    def _lane(self, lane: str, times: Times, values: Sequence[str]) -> None:
+    def _lane(self, name: str, times: Times, values: Sequence[str], kind: str = "lane") -> None:
         """Write the changes of a lane in the order received; times increase, even if a braking sample has a later stamp than the next one."""
+        lane = f"{kind}/{name}"
         value, since_ns = self._lanes.get(lane, ("", -1))
         changes = []
         for time_ns, new in zip(times.tolist(), values, strict=True):
@@ -272,7 +326,7 @@ class RerunRecording:
         self._lanes[lane] = value, since_ns
         if changes:
             begins, states = zip(*changes, strict=True)
-            self._columns(f"lane/{lane}", np.array(begins, np.int64), rr.StateChange.columns(state=states))
+            self._columns(lane, np.array(begins, np.int64), rr.StateChange.columns(state=states))
 
     def _events(self, times: Times, events: list[Event]) -> None:
         for source in sorted({event.source for event in events}):

@@ -7,6 +7,7 @@ import logging
 import subprocess
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Event
@@ -27,30 +28,55 @@ DRAIN_PERIOD_S = 0.05
 log = logging.getLogger(__name__)
 
 
-def main(
-    bus_settings: BusSettings,
-    keys: Keys,
-    *,
-    robots: Sequence[str] = (),
-    rerun_spawn: bool = False,
-    rerun_connect: str | None = None,
-    rerun_save: Path | None = None,
-    rerun_memory_limit: str = "25%",
-    web_port: int | None = None,
-    stop: Event | None = None,
-) -> int:
+@dataclass(frozen=True)
+class Places:
     """
-    Draw a robot until stopped; in a spawned viewer if neither a viewer nor a file is given.
+    Where to draw; in a spawned viewer if neither a viewer, nor a file, nor a page is given.
 
-    Args:
-        bus_settings: How to join the bus.
-        keys: Where the robot's streams are.
-        robots: Names of several robots below the same prefix, to draw in one view instead.
+    Attributes:
         rerun_spawn: Whether to start a viewer on this machine, listening on loopback; it stays open afterwards.
         rerun_connect: Address of a viewer, which may start later: ``HOST:PORT``, or a URL of Rerun.
         rerun_save: File to record to, overwritten.
         rerun_memory_limit: Memory a spawned viewer may fill before it forgets the oldest.
         web_port: Port at which to serve a page for browsers, on loopback; None: none is served.
+    """
+
+    rerun_spawn: bool = False
+    rerun_connect: str | None = None
+    rerun_save: Path | None = None
+    rerun_memory_limit: str = "25%"
+    web_port: int | None = None
+
+    @property
+    def url(self) -> str:
+        """
+        Rerun's URL of the viewer.
+
+        Raises:
+            ConfigError: The address is none.
+        """
+        return viewer_url(self.rerun_connect or RERUN_ADDRESS)
+
+    @property
+    def spawned(self) -> bool:
+        """Whether a viewer is started."""
+        return self.rerun_spawn or (self.rerun_connect is None and self.rerun_save is None and self.web_port is None)
+
+    @property
+    def shown(self) -> bool:
+        """Whether anything but a file is drawn into."""
+        return self.spawned or self.rerun_connect is not None or self.web_port is not None
+
+
+def main(bus_settings: BusSettings, keys: Keys, places: Places, *, robots: Sequence[str] = (), stop: Event | None = None) -> int:
+    """
+    Draw a robot until stopped.
+
+    Args:
+        bus_settings: How to join the bus.
+        keys: Where the robot's streams are.
+        places: Where to draw.
+        robots: Names of several robots below the same prefix, to draw in one view instead.
         stop: Event that stops the process; None: SIGINT and SIGTERM do.
 
     Returns:
@@ -59,8 +85,7 @@ def main(
     Raises:
         ConfigError: An address or a file is not valid.
     """
-    rerun_spawn |= rerun_connect is None and rerun_save is None and web_port is None
-    url = viewer_url(rerun_connect or RERUN_ADDRESS)
+    url = places.url
     stop = stop or stop_on_signals()
     with Bus.join(bus_settings, keys, stop=stop, say=log.warning) as bus:
         names = [*robots] or [keys.robot]
@@ -73,12 +98,12 @@ def main(
         for one in buses:
             one.alive(ROLE)
         title = " and ".join(names)
-        outlets = [file_outlet(rerun_save, title, roots)] if rerun_save is not None else []
-        spawned = spawn_viewer(url, rerun_memory_limit) if rerun_spawn else None
-        server = None if web_port is None else serve_page(url, web_port, rerun_memory_limit)
-        if web_port is not None:
-            log.info("open %s", page(url, web_port))
-        if rerun_spawn or rerun_connect is not None or server is not None:
+        outlets = [file_outlet(places.rerun_save, title, roots)] if places.rerun_save is not None else []
+        spawned = spawn_viewer(url, places.rerun_memory_limit) if places.spawned else None
+        server = None if places.web_port is None else serve_page(url, places.web_port, places.rerun_memory_limit)
+        if places.web_port is not None:
+            log.info("open %s", page(url, places.web_port))
+        if places.shown:
             outlets.append(viewer_outlet(url, title, roots))
         log.info("listening to %s", " and ".join(one.keys.below("*") for one in buses))
         announcer = Announcer(buses[0], ROLE, time.time_ns() // 1_000_000_000)
@@ -91,7 +116,7 @@ def main(
         end_page(server)
     for notice in notices(outlets):
         log.error("%s", notice.text)
-    return 0 if rerun_save is None or complete[0] else 1
+    return 0 if places.rerun_save is None or complete[0] else 1
 
 
 def pump(
@@ -123,26 +148,13 @@ def notices(outlets: Sequence[Outlet]) -> list[Notice]:
     return [outlet.notices.popleft() for outlet in outlets for _ in range(len(outlet.notices))]
 
 
-def show(
-    path: Path,
-    *,
-    rerun_spawn: bool = False,
-    rerun_connect: str | None = None,
-    rerun_save: Path | None = None,
-    rerun_memory_limit: str = "25%",
-    web_port: int | None = None,
-    stop: Event | None = None,
-) -> int:
+def show(path: Path, places: Places, *, stop: Event | None = None) -> int:
     """
     Draw a recording whole, where `main` draws a robot live, and return the exit status; serve a page until stopped.
 
     Args:
         path: The recording, or the folder of its segments.
-        rerun_spawn: As in `main`.
-        rerun_connect: As in `main`.
-        rerun_save: As in `main`.
-        rerun_memory_limit: As in `main`.
-        web_port: As in `main`.
+        places: Where to draw.
         stop: As in `main`.
 
     Raises:
@@ -150,20 +162,20 @@ def show(
     """
     from rti_mpc_service.view.show import draw_in_viewer, draw_into_file, opened  # needs the extra `record`
 
-    recording, url = opened(path), viewer_url(rerun_connect or RERUN_ADDRESS)
-    if rerun_save is not None:
-        draw_into_file(recording, rerun_save)
-    if rerun_save is not None and not rerun_spawn and rerun_connect is None and web_port is None:
+    recording, url = opened(path), places.url
+    if places.rerun_save is not None:
+        draw_into_file(recording, places.rerun_save)
+    if not places.shown:
         return 0
     stop = stop or stop_on_signals()
-    server = None if web_port is None else serve_page(url, web_port, rerun_memory_limit)
-    if server is None and rerun_connect is None:
-        spawn_viewer(url, rerun_memory_limit)
+    server = None if places.web_port is None else serve_page(url, places.web_port, places.rerun_memory_limit)
+    if server is None and places.rerun_connect is None:
+        spawn_viewer(url, places.rerun_memory_limit)
     try:
         reached(url, stop)
         draw_in_viewer(recording, path.stem, url)
-        if web_port is not None:
-            log.info("open %s", page(url, web_port))
+        if places.web_port is not None:
+            log.info("open %s", page(url, places.web_port))
             stop.wait()
     finally:
         if server is not None:

@@ -292,3 +292,43 @@ def test_absurd_numbers_are_written_or_left_out_and_what_is_honest_stays(writer:
     writer.send(state(12, [3.0, 4.0, 0.1, 0.2, 0.3], epoch=2))
     rows = writer.read()
     assert [row for row in rows["state/y"] if abs(row[1][0]) < 10.0 and row[1][0] > 1e-3] == [(1.0, [2.0]), (12.0, [4.0])]
+
+
+def test_bounds_have_lanes_from_when_they_act_on_and_parameters_from_their_first_change(writer: Writer) -> None:
+    limits = {"lbdu": [None, None], "ubdu": [None, None]}
+    fast = {k: np.array([[0.5 if k == 2 else 0.1, 0.0]] * 3) for k in range(4)}
+    writer.send(described("controller", STATES, INPUTS, STATES[:3], **LIMITS, **limits))
+    writer.send(*(replace(telemetry(k), u=fast[k], parameter_version=k // 3) for k in range(2)))
+    writer.send(*(replace(telemetry(k), u=fast[k], parameter_version=k // 3) for k in (2, 3)))
+    rows = writer.read()
+    assert rows["bound/u_c"] == [(2.0, ["upper"]), (3.0, ["free"])]
+    assert "bound/omega_c" not in rows
+    assert rows["lane/parameters"] == [(2.0, ["version 0"]), (3.0, ["version 1"])]
+
+
+def test_cost_by_term_needs_weights_and_leaves_the_rest(writer: Writer) -> None:
+    weights = {"Q": np.eye(3).tolist(), "R": np.eye(2).tolist(), "delta": [2.0] * 3, "lambda_": [1.0] * 3}
+    writer.send(described("controller", STATES, INPUTS, STATES[:3], **LIMITS, weights=weights))
+    writer.send(*(replace(telemetry(k), x=np.full((4, 5), 0.1), u=np.full((3, 2), 0.1 * k)) for k in range(2)))
+    rows = writer.read()
+    assert rows["cost/error/y"] == [(k, [pytest.approx(3 * 2.0 * 0.01)]) for k in range(2)]
+    assert [value for _, [value] in rows["cost/changes/u_c"]] == [0.0, pytest.approx(0.01)], "against the sample before"
+    assert [value for _, [value] in rows["cost/rest"]] == [pytest.approx(2.0 - 0.18), pytest.approx(2.0 - 0.2)]
+
+
+def test_a_followed_path_is_drawn_with_its_edges(writer: Writer) -> None:
+    knots = [(0.5 * i, 0.0, 0.2, 0.3, 1.0) for i in range(6)]
+    parameters = [
+        ("path_start", "path_start"),
+        ("path_step", ""),
+        *((f"path_{i}_{part}", "path_x" * (part == "x")) for i in range(6) for part in "xyrls"),
+    ]
+    labels = [{"name": name, "unit": "m", "angle": False, "role": role} for name, role in parameters]
+    writer.send(described("controller", STATES, INPUTS, [("contour", "m")], stage_parameters=labels))
+    p = np.array([[0.0, 0.5, *(value for knot in knots for value in knot)]] * 2)
+    writer.send(replace(reference([[0.0], [0.0]]), p=p), replace(reference([[0.0], [0.0]]), p=p[:, :5]))
+    rows = writer.read()
+    for path, y in (("world/path", 0.0), ("world/path/right", -0.2), ("world/path/left", 0.3)):
+        [(_, [strip])] = rows[path]
+        assert np.array(strip)[:, 1] == pytest.approx(y, abs=1e-6)  # single precision
+        assert (strip[0][0], strip[-1][0]) == (0.5, 2.0), "where its knots say it all"

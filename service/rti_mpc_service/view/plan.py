@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Facts about a plan from the messages alone: what its cost (4) is made of, and which bounds act in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rti_mpc.array import Array
+from rti_mpc.contract.message import Telemetry
+from rti_mpc.contract.status import Mode
+from rti_mpc.wire.info import Info
+
+TOUCHING = 1e-4  # distance from a bound at which it acts, relative to half of what its signal ranges over
+FREE, LATER = "free", " later"
+LEVELS, RATES, TOUCHED = ("lower", "upper"), ("falls", "rises"), "touched"
+SIDES = (*LEVELS, *RATES)
+NOW = (TOUCHED, *(", ".join(some) for count in range(1, 5) for some in combinations(SIDES, count)))  # what may act at the first stage
+PLANNED = (Mode.TRACKING, Mode.HOLDING)
+ACTING = (*NOW, *(f"{words}{LATER}" for words in NOW))
+
+
+def is_plan(sample: Telemetry) -> bool:
+    """Whether a sample has a plan of its own."""
+    return sample.mode in PLANNED and 0 < len(sample.u) == len(sample.y_ref) == len(sample.x) - 1
+
+
+def cost_terms(info: Info, sample: Telemetry, u_before: Array | None) -> dict[str, float]:
+    r"""
+    Split the cost of a plan.
+
+    Args:
+        info: Description with weights and with the state that each output is.
+        sample: With a plan of its own.
+        u_before: Inputs that acted before the plan, shape ``(nu,)``; None: not known.
+
+    Returns:
+        ``error/NAME`` of each output that is a state, :math:`\sum_i \delta_i e_i (Q e)_i`; ``changes/NAME`` of each input, likewise
+        with :math:`\lambda`, R and the increments; and ``rest``: what remains of the cost, which is that of softened bounds, the
+        terminal weight, inputs themselves and other outputs. Empty without weights.
+    """
+    if info.weights is None or len(info.weights.delta) != (N := len(sample.u)) or len(info.weights.lambda_) > N:
+        return {}
+    w = info.weights
+    outputs, states = ([pair[k] for pair in info.tracked] for k in (0, 1))
+    error = np.zeros((N, len(info.outputs)))
+    error[:, outputs] = sample.x[1:, states] - sample.y_ref[:, outputs]
+    change = np.diff(sample.u, axis=0, prepend=sample.u[:1] if u_before is None else u_before[None])
+    lambda_ = np.resize(np.array(w.lambda_), N)  # no input changes after the control horizon
+    by_output = (np.array(w.delta)[:, None] * error * (error @ np.array(w.Q))).sum(axis=0)
+    by_input = (lambda_[:, None] * change * (change @ np.array(w.R))).sum(axis=0)
+    terms = {f"error/{info.outputs[i].name}": float(by_output[i]) for i in outputs}
+    terms |= {f"changes/{label.name}": float(value) for label, value in zip(info.inputs, by_input, strict=True)}
+    return {**terms, "rest": sample.cost - sum(terms.values())}
+
+
+def acting_bounds(info: Info, sample: Telemetry, u_before: Array | None, discs: tuple[Array, ...] = ()) -> dict[str, str]:
+    """
+    Say which bounds a plan touches.
+
+    Args:
+        info: Description with the bounds.
+        sample: With a plan of its own.
+        u_before: Inputs that acted before the plan, shape ``(nu,)``; None: not known.
+        discs: Distance of the position to the edge of each obstacle at nodes 1 to N, each of shape ``(N,)``, in m.
+
+    Returns:
+        By name of every bounded signal, and of every obstacle: the sides that act at the first stage; else those that act at a later one,
+        followed by `LATER`; else `FREE`.
+    """
+    rates = np.diff(sample.u, axis=0, prepend=sample.u[:1] if u_before is None else u_before[None])
+    along: dict[str, list[tuple[str, NDArray[np.bool_]]]] = {}
+    for labels, values, lower, upper, sides in (
+        (info.states, sample.x[1:], info.lbx, info.ubx, LEVELS),
+        (info.inputs, sample.u, info.lbu, info.ubu, LEVELS),
+        (info.inputs, rates, info.lbdu, info.ubdu, RATES),
+    ):
+        for j, label in enumerate(labels):
+            along.setdefault(label.name, []).extend(_touched(values[:, j], lower[j], upper[j], sides))
+    for i, away in enumerate(discs):
+        along[f"obstacle_{i}"] = [(TOUCHED, away <= TOUCHING)]
+    return {name: _said(sides) for name, sides in along.items() if sides}
+
+
+def _touched(values: Array, lower: float, upper: float, sides: tuple[str, str]) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Yield each of the two sides with the stages at which it acts, unless there is no bound there."""
+    half = 0.5 * (upper - lower)
+    for side, bound, sign in zip(sides, (lower, upper), (-1.0, 1.0), strict=True):
+        if np.isfinite(bound):
+            yield side, sign * (values - bound) >= -TOUCHING * (half if np.isfinite(half) else max(1.0, abs(bound)))
+
+
+def _said(sides: list[tuple[str, NDArray[np.bool_]]]) -> str:
+    now = ", ".join(side for side, acts in sides if acts[0])
+    later = ", ".join(side for side, acts in sides if acts.any())
+    return now or (later and later + LATER) or FREE

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cost by term and acting bounds, told from messages, against what the controller itself holds."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rti_mpc.contract.message import Telemetry
+from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.rti.rti import Rti
+from rti_mpc.wire.info import Info
+from rti_mpc_service.config.build import build_rti
+from rti_mpc_service.config.config import load
+from rti_mpc_service.config.schema import Config
+from rti_mpc_service.controller.description import controller_info
+from rti_mpc_service.replay import plan as held
+from rti_mpc_service.shipped import ROBOTS
+from rti_mpc_service.view.plan import acting_bounds, cost_terms, is_plan
+
+NEAR, FAR = 0.02, 2.0  # m, of the reference from the robot; far: it drives as fast as it may
+
+
+@pytest.fixture(scope="module")
+def pioneer() -> tuple[Config, Rti]:
+    config = load(ROBOTS["pioneer_3dx"])
+    return config, build_rti(config)
+
+
+def solved(rti: Rti, away_m: float) -> Telemetry:
+    """Telemetry of a plan towards a point ahead of a resting robot."""
+    ocp = rti.ocp
+    x0, y_ref = np.zeros(ocp.model.nx), np.zeros((ocp.N, ocp.model.ny))
+    y_ref[:, 0] = away_m
+    rti.reset(x0, np.zeros(ocp.model.nu))
+    for _ in range(8):
+        rti.prepare(y_ref, np.tile(ocp.model.p_nominal, (ocp.N + 1, 1)), shift=False)
+        rti.feedback(x0)
+    u = rti.u[np.minimum(np.arange(ocp.N), len(rti.u) - 1)].copy()
+    stamps, numbers = (1, 1, 0, 1, 0), (1, 0.0, 0.0, rti.cost, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0)
+    return Telemetry(*stamps, Mode.TRACKING, QpStatus.SOLVED, *numbers, x0, rti.x.copy(), u, y_ref)
+
+
+def info_of(rti: Rti) -> Info:
+    document = {"role": "controller", **controller_info(rti.ocp, rti.ocp.model.np_)}
+    return Info.from_json(json.loads(json.dumps(document)))
+
+
+@pytest.mark.parametrize("away_m", [NEAR, FAR])
+def test_the_terms_of_a_cost_are_those_of_the_controller(pioneer: tuple[Config, Rti], away_m: float) -> None:
+    config, rti = pioneer
+    sample = solved(rti, away_m)
+    terms, known = cost_terms(info_of(rti), sample, rti.u_prev), held.cost_terms(rti, config)
+    told = {path.replace("/", " of "): value for path, value in terms.items() if "/" in path}
+    assert known, "there is a cost"
+    for name, value in known.items():
+        if name in told:
+            assert told[name] == pytest.approx(value, rel=1e-9), name
+    rest = sum(value for name, value in known.items() if name not in told)
+    assert sum(terms.values()) == pytest.approx(sample.cost, rel=1e-9)
+    assert terms["rest"] == pytest.approx(rest, abs=1e-9 * sample.cost)  # of rounding in the sum
+
+
+def test_the_bounds_that_act_are_those_of_the_controller(pioneer: tuple[Config, Rti]) -> None:
+    config, rti = pioneer
+    for away_m in (NEAR, FAR):
+        sample = solved(rti, away_m)
+        expected: dict[str, set[str]] = {}
+        for bound in held.acting_bounds(rti, config):
+            side = {"upper": "rises", "lower": "falls"}[bound["side"]] if bound["kind"] == "increment" else bound["side"]
+            expected.setdefault(bound["name"], set()).add(side)
+        said = acting_bounds(info_of(rti), sample, rti.u_prev)
+        acting = {name: words for name, words in said.items() if words != "free"}
+        assert acting.keys() == expected.keys()
+        for name, words in acting.items():
+            assert set(words.removesuffix(" later").split(", ")) <= expected[name]
+    assert said["u_c"] != "free", "the far reference is driven to as fast as allowed"
+
+
+def test_a_bound_acts_now_or_later_in_the_plan(pioneer: tuple[Config, Rti]) -> None:
+    _, rti = pioneer
+    info, sample = info_of(rti), solved(rti, NEAR)
+    u = np.zeros_like(sample.u)
+    u[3, 0] = info.ubu[0]
+    wide = replace(info, lbdu=(-np.inf,) * 2, ubdu=(np.inf,) * 2)
+    assert acting_bounds(wide, replace(sample, u=u), None)["u_c"] == "upper later"
+    u[0, 0] = info.lbu[0]
+    assert acting_bounds(wide, replace(sample, u=u), None)["u_c"] == "lower"
+    assert acting_bounds(wide, replace(sample, u=u), None)["omega_c"] == "free"
+    away = np.array([0.3, 0.0])
+    assert acting_bounds(wide, sample, None, (away,))["obstacle_0"] == "touched later"
+
+
+def test_a_sample_without_a_plan_has_no_terms(pioneer: tuple[Config, Rti]) -> None:
+    _, rti = pioneer
+    sample = solved(rti, NEAR)
+    assert is_plan(sample)
+    assert not is_plan(replace(sample, mode=Mode.BRAKING))
+    assert not is_plan(replace(sample, y_ref=sample.y_ref[:-1]))
+    assert cost_terms(replace(info_of(rti), weights=None), sample, None) == {}
+
+
+def test_a_path_s_window_is_where_the_path_is() -> None:
+    from rti_mpc.model.path_following import path_following, window_place
+    from rti_mpc.model.robots.unicycle import unicycle
+    from rti_mpc.reference.path_source import PathSource
+    from rti_mpc.reference.tracks import track
+    from rti_mpc_service.view.path_window import path_window
+
+    model, path = path_following(unicycle()), track("hairpin")
+    place = window_place(model)
+    assert place is not None
+    source = PathSource([path], model.p_nominal, *place)
+    edges = path_window(source.parameters(2.0, 1.0), *place)
+    s = np.linspace(0.0, path.length, 4000)
+    centre = path.position(s)
+    away = np.array([np.hypot(*(centre - point).T).min() for point in edges[0]])
+    assert away.max() < 0.02  # m: a spline through control points of the same path, and 4000 points of it
+    widths = [np.hypot(*(edge - edges[0]).T) for edge in edges[1:]]
+    assert [width.min() > 0.1 for width in widths] == [True, True]
+    (along_x, along_y), (left_x, left_y) = np.diff(edges[0], axis=0).T, (edges[2] - edges[0])[:-1].T
+    assert (along_x * left_y - along_y * left_x > 0.0).all(), "the left edge is to the left"
