@@ -21,6 +21,7 @@ from rti_mpc_service.config.schema import Config
 from rti_mpc_service.rig.scenario import configured
 from rti_mpc_service.rig.summary import TRANSIENT_S
 from rti_mpc_service.scenario import find_scenario
+from rti_mpc_service.tune.recorded import is_recording, recorded
 from rti_mpc_service.tune.varied import with_values
 
 DEFAULT_SEED = 1  # of noise and dropout, as of `rti_mpc_sim.settings.RobotSettings`
@@ -50,12 +51,13 @@ class Course:
     A scenario by its options, as on the command line; see `rti_mpc_service.scenario.find_scenario`.
 
     Attributes:
-        name: A scenario or a CSV file; None: the robot's own.
+        name: A scenario, a CSV file or a recording; None: the robot's own.
         heading: Of a path.
         duration_s: How long it is followed.
         speed_m_s: Along waypoints.
         smooth_m: Path that waypoints are averaged over.
         seed: Added to the seed of noise and dropout.
+        part: Of a recording, begin and end as fractions of what was followed without a break.
     """
 
     name: str | None = None
@@ -64,6 +66,7 @@ class Course:
     speed_m_s: float = 0.25
     smooth_m: float | None = None
     seed: int = 0
+    part: tuple[float, float] = (0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,12 @@ class ClosedLoop:
     """
 
     def __init__(self, config: Config, course: Course, make_body: MakeBody) -> None:
-        self.scenario = find_scenario(config, course.name, course.heading, course.duration_s, course.speed_m_s, course.smooth_m)
+        if course.name is not None and is_recording(course.name):
+            if course.heading is not None:
+                raise ConfigError(f"--heading is of paths in the plane, it must be left out for {course.name}, got {course.heading}")
+            config, self.scenario = recorded(config, course.name, course.part, course.duration_s)
+        else:
+            self.scenario = find_scenario(config, course.name, course.heading, course.duration_s, course.speed_m_s, course.smooth_m)
         placed = configured(config, self.scenario)
         seed = DEFAULT_SEED if placed.sim.seed is None else placed.sim.seed
         sim = placed.sim.model_copy(update={"seed": seed + course.seed})

@@ -29,6 +29,7 @@ from rti_mpc_service.tune.choice import beats, choose, front
 from rti_mpc_service.tune.closed_loop import ClosedLoop, Course, Driven, MakeBody
 from rti_mpc_service.tune.edit import commented, edited
 from rti_mpc_service.tune.figure import figure
+from rti_mpc_service.tune.recorded import is_recording
 from rti_mpc_service.tune.study import STUDIED, Tried, finished, name_of, open_study, run, tried
 from rti_mpc_service.tune.varied import Varied, find_varied, with_values
 from rti_mpc_service.tune.workers import workers
@@ -59,7 +60,7 @@ def main(
     Args:
         path: The robot's file.
         course: Scenario of the study.
-        held_out: Scenario that decides, with the same options; None: another one of the same kind.
+        held_out: Scenario that decides, with the same options; None: another one of the same kind, or the second half of a recording.
         make_body: Maker of the simulated robot.
         vary: Each ``KEY`` or ``KEY=LOW:HIGH``.
         trials: Number of trials that the study is to have.
@@ -80,7 +81,7 @@ def main(
     course = replace(course, name=course.name or config.reference.scenario)
     model = build_model(config)
     varied = find_varied(config, model, vary)
-    other = replace(course, name=held_out or default_held_out(course.name, planar=in_plane(model.outputs)), seed=course.seed + 1)
+    course, other = parted(course, held_out, planar=in_plane(model.outputs))
     build_rti(config)  # shows that it compiles
     courses = {STUDIED: course, HELD_OUT: other}
     loops = {name: ClosedLoop(config, each, make_body) for name, each in courses.items()}
@@ -161,6 +162,13 @@ def written_to(path: Path, config: Config, out: Path | None) -> Path:
     if not out.resolve().parent.is_dir():
         raise ConfigError(f"--out must be in a folder that exists, got {out}")
     return out
+
+
+def parted(course: Course, held_out: str | None, *, planar: bool) -> tuple[Course, Course]:
+    """Return the course of the study and the held-out one, with other noise: of a recording its first and second half if none was asked for."""
+    if is_recording(course.name) and held_out in (None, course.name):
+        return replace(course, part=(0.0, 0.5)), replace(course, part=(0.5, 1.0), seed=course.seed + 1)
+    return course, replace(course, name=held_out or default_held_out(course.name, planar=planar), seed=course.seed + 1)
 
 
 def default_held_out(studied: str | None, *, planar: bool) -> str:
