@@ -300,16 +300,16 @@ def view(
     rerun_web_port: Annotated[int, typer.Option(metavar="PORT", min=1, max=65535, help="Port of this page.")] = 9090,
 ) -> int:
     """Draw the robot live in Rerun, or record it; or draw a recording."""
-    from rti_mpc_service.view.view import Places, main, show
+    from rti_mpc_service.view.view import Screens, main, show
 
-    places = Places(rerun_spawn, rerun_connect, rerun_save, rerun_memory_limit, rerun_web_port if web else None)
+    screens = Screens(rerun_spawn, rerun_connect, rerun_save, rerun_memory_limit, rerun_web_port if web else None)
     if not words:
-        return main(bus, config.keys(), places, robots=robot or ())
+        return main(bus, config.keys(), screens, robots=robot or ())
     if len(words) > 1:
         raise ConfigError(f"view draws one recording, got {' '.join(words)}")
     if robot:
         raise ConfigError("--robot is for live robots: all those of a recording are drawn")
-    return show(Path(words[0]), places)
+    return show(Path(words[0]), screens)
 
 
 @partial(process, with_model=False)

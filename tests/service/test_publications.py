@@ -86,7 +86,7 @@ def test_viewer_publishes_what_the_table_lets_it(session: FakeSession, tmp_path:
     pytest.importorskip("rerun")
     from rti_mpc_service.view import view
 
-    view.main(SETTINGS, KEYS, view.Places(rerun_save=tmp_path / "run.rrd"), stop=STOPPED)
+    view.main(SETTINGS, KEYS, view.Screens(rerun_save=tmp_path / "run.rrd"), stop=STOPPED)
     assert session.said == may("viewer")
 
 

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Places:
+class Screens:
     """
     Where to draw; in a spawned viewer if neither a viewer, nor a file, nor a page is given.
 
@@ -68,14 +68,14 @@ class Places:
         return self.spawned or self.rerun_connect is not None or self.web_port is not None
 
 
-def main(bus_settings: BusSettings, keys: Keys, places: Places, *, robots: Sequence[str] = (), stop: Event | None = None) -> int:
+def main(bus_settings: BusSettings, keys: Keys, screens: Screens, *, robots: Sequence[str] = (), stop: Event | None = None) -> int:
     """
     Draw a robot until stopped.
 
     Args:
         bus_settings: How to join the bus.
         keys: Where the robot's streams are.
-        places: Where to draw.
+        screens: Where to draw.
         robots: Names of several robots below the same prefix, to draw in one view instead.
         stop: Event that stops the process; None: SIGINT and SIGTERM do.
 
@@ -85,7 +85,7 @@ def main(bus_settings: BusSettings, keys: Keys, places: Places, *, robots: Seque
     Raises:
         ConfigError: An address or a file is not valid.
     """
-    url = places.url
+    url = screens.url
     stop = stop or stop_on_signals()
     with Bus.join(bus_settings, keys, stop=stop, say=log.warning) as bus:
         names = [*robots] or [keys.robot]
@@ -98,12 +98,12 @@ def main(bus_settings: BusSettings, keys: Keys, places: Places, *, robots: Seque
         for one in buses:
             one.alive(ROLE)
         title = " and ".join(names)
-        outlets = [file_outlet(places.rerun_save, title, roots)] if places.rerun_save is not None else []
-        spawned = spawn_viewer(url, places.rerun_memory_limit) if places.spawned else None
-        server = None if places.web_port is None else serve_page(url, places.web_port, places.rerun_memory_limit)
-        if places.web_port is not None:
-            log.info("open %s", page(url, places.web_port))
-        if places.shown:
+        outlets = [file_outlet(screens.rerun_save, title, roots)] if screens.rerun_save is not None else []
+        spawned = spawn_viewer(url, screens.rerun_memory_limit) if screens.spawned else None
+        server = None if screens.web_port is None else serve_page(url, screens.web_port, screens.rerun_memory_limit)
+        if screens.web_port is not None:
+            log.info("open %s", page(url, screens.web_port))
+        if screens.shown:
             outlets.append(viewer_outlet(url, title, roots))
         log.info("listening to %s", " and ".join(one.keys.below("*") for one in buses))
         announcer = Announcer(buses[0], ROLE, time.time_ns() // 1_000_000_000)
@@ -116,7 +116,7 @@ def main(bus_settings: BusSettings, keys: Keys, places: Places, *, robots: Seque
         end_page(server)
     for notice in notices(outlets):
         log.error("%s", notice.text)
-    return 0 if places.rerun_save is None or complete[0] else 1
+    return 0 if screens.rerun_save is None or complete[0] else 1
 
 
 def pump(
@@ -148,13 +148,13 @@ def notices(outlets: Sequence[Outlet]) -> list[Notice]:
     return [outlet.notices.popleft() for outlet in outlets for _ in range(len(outlet.notices))]
 
 
-def show(path: Path, places: Places, *, stop: Event | None = None) -> int:
+def show(path: Path, screens: Screens, *, stop: Event | None = None) -> int:
     """
     Draw a recording whole, where `main` draws a robot live, and return the exit status; serve a page until stopped.
 
     Args:
         path: The recording, or the folder of its segments.
-        places: Where to draw.
+        screens: Where to draw.
         stop: As in `main`.
 
     Raises:
@@ -162,20 +162,20 @@ def show(path: Path, places: Places, *, stop: Event | None = None) -> int:
     """
     from rti_mpc_service.view.show import draw_in_viewer, draw_into_file, opened  # needs the extra `record`
 
-    recording, url = opened(path), places.url
-    if places.rerun_save is not None:
-        draw_into_file(recording, places.rerun_save)
-    if not places.shown:
+    recording, url = opened(path), screens.url
+    if screens.rerun_save is not None:
+        draw_into_file(recording, screens.rerun_save)
+    if not screens.shown:
         return 0
     stop = stop or stop_on_signals()
-    server = None if places.web_port is None else serve_page(url, places.web_port, places.rerun_memory_limit)
-    if server is None and places.rerun_connect is None:
-        spawn_viewer(url, places.rerun_memory_limit)
+    server = None if screens.web_port is None else serve_page(url, screens.web_port, screens.rerun_memory_limit)
+    if server is None and screens.rerun_connect is None:
+        spawn_viewer(url, screens.rerun_memory_limit)
     try:
         reached(url, stop)
         draw_in_viewer(recording, path.stem, url)
-        if places.web_port is not None:
-            log.info("open %s", page(url, places.web_port))
+        if screens.web_port is not None:
+            log.info("open %s", page(url, screens.web_port))
             stop.wait()
     finally:
         if server is not None:
