@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Isolation of the controller from viewers: one that hangs, one that stops, or one whose disk is full delays no sample.
+Isolation of the controller from those who watch: a viewer that hangs, one that stops, one whose disk is full, and a recorder delay no sample.
 
 Real processes, 100 samples per second in real time, in rounds of blocks in random
 order. Each trouble begins with its block and is compared with the block of the
@@ -43,12 +43,16 @@ TROUBLES: dict[str, Callable[[int], object]] = {
     "stopped": lambda pid: os.kill(pid, signal.SIGINT),
     "full disk": lambda pid: resource.prlimit(pid, resource.RLIMIT_FSIZE, (1, 1)),
 }
-BLOCKS = ("alone", "alone again", *TROUBLES)
+BLOCKS = ("alone", "alone again")
 COMPARED = {"hung": "alone", "stopped": "alone", "full disk": "watched"}
+RECORDED = "recorded"
+RECORDS_B = 100_000  # size of a recording whose first chunks, with the attachments, are written
 
 
 def block(robot: Driven, name: str) -> list[Telemetry]:
-    """Samples from the beginning of a trouble on, or of a time without a viewer."""
+    """Samples from the beginning of a trouble on, of a time in which a recorder writes, or of one in which nobody watches."""
+    if name == RECORDED:
+        return recorded(robot)
     if name not in TROUBLES:
         return robot.samples(BLOCK_SAMPLES)
     recording = robot.folder / "run.rrd"
@@ -65,32 +69,56 @@ def block(robot: Driven, name: str) -> list[Telemetry]:
     return samples
 
 
+def recorded(robot: Driven) -> list[Telemetry]:
+    """Samples while a recorder writes all streams and the journal."""
+    recording = robot.folder / "run.mcap"
+    recording.unlink(missing_ok=True)
+    robot.children.start("recorder", "rti_mpc_service.cli", "record", robot.toml, "-e", robot.endpoint, "--out", recording, nice=10)
+    until(lambda: "recorder" in robot.lives and recording.exists() and recording.stat().st_size > RECORDS_B, "it records", patience_s=30.0)
+    robot.listen()
+    size = recording.stat().st_size
+    samples = robot.samples(BLOCK_SAMPLES)
+    assert recording.stat().st_size > size, "it has gone on"
+    robot.children.end("recorder")
+    until(lambda: "recorder" not in robot.lives, "the recorder is gone")
+    return samples
+
+
 def test_no_trouble_of_a_viewer_can_be_told_from_the_noise_of_the_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told_from_noise(tmp_path, capsys, (*BLOCKS, *TROUBLES), COMPARED)
+
+
+def test_a_recorder_cannot_be_told_from_the_noise_of_the_machine(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    told_from_noise(tmp_path, capsys, (*BLOCKS, RECORDED), {RECORDED: "alone"})
+
+
+def told_from_noise(tmp_path: Path, capsys: pytest.CaptureFixture[str], names: tuple[str, ...], against: dict[str, str]) -> None:
+    """Drive a robot in rounds of these blocks, print their times, and compare some with the block of the same round that each is set against."""
     rng = np.random.default_rng(1)
-    blocks: dict[str, list[list[Telemetry]]] = {name: [] for name in BLOCKS}
+    blocks: dict[str, list[list[Telemetry]]] = {name: [] for name in names}
     with driven(tmp_path, DT_S, duration_s=3600.0, realtime=REALTIME) as robot:
         robot.samples(COLD_SAMPLES)
         for _ in range(ROUNDS):
-            for name in rng.permutation(BLOCKS).tolist():
+            for name in rng.permutation(names).tolist():
                 blocks[name].append(block(robot, name))
         for name in ("controller", "robot", "reference"):
             assert robot.children.end(name) == 0
         log, said = robot.log(), (tmp_path / "controller.log").read_text()
     granted = next(line for line in said.splitlines() if "real time: " in line)
     answered_us = dict(zip(log.seq.tolist(), log.latency_us.tolist(), strict=True))
-    inside = {name: np.array([[sample.latency_us for sample in one] for one in blocks[name]]) for name in BLOCKS}
-    outside = {name: np.array([[answered_us[sample.state_seq] for sample in one] for one in blocks[name]]) for name in BLOCKS}
+    inside = {name: np.array([[sample.latency_us for sample in one] for one in blocks[name]]) for name in names}
+    outside = {name: np.array([[answered_us[sample.state_seq] for sample in one] for one in blocks[name]]) for name in names}
     with capsys.disabled():
-        print(f"\n{machine.machine_info()}\n{ROUNDS} rounds of {len(BLOCKS)} blocks of {BLOCK_SAMPLES} samples, {granted}")
+        print(f"\n{machine.machine_info()}\n{ROUNDS} rounds of {len(names)} blocks of {BLOCK_SAMPLES} samples, {granted}")
         for what, times in {"state in to command out": inside, "state sent to command received, at the robot": outside}.items():
             p99, spread = compared(times)
             print(f"{what}; two equal blocks differ in p99 by {spread:.1%}")
-            for name in BLOCKS:
-                beside = COMPARED.get(name, "alone")
+            for name in names:
+                beside = against.get(name, "alone")
                 print(f"  {name:12} {quantiles(times[name])}, p99 {ratio(p99, name, beside):.3f} of {beside} in the same round")
     if not SHORT:  # of two rounds there is no spread to compare with
         p99, spread = compared(inside)
-        for name, beside in COMPARED.items():
+        for name, beside in against.items():
             assert ratio(p99, name, beside) <= 1.0 + max(0.05, spread), name
 
 
