@@ -279,8 +279,9 @@ class RerunRecording:
                         sides[name].append((time_ns, side))
         for name, points in terms.items():
             self._scalars(f"cost/{name}", np.array([t for t, _ in points], np.int64), np.array([value for _, value in points]))
+        inputs = [label.name for label in self.info.inputs]
         for name, said in sides.items():
-            if f"bound/{name}" in self._lanes or any(side != FREE for _, side in said):  # what never acts needs no lane
+            if name in inputs or f"bound/{name}" in self._lanes or any(side != FREE for _, side in said):  # else what never acts needs no lane
                 self._lane(name, np.array([t for t, _ in said], np.int64), [side for _, side in said], "bound")
 
     def _distances(self, sample: Telemetry) -> tuple[Array, ...]:

@@ -294,15 +294,17 @@ def test_absurd_numbers_are_written_or_left_out_and_what_is_honest_stays(writer:
     assert [row for row in rows["state/y"] if abs(row[1][0]) < 10.0 and row[1][0] > 1e-3] == [(1.0, [2.0]), (12.0, [4.0])]
 
 
-def test_bounds_have_lanes_from_when_they_act_on_and_parameters_from_their_first_change(writer: Writer) -> None:
-    limits = {"lbdu": [None, None], "ubdu": [None, None]}
+def test_bounds_of_inputs_have_lanes_others_from_when_they_act_on_and_parameters_from_their_first_change(writer: Writer) -> None:
+    limits = {"lbx": [None] * 5, "ubx": [None, None, None, 3.0, 9.0]}
     fast = {k: np.array([[0.5 if k == 2 else 0.1, 0.0]] * 3) for k in range(4)}
     writer.send(described("controller", STATES, INPUTS, STATES[:3], **LIMITS, **limits))
-    writer.send(*(replace(telemetry(k), u=fast[k], parameter_version=k // 3) for k in range(2)))
-    writer.send(*(replace(telemetry(k), u=fast[k], parameter_version=k // 3) for k in (2, 3)))
+    speeds = {k: np.array([[0.0, 0.0, 0.0, 0.0 if i < 3 or k != 2 else 3.0, 0.0] for i in range(4)]) for k in range(4)}
+    writer.send(*(replace(telemetry(k), x=speeds[k], u=fast[k], parameter_version=k // 3) for k in range(2)))
+    writer.send(*(replace(telemetry(k), x=speeds[k], u=fast[k], parameter_version=k // 3) for k in (2, 3)))
     rows = writer.read()
-    assert rows["bound/u_c"] == [(2.0, ["upper"]), (3.0, ["free"])]
-    assert "bound/omega_c" not in rows
+    assert rows["bound/u_c"] == [(0.0, ["free"]), (2.0, ["upper"]), (3.0, ["free"])]
+    assert rows["bound/u"] == [(2.0, ["upper later"]), (3.0, ["free"])], "a state, from when it acts on"
+    assert "bound/omega" not in rows
     assert rows["lane/parameters"] == [(2.0, ["version 0"]), (3.0, ["version 1"])]
 
 
