@@ -170,6 +170,11 @@ class Replay:
             self._proposal = result
         return None
 
+    @property
+    def proposal(self) -> Command | None:
+        """The command that the controller has proposed last, and that is not committed yet."""
+        return self._proposal
+
     def _inject(self, failure: str, samples: int) -> None:
         inject = getattr(self._rti, "inject", None)
         if inject is None:

@@ -31,6 +31,7 @@ from rti_mpc_service.config.build import build_model, build_signals, bus_setting
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.config.signals_file import check_against
+from rti_mpc_service.replay.commands import cases
 from rti_mpc_service.shipped import ROBOTS, robot_file
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 app.add_typer(certs, name="certs")
+app.add_typer(cases)
 
 
 def print_version(wanted: bool) -> None:
@@ -384,6 +386,7 @@ def why(
     at: Annotated[str | None, typer.Option("--at", metavar="TIME", help="Time after the first command, such as 72.5s.")] = None,
     seq: Annotated[int | None, typer.Option("--seq", metavar="NUMBER", help="Number of the command instead.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    case: Annotated[Path | None, typer.Option(metavar="FILE.npz", help="Also write the sample's QP as a case, for `rti-mpc solve-case`.")] = None,
     robot: RecordedRobot = None,
     owner: Owner = None,
     folder: ModelFolder = Path(),
@@ -394,7 +397,8 @@ def why(
     from rti_mpc_service.replay.why import main
 
     at_s = None if at is None else parse_start(at)
-    raise typer.Exit(main(recording, at_s=at_s, seq=seq, robot=robot, owner=owner, folder=folder, trust=trust, as_json=as_json))
+    choice: dict[str, Any] = {"robot": robot, "owner": owner, "folder": folder, "trust": trust}
+    raise typer.Exit(main(recording, at_s=at_s, seq=seq, as_json=as_json, case_path=case, **choice))
 
 
 @partial(process, with_model=False)

@@ -36,6 +36,8 @@ SOLVER_TOLERANCES: dict[str, dict[str, Any]] = {
     "proxqp": {"eps_abs": 1e-10, "eps_rel": 0.0},
 }
 
+OSQP_TIGHT: dict[str, Any] = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100_000}
+
 
 class ForeignSolver:
     """
@@ -134,6 +136,33 @@ def check_name(name: str) -> None:
             f"solver must be riccati, osqp, or one that is installed, {', '.join(here)}, got {name!r}; "
             f"pip install 'qpsolvers[NAME]' brings {', '.join(others)}"
         )
+
+
+def solve_once(qp: QpData, name: str) -> tuple[QpStatus, int, Array, float]:
+    """
+    Let a solver solve a QP as it is, off the hot path, OSQP of qpsolvers to a tolerance of 1e-9 included.
+
+    Returns:
+        Status; iterations, 0 if it does not report them; solution, shape ``(n,)``, empty without one; and dual residual, NaN without multipliers.
+
+    Raises:
+        OcpError: The solver raised.
+    """
+    import qpsolvers
+
+    problem: Any = qp.to_problem()
+    if name not in qpsolvers.sparse_solvers:
+        problem.P, problem.G, problem.A = (matrix.toarray() for matrix in (problem.P, problem.G, problem.A))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # warnings of a failed solve: the status says the same
+        try:
+            found = qpsolvers.solve_problem(problem, name, **(OSQP_TIGHT if name == "osqp" else SOLVER_TOLERANCES.get(name, {})))
+        except Exception as error:  # a foreign solver may raise anything
+            raise OcpError(f"solver {name} must be able to solve, it raised {type(error).__name__}: {str(error).partition(chr(10))[0]}") from error
+    status = outcome(found)
+    if not status.usable:
+        return status, iterations(found), np.zeros(0), float("nan")
+    return status, iterations(found), np.asarray(found.x), residuals(problem, found)[1]
 
 
 def outcome(solution: qpsolvers.Solution) -> QpStatus:

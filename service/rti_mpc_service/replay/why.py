@@ -26,9 +26,11 @@ from rti_mpc.journal.entry import JournalEntry, decode_entries
 from rti_mpc.journal.replay import Difference, Replay, replay
 from rti_mpc.recording.reader import Recording
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS
-from rti_mpc.rti.qp.osqp import Solver
+from rti_mpc_service.replay.case import QpCase, take
 from rti_mpc_service.replay.plan import acting_bounds, cost_terms
 from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, journals, rebuild
+from rti_mpc_service.replay.trouble import about, solver_of
+from rti_mpc_service.replay.without import without
 
 LOOK_BACK_S = 10.0  # of the robot's time, over which the events before a command are told
 MAX_EVENTS = 8  # of those, the last ones
@@ -68,6 +70,7 @@ def main(
     folder: Path = Path(),
     trust: bool = False,
     as_json: bool = False,
+    case_path: Path | None = None,
 ) -> int:
     """
     Explain one command of a recording.
@@ -81,6 +84,7 @@ def main(
         folder: Where a model of the user's own is looked for.
         trust: Whether to run the attached source of a model.
         as_json: Whether to print JSON.
+        case_path: File for the sample's QP as a case; None: none.
 
     Returns:
         Exit status 0.
@@ -93,7 +97,11 @@ def main(
     for journal in journals(path, robot, owner):
         place = find(journal, at_s, seq)
         if place is not None:
-            facts = explain(journal, rebuild(journal, folder=folder, trust=trust), place)
+            facts, case = explained(journal, rebuild(journal, folder=folder, trust=trust), place)
+            if case_path is not None:
+                if case is None:
+                    raise ConfigError(f"--case needs a command whose sample had a QP, got command {place.command.seq}: {facts['rung']}")
+                case.save(case_path)
             facts["times"] = phase_times(path, journal, place.command)
             print(json.dumps(facts, indent=1) if as_json else "\n".join(lines(facts)))
             return 0
@@ -125,9 +133,20 @@ def explain(journal: Journaled, built: Rebuilt, place: Place) -> dict[str, Any]:
     Raises:
         ConfigError: No replay reaches it.
     """
+    return explained(journal, built, place)[0]
+
+
+def explained(journal: Journaled, built: Rebuilt, place: Place) -> tuple[dict[str, Any], QpCase | None]:
+    """
+    Return the facts about a command, and the QP of its sample, if it had one.
+
+    Raises:
+        ConfigError: No replay reaches it.
+    """
     controller, on = built.controller, Replay(built.controller, built.rti)
     told: deque[dict[str, Any]] = deque(maxlen=64)
     facts: dict[str, Any] = {}
+    case: QpCase | None = None
     stamp_ns, prepared = 0, 0
     for entry, difference in replay(on, journal.messages, snapshot_for(journal, place)):
         if entry.name == "receive_state":
@@ -136,6 +155,8 @@ def explain(journal: Journaled, built: Rebuilt, place: Place) -> dict[str, Any]:
         told.extend(event(code, text, stamp_ns) for code, text in said)
         if entry.seq == place.entry:
             facts = facts_of(built, on, place, entry, difference)
+            if facts["solver"] is not None:
+                case = take(built.rti, about(journal, built, place.command, "asked for"))
             facts["events"] = [one for one in told if place.command.stamp_ns - one["stamp_ns"] <= 1e9 * LOOK_BACK_S][-MAX_EVENTS:]
         elif facts and entry.name == "prepare":
             prepared += 1
@@ -144,7 +165,9 @@ def explain(journal: Journaled, built: Rebuilt, place: Place) -> dict[str, Any]:
     if not facts:
         raise ConfigError(f"command {place.command.seq} must follow a snapshot without a gap, got {[*map(str, on.outcome.gaps)] or 'none before it'}")
     facts["second_opinion"] = second_opinion(controller.telemetry(**NO_TIMES), place.command.seq)
-    return facts
+    for bound in facts["bounds"]:  # the replay has ended: the arrays of its controller are free
+        bound["without"] = None if case is None else without(case, built.rti, built.config, bound)
+    return facts, case
 
 
 NO_TIMES: dict[str, float] = {"prepare_us": 0.0, "feedback_us": 0.0, "latency_us": 0.0, "slack_s": 0.0}
@@ -207,14 +230,6 @@ def facts_of(built: Rebuilt, on: Replay, place: Place, entry: JournalEntry, diff
         "parameters": {"version": sample.parameter_version, "changed": changed},
         "disturbances": sample.d.tolist(),
     }
-
-
-def solver_of(rti: Any) -> str:
-    """Return the name of the solver of the last QP."""
-    if rti.solver is rti.active_set:
-        return "riccati"
-    whole = " with softened bounds" if rti.solver is rti.solvers[-1] and len(rti.solvers) > 1 else ""
-    return ("osqp" if isinstance(rti.solver, Solver) else "another solver") + whole
 
 
 def reference_of(built: Rebuilt, command: Command) -> dict[str, Any] | None:
@@ -321,6 +336,7 @@ def solved(facts: Mapping[str, Any]) -> Iterator[str]:
     yield "bounds that act:" if facts["bounds"] else "no bound acts"
     for bound in facts["bounds"]:
         yield f"  {bound_text(bound)}"
+        yield f"    {without_text(bound['without'], facts['inputs'])}"
 
 
 def count(number: int, what: str) -> str:
@@ -336,6 +352,14 @@ def bound_text(bound: Mapping[str, Any]) -> str:
         return f"{bound['name']} {way} as fast as it may, {value} per sample: stages {stages}"
     over = f", exceeded by {bound['violation']:.3g} {bound['unit']}" if bound["violation"] > ROUNDING * max(1.0, abs(bound["bound"])) else ""
     return f"{bound['name']} at its {bound['side']} bound, {value}: stages {stages}{over}"
+
+
+def without_text(planned: Mapping[str, float] | None, inputs: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return in words what would have been planned without a bound."""
+    if planned is None:
+        return "without it: no plan was found"
+    changed = [f"{name} = {value:.4g} {inputs[name]['unit']}" for name, value in planned.items() if f"{value:.4g}" != f"{inputs[name]['value']:.4g}"]
+    return f"without it: {', '.join(changed)}" if changed else "without it: the same command"
 
 
 def spans(stages: Sequence[int]) -> str:

@@ -9,13 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from rti_mpc.contract.message import End, Journal, Reference, State
+from rti_mpc.control.call import Call
 from rti_mpc.control.controller import Controller
 from rti_mpc.journal.book import Book
+from rti_mpc.recording.writer import RecordingWriter
 from rti_mpc.reference.trajectory import circle
 from rti_mpc.rti.rti import Rti
+from rti_mpc.wire.cdr import encode
+from rti_mpc.wire.keys import Keys
 from rti_mpc_service.config.build import build_controller, build_model, build_rti, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_stop
+from rti_mpc_service.injection import FaultyRti
 from rti_mpc_service.origin import origin_files
 from rti_mpc_service.replay.rebuild import Journaled
 from rti_mpc_sim.lockstep import Lockstep
@@ -81,3 +86,26 @@ def journal_of(
             book.photograph(now_ns)
         messages += book.messages(now_ns)
     return Journaled(config.robot, 5, messages, origin_files(config, build_model(config)))
+
+
+def failing(failure: str, samples: int) -> Act:
+    """Inject a failure, as the process does on request."""
+
+    def act(controller: Controller, rti: Rti) -> None:
+        assert isinstance(rti, FaultyRti)
+        rti.inject({"failure": failure, "samples": samples})
+        controller.on_call(Call("inject", (failure, samples), {}))
+
+    return act
+
+
+def recorded(journal: Journaled, path: Path) -> Path:
+    """Write a journal as a recorder does, with the attached files, and return the file."""
+    keys = Keys("rti_mpc", journal.robot)
+    writer = RecordingWriter(path, 0, 0, "0")
+    for name, text in journal.files.items():
+        writer.attach(f"{journal.robot}/{journal.owner}/{name}", "text/plain", text.encode(), 0)
+    for message in journal.messages:
+        writer.add(journal.robot, keys.journal, message.local_ns, encode(message), message.seq)
+    writer.finish({})
+    return path

@@ -15,7 +15,7 @@ from rti_mpc.contract.status import Mode
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
 from rti_mpc_service.replay.why import Place, explain, find, lines
-from tests.service.replay.driven import journal_of, straight
+from tests.service.replay.driven import failing, journal_of, straight
 
 INJECTED = SHIPPED.read_text() + "\n[debug]\ninject = true\n"
 
@@ -42,6 +42,8 @@ def test_bound_that_acts_is_named_with_its_stages_and_the_cost_is_told_by_term(t
     assert "command 1 of pioneer, at 0.100 s: TRACKING, u_c = 0.25 m/s" in text
     assert "u_c rises as fast as it may, 0.25 m/s per sample: stages 0 to 1" in text
     assert "u_c at its upper bound, 0.5 m/s: stages 1 to " in text
+    assert "without it: the same command" in text, "its upper bound begins to act after the command"
+    assert "without it: u_c = 0.5 m/s" in text, "it would have risen at once"
     assert "riccati: SOLVED in 1 iteration, 1 QP" in text
     assert "of half an input's range" in text
     assert "error of x 99 %" in text
@@ -71,14 +73,7 @@ def test_fallback_says_which_plan_goes_on_and_what_failed(tmp_path: Path) -> Non
     path = tmp_path / "robot.toml"
     path.write_text(INJECTED)
 
-    def fail(controller: Any, rti: Any) -> None:
-        request = {"failure": "qp", "samples": 2}
-        rti.inject(request)
-        from rti_mpc.control.call import Call
-
-        controller.on_call(Call("inject", ("qp", 2), {}))
-
-    journal = journal_of(path, samples=40, acts={20: fail})
+    journal = journal_of(path, samples=40, acts={20: failing("qp", 2)})
     text, _ = asked(journal, first(journal, lambda command: command.mode is Mode.FALLBACK), tmp_path)
     assert "rung 2 of the ladder: the previous plan, shifted" in text
     assert "its QP was infeasible" in text
@@ -96,6 +91,7 @@ def test_obstacle_that_blocks_is_named_with_the_nodes_at_which_it_acts(tmp_path:
     assert facts["blocked"], text
     assert "the way is blocked: an obstacle or constraint holds it" in text
     assert "disc_0 at its lower bound, 0 m: stages" in text
+    assert "without it: u_c = 0.25 m/s" in text
 
 
 def test_changed_parameters_are_told_with_the_values_of_both(tmp_path: Path) -> None:
