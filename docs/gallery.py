@@ -220,7 +220,10 @@ Here each follows its own scenario in lockstep, without clock and bus; errors ar
 
 Short programs in `examples/` use them: `race.py` laps three tracks, `quadrotor.py` flies to a point and back,
 `tuning.py` compares weights in a table,
-`obstacles.py` passes discs, `observer.py` estimates the current that the boat is in.
+`obstacles.py` passes discs, `observer.py` estimates the current that the boat is in, `own_planner.py` follows a walker
+whose way nobody knows, by a short reference twice a second:
+
+![A robot a second behind a walker](gallery/own_planner.png)
 
 | robot | states, inputs | period | horizon | at rest without feedback | error |
 | --- | --- | --- | --- | --- | --- |

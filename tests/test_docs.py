@@ -45,6 +45,14 @@ def test_tutorial_of_your_robot_runs_word_by_word(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_problem_of_the_comparison_is_solved_as_its_page_says(tmp_path: Path) -> None:
+    (ours,) = blocks("comparison.md", "python")
+    command = [sys.executable, "-c", ours]
+    done = subprocess.run(command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, timeout=120)
+    assert done.stdout == "0.9 mm off\n", done.stderr
+
+
+@pytest.mark.slow
 def test_tutorial_of_the_adapter_drives_the_robot_word_by_word(tmp_path: Path) -> None:
     """With another endpoint, since the default one may be in use."""
     endpoint = free_endpoint()

@@ -16,6 +16,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 MOST = {
     "observer": (r"([\d.]+) mm with it", 5.0),
     "obstacles": (r"([\d.]+) mm off in the end", 1.0),
+    "own_planner": (r"([\d.]+) mm off the walker", 20.0),
     "quadrotor": (r"([\d.]+) mm from where", 1.0),
     "race": (r"oval +([\d.]+) s", 13.5),
     "tuning": (r"R = 0\.0001 +[\d.]+ +([\d.]+)", 0.001),
