@@ -454,6 +454,14 @@ def params(
     return params(bus, config.keys(), words or ["get"], timeout)
 
 
+@partial(process, with_model=False)
+def snapshot(config: Config, bus: BusSettings, timeout: Timeout = 2.0) -> int:
+    """Ask the leading controller for a snapshot, from which a replay of its recording can begin."""
+    from rti_mpc_service.request import main
+
+    return main(bus, config.keys(), "snapshot", timeout)
+
+
 @app.command()
 def demo(
     config: ConfigPath = SHIPPED,

@@ -52,7 +52,7 @@ def test_journal_of_a_run_with_whatever_an_operator_and_a_link_do_replays_withou
         heard(system.bus.subscriber(system.keys.command), Command, lambda command: command.mode is Mode.BRAKING)
         system.running["robot"].send_signal(signal.SIGCONT)
         system.tracking()
-        ask(system, request="snapshot")
+        asked(system, "snapshot")
         system.kill("robot")
         system.start("robot")
         system.tracking()

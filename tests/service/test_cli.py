@@ -88,7 +88,7 @@ def test_outputs_that_no_path_fills_are_refused_by_name_in_the_terminal(command:
     sorted(
         set(COMMANDS)
         - OF_RECORDINGS
-        - {"bench", "certs", "enable", "guard", "init", "paper", "params", "record", "robots", "router", "schema", "status", "stop"}
+        - {"bench", "certs", "enable", "guard", "init", "paper", "params", "record", "robots", "router", "schema", "snapshot", "status", "stop"}
     ),
 )
 def test_model_that_cannot_be_imported_is_refused_by_every_process_that_loads_it_with_file_and_line(command: str, tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ ROLES_OF_COMMAND: dict[str, tuple[str, ...]] = {
     "stop": ("operator",),
     "enable": ("operator",),
     "params": ("operator",),
+    "snapshot": ("operator",),
 }
 MAX_NAME_CHARS = 64  # of a common name in a certificate
 

@@ -20,7 +20,8 @@ from typing import Any
 from rti_mpc.errors import MessageError
 from rti_mpc.wire import document
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, Subscriber
-from rti_mpc.wire.streams import PING, PONG, STREAMS, Kind, Stream
+from rti_mpc.wire.received import Received
+from rti_mpc.wire.streams import INFO, PING, PONG, STREAMS, Kind, Stream
 from rti_mpc_service.record.inbox import Arrived, Inbox
 
 HEARD: tuple[Stream[Any], ...] = tuple(stream for stream in STREAMS if stream.kind is Kind.MESSAGE and stream not in (PING, PONG))
@@ -30,8 +31,8 @@ MAX_BUNDLE_BYTES = 1 << 24  # of a controller's files
 log = logging.getLogger(__name__)
 
 
-def hear(bus: Bus, inbox: Inbox) -> None:
-    """Put all messages of a robot into an inbox, until the bus is closed."""
+def hear(bus: Bus, inbox: Inbox, describe: Callable[[str, Received], object]) -> None:
+    """Put all messages of a robot into an inbox, until the bus is closed, and hand over descriptions at once: who publishes one may soon be dead."""
     robot = bus.keys.robot
     for stream in HEARD:
         subscriber = bus.subscriber(bus.keys.of(stream, "*"), capacity=RING_MESSAGES)
@@ -39,6 +40,8 @@ def hear(bus: Bus, inbox: Inbox) -> None:
         def follow(subscriber: Subscriber = subscriber, stream: Stream[Any] = stream) -> None:
             while (received := subscriber.recv()) is not None:
                 inbox.put(Arrived(robot, stream, time.monotonic_ns(), received))
+                if stream is INFO:
+                    describe(robot, received)
 
         Thread(target=follow, name=f"{robot}/{stream.name}", daemon=True).start()
 

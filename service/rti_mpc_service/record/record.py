@@ -30,7 +30,8 @@ from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Key, Keys
-from rti_mpc.wire.streams import CONTROLLER_ROLES, INFO, JOURNAL, admitted, role_of
+from rti_mpc.wire.received import Received
+from rti_mpc.wire.streams import CONTROLLER_ROLES, JOURNAL, admitted, role_of
 from rti_mpc_service.announce import announce
 from rti_mpc_service.record.hearing import fetch_origin, hear
 from rti_mpc_service.record.inbox import Arrived, Inbox
@@ -131,7 +132,7 @@ class Recorder:
                 return
             self._buses[robot] = bus
             self._announcers.append(Announcer(bus, ROLE, time.time_ns() // 1_000_000_000))
-        hear(bus, self._inbox)
+        hear(bus, self._inbox, self._described)
         bus.alive(ROLE)
         bus.expect("message", lambda: any(entry[0].startswith(f"{bus.keys.prefix}/{robot}/") for entry in list(self._last)))
 
@@ -187,7 +188,7 @@ class Recorder:
             return
         if stream.message is None:
             try:
-                self._described(entry, document.read(received.payload, received.size))
+                document.read(received.payload, received.size)
             except MessageError:
                 self.counts["refused"] += 1
                 return
@@ -216,16 +217,19 @@ class Recorder:
             self.counts["missing"] += seq - last - 1
         self._last[key, epoch] = max(seq, last or 0)
 
-    def _described(self, entry: Arrived, info: Mapping[str, Any]) -> None:
-        """Ask a controller that has described itself for the first time for its files."""
-        role, epoch = role_of(entry.received.key).partition(".")[0], info.get("epoch")
-        if entry.stream is not INFO or role not in CONTROLLER_ROLES or type(epoch) is not int:
+    def _described(self, robot: str, received: Received) -> None:
+        """Ask a controller that has described itself for the first time for its files; in the thread that hears descriptions of this robot."""
+        try:
+            epoch = document.read(received.payload, received.size).get("epoch")
+        except MessageError:
+            return
+        if role_of(received.key).partition(".")[0] not in CONTROLLER_ROLES or type(epoch) is not int:
             return
         owner = epoch % (1 << NUMBER_BITS)
-        if (entry.robot, owner) in self._owners or len(self._owners) >= MAX_NUMBERED:
+        if (robot, owner) in self._owners or len(self._owners) >= MAX_NUMBERED:
             return
-        self._owners.add((entry.robot, owner))
-        fetch_origin(self._buses[entry.robot], owner, partial(self._give, f"{entry.robot}/{owner}"))
+        self._owners.add((robot, owner))
+        fetch_origin(self._buses[robot], owner, partial(self._give, f"{robot}/{owner}"))
 
     def _give(self, beginning: str, files: Mapping[str, str]) -> None:
         with self._lock:

@@ -9,9 +9,11 @@ import resource
 import zlib
 from pathlib import Path
 from threading import Event as Flag
+from typing import Any
 
 import pytest
 
+from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.errors import ConfigError
 from rti_mpc.recording import Recording
 from rti_mpc.wire.bus import Bus
@@ -21,6 +23,7 @@ from rti_mpc.wire.received import Received
 from rti_mpc_service.config.build import build_model
 from rti_mpc_service.config.config import load
 from rti_mpc_service.origin import Origin
+from rti_mpc_service.record import record
 from rti_mpc_service.record.inbox import ENTRY_BYTES, Arrived, Inbox
 from rti_mpc_service.record.record import EVERYTHING, Recorder, parse_retention
 from rti_mpc_service.record.segments import SEGMENTS, Retention, Segments
@@ -132,6 +135,33 @@ def test_size_of_all_segments_is_limited(tmp_path: Path) -> None:
         assert sum(file.stat().st_size for file in (tmp_path / "runs").iterdir()) <= limit
     bench.segments.writer.finish({})
     assert sum(file.stat().st_size for file in (tmp_path / "runs").iterdir()) > limit // 2
+
+
+class DescribedSession(FakeSession):
+    """A session on which one controller describes itself, once."""
+
+    def subscriber(self, key: Key[Any], capacity: int, *, history: bool, wakes: bool = False) -> Any:
+        subscriber = super().subscriber(key, capacity, history=history, wakes=wakes)
+        if key.stream is KEYS.info("controller").stream:
+            described = Received(json.dumps(INFO | {"epoch": (5 << NUMBER_BITS) + 9}).encode(), "application/json", KEYS.info("controller"))
+            waiting = iter([described])
+            subscriber.recv = lambda: next(waiting, None)
+        return subscriber
+
+
+def test_controller_is_asked_for_its_files_as_soon_as_it_describes_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not only when what has arrived is next written: it may be dead by then, and nobody else has its configuration."""
+    asked, done = list[int](), Flag()
+
+    def fetch(_: Bus, owner: int, __: object) -> None:
+        asked.append(owner)
+        done.set()
+
+    monkeypatch.setattr(record, "fetch_origin", fetch)
+    recorder = Recorder(Bus(DescribedSession(), KEYS), Segments(tmp_path / "run.mcap", EVERYTHING, START_NS, UNIX_OFFSET_NS))
+    recorder.follow(KEYS.robot)
+    assert done.wait(10.0), "it is asked by the thread that hears it; nothing is written in this test"
+    assert asked == [9]
 
 
 @pytest.mark.parametrize(
