@@ -34,6 +34,7 @@ from rti_mpc_service.host import machine
 from rti_mpc_service.origin import code_hash, model_equations, model_source
 from rti_mpc_service.replay.coverage import Heard, heard_commands
 
+CONFIGURATION = "config.toml"  # name of the attached configuration
 MAX_VERSIONS_BYTES = 1 << 20
 
 
@@ -125,7 +126,7 @@ def rebuild(journal: Journaled, *, folder: Path, trust: bool = False) -> Rebuilt
     Raises:
         ConfigError: Nothing is attached, or the model here is another one.
     """
-    if "config.toml" not in journal.files:
+    if CONFIGURATION not in journal.files:
         owner = f"controller {journal.owner} of {journal.robot}"
         raise ConfigError(f"the configuration of {owner} must be attached to the recording, got {[*journal.files]}")
     recorded = document.read(journal.files.get("versions.json", "{}").encode(), most=MAX_VERSIONS_BYTES)
@@ -152,8 +153,8 @@ def configuration(files: Mapping[str, str], temporary: Path, *, folder: Path, tr
     Raises:
         ConfigError: It is not valid, or the source of its model here is not the attached one.
     """
-    path = temporary / "config.toml"
-    path.write_text(files["config.toml"], encoding="utf-8")
+    path = temporary / CONFIGURATION
+    path.write_text(files[CONFIGURATION], encoding="utf-8")
     config = load(path, with_model=False)
     module, _, function = config.model.name.partition(":")
     if function:

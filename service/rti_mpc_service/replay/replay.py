@@ -30,7 +30,7 @@ from rti_mpc_service.config.refusal import explain
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.replay import coverage
 from rti_mpc_service.replay.coverage import uncovered
-from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, journals, rebuild
+from rti_mpc_service.replay.rebuild import CONFIGURATION, Journaled, Rebuilt, journals, rebuild
 
 TOLERANCE = 1e-6  # of commands on another machine, relative to 1 + their magnitude
 TUNABLE = ("ocp.weights.", "ocp.bounds.")  # beginnings of the keys that `--set` takes
@@ -97,9 +97,14 @@ def main(
     """
     accounts = []
     status = 0
-    for journal in journals(path, robot, owner):
-        built = rebuild(journal, folder=folder, trust=trust)
+    found = journals(path, robot, owner)
+    for journal in found:
         print(f"{journal.robot}, controller {journal.owner}")
+        if len(found) > 1 and CONFIGURATION not in journal.files:
+            print("  not covered: it was dead before the recorder had its configuration")
+            status = 1
+            continue
+        built = rebuild(journal, folder=folder, trust=trust)
         for line in built.others:
             print(f"  {line}")
         if built.others and not assignments:

@@ -14,6 +14,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
 from rti_mpc_service.init import main as init
+from rti_mpc_service.replay import replay
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
 from rti_mpc_service.replay.replay import lines, overridden, play
 from tests.service.replay.driven import journal_of
@@ -109,3 +110,13 @@ def test_source_of_a_model_of_ones_own_runs_only_if_it_is_here_or_trusted(tmp_pa
 def test_recording_without_a_configuration_is_refused(journal: Journaled, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="configuration of controller 5 of pioneer must be attached"):
         rebuild(replace(journal, files={}), folder=tmp_path)
+
+
+def test_controller_without_a_configuration_does_not_keep_the_others_from_being_replayed(
+    journal: Journaled, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(replay, "journals", lambda *_: [replace(journal, owner=6, files={}), journal])
+    assert replay.main(Path("run.mcap")) == 1
+    printed = capsys.readouterr().out
+    assert "controller 6\n  not covered: it was dead before the recorder had its configuration\npioneer, controller 5\n" in printed
+    assert "0 bits differ" in printed
