@@ -516,11 +516,14 @@ def faults(
     scenario: ScenarioName = None,
     waypoint_speed: WaypointSpeed = 0.25,
     waypoint_smoothing: WaypointSmoothing = None,
+    record: Annotated[
+        Path | None, typer.Option("--record", metavar="DIR", help="Record all streams into a new folder, to replay what each controller did.")
+    ] = None,
 ) -> None:
     """Inject faults into a running system, one after the other, and print what the robot did: the fault matrix."""
     from rti_mpc_service.faults.run import main
 
-    raise typer.Exit(main(file_of(config, robot), tuple(only or ()), path, scenario, waypoint_speed, waypoint_smoothing))
+    raise typer.Exit(main(file_of(config, robot), tuple(only or ()), path, scenario, waypoint_speed, waypoint_smoothing, record))
 
 
 @process

@@ -70,6 +70,25 @@ def test_robot_is_tested_on_waypoints(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_recordings_of_faults_replay_without_a_differing_bit(tmp_path: Path) -> None:
+    """A controller that is killed and its successor, and one whose robot's clock jumps; what no entry covers is said."""
+    pytest.importorskip("mcap")
+    recordings, told = tmp_path / "recordings", tmp_path / "replay.json"
+    rows = matrix(tmp_path / "faults.json", "controller_killed", "clock_back", robot=("--record", recordings))
+    assert len(rows) == 2
+    assert sorted(path.name for path in recordings.iterdir()) == ["00-peers.mcap", "01-sensor.mcap"]
+    done = rti_mpc("replay", recordings, "--json", told)
+    print(done.stdout)
+    assert done.returncode == 0, done.stdout + done.stderr
+    accounts = json.loads(told.read_text())
+    assert len(accounts) == 3
+    for account in accounts:
+        assert (account["differing"], account["other"]) == (0, [])
+        assert account["commands"] > 5
+        assert account["commands_not_covered"] <= 5, "those of the last tenths of a second of the one that is killed"
+
+
+@pytest.mark.slow
 @pytest.mark.skipif("CI" in os.environ, reason="the rows above are its short form")
 def test_whole_matrix_is_within_its_promises(tmp_path: Path) -> None:
     rows = matrix(tmp_path / "faults.json", timeout_s=1800.0)

@@ -77,6 +77,7 @@ def main(
     scenario: str | None = None,
     waypoint_speed_m_s: float = 0.25,
     waypoint_smoothing_m: float | None = None,
+    record: Path | None = None,
 ) -> int:
     """
     Inject faults, print the matrix, and write it to a file if asked to.
@@ -88,14 +89,19 @@ def main(
         scenario: What the robot follows, see `rti_mpc_service.scenario.find_scenario`; also of the other two.
         waypoint_speed_m_s: Speed along waypoints.
         waypoint_smoothing_m: Path that waypoints are averaged over.
+        record: Folder for a recording of each system; None: nothing is recorded.
 
     Returns:
         Exit status: 0 if every promise was kept; 1 if one was not, or the host has no witness.
 
     Raises:
-        ConfigError: A name is unknown, the robot cannot be guarded or has no pose to start from, or the scenario ends too early.
+        ConfigError: A name is unknown, the robot cannot be guarded or has no pose to start from, the scenario ends too early,
+            or the folder cannot take recordings.
+        ModuleNotFoundError: It is to be recorded, without the extra that does that.
     """
     faults = chosen(only)
+    if record is not None:
+        check_folder(record)
     config = load(config_path)
     law = check_stop(config)
     heading = BEST_HEADINGS.get(scenario or "")
@@ -106,11 +112,13 @@ def main(
     folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
     try:
         with Host() as host, MatrixReport(console := plain_console(), len(faults)) as report:
-            inject(config, [of_robot(fault, config, law) for fault in faults], folder, report, stop, host, reference)
+            inject(config, [of_robot(fault, config, law) for fault in faults], folder, report, stop, host, reference, record)
     except Unwitnessed as error:  # from the start
         say(str(error))
         return EXIT_FAILED
     report.conclude()
+    if record is not None:
+        console.print(f"recordings {record}, to be repeated by: rti-mpc replay {record}", soft_wrap=True)
     if report.kept:
         shutil.rmtree(folder)
     else:
@@ -118,6 +126,25 @@ def main(
     if path is not None:
         path.write_text(json.dumps([row.to_json() for row in report.rows], indent=1) + "\n", encoding="utf-8")
     return 0 if report.kept and not stop.is_set() else 1
+
+
+def check_folder(record: Path) -> None:
+    """
+    Make the folder of the recordings.
+
+    Raises:
+        ConfigError: It cannot be made, or holds recordings, which a recorder does not overwrite.
+        ModuleNotFoundError: The extra that records is not installed.
+    """
+    if find_spec("mcap") is None:
+        raise ModuleNotFoundError(name="mcap")
+    try:
+        record.mkdir(parents=True, exist_ok=True)
+        held = sorted(path.name for path in record.glob("*.mcap"))
+    except OSError as error:
+        raise ConfigError(f"--record must be a folder that can be written, got {record}: {error.strerror}") from error
+    if held:
+        raise ConfigError(f"--record must be a folder without recordings, got {record} with {held[0]}")
 
 
 def chosen(only: Sequence[str]) -> list[Fault]:
@@ -181,9 +208,16 @@ def of_robot(fault: Fault, config: Config, law: StopLaw | None) -> Fault:
 
 
 def inject(
-    config: Config, faults: Sequence[Fault], folder: Path, report: MatrixReport, stop: Event, host: Host, reference: Sequence[object] = ()
+    config: Config,
+    faults: Sequence[Fault],
+    folder: Path,
+    report: MatrixReport,
+    stop: Event,
+    host: Host,
+    reference: Sequence[object] = (),
+    record: Path | None = None,
 ) -> None:
-    """Inject all faults one after the other, or until stopped; `reference` are options of `rti-mpc reference`."""
+    """Inject all faults one after the other, or until stopped; `reference` are options of `rti-mpc reference`, `record` is a folder of recordings."""
     limits = guard_limits(config, build_signals(config))
     system: System | None = None
     with ExitStack() as stack:
@@ -195,7 +229,8 @@ def inject(
                 if system is None or system.wiring is not fault.wiring:
                     stack.close()
                     report.say(fault, f"starting {fault.wiring.value}")
-                    system = stack.enter_context(System(config, fault.wiring, folder / f"{number}", stop, reference))
+                    recording = None if record is None else record / f"{number:02}-{fault.wiring.value}.mcap"
+                    system = stack.enter_context(System(config, fault.wiring, folder / f"{number}", stop, reference, recording))
                 near = make_ready(system, fault, report)
                 row = suffer(system, fault, limits, report, host, near)
             except Failed as error:

@@ -38,6 +38,8 @@ from rti_mpc_service.rig.scenario import write_files
 from rti_mpc_service.rig.witness import Witness
 
 REQUEST_TIMEOUT_S = 2.0
+RECORDER = "recorder"
+WATCHERS = ("viewer", RECORDER)  # roles that wait while others work
 STEADY_NS = 1_000_000_000  # for which an estimate does not change any more that has come to what it estimates
 STEADY_SHARE = 1e-3  # of its largest magnitude, by which it may still
 
@@ -64,6 +66,7 @@ class System:
         folder: Folder of their files, to be made.
         stop: Ends all waiting.
         reference: Options of `rti-mpc reference`.
+        recording: File to record all streams to; None: nothing is recorded.
 
     Attributes:
         wiring: How they are linked.
@@ -78,7 +81,9 @@ class System:
         motion: What the robot's reaction is measured by.
     """
 
-    def __init__(self, config: Config, wiring: Wiring, folder: Path, stop: Event, reference: Sequence[object] = ()) -> None:
+    def __init__(
+        self, config: Config, wiring: Wiring, folder: Path, stop: Event, reference: Sequence[object] = (), recording: Path | None = None
+    ) -> None:
         folder.mkdir(parents=True)
         self.keys = config.keys()
         self.period_ns = round(1e9 * config.ocp.dt_s)
@@ -90,6 +95,7 @@ class System:
         self.motion = Motion(model)
         states, inputs = (tuple(Label(signal.name) for signal in signals) for signals in (model.states, model.inputs))
         self._info = Info("robot", states=states, inputs=inputs)
+        self._recording = recording
         self._suspended: set[str] = set()
         write_files(folder / "config.toml", config)
         write_files(folder / "robot.toml", config.model_copy(update={"prefix": self._robot_keys.prefix}))
@@ -105,6 +111,8 @@ class System:
             self.witness = Witness(self.bus)
             self._references = self.bus.publisher(self.keys.reference)
             self.observer = RunObserver(self.bus, self._robot_keys, self.motion)
+            if recording is not None:
+                self.ensure(RECORDER)
         except BaseException:
             self.children.__exit__(None, None, None)
             raise
@@ -115,6 +123,10 @@ class System:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
         self.resume(*self._suspended)
         self.link.restore()
+        if self._recording is not None and kind is None:  # its recorder ends when all others have said their last
+            for role in self.children.names:
+                if role != RECORDER:
+                    self.children.end(role)
         self.children.__exit__(kind, error, traceback)
         self.link.close()
         self.bus.close()
@@ -128,7 +140,7 @@ class System:
                 self.robots += 1
                 self.observer.forget()
             module, *arguments = self._command(role)
-            self.children.start(role, str(module), *arguments, nice=WATCHER_NICENESS if role == "viewer" else 0)
+            self.children.start(role, str(module), *arguments, nice=WATCHER_NICENESS if role in WATCHERS else 0)
 
     def kill(self, *roles: str) -> None:
         """Kill processes by SIGKILL."""
@@ -176,6 +188,7 @@ class System:
             "reference": (CLI_MODULE, "reference", *meeting, *self._reference),
             "robot": (CLI_MODULE, "sim", *meeting, *(() if "-m" in meeting else ("-l", "tcp/127.0.0.1:0")), "--log", self.log_path),
             "viewer": (CLI_MODULE, "view", *meeting, "--rerun-save", self._folder / "run.rrd"),
+            RECORDER: (CLI_MODULE, "record", *meeting, "--out", self._recording),
             "router": (CLI_MODULE, "router", here, "-l", self._endpoint),
             RELAY: ("rti_mpc_service.faults.relay", self._endpoint, self._robot_keys.prefix, self.keys.prefix, self.keys.robot),
         }

@@ -35,7 +35,7 @@ class Children:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
-        for name in list(self._running):
+        for name in self.names:
             self.end(name, 0.0 if kind else END_TIMEOUT_S)
 
     def start(self, name: str, module: str, *arguments: object, nice: int = 0) -> int:
@@ -61,6 +61,11 @@ class Children:
         self._running[name] = child
         self._logged.add(name)
         return child.pid
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the processes that were started and not ended by us, oldest first."""
+        return list(self._running)
 
     def log(self, name: str) -> Path:
         """Return the file that holds the output of a process."""
