@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rti_mpc.angle import whole_turns
-from rti_mpc.array import Array
+from rti_mpc.array import Array, bounded
 from rti_mpc.contract.cadence import Cadence
 from rti_mpc.contract.lives import Heard, Lives
 from rti_mpc.contract.message import Notice, Severity, State
@@ -129,7 +129,7 @@ class StateStream:
 
     def _judge(self, state: State, arrival_ns: int) -> tuple[Arrival, str, str]:
         """Return the verdict on a state, with the code and the text of its notice."""
-        if not all(abs(value) <= MAX_STATE_MAGNITUDE for value in state.x.tolist()):  # false for NaN, too
+        if not bounded(state.x, MAX_STATE_MAGNITUDE):
             return Arrival.REFUSED, "state_refused", f"a state must be finite and at most {MAX_STATE_MAGNITUDE:g}, got {state.x.tolist()}"
         heard = self.lives.judge(state.epoch, arrival_ns, self.clock.rate)
         self.notice = self.lives.notice

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from rti_mpc.array import Array
+from rti_mpc.array import Array, bounded
 from rti_mpc.contract.message import Command, Event, Journal, Reference, State, Telemetry
 from rti_mpc.errors import MessageError
 from rti_mpc.wire.layout import LAYOUTS, MIN_PERIOD_NS, NUMBER_LIMIT, Field
@@ -38,9 +38,8 @@ HEADER_BYTES = len(HEADER)  # alignment is counted from the end of the header
 
 STRUCT_FORMATS = {"uint8": "B", "uint32": "I", "uint64": "Q", "int64": "q", "float64": "d"}  # key: type of a scalar in .msg files
 LITTLE_ENDIAN = np.dtype("<f8")
-FEW = 32  # numbers of an array, up to which a loop over floats is faster than NumPy
+FLOAT64 = np.dtype(np.float64)
 UINT32 = Struct("<I")
-UINT32_PADDED = Struct("<I4x")  # followed by four bytes that align a float64
 
 # Both continue at an offset from the end of the header. A writer returns the bytes of its fields; a reader appends their
 # values to a list and returns the offset after them.
@@ -176,20 +175,28 @@ def _scalar_reader(fields: Sequence[Field]) -> Reader:
 # Arrays.
 
 
+def _heads(words: int, *, filled: bool) -> tuple[Struct, ...]:
+    """Layouts of the words before an array's numbers, and the padding before and after them, one for each offset modulo 8."""
+    layouts = []
+    for start in range(8):
+        before = -start % 4
+        after = -(start + before + UINT32.size * words) % 8 if filled else 0  # numbers are aligned to eight
+        layouts.append(Struct(f"<{before}x{words}I{after}x"))
+    return tuple(layouts)
+
+
 def _array_writer(field: Field, *, with_width: bool) -> Writer:
     name = field.name
+    empty, filled = (_heads(1 + with_width, filled=filled) for filled in (False, True))
 
     def write(message: Any, offset: int) -> bytes:
         array: Array = getattr(message, name)
-        head = b""
-        if with_width:
-            head = bytes(-offset % 4) + UINT32.pack(array.shape[1])
-            offset += len(head)
-        padding = -offset % 4
-        offset += padding
         size = array.size
-        length = (UINT32_PADDED if size and offset % 8 == 0 else UINT32).pack(size)
-        return head + bytes(padding) + length + array.astype(LITTLE_ENDIAN, copy=False).tobytes()
+        if array.dtype is not LITTLE_ENDIAN:
+            array = array.astype(LITTLE_ENDIAN)
+        head = (filled if size else empty)[offset % 8]
+        words = head.pack(array.shape[1], size) if with_width else head.pack(size)
+        return words + array.tobytes() if size else words
 
     return write
 
@@ -202,11 +209,12 @@ def _array_reader(field: Field, *, width_at: int | None) -> Reader:
         field: Field of the array.
         width_at: Index, among the values read, of an earlier matrix with the same row width; None if the width is stored before this array.
     """
-    name = field.name
+    name, has_rows = field.name, bool(field.width)
+    finite, filled = field.finite, field.filled
 
     def read(payload: bytes, offset: int, values: list[Any]) -> int:
         width = 0
-        if field.width and width_at is None:
+        if has_rows and width_at is None:
             width, offset = _word(payload, offset, field.width)
         elif width_at is not None:
             width = values[width_at].shape[1]
@@ -216,23 +224,16 @@ def _array_reader(field: Field, *, width_at: int | None) -> Reader:
         end = offset + 8 * size
         if HEADER_BYTES + end > len(payload):
             raise Refused("truncated", f"{name} must hold the {size} numbers it declares, got {max(0, len(payload) - HEADER_BYTES - offset) // 8}")
-        array = np.frombuffer(payload, LITTLE_ENDIAN, size, HEADER_BYTES + offset).astype(np.float64)
-        if field.filled and not size:
+        array = np.frombuffer(payload, LITTLE_ENDIAN, size, HEADER_BYTES + offset).astype(FLOAT64)
+        if filled and not size:
             raise Refused("length", f"{name} must hold at least one row, got none")
-        if field.finite and not _fits(array):
+        if finite and not bounded(array, NUMBER_LIMIT):
             wrong = array[~(np.abs(array) <= NUMBER_LIMIT)][0]
             raise Refused("not_finite", f"{name} must be finite and at most {NUMBER_LIMIT:g}, got {wrong} among {size} numbers")
-        values.append(_rows(array, width, name) if field.width else array)
+        values.append(_rows(array, width, name) if has_rows else array)
         return end
 
     return read
-
-
-def _fits(array: Array) -> bool:
-    """Whether all numbers are finite and inside the limit."""
-    if array.size <= FEW:
-        return all(abs(value) <= NUMBER_LIMIT for value in array.tolist())
-    return bool((np.abs(array) <= NUMBER_LIMIT).all())
 
 
 def _word(payload: bytes, offset: int, name: str) -> tuple[int, int]:
