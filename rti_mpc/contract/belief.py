@@ -166,4 +166,7 @@ class Belief(Schedule):
 
 def alike(believed: list[float], reported: list[float]) -> bool:
     """Return whether two inputs are equal but for rounding."""
-    return all(abs(one - other) <= INPUT_TOLERANCE * (1.0 + abs(other)) for one, other in zip(believed, reported, strict=True))
+    for one, other in zip(believed, reported, strict=True):  # a loop: a generator takes twice as long for a few numbers
+        if not abs(one - other) <= INPUT_TOLERANCE * (1.0 + abs(other)):  # false for NaN, too
+            return False
+    return True

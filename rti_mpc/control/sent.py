@@ -146,8 +146,8 @@ class Sent:
         second = lowest.copy(), highest.copy()
         self._narrow(lowest, highest, self._schedule, t_ns - self._dt_ns + 1, t_ns)  # the input of `t_ns` has narrowed them already
         self._narrow(lowest, highest, self._slowest, t_ns - self._window_ns, t_ns + self._transit_ns + 1)
-        rows = np.array([lowest, second[0], highest, second[1]])
-        return rows[:2], rows[2:]
+        rows = np.array(lowest + second[0] + highest + second[1]).reshape(2, 2, self._nu)
+        return rows[0], rows[1]
 
     def _narrow(self, lowest: list[float], highest: list[float], schedule: Schedule, from_ns: int, to_ns: int) -> None:
         """Narrow intervals to the slew limits of all inputs that act before a time; where that leaves nothing, to the nearest value."""
@@ -157,9 +157,10 @@ class Sent:
 
     def _near(self, lowest: list[float], highest: list[float], u: Array) -> None:
         """Narrow intervals to what is within the slew limits of an input."""
+        falling, rising = self._falling, self._rising
         for j, value in enumerate(u.tolist()):
-            low, high = value + self._falling[j], value + self._rising[j]
-            if low > lowest[j]:
-                lowest[j] = min(low, highest[j])
-            if high < highest[j]:
-                highest[j] = max(high, lowest[j])
+            least, most = lowest[j], highest[j]
+            if (low := value + falling[j]) > least:
+                lowest[j] = least = most if most < low else low
+            if (high := value + rising[j]) < most:
+                highest[j] = least if least > high else high
