@@ -23,7 +23,7 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.codegen import bind, function
+from rti_mpc.codegen import bind, compiled, function
 from rti_mpc.rti.linearization import all_inputs, constraints
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import TOUCHING_DISTANCE, Rti
@@ -39,7 +39,7 @@ class Blockage:
         blocked: Whether the robot is blocked.
     """
 
-    def __init__(self, rti: Rti) -> None:
+    def __init__(self, rti: Rti, *, compile: bool = True) -> None:
         ocp = rti.ocp
         self.blocked = False
         self._stages = ocp.N
@@ -49,7 +49,8 @@ class Blockage:
         self._held: Array = np.zeros(len(self._names))
         sample = {"x": rti.x, "u": rti.u, "y_ref": rti.y_ref, "p": rti.p, "scale": rti.scale}
         weights = {name: rti.guess.weights[name] for name in ("lbx", "ubx", "lh", "uh")}
-        self._measure = bind(progress(ocp), sample | weights, {"squares": self._squares, "held": self._held})
+        measure = progress(ocp)
+        self._measure = bind(compiled(measure)[0] if compile else measure, sample | weights, {"squares": self._squares, "held": self._held})
 
     @property
     def cause(self) -> str:

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import isfinite
+from operator import le
 
 import numpy as np
 
@@ -126,7 +127,7 @@ class Controller:
         settling_s = limits.settling_s + (0.0 if stop_law is None else stop_law.rows * stop_law.period_s)
         self._states = StateStream(model, self._stale_ns, self.grid.dt_ns, settling_s, observer)
         self.np_ = model.np_ - len(self._states.d)
-        self._track = Track(model, ocp.N, self.grid.dt_ns)
+        self._track = Track(model, ocp.N, self.grid.dt_ns, compile=compile)
         angles = np.array([signal.angle for signal in model.states])
         self._sent = Sent(self._u_rest, ocp.lbdu, ocp.ubdu, self.grid.dt_ns, (ocp.lbu, ocp.ubu), angles)
         self._prediction = Prediction(model, self._sent, compile=compile)
@@ -145,7 +146,7 @@ class Controller:
         self._stopped = ""  # why an operator's stop is latched
         self._issued = Issued(epoch, config_hash, self.grid.dt_ns)
         self._record = Record(rti, self._tuning)
-        self._blockage = Blockage(rti)
+        self._blockage = Blockage(rti, compile=compile)
         self._opinions = second_opinions(rti, second_opinion, self.say)
         self._delay = DelayEstimator(model, self.grid.dt_ns, self.grid.most_ns, compile=compile) if timing.delay_s is None else None
         self._understudy = StateStream(model, self._stale_ns, self.grid.dt_ns, settling_s)  # judges states in rehearsals
@@ -679,7 +680,8 @@ class Controller:
     def _within(self, u: Array, t_ns: int) -> Array:
         """Return an input that is reported at a time, inside its bounds, or those that were tightened since."""
         lbu, ubu = self.envelope.limits["lbu"], self.envelope.limits["ubu"]
-        if all(low <= value <= high for low, value, high in zip(lbu.tolist(), u.tolist(), ubu.tolist(), strict=True)):
+        values = u.tolist()
+        if all(map(le, lbu.tolist(), values)) and all(map(le, values, ubu.tolist())):
             return u
         believed = self._sent.at(t_ns - 1)[0]  # it may be outside bounds that were tightened
         inside: Array = np.minimum(np.maximum(u, np.minimum(lbu, believed)), np.maximum(ubu, believed))

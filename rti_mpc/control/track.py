@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.codegen import bind, function
+from rti_mpc.codegen import bind, compiled, function
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, End, Reference
 from rti_mpc.model.model import Model
 
@@ -34,20 +34,21 @@ class Track:
         arriving: A checked reference and its `lay_out`, until `anchor` has a state to start at; else None.
     """
 
-    def __init__(self, model: Model, N: int, dt_ns: int) -> None:
+    def __init__(self, model: Model, N: int, dt_ns: int, *, compile: bool = True) -> None:
         self.y_ref: Array = np.zeros((N, model.ny))
         self._nominal: Array = np.array(model.p_nominal)
         self.p: Array = np.tile(self._nominal, (N + 1, 1))
         self._angles = [j for j, signal in enumerate(model.outputs) if signal.angle]
         grid, at, below = np.zeros(3), np.zeros(N + 1), np.zeros(N + 1)
         self._grid, self._below = grid.data, below
-        self._place = bind(placing(N, dt_ns), {"grid": grid}, {"at": at, "below": below})
         # A reference gives no parameters, or has all of them in its rows.
         self._found = {columns: np.zeros((N + 1, 2 * columns)) for columns in (model.ny, model.ny + model.np_)}
+        functions = [placing(N, dt_ns), *(interpolation(N, model.ny, columns) for columns in self._found)]
+        place, *interpolations = compiled(*functions) if compile else functions
+        self._place = bind(place, {"grid": grid}, {"at": at, "below": below})
         outputs = {"y_ref": self.y_ref, "p": self.p}
         self._interpolate: dict[int, Callable[[], None]] = {}
-        for columns, found in self._found.items():
-            interpolate = interpolation(N, model.ny, columns)
+        for interpolate, (columns, found) in zip(interpolations, self._found.items(), strict=True):
             written = {name: outputs[name] for name in interpolate.name_out()}
             self._interpolate[columns] = bind(interpolate, {"found": found, "at": at, "below": below}, written)
         self.arriving: tuple[Reference, Array] | None = None
@@ -145,4 +146,4 @@ def interpolation(N: int, ny: int, columns: int) -> ca.Function:
     found, at, below = ca.SX.sym("found", 2 * columns, N + 1), ca.SX.sym("at", N + 1), ca.SX.sym("below", N + 1)
     values = found[:columns, :] + ca.repmat((at - below).T, columns, 1) * found[columns:, :]
     written = {"y_ref": values[:ny, 1:]} | ({"p": values[ny:, :]} if columns > ny else {})
-    return function("interpolation", {"found": found, "at": at, "below": below}, written)
+    return function(f"interpolation_{columns}", {"found": found, "at": at, "below": below}, written)

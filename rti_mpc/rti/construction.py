@@ -24,6 +24,7 @@ from rti_mpc.rti.places import Places, places
 from rti_mpc.rti.qp.sequential import sequential
 from rti_mpc.rti.qp.simultaneous import simultaneous
 from rti_mpc.rti.qp.transcription import Transcription
+from rti_mpc.rti.turns import largest_steps
 
 FORMULATIONS = {"simultaneous": simultaneous, "sequential": sequential}
 
@@ -40,6 +41,7 @@ class Construction:
         shift: See `rti_mpc.rti.linearization.shift`.
         cost: See `rti_mpc.rti.linearization.plan_cost`.
         output: Outputs at a node, ``(x, p) -> y``.
+        steps: See `rti_mpc.rti.turns.largest_steps`.
         made: The compiled functions by name.
         normalised: Arrays and factor of the cost by name as the first `Rti` has normalised the problem; empty until then.
     """
@@ -50,6 +52,7 @@ class Construction:
     shift: ca.Function
     cost: ca.Function
     output: ca.Function
+    steps: ca.Function
     made: dict[str, ca.Function]
     normalised: dict[str, Any] = field(default_factory=dict)
 
@@ -87,10 +90,10 @@ def construct(ocp: Ocp, formulation: str, structured: bool, build: str | None) -
     check_stiffness(ocp, x_nominal)
     transcriptions = tuple(FORMULATIONS[formulation](ocp, softened=softened) for softened in (False, True)[: 2 if len(ocp.lg) else 1])
     active_set = (places(ocp), certificate(ocp)) if structured else None
-    moves, cost = shift(ocp), plan_cost(ocp)
-    native = [moves, cost, *natives(transcriptions, active_set)]
+    moves, cost, output, steps = shift(ocp), plan_cost(ocp), ocp.model.h(), largest_steps(ocp)
+    native = [moves, cost, output, steps, *natives(transcriptions, active_set)]
     made = dict(zip((f.name() for f in native), compiled(*native, build=build) if build else native, strict=True))
-    return Construction(x_nominal, transcriptions, active_set, moves, cost, ocp.model.h(), made)
+    return Construction(x_nominal, transcriptions, active_set, moves, cost, output, steps, made)
 
 
 def natives(transcriptions: tuple[Transcription, ...], structured: tuple[Places, ca.Function] | None) -> list[ca.Function]:

@@ -144,7 +144,8 @@ class Rti:
 
         make = built.make
         self.advance = bind(make(built.shift), {"x": self.x, "u": self.u, "p": self.p}, {"x_next": x, "u_next": u})
-        self._turns = Turns(ocp, built.output, x, self.x0, self.y_ref, self.p, (self._weights["lbx"], self._weights["ubx"]))
+        bounds = self._weights["lbx"], self._weights["ubx"]
+        self._turns = Turns(ocp, (make(built.output), make(built.steps)), x, self.x0, self.y_ref, self.p, bounds)
         self._cost: Array = np.zeros(1)
         self.evaluate = bind(make(built.cost), self.guess.arguments | {"x": self.x, "u": self.u}, {"cost": self._cost})
         qps = [Qp(transcription, self.guess, make) for transcription in built.transcriptions]

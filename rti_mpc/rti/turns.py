@@ -13,6 +13,7 @@ changes the direction at most once.
 from __future__ import annotations
 
 import math
+from functools import reduce
 from typing import Any
 
 import casadi as ca
@@ -20,7 +21,7 @@ import numpy as np
 
 from rti_mpc.angle import whole_turns
 from rti_mpc.array import Array
-from rti_mpc.codegen import bind
+from rti_mpc.codegen import bind, function
 from rti_mpc.rti.ocp import Ocp
 
 HYSTERESIS_RAD = 0.3  # an error must exceed half a turn by this much before the other way round is taken
@@ -38,7 +39,7 @@ class Turns:
 
     Args:
         ocp: The problem; it repeats with each turn of a state that is an angle.
-        output: Outputs at a node, ``(x, p) -> y``.
+        functions: Outputs at a node, ``(x, p) -> y``, and `largest_steps`.
         x: State guess, shape ``(N + 1, nx)``.
         x0: Initial state, shape ``(nx,)``.
         y_ref: Reference rows, shape ``(N, ny)``.
@@ -46,7 +47,9 @@ class Turns:
         bounds: Lower and upper bounds on states that act, each of shape ``(nx,)``; infinite or huge where there are none.
     """
 
-    def __init__(self, ocp: Ocp, output: ca.Function, x: Array, x0: Array, y_ref: Array, p: Array, bounds: tuple[Array, Array]) -> None:
+    def __init__(
+        self, ocp: Ocp, functions: tuple[ca.Function, ca.Function], x: Array, x0: Array, y_ref: Array, p: Array, bounds: tuple[Array, Array]
+    ) -> None:
         model = ocp.model
         y: Array = np.zeros(model.ny)
         self._x, self._y_ref = x, y_ref
@@ -54,12 +57,14 @@ class Turns:
         self._lbx, self._ubx = bounds
         views: list[Any] = [array.data for array in (x0, x[0], y, y_ref[0])]  # read faster than arrays
         self._x0, self._guess, self._y, self._y_first = views
+        output, steps = functions
         self._output = bind(output, {"x": x0, "p": p[0]}, {"y": y})
         self._states = [j for j, signal in enumerate(model.states) if signal.angle]
         self._outputs = [j for j, signal in enumerate(model.outputs) if signal.angle]
         self._bounded = [j for j in self._states if ocp.ubx[j] - ocp.lbx[j] <= math.tau]
-        self._steps = [(y_ref[1:, j], y_ref[:-1, j]) for j in self._outputs]
-        self._step: Array = np.zeros(ocp.N - 1)
+        largest: Array = np.zeros(len(self._outputs))
+        self._largest = largest.data
+        self._measure = bind(steps, {"y_ref": y_ref}, {"largest": largest})
         self._added = [0.0] * model.ny  # whole turns added to the rows of the reference as they are given
         self._errors = [0.0] * model.ny
 
@@ -69,9 +74,11 @@ class Turns:
 
     def take_reference(self) -> None:
         """Unwrap the rows of the reference, and add the turns of the sample before."""
-        for j, (later, earlier) in zip(self._outputs, self._steps, strict=True):
-            np.subtract(later, earlier, out=self._step)
-            if self._step.dot(self._step) >= math.pi**2:  # one of the steps may exceed half a turn
+        if not self._outputs:
+            return
+        self._measure()
+        for j, largest in zip(self._outputs, self._largest, strict=True):
+            if largest >= math.pi:
                 self._y_ref[:, j] = np.unwrap(self._y_ref[:, j])
             if self._added[j]:
                 self._y_ref[:, j] += self._added[j]
@@ -107,3 +114,11 @@ class Turns:
                 changed = True
             self._errors[j] = error - turns
         return changed
+
+
+def largest_steps(ocp: Ocp) -> ca.Function:
+    """Build ``y_ref -> largest``: for each output that is an angle, the largest distance from one row of the reference to the next."""
+    y_ref = ca.SX.sym("y_ref", ocp.model.ny, ocp.N)
+    change = ca.fabs(y_ref[:, 1:] - y_ref[:, :-1])
+    largest = [reduce(ca.fmax, ca.horzsplit(change[j, :]), ca.SX(0)) for j, signal in enumerate(ocp.model.outputs) if signal.angle]
+    return function("largest_steps", {"y_ref": y_ref}, {"largest": ca.densify(ca.vertcat(*largest))})

@@ -112,3 +112,16 @@ def test_message_is_not_changed_and_may_change_later() -> None:
     y[:] = 9.0
     track.look_up(0)
     np.testing.assert_array_equal(track.y_ref, first)
+
+
+def test_compiled_and_interpreted_rows_are_the_same_bit_for_bit() -> None:
+    model, rng = beacon().model, np.random.default_rng(6)
+    y, p = rng.normal(size=(40, model.ny)), rng.normal(size=(40, model.np_))
+    tracks = [Track(model, N, 100 * MS, compile=compile) for compile in (False, True)]
+    for parameters in (None, p):
+        for track in tracks:
+            follow(track, reference(y, parameters, stamp_ms=3))
+        for t_ns in rng.integers(-200 * MS, 1000 * MS, size=50):
+            for track in tracks:
+                track.look_up(int(t_ns))
+            assert all(track.y_ref.tobytes() + track.p.tobytes() == tracks[0].y_ref.tobytes() + tracks[0].p.tobytes() for track in tracks)
