@@ -20,9 +20,11 @@ FAILURES = {
     "solver": "the first solver finds nothing: another one must, with softened bounds",
     "qp": "no solver finds anything",
     "nan_model": "the model gives NaN",
+    "gradient": "the first solver takes a gradient of the cost that is too large, and its certificate with it: only the second opinion can tell",
     "over_budget": "a sample takes one and a half periods, of wall time",
 }
 OVER_BUDGET_PERIODS = 1.5  # duration of a sample that exceeds its budget
+GRADIENT_ERROR = 1.5  # factor of the wrong gradient
 MAX_FAILING_SAMPLES = 10_000  # per request
 
 
@@ -61,6 +63,17 @@ class FaultyRti(Rti):
         if self._failing == "nan_model":  # what it predicts, and whatever is linearized there, with parameters or without
             self.guess.sample["x"][1:] = np.nan
             self._linearize()
+        if self._failing == "gradient":
+            self._linearize()
+
+    def _linearize(self) -> None:
+        """As `Rti._linearize`; a wrong gradient is that of another reference, which nobody else sees."""
+        right = self.y_ref.copy()
+        if self._failing == "gradient":
+            y = np.array(self.ocp.model.h().map(self.ocp.N)(self.guess.sample["x"][1:].T, self.p[1:].T)).T
+            self.y_ref[:] = y + GRADIENT_ERROR * (right - y)
+        super()._linearize()
+        self.y_ref[:] = right
 
     def feedback(self, x0: Array) -> QpStatus:
         """As `Rti.feedback`."""

@@ -279,7 +279,7 @@ def assert_applied_inside_slew(controller: Controller, body: Lockstep, run: Run)
 @pytest.mark.parametrize(
     ("request_", "error"),
     [
-        ({"failure": "flood"}, "failure must be one of solver, qp, nan_model, over_budget, got 'flood'"),
+        ({"failure": "flood"}, "failure must be one of solver, qp, nan_model, gradient, over_budget, got 'flood'"),
         ({}, "got None"),
         ({"failure": "qp", "samples": 0}, f"samples must be a whole number from 1 to {MAX_FAILING_SAMPLES}, got 0"),
         ({"failure": "qp", "samples": "3"}, "got '3'"),
@@ -298,4 +298,4 @@ def test_failures_are_as_many_samples_as_asked_for(driving: tuple[Controller, Lo
         fail(rti, "qp", samples)
         run = drive(controller, body, 1e-9 * body.now_ns + 1.0)
         assert sum(command.status is QpStatus.INFEASIBLE for command in run.commands) == samples
-    assert set(FAILURES) == {"solver", "qp", "nan_model", "over_budget"}
+    assert set(FAILURES) == {"solver", "qp", "nan_model", "gradient", "over_budget"}

@@ -21,6 +21,7 @@ import numpy as np
 
 from rti_mpc.contract.message import Command, JournalKind, Telemetry
 from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.control.opinions import DISAGREEMENT
 from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.journal.entry import JournalEntry, decode_entries
 from rti_mpc.journal.replay import Difference, Replay, replay
@@ -327,6 +328,8 @@ def solved(facts: Mapping[str, Any]) -> Iterator[str]:
     if (second := facts["second_opinion"]) is not None and second["difference"] is not None:
         worked = f"{second['status']} in {count(second['iterations'], 'iteration')}"
         yield f"OSQP: {worked}, and differs by {second['difference']:.1e} of half an input's range"
+        if second["difference"] > DISAGREEMENT and second["status"] == "SOLVED":
+            yield f"the two solvers disagree, by more than {DISAGREEMENT:g}: one of them is wrong"
     else:
         yield "OSQP: no opinion"
     total = sum(facts["cost_terms"].values())

@@ -111,3 +111,17 @@ def test_takeover_is_one_of_the_events(tmp_path: Path) -> None:
     text, facts = asked(journal, place, tmp_path)
     assert "took_over: this controller leads, with epoch 6" in text
     assert facts["epoch"] == 6
+
+
+def test_disagreement_on_request_is_explained_with_what_the_other_solver_says(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(INJECTED)
+    journal = journal_of(path, samples=30, acts={20: failing("gradient", 6)})
+    place = find(journal, None, 25)
+    text, facts = asked(journal, place, tmp_path)
+    assert facts["status"] == "SOLVED", "by its own certificate"
+    assert facts["second_opinion"]["difference"] > 1e-3
+    assert "the two solvers disagree, by more than 0.001: one of them is wrong" in text
+    assert "solvers_disagree: OSQP's plans differ by more than 0.001" in text
+    assert "injected: failure 'gradient' was injected on request, for 6 samples" in text
+    assert "disagree" not in asked(journal, find(journal, None, 15), tmp_path)[0]
