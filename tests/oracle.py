@@ -79,7 +79,9 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Arra
     for k in range(N):
         held = u[:, min(k, N_u - 1)]
         e = model.residual(h(x[:, k + 1], held, p), y_ref[:, k])
-        cost += ca.bilin(ca.DM(ocp.delta[k] * ocp.Q + (ocp.Q_e if k == N - 1 else 0.0)), e, e)
+        factors = np.broadcast_to(ocp.delta[k], model.ny) ** 0.5
+        cost += ca.bilin(ca.DM(ocp.Q), factors * e, factors * e)
+        cost += ca.bilin(ca.DM(ocp.Q_e), e, e) if k == N - 1 else 0.0
         cost += ca.dot(ca.DM(ocp.z), s[:, k]) + 0.5 * ca.dot(ca.DM(ocp.Z), s[:, k] ** 2)
         x_next, equations = collocated(ocp, x[:, k], held, K[k]) if implicit else (phi(x[:, k], held, p), ca.SX(0, 1))
         equations = ca.vertcat(x_next - x[:, k + 1], equations)

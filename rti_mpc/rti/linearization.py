@@ -118,7 +118,7 @@ class Linearization:
         self.u_prev = ca.MX.sym("u_prev", nu)
         self.y_ref = ca.MX.sym("y_ref", model.ny, N)
         self.p = ca.MX.sym("p", model.np_, N + 1)
-        self.w = {name: ca.MX.sym(name, *np.shape(getattr(ocp, name))) for name in WEIGHTS_AND_BOUNDS}
+        self.w = {name: ca.MX.sym(name, *np.shape(getattr(ocp, name))[::-1]) for name in WEIGHTS_AND_BOUNDS}
         self._scale = ca.MX.sym("scale", nx + nu + len(ocp.lg))
         self.scale_x, self.scale_u, self.scale_g = self._scale[:nx], self._scale[nx : nx + nu], self._scale[nx + nu :]
 
@@ -130,7 +130,11 @@ class Linearization:
         self.b = stages[:nx, :] - self.x[:, 1:]
 
         node, self.H_i = gauss_newton(ocp)
-        W = ca.kron(self.w["delta"].T, self.w["Q"])
+        if ocp.delta.ndim == 1:
+            W = ca.kron(self.w["delta"].T, self.w["Q"])
+        else:
+            root = ca.sqrt(self.w["delta"])  # a column per stage
+            W = ca.repmat(self.w["Q"], 1, N) * ca.kron(root, ca.DM.ones(1, model.ny)) * ca.repmat(ca.vec(root).T, model.ny, 1)
         W = ca.horzcat(W[:, : -model.ny], W[:, -model.ny :] + self.w["Q_e"])
         nv = self.H_i.size1()
         nodes = node.map(N)(self.x[:, 1:], *([inputs] if nv > nx else []), self.p[:, 1:], self.y_ref, W)

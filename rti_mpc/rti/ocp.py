@@ -62,7 +62,8 @@ class Ocp:
             model in discrete time, whose period `dt` must be.
         Q: Output weight, shape ``(ny, ny)``, or given by its diagonal; cost / unit of the outputs squared.
         R: Increment weight, shape ``(nu, nu)``, or given by its diagonal; cost / unit of the inputs squared.
-        delta: Penalty sequence on outputs, shape ``(N,)``, or given as a constant.
+        delta: Penalty sequence on outputs, shape ``(N,)``, or given as a constant; or one for each output, shape ``(N, ny)``, so that weights differ
+            from stage to stage: stage i weighs by :math:`D_i^{1/2} Q D_i^{1/2}`, which for a diagonal Q is :math:`D_i Q`, see `Q_at`.
         lambda_: Penalty sequence on increments, shape ``(N_u,)``, or given as a constant.
         lbu: Lower bound on inputs, shape ``(nu,)``; none by default, as for the following.
         ubu: Upper bound on inputs, shape ``(nu,)``.
@@ -191,7 +192,8 @@ class Ocp:
         sizes = {"nx": self.model.nx, "nu": self.model.nu, "ny": self.model.ny, "nh": self.h_expr.numel(), "N": self.N, "N_u": self.N_u}
         for name, value in values.items():
             check, size = WEIGHTS_AND_BOUNDS[given.one_of("the name of a weight or bound", name, WEIGHTS_AND_BOUNDS)]
-            array = check(name, value, sizes[size])
+            each = name == "delta" and np.ndim(given.numbers(name, value)) == 2
+            array = output_weights(name, value, self.N, self.model.ny) if each else check(name, value, sizes[size])
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         if not np.all(self.lbu <= self.ubu):
@@ -203,6 +205,13 @@ class Ocp:
             raise OcpError(wrong)
         if np.any(self.lbdu > 0) or np.any(self.ubdu < 0):
             raise OcpError(f"lbdu <= 0 <= ubdu must hold, or no input could be kept, got {self.lbdu} and {self.ubdu}")
+
+    def Q_at(self, k: int) -> Array:
+        """Return the weight of outputs at node ``k + 1``, without the terminal weight, shape ``(ny, ny)``."""
+        if self.delta.ndim == 1:
+            return np.asarray(self.delta[k] * self.Q)
+        root = np.sqrt(self.delta[k])
+        return np.asarray(self.Q * np.outer(root, root))
 
     @property
     def soft(self) -> tuple[int, ...]:
@@ -276,6 +285,14 @@ def weights(name: str, value: ArrayLike, length: int) -> Array:
     if not np.all(np.isfinite(array)) or np.any(array < 0):
         raise OcpError(f"{name} must be finite and not negative, got {array.tolist()}")
     return array
+
+
+def output_weights(name: str, value: ArrayLike, N: int, ny: int) -> Array:
+    """Return a copy of finite weights >= 0 of shape ``(N, ny)``."""
+    array = given.numbers(name, value)
+    if array.shape != (N, ny):
+        raise OcpError(f"{name} must be a number or have shape ({N},), or ({N}, {ny}) for each output by itself, got shape {array.shape}")
+    return weights(name, array.ravel(), N * ny).reshape(N, ny)
 
 
 def weight_matrix(name: str, value: ArrayLike, size: int) -> Array:

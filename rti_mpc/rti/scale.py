@@ -41,7 +41,7 @@ def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
     response = response[1:]
 
     node, H_i = gauss_newton(ocp)
-    W = np.hstack([ocp.delta[k] * ocp.Q + (ocp.Q_e if k == N - 1 else 0.0) for k in range(N)])
+    W = np.hstack([ocp.Q_at(k) + (ocp.Q_e if k == N - 1 else 0.0) for k in range(N)])
     nv = H_i.size1()
     at = (x[1:].T, held.T) if nv > model.nx else (x[1:].T,)
     H = dense(H_i, np.array(node.map(N)(*at, p[1:].T, y_ref.T, W))[nv + 1 :])

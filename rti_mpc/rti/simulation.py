@@ -71,7 +71,7 @@ class Simulation:
         ocp = self.ocp
         off = self.u - np.array(ca.Function("u_ref", [ocp.model.p], [ocp.u_ref])(ocp.model.p_nominal)).ravel()
         of_inputs = ocp.lambda_[0] * np.einsum("ki,ij,kj->", du, ocp.R, du) + np.einsum("ki,i,ki->", off, ocp.R_u, off)
-        return float(ocp.delta[0] * np.einsum("ki,ij,kj->", e, ocp.Q, e) + of_inputs)
+        return float(np.einsum("ki,ij,kj->", e, ocp.Q_at(0), e) + of_inputs)
 
     def _residual(self) -> Array:
         """Return what the cost weighs of outputs and reference, shape ``(M + 1, ny)``."""

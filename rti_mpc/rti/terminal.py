@@ -62,7 +62,7 @@ def lqr_weight(ocp: Ocp, x: Array, u: Array) -> Array:
     try:
         of_inputs = np.diag([*np.zeros(nx), *ocp.R_u])
         R = ocp.lambda_[-1] * ocp.R
-        S = solve_discrete_are(F, G, ocp.delta[-1] * C.T @ ocp.Q @ C + of_inputs, R)
+        S = solve_discrete_are(F, G, C.T @ ocp.Q_at(ocp.N - 1) @ C + of_inputs, R)
         # Whether an equation without a stabilizing solution is noticed above depends on rounding; its closed loop never contracts.
         radius = abs(np.linalg.eigvals(F - G @ np.linalg.solve(R + G.T @ S @ G, G.T @ S @ F))).max()
         if not radius < MAX_RADIUS:
@@ -70,5 +70,5 @@ def lqr_weight(ocp: Ocp, x: Array, u: Array) -> Array:
     except (LinAlgError, ValueError) as error:
         raise OcpError(f"model {model.name} must be stabilizable where a terminal weight is wanted, at x = {x}, u = {u}: {error}") from error
     # The least of xi' S xi over all xi of one output y is y' (C S^-1 C')^-1 y.
-    weight = np.linalg.inv(C @ np.linalg.pinv(S) @ C.T) - ocp.delta[-1] * ocp.Q
+    weight = np.linalg.inv(C @ np.linalg.pinv(S) @ C.T) - ocp.Q_at(ocp.N - 1)
     return np.asarray((weight + weight.T) / 2)

@@ -60,6 +60,8 @@ def test_arrays_are_owned_and_read_only() -> None:
         ({"R": [[1.0, 0.1], [0.2, 1.0]]}, "R must be finite, symmetric and positive semidefinite"),
         ({"R": [1.0, np.nan]}, "R must be finite"),
         ({"delta": [1.0] * 6}, r"delta must be a number or have shape \(7,\), got shape \(6,\)"),
+        ({"delta": np.ones((3, 7))}, r"delta must be a number or have shape \(7,\), or \(7, 3\) for each output by itself, got shape \(3, 7\)"),
+        ({"delta": -np.ones((7, 3))}, "delta must be finite and not negative"),
         ({"N_u": 3, "lambda_": [1.0] * 7}, r"lambda_ must be a number or have shape \(3,\)"),
         ({"lambda_": -1.0}, "lambda_ must be finite and not negative"),
         ({"z": INF}, "z must be finite and not negative"),

@@ -74,6 +74,8 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "outputs of inputs": felt_car,
     "outputs of inputs, held inputs, weight at the end": lambda: felt_car(N_u=3, Q_e=[0.5, 0.5, 0.0, 1.0, 0.0, 0.5]),
     "outputs of inputs beside weights of inputs": lambda: felt_car(R_u=[0.05, 0.2], u_ref=[0.1, -0.1], N_u=5),
+    "weights by stage": lambda: sampled_car(delta=np.column_stack([np.linspace(0.2, 3, 8), np.linspace(2, 0.1, 8), [0, 0, 0, 1, 0, 4, 0, 8]])),
+    "weights by stage of outputs of inputs, held inputs": lambda: felt_car(delta=np.linspace(0.1, 2, 48).reshape(8, 6), N_u=3),
     "fixed input": lambda: sampled_car(lbu=[-0.5, 0.3], ubu=[0.5, 0.3], lbdu=-np.inf, ubdu=np.inf),
     "terminal set": lambda: sampled_car(lbx_e=[-np.inf] * 3 + [-0.05], ubx_e=[np.inf] * 3 + [0.02]),
     "terminal set, from above alone, held inputs": lambda: sampled_car(ubx_e=[np.inf] * 3 + [0.05], N_u=3, z=[1.0] * 4, Z=[0.0] * 4),
@@ -157,6 +159,19 @@ def test_bounds_at_the_end_alone_do_not_act_before_it() -> None:
     assert abs(rti.x[-1, 1]) < 1.1e-3
     assert rti.x[:-1, 1].max() > 0.5
     assert rti.violation < 1e-6
+
+
+def test_weights_by_stage_are_retuned_as_if_the_problem_had_been_built_with_them() -> None:
+    before, after = (np.linspace(*ends, 24).reshape(8, 3) for ends in ((0.5, 1.5), (2.0, 0.1)))
+    built, retuned = (Rti(sampled_car(delta=delta), compile=False, iterations=20, tolerance=1e-9) for delta in (after, before))
+    retuned.retune({"delta": after})
+    x0, y_ref, u_prev = around_a_bend(built.ocp, 1)[0]
+    for rti in (built, retuned):
+        rti.reset(x0, u_prev)
+        rti.prepare(y_ref, shift=False)
+        assert rti.feedback(x0) is QpStatus.SOLVED
+    np.testing.assert_allclose(retuned.u, built.u, rtol=0, atol=1e-7)  # each is converged in scales of its own
+    assert retuned.cost == pytest.approx(built.cost, rel=1e-6)  # 1000 per unit by which a state exceeds its bound in rounding
 
 
 def test_reference_of_inputs_moves_with_the_parameters_of_the_stages() -> None:

@@ -58,7 +58,7 @@ class Ipopt:
             rows.append((phi(x[:, k], held, p[:, k]) - x[:, k + 1], none, none))
             y, bounded, h = outputs(x[:, k + 1], held, p[:, k + 1])
             e = y - y_ref[:, k]
-            cost += ca.bilin(ca.DM(ocp.delta[k] * ocp.Q + (ocp.Q_e if k == N - 1 else 0.0)), e, e)
+            cost += ca.bilin(ca.DM(ocp.Q_at(k) + (ocp.Q_e if k == N - 1 else 0.0)), e, e)
             if softened:
                 g, infinite = ca.vertcat(bounded, h), np.full(ng, np.inf)
                 rows += [(g + s[:, k], ocp.lg, infinite), (g - s[:, k], -infinite, ocp.ug)]

@@ -113,7 +113,8 @@ def cost_terms(rti: Rti, config: Config) -> dict[str, float]:
     w = {name: array / rti.cost_scale if name in COST_WEIGHTS else array for name, array in rti.guess.weights.items()}
     errors = outputs_of(model.outputs_at(), rti) - rti.y_ref
     increments = np.diff(rti.u, axis=0, prepend=rti.u_prev[None])
-    by_output = (w["delta"][:, None] * errors * (errors @ w["Q"])).sum(axis=0)
+    weighed = np.sqrt(w["delta"]).reshape(ocp.N, -1) * errors
+    by_output = (weighed * (weighed @ w["Q"])).sum(axis=0)
     by_input = (w["lambda_"][:, None] * increments * (increments @ w["R"])).sum(axis=0)
     terms = {f"error of {signal.name}": float(value) for signal, value in zip(model.outputs, by_output, strict=True)}
     terms |= {f"changes of {signal.name}": float(value) for signal, value in zip(model.inputs, by_input, strict=True)}
