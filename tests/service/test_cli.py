@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[2]
 ZENOH = ("--mode", "--connect", "--listen", "--config", "--cfg", "--no-multicast-scouting")
 RTI_MPC = (sys.executable, "-c", "from rti_mpc_service.cli import main; main()")
 COMMANDS = sorted(typer.main.get_group(app).commands)
-OF_RECORDINGS = {"export", "replay"}  # commands that take a recording in place of a configuration
+OF_RECORDINGS = {"export", "replay", "solve-case", "why"}  # commands that read a recording, or a case of one, and no bus
 IN_PLACE = "--path is followed in place of a scenario and says nothing of time"
 
 
@@ -34,9 +34,6 @@ def rti_mpc(*arguments: str, **environment: str) -> subprocess.CompletedProcess[
     return subprocess.run(
         [*RTI_MPC, *arguments], cwd=ROOT, env={**os.environ, "COLUMNS": "200", **environment}, capture_output=True, text=True, timeout=60
     )
-
-
-OF_RECORDINGS = {"export", "replay", "why"}  # commands that read a recording, and no bus
 
 
 @pytest.mark.parametrize("command", COMMANDS)

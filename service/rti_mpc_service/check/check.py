@@ -142,12 +142,11 @@ def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> Check
     failed_at: Array | None = None
 
     def sample(x: Array, y_ref: Array, *, asked: bool) -> tuple[float, float]:
-        """Solve one sample, and compare its QP if `asked`; return the times of both phases, us."""
+        """Solve one sample, and compare its last QP if `asked`; return the times of both phases, us."""
         nonlocal failed_at
         began_ns = time.perf_counter_ns()
         rti.prepare(y_ref)
         prepared_ns = time.perf_counter_ns()
-        guess = tuple(array.copy() for array in rti.guess.start.values())
         fed_ns = time.perf_counter_ns()
         status = rti.feedback(x)
         done_ns = time.perf_counter_ns()
@@ -155,8 +154,8 @@ def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> Check
         if failed_at is None and not status.usable:
             failed_at = x
         bounds.note_plan()
-        if asked and status.usable:
-            mine, theirs = (solution(one, guess, y_ref, x, rti.taken) for one in (tight, judge))
+        if asked and status is QpStatus.SOLVED:
+            mine, theirs = (solution(one, rti.guess.start.values(), y_ref, x) for one in (tight, judge))
             if mine is not None and theirs is not None:
                 differences.append(float(np.max(np.abs(mine - theirs) / scale)))
                 deviations.append(float(np.max(np.abs(rti.u - theirs) / scale)))
@@ -184,11 +183,8 @@ def tight_copy(rti: Rti, solver: str, formulation: str) -> Rti:
     return Rti(rti.ocp, settings, formulation=formulation, solver=solver, iterations=1, compile=False)
 
 
-def solution(one: Rti, guess: tuple[Array, ...], y_ref: Array, x0: Array, qps: int) -> Array | None:
-    """Return the inputs after so many QPs from a guess of x, u and u_prev, shape ``(N_u, nu)``; None if one is not solved."""
+def solution(one: Rti, guess: Iterable[Array], y_ref: Array, x0: Array) -> Array | None:
+    """Return the inputs of the QP at a guess of x, u and u_prev, shape ``(N_u, nu)``; None if it is not solved."""
     one.x[:], one.u[:], one.u_prev[:] = guess
-    for _ in range(qps):
-        one.prepare(y_ref, shift=False)
-        if one.feedback(x0) is not QpStatus.SOLVED:
-            return None
-    return one.u.copy()
+    one.prepare(y_ref, shift=False)
+    return one.u.copy() if one.feedback(x0) is QpStatus.SOLVED else None

@@ -117,6 +117,9 @@ class QpCase:
             ConfigError: It is no case.
         """
         try:
+            with path.open("rb") as raw:
+                if not zipfile.is_zipfile(raw):
+                    raise ValueError("what is no npz file")
             with np.load(path, allow_pickle=False) as file:
                 if str(file["format"]) != FORMAT:
                     raise ValueError(f"format {file['format']}")
