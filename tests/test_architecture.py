@@ -35,7 +35,10 @@ LIBRARY = {
 # The commands of the service: none is a library of another. What they share is beside them, or in `config`, `host` and `rig`.
 NAMES = ("bench", "check", "conformance", "controller", "demo", "doctor", "faults", "paper", "record", "replay", "status", "tune", "view")
 COMMANDS = {f"rti_mpc_service.{name}" for name in NAMES}
-BORROWED = {"rti_mpc_service.paper": {"rti_mpc_service.bench"}}  # command: what it takes of another all the same
+BORROWED = {
+    "rti_mpc_service.paper": {"rti_mpc_service.bench"},
+    "rti_mpc_service.replay": {"rti_mpc_service.record"},
+}  # command: what it takes of another all the same
 
 # What no file of a package imports; the command line alone may start a simulation, lazily.
 FORBIDDEN = {

@@ -380,25 +380,33 @@ def replay(
     raise typer.Exit(main(recording, start_s=parse_start(start), assignments=assignments or (), tolerance=tolerance, json_path=path, **choice))
 
 
-@app.command()
+@partial(process, with_model=False)
 def why(
-    recording: RecordingPath,
+    config: Config,
+    bus: BusSettings,
+    words: Annotated[list[str] | None, typer.Argument(metavar="[RUN.mcap]", help="Recording, in place of the running controller.")] = None,
     at: Annotated[str | None, typer.Option("--at", metavar="TIME", help="Time after the first command, such as 72.5s.")] = None,
-    seq: Annotated[int | None, typer.Option("--seq", metavar="NUMBER", help="Number of the command instead.")] = None,
+    seq: Annotated[int | None, typer.Option("--seq", metavar="NUMBER", help="Number of the command.", show_default="the last command")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     case: Annotated[Path | None, typer.Option(metavar="FILE.npz", help="Also write the sample's QP as a case, for `rti-mpc solve-case`.")] = None,
     robot: RecordedRobot = None,
     owner: Owner = None,
     folder: ModelFolder = Path(),
     trust: Trust = False,
-) -> None:
-    """Explain a recorded command: who solved it, which bounds act, what its plan costs, and the events that led there."""
+) -> int:
+    """Explain a command, recorded or just sent: who solved it, which bounds act, what its plan costs, and the events that led there."""
+    from rti_mpc_service.replay import live
     from rti_mpc_service.replay.replay import parse_start
     from rti_mpc_service.replay.why import main
 
-    at_s = None if at is None else parse_start(at)
-    choice: dict[str, Any] = {"robot": robot, "owner": owner, "folder": folder, "trust": trust}
-    raise typer.Exit(main(recording, at_s=at_s, seq=seq, as_json=as_json, case_path=case, **choice))
+    choice: dict[str, Any] = {"owner": owner, "folder": folder, "trust": trust, "as_json": as_json, "case_path": case}
+    if not words:
+        if not (at is None and seq is None and robot is None):
+            raise ConfigError("--at, --seq and --robot must come with a recording: a running controller is asked for its last command")
+        return live.main(bus, config.keys(), **choice)
+    if len(words) > 1:
+        raise ConfigError(f"why explains a command of one recording, got {' '.join(words)}")
+    return main(Path(words[0]), at_s=None if at is None else parse_start(at), seq=seq, robot=robot, **choice)
 
 
 @partial(process, with_model=False)

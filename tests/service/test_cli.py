@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[2]
 ZENOH = ("--mode", "--connect", "--listen", "--config", "--cfg", "--no-multicast-scouting")
 RTI_MPC = (sys.executable, "-c", "from rti_mpc_service.cli import main; main()")
 COMMANDS = sorted(typer.main.get_group(app).commands)
-OF_RECORDINGS = {"export", "replay", "solve-case", "why"}  # commands that read a recording, or a case of one, and no bus
+OF_RECORDINGS = {"export", "replay", "solve-case"}  # commands that read a recording, or a case of one, and no bus
 IN_PLACE = "--path is followed in place of a scenario and says nothing of time"
 
 
@@ -85,7 +85,23 @@ def test_outputs_that_no_path_fills_are_refused_by_name_in_the_terminal(command:
     sorted(
         set(COMMANDS)
         - OF_RECORDINGS
-        - {"bench", "certs", "enable", "guard", "init", "paper", "params", "record", "robots", "router", "schema", "snapshot", "status", "stop"}
+        - {
+            "bench",
+            "certs",
+            "enable",
+            "guard",
+            "init",
+            "paper",
+            "params",
+            "record",
+            "robots",
+            "router",
+            "schema",
+            "snapshot",
+            "status",
+            "stop",
+            "why",
+        }
     ),
 )
 def test_model_that_cannot_be_imported_is_refused_by_every_process_that_loads_it_with_file_and_line(command: str, tmp_path: Path) -> None:

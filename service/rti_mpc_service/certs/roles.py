@@ -32,6 +32,7 @@ ROLES_OF_COMMAND: dict[str, tuple[str, ...]] = {
     "enable": ("operator",),
     "params": ("operator",),
     "snapshot": ("operator",),
+    "why": ("recorder",),
 }
 MAX_NAME_CHARS = 64  # of a common name in a certificate
 

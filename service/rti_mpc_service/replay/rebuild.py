@@ -86,9 +86,12 @@ def journals(path: Path, robot: str | None = None, owner: int | None = None) -> 
         owner: Number of a controller; None: all.
 
     Raises:
-        ConfigError: There is none.
+        ConfigError: There is none, or the recording cannot be read.
     """
-    recording = Recording(path)
+    try:
+        recording = Recording(path)
+    except OSError as error:
+        raise ConfigError(f"{path} must be a recording that can be read: {error.strerror}") from error
     found: dict[tuple[str, int], list[Journal]] = {}
     for recorded in recording.messages(robot, ("journal",)):
         message = recorded.message

@@ -74,7 +74,7 @@ def main(
     case_path: Path | None = None,
 ) -> int:
     """
-    Explain one command of a recording.
+    Explain one command of a recording: the last one whose sample is followed by another, if neither a time nor a number is given.
 
     Args:
         path: The recording.
@@ -93,8 +93,8 @@ def main(
     Raises:
         ConfigError: There is no such command, or it cannot be repeated here.
     """
-    if (at_s is None) == (seq is None):
-        raise ConfigError("why must be asked with --at TIME or with --seq NUMBER, one of the two")
+    if at_s is not None and seq is not None:
+        raise ConfigError("why must be asked with --at TIME or with --seq NUMBER, not with both")
     for journal in journals(path, robot, owner):
         place = find(journal, at_s, seq)
         if place is not None:
@@ -106,25 +106,33 @@ def main(
             facts["times"] = phase_times(path, journal, place.command)
             print(json.dumps(facts, indent=1) if as_json else "\n".join(lines(facts)))
             return 0
-    what = f"a command {seq}" if seq is not None else f"a command {at_s:g} s after its first one"
+    what = "two commands" if at_s is None else f"a command {at_s:g} s after its first one"
+    what = what if seq is None else f"a command {seq}"
     raise ConfigError(f"{path} must hold {what}, in the journal of a controller that led then")
 
 
 def find(journal: Journaled, at_s: float | None, seq: int | None) -> Place | None:
-    """Return the place of a command that acted, None if there is none."""
-    first_ns, standing_by = None, False
+    """Return the place of a command that acted, the last but one without a time and a number; None if there is none."""
+    places = list(acted(journal))
+    if at_s is None and seq is None:
+        return places[-2] if len(places) > 1 else None
+    for place in places:
+        after_s = 1e-9 * (place.command.stamp_ns - places[0].command.stamp_ns)
+        if place.command.seq == seq or (at_s is not None and after_s >= at_s):
+            return place
+    return None
+
+
+def acted(journal: Journaled) -> Iterator[Place]:
+    """Yield the places of the commands that were committed while the controller led."""
+    standing_by = False
     for message in journal.messages:
         if message.kind is JournalKind.SNAPSHOT:
             continue
         for entry in decode_entries(message.data, message.seq):
             standing_by = entry.name == "stand_by" or (standing_by and entry.name != "lead")
-            if entry.name != "commit" or standing_by:
-                continue
-            command: Command = entry.args[0]
-            first_ns = command.stamp_ns if first_ns is None else first_ns
-            if command.seq == seq or (at_s is not None and command.stamp_ns - first_ns >= 1e9 * at_s):
-                return Place(entry.seq, command)
-    return None
+            if entry.name == "commit" and not standing_by:
+                yield Place(entry.seq, entry.args[0])
 
 
 def explain(journal: Journaled, built: Rebuilt, place: Place) -> dict[str, Any]:

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from rti_mpc.contract.status import Mode
+from rti_mpc.errors import ConfigError
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
-from rti_mpc_service.replay.why import Place, explain, find, lines
-from tests.service.replay.driven import failing, journal_of, straight
+from rti_mpc_service.replay.why import Place, acted, explain, find, lines, main
+from tests.service.replay.driven import failing, journal_of, recorded, straight
 
 INJECTED = SHIPPED.read_text() + "\n[debug]\ninject = true\n"
 
@@ -125,3 +126,19 @@ def test_disagreement_on_request_is_explained_with_what_the_other_solver_says(tm
     assert "solvers_disagree: OSQP's plans differ by more than 0.001" in text
     assert "injected: failure 'gradient' was injected on request, for 6 samples" in text
     assert "disagree" not in asked(journal, find(journal, None, 15), tmp_path)[0]
+
+
+def test_last_command_is_explained_where_none_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    journal = journal_of(SHIPPED, samples=12)
+    place = find(journal, None, None)
+    assert place is not None
+    assert place.command.seq == max(one.command.seq for one in acted(journal)) - 1, "the one that is followed by another sample"
+    assert main(recorded(journal, tmp_path / "run.mcap"), as_json=True) == 0
+    assert json.loads(capsys.readouterr().out)["seq"] == place.command.seq
+    with pytest.raises(ConfigError, match=r"--at TIME or with --seq NUMBER, not with both"):
+        main(tmp_path / "run.mcap", at_s=1.0, seq=1)
+
+
+def test_recording_that_is_not_there_is_refused_in_a_line(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"nowhere\.mcap must be a recording that can be read: No such file or directory"):
+        main(tmp_path / "nowhere.mcap")

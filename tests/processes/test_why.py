@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Explanation of what a running controller has just done."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rti_mpc_service.rig.endpoint import free_endpoint
+from tests.processes.system import System, rti_mpc
+
+pytestmark = pytest.mark.slow
+pytest.importorskip("mcap")
+
+
+def test_running_controller_is_explained_while_it_drives_on(tmp_path: Path) -> None:
+    with System(tmp_path) as system:
+        system.start("robot", "controller", "reference")
+        system.tracking()
+        done = rti_mpc("why", "-e", system.endpoint, "--json")
+        assert done.returncode == 0, done.stdout + done.stderr
+        first = json.loads(done.stdout)
+        assert first["replayed"] == "0 bits differ"
+        assert (first["robot"], first["mode"]) == ("pioneer", "TRACKING")
+        assert set(first["inputs"]) == {"u_c", "omega_c"}
+        assert first["times"]["feedback_us"] > 0
+        system.tracking()
+        then = json.loads(rti_mpc("why", "-e", system.endpoint, "--json").stdout)
+        assert then["seq"] > first["seq"]
+        assert rti_mpc("why", "-e", system.endpoint).stdout.startswith("command ")
+
+
+def test_controller_that_does_not_run_is_explained_by_one_line() -> None:
+    done = rti_mpc("why", "-e", free_endpoint())
+    assert (done.returncode, done.stdout.count("INFO")) == (2, 0)
+    assert "must hold the journal of a robot, got none" in done.stderr
