@@ -8,8 +8,6 @@ the full step. Only feedback is on the path from sensor to actuator
 [Diehl2005]_ [Gros2020]_. If that step is large, one linearization was not enough, and
 feedback iterates a few times at most. With at most one iteration this is the plain
 scheme; with many, and a small tolerance, it is sequential quadratic programming.
-Gauss-Newton converges linearly, so that a step tells the next ones: from the third QP of
-a sample on, the guess is where they lead, if they shrink (Anderson's method, [Walker2011]_).
 
 `ActiveSet` solves nearly every QP; a QP solver takes over when it fails. Softened bounds
 rarely act, so the QP solver first solves the QP without them. A plan that keeps them
@@ -44,7 +42,6 @@ BUILT_IN_SOLVERS = ("riccati", "osqp")  # any other solver is one of qpsolvers
 MAX_SEQUENTIAL_N_U = 10  # control horizon up to which the sequential formulation is the faster one, see docs/engine.md
 SOLVED, INACCURATE = QpStatus.SOLVED, QpStatus.INACCURATE  # read faster than a member of the enumeration
 MAX_ITERATIONS = 3  # per sample
-MOST_STEPS_AHEAD, MOST_CHANGE_AHEAD = 3.0, 0.25  # by which a guess may be ahead of the plan: in last steps, and in half ranges of an input
 STEP_TOLERANCE = 0.015  # a larger step is followed by another iteration: closed-loop costs within 0.5 % of converged NMPC, see docs/engine.md
 COST_WEIGHTS = ("delta", "lambda_", "z", "Z", "Q_e", "zh", "Zh", "R_u")  # weights that are multiplied by the scale of the cost
 TOUCHING_DISTANCE = 2e-3  # relative to the scale of a softened bound: a plan further away than this has left the bound
@@ -135,13 +132,9 @@ class Rti:
         self._violation: Array = np.zeros(2)  # of softened bounds, as it is and relative to their scales
         change: Array = np.zeros(1)
         self._change = change.data
-        self._step, self._last_step, self._squared = np.zeros_like(u), np.zeros_like(u), 0.0  # the last two steps of the inputs, in half ranges
-        self._plan_behind = tuple((guess, np.zeros_like(guess), plan) for guess, plan in ((x, self.x), (u, self.u)))
-        self._ahead = False  # whether the guess is extrapolated, and no plan
         # OSQP knows no infinity but its own.
         self._weights = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS_AND_BOUNDS}
         self.scale: Array = np.ones(model.nx + model.nu + len(ocp.lg))
-        self._scale_u = self.scale[model.nx : model.nx + model.nu]
         self.guess = Guess(
             sample={"x": x, "u": u, "u_prev": self.u_prev, "y_ref": self.y_ref, "p": self.p},
             weights=self._weights | {"scale": self.scale},
@@ -305,7 +298,6 @@ class Rti:
 
     def _relinearize(self) -> None:
         """Linearize at the plan itself, and prepare the solver."""
-        self._ahead = False
         for guess, plan in self._pairs:
             guess[:] = plan
         self._linearize()
@@ -325,11 +317,7 @@ class Rti:
         self._loaded = True
 
     def keep_guess(self) -> None:
-        """Take the guess as the plan, because there is no better one; if it is extrapolated, the plan that it comes from."""
-        if self._ahead:
-            self._ahead = False
-            for extrapolated, behind, _ in self._plan_behind:
-                extrapolated[:] = behind
+        """Take the guess as the plan, because there is no better one."""
         for guess, plan in self._pairs:
             plan[:] = guess
         if self.active_set is not None:
@@ -399,7 +387,6 @@ class Rti:
             self._iterate()
         if self.status is SOLVED and self.active_set is not None:
             self.status = self._certified(self.active_set)
-        self._ahead = False  # for all that follows, the plan counts
         return self.status
 
     @property
@@ -446,43 +433,12 @@ class Rti:
     def _iterate(self) -> None:
         """Iterate at the plan while the step is large; an iteration that fails leaves the plan of the one before."""
         while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
-            if (steps := self._steps_ahead()) > 0.0:
-                self._extrapolate(steps)
-            else:
-                self._relinearize()
+            self._relinearize()
             if not (status := self.solve()).usable:
                 self.status = INACCURATE  # the plan comes from an earlier QP, which cannot be certified any more
                 break
             self.status = status
             self.taken += 1
-
-    def _steps_ahead(self) -> float:
-        """
-        Return how many times the last step will follow if each step is to the one before as the last one was; 0 if that cannot be told.
-
-        It can where steps become shorter and keep their direction, unless an earlier QP of the sample had places that did not settle.
-        """
-        self._step, self._last_step, squared = self._last_step, self._step, self._squared
-        step, (guess, _, plan) = self._step, self._plan_behind[1]
-        np.subtract(plan, guess, out=step)
-        np.divide(step, self._scale_u, out=step)
-        self._squared = float(np.vdot(step, step))
-        if self.taken == 1 or not self._squared < squared or (self.active_set is not None and self.active_set.steps > 0):
-            return 0.0
-        along = float(np.vdot(step, self._last_step))
-        return max(0.0, min(MOST_STEPS_AHEAD, MOST_CHANGE_AHEAD / self._change[0], along / (squared - along)))
-
-    def _extrapolate(self, steps: float) -> None:
-        """Linearize so many steps ahead of the plan."""
-        for guess, behind, plan in self._plan_behind:
-            np.subtract(plan, guess, out=behind)
-            np.multiply(behind, steps, out=behind)
-            np.add(plan, behind, out=guess)
-            behind[:] = plan
-        guess, _, _ = self._plan_behind[1]
-        np.clip(guess, self._weights["lbu"], self._weights["ubu"], out=guess)
-        self._ahead = True
-        self._linearize()
 
     def solve_qp(self) -> QpStatus:
         """Solve with the QP solver."""

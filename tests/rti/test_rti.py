@@ -20,7 +20,6 @@ from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import OcpError, ShapeError
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model, Signal
-from rti_mpc.rti import rti as rti_module
 from rti_mpc.rti.certificate import certificate
 from rti_mpc.rti.construction import FORMULATIONS, natives
 from rti_mpc.rti.ocp import Ocp
@@ -227,52 +226,6 @@ def test_iteration_that_fails_leaves_the_plan_of_the_one_before(monkeypatch: pyt
     assert rti.taken == 1
     for array, same in zip(unmoving(rti), unmoving(plain), strict=True):
         np.testing.assert_array_equal(array, same)
-
-
-def test_guess_ahead_of_shrinking_steps_saves_iterations_on_the_way_to_the_same_plan(monkeypatch: pytest.MonkeyPatch) -> None:
-    ocp = pioneer(N=20)
-    taken: list[list[int]] = []
-    plans: list[Array] = []
-    for ahead in (rti_module.MOST_STEPS_AHEAD, 0.0):
-        monkeypatch.setattr(rti_module, "MOST_STEPS_AHEAD", ahead)
-        rti = Rti(ocp, iterations=200, tolerance=1e-9, compile=False)
-        assert rti.active_set is not None
-        taken.append([])
-        for x0, y_ref, u_prev in near_the_eight(ocp, seed=26, count=10):
-            rti.reset(x0, u_prev)
-            rti.prepare(y_ref, shift=False)
-            assert rti.feedback(x0) is QpStatus.SOLVED
-            if rti.active_set.steps == 0:  # otherwise every guess is a plan
-                taken[-1].append(rti.taken)
-                plans.append(rti.u.copy())
-    fewer, more = taken
-    assert len(fewer) == len(more) >= 5
-    assert max(more) < 200
-    assert sum(fewer) < 0.8 * sum(more)
-    half = len(fewer)
-    np.testing.assert_allclose(plans[:half], plans[half:], rtol=0, atol=1e-6)  # both stop at steps of 1e-9, from different sides
-
-
-def test_iteration_that_fails_ahead_of_the_plan_leaves_that_plan(monkeypatch: pytest.MonkeyPatch) -> None:
-    ocp = pioneer(N=20)
-    rti = Rti(ocp, iterations=200, tolerance=1e-9, compile=False)
-    _, (x0, y_ref, u_prev) = near_the_eight(ocp, seed=26, count=2)
-    assert rti.active_set is not None
-    plans: list[Array] = []
-    extrapolate, solve = rti._extrapolate, rti.active_set.solve
-
-    def keep_plan(steps: float) -> None:
-        plans.extend((rti.x.copy(), rti.u.copy()))
-        extrapolate(steps)
-
-    monkeypatch.setattr(rti, "_extrapolate", keep_plan)
-    monkeypatch.setattr(rti.active_set, "solve", lambda: not plans and solve())
-    monkeypatch.setattr(rti, "solve_qp", lambda: QpStatus.FAILED)
-    rti.reset(x0, u_prev)
-    rti.prepare(y_ref, shift=False)
-    assert rti.feedback(x0) is QpStatus.INACCURATE
-    np.testing.assert_array_equal(rti.x, plans[0])
-    np.testing.assert_array_equal(rti.u, plans[1])
 
 
 @pytest.mark.parametrize("finds_a_way", [(False, True, False, True), (True, False, True, False)])
