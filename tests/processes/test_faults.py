@@ -84,7 +84,7 @@ def test_recordings_of_faults_replay_without_a_differing_bit(tmp_path: Path) -> 
     assert len(accounts) == 3
     for account in accounts:
         assert (account["differing"], account["other"]) == (0, [])
-        assert account["commands"] > 5
+        assert account["commands"] > 0
         assert account["commands_not_covered"] <= 5, "those of the last tenths of a second of the one that is killed"
 
 

@@ -12,6 +12,7 @@ one copies and builds namespaces at every call, which costs more than the solve.
 from __future__ import annotations
 
 import math
+import signal
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +36,7 @@ STATUS_BY_OSQP_CODE = {
     7: QpStatus.MAX_ITER,
     8: QpStatus.TIME_LIMIT,
 }
+INTERRUPTED = 10  # while OSQP iterates, its own handler takes Ctrl-C
 
 MAX_ENTRY = 1e7  # of a scaled matrix: beyond it the factorization is rounding alone, and OSQP prints a line on standard output
 ACTING_MULTIPLIER = 1e-6  # a softened bound with a larger multiplier acts; those of the others are exactly zero
@@ -277,6 +279,10 @@ class Solver:
                 return QpStatus.FAILED
         self._held = None
         self.workspace.solve()
+        while self._info.status_val == INTERRUPTED:
+            self.iterations += int(self._info.iter)
+            signal.raise_signal(signal.SIGINT)  # for the handler of the process, without which nobody would be told
+            self.workspace.solve()
         self.iterations += int(self._info.iter)
         status = STATUS_BY_OSQP_CODE.get(self._info.status_val, QpStatus.FAILED)
         if not status.usable:

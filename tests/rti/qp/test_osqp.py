@@ -3,6 +3,11 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from functools import partial
+from threading import Timer
+
 import casadi as ca
 import numpy as np
 import osqp
@@ -13,7 +18,7 @@ from rti_mpc.contract.status import QpStatus
 from rti_mpc.model.model import Model, Signal
 from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.ocp import Ocp
-from rti_mpc.rti.qp.osqp import STATUS_BY_OSQP_CODE, SolverSettings
+from rti_mpc.rti.qp.osqp import INTERRUPTED, STATUS_BY_OSQP_CODE, SolverSettings
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.bench.families import FAMILIES
 from rti_mpc_service.bench.family_bench import drive_family
@@ -32,9 +37,33 @@ def test_inner_object_of_osqp_offers_what_is_driven() -> None:
     inner = rti().solver.workspace
     for name in ("update_data_vec", "update_data_mat", "update_rho", "solve", "warm_start"):
         assert callable(getattr(inner, name))
-    codes = {"SOLVED": 1, "SOLVED_INACCURATE": 2, "PRIMAL_INFEASIBLE": 3, "DUAL_INFEASIBLE": 5, "MAX_ITER_REACHED": 7, "TIME_LIMIT_REACHED": 8}
+    codes = {
+        "SOLVED": 1,
+        "SOLVED_INACCURATE": 2,
+        "PRIMAL_INFEASIBLE": 3,
+        "DUAL_INFEASIBLE": 5,
+        "MAX_ITER_REACHED": 7,
+        "TIME_LIMIT_REACHED": 8,
+        "SIGINT": INTERRUPTED,
+    }
     assert {name: int(osqp.SolverStatus[f"OSQP_{name}"]) for name in codes} == codes
-    assert set(codes.values()) <= set(STATUS_BY_OSQP_CODE)
+    assert set(codes.values()) - {INTERRUPTED} <= set(STATUS_BY_OSQP_CODE)
+
+
+def test_ctrl_c_during_a_solve_is_handed_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OSQP's own handler would keep it. What is solved here, in one piece, would take minutes, so the signal comes meanwhile."""
+    monkeypatch.setattr("rti_mpc.rti.qp.osqp.ADAPTATION_ITERATIONS", 100_000_000)
+    one = rti(SolverSettings(eps=1e-15, max_iter=100_000_000))
+    one.prepare(np.ones((one.ocp.N, 2)))
+    press = Timer(0.3, partial(os.kill, os.getpid(), signal.SIGINT))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        press.start()
+        with pytest.raises(KeyboardInterrupt):
+            one.feedback(np.zeros(2))
+    finally:
+        press.join()
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
