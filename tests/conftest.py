@@ -38,14 +38,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if "CI" not in os.environ:
         return
     seen: Counter[str] = Counter()
-    left = []
+    left: set[pytest.Item] = set()
     for item in items:
         if item.get_closest_marker("slow") is not None:
             name = item.nodeid.partition("[")[0]
             if seen[name] % SHORT_FORM:
-                left.append(item)
+                left.add(item)
             seen[name] += 1
-    config.hook.pytest_deselected(items=left)
+    config.hook.pytest_deselected(items=list(left))
     items[:] = [item for item in items if item not in left]
 
 
