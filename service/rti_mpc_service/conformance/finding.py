@@ -17,7 +17,16 @@ T = TypeVar("T")
 
 
 class Unseen(Exception):
-    """A case cannot be judged; the text says why."""
+    """
+    A case cannot be judged; the text says why.
+
+    Attributes:
+        late_ms: Delay of the host that would explain it; 0: none would.
+    """
+
+    def __init__(self, reason: str, late_ms: float = 0.0) -> None:
+        super().__init__(reason)
+        self.late_ms = late_ms
 
 
 @dataclass(frozen=True)
@@ -28,7 +37,7 @@ class Finding:
     Attributes:
         kept: Whether the promise is kept; None if it is not visible.
         seen: What was seen, in words.
-        late_ms: Delay of the host that would explain a broken promise; 0: none would.
+        late_ms: Delay of the host that would explain that it is not; 0: none would.
     """
 
     kept: bool | None
@@ -62,7 +71,7 @@ class Judgement:
     Attributes:
         case: The case.
         finding: What was seen.
-        excused: Whether delays of the host alone explain that it is broken.
+        excused: Whether delays of the host alone explain that it is broken or not visible.
     """
 
     case: Case[Any]
@@ -77,9 +86,9 @@ class Judgement:
     @property
     def verdict(self) -> str:
         """The verdict, in a word or two."""
-        if self.finding.kept is None:
-            return "not visible"
-        return "yes" if self.finding.kept else "host" if self.excused else "NO"
+        if self.excused:
+            return "host"
+        return {True: "yes", False: "NO", None: "not visible"}[self.finding.kept]
 
     def to_json(self) -> dict[str, Any]:
         """Return everything, in JSON."""
@@ -95,9 +104,9 @@ def judgements(cases: Sequence[Case[T]], judged: T, host: Host | None) -> Iterat
             try:
                 finding = case.judge(judged)
             except Unseen as reason:
-                finding = Finding(None, str(reason))
+                finding = Finding(None, str(reason), reason.late_ms)
             held_up_ms = 0.0
-            if finding.kept is False and finding.late_ms > 0.0 and host is not None:
+            if not finding.kept and finding.late_ms > 0.0 and host is not None:
                 held_up_ms = host.held_up_ms(since_ns, time.monotonic_ns())
             judgement = Judgement(case, finding, held_up_ms > 0.0 and held_up_ms >= SEEN_SHARE * finding.late_ms)
             if not judgement.excused:

@@ -44,6 +44,7 @@ from rti_mpc_service.conformance.wrong import refused, wrong
 NUDGE_SHARE = 0.03  # of an input's range: a robot moves no more than it must to be judged
 NEAR_SHARE = 1 / 3  # of a nudge, within which an input is as it should be
 SETTLING_NS = 20_000_000_000  # robot time for a robot to come to rest
+BUSY_SHARE = 0.1  # of that time, for which a host that holds us up explains that it does not
 WAY_NS = 3_000_000_000  # robot time for which a way to rest is watched
 SAMPLES = 9  # times within which an input may be late, at which it is looked up
 ROWS = 20  # that follow the end of a command, and must not act
@@ -130,7 +131,7 @@ class MovingTrial:
         self.run(MIN_ANSWERS * self.dt_ns, healthy)
         self.run(SETTLING_NS, healthy, until=lambda _: self._controller.at_rest)
         if not self._controller.at_rest:
-            raise Unseen(f"healthy commands did not bring it to rest within {seconds(SETTLING_NS)}")
+            raise Unseen(f"healthy commands did not bring it to rest within {seconds(SETTLING_NS)}", 1e-6 * BUSY_SHARE * SETTLING_NS)
 
     def tell(self, make: Callable[[Command], Command] = healthy) -> Command:
         """Send the next command, changed, twice in case one is lost, and return it; nothing is sent after it."""
