@@ -113,10 +113,7 @@ class System:
         self.fault_at_ns = time.monotonic_ns()
         process.send_signal(signal.SIGINT)
         try:
-            with suppress(subprocess.TimeoutExpired):
-                return process.wait(PATIENCE_S / 2)
-            process.send_signal(signal.SIGINT)  # one may be lost: between the last iteration of OSQP and its end its own handler keeps it
-            return process.wait(PATIENCE_S / 2)
+            return process.wait(PATIENCE_S)
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGABRT)  # where every thread is, to its log
             process.wait(PATIENCE_S)

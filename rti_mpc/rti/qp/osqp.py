@@ -11,6 +11,7 @@ one copies and builds namespaces at every call, which costs more than the solve.
 
 from __future__ import annotations
 
+import ctypes
 import math
 import signal
 from dataclasses import dataclass
@@ -36,7 +37,10 @@ STATUS_BY_OSQP_CODE = {
     7: QpStatus.MAX_ITER,
     8: QpStatus.TIME_LIMIT,
 }
-INTERRUPTED = 10  # while OSQP iterates, its own handler takes Ctrl-C
+INTERRUPTED = 10
+# During a solve OSQP's own handler takes Ctrl-C. It ends with the status above only before an iteration, so that one that
+# comes later, in the last iteration or while polishing, is in no status. This tells of both until the next solve.
+interrupted = ctypes.PyDLL(osqp.ext_builtin.__file__).osqp_is_interrupted
 
 MAX_ENTRY = 1e7  # of a scaled matrix: beyond it the factorization is rounding alone, and OSQP prints a line on standard output
 ACTING_MULTIPLIER = 1e-6  # a softened bound with a larger multiplier acts; those of the others are exactly zero
@@ -278,16 +282,20 @@ class Solver:
                 self.cold = True
                 return QpStatus.FAILED
         self._held = None
-        self.workspace.solve()
+        self._solve()
         while self._info.status_val == INTERRUPTED:
-            self.iterations += int(self._info.iter)
-            signal.raise_signal(signal.SIGINT)  # for the handler of the process, without which nobody would be told
-            self.workspace.solve()
-        self.iterations += int(self._info.iter)
+            self._solve()
         status = STATUS_BY_OSQP_CODE.get(self._info.status_val, QpStatus.FAILED)
         if not status.usable:
             self.cold = True  # no solve starts from a failed one
         return status
+
+    def _solve(self) -> None:
+        """Let OSQP iterate, and hand a Ctrl-C on that came meanwhile."""
+        self.workspace.solve()
+        self.iterations += int(self._info.iter)
+        if interrupted():
+            signal.raise_signal(signal.SIGINT)  # for the handler of the process, without which nobody would be told
 
     def _adapt(self) -> bool:
         """Take the next step size, weigh the rows by the last iterate, and return whether there still is a QP to be solved."""

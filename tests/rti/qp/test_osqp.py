@@ -50,10 +50,17 @@ def test_inner_object_of_osqp_offers_what_is_driven() -> None:
     assert set(codes.values()) - {INTERRUPTED} <= set(STATUS_BY_OSQP_CODE)
 
 
-def test_ctrl_c_during_a_solve_is_handed_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """OSQP's own handler would keep it. What is solved here, in one piece, would take minutes, so the signal comes meanwhile."""
+@pytest.mark.parametrize(
+    "settings",
+    [
+        pytest.param(SolverSettings(eps=1e-15, max_iter=100_000_000), id="iterating"),
+        pytest.param(SolverSettings(eps=1e3, check_termination=1, polish=1_000_000), id="polishing"),
+    ],
+)
+def test_ctrl_c_during_a_solve_is_handed_on(monkeypatch: pytest.MonkeyPatch, settings: SolverSettings) -> None:
+    """OSQP's own handler would keep it. What is solved here, in one piece, takes long, so the signal comes meanwhile."""
     monkeypatch.setattr("rti_mpc.rti.qp.osqp.ADAPTATION_ITERATIONS", 100_000_000)
-    one = rti(SolverSettings(eps=1e-15, max_iter=100_000_000))
+    one = rti(settings)
     one.prepare(np.ones((one.ocp.N, 2)))
     press = Timer(0.3, partial(os.kill, os.getpid(), signal.SIGINT))
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
