@@ -152,7 +152,7 @@ class Replay:
         self.outcome.entries += 1
         try:
             if name == "commit":
-                return self._commit(*args)
+                return self.commit(*args)
             if name == "inject":
                 self._inject(*args)
                 return None
@@ -181,7 +181,7 @@ class Replay:
             raise JournalError("a journal with injected failures must be replayed with debug.inject = true")
         inject({"failure": failure, "samples": samples})
 
-    def _commit(self, recorded: Command, left_ns: int | None) -> Difference | None:
+    def commit(self, recorded: Command, left_ns: int | None) -> Difference | None:
         """Compare the proposal with the recorded command, which then counts as sent."""
         proposal, self._proposal = self._proposal, None
         self.outcome.samples += 1

@@ -364,7 +364,11 @@ def replay(
     start: Annotated[str | None, typer.Option("--from", metavar="TIME", help="Time after the first state from which on to replay.")] = None,
     assignments: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Another weight or bound: what would have been commanded in the same states; repeatable."),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Another weight or bound: what would have been commanded in the same states; repeatable.",
+        ),
     ] = None,
     robot: RecordedRobot = None,
     owner: Owner = None,
@@ -372,12 +376,19 @@ def replay(
     trust: Trust = False,
     tolerance: Annotated[float, typer.Option(min=0.0, help="Largest relative difference on another machine or other versions.")] = 1e-6,
     path: JsonPath = None,
+    closed_loop: Annotated[
+        bool, typer.Option("--closed-loop", help="Then drive the simulated robot of the configuration, with --set if given, and compare both drives.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder for a figure of both drives, and a recording of both for `rti-mpc view`.")
+    ] = None,
 ) -> None:
-    """Repeat what a recorded controller did, from its journal, and compare each command bit by bit."""
+    """Repeat what a recorded controller did, from its journal, and compare each command bit by bit; or drive it in closed loop."""
     from rti_mpc_service.replay.replay import main, parse_start
 
     choice: dict[str, Any] = {"robot": robot, "owner": owner, "folder": folder, "trust": trust}
-    raise typer.Exit(main(recording, start_s=parse_start(start), assignments=assignments or (), tolerance=tolerance, json_path=path, **choice))
+    choice |= {"tolerance": tolerance, "json_path": path, "make_body": lockstep_robot if closed_loop else None, "out": out}
+    raise typer.Exit(main(recording, start_s=parse_start(start), assignments=assignments or (), **choice))
 
 
 @partial(process, with_model=False)
@@ -604,12 +615,12 @@ def robots() -> None:
     main()
 
 
-def lockstep_robot(settings: dict[str, Any]) -> Any:
-    """Make a simulated robot that its caller advances. Other processes find this function by its name."""
+def lockstep_robot(settings: dict[str, Any], epoch: int = 1, now_ns: int = 0) -> Any:
+    """Make a simulated robot that its caller advances, from a time on. Other processes find this function by its name."""
     from rti_mpc_sim.lockstep import Lockstep
     from rti_mpc_sim.settings import RobotSettings
 
-    return Lockstep(RobotSettings(**settings))
+    return Lockstep(RobotSettings(**settings), epoch, now_ns)
 
 
 @app.command()

@@ -26,7 +26,7 @@ from rti_mpc_sim.settings import RobotSettings
 
 class Lockstep:
     """
-    One robot, from time 0.
+    One robot, from a time on, 0 by default.
 
     Attributes:
         now_ns: Robot time.
@@ -37,10 +37,10 @@ class Lockstep:
         sensor: Its sensors.
     """
 
-    def __init__(self, settings: RobotSettings, epoch: int = 1) -> None:
+    def __init__(self, settings: RobotSettings, epoch: int = 1, now_ns: int = 0) -> None:
         model = settings.model
         angles = tuple(i for i, signal in enumerate(model.states) if signal.angle)
-        self.now_ns = 0
+        self.now_ns = now_ns
         self.epoch = epoch
         self.period_ns = settings.state_period_ns
         self.actuator = Actuator(
@@ -57,7 +57,7 @@ class Lockstep:
         self.x: Array = self._plant.x
         self.u: Array = self._plant.u
         self._reports_inputs = settings.reports_inputs
-        self._next_ns = 0
+        self._next_ns = now_ns
 
     @property
     def counters(self) -> Counters:
@@ -84,11 +84,29 @@ class Lockstep:
         if self.now_ns < self._next_ns:
             return None
         self._next_ns = (self.now_ns // self.period_ns + 1) * self.period_ns
+        return self._measure()
+
+    def _measure(self) -> int:
         actuator = self.actuator
         acting = (actuator.u, *actuator.source) if self._reports_inputs else UNREPORTED
         seq = self.sensor.measure(self.x, self.now_ns, *acting)
         actuator.measure(self.sensor.x, self.now_ns)
         return seq
+
+    def place(self, x: Array, now_ns: int) -> None:
+        """Advance to a time, and go on from another state there, shape ``(nx,)``; what is measured then reaches nobody."""
+        self.advance(now_ns)
+        self._plant.place(x)
+        self._measure()
+        self.sensor.take(now_ns)
+
+    def state_at(self, stamp_ns: int) -> State:
+        """Advance to a time, and return the state that is measured then, whatever the period; of a robot that loses and delays no state."""
+        self.advance(stamp_ns)
+        self._measure()
+        state = self.sensor.take(stamp_ns)
+        assert state is not None
+        return state
 
     def tick(self) -> State:
         """Advance to the next state that is not lost, and return it."""

@@ -60,6 +60,10 @@ class Plant:
         phi = integrator(lagging(model, lag_s) if lag_s > 0.0 else model, substeps=substeps)
         self._evaluate = bind(phi, {"x": self._state, "u": self._input, "p": self._p, "dt": self._dt}, {"x_next": self._next})
 
+    def place(self, x: Array) -> None:
+        """Go on from another state, shape ``(nx,)``; inputs that lag go on from what they are."""
+        self.x[:] = x
+
     def advance(self, u: Array, duration_s: float) -> None:
         """Integrate over an interval in which the input, shape ``(nu,)``, is held."""
         self._input[:] = u
@@ -92,6 +96,11 @@ class SampledPlant:
         self._p = np.array(model.p_nominal, dtype=np.float64)  # (np,)
         after = ca.Function("after", [model.x, model.u, model.p], [ca.densify(model.disc_dyn_expr)], ["x", "u", "p"], ["x_next"])
         self._evaluate = bind(after, {"x": self._start, "u": self._mean, "p": self._p}, {"x_next": self._next})
+
+    def place(self, x: Array) -> None:
+        """Go on from another state, shape ``(nx,)``, at the beginning of a period."""
+        self.x[:] = self._start[:] = x
+        self._sum[:] = self._elapsed_s = 0.0
 
     def advance(self, u: Array, duration_s: float) -> None:
         """Advance over an interval in which the input, shape ``(nu,)``, is held."""

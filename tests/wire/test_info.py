@@ -13,7 +13,7 @@ from rti_mpc.wire.info import Info, Label, Leader, Obstacle, bounds, labels, obs
 from rti_mpc.wire.received import Received
 from rti_mpc_service.config.build import build_ocp
 from rti_mpc_service.config.config import load
-from rti_mpc_service.controller.description import controller_info
+from rti_mpc_service.description import controller_info
 from tests.service.config.test_config import DISC, MINIMAL
 
 PIONEER: dict[str, Any] = {

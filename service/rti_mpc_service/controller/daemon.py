@@ -44,7 +44,6 @@ from rti_mpc_service.announce import announce
 from rti_mpc_service.config.build import build_controller, build_rti
 from rti_mpc_service.config.fit import check_stop
 from rti_mpc_service.config.schema import Config
-from rti_mpc_service.controller.description import controller_info
 from rti_mpc_service.controller.journal import JournalPublisher
 from rti_mpc_service.controller.leadership import LEADER, LISTEN_BEFORE_START_S, STANDBY, Candidate, hear_others
 from rti_mpc_service.controller.orders import Orders
@@ -52,6 +51,7 @@ from rti_mpc_service.controller.params import Params
 from rti_mpc_service.controller.references import References
 from rti_mpc_service.controller.rehearsal import Rehearsal
 from rti_mpc_service.controller.slack import Slack
+from rti_mpc_service.description import controller_info
 from rti_mpc_service.host import realtime
 from rti_mpc_service.latch_file import LatchFile
 from rti_mpc_service.operator_stop import OperatorStop

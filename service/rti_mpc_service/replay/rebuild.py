@@ -26,7 +26,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.recording.reader import Recording
 from rti_mpc.rti.rti import Rti
 from rti_mpc.wire import document
-from rti_mpc_service.config.build import build_controller, build_model, build_rti
+from rti_mpc_service.config.build import build_controller, build_model, build_rti, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_model, check_stop
 from rti_mpc_service.config.schema import Config
@@ -67,12 +67,14 @@ class Rebuilt:
         config: Its configuration.
         controller: The controller, before its first call.
         rti: Its real-time iteration.
+        robot: Arguments of `rti_mpc_sim.settings.RobotSettings` for the configuration's simulated robot.
         others: What is not as it was when it was recorded, a line each: with nothing, every bit must be the same.
     """
 
     config: Config
     controller: Controller
     rti: Rti
+    robot: dict[str, Any]
     others: list[str]
 
 
@@ -140,7 +142,8 @@ def rebuild(journal: Journaled, *, folder: Path, trust: bool = False) -> Rebuilt
             raise ConfigError(f"model {config.model.name} must have the equations that were recorded, got others: use the rti-mpc that recorded it")
         rti = build_rti(config)
         controller = build_controller(config, rti, check_stop(config))
-    return Rebuilt(config, controller, rti, list(changes(recorded)))
+        robot = robot_settings(config)
+    return Rebuilt(config, controller, rti, robot, list(changes(recorded)))
 
 
 def configuration(files: Mapping[str, str], temporary: Path, *, folder: Path, trust: bool) -> Config:

@@ -29,7 +29,9 @@ from rti_mpc_service.config.fit import check_names, check_tree
 from rti_mpc_service.config.refusal import explain
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.replay import coverage
+from rti_mpc_service.replay.closed_loop import compare
 from rti_mpc_service.replay.coverage import uncovered
+from rti_mpc_service.replay.drive import Drive, MakePlacedBody, drive
 from rti_mpc_service.replay.rebuild import CONFIGURATION, Journaled, Rebuilt, journals, rebuild
 
 TOLERANCE = 1e-6  # of commands on another machine, relative to 1 + their magnitude
@@ -74,6 +76,8 @@ def main(
     trust: bool = False,
     tolerance: float = TOLERANCE,
     json_path: Path | None = None,
+    make_body: MakePlacedBody | None = None,
+    out: Path | None = None,
 ) -> int:
     """
     Replay a recording, and print what it shows.
@@ -88,14 +92,19 @@ def main(
         trust: Whether to run the attached source of a model.
         tolerance: Largest difference on another machine, relative to 1 + the magnitude.
         json_path: File for the results.
+        make_body: Maker of the simulated robot that is driven in closed loop, with `assignments`, if any; None: open loop.
+        out: Folder for a figure and a recording of each closed loop beside the recorded one.
 
     Returns:
-        Exit status: 0 if every command was repeated, else 1; with `assignments` always 0.
+        Exit status: 0 if every command was repeated, else 1; with `assignments` in open loop always 0.
 
     Raises:
         ConfigError: The recording cannot be replayed here.
     """
-    accounts = []
+    if out is not None and make_body is None:
+        raise ConfigError("--out must come with --closed-loop, whose figure and recording it is for")
+    accounts, closed_loops = [], []
+    changed = () if make_body is not None else assignments  # of what is replayed in open loop
     status = 0
     found = journals(path, robot, owner)
     for journal in found:
@@ -107,24 +116,32 @@ def main(
         built = rebuild(journal, folder=folder, trust=trust)
         for line in built.others:
             print(f"  {line}")
-        if built.others and not assignments:
+        if built.others and not changed:
             print(f"  so commands are compared within {tolerance:g}, relative to 1 + their magnitude, not bit by bit")
-        account = play(journal, built, start_s, assignments)
+        override = overridden(built.config, built.rti.ocp, assignments)  # refused before anything is replayed
+        recorded = None if make_body is None else Drive(built, begin_ns(journal) + round(1e9 * start_s))
+        account = play(journal, built, start_s, changed, recorded)
         accounts.append(account)
         limit = tolerance if built.others else 0.0
-        for line in lines(account, limit, assignments):
+        for line in lines(account, limit, changed):
             print(f"  {line}")
+        if recorded is not None and make_body is not None:
+            on = Drive(rebuild(journal, folder=folder, trust=trust), recorded.start_ns, make_body, override)
+            drive(on, journal.messages, snapshot_before(journal, start_s))
+            closed_loops.append(compare(path, journal, recorded, on, assignments, start_s, out))
         outcome = account.on.outcome
-        if not assignments and (not outcome.samples or outcome.size > limit or (outcome.differing and not built.others)):
+        if not changed and (not outcome.samples or outcome.size > limit or (outcome.differing and not built.others)):
             status = 1
     if json_path is not None:
-        json_path.write_text(json.dumps([summary(account) for account in accounts], indent=1))
+        driven = closed_loops or [None] * len(accounts)
+        results = [summary(account) | ({} if loop is None else {"closed_loop": loop}) for account, loop in zip(accounts, driven, strict=True)]
+        json_path.write_text(json.dumps(results, indent=1))
     return status
 
 
-def play(journal: Journaled, built: Rebuilt, start_s: float = 0.0, assignments: Sequence[str] = ()) -> Account:
-    """Replay one controller."""
-    on = Replay(built.controller, built.rti)
+def play(journal: Journaled, built: Rebuilt, start_s: float = 0.0, assignments: Sequence[str] = (), on: Replay | None = None) -> Account:
+    """Replay one controller, by a replay of its own if none is given."""
+    on = on or Replay(built.controller, built.rti)
     account = Account(journal, built, on, start_s=start_s)
     override = overridden(built.config, built.rti.ocp, assignments) if assignments else {}
     steps: Iterator[tuple[JournalEntry, Difference | None]] = replay(on, journal.messages, snapshot_before(journal, start_s))
@@ -143,10 +160,15 @@ def play(journal: Journaled, built: Rebuilt, start_s: float = 0.0, assignments: 
 
 def snapshot_before(journal: Journaled, start_s: float) -> int:
     """Return the number from which on snapshots are used, so that the replay covers a robot time after the first state."""
-    first_ns = next((message.stamp_ns for message in journal.messages if message.stamp_ns), 0)
+    first_ns = begin_ns(journal)
     before = [message.seq for message in journal.messages if message.stamp_ns and message.stamp_ns - first_ns <= 1e9 * start_s]
     snapshots = [message.seq for message in journal.messages if message.kind.name == "SNAPSHOT"]
     return max((seq for seq in snapshots if before and seq <= before[-1]), default=0) if start_s > 0.0 else 0
+
+
+def begin_ns(journal: Journaled) -> int:
+    """Return the robot time from which `--from` counts."""
+    return next((message.stamp_ns for message in journal.messages if message.stamp_ns), 0)
 
 
 def overridden(config: Config, ocp: Ocp, assignments: Sequence[str]) -> dict[str, Array]:

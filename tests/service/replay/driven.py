@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -99,13 +99,15 @@ def failing(failure: str, samples: int) -> Act:
     return act
 
 
-def recorded(journal: Journaled, path: Path) -> Path:
-    """Write a journal as a recorder does, with the attached files, and return the file."""
+def recorded(journal: Journaled, path: Path, states: Sequence[State] = ()) -> Path:
+    """Write a journal as a recorder does, with the attached files, and states that arrive at their stamps; return the file."""
     keys = Keys("rti_mpc", journal.robot)
     writer = RecordingWriter(path, 0, 0, "0")
     for name, text in journal.files.items():
         writer.attach(f"{journal.robot}/{journal.owner}/{name}", "text/plain", text.encode(), 0)
     for message in journal.messages:
         writer.add(journal.robot, keys.journal, message.local_ns, encode(message), message.seq)
+    for state in states:
+        writer.add(journal.robot, keys.state, state.stamp_ns, encode(state), state.seq)
     writer.finish({})
     return path

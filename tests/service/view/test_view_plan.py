@@ -16,7 +16,7 @@ from rti_mpc.wire.info import Info
 from rti_mpc_service.config.build import build_rti
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
-from rti_mpc_service.controller.description import controller_info
+from rti_mpc_service.description import controller_info
 from rti_mpc_service.replay import plan as held
 from rti_mpc_service.shipped import ROBOTS
 from rti_mpc_service.view.plan import acting_bounds, cost_terms, is_plan

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Closed loop from a recording: the recorded controller, or one with other weights, drives the simulated robot."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rti_mpc.contract.message import JournalKind
+from rti_mpc.control.controller import Controller
+from rti_mpc.recording import Recording
+from rti_mpc.rti.rti import Rti
+from rti_mpc_service.cli import SHIPPED, lockstep_robot
+from rti_mpc_service.replay.closed_loop import numbers_of, run_of
+from rti_mpc_service.replay.drive import Drive, Passage, drive
+from rti_mpc_service.replay.rebuild import Journaled, rebuild
+from rti_mpc_service.replay.replay import main, overridden, snapshot_before
+from tests.loop import MS
+from tests.service.replay.driven import journal_of, recorded, straight
+
+
+def stop(controller: Controller, rti: Rti) -> None:
+    controller.stop("by an operator")
+
+
+def enable(controller: Controller, rti: Rti) -> None:
+    controller.enable()
+
+
+def passages(journal: Journaled, folder: Path, assignments: tuple[str, ...] = (), start_s: float = 0.0) -> tuple[Passage, Passage]:
+    """The drive as it was recorded, and in closed loop."""
+    found = []
+    for make_body in (None, lockstep_robot):
+        built = rebuild(journal, folder=folder)
+        override = overridden(built.config, built.rti.ocp, assignments) if make_body is not None else {}
+        found.append(drive(Drive(built, round(1e9 * start_s), make_body, override), journal.messages, snapshot_before(journal, start_s)))
+    return found[0], found[1]
+
+
+def states(passage: Passage) -> list[Any]:
+    return [[state.seq, state.stamp_ns, state.command_seq, *state.x, *state.u] for state in passage.states]
+
+
+def test_same_settings_in_closed_loop_drive_as_recorded_also_through_a_stop_and_missing_states(tmp_path: Path) -> None:
+    journal = journal_of(SHIPPED, samples=60, acts={25: stop, 40: enable}, sees=lambda k, state: None if k == 10 else state)
+    was, driven = passages(journal, tmp_path)
+    assert len(was.states) == 59
+    assert states(driven) == states(was), "the simulated robot is that of the recording, and commands arrive when they did: no bit differs"
+    assert [command.u.tolist() for command in driven.commands] == [command.u.tolist() for command in was.commands]
+    assert {"stop", "enable"} <= {event.code for event in driven.events}
+    assert driven.solved["stopped"] > 5
+
+
+@pytest.mark.slow
+def test_drive_from_the_middle_begins_with_the_state_and_the_inputs_of_that_time(tmp_path: Path) -> None:
+    journal = journal_of(SHIPPED, samples=60)
+    was, driven = passages(journal, tmp_path, start_s=4.0)
+    assert was.states[0].stamp_ns == 4000 * MS
+    assert states(driven) == pytest.approx(np.array(states(was)), abs=1e-9), "the robot goes on from a state that has wrapped its angles"
+
+
+@pytest.mark.slow
+def test_other_weights_drive_another_way(tmp_path: Path) -> None:
+    journal = journal_of(SHIPPED, samples=40, follows=straight(5.0, 0.3))
+    built = rebuild(journal, folder=tmp_path)
+    was, driven = (
+        numbers_of(passage, run_of(passage, built.rti.ocp, 1.0, ""), built.rti.ocp)
+        for passage in passages(journal, tmp_path, ("ocp.weights.R.u_c=30", "ocp.weights.R.omega_c=30"))
+    )
+    assert driven["effort"] < 0.9 * was["effort"], "changes of the inputs cost more"
+    assert driven["x_rms"] > 1.05 * was["x_rms"], "so it catches up later"
+    assert driven["samples"] == was["samples"]
+
+
+@pytest.mark.slow
+def test_closed_loop_ends_where_entries_are_missing(tmp_path: Path) -> None:
+    journal = journal_of(SHIPPED, samples=60)
+    calls = [message for message in journal.messages if message.kind is JournalKind.CALLS and message.stamp_ns == 3000 * MS]
+    gap = replace(journal, messages=[message for message in journal.messages if message is not calls[0]])
+    was, driven = passages(gap, tmp_path)
+    assert was.states[-1].stamp_ns == driven.states[-1].stamp_ns == 2900 * MS
+
+
+@pytest.mark.slow
+def test_both_drives_are_told_in_numbers_drawn_and_written_into_one_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    journal = journal_of(SHIPPED, samples=60)
+    was, _ = passages(journal, tmp_path)
+    path = recorded(journal, tmp_path / "run.mcap", was.states)
+    status = main(path, assignments=["ocp.weights.R.u_c=30"], make_body=lockstep_robot, out=tmp_path / "out", json_path=tmp_path / "run.json")
+    text = capsys.readouterr().out
+    assert status == 0, text
+    assert "0 bits differ" in text
+    assert "in closed loop with ocp.weights.R.u_c=30, 5.8 s from 0.0 s on, numbers after 2.9 s" in text
+    (result,) = json.loads((tmp_path / "run.json").read_text())
+    loop = result["closed_loop"]
+    assert loop["closed_loop"]["distance_mm_rms"] != loop["recorded"]["distance_mm_rms"]
+    assert loop["closed_loop"]["samples_by"] == {"riccati": 59}
+    both = Recording(tmp_path / "out" / "pioneer-5.mcap")
+    assert both.robots == ["pioneer", "pioneer_closed_loop"]
+    begins = {robot: next(both.messages(robot, ("state",))) for robot in both.robots}
+    assert len({(each.local_ns, each.message.stamp_ns) for each in begins.values()}) == 1, "both begin at once, so one axis of time fits both"
+    assert set(both.streams["pioneer_closed_loop"]) == {"state", "command", "telemetry", "info", "reference/anchored", "event"}
+    assert (tmp_path / "out" / "pioneer-5.png").stat().st_size > 20_000
