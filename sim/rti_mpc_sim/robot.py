@@ -24,7 +24,7 @@ import numpy as np
 
 import rti_mpc
 from rti_mpc.array import Array
-from rti_mpc.contract.message import Command, Notice, Severity, State
+from rti_mpc.contract.message import Command, Notice, Severity
 from rti_mpc.contract.schedule import unfit
 from rti_mpc.model.model import Model
 from rti_mpc.wire.actuator import STALE_NS, Counters
@@ -42,6 +42,7 @@ ROLE = "robot"
 STANDSTILL_CHANGE = 1e-6  # nothing moves any more if no state changes by more in a period, in any unit
 STANDSTILL_RATE = 1e-3  # the robot stands if no state changes faster, in any unit per s
 MAX_COAST_NS = 10_000_000_000  # robot time with the inputs at rest after which it is decided whether the robot stands
+SENDING_S = 1e-3  # real time between two states on that way: many at once would be dropped as congestion
 MAX_WAY_NS = 120_000_000_000  # robot time that the inputs may take to come to rest
 LISTEN_BEFORE_START_S = 0.5  # how long a starting robot listens for another one of its name
 PRESENCE_LEASE_S = 2.0  # time after which the presence of a process that was killed or hangs has ended
@@ -188,10 +189,10 @@ class Robot:
         logger.warning("%s", notice.text)
 
     def finish(self) -> RobotSummary:
-        """Go the way to rest, coast until the robot stands, send that state, and sum up."""
+        """Go the way to rest and coast until the robot stands, ahead of the clock, and sum up."""
         body = self.body
         body.actuator.switch_off()
-        x, moved, rate, last = body.x.copy(), np.inf, np.zeros_like(body.x), None
+        x, moved, rate = body.x.copy(), np.inf, np.zeros_like(body.x)
         begun_ns = rested_ns = body.now_ns
         while body.now_ns < min(begun_ns + MAX_WAY_NS, rested_ns + MAX_COAST_NS) and not (body.actuator.at_rest and moved < STANDSTILL_CHANGE):
             x[:], before_ns = body.x, body.now_ns
@@ -199,9 +200,8 @@ class Robot:
             moved = np.abs(body.x - x).max()
             rate[:] = (body.x - x) / (1e-9 * max(1, body.now_ns - before_ns))
             rested_ns = rested_ns if body.actuator.at_rest else body.now_ns
-            last = body.sensor.take(body.now_ns) or last
-        if last is not None:
-            self._send(last)
+            self._send_due()
+            time.sleep(SENDING_S)
         how = standing(self._model, rate)
         stands = how == "stands"
         self._announcer.say(Notice(Severity.INFO if stands else Severity.WARNING, "robot_stopped", f"the robot was stopped and {how}"), body.now_ns)
@@ -237,8 +237,7 @@ class Robot:
         if self.body.counters.starved > starved:
             ran_out = Notice(Severity.ERROR, "command_ran_out", "no valid command is left: the robot goes to rest by itself")
             self._announcer.say(ran_out, to_ns)
-        while (state := self.body.sensor.take(to_ns)) is not None:
-            self._send(state)
+        self._send_due()
 
     def _take(self, command: Command, monotonic_ns: int) -> None:
         """Hand a command to the actuators."""
@@ -257,8 +256,9 @@ class Robot:
         if (seq := body.measure()) is not None:
             self._log.measured(seq, body.now_ns, body.x, body.u, body.counters, time.monotonic_ns())
 
-    def _send(self, state: State) -> None:
-        """Send a state."""
-        self._log.sent(state.seq, time.monotonic_ns())
-        self._states.put(state)
-        self._sent += 1
+    def _send_due(self) -> None:
+        """Send the states that are due."""
+        while (state := self.body.sensor.take(self.body.now_ns)) is not None:
+            self._log.sent(state.seq, time.monotonic_ns())
+            self._states.put(state)
+            self._sent += 1

@@ -163,6 +163,23 @@ def test_commanded_robot_moves_stops_on_silence_and_ends_on_ctrl_c_standing(endp
     assert abs(float(lines[-1]["u"])) < 1e-5
 
 
+def test_robot_that_is_stopped_sends_each_state_of_its_way_to_rest(endpoint: str, tmp_path: Path, host: Host) -> None:
+    """Its numbers have no gap, so that a recorder misses nothing."""
+    with running(ROBOT, endpoint, 1.0, 0.05, tmp_path / "log.csv") as process, peer(endpoint) as bus:
+        states, events, commands = bus.subscriber(KEYS.state, capacity=1024), bus.subscriber(KEYS.events, capacity=16), bus.publisher(KEYS.command)
+        seqs, heard = itertools.count(1), [next_state(states)]
+        while heard[-1].x[3] < 0.3:
+            commands.put(command(heard[-1], next(seqs), [0.4, 0.2]))
+            heard.append(next_state(states))
+        interrupted(process, host)
+        for received in iter(events.recv, None):
+            if decode(Event, received.payload).code == "robot_stopped":
+                break
+        heard += [decode(State, received.payload) for received in states.drain()]
+        assert [state.seq - heard[0].seq for state in heard] == list(range(len(heard)))
+        assert np.abs(heard[-1].x[3:]).max() < 1e-5
+
+
 def test_what_is_no_command_is_counted_and_published_and_stops_nothing(endpoint: str, tmp_path: Path, host: Host) -> None:
     log = tmp_path / "log.csv"
     with running(ROBOT, endpoint, 1.0, 0.02, log) as process, peer(endpoint) as bus:
