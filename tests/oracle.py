@@ -77,7 +77,7 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Arra
     rows: list[tuple[Array, ca.SX, Array]] = [(np.zeros(nx), x[:, 0] - x0, np.zeros(nx))]
     cost = ca.SX(0)
     for k in range(N):
-        held = u[:, min(k, N_u - 1)]
+        held = u[:, [j for j, length in enumerate(ocp.blocks) for _ in range(length)][k]]
         e = model.residual(h(x[:, k + 1], held, p), y_ref[:, k])
         factors = np.broadcast_to(ocp.delta[k], model.ny) ** 0.5
         cost += ca.bilin(ca.DM(ocp.Q), factors * e, factors * e)

@@ -24,7 +24,8 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled, function
-from rti_mpc.rti.linearization import all_inputs, constraints
+from rti_mpc.rti.blocks import all_inputs
+from rti_mpc.rti.linearization import constraints
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import TOUCHING_DISTANCE, Rti
 
@@ -109,7 +110,7 @@ def progress(ocp: Ocp) -> ca.Function:
     ]
     if nh:
         constraint, *_ = constraints(ocp)
-        u_held = all_inputs(u, N)
+        u_held = all_inputs(u, ocp.blocks)
         g = constraint.map(N)(x[:, 1:], u_held, p[:, 1:])[len(ocp.soft) : ocp.ng_path, :]
         near = TOUCHING_DISTANCE * scale[model.nx + model.nu + len(ocp.soft) :][:nh]
         held += [ca.mmax(ca.fmax(g[k, :] - uh[k], lh[k] - g[k, :])) + near[k] for k in range(nh)]

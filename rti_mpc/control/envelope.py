@@ -49,7 +49,7 @@ class Envelope:
             reach: Lowest and highest first two rows, each of shape ``(2, nu)``.
 
         Returns:
-            All `N` rows, inputs held after `N_u` expanded, shape ``(N, nu)``.
+            All `N` rows, inputs held over their blocks, shape ``(N, nu)``.
         """
         self._u[:] = u
         self._reach[0][:], self._reach[1][:] = reach
@@ -86,12 +86,14 @@ def clipping(ocp: Ocp) -> ca.Function:
     lowest, highest = ca.SX.sym("lowest", nu, 2), ca.SX.sym("highest", nu, 2)
     lbu, ubu, lbdu, ubdu = (ca.SX.sym(name, nu) for name in INPUT_BOUNDS)
     rows: list[ca.SX] = []
-    for k in range(ocp.N_u):
+    for k, j in enumerate(ocp.held.tolist()):
+        if k > 1 and ocp.starts[j] != k:
+            rows.append(rows[-1])
+            continue
         lower, upper = (rows[-1] + lbdu, rows[-1] + ubdu) if k else (lowest[:, 0], highest[:, 0])
         if k == 1:
             lower, upper = ca.fmax(lower, lowest[:, 1]), ca.fmin(upper, highest[:, 1])
-        wanted = ca.fmin(ca.fmax(u[:, k], lbu), ubu)
+        wanted = ca.fmin(ca.fmax(u[:, j], lbu), ubu)
         rows.append(ca.fmin(ca.fmax(wanted, lower), upper))
-    rows += [rows[-1]] * (ocp.N - ocp.N_u)
     inputs = {"u": u, "lowest": lowest, "highest": highest, "lbu": lbu, "ubu": ubu, "lbdu": lbdu, "ubdu": ubdu}
     return function("clipping", inputs, {"rows": ca.densify(ca.horzcat(*rows))})

@@ -23,7 +23,8 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.codegen import function
-from rti_mpc.rti.linearization import Linearization, all_inputs, divided
+from rti_mpc.rti.blocks import all_inputs, summed
+from rti_mpc.rti.linearization import Linearization, divided
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.recursion import recur
 
@@ -52,12 +53,12 @@ def certificate(ocp: Ocp) -> ca.Function:
     dx, du = x_plan - lin.x, u_plan - lin.u
     shared = [ca.repmat(e, 1, N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg, lin.scale_x, lin.scale_g)]
     data = (forms.A, forms.B, forms.b, forms.H, forms.h, forms.g, forms.g_x, forms.g_u)
-    nodes = node(ocp, lin).map(N)(*data, dx[:, :-1], all_inputs(du, N), dx[:, 1:], of_softened, *shared)
+    nodes = node(ocp, lin).map(N)(*data, dx[:, :-1], all_inputs(du, ocp.blocks), dx[:, 1:], of_softened, *shared)
     sums, by_x, by_u = nodes[:3, :], nodes[3 : 3 + nx, :], nodes[3 + nx :, :]
 
     sweep = recur("adjoint", [(adjoint(lin), N)], {"pi": "pi_before"}, ["gradient"], backward=True)
     gradient = sweep(A=forms.A, B=forms.B, by_u=by_u, by_x=by_x, pi=ca.MX.zeros(nx))["gradient"]
-    reduced = ca.horzcat(gradient[:, : N_u - 1], ca.sum2(gradient[:, N_u - 1 :]))
+    reduced = summed(gradient, ocp.blocks)
 
     planned = u_plan - ca.horzcat(lin.u_prev, u_plan[:, :-1])
     forces = (lin.R @ planned) * ca.repmat(w["lambda_"].T, nu, 1)

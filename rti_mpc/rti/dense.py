@@ -18,6 +18,7 @@ import casadi as ca
 from rti_mpc.codegen import BEFORE_BODY
 from rti_mpc.rti.linearization import Linearization
 from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.recursion import block_table, stage_in_c
 
 LEAST_SIZE = 12  # states and inputs from which on loops are faster
 PADDED = 4  # columns are padded to multiples of this, the numbers in the longest vector that is used
@@ -42,7 +43,7 @@ BODY = """
   }
   for (k = STAGES - 1; k >= 0; --k) {
     STAGE_ARGUMENTS
-    casadi_real *gain = res[0] ? res[0] + GAIN * k : spare;
+    casadi_real *gain = res[0] ? res[0] + GAIN * OF_BLOCK : spare;
 
     /* the cost of the node at the end */
     for (e = 0; e < NONZEROS_H; ++e) M[1 + column_H[e]][1 + row_H[e]] += H[e];
@@ -75,7 +76,7 @@ BODY = """
       add(j / LANES + 1, M_[j], Phi + first[j], row + first[j], first[j + 1] - first[j], T_[0]);
     }
 
-    if (k < FREE) {  /* its input is eliminated */
+    if (IS_FREE) {  /* its input is eliminated */
       for (j = 0; j < NU; ++j) for (i = 0; i < NU; ++i) R_k[j][i] = 0;
       for (e = 0; e < NONZEROS_R; ++e) R_k[column_R[e]][row_R[e]] = arg_R[e] * lambda_k[0];
       for (r = 0; r < NU; ++r) {
@@ -118,7 +119,7 @@ BODY = """
 """
 
 
-def backward_in_c(ocp: Ocp, lin: Linearization, free: ca.Function) -> str | None:
+def backward_in_c(ocp: Ocp, lin: Linearization, free: ca.Function, held: ca.Function) -> str | None:
     """
     Return the recursion whose stages are `rti_mpc.rti.riccati.backward_free` and `backward_held` in C, see `function_in_c`; None for few states.
 
@@ -126,6 +127,7 @@ def backward_in_c(ocp: Ocp, lin: Linearization, free: ca.Function) -> str | None
         ocp: The problem.
         lin: Its linearization.
         free: A stage with an input, for its arguments.
+        held: A stage without.
     """
     nx, nu = ocp.model.nx, ocp.model.nu
     if nx + nu < LEAST_SIZE:
@@ -155,10 +157,15 @@ def backward_in_c(ocp: Ocp, lin: Linearization, free: ca.Function) -> str | None
     shared = ("P", "p", "R", "damping")
     names = free.name_in()
     once = [f"const casadi_real *arg_{name} = arg[{names.index(name)}];" for name in shared]
-    each = [f"const casadi_real *{name} = arg[{i}] + {free.size1_in(i)} * k;" for i, name in enumerate(names) if name not in shared]
+    block = ocp.held.tolist()
+    is_free, of_block = stage_in_c(block)
+    at = {name: "k" if name in held.name_in() else of_block for name in names}
+    each = [f"const casadi_real *{name} = arg[{i}] + {free.size1_in(i)} * {at[name]};" for i, name in enumerate(names) if name not in shared]
     lines = [f"enum {{ {', '.join(f'{name} = {number}' for name, number in sizes.items())} }};"]
+    lines += [block_table(block)] if of_block != "k" else []
     lines += [f"static const int {name}[] = {{ {', '.join(map(str, numbers or [0]))} }};" for name, numbers in tables.items()]
     body = BODY.strip("\n").replace("STAGE_ARGUMENTS", "\n    ".join(each)).replace("OF_OUTPUTS", "NX" if H.size1() == nx else "NX + NU")
+    body = body.replace("IS_FREE", "k < FREE" if of_block == "k" else is_free).replace("OF_BLOCK", of_block)
     return "\n".join([*additions(width), BEFORE_BODY, *(f"  {line}" for line in lines + once), body])
 
 

@@ -22,7 +22,8 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.codegen import function
-from rti_mpc.rti.linearization import Forms, Linearization, all_inputs, change, divided
+from rti_mpc.rti.blocks import all_inputs
+from rti_mpc.rti.linearization import Forms, Linearization, change, divided
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.riccati import Riccati, Rows, Stage, softened_steps
@@ -120,7 +121,7 @@ def enter(ocp: Ocp, lin: Linearization, stages: ca.MX) -> ca.Function:
     sides = Sides(ocp, lin, forms)
     x_plan, u_plan = ca.MX.sym("x_plan", nx, N + 1), ca.MX.sym("u_plan", nu, N_u)
     dx, du = x_plan - lin.x, u_plan - lin.u
-    softened = softened_steps(ocp, lin).map(N)(forms.g_x, forms.g_u, dx[:, 1:], all_inputs(du, N))
+    softened = softened_steps(ocp, lin).map(N)(forms.g_x, forms.g_u, dx[:, 1:], all_inputs(du, ocp.blocks))
     d = ca.veccat(du, du - ca.horzcat(ca.MX.zeros(nu), du[:, :-1]), softened)
     hard, room = sides.split(sides.room(d))
     start = ca.MX.sym("start")
@@ -225,7 +226,7 @@ def moved_to(ocp: Ocp, lin: Linearization, forms: Forms, dx: ca.MX, d: Rows) -> 
     symbols = [*of.dynamics.values(), of.b, of.cost["H"], of.h, before, du, after]
     end = ca.vertcat(after, du)[: of.H.shape[0]]
     node = ca.Function("moved", symbols, [ca.densify(of.A @ before + of.B @ du + of.b - after), ca.densify(of.h + of.H @ end)]).map(N)
-    b, h = node(forms.A, forms.B, forms.b, forms.H, forms.h, dx[:, :-1], all_inputs(d.u, N), dx[:, 1:])
+    b, h = node(forms.A, forms.B, forms.b, forms.H, forms.h, dx[:, :-1], all_inputs(d.u, ocp.blocks), dx[:, 1:])
     force = forms.force + (lin.R @ d.du) * ca.repmat(lin.w["lambda_"].T, nu, 1)
     damped = ca.veccat(ca.repmat(forms.damping, 1, N_u) * d.u, ca.MX.zeros(d.du.shape), ca.MX.zeros(d.g.shape))
     return forms._replace(b=b, h=h, force=force), damped

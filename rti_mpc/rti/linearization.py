@@ -32,6 +32,7 @@ import scipy.sparse as sp
 
 from rti_mpc.codegen import function
 from rti_mpc.model.integrator import sensitivities
+from rti_mpc.rti.blocks import all_inputs, at_starts, moved_on, summed
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 
 DAMPING_PER_COST = 0.005  # weight of half the square of a step, in half ranges of an input, per cost at the guess; see docs/engine.md
@@ -113,6 +114,7 @@ class Linearization:
     def __init__(self, ocp: Ocp) -> None:
         model, N, N_u = ocp.model, ocp.N, ocp.N_u
         nx, nu = model.nx, model.nu
+        self._blocks = ocp.blocks
         self.x = ca.MX.sym("x", nx, N + 1)
         self.u = ca.MX.sym("u", nu, N_u)
         self.u_prev = ca.MX.sym("u_prev", nu)
@@ -123,7 +125,7 @@ class Linearization:
         self.scale_x, self.scale_u, self.scale_g = self._scale[:nx], self._scale[nx : nx + nu], self._scale[nx + nu :]
 
         stage, self.A_k, self.B_k = linearize(ocp)
-        inputs = all_inputs(self.u, N)
+        inputs = all_inputs(self.u, ocp.blocks)
         stages = stage.map(N)(self.x[:, :-1], inputs, self.p[:, :-1])
         to_B = nx + self.A_k.nnz()
         self.A, self.B = stages[nx:to_B, :], stages[to_B:, :]
@@ -155,7 +157,7 @@ class Linearization:
         self.force = (self.R @ self.increments) * ca.repmat(self.w["lambda_"].T, nu, 1)
         self.cost = ca.sum2(nodes[nv, :]) + ca.dot(self.increments, self.force)
         if ocp.R_u.any():
-            off = self.u - input_reference(ocp)(self.p[:, :N_u])
+            off = self.u - input_reference(ocp)(at_starts(self.p, ocp.blocks))
             gradient = ca.repmat(w["R_u"], 1, N_u) * off
             self.force += running_sum(gradient)
             self.cost += ca.dot(off, gradient)
@@ -216,8 +218,7 @@ class Linearization:
         """Return the gradient of half the increment cost in the inputs, and of what outputs cost by their inputs, shape ``(nu, N_u)``."""
         gradient = self.force - ca.horzcat(self.force[:, 1:], ca.MX.zeros(self.u_prev.numel()))
         if self.gradient.shape[0] > self.x.shape[0]:
-            of_outputs, N_u = self.gradient[self.x.shape[0] :, :], self.u.shape[1]
-            gradient += ca.horzcat(of_outputs[:, : N_u - 1], ca.sum2(of_outputs[:, N_u - 1 :]))
+            gradient += summed(self.gradient[self.x.shape[0] :, :], self._blocks)
         return ca.MX(gradient)
 
     def output_hessian(self, i: int) -> tuple[ca.MX, ca.MX]:
@@ -235,13 +236,14 @@ class Linearization:
         following = 0 if last else self.w["lambda_"][k + 1]
         diagonal = self.R * (self.w["lambda_"][k] + following) + ca.diag(self.damping)
         if self.gradient.shape[0] > self.x.shape[0]:
-            for i in range(k, self.y_ref.shape[1] if last else k + 1):
+            first = sum(self._blocks[:k])
+            for i in range(first, first + self._blocks[k]):
                 diagonal += self.output_hessian(i)[1]
         return diagonal, None if last else -self.R * following
 
 
 def input_reference(ocp: Ocp) -> ca.Function:
-    """Build ``p -> u_ref`` for the stages of the control horizon, columns are stages."""
+    """Build ``p -> u_ref`` for the first stages of all blocks, columns are blocks."""
     return ca.Function("u_ref", [ocp.model.p], [ca.densify(ocp.u_ref)]).map(ocp.N_u)
 
 
@@ -249,11 +251,6 @@ def running_sum(columns: ca.MX) -> ca.MX:
     """Return the sum of each column and of all after it."""
     backwards = ca.cumsum(columns[:, ::-1], 1)
     return ca.MX(backwards[:, ::-1])
-
-
-def all_inputs(u: ca.MX, N: int) -> ca.MX:
-    """Return the inputs of all stages, shape ``(nu, N)``, the last one of the control horizon held after it."""
-    return ca.horzcat(u, ca.repmat(u[:, -1], 1, N - u.shape[1]))
 
 
 def divided(flat: ca.MX, like: Sequence[ca.MX]) -> list[ca.MX]:
@@ -330,11 +327,15 @@ def pattern(weight: np.ndarray[Any, Any]) -> ca.DM:
 
 
 def shift(ocp: Ocp) -> ca.Function:
-    """Build ``(x, u, p) -> (x_next, u_next)``: a plan moved on by one stage, its last input repeated, with the state the model predicts."""
+    """
+    Build ``(x, u, p) -> (x_next, u_next)``: a plan moved on by one stage, its last input repeated, with the state the model predicts.
+
+    Each block has the input that acts where it begins then.
+    """
     model, nodes = ocp.model, ocp.N + 1
     x, u, p = ca.MX.sym("x", model.nx, nodes), ca.MX.sym("u", model.nu, ocp.N_u), ca.MX.sym("p", model.np_, nodes)
     x_next = ocp.phi()(x[:, -1], u[:, -1], p[:, -1])
-    moved = {"x_next": ca.horzcat(x[:, 1:], x_next), "u_next": ca.horzcat(u[:, 1:], u[:, -1])}
+    moved = {"x_next": ca.horzcat(x[:, 1:], x_next), "u_next": moved_on(u, ocp.blocks)}
     return function("shift", {"x": x, "u": u, "p": p}, moved)
 
 

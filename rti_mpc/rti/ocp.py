@@ -4,7 +4,7 @@ The optimal control problem of one sample, frozen and validated.
 
 Over stages of `dt` seconds, with the outputs :math:`y_i = y(x_i, u_{i-1}, p_i)` (`y_expr`), the
 general constraints :math:`h(x, u, p)` (`h_expr`), the previous input :math:`u_{-1}`, and
-inputs held after the control horizon,
+inputs held after the control horizon, or over the stages of each of :math:`N_u` blocks,
 
 .. math::
 
@@ -27,14 +27,14 @@ constraints, bounds and slack weights have the names of acados [Verschueren2022]
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from rti_mpc import given
 from rti_mpc.array import Array
@@ -55,7 +55,9 @@ class Ocp:
     Attributes:
         model: Dynamics and outputs.
         N: Horizon, in stages.
-        N_u: Control horizon, ``1 <= N_u <= N``; `N` by default.
+        N_u: Control horizon, ``1 <= N_u <= N``; `N` by default. The number of blocks, if these are given.
+        blocks: Stages of each block, over which its input is held (move blocking); together `N`. Those of a control horizon are one stage long, but
+            the last, which holds to the end. Increments, their weights `lambda_` and bounds, and `R_u` count once a block, at its first stage.
         dt: Duration of a stage, s.
         method: Integrator of a stage: ``"rk4"``, ``"irk"``, Radau IIA, for a stiff model, or ``"euler"``; the model's own by default. Any but
             ``"euler"`` becomes the model's, as do the two below, so that all that predict with it have the same integrator. ``"discrete"`` for a
@@ -91,6 +93,7 @@ class Ocp:
     model: Model
     N: int
     N_u: int
+    blocks: tuple[int, ...]
     dt: float
     method: str
     Q: Array
@@ -125,6 +128,7 @@ class Ocp:
         Q: ArrayLike,
         R: ArrayLike,
         N_u: int | None = None,
+        blocks: Sequence[int] | None = None,
         method: str | None = None,
         sim_method_num_stages: int | None = None,
         sim_method_num_steps: int | None = None,
@@ -151,9 +155,14 @@ class Ocp:
     ) -> None:
         given.instance("model", model, Model)
         N = given.whole("N", N, 0)
-        N_u = N if N_u is None else given.whole("N_u", N_u, 0)
-        if not 1 <= N_u <= N:
-            raise OcpError(f"N_u and N must satisfy 1 <= N_u <= N, got N_u = {N_u}, N = {N}")
+        if blocks is None:
+            N_u = N if N_u is None else given.whole("N_u", N_u, 0)
+            if not 1 <= N_u <= N:
+                raise OcpError(f"N_u and N must satisfy 1 <= N_u <= N, got N_u = {N_u}, N = {N}")
+            blocks = [1] * (N_u - 1) + [N - N_u + 1]
+        elif N_u is not None:
+            raise OcpError(f"N_u must be left out where blocks are given: it is their number, got N_u = {N_u}, blocks = {given.quoted(blocks)}")
+        blocks = stages_of_blocks(blocks, N)
         if not (np.isfinite(seconds := given.number("dt", dt)) and seconds > 0):
             raise OcpError(f"dt must be a positive number of seconds, got {dt}")
         model = integrated(model, method, sim_method_num_stages, sim_method_num_steps, seconds)
@@ -168,7 +177,8 @@ class Ocp:
         inputs = column("u_ref", model.u_rest if u_ref is None else u_ref)
         if isinstance(inputs, ca.MX) or inputs.shape != (model.nu, 1) or [s for s in ca.symvar(inputs) if not ca.depends_on(model.p, s)]:
             raise OcpError(f"u_ref must be {model.nu} numbers, or SX of the model's p, in a column, got {given.quoted(inputs)}")
-        fields: dict[str, Any] = {"model": model, "N": N, "N_u": N_u, "dt": seconds, "method": method, "h_expr": h_expr, "u_ref": inputs}
+        fields: dict[str, Any] = {"model": model, "N": N, "N_u": len(blocks), "blocks": blocks, "dt": seconds, "method": method}
+        fields |= {"h_expr": h_expr, "u_ref": inputs}
         for name, value in fields.items():
             object.__setattr__(self, name, value)
         values = {"Q": Q, "R": R, "delta": delta, "lambda_": lambda_, "lbu": lbu, "ubu": ubu, "lbdu": lbdu, "ubdu": ubdu, "lbx": lbx, "ubx": ubx}
@@ -212,6 +222,16 @@ class Ocp:
             return np.asarray(self.delta[k] * self.Q)
         root = np.sqrt(self.delta[k])
         return np.asarray(self.Q * np.outer(root, root))
+
+    @property
+    def held(self) -> NDArray[np.int_]:
+        """Row of the inputs that acts at each stage, shape ``(N,)``."""
+        return np.repeat(np.arange(self.N_u), self.blocks)
+
+    @property
+    def starts(self) -> NDArray[np.int_]:
+        """First stage of each block, shape ``(N_u,)``."""
+        return np.cumsum((0, *self.blocks[:-1]))
 
     @property
     def soft(self) -> tuple[int, ...]:
@@ -262,6 +282,21 @@ def integrated(model: Model, method: str | None, stages: int | None, steps: int 
         if not np.isclose(model.dt, dt, rtol=1e-9, atol=0.0):
             raise OcpError(f"dt must be the period of model {model.name}, which is in discrete time, {model.dt:g} s, got {dt:g}")
     return replace(model, **changes) if changes else model
+
+
+def stages_of_blocks(blocks: Sequence[int], N: int) -> tuple[int, ...]:
+    """
+    Return the lengths of blocks as they are kept.
+
+    Raises:
+        OcpError: One is no whole number of at least 1, or they do not fill the horizon.
+    """
+    if not isinstance(blocks, Sequence | np.ndarray) or isinstance(blocks, str) or not len(blocks):
+        raise OcpError(f"blocks must be a list of the stages of each block, got {given.quoted(blocks)}")
+    lengths = tuple(given.whole("each of blocks", length, 1) for length in blocks)
+    if sum(lengths) != N:
+        raise OcpError(f"blocks must have N = {N} stages together, got {sum(lengths)} in {list(lengths)}")
+    return lengths
 
 
 def rest_fault(ocp: Ocp) -> str:

@@ -21,7 +21,8 @@ import numpy as np
 
 from rti_mpc.codegen import function
 from rti_mpc.rti import interior_point
-from rti_mpc.rti.linearization import Forms, Linearization, all_inputs, change, divided, shift
+from rti_mpc.rti.blocks import all_inputs, moved_on, repeated
+from rti_mpc.rti.linearization import Forms, Linearization, change, divided, shift
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.recursion import recur
@@ -94,7 +95,7 @@ def places(ocp: Ocp) -> Places:
     at = Sample(lin, lin.forms_in(stages), found, Rows(*divided(flat, kinds)))
 
     x, u = shift(ocp)(lin.x, lin.u, lin.p)
-    moved = ca.veccat(*(ca.horzcat(kind[:, 1:], kind[:, -1]) for kind in (at.place.u, at.place.du, at.place.g)))
+    moved = ca.veccat(*(moved_on(kind, ocp.blocks) for kind in (at.place.u, at.place.du)), ca.horzcat(at.place.g[:, 1:], at.place.g[:, -1]))
     linearized = linearize(**(lin.arguments | {"x": x, "u": u}))["stages"]
     advance = {"x_next": x, "u_next": u, "places_next": moved, "stages": linearized}
 
@@ -126,13 +127,13 @@ def penalties(ocp: Ocp, at: Sample) -> tuple[Rows, Rows]:
     pulls += beyond / 2 * (Z * (value - ca.if_else(place > 0, upper, lower)) + ca.sign(place) * z)
     softened = ca.Function("hold_softened", [place, value, lower, upper, weight, z, Z], [weighs + beyond * Z / 2, pulls]).map(ocp.N)
 
-    def repeated(*rows: ca.MX, times: int) -> list[ca.MX]:
+    def of_all(*rows: ca.MX, times: int) -> list[ca.MX]:
         return [ca.repmat(row, 1, times) for row in rows]
 
     stiff_u = PENALTY / lin.scale_u**2
-    weight_u, pull_u = held(at.place.u, lin.u, *repeated(w["lbu"], w["ubu"], stiff_u, times=ocp.N_u))
-    weight_du, pull_du = held(at.place.du, at.forms.increments, *repeated(w["lbdu"], w["ubdu"], stiff_u, times=ocp.N_u))
-    limits = repeated(lin.lg, lin.ug, PENALTY / lin.scale_g**2, lin.zg, lin.Zg, times=ocp.N)
+    weight_u, pull_u = held(at.place.u, lin.u, *of_all(w["lbu"], w["ubu"], stiff_u, times=ocp.N_u))
+    weight_du, pull_du = held(at.place.du, at.forms.increments, *of_all(w["lbdu"], w["ubdu"], stiff_u, times=ocp.N_u))
+    limits = of_all(lin.lg, lin.ug, PENALTY / lin.scale_g**2, lin.zg, lin.Zg, times=ocp.N)
     weight_g, pull_g = softened(at.place.g, at.forms.g, *limits)
     return Rows(weight_u, weight_du, weight_g), Rows(pull_u, pull_du, pull_g)
 
@@ -145,7 +146,7 @@ def hold(place: ca.SX, value: ca.SX, lower: ca.SX, upper: ca.SX, weight: ca.SX) 
 
 def roll_out(ocp: Ocp, at: Sample, x0: ca.MX) -> dict[str, ca.MX]:
     """Return the outputs of `Places.roll_out`, by name."""
-    lin, forms, w, N_u = at.lin, at.forms, at.lin.w, ocp.N_u
+    lin, forms, w = at.lin, at.forms, at.lin.w
     nx, nu = ocp.model.nx, ocp.model.nu
     limits = {"lg": lin.lg, "ug": lin.ug, "zg": lin.zg, "Zg": lin.Zg, "stiff_g": PENALTY / lin.scale_g**2, "scale_g": lin.scale_g}
     bounds = {name: w[name] for name in ("lbu", "ubu", "lbdu", "ubdu")} | {"stiff_u": PENALTY / lin.scale_u**2, "scale_u": lin.scale_u}
@@ -157,7 +158,7 @@ def roll_out(ocp: Ocp, at: Sample, x0: ca.MX) -> dict[str, ca.MX]:
     }
     carried = {"s": "s_after", "slip": "slip_after", "verdict": "verdict_after", "before": "u_plan"}
     outputs = ["x_plan", "u_plan", "verdict_after", "place_u_found", "place_du_found", "place_g_found", "force", "paid"]
-    rolling = [(roll_free(ocp, lin), N_u), (roll_held(ocp, lin), ocp.N - N_u)]
+    rolling = repeated(roll_free(ocp, lin), roll_held(ocp, lin), ocp.blocks)
     along = recur("rolled_out", rolling, carried, outputs, shared=[*limits, *bounds])(
         A=forms.A,
         B=forms.B,
@@ -310,7 +311,7 @@ def refine(
     N, N_u, nu, w = ocp.N, ocp.N_u, ocp.model.nu, lin.w
     of_increments, of_softened = divided(multipliers, [lin.u, lin.g])
     du = u_plan - lin.u
-    values = forms.g + softened_steps(ocp, lin).map(N)(forms.g_x, forms.g_u, x_plan[:, 1:] - lin.x[:, 1:], all_inputs(du, N))
+    values = forms.g + softened_steps(ocp, lin).map(N)(forms.g_x, forms.g_u, x_plan[:, 1:] - lin.x[:, 1:], all_inputs(du, ocp.blocks))
     weight = ca.repmat(PENALTY / lin.scale_g**2, 1, N) * (ca.fabs(place.g) == 1)
     lower, upper = (ca.repmat(e, 1, N) for e in (lin.lg, lin.ug))
     excess = values - ca.if_else(place.g > 0, upper, lower)
@@ -322,7 +323,7 @@ def refine(
     beyond = side * (ca.repmat(lin.zg, 1, N) + ca.repmat(lin.Zg, 1, N) * by) / 2
     paid = ca.if_else(ca.fabs(place.g) == 2, beyond, (of_softened + weight * (excess + rows.g)) * (ca.fabs(place.g) == 1))
     force = of_increments + ca.repmat(PENALTY / lin.scale_u**2, 1, N_u) * (ca.fabs(place.du) == 1) * rows.du
-    amending = [(amend_free(lin, nu), N_u), (amend_held(lin, nu), N - N_u)]
+    amending = repeated(amend_free(lin, nu), amend_held(lin, nu), ocp.blocks)
     carried = {"before": "u_refined", "du": "du_after", "dx": "dx_after"}
     bounds = {name: w[name] for name in ("lbu", "ubu", "lbdu", "ubdu")}
     amended = recur("amended", amending, carried, ["x_refined", "u_refined"], shared=[*bounds])(

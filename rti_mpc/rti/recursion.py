@@ -38,6 +38,7 @@ def recur(
     Args:
         name: Name of the recursion.
         stages: Functions of one stage and how often each is repeated, in the order of the horizon; the first has the arguments and results of all.
+            There are two at most, which may take turns.
         carried: Arguments that are results of the stage before, by the names of these; the caller gives the first ones.
         outputs: Results to be returned, a column per stage that has them.
         shared: Arguments that are the same at every stage. Of any other one the caller gives a column for each stage that has it.
@@ -49,7 +50,9 @@ def recur(
     """
     first = stages[0][0]
     stages = [(stage, count) for stage, count in stages if count]
-    starts = [sum(count for _, count in stages[:i]) for i in range(len(stages) + 1)]
+    kinds = {stage.name(): stage for stage, _ in stages}
+    sequence = [stage for stage, count in stages for _ in range(count)]
+    block = [sum(stage.name() == first.name() for stage in sequence[: k + 1]) - 1 for k in range(len(sequence))]  # column of what the first alone has
 
     def width(argument: str) -> int:
         alone = argument in carried or argument in shared
@@ -59,19 +62,21 @@ def recur(
     split = {argument: columns(matrix) for argument, matrix in given.items() if argument not in carried and argument not in shared}
     now = dict(given)
     found: dict[str, Columns] = {output: [] for output in outputs}
-    sequence = [(k, stage) for start, (stage, count) in zip(starts, stages, strict=False) for k in range(start, start + count)]
-    for k, stage in reversed(sequence) if backward else sequence:
-        after = stage(**{argument: split[argument][k] if argument in split else now[argument] for argument in stage.name_in()})
+    everywhere = set.intersection(*(set(stage.name_in()) for stage in kinds.values()))
+    for k in range(len(sequence))[:: -1 if backward else 1]:
+        stage, at = sequence[k], {argument: k if argument in everywhere else block[k] for argument in split}
+        after = stage(**{argument: split[argument][at[argument]] if argument in split else now[argument] for argument in stage.name_in()})
         now |= {argument: after[result] for argument, result in carried.items() if result in after}
         for output in set(outputs) & set(after):
             found[output].append(after[output])
     results = {output: ca.horzcat(*(reversed(parts) if backward else parts)) for output, parts in found.items()}
-    return function_in_c(name, given, results, in_c or "\n".join(_loop(stages, starts, given, carried, outputs, backward)))
+    return function_in_c(name, given, results, in_c or "\n".join(_loop(stages, [*kinds.values()], block, given, carried, outputs, backward)))
 
 
 def _loop(
     stages: Sequence[tuple[ca.Function, int]],
-    starts: Sequence[int],
+    kinds: Sequence[ca.Function],
+    block: Sequence[int],
     given: Mapping[str, ca.MX],
     carried: Mapping[str, str],
     outputs: Sequence[str],
@@ -79,25 +84,49 @@ def _loop(
 ) -> Iterator[str]:
     """Return the body of the same recursion in C: results that are carried on lie in their column or, by turns, in two buffers."""
     place: dict[str, int] = {argument: i for i, argument in enumerate(given)}
+    is_first, of_block = stage_in_c(block)
+
+    def column(name: str) -> str:
+        return "k" if all(name in (*kind.name_in(), *kind.name_out()) for kind in kinds) else of_block
+
+    if len(stages) > len(kinds):
+        yield block_table(block)
     yield "casadi_int k;"
     yield f"const casadi_real **a = arg + {len(given)};"
     yield f"casadi_real **r = res + {len(outputs)};"
     for argument in carried:
         yield f"const casadi_real *now_{argument} = arg[{place[argument]}];"
         yield f"casadi_real {argument}[2][{max(1, given[argument].size1())}];"
-    yield f"for (k = {starts[-1] - 1}; k >= 0; --k) {{" if backward else f"for (k = 0; k < {starts[-1]}; ++k) {{"
-    for i, (stage, _) in enumerate(stages):
-        yield f"  {'else ' if i else ''}{f'if (k < {starts[i + 1]}) ' if i + 1 < len(stages) else ''}{{"
+    yield f"for (k = {len(block) - 1}; k >= 0; --k) {{" if backward else f"for (k = 0; k < {len(block)}; ++k) {{"
+    for i, stage in enumerate(kinds):
+        yield f"  {'else ' if i else ''}{f'if ({is_first}) ' if i + 1 < len(kinds) else ''}{{"
         for j, argument in enumerate(stage.name_in()):
             whole, rows, source = given[argument].size2() == 1, given[argument].size1(), f"arg[{place[argument]}]"
-            at = f"now_{argument}" if argument in carried else source if whole or not rows else f"{source} + {rows} * k"
+            at = f"now_{argument}" if argument in carried else source if whole or not rows else f"{source} + {rows} * {column(argument)}"
             yield f"    a[{j}] = {at};"
         for j, result in enumerate(stage.name_out()):
             buffer = next((f"{argument}[k & 1]" for argument, following in carried.items() if following == result), "0")
-            column = f"res[{outputs.index(result)}]" if result in outputs else ""
-            yield f"    r[{j}] = {f'{column} ? {column} + {stage.size1_out(j)} * k : {buffer}' if column else buffer};"
+            to = f"res[{outputs.index(result)}]" if result in outputs else ""
+            yield f"    r[{j}] = {f'{to} ? {to} + {stage.size1_out(j)} * {column(result)} : {buffer}' if to else buffer};"
         yield f"    if (${stage.name()}(a, r, iw, w, 0)) return 1;"
         yield from (f"    now_{argument} = r[{stage.index_out(result)}];" for argument, result in carried.items() if result in stage.name_out())
         yield "  }"
     yield "}"
     yield "return 0;"
+
+
+def stage_in_c(block: Sequence[int]) -> tuple[str, str]:
+    """
+    Return in C whether a stage k is the first one of its block, and the number of that block.
+
+    Without more than one block of several stages, at the end, these are known without `block_table`.
+    """
+    own = block[-1] + 1
+    if list(block) == [min(k, own - 1) for k in range(len(block))]:
+        return f"k < {own}", "k"
+    return "!k || block[k] != block[k - 1]", "block[k]"
+
+
+def block_table(block: Sequence[int]) -> str:
+    """Return in C the number of the block of each stage."""
+    return f"static const int block[] = {{ {', '.join(map(str, block))} }};"

@@ -15,8 +15,8 @@ with softened bounds, adds :math:`\tfrac12 W d^2 + v d` in its deviation d from 
 the solver chooses the weight W and the pull v. Once the gains are known, other pulls
 cost only a sweep over vectors.
 
-Stages are separate functions: *free* ones, whose input is a variable, and those after
-the control horizon, where the input before is *held*.
+Stages are separate functions: *free* ones, whose input is a variable, and those where
+the input before is *held*, after the control horizon or the first stage of a block.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from typing import NamedTuple
 import casadi as ca
 
 from rti_mpc.codegen import function
+from rti_mpc.rti.blocks import at_starts, repeated
 from rti_mpc.rti.dense import backward_in_c
 from rti_mpc.rti.linearization import Forms, Linearization, nonzeros
 from rti_mpc.rti.ocp import Ocp
@@ -65,12 +66,11 @@ class Riccati:
         self._n = n = nx + nu
         self._ends = (nu * n, nu * (n + 1))
         self.size = nu * (n + 1) + nu * (nu + 1) // 2
-        repeated = ocp.N_u, ocp.N - ocp.N_u
         backward, sweep, forward = (
-            [*zip((free(ocp, lin), held(ocp, lin)), repeated, strict=True)]
+            repeated(free(ocp, lin), held(ocp, lin), ocp.blocks)
             for free, held in ((backward_free, backward_held), (sweep_free, sweep_held), (forward_free, forward_held))
         )
-        dense, costs = backward_in_c(ocp, lin, backward[0][0]), {"P": "P_before", "p": "p_before"}
+        dense, costs = backward_in_c(ocp, lin, *(stage for stage, _ in backward[:2])), {"P": "P_before", "p": "p_before"}
         self._backward = recur("backward", backward, costs, ["gain"], shared=["R", "damping"], backward=True, in_c=dense)
         self._sweep = recur("sweep", sweep, {"p": "p_before"}, ["kappa"], backward=True)
         self._forward = recur("forward", forward, {"s": "s_after"}, ["s_after", "g", "increment"])
@@ -118,11 +118,11 @@ class Riccati:
 
     def rolled(self, forms: Forms, gains: ca.MX, s: ca.MX, *, defects: bool) -> tuple[ca.MX, ca.MX, Rows]:
         """Return the steps in states, shape ``(nx, N + 1)``, and in inputs, shape ``(nu, N_u)``, and the rows, all in deviations, from s on."""
-        nx, N_u, b = self._ocp.model.nx, self._ocp.N_u, forms.b if defects else ca.MX.zeros(forms.b.shape)
+        nx, b = self._ocp.model.nx, forms.b if defects else ca.MX.zeros(forms.b.shape)
         data = {"A": forms.A, "B": forms.B, "b": b, "g_x": forms.g_x, "g_u": forms.g_u}
         after = self._forward(**data, gain=gains, s=s)
         ends = after["s_after"]
-        du = ends[nx:, :N_u]
+        du = at_starts(ends[nx:, :], self._ocp.blocks)
         return ca.horzcat(s[:nx], ends[:nx, :]), du, Rows(du, after["increment"], after["g"])
 
 

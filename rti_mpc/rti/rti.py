@@ -345,7 +345,7 @@ class Rti:
     def _meet_reference(self) -> None:
         """Let the reference be the outputs of the guess."""
         N = self.ocp.N
-        held = self.u[np.minimum(np.arange(N), self.ocp.N_u - 1)]
+        held = self.u[self.ocp.held]
         self.y_ref[:] = np.array(self.ocp.model.outputs_at().map(N)(self.x[1:].T, held.T, self.p[1:].T)).T
 
     def shift(self) -> None:

@@ -31,7 +31,7 @@ def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
         p: Stage parameters, shape ``(N + 1, np)``.
     """
     model, N = ocp.model, ocp.N
-    held = u[np.minimum(np.arange(N), ocp.N_u - 1)]
+    held = u[ocp.held]
     stage, A_k, B_k = linearize(ocp)
     columns = np.array(stage.map(N)(x[:-1].T, held.T, p[:-1].T))[model.nx :]
     A, B = dense(A_k, columns[: A_k.nnz()]), dense(B_k, columns[A_k.nnz() :])

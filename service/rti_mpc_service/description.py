@@ -23,10 +23,11 @@ def controller_info(ocp: Ocp, np_: int) -> dict[str, Any]:
         **info.labels(model.counterparts(), **vectors),
         **info.bounds(**{name: getattr(ocp, name).tolist() for name in limits}),
         "p_nominal": list(model.p_nominal[:np_]),
-        **info.weights(Q=ocp.Q.tolist(), R=ocp.R.tolist(), delta=ocp.delta.tolist(), lambda_=ocp.lambda_.tolist()),
+        **info.weights(Q=ocp.Q.tolist(), R=ocp.R.tolist(), delta=ocp.delta.tolist(), lambda_=ocp.lambda_[ocp.held].tolist()),
         **info.obstacles(discs_of(model)),
         "N": ocp.N,
         "N_u": ocp.N_u,
+        "blocks": list(ocp.blocks),
         "dt_s": ocp.dt,
         "integrator": ocp.method,
     }

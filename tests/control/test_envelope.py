@@ -30,8 +30,15 @@ def test_plan_that_is_inside_passes_unchanged_and_its_held_inputs_are_expanded(e
     np.testing.assert_array_equal(rows, plan[[0, 1, 2, 3, 4, 5, 5, 5]])
 
 
-def test_any_plan_comes_out_inside(envelope: Envelope) -> None:
-    rng = np.random.default_rng(1)
+@pytest.mark.parametrize("blocks", [[2, 1, 1, 1, 2, 1], [1, 1, 1, 2, 1, 2]])
+def test_inputs_are_held_over_their_blocks(blocks: list[int]) -> None:
+    envelope, plan = Envelope(pioneer(N=8, blocks=blocks), compile=False), np.cumsum(np.full((6, 2), 0.05), axis=0)
+    np.testing.assert_array_equal(envelope.fit(plan, around(np.zeros(2))), np.repeat(plan, blocks, axis=0))
+
+
+@pytest.mark.parametrize("blocks", [[1, 1, 1, 1, 1, 3], [3, 1, 1, 1, 1, 1]])
+def test_any_plan_comes_out_inside(blocks: list[int]) -> None:
+    envelope, rng = Envelope(pioneer(N=8, blocks=blocks), compile=False), np.random.default_rng(1)
     for _ in range(2000):
         acting = rng.uniform(-BOUND, BOUND)
         plan = rng.choice([0.0, 1.0, 1e300]) * rng.standard_normal((6, 2))

@@ -23,6 +23,7 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "beacon": beacon,
     "pioneer": lambda: pioneer(N=15),
     "pioneer_with_held_inputs": lambda: pioneer(N=15, N_u=4, lbdu=-np.inf, ubdu=np.inf),
+    "pioneer_in_blocks": lambda: pioneer(N=15, blocks=[1, 2, 1, 3, 8]),
     "fenced": lambda: fenced(N=10),
 }
 

@@ -14,6 +14,7 @@ from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.errors import OcpError
 from rti_mpc.model.model import Model
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc.rti.linearization import shift
 from rti_mpc.rti.ocp import Ocp, rest_fault
 from rti_mpc.rti.rti import Rti
 from tests.problems import INF, PAPER, double_integrator, pioneer
@@ -46,12 +47,34 @@ def test_arrays_are_owned_and_read_only() -> None:
         ocp.N = 3  # type: ignore[misc]
 
 
+def test_control_horizon_is_blocks_of_one_stage_and_one_to_the_end() -> None:
+    ocp = double_integrator(N=6, N_u=3)
+    assert ocp.blocks == (1, 1, 4)
+    assert ocp.held.tolist() == [0, 1, 2, 2, 2, 2]
+    blocks = double_integrator(N=6, blocks=np.array([2, 1, 3]))
+    assert (blocks.blocks, blocks.N_u) == ((2, 1, 3), 3)
+    assert blocks.held.tolist() == [0, 0, 1, 2, 2, 2]
+    assert blocks.starts.tolist() == [0, 2, 3]
+
+
+def test_plan_in_blocks_is_moved_on_as_each_block_begins_a_stage_later() -> None:
+    ocp = double_integrator(N=8, blocks=[2, 1, 3, 2])
+    x, u = np.zeros((2, 9)), np.array([[10.0, 20.0, 30.0, 40.0]])
+    moved = shift(ocp)(x=x, u=u)["u_next"]
+    np.testing.assert_array_equal(np.array(moved), [[10.0, 30.0, 30.0, 40.0]])  # at stages 1, 3, 4 and 7
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"N_u": 0}, "1 <= N_u <= N, got N_u = 0, N = 7"),
         ({"N_u": 8}, "1 <= N_u <= N, got N_u = 8, N = 7"),
         ({"N": 0}, "1 <= N_u <= N"),
+        ({"blocks": [1, 2, 3]}, r"blocks must have N = 7 stages together, got 6 in \[1, 2, 3\]"),
+        ({"blocks": [1, 0, 6]}, "each of blocks must be a whole number of at least 1, got 0"),
+        ({"blocks": []}, "blocks must be a list of the stages of each block"),
+        ({"blocks": [1, 2, 4], "N_u": 3}, "N_u must be left out where blocks are given: it is their number, got N_u = 3"),
+        ({"blocks": [1, 2, 4], "lambda_": [1.0] * 7}, r"lambda_ must be a number or have shape \(3,\)"),
         ({"dt": 0.0}, "dt must be a positive number of seconds, got 0.0"),
         ({"dt": INF}, "dt must be a positive"),
         ({"method": "heun"}, "integrator must be one of euler, rk4, irk, got 'heun'"),

@@ -28,8 +28,12 @@ from rti_mpc.rti.rti import Rti
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler on this machine")
 
 
-def problem(nx: int, nu: int, N: int, N_u: int, *, softened: bool = True, of_inputs: bool = False) -> Ocp:
-    """A model with a sparse Jacobian, weights that are full matrices, and two states and an expression of states and inputs softly bounded."""
+def problem(nx: int, nu: int, N: int, within: int | list[int], *, softened: bool = True, of_inputs: bool = False) -> Ocp:
+    """
+    A model with a sparse Jacobian, weights that are full matrices, and two states and an expression of states and inputs softly bounded.
+
+    Inputs are free within a control horizon, or held in blocks.
+    """
     rng = np.random.default_rng(nx)
     x, u = ca.SX.sym("x", nx), ca.SX.sym("u", nu)
     A = rng.normal(size=(nx, nx)) * (rng.random((nx, nx)) < 0.4) - np.eye(nx)
@@ -43,8 +47,13 @@ def problem(nx: int, nu: int, N: int, N_u: int, *, softened: bool = True, of_inp
     room = np.array([1.0, 1.0, *[np.inf] * (nx - 2)])
     expression = x[0] * u[nu - 1] + x[nx - 1]
     given: dict[str, Any] = {"lbx": -room, "ubx": room, "h_expr": expression, "lh": -0.5, "uh": 0.5} if softened else {}
-    weights: dict[str, Any] = {"Q": root @ root.T + np.eye(3), "R": turn @ turn.T + np.eye(nu), "lambda_": rng.uniform(0.5, 2.0, N_u)}
-    return Ocp(model, N=N, N_u=N_u, dt=0.05, method="euler", **weights, lbu=-1.0, ubu=1.0, lbdu=-0.3, ubdu=0.3, **given)
+    weights: dict[str, Any] = {
+        "Q": root @ root.T + np.eye(3),
+        "R": turn @ turn.T + np.eye(nu),
+        "lambda_": rng.uniform(0.5, 2.0, len(within) if isinstance(within, list) else within),
+    }
+    weights |= {"blocks": within} if isinstance(within, list) else {"N_u": within}
+    return Ocp(model, N=N, dt=0.05, method="euler", **weights, lbu=-1.0, ubu=1.0, lbdu=-0.3, ubdu=0.3, **given)
 
 
 def arguments(of: ca.Function, ocp: Ocp, rng: np.random.Generator, known: dict[str, ca.DM]) -> dict[str, ca.DM]:
@@ -66,19 +75,27 @@ def assert_equal(of: ca.Function, fast: ca.Function, given: dict[str, ca.DM]) ->
 
 @needs_compiler
 @pytest.mark.parametrize(
-    ("nx", "nu", "N", "N_u", "softened"),
+    ("nx", "nu", "N", "within", "softened"),
     [
         (3, 2, 5, 2, True),
         (LEAST_SIZE - 2, 2, 4, 3, True),
+        (3, 2, 6, [1, 2, 1, 2], True),
         *(
             pytest.param(*shape, marks=pytest.mark.slow)
-            for shape in ((3, 2, 5, 5, True), (2, 1, 1, 1, True), (13, 4, 3, 3, True), (21, 3, 2, 1, True), (30, 1, 2, 2, False))
+            for shape in (
+                (3, 2, 5, 5, True),
+                (2, 1, 1, 1, True),
+                (13, 4, 3, 3, True),
+                (21, 3, 2, 1, True),
+                (30, 1, 2, 2, False),
+                (13, 4, 6, [2, 1, 3], True),
+            )
         ),
     ],
 )
-def test_compiled_recursions_equal_the_expressions(nx: int, nu: int, N: int, N_u: int, softened: bool) -> None:
-    """Of few states as scalars, of many as dense columns; with held inputs, full weights, outputs of inputs, and no softened bounds at all."""
-    ocp = problem(nx, nu, N, N_u, softened=softened, of_inputs=nx >= LEAST_SIZE - 2)
+def test_compiled_recursions_equal_the_expressions(nx: int, nu: int, N: int, within: int | list[int], softened: bool) -> None:
+    """Of few states as scalars, of many as dense columns; with held inputs, blocks, full weights, outputs of inputs, no softened bounds at all."""
+    ocp = problem(nx, nu, N, within, softened=softened, of_inputs=nx >= LEAST_SIZE - 2)
     rng, functions, judged = np.random.default_rng(5), places(ocp), certificate(ocp)
     fast = compiled(functions.gains, functions.roll_out, functions.refine, judged)
     known = {"stages": functions.linearize(**arguments(functions.linearize, ocp, rng, {}))["stages"]}

@@ -25,7 +25,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from rti_mpc.codegen import function
-from rti_mpc.rti.linearization import Linearization, all_inputs, change
+from rti_mpc.rti.blocks import all_inputs
+from rti_mpc.rti.linearization import Linearization, change
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import (
     KIND_NAMES,
@@ -48,7 +49,7 @@ class Condensing:
     Expressions of the condensed problem.
 
     Attributes:
-        G: Response of the states at nodes 1 to N to the inputs that have acted by then, each of shape ``(nx, nu * min(i, N_u))``.
+        G: Response of the states at nodes 1 to N to the inputs that have acted by then, each of shape ``(nx, nu * (held[i - 1] + 1))``.
         Phi: Response to the initial state, each of shape ``(nx, nx)``.
         c: Response to the defects, each of shape ``(nx, 1)``.
         H: Rows of the Hessian up to the diagonal block, one of shape ``(nu, nu * (k + 1))`` for each input.
@@ -57,7 +58,7 @@ class Condensing:
     """
 
     def __init__(self, ocp: Ocp, lin: Linearization) -> None:
-        N, N_u, nx, nu = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu
+        N, N_u, nx, nu, held = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu, ocp.held.tolist()
         self.G: list[ca.MX] = []
         self.Phi: list[ca.MX] = []
         self.c: list[ca.MX] = []
@@ -67,9 +68,9 @@ class Condensing:
 
         G, Phi, c = ca.MX(nx, 0), ca.MX(ca.DM.eye(nx)), ca.MX.zeros(nx)
         for k in range(N):
-            G = over_blocks(apply_A, min(k, N_u), [0])(lin.A[:, k], G) if k else G
+            G = over_blocks(apply_A, held[k - 1] + 1, [0])(lin.A[:, k], G) if k else G
             B_k = dense_B(lin.B[:, k])
-            G = ca.horzcat(G, B_k) if k < N_u else ca.horzcat(G[:, :-nu], G[:, -nu:] + B_k)
+            G = ca.horzcat(G, B_k) if k == 0 or held[k] > held[k - 1] else ca.horzcat(G[:, :-nu], G[:, -nu:] + B_k)
             Phi = on_state[0](lin.A[:, k], Phi)
             c = on_defect[0](lin.A[:, k], c) + lin.b[:, k]
             self.G.append(G)
@@ -82,7 +83,7 @@ class Condensing:
         m = [ca.MX.zeros(nu) for _ in range(N_u)]
         W_G, W_Phi, W_c = ca.MX.zeros(nx, nu * N_u), ca.MX.zeros(nx, nx), ca.MX.zeros(nx)
         for k in reversed(range(N)):
-            blocks = min(k + 1, N_u)
+            blocks = held[k] + 1
             A_after = lin.A[:, k + 1] if k < N - 1 else ca.MX.zeros(lin.A_k.nnz())
             W_G = over_blocks(apply_H_A, blocks, [0, 1])(lin.hessian[:, k], A_after, self.G[k], W_G[:, : nu * blocks])
             W_Phi = on_state[1](lin.hessian[:, k], A_after, self.Phi[k], W_Phi)
@@ -240,7 +241,7 @@ def full_step(ocp: Ocp, kind: str, lin: Linearization, n: int, remembered: int) 
     if N > 1:
         advance = advance.mapaccum("advances", N)
     deviation = x0 - x[:, 0]
-    dx = ca.horzcat(deviation, advance(deviation, A, B, all_inputs(du, N), b))
+    dx = ca.horzcat(deviation, advance(deviation, A, B, all_inputs(du, ocp.blocks), b))
     u_plan = clipped(u + du, u_prev, w)
     start = {"x": x, "u": u, "u_prev": u_prev, "solution": z, "x0": x0, "memory": known.memory}
     plan = {"x_plan": x + dx, "u_plan": u_plan, "violation": known.violation(dx, du, w), "change": change(lin, u_plan)}

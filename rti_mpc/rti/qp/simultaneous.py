@@ -47,7 +47,7 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
         softened: Whether the softened bounds, on states and general constraints, and their slacks are there.
     """
     lin = Linearization(ocp)
-    N, N_u, nx, nu = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu
+    N, N_u, nx, nu, held = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu, ocp.held.tolist()
     ng = len(ocp.lg) if softened else 0
     kind = KIND_NAMES[softened]
     to_du, to_s = (N + 1) * nx, (N + 1) * nx + N_u * nu
@@ -61,7 +61,7 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
     # Dynamics: A_k dx_k + B_k du_k - dx_{k+1} = -b_k.
     row = rows.add(ca.MX.zeros(lin.b.shape), lin.b, ca.MX.zeros(lin.b.shape), by_state)
     A.place_values(ca.vec(lin.A), [(row + k * nx, k * nx, lin.A_k) for k in range(N)])
-    A.place_values(ca.vec(lin.B), [(row + k * nx, to_du + min(k, N_u - 1) * nu, lin.B_k) for k in range(N)])
+    A.place_values(ca.vec(lin.B), [(row + k * nx, to_du + held[k] * nu, lin.B_k) for k in range(N)])
     A.place(row, nx, -sp.eye_array(N * nx))
 
     input_rows(ocp, lin, rows, A, to_du)
@@ -74,7 +74,7 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
         if at:
             side = repeated_column(limit[at], N)
             row = rows.add(None if sign < 0 else side, lin.g[at, :], side if sign < 0 else None, by_bound[at])
-            places = [(row + i * len(at), nx + i * nx, to_du + min(i, N_u - 1) * nu) for i in range(N)]  # row, column of dx, column of du
+            places = [(row + i * len(at), nx + i * nx, to_du + held[i] * nu) for i in range(N)]  # row, column of dx, column of du
             for column, values, sparsity in ((1, lin.g_x, lin.G_x), (2, lin.g_u, lin.G_u)):
                 chosen, block = picked(sparsity, at)
                 if chosen:
@@ -94,7 +94,7 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
     P.place_values(ca.vec(lin.hessian[in_upper, :]), [(nx + i * nx, nx + i * nx, H_upper) for i in range(N)])
     for i in range(N) if lin.H_i.size1() > nx else ():
         coupling, _ = lin.output_hessian(i)
-        P.place_values(nonzeros(coupling), [(nx + i * nx, to_du + min(i, N_u - 1) * nu, coupling.sparsity())])
+        P.place_values(nonzeros(coupling), [(nx + i * nx, to_du + held[i] * nu, coupling.sparsity())])
     for k in range(N_u):
         at_k = to_du + k * nu
         diagonal, beside = lin.increment_hessian(k)

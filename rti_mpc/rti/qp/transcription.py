@@ -17,7 +17,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from rti_mpc.codegen import function
-from rti_mpc.rti.linearization import Linearization, all_inputs, softened
+from rti_mpc.rti.blocks import all_inputs
+from rti_mpc.rti.linearization import Linearization, softened
 from rti_mpc.rti.ocp import Ocp
 
 KIND_NAMES = {False: "relaxed", True: "whole"}  # key: whether the QP has softened bounds; functions compiled together need different names
@@ -213,7 +214,7 @@ class Remembered:
         shares = [by / one for by, one in zip(excess, scales, strict=True)]
         worst = ca.Function("worst", [g, g_x, g_u, dx_i, du_i, lg, ug, scale], [ca.vertcat(*(ca.mmax(ca.vertcat(*of)) for of in (excess, shares)))])
         limits = (*softened_bounds(ocp, w), lin.scale_g)
-        found = worst.map(N)(*self._parts, dx[:, 1:], all_inputs(du, N), *(repeated_column(limit, N) for limit in limits))
+        found = worst.map(N)(*self._parts, dx[:, 1:], all_inputs(du, ocp.blocks), *(repeated_column(limit, N) for limit in limits))
         return ca.vertcat(*(ca.mmax(row) for row in ca.vertsplit(found)))
 
 

@@ -54,7 +54,8 @@ class Ipopt:
         none: Array = np.zeros(model.nx)
         cost, rows = ca.SX(0), [(x[:, 0] - x0, none, none)]
         for k in range(N):
-            held = u[:, min(k, N_u - 1)]
+            j = int(ocp.held[k])
+            held = u[:, j]
             rows.append((phi(x[:, k], held, p[:, k]) - x[:, k + 1], none, none))
             y, bounded, h = outputs(x[:, k + 1], held, p[:, k + 1])
             e = y - y_ref[:, k]
@@ -65,9 +66,9 @@ class Ipopt:
                 cost += ca.dot(z, s[:, k]) + 0.5 * ca.dot(Z, s[:, k] ** 2)
             else:
                 rows.append((h, ocp.lh, ocp.uh))
-            if k < N_u:
-                du = held - (u[:, k - 1] if k else u_prev)
-                cost += ocp.lambda_[k] * ca.bilin(ca.DM(ocp.R), du, du)
+            if k == ocp.starts[j]:
+                du = held - (u[:, j - 1] if j else u_prev)
+                cost += ocp.lambda_[j] * ca.bilin(ca.DM(ocp.R), du, du)
                 if slewed:
                     rows.append((du, ocp.lbdu, ocp.ubdu))
         nlp = {"x": ca.veccat(x, u, s), "f": cost, "g": ca.veccat(*(row for row, _, _ in rows)), "p": ca.veccat(x0, u_prev, y_ref, p)}

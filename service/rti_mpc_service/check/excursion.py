@@ -63,7 +63,7 @@ class Bounds:
     def note_plan(self) -> None:
         """Note which bounds the last plan has reached."""
         rti, ocp = self._rti, self._rti.ocp
-        held = rti.u[np.minimum(np.arange(ocp.N), ocp.N_u - 1)]
+        held = rti.u[ocp.held]
         increments = np.diff(rti.u, axis=0, prepend=rti.u_prev[None])
         softened = np.array(self._softened(rti.x[1:].T, held.T, rti.p[1:].T)).reshape(-1, ocp.N).T
         found = []

@@ -67,7 +67,8 @@ def build_ocp(config: Config) -> Ocp:
     problem = Ocp(
         model,
         N=config.ocp.N,
-        N_u=config.N_u,
+        N_u=config.ocp.N_u,
+        blocks=config.ocp.blocks,
         dt=config.ocp.dt_s,
         method="euler" if config.ocp.integrator == "euler" else None,
         u_ref=[config.ocp.weights.u_ref.get(input.name, rest) for input, rest in zip(model.inputs, model.u_rest, strict=True)],

@@ -33,6 +33,10 @@ def check_tree(config: Config) -> None:
         raise ConfigError("ocp.terminal must have Q or lqr, not both")
     if config.observer.at_rest and not config.observer.disturbances:
         raise ConfigError("observer.at_rest says what observer.disturbances do while the robot stands, and there are none")
+    if ocp.blocks is not None and ocp.N_u is not None:
+        raise ConfigError("ocp must have N_u or blocks, not both")
+    if ocp.blocks is not None and sum(ocp.blocks) != ocp.N:
+        raise ConfigError(f"ocp.blocks must have ocp.N = {ocp.N} stages together, got {sum(ocp.blocks)} in {quoted(list(ocp.blocks))}")
     if config.N_u > ocp.N:
         raise ConfigError(f"ocp.N_u must be at most ocp.N = {ocp.N}, got {ocp.N_u}")
     for key, values, length in (("delta", ocp.weights.delta, ocp.N), ("lambda", ocp.weights.lambda_, config.N_u)):

@@ -101,7 +101,9 @@ class WeightSection(Section):
     )
     u_ref: dict[str, float] = Field(default={}, description="inputs from which R_u counts, by name, in the input's unit; that at rest if left out")
     delta: Weights = Field(default=(1.0,), description="factor of Q, without unit: one number, or a list of N, one per stage")
-    lambda_: Weights = Field(default=(1.0,), alias="lambda", description="factor of R, without unit: one number, or a list of N_u, one per stage")
+    lambda_: Weights = Field(
+        default=(1.0,), alias="lambda", description="factor of R, without unit: one number, or a list of N_u, one per stage or block"
+    )
 
 
 class BoundSection(Section):
@@ -156,6 +158,12 @@ class OcpSection(Section):
 
     N: int = Field(ge=1, le=1000, description="horizon, in stages")
     N_u: int | None = Field(default=None, ge=1, description="control horizon, in stages; N if left out")
+    blocks: tuple[Annotated[int, Field(ge=1)], ...] | None = Field(
+        default=None,
+        strict=False,
+        min_length=1,
+        description="stages of each block over which inputs are held, together N, instead of N_u; one a stage if left out",
+    )
     dt_s: Period = Field(description="duration of a stage and period of the controller, in seconds")
     integrator: Literal["rk4", "euler", "irk"] | None = Field(
         default=None,
@@ -337,8 +345,8 @@ class Config(Section):
 
     @property
     def N_u(self) -> int:
-        """Control horizon, in stages."""
-        return self.ocp.N_u or self.ocp.N
+        """Control horizon, in stages, or the number of blocks."""
+        return len(self.ocp.blocks) if self.ocp.blocks else self.ocp.N_u or self.ocp.N
 
     @property
     def stale_s(self) -> float:

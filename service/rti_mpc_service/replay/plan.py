@@ -21,7 +21,8 @@ def acting_bounds(rti: Rti, config: Config) -> list[dict[str, Any]]:
     """
     Return the bounds that a plan touches, each with its name, its side, its value, and the stages at which it acts.
 
-    Stages of inputs and increments begin at 0, which acts next; those of states and constraints at 1.
+    Stages of inputs and increments begin at 0, which acts next; of inputs that are held the first one is named. Those of states and constraints
+    begin at 1.
     """
     model, weights = rti.ocp.model, rti.guess.weights
     scale_u, scale_g = rti.scale[model.nx : model.nx + model.nu], rti.scale[model.nx + model.nu :]
@@ -32,20 +33,20 @@ def acting_bounds(rti: Rti, config: Config) -> list[dict[str, Any]]:
             for side, name in (("lower", lower), ("upper", upper)):
                 bound = float(weights[name][j])
                 touching = np.abs(values[:, j] - bound) <= ACTING_DISTANCE * scale_u[j]
-                found += _acting(kind, signal.name, signal.unit, side, bound, touching, 0, 0.0)
+                found += _acting(kind, signal.name, signal.unit, side, bound, rti.ocp.starts[touching], 0.0)
     for soft, scale in zip(softened(rti, config), scale_g, strict=True):
         for side, bound, sign in (("lower", soft.lower, -1.0), ("upper", soft.upper, 1.0)):
             over = sign * (soft.values - bound)
             violation = max(0.0, float(over.max()))
-            found += _acting(soft.kind, soft.name, soft.unit, side, bound, over > -TOUCHING_DISTANCE * scale, soft.first, violation)
+            stages = soft.first + np.flatnonzero(over > -TOUCHING_DISTANCE * scale)
+            found += _acting(soft.kind, soft.name, soft.unit, side, bound, stages, violation)
     return found
 
 
-def _acting(kind: str, name: str, unit: str, side: str, bound: float, touching: Any, first: int, violation: float) -> Iterator[dict[str, Any]]:
+def _acting(kind: str, name: str, unit: str, side: str, bound: float, stages: Any, violation: float) -> Iterator[dict[str, Any]]:
     """Yield a bound if it acts at any stage."""
-    if touching.any():
-        stages = [int(k) + first for k in np.flatnonzero(touching)]
-        yield {"kind": kind, "name": name, "unit": unit, "side": side, "bound": bound, "stages": stages, "violation": violation}
+    if len(stages):
+        yield {"kind": kind, "name": name, "unit": unit, "side": side, "bound": bound, "stages": stages.tolist(), "violation": violation}
 
 
 class BoundAlongPlan(NamedTuple):
@@ -102,7 +103,7 @@ def constraint_signals(rti: Rti, config: Config) -> Sequence[Any]:
 
 def outputs_of(function: Any, rti: Rti) -> Array:
     """Evaluate a function of state, input and parameters at nodes 1 to N of the plan, shape ``(N, outputs)``."""
-    N, held = rti.ocp.N, rti.u[np.minimum(np.arange(rti.ocp.N), len(rti.u) - 1)]
+    N, held = rti.ocp.N, rti.u[rti.ocp.held]
     arguments = (rti.x[1:].T, held.T, rti.p[1:].T)[: function.n_in()] if function.n_in() == 3 else (rti.x[1:].T, rti.p[1:].T)
     return np.array(function.map(N)(*arguments)).T
 
@@ -118,7 +119,7 @@ def cost_terms(rti: Rti, config: Config) -> dict[str, float]:
     by_input = (w["lambda_"][:, None] * increments * (increments @ w["R"])).sum(axis=0)
     terms = {f"error of {signal.name}": float(value) for signal, value in zip(model.outputs, by_output, strict=True)}
     terms |= {f"changes of {signal.name}": float(value) for signal, value in zip(model.inputs, by_input, strict=True)}
-    off = rti.u - np.array(input_reference(ocp)(rti.p[: len(rti.u)].T)).T
+    off = rti.u - np.array(input_reference(ocp)(rti.p[ocp.starts].T)).T
     for signal, value in zip(model.inputs, (w["R_u"] * off**2).sum(axis=0), strict=True):
         terms[f"{signal.name} itself"] = float(value)
     terms["terminal weight"] = float(errors[-1] @ w["Q_e"] @ errors[-1])

@@ -28,6 +28,7 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "fenced_with_held_inputs": lambda: fenced(N=6, N_u=3, ubx=INF, lbx=-INF),
     "beacon_euler": lambda: beacon(method="euler", delta=[1, 2, 3, 4, 5, 6]),
     "beacon_rk4": lambda: beacon(N_u=1),
+    "fenced_in_blocks": lambda: fenced(N=6, blocks=[2, 1, 3]),
     "double_integrator": lambda: double_integrator(lbx=[-INF, -0.5]),
 }
 
@@ -88,7 +89,7 @@ class ByHand:
         """Left-hand sides of all constraints, in the order the transcription documents."""
         ocp, rti = self.ocp, self._rti
         x, u, s = self._split(v)
-        held = np.minimum(np.arange(ocp.N), ocp.N_u - 1)
+        held = np.repeat(np.arange(ocp.N_u), ocp.blocks)
         phi = [np.array(self._phi(x[k], u[held[k]], rti.p[k])).ravel() for k in range(ocp.N)]
         du = np.diff(np.vstack([rti.u_prev, u]), axis=0)
         g = np.array([np.array(self._g(x[i], u[held[i - 1]], rti.p[i])).ravel() for i in range(1, ocp.N + 1)])

@@ -63,9 +63,13 @@ WRONG = [
     ("dt_s = 0.1", "", ["ocp.dt_s", "missing", "in seconds"]),
     ("N = 20", "N = 20.5", ["ocp.N", "whole number", "20.5"]),
     ("N = 20", "N = true", ["ocp.N", "whole number", "True"]),
+    ("N = 20", "N = 20\nblocks = [1, 2, 18]", ["ocp.blocks", "ocp.N = 20", "21 in [1, 2, 18]"]),
+    ("N = 20", "N = 20\nblocks = [20, 0]", ["ocp.blocks", "at least 1", "0"]),
+    ("N = 20", "N = 20\nblocks = []", ["ocp.blocks", "at least 1"]),
+    ("N = 20", "N = 20\nN_u = 2\nblocks = [1, 19]", ["ocp", "N_u or blocks, not both"]),
     ("N = 20", "N = 20\nN_u = 21", ["ocp.N_u", "at most ocp.N = 20", "21"]),
     ("N = 20", "N = 20\nstale_s = 0.1", ["ocp.stale_s", "timing.stale_s"]),
-    ("N = 20", "N = 20\nhorizon = 7", ["ocp.horizon", "N, N_u, dt_s"]),
+    ("N = 20", "N = 20\nhorizon = 7", ["ocp.horizon", "N, N_u, blocks, dt_s"]),
     ("N = 20", "n = 20", ["ocp.n is unknown", "perhaps ocp.N is meant", "in stages", "20"]),
     ('integrator = "rk4"', 'integrator = "rk5"', ["ocp.integrator", "'rk4', 'euler' or 'irk'", "'rk5'"]),
     ("psi = 0.05", "psi = -0.05", ["ocp.weights.Q.psi", "at least 0", "-0.05"]),
@@ -234,6 +238,16 @@ def test_wrong_value_is_refused_in_one_line_that_says_what_would_be_right(
 def test_file_that_is_not_there_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=re.escape(str(tmp_path / "none.toml"))):
         load(tmp_path / "none.toml")
+
+
+def test_blocks_of_held_inputs_are_those_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(
+        SHIPPED.read_text().replace("N = 20", "N = 20\nblocks = [1, 1, 2, 4, 12]", 1).replace("lambda = 0.8", "lambda = [5, 4, 3, 2, 1]", 1)
+    )
+    ocp = build_ocp(load(path))
+    assert (ocp.blocks, ocp.N_u) == ((1, 1, 2, 4, 12), 5)
+    np.testing.assert_array_equal(ocp.lambda_, [5, 4, 3, 2, 1])
 
 
 def test_configuration_becomes_the_ocp_it_describes(tmp_path: Path) -> None:
