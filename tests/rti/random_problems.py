@@ -50,7 +50,7 @@ class Structure:
         ny: Number of outputs.
         nh: Number of general constraints.
         N: Horizon.
-        N_u: Control horizon.
+        blocks: Stages of each block of held inputs; `N_u` of them.
         unit_x: Units of the states, shape ``(nx,)``.
         unit_u: Units of the inputs, shape ``(nu,)``.
         unit_y: Units of the outputs, shape ``(ny,)``.
@@ -63,12 +63,22 @@ class Structure:
     ny: int
     nh: int
     N: int
-    N_u: int
+    blocks: tuple[int, ...]
     unit_x: Array
     unit_u: Array
     unit_y: Array
     unit_h: Array
     finite: dict[str, Any]
+
+    @property
+    def N_u(self) -> int:
+        """Number of blocks."""
+        return len(self.blocks)
+
+    @property
+    def block_of(self) -> Array:
+        """Block of each stage, shape ``(N,)``."""
+        return np.repeat(np.arange(self.N_u), self.blocks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +125,10 @@ def random_structure(rng: np.random.Generator) -> Structure:
         "lh": (nh, 0.7),
         "uh": (nh, 1.0),
     }
-    return Structure(nx, nu, ny, nh, N, N_u, *units, {name: rng.random(size) < share for name, (size, share) in shares.items()})
+    (apart,) = rng.spawn(1)  # so that the other numbers are those of a structure with a control horizon
+    inner = apart.choice(np.arange(1, N), N_u - 1, replace=False) if apart.random() < 0.5 else np.arange(1, N_u)
+    blocks = tuple(np.diff([0, *sorted(inner.tolist()), N]).tolist())
+    return Structure(nx, nu, ny, nh, N, blocks, *units, {name: rng.random(size) < share for name, (size, share) in shares.items()})
 
 
 def random_data(s: Structure, rng: np.random.Generator) -> Data:
@@ -197,7 +210,7 @@ def problem(s: Structure, data: Data) -> Ocp:
     )
     constraint = {"h_expr": E @ x + F @ u} if s.nh else {}
     values = {name: value for name, value in in_units(s, data).items() if s.nh or not name.endswith("h")}
-    return Ocp(model, N=s.N, N_u=s.N_u, dt=DT, method="euler", **constraint, **values)
+    return Ocp(model, N=s.N, blocks=s.blocks, dt=DT, method="euler", **constraint, **values)
 
 
 class Truth:
@@ -234,8 +247,8 @@ class Truth:
         return max(float(np.max(gap)) for gap in gaps)
 
     def _held(self, u: Array) -> Array:
-        """Inputs of all stages, those after the control horizon held."""
-        return np.vstack([u, np.tile(u[-1], (self._s.N - self._s.N_u, 1))])
+        """Inputs of all stages."""
+        return u[self._s.block_of]
 
     def rolled_out(self, u: Array) -> Array:
         """States that follow from inputs."""
@@ -248,7 +261,7 @@ class Truth:
         """``P, q, A, b, G, h`` of: half z'Pz + q'z, least, where Az = b and Gz <= h."""
         s, d, v = self._s, self._d, self._d.values
         nx, nu, N, N_u = s.nx, s.nu, s.N, s.N_u
-        hold = sp.csr_matrix((np.ones(N), (np.arange(N), np.minimum(np.arange(N), N_u - 1))), shape=(N, N_u))
+        hold = sp.csr_matrix((np.ones(N), (np.arange(N), s.block_of)), shape=(N, N_u))
         eye_N, down = sp.eye(N), sp.eye(N, k=-1)
         difference = sp.kron(sp.eye(N_u) - sp.eye(N_u, k=-1), sp.eye(nu))
         first_u = np.concatenate([d.u_prev, np.zeros((N_u - 1) * nu)])
@@ -327,7 +340,7 @@ class Truth:
         r, costate = np.zeros_like(u), np.zeros(s.nx, dtype=long)
         for k in reversed(range(s.N)):
             costate = A.T @ costate + by_x[k] if k < s.N - 1 else by_x[k]
-            r[min(k, s.N_u - 1)] += B.T @ costate + by_u[k]
+            r[s.block_of[k]] += B.T @ costate + by_u[k]
         du = np.diff(np.vstack([d.u_prev, u]), axis=0)
         force = 2.0 * v["lambda_"][:, None] * (du @ v["R"]) + upper_du - lower_du
         r += force
