@@ -364,11 +364,7 @@ def replay(
     start: Annotated[str | None, typer.Option("--from", metavar="TIME", help="Time after the first state from which on to replay.")] = None,
     assignments: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="Another weight or bound: what would have been commanded in the same states; repeatable.",
-        ),
+        typer.Option("--set", metavar="KEY=VALUE", help="Another weight or bound: what would have been commanded in the same states; repeatable."),
     ] = None,
     robot: RecordedRobot = None,
     owner: Owner = None,
@@ -377,7 +373,7 @@ def replay(
     tolerance: Annotated[float, typer.Option(min=0.0, help="Largest relative difference on another machine or other versions.")] = 1e-6,
     path: JsonPath = None,
     closed_loop: Annotated[
-        bool, typer.Option("--closed-loop", help="Then drive the simulated robot of the configuration, with --set if given, and compare both drives.")
+        bool, typer.Option("--closed-loop", help="Also drive the simulated robot of the configuration, with --set if given, and compare both drives.")
     ] = False,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Folder for a figure of both drives, and a recording of both for `rti-mpc view`.")

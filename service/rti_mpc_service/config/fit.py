@@ -39,9 +39,10 @@ def check_tree(config: Config) -> None:
         raise ConfigError(f"ocp.blocks must have ocp.N = {ocp.N} stages together, got {sum(ocp.blocks)} in {quoted(list(ocp.blocks))}")
     if config.N_u > ocp.N:
         raise ConfigError(f"ocp.N_u must be at most ocp.N = {ocp.N}, got {ocp.N_u}")
-    for key, values, length in (("delta", ocp.weights.delta, ocp.N), ("lambda", ocp.weights.lambda_, config.N_u)):
+    of_lambda = "stage" if ocp.blocks is None else "block"
+    for key, values, length, each in (("delta", ocp.weights.delta, ocp.N, "stage"), ("lambda", ocp.weights.lambda_, config.N_u, of_lambda)):
         if len(values) not in (1, length):
-            raise ConfigError(f"ocp.weights.{key} must be a number or a list of {length}, one per stage, got {quoted(list(values))}")
+            raise ConfigError(f"ocp.weights.{key} must be a number or a list of {length}, one per {each}, got {quoted(list(values))}")
     if config.bus.config is not None and not config.bus.config.is_file():
         raise ConfigError(f"bus.config must be a file, got {config.bus.config}")
     if config.guard.enabled:

@@ -13,6 +13,7 @@ import numpy as np
 
 import rti_mpc
 from rti_mpc.array import Array
+from rti_mpc.errors import ConfigError
 from rti_mpc.recording.reader import STREAM_OF_NAME, Recorded, Recording
 from rti_mpc.recording.writer import RecordingWriter
 from rti_mpc.wire.cdr import encode
@@ -40,10 +41,13 @@ def write_both(out: Path, path: Path, journal: Journaled, recorded: Passage, dri
 
     Raises:
         OSError: The file cannot be written.
+        ConfigError: The recording has no state of the robot in this drive, so that nothing says when its messages came.
     """
     recording = Recording(path)
     copied = [*recording.messages(journal.robot, (*COPIED, *CACHED))]
     heard = [(each.message.stamp_ns, each.local_ns) for each in copied if each.stream == "state" and each.message.epoch == recorded.states[0].epoch]
+    if not heard:
+        raise ConfigError(f"--out must have a recording with the states of {journal.robot}, got {path} with its journal alone")
     stamps, locals_ns = (np.array(column, np.float64) for column in zip(*sorted(heard), strict=True))
     begin_ns, end_ns = (float(np.interp(state.stamp_ns, stamps, locals_ns)) for state in (recorded.states[0], recorded.states[-1]))
     messages = [*of_recorded(copied, begin_ns, end_ns), *of_driven(copied, journal, driven, stamps, locals_ns)]

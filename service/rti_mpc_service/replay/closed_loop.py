@@ -47,10 +47,13 @@ def compare(
         out: Folder for figure and recording; None: neither.
 
     Returns:
-        None if there is no drive, because the controller never led.
+        None if there is no drive; numbers that are not known are None.
+
+    Raises:
+        ConfigError: Figure or recording cannot be written.
     """
     if len(recorded.passage.samples) < 2 or len(driven.passage.samples) < 2:
-        print("  no closed loop: this controller led no robot whose acting command is known")
+        print(f"  no closed loop: {undriven(journal, recorded, start_s)}")
         return None
     ocp = recorded.ocp
     heard = heard_samples(path, journal)
@@ -65,15 +68,28 @@ def compare(
     said = f"with {', '.join(assignments)}" if assignments else "with the same settings"
     after = f", numbers after {run.transient_s:g} s" if run.transient_s else ""
     print(f"  in closed loop {said}, {run.time_s[-1]:.1f} s from {begin_s:.1f} s on{after}:")
-    for line in (*lines(numbers, ocp, run), *told_apart(apart, ocp)):
+    for line in (*lines(numbers, run), told_apart(apart, ocp)):
         print(f"    {line}")
     if driven.passage.unsent:
         print(f"    {driven.passage.unsent} commands were not sent: when it was recorded, there was none to send")
     if out is not None:
         write(out, path, journal, recorded, driven, runs, said)
     solved = [dict(on.passage.solved) for on in (recorded, driven)]
-    sides = {name.replace(" ", "_"): each | {"samples_by": by} for name, each, by in zip(NAMES, numbers, solved, strict=True)}
-    return {"with": [*assignments], "begin_s": begin_s, "duration_s": float(run.time_s[-1]), **sides, "apart": apart}
+    sides = {name.replace(" ", "_"): known(each) | {"samples_by": by} for name, each, by in zip(NAMES, numbers, solved, strict=True)}
+    return {"with": [*assignments], "begin_s": begin_s, "duration_s": float(run.time_s[-1]), **sides, "apart": known(apart)}
+
+
+def undriven(journal: Journaled, recorded: Drive, start_s: float) -> str:
+    """Return why there is no drive."""
+    beyond_s = 1e-9 * (recorded.start_ns - max(message.stamp_ns for message in journal.messages))
+    if start_s and beyond_s > 0.0:
+        return f"--from must be before this controller's last state, {start_s - beyond_s:.1f} s after its first one, got {start_s:g} s"
+    return "from there on this controller has not led two samples in a row, after a state whose command is in the recording"
+
+
+def known(numbers: Numbers) -> dict[str, float | None]:
+    """Return numbers for JSON, which has no NaN."""
+    return {name: value if np.isfinite(value) else None for name, value in numbers.items()}
 
 
 def heard_samples(path: Path, journal: Journaled) -> dict[tuple[int, int], Telemetry]:
@@ -152,7 +168,7 @@ def distance(recorded: Run, driven: Run) -> dict[str, float]:
     return dict(zip(names, map(largest, np.hstack([x, u]).T), strict=True))
 
 
-def lines(numbers: Sequence[Mapping[str, float]], ocp: Ocp, run: Run) -> Iterator[str]:
+def lines(numbers: Sequence[Mapping[str, float]], run: Run) -> Iterator[str]:
     """Yield a table of the numbers of both drives."""
     yield row("", NAMES)
     rows = [(f"error of {output}, {kind}", f"{output.name}_{kind}") for output in run.info.outputs for kind in ("rms", "max")]
@@ -177,10 +193,10 @@ def row(label: str, cells: Sequence[str]) -> str:
     return f"{label:<{LABEL_CHARACTERS}}" + "".join(f" {cell:>12}" for cell in cells)
 
 
-def told_apart(apart: Mapping[str, float], ocp: Ocp) -> Iterator[str]:
-    """Yield how far the drives are apart."""
+def told_apart(apart: Mapping[str, float], ocp: Ocp) -> str:
+    """Return how far the drives are apart, in words."""
     units = {signal.name: signal.unit for signal in (*ocp.model.states, *ocp.model.inputs)}
-    yield f"apart at most: {', '.join(f'{name} {value:.3g} {units[name]}' for name, value in apart.items())}"
+    return f"apart at most: {', '.join(f'{name} {value:.3g} {units[name]}' for name, value in apart.items())}"
 
 
 def write(out: Path, path: Path, journal: Journaled, recorded: Drive, driven: Drive, runs: Sequence[Run], said: str) -> None:
@@ -188,7 +204,7 @@ def write(out: Path, path: Path, journal: Journaled, recorded: Drive, driven: Dr
     Write the figure, where matplotlib is installed, and the recording of both drives.
 
     Raises:
-        ConfigError: The folder cannot be written.
+        ConfigError: The folder cannot be written, or the recording has no state of the drive.
     """
     from importlib.util import find_spec
 
@@ -196,11 +212,11 @@ def write(out: Path, path: Path, journal: Journaled, recorded: Drive, driven: Dr
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_both(out / f"{name}.mcap", path, journal, recorded.passage, driven)
+        if find_spec("matplotlib") is not None:
+            from rti_mpc_service.replay.figure import figure
+
+            figure(runs, out / f"{name}.png", f"{journal.robot}, {said}")
+            print(f"    figure     {out / f'{name}.png'}")
     except OSError as error:
         raise ConfigError(f"--out must be a folder that can be written, got {out}: {error.strerror}") from error
-    if find_spec("matplotlib") is not None:
-        from rti_mpc_service.replay.figure import figure
-
-        figure(runs, out / f"{name}.png", f"{journal.robot}, {said}")
-        print(f"    figure     {out / f'{name}.png'}")
     print(f"    view both  rti-mpc view {out / f'{name}.mcap'}")

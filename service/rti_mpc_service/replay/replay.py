@@ -103,6 +103,8 @@ def main(
     """
     if out is not None and make_body is None:
         raise ConfigError("--out must come with --closed-loop, whose figure and recording it is for")
+    if out is not None and out.exists() and not out.is_dir():
+        raise ConfigError(f"--out must be a folder, or a name that is free, got the file {out}")
     accounts, closed_loops = [], []
     changed = () if make_body is not None else assignments  # of what is replayed in open loop
     status = 0

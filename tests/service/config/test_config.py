@@ -248,6 +248,9 @@ def test_blocks_of_held_inputs_are_those_of_the_file(tmp_path: Path) -> None:
     ocp = build_ocp(load(path))
     assert (ocp.blocks, ocp.N_u) == ((1, 1, 2, 4, 12), 5)
     np.testing.assert_array_equal(ocp.lambda_, [5, 4, 3, 2, 1])
+    path.write_text(path.read_text().replace("lambda = [5, 4, 3, 2, 1]", "lambda = [5, 4]"))
+    with pytest.raises(ConfigError, match=r"ocp\.weights\.lambda must be a number or a list of 5, one per block, got \[5\.0, 4\.0\]"):
+        load(path)
 
 
 def test_configuration_becomes_the_ocp_it_describes(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from rti_mpc.contract.message import JournalKind
 from rti_mpc.control.controller import Controller
+from rti_mpc.errors import ConfigError
 from rti_mpc.recording import Recording
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.cli import SHIPPED, lockstep_robot
@@ -106,3 +107,25 @@ def test_both_drives_are_told_in_numbers_drawn_and_written_into_one_recording(tm
     assert len({(each.local_ns, each.message.stamp_ns) for each in begins.values()}) == 1, "both begin at once, so one axis of time fits both"
     assert set(both.streams["pioneer_closed_loop"]) == {"state", "command", "telemetry", "info", "reference/anchored", "event"}
     assert (tmp_path / "out" / "pioneer-5.png").stat().st_size > 20_000
+
+
+def test_folder_that_is_a_file_is_refused_before_anything_is_driven(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = recorded(journal_of(SHIPPED, samples=5), tmp_path / "run.mcap")
+    with pytest.raises(ConfigError, match=r"--out must be a folder, or a name that is free, got the file .*run\.mcap"):
+        main(path, make_body=lockstep_robot, out=path)
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.slow
+def test_recording_that_says_too_little_for_a_comparison_is_told_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From where it has ended, without states, and of a robot that follows nothing after the first half, of which JSON has no NaN."""
+    path = recorded(journal_of(SHIPPED, samples=20, acts={8: stop}), tmp_path / "run.mcap")
+    assert main(path, make_body=lockstep_robot, start_s=7.0) == 0
+    assert "no closed loop: --from must be before this controller's last state, 1.8 s after its first one, got 7 s" in capsys.readouterr().out
+    with pytest.raises(ConfigError, match=r"--out must have a recording with the states of pioneer, got .* with its journal alone"):
+        main(path, make_body=lockstep_robot, out=tmp_path / "out")
+    main(path, make_body=lockstep_robot, json_path=tmp_path / "run.json")
+    text = (tmp_path / "run.json").read_text()
+    assert "NaN" not in text
+    (result,) = json.loads(text)
+    assert result["closed_loop"]["recorded"]["x_rms"] is None
