@@ -42,7 +42,7 @@ ROLE = "robot"
 STANDSTILL_CHANGE = 1e-6  # nothing moves any more if no state changes by more in a period, in any unit
 STANDSTILL_RATE = 1e-3  # the robot stands if no state changes faster, in any unit per s
 MAX_COAST_NS = 10_000_000_000  # robot time with the inputs at rest after which it is decided whether the robot stands
-SENDING_S = 1e-3  # real time between two states on that way: many at once would be dropped as congestion
+COAST_SHARE = 0.05  # of its robot time that this takes in real time: many states at once would be dropped as congestion
 MAX_WAY_NS = 120_000_000_000  # robot time that the inputs may take to come to rest
 LISTEN_BEFORE_START_S = 0.5  # how long a starting robot listens for another one of its name
 PRESENCE_LEASE_S = 2.0  # time after which the presence of a process that was killed or hangs has ended
@@ -201,7 +201,7 @@ class Robot:
             rate[:] = (body.x - x) / (1e-9 * max(1, body.now_ns - before_ns))
             rested_ns = rested_ns if body.actuator.at_rest else body.now_ns
             self._send_due()
-            time.sleep(SENDING_S)
+            time.sleep(1e-9 * COAST_SHARE * body.period_ns)
         how = standing(self._model, rate)
         stands = how == "stands"
         self._announcer.say(Notice(Severity.INFO if stands else Severity.WARNING, "robot_stopped", f"the robot was stopped and {how}"), body.now_ns)
