@@ -11,6 +11,7 @@ from typing import Any
 from mcap.records import Attachment, Channel, Metadata
 
 from rti_mpc.errors import MessageError
+from rti_mpc.recording.host import HOST
 from rti_mpc.recording.mcap_file import McapFile
 from rti_mpc.recording.ros2 import JSON, read_text
 from rti_mpc.recording.writer import ABOUT, OUTCOME
@@ -19,7 +20,7 @@ from rti_mpc.wire.cdr import decode, encoding
 from rti_mpc.wire.received import Received
 from rti_mpc.wire.streams import STREAMS, Kind, Stream
 
-STREAM_OF_NAME: dict[str, Stream[Any]] = {stream.name: stream for stream in STREAMS if stream.kind is Kind.MESSAGE}
+STREAM_OF_NAME: dict[str, Stream[Any]] = {stream.name: stream for stream in (*STREAMS, HOST) if stream.kind is Kind.MESSAGE}
 
 
 @dataclass(frozen=True, slots=True)

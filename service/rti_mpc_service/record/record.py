@@ -9,6 +9,7 @@ recorded, since readers would stop at it.
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 import time
@@ -23,6 +24,7 @@ from typing import Any
 from rti_mpc.contract.epoch import MAX_SEQ_GAP, NUMBER_BITS
 from rti_mpc.contract.message import Notice, Severity
 from rti_mpc.errors import ConfigError, MessageError
+from rti_mpc.recording.host import HOST
 from rti_mpc.recording.repair import repair
 from rti_mpc.wire import document
 from rti_mpc.wire.announcer import Announcer
@@ -33,6 +35,7 @@ from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.received import Received
 from rti_mpc.wire.streams import CONTROLLER_ROLES, JOURNAL, admitted, role_of
 from rti_mpc_service.announce import announce
+from rti_mpc_service.host.pressure import waited_us
 from rti_mpc_service.record.hearing import fetch_origin, hear
 from rti_mpc_service.record.inbox import Arrived, Inbox
 from rti_mpc_service.record.segments import Retention, Segments
@@ -120,6 +123,7 @@ class Recorder:
         self._keys: dict[str, Key[Any] | None] = {}  # None: of a role beyond the limit of roles
         self._last: dict[tuple[str, int], int] = {}  # sequence numbers by key and epoch
         self._owners: set[tuple[str, int]] = set()  # controllers whose files were asked for
+        self._waited: tuple[int, int] | None = None  # monotonic time, ns, and what the host had waited then, us
 
     def follow(self, robot: str) -> None:
         """Record a robot from now on, too; in any thread."""
@@ -172,9 +176,22 @@ class Recorder:
                 self._segments.attach(f"{beginning}/{name}", media_type, text.encode(errors="replace"), now_ns)
         for entry in self._inbox.take():
             self._record(entry)
+        self._watch_host(now_ns)
         self._segments.writer.flush()
         for entry in self._segments.roll(now_ns, self._outcome()):
             self._add(entry, self._keys[entry.received.key])
+
+    def _watch_host(self, now_ns: int) -> None:
+        """Add to each robot's streams for how long this host's processes waited for a core since the last chunk, where the kernel counts it."""
+        before, total_us = self._waited, waited_us()
+        self._waited = None if total_us is None else (now_ns, total_us)
+        if before is None or total_us is None:
+            return
+        payload = json.dumps({"from_ns": before[0], "waited_s": 1e-6 * (total_us - before[1])}).encode()
+        with self._lock:
+            buses = dict(self._buses)
+        for robot, bus in buses.items():
+            self._segments.writer.add(robot, bus.keys.of(HOST), now_ns, payload)
 
     def _record(self, entry: Arrived) -> None:
         """Check a message and add it to the chunk."""

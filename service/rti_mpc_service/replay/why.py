@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -103,7 +104,8 @@ def main(
                 if case is None:
                     raise ConfigError(f"--case needs a command whose sample had a QP, got command {place.command.seq}: {facts['rung']}")
                 case.save(case_path)
-            facts["times"] = phase_times(path, journal, place.command)
+            facts["times"], arrived_ns = phase_times(path, journal, place.command)
+            facts["host"] = host_meanwhile(path, journal, arrived_ns)
             print(json.dumps(facts, indent=1) if as_json else "\n".join(lines(facts)))
             return 0
     what = "two commands" if at_s is None else f"a command {at_s:g} s after its first one"
@@ -282,15 +284,27 @@ def second_opinion(sample: Telemetry, seq: int) -> dict[str, Any] | None:
     }
 
 
-def phase_times(path: Path, journal: Journaled, command: Command) -> dict[str, float] | None:
-    """Return the times of a sample from its recorded telemetry, None if there is none."""
+def phase_times(path: Path, journal: Journaled, command: Command) -> tuple[dict[str, float], int] | tuple[None, None]:
+    """Return the times of a sample from its recorded telemetry, and when that arrived, local ns; None if there is none."""
     for recorded in Recording(path).messages(journal.robot, ("telemetry", "telemetry/standby")):
         try:
             sample: Telemetry = recorded.message
         except MessageError:
             continue
         if (sample.epoch, sample.seq) == (command.epoch, command.seq):
-            return {name: getattr(sample, name) for name in ("prepare_us", "feedback_us", "latency_us", "slack_s", "second_us")}
+            return {name: getattr(sample, name) for name in ("prepare_us", "feedback_us", "latency_us", "slack_s", "second_us")}, recorded.local_ns
+    return None, None
+
+
+def host_meanwhile(path: Path, journal: Journaled, arrived_ns: int | None) -> dict[str, float] | None:
+    """Return for how long processes of the recorder's host waited for a core around a local time, and in what time, s; None if it is not recorded."""
+    if arrived_ns is None:
+        return None
+    for recorded in Recording(path).messages(journal.robot, ("host",)):
+        with suppress(MessageError, LookupError, TypeError, ValueError):  # what another program may have written
+            from_ns, waited_s = int(recorded.message["from_ns"]), float(recorded.message["waited_s"])
+            if from_ns < arrived_ns <= recorded.local_ns:
+                return {"waited_s": waited_s, "of_s": 1e-9 * (recorded.local_ns - from_ns)}
     return None
 
 
@@ -318,6 +332,10 @@ def lines(facts: Mapping[str, Any]) -> Iterator[str]:
             f"{name} {times[f'{key}_us']:.0f} us" for name, key in (("preparation", "prepare"), ("feedback", "feedback"), ("latency", "latency"))
         )
         yield f"times: {phases}; {1e3 * times['slack_s']:.1f} ms of slack"
+        if (host := facts["host"]) is None:
+            yield "host: the recording does not say what it did meanwhile"
+        else:
+            yield f"host of the recorder: processes waited for a core for {host['waited_s'] / host['of_s']:.0%} of the {host['of_s']:.1f} s around it"
     if facts["events"]:
         yield f"what led there, in the {LOOK_BACK_S:g} s before:"
     for one in facts["events"]:

@@ -12,6 +12,8 @@ from threading import Event as Flag
 from typing import Any
 
 import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.errors import ConfigError
@@ -22,6 +24,7 @@ from rti_mpc.wire.keys import Key
 from rti_mpc.wire.received import Received
 from rti_mpc_service.config.build import build_model
 from rti_mpc_service.config.config import load
+from rti_mpc_service.host.pressure import waited_us
 from rti_mpc_service.origin import Origin
 from rti_mpc_service.record import record
 from rti_mpc_service.record.inbox import ENTRY_BYTES, Arrived, Inbox
@@ -66,6 +69,29 @@ def test_recorder_writes_what_can_be_decoded_and_counts_the_rest(tmp_path: Path)
     assert [recorded.local_ns for recorded in recording.messages(streams=("state",))] == [START_NS + k * MS for k in (1, 2, 5, 6)]
     assert recording.outcome == {"recorded": "5", "missing": "2", "refused": "3", "dropped": "0"}
     assert b"2 messages are missing" in bench.session.put[KEYS.event("recorder")]
+
+
+def test_waiting_for_cores_is_recorded_for_each_chunk_and_read_by_tools_of_ros(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    totals_us = iter([1_000_000, 1_200_000, None, 1_500_000])
+    monkeypatch.setattr(record, "waited_us", lambda: next(totals_us))
+    bench = Bench(tmp_path / "run.mcap")
+    for k in range(4):
+        bench.recorder._write(START_NS + 500 * k * MS)
+    bench.segments.writer.finish({})
+    (told,) = Recording(tmp_path / "run.mcap").messages("wheels", ("host",))
+    assert told.local_ns == START_NS + 500 * MS
+    assert told.message == {"from_ns": START_NS, "waited_s": pytest.approx(0.2, rel=1e-9)}, "rounding"
+    with (tmp_path / "run.mcap").open("rb") as file:
+        ((_, channel, _, text),) = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+    assert channel.topic == "/rti_mpc/wheels/host"
+    assert json.loads(text.data) == told.message
+    assert not [key for key in bench.session.put if key.endswith("host")], "nothing is on the bus"
+
+
+def test_kernel_that_does_not_count_waiting_is_no_failure(tmp_path: Path) -> None:
+    assert waited_us(tmp_path / "cpu") is None
+    (tmp_path / "cpu").write_text("some avg10=13.38 avg60=5.64 avg300=10.19 total=7288\nfull avg10=0.00 avg60=0.00 avg300=0.00 total=3\n")
+    assert waited_us(tmp_path / "cpu") == 7288
 
 
 def test_file_that_is_there_is_not_overwritten(tmp_path: Path) -> None:

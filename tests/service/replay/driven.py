@@ -99,8 +99,8 @@ def failing(failure: str, samples: int) -> Act:
     return act
 
 
-def recorded(journal: Journaled, path: Path, states: Sequence[State] = ()) -> Path:
-    """Write a journal as a recorder does, with the attached files, and states that arrive at their stamps; return the file."""
+def recorded(journal: Journaled, path: Path, states: Sequence[State] = (), also: Callable[[RecordingWriter], None] = lambda _: None) -> Path:
+    """Write a journal as a recorder does, with the attached files, states that arrive at their stamps, and what `also` adds; return the file."""
     keys = Keys("rti_mpc", journal.robot)
     writer = RecordingWriter(path, 0, 0, "0")
     for name, text in journal.files.items():
@@ -109,5 +109,6 @@ def recorded(journal: Journaled, path: Path, states: Sequence[State] = ()) -> Pa
         writer.add(journal.robot, keys.journal, message.local_ns, encode(message), message.seq)
     for state in states:
         writer.add(journal.robot, keys.state, state.stamp_ns, encode(state), state.seq)
+    also(writer)
     writer.finish({})
     return path

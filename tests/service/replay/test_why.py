@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,14 @@ import pytest
 
 from rti_mpc.contract.status import Mode
 from rti_mpc.errors import ConfigError
+from rti_mpc.recording.host import HOST
+from rti_mpc.recording.writer import RecordingWriter
+from rti_mpc.wire.cdr import encode
+from rti_mpc.wire.keys import Keys
 from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
 from rti_mpc_service.replay.why import Place, acted, explain, find, lines, main
+from tests.recording.samples import telemetry
 from tests.service.replay.driven import failing, journal_of, recorded, straight
 
 INJECTED = SHIPPED.read_text() + "\n[debug]\ninject = true\n"
@@ -137,6 +143,29 @@ def test_last_command_is_explained_where_none_is_asked_for(tmp_path: Path, capsy
     assert json.loads(capsys.readouterr().out)["seq"] == place.command.seq
     with pytest.raises(ConfigError, match=r"--at TIME or with --seq NUMBER, not with both"):
         main(tmp_path / "run.mcap", at_s=1.0, seq=1)
+
+
+def test_host_that_held_processes_up_is_told_and_a_recording_without_it_explained_all_the_same(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    journal = journal_of(SHIPPED, samples=12)
+    command = next(one.command for one in acted(journal) if one.command.seq == 5)
+    sample = replace(telemetry(1), epoch=command.epoch, seq=5)
+    for name, hosts in (("without", []), ("with", [(0, 0.1), (500_000_000, 0.17), (1_000_000_000, 0.4)])):
+        path, keys = tmp_path / f"{name}.mcap", Keys("rti_mpc", journal.robot)
+
+        def add(writer: RecordingWriter, hosts: list[tuple[int, float]] = hosts, keys: Keys = keys) -> None:
+            writer.add(journal.robot, keys.telemetry, 700_000_000, encode(sample), 5)
+            for from_ns, waited_s in hosts:
+                writer.add(journal.robot, keys.of(HOST), from_ns + 500_000_000, json.dumps({"from_ns": from_ns, "waited_s": waited_s}).encode())
+
+        recorded(journal, path, also=add)
+    assert main(tmp_path / "with.mcap", seq=5) == 0
+    assert "host of the recorder: processes waited for a core for 34% of the 0.5 s around it" in capsys.readouterr().out
+    assert main(tmp_path / "with.mcap", seq=5, as_json=True) == 0
+    assert json.loads(capsys.readouterr().out)["host"] == {"waited_s": 0.17, "of_s": 0.5}
+    assert main(tmp_path / "without.mcap", seq=5) == 0
+    assert "host: the recording does not say what it did meanwhile" in capsys.readouterr().out
 
 
 def test_recording_that_is_not_there_is_refused_in_a_line(tmp_path: Path) -> None:
