@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -25,6 +26,8 @@ from rti_mpc_service.tune.varied import Varied
 from rti_mpc_service.tune.workers import DriveAll
 
 BATCH_TRIALS = 8  # asked for at once, whatever the number of processes
+OPENINGS = 4  # of a storage: one that others begin at the same time refuses those who find its tables half made
+REOPENED_S = 0.25  # between two of them
 FINISHED = (TrialState.COMPLETE, TrialState.FAIL)
 SAME_TOLERANCE = 1e-3  # relative: two machines round differently; another model or version of the controller differs by more
 STUDIED = "studied"  # name of the course of the study among the workers'
@@ -70,11 +73,15 @@ def open_study(storage: str, name: str, today: Driven) -> optuna.Study:
         ConfigError: The storage cannot be used, or the study was made with another model or version, since today's values lead elsewhere there.
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    try:
-        study = optuna.create_study(storage=storage, study_name=name, directions=["minimize", "minimize"], load_if_exists=True)
-    except Exception as error:  # SQLAlchemy's, a database driver's or Optuna's, by the kind of URL
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ConfigError(f"--storage must be a storage of Optuna that can be used: {reason}") from error
+    for left in reversed(range(OPENINGS)):
+        try:
+            study = optuna.create_study(storage=storage, study_name=name, directions=["minimize", "minimize"], load_if_exists=True)
+            break
+        except Exception as error:  # SQLAlchemy's, a database driver's or Optuna's, by the kind of URL
+            if not left:
+                reason = (str(error).splitlines() or [type(error).__name__])[0]
+                raise ConfigError(f"--storage must be a storage of Optuna that can be used: {reason}") from error
+            time.sleep(REOPENED_S)
     known = study.user_attrs.get("today")
     if known is None:
         study.set_user_attr("today", [today.error, today.effort])
