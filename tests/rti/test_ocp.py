@@ -57,6 +57,12 @@ def test_control_horizon_is_blocks_of_one_stage_and_one_to_the_end() -> None:
     assert blocks.starts.tolist() == [0, 2, 3]
 
 
+@pytest.mark.parametrize("horizon", [{"N_u": 3}, {"blocks": [2, 1, 3]}, {}])
+def test_problem_with_another_weight_keeps_its_blocks(horizon: dict[str, Any]) -> None:
+    ocp = double_integrator(N=6, **horizon)
+    assert replace(ocp, Q=np.ones(2)).blocks == ocp.blocks
+
+
 def test_plan_in_blocks_is_moved_on_as_each_block_begins_a_stage_later() -> None:
     ocp = double_integrator(N=8, blocks=[2, 1, 3, 2])
     x, u = np.zeros((2, 9)), np.array([[10.0, 20.0, 30.0, 40.0]])
@@ -73,7 +79,7 @@ def test_plan_in_blocks_is_moved_on_as_each_block_begins_a_stage_later() -> None
         ({"blocks": [1, 2, 3]}, r"blocks must have N = 7 stages together, got 6 in \[1, 2, 3\]"),
         ({"blocks": [1, 0, 6]}, "each of blocks must be a whole number of at least 1, got 0"),
         ({"blocks": []}, "blocks must be a list of the stages of each block"),
-        ({"blocks": [1, 2, 4], "N_u": 3}, "N_u must be left out where blocks are given: it is their number, got N_u = 3"),
+        ({"blocks": [1, 2, 4], "N_u": 2}, "N_u must be left out where blocks are given: it is their number, got N_u = 2"),
         ({"blocks": [1, 2, 4], "lambda_": [1.0] * 7}, r"lambda_ must be a number or have shape \(3,\)"),
         ({"dt": 0.0}, "dt must be a positive number of seconds, got 0.0"),
         ({"dt": INF}, "dt must be a positive"),
