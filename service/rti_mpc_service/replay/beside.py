@@ -41,8 +41,10 @@ def write_both(out: Path, path: Path, journal: Journaled, recorded: Passage, dri
 
     Raises:
         OSError: The file cannot be written.
-        ConfigError: The recording has no state of the robot in this drive, so that nothing says when its messages came.
+        ConfigError: The file is the recording itself, or this has no state of the robot in this drive, so that nothing says when its messages came.
     """
+    if out.exists() and out.samefile(path):
+        raise ConfigError(f"--out must be a folder in which {out.name} is not the recording itself, got {out.parent}")
     recording = Recording(path)
     copied = [*recording.messages(journal.robot, (*COPIED, *CACHED))]
     heard = [(each.message.stamp_ns, each.local_ns) for each in copied if each.stream == "state" and each.message.epoch == recorded.states[0].epoch]

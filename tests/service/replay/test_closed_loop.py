@@ -17,6 +17,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.recording import Recording
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.cli import SHIPPED, lockstep_robot
+from rti_mpc_service.replay.beside import write_both
 from rti_mpc_service.replay.closed_loop import numbers_of, run_of
 from rti_mpc_service.replay.drive import Drive, Passage, drive
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
@@ -129,3 +130,12 @@ def test_recording_that_says_too_little_for_a_comparison_is_told_in_a_line(tmp_p
     assert "NaN" not in text
     (result,) = json.loads(text)
     assert result["closed_loop"]["recorded"]["x_rms"] is None
+
+
+def test_recording_is_not_overwritten_by_that_of_both_drives(tmp_path: Path) -> None:
+    path = tmp_path / "pioneer-5.mcap"
+    path.write_bytes(b"precious")
+    nothing: Any = None  # is looked at before
+    with pytest.raises(ConfigError, match=r"--out must be a folder in which pioneer-5\.mcap is not the recording itself"):
+        write_both(path, path, nothing, nothing, nothing)
+    assert path.read_bytes() == b"precious"
