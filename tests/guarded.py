@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config import signals_file
 from rti_mpc_service.config.build import build_signals
 from rti_mpc_service.config.config import load
+from rti_mpc_service.shipped import SHIPPED
 
 GUARDED = "\n[guard]\nenabled = true\n"
 

@@ -38,15 +38,16 @@ COMMANDS = {f"rti_mpc_service.{name}" for name in NAMES}
 BORROWED = {
     "rti_mpc_service.paper": {"rti_mpc_service.bench"},
     "rti_mpc_service.replay": {"rti_mpc_service.record"},
+    "rti_mpc_service.commands": COMMANDS,
 }  # command: what it takes of another all the same
 
-# What no file of a package imports; the command line alone may start a simulation, lazily.
+# What no file of a package imports; one file of commands alone knows the simulation, lazily.
 FORBIDDEN = {
     "rti_mpc": {"rti_mpc_service", "rti_mpc_sim", "asyncio", "logging", "pydantic", "typer", "rich"},
     "rti_mpc_service": {"rti_mpc_sim"},
     "rti_mpc_sim": {"rti_mpc_service", "osqp", "pydantic", "typer"},
 }
-COMMAND_LINE = "service/rti_mpc_service/cli.py"
+SIMULATION = "service/rti_mpc_service/commands/robot.py"
 CLOCKS = {"time", "datetime", "threading", "multiprocessing", "concurrent", "random"}  # what would make two runs of one sample differ
 
 # The one place of a foreign package: files, or all files of a folder.
@@ -127,7 +128,7 @@ def folders_imported(path: Path) -> set[str]:
 def test_package_does_not_import_upwards(package: str) -> None:
     assert files(package)
     for path in files(package):
-        if relative(path) != COMMAND_LINE:
+        if relative(path) != SIMULATION:
             assert not roots(path) & FORBIDDEN[package], path
 
 
@@ -146,7 +147,7 @@ def test_every_folder_of_the_library_has_its_place() -> None:
 def test_command_is_no_library_of_another() -> None:
     for path in files("rti_mpc_service"):
         folder = folder_of_file(path)
-        if folder in COMMANDS or folder != "rti_mpc_service":
+        if folder != "rti_mpc_service":
             assert folders_imported(path) & COMMANDS <= BORROWED.get(folder, set()), path
 
 

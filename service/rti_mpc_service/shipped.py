@@ -13,6 +13,7 @@ PACKAGE = Path(str(files("rti_mpc_service")))
 DEPLOY = PACKAGE / "deploy" if (PACKAGE / "deploy").is_dir() else PACKAGE.parents[1] / "deploy"  # in the wheel, in a clone
 TEMPLATES = PACKAGE / "templates"
 ROBOTS = {path.stem: path for path in (DEPLOY / "pioneer_3dx.toml", *sorted((DEPLOY / "robots").glob("*.toml")))}
+SHIPPED = ROBOTS["pioneer_3dx"]
 
 
 def robot_file(name: str) -> Path:

@@ -14,12 +14,12 @@ from rti_mpc.contract.message import Telemetry
 from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.info import Info, Label
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
 from rti_mpc_service.rig import robot_log
 from rti_mpc_service.rig.children import Children
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.rig.robot_log import RobotLog
+from rti_mpc_service.shipped import SHIPPED
 from tests.processes.system import until
 
 INFO = Info("controller", states=tuple(map(Label, ("x", "y", "psi", "u", "omega"))), inputs=tuple(map(Label, ("u_c", "omega_c"))))

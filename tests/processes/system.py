@@ -23,10 +23,10 @@ from rti_mpc.contract.message import Command, Event, State, Telemetry
 from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import M, decode
 from rti_mpc_service.certs.folder import secured
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
+from rti_mpc_service.shipped import SHIPPED
 from tests.in_time import in_time
 
 ROOT = Path(__file__).parents[2]

@@ -18,8 +18,8 @@ import pytest
 from rti_mpc.contract.epoch import highest_believed
 from rti_mpc.contract.message import Command
 from rti_mpc.wire.bus import unix_s
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.shipped import SHIPPED
 from tests.guarded import GUARDED, write_robot
 from tests.in_time import on_time
 from tests.processes.attack import RATE_HZ, Attack

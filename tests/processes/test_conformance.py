@@ -19,9 +19,9 @@ import pytest
 from rti_mpc.contract.message import State
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.session import BusSettings
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
 from rti_mpc_service.rig.endpoint import free_endpoint
+from rti_mpc_service.shipped import SHIPPED
 from tests.guarded import write_robot
 from tests.movers import toml
 from tests.processes.system import PATIENCE_S, ROOT, command_line, environment, heard, listening, rti_mpc, until

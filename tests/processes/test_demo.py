@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 
 from rti_mpc.recording import Recording
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
 from rti_mpc_service.demo.demo import compiling
 from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.shipped import SHIPPED
 from tests.in_time import explained
 from tests.processes.system import PATIENCE_S, ROOT, command_line, environment, rti_mpc, until
 

@@ -21,8 +21,8 @@ from rti_mpc.contract.message import Command, Event
 from rti_mpc.contract.schedule import RAMP_STEP_NS
 from rti_mpc.contract.status import Mode
 from rti_mpc.wire.cdr import decode
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.shipped import SHIPPED
 from tests.guarded import write_robot
 from tests.in_time import in_time
 from tests.processes.record import FAST_STATES, MS, SLEW, Record, recorded, within_slew

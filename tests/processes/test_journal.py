@@ -13,7 +13,7 @@ import pytest
 from rti_mpc.contract.message import Command, Telemetry
 from rti_mpc.contract.status import Mode
 from rti_mpc.wire.cdr import decode
-from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.shipped import SHIPPED
 from tests.guarded import write_robot
 from tests.processes.system import System, heard, rti_mpc
 

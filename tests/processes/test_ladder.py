@@ -16,8 +16,8 @@ from rti_mpc.contract.message import Command, Event, Telemetry
 from rti_mpc.contract.status import Mode
 from rti_mpc.wire.bus import Subscriber
 from rti_mpc.wire.cdr import decode
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.shipped import SHIPPED
 from tests.in_time import on_time
 from tests.processes.system import CONFIG, KEYS, SPEED, System, heard
 

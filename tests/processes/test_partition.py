@@ -21,12 +21,12 @@ import pytest
 
 from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.contract.status import Mode
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.build import build_signals, guard_limits
 from rti_mpc_service.config.config import load
 from rti_mpc_service.faults.measure import Incident, measure
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig import robot_log
+from rti_mpc_service.shipped import SHIPPED
 from tests.bench.driven import INFO
 from tests.guarded import GUARDED, write_robot
 from tests.in_time import MS, in_time

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
+from rti_mpc_service.shipped import SHIPPED
 from tests.guarded import write_robot
 from tests.in_time import MS, computed_ms, in_time
 from tests.processes.system import ROOT, command_line, environment, until

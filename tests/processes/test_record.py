@@ -22,9 +22,9 @@ from rti_mpc.recording import Recording
 from rti_mpc.recording.repair import repair
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.keys import Keys
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
+from rti_mpc_service.shipped import SHIPPED
 from tests.in_time import PATIENT, in_time
 from tests.processes.system import KEYS, ROOT, System, command_line, environment, rti_mpc, until
 from tests.recording.test_recording import read_by_others

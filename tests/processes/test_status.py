@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.rig.endpoint import free_endpoint
+from rti_mpc_service.shipped import SHIPPED
 from tests.processes.system import System, rti_mpc, until
 
 pytestmark = pytest.mark.slow

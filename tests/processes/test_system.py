@@ -20,8 +20,8 @@ from rti_mpc.wire import cdr
 from rti_mpc.wire.bus import Bus, Publisher
 from rti_mpc.wire.cdr import decode, encode
 from rti_mpc.wire.session import BusSettings
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.shipped import SHIPPED
 from tests.in_time import MS, in_time, on_time
 from tests.processes.system import CONFIG, KEYS, SPEED, System, heard, interrupted_in_time, rti_mpc, until
 

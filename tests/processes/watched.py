@@ -13,8 +13,8 @@ from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.contract.message import Command, Telemetry
 from rti_mpc.contract.status import Mode
 from rti_mpc.wire.cdr import decode
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.shipped import SHIPPED
 from tests.guarded import write_robot
 from tests.in_time import on_time
 from tests.processes.system import KEYS, System, heard, owner, until

@@ -15,9 +15,9 @@ import typer.main
 from typer.testing import CliRunner
 
 from rti_mpc.errors import ConfigError
-from rti_mpc_service.cli import SHIPPED, app
+from rti_mpc_service.cli import app
 from rti_mpc_service.faults.table import FAULTS
-from rti_mpc_service.shipped import TEMPLATES
+from rti_mpc_service.shipped import SHIPPED, TEMPLATES
 from tests.in_time import awake_ms
 from tests.robots import toml
 

@@ -18,8 +18,8 @@ import pytest
 from rti_mpc.contract.message import State
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.keys import Keys
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.rig.endpoint import free_endpoint
+from rti_mpc_service.shipped import SHIPPED
 from tests.processes.system import CONFIG
 
 ROOT = Path(__file__).parents[2]

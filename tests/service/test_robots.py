@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rti_mpc.errors import ConfigError
-from rti_mpc_service.cli import file_of
+from rti_mpc_service.commands.arguments import file_of
 from rti_mpc_service.config.config import load
 from rti_mpc_service.robots import main
 from rti_mpc_service.scenario import find_scenario

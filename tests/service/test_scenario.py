@@ -10,7 +10,6 @@ import pytest
 
 from rti_mpc.errors import ConfigError
 from rti_mpc.reference.trajectory import eight, rows
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config import signals_file
 from rti_mpc_service.config.build import build_signals, with_initial_state
 from rti_mpc_service.config.config import load
@@ -18,6 +17,7 @@ from rti_mpc_service.config.schema import Config
 from rti_mpc_service.demo.demo import check_start
 from rti_mpc_service.rig.scenario import configured, write_files
 from rti_mpc_service.scenario import find_scenario
+from rti_mpc_service.shipped import SHIPPED
 from tests.robots import toml
 
 

@@ -56,7 +56,7 @@ import sys
 from rti_mpc.wire.bus import BusSettings
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service import reference as source
-from rti_mpc_service.cli import SHIPPED
+from rti_mpc_service.shipped import SHIPPED
 from rti_mpc_service.config.config import load
 from rti_mpc_service.scenario import find_scenario
 

@@ -16,8 +16,9 @@ from rti_mpc.wire.streams import STREAMS, Kind
 from rti_mpc_service.certs.access import access_control, zenoh_configuration
 from rti_mpc_service.certs.folder import credentials, secured
 from rti_mpc_service.certs.roles import ROLES, ROLES_OF_COMMAND, common_name
-from rti_mpc_service.cli import SHIPPED, app
+from rti_mpc_service.cli import app
 from rti_mpc_service.config.config import load
+from rti_mpc_service.shipped import SHIPPED
 
 pytest.importorskip("cryptography", reason="the extra certs is not installed: certificates were NOT tried")
 

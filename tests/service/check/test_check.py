@@ -15,8 +15,8 @@ from rti_mpc.contract.status import QpStatus
 from rti_mpc.rti.rest import Rest, RestClass, assess
 from rti_mpc_service.check import check, rest
 from rti_mpc_service.check.rest import rest_line
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
+from rti_mpc_service.shipped import SHIPPED
 from tests.movers import law_of, ocp_of
 from tests.problems import pioneer
 from tests.service.config.test_config import MINIMAL

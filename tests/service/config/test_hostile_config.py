@@ -13,9 +13,9 @@ import pytest
 from rti_mpc.errors import ConfigError
 from rti_mpc.reference.trajectory import find_trajectory
 from rti_mpc.wire.session import BusSettings, zenoh_config
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
 from rti_mpc_service.request import parse_assignments
+from rti_mpc_service.shipped import SHIPPED
 from tests.processes.system import rti_mpc
 
 TEXT = SHIPPED.read_text()

@@ -14,11 +14,12 @@ from typer.testing import CliRunner
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.check import check
-from rti_mpc_service.cli import SHIPPED, app
+from rti_mpc_service.cli import app
 from rti_mpc_service.config import signals_file
 from rti_mpc_service.config.build import build_signals, guard_limits
 from rti_mpc_service.config.config import load
 from rti_mpc_service.controller import daemon
+from rti_mpc_service.shipped import SHIPPED
 
 MODEL = """
 import casadi as ca

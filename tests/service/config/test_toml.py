@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config import toml
 from rti_mpc_service.config.config import load
+from rti_mpc_service.shipped import SHIPPED
 from tests.service.config.test_config import MINIMAL
 
 ODD = """

@@ -15,11 +15,11 @@ from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command
 from rti_mpc.wire.actuator import Actuator
 from rti_mpc.wire.source import Source, Verdict
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.build import build_signals, guard_limits, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.conformance.finding import judgements
 from rti_mpc_service.conformance.robot import CASES, Trial
+from rti_mpc_service.shipped import SHIPPED
 from rti_mpc_sim.settings import RobotSettings
 from tests.service.conformance.link import EPOCH, MS, as_it_is
 from tests.service.conformance.link import LockstepLink as Link

@@ -16,11 +16,11 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.reference.trajectory import circle
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS
 from rti_mpc.rti.rti import Rti
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.build import build_ocp, build_rti
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.controller.params import Params, changed_problem, parameter_values
+from rti_mpc_service.shipped import SHIPPED
 from tests.loop import drive, reference, robot
 from tests.service.config.test_config import MINIMAL
 

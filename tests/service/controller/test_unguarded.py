@@ -14,10 +14,10 @@ import pytest
 from rti_mpc.contract.message import Severity
 from rti_mpc.wire import bus as bus_module
 from rti_mpc.wire.bus import BusSettings
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_stop
 from rti_mpc_service.controller import daemon
+from rti_mpc_service.shipped import SHIPPED
 from tests.movers import toml
 from tests.wire.fake_session import FakeSession
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.doctor import doctor
 from rti_mpc_service.doctor.doctor import PERIOD_MARGIN_FACTOR, finding_rows, period_verdict
 from rti_mpc_service.host.jitter import bare_timer
+from rti_mpc_service.shipped import SHIPPED
 from tests.processes.system import rti_mpc
 
 PARTS = ("prepare_us", "feedback_us", "timer_us", "round_trip_us")

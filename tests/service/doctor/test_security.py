@@ -10,8 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from rti_mpc.wire.keys import Keys
-from rti_mpc_service.cli import SHIPPED, app
+from rti_mpc_service.cli import app
 from rti_mpc_service.doctor import security
+from rti_mpc_service.shipped import SHIPPED
 
 pytest.importorskip("cryptography", reason="the extra certs is not installed: certificates were NOT tried")
 

@@ -12,7 +12,6 @@ import pytest
 from rich.console import Console
 
 from rti_mpc.errors import ConfigError
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
 from rti_mpc_service.faults import run
 from rti_mpc_service.faults.measure import Measured
@@ -20,6 +19,7 @@ from rti_mpc_service.faults.report import MatrixReport, MatrixRow
 from rti_mpc_service.faults.table import FAULTS
 from rti_mpc_service.host.hold_up import Host, Unwitnessed
 from rti_mpc_service.scenario import find_scenario
+from rti_mpc_service.shipped import SHIPPED
 
 BY_NAME = {fault.name: fault for fault in FAULTS}
 STOPPED = Measured(0.2, 0.21, 0.4, 1.8, 0.25, 0, 1.0, 2.5, 30, 0.5, 0.5)

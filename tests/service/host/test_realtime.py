@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from rti_mpc.wire.bus import Bus, BusSettings
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.rig.children import Children
 from rti_mpc_service.rig.endpoint import free_endpoint
+from rti_mpc_service.shipped import SHIPPED
 from tests.processes.system import KEYS, until
 
 ROOT = Path(__file__).parents[3]

@@ -12,7 +12,6 @@ import pytest
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import ConfigError
 from rti_mpc.rti.scaled import Scaled
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
 from rti_mpc_service.replay.answer import answer, of_other, rebuilt
 from rti_mpc_service.replay.case import QpCase, qp_at
@@ -22,6 +21,7 @@ from rti_mpc_service.replay.trouble import troubles
 from rti_mpc_service.replay.why import explained, find
 from rti_mpc_service.replay.why import main as why
 from rti_mpc_service.replay.without import moved, without
+from rti_mpc_service.shipped import SHIPPED
 from tests.service.replay.driven import failing, journal_of, recorded, straight
 
 SOLVERS = ("riccati", "osqp", "daqp", "clarabel", "piqp")

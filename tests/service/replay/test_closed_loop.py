@@ -16,12 +16,13 @@ from rti_mpc.control.controller import Controller
 from rti_mpc.errors import ConfigError
 from rti_mpc.recording import Recording
 from rti_mpc.rti.rti import Rti
-from rti_mpc_service.cli import SHIPPED, lockstep_robot
+from rti_mpc_service.commands.robot import lockstep_robot
 from rti_mpc_service.replay.beside import write_both
 from rti_mpc_service.replay.closed_loop import numbers_of, run_of
 from rti_mpc_service.replay.drive import Drive, Passage, drive
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
 from rti_mpc_service.replay.replay import main, overridden, snapshot_before
+from rti_mpc_service.shipped import SHIPPED
 from tests.loop import MS
 from tests.service.replay.driven import journal_of, recorded, straight
 

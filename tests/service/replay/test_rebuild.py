@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from rti_mpc.errors import ConfigError
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.config import load
 from rti_mpc_service.init import main as init
 from rti_mpc_service.replay import replay
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
 from rti_mpc_service.replay.replay import lines, overridden, play
+from rti_mpc_service.shipped import SHIPPED
 from tests.service.replay.driven import journal_of
 
 

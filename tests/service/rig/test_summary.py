@@ -15,12 +15,12 @@ from rti_mpc.contract.message import End, Event, Reference, Severity, Telemetry
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.reference.trajectory import circle
 from rti_mpc.wire.info import Info, Label
-from rti_mpc_service.cli import SHIPPED
 from rti_mpc_service.config.build import build_ocp
 from rti_mpc_service.config.config import load
 from rti_mpc_service.rig.robot_log import COUNTERS, RobotLog
 from rti_mpc_service.rig.summary import Outcome, excess, excess_share, summarize
 from rti_mpc_service.scenario import find_scenario
+from rti_mpc_service.shipped import SHIPPED
 
 MS = 1_000_000
 ANCHOR_NS = 700 * MS

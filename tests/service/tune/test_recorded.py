@@ -17,7 +17,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.recording.writer import RecordingWriter
 from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.keys import Keys
-from rti_mpc_service.cli import lockstep_robot
+from rti_mpc_service.commands.robot import lockstep_robot
 from rti_mpc_service.config.config import load
 from rti_mpc_service.tune.closed_loop import ClosedLoop, Course
 from rti_mpc_service.tune.recorded import is_recording, recorded

@@ -17,7 +17,7 @@ import pytest
 from sqlalchemy.exc import SQLAlchemyError
 
 from rti_mpc.errors import ConfigError
-from rti_mpc_service.cli import lockstep_robot
+from rti_mpc_service.commands.robot import lockstep_robot
 from rti_mpc_service.config.config import load
 from rti_mpc_service.tune.choice import beats, choose, front
 from rti_mpc_service.tune.closed_loop import Body, ClosedLoop, Course, Driven

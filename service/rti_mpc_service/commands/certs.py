@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from rti_mpc_service.certs.roles import ROLES
-from rti_mpc_service.command_group import Commands
+from rti_mpc_service.commands.group import Commands
 from rti_mpc_service.config.config import load
 
 certs = typer.Typer(cls=Commands, help="Make an authority and certificates for the processes of a robot.", no_args_is_help=True)

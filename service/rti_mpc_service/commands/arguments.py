@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arguments and options that several commands have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rti_mpc.errors import ConfigError
+from rti_mpc_service.shipped import SHIPPED, robot_file
+
+
+def claimed(path: Path | None) -> Path | None:
+    """Check that a file can be written, before its content is computed for minutes."""
+    try:
+        if path is not None:
+            path.touch()
+    except OSError as error:
+        raise ConfigError(f"--json must be a file that can be written, got {path}: {error.strerror}") from error
+    return path
+
+
+ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="The robot's TOML file.", show_default="the shipped pioneer_3dx.toml")]
+RobotName = Annotated[str | None, typer.Option("--robot", metavar="NAME", help="A robot that ships, instead of CONFIG: see `rti-mpc robots`.")]
+JsonPath = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write the results as JSON.", callback=claimed)]
+
+
+def file_of(config: Path, robot: str | None) -> Path:
+    """
+    Return the TOML file that a command is about.
+
+    Raises:
+        ConfigError: There are two, or no robot of this name ships.
+    """
+    if robot is not None and config != SHIPPED:
+        raise ConfigError(f"CONFIG or --robot must be left out, got {config} and {robot}")
+    return config if robot is None else robot_file(robot)
+
+
+ScenarioName = Annotated[
+    str | None,
+    typer.Option(
+        metavar="circle|eight|positioning|sines|steps|FILE.csv",
+        help="Reference to follow; a file holds waypoints, or columns t and all outputs by name.",
+        show_default="that of the file; or eight for a robot in the plane, sines of its outputs for any other",
+    ),
+]
+WaypointSpeed = Annotated[float, typer.Option(metavar="M/S", min=0.001, help="Speed along waypoints.")]
+WaypointSmoothing = Annotated[
+    float | None,
+    typer.Option(
+        metavar="M", min=0.0, help="Length of path over which waypoints are averaged; 0: not averaged.", show_default="as their noise needs"
+    ),
+]
+Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", min=0.1, help="Longest time to wait for an answer.")]
+
+
+StatePath = Annotated[
+    Path | None,
+    typer.Option(
+        "--state",
+        metavar="DIR",
+        help="Folder in which an operator's stop is kept across restarts.",
+        show_default="$STATE_DIRECTORY, $XDG_STATE_HOME/rti_mpc or ~/.local/state/rti_mpc",
+    ),
+]
