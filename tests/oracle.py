@@ -94,9 +94,10 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Arra
     last = u_prev
     for k in range(N_u):
         du = u[:, k] - last
-        cost += ocp.lambda_[k] * ca.bilin(ca.DM(ocp.R), du, du)
+        changed = np.broadcast_to(ocp.lambda_[k], nu) ** 0.5 * du
+        cost += ca.bilin(ca.DM(ocp.R), changed, changed)
         rows.append((ocp.lbdu, du, ocp.ubdu))
-        cost += ca.dot(ca.DM(ocp.R_u), (u[:, k] - u_ref) ** 2)
+        cost += ca.dot(ca.DM(np.broadcast_to(ocp.R_u, (N_u, nu))[k]), (u[:, k] - u_ref) ** 2)
         last = u[:, k]
 
     lbg, g, ubg = zip(*rows, strict=True)

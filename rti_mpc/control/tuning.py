@@ -62,6 +62,11 @@ class Tuning:
         for name in COMPILED_FIELDS:
             if getattr(ocp, name) != getattr(built, name):
                 raise OcpError(f"{name} must stay {getattr(built, name)}, got {getattr(ocp, name)}: it is part of the compiled code")
+        for name in WEIGHTS_AND_BOUNDS:
+            if (shape := np.shape(getattr(ocp, name))) != (compiled := np.shape(getattr(built, name))):
+                raise OcpError(
+                    f"{name} must keep its shape {compiled}, got {shape}: whether it differs from stage to stage is part of the compiled code"
+                )
         for name in COMPILED_BOUNDS:
             if not np.array_equal(np.isfinite(getattr(ocp, name)), np.isfinite(getattr(built, name))):
                 raise OcpError(f"{name} must be finite exactly where it was when compiled, got {getattr(ocp, name)}")

@@ -60,6 +60,11 @@ def summed(stages: ca.MX, blocks: Blocks) -> ca.MX:
     return ca.horzcat(*parts)
 
 
+def at_each(columns: ca.MX, count: int) -> ca.MX:
+    """Return a column for each stage or block: the only one repeated, or as they are."""
+    return columns if columns.size2() > 1 else ca.repmat(columns, 1, count)
+
+
 def moved_on(columns: ca.MX, blocks: Blocks) -> ca.MX:
     """Return what each block has one stage later, when the plan is that of the next sample: columns are blocks, the last one is repeated."""
     return ca.horzcat(*(columns[:, first:after] for first, after in _runs(_one_later(blocks))))

@@ -23,7 +23,7 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.codegen import function
-from rti_mpc.rti.blocks import all_inputs, summed
+from rti_mpc.rti.blocks import all_inputs, at_each, summed
 from rti_mpc.rti.linearization import Linearization, divided
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.recursion import recur
@@ -61,13 +61,13 @@ def certificate(ocp: Ocp) -> ca.Function:
     reduced = summed(gradient, ocp.blocks)
 
     planned = u_plan - ca.horzcat(lin.u_prev, u_plan[:, :-1])
-    forces = (lin.R @ planned) * ca.repmat(w["lambda_"].T, nu, 1)
+    forces = lin.weighed(planned)
     push, at_guess, of_steps = forces + of_increments, forms.force, ca.MX(0)
     if ocp.R_u.any():  # the force has the gradient of the cost of inputs, summed up
-        at_guess = (lin.R @ forms.increments) * ca.repmat(w["lambda_"].T, nu, 1)
+        at_guess = lin.weighed(forms.increments)
         push += forms.force - at_guess
-        of_steps = ca.dot(forms.force - at_guess, planned - forms.increments) + ca.dot(ca.repmat(w["R_u"], 1, N_u) * du, du) / 2
-    push = push - ca.horzcat(push[:, 1:], ca.MX.zeros(nu)) + ca.repmat(forms.damping, 1, N_u) * du
+        of_steps = ca.dot(forms.force - at_guess, planned - forms.increments) + ca.dot(at_each(w["R_u"], N_u) * du, du) / 2
+    push = push - ca.horzcat(push[:, 1:], ca.MX.zeros(nu)) + at_each(forms.damping, N_u) * du
     shared = [ca.repmat(e, 1, N_u) for e in (w["lbu"], w["ubu"], w["lbdu"], w["ubdu"], lin.scale_u)]
     inputs = of_inputs(ocp).map(N_u)(reduced + push, u_plan, planned, of_increments, *shared)
 

@@ -23,6 +23,7 @@ from rti_mpc.rti.recursion import block_table, stage_in_c
 LEAST_SIZE = 12  # states and inputs from which on loops are faster
 PADDED = 4  # columns are padded to multiples of this, the numbers in the longest vector that is used
 SHORTEST = 2  # numbers in a vector of any processor
+INPUT_WEIGHTS = ("R", "damping")  # arguments of a stage that are the same at every one, mostly
 MOST_VECTORS = 12  # sums that fit into its registers
 
 BODY = """
@@ -154,19 +155,29 @@ def backward_in_c(ocp: Ocp, lin: Linearization, free: ca.Function, held: ca.Func
         "nonzero_G": [e for row in by_row for e, _ in row],
         "column_G": [j for row in by_row for _, j in row],
     }
-    shared = ("P", "p", "R", "damping")
+    shared = ("P", "p", *input_weights_shared(ocp))
     names = free.name_in()
     once = [f"const casadi_real *arg_{name} = arg[{names.index(name)}];" for name in shared]
     block = ocp.held.tolist()
     is_free, of_block = stage_in_c(block)
     at = {name: "k" if name in held.name_in() else of_block for name in names}
-    each = [f"const casadi_real *{name} = arg[{i}] + {free.size1_in(i)} * {at[name]};" for i, name in enumerate(names) if name not in shared]
+    each = [
+        f"const casadi_real *{'arg_' * (name in INPUT_WEIGHTS)}{name} = arg[{i}] + {free.size1_in(i)} * {at[name]};"
+        for i, name in enumerate(names)
+        if name not in shared
+    ]
     lines = [f"enum {{ {', '.join(f'{name} = {number}' for name, number in sizes.items())} }};"]
     lines += [block_table(block)] if of_block != "k" else []
     lines += [f"static const int {name}[] = {{ {', '.join(map(str, numbers or [0]))} }};" for name, numbers in tables.items()]
     body = BODY.strip("\n").replace("STAGE_ARGUMENTS", "\n    ".join(each)).replace("OF_OUTPUTS", "NX" if H.size1() == nx else "NX + NU")
+    body = body if "lambda_k" in names else body.replace(" * lambda_k[0]", "")
     body = body.replace("IS_FREE", "k < FREE" if of_block == "k" else is_free).replace("OF_BLOCK", of_block)
     return "\n".join([*additions(width), BEFORE_BODY, *(f"  {line}" for line in lines + once), body])
+
+
+def input_weights_shared(ocp: Ocp) -> list[str]:
+    """Return which of `INPUT_WEIGHTS` are the same at every stage."""
+    return [name for name, weight in zip(INPUT_WEIGHTS, (ocp.lambda_, ocp.R_u), strict=True) if weight.ndim == 1]
 
 
 def additions(width: int) -> Iterator[str]:

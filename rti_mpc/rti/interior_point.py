@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.codegen import function
-from rti_mpc.rti.blocks import all_inputs
+from rti_mpc.rti.blocks import all_inputs, at_each
 from rti_mpc.rti.linearization import Forms, Linearization, change, divided
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
@@ -220,13 +220,13 @@ def step(ocp: Ocp, lin: Linearization, recursion: Riccati, stages: ca.MX, x0: ca
 
 def moved_to(ocp: Ocp, lin: Linearization, forms: Forms, dx: ca.MX, d: Rows) -> tuple[Forms, ca.MX]:
     """Return the linearization in deviations from a plan, in which steps lose no digits near the optimum, and the pull of the damping there."""
-    N, N_u, nu = ocp.N, ocp.N_u, ocp.model.nu
+    N, N_u = ocp.N, ocp.N_u
     of = Stage(ocp, lin)
     before, du, after = ca.SX.sym("before", of.nx), ca.SX.sym("du", of.nu), ca.SX.sym("after", of.nx)
     symbols = [*of.dynamics.values(), of.b, of.cost["H"], of.h, before, du, after]
     end = ca.vertcat(after, du)[: of.H.shape[0]]
     node = ca.Function("moved", symbols, [ca.densify(of.A @ before + of.B @ du + of.b - after), ca.densify(of.h + of.H @ end)]).map(N)
     b, h = node(forms.A, forms.B, forms.b, forms.H, forms.h, dx[:, :-1], all_inputs(d.u, ocp.blocks), dx[:, 1:])
-    force = forms.force + (lin.R @ d.du) * ca.repmat(lin.w["lambda_"].T, nu, 1)
-    damped = ca.veccat(ca.repmat(forms.damping, 1, N_u) * d.u, ca.MX.zeros(d.du.shape), ca.MX.zeros(d.g.shape))
+    force = forms.force + lin.weighed(d.du)
+    damped = ca.veccat(at_each(forms.damping, N_u) * d.u, ca.MX.zeros(d.du.shape), ca.MX.zeros(d.g.shape))
     return forms._replace(b=b, h=h, force=force), damped

@@ -32,7 +32,7 @@ import scipy.sparse as sp
 
 from rti_mpc.codegen import function
 from rti_mpc.model.integrator import sensitivities
-from rti_mpc.rti.blocks import all_inputs, at_starts, moved_on, summed
+from rti_mpc.rti.blocks import all_inputs, at_each, at_starts, moved_on, summed
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 
 DAMPING_PER_COST = 0.005  # weight of half the square of a step, in half ranges of an input, per cost at the guess; see docs/engine.md
@@ -53,7 +53,7 @@ class Forms(NamedTuple):
         g: Expressions with softened bounds, shape ``(ng, N)``.
         g_x: Nonzeros of the sensitivities of g to the state, shape ``(nnz, N)``.
         g_u: Nonzeros of the sensitivities of g to the input, shape ``(nnz, N)``.
-        damping: Weight of half the square of a step in each input, shape ``(nu, 1)``.
+        damping: Weight of half the square of a step in each input, shape ``(nu, 1)``, or ``(nu, N_u)`` where `R_u` differs from block to block.
         checksum: A number that is finite if and only if all of this is.
         cost: The cost (4) at the guess.
     """
@@ -103,7 +103,8 @@ class Linearization:
         increments: ``u_k - u_{k-1}``, shape ``(nu, N_u)``.
         force: ``lambda_k R (u_k - u_{k-1})``, shape ``(nu, N_u)``, and the gradient of half the cost of inputs, summed from the last stage on: force
             acts on increments.
-        damping: Weight of half the square of a step in each input, shape ``(nu, 1)``: that of inputs, and a damping, zero for a linear model.
+        damping: Weight of half the square of a step in each input, shape ``(nu, 1)``: that of inputs, and a damping, zero for a linear model;
+            ``(nu, N_u)`` where `R_u` differs from block to block.
         R: Increment weight, sparse, shape ``(nu, nu)``.
         cost: The cost (4) at the guess.
         checksum: A number that is finite if and only if all of the above is.
@@ -154,16 +155,16 @@ class Linearization:
 
         self.increments = self.u - ca.horzcat(self.u_prev, self.u[:, :-1])
         self.R = self.w["R"] * pattern(ocp.R)
-        self.force = (self.R @ self.increments) * ca.repmat(self.w["lambda_"].T, nu, 1)
+        self.force = self.weighed(self.increments)
         self.cost = ca.sum2(nodes[nv, :]) + ca.dot(self.increments, self.force)
         if ocp.R_u.any():
             off = self.u - input_reference(ocp)(at_starts(self.p, ocp.blocks))
-            gradient = ca.repmat(w["R_u"], 1, N_u) * off
+            gradient = at_each(w["R_u"], N_u) * off
             self.force += running_sum(gradient)
             self.cost += ca.dot(off, gradient)
         self.damping = damping(ocp) * self.cost / self.scale_u**2
         if ocp.R_u.any():
-            self.damping += w["R_u"]
+            self.damping = (self.damping if ocp.R_u.ndim == 1 else ca.repmat(self.damping, 1, N_u)) + w["R_u"]
         self.checksum = ca.sum1(ca.vec(stages)) + ca.sum1(ca.vec(nodes)) + self.cost + ca.sum1(ca.vec(self.b))
         self.checksum += ca.sum1(ca.vec(bounded))
         self.forms = Forms(
@@ -214,6 +215,19 @@ class Linearization:
         """Return the forms from a column like `stages`."""
         return Forms(*divided(stages, self.forms))
 
+    def weighed(self, increments: ca.MX) -> ca.MX:
+        """Return ``R_k du_k`` of increments, a column per block, shape ``(nu, N_u)``."""
+        if (lambda_ := self.w["lambda_"]).size2() == 1:
+            return ca.MX((self.R @ increments) * ca.repmat(lambda_.T, increments.size1(), 1))
+        root = ca.sqrt(lambda_)
+        return ca.MX(root * (self.R @ (root * increments)))
+
+    @property
+    def R_k(self) -> ca.MX:
+        """Nonzeros of the increment weight of each block, a column per block, where these differ by more than a factor."""
+        root, (rows, columns) = ca.sqrt(self.w["lambda_"]), self.R.sparsity().get_triplet()
+        return ca.MX(at_each(nonzeros(self.R), root.size2()) * root[rows, :] * root[columns, :])
+
     def increment_gradient(self) -> ca.MX:
         """Return the gradient of half the increment cost in the inputs, and of what outputs cost by their inputs, shape ``(nu, N_u)``."""
         gradient = self.force - ca.horzcat(self.force[:, 1:], ca.MX.zeros(self.u_prev.numel()))
@@ -233,13 +247,18 @@ class Linearization:
         The former has what outputs cost by their inputs as well.
         """
         last = k == self.u.shape[1] - 1
-        following = 0 if last else self.w["lambda_"][k + 1]
-        diagonal = self.R * (self.w["lambda_"][k] + following) + ca.diag(self.damping)
+        if (lambda_ := self.w["lambda_"]).size2() == 1:
+            following = 0 if last else lambda_[k + 1]
+            weight, beside = self.R * (lambda_[k] + following), -self.R * following
+        else:
+            here, after = (ca.MX(self.R.sparsity(), self.R_k[:, min(j, self.u.shape[1] - 1)]) for j in (k, k + 1))
+            weight, beside = here if last else here + after, -after
+        diagonal = weight + ca.diag(self.damping[:, k if self.damping.size2() > 1 else 0])
         if self.gradient.shape[0] > self.x.shape[0]:
             first = sum(self._blocks[:k])
             for i in range(first, first + self._blocks[k]):
                 diagonal += self.output_hessian(i)[1]
-        return diagonal, None if last else -self.R * following
+        return diagonal, None if last else beside
 
 
 def input_reference(ocp: Ocp) -> ca.Function:

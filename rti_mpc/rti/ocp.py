@@ -66,7 +66,8 @@ class Ocp:
         R: Increment weight, shape ``(nu, nu)``, or given by its diagonal; cost / unit of the inputs squared.
         delta: Penalty sequence on outputs, shape ``(N,)``, or given as a constant; or one for each output, shape ``(N, ny)``, so that weights differ
             from stage to stage: stage i weighs by :math:`D_i^{1/2} Q D_i^{1/2}`, which for a diagonal Q is :math:`D_i Q`, see `Q_at`.
-        lambda_: Penalty sequence on increments, shape ``(N_u,)``, or given as a constant.
+        lambda_: Penalty sequence on increments, shape ``(N_u,)``, or given as a constant; or one for each input, shape ``(N_u, nu)``, which weighs by
+            :math:`L_k^{1/2} R L_k^{1/2}`, see `R_at`.
         lbu: Lower bound on inputs, shape ``(nu,)``; none by default, as for the following.
         ubu: Upper bound on inputs, shape ``(nu,)``.
         lbdu: Lower bound on the increment of inputs from stage to stage, shape ``(nu,)``.
@@ -78,7 +79,8 @@ class Ocp:
         lbx_e: Softened lower bound on states at node N alone, besides `lbx`, shape ``(nx,)``: a terminal set. Its slacks have the weights `z`, `Z`.
         ubx_e: Softened upper bound on states at node N alone, shape ``(nx,)``.
         Q_e: Terminal weight, added to ``delta_N Q``, shape ``(ny, ny)``, or given by its diagonal; none by default.
-        R_u: Weights of inputs themselves, beside those of their increments, shape ``(nu,)``; none by default; cost / unit of the inputs squared.
+        R_u: Weights of inputs themselves, beside those of their increments, shape ``(nu,)``, or ``(N_u, nu)``; none by default; cost / unit of the
+            inputs squared.
         u_ref: Inputs from which `R_u` counts, an expression in the model's p, shape ``(nu, 1)``, or given by numbers; those at rest by default.
         h_expr: General constraints h(x, u, p) in the model's symbols, shape ``(nh, 1)``; the model's by default.
         lh: Softened lower bound on h, shape ``(nh,)``.
@@ -201,9 +203,9 @@ class Ocp:
         """Check and copy weights and bounds; only for an object that nobody reads yet."""
         sizes = {"nx": self.model.nx, "nu": self.model.nu, "ny": self.model.ny, "nh": self.h_expr.numel(), "N": self.N, "N_u": self.N_u}
         for name, value in values.items():
-            check, size = WEIGHTS_AND_BOUNDS[given.one_of("the name of a weight or bound", name, WEIGHTS_AND_BOUNDS)]
-            each = name == "delta" and np.ndim(given.numbers(name, value)) == 2
-            array = output_weights(name, value, self.N, self.model.ny) if each else check(name, value, sizes[size])
+            check, size, *each = WEIGHTS_AND_BOUNDS[given.one_of("the name of a weight or bound", name, WEIGHTS_AND_BOUNDS)]
+            shape = [sizes[one] for one in each]
+            array = by_stage(name, value, check, sizes[size], *shape) if shape else check(name, value, sizes[size])
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         if not np.all(self.lbu <= self.ubu):
@@ -222,6 +224,13 @@ class Ocp:
             return np.asarray(self.delta[k] * self.Q)
         root = np.sqrt(self.delta[k])
         return np.asarray(self.Q * np.outer(root, root))
+
+    def R_at(self, k: int) -> Array:
+        """Return the weight of the increments of block ``k``, shape ``(nu, nu)``."""
+        if self.lambda_.ndim == 1:
+            return np.asarray(self.lambda_[k] * self.R)
+        root = np.sqrt(self.lambda_[k])
+        return np.asarray(self.R * np.outer(root, root))
 
     @property
     def held(self) -> NDArray[np.int_]:
@@ -322,12 +331,14 @@ def weights(name: str, value: ArrayLike, length: int) -> Array:
     return array
 
 
-def output_weights(name: str, value: ArrayLike, N: int, ny: int) -> Array:
-    """Return a copy of finite weights >= 0 of shape ``(N, ny)``."""
+def by_stage(name: str, value: ArrayLike, check: Callable[[str, ArrayLike, int], Array], length: int, stages: int, size: int) -> Array:
+    """Return a copy of weights or bounds of shape ``(stages, size)``, or, where they are no rows, of shape ``(length,)``, as `check` does."""
     array = given.numbers(name, value)
-    if array.shape != (N, ny):
-        raise OcpError(f"{name} must be a number or have shape ({N},), or ({N}, {ny}) for each output by itself, got shape {array.shape}")
-    return weights(name, array.ravel(), N * ny).reshape(N, ny)
+    if array.ndim < 2 or (hasattr(value, "full") and array.shape == (length, 1)):
+        return check(name, value, length)
+    if array.shape != (stages, size):
+        raise OcpError(f"{name} must be a number or have shape ({length},), or ({stages}, {size}), a row per stage, got shape {array.shape}")
+    return check(name, array.ravel(), stages * size).reshape(stages, size)
 
 
 def weight_matrix(name: str, value: ArrayLike, size: int) -> Array:
@@ -364,13 +375,14 @@ def vector(name: str, value: ArrayLike, length: int) -> Array:
     return np.array(np.broadcast_to(array, (length,)))
 
 
-# Weights and bounds by the attributes of the Ocp, with the function that checks and copies each, and the name of its length. They may
-# change between samples; the compiled functions read them in this order.
-WEIGHTS_AND_BOUNDS: dict[str, tuple[Callable[[str, ArrayLike, int], Array], str]] = {
+# Weights and bounds by the attributes of the Ocp, with the function that checks and copies each, the name of its length, and, where it may
+# differ from stage to stage, the names of its rows' number and length. They may change between samples; the compiled functions read them in
+# this order.
+WEIGHTS_AND_BOUNDS: dict[str, tuple[Any, ...]] = {
     "Q": (weight_matrix, "ny"),
     "R": (weight_matrix, "nu"),
-    "delta": (weights, "N"),
-    "lambda_": (weights, "N_u"),
+    "delta": (weights, "N", "N", "ny"),
+    "lambda_": (weights, "N_u", "N_u", "nu"),
     "lbu": (bound, "nu"),
     "ubu": (bound, "nu"),
     "lbdu": (bound, "nu"),
@@ -386,5 +398,5 @@ WEIGHTS_AND_BOUNDS: dict[str, tuple[Callable[[str, ArrayLike, int], Array], str]
     "Zh": (weights, "nh"),
     "lbx_e": (bound, "nx"),
     "ubx_e": (bound, "nx"),
-    "R_u": (weights, "nu"),
+    "R_u": (weights, "nu", "N_u", "nu"),
 }

@@ -28,7 +28,7 @@ import casadi as ca
 
 from rti_mpc.codegen import function
 from rti_mpc.rti.blocks import at_starts, repeated
-from rti_mpc.rti.dense import backward_in_c
+from rti_mpc.rti.dense import backward_in_c, input_weights_shared
 from rti_mpc.rti.linearization import Forms, Linearization, nonzeros
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.recursion import recur
@@ -71,7 +71,7 @@ class Riccati:
             for free, held in ((backward_free, backward_held), (sweep_free, sweep_held), (forward_free, forward_held))
         )
         dense, costs = backward_in_c(ocp, lin, *(stage for stage, _ in backward[:2])), {"P": "P_before", "p": "p_before"}
-        self._backward = recur("backward", backward, costs, ["gain"], shared=["R", "damping"], backward=True, in_c=dense)
+        self._backward = recur("backward", backward, costs, ["gain"], shared=input_weights_shared(ocp), backward=True, in_c=dense)
         self._sweep = recur("sweep", sweep, {"p": "p_before"}, ["kappa"], backward=True)
         self._forward = recur("forward", forward, {"s": "s_after"}, ["s_after", "g", "increment"])
         stages, gains, start = ca.MX.sym("stages", lin.stages.numel()), ca.MX.sym("gains", self.size, ocp.N_u), ca.MX.zeros(n)
@@ -89,7 +89,8 @@ class Riccati:
         n, lin = self._n, self._lin
         data = {"A": forms.A, "B": forms.B, "b": forms.b, "H": forms.H, "h": forms.h, "g_x": forms.g_x, "g_u": forms.g_u}
         rows = {"weight_u": weight.u, "pull_u": pull.u, "weight_du": weight.du, "pull_du": pull.du, "weight_g": weight.g, "pull_g": pull.g}
-        cost = {"R": nonzeros(lin.R), "lambda_k": lin.w["lambda_"].T, "damping": forms.damping, "force": forms.force}
+        R = {"R": nonzeros(lin.R), "lambda_k": lin.w["lambda_"].T} if self._ocp.lambda_.ndim == 1 else {"R": lin.R_k}
+        cost = {**R, "damping": forms.damping, "force": forms.force}
         end = {"P": ca.MX.zeros(n * (n + 1) // 2), "p": ca.MX.zeros(n)}
         found: ca.MX = self._backward(**data, **rows, **cost, **end)["gain"]
         return found
@@ -217,10 +218,10 @@ def backward_free(ocp: Ocp, lin: Linearization) -> ca.Function:
     of = Stage(ocp, lin)
     n, nu = of.n, of.nu
     Qxx, Qux, Quu, qx, qu, symbols = behind(of)
-    R_nz, lambda_ = ca.SX.sym("R", lin.R.sparsity().nnz()), ca.SX.sym("lambda_k")
+    R_nz, factor = ca.SX.sym("R", lin.R.sparsity().nnz()), {"lambda_k": ca.SX.sym("lambda_k")} if ocp.lambda_.ndim == 1 else {}
     names = ("damping", "force", "weight_u", "pull_u", "weight_du", "pull_du")
     damping, force, weight_u, pull_u, weight_du, pull_du = own = [ca.SX.sym(name, nu) for name in names]
-    R = ca.SX(lin.R.sparsity(), R_nz) * lambda_ + ca.diag(weight_du)
+    R = ca.SX(lin.R.sparsity(), R_nz) * factor.get("lambda_k", 1) + ca.diag(weight_du)
     force = force + pull_du
     Quu, qu = Quu + R + ca.diag(weight_u + damping), qu + force + pull_u
     Qus = ca.horzcat(Qux, -R)
@@ -231,7 +232,7 @@ def backward_free(ocp: Ocp, lin: Linearization) -> ca.Function:
     p_before = ca.vertcat(qx, -force) - Qus.T @ gain[:, n]
     found = ca.vertcat(ca.vec(ca.densify(gain)), nonzeros(L))
     P_before, p_before, found = ca.cse([nonzeros(ca.densify(P_before)[ca.Sparsity.upper(n)]), ca.densify(p_before), found])
-    inputs = {**symbols, "R": R_nz, "lambda_k": lambda_, **dict(zip(names, own, strict=True))}
+    inputs = {**symbols, "R": R_nz, **factor, **dict(zip(names, own, strict=True))}
     return function("free", inputs, {"P_before": P_before, "p_before": p_before, "gain": found})
 
 

@@ -46,7 +46,7 @@ def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
     at = (x[1:].T, held.T) if nv > model.nx else (x[1:].T,)
     H = dense(H_i, np.array(node.map(N)(*at, p[1:].T, y_ref.T, W))[nv + 1 :])
     seen = np.concatenate([response, np.tile(np.eye(model.nu), (N, 1, 1))], axis=1)[:, :nv]
-    curvature = np.einsum("kai,kab,kbi->i", seen, H, seen) + ocp.lambda_.sum() * np.diag(ocp.R) + ocp.N_u * ocp.R_u
+    curvature = np.einsum("kai,kab,kbi->i", seen, H, seen) + ocp.lambda_.sum(axis=0) * np.diag(ocp.R) + ocp.N_u * np.atleast_2d(ocp.R_u).mean(axis=0)
 
     reach_u = first(
         half(ocp.lbu, ocp.ubu),

@@ -70,7 +70,7 @@ class Simulation:
         e, du = self._residual()[1:], np.diff(self.u, axis=0, prepend=self.u0[None])
         ocp = self.ocp
         off = self.u - np.array(ca.Function("u_ref", [ocp.model.p], [ocp.u_ref])(ocp.model.p_nominal)).ravel()
-        of_inputs = ocp.lambda_[0] * np.einsum("ki,ij,kj->", du, ocp.R, du) + np.einsum("ki,i,ki->", off, ocp.R_u, off)
+        of_inputs = np.einsum("ki,ij,kj->", du, ocp.R_at(0), du) + np.einsum("ki,i,ki->", off, np.atleast_2d(ocp.R_u)[0], off)
         return float(np.einsum("ki,ij,kj->", e, ocp.Q_at(0), e) + of_inputs)
 
     def _residual(self) -> Array:

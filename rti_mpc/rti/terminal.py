@@ -60,8 +60,8 @@ def lqr_weight(ocp: Ocp, x: Array, u: Array) -> Array:
     G = np.vstack([B, np.eye(nu)])
     C = np.hstack([C, D])
     try:
-        of_inputs = np.diag([*np.zeros(nx), *ocp.R_u])
-        R = ocp.lambda_[-1] * ocp.R
+        of_inputs = np.diag([*np.zeros(nx), *np.atleast_2d(ocp.R_u)[-1]])
+        R = ocp.R_at(ocp.N_u - 1)
         S = solve_discrete_are(F, G, C.T @ ocp.Q_at(ocp.N - 1) @ C + of_inputs, R)
         # Whether an equation without a stabilizing solution is noticed above depends on rounding; its closed loop never contracts.
         radius = abs(np.linalg.eigvals(F - G @ np.linalg.solve(R + G.T @ S @ G, G.T @ S @ F))).max()

@@ -62,6 +62,9 @@ def felt_car(**changes: Any) -> Ocp:
     return Ocp(felt, **LIMITS | {"Q": Q, "lbx": [-np.inf] * 3 + [-0.35], "ubx": [np.inf] * 3 + [0.35]} | changes)
 
 
+COUPLED = np.array([[0.2, 0.08], [0.08, 0.1]])
+CHANGING = np.column_stack([np.linspace(0.2, 3, 8), [2, 0, 1, 0.5, 0, 4, 0.3, 1]])
+
 PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "implicit integrator": lambda: lagging_car(method="irk"),
     "implicit integrator of three stages in two steps": lambda: lagging_car(method="irk", sim_method_num_stages=3, sim_method_num_steps=2, N_u=3),
@@ -81,6 +84,9 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "blocks, the first one longer, weights of inputs": lambda: sampled_car(blocks=[2, 1, 3, 2], R_u=[0.8, 0.3], u_ref=[0.1, -0.2]),
     "blocks, stages of their own between and after them": lambda: sampled_car(blocks=[3, 1, 2, 1, 1], lambda_=[1.0, 0.5, 2.0, 1.5, 0.3]),
     "blocks, outputs of inputs, weights by stage": lambda: felt_car(blocks=[1, 2, 2, 3], delta=np.linspace(0.1, 2, 48).reshape(8, 6)),
+    "weights of increments by stage": lambda: sampled_car(R=COUPLED, lambda_=CHANGING),
+    "weights of increments and of inputs by block": lambda: sampled_car(blocks=[1, 1, 2, 4], R=COUPLED, lambda_=CHANGING[::2], R_u=CHANGING[::-2]),
+    "weights of increments and of inputs by stage, outputs of inputs": lambda: felt_car(N_u=3, lambda_=CHANGING[:3], R_u=0.02 * CHANGING[3:6]),
     "fixed input": lambda: sampled_car(lbu=[-0.5, 0.3], ubu=[0.5, 0.3], lbdu=-np.inf, ubdu=np.inf),
     "terminal set": lambda: sampled_car(lbx_e=[-np.inf] * 3 + [-0.05], ubx_e=[np.inf] * 3 + [0.02]),
     "terminal set, from above alone, held inputs": lambda: sampled_car(ubx_e=[np.inf] * 3 + [0.05], N_u=3, z=[1.0] * 4, Z=[0.0] * 4),
@@ -177,6 +183,20 @@ def test_weights_by_stage_are_retuned_as_if_the_problem_had_been_built_with_them
         assert rti.feedback(x0) is QpStatus.SOLVED
     np.testing.assert_allclose(retuned.u, built.u, rtol=0, atol=1e-7)  # each is converged in scales of its own
     assert retuned.cost == pytest.approx(built.cost, rel=1e-6)  # 1000 per unit by which a state exceeds its bound in rounding
+
+
+def test_weights_of_increments_by_stage_are_those_of_a_horizon_whose_stages_are_weighed_alike() -> None:
+    """The factors of one input, all alike, are the factor of its weight: the same plan as from a sequence for all inputs."""
+    x0, y_ref, u_prev = around_a_bend(sampled_car(), 1)[0]
+    plans = []
+    for changes in ({"lambda_": np.tile([2.0, 0.5], (8, 1)), "R_u": np.tile([0.3, 0.1], (8, 1))}, {"R": [0.4, 0.05], "R_u": [0.3, 0.1]}):
+        rti = Rti(sampled_car(**changes), compile=False, iterations=20, tolerance=1e-9)
+        rti.reset(x0, u_prev)
+        rti.prepare(y_ref, shift=False)
+        assert rti.feedback(x0) is QpStatus.SOLVED
+        plans.append((rti.u.copy(), rti.cost))
+    np.testing.assert_allclose(plans[0][0], plans[1][0], rtol=0, atol=1e-7)  # each is converged in scales of its own
+    assert plans[0][1] == pytest.approx(plans[1][1], rel=1e-6)
 
 
 def test_reference_of_inputs_moves_with_the_parameters_of_the_stages() -> None:

@@ -75,7 +75,7 @@ class Family:
         y, g = (np.array(value).ravel() for value in self._outputs(x, u, self._nominal if p is None else p))
         e, du, (z, Z) = y - y_ref, u - u_prev, self._slack_weights
         s = np.maximum(0.0, np.maximum(g - ocp.ug, ocp.lg - g))
-        return float(e @ ocp.Q_at(0) @ e + ocp.lambda_[0] * du @ ocp.R @ du + z @ s + 0.5 * s @ (Z * s))
+        return float(e @ ocp.Q_at(0) @ e + du @ ocp.R_at(0) @ du + z @ s + 0.5 * s @ (Z * s))
 
 
 def paper(N: int) -> Family:

@@ -68,7 +68,7 @@ class Ipopt:
                 rows.append((h, ocp.lh, ocp.uh))
             if k == ocp.starts[j]:
                 du = held - (u[:, j - 1] if j else u_prev)
-                cost += ocp.lambda_[j] * ca.bilin(ca.DM(ocp.R), du, du)
+                cost += ca.bilin(ca.DM(ocp.R_at(j)), du, du)
                 if slewed:
                     rows.append((du, ocp.lbdu, ocp.ubdu))
         nlp = {"x": ca.veccat(x, u, s), "f": cost, "g": ca.veccat(*(row for row, _, _ in rows)), "p": ca.veccat(x0, u_prev, y_ref, p)}

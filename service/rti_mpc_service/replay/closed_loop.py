@@ -136,9 +136,7 @@ def numbers_of(passage: Passage, run: Run, ocp: Ocp) -> Numbers:
         found |= {f"{output.name}_rms": rms(e[:, i]), f"{output.name}_max": largest(e[:, i])}
     if run.planar:
         found |= {"distance_mm_rms": rms(run.error_mm[settled]), "distance_mm_max": largest(run.error_mm[settled])}
-    found["cost"] = (
-        float(np.mean(np.einsum("ki,ij,kj->k", e, ocp.Q_at(0), e) + np.einsum("ki,ij,kj->k", du, ocp.lambda_[0] * ocp.R, du))) if len(e) else np.nan
-    )
+    found["cost"] = float(np.mean(np.einsum("ki,ij,kj->k", e, ocp.Q_at(0), e) + np.einsum("ki,ij,kj->k", du, ocp.R_at(0), du))) if len(e) else np.nan
     found["effort"] = float(np.sqrt((relative**2).sum(axis=1).mean())) if len(e) else np.nan
     return found | {"samples": float(len(passage.samples))} | {f"by {who}": float(count) for who, count in sorted(passage.solved.items())}
 

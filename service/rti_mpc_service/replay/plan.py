@@ -116,7 +116,8 @@ def cost_terms(rti: Rti, config: Config) -> dict[str, float]:
     increments = np.diff(rti.u, axis=0, prepend=rti.u_prev[None])
     weighed = np.sqrt(w["delta"]).reshape(ocp.N, -1) * errors
     by_output = (weighed * (weighed @ w["Q"])).sum(axis=0)
-    by_input = (w["lambda_"][:, None] * increments * (increments @ w["R"])).sum(axis=0)
+    weighed = np.sqrt(w["lambda_"]).reshape(ocp.N_u, -1) * increments
+    by_input = (weighed * (weighed @ w["R"])).sum(axis=0)
     terms = {f"error of {signal.name}": float(value) for signal, value in zip(model.outputs, by_output, strict=True)}
     terms |= {f"changes of {signal.name}": float(value) for signal, value in zip(model.inputs, by_input, strict=True)}
     off = rti.u - np.array(input_reference(ocp)(rti.p[ocp.starts].T)).T
