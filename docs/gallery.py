@@ -230,6 +230,11 @@ is 12 cm off; configured or measured, it is as good as without one:
 
 ![A circle drawn by an arm with a delay](gallery/delay.png)
 
+`several_robots.py` drives a TurtleBot, a car and a quadrotor on one host and one bus, each with a controller, a reference
+and a clock of its own, and watches all of them by `rti-mpc status --once --json`, as a script of one's own can:
+
+![Tracks of three robots in one plane](gallery/several_robots.png)
+
 | robot | states, inputs | period | horizon | at rest without feedback | error |
 | --- | --- | --- | --- | --- | --- |
 """
