@@ -33,6 +33,7 @@ from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.reference import ROLE, STALE_S
+from rti_mpc_service.scenario import Scenario
 
 if TYPE_CHECKING:
     from rti_mpc.model.model import Model
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
 LOOK_PERIOD_S = 0.02  # period of reading states
 PERIOD_NS = 100_000_000  # of the robot's time between two references
 LASTS_NS = 1_000_000_000  # of the robot's time, after which a robot without another reference stops
+START_S = 5.0  # of a scenario, for a start from rest
+SLOWER, LAPS = 1.1, 2  # times of the speed profile that a robot may take for a lap, and laps of a closed path
 
 logger = logging.getLogger(ROLE)
 
@@ -63,6 +66,56 @@ def find_path(name: str, speed_m_s: float, limits: SpeedLimits | None, smooth_m:
     return pieces if limits is None else tuple(piece.limited(limits, inside=True) for piece in pieces)
 
 
+def path_of_options(
+    name: str, path_limits: tuple[float, float, float, float] | None, waypoint_speed_m_s: float, smooth_m: float | None, **others: object
+) -> tuple[Path, ...]:
+    """
+    Find the path that the options of a command ask for.
+
+    Args:
+        name: As of `find_path`.
+        path_limits: Speed in m/s, lateral acceleration, acceleration and braking in m/s^2; None: the speeds of the file.
+        waypoint_speed_m_s: Speed in m/s where neither says one.
+        smooth_m: As of `find_path`.
+        others: Values of options that say what is followed in time.
+
+    Raises:
+        ConfigError: One of the others was given, there is no such track, or the file is wrong.
+    """
+    if given := [f"--{option}" for option, value in others.items() if value is not None]:
+        raise ConfigError(f"--path is followed in place of a scenario and says nothing of time: {', '.join(given)} must be left out")
+    limits = None if path_limits is None else SpeedLimits(*path_limits)
+    return find_path(name, waypoint_speed_m_s if limits is None else limits.speed, limits, smooth_m)
+
+
+def path_scenario(model: Model, name: str, pieces: Sequence[Path]) -> Scenario:
+    """
+    Return a path as a scenario of a robot that follows it: its outputs are to be zero, for two laps or once to the end.
+
+    Raises:
+        ConfigError: The model follows no path.
+    """
+    path_source(model, pieces)
+    rows = np.zeros((2, model.ny))
+    time_s = START_S + SLOWER * sum(piece.time_s for piece in pieces) * (LAPS if pieces[-1].closed else 1)
+    return Scenario(File(name).stem, model.nx, lambda x: rows, 1e-9 * LASTS_NS, time_s, End.STOP, pieces=tuple(pieces))
+
+
+def path_source(model: Model, pieces: Sequence[Path]) -> tuple[PathSource, list[int], int]:
+    """
+    Return the source of a path for a robot, and which of its states are position and progress.
+
+    Raises:
+        ConfigError: The model follows no path.
+    """
+    from rti_mpc.model.path_following import window_place
+
+    window, position, progress = window_place(model), plane(model.states), place(model.states, "progress")
+    if window is None or position is None or progress is None:
+        raise ConfigError(f"model {model.name} must be one of path_following for --path, it has no parameter whose role is path_start")
+    return PathSource(pieces, model.p_nominal, *window), list(position), progress
+
+
 class PathReferences:
     """
     References of a robot that follows a path, as its states come.
@@ -77,13 +130,7 @@ class PathReferences:
     """
 
     def __init__(self, model: Model, pieces: Sequence[Path], epoch: int) -> None:
-        from rti_mpc.model.path_following import window_place
-
-        window, position, progress = window_place(model), plane(model.states), place(model.states, "progress")
-        if window is None or position is None or progress is None:
-            raise ConfigError(f"model {model.name} must be one of path_following for --path, it has no parameter whose role is path_start")
-        self._source = PathSource(pieces, model.p_nominal, *window)
-        self._position, self._progress = list(position), progress
+        self._source, self._position, self._progress = path_source(model, pieces)
         self._epoch, self._seq = epoch, 0
         self._y: Array = np.zeros((2, model.ny))
         self._sent_ns: int | None = None

@@ -27,6 +27,7 @@ from rti_mpc_service.config.schema import Config
 
 if TYPE_CHECKING:
     from rti_mpc.model.model import Model
+    from rti_mpc.reference.path import Path as SmoothPath
 
 ROW_PERIOD_S = 0.05  # between rows at most; the receiver interpolates, on the eight within 0.02 mm
 PERIOD_HORIZONS = 4  # horizons that a sine lasts at least, for robots that take longer than others
@@ -47,6 +48,7 @@ class Scenario:
         end: What to do after its last row.
         path: The path in the plane, if it is one.
         heading: What the reference says of it; None where no output is a heading.
+        pieces: Pieces of a path that says nothing of time, for a robot that follows one; empty for all else.
     """
 
     name: str
@@ -57,6 +59,16 @@ class Scenario:
     end: End
     path: Trajectory | None = None
     heading: Heading | None = None
+    pieces: tuple[SmoothPath, ...] = ()
+
+    @property
+    def pose0(self) -> tuple[float, float, float] | None:
+        """Where a simulated robot is to start, in m and rad: where its path does, in the plane; None if it follows none."""
+        if not self.pieces:
+            return None if self.path is None else self.path.pose0
+        start = np.array(0.0)
+        (x, y), (along_x, along_y) = self.pieces[0].position(start), self.pieces[0].tangent(start)
+        return float(x), float(y), float(np.arctan2(along_y, along_x))
 
     @property
     def title(self) -> str:

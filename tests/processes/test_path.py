@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.processes.system import System
+from tests.processes.system import System, rti_mpc
 
 pytestmark = pytest.mark.slow
 
@@ -34,12 +35,18 @@ constraints = { left = [0.1, inf], right = [0.1, inf] }
 TRACK = "x_m,y_m,w_tr_right_m,w_tr_left_m\n0,0,0.3,0.3\n1,0,0.3,0.3\n2,1,0.3,0.3\n3,1,0.3,0.3\n"
 
 
+def robot_in(folder: Path) -> Path:
+    """Write a robot that follows a path, and a track; return its TOML file."""
+    (folder / "my_robot.py").write_text(ROBOT)
+    (folder / "robot.toml").write_text(TOML)
+    (folder / "track.csv").write_text(TRACK)
+    return folder / "robot.toml"
+
+
 def test_robot_follows_a_file_to_its_end_and_stops_without_its_path(tmp_path: Path) -> None:
-    (tmp_path / "my_robot.py").write_text(ROBOT)
-    (tmp_path / "robot.toml").write_text(TOML)
-    (tmp_path / "track.csv").write_text(TRACK)
+    config = robot_in(tmp_path)
     path = ("reference", "--path", tmp_path / "track.csv", "--path-limits", 0.4, 0.3, 0.3, 0.3)
-    with System(tmp_path, tmp_path / "robot.toml", robot=("sim", "--speed", 2), reference=path) as system:
+    with System(tmp_path, config, robot=("sim", "--speed", 2), reference=path) as system:
         system.start("robot", "controller", "reference")
         moving = system.state(lambda state: state.x[3] > 0.2 and state.x[0] > 0.5)
         assert 0.3 < moving.x[5] < 3.0  # m of progress
@@ -48,3 +55,35 @@ def test_robot_follows_a_file_to_its_end_and_stops_without_its_path(tmp_path: Pa
         assert system.interrupt("reference") == 0
         stopped = system.event("mode", "controller")
         assert stopped.text.endswith("the reference ended with STOP")
+
+
+def test_demo_drives_a_path_as_the_whole_system(tmp_path: Path) -> None:
+    """To its end, inside its edges, with a summary and a figure."""
+    config, out = robot_in(tmp_path), tmp_path / "out"
+    done = rti_mpc("demo", config, "--path", tmp_path / "track.csv", "--path-limits", 0.4, 0.3, 0.3, 0.3, "--speed", 2, "--out", out)
+    assert done.returncode == 0, done.stdout + done.stderr
+    summary = json.loads((out / "summary.json").read_text())
+    path = summary["path"]
+    assert summary["driven"]
+    assert path["driven_m"] == pytest.approx(path["length_m"], abs=0.05), done.stdout
+    assert path["laps_s"] == []
+    assert 90.0 < path["closest_to_edge_mm"] < 300.0, "100 mm are to be kept"
+    assert f"{path['driven_m']:.1f} m of {path['length_m']:.1f} m" in done.stdout
+    assert (out / "run.png").stat().st_size > 20_000
+
+
+def test_path_and_robot_that_do_not_fit_are_refused_before_anything_starts(tmp_path: Path) -> None:
+    config = robot_in(tmp_path)
+    for options, said in (
+        ((config,), "model pioneer_3dx follows a path: --path must say which, hairpin, chicane, oval or a FILE.csv"),
+        ((config, "--path", "spiral"), "--path must be one of hairpin, chicane, oval or a FILE.csv of a path, got 'spiral'"),
+        (
+            (config, "--path", "oval", "--scenario", "eight"),
+            "--path is followed in place of a scenario and says nothing of time: --scenario must be left out",
+        ),
+        (("--path", "oval"), "model pioneer_3dx must be one of path_following for --path, it has no parameter whose role is path_start"),
+        (("--path-limits", 1, 1, 1, 1), "--path-limits are those of a --path, which must be given as well"),
+    ):
+        done = rti_mpc("demo", *options, "--out", tmp_path / "out")
+        assert (done.returncode, done.stderr) == (2, f"rti-mpc: {said}\n")
+    assert not (tmp_path / "out").exists()

@@ -54,6 +54,16 @@ WaypointSmoothing = Annotated[
         metavar="M", min=0.0, help="Length of path over which waypoints are averaged; 0: not averaged.", show_default="as their noise needs"
     ),
 ]
+PathName = Annotated[
+    str | None,
+    typer.Option("--path", metavar="FILE.csv", help="Path for a robot that follows one, in place of a scenario: a file, or a track that ships."),
+]
+PathLimits = Annotated[
+    tuple[float, float, float, float] | None,
+    typer.Option(
+        metavar="V LATERAL ACCELERATION BRAKING", help="Limits of the speed along it, in m/s and m/s^2.", show_default="the speeds of the file"
+    ),
+]
 Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", min=0.1, help="Longest time to wait for an answer.")]
 
 

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer.core import TyperCommand
 
-from rti_mpc_service.commands.arguments import ConfigPath, JsonPath, RobotName, ScenarioName, WaypointSmoothing, WaypointSpeed, file_of
+from rti_mpc_service.commands.arguments import (
+    ConfigPath,
+    JsonPath,
+    PathLimits,
+    PathName,
+    RobotName,
+    ScenarioName,
+    WaypointSmoothing,
+    WaypointSpeed,
+    file_of,
+)
 from rti_mpc_service.commands.on_bus import on_bus
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
@@ -45,6 +55,8 @@ def demo(
     guard: Annotated[bool, typer.Option("--guard", help="Run a guard between controller and robot.")] = False,
     waypoint_speed: WaypointSpeed = 0.25,
     waypoint_smoothing: WaypointSmoothing = None,
+    track: PathName = None,
+    path_limits: PathLimits = None,
 ) -> None:
     """Run the whole system on this machine, and print a summary of errors, limits and times."""
     from rti_mpc_service.demo.demo import main
@@ -56,6 +68,8 @@ def demo(
             heading=heading,
             waypoint_speed_m_s=waypoint_speed,
             waypoint_smoothing_m=waypoint_smoothing,
+            path=track,
+            path_limits=path_limits,
             speed=speed,
             duration_s=duration,
             folder=out,

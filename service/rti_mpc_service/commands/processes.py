@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from rti_mpc.errors import ConfigError
-from rti_mpc_service.commands.arguments import ScenarioName, StatePath, WaypointSmoothing, WaypointSpeed
+from rti_mpc_service.commands.arguments import PathLimits, PathName, ScenarioName, StatePath, WaypointSmoothing, WaypointSpeed
 from rti_mpc_service.commands.on_bus import on_bus
 from rti_mpc_service.config.build import build_model, build_signals, stage_parameters
 from rti_mpc_service.config.schema import Config
@@ -63,29 +63,19 @@ def reference(
     ] = None,
     waypoint_speed: WaypointSpeed = 0.25,
     waypoint_smoothing: WaypointSmoothing = None,
-    track: Annotated[
-        str | None,
-        typer.Option("--path", metavar="FILE.csv", help="Path for a robot that follows one, in place of a scenario: a file, or a track that ships."),
-    ] = None,
-    path_limits: Annotated[
-        tuple[float, float, float, float] | None,
-        typer.Option(
-            metavar="V LATERAL ACCELERATION BRAKING", help="Limits of the speed along it, in m/s and m/s^2.", show_default="the speeds of the file"
-        ),
-    ] = None,
+    track: PathName = None,
+    path_limits: PathLimits = None,
 ) -> None:
     """Publish a reference that starts at the robot's current state, and again after each restart of the robot."""
     from rti_mpc_service.reference import main
     from rti_mpc_service.scenario import find_scenario
 
     if track is not None:
-        if left_out := [f"--{name}" for name, value in {"scenario": scenario, "heading": heading, "duration": duration}.items() if value is not None]:
-            raise ConfigError(f"--path is followed in place of a scenario and says nothing of time: {', '.join(left_out)} must be left out")
-        from rti_mpc.reference.speed_profile import SpeedLimits
         from rti_mpc_service import path_reference
 
-        limits = None if path_limits is None else SpeedLimits(*path_limits)
-        pieces = path_reference.find_path(track, waypoint_speed if limits is None else limits.speed, limits, waypoint_smoothing)
+        pieces = path_reference.path_of_options(
+            track, path_limits, waypoint_speed, waypoint_smoothing, scenario=scenario, heading=heading, duration=duration
+        )
         path_reference.main(track, build_model(config), pieces, bus, config.keys())
         return
     if path_limits is not None:

@@ -82,6 +82,8 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
     if summary["final_error_mm"] is None:  # no path in the plane
         after = f"after {summary['transient_s']:g} s"
         rows = [(f"error of {name} {after}", output_text(error)) for name, error in summary["outputs"].items()]
+    if (path := summary["path"]) is not None:
+        rows = [("path", path_text(path)), ("nearer edge", f"at least {path['closest_to_edge_mm']:.3g} mm away"), *rows]
     rows = [row for row in rows if MISSING_TEXT not in row[1]]
     rows += [
         ("samples in period", f"{summary['in_period_share']:.2%} of {summary['samples']}, {summary['skipped']} skipped"),
@@ -104,6 +106,12 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
         )
     for fault in summary["events"]:
         console.print("{severity} of the {source} at {at_s:.1f} s: {text}".format(**fault), soft_wrap=True)
+
+
+def path_text(path: Mapping[str, Any]) -> str:
+    """Return how far a robot has driven along a path, and how long that should have taken."""
+    laps = f", laps of {', '.join(f'{lap:.2f}' for lap in path['laps_s'])} s" if path["laps_s"] else ""
+    return "{driven_m:.1f} m of {length_m:.1f} m{laps}; {profile_s:.1f} s by the speed profile".format(laps=laps, **path)
 
 
 def second_opinion_text(opinion: Mapping[str, Any]) -> str:

@@ -29,6 +29,8 @@ from rti_mpc.contract.message import Command, Reference, State, Telemetry
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.errors import ConfigError
 from rti_mpc.model.model import Model
+from rti_mpc.model.path_following import window_place
+from rti_mpc.reference.tracks import TRACKS
 from rti_mpc.reference.trajectory import Heading
 from rti_mpc.signals import in_plane, plane
 from rti_mpc.wire.bus import Bus, BusSettings
@@ -42,12 +44,13 @@ from rti_mpc_service.demo.board import Board, print_summary
 from rti_mpc_service.host import machine
 from rti_mpc_service.host.echo import ROLE as ECHO
 from rti_mpc_service.host.echo import Echo
+from rti_mpc_service.path_reference import path_of_options, path_scenario
 from rti_mpc_service.rig import robot_log
 from rti_mpc_service.rig.children import Children
 from rti_mpc_service.rig.company import CLI_MODULE, START_TIMEOUT_S, WATCHER_NICENESS, Failed, check_children, wait
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.rig.run_data import wanted
-from rti_mpc_service.rig.scenario import BEST_HEADINGS, configured, reference_options, write_files
+from rti_mpc_service.rig.scenario import BEST_HEADINGS, configured, path_options, reference_options, write_files
 from rti_mpc_service.rig.summary import Outcome, summarize
 from rti_mpc_service.rig.witness import Witness
 from rti_mpc_service.scenario import Scenario, find_scenario
@@ -70,10 +73,8 @@ class DemoPlan:
 
     Attributes:
         config: Configuration that all processes load.
-        name: Name of the scenario, as on the command line; None: the robot's own.
         scenario: Scenario to follow.
-        waypoint_speed_m_s: Speed along the waypoints of a file.
-        waypoint_smoothing_m: Length of path over which they are averaged; None: as their noise needs.
+        reference: Options of the reference's process.
         duration_s: Duration of the run in robot time.
         speed: Seconds of robot time per second.
         folder: Folder of all results.
@@ -81,19 +82,12 @@ class DemoPlan:
     """
 
     config: Config
-    name: str | None
     scenario: Scenario
-    waypoint_speed_m_s: float
-    waypoint_smoothing_m: float | None
+    reference: tuple[object, ...]
     duration_s: float
     speed: float
     folder: Path
     viewer: bool
-
-    @property
-    def reference_s(self) -> float:
-        """How long the reference lasts."""
-        return self.duration_s + self.config.ocp.N * self.config.ocp.dt_s + REFERENCE_MARGIN_S
 
 
 def plan(
@@ -103,6 +97,8 @@ def plan(
     heading: Heading | None,
     waypoint_speed_m_s: float,
     waypoint_smoothing_m: float | None,
+    path: str | None,
+    path_limits: tuple[float, float, float, float] | None,
     speed: float,
     duration_s: float | None,
     folder: Path | None,
@@ -113,24 +109,42 @@ def plan(
     Return the settings of a demo; what is None is decided by the scenario.
 
     Raises:
-        ConfigError: There is no such scenario, or it does not fit the robot.
+        ConfigError: There is no such scenario or path, or it does not fit the robot.
         OcpError: No consistent heading repeats on a closed path.
     """
-    best = heading or BEST_HEADINGS.get(name or "")
-    scenario = find_scenario(config, name, best, speed_m_s=waypoint_speed_m_s, smooth_m=waypoint_smoothing_m)
+    waypoints = (waypoint_speed_m_s, waypoint_smoothing_m)
+    if path is not None:
+        scenario = path_scenario(build_model(config), path, path_of_options(path, path_limits, *waypoints, scenario=name, heading=heading))
+        reference = path_options(path, path_limits, *waypoints)
+    else:
+        check_no_path(config, path_limits)
+        scenario = find_scenario(config, name, heading or BEST_HEADINGS.get(name or ""), None, *waypoints)
+        lasts_s = (duration_s or scenario.duration_s) + config.ocp.N * config.ocp.dt_s + REFERENCE_MARGIN_S
+        reference = reference_options(name, scenario, lasts_s, *waypoints)
     config = configured(config, scenario, guard)
     check_start(config)
     return DemoPlan(
         config=config,
-        name=name,
         scenario=scenario,
-        waypoint_speed_m_s=waypoint_speed_m_s,
-        waypoint_smoothing_m=waypoint_smoothing_m,
+        reference=reference,
         duration_s=duration_s or scenario.duration_s,
         speed=speed,
         folder=folder or Path("runs") / f"{scenario.name}-{datetime.now():%Y%m%d-%H%M%S}",
         viewer=viewer,
     )
+
+
+def check_no_path(config: Config, path_limits: object) -> None:
+    """
+    Check that nothing asks for a path, where none is given.
+
+    Raises:
+        ConfigError: The robot follows one, or limits are given for one.
+    """
+    if path_limits is not None:
+        raise ConfigError("--path-limits are those of a --path, which must be given as well")
+    if window_place(model := build_model(config)) is not None:
+        raise ConfigError(f"model {model.name} follows a path: --path must say which, {', '.join(TRACKS)} or a FILE.csv")
 
 
 def check_start(config: Config) -> None:
@@ -220,13 +234,13 @@ def drive(run: DemoPlan, console: Console, stop: Event) -> Outcome:
             if children.end(name, WATCHER_END_TIMEOUT_S if name in WATCHERS else END_TIMEOUT_S):
                 board.console.print(f"{name} did not end well, see {children.log(name)}", soft_wrap=True)
         witness.listen()
-    if witness.info is None or witness.reference is None:
+    if witness.info is None or witness.reference is None or witness.began_ns is None:
         raise Failed("stopped before the robot had a reference")
     return Outcome(
         scenario=run.scenario,
         reference=witness.reference,
         plant=robot_settings(run.config)["model"],
-        anchor_ns=witness.reference.stamp_ns,
+        anchor_ns=witness.began_ns,
         duration_s=run.duration_s,
         speed=run.speed,
         ocp=ocp,
@@ -247,11 +261,10 @@ def compiling(log: Path) -> set[str]:
 def start(run: DemoPlan, children: Children, endpoint: str, size: int) -> None:
     """Start all processes except the robot."""
     keys, config = run.config.keys(), run.folder / "config.toml"
-    scenario = reference_options(run.name, run.scenario, run.reference_s, run.waypoint_speed_m_s, run.waypoint_smoothing_m)
     children.start("controller", CLI_MODULE, "run", config, "-e", endpoint)
     for name in guards(run):
         children.start(name, CLI_MODULE, "guard", config, "-e", endpoint)
-    children.start("reference", CLI_MODULE, "reference", config, "-e", endpoint, *scenario, nice=WATCHER_NICENESS)
+    children.start("reference", CLI_MODULE, "reference", config, "-e", endpoint, *run.reference, nice=WATCHER_NICENESS)
     children.start("echo", "rti_mpc_service.host.echo", endpoint, keys.prefix, keys.robot, size)
     live = ("--rerun-spawn",) if run.viewer else ()
     commands = {
@@ -271,9 +284,9 @@ def follow(run: DemoPlan, model: Model, witness: Witness, board: Board, children
     """
     wait(lambda: witness.listen().begun, children, stop, START_TIMEOUT_S, "the first sample")
     heard, heard_s, shown_s = 0, time.monotonic(), 0.0
-    while not stop.is_set() and witness.reference is not None:
+    while not stop.is_set() and witness.reference is not None and witness.began_ns is not None:
         now_s, last = time.monotonic(), witness.telemetry[-1]
-        time_s = 1e-9 * (last.state_stamp_ns - witness.reference.stamp_ns)
+        time_s = 1e-9 * (last.state_stamp_ns - witness.began_ns)
         if len(witness.telemetry) > heard:
             heard, heard_s = len(witness.telemetry), now_s
         if time_s >= run.duration_s or now_s - heard_s > CONTROLLER_SILENCE_S:
@@ -288,8 +301,7 @@ def follow(run: DemoPlan, model: Model, witness: Witness, board: Board, children
 
 def error_text(model: Model, sample: Telemetry, reference: Reference) -> str:
     """Return the error of a sample as text: the distance in the plane, or the error of each output."""
-    y = np.array(model.h()(sample.x0, model.p_nominal)).ravel()
-    error, columns = y - wanted(reference, np.array(sample.stamp_ns)), plane(model.outputs)
+    error, columns = sample.y - wanted(reference, np.array(sample.stamp_ns)), plane(model.outputs)
     if in_plane(model.outputs) and columns is not None:
         return f"{1e3 * float(np.hypot(*error[list(columns)])):.2f} mm"
     errors = [math.remainder(value, math.tau) if output.angle else value for value, output in zip(error, model.outputs, strict=True)]

@@ -61,7 +61,7 @@ def figure(run: Run, path: Path) -> None:
         panels = [_error, *panels]
     with mpl.rc_context(PLOT_STYLE):
         below = 0 if run.planar else ny
-        above = PATH_PANELS if not run.planar and plane(run.info.outputs) is not None else 0
+        above = PATH_PANELS if not run.planar and (run.along is not None or plane(run.info.outputs) is not None) else 0
         page = Figure(figsize=(13.0, max(7.6, 1.8 * len(panels), 1.8 * (above + below))), layout="constrained")
         FigureCanvasAgg(page)
         halves = page.add_gridspec(1, 2, width_ratios=[1.0, 1.15])
@@ -89,7 +89,10 @@ def _stack(page: Figure, place: SubplotSpec, run: Run, panels: Sequence[Callable
 
 def _path(axes: Axes, run: Run) -> None:
     """Draw the plane, equal axes, with the robot where it started and where it ended."""
-    axes.plot(*run.path.T, color=REFERENCE_COLOR, linewidth=5.0, alpha=0.55, solid_capstyle="round", label="reference")
+    for edge in [] if run.along is None else run.along.edges:
+        axes.plot(*edge.T, color=INK_COLOR, linewidth=1.0)
+    wanted = "reference" if run.along is None else "path"
+    axes.plot(*run.path.T, color=REFERENCE_COLOR, linewidth=5.0, alpha=0.55, solid_capstyle="round", label=wanted)
     axes.plot(*run.position.T, color=MEASURED_COLOR, label="robot, true position")
     if run.info.heading is not None:
         for row, alpha in ((0, 0.5), (-1, 1.0)):

@@ -12,6 +12,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import Reference
 from rti_mpc.signals import in_plane, plane
 from rti_mpc.wire.info import Info
+from rti_mpc_service.rig.along_path import AlongPath
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,7 @@ class Run:
         latency_us: Time from a state sent to its command received, shape ``(K,)``.
         speed: Seconds of robot time per second.
         transient_s: Time that the robot may take to reach the reference.
+        along: The drive along a path that says nothing of time; None where none was followed.
     """
 
     info: Info
@@ -48,6 +50,7 @@ class Run:
     latency_us: Array
     speed: float = 1.0
     transient_s: float = 20.0
+    along: AlongPath | None = None
 
     @property
     def time_s(self) -> Array:
@@ -66,13 +69,13 @@ class Run:
 
     @property
     def position(self) -> Array:
-        """True positions in m, shape ``(M, 2)``; NaN where none of the outputs are."""
-        return self._position(self.y)
+        """True positions in m, shape ``(M, 2)``; NaN where none of the outputs are, and no path is followed."""
+        return self._position(self.y) if self.along is None else self.along.position
 
     @property
     def path(self) -> Array:
-        """Positions the reference asks for in m, shape ``(M, 2)``; NaN likewise."""
-        return self._position(self.reference)
+        """Positions the reference asks for in m, shape ``(M, 2)``, or points of a path at the robot's progress; NaN likewise."""
+        return self._position(self.reference) if self.along is None else self.along.point
 
     @property
     def error_mm(self) -> Array:

@@ -24,8 +24,8 @@ def configured(config: Config, scenario: Scenario, guard: bool = False) -> Confi
         ConfigError: An input has no bounds, which a guard needs.
     """
     model = build_model(config)
-    if scenario.path is not None:
-        pose = dict(zip(POSE_ROLES, scenario.path.pose0, strict=True))
+    if scenario.pose0 is not None:
+        pose = dict(zip(POSE_ROLES, scenario.pose0, strict=True))
         config = with_initial_state(config, [f"{state.name}={pose[state.role]!r}" for state in model.states if state.role in pose])
     content = config.model_dump(by_alias=True, exclude_unset=True, exclude={"bus"})
     if scenario.heading == "none":
@@ -35,6 +35,15 @@ def configured(config: Config, scenario: Scenario, guard: bool = False) -> Confi
     config = Config.model_validate(content)
     check_tree(config)
     return config
+
+
+def path_options(
+    name: str, path_limits: tuple[float, float, float, float] | None, waypoint_speed_m_s: float, waypoint_smoothing_m: float | None
+) -> tuple[object, ...]:
+    """Return the options with which `rti-mpc reference` sends a path."""
+    limits = () if path_limits is None else ("--path-limits", *path_limits)
+    smoothing = () if waypoint_smoothing_m is None else ("--waypoint-smoothing", waypoint_smoothing_m)
+    return ("--path", name, *limits, "--waypoint-speed", waypoint_speed_m_s, *smoothing)
 
 
 def reference_options(

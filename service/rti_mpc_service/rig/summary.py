@@ -24,6 +24,7 @@ from rti_mpc.model.model import Model
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.signals import plane
 from rti_mpc.wire.info import Info
+from rti_mpc_service.rig.along_path import AlongPath
 from rti_mpc_service.rig.robot_log import RobotLog
 from rti_mpc_service.rig.run_data import Run, wanted
 from rti_mpc_service.scenario import Scenario
@@ -91,6 +92,10 @@ class Outcome:
         """Return the run between anchor and end for figures; samples whose command never arrived are left out."""
         log = self.log.part((self.anchor_ns <= self.log.stamp_ns) & (self.log.stamp_ns <= self.end_ns))
         latency_us = dict(zip(log.seq.tolist(), log.latency_us.tolist(), strict=True))
+        along = None
+        if self.scenario.pieces and len(log.x):
+            along = AlongPath.of(self.plant, self.scenario.pieces, 1e-9 * (log.stamp_ns - log.stamp_ns[0]), log.x)
+        p = np.array(self.plant.p_nominal)[:, None] if along is None else along.p.T
         answered = [sample for sample in self.samples if np.isfinite(latency_us.get(sample.state_seq, np.nan))]
         return Run(
             info=self.info,
@@ -98,7 +103,7 @@ class Outcome:
             stamp_ns=log.stamp_ns,
             x=log.x,
             u_applied=log.u,
-            y=np.array(self.plant.outputs_at()(log.x.T, log.u.T, self.plant.p_nominal)).reshape(-1, len(log.x)).T,
+            y=np.array(self.plant.outputs_at()(log.x.T, log.u.T, p)).reshape(-1, len(log.x)).T,
             reference=self._wanted(log.stamp_ns),
             sample_stamp_ns=np.array([sample.stamp_ns for sample in answered], dtype=np.int64),
             prepare_us=np.array([sample.prepare_us for sample in answered]),
@@ -106,6 +111,7 @@ class Outcome:
             latency_us=np.array([latency_us[sample.state_seq] for sample in answered]),
             speed=self.speed,
             transient_s=min(TRANSIENT_S, self.duration_s / 2),
+            along=along,
         )
 
     def _wanted(self, stamp_ns: NDArray[np.int64]) -> Array:
@@ -138,6 +144,7 @@ def summarize(outcome: Outcome) -> dict[str, Any]:
         "samples": len(samples),
         **errors(run, outcome.scenario.path.lap_s if outcome.scenario.path is not None else None),
         "outputs": output_errors(run),
+        "path": None if run.along is None else run.along.summary(),
         "in_period_share": (len(samples) - len(misses)) / (len(samples) + skipped),
         "misses": [
             {

@@ -25,6 +25,7 @@ class Witness:
         telemetry: One message per sample.
         events: Events in the order of arrival.
         reference: The last reference, with its real stamp.
+        began_ns: Stamp of the first one.
         info: The controller's description of itself.
         lives: Roles that are present now.
     """
@@ -33,6 +34,7 @@ class Witness:
         self.telemetry: list[Telemetry] = []
         self.events: list[Event] = []
         self.reference: Reference | None = None
+        self.began_ns: int | None = None
         self.info: Info | None = None
         self.lives: set[str] = set()
         self._bus = bus
@@ -63,6 +65,8 @@ class Witness:
             if (sample := self._samples_in.accept(received, now_ns)) is not None:
                 self.telemetry.append(sample)
         self.reference = self._references_in.newest(self._references.drain(), now_ns) or self.reference
+        if self.began_ns is None and self.reference is not None:
+            self.began_ns = self.reference.stamp_ns
         for received in self._infos.drain():
             with suppress(MessageError):
                 self.info = Info.from_received(received)

@@ -24,6 +24,7 @@ SUMMARY: dict[str, Any] = {
     "last_lap_max_error_mm": None,
     "final_speed_mm_s": None,
     "outputs": {"force [left]": {"unit": "N", "max": 1.23, "rms": 0.456}},
+    "path": {"length_m": 12.5, "driven_m": 30.25, "laps_s": [4.125, 5.0], "profile_s": 3.75, "closest_to_edge_mm": 148.0},
     "in_period_share": 1.0,
     "samples": 987654321,
     "skipped": 0,
@@ -47,6 +48,8 @@ def test_summary_loses_no_number_and_no_word(columns: str, monkeypatch: pytest.M
     assert any(line.startswith("error of force [left] after 15 s ") and line.endswith(" max 1.23 N, rms 0.456 N") for line in lines)
     assert printed.count("123456789") == 12
     assert printed.count("918273645") == 4
+    assert "30.2 m of 12.5 m, laps of 4.12, 5.00 s; 3.8 s by the speed profile" in printed
+    assert "at least 148 mm away" in printed
     assert "987654321, 0 skipped" in printed
     assert "50.00% of the samples, at most 2e-09 of half a range off, p50 918.0, p99 4321.0 us" in printed
     assert "WARNING of the robot at 1.0 s: a sentence of many words [of the robot], on one line" in lines
