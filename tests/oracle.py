@@ -48,6 +48,11 @@ def collocated(ocp: Ocp, x: ca.SX, u: ca.SX, K: ca.SX) -> tuple[ca.SX, ca.SX]:
     return x, ca.vertcat(*equations)
 
 
+def row(bound: Array, k: int) -> Array:
+    """Return the bound of a stage."""
+    return bound if bound.ndim == 1 else bound[k]
+
+
 def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Array, Array], tuple[Array, Array, float]]:
     """
     Build the nonlinear program of `rti_mpc.rti.ocp`, by multiple shooting, or by collocation where the integrator is implicit.
@@ -68,6 +73,8 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Arra
     u = ca.SX.sym("u", nu, N_u)
     s = ca.SX.sym("s", nx, N)
     s_e = ca.SX.sym("s_e", nx)
+    nh = ocp.h_expr.numel()
+    s_h, constraint = ca.SX.sym("s_h", nh, N), ca.Function("constraint", [model.x, model.u, model.p], [ca.densify(ocp.h_expr)])
     implicit = ocp.method == "irk"
     K = [ca.SX.sym(f"K_{k}", nx, model.sim_method_num_steps * model.sim_method_num_stages if implicit else 0) for k in range(N)]
     x0 = ca.SX.sym("x0", nx)
@@ -86,8 +93,12 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Arra
         x_next, equations = collocated(ocp, x[:, k], held, K[k]) if implicit else (phi(x[:, k], held, p), ca.SX(0, 1))
         equations = ca.vertcat(x_next - x[:, k + 1], equations)
         rows.append((np.zeros(equations.numel()), equations, np.zeros(equations.numel())))
-        rows.append((np.full(nx, -np.inf), x[:, k + 1] - s[:, k], ocp.ubx))
-        rows.append((ocp.lbx, x[:, k + 1] + s[:, k], np.full(nx, np.inf)))
+        rows.append((np.full(nx, -np.inf), x[:, k + 1] - s[:, k], row(ocp.ubx, k)))
+        rows.append((row(ocp.lbx, k), x[:, k + 1] + s[:, k], np.full(nx, np.inf)))
+        if nh:
+            value = constraint(x[:, k + 1], held, p)
+            cost += ca.dot(ca.DM(ocp.zh), s_h[:, k]) + 0.5 * ca.dot(ca.DM(ocp.Zh), s_h[:, k] ** 2)
+            rows += [(np.full(nh, -np.inf), value - s_h[:, k], row(ocp.uh, k)), (row(ocp.lh, k), value + s_h[:, k], np.full(nh, np.inf))]
     cost += ca.dot(ca.DM(ocp.z), s_e) + 0.5 * ca.dot(ca.DM(ocp.Z), s_e**2)
     rows.append((np.full(nx, -np.inf), x[:, N] - s_e, ocp.ubx_e))
     rows.append((ocp.lbx_e, x[:, N] + s_e, np.full(nx, np.inf)))
@@ -96,24 +107,25 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Arra
         du = u[:, k] - last
         changed = np.broadcast_to(ocp.lambda_[k], nu) ** 0.5 * du
         cost += ca.bilin(ca.DM(ocp.R), changed, changed)
-        rows.append((ocp.lbdu, du, ocp.ubdu))
+        rows.append((row(ocp.lbdu, k), du, row(ocp.ubdu, k)))
         cost += ca.dot(ca.DM(np.broadcast_to(ocp.R_u, (N_u, nu))[k]), (u[:, k] - u_ref) ** 2)
         last = u[:, k]
 
     lbg, g, ubg = zip(*rows, strict=True)
-    program = {"x": ca.veccat(x, u, s, s_e, *K), "f": cost, "g": ca.vertcat(*g), "p": ca.veccat(x0, u_prev, y_ref)}
+    program = {"x": ca.veccat(x, u, s, s_e, s_h, *K), "f": cost, "g": ca.vertcat(*g), "p": ca.veccat(x0, u_prev, y_ref)}
     solver = ca.nlpsol("nlp", "ipopt", program, IPOPT)
     free, rates = np.full(nx * (N + 1), np.inf), np.full(sum(each.numel() for each in K), np.inf)
-    most = np.full(nx * (N + 1), np.inf if slacks else 0.0)
+    slack = nx * (N + 1) + nh * N
+    most = np.full(slack, np.inf if slacks else 0.0)
     bounds = {
         "lbg": np.concatenate(lbg),
         "ubg": np.concatenate(ubg),
-        "lbx": np.concatenate([-free, np.tile(ocp.lbu, N_u), np.zeros(nx * (N + 1)), -rates]),
-        "ubx": np.concatenate([free, np.tile(ocp.ubu, N_u), most, rates]),
+        "lbx": np.concatenate([-free, np.broadcast_to(ocp.lbu, (N_u, nu)).ravel(), np.zeros(slack), -rates]),
+        "ubx": np.concatenate([free, np.broadcast_to(ocp.ubu, (N_u, nu)).ravel(), most, rates]),
     }
 
     def solve(x0: Array, u_prev: Array, y_ref: Array, x: Array, u: Array) -> tuple[Array, Array, float]:
-        guess = np.concatenate([x.ravel(), u.ravel(), np.zeros(nx * (N + 1) + len(rates))])
+        guess = np.concatenate([x.ravel(), u.ravel(), np.zeros(slack + len(rates))])
         answer = solver(x0=guess, p=np.concatenate([x0, u_prev, y_ref.ravel()]), **bounds)
         assert solver.stats()["success"], solver.stats()["return_status"]
         z = np.array(answer["x"]).ravel()

@@ -101,7 +101,10 @@ OCP = {
     "R that is symbolic": (lambda: ocp(R=U), "R must be real numbers, got SX(u)"),
     "lbu of a bound per state": (lambda: ocp(lbu=[-1, -1]), "lbu must be a number or have shape (1,), got shape (2,)"),
     "ubx that is complex": (lambda: ocp(ubx=1 + 1j), "ubx must be real numbers, got (1+1j)"),
-    "ubx that is a column": (lambda: ocp(ubx=np.ones((2, 1))), "ubx must be a number or have shape (2,), got shape (2, 1)"),
+    "ubx that is a column": (
+        lambda: ocp(ubx=np.ones((2, 1))),
+        "ubx must be a number or have shape (2,), or (4, 2), a row per stage, got shape (2, 1)",
+    ),
     "h_expr in MX": (lambda: ocp(h_expr=MX_X), "h_expr must be SX, of the model's x, u, p"),
     "h_expr of another symbol": (lambda: ocp(h_expr=WIND), "h_expr must be a column of the model's x, u, p"),
     "retuned by an unknown name": (lambda: ocp().retuned(lbz=1.0), "the name of a weight or bound must be one of Q, R, "),

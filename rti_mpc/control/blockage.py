@@ -95,8 +95,10 @@ def progress(ocp: Ocp) -> ca.Function:
     """
     model, N, Q, nh = ocp.model, ocp.N, ca.DM(ocp.Q), ocp.h_expr.numel()
     x, u, y_ref = ca.MX.sym("x", model.nx, N + 1), ca.MX.sym("u", model.nu, ocp.N_u), ca.MX.sym("y_ref", model.ny, N)
-    p, scale = ca.MX.sym("p", model.np_, N + 1), ca.MX.sym("scale", model.nx + model.nu + len(ocp.lg))
-    lbx, ubx, lh, uh = (ca.MX.sym(name, size) for name, size in (("lbx", model.nx), ("ubx", model.nx), ("lh", nh), ("uh", nh)))
+    p, scale = ca.MX.sym("p", model.np_, N + 1), ca.MX.sym("scale", model.nx + model.nu + ocp.ng)
+    bounds = {name: ca.MX.sym(name, *np.shape(getattr(ocp, name))[::-1]) for name in ("lbx", "ubx", "lh", "uh")}
+    lbx, ubx = (bound if bound.size2() == 1 else bound[:, -1] for bound in (bounds["lbx"], bounds["ubx"]))  # those of the end
+    lh, uh = bounds["lh"], bounds["uh"]
     output = model.h()
     start, end = output(x[:, 0], p[:, -1]), output(x[:, -1], p[:, -1])  # both outputs with the parameters of one time: a moving beacon is no progress
     moved, left = end - start, y_ref[:, -1] - end
@@ -113,6 +115,6 @@ def progress(ocp: Ocp) -> ca.Function:
         u_held = all_inputs(u, ocp.blocks)
         g = constraint.map(N)(x[:, 1:], u_held, p[:, 1:])[len(ocp.soft) : ocp.ng_path, :]
         near = TOUCHING_DISTANCE * scale[model.nx + model.nu + len(ocp.soft) :][:nh]
-        held += [ca.mmax(ca.fmax(g[k, :] - uh[k], lh[k] - g[k, :])) + near[k] for k in range(nh)]
-    inputs = {"x": x, "u": u, "y_ref": y_ref, "p": p, "scale": scale, "lbx": lbx, "ubx": ubx, "lh": lh, "uh": uh}
+        held += [ca.mmax(ca.fmax(g[k, :] - uh[k, :], lh[k, :] - g[k, :])) + near[k] for k in range(nh)]
+    inputs = {"x": x, "u": u, "y_ref": y_ref, "p": p, "scale": scale, **bounds}
     return function("progress", inputs, {"squares": squares, "held": ca.densify(ca.vertcat(*held))})

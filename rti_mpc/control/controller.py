@@ -32,7 +32,7 @@ from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.blockage import Blockage
 from rti_mpc.control.call import Call, reported
 from rti_mpc.control.delay import DelayEstimator
-from rti_mpc.control.envelope import Envelope
+from rti_mpc.control.envelope import INPUT_BOUNDS, Envelope
 from rti_mpc.control.grid import Grid
 from rti_mpc.control.grid import Timing as Timing
 from rti_mpc.control.issued import ENDING, NO_ENDING, Issued
@@ -121,15 +121,16 @@ class Controller:
         self.skipped = 0
         self.ladder = Ladder()
         self.envelope = Envelope(ocp, compile=compile)
-        self._tuning = Tuning(rti, self.envelope.limits)
+        self._tuning = Tuning(rti, self.envelope)
         self.grid = Grid(ocp.dt, timing)
-        limits = Limits(self._u_rest, ocp.lbu, ocp.ubu, ocp.lbdu, ocp.ubdu, ocp.dt, 1e-9 * self.grid.most_ns)
+        lbu, ubu, lbdu, ubdu = (ocp.widest(name) for name in INPUT_BOUNDS)
+        limits = Limits(self._u_rest, lbu, ubu, lbdu, ubdu, ocp.dt, 1e-9 * self.grid.most_ns)
         settling_s = limits.settling_s + (0.0 if stop_law is None else stop_law.rows * stop_law.period_s)
         self._states = StateStream(model, self._stale_ns, self.grid.dt_ns, settling_s, observer)
         self.np_ = model.np_ - len(self._states.d)
         self._track = Track(model, ocp.N, self.grid.dt_ns, compile=compile)
         angles = np.array([signal.angle for signal in model.states])
-        self._sent = Sent(self._u_rest, ocp.lbdu, ocp.ubdu, self.grid.dt_ns, (ocp.lbu, ocp.ubu), angles)
+        self._sent = Sent(self._u_rest, lbdu, ubdu, self.grid.dt_ns, (lbu, ubu), angles)
         self._prediction = Prediction(model, self._sent, compile=compile)
         self._x0 = self._prediction.x
         self._plan = rti.u.reshape(-1)

@@ -2,7 +2,7 @@
 """
 Envelope of the inputs: the last check of every plan, whichever solver made it.
 
-Bounds hold for each row, slew limits from row to row; the first two rows are also held
+Bounds hold for each row, those of its stage, slew limits from row to row; the first two rows are also held
 to what `rti_mpc.control.sent.Sent.reach` allows. The check needs no solver, and a plan
 that is inside already passes unchanged.
 """
@@ -24,21 +24,31 @@ class Envelope:
     Bounds and slew limits of the inputs.
 
     Attributes:
-        limits: Bounds by the names in `INPUT_BOUNDS`, each of shape ``(nu,)``; may be overwritten, and hold from the next plan on.
+        limits: Bounds by the names in `INPUT_BOUNDS`, each of shape ``(nu,)``, the widest of all stages; may be overwritten, and hold from the next
+            plan on.
+        bounds: Those of a fresh plan, a row per block, ``(N_u, nu)``, where they differ from stage to stage; else the same arrays.
         written: The arrays that `fit` writes.
     """
 
     def __init__(self, ocp: Ocp, *, compile: bool = True) -> None:
         nu = ocp.model.nu
-        self.limits = {name: np.array(getattr(ocp, name)) for name in INPUT_BOUNDS}
+        self.limits = {name: ocp.widest(name) for name in INPUT_BOUNDS}
+        by_stage = {name: np.array(getattr(ocp, name)) for name in INPUT_BOUNDS if getattr(ocp, name).ndim == 2}
+        self.bounds = self.limits | by_stage
         self._u_rest: Array = np.array(ocp.model.u_rest)
         self._u: Array = np.zeros((ocp.N_u, nu))
         self._rows: Array = np.zeros((ocp.N, nu))
         self._reach: tuple[Array, Array] = (np.zeros((2, nu)), np.zeros((2, nu)))
         self.written = (self._u, *self._reach, self._rows)
         fit = clipping(ocp)
-        inputs = {"u": self._u, "lowest": self._reach[0], "highest": self._reach[1], **self.limits}
+        inputs = {"u": self._u, "lowest": self._reach[0], "highest": self._reach[1], **self.bounds}
         self._fit = bind(compiled(fit)[0] if compile else fit, inputs, {"rows": self._rows})
+
+    def take(self, name: str, bound: Array) -> None:
+        """Take another bound of inputs, of the shape that it has in the problem."""
+        self.bounds[name][...] = bound
+        if bound.ndim == 2:
+            self.limits[name][:] = (bound.min if name.startswith("l") else bound.max)(axis=0)
 
     def fit(self, u: Array, reach: tuple[Array, Array]) -> Array:
         """
@@ -58,7 +68,7 @@ class Envelope:
 
     def refit(self, rows: Array, elapsed: int, reach: tuple[Array, Array]) -> Array:
         """
-        Bring an earlier plan inside again, without its first rows, whose time is over.
+        Bring an earlier plan inside again, without its first rows, whose time is over. Its rows keep the bounds of the stages they were planned for.
 
         Args:
             rows: Inputs of all stages, shape ``(N, nu)``; the last is repeated.
@@ -84,16 +94,17 @@ def clipping(ocp: Ocp) -> ca.Function:
     nu = ocp.model.nu
     u = ca.SX.sym("u", nu, ocp.N_u)
     lowest, highest = ca.SX.sym("lowest", nu, 2), ca.SX.sym("highest", nu, 2)
-    lbu, ubu, lbdu, ubdu = (ca.SX.sym(name, nu) for name in INPUT_BOUNDS)
+    bounds = {name: ca.SX.sym(name, *np.shape(getattr(ocp, name))[::-1]) for name in INPUT_BOUNDS}
     rows: list[ca.SX] = []
     for k, j in enumerate(ocp.held.tolist()):
         if k > 1 and ocp.starts[j] != k:
             rows.append(rows[-1])
             continue
+        lbu, ubu, lbdu, ubdu = (bound[:, j] if bound.size2() > 1 else bound for bound in bounds.values())
         lower, upper = (rows[-1] + lbdu, rows[-1] + ubdu) if k else (lowest[:, 0], highest[:, 0])
         if k == 1:
             lower, upper = ca.fmax(lower, lowest[:, 1]), ca.fmin(upper, highest[:, 1])
         wanted = ca.fmin(ca.fmax(u[:, j], lbu), ubu)
         rows.append(ca.fmin(ca.fmax(wanted, lower), upper))
-    inputs = {"u": u, "lowest": lowest, "highest": highest, "lbu": lbu, "ubu": ubu, "lbdu": lbdu, "ubdu": ubdu}
+    inputs = {"u": u, "lowest": lowest, "highest": highest, **bounds}
     return function("clipping", inputs, {"rows": ca.densify(ca.horzcat(*rows))})

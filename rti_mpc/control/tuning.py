@@ -10,12 +10,10 @@ slew limits and the new ones.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.control.envelope import INPUT_BOUNDS
+from rti_mpc.control.envelope import INPUT_BOUNDS, Envelope
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp, rest_fault
 from rti_mpc.rti.rti import Rti
@@ -33,18 +31,18 @@ class Tuning:
         wanted: Problem with the wanted weights and bounds.
     """
 
-    def __init__(self, rti: Rti, limits: Mapping[str, Array] | None = None) -> None:
+    def __init__(self, rti: Rti, envelope: Envelope | None = None) -> None:
         """
         Begin with the weights and bounds that an `Rti` was built with.
 
         Args:
             rti: Real-time iteration to be tuned.
-            limits: Further arrays that the acting bounds are written to, by name: ``lbu`` and ``ubu``, each of shape ``(nu,)``.
+            envelope: Envelope that takes the acting bounds of inputs, too.
         """
         self.version = 0
         self._rti = rti
-        self._limits = {} if limits is None else {name: limits[name] for name in ("lbu", "ubu")}
-        self._changed = False
+        self._envelope = envelope
+        self._changed = rti.ocp.lbu.ndim == 2  # bounds that differ from stage to stage may have to yield at any sample
         self.wanted = rti.ocp
         self._wanted_version = 0
         self._slew = rti.ocp.lbdu, rti.ocp.ubdu  # of this sample
@@ -95,10 +93,38 @@ class Tuning:
         if not self._changed:
             return
         wanted, (lbdu, ubdu) = self.wanted, self._slew
-        bounds = dict(zip(INPUT_BOUNDS, (np.minimum(wanted.lbu, u_prev + ubdu), np.maximum(wanted.ubu, u_prev + lbdu), lbdu, ubdu), strict=True))
+        lbu, ubu = reachable(wanted.lbu, wanted.ubu, lbdu, ubdu, u_prev)
+        bounds = dict(zip(INPUT_BOUNDS, (lbu, ubu, lbdu, ubdu), strict=True))
         fresh = self.version != self._written
-        if fresh or any(not np.array_equal(bounds[name], self._acting[name]) for name in INPUT_BOUNDS):
+        if fresh or any(bound is not self._acting[name] and not np.array_equal(bound, self._acting[name]) for name, bound in bounds.items()):
             self._rti.retune({**{name: getattr(wanted, name) for name in WEIGHTS_AND_BOUNDS if fresh}, **bounds})
-            for name, limit in self._limits.items():
-                limit[:] = bounds[name]
+            if self._envelope is not None:
+                self._envelope.take("lbu", lbu)
+                self._envelope.take("ubu", ubu)
         self._acting, self._written = bounds, self.version
+
+
+def reachable(lbu: Array, ubu: Array, lbdu: Array, ubdu: Array, u_prev: Array) -> tuple[Array, Array]:
+    """
+    Return the bounds of inputs, moved where the inputs cannot be inside yet, so that every plan can keep them.
+
+    Args:
+        lbu: Lower bounds, shape ``(nu,)``, or ``(N_u, nu)`` where they differ from block to block.
+        ubu: Upper bounds, likewise.
+        lbdu: Lower bounds of the increments, shape ``(nu,)`` or ``(N_u, nu)``.
+        ubdu: Upper bounds of the increments.
+        u_prev: Input before the plan, shape ``(nu,)``.
+    """
+    least, most = u_prev + (lbdu if lbdu.ndim == 1 else lbdu[0]), u_prev + (ubdu if ubdu.ndim == 1 else ubdu[0])
+    if lbu.ndim == 1:
+        return np.minimum(lbu, most), np.maximum(ubu, least)
+    if (lbu[0] <= most).all() and (ubu[0] >= least).all():
+        return lbu, ubu  # those of the next blocks can be reached from there, as `Ocp` demands
+    falling, rising = np.broadcast_to(lbdu, lbu.shape), np.broadcast_to(ubdu, ubu.shape)
+    lower, upper = lbu.copy(), ubu.copy()
+    for k in range(len(lower)):
+        if k:
+            least, most = least + falling[k], most + rising[k]
+        lower[k], upper[k] = np.minimum(lower[k], most), np.maximum(upper[k], least)
+        least, most = np.maximum(least, lower[k]), np.minimum(most, upper[k])
+    return lower, upper

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import pairwise
+from typing import Any
 
 import casadi as ca
 
@@ -60,7 +61,7 @@ def summed(stages: ca.MX, blocks: Blocks) -> ca.MX:
     return ca.horzcat(*parts)
 
 
-def at_each(columns: ca.MX, count: int) -> ca.MX:
+def at_each(columns: Any, count: int) -> Any:
     """Return a column for each stage or block: the only one repeated, or as they are."""
     return columns if columns.size2() > 1 else ca.repmat(columns, 1, count)
 

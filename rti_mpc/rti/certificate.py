@@ -24,8 +24,9 @@ import numpy as np
 
 from rti_mpc.codegen import function
 from rti_mpc.rti.blocks import all_inputs, at_each, summed
-from rti_mpc.rti.linearization import Linearization, divided
+from rti_mpc.rti.linearization import Linearization, divided, partly, where_bounded
 from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.recursion import recur
 
 SMALLEST_DIVISOR = 1e-300  # replaces a quadratic penalty of zero
@@ -41,17 +42,18 @@ def certificate(ocp: Ocp) -> ca.Function:
     cost of the plan, penalties included, both normalised.
     """
     lin = Linearization(ocp)
-    N, N_u, nx, nu, ng = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu, len(ocp.lg)
+    N, N_u, nx, nu, ng = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu, ocp.ng
     x_plan, u_plan, x0 = ca.MX.sym("x_plan", nx, N + 1), ca.MX.sym("u_plan", nu, N_u), ca.MX.sym("x0", nx)
     stages, multipliers = ca.MX.sym("stages", lin.stages.numel()), ca.MX.sym("multipliers", nu * N_u + ng * N)
     forms = lin.forms_in(stages)
     given_increments, of_softened = divided(multipliers, [lin.u, lin.g])
-    towards = [ca.repmat(ca.DM(np.where(np.isfinite(bounds), np.inf, 0.0)), 1, N_u) for bounds in (ocp.lbdu, ocp.ubdu)]
-    of_increments = ca.fmax(-towards[0], ca.fmin(given_increments, towards[1]))  # none pushes where there is no bound
+    of_increments = where_bounded(given_increments, ocp.lbdu, ocp.ubdu)
+    if partly(ocp.lg).any() or partly(ocp.ug).any():
+        of_softened = where_bounded(of_softened, ocp.lg, ocp.ug)
     w = lin.w
 
     dx, du = x_plan - lin.x, u_plan - lin.u
-    shared = [ca.repmat(e, 1, N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg, lin.scale_x, lin.scale_g)]
+    shared = [at_each(e, N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg, lin.scale_x, lin.scale_g)]
     data = (forms.A, forms.B, forms.b, forms.H, forms.h, forms.g, forms.g_x, forms.g_u)
     nodes = node(ocp, lin).map(N)(*data, dx[:, :-1], all_inputs(du, ocp.blocks), dx[:, 1:], of_softened, *shared)
     sums, by_x, by_u = nodes[:3, :], nodes[3 : 3 + nx, :], nodes[3 + nx :, :]
@@ -68,7 +70,7 @@ def certificate(ocp: Ocp) -> ca.Function:
         push += forms.force - at_guess
         of_steps = ca.dot(forms.force - at_guess, planned - forms.increments) + ca.dot(at_each(w["R_u"], N_u) * du, du) / 2
     push = push - ca.horzcat(push[:, 1:], ca.MX.zeros(nu)) + at_each(forms.damping, N_u) * du
-    shared = [ca.repmat(e, 1, N_u) for e in (w["lbu"], w["ubu"], w["lbdu"], w["ubdu"], lin.scale_u)]
+    shared = [at_each(e, N_u) for e in (w["lbu"], w["ubu"], w["lbdu"], w["ubdu"], lin.scale_u)]
     inputs = of_inputs(ocp).map(N_u)(reduced + push, u_plan, planned, of_increments, *shared)
 
     primal = ca.fmax(ca.fmax(ca.mmax(sums[0, :]), ca.mmax(inputs[0, :])), ca.mmax(ca.fabs(x_plan[:, 0] - x0) / lin.scale_x))
@@ -81,7 +83,7 @@ def certificate(ocp: Ocp) -> ca.Function:
 
 def node(ocp: Ocp, lin: Linearization) -> ca.Function:
     """Build the terms of one stage and the node at its end: ``-> [violation of the dynamics; gap; cost; gradients in dx and du]``."""
-    nx, nu, ng = ocp.model.nx, ocp.model.nu, len(ocp.lg)
+    nx, nu, ng = ocp.model.nx, ocp.model.nu, ocp.ng
     nz = [ca.SX.sym(name, pattern.nnz()) for name, pattern in zip("ABHXU", (lin.A_k, lin.B_k, lin.H_i, lin.G_x, lin.G_u), strict=True)]
     A, B, H, G_x, G_u = (ca.SX(pattern, values) for pattern, values in zip((lin.A_k, lin.B_k, lin.H_i, lin.G_x, lin.G_u), nz, strict=True))
     b, before, after, scale_x = (ca.SX.sym(name, nx) for name in ("b", "before", "after", "scale_x"))
@@ -94,8 +96,9 @@ def node(ocp: Ocp, lin: Linearization) -> ca.Function:
     end = ca.vertcat(after, du)[: H.shape[0]]
     cost = ca.dot(h, end) + ca.dot(end, H @ end) / 2
     taken = ca.SX(ng, 1)
+    below, above = (np.isfinite(ocp.tightest(name)) for name in ("lg", "ug"))
     for j in range(ng):
-        for sign, bound, there in ((1, ug[j], np.isfinite(ocp.ug[j])), (-1, -lg[j], np.isfinite(ocp.lg[j]))):
+        for sign, bound, there in ((1, ug[j], above[j]), (-1, -lg[j], below[j])):
             if there:
                 beyond = sign * value[j] - bound
                 s = ca.fmax(0, beyond)
@@ -127,9 +130,13 @@ def of_inputs(ocp: Ocp) -> ca.Function:
     names = ("r", "u", "increment", "mu", "lbu", "ubu", "lbdu", "ubdu", "scale")
     r, u, increment, mu, lbu, ubu, lbdu, ubdu, scale = symbols = [ca.SX.sym(name, nu) for name in names]
     violation, gap = ca.SX(0), ca.SX(0)
+    upper, lower = (("ubu", "ubdu"), ("lbu", "lbdu"))
     for j in range(nu):
-        for sign, bounds, limits, at, pace in ((1, ocp.ubu, ocp.ubdu, ubu[j], ubdu[j]), (-1, ocp.lbu, ocp.lbdu, -lbu[j], -lbdu[j])):
+        for sign, (of_input, of_step), at, pace in ((1, upper, ubu[j], ubdu[j]), (-1, lower, -lbu[j], -lbdu[j])):
+            bounds, limits = ocp.tightest(of_input), ocp.tightest(of_step)
             room = at - sign * u[j] if np.isfinite(bounds[j]) else scale[j]
+            if partly(getattr(ocp, of_input))[j]:
+                room = ca.if_else(at < INFINITY / 2, room, scale[j])
             gap += ca.fmax(0, -sign * r[j]) * ca.fmax(0, room)
             if np.isfinite(bounds[j]):
                 violation = ca.fmax(violation, -room / scale[j])

@@ -88,7 +88,7 @@ def construct(ocp: Ocp, formulation: str, structured: bool, build: str | None) -
     """Build the construction of a problem, as `construction`."""
     x_nominal = nominal_state(ocp)
     check_stiffness(ocp, x_nominal)
-    transcriptions = tuple(FORMULATIONS[formulation](ocp, softened=softened) for softened in (False, True)[: 2 if len(ocp.lg) else 1])
+    transcriptions = tuple(FORMULATIONS[formulation](ocp, softened=softened) for softened in (False, True)[: 2 if ocp.ng else 1])
     active_set = (places(ocp), certificate(ocp)) if structured else None
     moves, cost, output, steps = shift(ocp), plan_cost(ocp), ocp.model.h(), largest_steps(ocp)
     native = [moves, cost, output, steps, *natives(transcriptions, active_set)]

@@ -139,7 +139,7 @@ def backward_in_c(ocp: Ocp, lin: Linearization, free: ca.Function, held: ca.Func
     Phi = [[*range(nx + 1)], *([1 + i for i in column] for column in rows_by_column(A))]
     Phi += [[*(1 + i for i in column), 1 + nx + j] for j, column in enumerate(rows_by_column(B))]
     by_row = [[(e, j) for e, (i, j) in enumerate(zip(*G.get_triplet(), strict=True)) if i == r] for r in range(G.size1())]
-    sizes = {"NX": nx, "NU": nu, "NG": len(ocp.lg), "SIZE": size}
+    sizes = {"NX": nx, "NU": nu, "NG": ocp.ng, "SIZE": size}
     sizes |= {"STAGES": ocp.N, "FREE": ocp.N_u, "NONZEROS": sum(map(len, Phi)), "GAIN": free.size1_out("gain")}
     sizes |= {f"NONZEROS_{name}": pattern.nnz() for name, pattern in {"A": A, "H": H, "R": R, "G": G, "G_X": lin.G_x}.items()}
     tables = {

@@ -58,16 +58,18 @@ class Sides:
         first = 2 * N_u * ocp.model.nu  # row with a softened bound
 
         def along(inputs: ca.MX, increments: ca.MX, softened: ca.MX) -> ca.MX:
-            return ca.veccat(ca.repmat(inputs, 1, N_u), ca.repmat(increments, 1, N_u), ca.repmat(softened, 1, N))
+            return ca.MX(ca.veccat(at_each(inputs, N_u), at_each(increments, N_u), at_each(softened, N)))
 
         tables = (ocp.lbu, ocp.lbdu, ocp.lg), (ocp.ubu, ocp.ubdu, ocp.ug)
-        finite = [np.flatnonzero(np.isfinite(np.concatenate([np.tile(u, N_u), np.tile(du, N_u), np.tile(g, N)]))) for u, du, g in tables]
+        counts = (N_u, N_u, N)
+        rows_of = [[np.broadcast_to(of, (n, of.shape[-1])).ravel() for of, n in zip(table, counts, strict=True)] for table in tables]
+        finite = [np.flatnonzero(np.isfinite(np.concatenate(rows))) for rows in rows_of]
         sides = sorted(((int(row), sign) for sign, rows in zip((-1.0, 1.0), finite, strict=True) for row in rows), key=lambda side: side[0] >= first)
         self._rows, self._sign = [row for row, _ in sides], ca.DM([sign for _, sign in sides])
         self.hard = sum(row < first for row in self._rows)
         self.softened = len(sides) - self.hard
         number = {side: count for count, side in enumerate(sides)}
-        rows = range(first + len(ocp.lg) * N)
+        rows = range(first + ocp.ng * N)
         self._lower, self._upper = ([number.get((row, sign), len(sides)) for row in rows] for sign in (-1.0, 1.0))  # beyond them: none
         self.scale = along(lin.scale_u, lin.scale_u, lin.scale_g)
         self.scale_side = self.scale[self._rows]

@@ -30,6 +30,7 @@ import casadi as ca
 import numpy as np
 import scipy.sparse as sp
 
+from rti_mpc.array import Array
 from rti_mpc.codegen import function
 from rti_mpc.model.integrator import sensitivities
 from rti_mpc.rti.blocks import all_inputs, at_each, at_starts, moved_on, summed
@@ -99,7 +100,8 @@ class Linearization:
         g_u: Sensitivities of g to the input of the stage before the node, nonzeros of `G_u`, shape ``(nnz, N)``.
         G_x: Sparsity of the sensitivities to the state at one node, shape ``(ng, nx)``.
         G_u: Sparsity of the sensitivities to the input at one node, shape ``(ng, nu)``.
-        lg: Lower bounds on g, shape ``(ng, 1)``; `ug`, upper bounds; `zg` and `Zg`, weights of the slacks.
+        lg: Lower bounds on g, shape ``(ng, 1)``, or ``(ng, N)`` where they differ from stage to stage; `ug`, upper bounds; `zg` and `Zg`, weights of
+            the slacks, shape ``(ng, 1)``.
         increments: ``u_k - u_{k-1}``, shape ``(nu, N_u)``.
         force: ``lambda_k R (u_k - u_{k-1})``, shape ``(nu, N_u)``, and the gradient of half the cost of inputs, summed from the last stage on: force
             acts on increments.
@@ -122,7 +124,7 @@ class Linearization:
         self.y_ref = ca.MX.sym("y_ref", model.ny, N)
         self.p = ca.MX.sym("p", model.np_, N + 1)
         self.w = {name: ca.MX.sym(name, *np.shape(getattr(ocp, name))[::-1]) for name in WEIGHTS_AND_BOUNDS}
-        self._scale = ca.MX.sym("scale", nx + nu + len(ocp.lg))
+        self._scale = ca.MX.sym("scale", nx + nu + ocp.ng)
         self.scale_x, self.scale_u, self.scale_g = self._scale[:nx], self._scale[nx : nx + nu], self._scale[nx + nu :]
 
         stage, self.A_k, self.B_k = linearize(ocp)
@@ -146,7 +148,7 @@ class Linearization:
         w = self.w
         constraint, self.G_x, self.G_u = constraints(ocp)
         bounded = constraint.map(N)(self.x[:, 1:], inputs, self.p[:, 1:])
-        to_x, to_u = len(ocp.lg), len(ocp.lg) + self.G_x.nnz()
+        to_x, to_u = ocp.ng, ocp.ng + self.G_x.nnz()
         self.g, self.g_x, self.g_u = bounded[:to_x, :], bounded[to_x:to_u, :], bounded[to_u:, :]
         self.lg, self.ug = softened(ocp, w, "lbx", "lh", "lbx_e"), softened(ocp, w, "ubx", "uh", "ubx_e")
         self.zg, self.Zg = softened(ocp, w, "z", "zh", "z"), softened(ocp, w, "Z", "Zh", "Z")
@@ -186,9 +188,10 @@ class Linearization:
 
     def _bound_at_the_end_alone(self, ocp: Ocp) -> None:
         """Let the rows of `soft_e` be inside their bounds, whatever the state is, at all nodes but the last."""
-        rows = slice(ocp.ng_path, len(ocp.lg))
-        above, below = np.isfinite(ocp.lg[rows]).astype(float), np.isfinite(ocp.ug[rows]).astype(float)  # 1 where there is such a bound
-        inside = self.lg[rows] * above + self.ug[rows] * below + self.scale_g[rows] * (above - below)
+        rows = slice(ocp.ng_path, ocp.ng)
+        above, below = (np.isfinite(ocp.tightest(name)[rows]).astype(float) for name in ("lg", "ug"))  # 1 where there is such a bound
+        lower, upper = (bounds if bounds.size2() == 1 else bounds[:, -1] for bounds in (self.lg, self.ug))
+        inside = lower[rows] * above + upper[rows] * below + self.scale_g[rows] * (above - below)
         inside = inside / (above + below)  # halfway between two bounds, or one scale from the only one
         early = ca.repmat(inside, 1, ocp.N - 1)
         self.g = ca.vertcat(self.g[: ocp.ng_path, :], ca.horzcat(early, self.g[rows, -1]))
@@ -326,8 +329,30 @@ def constraints(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
 
 
 def softened(ocp: Ocp, w: dict[str, Any], of_states: str, of_constraints: str, of_end: str) -> Any:
-    """Return what the rows of `constraints` have by these names of weights or bounds, shape ``(ng, 1)``."""
+    """Return what the rows of `constraints` have by these names of weights or bounds, shape ``(ng, 1)``, or ``(ng, N)`` if any has rows."""
+    if max(w[name].shape[1] for name in (of_states, of_constraints, of_end)) > 1:
+        parts = w[of_states][list(ocp.soft), :], w[of_constraints], w[of_end][list(ocp.soft_e), :]
+        return ca.vertcat(*(at_each(part, ocp.N) for part in parts))
     return ca.vertcat(w[of_states][list(ocp.soft), 0], w[of_constraints], w[of_end][list(ocp.soft_e), 0])
+
+
+def where_bounded(numbers: Any, lower: Array, upper: Array) -> Any:
+    """
+    Return numbers that push down from an upper bound, above 0, or up from a lower one, below 0: zero where there is no such bound.
+
+    Args:
+        numbers: A column per stage or block.
+        lower: The bounds, a row per stage or block, or one for all.
+        upper: The upper ones, likewise.
+    """
+    most = [at_each(ca.DM(np.where(np.isfinite(bounds), np.inf, 0.0).T), numbers.shape[1]) for bounds in (lower, upper)]
+    return ca.fmax(-most[0], ca.fmin(numbers, most[1]))
+
+
+def partly(bounds: Array) -> Any:
+    """Return which signals have a bound at some stages and none at others, shape ``(n,)``."""
+    there = np.isfinite(np.atleast_2d(bounds))
+    return there.any(axis=0) & ~there.all(axis=0)
 
 
 def nonzeros(matrix: Any) -> Any:
@@ -375,6 +400,6 @@ def damping(ocp: Ocp) -> float:
 def plan_cost(ocp: Ocp) -> ca.Function:
     """Build ``(x, u, u_prev, y_ref, p, *WEIGHTS_AND_BOUNDS, scale) -> cost``: the cost (4) of a plan and its penalties, nothing of it linearized."""
     lin = Linearization(ocp)
-    lg, ug, zg, Zg = (ca.repmat(e, 1, ocp.N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg))
+    lg, ug, zg, Zg = (at_each(e, ocp.N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg))
     s = ca.fmax(0, ca.fmax(lin.g - ug, lg - lin.g))
     return function("cost", lin.arguments, {"cost": lin.cost + ca.dot(zg, s) + ca.dot(Zg, s**2) / 2})

@@ -41,7 +41,7 @@ def nominal_state(ocp: Ocp) -> Array:
         OcpError: The model is singular there, or wherever it was looked for.
     """
     model = ocp.model
-    u_rest = np.clip(model.u_rest, ocp.lbu, ocp.ubu)
+    u_rest = np.clip(model.u_rest, ocp.widest("lbu"), ocp.widest("ubu"))
     values = model_and_derivatives(ocp)
 
     def regular(x: Array) -> bool:
@@ -51,12 +51,12 @@ def nominal_state(ocp: Ocp) -> Array:
         if not regular(x := np.array(model.x_nominal)):
             raise OcpError(f"x_nominal must be a state at which model {model.name} is finite and differentiable, got {named(ocp, x)}")
         return x
-    if regular(zero := np.clip(np.zeros(model.nx), ocp.lbx, ocp.ubx)):
+    if regular(zero := np.clip(np.zeros(model.nx), ocp.widest("lbx"), ocp.widest("ubx"))):
         return np.asarray(zero)
     rng = np.random.default_rng(1)
     candidates = [np.ones(model.nx), *(size * rng.normal(size=model.nx) for size in np.geomspace(1e-2, 1e4, RANDOM_STATES))]
     for candidate in candidates:
-        if regular(x := np.clip(candidate, ocp.lbx, ocp.ubx)):
+        if regular(x := np.clip(candidate, ocp.widest("lbx"), ocp.widest("ubx"))):
             settled = np.array(ocp.phi().mapaccum(SETTLING_STAGES)(x, u_rest, model.p_nominal))[:, -1]
             return settled if regular(settled) else np.asarray(x)
     told = f"model {model.name} must be finite and differentiable at a nominal state: give one, x_nominal"
@@ -89,7 +89,7 @@ def check_stiffness(ocp: Ocp, x: Array) -> None:
     """
     model = ocp.model
     rates = ca.Function("rates", [model.x, model.u, model.p], [ca.densify(ca.jacobian(model.rate_expr, model.x))])
-    eigenvalues, modes = np.linalg.eig(np.array(rates(x, np.clip(model.u_rest, ocp.lbu, ocp.ubu), model.p_nominal)))
+    eigenvalues, modes = np.linalg.eig(np.array(rates(x, np.clip(model.u_rest, ocp.widest("lbu"), ocp.widest("ubu")), model.p_nominal)))
     if model.dt is not None or ocp.method == IRK:
         return  # it follows any motion that decays
     growth, steps = GROWTH[ocp.method], model.sim_method_num_steps

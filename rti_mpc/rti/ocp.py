@@ -44,6 +44,7 @@ from rti_mpc.model.integrator import TABLEAUS, steps
 from rti_mpc.model.model import IRK, Model
 
 DISCRETE = "discrete"  # method of a problem whose model is in discrete time
+PAIRS = (("lbu", "ubu"), ("lbdu", "ubdu"), ("lbx", "ubx"), ("lh", "uh"))  # bounds that may differ from stage to stage, both of them then
 DEFAULT_SLACK_WEIGHT = 1e3  # L1 weight, in cost per unit of the state, and L2 weight, in cost per unit squared
 
 
@@ -68,7 +69,9 @@ class Ocp:
             from stage to stage: stage i weighs by :math:`D_i^{1/2} Q D_i^{1/2}`, which for a diagonal Q is :math:`D_i Q`, see `Q_at`.
         lambda_: Penalty sequence on increments, shape ``(N_u,)``, or given as a constant; or one for each input, shape ``(N_u, nu)``, which weighs by
             :math:`L_k^{1/2} R L_k^{1/2}`, see `R_at`.
-        lbu: Lower bound on inputs, shape ``(nu,)``; none by default, as for the following.
+        lbu: Lower bound on inputs, shape ``(nu,)``; none by default, as for the following. Bounds of inputs and increments may have a row per block,
+            shape ``(N_u, nu)``, those of states a row per node, ``(N, nx)``, those of h ``(N, nh)``; an upper bound then has one if its lower one
+            has, see `widest` and `tightest`.
         ubu: Upper bound on inputs, shape ``(nu,)``.
         lbdu: Lower bound on the increment of inputs from stage to stage, shape ``(nu,)``.
         ubdu: Upper bound on the increment of inputs, shape ``(nu,)``.
@@ -89,7 +92,8 @@ class Ocp:
         Zh: L2 weight of the slacks of h, shape ``(nh,)``, or given as a constant.
 
     Raises:
-        OcpError: An argument does not fit; the message names it, and what it must be. A rest input other than zero must be inside the bounds.
+        OcpError: An argument does not fit; the message names it, and what it must be. A rest input other than zero must be inside the bounds, and
+            from anywhere in the bounds of the first block those of all others must be reached in turn, inside those of increments.
     """
 
     model: Model
@@ -208,15 +212,24 @@ class Ocp:
             array = by_stage(name, value, check, sizes[size], *shape) if shape else check(name, value, sizes[size])
             array.setflags(write=False)
             object.__setattr__(self, name, array)
-        if not np.all(self.lbu <= self.ubu):
-            raise OcpError(f"lbu must not lie above ubu, got {self.lbu} and {self.ubu}")
+        for pair in PAIRS:
+            bounds = getattr(self, pair[0]), getattr(self, pair[1])
+            if bounds[0].ndim != bounds[1].ndim:
+                for name, rows in zip(pair, (bound.copy("C") for bound in np.broadcast_arrays(*bounds)), strict=True):
+                    rows.setflags(write=False)
+                    object.__setattr__(self, name, rows)
+        if wrong := where(self.lbu > self.ubu, self.lbu, self.ubu):
+            raise OcpError(f"lbu must not lie above ubu, got {wrong}")
         for lower, upper in (("lbx", "ubx"), ("lh", "uh"), ("lbx_e", "ubx_e")):
-            if not np.all(getattr(self, lower) < getattr(self, upper)):
-                raise OcpError(f"{lower} must lie below {upper}, got {getattr(self, lower)} and {getattr(self, upper)}")
+            bounds = getattr(self, lower), getattr(self, upper)
+            if wrong := where(bounds[0] >= bounds[1], *bounds):
+                raise OcpError(f"{lower} must lie below {upper}, got {wrong}")
         if any(self.model.u_rest) and (wrong := rest_fault(self)):
             raise OcpError(wrong)
-        if np.any(self.lbdu > 0) or np.any(self.ubdu < 0):
-            raise OcpError(f"lbdu <= 0 <= ubdu must hold, or no input could be kept, got {self.lbdu} and {self.ubdu}")
+        if wrong := where((self.lbdu > 0) | (self.ubdu < 0), self.lbdu, self.ubdu):
+            raise OcpError(f"lbdu <= 0 <= ubdu must hold, or no input could be kept, got {wrong}")
+        if wrong := pace_fault(self):
+            raise OcpError(wrong)
 
     def Q_at(self, k: int) -> Array:
         """Return the weight of outputs at node ``k + 1``, without the terminal weight, shape ``(ny, ny)``."""
@@ -232,6 +245,16 @@ class Ocp:
         root = np.sqrt(self.lambda_[k])
         return np.asarray(self.R * np.outer(root, root))
 
+    def widest(self, name: str) -> Array:
+        """Return a bound over all stages, the loosest of each signal, shape ``(n,)``: infinite where a stage has none; what a robot may ever do."""
+        rows = np.atleast_2d(getattr(self, name))
+        return np.asarray((rows.min if name.startswith("l") else rows.max)(axis=0))
+
+    def tightest(self, name: str) -> Array:
+        """Return the tightest bound of each signal over all stages, shape ``(n,)``: infinite where no stage has one."""
+        rows = np.atleast_2d(getattr(self, name))
+        return np.asarray((rows.max if name.startswith("l") else rows.min)(axis=0))
+
     @property
     def held(self) -> NDArray[np.int_]:
         """Row of the inputs that acts at each stage, shape ``(N,)``."""
@@ -245,7 +268,7 @@ class Ocp:
     @property
     def soft(self) -> tuple[int, ...]:
         """Indices of the states with a bound, each of which has one slack per node."""
-        return tuple(int(j) for j in np.flatnonzero(np.isfinite(self.lbx) | np.isfinite(self.ubx)))
+        return tuple(int(j) for j in np.flatnonzero(np.isfinite(self.tightest("lbx")) | np.isfinite(self.tightest("ubx"))))
 
     @property
     def soft_e(self) -> tuple[int, ...]:
@@ -258,14 +281,25 @@ class Ocp:
         return len(self.soft) + self.h_expr.numel()
 
     @property
+    def ng(self) -> int:
+        """Number of softened bounds."""
+        return self.ng_path + len(self.soft_e)
+
+    @property
     def lg(self) -> Array:
-        """Softened lower bounds: of the states in `soft`, of `h_expr`, then of the states in `soft_e`; shape ``(ng,)``."""
-        return np.concatenate([self.lbx[list(self.soft)], self.lh, self.lbx_e[list(self.soft_e)]])
+        """Softened lower bounds: of the states in `soft`, of `h_expr`, then of the states in `soft_e`; ``(ng,)``, or ``(N, ng)`` if any has rows."""
+        return self._softened(self.lbx, self.lh, self.lbx_e)
 
     @property
     def ug(self) -> Array:
         """Softened upper bounds, as `lg`."""
-        return np.concatenate([self.ubx[list(self.soft)], self.uh, self.ubx_e[list(self.soft_e)]])
+        return self._softened(self.ubx, self.uh, self.ubx_e)
+
+    def _softened(self, of_states: Array, of_constraints: Array, of_end: Array) -> Array:
+        parts = [of_states[..., list(self.soft)], of_constraints, of_end[list(self.soft_e)]]
+        if max(part.ndim for part in parts) == 1:
+            return np.concatenate(parts)
+        return np.hstack([np.broadcast_to(part, (self.N, part.shape[-1])) for part in parts])
 
     def phi(self) -> ca.Function:
         """One stage of the dynamics, ``phi(x, u, p) -> x_next``."""
@@ -314,12 +348,39 @@ def rest_fault(ocp: Ocp) -> str:
 
     A problem whose rest input is zero may exclude it; a controller that must stop a robot may not.
     """
-    for signal, rest, *limits in zip(ocp.model.inputs, ocp.model.u_rest, ocp.lbu, ocp.ubu, ocp.lbdu, ocp.ubdu, strict=True):
+    bounds = [ocp.tightest(name) for name in ("lbu", "ubu", "lbdu", "ubdu")]
+    for signal, rest, *limits in zip(ocp.model.inputs, ocp.model.u_rest, *bounds, strict=True):
         lower, upper, falling, rising = map(float, limits)
         if not lower <= rest <= upper:
             return f"the bounds of input {signal.name} must hold its rest, {rest:g} {signal.unit}, or it could not be stopped, got {[lower, upper]}"
         if not falling < 0.0 < rising:
             return f"the increments of input {signal.name} must hold lower < 0 < upper, or it could not be stopped, got {[falling, rising]}"
+    return ""
+
+
+def where(wrong: NDArray[np.bool_], lower: Array, upper: Array) -> str:
+    """Write the bounds that are wrong, those of the first row where there are several; empty if none are."""
+    if not np.any(wrong):
+        return ""
+    if wrong.ndim == 1:
+        return f"{lower} and {upper}"
+    k = int(np.argmax(wrong.any(axis=1)))
+    return f"{lower[k]} and {upper[k]} in row {k}"
+
+
+def pace_fault(ocp: Ocp) -> str:
+    """Return which inputs of the first block could not reach the bounds of all others in turn, inside their increments; empty if all can."""
+    if ocp.lbu.ndim == 1:
+        return ""
+    falling, rising = (np.broadcast_to(bound, ocp.lbu.shape) for bound in (ocp.lbdu, ocp.ubdu))
+    low, high = ocp.lbu[-1], ocp.ubu[-1]
+    for k in reversed(range(ocp.N_u - 1)):  # those from which the bounds after block k can be kept
+        low, high = np.maximum(ocp.lbu[k], low - rising[k + 1]), np.minimum(ocp.ubu[k], high - falling[k + 1])
+    for j, signal in enumerate(ocp.model.inputs):
+        if low[j] > ocp.lbu[0, j] or high[j] < ocp.ubu[0, j]:
+            first, able = (f"[{least[j]:g}, {most[j]:g}]" for least, most in ((ocp.lbu[0], ocp.ubu[0]), (low, high)))
+            told = f"from anywhere in those of the first, {first}, inside its increments"
+            return f"bounds of input {signal.name} must be reached in every block {told}, got bounds that can be reached from {able} alone"
     return ""
 
 
@@ -383,17 +444,17 @@ WEIGHTS_AND_BOUNDS: dict[str, tuple[Any, ...]] = {
     "R": (weight_matrix, "nu"),
     "delta": (weights, "N", "N", "ny"),
     "lambda_": (weights, "N_u", "N_u", "nu"),
-    "lbu": (bound, "nu"),
-    "ubu": (bound, "nu"),
-    "lbdu": (bound, "nu"),
-    "ubdu": (bound, "nu"),
-    "lbx": (bound, "nx"),
-    "ubx": (bound, "nx"),
+    "lbu": (bound, "nu", "N_u", "nu"),
+    "ubu": (bound, "nu", "N_u", "nu"),
+    "lbdu": (bound, "nu", "N_u", "nu"),
+    "ubdu": (bound, "nu", "N_u", "nu"),
+    "lbx": (bound, "nx", "N", "nx"),
+    "ubx": (bound, "nx", "N", "nx"),
     "z": (weights, "nx"),
     "Z": (weights, "nx"),
     "Q_e": (weight_matrix, "ny"),
-    "lh": (bound, "nh"),
-    "uh": (bound, "nh"),
+    "lh": (bound, "nh", "N", "nh"),
+    "uh": (bound, "nh", "N", "nh"),
     "zh": (weights, "nh"),
     "Zh": (weights, "nh"),
     "lbx_e": (bound, "nx"),

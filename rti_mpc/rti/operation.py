@@ -37,8 +37,8 @@ def states_of_operation(ocp: Ocp, count: int, seed: int = 1) -> tuple[Array, Arr
     """
     model, rng, is_regular = ocp.model, np.random.default_rng(seed), regular(ocp)
     nominal, rest = nominal_state(ocp), np.array(model.u_rest)
-    lowest, highest = around(ocp.lbx, ocp.ubx, nominal)
-    low_u, high_u = around(ocp.lbu, ocp.ubu, rest)
+    lowest, highest = around(ocp.widest("lbx"), ocp.widest("ubx"), nominal)
+    low_u, high_u = around(ocp.widest("lbu"), ocp.widest("ubu"), rest)
     ends = np.concatenate([lowest, low_u]), np.concatenate([highest, high_u])
     found: list[Array] = []
     drawn = [*corners(*ends, rng, count // 4), *rng.uniform(*ends, size=(count - count // 4 - 2, model.nx + model.nu))]

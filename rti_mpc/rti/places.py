@@ -21,8 +21,8 @@ import numpy as np
 
 from rti_mpc.codegen import function
 from rti_mpc.rti import interior_point
-from rti_mpc.rti.blocks import all_inputs, moved_on, repeated
-from rti_mpc.rti.linearization import Forms, Linearization, change, divided, shift
+from rti_mpc.rti.blocks import all_inputs, at_each, moved_on, repeated
+from rti_mpc.rti.linearization import Forms, Linearization, change, divided, partly, shift, where_bounded
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.recursion import recur
@@ -95,7 +95,11 @@ def places(ocp: Ocp) -> Places:
     at = Sample(lin, lin.forms_in(stages), found, Rows(*divided(flat, kinds)))
 
     x, u = shift(ocp)(lin.x, lin.u, lin.p)
-    moved = ca.veccat(*(moved_on(kind, ocp.blocks) for kind in (at.place.u, at.place.du)), ca.horzcat(at.place.g[:, 1:], at.place.g[:, -1]))
+    rows = *(moved_on(kind, ocp.blocks) for kind in (at.place.u, at.place.du)), ca.horzcat(at.place.g[:, 1:], at.place.g[:, -1])
+    bounds = (ocp.lbu, ocp.ubu), (ocp.lbdu, ocp.ubdu), (ocp.lg, ocp.ug)
+    moved = ca.veccat(
+        *(where_bounded(row, *pair) if partly(pair[0]).any() or partly(pair[1]).any() else row for row, pair in zip(rows, bounds, strict=True))
+    )
     linearized = linearize(**(lin.arguments | {"x": x, "u": u}))["stages"]
     advance = {"x_next": x, "u_next": u, "places_next": moved, "stages": linearized}
 
@@ -118,7 +122,7 @@ def places(ocp: Ocp) -> Places:
 
 def penalties(ocp: Ocp, at: Sample) -> tuple[Rows, Rows]:
     """Return the weight and the pull of each row, which follow from its place."""
-    lin, w, nu, ng = at.lin, at.lin.w, ocp.model.nu, len(ocp.lg)
+    lin, w, nu, ng = at.lin, at.lin.w, ocp.model.nu, ocp.ng
     place, value, lower, upper, weight = (ca.SX.sym(name, nu) for name in ("place", "value", "lower", "upper", "weight"))
     held = ca.Function("hold", [place, value, lower, upper, weight], [*hold(place, value, lower, upper, weight)]).map(ocp.N_u)
     place, value, lower, upper, weight, z, Z = (ca.SX.sym(name, ng) for name in ("place", "value", "lower", "upper", "weight", "z", "Z"))
@@ -128,7 +132,7 @@ def penalties(ocp: Ocp, at: Sample) -> tuple[Rows, Rows]:
     softened = ca.Function("hold_softened", [place, value, lower, upper, weight, z, Z], [weighs + beyond * Z / 2, pulls]).map(ocp.N)
 
     def of_all(*rows: ca.MX, times: int) -> list[ca.MX]:
-        return [ca.repmat(row, 1, times) for row in rows]
+        return [at_each(row, times) for row in rows]
 
     stiff_u = PENALTY / lin.scale_u**2
     weight_u, pull_u = held(at.place.u, lin.u, *of_all(w["lbu"], w["ubu"], stiff_u, times=ocp.N_u))
@@ -159,7 +163,7 @@ def roll_out(ocp: Ocp, at: Sample, x0: ca.MX) -> dict[str, ca.MX]:
     carried = {"s": "s_after", "slip": "slip_after", "verdict": "verdict_after", "before": "u_plan"}
     outputs = ["x_plan", "u_plan", "verdict_after", "place_u_found", "place_du_found", "place_g_found", "force", "paid"]
     rolling = repeated(roll_free(ocp, lin), roll_held(ocp, lin), ocp.blocks)
-    along = recur("rolled_out", rolling, carried, outputs, shared=[*limits, *bounds])(
+    along = recur("rolled_out", rolling, carried, outputs, shared=[name for name, e in (limits | bounds).items() if e.size2() == 1])(
         A=forms.A,
         B=forms.B,
         b=forms.b,
@@ -228,9 +232,10 @@ def softened_rows(ocp: Ocp, of: Stage, s: ca.SX, slip: ca.SX, du: ca.SX, slipped
     value = g + of.G @ end
     planned = value + of.G @ ca.vertcat(drift, slipped)
     found, paid = ca.SX(of.ng, 1), ca.SX(of.ng, 1)
+    lb, ub = ocp.tightest("lg"), ocp.tightest("ug")
     for j in range(of.ng):
-        over, under = excess_of(value[j], lg[j], ug[j], ocp.lg[j], ocp.ug[j])
-        exceeds = ca.fmax(*excess_of(planned[j], lg[j], ug[j], ocp.lg[j], ocp.ug[j]))
+        over, under = excess_of(value[j], lg[j], ug[j], lb[j], ub[j])
+        exceeds = ca.fmax(*excess_of(planned[j], lg[j], ug[j], lb[j], ub[j]))
         worst, share = ca.fmax(worst, exceeds), ca.fmax(share, exceeds / scale_g[j])
         found[j] = new_place(place_g[j], stiff_g[j], scale_g[j], over, under, zg[j] / 2)
         changes += found[j] != place_g[j]
@@ -271,8 +276,8 @@ def roll_free(ocp: Ocp, lin: Linearization) -> ca.Function:
         return ca.densify(ca.vertcat(*now))
 
     planned = increment + du - s[of.nx :]
-    outputs["place_u_found"] = placed(u + du, place_u, lbu, ubu, ocp.lbu, ocp.ubu)
-    outputs["place_du_found"] = placed(planned, place_du, lbdu, ubdu, ocp.lbdu, ocp.ubdu)
+    outputs["place_u_found"] = placed(u + du, place_u, lbu, ubu, ocp.tightest("lbu"), ocp.tightest("ubu"))
+    outputs["place_du_found"] = placed(planned, place_du, lbdu, ubdu, ocp.tightest("lbdu"), ocp.tightest("ubdu"))
     verdict[0] += ca.sum1(outputs["place_u_found"] != place_u)
     verdict[0] += ca.sum1(outputs["place_du_found"] != place_du)
     outputs["force"] = ca.densify(stiff * (ca.fabs(place_du) == 1) * (planned - ca.if_else(place_du > 0, ubdu, lbdu)))
@@ -313,7 +318,7 @@ def refine(
     du = u_plan - lin.u
     values = forms.g + softened_steps(ocp, lin).map(N)(forms.g_x, forms.g_u, x_plan[:, 1:] - lin.x[:, 1:], all_inputs(du, ocp.blocks))
     weight = ca.repmat(PENALTY / lin.scale_g**2, 1, N) * (ca.fabs(place.g) == 1)
-    lower, upper = (ca.repmat(e, 1, N) for e in (lin.lg, lin.ug))
+    lower, upper = (at_each(e, N) for e in (lin.lg, lin.ug))
     excess = values - ca.if_else(place.g > 0, upper, lower)
     zero = ca.MX.zeros(nu, N_u)
     _, rows = recursion.response(stages, at.gains, Rows(r * (place.u == 0), zero, weight * excess))
@@ -326,7 +331,7 @@ def refine(
     amending = repeated(amend_free(lin, nu), amend_held(lin, nu), ocp.blocks)
     carried = {"before": "u_refined", "du": "du_after", "dx": "dx_after"}
     bounds = {name: w[name] for name in ("lbu", "ubu", "lbdu", "ubdu")}
-    amended = recur("amended", amending, carried, ["x_refined", "u_refined"], shared=[*bounds])(
+    amended = recur("amended", amending, carried, ["x_refined", "u_refined"], shared=[name for name, e in bounds.items() if e.size2() == 1])(
         A=forms.A,
         B=forms.B,
         x_plan=x_plan[:, 1:],

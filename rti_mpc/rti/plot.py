@@ -80,7 +80,7 @@ def draw_output(axes: Axes, run: Simulation, i: int) -> None:
 def draw_input(axes: Axes, run: Simulation, i: int) -> None:
     """Draw an input as the steps it is, between its bounds."""
     signal, ocp = run.ocp.model.inputs[i], run.ocp
-    for bound in (ocp.lbu[i], ocp.ubu[i]):
+    for bound in (ocp.widest("lbu")[i], ocp.widest("ubu")[i]):
         if np.isfinite(bound):
             axes.axhline(bound, color=BOUND, linewidth=1.0, linestyle="--")
     axes.step(run.t, np.append(run.u[:, i], run.u[-1, i]), where="post", color=INPUT)

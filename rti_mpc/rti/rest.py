@@ -75,10 +75,10 @@ def motion_at_rest(ocp: Ocp) -> str:
     model, rng = ocp.model, np.random.default_rng(1)
     u_rest: Array = np.array(model.u_rest)
     move, rate, is_regular = motion(model), derivative(model), regular(ocp)
-    inputs = list(corners(*around(ocp.lbu, ocp.ubu, u_rest), rng))
-    start = np.clip(nominal_state(ocp), ocp.lbx, ocp.ubx)
-    lowest, highest = around(ocp.lbx, ocp.ubx, start)
-    states = [np.clip(move(start, u, DRIVEN_S), ocp.lbx, ocp.ubx) for u in inputs]
+    inputs = list(corners(*around(ocp.widest("lbu"), ocp.widest("ubu"), u_rest), rng))
+    start = np.clip(nominal_state(ocp), ocp.widest("lbx"), ocp.widest("ubx"))
+    lowest, highest = around(ocp.widest("lbx"), ocp.widest("ubx"), start)
+    states = [np.clip(move(start, u, DRIVEN_S), ocp.widest("lbx"), ocp.widest("ubx")) for u in inputs]
     states += [rng.uniform(lowest, highest) for _ in range(SEEDED_STATES)]
     states = [start, *(x for x in states if is_regular(x, u_rest))]
     rates = np.abs([rate(x, u) for x in states for u in (*inputs, u_rest)])
@@ -324,9 +324,10 @@ def ramps(ocp: Ocp, starts: Starts) -> Ways:
     model, (X, U, P) = ocp.model, starts
     rest, rows = np.array(model.u_rest), max(2, math.ceil(SETTLING_S / ocp.dt))
     phi = integrator(model, substeps=4 if model.dt is None else 1)
+    falling, rising = ocp.widest("lbdu"), ocp.widest("ubdu")
     u, states, inputs, x = U, [], [], X
     for _ in range(rows):
-        u = u + np.clip(rest - u, ocp.lbdu, ocp.ubdu)
+        u = u + np.clip(rest - u, falling, rising)
         states.append(x)
         inputs.append(u)
         x = np.array(phi(x.T, u.T, P.T, ocp.dt)).T
@@ -349,6 +350,7 @@ def played(ocp: Ocp, law: StopLaw, ways: Ways, starts: Starts, feedback: float, 
         Rates of the states in the end, shape ``(n, nx)``.
     """
     model, U, p = ocp.model, starts.u, starts.p.T
+    lbu, ubu, lbdu, ubdu = (ocp.widest(name) for name in ("lbu", "ubu", "lbdu", "ubdu"))
     phi = integrator(model, substeps=law.substeps)
     rows_late, late_s = divmod(DELAY_S, law.period_s)
     x, before = ways.x[:, 0], U
@@ -356,7 +358,7 @@ def played(ocp: Ocp, law: StopLaw, ways: Ways, starts: Starts, feedback: float, 
     for i in range(law.rows + math.ceil(STANDING_S / law.period_s)):
         row = min(i, law.rows - 1)
         u = ways.u[:, row] - feedback * np.einsum("nij,nj->ni", ways.K, x - ways.x[:, row])
-        u = np.clip(np.clip(u, ocp.lbu, ocp.ubu), before + ocp.lbdu, before + ocp.ubdu)
+        u = np.clip(np.clip(u, lbu, ubu), before + lbdu, before + ubdu)
         before, past = u, [*past[1:], u]
         for acting, span_s in ((past[0], late_s), (past[1], law.period_s - late_s)):
             x = np.array(phi(x.T, answer * acting.T, p, span_s)).T

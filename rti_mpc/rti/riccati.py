@@ -141,7 +141,7 @@ class Stage:
 
     def __init__(self, ocp: Ocp, lin: Linearization) -> None:
         nx, nu = ocp.model.nx, ocp.model.nu
-        self.nx, self.nu, self.n, self.ng = nx, nu, nx + nu, len(ocp.lg)
+        self.nx, self.nu, self.n, self.ng = nx, nu, nx + nu, ocp.ng
         patterns = {"A": lin.A_k, "B": lin.B_k, "H": lin.H_i, "g_x": lin.G_x, "g_u": lin.G_u}
         nz = {name: ca.SX.sym(name, pattern.nnz()) for name, pattern in patterns.items()}
         self.A, self.B, self.H, G_x, G_u = (ca.SX(pattern, nz[name]) for name, pattern in patterns.items())

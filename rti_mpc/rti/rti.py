@@ -134,7 +134,7 @@ class Rti:
         self._change = change.data
         # OSQP knows no infinity but its own.
         self._weights = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS_AND_BOUNDS}
-        self.scale: Array = np.ones(model.nx + model.nu + len(ocp.lg))
+        self.scale: Array = np.ones(model.nx + model.nu + ocp.ng)
         self.guess = Guess(
             sample={"x": x, "u": u, "u_prev": self.u_prev, "y_ref": self.y_ref, "p": self.p},
             weights=self._weights | {"scale": self.scale},
@@ -144,7 +144,7 @@ class Rti:
 
         make = built.make
         self.advance = bind(make(built.shift), {"x": self.x, "u": self.u, "p": self.p}, {"x_next": x, "u_next": u})
-        bounds = self._weights["lbx"], self._weights["ubx"]
+        bounds = np.atleast_2d(self._weights["lbx"])[0], np.atleast_2d(self._weights["ubx"])[0]
         self._turns = Turns(ocp, (make(built.output), make(built.steps)), x, self.x0, self.y_ref, self.p, bounds)
         self._cost: Array = np.zeros(1)
         self.evaluate = bind(make(built.cost), self.guess.arguments | {"x": self.x, "u": self.u}, {"cost": self._cost})

@@ -49,20 +49,20 @@ def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
     curvature = np.einsum("kai,kab,kbi->i", seen, H, seen) + ocp.lambda_.sum(axis=0) * np.diag(ocp.R) + ocp.N_u * np.atleast_2d(ocp.R_u).mean(axis=0)
 
     reach_u = first(
-        half(ocp.lbu, ocp.ubu),
-        half(ocp.lbdu, ocp.ubdu) * ocp.N_u,
-        beyond(ocp.lbu, ocp.ubu, np.array(model.u_rest)),
+        half(ocp.widest("lbu"), ocp.widest("ubu")),
+        half(ocp.widest("lbdu"), ocp.widest("ubdu")) * ocp.N_u,
+        beyond(ocp.widest("lbu"), ocp.widest("ubu"), np.array(model.u_rest)),
         1.0 / np.sqrt(curvature),
     )
     reach = shared(np.abs(response * reach_u).sum(axis=2).max(axis=0), [state.unit for state in model.states])
-    scale_x = first(half(ocp.lbx, ocp.ubx), reach, beyond(ocp.lbx, ocp.ubx, np.zeros(model.nx)))
+    scale_x = first(half(ocp.widest("lbx"), ocp.widest("ubx")), reach, beyond(ocp.widest("lbx"), ocp.widest("ubx"), np.zeros(model.nx)))
 
     constraint, G_x, G_u = constraints(ocp)
-    ng = len(ocp.lg)
+    ng = ocp.ng
     columns = np.array(constraint.map(N)(x[1:].T, held.T, p[1:].T)).reshape(-1, N)[ng:]
     by_x, by_u = dense(G_x, columns[: G_x.nnz()]), dense(G_u, columns[G_x.nnz() :])
     reach_g = np.abs((by_x @ response + by_u) * reach_u).sum(axis=2).max(axis=0, initial=0.0)
-    scale_g = first(half(ocp.lg, ocp.ug), reach_g, beyond(ocp.lg, ocp.ug, np.zeros(ng)))
+    scale_g = first(half(ocp.widest("lg"), ocp.widest("ug")), reach_g, beyond(ocp.widest("lg"), ocp.widest("ug"), np.zeros(ng)))
     scale_g[: len(ocp.soft)], scale_g[ocp.ng_path :] = scale_x[list(ocp.soft)], scale_x[list(ocp.soft_e)]
     return np.concatenate([scale_x, reach_u, scale_g])
 

@@ -82,7 +82,7 @@ class Simulation:
     def summary(self) -> dict[str, float]:
         """Return closed-loop cost, largest error of each output in the second half, largest excess of a bound on states, and unusable samples."""
         settled = np.abs(self.error[int(SETTLED_SHARE * len(self.t)) :]).max(axis=0)
-        excess = np.maximum(self.x[1:] - self.ocp.ubx, self.ocp.lbx - self.x[1:])
+        excess = np.maximum(self.x[1:] - self.ocp.widest("ubx"), self.ocp.widest("lbx") - self.x[1:])
         return {
             "cost": self.cost,
             **{f"{signal.name} off by [{signal.unit}]": float(value) for signal, value in zip(self.ocp.model.outputs, settled, strict=True)},

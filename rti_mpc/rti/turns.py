@@ -61,7 +61,7 @@ class Turns:
         self._output = bind(output, {"x": x0, "p": p[0]}, {"y": y})
         self._states = [j for j, signal in enumerate(model.states) if signal.angle]
         self._outputs = [j for j, signal in enumerate(model.outputs) if signal.angle]
-        self._bounded = [j for j in self._states if ocp.ubx[j] - ocp.lbx[j] <= math.tau]
+        self._bounded = [j for j in self._states if bounds[1][j] - bounds[0][j] <= math.tau]
         largest: Array = np.zeros(len(self._outputs))
         self._largest = largest.data
         self._measure = bind(steps, {"y_ref": y_ref}, {"largest": largest})

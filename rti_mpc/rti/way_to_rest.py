@@ -116,7 +116,7 @@ class WayToRest:
         self.K: Array = np.zeros((nu, nx))
         self.x_e, self.u_e = np.zeros(nx), np.array(model.u_rest)
         self._u_rest: Array = np.array(model.u_rest)
-        limits = {name: np.array(getattr(ocp, name)) for name in LIMITS} if limits is None else limits
+        limits = {name: ocp.widest(name) for name in LIMITS} if limits is None else limits
         self._limits = {name: limits[name] for name in LIMITS}
         self._start, self._near = np.zeros(nx), (np.zeros(nx), np.zeros(nu))
         self._reach = np.zeros((2, nu)), np.zeros((2, nu))

@@ -21,7 +21,7 @@ def controller_info(ocp: Ocp, np_: int) -> dict[str, Any]:
         "version": rti_mpc.__version__,
         "model": ocp.model.name,
         **info.labels(model.counterparts(), **vectors),
-        **info.bounds(**{name: getattr(ocp, name).tolist() for name in limits}),
+        **info.bounds(**{name: ocp.widest(name).tolist() for name in limits}),
         "p_nominal": list(model.p_nominal[:np_]),
         **info.weights(Q=ocp.Q.tolist(), R=ocp.R.tolist(), delta=ocp.delta.tolist(), lambda_=ocp.lambda_[ocp.held].tolist()),
         **info.obstacles(discs_of(model)),

@@ -53,6 +53,21 @@ def test_any_plan_comes_out_inside(blocks: list[int]) -> None:
             assert np.all(np.abs(rows[1] - acting) <= (1 + 1e-14) * STEP)
 
 
+def test_fresh_plan_obeys_the_bounds_of_its_stages_and_what_replaces_it_the_widest() -> None:
+    ubu = np.column_stack([np.linspace(0.5, 0.1, 8), np.full(8, 0.7)])
+    lbdu = np.column_stack([np.linspace(-0.25, -0.1, 8), np.full(8, -0.4)])
+    envelope = Envelope(pioneer(N=8, ubu=ubu, lbdu=lbdu), compile=False)
+    rows = envelope.fit(np.full((8, 2), 0.6), around(np.full(2, 0.4)))
+    np.testing.assert_allclose(rows[:, 0], ubu[:, 0], rtol=0, atol=1e-15)
+    falling = envelope.fit(np.linspace([0.5, 0.7], [-5.0, 0.7], 8), around(np.full(2, 0.5)))
+    assert np.all(np.diff(falling[:, 0]) >= lbdu[1:, 0] - 1e-15)
+    shifted = envelope.refit(np.full((8, 2), 0.5), 2, around(np.full(2, 0.4)))
+    np.testing.assert_array_equal(shifted[:, 0], 0.5)
+    envelope.take("ubu", ubu - 0.05)
+    np.testing.assert_allclose(envelope.limits["ubu"], [0.45, 0.65], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(envelope.fit(np.full((8, 2), 0.6), around(np.full(2, 0.4)))[:, 0], ubu[:, 0] - 0.05, rtol=0, atol=1e-15)
+
+
 def test_ramp_goes_to_rest_as_fast_as_it_may(envelope: Envelope) -> None:
     rows = envelope.ramp(around(np.array([0.5, -0.3])))
     np.testing.assert_allclose(rows[:, 0], [0.25, 0.25, 0, 0, 0, 0, 0, 0])  # the second row not before the first has surely arrived

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
+from rti_mpc.control.envelope import Envelope
 from rti_mpc.control.tuning import Tuning
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.construction import FORMULATIONS
@@ -121,6 +122,30 @@ def test_bound_below_the_present_input_is_approached_within_the_slew_limits_old_
     reached = int(np.argmax(after[:, 0] <= 0.1 + 1e-12))
     assert reached == np.ceil((before[-1, 0] - 0.1) / 0.06) - 1, "no slower than the limits allow"
     assert after[reached:, 0].max() <= 0.1 + 1e-12
+
+
+def test_bounds_by_stage_yield_to_an_input_outside_those_of_the_first_and_come_back_as_fast_as_it_may() -> None:
+    """Such an input is left by a plan that was sent again, whose later rows had wider bounds."""
+    ubu = np.column_stack([[0.1, 0.1, 0.3, 0.3, 0.5, 0.5, 0.5], np.full(7, 0.745)])
+    rti = Rti(pioneer(ubu=ubu), compile=False)
+    envelope = Envelope(rti.ocp, compile=False)
+    tuning = Tuning(rti, envelope)
+    rti.reset(np.zeros(5), np.array([0.45, 0.0]))
+    rti.u[0] = rti.u_prev
+    sent = drive(rti, tuning, 1)
+    np.testing.assert_allclose(envelope.bounds["ubu"][:3, 0], [0.2, 0.1, 0.3], rtol=0, atol=1e-12)
+    sent = np.vstack([[0.45, 0.0], sent, drive(rti, tuning, 6)])
+    np.testing.assert_allclose(sent[:3, 0], [0.45, 0.2, 0.1], rtol=0, atol=1e-9)
+    assert sent[2:, 0].max() <= 0.1 + 1e-12
+    np.testing.assert_array_equal(envelope.bounds["ubu"], ubu)
+
+
+def test_weights_and_bounds_keep_their_shape() -> None:
+    tuning = Tuning(Rti(pioneer(), compile=False))
+    with pytest.raises(
+        OcpError, match=r"lbu must keep its shape \(2,\), got \(7, 2\): whether it differs from stage to stage is part of the compiled"
+    ):
+        tuning.change(pioneer(ubu=[[0.4, 0.7]] * 7), 1)
 
 
 def test_first_increment_keeps_the_old_slew_limits_and_the_next_the_new_ones() -> None:

@@ -100,11 +100,33 @@ def test_plan_in_blocks_is_moved_on_as_each_block_begins_a_stage_later() -> None
         ({"ubu": [np.nan, 1.0]}, "ubu must not be NaN"),
         ({"lbdu": 0.1}, "lbdu <= 0 <= ubdu must hold, or no input could be kept"),
         ({"lbx": [0.0, 0.0]}, r"lbx must be a number or have shape \(5,\)"),
+        ({"lbx": np.zeros((8, 5))}, r"lbx must be a number or have shape \(5,\), or \(7, 5\), a row per stage, got shape \(8, 5\)"),
+        ({"N_u": 3, "ubu": np.ones((7, 2))}, r"ubu must be a number or have shape \(2,\), or \(3, 2\), a row per stage, got shape \(7, 2\)"),
+        ({"ubu": [[1.0, 1.0]] * 4 + [[0.5, -0.8]] * 3}, r"lbu must not lie above ubu, got \[-0.5   -0.745\] and \[ 0.5 -0.8\] in row 4"),
+        ({"ubx": [[INF, INF, INF, -0.5, 0.745]] * 7}, "lbx must lie below ubx, got .* in row 0"),
+        ({"lbdu": [[-0.1, 0.1]] * 7}, "lbdu <= 0 <= ubdu must hold, .* in row 0"),
+        (
+            {"ubu": [[0.5, 0.7]] * 6 + [[-0.4, 0.7]], "lbdu": -0.1},
+            r"bounds of input u_c must be reached in every block from anywhere .* from \[-0.5, 0.2\] alone",
+        ),
     ],
 )
 def test_argument_that_does_not_fit_is_refused_by_name(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(OcpError, match=message):
         pioneer(**changes)
+
+
+def test_bounds_by_stage_have_rows_on_both_sides_and_a_widest_and_a_tightest_one() -> None:
+    ocp = pioneer(ubu=[[0.5, INF]] * 3 + [[0.4, 0.2]] * 4, lbdu=-INF)
+    assert ocp.lbu.shape == ocp.ubu.shape == (7, 2)
+    assert not ocp.lbu.flags.writeable
+    np.testing.assert_array_equal(ocp.widest("ubu"), [0.5, INF])
+    np.testing.assert_array_equal(ocp.tightest("ubu"), [0.4, 0.2])
+    np.testing.assert_array_equal(ocp.widest("lbu"), ocp.tightest("lbu"))
+    np.testing.assert_array_equal(ocp.retuned(ubu=[0.3, 0.3]).ubu, [[0.3, 0.3]] * 7)
+    by_node = pioneer(lbx=[[-INF] * 3 + [-0.5, -INF]] * 6 + [[-INF] * 3 + [-0.3, -0.7]], ubx=INF)
+    assert by_node.soft == (3, 4)
+    assert by_node.lg.shape == by_node.ug.shape == (7, 2)
 
 
 def test_bounds_that_leave_out_a_declared_rest_are_refused_with_the_input_and_its_rest() -> None:

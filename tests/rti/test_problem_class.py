@@ -64,6 +64,28 @@ def felt_car(**changes: Any) -> Ocp:
 
 COUPLED = np.array([[0.2, 0.08], [0.08, 0.1]])
 CHANGING = np.column_stack([np.linspace(0.2, 3, 8), [2, 0, 1, 0.5, 0, 4, 0.3, 1]])
+NONE = np.inf
+FALLING = np.array([0.06, 0.05, NONE, 0.04, 0.03, NONE, NONE, 0.02])
+NARROWING = {
+    "lbu": np.column_stack([np.linspace(-0.5, -0.3, 8), np.full(8, -0.8)]),
+    "ubu": np.column_stack([np.linspace(0.5, 0.3, 8), np.full(8, 0.8)]),
+    "lbdu": np.column_stack([np.linspace(-0.25, -0.1, 8), np.full(8, -0.4)]),
+}
+AT_SOME_STAGES = {
+    "lbu": np.column_stack([np.full(8, -0.5), [-NONE, -0.8, -NONE, -0.4, -0.4, -0.4, -0.4, -0.4]]),
+    "ubu": np.column_stack([[0.5, NONE, NONE, 0.3, 0.3, 0.3, 0.3, NONE], np.full(8, 0.8)]),
+    "lbdu": -NONE,
+    "ubdu": np.column_stack([[NONE, NONE, 0.2, 0.2, 0.2, 0.2, NONE, 0.2], np.full(8, NONE)]),
+}
+SLOWING = {"ubx": np.column_stack([np.full((8, 3), NONE), [NONE, NONE, 0.35, 0.3, NONE, 0.25, 0.3, 0.2]])}
+
+
+def pulled_car(**changes: Any) -> Ocp:
+    """The same car, whose sideways acceleration is bounded, a constraint of states and inputs."""
+    ocp = sampled_car()
+    given = {"model": ocp.model, "lbx": ocp.lbx, "ubx": ocp.ubx, "h_expr": ocp.model.x[3] * ocp.model.u[1]}
+    return Ocp(**LIMITS | given | changes)
+
 
 PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "implicit integrator": lambda: lagging_car(method="irk"),
@@ -87,6 +109,11 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "weights of increments by stage": lambda: sampled_car(R=COUPLED, lambda_=CHANGING),
     "weights of increments and of inputs by block": lambda: sampled_car(blocks=[1, 1, 2, 4], R=COUPLED, lambda_=CHANGING[::2], R_u=CHANGING[::-2]),
     "weights of increments and of inputs by stage, outputs of inputs": lambda: felt_car(N_u=3, lambda_=CHANGING[:3], R_u=0.02 * CHANGING[3:6]),
+    "bounds of inputs and increments by stage": lambda: sampled_car(**NARROWING),
+    "bounds of states and increments by block and stage": lambda: sampled_car(blocks=[1, 1, 2, 4], lbdu=NARROWING["lbdu"][::2], **SLOWING),
+    "bounds at some stages alone": lambda: sampled_car(**AT_SOME_STAGES, **SLOWING),
+    "bounds of a constraint by stage, held inputs": lambda: pulled_car(N_u=3, lh=np.array([[-NONE]] * 4 + [[-0.02]] * 4), uh=FALLING[:, None]),
+    "bounds of states and a constraint by stage, a terminal set": lambda: pulled_car(uh=FALLING[:, None], ubx_e=[NONE] * 3 + [0.1], **SLOWING),
     "fixed input": lambda: sampled_car(lbu=[-0.5, 0.3], ubu=[0.5, 0.3], lbdu=-np.inf, ubdu=np.inf),
     "terminal set": lambda: sampled_car(lbx_e=[-np.inf] * 3 + [-0.05], ubx_e=[np.inf] * 3 + [0.02]),
     "terminal set, from above alone, held inputs": lambda: sampled_car(ubx_e=[np.inf] * 3 + [0.05], N_u=3, z=[1.0] * 4, Z=[0.0] * 4),

@@ -22,13 +22,14 @@ from rti_mpc.rti.certificate import certificate
 from rti_mpc.rti.dense import LEAST_SIZE
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 from rti_mpc.rti.places import places
+from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.recursion import recur
 from rti_mpc.rti.rti import Rti
 
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler on this machine")
 
 
-def problem(nx: int, nu: int, N: int, within: int | list[int], *, softened: bool = True, of_inputs: bool = False) -> Ocp:
+def problem(nx: int, nu: int, N: int, within: int | list[int], *, softened: bool = True, of_inputs: bool = False, by_stage: bool = False) -> Ocp:
     """
     A model with a sparse Jacobian, weights that are full matrices, and two states and an expression of states and inputs softly bounded.
 
@@ -53,12 +54,20 @@ def problem(nx: int, nu: int, N: int, within: int | list[int], *, softened: bool
         "lambda_": rng.uniform(0.5, 2.0, len(within) if isinstance(within, list) else within),
     }
     weights |= {"blocks": within} if isinstance(within, list) else {"N_u": within}
-    return Ocp(model, N=N, dt=0.05, method="euler", **weights, lbu=-1.0, ubu=1.0, lbdu=-0.3, ubdu=0.3, **given)
+    bounds: dict[str, Any] = {"lbu": -1.0, "ubu": 1.0, "lbdu": -0.3, "ubdu": 0.3}
+    if by_stage:
+        N_u = len(weights["lambda_"])
+        weights |= {"lambda_": rng.uniform(0.5, 2.0, (N_u, nu)), "R_u": rng.uniform(0.5, 2.0, (N_u, nu))}
+        bounds |= {"ubu": rng.uniform(0.8, 1.0, (N_u, nu)), "lbdu": rng.uniform(-0.4, -0.3, (N_u, nu))}
+        given |= {"ubx": room * rng.uniform(0.5, 1.0, (N, 1)), "uh": rng.choice([0.5, np.inf], (N, 1))}
+    return Ocp(model, N=N, dt=0.05, method="euler", **weights, **bounds, **given)
 
 
 def arguments(of: ca.Function, ocp: Ocp, rng: np.random.Generator, known: dict[str, ca.DM]) -> dict[str, ca.DM]:
     """Numbers for a function of the solver: the problem's weights and bounds, what is known, and random ones."""
-    fixed = {name: getattr(ocp, name) for name in WEIGHTS_AND_BOUNDS} | {"scale": np.ones(of.size1_in("scale"))} | known
+    fixed = (
+        {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY).T for name in WEIGHTS_AND_BOUNDS} | {"scale": np.ones(of.size1_in("scale"))} | known
+    )
     return {name: ca.DM(fixed[name]) if name in fixed else ca.DM(rng.normal(size=of.size_in(name))) for name in of.name_in()}
 
 
@@ -75,27 +84,29 @@ def assert_equal(of: ca.Function, fast: ca.Function, given: dict[str, ca.DM]) ->
 
 @needs_compiler
 @pytest.mark.parametrize(
-    ("nx", "nu", "N", "within", "softened"),
+    ("nx", "nu", "N", "within", "softened", "by_stage"),
     [
-        (3, 2, 5, 2, True),
-        (LEAST_SIZE - 2, 2, 4, 3, True),
-        (3, 2, 6, [1, 2, 1, 2], True),
+        (3, 2, 5, 2, True, False),
+        (LEAST_SIZE - 2, 2, 4, 3, True, False),
+        (3, 2, 6, [1, 2, 1, 2], True, False),
+        (3, 2, 5, 2, True, True),
         *(
             pytest.param(*shape, marks=pytest.mark.slow)
             for shape in (
-                (3, 2, 5, 5, True),
-                (2, 1, 1, 1, True),
-                (13, 4, 3, 3, True),
-                (21, 3, 2, 1, True),
-                (30, 1, 2, 2, False),
-                (13, 4, 6, [2, 1, 3], True),
+                (3, 2, 5, 5, True, False),
+                (2, 1, 1, 1, True, False),
+                (13, 4, 3, 3, True, False),
+                (21, 3, 2, 1, True, False),
+                (30, 1, 2, 2, False, False),
+                (13, 4, 6, [2, 1, 3], True, False),
+                (13, 4, 6, [2, 1, 3], True, True),
             )
         ),
     ],
 )
-def test_compiled_recursions_equal_the_expressions(nx: int, nu: int, N: int, within: int | list[int], softened: bool) -> None:
-    """Of few states as scalars, of many as dense columns; with held inputs, blocks, full weights, outputs of inputs, no softened bounds at all."""
-    ocp = problem(nx, nu, N, within, softened=softened, of_inputs=nx >= LEAST_SIZE - 2)
+def test_compiled_recursions_equal_the_expressions(nx: int, nu: int, N: int, within: int | list[int], softened: bool, by_stage: bool) -> None:
+    """Of few states as scalars, of many as dense columns; held inputs, blocks, full weights, outputs of inputs, rows by stage, no softened bounds."""
+    ocp = problem(nx, nu, N, within, softened=softened, of_inputs=nx >= LEAST_SIZE - 2, by_stage=by_stage)
     rng, functions, judged = np.random.default_rng(5), places(ocp), certificate(ocp)
     fast = compiled(functions.gains, functions.roll_out, functions.refine, judged)
     known = {"stages": functions.linearize(**arguments(functions.linearize, ocp, rng, {}))["stages"]}

@@ -130,7 +130,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
     lin = Linearization(ocp)
     condensed = Condensing(ocp, lin)
     N, N_u, nu = ocp.N, ocp.N_u, ocp.model.nu
-    ng = len(ocp.lg) if softened else 0
+    ng = ocp.ng if softened else 0
     kind = KIND_NAMES[softened]
     to_s = N_u * nu
     n = to_s + N * ng
@@ -143,12 +143,13 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
     sides: list[tuple[int, list[int]]] = []
     # Softened bounds on g: the same with g_x G_i for the response to the inputs; feedback subtracts the one to the initial state.
     responses: list[ca.MX] = []
-    for bounds, limit, sign in ((ocp.ug, lin.ug, -1), (ocp.lg, lin.lg, 1)):
+    for bounds, limit, sign in ((ocp.tightest("ug"), lin.ug, -1), (ocp.tightest("lg"), lin.lg, 1)):
         at = finite(bounds) if ng else []
         for i in range(N) if at else ():
             G_x, G_u = (ca.densify(ca.MX(sparsity, e[:, i])[at, :]) for sparsity, e in ((lin.G_x, lin.g_x), (lin.G_u, lin.g_u)))
             value = lin.g[at, i] + G_x @ condensed.c[i]
-            row = rows.add(None if sign < 0 else limit[at], value, limit[at] if sign < 0 else None, by_bound[at])
+            side = limit[at] if limit.size2() == 1 else limit[at, i]
+            row = rows.add(None if sign < 0 else side, value, side if sign < 0 else None, by_bound[at])
             response = G_x @ condensed.G[i]
             response = ca.horzcat(response[:, :-nu], response[:, -nu:] + G_u)
             A.place_values(ca.vec(response), [(row, 0, ca.Sparsity.dense(*response.shape))])

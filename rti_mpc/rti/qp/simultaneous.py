@@ -18,6 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from rti_mpc.codegen import function
+from rti_mpc.rti.blocks import at_each
 from rti_mpc.rti.linearization import Linearization, change, nonzeros
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import (
@@ -33,8 +34,8 @@ from rti_mpc.rti.qp.transcription import (
     head,
     input_rows,
     measured_by,
+    of_signals,
     picked,
-    repeated_column,
 )
 
 
@@ -48,7 +49,7 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
     """
     lin = Linearization(ocp)
     N, N_u, nx, nu, held = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu, ocp.held.tolist()
-    ng = len(ocp.lg) if softened else 0
+    ng = ocp.ng if softened else 0
     kind = KIND_NAMES[softened]
     to_du, to_s = (N + 1) * nx, (N + 1) * nx + N_u * nu
     n = to_s + N * ng
@@ -69,10 +70,10 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
     first_soft = rows.count
     sides: list[tuple[int, list[int]]] = []
     # Softened bounds: g - s <= ug, g + s >= lg, s >= 0.
-    for bounds, limit, sign in ((ocp.ug, lin.ug, -1), (ocp.lg, lin.lg, 1)):
+    for bounds, limit, sign in ((ocp.tightest("ug"), lin.ug, -1), (ocp.tightest("lg"), lin.lg, 1)):
         at = finite(bounds) if ng else []
         if at:
-            side = repeated_column(limit[at], N)
+            side = at_each(of_signals(limit, at), N)
             row = rows.add(None if sign < 0 else side, lin.g[at, :], side if sign < 0 else None, by_bound[at])
             places = [(row + i * len(at), nx + i * nx, to_du + held[i] * nu) for i in range(N)]  # row, column of dx, column of du
             for column, values, sparsity in ((1, lin.g_x, lin.G_x), (2, lin.g_u, lin.G_u)):

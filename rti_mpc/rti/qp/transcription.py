@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from rti_mpc.codegen import function
-from rti_mpc.rti.blocks import all_inputs
+from rti_mpc.rti.blocks import all_inputs, at_each
 from rti_mpc.rti.linearization import Linearization, softened
 from rti_mpc.rti.ocp import Ocp
 
@@ -150,16 +150,16 @@ def input_rows(ocp: Ocp, lin: Linearization, rows: BoundRows, A: Blocks, to_du: 
     difference = sp.eye_array(N_u) - sp.eye_array(N_u, k=-1)
     _, by_input, _ = measured_by(ocp)
     for lb, value, ub, over in (("lbu", lin.u, "ubu", sp.eye_array(N_u)), ("lbdu", lin.increments, "ubdu", difference)):
-        at = finite(getattr(ocp, lb), getattr(ocp, ub))
+        at = finite(ocp.tightest(lb), ocp.tightest(ub))
         if at:
-            row = rows.add(repeated_column(lin.w[lb][at], N_u), value[at, :], repeated_column(lin.w[ub][at], N_u), by_input[at])
+            row = rows.add(at_each(of_signals(lin.w[lb], at), N_u), value[at, :], at_each(of_signals(lin.w[ub], at), N_u), by_input[at])
             A.place(row, to_du, sp.kron(over, np.eye(nu)[at]))
 
 
 def measured_by(ocp: Ocp) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     """Return the indices of the scales of states, of inputs and of softened bounds."""
     nx, nu = ocp.model.nx, ocp.model.nu
-    return np.arange(nx), nx + np.arange(nu), nx + nu + np.arange(len(ocp.lg))
+    return np.arange(nx), nx + np.arange(nu), nx + nu + np.arange(ocp.ng)
 
 
 def clipped(u: ca.MX, u_prev: ca.MX, w: dict[str, ca.MX]) -> ca.MX:
@@ -175,7 +175,7 @@ def clipped(u: ca.MX, u_prev: ca.MX, w: dict[str, ca.MX]) -> ca.MX:
     clip = ca.Function("clip", [last, wanted, lbdu, ubdu, lbu, ubu], [met])
     if N_u > 1:
         clip = clip.mapaccum("clips", N_u)
-    return ca.MX(clip(u_prev, u, *(repeated_column(w[name], N_u) for name in ("lbdu", "ubdu", "lbu", "ubu"))))
+    return ca.MX(clip(u_prev, u, *(at_each(w[name], N_u) for name in ("lbdu", "ubdu", "lbu", "ubu"))))
 
 
 class Remembered:
@@ -202,24 +202,25 @@ class Remembered:
         Negative if the plan keeps all of them.
         """
         ocp, lin = self._ocp, self._lin
-        ng, N = len(ocp.lg), ocp.N
+        ng, N = ocp.ng, ocp.N
         if not ng:
             return ca.MX(ca.DM([-INFINITY, -INFINITY]))
         names = ("g", "g_x", "g_u", "lg", "ug", "scale")
         g, g_x, g_u, lg, ug, scale = (ca.SX.sym(n, e.shape[0]) for n, e in zip(names, (*head(lin), lin.lg, lin.ug, lin.scale_g), strict=True))
         dx_i, du_i = ca.SX.sym("dx", dx.shape[0]), ca.SX.sym("du", du.shape[0])
         value = g + ca.SX(lin.G_x, g_x) @ dx_i + ca.SX(lin.G_u, g_u) @ du_i
-        excess = [(value - ug)[j] for j in finite(ocp.ug)] + [(lg - value)[j] for j in finite(ocp.lg)]
-        scales = [scale[j] for j in (*finite(ocp.ug), *finite(ocp.lg))]
+        above, below = finite(ocp.tightest("ug")), finite(ocp.tightest("lg"))
+        excess = [(value - ug)[j] for j in above] + [(lg - value)[j] for j in below]
+        scales = [scale[j] for j in (*above, *below)]
         shares = [by / one for by, one in zip(excess, scales, strict=True)]
         worst = ca.Function("worst", [g, g_x, g_u, dx_i, du_i, lg, ug, scale], [ca.vertcat(*(ca.mmax(ca.vertcat(*of)) for of in (excess, shares)))])
         limits = (*softened_bounds(ocp, w), lin.scale_g)
-        found = worst.map(N)(*self._parts, dx[:, 1:], all_inputs(du, ocp.blocks), *(repeated_column(limit, N) for limit in limits))
+        found = worst.map(N)(*self._parts, dx[:, 1:], all_inputs(du, ocp.blocks), *(at_each(limit, N) for limit in limits))
         return ca.vertcat(*(ca.mmax(row) for row in ca.vertsplit(found)))
 
 
 def softened_bounds(ocp: Ocp, w: dict[str, Any]) -> tuple[Any, Any]:
-    """Return the softened lower and upper bounds as expressions, each of shape ``(ng, 1)``."""
+    """Return the softened lower and upper bounds as expressions, each of shape ``(ng, 1)``, or ``(ng, N)``."""
     return softened(ocp, w, "lbx", "lh", "lbx_e"), softened(ocp, w, "ubx", "uh", "ubx_e")
 
 
@@ -239,9 +240,9 @@ def finite(*bounds: np.ndarray[Any, Any]) -> list[int]:
     return [int(j) for j in np.flatnonzero(np.any(np.isfinite(bounds), axis=0))]
 
 
-def repeated_column(column: ca.MX, times: int) -> ca.MX:
-    """Repeat a column for every stage."""
-    return ca.repmat(column, 1, times)
+def of_signals(bounds: ca.MX, at: list[int]) -> ca.MX:
+    """Return the bounds of some signals, a column for all stages or one for each."""
+    return bounds[at] if bounds.size2() == 1 else bounds[at, :]
 
 
 def data_functions(lin: Linearization, kind: str, **data: ca.MX) -> tuple[ca.Function, tuple[str, ...], ca.Function]:

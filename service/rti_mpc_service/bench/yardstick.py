@@ -42,7 +42,7 @@ class Ipopt:
 
     def __init__(self, ocp: Ocp, *, softened: bool = False) -> None:
         model, N, N_u, soft = ocp.model, ocp.N, ocp.N_u, list(ocp.soft)
-        ng = len(ocp.lg) if softened else 0
+        ng = ocp.ng if softened else 0
         self._nx, self._nu, self._ng, self._N, self._N_u = model.nx, model.nu, ng, N, N_u
         x, u, s = ca.SX.sym("x", model.nx, N + 1), ca.SX.sym("u", model.nu, N_u), ca.SX.sym("s", ng, N)
         x0, u_prev = ca.SX.sym("x0", model.nx), ca.SX.sym("u_prev", model.nu)

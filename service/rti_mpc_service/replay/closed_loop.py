@@ -129,7 +129,7 @@ def numbers_of(passage: Passage, run: Run, ocp: Ocp) -> Numbers:
     follows = np.array([sample.mode in FOLLOWING for sample in passage.samples])
     settled = run.settled & follows & np.isfinite(run.reference).all(axis=1)
     e, du = run.output_error[settled], np.diff(run.u_applied, axis=0, prepend=run.u_applied[:1])[settled]
-    half = 0.5 * (ocp.ubu - ocp.lbu)
+    half = 0.5 * (ocp.widest("ubu") - ocp.widest("lbu"))
     relative = du / np.where(np.isfinite(half) & (half > 0.0), half, 1.0)
     found: Numbers = {}
     for i, output in enumerate(ocp.model.outputs):

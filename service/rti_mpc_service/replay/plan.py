@@ -31,21 +31,22 @@ def acting_bounds(rti: Rti, config: Config) -> list[dict[str, Any]]:
     for kind, values, lower, upper in (("input", rti.u, "lbu", "ubu"), ("increment", increments, "lbdu", "ubdu")):
         for j, signal in enumerate(model.inputs):
             for side, name in (("lower", lower), ("upper", upper)):
-                bound = float(weights[name][j])
-                touching = np.abs(values[:, j] - bound) <= ACTING_DISTANCE * scale_u[j]
-                found += _acting(kind, signal.name, signal.unit, side, bound, rti.ocp.starts[touching], 0.0)
+                bounds = np.broadcast_to(weights[name], values.shape)[:, j]
+                touching = np.abs(values[:, j] - bounds) <= ACTING_DISTANCE * scale_u[j]
+                found += _acting(kind, signal.name, signal.unit, side, bounds[touching], rti.ocp.starts[touching], 0.0)
     for soft, scale in zip(softened(rti, config), scale_g, strict=True):
         for side, bound, sign in (("lower", soft.lower, -1.0), ("upper", soft.upper, 1.0)):
             over = sign * (soft.values - bound)
             violation = max(0.0, float(over.max()))
-            stages = soft.first + np.flatnonzero(over > -TOUCHING_DISTANCE * scale)
-            found += _acting(soft.kind, soft.name, soft.unit, side, bound, stages, violation)
+            touching = np.flatnonzero(over > -TOUCHING_DISTANCE * scale)
+            found += _acting(soft.kind, soft.name, soft.unit, side, bound[touching], soft.first + touching, violation)
     return found
 
 
-def _acting(kind: str, name: str, unit: str, side: str, bound: float, stages: Any, violation: float) -> Iterator[dict[str, Any]]:
-    """Yield a bound if it acts at any stage."""
+def _acting(kind: str, name: str, unit: str, side: str, bounds: Array, stages: Any, violation: float) -> Iterator[dict[str, Any]]:
+    """Yield a bound if it acts at any stage, with its value at the first of them."""
     if len(stages):
+        bound = float(bounds[0])
         yield {"kind": kind, "name": name, "unit": unit, "side": side, "bound": bound, "stages": stages.tolist(), "violation": violation}
 
 
@@ -57,7 +58,7 @@ class BoundAlongPlan(NamedTuple):
         kind: ``"state"``, ``"constraint"``, or ``"end"`` for a state that is bounded at the last node alone.
         name: Name of the signal.
         unit: Its unit.
-        lower: Lower bound.
+        lower: Lower bound, shape ``(nodes,)``.
         upper: Upper bound.
         values: Values along the plan.
         first: Node of the first of them.
@@ -66,8 +67,8 @@ class BoundAlongPlan(NamedTuple):
     kind: str
     name: str
     unit: str
-    lower: float
-    upper: float
+    lower: Array
+    upper: Array
     values: Array
     first: int
 
@@ -76,15 +77,16 @@ def softened(rti: Rti, config: Config) -> list[BoundAlongPlan]:
     """Return the softened bounds in the order of `Ocp.lg`."""
     ocp, w = rti.ocp, rti.guess.weights
     g = outputs_of(constraints(ocp)[0], rti)
-    rows = [("state", ocp.model.states[j], w["lbx"][j], w["ubx"][j]) for j in ocp.soft]
-    rows += [("constraint", signal, w["lh"][j], w["uh"][j]) for j, signal in enumerate(constraint_signals(rti, config))]
+    rows = [("state", ocp.model.states[j], w["lbx"][..., j], w["ubx"][..., j]) for j in ocp.soft]
+    rows += [("constraint", signal, w["lh"][..., j], w["uh"][..., j]) for j, signal in enumerate(constraint_signals(rti, config))]
     rows += [("end", ocp.model.states[j], w["lbx_e"][j], w["ubx_e"][j]) for j in ocp.soft_e]
-    return [
-        BoundAlongPlan(
-            kind, signal.name, signal.unit, float(low), float(high), g[-1:, j] if kind == "end" else g[:, j], ocp.N if kind == "end" else 1
-        )
-        for j, (kind, signal, low, high) in enumerate(rows)
-    ]
+    found = []
+    for j, (kind, signal, low, high) in enumerate(rows):
+        first = ocp.N if kind == "end" else 1
+        values = g[first - 1 :, j]
+        lower, upper = (np.broadcast_to(bound, values.shape) for bound in (low, high))
+        found.append(BoundAlongPlan(kind, signal.name, signal.unit, lower, upper, values, first))
+    return found
 
 
 def slack_weights(ocp: Ocp, w: Mapping[str, Array]) -> tuple[Array, Array]:

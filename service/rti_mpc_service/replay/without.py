@@ -51,5 +51,5 @@ def moved(case: QpCase, rti: Rti, config: Config, bound: Mapping[str, Any]) -> d
         scale = rti.scale[model.nx + signals.index(name)]
     array = BOUNDS[kind][upper]
     values = case.guess[array].copy()
-    values[signals.index(name)] += FAR * scale * (1.0 if upper else -1.0)
+    values[..., signals.index(name)] += FAR * scale * (1.0 if upper else -1.0)
     return {array: values}

@@ -207,10 +207,10 @@ def limits(outcome: Outcome, samples: Sequence[Telemetry]) -> dict[str, Any]:
     commanded = np.vstack([sample.u for sample in samples])
     steps = np.vstack([np.diff(sample.u, axis=0) for sample in samples])
     return {
-        "commanded_inputs_in_bounds": not excess(commanded, ocp.lbu, ocp.ubu).any(),
-        "commanded_increments_in_bounds": not (excess(steps, ocp.lbdu, ocp.ubdu) > INCREMENT_ROUNDING).any(),
-        "applied_inputs_in_bounds": not excess(log.u, ocp.lbu, ocp.ubu).any(),
-        "states_over_share": float(excess_share(log.x, ocp.lbx, ocp.ubx).max()),
+        "commanded_inputs_in_bounds": not excess(commanded, ocp.widest("lbu"), ocp.widest("ubu")).any(),
+        "commanded_increments_in_bounds": not (excess(steps, ocp.widest("lbdu"), ocp.widest("ubdu")) > INCREMENT_ROUNDING).any(),
+        "applied_inputs_in_bounds": not excess(log.u, ocp.widest("lbu"), ocp.widest("ubu")).any(),
+        "states_over_share": float(excess_share(log.x, ocp.widest("lbx"), ocp.widest("ubx")).max()),
     }
 
 

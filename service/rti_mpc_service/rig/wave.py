@@ -29,6 +29,8 @@ def inside(ocp: Ocp, start: Array) -> tuple[Array, Array]:
     """Return between which values a wave from `start` stays, all of shape ``(ny,)``; infinite where no bound is within its span."""
     states = [state.name for state in ocp.model.states]
     places = [states.index(name) if name else None for name in ocp.model.counterparts()["outputs"]]
-    lower, upper = (np.array([none if j is None else bounds[j] for j in places]) for bounds, none in ((ocp.lbx, -np.inf), (ocp.ubx, np.inf)))
+    lower, upper = (
+        np.array([none if j is None else bounds[j] for j in places]) for bounds, none in ((ocp.widest("lbx"), -np.inf), (ocp.widest("ubx"), np.inf))
+    )
     distance = BOUND_DISTANCE_SHARE * (np.minimum(upper, start + WAVE_SPAN) - np.maximum(lower, start - WAVE_SPAN))
     return np.where(lower > start - WAVE_SPAN, lower + distance, -np.inf), np.where(upper < start + WAVE_SPAN, upper - distance, np.inf)

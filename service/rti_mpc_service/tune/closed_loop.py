@@ -125,7 +125,7 @@ class ClosedLoop:
         self._Q = np.diag(ocp.Q)
         if not self._Q.any():
             raise ConfigError(f"ocp.weights.Q must weight an output that {self.scenario.title} leads, got none above 0")
-        half = 0.5 * (ocp.ubu - ocp.lbu)
+        half = 0.5 * (ocp.widest("ubu") - ocp.widest("lbu"))
         self._range = np.where(np.isfinite(half) & (half > 0.0), half, 1.0)
 
     def _problem(self, config: Config) -> Ocp:
