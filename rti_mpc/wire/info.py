@@ -74,14 +74,14 @@ class Weights:
     Attributes:
         Q: Of outputs, ``ny`` rows.
         R: Of increments, ``nu`` rows.
-        delta: Of each stage's outputs.
-        lambda_: Of each stage's increments, within the control horizon.
+        delta: Of each stage's outputs; a row per stage where they differ by output.
+        lambda_: Of each stage's increments, within the control horizon, likewise.
     """
 
     Q: tuple[tuple[float, ...], ...]
     R: tuple[tuple[float, ...], ...]
-    delta: tuple[float, ...]
-    lambda_: tuple[float, ...]
+    delta: tuple[float, ...] | tuple[tuple[float, ...], ...]
+    lambda_: tuple[float, ...] | tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -332,7 +332,12 @@ def _weights(values: Mapping[str, Any], ny: int, nu: int) -> Weights:
     rows = {name: tuple(_numbers(row, size) for row in _few(values[name])) for name, size in (("Q", ny), ("R", nu))}
     if (len(rows["Q"]), len(rows["R"])) != (ny, nu):
         raise ValueError(f"weights of {ny} outputs and {nu} inputs expected, got {len(rows['Q'])} and {len(rows['R'])}")
-    return Weights(**rows, delta=_numbers(values["delta"]), lambda_=_numbers(values["lambda_"]))
+    return Weights(**rows, delta=_factors(values["delta"], ny), lambda_=_factors(values["lambda_"], nu))
+
+
+def _factors(values: Sequence[Any], width: int) -> tuple[float, ...] | tuple[tuple[float, ...], ...]:
+    by_signal = len(values) > 0 and isinstance(values[0], Sequence)
+    return tuple(_numbers(row, width) for row in values) if by_signal else _numbers(values)
 
 
 def _numbers(values: Sequence[Any], length: int | None = None) -> tuple[float, ...]:

@@ -18,9 +18,11 @@ import pytest
 
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
+from rti_mpc.errors import OcpError
 from rti_mpc.model.model import Model, Signal
 from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.places import places
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import BUILT_IN_SOLVERS, Rti
 from tests.oracle import nlp
@@ -224,6 +226,41 @@ def test_weights_of_increments_by_stage_are_those_of_a_horizon_whose_stages_are_
         plans.append((rti.u.copy(), rti.cost))
     np.testing.assert_allclose(plans[0][0], plans[1][0], rtol=0, atol=1e-7)  # each is converged in scales of its own
     assert plans[0][1] == pytest.approx(plans[1][1], rel=1e-6)
+
+
+def test_bounds_at_some_stages_alone_stay_certified_while_the_plan_is_shifted() -> None:
+    """A place at a bound that moves on to a stage without one is a free one there."""
+    moved = places(sampled_car(**AT_SOME_STAGES, **SLOWING)).advance(places=np.ones(2 * 16 + 8))["places_next"]
+    there = (AT_SOME_STAGES["ubu"], AT_SOME_STAGES["ubdu"], SLOWING["ubx"][:, 3:])
+    np.testing.assert_array_equal(np.array(moved).ravel(), np.concatenate([np.isfinite(bounds).ravel() for bounds in there]))
+    rti, rng, x = Rti(sampled_car(**AT_SOME_STAGES, **SLOWING), compile=False), np.random.default_rng(7), np.array([0.0, 0.1, 0.2, 0.1])
+    rti.reset(x, np.zeros(2))
+    acted = False
+    for k in range(15):
+        psi = 0.05 * (k + np.arange(1, 9))
+        rti.prepare(np.column_stack([0.04 * np.cumsum(np.cos(psi)) + 0.04 * k, 0.04 * np.cumsum(np.sin(psi)), psi]))
+        assert rti.feedback(x) is QpStatus.SOLVED
+        acted |= bool(np.any(rti.x[1:, 3] > SLOWING["ubx"][:, 3] - 1e-6))
+        x = rti.x[1] + 0.01 * rng.normal(size=4)
+    assert acted
+
+
+def test_outputs_and_constraints_in_mx_are_those_in_sx() -> None:
+    """A model carries its constraint over to SX; a constraint of a problem alone has no symbols there, and is refused with what to do."""
+    plans, symbols = [], (ca.SX, ca.MX)
+    for kind in symbols:
+        x, u = kind.sym("x", 2), kind.sym("u")
+        outputs, constraint = ca.vertcat(x[0], x[1] * u), x[1] + 0.5 * u
+        model = Model("mass", x, u, ca.vertcat(x[1], u), outputs, ("r", "v"), "a", ("r", "power"), h_expr=constraint, constraints="reserve")
+        rti = Rti(Ocp(model, N=6, dt=0.1, Q=[1, 0.1], R=1e-2, Q_e=[5, 0], lh=-1, uh=0.3), compile=False)
+        rti.reset(np.zeros(2), np.zeros(1))
+        rti.prepare(np.tile([1.0, 0.0], (6, 1)))
+        assert rti.feedback(np.zeros(2)) is QpStatus.SOLVED
+        plans.append(rti.u.copy())
+    np.testing.assert_allclose(plans[1], plans[0], rtol=0, atol=1e-12)
+    assert np.max(np.abs(plans[0])) > 0.1
+    with pytest.raises(OcpError, match="h_expr must be SX, of the model's x, u, p, or be given to the Model"):
+        Ocp(model, N=6, dt=0.1, Q=[1, 1], R=1, h_expr=x[0] * u)
 
 
 def test_reference_of_inputs_moves_with_the_parameters_of_the_stages() -> None:

@@ -62,8 +62,9 @@ def build_ocp(config: Config) -> Ocp:
     model = with_disturbances(with_obstacles(own, discs), config.observer.disturbances)
     limits, terminal = config.ocp.bounds, config.ocp.terminal
     outside = {signal.name: (0.0, math.inf) for signal in model.constraints[len(own.constraints) :]}
-    bounded = [i for i, signal in enumerate(model.constraints) if signal.name in (limits.constraints | outside)]
-    lh, uh = bounds(limits.constraints | outside, names(model.constraints[i] for i in bounded))
+    stages = config.ocp.stages
+    bounded = [i for i, signal in enumerate(model.constraints) if signal.name in {**limits.constraints, **outside, **stages.constraints}]
+    lh, uh = by_stage(limits.constraints | outside, stages.constraints, names(model.constraints[i] for i in bounded), config.ocp.N)
     problem = Ocp(
         model,
         N=config.ocp.N,
@@ -91,18 +92,18 @@ def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
     """Return the weights and bounds that may change at run time, by their names in `Ocp`."""
     from rti_mpc.rti.ocp import DEFAULT_SLACK_WEIGHT
 
-    weights, limits = config.ocp.weights, config.ocp.bounds
+    weights, limits, stages, N, N_u = config.ocp.weights, config.ocp.bounds, config.ocp.stages, config.ocp.N, config.N_u
     z, Z = (DEFAULT_SLACK_WEIGHT if weight is None else weight for weight in (limits.soft_weight, limits.soft_weight_L2))
-    lbu, ubu = bounds(limits.inputs, names(model.inputs))
-    lbdu, ubdu = bounds(limits.increments, names(model.inputs))
-    lbx, ubx = bounds(limits.states, names(model.states))
+    lbu, ubu = by_stage(limits.inputs, stages.inputs, names(model.inputs), N_u)
+    lbdu, ubdu = by_stage(limits.increments, stages.increments, names(model.inputs), N_u)
+    lbx, ubx = by_stage(limits.states, stages.states, names(model.states), N)
     lbx_e, ubx_e = bounds(limits.terminal, names(model.states))
     return {
         "Q": [weights.Q[output.name] for output in model.outputs],
         "R": [weights.R[input.name] for input in model.inputs],
         "R_u": [weights.R_u.get(input.name, 0.0) for input in model.inputs],
-        "delta": as_sequence(weights.delta, config.ocp.N),
-        "lambda_": as_sequence(weights.lambda_, config.N_u),
+        "delta": factors(as_sequence(weights.delta, N), stages.delta, names(model.outputs)),
+        "lambda_": factors(as_sequence(weights.lambda_, N_u), stages.lambda_, names(model.inputs)),
         "lbu": lbu,
         "ubu": ubu,
         "lbdu": lbdu,
@@ -285,6 +286,22 @@ def bounds(table: Mapping[str, tuple[float, float]], names: Iterable[str]) -> tu
     """Return lower and upper bounds in the order of the names."""
     pairs = [table.get(name, (-math.inf, math.inf)) for name in names]
     return [lower for lower, _ in pairs], [upper for _, upper in pairs]
+
+
+def by_stage(
+    table: Mapping[str, tuple[float, float]], stages: Mapping[str, Sequence[tuple[float, float]]], names: Sequence[str], count: int
+) -> tuple[Any, Any]:
+    """Return lower and upper bounds as `bounds`, or, where some differ from stage to stage, with a row for each: the narrower of both."""
+    lower, upper = bounds(table, names)
+    if not stages:
+        return lower, upper
+    rows = [[stages.get(name, [(-math.inf, math.inf)] * count)[k] for name in names] for k in range(count)]
+    return [np.maximum(lower, [low for low, _ in row]) for row in rows], [np.minimum(upper, [high for _, high in row]) for row in rows]
+
+
+def factors(sequence: tuple[float, ...], stages: Mapping[str, Sequence[float]], names: Sequence[str]) -> Any:
+    """Return factors of weights, one per stage, or, where some differ by signal, a row per stage."""
+    return [[factor * stages[name][k] if name in stages else factor for name in names] for k, factor in enumerate(sequence)] if stages else sequence
 
 
 def names(signals: Iterable[Signal | Label]) -> list[str]:

@@ -124,6 +124,31 @@ class BoundSection(Section):
     soft_weight_L2: Weight | None = Field(default=None, description="L2 weight on the same, in cost / that unit squared")
 
 
+class StagesSection(Section):
+    """Factors and bounds that differ from stage to stage, lists by name: one entry per stage, for inputs and increments per block of held inputs."""
+
+    delta: dict[str, Annotated[tuple[Weight, ...], Field(strict=False)]] = Field(
+        default={}, description="factors of an output's weight, besides weights.delta, a list of N by name, without unit"
+    )
+    lambda_: dict[str, Annotated[tuple[Weight, ...], Field(strict=False)]] = Field(
+        default={},
+        alias="lambda",
+        description="factors of the weight of an input's increments, besides weights.lambda, a list of N_u by name, without unit",
+    )
+    inputs: dict[str, Annotated[tuple[InputInterval, ...], Field(strict=False)]] = Field(
+        default={}, description="bounds of inputs in each block, inside bounds.inputs, in the input's unit"
+    )
+    increments: dict[str, Annotated[tuple[Increment, ...], Field(strict=False)]] = Field(
+        default={}, description="bounds of the change of an input at the start of each block, inside bounds.increments, in the input's unit"
+    )
+    states: dict[str, Annotated[tuple[Interval, ...], Field(strict=False)]] = Field(
+        default={}, description="softened bounds of states at nodes 1 to N, inside bounds.states, in the state's unit"
+    )
+    constraints: dict[str, Annotated[tuple[Interval, ...], Field(strict=False)]] = Field(
+        default={}, description="softened bounds of the model's constraints at nodes 1 to N, inside bounds.constraints, in the constraint's unit"
+    )
+
+
 class RegulatorSection(Section):
     """Point at which the linear-quadratic regulator is linearized; left out: the model's nominal state, mostly zero, and the inputs at rest."""
 
@@ -177,6 +202,7 @@ class OcpSection(Section):
     weights: WeightSection = Field(description="weights of the cost")
     bounds: BoundSection = Field(default=BoundSection(), description="bounds of inputs, increments, states and constraints")
     terminal: TerminalSection = Field(default=TerminalSection(), description="terminal weight; none if left out")
+    stages: StagesSection = Field(default=StagesSection(), description="what differs from stage to stage; nothing if left out")
     obstacles: Annotated[tuple[ObstacleSection, ...], Field(strict=False)] = Field(default=(), description="discs to stay out of; none if left out")
 
 

@@ -98,7 +98,11 @@ def slack_weights(ocp: Ocp, w: Mapping[str, Array]) -> tuple[Array, Array]:
 
 def constraint_signals(rti: Rti, config: Config) -> Sequence[Any]:
     """Return the signals of the general constraints that are bounded."""
-    signals = [signal for signal in rti.ocp.model.constraints if signal.name in config.ocp.bounds.constraints or signal.name.startswith("disc_")]
+    signals = [
+        signal
+        for signal in rti.ocp.model.constraints
+        if signal.name in {**config.ocp.bounds.constraints, **config.ocp.stages.constraints} or signal.name.startswith("disc_")
+    ]
     assert len(signals) == rti.ocp.h_expr.numel(), "those that `build_ocp` bounds"
     return signals
 

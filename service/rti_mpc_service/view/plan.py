@@ -49,9 +49,11 @@ def cost_terms(info: Info, sample: Telemetry, u_before: Array | None) -> dict[st
     error = np.zeros((N, len(info.outputs)))
     error[:, outputs] = sample.x[1:, states] - sample.y_ref[:, outputs]
     change = np.diff(sample.u, axis=0, prepend=sample.u[:1] if u_before is None else u_before[None])
-    lambda_ = np.resize(np.array(w.lambda_), N)  # no input changes after the control horizon
-    by_output = (np.array(w.delta)[:, None] * error * (error @ np.array(w.Q))).sum(axis=0)
-    by_input = (lambda_[:, None] * change * (change @ np.array(w.R))).sum(axis=0)
+    lambda_ = np.array(w.lambda_).reshape(len(w.lambda_), -1)
+    lambda_ = np.resize(lambda_, (N, lambda_.shape[1]))  # no input changes after the control horizon
+    error, change = np.sqrt(np.array(w.delta)).reshape(N, -1) * error, np.sqrt(lambda_) * change
+    by_output = (error * (error @ np.array(w.Q))).sum(axis=0)
+    by_input = (change * (change @ np.array(w.R))).sum(axis=0)
     terms = {f"error/{info.outputs[i].name}": float(by_output[i]) for i in outputs}
     terms |= {f"changes/{label.name}": float(value) for label, value in zip(info.inputs, by_input, strict=True)}
     return {**terms, "rest": sample.cost - sum(terms.values())}
