@@ -28,6 +28,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.cache import cache_dir, is_intact, make_private, write_sealed
 from rti_mpc.errors import ShapeError
+from rti_mpc.units import FEWER_PASSES, FUNCTION, units
 
 COMPILER_FLAGS = ("-O3", "-std=gnu89", "-fno-semantic-interposition", "-shared", "-fPIC", "-w")  # no fast-math
 
@@ -84,26 +85,26 @@ def compiled(*functions: ca.Function, build: str = "portable") -> list[ca.Functi
     generator = ca.CodeGenerator("functions", {"with_header": False})
     for function in functions:
         generator.add(function)
-    source = with_bodies(generator.dump())
+    sources = units(with_bodies(generator.dump()))
     flags = flags_of(build)
     target = (resolved(compiler, flags), processor_flags()) if build == "native" else (os.uname().machine,)
-    key = hashlib.sha256("\0".join((source, compiler, *flags, *target)).encode()).hexdigest()[:32]
+    key = hashlib.sha256("\0".join((*sources, compiler, *flags, *target)).encode()).hexdigest()[:32]
     name = f"{functions[0].name()}-{key}.so"
     try:
         try:
             folder = cache_dir()
             make_private(folder)
-            return load(functions, folder / name, key, [compiler, *flags], source)
+            return load(functions, folder / name, key, [compiler, *flags], sources)
         except OSError as error:
             warnings.warn(f"compiled code is not kept for the next start: {error}", stacklevel=2)
         with tempfile.TemporaryDirectory(prefix="rti_mpc-") as private:
-            return load(functions, Path(private) / name, key, [compiler, *flags], source)
+            return load(functions, Path(private) / name, key, [compiler, *flags], sources)
     except (OSError, subprocess.CalledProcessError) as error:
         warnings.warn(f"{functions[0].name()} is interpreted, several times slower than compiled: {_brief(error)}", stacklevel=2)
         return list(functions)
 
 
-def load(functions: Sequence[ca.Function], library: Path, key: str, compiler: Sequence[str], source: str) -> list[ca.Function]:
+def load(functions: Sequence[ca.Function], library: Path, key: str, compiler: Sequence[str], sources: Sequence[str]) -> list[ca.Function]:
     """
     Load functions from a file, which is built first if it is not there or fails a check, see `rti_mpc.cache`.
 
@@ -112,7 +113,7 @@ def load(functions: Sequence[ca.Function], library: Path, key: str, compiler: Se
         CalledProcessError: The compiler failed.
     """
     if not is_intact(library, key):
-        write_sealed(library, key, build(compiler, source))
+        write_sealed(library, key, build(compiler, sources))
     try:
         path = os.fsencode(library).decode()  # CasADi needs UTF-8 in any locale
         return [ca.external(function.name(), path) for function in functions]
@@ -121,17 +122,22 @@ def load(functions: Sequence[ca.Function], library: Path, key: str, compiler: Se
         raise OSError(f"{library} cannot be loaded: {_first_line(why)}") from None
 
 
-def build(compiler: Sequence[str], source: str) -> bytes:
-    """Compile by a compiler with its flags, and return the shared object."""
-    with tempfile.TemporaryDirectory(prefix="rti_mpc-") as folder:
-        code = Path(folder) / "function.c"
-        code.write_text(source, encoding="utf-8")
-        made = code.with_suffix(".so")
-        environment = {"PATH": os.defpath, **os.environ}  # where the compiler was looked for, for its linker
-        command = [*compiler, "-o", str(made), str(code), "-lm"]
-        with while_compiling(len(source) / COMPILER_RATE):
-            subprocess.run(command, check=True, capture_output=True, env=environment)
-        return made.read_bytes()
+def build(compiler: Sequence[str], sources: Sequence[str]) -> bytes:
+    """Compile translation units one after another, see `rti_mpc.units`, by a compiler with its flags, and return the shared object."""
+    environment = {"PATH": os.defpath, **os.environ}  # where the compiler was looked for, for its linker
+    with tempfile.TemporaryDirectory(prefix="rti_mpc-") as folder, while_compiling(sum(map(len, sources)) / COMPILER_RATE):
+
+        def compile(source: str, of: str, *options: str) -> Path:
+            code = Path(folder) / f"{of}.c"
+            code.write_text(source, encoding="utf-8")
+            made = code.with_suffix(".o")
+            subprocess.run([*compiler, "-o", str(made), str(code), *options], check=True, capture_output=True, env=environment)
+            return made
+
+        rest, *alone = sources
+        fewer = FEWER_PASSES if alone and resolved(compiler[0], FEWER_PASSES) else ()
+        objects = [compile(source, f"function_{number}", "-c", *fewer) for number, source in enumerate(alone)]
+        return compile(rest, "functions", *map(str, objects), "-lm").read_bytes()
 
 
 def _brief(error: Exception) -> str:
@@ -165,8 +171,6 @@ def function_in_c(name: str, inputs: Mapping[str, Any], outputs: Mapping[str, An
     _bodies[unique] = body
     return function(unique, inputs, outputs)
 
-
-FUNCTION = re.compile(r"^/\* (?P<name>\w+):\(.*\*/\nstatic int (?P<symbol>\w+)\(.*\{\n(?P<body>(?:.*\n)*?)\}\n", flags=re.MULTILINE)
 
 CALL = re.compile(r"\w+(?=\()")
 
