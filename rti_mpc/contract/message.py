@@ -203,12 +203,13 @@ class JournalKind(IntEnum):
 
     CALLS = 0
     SNAPSHOT = 1
+    CASE = 2
 
 
 @dataclass(slots=True)
 class Journal:
     """
-    Part of a controller's journal: a batch of consecutive entries, or a snapshot of its state, which is one entry.
+    Part of a controller's journal: a batch of consecutive entries, or one that is a snapshot of its state or the QP of a failed or late sample.
 
     Attributes:
         epoch: Number of the controller's process; it does not change when a standby takes over.
@@ -216,7 +217,7 @@ class Journal:
         stamp_ns: Stamp of the robot's last state when this was published; 0: none had come.
         local_ns: Local monotonic time at which this was published.
         dropped: Entries dropped since the start.
-        data: Entries or snapshot, in an encoding of their own.
+        data: Entries or snapshot, in an encoding of their own; a case as NumPy's npz, empty if it was too long.
     """
 
     epoch: int

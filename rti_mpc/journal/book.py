@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The journal of one controller: a bounded queue of its calls, and snapshots between them.
+The journal of one controller: a bounded queue of its calls, with snapshots and cases between them.
 
 The thread that controls appends to the queue, which takes less than a microsecond; what
 finds no room is dropped and counted. Another thread empties it into messages.
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from typing import Protocol
 
 from rti_mpc.contract.message import Journal, JournalKind
 from rti_mpc.control.call import Call
@@ -23,6 +24,13 @@ MAX_WAITING_ENTRIES = 4096  # several seconds of a controller at 100 Hz
 MAX_BATCH_BYTES = 1 << 16  # from which on a message is complete
 MAX_DATA_BYTES = 1 << 23  # of one message
 PERIOD_NS = 10_000_000_000  # local time from one snapshot to the next
+
+
+class Enclosure(Protocol):
+    """QP of a failed or late sample, copied, for those who look at the recording; no command depends on it."""
+
+    def encode(self, pause: Callable[[], object]) -> bytes:
+        """Return its bytes; `pause` is called often, so that others get the interpreter's lock meanwhile."""
 
 
 class Book:
@@ -46,7 +54,7 @@ class Book:
         self._controller = controller
         self._camera = Camera(controller)
         self._capacity = capacity
-        self._queue: deque[tuple[int, Call | Snapshot]] = deque()
+        self._queue: deque[tuple[int, Call | Snapshot | Enclosure]] = deque()
         self._seq = 0
         self._last_ns: int | None = None  # local time of the last snapshot
         self._covered = 0  # entries dropped before it
@@ -61,6 +69,14 @@ class Book:
             self._queue.append((self._seq, call))
         else:
             self.dropped += 1
+
+    def keep(self, case: Enclosure) -> bool:
+        """Append a case, and return whether there was room for it; on the thread that controls."""
+        if len(self._queue) >= self._capacity:
+            return False
+        self._seq += 1
+        self._queue.append((self._seq, case))
+        return True
 
     def ask(self) -> None:
         """Ask for a snapshot; in any thread."""
@@ -105,9 +121,9 @@ class Book:
             seq, item = self._queue.popleft()
             if isinstance(item, Call) and item.name == "receive_state":
                 self._stamp_ns = item.args[0].stamp_ns
-            content = item.encode(pause) if isinstance(item, Snapshot) else encode_call(item)
+            content = encode_call(item) if isinstance(item, Call) else item.encode(pause)
             pause()
-            if entries and (isinstance(item, Snapshot) or seq != first + len(entries) or size + len(content) > MAX_BATCH_BYTES):
+            if entries and (not isinstance(item, Call) or seq != first + len(entries) or size + len(content) > MAX_BATCH_BYTES):
                 yield self._message(first, local_ns, JournalKind.CALLS, join_entries(entries))
                 entries, size = [], 0
             if isinstance(item, Snapshot):
@@ -116,6 +132,9 @@ class Book:
                     continue
                 self.failure = ""
                 yield self._message(seq, local_ns, JournalKind.SNAPSHOT, content)
+                continue
+            if not isinstance(item, Call):
+                yield self._message(seq, local_ns, JournalKind.CASE, content if len(content) <= MAX_DATA_BYTES else b"")
                 continue
             first = first if entries else seq
             entries.append(content)

@@ -172,8 +172,8 @@ LAYOUTS: dict[type[Any], tuple[Field, ...]] = {
         *_head("stamp of the robot's last state when this was published, ns of the robot's clock; 0: none had come"),
         Field("local_ns", "int64", "local monotonic time at which this was published, ns"),
         Field("dropped", "uint64", "number of entries dropped since the start"),
-        Field("kind", "uint8", "content of data: CALLS, entries from seq on; SNAPSHOT, one entry", member_of=JournalKind),
-        Field("data", "uint8[]", "entries or snapshot, in a versioned encoding of their own"),
+        Field("kind", "uint8", "content of data: CALLS, entries from seq on; SNAPSHOT and CASE, one entry", member_of=JournalKind),
+        Field("data", "uint8[]", "entries or snapshot, in a versioned encoding of their own; a case as NumPy's npz"),
     ),
     Event: (
         *_head("time of the event, ns of the robot's clock"),
@@ -196,7 +196,7 @@ MESSAGE_DESCRIPTIONS: dict[type[Any], str] = {
     Reference: "Output reference on a regular time grid. It ends with its last row; it need not be repeated before.",
     Command: "A plan of inputs: row i acts from stamp_ns + i * period_ns on. From valid_until_ns on, only the way to rest acts.",
     Telemetry: "What the controller measured and computed at one sample. Numbers may be NaN where nothing was computed.",
-    Journal: "Part of a controller's journal: calls that its commands depend on, or a snapshot of its state.",
+    Journal: "Part of a controller's journal: calls that its commands depend on, a snapshot of its state, or the QP of a failed or late sample.",
     Event: "A mode change or a fault.",
 }
 WIDTH_DESCRIPTIONS: dict[str, str] = {"nx": "states per row", "nu": "inputs per row", "ny": "outputs per row", "np": "stage parameters per row"}

@@ -13,6 +13,8 @@ import pytest
 from rti_mpc.contract.message import Command, Telemetry
 from rti_mpc.contract.status import Mode
 from rti_mpc.wire.cdr import decode
+from rti_mpc_service.replay.rebuild import journals, rebuild
+from rti_mpc_service.replay.trouble import kept, troubles
 from rti_mpc_service.shipped import SHIPPED
 from tests.guarded import write_robot
 from tests.processes.system import System, heard, rti_mpc
@@ -71,6 +73,15 @@ def test_journal_of_a_run_with_whatever_an_operator_and_a_link_do_replays_withou
     print(done.stdout)
     assert done.returncode == 0, done.stderr
     assert re.search(r"omega_c: \S+ rad/s away on average", done.stdout)
+    (journal,) = journals(run)
+    was = {case.about["seq"]: case for case in kept(journal)}
+    assert any(case.about["why"] == "it failed" for case in was.values())
+    built = rebuild(journal, folder=Path())
+    for made in troubles(journal, built):
+        if (one := was.pop(made.about["seq"], None)) is not None:
+            assert one.qp.A.data.tobytes() == made.qp.A.data.tobytes()
+            assert one.z.tobytes() == made.z.tobytes()
+    assert not was, "a replay makes each of them, too"
     why = rti_mpc("why", run, "--seq", 20)
     print(why.stdout)
     assert why.returncode == 0, why.stderr

@@ -211,7 +211,7 @@ MALFORMED = [
     (Telemetry, words(TELEMETRY, 184, 4), "length"),
     (Telemetry, encode(TELEMETRY)[:-8], "truncated"),
     (Telemetry, encode(replace(TELEMETRY, y=np.zeros(2))), "length"),
-    (Journal, byte(JOURNAL, 40, 2), "value"),
+    (Journal, byte(JOURNAL, 40, 3), "value"),
     (Journal, words(JOURNAL, 44, 4), "truncated"),
     (Journal, words(JOURNAL, 44, 2), "oversized"),
     (Event, words(EVENT, 24, 2**32 - 1), "truncated"),

@@ -45,6 +45,7 @@ from rti_mpc_service.config.build import build_controller, build_rti
 from rti_mpc_service.config.fit import check_stop
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.controller.journal import JournalPublisher
+from rti_mpc_service.controller.kept_case import KeptCase
 from rti_mpc_service.controller.leadership import LEADER, LISTEN_BEFORE_START_S, STANDBY, Candidate, hear_others
 from rti_mpc_service.controller.orders import Orders
 from rti_mpc_service.controller.params import Params
@@ -175,6 +176,7 @@ class Daemon:
         self._telemetries = {role: bus.publisher(key) for role, key in ((LEADER, keys.telemetry), (STANDBY, keys.standby_telemetry))}
         book.epoch = leadership.epoch
         self._journal = JournalPublisher(bus, controller, book)
+        self._case = KeptCase(rti, book)
         self._states_in = bus.intake(State, config.stale_s, {"x": model.nx, "u": model.nu})
         bus.watch_certificate(controller.say)
         self._references = References(bus, controller, model.ny)
@@ -251,13 +253,14 @@ class Daemon:
                 return
             if controller.continues(state):  # not for a repeated or outdated state
                 self._leadership.receive_state(state, arrival_ns)
-            command = controller.receive_state(state, arrival_ns)
+            command = proposal = controller.receive_state(state, arrival_ns)
             acted_ns = time.monotonic_ns()
-            if command is not None:
-                command = controller.in_time(command, acted_ns)
+            if proposal is not None:
+                command = controller.in_time(proposal, acted_ns)
                 if command is not None:
                     self._send(command, acted_ns)
                 sent_ns = time.monotonic_ns()
+                self._case.note(proposal, command, sent_ns)
                 controller.prepare()
                 prepared_ns = time.monotonic_ns()
                 self._lock.notify_all()

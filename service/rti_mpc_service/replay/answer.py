@@ -18,7 +18,7 @@ from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.rti.qp.qp import QpData
 from rti_mpc.rti.qp.qpsolvers import check_name, solve_once
 from rti_mpc.rti.rti import Rti
-from rti_mpc_service.replay.case import QpCase, qp_at, solution
+from rti_mpc_service.case import QpCase, qp_at, solution
 
 OURS = "riccati"
 
@@ -122,7 +122,7 @@ def of_ours(case: QpCase, rti: Rti, changed: Mapping[str, Array] | None = None) 
     taken_s = time.perf_counter() - start
     if not status.usable:
         return Answer(OURS, status, own.iterations, taken_s)
-    z = solution(qp_at(rti.ocp, here), rti.x - here["x"], rti.u - here["u"]) / case.columns
+    z = solution(qp_at(rti, here), rti.x - here["x"], rti.u - here["u"]) / case.columns
     return Answer(OURS, status, own.iterations, taken_s, z, {"gap": own.res_dual})
 
 

@@ -26,8 +26,8 @@ from rti_mpc.contract.status import Mode
 from rti_mpc.journal.entry import JournalEntry
 from rti_mpc.journal.replay import Difference, Replay, replay
 from rti_mpc.signals import Signal
+from rti_mpc_service.case import solver_of
 from rti_mpc_service.replay.rebuild import Rebuilt
-from rti_mpc_service.replay.trouble import solver_of
 from rti_mpc_service.rig.run_data import wanted
 
 PLANNED = (Mode.TRACKING, Mode.HOLDING)  # modes of samples with a plan of their own

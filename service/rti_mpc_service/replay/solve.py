@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from rti_mpc.control.opinions import DISAGREEMENT
+from rti_mpc_service.case import QpCase
 from rti_mpc_service.replay.answer import answer, compared
-from rti_mpc_service.replay.case import QpCase
 from rti_mpc_service.replay.trouble import cases_of
 from rti_mpc_service.replay.why import count
 

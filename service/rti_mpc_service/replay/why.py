@@ -28,10 +28,10 @@ from rti_mpc.journal.entry import JournalEntry, decode_entries
 from rti_mpc.journal.replay import Difference, Replay, replay
 from rti_mpc.recording.reader import Recording
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS
-from rti_mpc_service.replay.case import QpCase, take
+from rti_mpc_service.case import QpCase, about_sample, solver_of, take
 from rti_mpc_service.replay.plan import acting_bounds, cost_terms
 from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, journals, rebuild
-from rti_mpc_service.replay.trouble import about, solver_of
+from rti_mpc_service.replay.trouble import placed
 from rti_mpc_service.replay.without import without
 
 LOOK_BACK_S = 10.0  # of the robot's time, over which the events before a command are told
@@ -129,7 +129,7 @@ def acted(journal: Journaled) -> Iterator[Place]:
     """Yield the places of the commands that were committed while the controller led."""
     standing_by = False
     for message in journal.messages:
-        if message.kind is JournalKind.SNAPSHOT:
+        if message.kind is not JournalKind.CALLS:
             continue
         for entry in decode_entries(message.data, message.seq):
             standing_by = entry.name == "stand_by" or (standing_by and entry.name != "lead")
@@ -167,7 +167,7 @@ def explained(journal: Journaled, built: Rebuilt, place: Place) -> tuple[dict[st
         if entry.seq == place.entry:
             facts = facts_of(built, on, place, entry, difference)
             if facts["solver"] is not None:
-                case = take(built.rti, about(journal, built, place.command, "asked for"))
+                case = placed(take(built.rti, about_sample(built.rti, place.command, "asked for")), journal)
             facts["events"] = [one for one in told if place.command.stamp_ns - one["stamp_ns"] <= 1e9 * LOOK_BACK_S][-MAX_EVENTS:]
         elif facts and entry.name == "prepare":
             prepared += 1

@@ -9,9 +9,9 @@ from typing import Any
 from rti_mpc.array import Array
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.scaled import Scaled
+from rti_mpc_service.case import QpCase, qp_at
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.replay.answer import of_other, of_ours
-from rti_mpc_service.replay.case import QpCase, qp_at
 from rti_mpc_service.replay.plan import softened
 
 FAR = 1e6  # scales by which a bound is moved away, at all stages
@@ -32,7 +32,7 @@ def without(case: QpCase, rti: Rti, config: Config, bound: Mapping[str, Any]) ->
     if rti.active_set is not None:
         found = of_ours(case, rti, changed)
     else:
-        found = of_other(Scaled(qp_at(rti.ocp, case.guess | changed)), "daqp")
+        found = of_other(Scaled(qp_at(rti, case.guess | changed)), "daqp")
     if not found.status.usable:
         return None
     return {signal["name"]: float(value) for signal, value in zip(case.about["inputs"], case.inputs(found.z)[0], strict=True)}

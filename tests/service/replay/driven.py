@@ -20,6 +20,7 @@ from rti_mpc.wire.keys import Keys
 from rti_mpc_service.config.build import build_controller, build_model, build_rti, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_stop
+from rti_mpc_service.controller.kept_case import KeptCase
 from rti_mpc_service.injection import FaultyRti
 from rti_mpc_service.origin import origin_files
 from rti_mpc_service.replay.rebuild import Journaled
@@ -61,6 +62,7 @@ def journal_of(
     controller = build_controller(config, rti, check_stop(config))
     book = Book(controller)
     book.epoch = 5
+    case = KeptCase(rti, book)
     follows = reference(circle()) if follows is None else follows
     given = robot_settings(config)
     body = Lockstep(RobotSettings(**given | {"x0": [*follows.y[0], *given["x0"][len(follows.y[0]) :]]}))
@@ -72,13 +74,15 @@ def journal_of(
         (acts or {}).get(k, lambda *_: None)(controller, rti)
         state = body.tick()
         seen, now_ns = sees(k, state), body.now_ns
-        command = controller.tick(now_ns) if seen is None else controller.receive_state(seen, now_ns)
-        if command is not None and seen is not None:
-            command = controller.in_time(command, now_ns + MS * (late_ms or {}).get(k, 1))
+        command = proposal = controller.tick(now_ns) if seen is None else controller.receive_state(seen, now_ns)
+        if proposal is not None and seen is not None:
+            command = controller.in_time(proposal, now_ns + MS * (late_ms or {}).get(k, 1))
         if command is not None:
             body.accept(command, now_ns)
             controller.commit(command, now_ns)
         if seen is not None:
+            if proposal is not None:
+                case.note(proposal, command, now_ns)
             controller.prepare()
             while not controller.second_opinion():
                 pass

@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,10 @@ import numpy as np
 import scipy.sparse as sp
 
 from rti_mpc.array import Array
+from rti_mpc.contract.message import Command
+from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import ConfigError, MessageError
-from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.qp.osqp import Solver
 from rti_mpc.rti.qp.qp import Guess, Qp, QpData, Step
 from rti_mpc.rti.qp.simultaneous import simultaneous
 from rti_mpc.rti.rti import Rti
@@ -34,6 +37,7 @@ from rti_mpc.wire import document
 
 FORMAT = "rti_mpc case 1"
 MAX_ABOUT_BYTES = 1 << 24
+MAX_BYTES = 1 << 28  # of all arrays
 MATRICES, VECTORS = ("P", "A"), ("q", "l", "u")
 
 
@@ -43,8 +47,8 @@ class QpCase:
     The QP of one sample.
 
     Attributes:
-        about: What it is: robot, owner, seq, stamp_ns, why it was kept, solver, status, iterations; inputs, a list of name and unit; and the texts
-            attached to the recording, by name.
+        about: What it is: seq, stamp_ns, why it was kept, solver, status, iterations; inputs, a list of name and unit; not_kept, how many failed or
+            late samples before it were not; out of a recording also robot, owner, and the files attached for it, a text by name.
         qp: The QP, scaled and normalised.
         guess: Arrays of the guess by name, weights and initial state included, see `rti_mpc.rti.qp.qp.Guess`.
         columns: Scale of each variable, shape ``(n,)``.
@@ -90,37 +94,35 @@ class QpCase:
         value = self.qp.A @ z
         return float(np.maximum(np.maximum(value - self.qp.u, self.qp.l - value), 0.0).max())
 
-    def save(self, path: Path) -> None:
-        """
-        Write the file.
-
-        Raises:
-            ConfigError: It cannot be written.
-        """
-        arrays: dict[str, Any] = {name: getattr(self.qp, name) for name in VECTORS}
+    def encode(self, pause: Callable[[], object] = lambda: None) -> bytes:
+        """Return the bytes of its file; `pause` is called after each array, so that others get the interpreter's lock meanwhile."""
+        arrays: dict[str, Any] = {"about": json.dumps(self.about), "format": FORMAT, "columns": self.columns, "z": self.z}
+        arrays |= {name: getattr(self.qp, name) for name in VECTORS}
         for name in MATRICES:
             matrix = getattr(self.qp, name)
             arrays |= {f"{name}_data": matrix.data, f"{name}_indices": matrix.indices, f"{name}_indptr": matrix.indptr}
         arrays |= {f"guess_{name}": array for name, array in self.guess.items()}
-        try:
-            with path.open("wb") as file:
-                np.savez_compressed(file, about=json.dumps(self.about), format=FORMAT, columns=self.columns, z=self.z, **arrays)
-        except OSError as error:
-            raise ConfigError(f"a case must be a file that can be written, got {path}: {error.strerror}") from error
+        content = BytesIO()
+        with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, array in arrays.items():
+                with archive.open(f"{name}.npy", "w") as file:
+                    np.lib.format.write_array(file, np.asanyarray(array), allow_pickle=False)
+                pause()
+        return content.getvalue()
 
     @classmethod
-    def load(cls, path: Path) -> QpCase:
+    def decode(cls, content: bytes) -> QpCase:
         """
-        Read a file.
+        Return a case from the bytes of its file.
 
         Raises:
-            ConfigError: It is no case.
+            MessageError: They are none.
         """
         try:
-            with path.open("rb") as raw:
-                if not zipfile.is_zipfile(raw):
-                    raise ValueError("what is no npz file")
-            with np.load(path, allow_pickle=False) as file:
+            with zipfile.ZipFile(BytesIO(content)) as archive:
+                if (size := sum(entry.file_size for entry in archive.infolist())) > MAX_BYTES:
+                    raise ValueError(f"{size} bytes, more than {MAX_BYTES}")
+            with np.load(BytesIO(content), allow_pickle=False) as file:
                 if str(file["format"]) != FORMAT:
                     raise ValueError(f"format {file['format']}")
                 qp, n, m = QpData(), len(file["q"]), len(file["l"])
@@ -134,8 +136,33 @@ class QpCase:
             if case.qp.u.shape != (m,) or case.columns.shape != (n,) or case.z.shape != (n,) or guess["x"].size + guess["u"].size > n:
                 raise ValueError("arrays of different lengths")
         except (OSError, MessageError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            raise ConfigError(f"{path} must be a case, as rti-mpc why --case writes it, got {error}") from error
+            raise MessageError(str(error)) from error
         return case
+
+    def save(self, path: Path) -> None:
+        """
+        Write the file.
+
+        Raises:
+            ConfigError: It cannot be written.
+        """
+        try:
+            path.write_bytes(self.encode())
+        except OSError as error:
+            raise ConfigError(f"a case must be a file that can be written, got {path}: {error.strerror}") from error
+
+    @classmethod
+    def load(cls, path: Path) -> QpCase:
+        """
+        Read a file.
+
+        Raises:
+            ConfigError: It is no case.
+        """
+        try:
+            return cls.decode(path.read_bytes())
+        except (OSError, MessageError) as error:
+            raise ConfigError(f"{path} must be a case, as rti-mpc why --case writes it, got {error}") from error
 
 
 def take(rti: Rti, about: Mapping[str, Any]) -> QpCase:
@@ -144,24 +171,80 @@ def take(rti: Rti, about: Mapping[str, Any]) -> QpCase:
 
     Args:
         rti: Real-time iteration of the sample.
-        about: As `QpCase.about`; status, solver and inputs are filled in.
+        about: As `QpCase.about`; the inputs are filled in.
     """
     arrays = {name: array.copy() for name, array in (rti.guess.arguments | {"x0": rti.x0}).items()}
-    qp = qp_at(rti.ocp, arrays)
+    return case_of(qp_on(rti, arrays), arrays, rti.x, rti.u, {"inputs": inputs_of(rti), **about})
+
+
+def case_of(qp: Qp, arrays: dict[str, Array], x: Array, u: Array, about: dict[str, Any], pause: Callable[[], object] = lambda: None) -> QpCase:
+    """
+    Return the case of a QP.
+
+    Args:
+        qp: The QP in the units of the model, to be filled.
+        arrays: Arrays of its guess by name.
+        x: States of the plan, shape ``(N + 1, nx)``.
+        u: Inputs of the plan, shape ``(N_u, nu)``.
+        about: As `QpCase.about`.
+        pause: Called often, so that others get the interpreter's lock meanwhile.
+    """
+    for fill in (qp.fill, qp.embed):
+        fill()
+        pause()
     scaled = Scaled(qp)
-    inputs = [{"name": signal.name, "unit": signal.unit} for signal in rti.ocp.model.inputs]
-    case = QpCase({"inputs": inputs, **about}, scaled, arrays, qp.scales()[0].copy(), np.zeros_like(scaled.q))
+    pause()
+    case = QpCase(about, scaled, arrays, qp.scales()[0].copy(), np.zeros_like(scaled.q))
     if case.usable:
-        case.z[:] = solution(qp, rti.x - arrays["x"], rti.u - arrays["u"]) / case.columns
+        case.z[:] = solution(qp, x - arrays["x"], u - arrays["u"]) / case.columns
+        pause()
     return case
 
 
-def qp_at(ocp: Ocp, arrays: Mapping[str, Array]) -> Qp:
+def inputs_of(rti: Rti) -> list[dict[str, str]]:
+    """Return name and unit of each input."""
+    return [{"name": signal.name, "unit": signal.unit} for signal in rti.ocp.model.inputs]
+
+
+def about_sample(rti: Rti, command: Command, why: str) -> dict[str, Any]:
+    """Return what a case says of its sample: that of a command, before the next one is prepared."""
+    return {
+        "seq": command.seq,
+        "stamp_ns": command.stamp_ns,
+        "why": why,
+        "solver": solver_of(rti),
+        "status": command.status.name,
+        "iterations": rti.solver.iterations,
+    }
+
+
+def trouble_of(proposal: Command, sent: Command | None) -> str:
+    """Return why the sample of a proposed command is a case, empty if it is none: it failed, or another command was sent in its place."""
+    if proposal.status is QpStatus.NONE:
+        return ""
+    return "it failed" if not proposal.status.usable else "it was late" if sent is not proposal else ""
+
+
+def solver_of(rti: Rti) -> str:
+    """Return the name of the solver of the last QP."""
+    if rti.solver is rti.active_set:
+        return "riccati"
+    whole = " with softened bounds" if rti.solver is rti.solvers[-1] and len(rti.solvers) > 1 else ""
+    return ("osqp" if isinstance(rti.solver, Solver) else "another solver") + whole
+
+
+def qp_on(rti: Rti, arrays: Mapping[str, Array]) -> Qp:
+    """Return the QP of the simultaneous formulation with all softened bounds, on the arrays of a guess; not filled."""
+    sample, weights = ({name: arrays[name] for name in names} for names in (rti.guess.sample, rti.guess.weights))
+    guess = Guess(sample, weights, arrays["x0"], Step(*map(np.zeros_like, rti.guess.plan)))
+    if rti.formulation == "simultaneous":
+        return rti.solvers[-1].qp.on(guess)
+    return Qp(simultaneous(rti.ocp), guess, lambda function: function)
+
+
+def qp_at(rti: Rti, arrays: Mapping[str, Array]) -> Qp:
     """Return the QP linearized at a guess, its initial state embedded."""
-    sample = {name: arrays[name] for name in ("x", "u", "u_prev", "y_ref", "p")}
-    weights = {name: array for name, array in arrays.items() if name not in sample and name != "x0"}
-    plan = Step(np.zeros_like(arrays["x"]), np.zeros_like(arrays["u"]), np.zeros(2), np.zeros(1))
-    qp = Qp(simultaneous(ocp), Guess(sample, weights, arrays["x0"], plan), lambda function: function)
+    qp = qp_on(rti, arrays)
     qp.fill()
     qp.embed()
     return qp
