@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -197,6 +198,12 @@ def told_apart(apart: Mapping[str, float], ocp: Ocp) -> str:
     return f"apart at most: {', '.join(f'{name} {value:.3g} {units[name]}' for name, value in apart.items())}"
 
 
+def free_name(out: Path, name: str) -> str:
+    """Return a name of which a folder has neither recording nor figure: the name itself, or with the first number from 2 on that is free."""
+    names = chain([name], (f"{name}-{number}" for number in count(2)))
+    return next(one for one in names if not any((out / f"{one}{suffix}").exists() for suffix in (".mcap", ".png")))
+
+
 def write(out: Path, path: Path, journal: Journaled, recorded: Drive, driven: Drive, runs: Sequence[Run], said: str) -> None:
     """
     Write the figure, where matplotlib is installed, and the recording of both drives.
@@ -206,9 +213,9 @@ def write(out: Path, path: Path, journal: Journaled, recorded: Drive, driven: Dr
     """
     from importlib.util import find_spec
 
-    name = f"{journal.robot}-{journal.owner}"
     try:
         out.mkdir(parents=True, exist_ok=True)
+        name = free_name(out, f"{journal.robot}-{journal.owner}")
         write_both(out / f"{name}.mcap", path, journal, recorded.passage, driven)
         if find_spec("matplotlib") is not None:
             from rti_mpc_service.replay.figure import figure

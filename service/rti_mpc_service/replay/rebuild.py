@@ -26,7 +26,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.recording.reader import Recording
 from rti_mpc.rti.rti import Rti
 from rti_mpc.wire import document
-from rti_mpc_service.config.build import build_controller, build_model, build_rti, robot_settings
+from rti_mpc_service.config.build import build_controller, build_ocp, build_rti, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_model, check_stop
 from rti_mpc_service.config.schema import Config
@@ -137,7 +137,7 @@ def rebuild(journal: Journaled, *, folder: Path, trust: bool = False) -> Rebuilt
     recorded = document.read(journal.files.get("versions.json", "{}").encode(), most=MAX_VERSIONS_BYTES)
     with tempfile.TemporaryDirectory(prefix="rti-mpc-replay-") as temporary:
         config = configuration(journal.files, Path(temporary), folder=folder, trust=trust)
-        equations = sha256(model_equations(build_model(config)).encode()).hexdigest()
+        equations = sha256(model_equations(build_ocp(config).model).encode()).hexdigest()  # with obstacles and disturbances, as the controller's
         if recorded.get("model_sha256", equations) != equations:
             raise ConfigError(f"model {config.model.name} must have the equations that were recorded, got others: use the rti-mpc that recorded it")
         rti = build_rti(config)

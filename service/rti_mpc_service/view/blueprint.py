@@ -53,6 +53,7 @@ RUNG_COLORS = {
     "braked": "bad",
     "rested": "latency",
 }  # the fallbacks
+DRIVEN_COLORS = ("measured", "error", "prepare", "latency", "limit", "actuation")  # of where robots have driven that share one view, in turn
 TERM_COLORS = ("measured", "command", "error", "prepare", "latency", "limit", "actuation", "edge")
 MODE_COLORS = dict(zip(Mode, ("idle", "idle", "good", "good", "warning", "warning", "bad"), strict=True))
 STATUS_COLORS = dict(zip(QpStatus, ("good", "warning", "warning", "warning", "bad", "bad", "idle"), strict=True))
@@ -270,9 +271,9 @@ UNIT_CIRCLE: Array = np.column_stack([np.cos(angles := np.linspace(0, 2 * np.pi,
 ROBOT_Z_M = 0.008  # [m], between trail and horizon
 
 
-def looks(info: Info, name: str = "") -> dict[str, rr.AsComponents]:
-    """Return the constant components of a recording, by entity; a robot is called by its name where there are several."""
-    return _series_looks(info) | _cost_looks(info) | _lane_looks(info) | (_world_looks(info, name) if info.planar else {})
+def looks(info: Info, name: str = "", driven: str = DRIVEN_COLORS[0]) -> dict[str, rr.AsComponents]:
+    """Return the constant components of a recording, by entity; of several robots each has its name, and a color of where it has driven."""
+    return _series_looks(info) | _cost_looks(info) | _lane_looks(info) | (_world_looks(info, name, driven) if info.planar else {})
 
 
 def legend(frame: Frame) -> rr.Points3D:
@@ -333,10 +334,11 @@ def _lane_looks(info: Info) -> dict[str, rr.AsComponents]:
     return looks
 
 
-def _world_looks(info: Info, name: str) -> dict[str, rr.AsComponents]:
+def _world_looks(info: Info, name: str, driven: str) -> dict[str, rr.AsComponents]:
     looks: dict[str, rr.AsComponents] = {"world": rr.ViewCoordinates.RIGHT_HAND_Z_UP}
     for path, strip in STRIPS.items():
-        looks[path] = rr.LineStrips3D.from_fields(colors=COLORS[strip.color], radii=rr.Radius.ui_points(strip.width / 2))
+        color = COLORS[driven if strip.color == DRIVEN_COLORS[0] else strip.color]
+        looks[path] = rr.LineStrips3D.from_fields(colors=color, radii=rr.Radius.ui_points(strip.width / 2))
     for k, polygon in enumerate(outline(info.model) if info.heading is not None else []):
         edge = lifted(np.vstack([polygon, polygon[:1]]), ROBOT_Z_M + 0.002)
         looks[f"world/robot/part_{k}"] = _filled(polygon, ROBOT_Z_M - 0.001 * (k > 0), COLORS["wheel" if k else "body"])
@@ -348,7 +350,7 @@ def _world_looks(info: Info, name: str) -> dict[str, rr.AsComponents]:
         )
     if info.position is not None:
         looks["world/robot/point"] = rr.Points3D(
-            [[0.0, 0.0, 0.02]], labels=[name] if name else None, show_labels=True, colors=COLORS["measured"], radii=rr.Radius.ui_points(3.0)
+            [[0.0, 0.0, 0.02]], labels=[name] if name else None, show_labels=True, colors=COLORS[driven], radii=rr.Radius.ui_points(3.0)
         )
     return looks
 

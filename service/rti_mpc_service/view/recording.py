@@ -16,7 +16,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, Event, Reference, Severity, State, Telemetry
 from rti_mpc.signals import plane
 from rti_mpc.wire.info import Info, Label, Obstacle
-from rti_mpc_service.view.blueprint import RUNG_COLORS, STRIPS, TIMELINE, Frame, below, blueprint, legend, lifted, looks
+from rti_mpc_service.view.blueprint import DRIVEN_COLORS, RUNG_COLORS, STRIPS, TIMELINE, Frame, below, blueprint, legend, lifted, looks
 from rti_mpc_service.view.path_window import KNOT_PARTS, MIN_KNOTS, path_window
 from rti_mpc_service.view.plan import FREE, acting_bounds, cost_terms, is_plan
 from rti_mpc_service.view.playback import Actuation, Playback, PlayedRow
@@ -63,7 +63,13 @@ class RerunRecording:
     held, and written when it comes, or with numbers for names if the recording ends without.
     """
 
-    def __init__(self, stream: rr.RecordingStream, root: str = "", lay_out: Callable[[Info, Frame | None], object] | None = None) -> None:
+    def __init__(
+        self,
+        stream: rr.RecordingStream,
+        root: str = "",
+        lay_out: Callable[[Info, Frame | None], object] | None = None,
+        driven: str = DRIVEN_COLORS[0],
+    ) -> None:
         """
         Write to a stream.
 
@@ -71,8 +77,10 @@ class RerunRecording:
             stream: Stream of Rerun.
             root: Entity below which everything is written; empty for the only robot.
             lay_out: Takes what a layout depends on, whenever it changes; None: the layout of the only robot is sent.
+            driven: Name of the color of where the robot has driven.
         """
         self.stream = stream
+        self._driven = driven
         self._root = root
         self._lay_out = lay_out or (lambda info, frame: stream.send_blueprint(blueprint(info, frame)))
         self.info: Info | None = None
@@ -126,7 +134,7 @@ class RerunRecording:
         if self.info is not None and _vectors(info) != _vectors(self.info):
             self._reference, self._last, self._last_output, self._planned, self._playback = None, None, None, None, Playback()
         self.info = info
-        for path, archetype in looks(info, self._root).items():
+        for path, archetype in looks(info, self._root, self._driven).items():
             self._log(path, archetype)
         self._lay_out(info, self._frame)
         held, self._held = list(self._held), deque(maxlen=MAX_HELD_ENTRIES)

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from itertools import cycle
 
 import rerun as rr
 
 from rti_mpc.wire.info import Info
-from rti_mpc_service.view.blueprint import Frame, common_blueprint
+from rti_mpc_service.view.blueprint import DRIVEN_COLORS, Frame, common_blueprint
 from rti_mpc_service.view.recording import Entry, RerunRecording
 
 
@@ -31,7 +32,8 @@ class Scene:
         """
         self.stream = stream
         self._layouts: dict[str, tuple[Info, Frame | None]] = {}
-        self._drawings = {root: RerunRecording(stream, root, self._layout_of(root)) for root in roots} or {"": RerunRecording(stream)}
+        colored = list(zip(roots, cycle(DRIVEN_COLORS), strict=False))
+        self._drawings = {root: RerunRecording(stream, root, self._layout_of(root), color) for root, color in colored} or {"": RerunRecording(stream)}
 
     def send(self, entries: Iterable[Entry]) -> None:
         """Write entries of any robots of the scene."""

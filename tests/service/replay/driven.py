@@ -17,7 +17,7 @@ from rti_mpc.reference.trajectory import circle
 from rti_mpc.rti.rti import Rti
 from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.keys import Keys
-from rti_mpc_service.config.build import build_controller, build_model, build_rti, robot_settings
+from rti_mpc_service.config.build import build_controller, build_rti, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_stop
 from rti_mpc_service.controller.kept_case import KeptCase
@@ -89,7 +89,7 @@ def journal_of(
         if k % 25 == 24:
             book.photograph(now_ns)
         messages += book.messages(now_ns)
-    return Journaled(config.robot, 5, messages, origin_files(config, build_model(config)))
+    return Journaled(config.robot, 5, messages, origin_files(config, rti.ocp.model))
 
 
 def failing(failure: str, samples: int) -> Act:

@@ -18,7 +18,7 @@ from rti_mpc.recording import Recording
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.commands.robot import lockstep_robot
 from rti_mpc_service.replay.beside import write_both
-from rti_mpc_service.replay.closed_loop import numbers_of, run_of
+from rti_mpc_service.replay.closed_loop import free_name, numbers_of, run_of
 from rti_mpc_service.replay.drive import Drive, Passage, drive
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
 from rti_mpc_service.replay.replay import main, overridden, snapshot_before
@@ -109,6 +109,12 @@ def test_both_drives_are_told_in_numbers_drawn_and_written_into_one_recording(tm
     assert len({(each.local_ns, each.message.stamp_ns) for each in begins.values()}) == 1, "both begin at once, so one axis of time fits both"
     assert set(both.streams["pioneer_closed_loop"]) == {"state", "command", "telemetry", "info", "reference/anchored", "event"}
     assert (tmp_path / "out" / "pioneer-5.png").stat().st_size > 20_000
+
+
+def test_files_of_an_earlier_comparison_stay(tmp_path: Path) -> None:
+    for taken, free in (("other-5.mcap", "robot-5"), ("robot-5.mcap", "robot-5-2"), ("robot-5-2.png", "robot-5-3")):
+        (tmp_path / taken).touch()
+        assert free_name(tmp_path, "robot-5") == free
 
 
 def test_folder_that_is_a_file_is_refused_before_anything_is_driven(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

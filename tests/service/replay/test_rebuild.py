@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 
 from rti_mpc.errors import ConfigError
+from rti_mpc_service.commands.robot import lockstep_robot
 from rti_mpc_service.config.config import load
 from rti_mpc_service.init import main as init
 from rti_mpc_service.replay import replay
+from rti_mpc_service.replay.drive import Drive, drive
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
 from rti_mpc_service.replay.replay import lines, overridden, play
+from rti_mpc_service.replay.why import explain, find
 from rti_mpc_service.shipped import SHIPPED
 from tests.service.replay.driven import journal_of
 
@@ -120,3 +123,25 @@ def test_controller_without_a_configuration_does_not_keep_the_others_from_being_
     printed = capsys.readouterr().out
     assert "controller 6\n  not covered: it was dead before the recorder had its configuration\npioneer, controller 5\n" in printed
     assert "0 bits differ" in printed
+
+
+DISTURBED = "[observer.disturbances]\nu_c = { drift = 0.1, limit = 0.3 }\n"
+OBSTACLE = "[[ocp.obstacles]]\ncentre_m = [5.0, 5.0]\nradius_m = 0.2\n\n[ocp.weights]"
+
+
+@pytest.mark.slow  # compiles a problem of its own
+def test_robot_with_an_observer_and_an_obstacle_is_replayed_explained_and_driven_in_closed_loop(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(SHIPPED.read_text().replace("N = 20 ", "N = 5 ").replace("[ocp.weights]", OBSTACLE, 1) + "\n" + DISTURBED)
+    journal = journal_of(path, samples=30)
+    outcome = play(journal, rebuild(journal, folder=tmp_path)).on.outcome
+    assert (outcome.samples, outcome.differing) == (29, 0)
+    place = find(journal, None, 10)
+    assert place is not None
+    facts = explain(journal, rebuild(journal, folder=tmp_path), place)
+    assert facts["replayed"] == "0 bits differ"
+    assert facts["mode"] == "TRACKING"
+    assert len(facts["disturbances"]) == 1
+    was, driven = (drive(Drive(rebuild(journal, folder=tmp_path), 0, body), journal.messages, 0) for body in (None, lockstep_robot))
+    assert len(was.states) > 20
+    assert [state.x.tolist() for state in driven.states] == [state.x.tolist() for state in was.states]

@@ -19,6 +19,7 @@ from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.wire.info import Info
 from rti_mpc_service.view.playback import Actuation
 from rti_mpc_service.view.recording import Entry, RerunRecording
+from rti_mpc_service.view.scene import Scene
 
 SECOND = 1_000_000_000
 STATES = [("x", "m"), ("y", "m"), ("psi", "rad"), ("u", "m/s"), ("omega", "rad/s")]
@@ -334,3 +335,20 @@ def test_a_followed_path_is_drawn_with_its_edges(writer: Writer) -> None:
         [(_, [strip])] = rows[path]
         assert np.array(strip)[:, 1] == pytest.approx(y, abs=1e-6)  # single precision
         assert (strip[0][0], strip[-1][0]) == (0.5, 2.0), "where its knots say it all"
+
+
+def test_robots_that_share_a_view_have_trails_of_different_colors(tmp_path: Path) -> None:
+    stream = rr.RecordingStream("test", recording_id="test")
+    stream.save(tmp_path / "run.rrd")
+    scene = Scene(stream, ("ant", "bee"))
+    scene.send([Entry(0, PIONEER, root) for root in ("ant", "bee")])
+    scene.finish()
+    stream.flush(timeout_sec=10.0)
+    stream.disconnect()
+    colors = [
+        chunk.to_record_batch().column("LineStrips3D:colors").to_pylist()
+        for chunk in RrdReader(tmp_path / "run.rrd").stream().to_chunks()
+        if chunk.entity_path in ("/ant/world/trail", "/bee/world/trail")
+    ]
+    assert len(colors) == 2
+    assert colors[0] != colors[1]
