@@ -24,6 +24,7 @@ from rti_mpc.model.model import Model, Signal
 from rti_mpc.rti.ocp import Ocp
 
 DT = 1.0
+SHARE_BY_STAGE = 0.3  # of the structures, whose weights and bounds differ from stage to stage
 LARGEST = 20, 6, 60  # states, inputs, stages
 ROOMS = {  # least and largest distance of each bound from zero
     "lbu": (0.2, 1.0),
@@ -56,6 +57,7 @@ class Structure:
         unit_y: Units of the outputs, shape ``(ny,)``.
         unit_h: Units of the general constraints, shape ``(nh,)``.
         finite: Which bounds are finite, by their names.
+        by_stage: Whether weights and bounds differ from stage to stage.
     """
 
     nx: int
@@ -69,6 +71,7 @@ class Structure:
     unit_y: Array
     unit_h: Array
     finite: dict[str, Any]
+    by_stage: bool
 
     @property
     def N_u(self) -> int:
@@ -128,7 +131,8 @@ def random_structure(rng: np.random.Generator) -> Structure:
     (apart,) = rng.spawn(1)  # so that the other numbers are those of a structure with a control horizon
     inner = apart.choice(np.arange(1, N), N_u - 1, replace=False) if apart.random() < 0.5 else np.arange(1, N_u)
     blocks = tuple(np.diff([0, *sorted(inner.tolist()), N]).tolist())
-    return Structure(nx, nu, ny, nh, N, blocks, *units, {name: rng.random(size) < share for name, (size, share) in shares.items()})
+    finite = {name: rng.random(size) < share for name, (size, share) in shares.items()}
+    return Structure(nx, nu, ny, nh, N, blocks, *units, finite, bool(apart.random() < SHARE_BY_STAGE))
 
 
 def random_data(s: Structure, rng: np.random.Generator) -> Data:
@@ -150,7 +154,18 @@ def random_data(s: Structure, rng: np.random.Generator) -> Data:
         **{name: 10.0 ** rng.uniform(0.0, 9.0, size) for name, size in (("z", s.nx), ("Z", s.nx), ("zh", s.nh), ("Zh", s.nh))},
     }
     u_prev = np.clip(0.3 * rng.normal(size=s.nu), values["lbu"], values["ubu"])
+    (apart,) = rng.spawn(1)  # as above
+    values |= rows_by_stage(s, values, apart) if s.by_stage else {}
     return Data(A, B, C, E, F, values, rng.normal(size=s.nx), u_prev, np.cumsum(0.5 * rng.normal(size=(s.N, s.ny)), axis=0))
+
+
+def rows_by_stage(s: Structure, values: dict[str, Array], rng: np.random.Generator) -> dict[str, Array]:
+    """Rows of weights and bounds for all stages; bounds of inputs widen, so that each can be reached from those before."""
+    rows = {}
+    for name in ROOMS:
+        factors = rng.uniform(0.5, 2.0, (s.N_u if name.endswith("u") else s.N, 1))
+        rows[name] = values[name] * (np.maximum.accumulate(factors / factors[0]) if name in ("lbu", "ubu") else factors)
+    return rows | {"delta": rng.uniform(0.5, 2.0, (s.N, s.ny)), "lambda_": rng.uniform(0.5, 2.0, (s.N_u, s.nu))}
 
 
 def parameters(s: Structure, data: Data) -> Array:
@@ -230,12 +245,11 @@ class Truth:
         """Cost (4) of states at nodes 0 to N, shape ``(N + 1, nx)``, and inputs, shape ``(N_u, nu)``, its slacks as small as may be."""
         d, v = self._d, self._d.values
         e = x[1:] @ d.C.T - d.y_ref
-        weighed = np.einsum("ki,ij,kj->k", e, v["Q"], e)
         du = np.diff(np.vstack([d.u_prev, u]), axis=0)
         bounded = np.hstack([x[1:], x[1:] @ d.E.T + self._held(u) @ d.F.T])
-        lower, upper = np.concatenate([v["lbx"], v["lh"]]), np.concatenate([v["ubx"], v["uh"]])
+        lower, upper = self._softened("lbx", "lh"), self._softened("ubx", "uh")
         slack = np.maximum(0.0, np.maximum(lower - bounded, bounded - upper)).ravel()
-        cost = v["delta"] @ weighed + e[-1] @ v["Q_e"] @ e[-1] + v["lambda_"] @ np.einsum("ki,ij,kj->k", du, v["R"], du)
+        cost = np.sum(e * self._weighed(e, "delta", "Q")) + e[-1] @ v["Q_e"] @ e[-1] + np.sum(du * self._weighed(du, "lambda_", "R"))
         return float(cost + self._soft[0] @ slack + 0.5 * self._soft[1] @ slack**2)
 
     def broken(self, x: Array, u: Array) -> float:
@@ -245,6 +259,17 @@ class Truth:
         gaps = [np.abs(x[0] - d.x0), np.abs(x[1:] - x[:-1] @ d.A.T - self._held(u) @ d.B.T)]
         gaps += [v["lbu"] - u, u - v["ubu"], v["lbdu"] - du, du - v["ubdu"]]
         return max(float(np.max(gap)) for gap in gaps)
+
+    def _softened(self, of_states: str, of_constraints: str) -> Array:
+        """Softened bounds at all nodes, shape ``(N, nx + nh)``."""
+        s, v = self._s, self._d.values
+        return np.hstack([np.broadcast_to(v[of_states], (s.N, s.nx)), np.broadcast_to(v[of_constraints], (s.N, s.nh))])
+
+    def _weighed(self, rows: Array, factors: str, weight: str) -> Array:
+        """Each row times the weight of its stage, in the precision of the rows."""
+        of_stages, matrix = (self._d.values[name].astype(rows.dtype) for name in (factors, weight))
+        root = np.sqrt(of_stages.reshape(len(rows), -1))
+        return np.asarray(root * ((root * rows) @ matrix))
 
     def _held(self, u: Array) -> Array:
         """Inputs of all stages."""
@@ -264,15 +289,20 @@ class Truth:
         hold = sp.csr_matrix((np.ones(N), (np.arange(N), s.block_of)), shape=(N, N_u))
         eye_N, down = sp.eye(N), sp.eye(N, k=-1)
         difference = sp.kron(sp.eye(N_u) - sp.eye(N_u, k=-1), sp.eye(nu))
+
+        def along(name: str) -> Array:
+            return np.broadcast_to(v[name], (N_u, nu)).ravel()
+
         first_u = np.concatenate([d.u_prev, np.zeros((N_u - 1) * nu)])
         to_states = sp.hstack([sp.eye(N * nx) - sp.kron(down, d.A), -sp.kron(hold, d.B), sp.csr_matrix((N * nx, N * (nx + s.nh)))])
         free = np.concatenate([d.A @ d.x0, np.zeros((N - 1) * nx)])
 
-        weigh = np.einsum("k,ij->kij", v["delta"], v["Q"])
+        roots = {name: np.sqrt(v[name].reshape(len(v[name]), -1)) for name in ("delta", "lambda_")}
+        weigh = np.array([root[:, None] * v["Q"] * root for root in roots["delta"]])
         weigh[-1] += v["Q_e"]
         H = sp.block_diag([2.0 * d.C.T @ W @ d.C for W in weigh])
         gradient = np.concatenate([-2.0 * d.C.T @ W @ r for W, r in zip(weigh, d.y_ref, strict=True)])
-        R = sp.block_diag([2.0 * weight * v["R"] for weight in v["lambda_"]])
+        R = sp.block_diag([2.0 * root[:, None] * v["R"] * root for root in roots["lambda_"]])
         P = sp.block_diag([H, difference.T @ R @ difference, sp.diags(self._soft[1])])
         q = np.concatenate([gradient, -difference.T @ R @ first_u, self._soft[0]])
 
@@ -287,12 +317,12 @@ class Truth:
         G = sp.vstack([rows_u, -rows_u, rows_du, -rows_du, upper_soft, lower_soft, positive])
         h = np.concatenate(
             [
-                np.tile(v["ubu"], N_u),
-                -np.tile(v["lbu"], N_u),
-                np.tile(v["ubdu"], N_u) + first_u,
-                -np.tile(v["lbdu"], N_u) - first_u,
-                np.tile(np.concatenate([v["ubx"], v["uh"]]), N),
-                -np.tile(np.concatenate([v["lbx"], v["lh"]]), N),
+                along("ubu"),
+                -along("lbu"),
+                along("ubdu") + first_u,
+                -along("lbdu") - first_u,
+                self._softened("ubx", "uh").ravel(),
+                -self._softened("lbx", "lh").ravel(),
                 np.zeros(slack.shape[0]),
             ]
         )
@@ -334,7 +364,7 @@ class Truth:
             x.append(A @ x[-1] + B @ row)
         nodes = np.array(x[1:])
         e, pull = nodes @ C.T - d.y_ref, upper - lower
-        by_x = 2.0 * v["delta"][:, None] * (e @ v["Q"] @ C) + pull[:, : s.nx] + pull[:, s.nx :] @ E
+        by_x = 2.0 * self._weighed(e, "delta", "Q") @ C + pull[:, : s.nx] + pull[:, s.nx :] @ E
         by_x[-1] += 2.0 * (e[-1] @ v["Q_e"] @ C)
         by_u = pull[:, s.nx :] @ F
         r, costate = np.zeros_like(u), np.zeros(s.nx, dtype=long)
@@ -342,7 +372,7 @@ class Truth:
             costate = A.T @ costate + by_x[k] if k < s.N - 1 else by_x[k]
             r[s.block_of[k]] += B.T @ costate + by_u[k]
         du = np.diff(np.vstack([d.u_prev, u]), axis=0)
-        force = 2.0 * v["lambda_"][:, None] * (du @ v["R"]) + upper_du - lower_du
+        force = 2.0 * self._weighed(du, "lambda_", "R") + upper_du - lower_du
         r += force
         r[:-1] -= force[1:]
 
@@ -352,7 +382,7 @@ class Truth:
         for multiplier, room in ((upper_du, v["ubdu"] - du), (lower_du, du - v["lbdu"])):
             bound += np.sum(multiplier * np.where(multiplier > 0.0, room, 0.0))
         values = np.hstack([nodes, nodes @ E.T + held @ F.T])
-        over, under = values - np.concatenate([v["ubx"], v["uh"]]), np.concatenate([v["lbx"], v["lh"]]) - values
+        over, under = values - self._softened("ubx", "uh"), self._softened("lbx", "lh") - values
         slack = np.maximum(0.0, np.maximum(over, under))
         z, Z = (soft.reshape(slack.shape).astype(long) for soft in self._soft)
         bound += np.sum(z * slack + Z * slack**2 / 2 + np.maximum(0.0, upper + lower - z) ** 2 / (2 * Z))
@@ -364,8 +394,9 @@ class Truth:
         s, v = self._s, self._d.values
         wanted = z[s.N * s.nx :][: s.N_u * s.nu].reshape(s.N_u, s.nu)
         u, last = np.empty_like(wanted), self._d.u_prev
+        lbu, ubu, lbdu, ubdu = (np.broadcast_to(v[name], wanted.shape) for name in ("lbu", "ubu", "lbdu", "ubdu"))
         for k, row in enumerate(wanted):
-            last = u[k] = np.clip(np.clip(row, last + v["lbdu"], last + v["ubdu"]), v["lbu"], v["ubu"])
+            last = u[k] = np.clip(np.clip(row, last + lbdu[k], last + ubdu[k]), lbu[k], ubu[k])
         return self.cost(self.rolled_out(u), u)
 
 
