@@ -12,10 +12,11 @@ import pytest
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
 from rti_mpc.model.integrator import integrator
+from rti_mpc.model.robots.two_link_arm import two_link_arm
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.operation import states_of_operation
 from rti_mpc.rti.rest import RestClass, assess, find_stop_law
-from rti_mpc.rti.way_to_rest import WayToRest
+from rti_mpc.rti.way_to_rest import StopLaw, WayToRest
 from tests.movers import car, law_of, mover, ocp_of
 from tests.problems import tank
 
@@ -102,6 +103,22 @@ def test_arm_is_held_by_its_torques_wherever_it_stops() -> None:
         weight = 0.25 * 9.81 * np.cos(way.x[-1, 0] + way.x[-1, 1])
         assert way.u[-1] == pytest.approx([0.75 * 9.81 * np.cos(way.x[-1, 0]) + weight, weight], abs=1e-5)
         assert abs(way.x[-1, 0] - q_1) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("x", "u"),
+    [((2.94, -0.15, 1.93, -0.1), (19.6, -12.0)), ((2.624, 0.207, 2.953, 1.296), (19.24, 9.58))],
+    ids=["slowly", "fast"],
+)
+def test_way_of_an_arm_that_is_nearly_stretched_is_aimed_at_where_it_ends(x: tuple[float, ...], u: tuple[float, ...]) -> None:
+    """Aimed at where the last pass had led, each pass ended on the other side of it, 0.2 to 0.8 rad away."""
+    limits = {"lbu": [-30.0, -15.0], "ubu": [30.0, 15.0], "lbdu": [-15.0, -8.0], "ubdu": [15.0, 8.0]}
+    ocp = Ocp(two_link_arm(), N=5, dt=0.02, Q=np.ones(2), R=np.ones(2), **limits)
+    scale_x, scale_u = np.array([3.0, 2.5, 3.0, 3.0]), np.array([30.0, 15.0])
+    way = WayToRest(ocp, StopLaw(22, 52, 0.02, 1, 0.01, np.array([3.0, 3.0, 416.0, 1194.0]), scale_x, scale_u), compile=False)
+    assert way.find(np.array(x), np.array(u))
+    assert way.x[-2] == pytest.approx(way.x_e, abs=0.02), "rad, rad/s"
+    assert np.abs(way.x[-2, 2:]).max() < 0.03, "rad/s: a hundredth of its speeds in operation"
 
 
 def test_way_that_is_followed_leads_back_to_where_it_ended_from_beside_it() -> None:

@@ -58,6 +58,7 @@ def chain(masses: int = 4, drag: float = DRAG) -> Model:
         inputs=tuple(Signal(f"u_{axis}", "m/s") for axis in "xyz"),
         outputs=(*position[3 * free :], *speed[middle]),
         x_nominal=tuple(hanging(at, velocity, acceleration)),
+        stop_expr=ca.SX(3, 1),  # its end stands, and the air does the rest
     )
 
 
