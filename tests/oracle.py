@@ -53,16 +53,17 @@ def row(bound: Array, k: int) -> Array:
     return bound if bound.ndim == 1 else bound[k]
 
 
-def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Array, Array], tuple[Array, Array, float]]:
+def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[..., tuple[Array, Array, float]]:
     """
     Build the nonlinear program of `rti_mpc.rti.ocp`, by multiple shooting, or by collocation where the integrator is implicit.
 
     Args:
         ocp: The problem.
-        slacks: Whether bounds on states are softened; hard ones if not.
+        slacks: Whether bounds on states and second differences are softened; hard ones if not.
 
     Returns:
-        ``solve(x0, u_prev, y_ref, x, u) -> (x, u, cost)`` from the guess ``x, u``; it fails where IPOPT does not converge.
+        ``solve(x0, u_prev, y_ref, x, u, u_before) -> (x, u, cost)`` from the guess ``x, u``; it fails where IPOPT does not converge. The input
+        before `u_prev` is as that one if it is left out.
     """
     model, N, N_u = ocp.model, ocp.N, ocp.N_u
     nx, nu = model.nx, model.nu
@@ -75,10 +76,11 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Arra
     s_e = ca.SX.sym("s_e", nx)
     nh = ocp.h_expr.numel()
     s_h, constraint = ca.SX.sym("s_h", nh, N), ca.Function("constraint", [model.x, model.u, model.p], [ca.densify(ocp.h_expr)])
+    s_u = ca.SX.sym("s_u", nu, N_u)
     implicit = ocp.method == "irk"
     K = [ca.SX.sym(f"K_{k}", nx, model.sim_method_num_steps * model.sim_method_num_stages if implicit else 0) for k in range(N)]
     x0 = ca.SX.sym("x0", nx)
-    u_prev = ca.SX.sym("u_prev", nu)
+    u_prev, u_before = ca.SX.sym("u_prev", nu), ca.SX.sym("u_before", nu)
     y_ref = ca.SX.sym("y_ref", model.ny, N)
 
     rows: list[tuple[Array, ca.SX, Array]] = [(np.zeros(nx), x[:, 0] - x0, np.zeros(nx))]
@@ -102,20 +104,23 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Arra
     cost += ca.dot(ca.DM(ocp.z), s_e) + 0.5 * ca.dot(ca.DM(ocp.Z), s_e**2)
     rows.append((np.full(nx, -np.inf), x[:, N] - s_e, ocp.ubx_e))
     rows.append((ocp.lbx_e, x[:, N] + s_e, np.full(nx, np.inf)))
-    last = u_prev
+    last, du_last = u_prev, u_prev - u_before
     for k in range(N_u):
         du = u[:, k] - last
         changed = np.broadcast_to(ocp.lambda_[k], nu) ** 0.5 * du
         cost += ca.bilin(ca.DM(ocp.R), changed, changed)
         rows.append((row(ocp.lbdu, k), du, row(ocp.ubdu, k)))
         cost += ca.dot(ca.DM(np.broadcast_to(ocp.R_u, (N_u, nu))[k]), (u[:, k] - u_ref) ** 2)
-        last = u[:, k]
+        cost += ca.dot(ca.DM(ocp.zddu), s_u[:, k]) + 0.5 * ca.dot(ca.DM(ocp.Zddu), s_u[:, k] ** 2)
+        rows.append((np.full(nu, -np.inf), du - du_last - s_u[:, k], ocp.ubddu))
+        rows.append((ocp.lbddu, du - du_last + s_u[:, k], np.full(nu, np.inf)))
+        last, du_last = u[:, k], du
 
     lbg, g, ubg = zip(*rows, strict=True)
-    program = {"x": ca.veccat(x, u, s, s_e, s_h, *K), "f": cost, "g": ca.vertcat(*g), "p": ca.veccat(x0, u_prev, y_ref)}
+    program = {"x": ca.veccat(x, u, s, s_e, s_h, s_u, *K), "f": cost, "g": ca.vertcat(*g), "p": ca.veccat(x0, u_prev, u_before, y_ref)}
     solver = ca.nlpsol("nlp", "ipopt", program, IPOPT)
     free, rates = np.full(nx * (N + 1), np.inf), np.full(sum(each.numel() for each in K), np.inf)
-    slack = nx * (N + 1) + nh * N
+    slack = nx * (N + 1) + nh * N + nu * N_u
     most = np.full(slack, np.inf if slacks else 0.0)
     bounds = {
         "lbg": np.concatenate(lbg),
@@ -124,9 +129,9 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[[Array, Array, Array, Arra
         "ubx": np.concatenate([free, np.broadcast_to(ocp.ubu, (N_u, nu)).ravel(), most, rates]),
     }
 
-    def solve(x0: Array, u_prev: Array, y_ref: Array, x: Array, u: Array) -> tuple[Array, Array, float]:
+    def solve(x0: Array, u_prev: Array, y_ref: Array, x: Array, u: Array, u_before: Array | None = None) -> tuple[Array, Array, float]:
         guess = np.concatenate([x.ravel(), u.ravel(), np.zeros(slack + len(rates))])
-        answer = solver(x0=guess, p=np.concatenate([x0, u_prev, y_ref.ravel()]), **bounds)
+        answer = solver(x0=guess, p=np.concatenate([x0, u_prev, u_prev if u_before is None else u_before, y_ref.ravel()]), **bounds)
         assert solver.stats()["success"], solver.stats()["return_status"]
         z = np.array(answer["x"]).ravel()
         return z[: x.size].reshape(x.shape), z[x.size : x.size + u.size].reshape(u.shape), float(answer["f"])

@@ -41,16 +41,16 @@ class Blockage:
     """
 
     def __init__(self, rti: Rti, *, compile: bool = True) -> None:
-        ocp = rti.ocp
+        ocp, own = rti.problem, rti.ocp.h_expr.numel()  # second differences follow the constraints, and hold no robot
         self.blocked = False
         self._stages = ocp.N
         self._contrary = 0
         self._squares: Array = np.zeros(2)
-        self._names = [ocp.model.states[j].name for _, j in bounded_outputs(ocp)] + [""] * ocp.h_expr.numel()
+        self._names = [ocp.model.states[j].name for _, j in bounded_outputs(ocp)] + [""] * own
         self._held: Array = np.zeros(len(self._names))
-        sample = {"x": rti.x, "u": rti.u, "y_ref": rti.y_ref, "p": rti.p, "scale": rti.scale}
+        sample = {"x": rti.guess.plan.x, "u": rti.u, "y_ref": rti.y_ref, "p": rti.guess.sample["p"], "scale": rti.scale}
         weights = {name: rti.guess.weights[name] for name in ("lbx", "ubx", "lh", "uh")}
-        measure = progress(ocp)
+        measure = progress(ocp, own)
         self._measure = bind(compiled(measure)[0] if compile else measure, sample | weights, {"squares": self._squares, "held": self._held})
 
     @property
@@ -86,12 +86,12 @@ def bounded_outputs(ocp: Ocp) -> list[tuple[int, int]]:
     return [(i, j) for i, j in pairs if j in ocp.soft]
 
 
-def progress(ocp: Ocp) -> ca.Function:
+def progress(ocp: Ocp, own: int) -> ca.Function:
     """
     Build ``(x, u, y_ref, p, scale, lbx, ubx, lh, uh) -> (squares, held)``.
 
     ``squares`` is ``[|y_N - y_0|^2, |y_ref,N - y_N|^2]``, both weighted by Q; ``held`` is above 0 where the plan is held: first the
-    bounds of `bounded_outputs`, then the general constraints.
+    bounds of `bounded_outputs`, then the first `own` general constraints.
     """
     model, N, Q, nh = ocp.model, ocp.N, ca.DM(ocp.Q), ocp.h_expr.numel()
     x, u, y_ref = ca.MX.sym("x", model.nx, N + 1), ca.MX.sym("u", model.nu, ocp.N_u), ca.MX.sym("y_ref", model.ny, N)
@@ -110,11 +110,11 @@ def progress(ocp: Ocp) -> ca.Function:
         )
         for i, j in bounded_outputs(ocp)
     ]
-    if nh:
+    if own:
         constraint, *_ = constraints(ocp)
         u_held = all_inputs(u, ocp.blocks)
         g = constraint.map(N)(x[:, 1:], u_held, p[:, 1:])[len(ocp.soft) : ocp.ng_path, :]
         near = TOUCHING_DISTANCE * scale[model.nx + model.nu + len(ocp.soft) :][:nh]
-        held += [ca.mmax(ca.fmax(g[k, :] - uh[k, :], lh[k, :] - g[k, :])) + near[k] for k in range(nh)]
+        held += [ca.mmax(ca.fmax(g[k, :] - uh[k, :], lh[k, :] - g[k, :])) + near[k] for k in range(own)]
     inputs = {"x": x, "u": u, "y_ref": y_ref, "p": p, "scale": scale, **bounds}
     return function("progress", inputs, {"squares": squares, "held": ca.densify(ca.vertcat(*held))})

@@ -485,9 +485,9 @@ class Controller:
         if len(self._states.d):
             self._track.p[:, self.np_ :] = self._states.d
         self._reach = self._sent.reach(act_ns)
-        u_prev = self._sent.at(act_ns - 1)[0]
+        u_prev, u_before = (self._sent.at(act_ns - 1 - age * self.grid.dt_ns)[0] for age in range(2))
         self._tuning.follow(u_prev)
-        self._rti.prepare(self._track.y_ref, self._track.p, shift=shift, u_prev=u_prev)
+        self._rti.prepare(self._track.y_ref, self._track.p, shift=shift, u_prev=u_prev, u_before=u_before)
         self._loaded = True
 
     def _rejoin(self, stamp_ns: int, behind: int) -> None:

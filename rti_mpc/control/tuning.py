@@ -19,7 +19,8 @@ from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp, rest_fault
 from rti_mpc.rti.rti import Rti
 
 COMPILED_FIELDS = ("N", "N_u", "blocks", "dt", "method")  # attributes of the Ocp that are compiled in
-COMPILED_BOUNDS = (*INPUT_BOUNDS, "lbx", "ubx", "lh", "uh", "lbx_e", "ubx_e")  # bounds of the Ocp: which of them are finite is compiled in
+# Bounds of the Ocp: which of them are finite is compiled in.
+COMPILED_BOUNDS = (*INPUT_BOUNDS, "lbx", "ubx", "lh", "uh", "lbx_e", "ubx_e", "lbddu", "ubddu")
 
 
 class Tuning:

@@ -293,7 +293,7 @@ def made_class(name: str) -> type[Any]:
 def is_fixed(value: Any) -> bool:
     """Whether an object has no state, or such that is held in pinned arrays."""
     kind = type(value)
-    return isinstance(value, (*FIXED_TYPES, functools.partial)) or kind.__name__ in FIXED_CLASSES or foreign(kind) or kind is Ocp
+    return isinstance(value, (*FIXED_TYPES, functools.partial)) or kind.__name__ in FIXED_CLASSES or foreign(kind) or issubclass(kind, Ocp)
 
 
 def foreign(kind: type[Any]) -> bool:

@@ -34,7 +34,7 @@ SMALLEST_DIVISOR = 1e-300  # replaces a quadratic penalty of zero
 
 def certificate(ocp: Ocp) -> ca.Function:
     """
-    Build ``(x, u, u_prev, x0, stages, x_plan, u_plan, multipliers, *WEIGHTS_AND_BOUNDS, scale) -> (r, primal, gap, cost)``.
+    Build ``(x, u, u_prev, x0, stages, x_plan, u_plan, multipliers, *ARGUMENTS, scale) -> (r, primal, gap, cost)``.
 
     `multipliers` holds those of increments, shape ``(nu, N_u)``, and then those of softened bounds, shape ``(ng, N)``; positive at an upper bound.
     `r` is the gradient of the Lagrangian reduced to the inputs, shape ``(nu, N_u)``, without the multipliers of bounds on inputs. `primal` is the

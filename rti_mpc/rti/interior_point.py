@@ -112,7 +112,7 @@ class Sides:
 
 def enter(ocp: Ocp, lin: Linearization, stages: ca.MX) -> ca.Function:
     """
-    Build ``(x, u, u_prev, stages, *WEIGHTS_AND_BOUNDS, scale, x_plan, u_plan, start) -> interior``: a plan pushed inside its bounds.
+    Build ``(x, u, u_prev, stages, *ARGUMENTS, scale, x_plan, u_plan, start) -> interior``: a plan pushed inside its bounds.
 
     `start` is the product of distance and multiplier at every hard side, and about that at softened ones. There, distance and slack grow by the
     same push, and the multipliers of both add up to the slope of the penalty, so that steps begin with all conditions on slacks met, whatever
@@ -141,7 +141,7 @@ def step(ocp: Ocp, lin: Linearization, recursion: Riccati, stages: ca.MX, x0: ca
     """
     Build one step of predictor and corrector.
 
-    It is ``(x, u, u_prev, x0, stages, *WEIGHTS_AND_BOUNDS, scale, interior, least) -> (interior_after, x_plan, u_plan, violation, change,
+    It is ``(x, u, u_prev, x0, stages, *ARGUMENTS, scale, interior, least) -> (interior_after, x_plan, u_plan, violation, change,
     places_found, multipliers, product)``, with the plan after it as from a roll-out, and the mean product of distances and multipliers. No step
     aims at products below `least`; at it, steps still remove what rounding has left in the gradient of the Lagrangian.
     """

@@ -32,9 +32,8 @@ import scipy.sparse as sp
 
 from rti_mpc.array import Array
 from rti_mpc.codegen import function
-from rti_mpc.model.integrator import sensitivities
 from rti_mpc.rti.blocks import all_inputs, at_each, at_starts, moved_on, summed
-from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
+from rti_mpc.rti.ocp import ARGUMENTS, Ocp
 
 DAMPING_PER_COST = 0.005  # weight of half the square of a step, in half ranges of an input, per cost at the guess; see docs/engine.md
 
@@ -84,7 +83,7 @@ class Linearization:
         u_prev: Input before the plan, shape ``(nu, 1)``.
         y_ref: Reference, shape ``(ny, N)``.
         p: Stage parameters, shape ``(np, N + 1)``.
-        w: The weights and bounds, by the names in `WEIGHTS_AND_BOUNDS`.
+        w: The weights and bounds, by the names in `ARGUMENTS`.
         scale_x: Scales of the states, see `rti_mpc.rti.scale`, shape ``(nx, 1)``; `scale_u` those of the inputs, `scale_g` those of g.
         A: Sensitivities to the state, nonzeros of `A_k` column by column, shape ``(nnz, N)``.
         B: Sensitivities to the input, nonzeros of `B_k`, shape ``(nnz, N)``.
@@ -123,7 +122,7 @@ class Linearization:
         self.u_prev = ca.MX.sym("u_prev", nu)
         self.y_ref = ca.MX.sym("y_ref", model.ny, N)
         self.p = ca.MX.sym("p", model.np_, N + 1)
-        self.w = {name: ca.MX.sym(name, *np.shape(getattr(ocp, name))[::-1]) for name in WEIGHTS_AND_BOUNDS}
+        self.w = {name: ca.MX.sym(name, *np.shape(getattr(ocp, name))[::-1]) for name in ARGUMENTS}
         self._scale = ca.MX.sym("scale", nx + nu + ocp.ng)
         self.scale_x, self.scale_u, self.scale_g = self._scale[:nx], self._scale[nx : nx + nu], self._scale[nx + nu :]
 
@@ -206,7 +205,7 @@ class Linearization:
 
     @property
     def weights(self) -> dict[str, ca.MX]:
-        """Arguments that stay from sample to sample: weights and bounds, by the names in `WEIGHTS_AND_BOUNDS`, and the scale."""
+        """Arguments that stay from sample to sample: weights and bounds, by the names in `ARGUMENTS`, and the scale."""
         return self.w | {"scale": self._scale}
 
     @property
@@ -289,7 +288,7 @@ def linearize(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
         ``stage(x, u, p) -> [phi; nonzeros of A; nonzeros of B]``, with the patterns of A, shape ``(nx, nx)``, and of B, shape ``(nx, nu)``.
     """
     model = ocp.model
-    x_next, A, B, _ = sensitivities(model, ocp.dt, ocp.method)
+    x_next, A, B = ocp.stage(derivatives=True)
     out = ca.cse(ca.densify(ca.vertcat(x_next, nonzeros(A), nonzeros(B))))
     return ca.Function("stage", [model.x, model.u, model.p], [out]), A.sparsity(), B.sparsity()
 
@@ -398,7 +397,7 @@ def damping(ocp: Ocp) -> float:
 
 
 def plan_cost(ocp: Ocp) -> ca.Function:
-    """Build ``(x, u, u_prev, y_ref, p, *WEIGHTS_AND_BOUNDS, scale) -> cost``: the cost (4) of a plan and its penalties, nothing of it linearized."""
+    """Build ``(x, u, u_prev, y_ref, p, *ARGUMENTS, scale) -> cost``: the cost (4) of a plan and its penalties, nothing of it linearized."""
     lin = Linearization(ocp)
     lg, ug, zg, Zg = (at_each(e, ocp.N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg))
     s = ca.fmax(0, ca.fmax(lin.g - ug, lg - lin.g))

@@ -17,11 +17,13 @@ inputs held after the control horizon, or over the stages of each of :math:`N_u`
     & lbu \le u_k \le ubu, \quad lbdu \le u_k - u_{k-1} \le ubdu, \\
     & lbx - s_i \le x_i \le ubx + s_i, \quad
       lh - s_i \le h(x_i, u_{i-1}, p_i) \le uh + s_i, \quad s_i \ge 0 , \\
+    & lbddu - s_k \le u_k - 2 u_{k-1} + u_{k-2} \le ubddu + s_k, \quad s_k \ge 0 , \\
     & lbx_e - s_e \le x_N \le ubx_e + s_e, \quad s_e \ge 0 .
 
 This is the cost (4) of [Rosales]_ in full, with an additional terminal weight.
-Bounds on states and general constraints, each with its own slacks, are softened
-by an exact penalty, so that no measurement makes the problem infeasible. Outputs,
+Bounds on states, on second differences of inputs and general constraints, each with its
+own slacks, are softened by an exact penalty, so that no measurement makes the problem
+infeasible. Outputs,
 constraints, bounds and slack weights have the names of acados [Verschueren2022]_.
 """
 
@@ -90,6 +92,12 @@ class Ocp:
         uh: Softened upper bound on h, shape ``(nh,)``.
         zh: L1 weight of the slacks of h, shape ``(nh,)``, or given as a constant.
         Zh: L2 weight of the slacks of h, shape ``(nh,)``, or given as a constant.
+        lbddu: Softened lower bound on the second difference of inputs, the change of the increment from stage to stage (jerk, where an increment
+            is an acceleration), from the last two inputs before the plan on, shape ``(nu,)``; in the unit of the input per stage squared, as
+            increments are per stage. See `rti_mpc.rti.second_difference`.
+        ubddu: Softened upper bound on the second difference of inputs, shape ``(nu,)``.
+        zddu: L1 weight of the slacks of second differences, shape ``(nu,)``, or given as a constant.
+        Zddu: L2 weight of the slacks of second differences, shape ``(nu,)``, or given as a constant.
 
     Raises:
         OcpError: An argument does not fit; the message names it, and what it must be. A rest input other than zero must be inside the bounds, and
@@ -124,6 +132,10 @@ class Ocp:
     ubx_e: Array
     R_u: Array
     u_ref: ca.SX
+    lbddu: Array
+    ubddu: Array
+    zddu: Array
+    Zddu: Array
 
     def __init__(
         self,
@@ -158,6 +170,10 @@ class Ocp:
         ubx_e: ArrayLike = np.inf,
         R_u: ArrayLike = 0.0,
         u_ref: ca.SX | ArrayLike | None = None,
+        lbddu: ArrayLike = -np.inf,
+        ubddu: ArrayLike = np.inf,
+        zddu: ArrayLike = DEFAULT_SLACK_WEIGHT,
+        Zddu: ArrayLike = DEFAULT_SLACK_WEIGHT,
     ) -> None:
         given.instance("model", model, Model)
         N = given.whole("N", N, 0)
@@ -189,7 +205,7 @@ class Ocp:
             object.__setattr__(self, name, value)
         values = {"Q": Q, "R": R, "delta": delta, "lambda_": lambda_, "lbu": lbu, "ubu": ubu, "lbdu": lbdu, "ubdu": ubdu, "lbx": lbx, "ubx": ubx}
         values |= {"z": z, "Z": Z, "Q_e": np.zeros(model.ny) if Q_e is None else Q_e, "lh": lh, "uh": uh, "zh": zh, "Zh": Zh}
-        values |= {"lbx_e": lbx_e, "ubx_e": ubx_e, "R_u": R_u}
+        values |= {"lbx_e": lbx_e, "ubx_e": ubx_e, "R_u": R_u, "lbddu": lbddu, "ubddu": ubddu, "zddu": zddu, "Zddu": Zddu}
         self._take(values)
 
     def retuned(self, **values: ArrayLike) -> Ocp:
@@ -228,6 +244,8 @@ class Ocp:
             raise OcpError(wrong)
         if wrong := where((self.lbdu > 0) | (self.ubdu < 0), self.lbdu, self.ubdu):
             raise OcpError(f"lbdu <= 0 <= ubdu must hold, or no input could be kept, got {wrong}")
+        if not np.all((self.lbddu < 0) & (self.ubddu > 0)):
+            raise OcpError(f"lbddu < 0 < ubddu must hold, or no increment could be kept and changed, got {self.lbddu} and {self.ubddu}")
         if wrong := pace_fault(self):
             raise OcpError(wrong)
 
@@ -276,6 +294,11 @@ class Ocp:
         return tuple(int(j) for j in np.flatnonzero(np.isfinite(self.lbx_e) | np.isfinite(self.ubx_e)))
 
     @property
+    def soft_ddu(self) -> tuple[int, ...]:
+        """Indices of the inputs with a bound on their second difference."""
+        return tuple(int(j) for j in np.flatnonzero(np.isfinite(self.lbddu) | np.isfinite(self.ubddu)))
+
+    @property
     def ng_path(self) -> int:
         """Number of softened bounds that act at every node; those of `soft_e` follow them."""
         return len(self.soft) + self.h_expr.numel()
@@ -304,8 +327,11 @@ class Ocp:
     def phi(self) -> ca.Function:
         """One stage of the dynamics, ``phi(x, u, p) -> x_next``."""
         model = self.model
-        x_next = steps(model, self.dt, self.method)[0]
-        return ca.Function("phi", [model.x, model.u, model.p], [x_next], ["x", "u", "p"], ["x_next"])
+        return ca.Function("phi", [model.x, model.u, model.p], [self.stage()[0]], ["x", "u", "p"], ["x_next"])
+
+    def stage(self, *, derivatives: bool = False) -> tuple[ca.SX, ...]:
+        """Return the state after a stage, and its derivatives in x and u if they are asked for, as expressions of the model's symbols."""
+        return steps(self.model, self.dt, self.method, derivatives=derivatives)[: 3 if derivatives else 1]
 
 
 def integrated(model: Model, method: str | None, stages: int | None, steps: int | None, dt: float) -> Model:
@@ -437,8 +463,7 @@ def vector(name: str, value: ArrayLike, length: int) -> Array:
 
 
 # Weights and bounds by the attributes of the Ocp, with the function that checks and copies each, the name of its length, and, where it may
-# differ from stage to stage, the names of its rows' number and length. They may change between samples; the compiled functions read them in
-# this order.
+# differ from stage to stage, the names of its rows' number and length. They may change between samples.
 WEIGHTS_AND_BOUNDS: dict[str, tuple[Any, ...]] = {
     "Q": (weight_matrix, "ny"),
     "R": (weight_matrix, "nu"),
@@ -460,4 +485,11 @@ WEIGHTS_AND_BOUNDS: dict[str, tuple[Any, ...]] = {
     "lbx_e": (bound, "nx"),
     "ubx_e": (bound, "nx"),
     "R_u": (weights, "nu", "N_u", "nu"),
+    "lbddu": (bound, "nu"),
+    "ubddu": (bound, "nu"),
+    "zddu": (weights, "nu"),
+    "Zddu": (weights, "nu"),
 }
+
+# Those that compiled functions have as arguments, in this order; those of second differences are among lh, uh, zh and Zh there.
+ARGUMENTS = tuple(name for name in WEIGHTS_AND_BOUNDS if name not in ("lbddu", "ubddu", "zddu", "Zddu"))

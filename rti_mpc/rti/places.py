@@ -43,14 +43,14 @@ class Places:
     bounds, are positive at an upper bound.
 
     Attributes:
-        linearize: ``(x, u, u_prev, y_ref, p, *WEIGHTS_AND_BOUNDS, scale) -> stages``.
-        advance: ``(x, u, u_prev, y_ref, p, *WEIGHTS_AND_BOUNDS, scale, places) -> (x_next, u_next, places_next, stages)``: the same at
+        linearize: ``(x, u, u_prev, y_ref, p, *ARGUMENTS, scale) -> stages``.
+        advance: ``(x, u, u_prev, y_ref, p, *ARGUMENTS, scale, places) -> (x_next, u_next, places_next, stages)``: the same at
             the plan shifted by one stage.
-        gains: ``(stages, u, *WEIGHTS_AND_BOUNDS, scale, places) -> gains``.
-        roll_out: ``(x, u, u_prev, x0, stages, gains, *WEIGHTS_AND_BOUNDS, scale, places) -> (x_plan, u_plan, violation, change, changes,
+        gains: ``(stages, u, *ARGUMENTS, scale, places) -> gains``.
+        roll_out: ``(x, u, u_prev, x0, stages, gains, *ARGUMENTS, scale, places) -> (x_plan, u_plan, violation, change, changes,
             places_found, multipliers)``: the plan after the full step, its largest violation of softened bounds, in their unit and relative to
             their scale, the size of the step, and how many places change: -1 if data, gains or plan are not finite.
-        refine: ``(x, u, u_prev, stages, gains, *WEIGHTS_AND_BOUNDS, scale, places, r, x_plan, u_plan, multipliers) -> (x_refined,
+        refine: ``(x, u, u_prev, stages, gains, *ARGUMENTS, scale, places, r, x_plan, u_plan, multipliers) -> (x_refined,
             u_refined, multipliers_refined)``: plan and multipliers after a Newton step that removes the remaining gradient r of the Lagrangian,
             see `rti_mpc.rti.certificate`.
         enter: The start of the interior point; see `rti_mpc.rti.interior_point`.

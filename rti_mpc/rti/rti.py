@@ -30,12 +30,13 @@ from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.active_set import ActiveSet
 from rti_mpc.rti.construction import FORMULATIONS, construction
-from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
+from rti_mpc.rti.ocp import ARGUMENTS, Ocp
 from rti_mpc.rti.qp.osqp import Solver, SolverSettings
 from rti_mpc.rti.qp.qp import Guess, Qp, Step, step_size
 from rti_mpc.rti.qp.qpsolvers import ForeignSolver, check_name
 from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.scale import scale
+from rti_mpc.rti.second_difference import REMEMBERED, Remembering, as_solved, parts
 from rti_mpc.rti.turns import Turns
 
 BUILT_IN_SOLVERS = ("riccati", "osqp")  # any other solver is one of qpsolvers
@@ -43,7 +44,7 @@ MAX_SEQUENTIAL_N_U = 10  # control horizon up to which the sequential formulatio
 SOLVED, INACCURATE = QpStatus.SOLVED, QpStatus.INACCURATE  # read faster than a member of the enumeration
 MAX_ITERATIONS = 3  # per sample
 STEP_TOLERANCE = 0.015  # a larger step is followed by another iteration: closed-loop costs within 0.5 % of converged NMPC, see docs/engine.md
-COST_WEIGHTS = ("delta", "lambda_", "z", "Z", "Q_e", "zh", "Zh", "R_u")  # weights that are multiplied by the scale of the cost
+COST_WEIGHTS = ("delta", "lambda_", "z", "Z", "Q_e", "zh", "Zh", "R_u", "zddu", "Zddu")  # weights that are multiplied by the scale of the cost
 TOUCHING_DISTANCE = 2e-3  # relative to the scale of a softened bound: a plan further away than this has left the bound
 
 
@@ -56,6 +57,8 @@ class Rti:
 
     Attributes:
         ocp: The problem.
+        problem: The problem as the solvers have it, whose further states are the inputs sent last, see `rti_mpc.rti.second_difference`; `ocp`
+            itself unless second differences are bounded. `scale` and `guess` are of this one.
         formulation: ``"simultaneous"`` or ``"sequential"``.
         iterations: QPs per sample at most: 1 is the plain real-time iteration, many with a small tolerance are converged SQP.
         tolerance: Change of the inputs, relative to their scale, half their range: an iteration with a larger change is followed by another.
@@ -63,6 +66,7 @@ class Rti:
         x: States of the plan of the last feedback, shape ``(N + 1, nx)``; the next guess is made of them.
         u: Inputs of the plan, shape ``(N_u, nu)``. Row 0 is the command.
         u_prev: Input before the plan, shape ``(nu,)``, from which the first increment is counted.
+        u_before: Input before that one, shape ``(nu,)``, on which the first second difference depends as well.
         y_ref: Reference rows of the current sample, shape ``(N, ny)``.
         p: Stage parameters of the current sample, shape ``(N + 1, np)``.
         x0: Initial state of the current sample, shape ``(nx,)``, its angles in the turn of the plan.
@@ -110,22 +114,29 @@ class Rti:
         check_options(solver, settings, iterations, tolerance)
         if build not in BUILDS:
             raise OcpError(f"build must be one of {', '.join(BUILDS)}, got {build!r}")
-        model, N, N_u = ocp.model, ocp.N, ocp.N_u
-        self.ocp = ocp
+        self.ocp, self.problem = ocp, as_solved(ocp)
+        own, model, N, N_u = ocp.model, self.problem.model, ocp.N, ocp.N_u
         self.formulation = formulation_of(ocp, formulation)
-        built = construction(ocp, self.formulation, structured=solver == "riccati", build=build if compile else None)
+        built = construction(self.problem, self.formulation, structured=solver == "riccati", build=build if compile else None)
         self.iterations, self.tolerance, self.taken = iterations, tolerance, 0
         # A step leads from a guess to a plan; the next guess is that plan, shifted by one stage. The two never share memory.
-        self.x: Array = np.zeros((N + 1, model.nx))
+        x_plan: Array = np.zeros((N + 1, model.nx))
         self.u: Array = np.zeros((N_u, model.nu))
-        x, u = np.zeros_like(self.x), np.zeros_like(self.u)
+        x, u = np.zeros_like(x_plan), np.zeros_like(self.u)
         # Copied through memory views that are made once: numpy decides at each copy how to do it, which takes longer than the copy.
-        self._pairs = tuple((guess.reshape(-1).data, plan.reshape(-1).data) for guess, plan in ((x, self.x), (u, self.u)))
+        self._pairs = tuple((guess.reshape(-1).data, plan.reshape(-1).data) for guess, plan in ((x, x_plan), (u, self.u)))
         self.u_prev: Array = np.array(model.u_rest, dtype=np.float64)
+        self.u_before = self.u_prev.copy()
         self.y_ref: Array = np.zeros((N, model.ny))
-        self.p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
-        self.x_nominal = built.x_nominal.copy()
-        self.x0: Array = self.x_nominal.copy()
+        p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
+        x0 = built.x_nominal.copy()
+        # What was sent, and where blocks begin, is after the model's own states and parameters: nobody else sees it.
+        self.x, self.p, self.x0 = x_plan[:, : own.nx], p[:, : own.np_], x0[: own.nx]
+        self._bounded = list(ocp.soft_ddu)
+        self._remembered: Array = x0[own.nx :].reshape(REMEMBERED, -1)
+        if isinstance(self.problem, Remembering):
+            p[:, own.np_ :] = self.problem.flags
+        self.x_nominal = self.x0.copy()
         self.status = QpStatus.NONE
         self.retuned = 0
         self._pending = False  # whether a sample was prepared and has had no feedback
@@ -133,21 +144,22 @@ class Rti:
         change: Array = np.zeros(1)
         self._change = change.data
         # OSQP knows no infinity but its own.
-        self._weights = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY) for name in WEIGHTS_AND_BOUNDS}
-        self.scale: Array = np.ones(model.nx + model.nu + ocp.ng)
+        self._weights = {name: np.clip(getattr(self.problem, name), -INFINITY, INFINITY) for name in ARGUMENTS}
+        self._parts = parts(ocp, self._weights)
+        self.scale: Array = np.ones(model.nx + model.nu + self.problem.ng)
         self.guess = Guess(
-            sample={"x": x, "u": u, "u_prev": self.u_prev, "y_ref": self.y_ref, "p": self.p},
+            sample={"x": x, "u": u, "u_prev": self.u_prev, "y_ref": self.y_ref, "p": p},
             weights=self._weights | {"scale": self.scale},
-            x0=self.x0,
-            plan=Step(self.x, self.u, self._violation, change),
+            x0=x0,
+            plan=Step(x_plan, self.u, self._violation, change),
         )
 
         make = built.make
-        self.advance = bind(make(built.shift), {"x": self.x, "u": self.u, "p": self.p}, {"x_next": x, "u_next": u})
+        self.advance = bind(make(built.shift), {"x": x_plan, "u": self.u, "p": p}, {"x_next": x, "u_next": u})
         bounds = np.atleast_2d(self._weights["lbx"])[0], np.atleast_2d(self._weights["ubx"])[0]
-        self._turns = Turns(ocp, (make(built.output), make(built.steps)), x, self.x0, self.y_ref, self.p, bounds)
+        self._turns = Turns(self.problem, (make(built.output), make(built.steps)), x, x0, self.y_ref, p, bounds)
         self._cost: Array = np.zeros(1)
-        self.evaluate = bind(make(built.cost), self.guess.arguments | {"x": self.x, "u": self.u}, {"cost": self._cost})
+        self.evaluate = bind(make(built.cost), self.guess.arguments | {"x": x_plan, "u": self.u}, {"cost": self._cost})
         qps = [Qp(transcription, self.guess, make) for transcription in built.transcriptions]
         self.active_set = None if built.structured is None else ActiveSet(*built.structured, self.guess, make)
         self._normalise(qps, built.normalised)
@@ -167,7 +179,7 @@ class Rti:
         """
         if not known:
             self._move(qps[0])
-            self.scale[:] = scale(self.ocp, self.x, self.u, self.y_ref, self.p)
+            self.scale[:] = scale(self.problem, self.guess.plan.x, self.u, self.y_ref, self.guess.sample["p"])
             motion = {name: array.copy() for name, array in self.guess.start.items()}
             known |= {"scale": self.scale.copy(), "cost_scale": 1.0 / step_size(qps[0]), "motion": motion}
         self.scale[:] = known["scale"]
@@ -175,7 +187,7 @@ class Rti:
         for name, array in known["motion"].items():
             self.guess.sample[name][:] = array
         for name in COST_WEIGHTS:
-            self._weights[name] *= self.cost_scale
+            self._parts[name][0][...] *= self.cost_scale
         self.y_ref[:] = 0.0
         for qp in qps:
             qp.fill()
@@ -204,16 +216,16 @@ class Rti:
 
         Args:
             x0: State, shape ``(nx,)``.
-            u_prev: Input that acts before the plan, shape ``(nu,)``.
+            u_prev: Input that acts before the plan, and has acted for long, shape ``(nu,)``.
 
         Raises:
             OcpError: One of them is no array of real numbers.
             ShapeError: A shape does not fit.
         """
         x0 = given.array("x0", x0, self.x0.shape)
-        self.u_prev[:] = given.array("u_prev", u_prev, self.u_prev.shape)
+        self.u_prev[:] = self.u_before[:] = given.array("u_prev", u_prev, self.u_prev.shape)
         self.u[:] = np.clip(self.u_prev, self.ocp.lbu, self.ocp.ubu)
-        self.x[:] = x0
+        self._stay_at(x0)
         self._pending = False
         self._turns.forget()
         self._backup = self.solvers[0]
@@ -246,17 +258,20 @@ class Rti:
             OcpError: A name is none of them, or a value no array of real numbers.
             ShapeError: A shape does not fit.
         """
-        owned = {name: self._weights[given.one_of("the name of a weight or bound", name, self._weights)] for name in values}
-        taken = {name: given.array(name, value, owned[name].shape) for name, value in values.items()}
+        known = {name: np.shape(getattr(self.ocp, given.one_of("the name of a weight or bound", name, self._parts))) for name in values}
+        taken = {name: given.array(name, value, known[name]) for name, value in values.items()}
         for name, value in taken.items():
-            np.clip(value, -INFINITY, INFINITY, out=owned[name])
+            part, entries = self._parts[name]
+            np.clip(value[..., entries], -INFINITY, INFINITY, out=part)
             if name in COST_WEIGHTS:
-                self._weights[name] *= self.cost_scale
+                part *= self.cost_scale
         for solver in self.solvers:
             solver.refill()
         self.retuned += 1
 
-    def prepare(self, y_ref: Array, p: Array | None = None, *, shift: bool = True, u_prev: Array | None = None) -> None:
+    def prepare(
+        self, y_ref: Array, p: Array | None = None, *, shift: bool = True, u_prev: Array | None = None, u_before: Array | None = None
+    ) -> None:
         """
         Shift the guess by one stage, linearize there and load the QP.
 
@@ -265,6 +280,7 @@ class Rti:
             p: Stage parameters at nodes 0 to N, shape ``(N + 1, np)``; None for those of the last sample.
             shift: Whether to shift to the next sample; False iterates on the same one.
             u_prev: Input that acts before the plan, shape ``(nu,)``, if it is not the first input of the last plan.
+            u_before: Input that acts a stage before that one, shape ``(nu,)``, if it is not `u_prev` of the sample before.
 
         Raises:
             OcpError: One of them is no array of real numbers; nothing has changed then, as for a wrong shape.
@@ -273,16 +289,22 @@ class Rti:
         y_ref = given.array("y_ref", y_ref, self.y_ref.shape)
         p = None if p is None else given.array("p", p, self.p.shape)
         u_prev = None if u_prev is None else given.array("u_prev", u_prev, self.u_prev.shape)
+        u_before = None if u_before is None else given.array("u_before", u_before, self.u_before.shape)
         if p is not None:
             self.p[...] = p
         if self._pending:
             self.keep_guess()
         self.y_ref[...] = y_ref
         self._turns.take_reference()
+        if u_before is not None:
+            self.u_before[...] = u_before
+        elif shift:
+            self.u_before[...] = self.u_prev
         if u_prev is not None:
             self.u_prev[...] = u_prev
         elif shift:
             self.u_prev[...] = self.u[0]
+        self._remember()
         self._pending = True
         if not shift:
             self._relinearize()
@@ -295,6 +317,17 @@ class Rti:
             self.advance()
         if self.solver is not self.active_set:  # if the QP solver was needed last, it is prepared as well
             self._load()
+
+    def _remember(self) -> None:
+        """Embed the last two inputs before the plan; nothing depends on the one before them."""
+        if self._bounded:
+            self._remembered[0], self._remembered[1:] = self.u_prev[self._bounded], self.u_before[self._bounded]
+
+    def _stay_at(self, x: Array) -> None:
+        """Let the states of the plan be those of a robot that stays in a state, shape ``(nx,)``, with the input before the plan."""
+        self.x[:] = x
+        if self._bounded:
+            self.guess.plan.x[:, self.ocp.model.nx :] = np.tile(self.u_prev[self._bounded], REMEMBERED)
 
     def _relinearize(self) -> None:
         """Linearize at the plan itself, and prepare the solver."""
@@ -327,7 +360,7 @@ class Rti:
         """Make a guess in motion, with inputs half way to their upper bounds, that is its own reference: scales are computed there, undamped."""
         ubu = self.ocp.ubu
         self.u[:] = np.where(np.isfinite(ubu), 0.5 * (np.clip(ubu, -INFINITY, INFINITY) + self.u_prev), self.u_prev)
-        self.x[:] = self.x_nominal
+        self._stay_at(self.x_nominal)
         for _ in range(self.ocp.N):
             self.shift()
         self.u_prev[:] = self.u[0]
@@ -337,7 +370,7 @@ class Rti:
         """Make a guess at the nominal state and the input at rest."""
         self.u_prev[:] = self.ocp.model.u_rest
         self.u[:] = np.clip(self.u_prev, self.ocp.lbu, self.ocp.ubu)
-        self.x[:] = self.x_nominal
+        self._stay_at(self.x_nominal)
         for guess, plan in self._pairs:
             guess[:] = plan
         self._meet_reference()
@@ -352,6 +385,7 @@ class Rti:
         """Shift the plan by one stage: its first input becomes the previous one, its last is repeated, with the state that the model predicts."""
         if self._pending:
             self.keep_guess()
+        self.u_before[...] = self.u_prev
         self.u_prev[...] = self.u[0]
         if self.active_set is None:
             self.advance()

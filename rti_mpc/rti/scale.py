@@ -5,8 +5,9 @@ Scale of each variable: its unit inside the solvers, so that the units of a mode
 The scale of an input is half the range between its bounds, or the sum of its largest
 increments over the control horizon, or follows from the curvature of the cost. The
 scale of a state is half the range between its bounds, or its reach: how far the inputs
-can move it over the horizon. The same holds for general constraints. Every tolerance is
-relative to these scales.
+can move it over the horizon. The same holds for general constraints. A second difference
+has the scale of its input, as an increment has. Every tolerance is relative to these
+scales.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.rti.linearization import constraints, gauss_newton, linearize
 from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.second_difference import Remembering
 
 
 def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
@@ -64,6 +66,9 @@ def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
     reach_g = np.abs((by_x @ response + by_u) * reach_u).sum(axis=2).max(axis=0, initial=0.0)
     scale_g = first(half(ocp.widest("lg"), ocp.widest("ug")), reach_g, beyond(ocp.widest("lg"), ocp.widest("ug"), np.zeros(ng)))
     scale_g[: len(ocp.soft)], scale_g[ocp.ng_path :] = scale_x[list(ocp.soft)], scale_x[list(ocp.soft_e)]
+    if isinstance(ocp, Remembering):
+        remembered = list(ocp.remembered)
+        scale_g[ocp.ng_path - len(remembered) : ocp.ng_path] = reach_u[remembered]
     return np.concatenate([scale_x, reach_u, scale_g])
 
 

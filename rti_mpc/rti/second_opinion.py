@@ -46,7 +46,7 @@ class SecondOpinion:
         Args:
             rti: Real-time iteration whose plans are judged; its backup, if that is OSQP, will start from the last opinion.
         """
-        theirs = rti.guess.arguments | {"x0": rti.x0, "plan": rti.u}
+        theirs = rti.guess.arguments | {"x0": rti.guess.x0, "plan": rti.u}
         ours = {name: array.copy() for name, array in theirs.items()}
         sample, weights = ({name: ours[name] for name in names} for names in (rti.guess.sample, rti.guess.weights))
         self._plan = Step(*map(np.zeros_like, rti.guess.plan))
@@ -54,7 +54,7 @@ class SecondOpinion:
         qp.fill()
         self._solver = Solver(qp, SETTINGS)
         self._rti, self._retuned = rti, rti.retuned
-        self._u, self._scale = ours["plan"], rti.scale[rti.ocp.model.nx :][: rti.ocp.model.nu]
+        self._u, self._scale = ours["plan"], rti.scale[rti.problem.model.nx :][: rti.ocp.model.nu]
         # Copied through memory views that are made once, as in `Rti`.
         pairs = {name: (array.reshape(-1).data, theirs[name].reshape(-1).data) for name, array in ours.items()}
         self._weights = tuple(pairs.pop(name) for name in weights)

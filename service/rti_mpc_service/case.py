@@ -173,8 +173,8 @@ def take(rti: Rti, about: Mapping[str, Any]) -> QpCase:
         rti: Real-time iteration of the sample.
         about: As `QpCase.about`; the inputs are filled in.
     """
-    arrays = {name: array.copy() for name, array in (rti.guess.arguments | {"x0": rti.x0}).items()}
-    return case_of(qp_on(rti, arrays), arrays, rti.x, rti.u, {"inputs": inputs_of(rti), **about})
+    arrays = {name: array.copy() for name, array in (rti.guess.arguments | {"x0": rti.guess.x0}).items()}
+    return case_of(qp_on(rti, arrays), arrays, rti.guess.plan.x, rti.u, {"inputs": inputs_of(rti), **about})
 
 
 def case_of(qp: Qp, arrays: dict[str, Array], x: Array, u: Array, about: dict[str, Any], pause: Callable[[], object] = lambda: None) -> QpCase:
@@ -239,7 +239,7 @@ def qp_on(rti: Rti, arrays: Mapping[str, Array]) -> Qp:
     guess = Guess(sample, weights, arrays["x0"], Step(*map(np.zeros_like, rti.guess.plan)))
     if rti.formulation == "simultaneous":
         return rti.solvers[-1].qp.on(guess)
-    return Qp(simultaneous(rti.ocp), guess, lambda function: function)
+    return Qp(simultaneous(rti.problem), guess, lambda function: function)
 
 
 def qp_at(rti: Rti, arrays: Mapping[str, Array]) -> Qp:

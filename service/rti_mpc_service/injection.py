@@ -55,11 +55,13 @@ class FaultyRti(Rti):
         self._begin()
         super().reset(x0, u_prev)
 
-    def prepare(self, y_ref: Array, p: Array | None = None, *, shift: bool = True, u_prev: Array | None = None) -> None:
+    def prepare(
+        self, y_ref: Array, p: Array | None = None, *, shift: bool = True, u_prev: Array | None = None, u_before: Array | None = None
+    ) -> None:
         """As `Rti.prepare`."""
         if shift:
             self._begin()
-        super().prepare(y_ref, p, shift=shift, u_prev=u_prev)
+        super().prepare(y_ref, p, shift=shift, u_prev=u_prev, u_before=u_before)
         if self._failing == "nan_model":  # what it predicts, and whatever is linearized there, with parameters or without
             self.guess.sample["x"][1:] = np.nan
             self._linearize()
@@ -70,7 +72,7 @@ class FaultyRti(Rti):
         """As `Rti._linearize`; a wrong gradient is that of another reference, which nobody else sees."""
         right = self.y_ref.copy()
         if self._failing == "gradient":
-            y = np.array(self.ocp.model.h().map(self.ocp.N)(self.guess.sample["x"][1:].T, self.p[1:].T)).T
+            y = np.array(self.ocp.model.h().map(self.ocp.N)(self.guess.sample["x"][1:, : self.ocp.model.nx].T, self.p[1:].T)).T
             self.y_ref[:] = y + GRADIENT_ERROR * (right - y)
         super()._linearize()
         self.y_ref[:] = right

@@ -31,6 +31,7 @@ TIGHT = SolverSettings(eps=1e-10, max_iter=200_000, scaling=10)
 POSE = (Signal("x", "m"), Signal("y", "m"), Signal("psi", "rad", angle=True))
 LIMITS: dict[str, Any] = {"N": 8, "dt": 0.1, "Q": [1.0, 1.0, 0.05], "R": [0.2, 0.1], "lbu": [-0.5, -0.8], "ubu": [0.5, 0.8]}
 LIMITS |= {"lbdu": [-0.25, -0.4], "ubdu": [0.25, 0.4]}
+BENDS: dict[str, Any] = {"lbddu": [-0.06, -0.1], "ubddu": [0.06, 0.12], "zddu": 10.0, "Zddu": 10.0}  # larger penalties take OSQP long
 
 
 def lagging_car(lag_s: float = 0.01, **changes: Any) -> Ocp:
@@ -118,6 +119,13 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "bounds of states and a constraint by stage, a terminal set": lambda: pulled_car(uh=FALLING[:, None], ubx_e=[NONE] * 3 + [0.1], **SLOWING),
     "fixed input": lambda: sampled_car(lbu=[-0.5, 0.3], ubu=[0.5, 0.3], lbdu=-np.inf, ubdu=np.inf),
     "terminal set": lambda: sampled_car(lbx_e=[-np.inf] * 3 + [-0.05], ubx_e=[np.inf] * 3 + [0.02]),
+    "second differences": lambda: sampled_car(N=5, **BENDS),
+    "second differences, held inputs": lambda: sampled_car(N_u=3, **BENDS),
+    "second differences, blocks": lambda: sampled_car(blocks=[1, 1, 2, 4], **BENDS),
+    "second differences, blocks, the first one longer, implicit integrator": lambda: lagging_car(method="irk", blocks=[2, 1, 5], **BENDS),
+    "second difference of one input, beside a terminal set and outputs of inputs": lambda: felt_car(
+        N_u=3, ubx_e=[np.inf] * 3 + [0.02], lbddu=[-np.inf, -0.1], ubddu=[np.inf, 0.1], z=10.0, Z=10.0, zddu=10.0
+    ),
     "terminal set, from above alone, held inputs": lambda: sampled_car(ubx_e=[np.inf] * 3 + [0.05], N_u=3, z=[1.0] * 4, Z=[0.0] * 4),
 }
 
@@ -146,11 +154,12 @@ def test_problem_is_solved_as_by_ipopt(name: str, formulation: str, solver: str)
     rti, solve = Rti(ocp, TIGHT, formulation=formulation, solver=solver, compile=False), nlp(ocp)
     bound = 0
     for x0, y_ref, u_prev in around_a_bend(ocp, 6):
+        u_before = u_prev - [0.04, -0.07]
         rti.reset(x0, u_prev)
-        x, u, cost = solve(x0, u_prev, y_ref, rti.x, rti.u)
+        x, u, cost = solve(x0, u_prev, y_ref, rti.x, rti.u, u_before)
         for _ in range(200):
             before = rti.u.copy()
-            rti.prepare(y_ref, shift=False)
+            rti.prepare(y_ref, shift=False, u_before=u_before)
             assert rti.feedback(x0) is QpStatus.SOLVED
             if np.abs(rti.u - before).max() < 1e-9:
                 break
@@ -158,7 +167,8 @@ def test_problem_is_solved_as_by_ipopt(name: str, formulation: str, solver: str)
         np.testing.assert_allclose(rti.x, x, rtol=0, atol=1e-6)
         assert rti.cost == pytest.approx(cost, rel=1e-6)
         du = np.diff(np.vstack([u_prev, u]), axis=0)
-        pairs = ((u, ocp.lbu, ocp.ubu), (du, ocp.lbdu, ocp.ubdu), (x[1:], ocp.lbx, ocp.ubx))
+        ddu = np.diff(np.vstack([u_prev - u_before, du]), axis=0)
+        pairs = ((u, ocp.lbu, ocp.ubu), (du, ocp.lbdu, ocp.ubdu), (x[1:], ocp.lbx, ocp.ubx), (ddu, ocp.lbddu, ocp.ubddu))
         bound += any(bool(np.any(np.isclose(z, lower, atol=1e-6) | np.isclose(z, upper, atol=1e-6))) for z, lower, upper in pairs)
     assert bound >= 2  # in so many of them bounds act
 
@@ -261,6 +271,61 @@ def test_outputs_and_constraints_in_mx_are_those_in_sx() -> None:
     assert np.max(np.abs(plans[0])) > 0.1
     with pytest.raises(OcpError, match="h_expr must be SX, of the model's x, u, p, or be given to the Model"):
         Ocp(model, N=6, dt=0.1, Q=[1, 1], R=1, h_expr=x[0] * u)
+
+
+def test_second_differences_that_cannot_be_kept_are_exceeded_by_as_little_as_can_be_and_the_excess_is_told() -> None:
+    """An input that rises by 0.2 a sample is 0.1 below its upper bound: to stay below it must bend by 0.1 at least, and by no more than 0.06."""
+    ocp = sampled_car(lbddu=[-0.06, -0.1], ubddu=[0.06, 0.1], lbx=-np.inf, ubx=np.inf)
+    rti, solve = Rti(ocp, compile=False, iterations=50, tolerance=1e-10), nlp(ocp)
+    x0, y_ref, u_prev, u_before = np.zeros(4), np.zeros((8, 3)), np.array([0.4, 0.0]), np.array([0.2, 0.0])
+    y_ref[:, 0] = 0.5 * np.arange(1, 9)
+    rti.reset(x0, u_prev)
+    rti.prepare(y_ref, shift=False, u_before=u_before)
+    assert rti.feedback(x0) is QpStatus.SOLVED
+    _, u, _ = solve(x0, u_prev, y_ref, rti.x, rti.u, u_before)
+    np.testing.assert_allclose(rti.u, u, rtol=0, atol=1e-6)
+    ddu = np.diff(np.vstack([u_before, u_prev, rti.u]), 2, axis=0)
+    assert rti.u.max() <= 0.5
+    assert rti.violation == pytest.approx(np.abs(ddu[:, 0]).max() - 0.06, abs=1e-6)  # it is that of the plan before its refinement
+    assert 0.04 < rti.violation < 0.061
+
+
+def test_second_differences_are_counted_from_sample_to_sample() -> None:
+    """Of the first two inputs of a plan each is sent in turn; the library remembers what came before."""
+    rti = Rti(sampled_car(**BENDS | {"zddu": 1e3}), compile=False)
+    x, sent = np.zeros(4), [np.zeros(2), np.zeros(2)]
+    rti.reset(x, np.zeros(2))
+    for k in range(25):
+        rti.prepare(np.column_stack([0.04 * (k + np.arange(1, 9)), np.full((8, 2), 0.3 if k < 12 else -0.3)]))
+        assert rti.feedback(x) is QpStatus.SOLVED
+        sent.append(rti.u[0].copy())
+        x = rti.x[1].copy()
+    ddu = np.diff(sent, 2, axis=0)
+    assert np.all(ddu <= np.array([0.06, 0.12]) + 1e-7)
+    assert np.all(ddu >= np.array([-0.06, -0.1]) - 1e-7)
+    assert np.isclose(ddu, [0.06, 0.12], atol=1e-7).any(axis=0).all()  # they act
+
+
+def test_second_differences_are_retuned_as_if_the_problem_had_been_built_with_them() -> None:
+    wide = {"lbddu": -0.2, "ubddu": [0.3, 0.2], "zddu": [5.0, 7.0], "Zddu": 1.0}
+    built, retuned = (Rti(sampled_car(**bends), compile=False, iterations=50, tolerance=1e-9) for bends in (BENDS, wide))
+    retuned.retune({name: getattr(built.ocp, name) for name in BENDS})
+    for x0, y_ref, u_prev in around_a_bend(built.ocp, 3):
+        for rti in (built, retuned):
+            rti.reset(x0, u_prev)
+            rti.prepare(y_ref, shift=False, u_before=u_prev)
+            assert rti.feedback(x0) is QpStatus.SOLVED
+        np.testing.assert_allclose(retuned.u, built.u, rtol=0, atol=1e-6)  # each is converged in scales of its own
+
+
+def test_states_and_parameters_of_a_plan_are_those_of_the_model_whatever_solvers_remember() -> None:
+    ocp = sampled_car(blocks=[1, 1, 2, 4], **BENDS)
+    rti = Rti(ocp, compile=False)
+    assert rti.ocp is ocp
+    assert (rti.x.shape, rti.x0.shape, rti.p.shape, rti.x_nominal.shape) == ((9, 4), (4,), (9, 0), (4,))
+    assert rti.problem.model.nx == 4 + 3 * 2
+    plain = sampled_car()
+    assert Rti(plain, compile=False).problem is plain
 
 
 def test_reference_of_inputs_moves_with_the_parameters_of_the_stages() -> None:

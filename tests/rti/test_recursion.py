@@ -20,7 +20,7 @@ from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.reference.trajectory import eight, rows
 from rti_mpc.rti.certificate import certificate
 from rti_mpc.rti.dense import LEAST_SIZE
-from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
+from rti_mpc.rti.ocp import ARGUMENTS, Ocp
 from rti_mpc.rti.places import places
 from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.recursion import recur
@@ -65,9 +65,7 @@ def problem(nx: int, nu: int, N: int, within: int | list[int], *, softened: bool
 
 def arguments(of: ca.Function, ocp: Ocp, rng: np.random.Generator, known: dict[str, ca.DM]) -> dict[str, ca.DM]:
     """Numbers for a function of the solver: the problem's weights and bounds, what is known, and random ones."""
-    fixed = (
-        {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY).T for name in WEIGHTS_AND_BOUNDS} | {"scale": np.ones(of.size1_in("scale"))} | known
-    )
+    fixed = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY).T for name in ARGUMENTS} | {"scale": np.ones(of.size1_in("scale"))} | known
     return {name: ca.DM(fixed[name]) if name in fixed else ca.DM(rng.normal(size=of.size_in(name))) for name in of.name_in()}
 
 

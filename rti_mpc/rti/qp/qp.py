@@ -51,7 +51,7 @@ class Guess:
 
     Attributes:
         sample: Arrays x, u, u_prev, y_ref and p, by these names.
-        weights: Weights and bounds, by the names in `rti_mpc.rti.ocp.WEIGHTS_AND_BOUNDS`, and the scale.
+        weights: Weights and bounds, by the names in `rti_mpc.rti.ocp.ARGUMENTS`, and the scale.
         x0: State embedded at node 0, shape ``(nx,)``.
         plan: The plan that the full step from the guess leads to.
     """

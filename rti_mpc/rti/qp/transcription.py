@@ -34,13 +34,13 @@ class Transcription:
     Attributes:
         P: Pattern of the upper triangle of the Hessian, shape ``(n, n)``.
         A: Pattern of the constraint matrix, shape ``(m, n)``.
-        everything: ``(x, u, u_prev, y_ref, p, *WEIGHTS_AND_BOUNDS, scale) -> (q, P_data, A_data, lower, upper, memory, checksum, cost)``;
+        everything: ``(x, u, u_prev, y_ref, p, *ARGUMENTS, scale) -> (q, P_data, A_data, lower, upper, memory, checksum, cost)``;
             `memory` holds the further arguments of `embed` and `step`, and `checksum` is finite if and only if all the others are.
         varying: Names of those of these eight that change from sample to sample.
         data: As `everything`, but returns only those in `varying`.
         embed: ``(x0, x, memory) -> `` the parts of the QP that depend on the initial state, with the name of the vector and ``_embedded``.
         embedded: Vector (q, lower or upper) and slice that each of these parts is written to.
-        step: ``(x, u, u_prev, solution, x0, memory, *WEIGHTS_AND_BOUNDS, scale) -> (x_plan, u_plan, violation, change)``: the plan after
+        step: ``(x, u, u_prev, solution, x0, memory, *ARGUMENTS, scale) -> (x_plan, u_plan, violation, change)``: the plan after
             the full step, its largest violation of softened bounds, in their unit and relative to their scale, and the size of the step.
         columns: Index of each variable's scale, see `rti_mpc.rti.scale`; shape ``(n,)``.
         rows: Index of each row's scale; shape ``(m,)``.

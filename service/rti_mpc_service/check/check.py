@@ -130,7 +130,7 @@ def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> Check
     first, second = config.solver.name, SECOND_SOLVER if config.solver.name != SECOND_SOLVER else "osqp"
     other = next(name for name in FORMULATIONS if name != rti.formulation)
     tight, judge = (tight_copy(rti, solver, formulation) for solver, formulation in ((first, rti.formulation), (second, other)))
-    bounds, scale = Bounds(rti), rti.scale[model.nx : model.nx + model.nu]
+    bounds, scale = Bounds(rti), rti.scale[rti.problem.model.nx :][: model.nu]
     disturbance = np.minimum(DISTURBANCE_SCALES * rti.scale[: model.nx], MAX_DISTURBANCE)
     rng = np.random.default_rng(1)
     x = np.array(robot_settings(config)["x0"])
@@ -154,7 +154,7 @@ def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> Check
             failed_at = x
         bounds.note_plan()
         if asked and status is QpStatus.SOLVED:
-            mine, theirs = (solution(one, rti.guess.start.values(), y_ref, x) for one in (tight, judge))
+            mine, theirs = (solution(one, rti, y_ref, x) for one in (tight, judge))
             if mine is not None and theirs is not None:
                 differences.append(float(np.max(np.abs(mine - theirs) / scale)))
                 deviations.append(float(np.max(np.abs(rti.u - theirs) / scale)))
@@ -182,8 +182,9 @@ def tight_copy(rti: Rti, solver: str, formulation: str) -> Rti:
     return Rti(rti.ocp, settings, formulation=formulation, solver=solver, iterations=1, compile=False)
 
 
-def solution(one: Rti, guess: Iterable[Array], y_ref: Array, x0: Array) -> Array | None:
-    """Return the inputs of the QP at a guess of x, u and u_prev, shape ``(N_u, nu)``; None if it is not solved."""
-    one.x[:], one.u[:], one.u_prev[:] = guess
+def solution(one: Rti, of: Rti, y_ref: Array, x0: Array) -> Array | None:
+    """Return the inputs of the QP at the guess of another copy, shape ``(N_u, nu)``; None if it is not solved."""
+    one.guess.plan.x[:], one.u[:], one.u_prev[:] = of.guess.start.values()
+    one.u_before[:] = of.u_before
     one.prepare(y_ref, shift=False)
     return one.u.copy() if one.feedback(x0) is QpStatus.SOLVED else None

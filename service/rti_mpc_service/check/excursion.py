@@ -48,13 +48,15 @@ class Bounds:
     def __init__(self, rti: Rti) -> None:
         self._rti, ocp = rti, rti.ocp
         model = ocp.model
-        self._scale_u, self._scale_g = rti.scale[model.nx : model.nx + model.nu], rti.scale[model.nx + model.nu :][: ocp.ng_path]
+        self._scale_u, self._scale_g = rti.scale[rti.problem.model.nx :][: model.nu], rti.scale[rti.problem.model.nx + model.nu :][: ocp.ng_path]
         lg, ug = (ocp.tightest(name)[: ocp.ng_path] for name in ("lg", "ug"))
         lbu, ubu, lbdu, ubdu = (ocp.tightest(name) for name in ("lbu", "ubu", "lbdu", "ubdu"))
         inputs = [signal.name for signal in model.inputs]
         softened = [model.states[j].name for j in ocp.soft] + [signal.name for signal in model.constraints[: ocp.h_expr.numel()]]
         softened += [f"constraint {j}" for j in range(len(softened) - len(ocp.soft), ocp.h_expr.numel())]
+        kinds: tuple[tuple[str, list[str], Array, Array], ...]
         kinds = (("", inputs, lbu, ubu), ("increment of ", inputs, lbdu, ubdu), ("", softened, lg, ug))
+        kinds += (("second difference of ", inputs, ocp.lbddu, ocp.ubddu),)
         self._there = np.concatenate([np.isfinite(bounds) for _, _, lower, upper in kinds for bounds in (lower, upper)])
         every = [f"{side} bound of {kind}{name}" for kind, names, _, _ in kinds for side in ("lower", "upper") for name in names]
         self.names = [name for name, there in zip(every, self._there, strict=True) if there]
@@ -72,6 +74,7 @@ class Bounds:
             (rti.u, ocp.lbu, ocp.ubu, self._scale_u),
             (increments, ocp.lbdu, ocp.ubdu, self._scale_u),
             (softened, ocp.lg[..., : ocp.ng_path], ocp.ug[..., : ocp.ng_path], self._scale_g),
+            (np.diff(increments, axis=0, prepend=(rti.u_prev - rti.u_before)[None]), ocp.lbddu, ocp.ubddu, self._scale_u),
         ):
             found += [(values <= lower + AT_BOUND_SCALES * scale).any(axis=0), (values >= upper - AT_BOUND_SCALES * scale).any(axis=0)]
         self.reached |= np.concatenate(found)[self._there]
@@ -94,7 +97,7 @@ def excursions(rti: Rti, x0: Array) -> Iterator[Excursion]:
                 way[j] = reach * (bounds[j] - rest[j])
                 yield Excursion(x0, held(nominal + REFERENCE_DISTANCE_FACTOR * displacement(ocp, x0, nominal, way), ocp.N))
     regular = regular_at(ocp)
-    scale_g = rti.scale[ocp.model.nx + ocp.model.nu :]
+    scale_g = rti.scale[rti.problem.model.nx + ocp.model.nu :]
     for bounds, outward in ((ocp.tightest("lg")[: ocp.ng_path], -START_EXCESS_SCALES), (ocp.tightest("ug")[: ocp.ng_path], START_EXCESS_SCALES)):
         for j in np.flatnonzero(np.isfinite(bounds)):
             starts = (start_at(rti, x0, int(j), bounds[j] + share * outward * scale_g[j]) for share in SHARES)

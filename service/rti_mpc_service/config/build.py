@@ -97,6 +97,7 @@ def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
     lbu, ubu = by_stage(limits.inputs, stages.inputs, names(model.inputs), N_u)
     lbdu, ubdu = by_stage(limits.increments, stages.increments, names(model.inputs), N_u)
     lbx, ubx = by_stage(limits.states, stages.states, names(model.states), N)
+    lbddu, ubddu = bounds(limits.second_differences, names(model.inputs))
     lbx_e, ubx_e = bounds(limits.terminal, names(model.states))
     return {
         "Q": [weights.Q[output.name] for output in model.outputs],
@@ -116,6 +117,10 @@ def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
         "Zh": Z,
         "lbx_e": lbx_e,
         "ubx_e": ubx_e,
+        "lbddu": lbddu,
+        "ubddu": ubddu,
+        "zddu": z,
+        "Zddu": Z,
     }
 
 

@@ -163,6 +163,7 @@ def check_names(config: Config, model: Model) -> None:
         ("ocp.weights.u_ref", ocp.weights.u_ref, "input", model.inputs),
         ("ocp.bounds.inputs", ocp.bounds.inputs, "input", model.inputs),
         ("ocp.bounds.increments", ocp.bounds.increments, "input", model.inputs),
+        ("ocp.bounds.second_differences", ocp.bounds.second_differences, "input", model.inputs),
         ("ocp.bounds.states", ocp.bounds.states, "state", model.states),
         ("ocp.bounds.terminal", ocp.bounds.terminal, "state", model.states),
         ("ocp.bounds.constraints", ocp.bounds.constraints, "constraint", model.constraints),

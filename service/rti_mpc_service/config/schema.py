@@ -41,6 +41,13 @@ def around_zero(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
+def within_zero(value: tuple[float, float]) -> tuple[float, float]:
+    """Accept an interval with zero inside it: limits of a second difference."""
+    if not value[0] < 0.0 < value[1]:
+        raise ValueError("must hold lower < 0 < upper, or no increment could be kept and changed")
+    return value
+
+
 def pair(value: object) -> object:
     """Accept ``[x, y]`` only."""
     if not (isinstance(value, list | tuple) and len(value) == 2 and all(type(v) in (int, float) for v in value)):
@@ -57,6 +64,7 @@ Bound = Annotated[float, AllowInfNan(True)]
 Interval = Annotated[tuple[Bound, Bound], BeforeValidator(interval)]
 InputInterval = Annotated[tuple[Bound, Bound], BeforeValidator(input_interval)]
 Increment = Annotated[Interval, AfterValidator(around_zero)]
+SecondDifference = Annotated[Interval, AfterValidator(within_zero)]
 Weight = Annotated[float, Field(ge=0, le=1e15)]  # limited so that sums with terms of order 1 keep their digits
 Positive = Annotated[float, Field(gt=0)]
 Weights = Annotated[tuple[Weight, ...], BeforeValidator(sequence, json_schema_input_type=Weight | tuple[Weight, ...])]
@@ -107,11 +115,15 @@ class WeightSection(Section):
 
 
 class BoundSection(Section):
-    """Bounds [lower, upper] of inputs, increments, states and constraints; a name left out has no bound."""
+    """Bounds [lower, upper] of inputs, increments, second differences, states and constraints; a name left out has no bound."""
 
     inputs: dict[str, InputInterval] = Field(default={}, description="bounds of inputs, by name, in the input's unit; equal ones fix the input")
     increments: dict[str, Increment] = Field(
         default={}, description="bounds of the change of an input from one sample to the next, by name, in the input's unit"
+    )
+    second_differences: dict[str, SecondDifference] = Field(
+        default={},
+        description="softened bounds of the change of an increment from one sample to the next (jerk), by name, in the input's unit",
     )
     states: dict[str, Interval] = Field(default={}, description="softened bounds of states, by name, in the state's unit")
     terminal: dict[str, Interval] = Field(

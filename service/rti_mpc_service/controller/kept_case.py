@@ -36,7 +36,7 @@ class KeptCase:
             rti: Real-time iteration of the controller.
             book: Its journal.
         """
-        theirs = rti.guess.arguments | {"x0": rti.x0, "x_plan": rti.x, "u_plan": rti.u}
+        theirs = rti.guess.arguments | {"x0": rti.guess.x0, "x_plan": rti.guess.plan.x, "u_plan": rti.u}
         ours = {name: array.copy() for name, array in theirs.items()}
         self._pairs = tuple((array.reshape(-1).data, theirs[name].reshape(-1).data) for name, array in ours.items() if array.size)
         self._plan = ours.pop("x_plan"), ours.pop("u_plan")

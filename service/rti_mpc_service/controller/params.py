@@ -29,10 +29,10 @@ from rti_mpc_service.config.refusal import entries, explain
 from rti_mpc_service.config.schema import Config
 
 WEIGHT_KEYS = ("ocp.weights.Q", "ocp.weights.R", "ocp.weights.R_u", "ocp.weights.delta", "ocp.weights.lambda", "ocp.bounds.soft_weight")
-BOUND_KEYS = ("ocp.bounds.inputs", "ocp.bounds.increments", "ocp.bounds.states")
+BOUND_KEYS = ("ocp.bounds.inputs", "ocp.bounds.increments", "ocp.bounds.second_differences", "ocp.bounds.states")
 VERSION_COUNT = 2**32  # telemetry has 32 bits for the version
 SAMPLE_TIMEOUT_PERIODS = 2  # how long to wait for the end of a sample
-SAMPLE_ARRAYS = ("x", "u", "u_prev", "y_ref", "p")  # arrays of an `Rti` that hold the present sample
+SAMPLE_ARRAYS = ("x", "u", "u_prev", "u_before", "y_ref", "p")  # arrays of an `Rti` that hold the present sample
 
 
 class Params:

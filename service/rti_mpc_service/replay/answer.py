@@ -107,7 +107,7 @@ def of_ours(case: QpCase, rti: Rti, changed: Mapping[str, Array] | None = None) 
     """
     if rti.active_set is None:
         raise ConfigError(f"--solver {OURS} needs a problem whose [solver] name is {OURS!r}, got another one in the case")
-    here = rti.guess.arguments | {"x0": rti.x0}
+    here = rti.guess.arguments | {"x0": rti.guess.x0}
     if {name: array.shape for name, array in here.items()} != {name: array.shape for name, array in case.guess.items()}:
         raise ConfigError("the guess of the case must have the arrays of its problem, got others")
     for name, array in here.items():
@@ -122,7 +122,7 @@ def of_ours(case: QpCase, rti: Rti, changed: Mapping[str, Array] | None = None) 
     taken_s = time.perf_counter() - start
     if not status.usable:
         return Answer(OURS, status, own.iterations, taken_s)
-    z = solution(qp_at(rti, here), rti.x - here["x"], rti.u - here["u"]) / case.columns
+    z = solution(qp_at(rti, here), rti.guess.plan.x - here["x"], rti.u - here["u"]) / case.columns
     return Answer(OURS, status, own.iterations, taken_s, z, {"gap": own.res_dual})
 
 

@@ -14,6 +14,7 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import COST_WEIGHTS, TOUCHING_DISTANCE, Rti
 from rti_mpc_service.config.schema import Config
 
+FIRST = {"state": 1, "constraint": 1, "second difference": 0}  # node, or stage, from which on values are known; others are of the last node
 ACTING_DISTANCE = 1e-6  # from a bound of an input, relative to the input's scale
 
 
@@ -24,7 +25,7 @@ def acting_bounds(rti: Rti, config: Config) -> list[dict[str, Any]]:
     Stages of inputs and increments begin at 0, which acts next; of inputs that are held the first one is named. Those of states and constraints
     begin at 1.
     """
-    model, weights = rti.ocp.model, rti.guess.weights
+    model, weights = rti.problem.model, rti.guess.weights
     scale_u, scale_g = rti.scale[model.nx : model.nx + model.nu], rti.scale[model.nx + model.nu :]
     increments = np.diff(rti.u, axis=0, prepend=rti.u_prev[None])
     found: list[dict[str, Any]] = []
@@ -55,13 +56,13 @@ class BoundAlongPlan(NamedTuple):
     A softened bound along a plan.
 
     Attributes:
-        kind: ``"state"``, ``"constraint"``, or ``"end"`` for a state that is bounded at the last node alone.
+        kind: ``"state"``, ``"constraint"``, ``"second difference"`` of an input, or ``"end"`` for a state that is bounded at the last node alone.
         name: Name of the signal.
         unit: Its unit.
         lower: Lower bound, shape ``(nodes,)``.
         upper: Upper bound.
         values: Values along the plan.
-        first: Node of the first of them.
+        first: Node, or of a second difference stage, of the first of them.
     """
 
     kind: str
@@ -75,15 +76,17 @@ class BoundAlongPlan(NamedTuple):
 
 def softened(rti: Rti, config: Config) -> list[BoundAlongPlan]:
     """Return the softened bounds in the order of `Ocp.lg`."""
-    ocp, w = rti.ocp, rti.guess.weights
+    ocp, w = rti.problem, rti.guess.weights
     g = outputs_of(constraints(ocp)[0], rti)
     rows = [("state", ocp.model.states[j], w["lbx"][..., j], w["ubx"][..., j]) for j in ocp.soft]
     rows += [("constraint", signal, w["lh"][..., j], w["uh"][..., j]) for j, signal in enumerate(constraint_signals(rti, config))]
+    nh = rti.ocp.h_expr.numel()
+    rows += [("second difference", ocp.model.inputs[j], w["lh"][..., nh + i], w["uh"][..., nh + i]) for i, j in enumerate(rti.ocp.soft_ddu)]
     rows += [("end", ocp.model.states[j], w["lbx_e"][j], w["ubx_e"][j]) for j in ocp.soft_e]
     found = []
     for j, (kind, signal, low, high) in enumerate(rows):
-        first = ocp.N if kind == "end" else 1
-        values = g[first - 1 :, j]
+        first = FIRST.get(kind, ocp.N)
+        values = g[-1:, j] if kind == "end" else g[:, j]
         lower, upper = (np.broadcast_to(bound, values.shape) for bound in (low, high))
         found.append(BoundAlongPlan(kind, signal.name, signal.unit, lower, upper, values, first))
     return found
@@ -110,7 +113,8 @@ def constraint_signals(rti: Rti, config: Config) -> Sequence[Any]:
 def outputs_of(function: Any, rti: Rti) -> Array:
     """Evaluate a function of state, input and parameters at nodes 1 to N of the plan, shape ``(N, outputs)``."""
     N, held = rti.ocp.N, rti.u[rti.ocp.held]
-    arguments = (rti.x[1:].T, held.T, rti.p[1:].T)[: function.n_in()] if function.n_in() == 3 else (rti.x[1:].T, rti.p[1:].T)
+    x, p = (rti.guess.plan.x, rti.guess.sample["p"]) if function.size1_in(0) > rti.ocp.model.nx else (rti.x, rti.p)
+    arguments = (x[1:].T, held.T, p[1:].T) if function.n_in() == 3 else (x[1:].T, p[1:].T)
     return np.array(function.map(N)(*arguments)).T
 
 
@@ -130,8 +134,8 @@ def cost_terms(rti: Rti, config: Config) -> dict[str, float]:
     for signal, value in zip(model.inputs, (w["R_u"] * off**2).sum(axis=0), strict=True):
         terms[f"{signal.name} itself"] = float(value)
     terms["terminal weight"] = float(errors[-1] @ w["Q_e"] @ errors[-1])
-    for soft, linear, square in zip(softened(rti, config), *slack_weights(ocp, w), strict=True):
+    for soft, linear, square in zip(softened(rti, config), *slack_weights(rti.problem, w), strict=True):
         slack = np.maximum(0.0, np.maximum(soft.lower - soft.values, soft.values - soft.upper))
-        name = f"bounds of {soft.name}"
+        name = f"bounds of {'the second difference of ' if soft.kind == 'second difference' else ''}{soft.name}"
         terms[name] = terms.get(name, 0.0) + float((linear * slack + 0.5 * square * slack**2).sum())
     return {name: value for name, value in terms.items() if value}

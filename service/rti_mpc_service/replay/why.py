@@ -379,8 +379,10 @@ def bound_text(bound: Mapping[str, Any]) -> str:
     if bound["kind"] == "increment":
         way = "rises" if bound["side"] == "upper" else "falls"
         return f"{bound['name']} {way} as fast as it may, {value} per sample: stages {stages}"
+    name = f"the second difference of {bound['name']}" if bound["kind"] == "second difference" else bound["name"]
+    value += " per sample squared" if bound["kind"] == "second difference" else ""
     over = f", exceeded by {bound['violation']:.3g} {bound['unit']}" if bound["violation"] > ROUNDING * max(1.0, abs(bound["bound"])) else ""
-    return f"{bound['name']} at its {bound['side']} bound, {value}: stages {stages}{over}"
+    return f"{name} at its {bound['side']} bound, {value}: stages {stages}{over}"
 
 
 def without_text(planned: Mapping[str, float] | None, inputs: Mapping[str, Mapping[str, Any]]) -> str:

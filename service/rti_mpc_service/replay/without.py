@@ -16,6 +16,7 @@ from rti_mpc_service.replay.plan import softened
 
 FAR = 1e6  # scales by which a bound is moved away, at all stages
 BOUNDS = {"input": ("lbu", "ubu"), "increment": ("lbdu", "ubdu"), "state": ("lbx", "ubx"), "constraint": ("lh", "uh"), "end": ("lbx_e", "ubx_e")}
+BOUNDS["second difference"] = BOUNDS["constraint"]  # among which solvers have them
 
 
 def without(case: QpCase, rti: Rti, config: Config, bound: Mapping[str, Any]) -> dict[str, float] | None:
@@ -40,16 +41,17 @@ def without(case: QpCase, rti: Rti, config: Config, bound: Mapping[str, Any]) ->
 
 def moved(case: QpCase, rti: Rti, config: Config, bound: Mapping[str, Any]) -> dict[str, Array]:
     """Return the array of bounds in which the bound is far away, by its name."""
-    model, upper = rti.ocp.model, bound["side"] == "upper"
+    model, upper = rti.problem.model, bound["side"] == "upper"
     rows = {(soft.kind, soft.name): i for i, soft in enumerate(softened(rti, config))}
     kind, name = bound["kind"], bound["name"]
     if (kind, name) in rows:
         scale = rti.scale[model.nx + model.nu + rows[kind, name]]
-        signals = [soft_name for soft_kind, soft_name in rows if soft_kind == kind] if kind == "constraint" else [s.name for s in model.states]
+        among = [row for row in rows if BOUNDS[row[0]] == BOUNDS["constraint"]]
+        at = among.index((kind, name)) if (kind, name) in among else [s.name for s in model.states].index(name)
     else:
-        signals = [signal.name for signal in model.inputs]
-        scale = rti.scale[model.nx + signals.index(name)]
+        at = [signal.name for signal in model.inputs].index(name)
+        scale = rti.scale[model.nx + at]
     array = BOUNDS[kind][upper]
     values = case.guess[array].copy()
-    values[..., signals.index(name)] += FAR * scale * (1.0 if upper else -1.0)
+    values[..., at] += FAR * scale * (1.0 if upper else -1.0)
     return {array: values}

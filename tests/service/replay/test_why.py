@@ -58,6 +58,17 @@ def test_bound_that_acts_is_named_with_its_stages_and_the_cost_is_told_by_term(t
     assert facts["state"]["age_s"] == 0.0
 
 
+def test_second_difference_at_its_bound_is_named_and_what_would_be_commanded_without_it(tmp_path: Path) -> None:
+    path = tmp_path / "bent.toml"
+    path.write_text(SHIPPED.read_text() + "\n[ocp.bounds.second_differences]\nu_c = [-0.05, 0.04]\n")
+    journal = journal_of(path, samples=20, follows=straight(5.0, 0.45))
+    text, facts = asked(journal, find(journal, None, 1), tmp_path)
+    assert "the second difference of u_c at its upper bound, 0.04 m/s per sample squared: stages 0 to " in text
+    assert "command 1 of pioneer, at 0.100 s: TRACKING, u_c = 0.04 m/s" in text
+    assert "without it: u_c = 0.2 m/s" in text, "it would have risen as fast as the lower bound lets it stop to rise"
+    assert sum(facts["cost_terms"].values()) == pytest.approx(facts["cost"], rel=1e-6)
+
+
 def test_command_is_found_by_its_time_as_by_its_number(tmp_path: Path) -> None:
     journal = journal_of(SHIPPED, samples=20)
     by_time, by_seq = find(journal, 1.0, None), find(journal, None, 11)
