@@ -4,31 +4,17 @@
 from __future__ import annotations
 
 import runpy
-import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from rti_mpc.reference.tracks import TRACKS, track
+from tests.bench.timed import timed
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "race.py"
 
 pytestmark = pytest.mark.benchmark
-
-
-def timed(call: Callable[..., Any], took_ms: list[float]) -> Callable[..., Any]:
-    """Return a call that appends the CPU time it takes."""
-
-    def measured(*arguments: Any) -> Any:
-        began_ns = time.thread_time_ns()
-        result = call(*arguments)
-        took_ms.append(1e-6 * (time.thread_time_ns() - began_ns))
-        return result
-
-    return measured
 
 
 def test_phases_of_a_race() -> None:
