@@ -122,7 +122,8 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "second differences": lambda: sampled_car(N=5, **BENDS),
     "second differences, held inputs": lambda: sampled_car(N_u=3, **BENDS),
     "second differences, blocks": lambda: sampled_car(blocks=[1, 1, 2, 4], **BENDS),
-    "second differences, blocks, the first one longer, implicit integrator": lambda: lagging_car(method="irk", blocks=[2, 1, 5], **BENDS),
+    "second differences, blocks, the first one longer": lambda: sampled_car(blocks=[2, 1, 5], **BENDS),
+    "second differences, implicit integrator, held inputs": lambda: lagging_car(method="irk", N_u=3, **BENDS),
     "second difference of one input, beside a terminal set and outputs of inputs": lambda: felt_car(
         N_u=3, ubx_e=[np.inf] * 3 + [0.02], lbddu=[-np.inf, -0.1], ubddu=[np.inf, 0.1], z=10.0, Z=10.0, zddu=10.0
     ),
