@@ -40,8 +40,9 @@ NEWTON_STEPS = 8  # to an equilibrium
 SETTLING_STEPS = 2  # to the equilibrium at the end of a way, which is near
 DAMPING = 1e-9  # of these steps, relative to squared ranges, where the equilibria are more than the equations tell
 INPUT_FREEDOM_FACTOR = 10.0  # by which inputs may move farther to an equilibrium than states, each measured by its range in operation
-FINDING_PASSES = 6  # over a way that is found anew, before the last one: equilibria of an arm depend on where it comes to rest
-RELAXATION = 0.1, 1.0  # least and largest share of the way to where the last pass has led that the next one aims farther; half of it at first
+FINDING_PASSES = 8  # over a way that is found anew, before the last one: equilibria of an arm depend on where it comes to rest
+FULL_PASSES = 3  # of these, each of which aims at where the one before has led
+RELAXATION = 0.1, 1.0  # least and largest share of the way there that the others aim farther
 FOUND_SHARE = 1e-3  # of its range in operation, within which a way leads to where it was aimed: there is no need of another pass
 SMALLEST = 1e-300  # replaces a change of zero
 FIRST_ROWS = 2  # whose reach depends on what was sent before
@@ -216,24 +217,28 @@ class WayToRest:
 
     def find(self, x: Array, u_prev: Array, reach: tuple[Array, Array] | None = None) -> bool:
         """
-        Roll a way out from a state nothing is known of before; as `begin`, aimed at the state itself, then nearer to where that leads.
+        Roll a way out from a state nothing is known of before; as `begin`, aimed at the state itself, then at where that leads.
 
         Aimed at its own end, a way is a fixed point. Aimed at where the last one led, an arm that is nearly stretched may end on either side of
-        it in turn for ever, hence the relaxation of Aitken, for vectors as in [Irons1969]_.
+        it in turn for ever, hence the relaxation of Aitken, for vectors as in [Irons1969]_. If none is found, the aim counts whose way ends
+        nearest to it.
         """
         self.aim(x, self._u_rest)
-        share, before = 0.5, None
-        for _ in range(FINDING_PASSES):
+        share, before, least, nearest = 1.0, np.zeros(len(x) + len(u_prev)), np.inf, (x, self._u_rest)
+        for k in range(FINDING_PASSES):
             if not self.begin(x, u_prev, reach):
                 break
             off = np.concatenate([(self.x[-1] - self.x_e) / self.law.scale_x, (self.u[-1] - self.u_e) / self.law.scale_u])
-            if np.abs(off).max() <= FOUND_SHARE:
+            if (size := float(np.abs(off).max())) <= FOUND_SHARE:
                 return True
-            if before is not None:
+            if size < least:
+                least, nearest = size, (self.x_e.copy(), self.u_e.copy())
+            if k >= FULL_PASSES:
                 change = off - before
                 share = min(max(-share * float(before @ change) / max(float(change @ change), SMALLEST), RELAXATION[0]), RELAXATION[1])
             before = off
             self.aim(self.x_e + share * (self.x[-1] - self.x_e), self.u_e + share * (self.u[-1] - self.u_e))
+        self.aim(*nearest)
         return self.begin(x, u_prev, reach)
 
     @property

@@ -12,6 +12,7 @@ import pytest
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
 from rti_mpc.model.integrator import integrator
+from rti_mpc.model.robots.dynamic_bicycle import dynamic_bicycle
 from rti_mpc.model.robots.two_link_arm import two_link_arm
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.operation import states_of_operation
@@ -119,6 +120,13 @@ def test_way_of_an_arm_that_is_nearly_stretched_is_aimed_at_where_it_ends(x: tup
     assert way.find(np.array(x), np.array(u))
     assert way.x[-2] == pytest.approx(way.x_e, abs=0.02), "rad, rad/s"
     assert np.abs(way.x[-2, 2:]).max() < 0.03, "rad/s: a hundredth of its speeds in operation"
+
+
+def test_ways_to_rest_are_found_for_a_car_that_slides() -> None:
+    """Wherever it stands it is at rest, so that a way may lead far from where it is aimed: aims that go half the way there do not find one."""
+    states = {"lbx": [-np.inf] * 3 + [-1.0, -1.0, -4.0, -0.4189], "ubx": [np.inf] * 3 + [5.0, 1.0, 4.0, 0.4189]}
+    limits = {"lbu": [-6.0, -3.2], "ubu": [6.0, 3.2], "lbdu": [-2.0, -1.0], "ubdu": [2.0, 1.0]}
+    assert find_stop_law(Ocp(dynamic_bicycle(), N=5, dt=0.02, Q=np.ones(3), R=np.ones(2), **states, **limits)) is not None
 
 
 def test_way_that_is_followed_leads_back_to_where_it_ended_from_beside_it() -> None:

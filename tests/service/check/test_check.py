@@ -14,6 +14,7 @@ import pytest
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.rti.rest import Rest, RestClass, assess
 from rti_mpc_service.check import check, rest
+from rti_mpc_service.check.agreement import Agreement
 from rti_mpc_service.check.rest import rest_line
 from rti_mpc_service.config.config import load
 from rti_mpc_service.shipped import SHIPPED
@@ -29,7 +30,7 @@ def test_two_solvers_are_compared_tightly_whatever_the_controllers_tolerance(fir
     path.write_text(MINIMAL + f"[ocp.bounds]\ninputs = {{ u_c = [-0.2, 0.2] }}\n[solver]\nname = '{first}'\n{loose}")
     report = check.check(load(path))
     assert report.second == second
-    assert report.opinions > check.COMPARED_WAVE_SAMPLES, "those at the bounds are asked about, too"
+    assert len(report.opinions) > check.COMPARED_WAVE_SAMPLES, "those at the bounds are asked about, too"
     assert report.agree
     assert report.difference < 1e-6
     assert (report.deviation > 1e-4) is (first == "osqp"), "what the tolerance costs is told apart from whether the QP is right"
@@ -114,7 +115,7 @@ def test_sample_without_a_plan_is_told_with_the_state_it_began_at(
 
 def test_no_number_is_cut_off_in_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     times = np.array([123456789.0])
-    report = check.CheckReport(times, times, Counter({QpStatus.SOLVED: 1}), "daqp", 1, 0.0, 0.0, 0, [])
+    report = check.CheckReport(times, times, Counter({QpStatus.SOLVED: 1}), "daqp", [Agreement(0.0, 0.0)], 0.0, 0, [])
     monkeypatch.setenv("COLUMNS", "20")
     monkeypatch.setattr(check, "check_stop", lambda config: None)
     monkeypatch.setattr(check, "check", lambda config, samples: report)

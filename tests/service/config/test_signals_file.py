@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.check import check
+from rti_mpc_service.check.agreement import Agreement
 from rti_mpc_service.cli import app
 from rti_mpc_service.config import signals_file
 from rti_mpc_service.config.build import build_signals, guard_limits
@@ -68,7 +69,7 @@ def test_guard_knows_a_model_from_the_file_that_check_writes_and_does_without_th
     path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     times = np.array([1.0])
-    report = check.CheckReport(times, times, Counter({QpStatus.SOLVED: 1}), "daqp", 1, 0.0, 0.0, 0, [])
+    report = check.CheckReport(times, times, Counter({QpStatus.SOLVED: 1}), "daqp", [Agreement(0.0, 0.0)], 0.0, 0, [])
     monkeypatch.setattr(check, "check", lambda config, samples: report)
     monkeypatch.setattr(check, "stop_from_everywhere", lambda ocp, law, **_: "")
     path.write_text(TOML.replace("enabled = true", "enabled = false"))
@@ -87,7 +88,7 @@ def test_check_writes_no_file_that_nobody_needs(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(signals_file, "write", lambda *_: pytest.fail("was to be written"))
     monkeypatch.setattr(check, "stop_from_everywhere", lambda ocp, law, **_: "")
     times = np.array([1.0])
-    monkeypatch.setattr(check, "check", lambda config, samples: check.CheckReport(times, times, Counter(), "daqp", 1, 0.0, 0.0, 0, []))
+    monkeypatch.setattr(check, "check", lambda config, samples: check.CheckReport(times, times, Counter(), "daqp", [Agreement(0.0, 0.0)], 0.0, 0, []))
     assert check.main(SHIPPED) == 0
 
 
