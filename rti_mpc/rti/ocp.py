@@ -23,8 +23,8 @@ inputs held after the control horizon, or over the stages of each of :math:`N_u`
 This is the cost (4) of [Rosales]_ in full, with an additional terminal weight.
 Bounds on states, on second differences of inputs and general constraints, each with its
 own slacks, are softened by an exact penalty, so that no measurement makes the problem
-infeasible. Outputs,
-constraints, bounds and slack weights have the names of acados [Verschueren2022]_.
+infeasible. Outputs, constraints, bounds and slack weights have the names of acados
+[Verschueren2022]_.
 """
 
 from __future__ import annotations

@@ -256,7 +256,7 @@ def solution(qp: Qp, dx: Array, du: Array) -> Array:
 
     Args:
         qp: The QP in the units of the model.
-        dx: Deviations of the states from the guess, shape ``(N + 1, nx)``.
+        dx: Deviations of the states from the guess, shape ``(N + 1, nx)``; empty for a QP of the sequential formulation.
         du: Deviations of the inputs, shape ``(N_u, nu)``.
     """
     z = np.zeros_like(qp.q)

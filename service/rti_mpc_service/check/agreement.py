@@ -16,6 +16,7 @@ import scipy.sparse as sp
 from rti_mpc.array import Array
 from rti_mpc.rti.active_set import COST_FLOOR
 from rti_mpc.rti.rti import Rti
+from rti_mpc_service.case import solution
 
 AGREEMENT_TOLERANCE = 1e-5  # largest difference between two tight solutions of one QP, relative to half the range of each input
 COST_TOLERANCE = 1e-8  # by which the costs of two that differ by more may differ, relative as the gap of a certified plan, which may be 1e-6
@@ -62,11 +63,5 @@ def cost(condensed: Rti, u: Array) -> float:
     qp = condensed.solvers[-1].qp
     qp.fill()
     qp.embed()
-    step = (u - condensed.guess.sample["u"]).ravel()
-    z = np.concatenate([step, np.zeros(len(qp.q) - step.size)])
-    free = qp.A @ z
-    for j in range(step.size, len(z)):
-        rows = slice(*qp.A.indptr[j : j + 2])
-        k, a = qp.A.indices[rows], qp.A.data[rows]
-        z[j] = np.max(np.where(a > 0, qp.l[k] - free[k], free[k] - qp.u[k]) / np.abs(a), initial=0.0)
+    z = solution(qp, np.zeros(0), u - condensed.guess.sample["u"])  # its states are eliminated
     return float(z @ (qp.P + sp.triu(qp.P, k=1).T) @ z / 2 + qp.q @ z)
