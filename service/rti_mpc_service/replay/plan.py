@@ -20,7 +20,7 @@ ACTING_DISTANCE = 1e-6  # from a bound of an input, relative to the input's scal
 
 def acting_bounds(rti: Rti, config: Config) -> list[dict[str, Any]]:
     """
-    Return the bounds that a plan touches, each with its name, its side, its value, and the stages at which it acts.
+    Return the bounds that a plan touches, each with its name, its side, the stages at which it acts, and its value at each of them.
 
     Stages of inputs and increments begin at 0, which acts next; of inputs that are held the first one is named. Those of states and constraints
     begin at 1.
@@ -45,10 +45,10 @@ def acting_bounds(rti: Rti, config: Config) -> list[dict[str, Any]]:
 
 
 def _acting(kind: str, name: str, unit: str, side: str, bounds: Array, stages: Any, violation: float) -> Iterator[dict[str, Any]]:
-    """Yield a bound if it acts at any stage, with its value at the first of them."""
+    """Yield a bound if it acts at any stage, with its value at each of them."""
     if len(stages):
-        bound = float(bounds[0])
-        yield {"kind": kind, "name": name, "unit": unit, "side": side, "bound": bound, "stages": stages.tolist(), "violation": violation}
+        at = {"bound": bounds.tolist(), "stages": stages.tolist()}
+        yield {"kind": kind, "name": name, "unit": unit, "side": side, **at, "violation": violation}
 
 
 class BoundAlongPlan(NamedTuple):

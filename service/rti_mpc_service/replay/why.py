@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ from rti_mpc_service.replay.without import without
 
 LOOK_BACK_S = 10.0  # of the robot's time, over which the events before a command are told
 MAX_EVENTS = 8  # of those, the last ones
+MAX_VALUES = 4  # of a bound that differs by stage, told each by itself
 MIN_COST_SHARE = 0.005  # of the cost, below which a term is left out of the lines
 ROUNDING = 1e-6  # relative: a violation below this is none
 PLANNED = (Mode.TRACKING, Mode.HOLDING)
@@ -375,14 +376,26 @@ def count(number: int, what: str) -> str:
 
 def bound_text(bound: Mapping[str, Any]) -> str:
     """Return a bound in words."""
-    value, stages = f"{bound['bound']:.4g} {bound['unit']}", spans(bound["stages"])
+    second = bound["kind"] == "second difference"
+    per = {"increment": " per sample", "second difference": " per sample squared"}.get(bound["kind"], "")
+    where = values_at(bound["bound"], bound["stages"], f"{bound['unit']}{per}")
     if bound["kind"] == "increment":
         way = "rises" if bound["side"] == "upper" else "falls"
-        return f"{bound['name']} {way} as fast as it may, {value} per sample: stages {stages}"
-    name = f"the second difference of {bound['name']}" if bound["kind"] == "second difference" else bound["name"]
-    value += " per sample squared" if bound["kind"] == "second difference" else ""
-    over = f", exceeded by {bound['violation']:.3g} {bound['unit']}" if bound["violation"] > ROUNDING * max(1.0, abs(bound["bound"])) else ""
-    return f"{name} at its {bound['side']} bound, {value}: stages {stages}{over}"
+        return f"{bound['name']} {way} as fast as it may, {where}"
+    name = f"the second difference of {bound['name']}" if second else bound["name"]
+    over = bound["violation"] > ROUNDING * max(1.0, *map(abs, bound["bound"]))
+    return f"{name} at its {bound['side']} bound, {where}" + (f", exceeded by {bound['violation']:.3g} {bound['unit']}" if over else "")
+
+
+def values_at(values: Sequence[float], stages: Sequence[int], unit: str) -> str:
+    """Return a bound's values, each with the stages at which it acts; of many that differ the first ones, and what the others range over."""
+    runs = [list(run) for _, run in groupby(zip(values, stages, strict=True), key=lambda at: f"{at[0]:.4g}")]
+    each, rest = (runs, []) if len(runs) <= MAX_VALUES else (runs[: MAX_VALUES - 1], [at for run in runs[MAX_VALUES - 1 :] for at in run])
+    words = [f"{run[0][0]:.4g} {unit}: {spans([stage for _, stage in run])}" for run in each]
+    if rest:
+        low, high = (extreme(value for value, _ in rest) for extreme in (min, max))
+        words.append(f"{low:.4g} to {high:.4g} {unit}: {spans([stage for _, stage in rest])}")
+    return "; ".join(words)
 
 
 def without_text(planned: Mapping[str, float] | None, inputs: Mapping[str, Mapping[str, Any]]) -> str:
@@ -394,7 +407,8 @@ def without_text(planned: Mapping[str, float] | None, inputs: Mapping[str, Mappi
 
 
 def spans(stages: Sequence[int]) -> str:
-    """Return numbers as spans, such as ``0 to 3, 7``."""
+    """Return numbers of stages as spans, such as ``stages 0 to 3, 7``."""
     ends = [k for k, (a, b) in enumerate(pairwise(stages)) if b != a + 1]
     starts, stops = [0, *(k + 1 for k in ends)], [*ends, len(stages) - 1]
-    return ", ".join(f"{stages[i]}" if i == j else f"{stages[i]} to {stages[j]}" for i, j in zip(starts, stops, strict=True))
+    listed = ", ".join(f"{stages[i]}" if i == j else f"{stages[i]} to {stages[j]}" for i, j in zip(starts, stops, strict=True))
+    return f"stage{'s' * (len(stages) > 1)} {listed}"

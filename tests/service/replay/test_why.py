@@ -18,12 +18,14 @@ from rti_mpc.recording.host import HOST
 from rti_mpc.recording.writer import RecordingWriter
 from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.keys import Keys
+from rti_mpc_service.config.config import load
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
 from rti_mpc_service.replay.why import Place, acted, explain, find, lines, main
 from rti_mpc_service.shipped import SHIPPED
 from tests.recording.samples import telemetry
 from tests.service.replay.driven import failing, journal_of, recorded, straight
 
+N = load(SHIPPED).ocp.N
 INJECTED = SHIPPED.read_text() + "\n[debug]\ninject = true\n"
 
 
@@ -67,6 +69,20 @@ def test_second_difference_at_its_bound_is_named_and_what_would_be_commanded_wit
     assert "command 1 of pioneer, at 0.100 s: TRACKING, u_c = 0.04 m/s" in text
     assert "without it: u_c = 0.2 m/s" in text, "it would have risen as fast as the lower bound lets it stop to rise"
     assert sum(facts["cost_terms"].values()) == pytest.approx(facts["cost"], rel=1e-6)
+
+
+def test_bound_that_differs_by_stage_is_told_with_its_value_where_it_acts(tmp_path: Path) -> None:
+    path = tmp_path / "staged.toml"
+    speeds = [0.45, 0.4, 0.4, 0.4, 0.3, 0.25, 0.24, 0.23, *[0.22] * (N - 8)]  # m/s, at nodes 1 to N
+    inputs = f"inputs = {{ u_c = {[[-0.5, 0.3], [-0.5, 0.32], *[[-0.5, 0.35]] * (N - 2)]} }}"
+    states = f"states = {{ u = {[[-0.5, speed] for speed in speeds]} }}"
+    path.write_text(f"{SHIPPED.read_text()}\n[ocp.stages]\n{inputs}\n{states}\n")
+    journal = journal_of(path, samples=22, follows=straight(9.0, 0.45))
+    text, facts = asked(journal, find(journal, None, 20), tmp_path)
+    assert "command 20 of pioneer, at 2.000 s: TRACKING, u_c = 0.3 m/s" in text
+    assert "u_c at its upper bound, 0.3 m/s: stage 0; 0.32 m/s: stage 1; 0.35 m/s: stages 2 to 3\n" in text
+    assert "u at its upper bound, 0.3 m/s: stage 5; 0.25 m/s: stage 6; 0.24 m/s: stage 7; 0.22 to 0.23 m/s: stages 8 to 20\n" in text
+    assert facts["bounds"][0]["bound"] == [0.3, 0.32, 0.35, 0.35], "for machines each stage has its own"
 
 
 def test_command_is_found_by_its_time_as_by_its_number(tmp_path: Path) -> None:
