@@ -83,6 +83,7 @@ class Guard:
         self._leader = (0, -1)  # epoch and sequence number of the last command that was in order
         self._led_ns = BEFORE_ALL_NS  # robot time of it
         self._told_ns = BEFORE_ALL_NS  # end of the last command that the robot was sent
+        self._told_rest = True  # whether that command, if it is the guard's own, leads to rest: reports may change what is believed after it was sent
         self._engaged = False  # whether this robot was ever sent a command
         self._untold = False  # whether the command to brake has still to be sent
         self._corrected = False  # whether the correction of its way to rest by the last state has still to be sent
@@ -103,8 +104,8 @@ class Guard:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the last command was to stand, or the robot was never commanded."""
-        return not self._engaged or self._schedule.rests(self._told_ns - 1)
+        """Whether the last command leads to rest and the robot is believed to come there by its end, or the robot was never commanded."""
+        return not self._engaged or (self._told_rest and self._schedule.rests(self._told_ns - 1))
 
     # Incoming messages.
 
@@ -187,7 +188,7 @@ class Guard:
         if not self.passing:
             self.passing = True
             self._say(Severity.INFO, "guard_passing", f"commands of epoch {command.epoch} pass", change=True)
-        self._engaged, self._corrected, self._told_ns, self._passed = True, False, until_ns, passed
+        self._engaged, self._corrected, self._told_ns, self._told_rest, self._passed = True, False, until_ns, True, passed
         self._lives.settling_s = self._limits.settling_s + self._limits.outlasts_s(passed)
         return passed
 
@@ -250,6 +251,7 @@ class Guard:
     def _tell(self, start_ns: int, valid_ns: int, period_ns: int, u: Array, state: State, way: Way | None) -> Command:
         """Return a command of the guard's own, with what is left of the way to rest after it, and note until when it lasts."""
         self._told_ns, self._untold, self._corrected = start_ns + valid_ns, False, False
+        self._told_rest = way is not None or not (u[-1] - self._schedule.rest(start_ns)).any()
         left: dict[str, Any] = {} if way is None else {"rest_period_ns": way.period_ns, "u_rest": way.u, "x_rest": way.x, "K": way.K}
         return self._numbered(
             Command(

@@ -534,6 +534,25 @@ def test_stopped_guard_ramps_to_rest_and_takes_no_command(scene: Scene) -> None:
     assert (-np.diff(inputs[-60:], axis=0) <= 0.2 * STEP + 1e-12).all()
 
 
+def test_stopped_guard_goes_on_until_it_has_told_rest_to_a_robot_that_was_late_to_hear_of_the_ramp(scene: Scene) -> None:
+    """What it tells meanwhile begins where the robot still was; then the robot reports that it is far ahead of that."""
+    scene.drive(1000)
+    scene.wait(30)
+    scene.guard.stop(scene.local_ns)
+    coming = [scene.guard.tick(scene.local_ns)]
+    heard_ns, last = scene.now_ns + 80 * MS, scene.published[-1]
+    while not scene.guard.at_rest:
+        *_, (scene.now_ns, u) = scene.actuator.play(scene.now_ns, scene.now_ns + 10 * MS)
+        scene.local_ns, scene.states, (epoch, seq) = scene.local_ns + 10 * MS, scene.states + 1, scene.actuator.source
+        state = State(scene.epoch, scene.states, scene.now_ns, np.zeros(5), u=u.copy(), command_epoch=epoch, command_seq=seq)
+        scene.guard.receive_state(state, scene.local_ns)
+        coming.append(scene.guard.tick(scene.local_ns))
+        while coming and scene.now_ns >= heard_ns:
+            last = scene.publish(coming.pop(0)) or last
+    assert last.mode is Mode.BRAKING
+    assert not last.u[-1].any()
+
+
 REASON = "asked for by ada@lab"
 WAY = np.array([max(0.0, 0.25 - 0.25 * k) * np.array([1.0, 0.6]) for k in range(20)])  # of a controller that is stopped at FULL
 

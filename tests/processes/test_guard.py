@@ -10,25 +10,25 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from rti_mpc.contract.message import Command, Event
-from rti_mpc.contract.schedule import RAMP_STEP_NS
 from rti_mpc.contract.status import Mode
 from rti_mpc.wire.cdr import decode
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.shipped import SHIPPED
 from tests.guarded import write_robot
-from tests.in_time import in_time
-from tests.processes.record import FAST_STATES, MS, SLEW, Record, recorded, within_slew
+from tests.in_time import explained, in_time
+from tests.processes.record import FAST_STATES, MS, Record, recorded, within_slew
 from tests.processes.system import CONFIG, KEYS, System, heard, interrupted_in_time, rti_mpc, until
 
 SPEED_M_S = 0.5
+LINK_MS = 100.0  # a link drops a message of the guard only where it was held up for longer: two wait there, one each 70 ms
 
 
 @pytest.fixture(scope="module")
@@ -142,9 +142,8 @@ def test_ctrl_c_ends_the_guard_with_a_ramp_to_rest(driven: System, host: Host) -
     until(lambda: "guard" not in driven.lives, "the guard is gone")
     last = decode(Command, actuation.drain()[-1].payload)
     assert last.mode is Mode.BRAKING
-    assert (
-        np.abs(last.u[-1]) <= SLEW * (RAMP_STEP_NS / (100 * MS)) + 1e-9
-    ).all()  # where the host holds up the link, the very last one, to stand, may be lost
+    told = not last.u[-1].any()
+    assert told or explained(host, "the guard's last command was lost", LINK_MS, driven.fault_at_ns, time.monotonic_ns())
     stopped_in_time(host, driven, recorded(driven, stopped_ns, 2700))
     assert "Traceback" not in driven.said("guard")
     assert CONFIG.guard.enabled is False, "the quickstart needs none"
