@@ -24,6 +24,7 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled, function
+from rti_mpc.contract.message import Notice, Severity
 from rti_mpc.rti.blocks import all_inputs
 from rti_mpc.rti.linearization import constraints
 from rti_mpc.rti.ocp import Ocp
@@ -60,6 +61,13 @@ class Blockage:
         beyond = ", ".join(name for name in names if name)
         reasons = (f"the reference lies beyond the bounds of {beyond}" if beyond else "", "an obstacle or constraint holds it" if "" in names else "")
         return " and ".join(filter(None, reasons))
+
+    @property
+    def notice(self) -> Notice:
+        """What to say when `blocked` has changed."""
+        if self.blocked:
+            return Notice(Severity.WARNING, "blocked", f"the way is blocked: the plan stops short of the reference, {self.cause}")
+        return Notice(Severity.INFO, "free", "the way is free again")
 
     def judge(self) -> bool:
         """Judge the plan of a new sample, and return whether `blocked` has changed."""

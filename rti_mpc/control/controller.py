@@ -18,8 +18,6 @@ first command acts late enough to arrive in time.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import isfinite
-from operator import le
 
 import numpy as np
 
@@ -33,22 +31,24 @@ from rti_mpc.control.blockage import Blockage
 from rti_mpc.control.call import Call, reported
 from rti_mpc.control.delay import DelayEstimator
 from rti_mpc.control.envelope import INPUT_BOUNDS, Envelope
+from rti_mpc.control.fallback import Fallback
 from rti_mpc.control.grid import Grid
 from rti_mpc.control.grid import Timing as Timing
-from rti_mpc.control.issued import ENDING, NO_ENDING, Issued
+from rti_mpc.control.issued import NO_ENDING, Issued
 from rti_mpc.control.ladder import Ladder
 from rti_mpc.control.mode import ModeMachine
 from rti_mpc.control.observer import Observer
 from rti_mpc.control.opinions import Opinion, second_opinions
+from rti_mpc.control.planner import Planner
 from rti_mpc.control.prediction import Prediction
 from rti_mpc.control.record import Record
+from rti_mpc.control.report import Reports
 from rti_mpc.control.sent import Sent
 from rti_mpc.control.state_stream import Arrival, StateStream
 from rti_mpc.control.stopping import Stopping
 from rti_mpc.control.track import Track
 from rti_mpc.control.tuning import Tuning
 from rti_mpc.errors import OcpError
-from rti_mpc.kept import Kept
 from rti_mpc.rti.ocp import Ocp, rest_fault
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.way_to_rest import StopLaw
@@ -57,7 +57,6 @@ INPUTS_UNREPORTED = (
     "the robot does not report which inputs act: commands are assumed to act, and only the robot itself or a guard can handle lost ones"
 )
 PLANNING_MODES = {Mode.TRACKING, Mode.HOLDING}  # in which each sample has a plan of its own, and it is certain which inputs act
-ITERATIONS_COLD = 3  # iterations of the first sample, whose guess is one state and one input at all stages
 
 
 class Controller:
@@ -131,27 +130,25 @@ class Controller:
         self._track = Track(model, ocp.N, self.grid.dt_ns, compile=compile)
         angles = np.array([signal.angle for signal in model.states])
         self._sent = Sent(self._u_rest, lbdu, ubdu, self.grid.dt_ns, (lbu, ubu), angles)
+        self._reports = Reports(self._sent, self.envelope.limits)
         self._prediction = Prediction(model, self._sent, compile=compile)
         self._x0 = self._prediction.x
-        self._plan = rti.u.reshape(-1)
         ways = None if stop_law is None else Stopping(ocp, stop_law, self.envelope.limits, self._prediction, self._valid_ns, compile=compile)
         self._ways = ways  # to rest; None: its inputs ramp to rest
         balances = stop_law is not None and stop_law.disturbances.size > 0
         self._known = PLANNING_MODES | ({Mode.STOPPED, Mode.BRAKING} if balances else set())  # modes in which disturbances are estimated
-        self._rows: Array = np.zeros((ocp.N, model.nu))  # all rows of the last plan, of which a command with a way to rest has the first ones
-        self._loaded = False  # whether the QP of t_k is prepared
-        self._reach: tuple[Array, Array] = (np.zeros((2, model.nu)), np.zeros((2, model.nu)))  # what the first rows at t_k may be
+        self._planner = Planner(rti, self._track, self._sent, self._prediction, self.envelope, self._tuning, self._states.d, self.grid.dt_ns)
         self._overran = False  # whether the last sample was over its budget
         self._unreported = False  # whether it was said that the robot does not report its inputs
         self._for_rival: tuple[int | None, tuple[Reference, Array] | None] = (None, None)  # the last reference, and which life might have begun then
         self._stopped = ""  # why an operator's stop is latched
         self._issued = Issued(epoch, config_hash, self.grid.dt_ns)
+        self._fallback = Fallback(self.ladder, self.envelope, self._sent, self._issued, ways, self._u_rest, self._valid_ns)
         self._record = Record(rti, self._tuning)
         self._blockage = Blockage(rti, compile=compile)
         self._opinions = second_opinions(rti, second_opinion, self.say)
         self._delay = DelayEstimator(model, self.grid.dt_ns, self.grid.most_ns, compile=compile) if timing.delay_s is None else None
         self._understudy = StateStream(model, self._stale_ns, self.grid.dt_ns, settling_s)  # judges states in rehearsals
-        self._kept = Kept((*rti.rehearsed, *self._prediction.written, *self.envelope.written))
 
     @property
     def mode(self) -> Mode:
@@ -213,8 +210,8 @@ class Controller:
         self._states.estimate(self._sent, known=self.mode in self._known and not surprised)
         if len(self._states.d):
             self._prediction.p[self.np_ :] = self._states.d
-        if surprised and self._loaded and self.grid.running:
-            self._load(shift=False)
+        if surprised and self._planner.loaded and self.grid.running:
+            self._planner.load(self.grid.act_ns, shift=False)
         if self.mode is Mode.IDLE:
             self._modes.enter(Mode.WAITING, "first state")
             if not len(state.u) and not self._unreported:
@@ -286,7 +283,7 @@ class Controller:
             OcpError: The problem differs in more than weights and bounds.
         """
         self._tuning.change(ocp, version)
-        return self._issued.seq + 1 + self._loaded
+        return self._issued.seq + 1 + self._planner.loaded
 
     @property
     def wanted(self) -> Ocp:
@@ -309,8 +306,8 @@ class Controller:
     def lead(self, epoch: int) -> None:
         """Let the commands of this controller act from the next one on; it continues from the inputs that have acted so far."""
         self._issued.epoch, self._standing_by = epoch, False
-        if self._loaded:
-            self._load(shift=False)
+        if self._planner.loaded:
+            self._planner.load(self.grid.act_ns, shift=False)
 
     @reported
     def tick(self, local_ns: int) -> Command | None:
@@ -355,7 +352,7 @@ class Controller:
             return command
         self._overran = True
         failure = f"a command was ready {1e-9 * (now_ns - command.stamp_ns):.3f} s late"
-        if self._plays_on(now_ns, counted=command.mode is Mode.FALLBACK):
+        if self._fallback.plays_on(now_ns, counted=command.mode is Mode.FALLBACK):
             self._modes.enter(Mode.FALLBACK, f"{failure}: the previous plan is continued", Severity.WARNING, "over_budget")
             return None
         if not self._stopped:
@@ -364,7 +361,7 @@ class Controller:
         if self._ways is not None and self._ways.feeds_back:  # the last command carries its way, which newer states correct than this sample's
             if not counted:
                 self.ladder.brake(at_rest=False)
-            self._issued.plan, self._loaded = None, False
+            self._issued.plan, self._planner.loaded = None, False
             return None
         assert self._states.last is not None
         return self._brake(self._states.last, now_ns + self.grid.delay_ns, command.status, wanted=counted)
@@ -392,20 +389,21 @@ class Controller:
         self._record.keep_plan(self._issued.seq)
         if self._opinions is not None:
             self._opinions.keep(self._issued.seq, planned=self.mode in (Mode.TRACKING, Mode.HOLDING) and not self._standing_by)
-        self._look_ahead()
+        if self.mode in PLANNING_MODES and self._blockage.judge():
+            self.say(self._blockage.notice)
         state = self._states.last
         if not self.grid.running or state is None:
             return
         if self._delay is not None:
             self._measure_delay(self._delay, state.stamp_ns)
         self.grid.advance(state.stamp_ns, self._states.clock.period_ns)
-        self._loaded = False
+        self._planner.loaded = False
         if self.mode in PLANNING_MODES:
             self.ladder.failed = 0
         elif self.mode is not Mode.FALLBACK or not np.isfinite(self._rti.x).all():
             return  # the next sample starts cold
         self._tuning.begin()
-        self._load(shift=True)
+        self._planner.load(self.grid.act_ns, shift=True)
         if self._ways is not None:
             self._ways.prepare()
 
@@ -443,19 +441,16 @@ class Controller:
             A command to be encoded and thrown away; None if the next sample does not begin with a feedback that is prepared.
         """
         state, grid = self._states.last, self.grid
-        if state is None or not self._loaded or self._standing_by or self.mode not in PLANNING_MODES:
+        if state is None or not self._planner.loaded or self._standing_by or self.mode not in PLANNING_MODES:
             return None
         self._check(state)
         self._understudy.receive(state, local_ns)
         due_ns = grid.act_ns - min(grid.delay_ns, grid.dt_ns - 1)  # or the first time at which `prepare` has asked for the inputs
         if len(state.u):
-            self._sent.expects(due_ns, self._within(state.u, due_ns), (state.command_epoch, state.command_seq))
+            self._reports.expects(state, due_ns)
         if grid.early(due_ns, self._states.clock.period_ns) or self._track.ended(grid.act_ns):
             return None
-        with self._kept:
-            self._prediction.predict(self._states.x, due_ns, grid.act_ns)
-            self._rti.rehearse(self._x0)
-            rows = self.envelope.fit(self._rti.u, self._reach)
+        rows = self._planner.rehearse(self._states.x, due_ns, grid.act_ns)
         self._modes.enter(self.mode, "nothing is said")
         return self._issued.build(state, grid.act_ns, grid.act_ns + self._valid_ns, self.mode, self._rti.status, rows)
 
@@ -468,42 +463,20 @@ class Controller:
         self._sent.delay_ns = estimator.delay_ns
         self.grid.adapt(estimator.delay_ns)
 
-    def _look_ahead(self) -> None:
-        """Report that the way is blocked, or free again."""
-        if self.mode not in PLANNING_MODES or not self._blockage.judge():
-            return
-        if self._blockage.blocked:
-            text = f"the way is blocked: the plan stops short of the reference, {self._blockage.cause}"
-            self._modes.say(Severity.WARNING, "blocked", text)
-        else:
-            self._modes.say(Severity.INFO, "free", "the way is free again")
-
-    def _load(self, *, shift: bool) -> None:
-        """Load the QP of `t_k`."""
-        act_ns = self.grid.act_ns
-        self._track.look_up(act_ns)
-        if len(self._states.d):
-            self._track.p[:, self.np_ :] = self._states.d
-        self._reach = self._sent.reach(act_ns)
-        u_prev, u_before = (self._sent.at(act_ns - 1 - age * self.grid.dt_ns)[0] for age in range(2))
-        self._tuning.follow(u_prev)
-        self._rti.prepare(self._track.y_ref, self._track.p, shift=shift, u_prev=u_prev, u_before=u_before)
-        self._loaded = True
-
     def _rejoin(self, stamp_ns: int, behind: int) -> None:
         """Move plan and grid to a state that the grid did not expect: a late one, or the first one after a gap."""
         self.skipped += behind
         last = self._issued.last
         if behind and last is not None and stamp_ns + self.grid.delay_ns < last.valid_until_ns:  # the last command still acts
             self.grid.catch_up(behind, stamp_ns)
-            if self._loaded:
+            if self._planner.loaded:
                 for _ in range(behind - 1):
                     self._rti.shift()
-                self._load(shift=True)
+                self._planner.load(self.grid.act_ns, shift=True)
             return
         if behind:
             self._modes.say(Severity.WARNING, "gap", f"no sample for {behind} periods: starting cold")
-        self._loaded = False
+        self._planner.loaded = False
         self._issued.plan = None
         if self._ways is not None:
             self._ways.forget()
@@ -523,73 +496,34 @@ class Controller:
             why = "two robots use this name" if disputed else "the reference ended with STOP"
             self._modes.enter(*((Mode.STOPPED, self._stopped) if self._stopped else (Mode.BRAKING, why)))
             return self._brake(state, act_ns, QpStatus.NONE, wanted=True)
-        self._prediction.predict(self._states.x, state.stamp_ns, act_ns)
-        status = self._rti.feedback(self._x0) if self._loaded else self._feedback_cold()
-        if not (status.usable and isfinite(self._plan.dot(self._plan))):
+        status, u = self._planner.plan(self._states.x, state.stamp_ns, act_ns)
+        if u is None:
             return self._fall_back(state, status)
         self.ladder.softened += self._rti.solver is not (self._rti.active_set or self._rti.solvers[0])
         mode, reason = (Mode.TRACKING, "following the reference") if ending is None else (Mode.HOLDING, "the reference has ended")
         if not self._overran:
             self._modes.enter(mode, reason)
         valid_until_ns = min(act_ns + self._rti.ocp.N * self.grid.dt_ns, state.stamp_ns + self.grid.delay_ns + self._valid_ns)
-        self._rows = u = self.envelope.fit(self._rti.u, self._reach)
         after = NO_ENDING
         if self._ways is not None:
             u, after = self._ways.after(u, act_ns, valid_until_ns)
         return self._issued.propose(state, act_ns, valid_until_ns, mode, status, u, plan=True, ending=after)
 
-    def _feedback_cold(self) -> QpStatus:
-        """Solve the first sample: the guess is the present state at all stages, and is iterated on."""
-        self._rti.reset(self._x0, self._sent.at(self.grid.act_ns - 1)[0])
-        self._tuning.begin()
-        status = QpStatus.FAILED
-        for _ in range(ITERATIONS_COLD):
-            self._load(shift=False)
-            status = self._rti.feedback(self._x0)
-        return status
-
     # Fallbacks.
-
-    def _plays_on(self, now_ns: int, *, counted: bool = False) -> bool:
-        """Whether the previous plan may serve a sample that has none of its own."""
-        plan = self._issued.plan
-        left = plan is not None and now_ns < plan.valid_until_ns
-        return left if counted else self.ladder.fall(plan_left=left)
 
     def _fall_back(self, state: State, status: QpStatus) -> Command:
         """Replace a plan that could not be computed."""
-        act_ns, plan, failure = self.grid.act_ns, self._issued.plan, f"the QP is {status.name.lower()}"
-        if self._plays_on(act_ns) and plan is not None:
+        act_ns, failure = self.grid.act_ns, f"the QP is {status.name.lower()}"
+        if self._fallback.plays_on(act_ns):
             self._modes.enter(Mode.FALLBACK, f"{failure}: the previous plan is continued", Severity.WARNING, "qp_failed")
-            rows = self.envelope.refit(plan.u, round((act_ns - plan.stamp_ns) / plan.period_ns), self._reach)
-            ending = {name: getattr(plan, name) for name in ENDING}  # it begins when that plan ends, and so does this one
-            return self._issued.propose(state, act_ns, plan.valid_until_ns, Mode.FALLBACK, status, rows, ending=ending)
+            return self._fallback.play_on(state, act_ns, status, self._planner.reach)
         self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "no_plan")
         return self._brake(state, act_ns, status)
 
     def _brake(self, state: State, act_ns: int, status: QpStatus, *, wanted: bool = False) -> Command:
-        """
-        Propose the brake law, because a stop is `wanted` or because there is no plan.
-
-        Its validity counts from its own time, not from its state's: a ramp depends on past
-        commands only, and never leads further from rest than they do; a way to rest goes
-        on from the state predicted with them.
-        """
-        reach, valid_ns, ending = self._sent.reach(act_ns), self._valid_ns, NO_ENDING
-        if self._ways is None:
-            rows = self.envelope.ramp(reach)
-            at_rest = bool((rows[0] == self._u_rest).all())
-        else:
-            u_prev = self._sent.at(act_ns - 1)[0]
-            rows, valid_ns, ending = self._ways.stop(self._states.x, state.stamp_ns, act_ns, u_prev, reach)
-            at_rest = self._ways.at_rest
-            whole = np.concatenate([rows, ending["u_rest"]])
-            self._rows = whole[np.minimum(np.arange(len(self._rows)), len(whole) - 1)]
-        if not wanted:
-            self.ladder.brake(at_rest=at_rest)
-        self._issued.plan = None
-        self._loaded = False
-        return self._issued.propose(state, act_ns, act_ns + valid_ns, self.mode, status, rows, ending=ending)
+        """Propose the brake law, see `Fallback.brake`; the next sample starts cold."""
+        self._planner.loaded = False
+        return self._fallback.brake(state, self._states.x, act_ns, self.mode, status, wanted=wanted)
 
     def _give_up(self, state: State) -> Command | None:
         """
@@ -599,15 +533,14 @@ class Controller:
         """
         if self.mode is Mode.IDLE:
             return None
-        act_ns, command = state.stamp_ns + self.grid.delay_ns, None
+        command = None
         ramps = self._ways is None  # the way to rest of the last command is better than anything that is made without a clock
         if ramps and self._issued.last is not None and (self._sent.at(state.stamp_ns)[0] != self._u_rest).any():
             self._modes.enter(Mode.STOPPED if self._stopped else Mode.BRAKING, self._states.cadence.fault)
-            rows = self.envelope.ramp(self._sent.reach(act_ns))
             valid_ns = max(1, round(self._valid_ns * min(1.0, self._states.cadence.rate)))  # as long as it should act, in the unit of the stamps
-            command = self._issued.propose(state, act_ns, act_ns + valid_ns, self.mode, QpStatus.NONE, np.tile(rows[0], (len(rows), 1)))
+            command = self._fallback.step(state, state.stamp_ns + self.grid.delay_ns, self.mode, valid_ns)
         self._issued.plan = None
-        self._overran = self._loaded = self.grid.running = False
+        self._overran = self._planner.loaded = self.grid.running = False
         self._modes.enter(Mode.IDLE, self._states.cadence.fault)
         return command
 
@@ -634,8 +567,7 @@ class Controller:
     @property
     def at_rest(self) -> bool:
         """Whether the last command that was sent is rest from its first row on, or none was ever sent."""
-        last = self._issued.last
-        return last is None or (np.array_equal(last.u[0], self._u_rest) if self._ways is None else self._ways.at_rest)
+        return self._fallback.at_rest
 
     def slack_s(self, local_ns: int) -> float:
         """Return robot time, s, from a local monotonic time to the state of the next sample."""
@@ -655,7 +587,7 @@ class Controller:
         assert self._issued.last is not None
         times = prepare_us, feedback_us, latency_us, slack_s, second_us
         last, opinion = self._issued.last, Opinion() if self._opinions is None else self._opinions.last
-        rows = last.u if self._ways is None else np.concatenate([last.u, self._rows[len(last.u) :]])
+        rows = last.u if self._ways is None else np.concatenate([last.u, self._ways.rows[len(last.u) :]])
         return self._record.telemetry(
             last, rows, self._x0, self._states.d, times, opinion, delay_s=1e-9 * self.grid.delay_ns, skipped=self.skipped, ladder=self.ladder
         )
@@ -670,29 +602,15 @@ class Controller:
 
     def _hear(self, state: State) -> bool:
         """Learn which input acts, from a report and, on a way to rest with feedback, from the state; return whether the report was not expected."""
-        surprised = len(state.u) > 0 and self._correct(state)
+        surprised = len(state.u) > 0 and self._reports.correct(state)
         self._sent.feed_back(state.x, state.stamp_ns)
         return surprised
-
-    def _correct(self, state: State) -> bool:
-        """Believe the input that a robot reports; return whether it was another than believed."""
-        return self._sent.correct(state.stamp_ns, self._within(state.u, state.stamp_ns), (state.command_epoch, state.command_seq))
-
-    def _within(self, u: Array, t_ns: int) -> Array:
-        """Return an input that is reported at a time, inside its bounds, or those that were tightened since."""
-        lbu, ubu = self.envelope.limits["lbu"], self.envelope.limits["ubu"]
-        values = u.tolist()
-        if all(map(le, lbu.tolist(), values)) and all(map(le, values, ubu.tolist())):
-            return u
-        believed = self._sent.at(t_ns - 1)[0]  # it may be outside bounds that were tightened
-        inside: Array = np.minimum(np.maximum(u, np.minimum(lbu, believed)), np.maximum(ubu, believed))
-        return inside
 
     def _anchor(self, state: State) -> Reference:
         """Follow the reference that has arrived, from the last state on if it is to start on arrival."""
         anchored = self._track.anchor(state.stamp_ns)
-        if self._loaded and self.grid.running:
-            self._load(shift=False)
+        if self._planner.loaded and self.grid.running:
+            self._planner.load(self.grid.act_ns, shift=False)
         return anchored
 
     def _forget(self, arrival: Arrival, state: State) -> None:
@@ -712,4 +630,4 @@ class Controller:
         if self._ways is not None:
             self._ways.forget()
         self._issued.plan = None
-        self._overran = self._loaded = self.grid.running = False
+        self._overran = self._planner.loaded = self.grid.running = False

@@ -43,6 +43,7 @@ class Stopping:
         duration_ns: How long a way to rest is; `period_ns`, each of its rows.
         feeds_back: Whether the ways carry a gain, by which whoever plays them corrects them with every state.
         at_rest: Whether the last stop commands a robot that has come to rest.
+        rows: All rows of the last plan or way to rest, shape ``(N, nu)``, of which its command has the first ones.
     """
 
     def __init__(self, ocp: Ocp, law: StopLaw, limits: Mapping[str, Array], prediction: Prediction, valid_ns: int, *, compile: bool = True) -> None:
@@ -64,6 +65,7 @@ class Stopping:
         self._way = WayToRest(ocp, law, limits, p=prediction.p, compile=compile)
         self.duration_ns = law.rows * self.period_ns
         self.at_rest = False
+        self.rows: Array = np.zeros((ocp.N, nu))
         self.feeds_back = not law.holds
         self._aimed = False  # whether the equilibrium aimed at is near where plans lead
         self._began_ns: int | None = None  # when the way that is followed began; None while none is
@@ -111,6 +113,7 @@ class Stopping:
             act_ns: When it begins to act, robot time.
             valid_until_ns: When it ends.
         """
+        self.rows = rows
         count = min(max(1, -(-(valid_until_ns - act_ns) // self._dt_ns)), len(rows))
         rows = rows[:count]
         last_ns = min(valid_until_ns - act_ns - (count - 1) * self._dt_ns, self._dt_ns)
@@ -162,6 +165,7 @@ class Stopping:
         still_to_move = (way.x[0] - way.x[-1]) / law.scale_x, (way.u[0] - way.u[-1]) / law.scale_u
         self.at_rest = bool(max(np.abs(part).max() for part in still_to_move) <= REST_SHARE)
         row = min(max(1, self._valid_ns // self.period_ns), len(way.u) - 1)
+        self.rows = way.u[np.minimum(np.arange(len(self.rows)), len(way.u) - 1)]
         return way.u[:row].copy(), min(row * self.period_ns, self._valid_ns), self._ending(row)
 
     def _ending(self, row: int) -> Ending:

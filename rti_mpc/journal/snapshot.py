@@ -35,7 +35,7 @@ from rti_mpc.rti.qp.osqp import Solver
 
 MADE_IN = ("rti_mpc.contract.", "rti_mpc.control.", "rti_mpc.rti.")  # modules of the classes whose objects are made anew
 # Attributes that no command depends on.
-NOT_STATE = {("Controller", "on_call"), ("Controller", "_understudy"), ("Controller", "_kept"), ("ModeMachine", "notices")}
+NOT_STATE = {("Controller", "on_call"), ("Controller", "_understudy"), ("Planner", "_kept"), ("ModeMachine", "notices")}
 FIXED_MODULES = ("casadi", "osqp")  # whose objects have no state of their own, or such that `rewarm` sets
 FIXED_CLASSES = {"Model", "Signal", "Timing", "SolverSettings", "Transcription", "StopLaw", "Disturbance", "ObserverSettings"}  # frozen
 FIXED_TYPES = (types.FunctionType, types.BuiltinFunctionType, types.MethodType, types.ModuleType, type, slice, range, np.dtype, memoryview)

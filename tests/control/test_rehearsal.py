@@ -23,7 +23,7 @@ from tests.control.test_call import life, made
 from tests.loop import MS, reference, robot
 from tests.problems import pioneer
 
-NOT_STATE = {"_understudy", "_kept"}  # attributes of a controller in which rehearsals are made
+NOT_STATE = {"_understudy", "_kept"}  # attributes of a controller and its planner in which rehearsals are made
 
 
 COMPARED_CALLS = 7  # state is compared after every so many calls, and after each one that is unusual

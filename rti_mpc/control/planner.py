@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Plan of one sample: the QP is prepared for the time at which the command acts, and solved from the state predicted there.
+
+The plan is brought inside the envelope of the inputs before anyone else sees it.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+
+import numpy as np
+
+from rti_mpc.array import Array
+from rti_mpc.contract.status import QpStatus
+from rti_mpc.control.envelope import Envelope
+from rti_mpc.control.prediction import Prediction
+from rti_mpc.control.sent import Sent
+from rti_mpc.control.track import Track
+from rti_mpc.control.tuning import Tuning
+from rti_mpc.kept import Kept
+from rti_mpc.rti.rti import Rti
+
+ITERATIONS_COLD = 3  # iterations of the first sample, whose guess is one state and one input at all stages
+
+
+class Planner:
+    """
+    Planner of one robot.
+
+    Attributes:
+        loaded: Whether the QP of the next sample is prepared.
+        reach: Lowest and highest first two rows of the plan, each of shape ``(2, nu)``.
+    """
+
+    def __init__(self, rti: Rti, track: Track, sent: Sent, prediction: Prediction, envelope: Envelope, tuning: Tuning, d: Array, dt_ns: int) -> None:
+        """
+        Begin with no QP.
+
+        Args:
+            rti: Real-time iteration.
+            track: Reference.
+            sent: Inputs that act before the plan.
+            prediction: Prediction of the state in which the plan begins.
+            envelope: Limits of the inputs.
+            tuning: Weights and bounds that act.
+            d: Estimated disturbances, shape ``(nd,)``, which are the last parameters of the model; owned by the caller.
+            dt_ns: Period of the commands.
+        """
+        self.loaded = False
+        self._x0 = prediction.x
+        self._rti, self._track, self._sent, self._prediction, self._envelope, self._tuning = rti, track, sent, prediction, envelope, tuning
+        self._d, self._np, self._dt_ns = d, rti.ocp.model.np_ - len(d), dt_ns
+        self._u = rti.u.reshape(-1)
+        nu = rti.ocp.model.nu
+        self.reach: tuple[Array, Array] = (np.zeros((2, nu)), np.zeros((2, nu)))
+        self._kept = Kept((*rti.rehearsed, *prediction.written, *envelope.written))
+
+    def load(self, act_ns: int, *, shift: bool) -> None:
+        """Load the QP of a command that acts at a time, at the last plan, shifted by a stage or as it is."""
+        self._track.look_up(act_ns)
+        if len(self._d):
+            self._track.p[:, self._np :] = self._d
+        self.reach = self._sent.reach(act_ns)
+        u_prev, u_before = (self._sent.at(act_ns - 1 - age * self._dt_ns)[0] for age in range(2))
+        self._tuning.follow(u_prev)
+        self._rti.prepare(self._track.y_ref, self._track.p, shift=shift, u_prev=u_prev, u_before=u_before)
+        self.loaded = True
+
+    def plan(self, x: Array, stamp_ns: int, act_ns: int) -> tuple[QpStatus, Array | None]:
+        """
+        Return the outcome of the QP, and the plan inside its limits, shape ``(N, nu)``; None if there is no plan.
+
+        Args:
+            x: State, shape ``(nx,)``.
+            stamp_ns: Its time.
+            act_ns: When the plan begins to act: that of the last `load`, if one is loaded.
+        """
+        self._prediction.predict(x, stamp_ns, act_ns)
+        status = self._rti.feedback(self._x0) if self.loaded else self._feedback_cold(act_ns)
+        if not (status.usable and isfinite(self._u.dot(self._u))):
+            return status, None
+        return status, self._envelope.fit(self._rti.u, self.reach)
+
+    def _feedback_cold(self, act_ns: int) -> QpStatus:
+        """Solve the first sample: the guess is the present state at all stages, and is iterated on."""
+        self._rti.reset(self._x0, self._sent.at(act_ns - 1)[0])
+        self._tuning.begin()
+        status = QpStatus.FAILED
+        for _ in range(ITERATIONS_COLD):
+            self.load(act_ns, shift=False)
+            status = self._rti.feedback(self._x0)
+        return status
+
+    def rehearse(self, x: Array, stamp_ns: int, act_ns: int) -> Array:
+        """Do what `plan` mostly does, and return rows of the same shape; whatever that overwrites is put back."""
+        with self._kept:
+            self._prediction.predict(x, stamp_ns, act_ns)
+            self._rti.rehearse(self._x0)
+            return self._envelope.fit(self._rti.u, self.reach)
