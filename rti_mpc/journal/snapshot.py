@@ -197,8 +197,7 @@ class Camera:
         """
         if [array.shape for array in self._pinned] != [array.shape for array in snapshot.pinned]:
             raise JournalError(
-                f"a snapshot must be of a controller built like this one, which has {len(self._pinned)} fixed arrays: got {len(snapshot.pinned)}, "
-                "or other shapes; use the configuration and the version that it was made with"
+                "a snapshot must be of a controller built like this one, by the same version from the same configuration, got another state"
             )
         for ours, theirs in zip(self._pinned, snapshot.pinned, strict=True):
             if ours.flags.writeable:

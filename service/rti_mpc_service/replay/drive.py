@@ -24,10 +24,10 @@ from rti_mpc.contract.robot_clock import RobotClock
 from rti_mpc.contract.schedule import NO_COMMAND
 from rti_mpc.contract.status import Mode
 from rti_mpc.journal.entry import JournalEntry
-from rti_mpc.journal.replay import Difference, Replay, replay
+from rti_mpc.journal.replay import Difference, Replay
 from rti_mpc.signals import Signal
 from rti_mpc_service.case import solver_of
-from rti_mpc_service.replay.rebuild import Rebuilt
+from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, repeat
 from rti_mpc_service.rig.run_data import wanted
 
 PLANNED = (Mode.TRACKING, Mode.HOLDING)  # modes of samples with a plan of their own
@@ -254,9 +254,9 @@ def unwrapped(reference: Reference, outputs: Sequence[Signal]) -> Reference:
     return replace(reference, y=y)
 
 
-def drive(on: Drive, messages: list[Journal], start_seq: int) -> Passage:
+def drive(on: Drive, journal: Journaled, start_seq: int) -> Passage:
     """Drive a journal from a snapshot on to the end of the drive, and return what happened."""
-    for _ in replay(on, messages, start_seq):
+    for _ in repeat(journal, on, start_seq):
         if on.ended:
             break
     return on.passage

@@ -9,7 +9,6 @@ code, and runs only if it is trusted.
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -17,25 +16,23 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-import rti_mpc
-from rti_mpc.codegen import BUILDS, flags_of
 from rti_mpc.contract.epoch import NUMBER_BITS
-from rti_mpc.contract.message import Journal
+from rti_mpc.contract.message import Journal, JournalKind
 from rti_mpc.control.controller import Controller
 from rti_mpc.errors import ConfigError
+from rti_mpc.journal.entry import JournalEntry, decode_entries
+from rti_mpc.journal.replay import Difference, Replay, replay
 from rti_mpc.recording.reader import Recording
 from rti_mpc.rti.rti import Rti
-from rti_mpc.wire import document
 from rti_mpc_service.config.build import build_controller, build_ocp, build_rti, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_model, check_stop
 from rti_mpc_service.config.schema import Config
-from rti_mpc_service.host import machine
-from rti_mpc_service.origin import code_hash, model_equations, model_source
+from rti_mpc_service.origin import model_equations, model_source
 from rti_mpc_service.replay.coverage import Heard, heard_commands
+from rti_mpc_service.replay.maker import changes, fitting, versions
 
 CONFIGURATION = "config.toml"  # name of the attached configuration
-MAX_VERSIONS_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -134,12 +131,13 @@ def rebuild(journal: Journaled, *, folder: Path, trust: bool = False) -> Rebuilt
     if CONFIGURATION not in journal.files:
         owner = f"controller {journal.owner} of {journal.robot}"
         raise ConfigError(f"the configuration of {owner} must be attached to the recording, got {[*journal.files]}")
-    recorded = document.read(journal.files.get("versions.json", "{}").encode(), most=MAX_VERSIONS_BYTES)
+    recorded = versions(journal.files)
     with tempfile.TemporaryDirectory(prefix="rti-mpc-replay-") as temporary:
         config = configuration(journal.files, Path(temporary), folder=folder, trust=trust)
         equations = sha256(model_equations(build_ocp(config).model).encode()).hexdigest()  # with obstacles and disturbances, as the controller's
-        if recorded.get("model_sha256", equations) != equations:
-            raise ConfigError(f"model {config.model.name} must have the equations that were recorded, got others: use the rti-mpc that recorded it")
+        with fitting(journal.files):
+            if recorded.get("model_sha256", equations) != equations:
+                raise ConfigError(f"model {config.model.name} must have the equations that were recorded, got others")
         rti = build_rti(config)
         controller = build_controller(config, rti, check_stop(config))
         robot = robot_settings(config)
@@ -161,7 +159,8 @@ def configuration(files: Mapping[str, str], temporary: Path, *, folder: Path, tr
     """
     path = temporary / CONFIGURATION
     path.write_text(files[CONFIGURATION], encoding="utf-8")
-    config = load(path, with_model=False)
+    with fitting(files):
+        config = load(path, with_model=False)
     module, _, function = config.model.name.partition(":")
     if function:
         own = Path(module).stem if module.endswith(".py") else module
@@ -182,17 +181,27 @@ def configuration(files: Mapping[str, str], temporary: Path, *, folder: Path, tr
     return config
 
 
-def changes(recorded: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what was another when a controller was recorded, a line each."""
-    if not recorded:
-        yield "the recording does not say with what it was made"
-        return
-    if recorded.get("code_sha256") != code_hash():
-        yield f"recorded with other code of rti-mpc than that of this {rti_mpc.__version__}: {recorded.get('rti_mpc')}"
-    compiler = shutil.which("cc") or "CasADi's virtual machine"
-    if recorded.get("build") not in [[compiler, *flags_of(build)] for build in BUILDS]:  # which of them, the configuration says
-        yield f"recorded with another build: {recorded.get('build')}"
-    then, here = recorded.get("machine") or {}, machine.machine_info()
-    for what in ("processor", "system", "python", "packages"):
-        if then.get(what) != here[what]:
-            yield f"recorded with another {what.removesuffix('s')}: {then.get(what)}, here {here[what]}"
+def repeat(journal: Journaled, on: Replay, start_seq: int = 0) -> Iterator[tuple[JournalEntry, Difference | None]]:
+    """
+    Repeat the journal of a controller, as `rti_mpc.journal.replay.replay` does.
+
+    Raises:
+        ConfigError: It does not fit the controller, and was recorded by other code.
+        JournalError: It does not fit the controller.
+    """
+    with fitting(journal.files):
+        yield from replay(on, journal.messages, start_seq)
+
+
+def entries(journal: Journaled) -> Iterator[JournalEntry]:
+    """
+    Yield the entries of a controller's journal, without repeating them.
+
+    Raises:
+        ConfigError: They are no entries, and were recorded by other code.
+        JournalError: They are no entries.
+    """
+    with fitting(journal.files):
+        for message in journal.messages:
+            if message.kind is JournalKind.CALLS:
+                yield from decode_entries(message.data, message.seq)

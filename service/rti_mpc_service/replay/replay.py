@@ -21,7 +21,7 @@ from pydantic import ValidationError
 from rti_mpc.array import Array
 from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.journal.entry import JournalEntry
-from rti_mpc.journal.replay import Difference, Gap, Replay, replay
+from rti_mpc.journal.replay import Difference, Gap, Replay
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 from rti_mpc_service.config import toml
 from rti_mpc_service.config.build import retuned
@@ -32,7 +32,7 @@ from rti_mpc_service.replay import coverage
 from rti_mpc_service.replay.closed_loop import compare
 from rti_mpc_service.replay.coverage import uncovered
 from rti_mpc_service.replay.drive import Drive, MakePlacedBody, drive
-from rti_mpc_service.replay.rebuild import CONFIGURATION, Journaled, Rebuilt, journals, rebuild
+from rti_mpc_service.replay.rebuild import CONFIGURATION, Journaled, Rebuilt, journals, rebuild, repeat
 
 TOLERANCE = 1e-6  # of commands on another machine, relative to 1 + their magnitude
 TUNABLE = ("ocp.weights.", "ocp.bounds.")  # beginnings of the keys that `--set` takes
@@ -129,7 +129,7 @@ def main(
             print(f"  {line}")
         if recorded is not None and make_body is not None:
             on = Drive(rebuild(journal, folder=folder, trust=trust), recorded.start_ns, make_body, override)
-            drive(on, journal.messages, snapshot_before(journal, start_s))
+            drive(on, journal, snapshot_before(journal, start_s))
             closed_loops.append(compare(path, journal, recorded, on, assignments, start_s, out))
         outcome = account.on.outcome
         if not changed and (not outcome.samples or outcome.size > limit or (outcome.differing and not built.others)):
@@ -146,7 +146,7 @@ def play(journal: Journaled, built: Rebuilt, start_s: float = 0.0, assignments: 
     on = on or Replay(built.controller, built.rti)
     account = Account(journal, built, on, start_s=start_s)
     override = overridden(built.config, built.rti.ocp, assignments) if assignments else {}
-    steps: Iterator[tuple[JournalEntry, Difference | None]] = replay(on, journal.messages, snapshot_before(journal, start_s))
+    steps: Iterator[tuple[JournalEntry, Difference | None]] = repeat(journal, on, snapshot_before(journal, start_s))
     if override and (first := next(steps, None)) is not None:
         on.override(**override)
         steps = chain([first], steps)

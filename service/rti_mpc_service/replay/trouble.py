@@ -16,9 +16,9 @@ from pathlib import Path
 
 from rti_mpc.contract.message import Command, JournalKind
 from rti_mpc.errors import ConfigError, MessageError
-from rti_mpc.journal.replay import Replay, replay
+from rti_mpc.journal.replay import Replay
 from rti_mpc_service.case import QpCase, about_sample, take, trouble_of
-from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, journals, rebuild
+from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, journals, rebuild, repeat
 
 MAX_CASES = 100  # of one recording
 
@@ -71,7 +71,7 @@ def troubles(journal: Journaled, built: Rebuilt) -> Iterator[QpCase]:
     """Yield the case of each failed or late sample of a controller, from its replay."""
     on = Replay(built.controller, built.rti)
     proposal: Command | None = None
-    for entry, _ in replay(on, journal.messages):
+    for entry, _ in repeat(journal, on):
         if entry.name == "receive_state":
             proposal = on.proposal
         elif entry.name == "in_time" and proposal is not None:

@@ -24,13 +24,13 @@ from rti_mpc.contract.message import Command, JournalKind, Telemetry
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.opinions import DISAGREEMENT
 from rti_mpc.errors import ConfigError, MessageError
-from rti_mpc.journal.entry import JournalEntry, decode_entries
-from rti_mpc.journal.replay import Difference, Replay, replay
+from rti_mpc.journal.entry import JournalEntry
+from rti_mpc.journal.replay import Difference, Replay
 from rti_mpc.recording.reader import Recording
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS
 from rti_mpc_service.case import QpCase, about_sample, solver_of, take
 from rti_mpc_service.replay.plan import acting_bounds, cost_terms
-from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, journals, rebuild
+from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, entries, journals, rebuild, repeat
 from rti_mpc_service.replay.trouble import placed
 from rti_mpc_service.replay.without import without
 
@@ -129,13 +129,10 @@ def find(journal: Journaled, at_s: float | None, seq: int | None) -> Place | Non
 def acted(journal: Journaled) -> Iterator[Place]:
     """Yield the places of the commands that were committed while the controller led."""
     standing_by = False
-    for message in journal.messages:
-        if message.kind is not JournalKind.CALLS:
-            continue
-        for entry in decode_entries(message.data, message.seq):
-            standing_by = entry.name == "stand_by" or (standing_by and entry.name != "lead")
-            if entry.name == "commit" and not standing_by:
-                yield Place(entry.seq, entry.args[0])
+    for entry in entries(journal):
+        standing_by = entry.name == "stand_by" or (standing_by and entry.name != "lead")
+        if entry.name == "commit" and not standing_by:
+            yield Place(entry.seq, entry.args[0])
 
 
 def explain(journal: Journaled, built: Rebuilt, place: Place) -> dict[str, Any]:
@@ -160,7 +157,7 @@ def explained(journal: Journaled, built: Rebuilt, place: Place) -> tuple[dict[st
     facts: dict[str, Any] = {}
     case: QpCase | None = None
     stamp_ns, prepared = 0, 0
-    for entry, difference in replay(on, journal.messages, snapshot_for(journal, place)):
+    for entry, difference in repeat(journal, on, snapshot_for(journal, place)):
         if entry.name == "receive_state":
             stamp_ns = entry.args[0].stamp_ns
         said = [*said_by(entry), *((notice.code, notice.text) for notice in controller.notices())]

@@ -41,7 +41,7 @@ def passages(journal: Journaled, folder: Path, assignments: tuple[str, ...] = ()
     for make_body in (None, lockstep_robot):
         built = rebuild(journal, folder=folder)
         override = overridden(built.config, built.rti.ocp, assignments) if make_body is not None else {}
-        found.append(drive(Drive(built, round(1e9 * start_s), make_body, override), journal.messages, snapshot_before(journal, start_s)))
+        found.append(drive(Drive(built, round(1e9 * start_s), make_body, override), journal, snapshot_before(journal, start_s)))
     return found[0], found[1]
 
 

@@ -4,13 +4,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rti_mpc.errors import ConfigError
+from rti_mpc.contract.message import JournalKind
+from rti_mpc.control.controller import Controller
+from rti_mpc.errors import ConfigError, RtiMpcError
+from rti_mpc.journal.snapshot import OBJECT, Snapshot
 from rti_mpc_service.commands.robot import lockstep_robot
 from rti_mpc_service.config.config import load
 from rti_mpc_service.init import main as init
@@ -110,6 +114,66 @@ def test_source_of_a_model_of_ones_own_runs_only_if_it_is_here_or_trusted(tmp_pa
     assert not account.on.outcome.differing
 
 
+def with_data(journal: Journaled, kind: JournalKind, change: Callable[[bytes], bytes]) -> Journaled:
+    """The journal with other content in its messages of a kind."""
+    return replace(journal, messages=[replace(one, data=change(one.data)) if one.kind is kind else one for one in journal.messages])
+
+
+def with_versions(journal: Journaled, **other: str) -> Journaled:
+    """The journal as another version would have made it."""
+    return replace(journal, files=journal.files | {"versions.json": json.dumps(json.loads(journal.files["versions.json"]) | other)})
+
+
+def other_state(content: bytes) -> bytes:
+    """A snapshot with one number more in one of its arrays."""
+    snapshot = Snapshot.decode(content)
+    return replace(snapshot, pinned=[np.append(snapshot.pinned[0], 0.0), *snapshot.pinned[1:]]).encode()
+
+
+def gone_class(content: bytes) -> bytes:
+    """A snapshot of a class that is not here."""
+    return replace(Snapshot.decode(content), tree=(OBJECT, 0, 0, "rti_mpc.control.gone.Gone", [])).encode()
+
+
+MISFITS: dict[str, tuple[Callable[[Journaled], Journaled], str]] = {
+    "snapshot": (lambda journal: with_data(journal, JournalKind.SNAPSHOT, other_state), "a snapshot must be of a controller built like this one"),
+    "class": (
+        lambda journal: with_data(journal, JournalKind.SNAPSHOT, gone_class),
+        "a snapshot must be of a controller built like this one",
+    ),
+    "encoding": (
+        lambda journal: with_data(journal, JournalKind.CALLS, lambda data: bytes((9,)) + data[1:]),
+        "a journal must be of encoding 1, got 9",
+    ),
+    "method": (lambda journal: with_data(journal, JournalKind.CALLS, lambda data: data[:1] + bytes((99,)) + data[2:]), "a journal must name one of"),
+    "key": (lambda journal: replace(journal, files=journal.files | {"config.toml": "later = 1\n" + journal.files["config.toml"]}), "later"),
+    "equations": (lambda journal: with_versions(journal, model_sha256="0"), "must have the equations that were recorded"),
+}
+
+
+@pytest.mark.parametrize("kind", MISFITS)
+def test_what_another_version_made_and_does_not_fit_is_told_by_that_version(journal: Journaled, kind: str, tmp_path: Path) -> None:
+    change, words = MISFITS[kind]
+    misfit = change(journal)
+    with pytest.raises(RtiMpcError, match=words) as refusal:
+        play(misfit, rebuild(misfit, folder=tmp_path))
+    assert "was made by" not in str(refusal.value), "the same code made it: something else is wrong with it"
+    other = with_versions(misfit, rti_mpc="0.0.9", code_sha256="abcdef0123456789")
+    with pytest.raises(ConfigError, match=words) as refusal:
+        play(other, rebuild(other, folder=tmp_path))
+    assert str(refusal.value).startswith("the recording was made by rti-mpc 0.0.9 of the code abcdef012345, this is ")
+    assert "and does not fit this one; use the one that made it" in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_entry_that_only_another_version_could_repeat_is_told_by_it_too(journal: Journaled, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    other = with_versions(journal, rti_mpc="0.0.9", code_sha256="abcdef0123456789")
+    built = rebuild(other, folder=tmp_path)
+    monkeypatch.delattr(Controller, "prepare")
+    with pytest.raises(ConfigError, match=r"was made by rti-mpc 0\.0\.9 .*AttributeError: .*prepare"):
+        play(other, built)
+
+
 def test_recording_without_a_configuration_is_refused(journal: Journaled, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="configuration of controller 5 of pioneer must be attached"):
         rebuild(replace(journal, files={}), folder=tmp_path)
@@ -142,6 +206,6 @@ def test_robot_with_an_observer_and_an_obstacle_is_replayed_explained_and_driven
     assert facts["replayed"] == "0 bits differ"
     assert facts["mode"] == "TRACKING"
     assert len(facts["disturbances"]) == 1
-    was, driven = (drive(Drive(rebuild(journal, folder=tmp_path), 0, body), journal.messages, 0) for body in (None, lockstep_robot))
+    was, driven = (drive(Drive(rebuild(journal, folder=tmp_path), 0, body), journal, 0) for body in (None, lockstep_robot))
     assert len(was.states) > 20
     assert [state.x.tolist() for state in driven.states] == [state.x.tolist() for state in was.states]
