@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What made a recording: the rti-mpc, its build and its machine, as attached, beside those that are here.
+Maker of a recording: the version of rti-mpc, its build and its machine, as attached, beside those that are here.
 
 Where other code of rti-mpc made it, whatever does not fit is told by that in one line:
 an entry, a snapshot, a configuration, the equations of a model, the guess of a case.
