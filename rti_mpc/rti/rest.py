@@ -334,7 +334,7 @@ def ramps(ocp: Ocp, starts: Starts) -> Ways:
     return Ways(np.stack(inputs, axis=1), np.stack(states, axis=1), np.zeros((len(X), model.nu, model.nx)), ocp.dt)
 
 
-def played(ocp: Ocp, law: StopLaw, ways: Ways, starts: Starts, feedback: float, answer: float) -> Array:
+def played(ocp: Ocp, law: StopLaw, ways: Ways, starts: Starts, feedback: float, answer: float) -> tuple[Array, Array]:
     """
     Play ways to rest on a plant that answers its inputs more or less than its model, and late; the last row for a while.
 
@@ -347,14 +347,14 @@ def played(ocp: Ocp, law: StopLaw, ways: Ways, starts: Starts, feedback: float, 
         answer: Factor of the inputs.
 
     Returns:
-        Rates of the states in the end, shape ``(n, nx)``.
+        States at the beginning of each row and in the end, shape ``(n, rows + 1, nx)``, and what the plant then answers, shape ``(n, nu)``.
     """
     model, U, p = ocp.model, starts.u, starts.p.T
     lbu, ubu, lbdu, ubdu = (ocp.widest(name) for name in ("lbu", "ubu", "lbdu", "ubdu"))
     phi = integrator(model, substeps=law.substeps)
     rows_late, late_s = divmod(DELAY_S, law.period_s)
     x, before = ways.x[:, 0], U
-    past = [U] * (int(rows_late) + 2)
+    past, states = [U] * (int(rows_late) + 2), [x]
     for i in range(law.rows + math.ceil(STANDING_S / law.period_s)):
         row = min(i, law.rows - 1)
         u = ways.u[:, row] - feedback * np.einsum("nij,nj->ni", ways.K, x - ways.x[:, row])
@@ -362,13 +362,34 @@ def played(ocp: Ocp, law: StopLaw, ways: Ways, starts: Starts, feedback: float, 
         before, past = u, [*past[1:], u]
         for acting, span_s in ((past[0], late_s), (past[1], law.period_s - late_s)):
             x = np.array(phi(x.T, answer * acting.T, p, span_s)).T
-    return rates_at(model, x, answer * before, starts.p)
+        states.append(x)
+    return np.stack(states, axis=1), answer * before
 
 
 def in_the_end(ocp: Ocp, law: StopLaw, ways: Ways, starts: Starts, feedback: float) -> Array:
     """Return how fast each state changes after each way, shape ``(n, nx)``: the faster of two plants that answer more, and less, than their model."""
     ends = [played(ocp, law, ways, starts, feedback, 1.0 + mismatch) for mismatch in (INPUT_MISMATCH_SHARE, -INPUT_MISMATCH_SHARE)]
-    return np.asarray(np.abs(ends).max(axis=0))
+    return np.asarray(np.abs([rates_at(ocp.model, x[:, -1], u, starts.p) for x, u in ends]).max(axis=0))
+
+
+def standing_s(ocp: Ocp, law: StopLaw, place: Callable[[Array], Array], speed: float) -> float:
+    """
+    Return how long after the beginning of its way to rest a robot stands, in s: at least as long as the way, at most `STANDING_S` longer.
+
+    Rows that act late lead a robot off its way where it brakes with all that its inputs can do. Its gain then leads it back, also after the
+    last row.
+
+    Args:
+        ocp: Its problem.
+        law: What its way to rest is made with.
+        place: Gives what is to stand from states, shape ``(n, nx)`` to ``(n, k)``.
+        speed: Below which it stands, in its unit per s.
+    """
+    starts = starts_of(ocp, TRIED_STATES, law.disturbances)
+    states, _ = played(ocp, law, ways_to_rest(ocp, law, starts, compile=False), starts, 0.0 if law.holds else 1.0, 1.0)
+    places = place(states.reshape(-1, ocp.model.nx)).reshape(*states.shape[:2], -1)
+    moves = np.linalg.norm(np.diff(places, axis=1), axis=2).max(axis=0) >= speed * law.period_s
+    return law.period_s * max(law.rows, int((moves * np.arange(1, len(moves) + 1)).max()))
 
 
 def rates_of_operation(model: Model, starts: Starts) -> Array:

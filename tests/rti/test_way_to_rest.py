@@ -16,7 +16,7 @@ from rti_mpc.model.robots.dynamic_bicycle import dynamic_bicycle
 from rti_mpc.model.robots.two_link_arm import two_link_arm
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.operation import states_of_operation
-from rti_mpc.rti.rest import RestClass, assess, find_stop_law
+from rti_mpc.rti.rest import STANDING_S, RestClass, assess, find_stop_law, standing_s
 from rti_mpc.rti.way_to_rest import StopLaw, WayToRest
 from tests.movers import car, law_of, mover, ocp_of
 from tests.problems import tank
@@ -95,6 +95,17 @@ def test_robot_that_has_come_off_its_way_is_back_and_still_soon(name: str) -> No
         rate, x = np.array(f(x, u, model.p_nominal)).ravel(), np.array(phi(x, u, model.p_nominal, period_s)).ravel()
     assert np.abs(x - way.x[-1]).max() < 1e-3, "m, rad"
     assert np.abs(rate[:2]).max() < 1e-3, "m/s, rad/s"
+
+
+def test_car_that_has_braked_with_all_it_has_is_led_back_onto_its_way_after_the_last_row() -> None:
+    ocp, law = ocp_of("car"), law_of("car")
+    assert law is not None
+    way_s = law.rows * law.period_s
+    stands_s = standing_s(ocp, law, lambda x: x[:, :2], speed=1e-3)
+    assert way_s < stands_s < way_s + 1.0
+    assert standing_s(ocp, law, lambda x: x[:, :2], speed=0.1) == pytest.approx(way_s), "a tenth of a metre per second it has lost before"
+    alone = replace(law, holds=True)
+    assert standing_s(ocp, alone, lambda x: x[:, :2], speed=1e-3) == pytest.approx(way_s + STANDING_S), "without its gain it drifts on"
 
 
 def test_arm_is_held_by_its_torques_wherever_it_stops() -> None:

@@ -28,14 +28,15 @@ from rti_mpc.array import Array
 from rti_mpc.contract.limits import Limits
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.interrupt import stop_on_signals
-from rti_mpc_service.config.build import build_signals, guard_limits, robot_settings
+from rti_mpc_service.config.build import build_ocp, build_signals, guard_limits, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_model, check_stop, check_tree
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.console import plain_console
 from rti_mpc_service.entry import EXIT_FAILED, say
 from rti_mpc_service.faults.excuse import excuses, explained
-from rti_mpc_service.faults.measure import Incident, measure, missed_ns
+from rti_mpc_service.faults.measure import STANDSTILL_SPEED_M_S, Incident, measure, missed_ns
+from rti_mpc_service.faults.motion import Motion
 from rti_mpc_service.faults.relay import ROLE as RELAY
 from rti_mpc_service.faults.report import MatrixReport, MatrixRow
 from rti_mpc_service.faults.system import System, Wiring
@@ -112,7 +113,7 @@ def main(
     folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
     try:
         with Host() as host, MatrixReport(console := plain_console(), len(faults)) as report:
-            inject(config, [of_robot(fault, config, law) for fault in faults], folder, report, stop, host, reference, record)
+            inject(config, of_robot(faults, config, law), folder, report, stop, host, reference, record)
     except Unwitnessed as error:  # from the start
         say(str(error))
         return EXIT_FAILED
@@ -195,14 +196,23 @@ def moving_s(config: Config, scenario: Scenario) -> float:
     return duration_s
 
 
-def of_robot(fault: Fault, config: Config, law: StopLaw | None) -> Fault:
-    """Return a fault as a robot must bear it that coasts, or goes a way to rest: it lasts until that is over, and is to stand then."""
-    adrift = law is not None and law.disturbances.size > 0 and "brake_s" not in fault.promise.at_most  # until it is commanded
-    if config.model.stop == "coasts" or adrift:
-        return replace(fault, promise=fault.promise.without_standstill())
-    if law is None or "brake_s" not in fault.promise.at_most:
-        return fault
-    within_s = config.timing.valid_s + law.rows * law.period_s
+def of_robot(faults: Sequence[Fault], config: Config, law: StopLaw | None) -> list[Fault]:
+    """Return faults as a robot must bear them that coasts, or goes a way to rest: they last until that is over, and it is to stand then."""
+    if config.model.stop == "coasts":
+        return [replace(fault, promise=fault.promise.without_standstill()) for fault in faults]
+    if law is None:
+        return list(faults)
+    from rti_mpc.rti.rest import standing_s
+
+    ocp = build_ocp(config)
+    within_s = config.timing.valid_s + standing_s(ocp, law, Motion(ocp.model).position, STANDSTILL_SPEED_M_S)
+    return [by_way(fault, within_s, disturbed=law.disturbances.size > 0) for fault in faults]
+
+
+def by_way(fault: Fault, within_s: float, *, disturbed: bool) -> Fault:
+    """Return a fault as a robot must bear it that stands so long after the fault, and before it is commanded only if nothing disturbs it."""
+    if "brake_s" not in fault.promise.at_most:
+        return replace(fault, promise=fault.promise.without_standstill()) if disturbed else fault
     stands = "still_s" in fault.promise.at_most
     return replace(fault, promise=fault.promise.by_way(within_s), hold_s=max(fault.hold_s, within_s + STANDING_S) if stands else fault.hold_s)
 

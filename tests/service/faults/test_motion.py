@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +10,18 @@ import pytest
 
 from rti_mpc.contract.message import End, Reference
 from rti_mpc.errors import ConfigError
+from rti_mpc.rti.rest import standing_s
+from rti_mpc_service.config.build import build_ocp
 from rti_mpc_service.config.config import load
-from rti_mpc_service.faults.measure import Incident
+from rti_mpc_service.faults.measure import STANDSTILL_SPEED_M_S, Incident
 from rti_mpc_service.faults.motion import Motion
 from rti_mpc_service.faults.promise import ALWAYS, HOLDS, KEEPS_ON, PAUSES, RECOVERY, STOPS, WAITS
 from rti_mpc_service.faults.report import MatrixRow
-from rti_mpc_service.faults.run import MIN_REFERENCE_S, error_before, moving_s, of_robot, prepared
+from rti_mpc_service.faults.run import MIN_REFERENCE_S, by_way, error_before, moving_s, of_robot, prepared
 from rti_mpc_service.faults.table import FAULTS
 from rti_mpc_service.rig.robot_log import RobotLog
 from rti_mpc_service.scenario import find_scenario
-from tests.movers import law_of
+from tests import movers
 from tests.robots import SHIPPED, arm, polar, shuffled, toml
 
 X = np.arange(5.0)
@@ -59,19 +60,26 @@ def test_robot_that_coasts_promises_nothing_of_its_standstill_but_where_it_is_he
     assert HOLDS.without_standstill() == HOLDS
 
 
-def test_robot_with_a_way_to_rest_is_held_to_its_end_and_not_to_inputs_at_rest() -> None:
-    law = law_of("car")
-    assert law is not None
-    config, fault = load(SHIPPED), next(fault for fault in FAULTS if fault.name == "controller_killed")
-    borne = of_robot(fault, config, law)
-    assert borne.promise.at_most == {**ALWAYS, **RECOVERY, "still_s": pytest.approx(0.25 + law.rows * law.period_s)}
-    assert borne.hold_s > borne.promise.at_most["still_s"]
-    assert of_robot(fault, config, None) == fault
-    missing = next(fault for fault in FAULTS if fault.name == "reference_missing")
-    assert of_robot(missing, config, law) == missing
-    assert of_robot(missing, config, replace(law, disturbances=np.ones(2))).promise.at_most == {**ALWAYS, **RECOVERY}, "it drifts until then"
+def test_robot_with_a_way_to_rest_is_to_stand_in_its_own_time_whatever_its_inputs_do() -> None:
+    fault, missing = (next(fault for fault in FAULTS if fault.name == name) for name in ("controller_killed", "reference_missing"))
+    borne = by_way(fault, 5.0, disturbed=False)
+    assert borne.promise.at_most == {**ALWAYS, **RECOVERY, "still_s": 5.0}
+    assert borne.hold_s > 5.0
+    assert by_way(missing, 5.0, disturbed=False) == missing
+    assert by_way(missing, 5.0, disturbed=True).promise.at_most == {**ALWAYS, **RECOVERY}, "it drifts until then"
     assert PAUSES.by_way(5.0).at_most == {**ALWAYS, **RECOVERY}
     assert HOLDS.by_way(5.0) == HOLDS
+
+
+def test_time_to_stand_begins_when_the_last_plan_has_ended_and_is_that_of_the_robot(tmp_path: Path) -> None:
+    (tmp_path / "robot.toml").write_text(movers.toml("car"))
+    config, law = load(tmp_path / "robot.toml"), movers.law_of("car")
+    assert law is not None
+    (borne,) = of_robot([fault for fault in FAULTS if fault.name == "controller_killed"], config, law)
+    ocp = build_ocp(config)
+    stands_s = standing_s(ocp, law, Motion(ocp.model).position, STANDSTILL_SPEED_M_S)
+    assert borne.promise.at_most["still_s"] == pytest.approx(config.timing.valid_s + stands_s)
+    assert of_robot(FAULTS, config, None) == list(FAULTS)
 
 
 def test_row_is_told_in_the_unit_of_the_robot() -> None:
