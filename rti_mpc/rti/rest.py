@@ -57,7 +57,7 @@ MAX_WAY_ROWS = 200
 MAX_HORIZON_ROWS = 100  # that the regulator looks ahead
 ROWS_FACTOR = 1.5  # a way has so many times the rows that the states tried need
 INPUT_WEIGHTS = (0.01, 0.1, 1.0, 10.0)  # relative to the weight of the rates; the one with the soonest rest is taken
-DELAY_S = 0.01  # from a state to the input that answers it, when a way is played
+DELAY_S = 0.01  # from a state to the input that answers it, when a way is played, beside the robot's own delay
 INPUT_MISMATCH_SHARE = 0.02  # by which the plant answers its inputs more, or less, than its model
 STANDING_S = 5.0  # for which the last row is then played
 UNDISTURBED: Array = np.zeros(0)
@@ -204,7 +204,7 @@ def starts_of(ocp: Ocp, count: int, disturbances: Array) -> Starts:
     return Starts(*states_of_operation(ocp, count), p)
 
 
-def find_stop_law(ocp: Ocp, disturbances: Array = UNDISTURBED) -> StopLaw | None:
+def find_stop_law(ocp: Ocp, disturbances: Array = UNDISTURBED, delay_s: float = 0.0) -> StopLaw | None:
     """
     Return what the way to rest of a problem is made with, None for a robot whose inputs need but ramp to rest.
 
@@ -212,13 +212,14 @@ def find_stop_law(ocp: Ocp, disturbances: Array = UNDISTURBED) -> StopLaw | None
         ocp: The problem.
         disturbances: Largest magnitudes of the last parameters of its model, shape ``(nd,)``: of what moves the robot also while
             its inputs are at rest, as a current does, and is to be balanced then.
+        delay_s: From a state to the input that answers it, s: a gain that is too large for it sways.
 
     Raises:
         OcpError: It does not come to rest from where it operates, or does not stay there; the message says from where.
     """
     if not disturbances.size and ocp.model.stop_expr is None and not motion_at_rest(ocp):
         return None
-    law = shaped(ocp, disturbances)
+    law = shaped(ocp, disturbances, delay_s)
     rest = assess(ocp, law, TRIED_STATES, compile=False)
     return replace(law, holds=rest.kind is RestClass.HOLDS, alone=rest.alone)
 
@@ -260,7 +261,7 @@ def assess(ocp: Ocp, law: StopLaw | None, count: int, *, compile: bool = True) -
         return Rest(RestClass.HOLDS, growth, time_s, moved, count)
     kept = in_the_end(ocp, law, ways, starts, feedback=1.0) <= STILL_SHARE * rates
     if not kept.all():
-        raise OcpError(unkept(model, starts, ~kept, ways))
+        raise OcpError(unkept(model, starts, ~kept, ways, law.delay_s))
     falls = growth > MAX_DRIFT_GROWTH_PER_S or alone.max() > FALLING_SHARE
     return Rest(RestClass.UNSTABLE if falls else RestClass.DRIFTS, growth, time_s, moved, count, unaided(model, law, rates, alone.max(axis=0)))
 
@@ -272,7 +273,7 @@ def growth_of(eigenvalues: np.ndarray[Any, Any], period_s: float | None) -> floa
     return float(np.log(np.abs(1.0 + period_s * eigenvalues).max(initial=1e-300)) / period_s)
 
 
-def shaped(ocp: Ocp, disturbances: Array) -> StopLaw:
+def shaped(ocp: Ocp, disturbances: Array, delay_s: float = 0.0) -> StopLaw:
     """
     Find the rows of the way to rest and the weight of its regulator: those with which seeded states of operation are at rest soonest, and stay there.
 
@@ -288,7 +289,8 @@ def shaped(ocp: Ocp, disturbances: Array) -> StopLaw:
         rows = whole(math.ceil(duration_s / (substeps * ocp.dt)))
         found = []
         for weight in INPUT_WEIGHTS:
-            law = StopLaw(rows, min(rows, MAX_HORIZON_ROWS), substeps * ocp.dt, substeps, weight, rates, scale_x, scale_u, disturbances=disturbances)
+            horizon, period_s = min(rows, MAX_HORIZON_ROWS), substeps * ocp.dt
+            law = StopLaw(rows, horizon, period_s, substeps, weight, rates, scale_x, scale_u, disturbances=disturbances, delay_s=delay_s)
             for count in (FIRST_TRIED_STATES, TRIED_STATES):
                 few = Starts(*(part[:count] for part in starts))
                 ways = ways_to_rest(ocp, law, few, compile=False)
@@ -298,7 +300,7 @@ def shaped(ocp: Ocp, disturbances: Array) -> StopLaw:
             if moving[:, -1].any():
                 wrong = unrested(model, starts, moving[:, -1], ways)
             elif not (kept := in_the_end(ocp, law, ways, starts, feedback=1.0) <= STILL_SHARE * rates).all():
-                wrong = unkept(model, starts, ~kept, ways)
+                wrong = unkept(model, starts, ~kept, ways, delay_s)
             else:
                 needed = int((moving.any(axis=2) * np.arange(1, rows)).max()) + 1
                 found.append(replace(law, rows=min(rows, whole(math.ceil(ROWS_FACTOR * needed) + 1))))
@@ -352,7 +354,7 @@ def played(ocp: Ocp, law: StopLaw, ways: Ways, starts: Starts, feedback: float, 
     model, U, p = ocp.model, starts.u, starts.p.T
     lbu, ubu, lbdu, ubdu = (ocp.widest(name) for name in ("lbu", "ubu", "lbdu", "ubdu"))
     phi = integrator(model, substeps=law.substeps)
-    rows_late, late_s = divmod(DELAY_S, law.period_s)
+    rows_late, late_s = divmod(DELAY_S + law.delay_s, law.period_s)
     x, before = ways.x[:, 0], U
     past, states = [U] * (int(rows_late) + 2), [x]
     for i in range(law.rows + math.ceil(STANDING_S / law.period_s)):
@@ -431,7 +433,7 @@ def unrested(model: Model, starts: Starts, moving: np.ndarray[Any, Any], ways: W
     return f"{ways.period_s * ways.x.shape[1]:.3g} s after a stop at {where} it still moves: {names}"
 
 
-def unkept(model: Model, starts: Starts, moving: np.ndarray[Any, Any], ways: Ways) -> str:
+def unkept(model: Model, starts: Starts, moving: np.ndarray[Any, Any], ways: Ways, delay_s: float) -> str:
     """Say the same of a way that is played, and where it ends."""
-    mismatch = f"if its inputs do {100 * INPUT_MISMATCH_SHARE:g} % more or less than modelled, {DELAY_S:g} s late"
+    mismatch = f"if its inputs do {100 * INPUT_MISMATCH_SHARE:g} % more or less than modelled, {DELAY_S + delay_s:g} s late"
     return f"{unrested(model, starts, moving, ways)}, {mismatch}"

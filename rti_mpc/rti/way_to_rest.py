@@ -73,6 +73,7 @@ class StopLaw:
         disturbances: Largest magnitudes of the model's last parameters, shape ``(nd,)``, that move the robot while its inputs are at
             rest; empty if none do. In them, not every heading is one to rest in.
         alone: How fast the robot moves in the end if its states are not fed back, in words; empty if it holds.
+        delay_s: Delay from a state to the input that answers it, s, for which it must come to rest.
     """
 
     rows: int
@@ -86,6 +87,7 @@ class StopLaw:
     holds: bool = False
     disturbances: Array = field(default_factory=lambda: np.zeros(0))
     alone: str = ""
+    delay_s: float = 0.0
 
 
 class WayToRest:

@@ -108,6 +108,17 @@ def test_car_that_has_braked_with_all_it_has_is_led_back_onto_its_way_after_the_
     assert standing_s(ocp, alone, lambda x: x[:, :2], speed=1e-3) == pytest.approx(way_s + STANDING_S), "without its gain it drifts on"
 
 
+def test_gain_of_a_robot_that_answers_late_is_one_with_which_it_does_not_sway() -> None:
+    ocp, law, delay_s = ocp_of("car"), law_of("car"), 0.2
+    assert law is not None
+    with pytest.raises(OcpError, match=r"it still moves: x, y, v, .* 0\.21 s late"):
+        assess(ocp, replace(law, delay_s=delay_s), 24, compile=False)
+    late = find_stop_law(ocp, delay_s=delay_s)
+    assert late is not None
+    assert late.input_weight > law.input_weight
+    assess(ocp, late, 24, compile=False)
+
+
 def test_arm_is_held_by_its_torques_wherever_it_stops() -> None:
     way = way_of("arm")
     for q_1 in (-1.5, 0.0, 1.5):

@@ -132,16 +132,17 @@ def check_stop(config: Config) -> StopLaw | None:
     if config.model.stop == "coasts":
         return None
     try:
-        return find_stop_law(build_ocp(config), disturbances_at_rest(config))
+        return find_stop_law(build_ocp(config), disturbances_at_rest(config), config.delay_s or 0.0)
     except OcpError as error:
         raise ConfigError(unstopped(config, error)) from error
 
 
 def unstopped(config: Config, seen: object) -> str:
     """Say that a stop does not bring the robot to rest, what was seen of it, and what to do."""
+    sooner = f"lower timing.delay_s, which is {config.delay_s:g} s, " if config.delay_s else ""
     calmer = "lower limits in observer.disturbances to what its inputs can balance, " if config.observer.at_rest else ""
     return (
-        f"model.name: a stop must bring {config.model.name} to rest: {seen}; {calmer}bound in ocp.bounds.states where it operates, "
+        f"model.name: a stop must bring {config.model.name} to rest: {seen}; {sooner}{calmer}bound in ocp.bounds.states where it operates, "
         f'let the model say how it stops (stop_expr), or say that it is let go by stop = "coasts" in [model]'
     )
 
