@@ -102,7 +102,7 @@ def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
     return {
         "Q": [weights.Q[output.name] for output in model.outputs],
         "R": [weights.R[input.name] for input in model.inputs],
-        "R_u": [weights.R_u.get(input.name, 0.0) for input in model.inputs],
+        "R_u": by_block(weights.R_u, stages.R_u, names(model.inputs), N_u),
         "delta": factors(as_sequence(weights.delta, N), stages.delta, names(model.outputs)),
         "lambda_": factors(as_sequence(weights.lambda_, N_u), stages.lambda_, names(model.inputs)),
         "lbu": lbu,
@@ -307,6 +307,13 @@ def by_stage(
 def factors(sequence: tuple[float, ...], stages: Mapping[str, Sequence[float]], names: Sequence[str]) -> Any:
     """Return factors of weights, one per stage, or, where some differ by signal, a row per stage."""
     return [[factor * stages[name][k] if name in stages else factor for name in names] for k, factor in enumerate(sequence)] if stages else sequence
+
+
+def by_block(weights: Mapping[str, float], stages: Mapping[str, Sequence[float]], names: Sequence[str], count: int) -> Any:
+    """Return weights in the order of the names, 0 for one left out, or, where some differ from block to block, a row per block."""
+    if not stages:
+        return [weights.get(name, 0.0) for name in names]
+    return [[stages[name][k] if name in stages else weights.get(name, 0.0) for name in names] for k in range(count)]
 
 
 def names(signals: Iterable[Signal | Label]) -> list[str]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 from rti_mpc.errors import ConfigError, OcpError
@@ -17,6 +17,15 @@ if TYPE_CHECKING:
     from rti_mpc.rti.way_to_rest import StopLaw
 
 COMPLETE_TABLES = ("ocp.weights.Q", "ocp.weights.R", "ocp.terminal.Q")  # that must have every name
+STAGE_TABLES = {  # of ocp.stages by field: what its names are, and what its lists have an entry for
+    "delta": ("output", "stage"),
+    "lambda_": ("input", "block"),
+    "R_u": ("input", "block"),
+    "inputs": ("input", "block"),
+    "increments": ("input", "block"),
+    "states": ("state", "stage"),
+    "constraints": ("constraint", "stage"),
+}
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -43,30 +52,20 @@ def check_tree(config: Config) -> None:
     for key, values, length, each in (("delta", ocp.weights.delta, ocp.N, "stage"), ("lambda", ocp.weights.lambda_, config.N_u, of_lambda)):
         if len(values) not in (1, length):
             raise ConfigError(f"ocp.weights.{key} must be a number or a list of {length}, one per {each}, got {quoted(list(values))}")
-    for key, table, length in stage_tables(config):
-        for name, listed in table.items():
+    for field, (_, each) in STAGE_TABLES.items():
+        length = ocp.N if each == "stage" else config.N_u
+        for name, listed in getattr(ocp.stages, field).items():
             if len(listed) != length:
-                each = "block of inputs" if length != ocp.N else "stage"
-                raise ConfigError(f"ocp.stages.{key}.{name} must be a list of {length}, one per {each}, got {len(listed)}")
+                of = "block of inputs" if length != ocp.N else "stage"
+                raise ConfigError(f"ocp.stages.{field.rstrip('_')}.{name} must be a list of {length}, one per {of}, got {len(listed)}")
+    if twice := sorted(ocp.stages.R_u.keys() & ocp.weights.R_u.keys()):
+        raise ConfigError(f"ocp.stages.R_u has the weights of {twice[0]} in each block, which ocp.weights.R_u must leave out")
     if config.bus.config is not None and not config.bus.config.is_file():
         raise ConfigError(f"bus.config must be a file, got {config.bus.config}")
     if config.guard.enabled:
         for name in ocp.weights.R:
             if name not in ocp.bounds.inputs:
                 raise ConfigError(f"ocp.bounds.inputs must bound every input where a guard is enabled, {name} is missing")
-
-
-def stage_tables(config: Config) -> list[tuple[str, Mapping[str, Sequence[object]], int]]:
-    """Return the tables of ``ocp.stages``, each with its key and the length of its lists."""
-    stages, N, N_u = config.ocp.stages, config.ocp.N, config.N_u
-    return [
-        ("delta", stages.delta, N),
-        ("lambda", stages.lambda_, N_u),
-        ("inputs", stages.inputs, N_u),
-        ("increments", stages.increments, N_u),
-        ("states", stages.states, N),
-        ("constraints", stages.constraints, N),
-    ]
 
 
 def check_model(config: Config) -> Ocp:
@@ -168,12 +167,7 @@ def check_names(config: Config, model: Model) -> None:
         ("ocp.bounds.states", ocp.bounds.states, "state", model.states),
         ("ocp.bounds.terminal", ocp.bounds.terminal, "state", model.states),
         ("ocp.bounds.constraints", ocp.bounds.constraints, "constraint", model.constraints),
-        ("ocp.stages.delta", ocp.stages.delta, "output", model.outputs),
-        ("ocp.stages.lambda", ocp.stages.lambda_, "input", model.inputs),
-        ("ocp.stages.inputs", ocp.stages.inputs, "input", model.inputs),
-        ("ocp.stages.increments", ocp.stages.increments, "input", model.inputs),
-        ("ocp.stages.states", ocp.stages.states, "state", model.states),
-        ("ocp.stages.constraints", ocp.stages.constraints, "constraint", model.constraints),
+        *((f"ocp.stages.{key.rstrip('_')}", getattr(ocp.stages, key), kind, getattr(model, f"{kind}s")) for key, (kind, _) in STAGE_TABLES.items()),
         *((("ocp.terminal.Q", terminal.Q, "output", model.outputs),) if terminal.Q is not None else ()),
         ("ocp.terminal.lqr.states", regulator.states, "state", model.states),
         ("ocp.terminal.lqr.inputs", regulator.inputs, "input", model.inputs),

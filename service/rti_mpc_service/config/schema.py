@@ -137,7 +137,7 @@ class BoundSection(Section):
 
 
 class StagesSection(Section):
-    """Factors and bounds that differ from stage to stage, lists by name: one entry per stage, for inputs and increments per block of held inputs."""
+    """What differs from stage to stage, lists by name: one entry per stage, for inputs and increments per block of held inputs."""
 
     delta: dict[str, Annotated[tuple[Weight, ...], Field(strict=False)]] = Field(
         default={}, description="factors of an output's weight, besides weights.delta, a list of N by name, without unit"
@@ -146,6 +146,10 @@ class StagesSection(Section):
         default={},
         alias="lambda",
         description="factors of the weight of an input's increments, besides weights.lambda, a list of N_u by name, without unit",
+    )
+    R_u: dict[str, Annotated[tuple[Weight, ...], Field(strict=False)]] = Field(
+        default={},
+        description="weights of an input itself in each block, instead of weights.R_u, a list of N_u by name, in cost / unit of the input squared",
     )
     inputs: dict[str, Annotated[tuple[InputInterval, ...], Field(strict=False)]] = Field(
         default={}, description="bounds of inputs in each block, inside bounds.inputs, in the input's unit"

@@ -25,11 +25,12 @@ params.live = true
 ocp.N = 4
 ocp.blocks = [1, 1, 2]
 ocp.dt_s = 0.1
-ocp.weights = { Q = { x = 1, y = 2, psi = 0.1 }, R = { u_c = 1, omega_c = 3 }, delta = [1, 2, 3, 4], lambda = 0.5 }
+ocp.weights = { Q = { x = 1, y = 2, psi = 0.1 }, R = { u_c = 1, omega_c = 3 }, delta = [1, 2, 3, 4], lambda = 0.5, R_u = { omega_c = 0.1 } }
 ocp.bounds = { inputs = { u_c = [-0.5, 0.5], omega_c = [-0.7, 0.7] }, states = { u = [-0.6, 0.6] } }
 [ocp.stages]
 delta = { x = [1, 0, 1, 2] }
 lambda = { omega_c = [1, 2, 4] }
+R_u = { u_c = [0, 0.5, 2] }
 inputs = { u_c = [[-0.5, 0.4], [-0.5, 0.3], [-0.8, 0.2]] }
 increments = { u_c = [[-0.2, 0.3], [-0.2, 0.3], [-inf, inf]] }
 states = { omega = [[-inf, inf], [-0.6, 0.6], [-0.5, 0.5], [-0.4, 0.4]] }
@@ -47,6 +48,7 @@ def test_tables_of_stages_scale_weights_and_narrow_bounds(tmp_path: Path) -> Non
     ocp = build_ocp(config)
     np.testing.assert_array_equal(ocp.delta, [[1, 1, 1], [0, 2, 2], [3, 3, 3], [8, 4, 4]])
     np.testing.assert_array_equal(ocp.lambda_, [[0.5, 0.5], [0.5, 1.0], [0.5, 2.0]])
+    np.testing.assert_array_equal(ocp.R_u, [[0.0, 0.1], [0.5, 0.1], [2.0, 0.1]])
     np.testing.assert_array_equal(ocp.ubu, [[0.4, 0.7], [0.3, 0.7], [0.2, 0.7]])
     np.testing.assert_array_equal(ocp.lbu[:, 0], [-0.5, -0.5, -0.5])  # no wider than the robot's own
     np.testing.assert_array_equal(ocp.lbdu[:, 0], [-0.2, -0.2, -np.inf])
@@ -74,6 +76,13 @@ def test_weights_are_changed_while_it_runs_and_tables_of_stages_are_not(tmp_path
     [
         ("x = [1, 0, 1, 2]", "x = [1, 2]", r"ocp\.stages\.delta\.x must be a list of 4, one per stage, got 2"),
         ("[1, 2, 4]", "[1, 2, 4, 8]", r"ocp\.stages\.lambda\.omega_c must be a list of 3, one per block of inputs, got 4"),
+        ("[0, 0.5, 2]", "[0, 0.5]", r"ocp\.stages\.R_u\.u_c must be a list of 3, one per block of inputs, got 2"),
+        ("[0, 0.5, 2]", "[0, 0.5, -2]", r"ocp\.stages\.R_u\.u_c"),
+        (
+            "u_c = [0, 0.5, 2]",
+            "omega_c = [0, 0.5, 2]",
+            r"ocp\.stages\.R_u has the weights of omega_c in each block, which ocp\.weights\.R_u must",
+        ),
         ("x = [1, 0, 1, 2]", "z = [1, 0, 1, 2]", r"ocp\.stages\.delta\.z"),
         ("[-0.5, 0.4], ", "", r"ocp\.stages\.inputs\.u_c must be a list of 3, one per block of inputs, got 2"),
         ("[-0.5, 0.4]", "[0.4, -0.5]", r"ocp\.stages\.inputs\.u_c.* must be \[lower, upper\]"),
