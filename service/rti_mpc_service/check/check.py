@@ -125,9 +125,23 @@ def main(path: Path) -> int:
     console.print(reached + (f", not to the {', the '.join(report.missed)}" if report.missed else ""), soft_wrap=True)
     console.print(stopped, soft_wrap=True)
     if config.guard.enabled or (law is not None and not law.holds):
-        file = signals_file.write(path, build_signals(config))
-        console.print(f"the model's signals, for a guard or an adapter: {file}", soft_wrap=True)
+        console.print(f"the model's signals, for a guard or an adapter: {written(path, config)}", soft_wrap=True)
     return 0 if report.agree and all(status.usable for status in report.statuses) else 1
+
+
+def written(path: Path, config: Config) -> str:
+    """
+    Write the signals beside the robot's file, and return where they are, or, if nothing can be written there and no guard is configured, what to do.
+
+    Raises:
+        ConfigError: They cannot be written, and a guard is configured, which reads them there.
+    """
+    try:
+        return str(signals_file.write(path, build_signals(config)))
+    except ConfigError as error:
+        if config.guard.enabled:
+            raise
+        return f"not written, {error}"
 
 
 def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> CheckReport:

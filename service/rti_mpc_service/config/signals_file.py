@@ -83,7 +83,8 @@ def write(path: Path, signals: Signals) -> Path:
             beside.write_text(text, encoding="utf-8")
             beside.replace(file)  # a guard that starts meanwhile reads the one or the other
     except OSError as error:
-        raise ConfigError(f"{file} must be a file that can be written, a guard reads the model's signals there: {error.strerror}") from error
+        cure = f"check a copy of {path.name} in a folder of your own"
+        raise ConfigError(f"{file} must be a file that can be written, a guard reads the model's signals there: {error.strerror}; {cure}") from error
     return file
 
 

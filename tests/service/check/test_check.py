@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from rti_mpc.contract.status import QpStatus
+from rti_mpc.errors import ConfigError
 from rti_mpc.rti.rest import Rest, RestClass, assess
 from rti_mpc_service.check import check, rest
 from rti_mpc_service.check.agreement import Agreement
@@ -44,6 +45,21 @@ def test_a_qp_that_is_not_the_other_formulations_is_noticed(tmp_path: Path, monk
     report = check.check(load(path))
     assert not report.agree
     np.testing.assert_allclose(report.difference, 1e-4, rtol=0.01)
+
+
+def test_signals_that_cannot_be_written_fail_the_check_only_where_a_guard_is_to_read_them(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL)
+    config = load(path)
+    file = tmp_path / "robot.signals.json"
+    assert check.written(path, config) == str(file)
+    file.unlink()
+    file.mkdir()  # as where a folder cannot be written, which nothing keeps root from
+    assert check.written(path, config).startswith(f"not written, {file} must be a file that can be written")
+    assert check.written(path, config).endswith("check a copy of robot.toml in a folder of your own")
+    guarded = config.model_copy(update={"guard": config.guard.model_copy(update={"enabled": True})})
+    with pytest.raises(ConfigError, match=r"check a copy of robot\.toml in a folder of your own$"):
+        check.written(path, guarded)
 
 
 CART = """

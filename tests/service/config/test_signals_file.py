@@ -135,6 +135,9 @@ def test_file_is_written_only_where_it_differs_and_a_folder_that_cannot_be_writt
     (checked.parent / "robot.signals.json.tmp").mkdir()  # in the way, for root as well
     assert signals_file.write(checked, signals) == file
     file.write_text("{}")
-    with pytest.raises(ConfigError, match=rf"^{file} must be a file that can be written, a guard reads the model's signals there: Is a directory$"):
+    with pytest.raises(
+        ConfigError,
+        match=rf"^{file} must be a file that can be written, a guard reads the model's signals there: Is a directory; check a copy",
+    ):
         signals_file.write(checked, signals)
     assert json.loads(file.read_text()) == {}, "what was there is not destroyed"
