@@ -22,6 +22,7 @@ from rti_mpc_service.replay.closed_loop import free_name, numbers_of, run_of
 from rti_mpc_service.replay.drive import Drive, Passage, drive
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
 from rti_mpc_service.replay.replay import main, overridden, snapshot_before
+from rti_mpc_service.replay.why import explain, find
 from rti_mpc_service.shipped import SHIPPED
 from tests.loop import MS
 from tests.service.replay.driven import journal_of, recorded, straight
@@ -57,6 +58,60 @@ def test_same_settings_in_closed_loop_drive_as_recorded_also_through_a_stop_and_
     assert [command.u.tolist() for command in driven.commands] == [command.u.tolist() for command in was.commands]
     assert {"stop", "enable"} <= {event.code for event in driven.events}
     assert driven.solved["stopped"] > 5
+
+
+def test_standby_that_took_over_is_driven_from_its_takeover_on_and_explained(tmp_path: Path) -> None:
+    journal = journal_of(SHIPPED, samples=40, acts={0: lambda controller, _: controller.stand_by(), 15: lambda controller, _: controller.lead(6)})
+    was, driven = passages(journal, tmp_path)
+    assert was.states[0].stamp_ns == driven.states[0].stamp_ns == 1500 * MS, "the first state that it answers"
+    assert len(was.samples) == len(driven.samples) > 20
+    assert states(driven) == pytest.approx(np.array(states(was)), abs=1e-9), "it goes on from a state that was read, not from the robot's own"
+    place = find(journal, 0.0, None)
+    assert place is not None
+    assert place.command.epoch == 6, "the first command that acted"
+    facts = explain(journal, rebuild(journal, folder=tmp_path), place)
+    assert facts["replayed"] == "0 bits differ"
+    assert ["stands_by", "took_over"] == [one["code"] for one in facts["events"] if one["code"] in ("stands_by", "took_over")][-2:]
+
+
+SAMPLED = """
+import casadi as ca
+from rti_mpc import Model, Signal
+
+def robot():
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    after = ca.vertcat(x[0] + 0.1 * x[1], 0.8 * x[1] + 0.2 * u)
+    signals = (Signal("position", "m"), Signal("speed", "m/s"))
+    return Model(name="sampled", x=x, u=u, y_expr=x, disc_dyn_expr=after, dt=0.1, states=signals, outputs=signals, inputs=(Signal("u_c", "m/s"),))
+"""
+SAMPLED_TOML = """
+robot = "sampled"
+model = { name = "sampled:robot" }
+[ocp]
+N = 5
+dt_s = 0.1
+weights = { Q = { position = 5.0, speed = 0.1 }, R = { u_c = 1.0 } }
+[ocp.bounds]
+inputs = { u_c = [-0.5, 0.5] }
+increments = { u_c = [-0.25, 0.25] }
+"""
+
+
+@pytest.mark.slow  # compiles a problem of its own
+def test_robot_in_discrete_time_is_driven_as_it_was_and_explained(tmp_path: Path) -> None:
+    (tmp_path / "sampled.py").write_text(SAMPLED)
+    (tmp_path / "robot.toml").write_text(SAMPLED_TOML)
+    follows = straight(5.0, 0.45)
+    journal = journal_of(tmp_path / "robot.toml", samples=20, follows=replace(follows, y=follows.y[:, :2]))
+    was, driven = passages(journal, tmp_path)
+    assert len(was.states) == 20
+    assert states(driven) == states(was), "no bit differs"
+    place = find(journal, None, 3)
+    assert place is not None
+    facts = explain(journal, rebuild(journal, folder=tmp_path), place)
+    assert facts["replayed"] == "0 bits differ"
+    assert sum(facts["cost_terms"].values()) == pytest.approx(facts["cost"], rel=1e-6), "all terms are there"
+    assert facts["bounds"]
 
 
 @pytest.mark.slow
