@@ -107,11 +107,6 @@ class ActiveSet:
         """Begin a sample that may have so many QPs."""
         self._qps, self.steps = qps, 0
 
-    @property
-    def has_steps(self) -> bool:
-        """Whether the sample has all the steps of the interior point left that one QP may take."""
-        return self.steps <= MAX_STEPS * (self._qps - 1)
-
     def forget(self) -> None:
         """Start cold, with no bound acting."""
         self._places[:] = self._found[:] = 0.0

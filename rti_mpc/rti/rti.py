@@ -7,9 +7,7 @@ solver, factorization included. Feedback embeds the initial state, solves and ta
 the full step. Only feedback is on the path from sensor to actuator
 [Diehl2005]_ [Gros2020]_. If that step is large, one linearization was not enough, and
 feedback iterates a few times at most. With at most one iteration this is the plain
-scheme; with many, and a small tolerance, it is sequential quadratic programming. The
-scheme needs a guess near the solution: the sample after a cold start, which has none,
-may iterate more often, unless the plain scheme is asked for.
+scheme; with many, and a small tolerance, it is sequential quadratic programming.
 
 `ActiveSet` solves nearly every QP; a QP solver takes over when it fails. Softened bounds
 rarely act, so the QP solver first solves the QP without them. A plan that keeps them
@@ -45,8 +43,6 @@ BUILT_IN_SOLVERS = ("riccati", "osqp")  # any other solver is one of qpsolvers
 MAX_SEQUENTIAL_N_U = 10  # control horizon up to which the sequential formulation is the faster one, see docs/engine.md
 SOLVED, INACCURATE = QpStatus.SOLVED, QpStatus.INACCURATE  # read faster than a member of the enumeration
 MAX_ITERATIONS = 3  # per sample
-MAX_COLD_ITERATIONS = 20  # in the first sample after a cold start, as long as each one lowers the cost of the plan by COLD_DECREASE
-COLD_DECREASE = 0.01  # relative
 STEP_TOLERANCE = 0.015  # a larger step is followed by another iteration: closed-loop costs within 0.5 % of converged NMPC, see docs/engine.md
 COST_WEIGHTS = ("delta", "lambda_", "z", "Z", "Q_e", "zh", "Zh", "R_u", "zddu", "Zddu")  # weights that are multiplied by the scale of the cost
 TOUCHING_DISTANCE = 2e-3  # relative to the scale of a softened bound: a plan further away than this has left the bound
@@ -64,10 +60,9 @@ class Rti:
         problem: The problem as the solvers have it, whose further states are the inputs sent last, see `rti_mpc.rti.second_difference`; `ocp`
             itself unless second differences are bounded. `scale` and `guess` are of this one.
         formulation: ``"simultaneous"`` or ``"sequential"``.
-        iterations: QPs per sample at most: 1 is the plain real-time iteration, many with a small tolerance are converged SQP. From 2 on, the first
-            sample after a cold start may have `MAX_COLD_ITERATIONS`, as long as no QP solver is needed.
+        iterations: QPs per sample at most: 1 is the plain real-time iteration, many with a small tolerance are converged SQP.
         tolerance: Change of the inputs, relative to their scale, half their range: an iteration with a larger change is followed by another.
-        taken: Iterations of the last feedback; 0 after a cold start.
+        taken: Iterations of the last feedback.
         x: States of the plan of the last feedback, shape ``(N + 1, nx)``; the next guess is made of them.
         u: Inputs of the plan, shape ``(N_u, nu)``. Row 0 is the command.
         u_prev: Input before the plan, shape ``(nu,)``, from which the first increment is counted.
@@ -232,7 +227,6 @@ class Rti:
         self.u[:] = np.clip(self.u_prev, self.ocp.lbu, self.ocp.ubu)
         self._stay_at(x0)
         self._pending = False
-        self.taken = 0
         self._turns.forget()
         self._backup = self.solvers[0]
         self._loaded = False
@@ -419,14 +413,12 @@ class Rti:
         self._pending = False
         if self._turns.settle():
             self._linearize()
-        cold = self.taken == 0 and self.iterations > 1
-        most = max(self.iterations, MAX_COLD_ITERATIONS) if cold else self.iterations
         if self.active_set is not None:
             self.active_set.begin(self.iterations)
         self.status = self.solve()
         self.taken = 1
         if self._change[0] > self.tolerance:
-            self._iterate(most)
+            self._iterate()
         if self.status is SOLVED and self.active_set is not None:
             self.status = self._certified(self.active_set)
         return self.status
@@ -472,27 +464,15 @@ class Rti:
             self.keep_guess()
         return status
 
-    def _iterate(self, most: int) -> None:
+    def _iterate(self) -> None:
         """Iterate at the plan while the step is large; an iteration that fails leaves the plan of the one before."""
-        before = np.inf
-        while self.status.usable and self.taken < most and self._change[0] > self.tolerance:
-            if most > self.iterations:
-                self.evaluate()
-                cost = self._cost[0]
-                if self.taken >= self.iterations and not (cost <= (1.0 - COLD_DECREASE) * before and self._has_steps):
-                    break
-                before = cost
+        while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
             self._relinearize()
             if not (status := self.solve()).usable:
                 self.status = INACCURATE  # the plan comes from an earlier QP, which cannot be certified any more
                 break
             self.status = status
             self.taken += 1
-
-    @property
-    def _has_steps(self) -> bool:
-        """Whether one QP more cannot take more than what a sample may have; a QP solver has no limit that QPs share."""
-        return self.active_set is not None and self.solver is self.active_set and self.active_set.has_steps
 
     def solve_qp(self) -> QpStatus:
         """Solve with the QP solver."""

@@ -26,8 +26,7 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.places import places
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.qp.simultaneous import simultaneous
-from rti_mpc.rti.rti import MAX_COLD_ITERATIONS, Rti
-from rti_mpc_service.bench.families import FAMILIES
+from rti_mpc.rti.rti import Rti
 from tests.oracle import nlp
 from tests.problems import INF, arc, beacon, double_integrator, pioneer
 
@@ -210,45 +209,6 @@ def test_sample_is_iterated_on_only_while_the_step_is_large() -> None:
         rti.prepare(y_ref, shift=False)
         rti.feedback(x0)
     assert rti.taken == 1
-
-
-def test_cold_sample_is_iterated_on_while_that_lowers_its_cost() -> None:
-    """A swing-up begins far from its solution; the samples after it start from its plan."""
-    family = FAMILIES["cart_pole"][0](40)
-    x, (y_ref, p) = family.start(0), family.at(0)
-    assert x is not None
-    rti, converged, plain = (Rti(family.ocp, iterations=most, compile=False) for most in (3, 60, 1))
-    for one in (rti, converged, plain):
-        one.reset(x, family.u0)
-        one.prepare(y_ref, p, shift=False)
-        assert one.feedback(x) is QpStatus.SOLVED
-    assert rti.cost < 1.01 * converged.cost, "the next QP would have lowered it by less than that; three QPs leave it at 2.1 times"
-    assert (plain.taken, rti.taken) == (1, MAX_COLD_ITERATIONS)
-    rti.prepare(y_ref, p)
-    rti.feedback(x + 0.1)
-    assert rti.taken == 3, "with a plan to start from"
-
-
-def test_cold_sample_of_a_qp_solver_has_no_more_qps_than_others() -> None:
-    """Each of its QPs may take all of its iterations; those of the interior point are shared."""
-    family = FAMILIES["cart_pole"][0](40)
-    x, (y_ref, p) = family.start(0), family.at(0)
-    assert x is not None
-    rti = Rti(family.ocp, solver="osqp", formulation="simultaneous", compile=False)
-    rti.reset(x, family.u0)
-    rti.prepare(y_ref, p, shift=False)
-    assert rti.feedback(x).usable
-    assert rti.taken == 3
-
-
-def test_cold_sample_whose_cost_falls_no_more_is_ended() -> None:
-    ocp = pioneer()
-    rti = Rti(ocp, iterations=3, tolerance=0.0, compile=False)
-    ((x0, y_ref, u_prev),) = near_the_eight(ocp, seed=24, count=1)
-    rti.reset(x0, u_prev)
-    rti.prepare(y_ref, shift=False)
-    assert rti.feedback(x0) is QpStatus.SOLVED
-    assert 3 <= rti.taken < 8
 
 
 def test_iteration_that_fails_leaves_the_plan_of_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
