@@ -579,8 +579,8 @@ class Controller:
         return self._states.clock.rate
 
     def robot_now_ns(self, local_ns: int) -> int:
-        """Return robot time at a local monotonic time."""
-        return self._states.clock.now_ns(local_ns)
+        """Return robot time at a local monotonic time, 0 before the first state."""
+        return self._states.clock.now_ns(local_ns) if self.heard else 0
 
     def telemetry(self, *, prepare_us: float, feedback_us: float, latency_us: float, slack_s: float, second_us: float = 0.0) -> Telemetry:
         """Return the telemetry of the last sample; the times come from the caller, who has a clock."""

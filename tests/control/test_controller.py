@@ -79,6 +79,14 @@ def test_nothing_is_commanded_before_state_and_reference(controller: Controller)
     assert command.mode is Mode.TRACKING
 
 
+def test_time_of_a_robot_that_was_not_heard_is_told_as_zero(controller: Controller) -> None:
+    """Whatever the host's clock shows: events have this stamp."""
+    body, started_ns = robot(circle()), 10**15
+    assert controller.robot_now_ns(started_ns) == 0
+    controller.receive_state(state := body.tick(), started_ns)
+    assert controller.robot_now_ns(started_ns) == state.stamp_ns
+
+
 def test_order_of_state_and_reference_does_not_matter(rti: Rti) -> None:
     """Nor for headings: the state is at 3 rad, the reference at -3, and that is 0.28 apart."""
     plans = []
