@@ -28,7 +28,8 @@ from rti_mpc_service.config.fit import check_names, check_rest, check_tree
 from rti_mpc_service.config.refusal import entries, explain
 from rti_mpc_service.config.schema import Config
 
-WEIGHT_KEYS = ("ocp.weights.Q", "ocp.weights.R", "ocp.weights.R_u", "ocp.weights.delta", "ocp.weights.lambda", "ocp.bounds.soft_weight")
+WEIGHT_TABLES = ("ocp.weights.Q", "ocp.weights.R", "ocp.weights.R_u")  # of weights, by name
+WEIGHT_KEYS = (*WEIGHT_TABLES, "ocp.weights.delta", "ocp.weights.lambda", "ocp.bounds.soft_weight")
 BOUND_KEYS = ("ocp.bounds.inputs", "ocp.bounds.increments", "ocp.bounds.second_differences", "ocp.bounds.states")
 VERSION_COUNT = 2**32  # telemetry has 32 bits for the version
 SAMPLE_TIMEOUT_PERIODS = 2  # how long to wait for the end of a sample
@@ -142,8 +143,13 @@ def changed_problem(file: Config, ocp: Ocp, changes: Mapping[str, Any]) -> tuple
     document = file.model_dump(by_alias=True)
     for key, value in changes.items():
         table, _, name = key.rpartition(".")
-        if key not in WEIGHT_KEYS and table not in (*WEIGHT_KEYS[:2], *BOUND_KEYS):
+        if key not in WEIGHT_KEYS and table not in (*WEIGHT_TABLES, *BOUND_KEYS):
             raise ConfigError(f"{key} {why_fixed(key)}, got {value!r}")
+        if "ocp.weights.R_u" in (key, table) and not weighs_inputs(file):
+            raise ConfigError(
+                f"{key} can be set only where the controller's file has a weight of R_u above 0, since its problem is compiled without R_u "
+                f"otherwise: give one there, and restart it, got {value!r}"
+            )
         entry_at(document, table)[name] = value
     try:
         config = Config.model_validate(document)
@@ -158,6 +164,11 @@ def changed_problem(file: Config, ocp: Ocp, changes: Mapping[str, Any]) -> tuple
     for wrong in wider_bounds(file, config, changes):
         raise ConfigError(wrong)
     return config, ocp
+
+
+def weighs_inputs(config: Config) -> bool:
+    """Whether the compiled problem has weights of inputs themselves: what is zero for all of them is left out of it."""
+    return any(config.ocp.weights.R_u.values()) or any(map(any, config.ocp.stages.R_u.values()))
 
 
 def why_fixed(key: str) -> str:

@@ -82,6 +82,8 @@ REFUSED: list[tuple[dict[str, Any], list[str]]] = [
     ({"ocp.weights.Q.phi": 1.0}, ["ocp.weights.Q.phi", "no output", "psi [rad]"]),
     ({"ocp.weights.Q.psi": -1.0}, ["ocp.weights.Q.psi", "at least 0", "-1.0"]),
     ({"ocp.weights.Q.psi": "1"}, ["ocp.weights.Q.psi", "must be a number", "'1'"]),
+    ({"ocp.weights.R_u.u_c": 0.5}, ["ocp.weights.R_u.u_c", "only where the controller's file has a weight of R_u above 0", "restart", "got 0.5"]),
+    ({"ocp.weights.R_u": {"u_c": 0.5}}, ["ocp.weights.R_u can be set only where"]),
     ({"ocp.weights.delta": [1.0, 2.0]}, ["ocp.weights.delta", "a list of 5", "[1.0, 2.0]"]),
     ({"ocp.bounds.inputs.u_c": [-0.6, 0.5]}, ["ocp.bounds.inputs.u_c", "inside the file's [-0.5, 0.5]", "guard", "[-0.6, 0.5]"]),
     ({"ocp.bounds.inputs.u_c": [0.3, 0.2]}, ["ocp.bounds.inputs.u_c", "lower < upper"]),
@@ -125,6 +127,26 @@ def test_change_without_a_solution_on_the_present_sample_is_refused(
     with pytest.raises(ConfigError, match="present sample must have a solution with the new values, its QP is failed"):
         params.answer({"set": {"ocp.weights.R.u_c": 2.0}})
     assert (params.version, params.answer({"get": True})["values"]) == (0, parameter_values(config))
+
+
+def test_weights_of_inputs_are_set_like_those_of_outputs_and_increments(tmp_path: Any) -> None:
+    config = configuration(tmp_path)
+    weighed = config.model_copy(
+        update={"ocp": config.ocp.model_copy(update={"weights": config.ocp.weights.model_copy(update={"R_u": {"omega_c": 0.1}})})}
+    )
+    rti = build_rti(weighed)
+    controller = Controller(rti, Timing())
+    params = Params(weighed, controller, rti, Condition())
+    assert params.answer({"get": True})["values"]["ocp.weights.R_u.omega_c"] == 0.1
+    controller.receive_reference(reference(circle()))
+    body = robot(circle())
+    assert abs(drive(controller, body, 2.0).commands[-1].u[0, 0]) > 0.1, "m/s"
+    params.answer({"set": {"ocp.weights.R_u.u_c": 1e4, "ocp.weights.R_u.omega_c": 0.0}})
+    np.testing.assert_array_equal(params.ocp.R_u, [1e4, 0.0])
+    assert abs(drive(controller, body, 5.0).commands[-1].u[0, 0]) < 1e-3, "m/s: to drive costs more than to stay behind"
+    params.answer({"set": {"ocp.weights.R_u.u_c": 0.0}})  # none is left, but the compiled problem has them
+    assert abs(drive(controller, body, 9.0).commands[-1].u[0, 0]) > 0.02, "m/s: it follows again"
+    assert params.answer({"set": {"ocp.weights.R_u.u_c": 0.5}})["version"] == 3
 
 
 def test_nothing_changes_unless_the_file_allows_it(tmp_path: Any) -> None:
