@@ -49,7 +49,7 @@ def collocated(ocp: Ocp, x: ca.SX, u: ca.SX, K: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 
 def row(bound: Array, k: int) -> Array:
-    """Return the bound of a stage."""
+    """Return the bound, or the weights, of a stage."""
     return bound if bound.ndim == 1 else bound[k]
 
 
@@ -91,7 +91,7 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[..., tuple[Array, Array, f
         factors = np.broadcast_to(ocp.delta[k], model.ny) ** 0.5
         cost += ca.bilin(ca.DM(ocp.Q), factors * e, factors * e)
         cost += ca.bilin(ca.DM(ocp.Q_e), e, e) if k == N - 1 else 0.0
-        cost += ca.dot(ca.DM(ocp.z), s[:, k]) + 0.5 * ca.dot(ca.DM(ocp.Z), s[:, k] ** 2)
+        cost += ca.dot(ca.DM(row(ocp.z, k)), s[:, k]) + 0.5 * ca.dot(ca.DM(row(ocp.Z, k)), s[:, k] ** 2)
         x_next, equations = collocated(ocp, x[:, k], held, K[k]) if implicit else (phi(x[:, k], held, p), ca.SX(0, 1))
         equations = ca.vertcat(x_next - x[:, k + 1], equations)
         rows.append((np.zeros(equations.numel()), equations, np.zeros(equations.numel())))
@@ -99,9 +99,9 @@ def nlp(ocp: Ocp, *, slacks: bool = True) -> Callable[..., tuple[Array, Array, f
         rows.append((row(ocp.lbx, k), x[:, k + 1] + s[:, k], np.full(nx, np.inf)))
         if nh:
             value = constraint(x[:, k + 1], held, p)
-            cost += ca.dot(ca.DM(ocp.zh), s_h[:, k]) + 0.5 * ca.dot(ca.DM(ocp.Zh), s_h[:, k] ** 2)
+            cost += ca.dot(ca.DM(row(ocp.zh, k)), s_h[:, k]) + 0.5 * ca.dot(ca.DM(row(ocp.Zh, k)), s_h[:, k] ** 2)
             rows += [(np.full(nh, -np.inf), value - s_h[:, k], row(ocp.uh, k)), (row(ocp.lh, k), value + s_h[:, k], np.full(nh, np.inf))]
-    cost += ca.dot(ca.DM(ocp.z), s_e) + 0.5 * ca.dot(ca.DM(ocp.Z), s_e**2)
+    cost += ca.dot(ca.DM(row(ocp.z, N - 1)), s_e) + 0.5 * ca.dot(ca.DM(row(ocp.Z, N - 1)), s_e**2)
     rows.append((np.full(nx, -np.inf), x[:, N] - s_e, ocp.ubx_e))
     rows.append((ocp.lbx_e, x[:, N] + s_e, np.full(nx, np.inf)))
     last, du_last = u_prev, u_prev - u_before

@@ -66,6 +66,11 @@ def at_each(columns: Any, count: int) -> Any:
     return columns if columns.size2() > 1 else ca.repmat(columns, 1, count)
 
 
+def stacked(columns: Any, count: int) -> Any:
+    """Return the columns of `at_each`, one below another."""
+    return ca.vec(columns) if columns.size2() > 1 else ca.repmat(columns, count)
+
+
 def moved_on(columns: ca.MX, blocks: Blocks) -> ca.MX:
     """Return what each block has one stage later, when the plan is that of the next sample: columns are blocks, the last one is repeated."""
     return ca.horzcat(*(columns[:, first:after] for first, after in _runs(_one_later(blocks))))

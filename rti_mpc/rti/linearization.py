@@ -100,7 +100,7 @@ class Linearization:
         G_x: Sparsity of the sensitivities to the state at one node, shape ``(ng, nx)``.
         G_u: Sparsity of the sensitivities to the input at one node, shape ``(ng, nu)``.
         lg: Lower bounds on g, shape ``(ng, 1)``, or ``(ng, N)`` where they differ from stage to stage; `ug`, upper bounds; `zg` and `Zg`, weights of
-            the slacks, shape ``(ng, 1)``.
+            the slacks, likewise.
         increments: ``u_k - u_{k-1}``, shape ``(nu, N_u)``.
         force: ``lambda_k R (u_k - u_{k-1})``, shape ``(nu, N_u)``, and the gradient of half the cost of inputs, summed from the last stage on: force
             acts on increments.

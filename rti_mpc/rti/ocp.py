@@ -12,7 +12,7 @@ inputs held after the control horizon, or over the stages of each of :math:`N_u`
             + \sum_{i=1}^{N_u} \lambda_i \|u_{i-1} - u_{i-2}\|_R^2
             + \sum_{i=1}^{N_u} \|u_{i-1} - u_{ref,i-1}\|_{R_u}^2
             + \|y_N - y_{ref,N}\|_{Q_e}^2
-            + \sum_{i=1}^{N} \left( z^T s_i + \tfrac12 s_i^T Z s_i \right) \\
+            + \sum_{i=1}^{N} \left( z_i^T s_i + \tfrac12 s_i^T Z_i s_i \right) \\
     \text{s.t.} \; & x_{k+1} = \phi(x_k, u_k, p_k), \quad x_0 \text{ given}, \\
     & lbu \le u_k \le ubu, \quad lbdu \le u_k - u_{k-1} \le ubdu, \\
     & lbx - s_i \le x_i \le ubx + s_i, \quad
@@ -79,9 +79,11 @@ class Ocp:
         ubdu: Upper bound on the increment of inputs, shape ``(nu,)``.
         lbx: Softened lower bound on states at nodes 1 to N, shape ``(nx,)``.
         ubx: Softened upper bound on states, shape ``(nx,)``.
-        z: L1 weight of the slacks, shape ``(nx,)``, or given as a constant; cost / unit of the state.
+        z: L1 weight of the slacks, shape ``(nx,)``, or given as a constant; cost / unit of the state. As the three other weights of slacks of states
+            and of h it may have a row per node, ``(N, nx)``: the last one is that of the end of the horizon.
         Z: L2 weight of the slacks, shape ``(nx,)``, or given as a constant; cost / unit of the state squared.
-        lbx_e: Softened lower bound on states at node N alone, besides `lbx`, shape ``(nx,)``: a terminal set. Its slacks have the weights `z`, `Z`.
+        lbx_e: Softened lower bound on states at node N alone, besides `lbx`, shape ``(nx,)``: a terminal set. Its slacks have the weights `z`, `Z`
+            of node N.
         ubx_e: Softened upper bound on states at node N alone, shape ``(nx,)``.
         Q_e: Terminal weight, added to ``delta_N Q``, shape ``(ny, ny)``, or given by its diagonal; none by default.
         R_u: Weights of inputs themselves, beside those of their increments, shape ``(nu,)``, or ``(N_u, nu)``; none by default; cost / unit of the
@@ -311,15 +313,16 @@ class Ocp:
     @property
     def lg(self) -> Array:
         """Softened lower bounds: of the states in `soft`, of `h_expr`, then of the states in `soft_e`; ``(ng,)``, or ``(N, ng)`` if any has rows."""
-        return self._softened(self.lbx, self.lh, self.lbx_e)
+        return self.softened(self.lbx, self.lh, self.lbx_e)
 
     @property
     def ug(self) -> Array:
         """Softened upper bounds, as `lg`."""
-        return self._softened(self.ubx, self.uh, self.ubx_e)
+        return self.softened(self.ubx, self.uh, self.ubx_e)
 
-    def _softened(self, of_states: Array, of_constraints: Array, of_end: Array) -> Array:
-        parts = [of_states[..., list(self.soft)], of_constraints, of_end[list(self.soft_e)]]
+    def softened(self, of_states: Array, of_constraints: Array, of_end: Array) -> Array:
+        """Return what the softened bounds have by these weights or bounds, in the order of `lg`, with a row per node if any has rows."""
+        parts = [of_states[..., list(self.soft)], of_constraints, of_end[..., list(self.soft_e)]]
         if max(part.ndim for part in parts) == 1:
             return np.concatenate(parts)
         return np.hstack([np.broadcast_to(part, (self.N, part.shape[-1])) for part in parts])
@@ -475,13 +478,13 @@ WEIGHTS_AND_BOUNDS: dict[str, tuple[Any, ...]] = {
     "ubdu": (bound, "nu", "N_u", "nu"),
     "lbx": (bound, "nx", "N", "nx"),
     "ubx": (bound, "nx", "N", "nx"),
-    "z": (weights, "nx"),
-    "Z": (weights, "nx"),
+    "z": (weights, "nx", "N", "nx"),
+    "Z": (weights, "nx", "N", "nx"),
     "Q_e": (weight_matrix, "ny"),
     "lh": (bound, "nh", "N", "nh"),
     "uh": (bound, "nh", "N", "nh"),
-    "zh": (weights, "nh"),
-    "Zh": (weights, "nh"),
+    "zh": (weights, "nh", "N", "nh"),
+    "Zh": (weights, "nh", "N", "nh"),
     "lbx_e": (bound, "nx"),
     "ubx_e": (bound, "nx"),
     "R_u": (weights, "nu", "N_u", "nu"),

@@ -325,7 +325,7 @@ def refine(
     step = rows.u
     side = ca.sign(place.g)
     by = side * (excess + rows.g)
-    beyond = side * (ca.repmat(lin.zg, 1, N) + ca.repmat(lin.Zg, 1, N) * by) / 2
+    beyond = side * (at_each(lin.zg, N) + at_each(lin.Zg, N) * by) / 2
     paid = ca.if_else(ca.fabs(place.g) == 2, beyond, (of_softened + weight * (excess + rows.g)) * (ca.fabs(place.g) == 1))
     force = of_increments + ca.repmat(PENALTY / lin.scale_u**2, 1, N_u) * (ca.fabs(place.du) == 1) * rows.du
     amending = repeated(amend_free(lin, nu), amend_held(lin, nu), ocp.blocks)

@@ -80,7 +80,22 @@ AT_SOME_STAGES = {
     "lbdu": -NONE,
     "ubdu": np.column_stack([[NONE, NONE, 0.2, 0.2, 0.2, 0.2, NONE, 0.2], np.full(8, NONE)]),
 }
+PENALTIES = np.column_stack([np.ones((8, 3)), [0.001, 3, 0.003, 0.01, 2, 0.001, 0.02, 5]])  # far below and above the multipliers of hard bounds
 SLOWING = {"ubx": np.column_stack([np.full((8, 3), NONE), [NONE, NONE, 0.35, 0.3, NONE, 0.25, 0.3, 0.2]])}
+
+
+def carried_over_car(**changes: Any) -> Ocp:
+    """The car in MX, with its constraint, which the model then has; its rates are a function of CasADi's, as a model that others wrote."""
+    x, u = ca.MX.sym("x", 4), ca.MX.sym("u", 2)
+    given = {name: ca.SX.sym(name, size) for name, size in (("x", 4), ("u", 2))}
+    turn = 0.1 * given["u"][1]
+    v = 0.5 * (given["x"][3] + given["u"][0])
+    heading = given["x"][2] + turn / 2
+    after = given["x"][:2] + 0.1 * v * ca.vertcat(ca.cos(heading), ca.sin(heading))
+    moved = ca.Function("moved", [*given.values()], [ca.vertcat(after, given["x"][2] + turn, v)])
+    signals = {"states": (*POSE, Signal("v", "m/s")), "inputs": ("v_c", "w_c"), "outputs": POSE, "constraints": "pull"}
+    model = Model(name="carried_over_car", x=x, u=u, disc_dyn_expr=moved(x, u), dt=0.1, y_expr=x[:3], h_expr=x[3] * u[1], **signals)
+    return Ocp(model, **LIMITS | changes)
 
 
 def pulled_car(**changes: Any) -> Ocp:
@@ -117,6 +132,20 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "bounds at some stages alone": lambda: sampled_car(**AT_SOME_STAGES, **SLOWING),
     "bounds of a constraint by stage, held inputs": lambda: pulled_car(N_u=3, lh=np.array([[-NONE]] * 4 + [[-0.02]] * 4), uh=FALLING[:, None]),
     "bounds of states and a constraint by stage, a terminal set": lambda: pulled_car(uh=FALLING[:, None], ubx_e=[NONE] * 3 + [0.1], **SLOWING),
+    "slack weights by stage": lambda: sampled_car(lbx=-NONE, ubx=[NONE] * 3 + [0.25], z=PENALTIES, Z=PENALTIES[::-1]),
+    "slack weights by stage, held inputs": lambda: sampled_car(N_u=3, lbx=-NONE, ubx=[NONE] * 3 + [0.25], z=PENALTIES, Z=0.0),
+    "slack weights by stage of a constraint, held inputs": lambda: pulled_car(
+        N_u=3, uh=FALLING[:, None], zh=PENALTIES[:, 3:], Zh=1.0, z=10.0, Z=10.0
+    ),
+    "slack weights by stage of the end alone": lambda: sampled_car(lbx=-NONE, ubx=NONE, ubx_e=[NONE] * 3 + [0.1], z=PENALTIES[::-1], Z=PENALTIES),
+    "slack weights by stage beside bounds by stage, blocks": lambda: pulled_car(
+        blocks=[1, 1, 2, 4], uh=FALLING[:, None], Zh=PENALTIES[:, 3:], zh=0.01, z=1.0, Z=1.0
+    ),
+    "slack weights by stage of a constraint, beside second differences, held inputs": lambda: pulled_car(
+        N_u=3, uh=FALLING[:, None], zh=PENALTIES[:, 3:], Zh=1.0, z=10.0, Z=10.0, **BENDS
+    ),
+    "a model in MX": lambda: carried_over_car(N_u=3, uh=FALLING[:, None]),
+    "outputs that count at the end alone": lambda: felt_car(Q=[1.0, 1.0, 0.05, 0, 0, 0], Q_e=[0, 0, 0, 2.0, 0.5, 0.1]),
     "fixed input": lambda: sampled_car(lbu=[-0.5, 0.3], ubu=[0.5, 0.3], lbdu=-np.inf, ubdu=np.inf),
     "terminal set": lambda: sampled_car(lbx_e=[-np.inf] * 3 + [-0.05], ubx_e=[np.inf] * 3 + [0.02]),
     "second differences": lambda: sampled_car(N=5, **BENDS),
@@ -223,6 +252,25 @@ def test_weights_by_stage_are_retuned_as_if_the_problem_had_been_built_with_them
         assert rti.feedback(x0) is QpStatus.SOLVED
     np.testing.assert_allclose(retuned.u, built.u, rtol=0, atol=1e-7)  # each is converged in scales of its own
     assert retuned.cost == pytest.approx(built.cost, rel=1e-6)  # 1000 per unit by which a state exceeds its bound in rounding
+
+
+def test_slack_weights_by_stage_let_a_bound_be_exceeded_where_they_are_small_and_are_retuned_as_if_built_with() -> None:
+    """The bound is hard in effect at the end alone, soft before; rows that are all alike are the weights of all nodes."""
+    at_the_end = np.full((8, 4), 1e-3)
+    at_the_end[-1] = 1e3
+    soft = {"lbx": -NONE, "ubx": [NONE] * 3 + [0.1], "Z": 0.0}
+    options: dict[str, Any] = {"compile": False, "iterations": 50, "tolerance": 1e-9}
+    built, retuned = (Rti(sampled_car(z=z, **soft), **options) for z in (at_the_end, at_the_end[::-1]))
+    retuned.retune({"z": at_the_end})
+    alike, constant = (Rti(sampled_car(z=z, **soft), **options) for z in (np.full((8, 4), 0.05), 0.05))
+    for one, other in ((built, retuned), (alike, constant)):
+        for rti in (one, other):
+            rti.reset(np.zeros(4), np.zeros(2))
+            rti.prepare(np.column_stack([0.04 * np.arange(1, 9), np.zeros((8, 2))]), shift=False)
+            assert rti.feedback(np.zeros(4)) is QpStatus.SOLVED
+        np.testing.assert_allclose(one.u, other.u, rtol=0, atol=1e-7)  # each is converged in scales of its own
+    assert built.x[1:-1, 3].max() > 0.2
+    assert built.x[-1, 3] < 0.1 + 1e-6
 
 
 def test_weights_of_increments_by_stage_are_those_of_a_horizon_whose_stages_are_weighed_alike() -> None:

@@ -25,7 +25,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from rti_mpc.codegen import function
-from rti_mpc.rti.blocks import all_inputs
+from rti_mpc.rti.blocks import all_inputs, stacked
 from rti_mpc.rti.linearization import Linearization, change
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import (
@@ -177,9 +177,9 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
         upper = np.vstack([np.ones((k * nu, nu)), np.triu(np.ones((nu, nu)))])
         P.place_values(ca.vec(column)[np.flatnonzero(upper.T.ravel()).tolist()], [(0, k * nu, ca.DM(sp.csc_matrix(upper)).sparsity())])
     if ng:
-        P.place_values(ca.repmat(SLACK_UNIT**2 / 2 * lin.Zg, N), [(to_s, to_s, ca.Sparsity.diag(N * ng))])
+        P.place_values(stacked(SLACK_UNIT**2 / 2 * lin.Zg, N), [(to_s, to_s, ca.Sparsity.diag(N * ng))])
     q_inputs = condensed.m + ca.vec(lin.increment_gradient())
-    q = ca.vertcat(q_inputs, *([ca.repmat(SLACK_UNIT / 2 * lin.zg, N)] if ng else []))
+    q = ca.vertcat(q_inputs, *([stacked(SLACK_UNIT / 2 * lin.zg, N)] if ng else []))
 
     lower, upper_bounds = ca.vertcat(*rows.lower), ca.vertcat(*rows.upper)
     Phi = ca.vertcat(*responses)

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from rti_mpc.codegen import function
-from rti_mpc.rti.blocks import at_each
+from rti_mpc.rti.blocks import at_each, stacked
 from rti_mpc.rti.linearization import Linearization, change, nonzeros
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import (
@@ -103,8 +103,8 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
         if beside is not None:
             P.place_values(nonzeros(beside), [(at_k, at_k + nu, beside.sparsity())])
     if ng:
-        P.place_values(ca.repmat(SLACK_UNIT**2 / 2 * lin.Zg, N), [(to_s, to_s, ca.Sparsity.diag(N * ng))])
-    q = ca.vertcat(zero, ca.vec(lin.gradient[:nx, :]), ca.vec(lin.increment_gradient()), *([ca.repmat(SLACK_UNIT / 2 * lin.zg, N)] if ng else []))
+        P.place_values(stacked(SLACK_UNIT**2 / 2 * lin.Zg, N), [(to_s, to_s, ca.Sparsity.diag(N * ng))])
+    q = ca.vertcat(zero, ca.vec(lin.gradient[:nx, :]), ca.vec(lin.increment_gradient()), *([stacked(SLACK_UNIT / 2 * lin.zg, N)] if ng else []))
 
     A_pattern, A_data = A.finish(rows.count, n)
     P_pattern, P_data = P.finish(n, n)

@@ -63,8 +63,8 @@ def build_ocp(config: Config) -> Ocp:
     limits, terminal = config.ocp.bounds, config.ocp.terminal
     outside = {signal.name: (0.0, math.inf) for signal in model.constraints[len(own.constraints) :]}
     stages = config.ocp.stages
-    bounded = [i for i, signal in enumerate(model.constraints) if signal.name in {**limits.constraints, **outside, **stages.constraints}]
-    lh, uh = by_stage(limits.constraints | outside, stages.constraints, names(model.constraints[i] for i in bounded), config.ocp.N)
+    bounded = bounded_constraints(config, model)
+    lh, uh = by_stage(limits.constraints | outside, stages.constraints, bounded, config.ocp.N)
     problem = Ocp(
         model,
         N=config.ocp.N,
@@ -74,7 +74,7 @@ def build_ocp(config: Config) -> Ocp:
         method="euler" if config.ocp.integrator == "euler" else None,
         u_ref=[config.ocp.weights.u_ref.get(input.name, rest) for input, rest in zip(model.inputs, model.u_rest, strict=True)],
         Q_e=None if terminal.Q is None else [terminal.Q[output.name] for output in model.outputs],
-        h_expr=model.h_expr[bounded, 0],
+        h_expr=model.h_expr[[i for i, name in enumerate(names(model.constraints)) if name in bounded], 0],
         lh=lh,
         uh=uh,
         **weights_and_bounds(config, model),
@@ -99,6 +99,7 @@ def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
     lbx, ubx = by_stage(limits.states, stages.states, names(model.states), N)
     lbddu, ubddu = bounds(limits.second_differences, names(model.inputs))
     lbx_e, ubx_e = bounds(limits.terminal, names(model.states))
+    constraints = bounded_constraints(config, model)
     return {
         "Q": [weights.Q[output.name] for output in model.outputs],
         "R": [weights.R[input.name] for input in model.inputs],
@@ -111,10 +112,10 @@ def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
         "ubdu": ubdu,
         "lbx": lbx,
         "ubx": ubx,
-        "z": z,
-        "Z": Z,
-        "zh": z,
-        "Zh": Z,
+        "z": slack_weights(z, stages.soft_weight, names(model.states), N),
+        "Z": slack_weights(Z, stages.soft_weight_L2, names(model.states), N),
+        "zh": slack_weights(z, stages.soft_weight, constraints, N),
+        "Zh": slack_weights(Z, stages.soft_weight_L2, constraints, N),
         "lbx_e": lbx_e,
         "ubx_e": ubx_e,
         "lbddu": lbddu,
@@ -122,6 +123,12 @@ def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
         "zddu": z,
         "Zddu": Z,
     }
+
+
+def bounded_constraints(config: Config, model: Model) -> list[str]:
+    """Return the names of the general constraints with bounds: those that the file bounds, and the obstacles, which come last."""
+    named, own = {**config.ocp.bounds.constraints, **config.ocp.stages.constraints}, len(model.constraints) - len(config.ocp.obstacles)
+    return [signal.name for i, signal in enumerate(model.constraints) if i >= own or signal.name in named]
 
 
 def regulator_weight(config: Config, problem: Ocp) -> Array:
@@ -307,6 +314,11 @@ def by_stage(
 def factors(sequence: tuple[float, ...], stages: Mapping[str, Sequence[float]], names: Sequence[str]) -> Any:
     """Return factors of weights, one per stage, or, where some differ by signal, a row per stage."""
     return [[factor * stages[name][k] if name in stages else factor for name in names] for k, factor in enumerate(sequence)] if stages else sequence
+
+
+def slack_weights(weight: float, stages: Mapping[str, Sequence[float]], names: Sequence[str], count: int) -> Any:
+    """Return the weights of slacks in the order of the names, or, where some differ from stage to stage, a row per stage."""
+    return by_block(dict.fromkeys(names, weight), {name: stages[name] for name in names if name in stages}, names, count)
 
 
 def by_block(weights: Mapping[str, float], stages: Mapping[str, Sequence[float]], names: Sequence[str], count: int) -> Any:

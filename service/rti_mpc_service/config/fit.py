@@ -25,6 +25,8 @@ STAGE_TABLES = {  # of ocp.stages by field: what its names are, and what its lis
     "increments": ("input", "block"),
     "states": ("state", "stage"),
     "constraints": ("constraint", "stage"),
+    "soft_weight": ("state or constraint", "stage"),
+    "soft_weight_L2": ("state or constraint", "stage"),
 }
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -60,6 +62,11 @@ def check_tree(config: Config) -> None:
                 raise ConfigError(f"ocp.stages.{field.rstrip('_')}.{name} must be a list of {length}, one per {of}, got {len(listed)}")
     if twice := sorted(ocp.stages.R_u.keys() & ocp.weights.R_u.keys()):
         raise ConfigError(f"ocp.stages.R_u has the weights of {twice[0]} in each block, which ocp.weights.R_u must leave out")
+    bounded = {*ocp.bounds.states, *ocp.bounds.terminal, *ocp.bounds.constraints, *ocp.stages.states, *ocp.stages.constraints}
+    for key in ("soft_weight", "soft_weight_L2"):
+        if unbounded := sorted(getattr(ocp.stages, key).keys() - bounded):
+            name = unbounded[0]
+            raise ConfigError(f"ocp.stages.{key}.{name} must be left out, or {name} bounded: it has no softened bound in ocp.bounds or ocp.stages")
     if config.bus.config is not None and not config.bus.config.is_file():
         raise ConfigError(f"bus.config must be a file, got {config.bus.config}")
     if config.guard.enabled:
@@ -167,11 +174,11 @@ def check_names(config: Config, model: Model) -> None:
         ("ocp.bounds.states", ocp.bounds.states, "state", model.states),
         ("ocp.bounds.terminal", ocp.bounds.terminal, "state", model.states),
         ("ocp.bounds.constraints", ocp.bounds.constraints, "constraint", model.constraints),
-        *((f"ocp.stages.{key.rstrip('_')}", getattr(ocp.stages, key), kind, getattr(model, f"{kind}s")) for key, (kind, _) in STAGE_TABLES.items()),
+        *((f"ocp.stages.{key.rstrip('_')}", getattr(ocp.stages, key), kind, signals_of(model, kind)) for key, (kind, _) in STAGE_TABLES.items()),
         *((("ocp.terminal.Q", terminal.Q, "output", model.outputs),) if terminal.Q is not None else ()),
         ("ocp.terminal.lqr.states", regulator.states, "state", model.states),
         ("ocp.terminal.lqr.inputs", regulator.inputs, "input", model.inputs),
-        ("observer.disturbances", observer.disturbances, "input or state", (*model.inputs, *model.states)),
+        ("observer.disturbances", observer.disturbances, "input or state", signals_of(model, "input or state")),
         ("observer.measured", dict.fromkeys(observer.measured), "state", model.states),
         ("observer.noise", observer.noise, "state", model.states),
         ("observer.process", observer.process, "state", model.states),
@@ -182,6 +189,11 @@ def check_names(config: Config, model: Model) -> None:
     for key, table, kind, signals in tables:
         if wrong := unknown_name(key, table, kind, signals, complete=key in COMPLETE_TABLES):
             raise ConfigError(wrong)
+
+
+def signals_of(model: Model, kind: str) -> tuple[Signal, ...]:
+    """Return the signals of a kind, such as ``"state"``, or of either of two, ``"state or constraint"``."""
+    return tuple(signal for each in kind.split(" or ") for signal in getattr(model, f"{each}s"))
 
 
 def check_solver(config: Config) -> None:

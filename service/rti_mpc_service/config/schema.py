@@ -163,6 +163,14 @@ class StagesSection(Section):
     constraints: dict[str, Annotated[tuple[Interval, ...], Field(strict=False)]] = Field(
         default={}, description="softened bounds of the model's constraints at nodes 1 to N, inside bounds.constraints, in the constraint's unit"
     )
+    soft_weight: dict[str, Annotated[tuple[Weight, ...], Field(strict=False)]] = Field(
+        default={},
+        description="L1 weights on the violation of bounds of a state or constraint at nodes 1 to N, the last one for a terminal bound, too, "
+        "instead of bounds.soft_weight, in cost / unit of what is bounded",
+    )
+    soft_weight_L2: dict[str, Annotated[tuple[Weight, ...], Field(strict=False)]] = Field(
+        default={}, description="L2 weights on the same, instead of bounds.soft_weight_L2, in cost / that unit squared"
+    )
 
 
 class RegulatorSection(Section):

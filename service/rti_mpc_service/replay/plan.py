@@ -93,9 +93,8 @@ def softened(rti: Rti, config: Config) -> list[BoundAlongPlan]:
 
 
 def slack_weights(ocp: Ocp, w: Mapping[str, Array]) -> tuple[Array, Array]:
-    """Return L1 and L2 weights of the slacks, in the order of `Ocp.lg`."""
-    soft, soft_e = list(ocp.soft), list(ocp.soft_e)
-    linear, square = (np.concatenate([w[x][soft], w[h], w[x][soft_e]]) for x, h in (("z", "zh"), ("Z", "Zh")))
+    """Return L1 and L2 weights of the slacks, in the order of `Ocp.lg`, at nodes 1 to N, shape ``(ng, N)``."""
+    linear, square = (np.broadcast_to(ocp.softened(w[x], w[h], w[x]), (ocp.N, ocp.ng)).T for x, h in (("z", "zh"), ("Z", "Zh")))
     return linear, square
 
 
@@ -137,5 +136,6 @@ def cost_terms(rti: Rti, config: Config) -> dict[str, float]:
     for soft, linear, square in zip(softened(rti, config), *slack_weights(rti.problem, w), strict=True):
         slack = np.maximum(0.0, np.maximum(soft.lower - soft.values, soft.values - soft.upper))
         name = f"bounds of {'the second difference of ' if soft.kind == 'second difference' else ''}{soft.name}"
-        terms[name] = terms.get(name, 0.0) + float((linear * slack + 0.5 * square * slack**2).sum())
+        at = slice(-len(slack), None)  # the last node, or all
+        terms[name] = terms.get(name, 0.0) + float((linear[at] * slack + 0.5 * square[at] * slack**2).sum())
     return {name: value for name, value in terms.items() if value}

@@ -17,6 +17,7 @@ from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.controller.params import changed_problem
 from rti_mpc_service.description import controller_info
+from rti_mpc_service.replay.plan import cost_terms
 
 FILE = """
 robot = "r"
@@ -34,6 +35,7 @@ R_u = { u_c = [0, 0.5, 2] }
 inputs = { u_c = [[-0.5, 0.4], [-0.5, 0.3], [-0.8, 0.2]] }
 increments = { u_c = [[-0.2, 0.3], [-0.2, 0.3], [-inf, inf]] }
 states = { omega = [[-inf, inf], [-0.6, 0.6], [-0.5, 0.5], [-0.4, 0.4]] }
+soft_weight = { u = [0, 1, 2, 50] }
 """
 
 
@@ -52,6 +54,8 @@ def test_tables_of_stages_scale_weights_and_narrow_bounds(tmp_path: Path) -> Non
     np.testing.assert_array_equal(ocp.ubu, [[0.4, 0.7], [0.3, 0.7], [0.2, 0.7]])
     np.testing.assert_array_equal(ocp.lbu[:, 0], [-0.5, -0.5, -0.5])  # no wider than the robot's own
     np.testing.assert_array_equal(ocp.lbdu[:, 0], [-0.2, -0.2, -np.inf])
+    np.testing.assert_array_equal(ocp.z[:, 3:], [[0, 1000], [1, 1000], [2, 1000], [50, 1000]])
+    np.testing.assert_array_equal([*ocp.Z, *ocp.zddu], 1000.0)
     np.testing.assert_array_equal(ocp.ubx[:, 3:], [[0.6, np.inf], [0.6, 0.6], [0.6, 0.5], [0.6, 0.4]])
     assert robot_settings(config)["ubu"] == [0.5, 0.7], "the robot itself keeps the bounds of all stages"
     told = Info.from_json({"role": "controller", **controller_info(ocp, 0)})
@@ -61,12 +65,27 @@ def test_tables_of_stages_scale_weights_and_narrow_bounds(tmp_path: Path) -> Non
     assert told.ubu == (0.4, 0.7)
 
 
+def test_cost_by_term_has_the_slack_weights_of_each_stage(tmp_path: Path) -> None:
+    narrow = "terminal = { u = [-0.1, 0.1] }, states = { u = [-0.6, 0.2] }"
+    config = written(tmp_path, FILE.replace("states = { u = [-0.6, 0.6] }", narrow, 1))
+    rti = Rti(build_ocp(config), compile=False)
+    x = np.array([0.0, 0.0, 0.0, 0.45, 0.0])  # m/s, faster than it may be
+    rti.reset(x, np.zeros(2))
+    rti.prepare(np.zeros((4, 3)))
+    assert rti.feedback(x).usable
+    terms = cost_terms(rti, config)
+    assert terms["bounds of u"] > 0.1  # 0.44
+    assert sum(terms.values()) == pytest.approx(rti.cost, rel=1e-9)
+
+
 def test_weights_are_changed_while_it_runs_and_tables_of_stages_are_not(tmp_path: Path) -> None:
     config = written(tmp_path)
     ocp = build_ocp(config)
     tuning = Tuning(Rti(ocp, compile=False))
     tuning.change(changed_problem(config, ocp, {"ocp.weights.R.u_c": 2.0, "ocp.bounds.inputs.u_c": [-0.3, 0.3]})[1], 1)
     np.testing.assert_array_equal(tuning.wanted.ubu[:, 0], [0.3, 0.3, 0.2])
+    tuning.change(changed_problem(config, ocp, {"ocp.bounds.soft_weight": 7.0})[1], 2)
+    np.testing.assert_array_equal(tuning.wanted.z[:, 3:], [[0, 7], [1, 7], [2, 7], [50, 7]])
     with pytest.raises(ConfigError, match=r"ocp\.stages\.delta\.x"):
         changed_problem(config, ocp, {"ocp.stages.delta.x": [1, 1, 1, 1]})
 
@@ -86,6 +105,9 @@ def test_weights_are_changed_while_it_runs_and_tables_of_stages_are_not(tmp_path
         ("x = [1, 0, 1, 2]", "z = [1, 0, 1, 2]", r"ocp\.stages\.delta\.z"),
         ("[-0.5, 0.4], ", "", r"ocp\.stages\.inputs\.u_c must be a list of 3, one per block of inputs, got 2"),
         ("[-0.5, 0.4]", "[0.4, -0.5]", r"ocp\.stages\.inputs\.u_c.* must be \[lower, upper\]"),
+        ("[0, 1, 2, 50]", "[0, 1, 2]", r"ocp\.stages\.soft_weight\.u must be a list of 4, one per stage, got 3"),
+        ("u = [0, 1, 2, 50]", "psi = [0, 1, 2, 50]", r"ocp\.stages\.soft_weight\.psi must be left out, or psi bounded"),
+        ("u = [0, 1, 2, 50]", "v = [0, 1, 2, 50]", r"ocp\.stages\.soft_weight\.v .*"),
         ("x = [1, 0, 1, 2]", "x = 3", r"ocp\.stages\.delta\.x"),
         ("[-0.2, 0.3], [-inf, inf]", "[0.2, 0.3], [-inf, inf]", r"ocp\.stages\.increments\.u_c.* must hold lower < 0 < upper"),
     ],
