@@ -184,9 +184,18 @@ class Ocp:
             if not 1 <= N_u <= N:
                 raise OcpError(f"N_u and N must satisfy 1 <= N_u <= N, got N_u = {N_u}, N = {N}")
             blocks = [1] * (N_u - 1) + [N - N_u + 1]
-        blocks = stages_of_blocks(blocks, N)
-        if N_u not in (None, len(blocks)):  # `dataclasses.replace` gives both
-            raise OcpError(f"N_u must be left out where blocks are given: it is their number, got N_u = {N_u}, blocks = {given.quoted(blocks)}")
+        try:
+            blocks = stages_of_blocks(blocks, N)
+            if N_u not in (None, len(blocks)):
+                raise OcpError(f"N_u must be left out where blocks are given: it is their number, got N_u = {N_u}, blocks = {given.quoted(blocks)}")
+        except OcpError as error:
+            # `dataclasses.replace` gives both, and what has a row per stage or block.
+            hint = (
+                ""
+                if N_u is None
+                else "; in a copy of another problem blocks=None makes them anew from N and N_u, and lambda_ and delta must fit them"
+            )
+            raise OcpError(f"{error}{hint}") from None
         if not (np.isfinite(seconds := given.number("dt", dt)) and seconds > 0):
             raise OcpError(f"dt must be a positive number of seconds, got {dt}")
         model = integrated(model, method, sim_method_num_stages, sim_method_num_steps, seconds)

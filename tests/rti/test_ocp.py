@@ -63,6 +63,21 @@ def test_problem_with_another_weight_keeps_its_blocks(horizon: dict[str, Any]) -
     assert replace(ocp, Q=np.ones(2)).blocks == ocp.blocks
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"N_u": 4}, "N_u must be left out where blocks are given.*; in a copy of another problem blocks=None makes them anew from N and N_u"),
+        ({"N": 8}, "blocks must have N = 8 stages together, got 6 in .*; in a copy of another problem blocks=None makes them anew from N and N_u"),
+        ({"N_u": 4, "blocks": None}, r"lambda_ must be a number or have shape \(4,\)"),
+    ],
+)
+def test_copy_of_a_problem_with_another_horizon_is_refused_with_what_else_it_needs(changes: dict[str, Any], message: str) -> None:
+    ocp = double_integrator(N=6)
+    with pytest.raises(OcpError, match=message):
+        replace(ocp, **changes)
+    assert replace(ocp, N=8, N_u=4, blocks=None, delta=1.0, lambda_=1.0).blocks == (1, 1, 1, 5)
+
+
 def test_plan_in_blocks_is_moved_on_as_each_block_begins_a_stage_later() -> None:
     ocp = double_integrator(N=8, blocks=[2, 1, 3, 2])
     x, u = np.zeros((2, 9)), np.array([[10.0, 20.0, 30.0, 40.0]])
