@@ -139,6 +139,7 @@ class Controller:
         self._known = PLANNING_MODES | ({Mode.STOPPED, Mode.BRAKING} if balances else set())  # modes in which disturbances are estimated
         self._planner = Planner(rti, self._track, self._sent, self._prediction, self.envelope, self._tuning, self._states.d, self.grid.dt_ns)
         self._overran = False  # whether the last sample was over its budget
+        self._late: Command | None = None  # the last plan, if it came too late to be sent: the next one begins where it ended
         self._unreported = False  # whether it was said that the robot does not report its inputs
         self._for_rival: tuple[int | None, tuple[Reference, Array] | None] = (None, None)  # the last reference, and which life might have begun then
         self._stopped = ""  # why an operator's stop is latched
@@ -342,6 +343,7 @@ class Controller:
             What to publish: the command itself; None if it is too late and the robot goes on with the previous plan, or with the way to rest
             that it corrects by its states; or a ramp to rest.
         """
+        self._late = None
         if self._states.cadence.fault:
             return command  # its lateness is unknown, and no other command follows
         now_ns = self._states.clock.latest_ns(local_ns)
@@ -357,6 +359,7 @@ class Controller:
             return None
         if not self._stopped:
             self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "over_budget")
+        self._late = command if command.mode in PLANNING_MODES else None
         counted = command.mode in (Mode.BRAKING, Mode.STOPPED)
         if self._ways is not None and self._ways.feeds_back:  # the last command carries its way, which newer states correct than this sample's
             if not counted:
@@ -400,8 +403,8 @@ class Controller:
         self._planner.loaded = False
         if self.mode in PLANNING_MODES:
             self.ladder.failed = 0
-        elif self.mode is not Mode.FALLBACK or not np.isfinite(self._rti.x).all():
-            return  # the next sample starts cold
+        elif self._late is None and (self.mode is not Mode.FALLBACK or not np.isfinite(self._rti.x).all()):
+            return  # the next sample starts cold; after a late one it does not, as a cold one takes longest and would be late again
         self._tuning.begin()
         self._planner.load(self.grid.act_ns, shift=True)
         if self._ways is not None:
@@ -466,8 +469,8 @@ class Controller:
     def _rejoin(self, stamp_ns: int, behind: int) -> None:
         """Move plan and grid to a state that the grid did not expect: a late one, or the first one after a gap."""
         self.skipped += behind
-        last = self._issued.last
-        if behind and last is not None and stamp_ns + self.grid.delay_ns < last.valid_until_ns:  # the last command still acts
+        last = self._late or self._issued.last
+        if behind and last is not None and stamp_ns + self.grid.delay_ns < last.valid_until_ns:  # the last command still acts, or a late plan would
             self.grid.catch_up(behind, stamp_ns)
             if self._planner.loaded:
                 for _ in range(behind - 1):
@@ -615,6 +618,7 @@ class Controller:
 
     def _forget(self, arrival: Arrival, state: State) -> None:
         """Forget the robot's last life; or, after a jump of its clock, all but the inputs from which it has braked since then."""
+        self._late = None
         if arrival is Arrival.NEW_LIFE:
             self._sent.clear()
         else:

@@ -71,7 +71,7 @@ LOSSY = [
 
 @pytest.mark.parametrize(("guarded", "reports"), LOSSY)
 def test_no_input_leaves_its_limits_whatever_is_lost_late_repeated_or_reordered_on_any_link(guarded: bool, reports: bool) -> None:
-    fuzz = Lossy(seed=1, guarded=guarded, reports=reports)
+    fuzz = Lossy(seed=4, guarded=guarded, reports=reports)  # a seed in whose few samples the clock jumps, which one in a thousand brings
     run(fuzz, SHORT_SAMPLES // 2)
     assert {"TRACKING", "BRAKING", "accepted", "lost to robot", "lost to standby", "lost to controller", "takeover", "jump"} <= set(fuzz.seen)
 

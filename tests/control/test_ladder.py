@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rti_mpc.contract.message import Command
+from rti_mpc.array import Array
+from rti_mpc.contract.message import Command, End, Reference
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.control.ladder import MAX_FALLBACK_SAMPLES, Ladder
@@ -14,8 +15,9 @@ from rti_mpc.reference.trajectory import circle
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc_service.injection import FAILURES, MAX_FAILING_SAMPLES, FaultyRti, answer
 from rti_mpc_sim.lockstep import Lockstep
+from rti_mpc_sim.settings import RobotSettings
 from tests.loop import MS, Run, drive, reference, robot
-from tests.movers import ocp_of
+from tests.movers import law_of, ocp_of
 from tests.problems import double_integrator, pioneer
 
 DT = 100 * MS
@@ -152,6 +154,56 @@ def test_samples_over_budget_brake_when_no_plan_is_left(driving: tuple[Controlle
     again = sample(controller, body)
     assert again is not None
     assert controller.mode is again.mode is Mode.TRACKING
+
+
+@pytest.mark.parametrize("name", ["pioneer", "arm", "car"])
+def test_robot_is_driven_though_only_samples_that_start_cold_take_longer_than_a_period(name: str) -> None:
+    """Under load a cold sample may take several periods. If the next one started cold again, the robot would never move."""
+    ocp, law = ocp_of(name), law_of(name)
+    rti = FaultyRti(ocp, compile=False)
+    controller = Controller(rti, Timing(), stop_law=law, compile=False)
+    y = np.tile(np.eye(ocp.model.ny)[0], (400, 1))
+    controller.receive_reference(Reference(1, 1, 0, round(1e9 * ocp.dt), End.HOLD, y, np.zeros((400, 0))))
+    body = Lockstep(RobotSettings(ocp.model, np.zeros(ocp.model.nx), np.full(ocp.model.nu, 1e3), state_period_s=ocp.dt))
+    starts, busy_ns, driven = list[int](), 0, list[Mode]()
+    cold = rti.reset
+
+    def reset(x0: Array, u_prev: Array) -> None:
+        starts.append(body.now_ns)
+        cold(x0, u_prev)
+
+    rti.reset = reset  # type: ignore[method-assign]
+    for _ in range(40):
+        state, before = body.tick(), len(starts)
+        if body.now_ns < busy_ns:
+            continue  # the controller takes the newest state when it is ready
+        command = controller.receive_state(state, body.now_ns)
+        if command is None:
+            continue
+        busy_ns = body.now_ns + round((1.8 if len(starts) > before else 0.3) * 1e9 * ocp.dt)
+        command = controller.in_time(command, busy_ns)
+        if command is not None:
+            controller.commit(command, busy_ns)
+            driven.append(command.mode)
+            body.accept(command, body.now_ns)
+        controller.prepare()
+    assert len(starts) == 1, "the others begin with the plan of the one before, sent or not"
+    assert driven[-30:] == [Mode.TRACKING] * 30
+
+
+def test_plan_that_was_late_is_not_gone_on_with_when_it_would_have_run_out(rti: FaultyRti) -> None:
+    controller, body = Controller(rti, Timing(), compile=False), robot(circle())
+    controller.receive_reference(reference(circle()))
+    assert controller.receive_state(body.tick(), body.now_ns) is None
+    late = controller.receive_state(body.tick(), body.now_ns)
+    assert late is not None
+    assert controller.in_time(late, body.now_ns + 110 * MS) is not late
+    controller.prepare()
+    for _ in range(3):
+        body.tick()
+    controller.notices()
+    controller.receive_state(body.tick(), body.now_ns)
+    assert "gap" in codes(controller)
 
 
 def test_ramp_that_is_late_itself_is_counted_once(driving: tuple[Controller, Lockstep], rti: FaultyRti) -> None:
