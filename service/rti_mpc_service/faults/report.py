@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -22,6 +23,7 @@ COLUMNS = (
     *("way\nUNIT", "step\n%", "error\nmUNIT", "recovery\ns", "kept"),
 )
 NO_VALUE = "-"
+PATIENCE_S = 10.0  # a wait that lasts longer is told, and again each time it has lasted twice as long
 
 
 @dataclass(frozen=True)
@@ -110,18 +112,36 @@ class MatrixReport(Redrawn):
         super().__init__(console)
         self.rows: list[MatrixRow] = []
         self._count = count
+        self._now = ""  # what happens now, and since when
+        self._since_s = self._tell_at_s = time.monotonic()
 
     @property
     def kept(self) -> bool:
         """Whether every promise was kept so far."""
         return not any(row.broken for row in self.rows)
 
+    @property
+    def complete(self) -> bool:
+        """Whether each fault has its row."""
+        return len(self.rows) == self._count
+
     def say(self, fault: Fault, text: str) -> None:
         """Show what happens now."""
+        self._now = f"{fault.name}, {text}"
+        self._since_s = time.monotonic()
+        self._tell_at_s = self._since_s + PATIENCE_S
         if self.live:
             head = Table.grid(padding=(0, 2))
             head.add_row(f"{len(self.rows)} of {self._count}", ProgressBar(total=self._count, completed=len(self.rows), width=32), fault.name, text)
             self.draw(Group(self._table(), head) if self.rows else head)
+
+    def waiting(self, text: str) -> None:
+        """Print a line if what happens now has lasted for long; `text` says what it waits for."""
+        self._now = f"{self._now.partition(',')[0]}, {text}"
+        if (now_s := time.monotonic()) >= self._tell_at_s:
+            lasted_s = now_s - self._since_s
+            self._tell_at_s = now_s + lasted_s
+            self.console.print(f"{self._now}, for {lasted_s:.0f} s", soft_wrap=True)
 
     def add(self, row: MatrixRow) -> None:
         """Add a row; without a terminal, as a line."""
@@ -136,6 +156,8 @@ class MatrixReport(Redrawn):
         for row in self.rows:
             if words := [*row.broken, *row.excused]:
                 self.console.print(f"{row.fault.name}: {row.fault.promise.text}: {'; '.join(words)}", soft_wrap=True)
+        if not self.complete:
+            self.console.print(f"stopped after {len(self.rows)} of {self._count} faults, in {self._now}", soft_wrap=True)
         kept = sum(not row.broken for row in self.rows)
         about = machine.machine_info()
         self.console.print(

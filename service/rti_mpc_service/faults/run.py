@@ -104,23 +104,25 @@ def main(
     if record is not None:
         check_folder(record)
     config = load(config_path)
-    law = check_stop(config)
     heading = BEST_HEADINGS.get(scenario or "")
     followed = find_scenario(config, scenario, heading, REFERENCE_DURATION_S, waypoint_speed_m_s, waypoint_smoothing_m)
     config = prepared(config, followed)
     reference = reference_options(scenario, followed, moving_s(config, followed), waypoint_speed_m_s, waypoint_smoothing_m)
-    stop = stop_on_signals()
-    folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
-    try:
-        with Host() as host, MatrixReport(console := plain_console(), len(faults)) as report:
-            inject(config, of_robot(faults, config, law), folder, report, stop, host, reference, record)
-    except Unwitnessed as error:  # from the start
-        say(str(error))
-        return EXIT_FAILED
+    with MatrixReport(console := plain_console(), len(faults)) as report:
+        report.say(faults[0], "finding how the robot comes to rest")
+        faults = of_robot(faults, config, check_stop(config))
+        stop = stop_on_signals()
+        folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
+        try:
+            with Host() as host:
+                inject(config, faults, folder, report, stop, host, reference, record)
+        except Unwitnessed as error:  # from the start
+            say(str(error))
+            return EXIT_FAILED
     report.conclude()
     if record is not None:
         console.print(f"recordings {record}, to be repeated by: rti-mpc replay {record}", soft_wrap=True)
-    if report.kept:
+    if report.complete and report.kept:
         shutil.rmtree(folder)
     else:
         console.print(f"what the processes said and the robot recorded: {folder}", soft_wrap=True)
@@ -240,7 +242,7 @@ def inject(
                     stack.close()
                     report.say(fault, f"starting {fault.wiring.value}")
                     recording = None if record is None else record / f"{number:02}-{fault.wiring.value}.mcap"
-                    system = stack.enter_context(System(config, fault.wiring, folder / f"{number}", stop, reference, recording))
+                    system = stack.enter_context(System(config, fault.wiring, folder / f"{number}", stop, reference, recording, report.waiting))
                 near = make_ready(system, fault, report)
                 row = suffer(system, fault, limits, report, host, near)
             except Failed as error:
@@ -297,7 +299,7 @@ def make_ready(system: System, fault: Fault, report: MatrixReport) -> bool:
         near = here and now_ns - away_ns >= 1e9 * near_s
         return (near and system.estimated()) or (now_ns - begun_ns > 1e9 * SETTLING_S and system.driven())
 
-    system.wait(ready, "the robot to be driven")
+    system.wait(ready, "the robot to be driven", missing=system.undriven)
     return near
 
 
@@ -385,4 +387,6 @@ def recovered(system: System, mend_ns: int, host: Host) -> None:
         return now_ns > deadline_ns
 
     with suppress(Failed):
-        system.wait(lambda: (system.driven() and system.last_sample_ns() > mend_ns) or over(), "the robot to be driven")
+        system.wait(
+            lambda: (system.driven() and system.last_sample_ns() > mend_ns) or over(), "the robot to be driven again", missing=system.undriven
+        )

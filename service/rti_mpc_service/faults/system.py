@@ -67,6 +67,7 @@ class System:
         stop: Ends all waiting.
         reference: Options of `rti-mpc reference`.
         recording: File to record all streams to; None: nothing is recorded.
+        tell: Takes what is waited for and what is missing, in words, again and again while that lasts.
 
     Attributes:
         wiring: How they are linked.
@@ -82,13 +83,20 @@ class System:
     """
 
     def __init__(
-        self, config: Config, wiring: Wiring, folder: Path, stop: Event, reference: Sequence[object] = (), recording: Path | None = None
+        self,
+        config: Config,
+        wiring: Wiring,
+        folder: Path,
+        stop: Event,
+        reference: Sequence[object] = (),
+        recording: Path | None = None,
+        tell: Callable[[str], object] = lambda _: None,
     ) -> None:
         folder.mkdir(parents=True)
         self.keys = config.keys()
         self.period_ns = round(1e9 * config.ocp.dt_s)
         self.robots = 0
-        self.wiring, self._folder, self._stop, self._reference = wiring, folder, stop, reference
+        self.wiring, self._folder, self._stop, self._reference, self._tell = wiring, folder, stop, reference, tell
         self._robot_keys = Keys(f"{self.keys.prefix}/behind", self.keys.robot) if wiring in RELAYED else self.keys
         self._balanced = disturbances_at_rest(config)
         model = build_model(config)
@@ -232,27 +240,51 @@ class System:
 
     def driven(self, error_m: float = np.inf) -> bool:
         """Whether the robot is driven, not only adrift, and nearer to its reference than `error_m`."""
+        return not self.undriven(error_m)
+
+    def undriven(self, error_m: float = np.inf) -> str:
+        """Return, in words, the first of what is missing for the robot to be driven, as `driven` has it; empty if nothing is."""
         witness = self.witness.listen()
-        return (
-            witness.begun
-            and bool(self.observer.answered)  # the robot in its present life
-            and witness.telemetry[-1].mode is Mode.TRACKING
-            and self.observer.speed_m_s() > self.motion.driven_speed
-            and self.error_m() < error_m
-        )
+        if not witness.begun:
+            return "no reference yet" if witness.reference is None else "the controller has sent no plan in time yet"
+        if not self.observer.answered:  # the robot in its present life
+            return "no state of the robot is answered"
+        if (mode := witness.telemetry[-1].mode) is not Mode.TRACKING:
+            return f"the controller is {mode.name.lower()}"
+        if (speed := self.observer.speed_m_s()) <= self.motion.driven_speed:
+            return f"the robot moves by {speed:.2g} {self.motion.unit}/s, and must by {self.motion.driven_speed:g}"
+        if (away := self.error_m()) >= error_m:
+            return f"the robot is {away:.2g} {self.motion.unit} from its reference, and must be within {error_m:g}"
+        return ""
 
     def estimated(self) -> bool:
         """Whether the controller knows what a stop is to balance, a current say: without it, its commands lead to no rest."""
         return steady(self.witness.listen().telemetry, self._balanced)
 
-    def wait(self, condition: Callable[[], object], what: str, patience_s: float = START_TIMEOUT_S) -> None:
+    def wait(self, condition: Callable[[], object], what: str, patience_s: float = START_TIMEOUT_S, missing: Callable[[], str] = lambda: "") -> None:
         """
         Wait for a condition, or until stopped.
+
+        Args:
+            condition: Is asked again and again.
+            what: What is waited for, in words.
+            patience_s: For how long.
+            missing: Returns, in words, what is still missing.
 
         Raises:
             Failed: It did not come true in time, or a process has ended by itself.
         """
-        wait(condition, self.children, self._stop, patience_s, what)
+
+        def met() -> bool:
+            if condition():
+                return True
+            self._tell(f"waiting for {what}{because(missing())}")
+            return False
+
+        try:
+            wait(met, self.children, self._stop, patience_s, what)
+        except Failed as error:
+            raise Failed(f"{error}{because(missing())}") from None
 
     @property
     def stopped(self) -> bool:
@@ -267,7 +299,13 @@ class System:
         """Start the processes that do not run, and wait until all are present."""
         self.start(*(role for role in roles if self.children.pid(role) is None))
         others = [role for role in roles if self._keys_of(role) is self.keys]  # a relay passes no presence on, and the robot's states tell
-        self.wait(lambda: not self.witness.listen().missing(set(others)), f"{', '.join(others)} to be there")
+        absent: list[str] = []
+
+        def there() -> bool:
+            absent[:] = self.witness.listen().missing(set(others))
+            return not absent
+
+        self.wait(there, f"{', '.join(others)} to be there", missing=lambda: f"no {' and no '.join(absent)} yet")
 
     # Messages to the system.
 
@@ -297,6 +335,11 @@ class System:
         if answer.get("ok") is not True:
             raise Failed(f"{key} was asked for {request}: {answer.get('error')}")
         return answer
+
+
+def because(missing: str) -> str:
+    """Return a reason to follow a text; empty if there is none."""
+    return f": {missing}" if missing else ""
 
 
 def steady(samples: Sequence[Telemetry], most: Array) -> bool:

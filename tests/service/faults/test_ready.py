@@ -6,6 +6,8 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from threading import Event
 from types import SimpleNamespace
 from typing import cast
 
@@ -39,7 +41,7 @@ def test_robot_is_ready_when_it_stays_on_its_path_if_it_must_and_knows_what_to_b
 ) -> None:
     t = [0.0]
 
-    def wait(condition: Callable[[], object], what: str) -> None:
+    def wait(condition: Callable[[], object], what: str, missing: Callable[[], str]) -> None:
         while not condition():
             t[0] += POLL_S
 
@@ -48,6 +50,7 @@ def test_robot_is_ready_when_it_stays_on_its_path_if_it_must_and_knows_what_to_b
         witness=SimpleNamespace(begun=False),
         observer=SimpleNamespace(epoch=0),
         driven=lambda most_m=np.inf: error_m(t[0]) < most_m,
+        undriven=lambda: "",
         estimated=lambda: t[0] >= known_s,
         wait=wait,
     )
@@ -58,17 +61,32 @@ def test_robot_is_ready_when_it_stays_on_its_path_if_it_must_and_knows_what_to_b
 
 
 @pytest.mark.parametrize(
-    ("mode", "answered", "speed_m_s", "driven"),
-    [(Mode.TRACKING, {7}, 0.25, True), (Mode.BRAKING, {7}, 0.25, False), (Mode.TRACKING, set(), 0.25, False), (Mode.TRACKING, {7}, 0.05, False)],
+    ("begun", "mode", "answered", "speed_m_s", "undriven"),
+    [
+        (True, Mode.TRACKING, {7}, 0.25, ""),
+        (False, Mode.TRACKING, {7}, 0.25, "the controller has sent no plan in time yet"),
+        (True, Mode.BRAKING, {7}, 0.25, "the controller is braking"),
+        (True, Mode.TRACKING, set(), 0.25, "no state of the robot is answered"),
+        (True, Mode.TRACKING, {7}, 0.05, "the robot moves by 0.05 m/s, and must by 0.1"),
+    ],
 )
 def test_robot_that_drifts_at_speed_is_not_driven_nor_one_that_was_before_it_was_restarted(
-    mode: Mode, answered: set[int], speed_m_s: float, driven: bool
+    begun: bool, mode: Mode, answered: set[int], speed_m_s: float, undriven: str
 ) -> None:
-    witness = SimpleNamespace(begun=True, telemetry=[SimpleNamespace(mode=mode)])
+    witness = SimpleNamespace(begun=begun, reference=object(), telemetry=[SimpleNamespace(mode=mode)])
     witness.listen = lambda: witness
-    observer, motion = SimpleNamespace(speed_m_s=lambda: speed_m_s, answered=answered), SimpleNamespace(driven_speed=0.1)
-    system = SimpleNamespace(witness=witness, observer=observer, motion=motion, error_m=lambda: 1.0)
-    assert System.driven(cast("System", system)) == driven
+    observer, motion = SimpleNamespace(speed_m_s=lambda: speed_m_s, answered=answered), SimpleNamespace(driven_speed=0.1, unit="m")
+    system = cast("System", SimpleNamespace(witness=witness, observer=observer, motion=motion, error_m=lambda: 1.0))
+    assert System.undriven(system) == undriven
+    assert System.undriven(system, 0.5) == (undriven or "the robot is 1 m from its reference, and must be within 0.5")
+
+
+def test_wait_tells_what_is_missing_while_it_lasts_and_when_it_was_in_vain(tmp_path: Path) -> None:
+    told = list[str]()
+    system = SimpleNamespace(children=SimpleNamespace(ended=lambda: None, folder=tmp_path), _stop=Event(), _tell=told.append)
+    with pytest.raises(Failed, match=r"waited 0 s for the robot to be driven in vain, see .*: the controller is braking"):
+        System.wait(cast("System", system), lambda: False, "the robot to be driven", 0.0, lambda: "the controller is braking")
+    assert set(told) == {"waiting for the robot to be driven: the controller is braking"}
 
 
 @pytest.mark.parametrize("begins_s", [None, -0.1, 1.0])  # at once, at the last good state, with the last row of a reference
@@ -96,6 +114,7 @@ class SlowHost(SimpleNamespace):
         self.witness, self.observer = witness, SimpleNamespace(epoch=1)
         self.reference_left_s = lambda: self.ends_s[-1] - self.t
         self.driven = lambda most_m=np.inf: drives_s <= self.t < self.ends_s[-1]
+        self.undriven = lambda: "" if self.driven() else "the controller is braking"
         self.estimated, self.ensure = lambda: True, lambda *_: None
         self.last_sample_ns = lambda: round(1e9 * self.t)
 
@@ -103,7 +122,7 @@ class SlowHost(SimpleNamespace):
         assert role == "reference"
         self.ends_s.append(self.t + 60.0)
 
-    def wait(self, condition: Callable[[], object], what: str, patience_s: float = 300.0) -> None:
+    def wait(self, condition: Callable[[], object], what: str, patience_s: float = 300.0, missing: Callable[[], str] = lambda: "") -> None:
         until_s = self.t + patience_s
         while not condition():
             self.t += POLL_S

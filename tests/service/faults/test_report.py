@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import io
 import json
+import time
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -60,6 +61,23 @@ def test_matrix_is_printed_with_what_was_not_kept() -> None:
     for cell in (*report.rows[0].cells(), *report.rows[1].cells()):
         assert cell in printed, "no number is cut off where the terminal is narrow"
     assert not report.kept
+
+
+def test_wait_that_lasts_is_told_in_a_line_and_a_run_that_ends_in_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    t, console = [0.0], Console(file=io.StringIO())
+    monkeypatch.setattr(time, "monotonic", lambda: t[0])
+    with MatrixReport(console, 2) as report:
+        report.add(row("controller_killed", STOPPED))
+        report.say(BY_NAME["controller_hung"], "starting peers")
+        for t[0] in range(60):
+            report.waiting("waiting for the robot to be driven: the controller is braking")
+    report.conclude()
+    said = "controller_hung, waiting for the robot to be driven: the controller is braking"
+    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert [line for line in lines if line.startswith(said)] == [f"{said}, for {s} s" for s in (10, 20, 40)]
+    assert lines[-2] == f"stopped after 1 of 2 faults, in {said}"
+    assert lines[-1].startswith("1 of 1 within their promise")
+    assert not report.complete
 
 
 class Dumb:
