@@ -43,6 +43,12 @@ class Promise:
         coasts = {"still_s", "distance_m"} if "brake_s" in self.at_most or "distance_m" in self.at_most else set()
         return replace(self, at_most={name: limit for name, limit in self.at_most.items() if name not in coasts})
 
+    def by_ramp(self, ramp_s: float) -> Promise:
+        """Return the promise of a robot whose slew limits take so long from its widest inputs to rest, once it brakes."""
+        if "zero_s" not in self.at_most:
+            return self
+        return replace(self, at_most={**self.at_most, "zero_s": max(self.at_most["zero_s"], self.at_most["brake_s"] + ramp_s)})
+
     def by_way(self, within_s: float) -> Promise:
         """Return the promise of a robot that its inputs at rest do not stop: it stands once its way to rest is over, whatever its inputs do there."""
         if "brake_s" not in self.at_most:

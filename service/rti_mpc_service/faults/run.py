@@ -67,6 +67,7 @@ MAX_REFERENCE_LEFT_S = 35.0  # duration of the reference that a fault needs, at 
 MIN_REFERENCE_S = MAX_REFERENCE_LEFT_S + SETTLING_S + 5.0  # and to be driven at first
 HELD_UP = "not judged, the host held the processes up"
 AFTER_RECOVERY_S = 0.3  # how long the robot is recorded after it has recovered
+AT_REST_S = 0.3  # how long a robot is seen with its inputs at rest after its ramp
 STANDING_S = 1.0  # how long a robot is seen to stand after its way to rest
 RECORD_TIMEOUT_S = 5.0  # for the robot to write its record; a line waits up to a second for an answer
 
@@ -199,7 +200,14 @@ def moving_s(config: Config, scenario: Scenario) -> float:
 
 
 def of_robot(faults: Sequence[Fault], config: Config, law: StopLaw | None) -> list[Fault]:
-    """Return faults as a robot must bear them that coasts, or goes a way to rest: they last until that is over, and it is to stand then."""
+    """
+    Return faults as a robot must bear them: one that ramps to rest, as fast as its slew limits allow; one that coasts; one that goes a way to rest.
+
+    They last until that is over.
+    """
+    if law is None:
+        ramp_s = guard_limits(config, build_signals(config)).ramp_s
+        faults = [by_ramp(fault, ramp_s) for fault in faults]
     if config.model.stop == "coasts":
         return [replace(fault, promise=fault.promise.without_standstill()) for fault in faults]
     if law is None:
@@ -209,6 +217,12 @@ def of_robot(faults: Sequence[Fault], config: Config, law: StopLaw | None) -> li
     ocp = build_ocp(config)
     within_s = config.timing.valid_s + standing_s(ocp, law, Motion(ocp.model).position, STANDSTILL_SPEED_M_S)
     return [by_way(fault, within_s, disturbed=law.disturbances.size > 0) for fault in faults]
+
+
+def by_ramp(fault: Fault, ramp_s: float) -> Fault:
+    """Return a fault as a robot must bear it whose slew limits take so long from its widest inputs to rest."""
+    promise = fault.promise.by_ramp(ramp_s)
+    return fault if promise == fault.promise else replace(fault, promise=promise, hold_s=max(fault.hold_s, promise.at_most["zero_s"] + AT_REST_S))
 
 
 def by_way(fault: Fault, within_s: float, *, disturbed: bool) -> Fault:

@@ -21,6 +21,7 @@ from rti_mpc_service.faults.run import MIN_REFERENCE_S, by_way, error_before, mo
 from rti_mpc_service.faults.table import FAULTS
 from rti_mpc_service.rig.robot_log import RobotLog
 from rti_mpc_service.scenario import find_scenario
+from rti_mpc_service.shipped import ROBOTS
 from tests import movers
 from tests.robots import SHIPPED, arm, polar, shuffled, toml
 
@@ -69,6 +70,17 @@ def test_robot_with_a_way_to_rest_is_to_stand_in_its_own_time_whatever_its_input
     assert by_way(missing, 5.0, disturbed=True).promise.at_most == {**ALWAYS, **RECOVERY}, "it drifts until then"
     assert PAUSES.by_way(5.0).at_most == {**ALWAYS, **RECOVERY}
     assert HOLDS.by_way(5.0) == HOLDS
+
+
+@pytest.mark.parametrize(("name", "zero_s"), [("pioneer_3dx", 0.5), ("omnidirectional", 0.7), ("unicycle", 0.8)])
+def test_inputs_are_to_be_zero_when_the_slew_limits_of_the_robot_allow_it_and_not_before(name: str, zero_s: float) -> None:
+    config = load(ROBOTS[name])
+    borne = {fault.name: fault for fault in of_robot(FAULTS, config, None)}
+    for fault in (borne["controller_killed"], borne["commands_lost"]):
+        assert fault.promise.at_most["zero_s"] == pytest.approx(zero_s)
+        assert fault.promise.at_most["brake_s"] == 0.3, "it begins to brake as soon as any other"
+        assert fault.hold_s >= zero_s + 0.3 - 1e-9, "and is seen at rest"
+    assert borne["viewer_hung"].promise == KEEPS_ON
 
 
 def test_time_to_stand_begins_when_the_last_plan_has_ended_and_is_that_of_the_robot(tmp_path: Path) -> None:
