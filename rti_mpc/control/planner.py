@@ -52,6 +52,9 @@ class Planner:
         self._rti, self._track, self._sent, self._prediction, self._envelope, self._tuning = rti, track, sent, prediction, envelope, tuning
         self._d, self._np, self._dt_ns = d, rti.ocp.model.np_ - len(d), dt_ns
         self._u = rti.u.reshape(-1)
+        # What nothing depends on is neither looked up nor handed on.
+        self._p = track.p if rti.ocp.model.np_ else None
+        self._remembers = len(rti.ocp.soft_ddu) > 0
         nu = rti.ocp.model.nu
         self.reach: tuple[Array, Array] = (np.zeros((2, nu)), np.zeros((2, nu)))
         self._kept = Kept((*rti.rehearsed, *prediction.written, *envelope.written))
@@ -62,9 +65,10 @@ class Planner:
         if len(self._d):
             self._track.p[:, self._np :] = self._d
         self.reach = self._sent.reach(act_ns)
-        u_prev, u_before = (self._sent.at(act_ns - 1 - age * self._dt_ns)[0] for age in range(2))
+        u_prev = self._sent.at(act_ns - 1)[0]
+        u_before = self._sent.at(act_ns - 1 - self._dt_ns)[0] if self._remembers else None
         self._tuning.follow(u_prev)
-        self._rti.prepare(self._track.y_ref, self._track.p, shift=shift, u_prev=u_prev, u_before=u_before)
+        self._rti.prepare(self._track.y_ref, self._p, shift=shift, u_prev=u_prev, u_before=u_before)
         self.loaded = True
 
     def plan(self, x: Array, stamp_ns: int, act_ns: int) -> tuple[QpStatus, Array | None]:

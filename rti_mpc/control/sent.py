@@ -65,13 +65,14 @@ class Sent:
         self._left_ns = max(self._left_ns + 1, left_ns)  # commands leave one after the other, whatever our idea of the robot's clock
         start_ns, over_ns = max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, self._left_ns), end_ns(command)
         if start_ns < over_ns:
-            before, _, braking = self._schedule.at(start_ns - 1)
-            if braking:
-                self._alone, self._went = (start_ns, before.copy()), self._schedule.acting(start_ns - 1)
+            acting = self._schedule.acting(start_ns - 1)
+            if acting is None or acting.end_ns < start_ns:
+                self._alone, self._went = (start_ns, self._schedule.at(start_ns - 1)[0].copy()), acting
             self._schedule.add(command, start_ns, over_ns, approached=False)
         start_ns = max(start_ns, self._left_ns + self._transit_ns)
         if start_ns < over_ns:
             self._slowest.add(command, start_ns, over_ns, approached=False)
+        self._slowest.forget(command.state_stamp_ns - self._dt_ns)  # `reach` looks back by less, from the time of a later command
 
     def expects(self, t_ns: int, u: Array, source: tuple[int, int]) -> bool:
         """Whether `correct` would find what is believed."""
@@ -134,33 +135,38 @@ class Sent:
         Where the robot brakes on its own, this leaves it the speed that it has. The plan
         that ended the braking may itself be late, and the robot have braked further.
         """
-        lowest, highest = [-inf] * self._nu, [inf] * self._nu
-        self._narrow(lowest, highest, self._schedule, t_ns, t_ns + self._dt_ns)
+        acted: list[list[float]] = []
+        self._add(acted, self._schedule, t_ns, t_ns + self._dt_ns)
         ended_ns, u = self._alone
         if abs(t_ns - ended_ns) < self._dt_ns:
             way, share = self._schedule.u_rest - u, (t_ns + self._dt_ns - ended_ns) / self._dt_ns
             further = u + np.clip(way, share * np.array(self._falling), share * np.array(self._rising))
             if self._went is not None and self._went.way is not None:
                 further = self._schedule.after(self._went, t_ns + self._dt_ns)[0]
-            self._near(lowest, highest, further)
+            acted.append(further.tolist())
+        lowest, highest, later = [-inf] * self._nu, [inf] * self._nu, len(acted)
+        self._narrow(lowest, highest, acted)
         second = lowest.copy(), highest.copy()
-        self._narrow(lowest, highest, self._schedule, t_ns - self._dt_ns + 1, t_ns)  # the input of `t_ns` has narrowed them already
-        self._narrow(lowest, highest, self._slowest, t_ns - self._window_ns, t_ns + self._transit_ns + 1)
+        self._add(acted, self._schedule, t_ns - self._dt_ns + 1, t_ns)  # the input of `t_ns` has narrowed them already
+        self._add(acted, self._slowest, t_ns - self._window_ns, t_ns + self._transit_ns + 1)
+        self._narrow(lowest, highest, acted[later:])
         rows = np.array(lowest + second[0] + highest + second[1]).reshape(2, 2, self._nu)
         return rows[0], rows[1]
 
-    def _narrow(self, lowest: list[float], highest: list[float], schedule: Schedule, from_ns: int, to_ns: int) -> None:
-        """Narrow intervals to the slew limits of all inputs that act before a time; where that leaves nothing, to the nearest value."""
+    def _add(self, acted: list[list[float]], schedule: Schedule, from_ns: int, to_ns: int) -> None:
+        """Add the inputs that act before a time, each of them once: a second time it would narrow no interval."""
         while from_ns < to_ns:
             u, from_ns, _ = schedule.at(from_ns)
-            self._near(lowest, highest, u)
+            if (values := u.tolist()) not in acted:
+                acted.append(values)
 
-    def _near(self, lowest: list[float], highest: list[float], u: Array) -> None:
-        """Narrow intervals to what is within the slew limits of an input."""
+    def _narrow(self, lowest: list[float], highest: list[float], acted: list[list[float]]) -> None:
+        """Narrow intervals to what is within the slew limits of all inputs; where that leaves nothing, to the nearest value."""
         falling, rising = self._falling, self._rising
-        for j, value in enumerate(u.tolist()):
-            least, most = lowest[j], highest[j]
-            if (low := value + falling[j]) > least:
-                lowest[j] = least = most if most < low else low
-            if (high := value + rising[j]) < most:
-                highest[j] = least if least > high else high
+        for values in acted:
+            for j, value in enumerate(values):
+                least, most = lowest[j], highest[j]
+                if (low := value + falling[j]) > least:
+                    lowest[j] = least = most if most < low else low
+                if (high := value + rising[j]) < most:
+                    highest[j] = least if least > high else high

@@ -35,7 +35,7 @@ class Arrival(Enum):
     JUMPED_BACK = "jumped back"  # the first state after the robot's clock has gone back: earlier stamps mean nothing any more
 
 
-UNKEPT = frozenset({Arrival.REPEATED, Arrival.REFUSED, Arrival.FOREIGN})  # states of which nothing is kept
+UNKEPT = Arrival.REPEATED, Arrival.REFUSED, Arrival.FOREIGN  # states of which nothing is kept
 NOTHING_SAID = Arrival.FRESH, "", ""
 
 

@@ -120,6 +120,22 @@ def test_robot_that_brakes_on_its_own_is_taken_over_at_the_speed_it_has() -> Non
     assert np.all(np.abs([lowest[0], highest[0]] - memory.at(2 * DT)[0]) <= 1.01 * step)
 
 
+def test_plans_that_no_later_command_can_meet_are_forgotten_and_no_reach_changes() -> None:
+    rng = np.random.default_rng(1)
+    memory, forgets_nothing = sent(), sent()
+    forgets_nothing._slowest.forget = lambda t_ns: None  # type: ignore[method-assign]
+    now_ms = 0
+    for k in range(60):
+        now_ms += int(rng.integers(20, 120))
+        if rng.random() < 0.8:  # else none is sent, and the robot may come to brake
+            one, left_ns = command(k, now_ms, rng.uniform(-0.5, 0.5, (5, 2))), (now_ms + int(rng.integers(0, 60))) * MS
+            for each in (memory, forgets_nothing):
+                each.append(one, left_ns)
+        for later_ms in (10, 50, 100, 240):
+            np.testing.assert_array_equal(memory.reach((now_ms + later_ms) * MS), forgets_nothing.reach((now_ms + later_ms) * MS))
+    assert len(memory._slowest) < 8 < len(forgets_nothing._slowest)
+
+
 def test_nothing_sent_lets_an_input_leave_rest_within_the_slew_limits() -> None:
     lowest, highest = sent().reach(0)
     np.testing.assert_array_equal([lowest, highest], [[-SLEW, -SLEW], [SLEW, SLEW]])
