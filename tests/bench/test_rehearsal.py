@@ -37,6 +37,7 @@ PAUSES = ("hot", "cold", "rehearsed")
 MAX_SAMPLES = {10: 150, 50: 300, 100: 300}  # by rate in Hz
 SAMPLES = {10: 150, 50: 600, 100: 1200}
 WAKING_S = 0.15e-3  # of the lead, before a rehearsal begins
+MAX_OF_COLD = 0.9  # feedback after a rehearsal, beside one without: 0.45 to 0.65 on a quiet host, 0.75 to 0.79 under a load of 20
 
 
 def feedback_us(rate: int, payloads: list[tuple[bytes, int]]) -> dict[str, np.ndarray]:
@@ -74,7 +75,7 @@ def feedback_us(rate: int, payloads: list[tuple[bytes, int]]) -> dict[str, np.nd
     return {name: 1e-3 * np.array(values) for name, values in took.items()}
 
 
-def test_feedback_is_nearly_as_fast_after_a_pause_as_without(capsys: pytest.CaptureFixture[str]) -> None:
+def test_feedback_after_a_pause_takes_less_time_with_a_rehearsal_than_without(capsys: pytest.CaptureFixture[str]) -> None:
     payloads = recorded()
     for rate in MAX_SAMPLES:
         took = feedback_us(rate, payloads)
@@ -82,6 +83,7 @@ def test_feedback_is_nearly_as_fast_after_a_pause_as_without(capsys: pytest.Capt
             print(f"\n{machine.machine_info()}\nfeedback at {rate} Hz, CPU time")
             for name in (*PAUSES, "rehearsal"):
                 print(f"  {name:10} {quantiles(took[name])}, {np.median(took[name]) / np.median(took['hot']):.2f} of hot")
+        assert SHORT or np.median(took["rehearsed"]) < MAX_OF_COLD * np.median(took["cold"])
 
 
 @pytest.mark.parametrize("rate", [10, 50, 100])
