@@ -86,6 +86,7 @@ class Guard:
         self._told_rest = True  # whether that command, if it is the guard's own, leads to rest: reports may change what is believed after it was sent
         self._engaged = False  # whether this robot was ever sent a command
         self._untold = False  # whether the command to brake has still to be sent
+        self._braked = (0, BEFORE_ALL_NS)  # number of the last command to brake, and its end
         self._corrected = False  # whether the correction of its way to rest by the last state has still to be sent
         self._passed: Command | None = None  # the last command that was passed
         self._stopped = False
@@ -140,7 +141,7 @@ class Guard:
             if ahead_ns > max(CLOCK_JUMP_NS, 2.5 * self._clock.period_ns):
                 self._jump(state, local_ns, "ahead")
         self._take(state, local_ns)
-        if len(state.u) == len(self._limits.u_rest):
+        if len(state.u) == len(self._limits.u_rest) and not self._unheard(state):
             self._schedule.correct(state.stamp_ns, np.clip(state.u, self._limits.lbu, self._limits.ubu), (state.command_epoch, state.command_seq))
         self._feed_back(state.x, state.stamp_ns, self._clock.now_ns(local_ns))
 
@@ -232,6 +233,11 @@ class Guard:
             u, period_ns = u[:1], valid_ns
         return self._tell(start_ns, valid_ns, period_ns, u, self._state, None if way is None else way.ahead(start_ns + valid_ns))
 
+    def _unheard(self, state: State) -> bool:
+        """Whether a report names an older command than the one to brake, which may still come: the ramp is then not to begin later."""
+        brake, until_ns = self._braked
+        return 0 < state.command_seq < brake and state.stamp_ns < until_ns
+
     def _feed_back(self, x: Array | None, stamp_ns: int, now_ns: int) -> None:
         """Correct the way to rest by a state, or by none if the last one is stale; nothing is sent that would displace a plan about to begin."""
         corrected = self._schedule.feed_back(x, stamp_ns, now_ns)
@@ -250,6 +256,8 @@ class Guard:
 
     def _tell(self, start_ns: int, valid_ns: int, period_ns: int, u: Array, state: State, way: Way | None) -> Command:
         """Return a command of the guard's own, with what is left of the way to rest after it, and note until when it lasts."""
+        if self._untold:
+            self._braked = self._seq + 1, start_ns + valid_ns
         self._told_ns, self._untold, self._corrected = start_ns + valid_ns, False, False
         self._told_rest = way is not None or not (u[-1] - self._schedule.rest(start_ns)).any()
         left: dict[str, Any] = {} if way is None else {"rest_period_ns": way.period_ns, "u_rest": way.u, "x_rest": way.x, "K": way.K}
@@ -427,6 +435,7 @@ class Guard:
         self._schedule.brake(self._limits.u_rest, BEFORE_ALL_NS)
         self._leader = 0, -1
         self._told_ns = BEFORE_ALL_NS
+        self._braked = 0, BEFORE_ALL_NS
         self._rest_by_ns = BEFORE_ALL_NS  # the robot is at rest: a latch from before passes nothing but rest
         self._engaged = self._untold = self._corrected = self.passing = False
         self._passed = None

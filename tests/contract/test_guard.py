@@ -534,23 +534,71 @@ def test_stopped_guard_ramps_to_rest_and_takes_no_command(scene: Scene) -> None:
     assert (-np.diff(inputs[-60:], axis=0) <= 0.2 * STEP + 1e-12).all()
 
 
-def test_stopped_guard_goes_on_until_it_has_told_rest_to_a_robot_that_was_late_to_hear_of_the_ramp(scene: Scene) -> None:
-    """What it tells meanwhile begins where the robot still was; then the robot reports that it is far ahead of that."""
+def end_late(scene: Scene, late_ms: int, *, always: bool, states_ms: int = 10) -> Command:
+    """Stop a guard of which the robot hears late, until some time after the stop or always, and which hears its inputs; return the last command."""
     scene.drive(1000)
     scene.wait(30)
     scene.guard.stop(scene.local_ns)
-    coming = [scene.guard.tick(scene.local_ns)]
-    heard_ns, last = scene.now_ns + 80 * MS, scene.published[-1]
-    while not scene.guard.at_rest:
-        *_, (scene.now_ns, u) = scene.actuator.play(scene.now_ns, scene.now_ns + 10 * MS)
-        scene.local_ns, scene.states, (epoch, seq) = scene.local_ns + 10 * MS, scene.states + 1, scene.actuator.source
-        state = State(scene.epoch, scene.states, scene.now_ns, np.zeros(5), u=u.copy(), command_epoch=epoch, command_seq=seq)
-        scene.guard.receive_state(state, scene.local_ns)
-        coming.append(scene.guard.tick(scene.local_ns))
-        while coming and scene.now_ns >= heard_ns:
-            last = scene.publish(coming.pop(0)) or last
+    scene.inputs.clear()
+    stopped_ns, coming = scene.now_ns, [(scene.now_ns, scene.guard.tick(scene.local_ns))]
+    while coming or not scene.guard.at_rest:
+        for until_ns, u in scene.actuator.play(scene.now_ns, scene.now_ns + 10 * MS):
+            scene.inputs.append(u.copy())
+            scene.now_ns = until_ns
+        scene.local_ns += 10 * MS
+        if scene.now_ns % (states_ms * MS) == 0:
+            scene.states, (epoch, seq) = scene.states + 1, scene.actuator.source
+            state = State(scene.epoch, scene.states, scene.now_ns, np.zeros(5), u=u.copy(), command_epoch=epoch, command_seq=seq)
+            scene.guard.receive_state(state, scene.local_ns)
+        if not scene.guard.at_rest:
+            coming.append((scene.now_ns, scene.guard.tick(scene.local_ns)))
+        while coming and scene.now_ns - (coming[0][0] if always else stopped_ns) >= late_ms * MS:
+            scene.publish(coming.pop(0)[1])
+    return scene.published[-1]
+
+
+@pytest.mark.parametrize(("late_ms", "always", "refused"), [(80, False, 0), (110, True, 1)])
+def test_stopped_guard_goes_on_until_it_has_told_rest_to_a_robot_that_was_late_to_hear_of_the_ramp(
+    scene: Scene, late_ms: int, always: bool, refused: int
+) -> None:
+    """Where the command to brake is over when it comes, the next one begins where the robot still was; then it reports that it is far ahead."""
+    last = end_late(scene, late_ms, always=always)
     assert last.mode is Mode.BRAKING
     assert not last.u[-1].any()
+    assert scene.refused == refused
+    scene.refused = 0
+
+
+@pytest.mark.parametrize("states_ms", [10, 50])
+@pytest.mark.parametrize("late_ms", [20, 50, 70, 90])
+@pytest.mark.parametrize("always", [False, True], ids=["the first one late", "all late"])
+def test_inputs_of_a_robot_that_was_late_to_hear_of_the_ramp_do_not_rise_on_it(scene: Scene, late_ms: int, states_ms: int, always: bool) -> None:
+    """It reports inputs that still drive while the command to brake is on its way; the guard's next one is not to begin from there."""
+    end_late(scene, late_ms, always=always, states_ms=states_ms)
+    inputs = np.array(scene.inputs)
+    assert (inputs[0] == FULL).all()
+    assert (np.diff(inputs, axis=0) <= 1e-12).all(), "rounding"
+
+
+@pytest.mark.parametrize(("after_ms", "names", "u"), [(20, "brake", 0.3), (20, "ramp", 0.3), (110, "driven", 0.5)])
+def test_robot_that_has_heard_of_the_ramp_or_never_will_is_where_it_says(scene: Scene, after_ms: int, names: str, u: float) -> None:
+    """It names the command to brake or its own ramp, or still the command before when that to brake is over."""
+    scene.drive(1000)
+    scene.wait(30)
+    driven = scene.published[-1].seq
+    scene.guard.stop(scene.local_ns)
+    scene.heard = False
+    scene.wait(after_ms)
+    seq = {"brake": driven + 1, "ramp": 0, "driven": driven}[names]
+    acting: Any = {"u": np.array([u, 0.0]), "command_epoch": scene.published[-1].epoch, "command_seq": seq}
+    state = State(scene.epoch, scene.states + 1, scene.now_ns, np.zeros(5), **acting)
+    scene.guard.receive_state(state, scene.local_ns)
+    told = len(scene.published)
+    while len(scene.published) == told:
+        scene.step()
+    begins = scene.published[-1]
+    on_the_ramp = u - LIMITS.slew[0] * 1e-9 * (begins.stamp_ns - state.stamp_ns)
+    assert begins.u[0, 0] == pytest.approx(on_the_ramp, abs=1.01 * 0.1 * STEP[0]), "a step of the ramp"
 
 
 REASON = "asked for by ada@lab"
