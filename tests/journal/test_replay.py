@@ -35,9 +35,10 @@ class Kind:
     delay_s: float | None = 0.0
     observed: bool = False
     second_opinion: int = 1
+    bounds: dict[str, Any] = field(default_factory=dict)
 
     def build(self) -> tuple[Controller, Rti]:
-        problem, observer = pioneer(N=6, N_u=4), None
+        problem, observer = pioneer(N=6, N_u=4, **self.bounds), None
         if self.observed:
             settings = ObserverSettings({"u_c": Disturbance(0.1, 0.3)}, ())
             observer = Observer(problem.model, settings, compile=False)
@@ -52,6 +53,7 @@ KINDS = {
     "osqp": Kind({"solver": "osqp"}, second_opinion=0),
     "sequential": Kind({"solver": "osqp", "formulation": "sequential"}, second_opinion=0),
     "daqp": Kind({"solver": "daqp"}),
+    "hard": Kind({"formulation": "sequential"}, bounds={"lbx": [-np.inf] * 5, "ubx": [np.inf] * 5}),
     "delay": Kind(delay_s=None),
     "observer": Kind(observed=True),
 }

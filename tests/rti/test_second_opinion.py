@@ -14,7 +14,7 @@ from rti_mpc.rti.qp.osqp import Solver, SolverSettings
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.second_opinion import SecondOpinion
 from rti_mpc_service.bench.families import FAMILIES, Family, discs_passed, paper, quadrotor
-from tests.problems import arc, fenced, pioneer, solve
+from tests.problems import arc, double_integrator, fenced, pioneer, solve
 
 AGREEMENT = 1e-3  # of half an input's range
 
@@ -101,6 +101,21 @@ def test_an_opinion_is_about_the_sample_it_was_kept_of_whatever_comes_next(make:
     assert finish(opinion).status is QpStatus.SOLVED
     assert opinion.difference == pytest.approx(at_once, abs=1e-7), "it starts elsewhere"
     assert opinion.difference < 1e-6
+
+
+def test_opinions_without_softened_bounds_say_nothing_on_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
+    """OSQP tells there of each solution on which no bound acts, also if it is not verbose: in the way of JSON, and of a controller whose pipe is full."""
+    rti = Rti(double_integrator(lbu=-1.0, ubu=1.0), formulation="sequential", compile=False)
+    opinion, acting = SecondOpinion(rti), []
+    for r in (5.0, 5.0, 0.05, 0.05, 5.0):
+        rti.prepare(np.zeros((rti.ocp.N, 2)))
+        rti.feedback(np.array([r, 0.0]))
+        acting.append(bool((np.abs(rti.u) == 1.0).any()))
+        assert form(opinion).status is QpStatus.SOLVED
+        assert opinion.difference < 1e-5
+        assert opinion.iterations < 200, "110: it still polishes"
+    assert acting == [True, True, False, False, True]
+    assert capsys.readouterr().out == ""
 
 
 def test_plans_are_the_same_bit_for_bit_with_second_opinions_and_without() -> None:

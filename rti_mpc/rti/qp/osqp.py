@@ -37,7 +37,7 @@ STATUS_BY_OSQP_CODE = {
     7: QpStatus.MAX_ITER,
     8: QpStatus.TIME_LIMIT,
 }
-INTERRUPTED = 10
+SOLVED, INTERRUPTED = 1, 10
 # During a solve OSQP's own handler takes Ctrl-C. It ends with the status above only before an iteration, so that one that
 # comes later, in the last iteration or while polishing, is in no status. This tells of both until the next solve.
 interrupted = ctypes.PyDLL(osqp.ext_builtin.__file__).osqp_is_interrupted
@@ -45,6 +45,7 @@ interrupted = ctypes.PyDLL(osqp.ext_builtin.__file__).osqp_is_interrupted
 MAX_ENTRY = 1e7  # of a scaled matrix: beyond it the factorization is rounding alone, and OSQP prints a line on standard output
 ACTING_MULTIPLIER = 1e-6  # a softened bound with a larger multiplier acts; those of the others are exactly zero
 ADAPTATION_ITERATIONS = 100  # after so many the step size is the next one, and rows are weighed anew; twice as many in each further round
+ACTING_RESIDUALS = 10.0  # steps of a multiplier by the primal residual: one that is larger does not vanish in a single iteration
 STEP_SIZES = 1.0, 0.1, 10.0  # in turn, relative to that of the settings: where OSQP is slow with one, it mostly converges with another
 
 
@@ -110,6 +111,9 @@ class Solver:
         self._held: tuple[Array, Array] | None = None  # iterate of the last `rewarm` until the next solve, as `solution`
         self._scaled = scaled = Scaled(qp)
         self._zero = (np.zeros_like(qp.q), np.zeros_like(qp.l))
+        # Where no row acts, OSQP says on standard output that it does not polish, also if it is not verbose. An equation acts always, and so does a
+        # slack, at zero or by its softened row. Without either polishing is off until a row acts, see `_polish`.
+        self._polishes_later = settings.polish > 0 and not len(qp.watched) and not qp.sides()[0].any()
         public = osqp.OSQP(algebra="builtin")
         public.setup(
             scaled.P.copy(),  # OSQP keeps its arguments, and writes into them
@@ -127,10 +131,11 @@ class Solver:
             scaling=settings.scaling,
             alpha=settings.alpha,
             warm_starting=True,
-            polishing=settings.polish > 0,
+            polishing=settings.polish > 0 and not self._polishes_later,
             polish_refine_iter=settings.polish,
         )
         self.workspace = public._solver
+        self._osqp_settings = public.settings
         self._info = self.workspace.info
         self._solution = self.workspace.solution
         refused = self.workspace.update_data_mat(P_x=scaled.P.data, P_i=None, A_x=scaled.A.data, A_i=None)
@@ -283,19 +288,40 @@ class Solver:
                 return QpStatus.FAILED
         self._held = None
         self._solve()
-        while self._info.status_val == INTERRUPTED:
-            self._solve()
+        if self._polishes_later and self._info.status_val == SOLVED and self._acts():
+            self._polish()
         status = STATUS_BY_OSQP_CODE.get(self._info.status_val, QpStatus.FAILED)
         if not status.usable:
             self.cold = True  # no solve starts from a failed one
         return status
 
     def _solve(self) -> None:
-        """Let OSQP iterate, and hand a Ctrl-C on that came meanwhile."""
-        self.workspace.solve()
-        self.iterations += int(self._info.iter)
-        if interrupted():
-            signal.raise_signal(signal.SIGINT)  # for the handler of the process, without which nobody would be told
+        """Let OSQP iterate, on after a Ctrl-C as well, which is handed on."""
+        status = INTERRUPTED
+        while status == INTERRUPTED:
+            self.workspace.solve()
+            self.iterations += int(self._info.iter)
+            status = self._info.status_val
+            if interrupted():
+                signal.raise_signal(signal.SIGINT)  # for the handler of the process, without which nobody would be told
+
+    def _acts(self) -> bool:
+        """Whether a row acts at the last iterate, and still will after one more iteration."""
+        return float(np.abs(self._solution.y).max()) > ACTING_RESIDUALS * self._step_size * self.res_prim
+
+    def _polish(self) -> None:
+        """Iterate once more, and polish: OSQP does so only after an iteration."""
+        self._take_settings(polishing=1, max_iter=1, check_termination=1)
+        try:
+            self._solve()
+        finally:
+            self._take_settings(polishing=0, max_iter=self._piece, check_termination=self._settings.check_termination)
+
+    def _take_settings(self, **changed: int) -> None:
+        """Change settings of OSQP."""
+        for name, value in changed.items():
+            setattr(self._osqp_settings, name, value)
+        self.workspace.update_settings(self._osqp_settings)
 
     def _adapt(self) -> bool:
         """Take the next step size, weigh the rows by the last iterate, and return whether there still is a QP to be solved."""
@@ -307,7 +333,12 @@ class Solver:
 
     def _take_step_size(self) -> None:
         """Take the step size whose turn it is."""
-        self.workspace.update_rho(self._settings.rho * STEP_SIZES[self._changes % len(STEP_SIZES)])
+        self.workspace.update_rho(self._step_size)
+
+    @property
+    def _step_size(self) -> float:
+        """Step size whose turn it is."""
+        return self._settings.rho * STEP_SIZES[self._changes % len(STEP_SIZES)]
 
     def plan(self) -> None:
         """Make the plan from the last iterate."""
