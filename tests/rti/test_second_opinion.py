@@ -104,7 +104,7 @@ def test_an_opinion_is_about_the_sample_it_was_kept_of_whatever_comes_next(make:
 
 
 def test_opinions_without_softened_bounds_say_nothing_on_standard_output(capsys: pytest.CaptureFixture[str]) -> None:
-    """OSQP tells there of each solution on which no bound acts, also if it is not verbose: in the way of JSON, and of a controller whose pipe is full."""
+    """OSQP tells there of each solution on which no bound acts, also if it is not verbose: before any JSON, and into a pipe that may be full."""
     rti = Rti(double_integrator(lbu=-1.0, ubu=1.0), formulation="sequential", compile=False)
     opinion, acting = SecondOpinion(rti), []
     for r in (5.0, 5.0, 0.05, 0.05, 5.0):

@@ -355,14 +355,19 @@ def suffer(system: System, fault: Fault, limits: Limits, report: MatrixReport, h
         raise Failed("stopped")
     log, incident = system.log(), Incident(fault_ns, mend_ns, end_ns)
     position = system.motion.position(log.x)
-    error = system.motion.distance(position, system.motion.wanted(reference, log.stamp_ns))
+    wanted = system.motion.wanted(reference, log.stamp_ns)
+    error = system.motion.distance(position, wanted)
+    moves = system.motion.distance(wanted[1:], wanted[:-1])
     measured, missed = measure(log, position, error, incident, limits), missed_ns(log, incident, limits.dt_s)
     promise = fault.promise if near else fault.promise.eased(error_before(log, error, incident))
 
     def held_up_ms(from_ns: int, to_ns: int) -> float:
         return host.held_up_ms(system.observer.arrival_ns(from_ns), system.observer.arrival_ns(to_ns))
 
-    excused = excuses(measured, missed, incident, system.period_ns, held_up_ms)
+    def moved_m(from_ns: int, to_ns: int) -> float:
+        return float(np.nansum(moves[(log.stamp_ns[1:] > from_ns) & (log.stamp_ns[1:] <= to_ns)]))
+
+    excused = excuses(measured, missed, incident, system.period_ns, held_up_ms=held_up_ms, moved_m=moved_m)
     return MatrixRow(fault, measured, promise.broken(measured, excused), explained(promise, measured, excused), system.motion.unit)
 
 

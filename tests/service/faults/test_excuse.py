@@ -26,7 +26,8 @@ def held_up(*stalls: tuple[float, float]) -> object:
 
 
 def excused(measured: Measured, *stalls: tuple[float, float]) -> dict[str, float]:
-    return excuses(measured, MISSED, INCIDENT, PERIOD_NS, held_up(*stalls))  # type: ignore[arg-type]
+    speed = 0.2  # m/s, of the reference
+    return excuses(measured, MISSED, INCIDENT, PERIOD_NS, held_up_ms=held_up(*stalls), moved_m=lambda from_ns, to_ns: speed * (to_ns - from_ns) / S)  # type: ignore[arg-type]
 
 
 def test_sample_that_was_missed_while_the_host_held_processes_up_is_shown_and_excused() -> None:
@@ -34,6 +35,17 @@ def test_sample_that_was_missed_while_the_host_held_processes_up_is_shown_and_ex
     assert KEEPS_ON.broken(DRIVING) == ["missed must be at most 0, got 2"]
     assert KEEPS_ON.broken(DRIVING, found) == []
     assert explained(KEEPS_ON, DRIVING, found) == ["missed must be at most 0, got 2, of which the host explains 2"]
+
+
+def test_error_is_excused_by_as_much_as_the_reference_moves_in_the_samples_that_the_host_took() -> None:
+    """A whole one may leave the robot where it was: 20 mm each, at 0.2 m/s."""
+    off = replace(DRIVING, error_m=0.025)
+    both, one = excused(off, (1.95, 60.0), (3.05, 30.0)), excused(off, (1.95, 60.0))
+    assert KEEPS_ON.broken(off, both) == []
+    assert explained(KEEPS_ON, off, both)[1] == "error_m must be at most 0.01, got 0.025, of which the host explains 0.04"
+    assert KEEPS_ON.broken(replace(off, missed=1), one) == []
+    assert KEEPS_ON.broken(replace(off, missed=1, error_m=0.031), one) == ["error_m must be at most 0.01, got 0.031"]
+    assert KEEPS_ON.broken(replace(off, missed=0), excused(off)) == ["error_m must be at most 0.01, got 0.025"], "nothing held it up"
 
 
 @pytest.mark.parametrize("stalls", [[], [(1.95, 60.0)], [(1.95, 60.0), (3.5, 500.0)], [(1.95, 60.0), (3.0, 20.0)]])
