@@ -92,12 +92,12 @@ def journals(path: Path, robot: str | None = None, owner: int | None = None) -> 
     except OSError as error:
         raise ConfigError(f"{path} must be a recording that can be read: {error.strerror}") from error
     found: dict[tuple[str, int], list[Journal]] = {}
-    for recorded in recording.messages(robot, ("journal",)):
+    for recorded in recording.messages(None, ("journal",)):
         message = recorded.message
         found.setdefault((recorded.robot, message.epoch % (1 << NUMBER_BITS)), []).append(message)
-    chosen = {key: messages for key, messages in found.items() if owner in (None, key[1])}
+    chosen = {key: messages for key, messages in found.items() if robot in (None, key[0]) and owner in (None, key[1])}
     if not chosen:
-        known = ", ".join(f"{name} {number}" for name, number in found) or "none"
+        known = ", ".join(f"--robot {name} --controller {number}" for name, number in found) or "none"
         raise ConfigError(f"{path} must hold the journal of {robot or 'a robot'}{'' if owner is None else f', controller {owner}'}, got {known}")
     heard = heard_commands(recording, robot)
     return [

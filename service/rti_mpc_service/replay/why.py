@@ -13,13 +13,13 @@ import json
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.contract.message import Command, JournalKind, Telemetry
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.opinions import DISAGREEMENT
@@ -29,8 +29,9 @@ from rti_mpc.journal.replay import Difference, Replay
 from rti_mpc.recording.reader import Recording
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS
 from rti_mpc_service.case import QpCase, about_sample, solver_of, take
+from rti_mpc_service.replay.place import Place, choose
 from rti_mpc_service.replay.plan import acting_bounds, cost_terms
-from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, entries, journals, rebuild, repeat
+from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, journals, rebuild, repeat
 from rti_mpc_service.replay.trouble import placed
 from rti_mpc_service.replay.without import without
 
@@ -47,20 +48,6 @@ RUNGS = {
     Mode.BRAKING: "rung 3 of the ladder: a way to rest, from past commands",
     Mode.STOPPED: "a way to rest, as long as the stop is latched",
 }
-
-
-@dataclass(frozen=True)
-class Place:
-    """
-    Place of a command in a journal.
-
-    Attributes:
-        entry: Number of the entry with which it was committed.
-        command: The command.
-    """
-
-    entry: int
-    command: Command
 
 
 def main(
@@ -82,7 +69,7 @@ def main(
         path: The recording.
         at_s: Robot time after the first command, from which on the first command is explained.
         seq: Number of the command instead.
-        robot: Name of a robot; None: the first one.
+        robot: Name of a robot; None: the one of a recording of one.
         owner: Number of a controller; None: the one that led then.
         folder: Where a model of the user's own is looked for.
         trust: Whether to run the attached source of a model.
@@ -93,46 +80,22 @@ def main(
         Exit status 0.
 
     Raises:
-        ConfigError: There is no such command, or it cannot be repeated here.
+        ConfigError: There is no such command, there are several, or it cannot be repeated here.
     """
     if at_s is not None and seq is not None:
         raise ConfigError("why must be asked with --at TIME or with --seq NUMBER, not with both")
-    for journal in journals(path, robot, owner):
-        place = find(journal, at_s, seq)
-        if place is not None:
-            facts, case = explained(journal, rebuild(journal, folder=folder, trust=trust), place)
-            if case_path is not None:
-                if case is None:
-                    raise ConfigError(f"--case needs a command whose sample had a QP, got command {place.command.seq}: {facts['rung']}")
-                case.save(case_path)
-            facts["times"], arrived_ns = phase_times(path, journal, place.command)
-            facts["host"] = host_meanwhile(path, journal, arrived_ns)
-            print(json.dumps(facts, indent=1) if as_json else "\n".join(lines(facts)))
-            return 0
-    what = "two commands" if at_s is None else f"a command {at_s:g} s after its first one"
-    what = what if seq is None else f"a command {seq}"
-    raise ConfigError(f"{path} must hold {what}, in the journal of a controller that led then")
-
-
-def find(journal: Journaled, at_s: float | None, seq: int | None) -> Place | None:
-    """Return the place of a command that acted, the last but one without a time and a number; None if there is none."""
-    places = list(acted(journal))
-    if at_s is None and seq is None:
-        return places[-2] if len(places) > 1 else None
-    for place in places:
-        after_s = 1e-9 * (place.command.stamp_ns - places[0].command.stamp_ns)
-        if place.command.seq == seq or (at_s is not None and after_s >= at_s):
-            return place
-    return None
-
-
-def acted(journal: Journaled) -> Iterator[Place]:
-    """Yield the places of the commands that were committed while the controller led."""
-    standing_by = False
-    for entry in entries(journal):
-        standing_by = entry.name == "stand_by" or (standing_by and entry.name != "lead")
-        if entry.name == "commit" and not standing_by:
-            yield Place(entry.seq, entry.args[0])
+    found = journals(path, robot, owner)
+    journal, place = choose(path, found, at_s, seq)
+    facts, case = explained(journal, rebuild(journal, folder=folder, trust=trust), place)
+    if case_path is not None:
+        if case is None:
+            raise ConfigError(f"--case needs a command whose sample had a QP, got command {place.command.seq}: {facts['rung']}")
+        case.save(case_path)
+    facts["times"], arrived_ns = phase_times(path, journal, place.command)
+    facts["host"] = host_meanwhile(path, journal, arrived_ns)
+    facts["other_controllers"] = [other.owner for other in found if other is not journal]
+    print(json.dumps(facts, indent=1) if as_json else "\n".join(lines(facts)))
+    return 0
 
 
 def explain(journal: Journaled, built: Rebuilt, place: Place) -> dict[str, Any]:
@@ -215,6 +178,7 @@ def facts_of(built: Rebuilt, on: Replay, place: Place, entry: JournalEntry, diff
     terms = cost_terms(rti, built.config) if planned else {}
     return {
         "robot": built.config.robot,
+        "controller": command.epoch % (1 << NUMBER_BITS),
         "seq": command.seq,
         "epoch": command.epoch,
         "stamp_ns": command.stamp_ns,
@@ -302,7 +266,8 @@ def host_meanwhile(path: Path, journal: Journaled, arrived_ns: int | None) -> di
         with suppress(MessageError, LookupError, TypeError, ValueError):  # what another program may have written
             from_ns, waited_s = int(recorded.message["from_ns"]), float(recorded.message["waited_s"])
             if from_ns < arrived_ns <= recorded.local_ns:
-                return {"waited_s": waited_s, "of_s": 1e-9 * (recorded.local_ns - from_ns)}
+                of_s = 1e-9 * (recorded.local_ns - from_ns)
+                return {"waited_s": min(waited_s, of_s), "of_s": of_s}  # the host counts a little after the time is read
     return None
 
 
@@ -310,6 +275,8 @@ def lines(facts: Mapping[str, Any]) -> Iterator[str]:
     """Yield the facts in words."""
     inputs = ", ".join(f"{name} = {of['value']:.4g} {of['unit']}" for name, of in facts["inputs"].items())
     yield f"command {facts['seq']} of {facts['robot']}, at {1e-9 * facts['stamp_ns']:.3f} s: {facts['mode']}, {inputs}"
+    if others := facts.get("other_controllers"):
+        yield f"it is of controller {facts['controller']}; --controller names others: {', '.join(map(str, others))}"
     if facts["replayed"] != "0 bits differ":
         yield f"the replay differs from it: {facts['replayed']}"
     yield f"it is {facts['rung']}"

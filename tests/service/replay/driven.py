@@ -103,14 +103,21 @@ def failing(failure: str, samples: int) -> Act:
     return act
 
 
-def recorded(journal: Journaled, path: Path, states: Sequence[State] = (), also: Callable[[RecordingWriter], None] = lambda _: None) -> Path:
-    """Write a journal as a recorder does, with the attached files, states that arrive at their stamps, and what `also` adds; return the file."""
+def recorded(
+    journal: Journaled,
+    path: Path,
+    states: Sequence[State] = (),
+    also: Callable[[RecordingWriter], None] = lambda _: None,
+    others: Sequence[Journaled] = (),
+) -> Path:
+    """Write journals as a recorder does, with the attached files, states that arrive at their stamps, and what `also` adds; return the file."""
     keys = Keys("rti_mpc", journal.robot)
     writer = RecordingWriter(path, 0, 0, "0")
-    for name, text in journal.files.items():
-        writer.attach(f"{journal.robot}/{journal.owner}/{name}", "text/plain", text.encode(), 0)
-    for message in journal.messages:
-        writer.add(journal.robot, keys.journal, message.local_ns, encode(message), message.seq)
+    for one in (journal, *others):
+        for name, text in one.files.items():
+            writer.attach(f"{one.robot}/{one.owner}/{name}", "text/plain", text.encode(), 0)
+        for message in one.messages:
+            writer.add(one.robot, keys.journal, message.local_ns, encode(message), message.seq)
     for state in states:
         writer.add(journal.robot, keys.state, state.stamp_ns, encode(state), state.seq)
     also(writer)

@@ -19,10 +19,11 @@ from rti_mpc_service.case import QpCase, qp_at
 from rti_mpc_service.config.build import build_rti
 from rti_mpc_service.config.config import load
 from rti_mpc_service.replay.answer import answer, of_other, rebuilt
+from rti_mpc_service.replay.place import find
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
 from rti_mpc_service.replay.solve import main
 from rti_mpc_service.replay.trouble import cases_of_one, kept, troubles
-from rti_mpc_service.replay.why import explained, find
+from rti_mpc_service.replay.why import explained
 from rti_mpc_service.replay.why import main as why
 from rti_mpc_service.replay.without import moved, without
 from rti_mpc_service.shipped import SHIPPED

@@ -11,20 +11,26 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rti_mpc.contract.message import JournalKind
+from rti_mpc.contract.message import JournalKind, State
 from rti_mpc.control.controller import Controller
 from rti_mpc.errors import ConfigError
 from rti_mpc.recording import Recording
+from rti_mpc.reference.speed_profile import SpeedLimits
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.commands.robot import lockstep_robot
+from rti_mpc_service.config.build import build_model
+from rti_mpc_service.config.config import load
+from rti_mpc_service.path_reference import PathReferences, find_path
 from rti_mpc_service.replay.beside import write_both
 from rti_mpc_service.replay.closed_loop import free_name, numbers_of, run_of
 from rti_mpc_service.replay.drive import Drive, Passage, drive
+from rti_mpc_service.replay.place import find
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
 from rti_mpc_service.replay.replay import main, overridden, snapshot_before
-from rti_mpc_service.replay.why import explain, find
+from rti_mpc_service.replay.why import explain
 from rti_mpc_service.shipped import SHIPPED
 from tests.loop import MS
+from tests.processes.test_path import robot_in
 from tests.service.replay.driven import journal_of, recorded, straight
 
 
@@ -112,6 +118,39 @@ def test_robot_in_discrete_time_is_driven_as_it_was_and_explained(tmp_path: Path
     assert facts["replayed"] == "0 bits differ"
     assert sum(facts["cost_terms"].values()) == pytest.approx(facts["cost"], rel=1e-6), "all terms are there"
     assert facts["bounds"]
+
+
+@pytest.mark.slow  # compiles a problem of its own
+def test_robot_that_follows_a_path_is_driven_as_it_was_and_explained(tmp_path: Path) -> None:
+    """Each reference holds the path around the robot, as its source sends it ten times a second."""
+    path = robot_in(tmp_path)
+    references = PathReferences(build_model(load(path)), find_path(str(tmp_path / "track.csv"), 0.25, SpeedLimits(0.4, 0.3, 0.3, 0.3)), 1)
+    start = np.zeros(7)
+    references.begin(start)
+    follows = references.answer(0, start)
+    assert follows is not None
+    seen: list[State] = []
+
+    def see(k: int, state: State) -> State:
+        seen.append(state)
+        return state
+
+    def send(controller: Controller, rti: Rti) -> None:
+        if seen and (reference := references.answer(seen[-1].stamp_ns, seen[-1].x)) is not None:
+            controller.receive_reference(reference)
+
+    journal = journal_of(path, samples=60, acts=dict.fromkeys(range(60), send), sees=see, follows=follows)
+    was, driven = passages(journal, tmp_path)
+    assert was.states[-1].x[5] > 1.2, "m of progress"
+    assert len(was.references) > 50
+    assert states(driven) == states(was), "no bit differs"
+    for seq in (1, 40):
+        place = find(journal, None, seq)
+        assert place is not None
+        facts = explain(journal, rebuild(journal, folder=tmp_path), place)
+        assert facts["replayed"] == "0 bits differ"
+        assert sum(facts["cost_terms"].values()) == pytest.approx(facts["cost"], rel=1e-6), "contour and lag of the path that it was sent"
+    assert {"error of contour", "error of lag", "error of pace_error"} <= set(facts["cost_terms"])
 
 
 @pytest.mark.slow

@@ -20,9 +20,10 @@ from rti_mpc_service.config.config import load
 from rti_mpc_service.init import main as init
 from rti_mpc_service.replay import replay
 from rti_mpc_service.replay.drive import Drive, drive
+from rti_mpc_service.replay.place import find
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
 from rti_mpc_service.replay.replay import lines, overridden, play
-from rti_mpc_service.replay.why import explain, find
+from rti_mpc_service.replay.why import explain
 from rti_mpc_service.shipped import SHIPPED
 from tests.service.replay.driven import journal_of
 

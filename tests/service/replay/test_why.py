@@ -19,8 +19,9 @@ from rti_mpc.recording.writer import RecordingWriter
 from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.config.config import load
+from rti_mpc_service.replay.place import Place, acted, find
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
-from rti_mpc_service.replay.why import Place, acted, explain, find, lines, main
+from rti_mpc_service.replay.why import explain, lines, main
 from rti_mpc_service.shipped import SHIPPED
 from tests.recording.samples import telemetry
 from tests.service.replay.driven import failing, journal_of, recorded, straight

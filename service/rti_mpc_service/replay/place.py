@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Place of a command in the journals of a recording: found by its time, by its number, or as the last one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rti_mpc.contract.message import Command
+from rti_mpc.errors import ConfigError
+from rti_mpc_service.replay.rebuild import Journaled, entries
+
+
+@dataclass(frozen=True)
+class Place:
+    """
+    Place of a command in a journal.
+
+    Attributes:
+        entry: Number of the entry with which it was committed.
+        command: The command.
+    """
+
+    entry: int
+    command: Command
+
+
+def choose(path: Path, journals: Sequence[Journaled], at_s: float | None, seq: int | None) -> tuple[Journaled, Place]:
+    """
+    Return the command that is asked for, and the journal of the controller that led then.
+
+    Args:
+        path: The recording.
+        journals: Controllers of the recording that are asked about.
+        at_s: Robot time after the first command of any of them; the first command from then on is meant.
+        seq: Number of the command instead; None without a time: the last one whose sample is followed by another.
+
+    Raises:
+        ConfigError: There is no such command, or there are several: of several robots, or of the same number by several controllers.
+    """
+    robots = sorted({journal.robot for journal in journals})
+    if len(robots) > 1:
+        raise ConfigError(f"--robot must name the robot whose command is explained, one of {', '.join(robots)}")
+    firsts = [place.command.stamp_ns for journal in journals for place in (next(acted(journal), None),) if place is not None]
+    begin_ns = min(firsts, default=0)
+    found = [(journal, place) for journal in journals if (place := find(journal, at_s, seq, begin_ns)) is not None]
+    if not found:
+        what = "two commands" if at_s is None else f"a command {at_s:g} s after its first one"
+        what = what if seq is None else f"a command {seq}"
+        raise ConfigError(f"{path} must hold {what}, in the journal of a controller that led then")
+    if seq is not None and len(found) > 1:
+        each = ", ".join(f"{journal.owner} at {1e-9 * place.command.stamp_ns:.1f} s" for journal, place in found)
+        raise ConfigError(f"--controller must say whose command {seq} is explained: {each}")
+    return (max if at_s is None else min)(found, key=lambda one: one[1].command.stamp_ns)
+
+
+def find(journal: Journaled, at_s: float | None, seq: int | None, begin_ns: int | None = None) -> Place | None:
+    """
+    Return the place of a command that acted; None if there is none.
+
+    Args:
+        journal: The controller.
+        at_s: Robot time after `begin_ns`, from which on the first command is meant.
+        seq: Its number instead; None without a time: the last command but one.
+        begin_ns: Robot time from which `at_s` counts; None: the controller's first command.
+    """
+    places = list(acted(journal))
+    if at_s is None and seq is None:
+        return places[-2] if len(places) > 1 else None
+    for place in places:
+        after_s = 1e-9 * (place.command.stamp_ns - (places[0].command.stamp_ns if begin_ns is None else begin_ns))
+        if place.command.seq == seq or (at_s is not None and after_s >= at_s):
+            return place
+    return None
+
+
+def acted(journal: Journaled) -> Iterator[Place]:
+    """
+    Yield the places of the commands that were committed while the controller led.
+
+    A recording that begins later than the controller does not say whether it led: it did not if it heard a leader, or leads from some entry on.
+    """
+    standing_by = next((entry.name for entry in entries(journal) if entry.name in ("stand_by", "lead", "overhear")), "stand_by") != "stand_by"
+    for entry in entries(journal):
+        standing_by = entry.name == "stand_by" or (standing_by and entry.name != "lead")
+        if entry.name == "commit" and not standing_by:
+            yield Place(entry.seq, entry.args[0])
