@@ -133,12 +133,12 @@ def check_stop(config: Config) -> StopLaw | None:
     Raises:
         ConfigError: The robot does not come to rest from where it operates; the text says from where, and what still moves.
     """
-    from rti_mpc.rti.rest import find_stop_law
+    from rti_mpc.rti.kept_law import find_kept_stop_law
 
     if config.model.stop == "coasts":
         return None
     try:
-        return find_stop_law(build_ocp(config), disturbances_at_rest(config), config.delay_s or 0.0)
+        return find_kept_stop_law(build_ocp(config), disturbances_at_rest(config), config.delay_s or 0.0)
     except OcpError as error:
         raise ConfigError(unstopped(config, error)) from error
 
