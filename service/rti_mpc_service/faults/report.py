@@ -127,21 +127,28 @@ class MatrixReport(Redrawn):
 
     def say(self, fault: Fault, text: str) -> None:
         """Show what happens now."""
-        self._now = f"{fault.name}, {text}"
-        self._since_s = time.monotonic()
-        self._tell_at_s = self._since_s + PATIENCE_S
+        self._begin(fault.name, text)
         if self.live:
             head = Table.grid(padding=(0, 2))
             head.add_row(f"{len(self.rows)} of {self._count}", ProgressBar(total=self._count, completed=len(self.rows), width=32), fault.name, text)
             self.draw(Group(self._table(), head) if self.rows else head)
 
     def waiting(self, text: str) -> None:
-        """Print a line if what happens now has lasted for long; `text` says what it waits for."""
-        self._now = f"{self._now.partition(',')[0]}, {text}"
+        """Print a line if a wait has lasted for long; `text` says what is waited for, and after a colon what is missing."""
+        name, _, before = self._now.partition(", ")
+        if before.partition(":")[0] != text.partition(":")[0]:
+            self._begin(name, text)
+        self._now = f"{name}, {text}"
         if (now_s := time.monotonic()) >= self._tell_at_s:
             lasted_s = now_s - self._since_s
             self._tell_at_s = now_s + lasted_s
             self.console.print(f"{self._now}, for {lasted_s:.0f} s", soft_wrap=True)
+
+    def _begin(self, name: str, text: str) -> None:
+        """Note what happens from now on."""
+        self._now = f"{name}, {text}"
+        self._since_s = time.monotonic()
+        self._tell_at_s = self._since_s + PATIENCE_S
 
     def add(self, row: MatrixRow) -> None:
         """Add a row; without a terminal, as a line."""

@@ -69,7 +69,9 @@ def test_wait_that_lasts_is_told_in_a_line_and_a_run_that_ends_in_it_says_so(mon
     with MatrixReport(console, 2) as report:
         report.add(row("controller_killed", STOPPED))
         report.say(BY_NAME["controller_hung"], "starting peers")
-        for t[0] in range(60):
+        for t[0] in range(9):
+            report.waiting("waiting for controller and robot to be there: no controller yet")
+        for t[0] in range(10, 70):
             report.waiting("waiting for the robot to be driven: the controller is braking")
     report.conclude()
     said = "controller_hung, waiting for the robot to be driven: the controller is braking"
