@@ -140,9 +140,9 @@ class Listener:
                 if isinstance(message, State):
                     yield self._entry(self._timeline.place_state(message.epoch, message.stamp_ns, now_ns), message)
                 elif received.key == self._actuation:
-                    yield self._entry(self._timeline.place(message.stamp_ns), Actuation(message))
+                    yield self._entry(self._timeline.place(message.stamp_ns, now_ns), Actuation(message))
                 elif message.stamp_ns != STAMP_ON_ARRIVAL:  # such a reference follows with its real stamp
-                    yield self._entry(self._timeline.place(message.stamp_ns), message)
+                    yield self._entry(self._timeline.place(message.stamp_ns, now_ns), message)
 
     def _door(self, stream: Stream[Any], received: Received) -> Door | None:
         """Return the intake of a key; None for events of a role beyond the limit of roles."""

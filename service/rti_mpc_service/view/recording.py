@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, Event, Reference, Severity, State, Telemetry
+from rti_mpc.contract.status import Mode
 from rti_mpc.signals import plane
 from rti_mpc.wire.info import Info, Label, Obstacle
 from rti_mpc_service.view.blueprint import DRIVEN_COLORS, RUNG_COLORS, STRIPS, TIMELINE, Frame, below, blueprint, legend, lifted, looks
 from rti_mpc_service.view.path_window import KNOT_PARTS, MIN_KNOTS, path_window
 from rti_mpc_service.view.plan import FREE, acting_bounds, cost_terms, is_plan
 from rti_mpc_service.view.playback import Actuation, Playback, PlayedRow
-from rti_mpc_service.view.tracking_error import tracking_error
+from rti_mpc_service.view.tracking_error import tracked, tracking_error
 
 Message = Info | Reference | State | Command | Actuation | Telemetry | Event
 Columns = Iterable[rr.ComponentColumn]
@@ -85,12 +86,15 @@ class RerunRecording:
         self._lay_out = lay_out or (lambda info, frame: stream.send_blueprint(blueprint(info, frame)))
         self.info: Info | None = None
         self._reference: Reference | None = None
+        self._references_now: list[Reference] = []  # those of the present entries, after the one before
+        self._told_modes: list[tuple[int, Mode]] = []  # times and modes of the samples of the present entries, after the one before
         self._frame: Frame | None = None
         self._held: deque[Entry] = deque(maxlen=MAX_HELD_ENTRIES)
         self._last: State | None = None
         self._last_output: Array | None = None  # position of the outputs, shape ``(1, 2)``
         self._planned: Telemetry | None = None  # the last sample
         self._playback = Playback()
+        self._going: set[str] = set()  # lines that may be broken, and are not
         self._lanes: dict[str, tuple[str, int]] = {}  # value and time of the last change of each lane
         self._writers: dict[type, Callable[[Times, list[Any]], None]] = {
             Reference: self._references,
@@ -108,6 +112,9 @@ class RerunRecording:
             groups[type(entry.message)].append(entry)
         for entry in groups.pop(Info, ()):
             self._info(entry.message)
+        if self.info is not None:  # else they are held
+            self._told_modes = [*self._told_modes[-1:], *((entry.time_ns, entry.message.mode) for entry in groups[Telemetry])]
+            self._references_now = self._references_now[-1:]
         for cls, write in self._writers.items():
             if self.info is None and cls is not Event:
                 self._held.extend(groups[cls])
@@ -133,6 +140,7 @@ class RerunRecording:
         """Take names from a description, and write the entries that were held for them."""
         if self.info is not None and _vectors(info) != _vectors(self.info):
             self._reference, self._last, self._last_output, self._planned, self._playback = None, None, None, None, Playback()
+            self._references_now = []
         self.info = info
         for path, archetype in looks(info, self._root, self._driven).items():
             self._log(path, archetype)
@@ -156,15 +164,19 @@ class RerunRecording:
         strips = [lifted(line, STRIPS[path].z) for line in lines]
         self._columns(path, times, rr.LineStrips3D.columns(strips=strips))
 
-    def _scalars(self, path: str, times: Times, values: Array) -> None:
-        """Write values, shape ``(n,)``; infinities and NaN are left out."""
+    def _scalars(self, path: str, times: Times, values: Array, *, broken: bool = False) -> None:
+        """Write values, shape ``(n,)``; infinities and NaN are left out, or are where the line is broken."""
         said = np.isfinite(values)
-        if said.any():
-            self._columns(path, times[said], rr.Scalars.columns(scalars=values[said]))
+        ends = ~said & np.concatenate([[path in self._going], said[:-1]]) & broken
+        if (shown := said | ends).any():
+            self._columns(path, times[shown], rr.Scalars.columns(scalars=values[said]).partition(said[shown].astype(int)))
+        if broken:
+            (self._going.add if said[-1] else self._going.discard)(path)
 
     def _references(self, times: Times, references: list[Reference]) -> None:
         assert self.info is not None
         self._reference = references[-1]
+        self._references_now += references
         pair = plane(self.info.outputs)
         if pair is not None and self.info.planar:
             self._look_at(Frame.around(references[-1].y[:, pair]))
@@ -204,11 +216,11 @@ class RerunRecording:
         self._last = states[-1]
 
     def _errors(self, times: Times, stamps: NDArray[np.int64], y: dict[int, Array]) -> None:
-        """Write how far outputs, by their indices, are from the reference."""
+        """Write how far outputs, by their indices, are from the reference, as long as it is tracked."""
         assert self.info is not None
-        assert self._reference is not None
-        for name, values in tracking_error(self.info, self._reference, stamps, y).items():
-            self._scalars(f"error/{name}", times, values)
+        follows = tracked(times, self._told_modes, self.info.dt_s)
+        for name, values in tracking_error(self.info, self._references_now, stamps, y).items():
+            self._scalars(f"error/{name}", times, np.where(follows, values, np.nan), broken=True)
 
     def _motion(self, times: Times, states: list[State], x: Array) -> None:
         """Write pose and trail: one segment per state, none between two lives of the robot."""

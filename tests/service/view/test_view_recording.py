@@ -116,6 +116,26 @@ def test_error_is_the_distance_from_the_interpolated_reference_in_mm(writer: Wri
     ]
 
 
+def test_while_an_operator_has_stopped_the_robot_there_is_no_error_and_its_line_is_broken(writer: Writer) -> None:
+    modes = {4: Mode.STOPPED, 5: Mode.STOPPED, 6: Mode.STOPPED, 7: Mode.TRACKING, 8: Mode.TRACKING}
+    writer.send(PIONEER, reference([[float(k), 0.0, 0.0] for k in range(30)]))
+    for together in (range(1, 6), range(6, 9)):  # the last sample before the present messages counts, too
+        writer.send(*(state(k, [3.0, 0.0, 0.0, 0.0, 0.0]) for k in together), *(telemetry(k, modes.get(k, Mode.TRACKING)) for k in together))
+    rows = writer.read()
+    stopped = [(t, [pytest.approx(1e3 * abs(t - 3.0))]) for t in (1.0, 2.0, 3.0)]
+    again = [(t, [pytest.approx(1e3 * abs(t - 3.0))]) for t in (7.0, 8.0)]
+    assert rows["error/position"] == [*stopped, (4.0, []), *again], "the reference goes on, the robot is not to follow it"
+    assert len(rows["state/x"]) == 8
+
+
+def test_a_reference_that_is_sent_again_and_again_leaves_no_gap_in_the_error(writer: Writer) -> None:
+    writer.send(PIONEER, reference([[0.0, 0.0, 0.0]] * 2))
+    for first in (1, 6):  # as a file is written, many messages together
+        anew = [reference([[0.0, 0.0, 0.0]] * 2, stamp_ns=k * SECOND) for k in range(first, first + 5)]
+        writer.send(*anew, *(state(k, [0.001 * k, 0.0, 0.0, 0.0, 0.0]) for k in range(first, first + 5)))
+    assert [(t, pytest.approx(v)) for t, v in writer.read()["error/position"]] == [(float(k), [float(k)]) for k in range(1, 11)]
+
+
 def test_heading_error_does_not_jump_where_the_angle_wraps(writer: Writer) -> None:
     writer.send(PIONEER, reference([[0.0, 0.0, 3.1], [0.0, 0.0, -3.1]]))
     writer.send(state(0, [0, 0, -3.1, 0, 0]), state(1, [0, 0, 3.1, 0, 0]))

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import pytest
+
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL
-from rti_mpc_service.view.timeline import GAP_BETWEEN_LIVES_NS, MAX_AHEAD_NS, Timeline
+from rti_mpc_service.view.timeline import GAP_BETWEEN_LIVES_NS, MAX_AHEAD_NS, MAX_APART_NS, Timeline
 
 SECOND = 1_000_000_000
 
@@ -54,3 +56,25 @@ def test_several_robots_share_the_local_time_of_their_first_states() -> None:
     assert early.place_state(1, 7_250, 999) == 300, "from then on by the robot's own clock"
     assert early.place(7_260) == 310
     assert early.place_state(2, 0, 900) == 800, "a restarted robot is placed anew"
+
+
+@pytest.mark.parametrize("speed", [0.375, 3.0])
+def test_robots_that_share_a_view_end_at_the_present_however_fast_their_clocks_are(speed: float) -> None:
+    timeline = Timeline(begun_ns=0)
+    placed = [timeline.place_state(1, round(speed * local_ns), 7 * SECOND + local_ns) for local_ns in range(0, 60 * SECOND, SECOND // 20)]
+    assert placed[0] == 7 * SECOND
+    assert sorted(placed) == placed, "never back in time"
+    assert abs(placed[-1] - 67 * SECOND) <= MAX_APART_NS + SECOND // 20
+    assert timeline.place(round(speed * 60 * SECOND)) - placed[-1] <= MAX_AHEAD_NS
+    assert timeline.place(0) >= 7 * SECOND, "what belongs to its beginning is not before it"
+
+
+def test_a_clock_that_waits_or_jumps_does_not_leave_the_robots_beside_it() -> None:
+    timeline = Timeline(begun_ns=0)
+    timeline.place_state(1, 0, SECOND)
+    assert timeline.place_state(1, SECOND // 10, 61 * SECOND) == 61 * SECOND - MAX_APART_NS, "its clock has waited for a minute"
+    assert timeline.place_state(1, 3600 * SECOND, 61 * SECOND) == 61 * SECOND + MAX_APART_NS, "its clock has jumped by an hour"
+
+
+def test_what_comes_before_the_first_state_of_one_of_several_robots_is_placed_when_it_has_arrived() -> None:
+    assert Timeline(begun_ns=2 * SECOND).place(4800 * SECOND, 5 * SECOND) == 3 * SECOND, "its stamp is of a clock that nobody knows yet"
