@@ -28,6 +28,7 @@ from rti_mpc_service.config import toml
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.host import machine
 
+CHECKOUT = Path(rti_mpc.__file__).parents[1]  # if it is one
 PIECE_CHARS = 40_000  # of one answer: parsing JSON holds the interpreter's lock
 MAX_EXPRESSION_CHARS = 200_000  # of a model's equations as text
 PRIVATE = {"bus": True, "model": {"folder"}}
@@ -74,6 +75,7 @@ def origin_files(config: Config, model: Model) -> dict[str, str]:
         files["equations.txt"] = equations
     versions = {
         "rti_mpc": rti_mpc.__version__,
+        "commit": machine.commit(CHECKOUT),
         "messages": MESSAGE_VERSION,
         "config_hash": config.config_hash,
         "code_sha256": code_hash(),

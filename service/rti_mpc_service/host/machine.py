@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import os
 import platform
+import subprocess
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 CPUINFO = Path("/proc/cpuinfo")
 GOVERNOR = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+GIT_TIMEOUT_S = 2.0
 PACKAGES = ("casadi", "eclipse-zenoh", "numpy", "osqp")
 
 
@@ -40,3 +42,15 @@ def processor() -> str:
             if name.strip() == "model name":
                 return value.strip()
     return platform.processor() or platform.machine()
+
+
+def commit(folder: Path) -> str | None:
+    """Return the git commit of a checkout, with ``-dirty`` where files differ from it; None without one, or without git."""
+    if not (folder / ".git").exists():  # one further up is another project's, in which this one is installed
+        return None
+    command = ["git", "-C", str(folder), "--no-optional-locks", "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=GIT_TIMEOUT_S, stdin=subprocess.DEVNULL)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() or None

@@ -18,7 +18,7 @@ from rti_mpc.codegen import BUILDS, flags_of
 from rti_mpc.errors import ConfigError, RtiMpcError
 from rti_mpc.wire import document
 from rti_mpc_service.host import machine
-from rti_mpc_service.origin import code_hash
+from rti_mpc_service.origin import CHECKOUT, code_hash
 
 VERSIONS = "versions.json"  # name of the attached file
 MAX_VERSIONS_BYTES = 1 << 20
@@ -37,7 +37,17 @@ def other_code(files: Mapping[str, str]) -> str:
     code = recorded.get("code_sha256")
     if code in (None, here):
         return ""
-    return f"rti-mpc {recorded.get('rti_mpc')} of the code {str(code)[:HASH_CHARS]}, this is {rti_mpc.__version__} of the code {here[:HASH_CHARS]}"
+    return f"rti-mpc {_named(recorded)} of the code {str(code)[:HASH_CHARS]}, this is {_here()} of the code {here[:HASH_CHARS]}"
+
+
+def _named(recorded: Mapping[str, Any]) -> str:
+    """Return the version, with the commit where it was a checkout."""
+    version, commit = recorded.get("rti_mpc"), recorded.get("commit")
+    return f"{version} (commit {commit})" if commit else f"{version}"
+
+
+def _here() -> str:
+    return _named({"rti_mpc": rti_mpc.__version__, "commit": machine.commit(CHECKOUT)})
 
 
 @contextmanager
@@ -68,7 +78,7 @@ def changes(recorded: Mapping[str, Any]) -> Iterator[str]:
         yield "the recording does not say with what it was made"
         return
     if recorded.get("code_sha256") != code_hash():
-        yield f"recorded with other code of rti-mpc than that of this {rti_mpc.__version__}: {recorded.get('rti_mpc')}"
+        yield f"recorded with other code of rti-mpc than that of this {_here()}: {_named(recorded)}"
     compiler = shutil.which("cc") or "CasADi's virtual machine"
     if recorded.get("build") not in [[compiler, *flags_of(build)] for build in BUILDS]:  # which of them, the configuration says
         yield f"recorded with another build: {recorded.get('build')}"

@@ -53,11 +53,12 @@ def test_replay_from_a_time_begins_at_the_last_snapshot_before_it(journal: Journ
 def test_what_is_not_as_it_was_is_said_and_the_first_difference_told(journal: Journaled, tmp_path: Path) -> None:
     versions = json.loads(journal.files["versions.json"])
     versions["machine"]["packages"]["numpy"] = "1.0"
-    versions["code_sha256"] = "0"
+    versions |= {"code_sha256": "0", "commit": "1234567-dirty"}
     files = journal.files | {"versions.json": json.dumps(versions)}
     built = rebuild(replace(journal, files=files), folder=tmp_path)
     assert len(built.others) == 2
-    assert "other code of rti-mpc" in built.others[0]
+    assert built.others[0].startswith("recorded with other code of rti-mpc than that of this ")
+    assert built.others[0].endswith(f": {versions['rti_mpc']} (commit 1234567-dirty)"), "all of them may be of one version"
     assert "'numpy': '1.0'" in built.others[1]
     account = play(journal, built, assignments=["ocp.weights.R.u_c=5"])
     assert account.wanted
@@ -159,7 +160,7 @@ def test_what_another_version_made_and_does_not_fit_is_told_by_that_version(jour
     with pytest.raises(RtiMpcError, match=words) as refusal:
         play(misfit, rebuild(misfit, folder=tmp_path))
     assert "was made by" not in str(refusal.value), "the same code made it: something else is wrong with it"
-    other = with_versions(misfit, rti_mpc="0.0.9", code_sha256="abcdef0123456789")
+    other = with_versions(misfit, rti_mpc="0.0.9", commit="", code_sha256="abcdef0123456789")
     with pytest.raises(ConfigError, match=words) as refusal:
         play(other, rebuild(other, folder=tmp_path))
     assert str(refusal.value).startswith("the recording was made by rti-mpc 0.0.9 of the code abcdef012345, this is ")
