@@ -29,7 +29,7 @@ from rti_mpc_service.tune.choice import beats, choose, front
 from rti_mpc_service.tune.closed_loop import ClosedLoop, Course, Driven, MakeBody
 from rti_mpc_service.tune.edit import commented, edited
 from rti_mpc_service.tune.figure import figure
-from rti_mpc_service.tune.recorded import is_recording
+from rti_mpc_service.tune.recorded import as_recorded, is_recording
 from rti_mpc_service.tune.study import STUDIED, Tried, finished, name_of, open_study, run, tried
 from rti_mpc_service.tune.varied import Varied, find_varied, with_values
 from rti_mpc_service.tune.workers import workers
@@ -82,6 +82,10 @@ def main(
     model = build_model(config)
     varied = find_varied(config, model, vary)
     course, other = parted(course, held_out, planar=in_plane(model.outputs))
+    robot = ""
+    if course.name is not None and is_recording(course.name):
+        config, robot = as_recorded(config, course.name, course.part)
+        console.print(robot, soft_wrap=True)
     build_rti(config)  # shows that it compiles
     courses = {STUDIED: course, HELD_OUT: other}
     loops = {name: ClosedLoop(config, each, make_body) for name, each in courses.items()}
@@ -136,6 +140,7 @@ def main(
         return NOTHING_GAINED
     before = ", ".join(f"{each.key} = {each.today:g}" for each in varied)
     comment = [f"Tuned by `rti-mpc tune`, {len(finished(study))} trials; error is rms, effort the rms of increments.", *gains, f"Before: {before}"]
+    comment += [robot[0].upper() + robot[1:]] if robot else []
     write(out, path, chosen.values, comment, config)
     console.print(f"written: {out}", soft_wrap=True)
     return 0
