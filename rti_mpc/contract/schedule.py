@@ -160,7 +160,8 @@ class Schedule:
         """Drop every plan: the inputs ramp to rest from `u`, shape ``(nu,)``, beginning at a time."""
         self._plans.clear()
         u = np.array(u, dtype=np.float64)
-        self._plans.append(Plan(t_ns, t_ns, t_ns, 1, u[None], u[None], u))
+        rows = np.vstack([u])  # no view: snapshots take memory that others own for what compiled code is bound to
+        self._plans.append(Plan(t_ns, t_ns, t_ns, 1, rows, rows, u))
 
     def cut(self, t_ns: int, now_ns: int) -> None:
         """End the plan that acts at a time there, and drop later ones; the robot's clock has jumped since, and that time is now `now_ns`."""
