@@ -105,8 +105,10 @@ class Guard:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the last command leads to rest and the robot is believed to come there by its end, or the robot was never commanded."""
-        return not self._engaged or (self._told_rest and self._schedule.rests(self._told_ns - 1))
+        """Whether the last command leads to rest and the robot, which has heard of braking, is believed to rest by then; or was never commanded."""
+        if self._state is None or not self._engaged:
+            return True
+        return self._told_rest and not self._unheard(self._state) and self._schedule.rests(self._told_ns - 1)
 
     # Incoming messages.
 

@@ -534,26 +534,35 @@ def test_stopped_guard_ramps_to_rest_and_takes_no_command(scene: Scene) -> None:
     assert (-np.diff(inputs[-60:], axis=0) <= 0.2 * STEP + 1e-12).all()
 
 
-def end_late(scene: Scene, late_ms: int, *, always: bool, states_ms: int = 10) -> Command:
-    """Stop a guard of which the robot hears late, until some time after the stop or always, and which hears its inputs; return the last command."""
+def end_late(scene: Scene, late_ms: int, *, always: bool, states_ms: int = 10, lost: int = 0) -> Command:
+    """
+    Stop a guard and let its process end; return its last command.
+
+    The robot, which reports its inputs, hears of it late, until some time after the stop or always; the first commands are lost.
+    """
     scene.drive(1000)
     scene.wait(30)
     scene.guard.stop(scene.local_ns)
     scene.inputs.clear()
-    stopped_ns, coming = scene.now_ns, [(scene.now_ns, scene.guard.tick(scene.local_ns))]
-    while coming or not scene.guard.at_rest:
+    stopped_ns, coming, ended = scene.now_ns, [(scene.now_ns, scene.guard.tick(scene.local_ns))], False
+    while coming or not ended:
         for until_ns, u in scene.actuator.play(scene.now_ns, scene.now_ns + 10 * MS):
             scene.inputs.append(u.copy())
             scene.now_ns = until_ns
         scene.local_ns += 10 * MS
-        if scene.now_ns % (states_ms * MS) == 0:
+        if scene.now_ns % (states_ms * MS) == 0 and not ended:
             scene.states, (epoch, seq) = scene.states + 1, scene.actuator.source
             state = State(scene.epoch, scene.states, scene.now_ns, np.zeros(5), u=u.copy(), command_epoch=epoch, command_seq=seq)
             scene.guard.receive_state(state, scene.local_ns)
-        if not scene.guard.at_rest:
+        ended |= scene.guard.at_rest  # then its process hears nothing more, whatever comes
+        if not ended:
             coming.append((scene.now_ns, scene.guard.tick(scene.local_ns)))
         while coming and scene.now_ns - (coming[0][0] if always else stopped_ns) >= late_ms * MS:
-            scene.publish(coming.pop(0)[1])
+            _, command = coming.pop(0)
+            if command is not None and lost:
+                lost -= 1
+            else:
+                scene.publish(command)
     return scene.published[-1]
 
 
@@ -567,6 +576,14 @@ def test_stopped_guard_goes_on_until_it_has_told_rest_to_a_robot_that_was_late_t
     assert not last.u[-1].any()
     assert scene.refused == refused
     scene.refused = 0
+
+
+@pytest.mark.parametrize("lost", [1, 2])
+def test_stopped_guard_goes_on_until_the_robot_has_heard_that_it_brakes(scene: Scene, lost: int) -> None:
+    """Its reports say that it has not, and then where it is on its own ramp, from where the guard goes on."""
+    last = end_late(scene, 0, always=False, lost=lost)
+    assert not last.u[-1].any()
+    assert scene.actuator.source[1] in (last.seq - 1, last.seq), "it obeys the last command, or the one before until that begins, not its own ramp"
 
 
 @pytest.mark.parametrize("states_ms", [10, 50])
