@@ -2,7 +2,7 @@
 """
 Laws of ways to rest, kept between starts beside the compiled code.
 
-Finding one takes long, 17 s of CPU time for a quadrotor, for which a robot whose
+Finding one takes long, 15 s of CPU time for a quadrotor, for which a robot whose
 controller was killed would stand. A law is kept under a hash of everything that it is
 found from: the whole problem, the disturbances, the delay, and this library's own code.
 """

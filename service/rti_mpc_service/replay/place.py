@@ -79,9 +79,11 @@ def acted(journal: Journaled) -> Iterator[Place]:
     """
     Yield the places of the commands that were committed while the controller led.
 
-    A recording that begins later than the controller does not say whether it led: it did not if it heard a leader, or leads from some entry on.
+    A recording that begins later than the controller does not say whether it led: it did if it stands by from some entry on, which follows the
+    first command that it hears of another leader; it did not if it leads from some entry on, or only hears another leader.
     """
-    standing_by = next((entry.name for entry in entries(journal) if entry.name in ("stand_by", "lead", "overhear")), "stand_by") != "stand_by"
+    roles = [entry.name for entry in entries(journal) if entry.name in ("stand_by", "lead", "overhear")]
+    standing_by = next((role for role in roles if role != "overhear"), roles[0] if roles else "stand_by") != "stand_by"
     for entry in entries(journal):
         standing_by = entry.name == "stand_by" or (standing_by and entry.name != "lead")
         if entry.name == "commit" and not standing_by:

@@ -18,7 +18,7 @@ class Timeline:
 
     For several robots, whose clocks have nothing in common, it is the local time since a
     common instant: each life of a robot begins when its first state has arrived, and goes on
-    by its own clock. One that runs slower or faster, waits or jumps is shifted again and again,
+    by its own clock. One that runs slower or faster, waits or jumps ahead is shifted again and again,
     so that all robots end at the present.
     """
 

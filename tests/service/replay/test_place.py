@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from rti_mpc.contract.epoch import NUMBER_BITS
+from rti_mpc.control.controller import Controller
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.replay import replay
 from rti_mpc_service.replay.place import acted, choose
@@ -27,6 +28,18 @@ EPOCH = (1 << NUMBER_BITS) + 6
 def leader() -> Journaled:
     """Number 5: it leads for 1.5 s, with epoch 5, and then stands by."""
     return journal_of(SHIPPED, samples=30, acts={15: lambda controller, _: controller.stand_by()})
+
+
+@pytest.fixture(scope="module")
+def relieved(leader: Journaled) -> Journaled:
+    """The leader where it stands by because it hears a command of another."""
+    other = replace(next(acted(leader)).command, epoch=EPOCH)
+
+    def hear(controller: Controller, _: object) -> None:
+        controller.overhear(other)
+        controller.stand_by()
+
+    return journal_of(SHIPPED, samples=30, acts={15: hear})
 
 
 @pytest.fixture(scope="module")
@@ -72,13 +85,14 @@ def test_robot_must_be_named_where_there_are_several(leader: Journaled) -> None:
         choose(PATH, [leader, replace(leader, robot="car")], None, 3)
 
 
-def test_standby_that_is_recorded_from_its_middle_on_has_not_led_until_it_says_so(leader: Journaled, standby: Journaled) -> None:
+def test_standby_that_is_recorded_from_its_middle_on_has_not_led_until_it_says_so(leader: Journaled, standby: Journaled, relieved: Journaled) -> None:
     """A command that it would have sent is none that was sent; a leader says nothing in a recording of some seconds."""
 
     def between(journal: Journaled, from_ms: int, to_ms: int) -> Journaled:
         return replace(journal, messages=[message for message in journal.messages if from_ms * MS < message.local_ns < to_ms * MS])
 
     assert len(list(acted(between(leader, 500, 1400)))) > 5
+    assert len(list(acted(between(relieved, 500, 3000)))) == 9, "it led until it stood by, from 0.6 to 1.4 s"
     assert not list(acted(between(standby, 500, 1400)))
     assert {place.command.epoch for place in acted(between(standby, 500, 3000))} == {EPOCH}
 
