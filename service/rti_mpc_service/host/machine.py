@@ -50,7 +50,8 @@ def commit(folder: Path) -> str | None:
         return None
     command = ["git", "-C", str(folder), "--no-optional-locks", "describe", "--always", "--dirty", "--abbrev=12"]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=GIT_TIMEOUT_S, stdin=subprocess.DEVNULL)
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}  # a hook's name another repository
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=GIT_TIMEOUT_S, stdin=subprocess.DEVNULL)
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.strip() or None

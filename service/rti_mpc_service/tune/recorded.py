@@ -50,8 +50,6 @@ def recorded(config: Config, name: str, part: tuple[float, float], duration_s: f
         ConfigError: It is no recording of this robot, or the span is too short.
     """
     model = build_model(config)
-    if window_place(model) is not None:
-        raise ConfigError(f"--scenario {name} must be of a robot that follows references in time, {config.robot} follows a path")
     states, samples, _ = _read(name, config.robot, model)
     span = _part(samples, config.ocp.dt_s, part)
     span = span if duration_s is None else span[: round(duration_s / config.ocp.dt_s)]
@@ -132,6 +130,8 @@ def _read(name: str, robot: str, model: Model) -> tuple[list[State], list[Teleme
     """Return the states, samples and commands of a robot; of the guard that it obeyed, if there was one."""
     from rti_mpc.recording import Recording  # needs the extra `record`
 
+    if window_place(model) is not None:
+        raise ConfigError(f"--scenario {name} must be of a robot that follows references in time, {robot} follows a path")
     try:
         recording = Recording(Path(name))
         if robot not in recording.robots:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -15,15 +16,17 @@ AUTHOR = ("-c", "user.name=a", "-c", "user.email=a@example.org")
 
 
 def git(folder: Path, *words: str) -> None:
-    subprocess.run(["git", "-C", str(folder), *AUTHOR, *words], check=True, capture_output=True)
+    settings = {"PATH": os.environ["PATH"], "GIT_CONFIG_GLOBAL": os.devnull, "GIT_CONFIG_NOSYSTEM": "1"}  # not those of whoever runs the tests
+    subprocess.run(["git", "-C", str(folder), *AUTHOR, *words], env=settings, check=True, capture_output=True)
 
 
 @pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
-def test_a_checkout_is_named_by_its_commit_and_by_whether_it_was_changed(tmp_path: Path) -> None:
+def test_a_checkout_is_named_by_its_commit_and_by_whether_it_was_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     git(tmp_path, "init")
     (tmp_path / "code.py").write_text("1")
     git(tmp_path, "add", "code.py")
     git(tmp_path, "commit", "-m", "first")
+    monkeypatch.setenv("GIT_DIR", str(tmp_path / "another"))
     named = commit(tmp_path)
     assert named is not None
     assert len(named) == 12
