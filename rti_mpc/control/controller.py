@@ -469,8 +469,10 @@ class Controller:
     def _rejoin(self, stamp_ns: int, behind: int) -> None:
         """Move plan and grid to a state that the grid did not expect: a late one, or the first one after a gap."""
         self.skipped += behind
-        last = self._late or self._issued.last
-        if behind and last is not None and stamp_ns + self.grid.delay_ns < last.valid_until_ns:  # the last command still acts, or a late plan would
+        late, last, act_ns = self._late, self._issued.last, stamp_ns + self.grid.delay_ns
+        if late is not None and act_ns >= late.valid_until_ns:
+            self._planner.loaded = False  # it would have run out: this sample starts cold
+        if behind and any(command is not None and act_ns < command.valid_until_ns for command in (late, last)):  # one still acts, or would
             self.grid.catch_up(behind, stamp_ns)
             if self._planner.loaded:
                 for _ in range(behind - 1):
