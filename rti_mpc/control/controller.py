@@ -359,7 +359,7 @@ class Controller:
             return None
         if not self._stopped:
             self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "over_budget")
-        self._late = command if command.mode in PLANNING_MODES else None
+        self._late = command if command.mode in PLANNING_MODES and now_ns < command.valid_until_ns else None
         counted = command.mode in (Mode.BRAKING, Mode.STOPPED)
         if self._ways is not None and self._ways.feeds_back:  # the last command carries its way, which newer states correct than this sample's
             if not counted:

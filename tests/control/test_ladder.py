@@ -206,14 +206,15 @@ def test_plan_that_was_late_is_not_gone_on_with_when_it_would_have_run_out(rti: 
     assert "gap" in codes(controller)
 
 
-def test_ramp_that_still_acts_keeps_the_samples_in_phase_when_a_late_plan_has_run_out(rti: FaultyRti) -> None:
+@pytest.mark.parametrize("ready_ms", [240, 280])
+def test_ramp_that_still_acts_keeps_the_samples_in_phase_when_a_late_plan_has_run_out(rti: FaultyRti, ready_ms: int) -> None:
     """A sample of almost three periods: its plan is valid until 250 ms, the ramp that was sent instead for longer."""
     controller, body = Controller(rti, Timing(), compile=False), robot(circle())
     controller.receive_reference(reference(circle()))
     assert controller.receive_state(body.tick(), body.now_ns) is None
     late, starts, cold = controller.receive_state(body.tick(), body.now_ns), list[int](), rti.reset
     assert late is not None
-    ready_ns = body.now_ns + 280 * MS
+    ready_ns = body.now_ns + ready_ms * MS
     ramp = controller.in_time(late, ready_ns)
     assert ramp is not None
     controller.commit(ramp, ready_ns)
@@ -232,6 +233,22 @@ def test_ramp_that_still_acts_keeps_the_samples_in_phase_when_a_late_plan_has_ru
     assert command.stamp_ns == late.stamp_ns + 3 * DT
     assert "gap" not in codes(controller)
     assert starts == [body.now_ns], "it starts cold"
+
+
+def test_nothing_is_prepared_from_a_late_plan_that_has_run_out_when_it_is_ready(rti: FaultyRti) -> None:
+    controller, body = Controller(rti, Timing(), compile=False), robot(circle())
+    controller.receive_reference(reference(circle()))
+    assert controller.receive_state(body.tick(), body.now_ns) is None
+    late = controller.receive_state(body.tick(), body.now_ns)
+    assert late is not None
+    controller.commit(controller.in_time(late, body.now_ns + 600 * MS) or late)
+    fail(rti, "qp", 1)
+    controller.prepare()
+    for _ in range(6):
+        body.tick()
+    command = controller.receive_state(body.tick(), body.now_ns)
+    assert command is not None
+    assert command.mode is Mode.BRAKING, "the next sample fails, which begins with its state"
 
 
 def test_ramp_that_is_late_itself_is_counted_once(driving: tuple[Controller, Lockstep], rti: FaultyRti) -> None:
