@@ -154,10 +154,10 @@ class Camera:
             return PROBLEM, {name: getattr(value, name).copy() for name in WEIGHTS_AND_BOUNDS}
         if isinstance(value, tuple):
             return TUPLE, "" if kind is tuple else full_name(kind), [self._node(item, path) for item in value]
-        again = self._seen.setdefault(id(value), len(self._seen))
-        if again < len(self._seen) - 1:
+        if (again := self._seen.get(id(value))) is not None:
             return AGAIN, again
-        return self._mutable(value, path, again, -1 if place is None else place)
+        self._seen[id(value)] = number = len(self._seen)
+        return self._mutable(value, path, number, -1 if place is None else place)
 
     def _mutable(self, value: Any, path: str, number: int, place: int) -> Node:
         """Return the node of an object that may be reached in several ways, with its number and its place among those built with the controller."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rti_mpc.contract.message import Journal, JournalKind
+from rti_mpc.contract.message import Journal, JournalKind, Notice, Severity
 from rti_mpc.control.controller import Controller
 from rti_mpc.errors import JournalError
 from rti_mpc.journal.book import PERIOD_NS, Book
@@ -104,6 +104,20 @@ def test_attribute_that_is_added_is_part_of_the_snapshot_without_being_named() -
     camera_of_other.restore(Snapshot.decode(camera.take().encode()))
     np.testing.assert_array_equal(other.grid.added[1]["b"], [4.0, 5.0])
     assert other.grid.added[2] == "late"
+
+
+@pytest.mark.parametrize("between", [[], [[]]], ids=["in a row", "apart"])
+def test_object_that_is_reached_twice_is_restored_as_one(between: list[Any]) -> None:
+    one: Any = made()
+    other: Any = made()
+    one.grid.added = other.grid.added = None
+    camera, camera_of_other = Camera(one), Camera(other)
+    shared = Notice(Severity.INFO, "code", "text")
+    one.grid.added = [shared, *between, shared]
+    camera_of_other.restore(Snapshot.decode(camera.take().encode()))
+    first, *_, last = other.grid.added
+    assert first == shared
+    assert first is last
 
 
 @pytest.mark.parametrize("value", [(n for n in "abc"), open, object()], ids=["generator", "function", "object"])
