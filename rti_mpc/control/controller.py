@@ -139,9 +139,7 @@ class Controller:
         self._known = PLANNING_MODES | ({Mode.STOPPED, Mode.BRAKING} if balances else set())  # modes in which disturbances are estimated
         self._planner = Planner(rti, self._track, self._sent, self._prediction, self.envelope, self._tuning, self._states.d, self.grid.dt_ns)
         self._overran = False  # whether the last sample was over its budget
-        self._late: Command | None = None  # the last plan, if it came too late to be sent: the next one begins where it ended
         self._unreported = False  # whether it was said that the robot does not report its inputs
-        self._for_rival: tuple[int | None, tuple[Reference, Array] | None] = (None, None)  # the last reference, and which life might have begun then
         self._stopped = ""  # why an operator's stop is latched
         self._issued = Issued(epoch, config_hash, self.grid.dt_ns)
         self._fallback = Fallback(self.ladder, self.envelope, self._sent, self._issued, ways, self._u_rest, self._valid_ns)
@@ -250,8 +248,7 @@ class Controller:
         if misfit := self._track.misfit(reference, self.np_):
             self._modes.say(Severity.WARNING, "reference_refused", misfit)
             return None
-        self._track.arriving = reference, self._track.lay_out(reference) if rows is None else rows
-        self._for_rival = self._states.lives.rival, self._track.arriving
+        self._track.arrive(reference, self._track.lay_out(reference) if rows is None else rows, self._states.lives.rival)
         anchored = None if self._states.last is None else self._anchor(self._states.last)
         return anchored if reference.stamp_ns == STAMP_ON_ARRIVAL else None
 
@@ -343,7 +340,7 @@ class Controller:
             What to publish: the command itself; None if it is too late and the robot goes on with the previous plan, or with the way to rest
             that it corrects by its states; or a ramp to rest.
         """
-        self._late = None
+        self._issued.late = None
         if self._states.cadence.fault:
             return command  # its lateness is unknown, and no other command follows
         now_ns = self._states.clock.latest_ns(local_ns)
@@ -359,7 +356,7 @@ class Controller:
             return None
         if not self._stopped:
             self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "over_budget")
-        self._late = command if command.mode in PLANNING_MODES and now_ns < command.valid_until_ns else None
+        self._issued.late = command if command.mode in PLANNING_MODES and now_ns < command.valid_until_ns else None
         counted = command.mode in (Mode.BRAKING, Mode.STOPPED)
         if self._ways is not None and self._ways.feeds_back:  # the last command carries its way, which newer states correct than this sample's
             if not counted:
@@ -403,7 +400,7 @@ class Controller:
         self._planner.loaded = False
         if self.mode in PLANNING_MODES:
             self.ladder.failed = 0
-        elif self._late is None and (self.mode is not Mode.FALLBACK or not np.isfinite(self._rti.x).all()):
+        elif self._issued.late is None and (self.mode is not Mode.FALLBACK or not np.isfinite(self._rti.x).all()):
             return  # the next sample starts cold; after a late one it does not, as a cold one takes longest and would be late again
         self._tuning.begin()
         self._planner.load(self.grid.act_ns, shift=True)
@@ -469,10 +466,10 @@ class Controller:
     def _rejoin(self, stamp_ns: int, behind: int) -> None:
         """Move plan and grid to a state that the grid did not expect: a late one, or the first one after a gap."""
         self.skipped += behind
-        late, last, act_ns = self._late, self._issued.last, stamp_ns + self.grid.delay_ns
+        late, act_ns = self._issued.late, stamp_ns + self.grid.delay_ns
         if late is not None and act_ns >= late.valid_until_ns:
             self._planner.loaded = False  # it would have run out: this sample starts cold
-        if behind and any(command is not None and act_ns < command.valid_until_ns for command in (late, last)):  # one still acts, or would
+        if behind and self._issued.lasts(act_ns):
             self.grid.catch_up(behind, stamp_ns)
             if self._planner.loaded:
                 for _ in range(behind - 1):
@@ -620,17 +617,15 @@ class Controller:
 
     def _forget(self, arrival: Arrival, state: State) -> None:
         """Forget the robot's last life; or, after a jump of its clock, all but the inputs from which it has braked since then."""
-        self._late = None
+        self._issued.late = None
         if arrival is Arrival.NEW_LIFE:
             self._sent.clear()
         else:
             self._sent.brake(self._states.before_ns, state.stamp_ns)
         if arrival is not Arrival.JUMPED_AHEAD:
             self._modes.enter(Mode.IDLE, "the robot was restarted, or its clock has jumped")
-            self._track.clear()
+            self._track.clear(state.epoch if arrival is Arrival.NEW_LIFE else None)
             self._blockage.clear()
-        if arrival is Arrival.NEW_LIFE and self._for_rival[0] == state.epoch:
-            self._track.arriving = self._for_rival[1]  # this reference came when the new life was heard, but not believed yet
         if self._delay is not None:
             self._delay.clear()
         if self._ways is not None:

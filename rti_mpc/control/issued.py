@@ -25,6 +25,7 @@ class Issued:
         seq: Sequence number of the last command that has left.
         last: The last command that has left; None before the first.
         plan: The last command with a plan of its own, as long as that plan may be continued; else None.
+        late: The last proposal, if it is a plan that was ready too late to be sent: the next plan begins from it; else None.
     """
 
     def __init__(self, epoch: int, config_hash: int, period_ns: int) -> None:
@@ -32,6 +33,7 @@ class Issued:
         self.seq = 0
         self.last: Command | None = None
         self.plan: Command | None = None
+        self.late: Command | None = None
         self._config_hash = config_hash
         self._period_ns = period_ns
         self._planned: Command | None = None  # the last one proposed, if it has a plan of its own
@@ -90,3 +92,7 @@ class Issued:
         self.seq, self.last = command.seq, command
         if command is self._planned:
             self.plan = command
+
+    def lasts(self, t_ns: int) -> bool:
+        """Whether at a time the last command acts still, or a late plan would."""
+        return any(command is not None and t_ns < command.valid_until_ns for command in (self.last, self.late))

@@ -52,6 +52,8 @@ class Track:
             written = {name: outputs[name] for name in interpolate.name_out()}
             self._interpolate[columns] = bind(interpolate, {"found": found, "at": at, "below": below}, written)
         self.arriving: tuple[Reference, Array] | None = None
+        self._last: tuple[Reference, Array] | None = None  # the last one that has arrived
+        self._last_for: int | None = None  # the life of the robot that was heard then, but not believed yet
         self._reference: Reference | None = None
         self._rows: Array = np.zeros((1, 2 * model.ny))
 
@@ -86,6 +88,18 @@ class Track:
             rows[:, j] = np.unwrap(rows[:, j])
         return np.hstack([rows, np.diff(rows, axis=0, append=rows[-1:])])
 
+    def arrive(self, reference: Reference, rows: Array, rival: int | None) -> None:
+        """
+        Take a reference in, until `anchor`.
+
+        Args:
+            reference: A checked reference.
+            rows: Its `lay_out`.
+            rival: Epoch of a new life of the robot that is heard, but not believed yet; None if there is none.
+        """
+        self.arriving = self._last = reference, rows
+        self._last_for = rival
+
     def anchor(self, stamp_ns: int) -> Reference:
         """
         Follow the reference that has arrived, and return it: from the state on if it was to start on arrival.
@@ -101,9 +115,11 @@ class Track:
         self.p[:] = self._nominal
         return reference
 
-    def clear(self) -> None:
-        """Forget the reference."""
+    def clear(self, life: int | None = None) -> None:
+        """Forget the reference; but one that arrived after a new life of the robot, by its epoch, was first heard is for that life."""
         self._reference = None
+        if life is not None and life == self._last_for:
+            self.arriving = self._last
 
     @property
     def followed(self) -> Reference | None:

@@ -39,6 +39,28 @@ def driving(rti: FaultyRti) -> tuple[Controller, Lockstep]:
     return controller, body
 
 
+def begun(rti: FaultyRti) -> tuple[Controller, Lockstep, Command]:
+    """A controller that has proposed its first plan."""
+    controller, body = Controller(rti, Timing(), compile=False), robot(circle())
+    controller.receive_reference(reference(circle()))
+    assert controller.receive_state(body.tick(), body.now_ns) is None
+    command = controller.receive_state(body.tick(), body.now_ns)
+    assert command is not None
+    return controller, body, command
+
+
+def cold_starts(rti: FaultyRti, monkeypatch: pytest.MonkeyPatch) -> list[Array]:
+    """The states from which samples start cold from now on."""
+    starts, cold = list[Array](), rti.reset
+
+    def reset(x0: Array, u_prev: Array) -> None:
+        starts.append(x0.copy())
+        cold(x0, u_prev)
+
+    monkeypatch.setattr(rti, "reset", reset)
+    return starts
+
+
 def fail(rti: FaultyRti, failure: str, samples: int) -> None:
     assert rti.inject({"failure": failure, "samples": samples})["ok"]
 
@@ -157,7 +179,7 @@ def test_samples_over_budget_brake_when_no_plan_is_left(driving: tuple[Controlle
 
 
 @pytest.mark.parametrize("name", ["pioneer", "arm", "car"])
-def test_robot_is_driven_though_only_samples_that_start_cold_take_longer_than_a_period(name: str) -> None:
+def test_robot_is_driven_though_only_samples_that_start_cold_take_longer_than_a_period(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Under load a cold sample may take several periods. If the next one started cold again, the robot would never move."""
     ocp, law = ocp_of(name), law_of(name)
     rti = FaultyRti(ocp, compile=False)
@@ -165,14 +187,7 @@ def test_robot_is_driven_though_only_samples_that_start_cold_take_longer_than_a_
     y = np.tile(np.eye(ocp.model.ny)[0], (400, 1))
     controller.receive_reference(Reference(1, 1, 0, round(1e9 * ocp.dt), End.HOLD, y, np.zeros((400, 0))))
     body = Lockstep(RobotSettings(ocp.model, np.zeros(ocp.model.nx), np.full(ocp.model.nu, 1e3), state_period_s=ocp.dt))
-    starts, busy_ns, driven = list[int](), 0, list[Mode]()
-    cold = rti.reset
-
-    def reset(x0: Array, u_prev: Array) -> None:
-        starts.append(body.now_ns)
-        cold(x0, u_prev)
-
-    rti.reset = reset  # type: ignore[method-assign]
+    starts, busy_ns, driven = cold_starts(rti, monkeypatch), 0, list[Mode]()
     for _ in range(40):
         state, before = body.tick(), len(starts)
         if body.now_ns < busy_ns:
@@ -192,11 +207,7 @@ def test_robot_is_driven_though_only_samples_that_start_cold_take_longer_than_a_
 
 
 def test_plan_that_was_late_is_not_gone_on_with_when_it_would_have_run_out(rti: FaultyRti) -> None:
-    controller, body = Controller(rti, Timing(), compile=False), robot(circle())
-    controller.receive_reference(reference(circle()))
-    assert controller.receive_state(body.tick(), body.now_ns) is None
-    late = controller.receive_state(body.tick(), body.now_ns)
-    assert late is not None
+    controller, body, late = begun(rti)
     assert controller.in_time(late, body.now_ns + 110 * MS) is not late
     controller.prepare()
     for _ in range(3):
@@ -207,13 +218,11 @@ def test_plan_that_was_late_is_not_gone_on_with_when_it_would_have_run_out(rti: 
 
 
 @pytest.mark.parametrize("ready_ms", [240, 280])
-def test_ramp_that_still_acts_keeps_the_samples_in_phase_when_a_late_plan_has_run_out(rti: FaultyRti, ready_ms: int) -> None:
+def test_ramp_that_still_acts_keeps_the_samples_in_phase_when_a_late_plan_has_run_out(
+    rti: FaultyRti, ready_ms: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A sample of almost three periods: its plan is valid until 250 ms, the ramp that was sent instead for longer."""
-    controller, body = Controller(rti, Timing(), compile=False), robot(circle())
-    controller.receive_reference(reference(circle()))
-    assert controller.receive_state(body.tick(), body.now_ns) is None
-    late, starts, cold = controller.receive_state(body.tick(), body.now_ns), list[int](), rti.reset
-    assert late is not None
+    (controller, body, late), starts = begun(rti), cold_starts(rti, monkeypatch)
     ready_ns = body.now_ns + ready_ms * MS
     ramp = controller.in_time(late, ready_ns)
     assert ramp is not None
@@ -222,25 +231,15 @@ def test_ramp_that_still_acts_keeps_the_samples_in_phase_when_a_late_plan_has_ru
     for _ in range(2):
         body.tick()
     controller.notices()
-
-    def reset(x0: Array, u_prev: Array) -> None:
-        starts.append(body.now_ns)
-        cold(x0, u_prev)
-
-    rti.reset = reset  # type: ignore[method-assign]
     command = controller.receive_state(body.tick(), body.now_ns)
     assert command is not None
     assert command.stamp_ns == late.stamp_ns + 3 * DT
     assert "gap" not in codes(controller)
-    assert starts == [body.now_ns], "it starts cold"
+    assert len(starts) == 1, "it starts cold"
 
 
 def test_nothing_is_prepared_from_a_late_plan_that_has_run_out_when_it_is_ready(rti: FaultyRti) -> None:
-    controller, body = Controller(rti, Timing(), compile=False), robot(circle())
-    controller.receive_reference(reference(circle()))
-    assert controller.receive_state(body.tick(), body.now_ns) is None
-    late = controller.receive_state(body.tick(), body.now_ns)
-    assert late is not None
+    controller, body, late = begun(rti)
     controller.commit(controller.in_time(late, body.now_ns + 600 * MS) or late)
     fail(rti, "qp", 1)
     controller.prepare()
