@@ -86,7 +86,7 @@ class Guard:
         self._told_rest = True  # whether that command, if it is the guard's own, leads to rest: reports may change what is believed after it was sent
         self._engaged = False  # whether this robot was ever sent a command
         self._untold = False  # whether the command to brake has still to be sent
-        self._braked = (0, BEFORE_ALL_NS)  # number of the last command to brake, and its end
+        self._braked = ((0, 0), BEFORE_ALL_NS)  # epoch and number of the last command to brake, and its end
         self._corrected = False  # whether the correction of its way to rest by the last state has still to be sent
         self._passed: Command | None = None  # the last command that was passed
         self._stopped = False
@@ -238,7 +238,7 @@ class Guard:
     def _unheard(self, state: State) -> bool:
         """Whether a report names an older command than the one to brake, which may still come: the ramp is then not to begin later."""
         brake, until_ns = self._braked
-        return 0 < state.command_seq < brake and state.stamp_ns < until_ns
+        return state.command_seq > 0 and (state.command_epoch, state.command_seq) < brake and state.stamp_ns < until_ns
 
     def _feed_back(self, x: Array | None, stamp_ns: int, now_ns: int) -> None:
         """Correct the way to rest by a state, or by none if the last one is stale; nothing is sent that would displace a plan about to begin."""
@@ -259,7 +259,7 @@ class Guard:
     def _tell(self, start_ns: int, valid_ns: int, period_ns: int, u: Array, state: State, way: Way | None) -> Command:
         """Return a command of the guard's own, with what is left of the way to rest after it, and note until when it lasts."""
         if self._untold:
-            self._braked = self._seq + 1, start_ns + valid_ns
+            self._braked = (self.epoch, self._seq + 1), start_ns + valid_ns
         self._told_ns, self._untold, self._corrected = start_ns + valid_ns, False, False
         self._told_rest = way is not None or not (u[-1] - self._schedule.rest(start_ns)).any()
         left: dict[str, Any] = {} if way is None else {"rest_period_ns": way.period_ns, "u_rest": way.u, "x_rest": way.x, "K": way.K}
@@ -437,7 +437,7 @@ class Guard:
         self._schedule.brake(self._limits.u_rest, BEFORE_ALL_NS)
         self._leader = 0, -1
         self._told_ns = BEFORE_ALL_NS
-        self._braked = 0, BEFORE_ALL_NS
+        self._braked = (0, 0), BEFORE_ALL_NS
         self._rest_by_ns = BEFORE_ALL_NS  # the robot is at rest: a latch from before passes nothing but rest
         self._engaged = self._untold = self._corrected = self.passing = False
         self._passed = None

@@ -600,22 +600,34 @@ def test_inputs_of_a_robot_that_was_late_to_hear_of_the_ramp_do_not_rise_on_it(s
 @pytest.mark.parametrize(("after_ms", "names", "u"), [(20, "brake", 0.3), (20, "ramp", 0.3), (110, "driven", 0.5)])
 def test_robot_that_has_heard_of_the_ramp_or_never_will_is_where_it_says(scene: Scene, after_ms: int, names: str, u: float) -> None:
     """It names the command to brake or its own ramp, or still the command before when that to brake is over."""
+    begins, since_ns = told_after(scene, after_ms, names, u)
+    on_the_ramp = u - LIMITS.slew[0] * 1e-9 * since_ns
+    assert begins.u[0, 0] == pytest.approx(on_the_ramp, abs=1.01 * 0.1 * STEP[0]), "a step of the ramp"
+
+
+@pytest.mark.parametrize("names", ["driven", "of a guard before"])
+def test_robot_that_has_not_heard_of_the_ramp_yet_is_where_it_will_be_on_it(scene: Scene, names: str) -> None:
+    """It names an older command, by epoch first: a guard before may have sent many more."""
+    begins, since_ns = told_after(scene, 20, names, 0.5)
+    assert begins.u[0, 0] <= 0.5 - LIMITS.slew[0] * 1e-9 * (since_ns + 20 * MS)
+
+
+def told_after(scene: Scene, after_ms: int, names: str, u: float) -> tuple[Command, int]:
+    """Return what a stopped guard tells a robot that reports an input and names a command, and how long after that report it acts."""
     scene.drive(1000)
     scene.wait(30)
-    driven = scene.published[-1].seq
+    driven = scene.published[-1]
     scene.guard.stop(scene.local_ns)
     scene.heard = False
     scene.wait(after_ms)
-    seq = {"brake": driven + 1, "ramp": 0, "driven": driven}[names]
-    acting: Any = {"u": np.array([u, 0.0]), "command_epoch": scene.published[-1].epoch, "command_seq": seq}
-    state = State(scene.epoch, scene.states + 1, scene.now_ns, np.zeros(5), **acting)
+    seq = {"brake": driven.seq + 1, "ramp": 0, "driven": driven.seq, "of a guard before": 100 * driven.seq}[names]
+    epoch = driven.epoch - (names == "of a guard before")
+    state = State(scene.epoch, scene.states + 1, scene.now_ns, np.zeros(5), u=np.array([u, 0.0]), command_epoch=epoch, command_seq=seq)
     scene.guard.receive_state(state, scene.local_ns)
     told = len(scene.published)
     while len(scene.published) == told:
         scene.step()
-    begins = scene.published[-1]
-    on_the_ramp = u - LIMITS.slew[0] * 1e-9 * (begins.stamp_ns - state.stamp_ns)
-    assert begins.u[0, 0] == pytest.approx(on_the_ramp, abs=1.01 * 0.1 * STEP[0]), "a step of the ramp"
+    return scene.published[-1], scene.published[-1].stamp_ns - state.stamp_ns
 
 
 REASON = "asked for by ada@lab"
