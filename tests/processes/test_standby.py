@@ -15,9 +15,9 @@ from rti_mpc.contract.message import Telemetry
 from rti_mpc.contract.status import Mode
 from rti_mpc.wire.cdr import decode
 from rti_mpc_service.host.hold_up import Host
-from tests.in_time import in_time
+from tests.in_time import in_time, on_time
 from tests.processes.system import KEYS, heard, owner, rti_mpc, until
-from tests.processes.watched import Watched, configuration, within_limits
+from tests.processes.watched import CONTROLLERS, Watched, configuration, within_limits
 
 
 @pytest.fixture(params=[0.1, pytest.param(0.02, marks=pytest.mark.slow)], ids=["10Hz", "50Hz"])
@@ -58,10 +58,10 @@ def test_standby_takes_over_in_time_and_the_old_leader_is_fenced(redundant: Watc
 
 
 @pytest.mark.slow
-def test_orders_hold_whoever_leads_and_of_two_that_stand_by_one_leads(tmp_path: Path) -> None:
+def test_orders_hold_whoever_leads_and_of_two_that_stand_by_the_lower_number_leads(tmp_path: Path, host: Host) -> None:
     with Watched(tmp_path, 0.1, live=True) as system:
         system.start("robot", "leader", "reference")
-        first = system.tracking()
+        system.tracking()
         assert rti_mpc("params", "set", system.config, "ocp.weights.Q.psi=0.0", "-e", system.endpoint).returncode == 0
         system.start("standby", "third")  # that hear of the change from the leader
         standby_telemetry = system.bus.subscriber(KEYS.standby_telemetry, capacity=64)
@@ -73,20 +73,23 @@ def test_orders_hold_whoever_leads_and_of_two_that_stand_by_one_leads(tmp_path: 
             return sum(role.startswith("standby.") for role in system.lives) == 2 and len(sources) > 20
 
         until(both, "two that stand by, with the change")
-        system.kill("leader")
-        second = system.led_by_another(first.epoch)
+        first = system.tracking().epoch
+        leading = system.process(first)  # a busy machine may have swapped them
+        low, high = sorted(CONTROLLERS - {leading}, key=lambda role: owner(system.said(role)))
+        system.kill(leading)
+        second = system.led_by_another(first)
         sample = heard(system.bus.subscriber(KEYS.telemetry), Telemetry, lambda sample: sample.epoch == second.epoch)
         assert sample.parameter_version == 1
         system.answers(second, 10)
-        assert {command.epoch for command in system.commands} == {first.epoch, second.epoch}
-        low, high = sorted(("standby", "third"), key=lambda role: owner(system.said(role)))
-        assert system.process(second.epoch) == low, "the lower number leads"
-        assert "leads from now on" not in system.said(high)
+        if on_time(host, "which of the two leads", 1e3 * system.dt_s, system.began_ns):
+            assert {command.epoch for command in system.commands} == {first, second.epoch}
+            assert system.process(second.epoch) == low
+            assert "leads from now on" not in system.said(high)
 
         answer = rti_mpc("stop", system.config, "-e", system.endpoint)
         assert (answer.returncode, json.loads(answer.stdout)["ok"]) == (0, True)
         system.state(lambda state: bool(np.abs(state.x[3:]).max() < 1e-3))
-        system.kill(low)
+        system.kill(system.process(second.epoch))
         third = system.led_by_another(second.epoch)
         system.answers(third, 10)
         assert {command.mode for command in system.commands if command.epoch == third.epoch} == {Mode.STOPPED}

@@ -113,9 +113,9 @@ def main(
         report.say(faults[0], "finding how the robot comes to rest")
         faults = of_robot(faults, config, check_stop(config))
         stop = stop_on_signals()
-        folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
         try:
             with Host() as host:
+                folder = Path(tempfile.mkdtemp(prefix="rti-mpc-faults-"))
                 inject(config, faults, folder, report, stop, host, reference, record)
         except Unwitnessed as error:  # from the start
             say(str(error))
