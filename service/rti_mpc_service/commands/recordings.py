@@ -68,7 +68,7 @@ Trust = Annotated[bool, typer.Option("--trust", help="Run the attached source of
 @recordings.command()
 def replay(
     recording: RecordingPath,
-    start: Annotated[str | None, typer.Option("--from", metavar="TIME", help="Time after the first state from which on to replay.")] = None,
+    start: Annotated[str | None, typer.Option("--from", metavar="TIME", help="Time of the robot's clock from which on to replay.")] = None,
     assignments: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Another weight or bound: what would have been commanded in the same states; repeatable."),
@@ -87,11 +87,12 @@ def replay(
     ] = None,
 ) -> None:
     """Repeat what a recorded controller did, from its journal, and compare each command bit by bit; or drive it in closed loop."""
-    from rti_mpc_service.replay.replay import main, parse_start
+    from rti_mpc_service.replay.replay import main
+    from rti_mpc_service.replay.robot_time import parse_time
 
     choice: dict[str, Any] = {"robot": robot, "owner": owner, "folder": folder, "trust": trust}
     choice |= {"tolerance": tolerance, "json_path": path, "make_body": lockstep_robot if closed_loop else None, "out": out}
-    raise typer.Exit(main(recording, start_s=parse_start(start), assignments=assignments or (), **choice))
+    raise typer.Exit(main(recording, start_s=parse_time(start), assignments=assignments or (), **choice))
 
 
 @on_bus(recordings, with_model=False)
@@ -99,7 +100,7 @@ def why(
     config: Config,
     bus: BusSettings,
     words: Annotated[list[str] | None, typer.Argument(metavar="[RUN.mcap]", help="Recording, in place of the running controller.")] = None,
-    at: Annotated[str | None, typer.Option("--at", metavar="TIME", help="Time after the first command, such as 72.5s.")] = None,
+    at: Annotated[str | None, typer.Option("--at", metavar="TIME", help="Time of the robot's clock, such as 72.5s.")] = None,
     seq: Annotated[int | None, typer.Option("--seq", metavar="NUMBER", help="Number of the command.", show_default="the last command")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     case: Annotated[Path | None, typer.Option(metavar="FILE.npz", help="Also write the sample's QP as a case, for `rti-mpc solve-case`.")] = None,
@@ -110,7 +111,7 @@ def why(
 ) -> int:
     """Explain a command, recorded or just sent: who solved it, which bounds act, what its plan costs, and the events that led there."""
     from rti_mpc_service.replay import live
-    from rti_mpc_service.replay.replay import parse_start
+    from rti_mpc_service.replay.robot_time import parse_time
     from rti_mpc_service.replay.why import main
 
     choice: dict[str, Any] = {"owner": owner, "folder": folder, "trust": trust, "as_json": as_json, "case_path": case}
@@ -120,7 +121,7 @@ def why(
         return live.main(bus, config.keys(), **choice)
     if len(words) > 1:
         raise ConfigError(f"why explains a command of one recording, got {' '.join(words)}")
-    return main(Path(words[0]), at_s=None if at is None else parse_start(at), seq=seq, robot=robot, **choice)
+    return main(Path(words[0]), at_s=parse_time(at), seq=seq, robot=robot, **choice)
 
 
 @recordings.command("solve-case")

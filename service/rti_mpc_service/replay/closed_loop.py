@@ -33,7 +33,7 @@ Column = tuple[str, str]  # name and unit of a number
 
 
 def compare(
-    path: Path, journal: Journaled, recorded: Drive, driven: Drive, assignments: Sequence[str], start_s: float, out: Path | None
+    path: Path, journal: Journaled, recorded: Drive, driven: Drive, assignments: Sequence[str], start_s: float | None, out: Path | None
 ) -> dict[str, Any] | None:
     """
     Print a recorded drive beside the same one in closed loop, write figure and recording, and return the numbers.
@@ -44,7 +44,7 @@ def compare(
         recorded: Its drive as it was.
         driven: Its drive in closed loop.
         assignments: What is other in closed loop, for the title.
-        start_s: Time from which on was asked for; 0: the transient at the beginning does not count.
+        start_s: Time of the robot's clock from which on was asked for; None: the transient at the beginning does not count.
         out: Folder for figure and recording; None: neither.
 
     Returns:
@@ -54,7 +54,7 @@ def compare(
         ConfigError: Figure or recording cannot be written.
     """
     if len(recorded.passage.samples) < 2 or len(driven.passage.samples) < 2:
-        print(f"  no closed loop: {undriven(journal, recorded, start_s)}")
+        print(f"  no closed loop: {undriven(journal, start_s)}")
         return None
     ocp = recorded.ocp
     heard = heard_samples(path, journal)
@@ -65,7 +65,7 @@ def compare(
         each |= phase_times(samples)
     apart = distance(*runs)
     run = runs[0]
-    begin_s = start_s + 1e-9 * (int(run.stamp_ns[0]) - recorded.start_ns)
+    begin_s = 1e-9 * int(run.stamp_ns[0])
     said = f"with {', '.join(assignments)}" if assignments else "with the same settings"
     after = f", numbers after {run.transient_s:g} s" if run.transient_s else ""
     print(f"  in closed loop {said}, {run.time_s[-1]:.1f} s from {begin_s:.1f} s on{after}:")
@@ -80,11 +80,11 @@ def compare(
     return {"with": [*assignments], "begin_s": begin_s, "duration_s": float(run.time_s[-1]), **sides, "apart": known(apart)}
 
 
-def undriven(journal: Journaled, recorded: Drive, start_s: float) -> str:
+def undriven(journal: Journaled, start_s: float | None) -> str:
     """Return why there is no drive."""
-    beyond_s = 1e-9 * (recorded.start_ns - max(message.stamp_ns for message in journal.messages))
-    if start_s and beyond_s > 0.0:
-        return f"--from must be before this controller's last state, {start_s - beyond_s:.1f} s after its first one, got {start_s:g} s"
+    last_s = 1e-9 * max(message.stamp_ns for message in journal.messages)
+    if start_s is not None and start_s > last_s:
+        return f"--from must be before this controller's last state, at {last_s:.3f} s, got {start_s:.3f} s"
     return "from there on this controller has not led two samples in a row, after a state whose command is in the recording"
 
 
@@ -99,7 +99,7 @@ def heard_samples(path: Path, journal: Journaled) -> dict[tuple[int, int], Telem
     return {(message.epoch, message.seq): message for message in messages}
 
 
-def run_of(passage: Passage, ocp: Ocp, start_s: float, title: str) -> Run:
+def run_of(passage: Passage, ocp: Ocp, start_s: float | None, title: str) -> Run:
     """Return a drive with a row per sample: states and outputs when its command begins to act, the input that it commands."""
     samples = passage.samples
     stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
@@ -116,7 +116,7 @@ def run_of(passage: Passage, ocp: Ocp, start_s: float, title: str) -> Run:
         prepare_us=np.array([sample.prepare_us for sample in samples]),
         feedback_us=np.array([sample.feedback_us for sample in samples]),
         latency_us=np.array([sample.latency_us for sample in samples]),
-        transient_s=0.0 if start_s else min(TRANSIENT_S, duration_s / 2),
+        transient_s=0.0 if start_s is not None else min(TRANSIENT_S, duration_s / 2),
     )
 
 

@@ -20,16 +20,16 @@ def heard_commands(recording: Recording, robot: str | None) -> dict[tuple[str, i
     return found
 
 
-def uncovered(heard: Mapping[tuple[int, int], int], compared: Collection[tuple[int, int]], start_s: float = 0.0) -> list[int]:
+def uncovered(heard: Mapping[tuple[int, int], int], compared: Collection[tuple[int, int]], *, from_the_first: bool = False) -> list[int]:
     """
     Return the stamps of the commands that were heard, and not compared.
 
     Args:
         heard: Commands that were heard.
         compared: Epochs and sequence numbers of those that were compared.
-        start_s: Above 0, only those after the first that was compared are meant.
+        from_the_first: Whether only those after the first that was compared are meant.
     """
-    first = min(compared, default=(0, 0)) if start_s > 0.0 else (0, 0)
+    first = min(compared, default=(0, 0)) if from_the_first else (0, 0)
     return sorted(stamp_ns for name, stamp_ns in heard.items() if name not in compared and name >= first)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from rti_mpc.contract.message import Command
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.replay.rebuild import Journaled, entries
+from rti_mpc_service.replay.robot_time import check_time, first_stamp
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ def choose(path: Path, journals: Sequence[Journaled], at_s: float | None, seq: i
     Args:
         path: The recording.
         journals: Controllers of the recording that are asked about.
-        at_s: Robot time after the first command of any of them; the first command from then on is meant.
+        at_s: Time of the robot's clock; the first command from then on is meant.
         seq: Number of the command instead; None without a time: the last one whose sample is followed by another.
 
     Raises:
@@ -42,35 +43,33 @@ def choose(path: Path, journals: Sequence[Journaled], at_s: float | None, seq: i
     robots = sorted({journal.robot for journal in journals})
     if len(robots) > 1:
         raise ConfigError(f"--robot must name the robot whose command is explained, one of {', '.join(robots)}")
-    firsts = [place.command.stamp_ns for journal in journals for place in (next(acted(journal), None),) if place is not None]
-    begin_ns = min(firsts, default=0)
-    found = [(journal, place) for journal in journals if (place := find(journal, at_s, seq, begin_ns)) is not None]
+    if at_s is not None:
+        check_time("--at", at_s, journals)
+    found = [(journal, place) for journal in journals if (place := find(journal, at_s, seq)) is not None]
     if not found:
-        what = "two commands" if at_s is None else f"a command {at_s:g} s after its first one"
+        what = "two commands" if at_s is None else f"a command that acts from {at_s:.3f} s on"
         what = what if seq is None else f"a command {seq}"
         raise ConfigError(f"{path} must hold {what}, in the journal of a controller that led then")
     if seq is not None and len(found) > 1:
-        each = ", ".join(f"{journal.owner} at {1e-9 * place.command.stamp_ns:.1f} s" for journal, place in found)
+        each = ", ".join(f"{journal.owner} at {1e-9 * place.command.stamp_ns:.3f} s" for journal, place in found)
         raise ConfigError(f"--controller must say whose command {seq} is explained: {each}")
     return (max if at_s is None else min)(found, key=lambda one: one[1].command.stamp_ns)
 
 
-def find(journal: Journaled, at_s: float | None, seq: int | None, begin_ns: int | None = None) -> Place | None:
+def find(journal: Journaled, at_s: float | None, seq: int | None) -> Place | None:
     """
     Return the place of a command that acted; None if there is none.
 
     Args:
         journal: The controller.
-        at_s: Robot time after `begin_ns`, from which on the first command is meant.
+        at_s: Time of the robot's clock, from which on the first command is meant.
         seq: Its number instead; None without a time: the last command but one.
-        begin_ns: Robot time from which `at_s` counts; None: the controller's first command.
     """
     places = list(acted(journal))
     if at_s is None and seq is None:
         return places[-2] if len(places) > 1 else None
     for place in places:
-        after_s = 1e-9 * (place.command.stamp_ns - (places[0].command.stamp_ns if begin_ns is None else begin_ns))
-        if place.command.seq == seq or (at_s is not None and after_s >= at_s):
+        if place.command.seq == seq or (at_s is not None and place.command.stamp_ns >= first_stamp(at_s)):
             return place
     return None
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from rti_mpc.array import Array
+from rti_mpc.contract.message import JournalKind
 from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.journal.entry import JournalEntry
 from rti_mpc.journal.replay import Difference, Gap, Replay
@@ -33,6 +34,7 @@ from rti_mpc_service.replay.closed_loop import compare
 from rti_mpc_service.replay.coverage import uncovered
 from rti_mpc_service.replay.drive import Drive, MakePlacedBody, drive
 from rti_mpc_service.replay.rebuild import CONFIGURATION, Journaled, Rebuilt, journals, rebuild, repeat
+from rti_mpc_service.replay.robot_time import check_time, first_stamp
 
 TOLERANCE = 1e-6  # of commands on another machine, relative to 1 + their magnitude
 TUNABLE = ("ocp.weights.", "ocp.bounds.")  # beginnings of the keys that `--set` takes
@@ -49,7 +51,7 @@ class Account:
         on: The replay.
         wanted: Time of each command, s of the robot, and its first row as it would be with other weights, and as it was; only with such.
         compared: Epoch and sequence number of each command that was compared.
-        start_s: Robot time from which on it was replayed.
+        start_s: Time of the robot's clock from which on it was replayed; None: all of it.
     """
 
     journal: Journaled
@@ -57,12 +59,12 @@ class Account:
     on: Replay
     wanted: list[tuple[float, Array, Array]] = field(default_factory=list)
     compared: set[tuple[int, int]] = field(default_factory=set)
-    start_s: float = 0.0
+    start_s: float | None = None
 
     @property
     def uncovered(self) -> list[int]:
         """Stamps of the commands that the recorder has heard, and that were not compared."""
-        return uncovered(self.journal.heard, self.compared, self.start_s)
+        return uncovered(self.journal.heard, self.compared, from_the_first=self.start_s is not None)
 
 
 def main(
@@ -70,7 +72,7 @@ def main(
     *,
     robot: str | None = None,
     owner: int | None = None,
-    start_s: float = 0.0,
+    start_s: float | None = None,
     assignments: Sequence[str] = (),
     folder: Path = Path(),
     trust: bool = False,
@@ -86,7 +88,7 @@ def main(
         path: The recording.
         robot: Name of a robot; None: all.
         owner: Number of a controller; None: all.
-        start_s: Robot time after the first command from which on it is replayed, from the last snapshot before it.
+        start_s: Time of the robot's clock from which on it is replayed, from the last snapshot before it; None: all of it.
         assignments: Other weights and bounds, each ``key=value`` as in the TOML file.
         folder: Where a model of the user's own is looked for.
         trust: Whether to run the attached source of a model.
@@ -109,6 +111,8 @@ def main(
     changed = () if make_body is not None else assignments  # of what is replayed in open loop
     status = 0
     found = journals(path, robot, owner)
+    if start_s is not None:
+        check_time("--from", start_s, found)
     for journal in found:
         print(f"{journal.robot}, controller {journal.owner}")
         if len(found) > 1 and CONFIGURATION not in journal.files:
@@ -121,7 +125,7 @@ def main(
         if built.others and not changed:
             print(f"  so commands are compared within {tolerance:g}, relative to 1 + their magnitude, not bit by bit")
         override = overridden(built.config, built.rti.ocp, assignments)  # refused before anything is replayed
-        recorded = None if make_body is None else Drive(built, begin_ns(journal) + round(1e9 * start_s))
+        recorded = None if make_body is None else Drive(built, first_stamp(start_s))
         account = play(journal, built, start_s, changed, recorded)
         accounts.append(account)
         limit = tolerance if built.others else 0.0
@@ -141,7 +145,7 @@ def main(
     return status
 
 
-def play(journal: Journaled, built: Rebuilt, start_s: float = 0.0, assignments: Sequence[str] = (), on: Replay | None = None) -> Account:
+def play(journal: Journaled, built: Rebuilt, start_s: float | None = None, assignments: Sequence[str] = (), on: Replay | None = None) -> Account:
     """Replay one controller, by a replay of its own if none is given."""
     on = on or Replay(built.controller, built.rti)
     account = Account(journal, built, on, start_s=start_s)
@@ -160,17 +164,10 @@ def play(journal: Journaled, built: Rebuilt, start_s: float = 0.0, assignments: 
     return account
 
 
-def snapshot_before(journal: Journaled, start_s: float) -> int:
-    """Return the number from which on snapshots are used, so that the replay covers a robot time after the first state."""
-    first_ns = begin_ns(journal)
-    before = [message.seq for message in journal.messages if message.stamp_ns and message.stamp_ns - first_ns <= 1e9 * start_s]
-    snapshots = [message.seq for message in journal.messages if message.kind.name == "SNAPSHOT"]
-    return max((seq for seq in snapshots if before and seq <= before[-1]), default=0) if start_s > 0.0 else 0
-
-
-def begin_ns(journal: Journaled) -> int:
-    """Return the robot time from which `--from` counts."""
-    return next((message.stamp_ns for message in journal.messages if message.stamp_ns), 0)
+def snapshot_before(journal: Journaled, start_s: float | None) -> int:
+    """Return the number from which on snapshots are used, so that the replay covers all from a time of the robot's clock on."""
+    before = list(takewhile(lambda message: message.stamp_ns < first_stamp(start_s), journal.messages))
+    return max((message.seq for message in before if message.kind is JournalKind.SNAPSHOT), default=0)
 
 
 def overridden(config: Config, ocp: Ocp, assignments: Sequence[str]) -> dict[str, Array]:
@@ -239,7 +236,7 @@ def open_loop(account: Account, assignments: Sequence[str]) -> Iterator[str]:
     for j, signal in enumerate(account.built.rti.ocp.model.inputs):
         apart = np.abs(other[:, j] - was[:, j])
         rms, most = float(np.sqrt((apart**2).mean())), int(apart.argmax())
-        yield f"  {signal.name}: {rms:.3g} {signal.unit} away on average (rms), at most {apart[most]:.3g} {signal.unit}, at {times[most]:.1f} s"
+        yield f"  {signal.name}: {rms:.3g} {signal.unit} away on average (rms), at most {apart[most]:.3g} {signal.unit}, at {times[most]:.3f} s"
 
 
 def summary(account: Account) -> dict[str, Any]:
@@ -254,21 +251,8 @@ def summary(account: Account) -> dict[str, Any]:
         "entries": outcome.entries,
         "differing": outcome.differing,
         "largest_difference": outcome.size if np.isfinite(outcome.size) else None,
-        "first_difference": None if first is None else {"seq": first.seq, "field": first.field, "text": str(first)},
+        "first_difference": None if first is None else {"seq": first.seq, "robot_s": 1e-9 * first.stamp_ns, "field": first.field, "text": str(first)},
         "not_covered": [{"first": gap.first, "last": gap.last, "why": gap.why} for gap in outcome.gaps],
         "commands_not_covered": len(account.uncovered),
         "snapshots": outcome.snapshots,
     }
-
-
-def parse_start(text: str | None) -> float:
-    """
-    Return a time such as ``72.5s`` in s.
-
-    Raises:
-        ConfigError: It is none.
-    """
-    try:
-        return 0.0 if text is None else float(text.removesuffix("s"))
-    except ValueError:
-        raise ConfigError(f"a time must be in seconds after the first command, such as 72.5s, got {text}") from None

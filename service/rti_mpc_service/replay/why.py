@@ -67,7 +67,7 @@ def main(
 
     Args:
         path: The recording.
-        at_s: Robot time after the first command, from which on the first command is explained.
+        at_s: Time of the robot's clock, from which on the first command is explained.
         seq: Number of the command instead.
         robot: Name of a robot; None: the one of a recording of one.
         owner: Number of a controller; None: the one that led then.
@@ -166,7 +166,7 @@ def said_by(entry: JournalEntry) -> Iterator[tuple[str, str]]:
 
 def event(code: str, text: str, stamp_ns: int) -> dict[str, Any]:
     """Return what was said, with its time."""
-    return {"stamp_ns": stamp_ns, "code": code, "text": text}
+    return {"stamp_ns": stamp_ns, "robot_s": 1e-9 * stamp_ns, "code": code, "text": text}
 
 
 def facts_of(built: Rebuilt, on: Replay, place: Place, entry: JournalEntry, difference: Difference | None) -> dict[str, Any]:
@@ -182,6 +182,7 @@ def facts_of(built: Rebuilt, on: Replay, place: Place, entry: JournalEntry, diff
         "seq": command.seq,
         "epoch": command.epoch,
         "stamp_ns": command.stamp_ns,
+        "robot_s": 1e-9 * command.stamp_ns,
         "mode": command.mode.name,
         "status": command.status.name,
         "inputs": {signal.name: {"value": float(command.u[0, j]), "unit": signal.unit} for j, signal in enumerate(rti.ocp.model.inputs)},
@@ -274,7 +275,7 @@ def host_meanwhile(path: Path, journal: Journaled, arrived_ns: int | None) -> di
 def lines(facts: Mapping[str, Any]) -> Iterator[str]:
     """Yield the facts in words."""
     inputs = ", ".join(f"{name} = {of['value']:.4g} {of['unit']}" for name, of in facts["inputs"].items())
-    yield f"command {facts['seq']} of {facts['robot']}, at {1e-9 * facts['stamp_ns']:.3f} s: {facts['mode']}, {inputs}"
+    yield f"command {facts['seq']} of {facts['robot']}, at {facts['robot_s']:.3f} s: {facts['mode']}, {inputs}"
     if others := facts.get("other_controllers"):
         yield f"it is of controller {facts['controller']}; --controller names others: {', '.join(map(str, others))}"
     if facts["replayed"] != "0 bits differ":
@@ -304,7 +305,7 @@ def lines(facts: Mapping[str, Any]) -> Iterator[str]:
     if facts["events"]:
         yield f"what led there, in the {LOOK_BACK_S:g} s before:"
     for one in facts["events"]:
-        yield f"  {1e-9 * one['stamp_ns']:.3f} s  {one['code']}: {one['text']}"
+        yield f"  {one['robot_s']:.3f} s  {one['code']}: {one['text']}"
 
 
 def solved(facts: Mapping[str, Any]) -> Iterator[str]:

@@ -27,6 +27,7 @@ from rti_mpc_service.replay.drive import Drive, Passage, drive
 from rti_mpc_service.replay.place import find
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
 from rti_mpc_service.replay.replay import main, overridden, snapshot_before
+from rti_mpc_service.replay.robot_time import first_stamp
 from rti_mpc_service.replay.why import explain
 from rti_mpc_service.shipped import SHIPPED
 from tests.loop import MS
@@ -42,13 +43,13 @@ def enable(controller: Controller, rti: Rti) -> None:
     controller.enable()
 
 
-def passages(journal: Journaled, folder: Path, assignments: tuple[str, ...] = (), start_s: float = 0.0) -> tuple[Passage, Passage]:
+def passages(journal: Journaled, folder: Path, assignments: tuple[str, ...] = (), start_s: float | None = None) -> tuple[Passage, Passage]:
     """The drive as it was recorded, and in closed loop."""
     found = []
     for make_body in (None, lockstep_robot):
         built = rebuild(journal, folder=folder)
         override = overridden(built.config, built.rti.ocp, assignments) if make_body is not None else {}
-        found.append(drive(Drive(built, round(1e9 * start_s), make_body, override), journal, snapshot_before(journal, start_s)))
+        found.append(drive(Drive(built, first_stamp(start_s), make_body, override), journal, snapshot_before(journal, start_s)))
     return found[0], found[1]
 
 

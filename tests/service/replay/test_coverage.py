@@ -17,4 +17,4 @@ def test_commands_that_were_heard_and_not_compared_are_told_with_their_times() -
 
 
 def test_commands_of_a_start_that_was_left_out_on_purpose_are_not_told() -> None:
-    assert uncovered(HEARD, {(1, seq) for seq in range(4, 9)}, start_s=0.2) == [900_000_000]
+    assert uncovered(HEARD, {(1, seq) for seq in range(4, 9)}, from_the_first=True) == [900_000_000]

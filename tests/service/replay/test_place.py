@@ -15,10 +15,11 @@ from rti_mpc.errors import ConfigError
 from rti_mpc_service.replay import replay
 from rti_mpc_service.replay.place import acted, choose
 from rti_mpc_service.replay.rebuild import Journaled
+from rti_mpc_service.replay.robot_time import check_time, parse_time
 from rti_mpc_service.replay.why import main
 from rti_mpc_service.shipped import SHIPPED
 from tests.loop import MS
-from tests.service.replay.driven import Act, journal_of, recorded
+from tests.service.replay.driven import Act, journal_of, recorded, straight
 
 PATH = Path("run.mcap")
 EPOCH = (1 << NUMBER_BITS) + 6
@@ -53,23 +54,39 @@ def standby(leader: Journaled) -> Journaled:
     return replace(made, owner=6, messages=[replace(message, epoch=EPOCH) for message in made.messages])
 
 
-def test_time_counts_from_the_first_command_of_whoever_led(leader: Journaled, standby: Journaled) -> None:
+def test_time_is_that_of_the_robots_clock_whoever_led(leader: Journaled, standby: Journaled) -> None:
     for order in ([leader, standby], [standby, leader]):
-        for at_s, owner in ((0.0, 5), (0.5, 5), (2.0, 6)):
+        for at_s, owner in ((0.1, 5), (0.6, 5), (2.1, 6)):
             journal, place = choose(PATH, order, at_s, None)
             assert journal.owner == owner
-            assert place.command.stamp_ns == pytest.approx(round(1e9 * at_s) + first_ns(leader), abs=50 * MS)
+            assert place.command.stamp_ns == pytest.approx(round(1e9 * at_s), abs=50 * MS)
         assert choose(PATH, order, None, None)[0].owner == 6, "the last command of all"
 
 
-def first_ns(journal: Journaled) -> int:
-    return next(acted(journal)).command.stamp_ns
+def test_time_as_it_is_printed_finds_its_command_and_one_that_is_not_in_the_recording_is_refused_with_those_that_are() -> None:
+    """The clock of this robot is the Unix time, and its stamps are no whole milliseconds."""
+    unix_ns = 1_764_000_000_000_700_000
+    follows = replace(straight(5.0), stamp_ns=unix_ns)
+    journal = journal_of(SHIPPED, samples=12, sees=lambda _, state: replace(state, stamp_ns=state.stamp_ns + unix_ns), follows=follows)
+    assert len(list(acted(journal))) > 5
+    for place in acted(journal):
+        assert choose(PATH, [journal], float(f"{1e-9 * place.command.stamp_ns:.3f}"), None)[1].entry == place.entry
+    with pytest.raises(ConfigError, match=r"--at must be a time of the robot's clock in the recording, from 1764\d+\.\d{3} s to \S+ s, got 1\.000 s"):
+        choose(PATH, [journal], 1.0, None)
+    with pytest.raises(ConfigError, match=r"--from must be .* got 1764000002\.000 s"):
+        check_time("--from", 1764000002.0, [journal])
+
+
+@pytest.mark.parametrize("text", ["1:30", "nan", "inf", ""])
+def test_what_is_no_time_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"a time must be in seconds of the robot's clock, such as 72\.5s, got"):
+        parse_time(text)
 
 
 def test_number_that_two_controllers_have_given_needs_the_controller(leader: Journaled, standby: Journaled) -> None:
     seq = 3
     both = [leader, renumbered(leader)]
-    with pytest.raises(ConfigError, match=r"--controller must say whose command 3 is explained: 5 at 0\.3 s, 6 at 0\.3 s"):
+    with pytest.raises(ConfigError, match=r"--controller must say whose command 3 is explained: 5 at 0\.300 s, 6 at 0\.300 s"):
         choose(PATH, both, None, seq)
     assert choose(PATH, both[1:], None, seq)[0].owner == 6
     with pytest.raises(ConfigError, match=r"run\.mcap must hold a command 400, in the journal of a controller that led then"):

@@ -88,7 +88,7 @@ def test_bound_that_differs_by_stage_is_told_with_its_value_where_it_acts(tmp_pa
 
 def test_command_is_found_by_its_time_as_by_its_number(tmp_path: Path) -> None:
     journal = journal_of(SHIPPED, samples=20)
-    by_time, by_seq = find(journal, 1.0, None), find(journal, None, 11)
+    by_time, by_seq = find(journal, 1.0, None), find(journal, None, 10)
     assert by_time is not None
     assert by_seq is not None
     assert by_time.entry == by_seq.entry
