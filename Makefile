@@ -18,7 +18,7 @@ demo: $(READY)
 	$(BIN)/rti-mpc demo $(ARGS)
 
 test: $(READY)
-	$(BIN)/pytest -n auto --dist loadfile $(ARGS)
+	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-busy: $(READY)
 	$(BIN)/python tests/busy.py $(ARGS)

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from pathlib import Path
 
 import pytest
 
@@ -15,6 +17,9 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # before NumPy is loaded: workers share
 from rti_mpc_service.host.hold_up import Host
 
 SHORT_FORM = 3
+TESTS = Path(__file__).parent
+WAITING = {"processes", "service", "test_docs.py"}  # files and folders of tests that wait for processes
+UNOPTIMIZED = f"{TESTS / 'compiler'}{os.pathsep}"  # first in the path, for processes that tests start, too
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -31,10 +36,30 @@ def pytest_configure(config: pytest.Config) -> None:
     state = tempfile.mkdtemp(prefix="rti-mpc-state-")  # a test neither forgets a user's stop nor makes one
     config.add_cleanup(lambda: shutil.rmtree(state, ignore_errors=True))
     os.environ["STATE_DIRECTORY"] = state
+    compiler = shutil.which("cc")
+    if compiler is not None and "not slow" in config.getoption("markexpr") and not os.environ.get("PATH", os.defpath).startswith(UNOPTIMIZED):
+        # Most of what tests compile serves once. Slow tests and benchmarks, whose figures are the product's, compile as it does.
+        os.environ |= {"OPTIMIZING_CC": compiler, "PATH": UNOPTIMIZED + os.environ.get("PATH", os.defpath)}
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Let the collector of cycles leave modules and tests alone, of which every worker has all: a third of the time it takes to find them."""
+    gc.disable()
+    found = yield
+    gc.freeze()
+    gc.enable()
+    return found
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """In CI, run each slow test with every `SHORT_FORM`th of its sets of parameters; `make test-slow` runs them all."""
+    """
+    Begin with tests that wait, so that those that compute keep the cores busy to the end.
+
+    In CI, run each slow test with every `SHORT_FORM`th of its sets of parameters; `make test-slow` runs them all.
+    """
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        items.sort(key=lambda item: WAITING.isdisjoint(item.path.relative_to(TESTS).parts))
     if "CI" not in os.environ:
         return
     seen: Counter[str] = Counter()
@@ -51,6 +76,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def pytest_xdist_auto_num_workers() -> int:
     return 2 * (os.cpu_count() or 1)  # tests of processes mostly wait; what they hold to times, they hold on a busy host
+
+
+@pytest.fixture
+def optimizing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compile as users do, in a test whose subject is the compiled code."""
+    monkeypatch.setenv("PATH", os.environ["PATH"].removeprefix(UNOPTIMIZED))
 
 
 @pytest.fixture(scope="module")  # its timers take a tenth of a core

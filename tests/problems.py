@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import pickle
+from collections.abc import Callable
+from functools import lru_cache, wraps
 from typing import Any
 
 import casadi as ca
@@ -16,8 +19,32 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
 
 INF = np.inf
+SHARED = 64  # problems that are kept, a few MB each
 
 
+def shared(build: Callable[..., Ocp]) -> Callable[..., Ocp]:
+    """
+    Return one object for equal changes: expressions of a problem are built once an object, see `rti_mpc.rti.construction`.
+
+    Changes that cannot be pickled, such as expressions, give a new one.
+    """
+
+    @lru_cache(SHARED)
+    def built(pickled: bytes) -> Ocp:
+        return build(**dict(pickle.loads(pickled)))
+
+    @wraps(build)
+    def one(**changes: Any) -> Ocp:
+        try:
+            pickled = pickle.dumps(sorted(changes.items()))
+        except Exception:  # CasADi's own
+            return build(**changes)
+        return built(pickled)
+
+    return one
+
+
+@shared
 def double_integrator(**changes: Any) -> Ocp:
     """A mass on a line, 2 states, 1 input, linear: position and speed follow a reference."""
     x = ca.SX.sym("x", 2)
@@ -35,6 +62,7 @@ def double_integrator(**changes: Any) -> Ocp:
     return Ocp(model, **({"N": 10, "dt": 0.1, "Q": [1.0, 0.1], "R": [0.05]} | changes))
 
 
+@shared
 def beacon(**changes: Any) -> Ocp:
     """A unicycle that sees the range and the bearing of a beacon, 3 states, 2 inputs: outputs not linear, a parameter in them, no bounds."""
     x = ca.SX.sym("x", 3)
@@ -72,11 +100,15 @@ PAPER: dict[str, Any] = {
 SLEW: dict[str, Any] = {"lbdu": [-0.25, -0.4], "ubdu": [0.25, 0.4]}
 
 
-def pioneer(**changes: Any) -> Ocp:
+def new_pioneer(**changes: Any) -> Ocp:
     """The paper's robot with the shipped configuration's bounds, 5 states, 2 inputs: everything at once."""
     return Ocp(pioneer_3dx(), **(PAPER | SLEW | changes))
 
 
+pioneer = shared(new_pioneer)
+
+
+@shared
 def fenced(**changes: Any) -> Ocp:
     """The paper's robot beside a disc, its power limited by an input at once, and a terminal weight: general constraints in x, u and p."""
     model = pioneer_3dx()

@@ -21,6 +21,7 @@ from rti_mpc.cache import cache_dir
 from rti_mpc.codegen import bind, compiled
 from rti_mpc.errors import ShapeError
 
+pytestmark = pytest.mark.usefixtures("optimizing")
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler on this machine")
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
 

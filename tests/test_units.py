@@ -15,6 +15,7 @@ from rti_mpc import units as division
 from rti_mpc.codegen import bind, compiled, with_bodies
 from rti_mpc.units import units
 
+pytestmark = pytest.mark.usefixtures("optimizing")
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler on this machine")
 STAGES = 3
 LONG = 50  # of a unit in these tests, so that the compiler is soon done

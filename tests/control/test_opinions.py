@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -120,6 +121,7 @@ def test_a_wrong_gradient_in_either_solver_is_told_within_three_samples(which: s
     """The certificate finds nothing wrong: it judges the plan by the same data. While all inputs are at bounds, nothing depends on the gradient."""
     body = robot(eight())
     drive(made(0), body, 3.0)
+    monkeypatch.setattr(construction, "_constructions", WeakKeyDictionary())
     if which == "active set":
         for name in ("places", "certificate"):
             monkeypatch.setattr(construction, name, misled(getattr(construction, name)))

@@ -13,7 +13,8 @@ import pytest
 from rti_mpc.rti import construction
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
-from tests.problems import arc, pioneer
+from tests.problems import arc
+from tests.problems import new_pioneer as pioneer
 
 T = 0.1 * np.arange(1, 8)
 
