@@ -26,7 +26,6 @@ from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.recursion import recur
 from rti_mpc.rti.rti import Rti
 
-pytestmark = pytest.mark.usefixtures("optimizing")
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler on this machine")
 
 

@@ -62,21 +62,22 @@ def unmoving(rti: Rti) -> tuple[Array, ...]:
 
 
 @pytest.mark.parametrize(
-    ("formulation", "solver", "changes"),
+    ("formulation", "solver", "changes", "states"),
     [
-        ("sequential", "riccati", {"method": "euler"}),
-        ("simultaneous", "riccati", NARROW),
-        ("simultaneous", "riccati", {"N": 10, "N_u": 4} | NARROW),
-        ("simultaneous", "osqp", {"N": 10, "N_u": 4} | NARROW),
+        ("sequential", "riccati", {"method": "euler"}, 50),
+        ("simultaneous", "riccati", NARROW, 50),
+        ("simultaneous", "riccati", {"N": 10, "N_u": 4} | NARROW, 50),
+        ("simultaneous", "osqp", {"N": 10, "N_u": 4} | NARROW, 10),
+        pytest.param("simultaneous", "osqp", {"N": 10, "N_u": 4} | NARROW, 50, marks=pytest.mark.slow),
     ],
-    ids=["paper_euler", "rk4_with_state_bounds", "held_inputs_with_state_bounds", "osqp"],
+    ids=["paper_euler", "rk4_with_state_bounds", "held_inputs_with_state_bounds", "osqp", "osqp at more states"],
 )
-def test_rti_converges_to_the_nonlinear_solution_when_the_state_is_held(formulation: str, solver: str, changes: dict[str, Any]) -> None:
+def test_rti_converges_to_the_nonlinear_solution_when_the_state_is_held(formulation: str, solver: str, changes: dict[str, Any], states: int) -> None:
     ocp = pioneer(**changes)
     rti = Rti(ocp, replace(TIGHT, scaling=10), formulation=formulation, solver=solver, compile=False)
     solve = nlp(ocp)
     active = np.zeros(3)
-    for x0, y_ref, u_prev in near_the_eight(ocp, seed=1, count=50):
+    for x0, y_ref, u_prev in near_the_eight(ocp, seed=1, count=states):
         rti.reset(x0, u_prev)
         x, u, cost = solve(x0, u_prev, y_ref, rti.x, rti.u)
         iterate(rti, x0, y_ref, u_prev, iterations=150, change=1e-7)
@@ -85,9 +86,9 @@ def test_rti_converges_to_the_nonlinear_solution_when_the_state_is_held(formulat
         du = np.diff(np.vstack([u_prev, u]), axis=0)
         at = (np.abs(u) - ocp.ubu, np.abs(du) - ocp.ubdu, (np.abs(x[1:]) - ocp.ubx)[:, 3:])
         active += [bool(np.any(a > -1e-6)) for a in at]
-    assert active[0] >= 10
-    assert active[1] >= 10
-    assert active[2] >= (40 if "ubx" in changes else 1)
+    assert active[0] >= 0.2 * states
+    assert active[1] >= 0.2 * states
+    assert active[2] >= (0.8 * states if "ubx" in changes else 1)
 
 
 def test_one_full_step_solves_a_linear_quadratic_ocp_exactly() -> None:
@@ -629,7 +630,7 @@ def test_prepare_and_feedback_do_not_grow_the_heap() -> None:
 @pytest.mark.parametrize(
     ("solver", "samples"),
     [
-        ("riccati", 20_000),
+        ("riccati", 8_000),
         ("osqp", 4_000),
         pytest.param("riccati", 100_000 if "CI" in os.environ else 1_000_000, marks=pytest.mark.slow),
         pytest.param("osqp", 20_000 if "CI" in os.environ else 200_000, marks=pytest.mark.slow),

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import tomllib
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -201,6 +202,12 @@ def test_version_names_what_decides_what_a_command_does() -> None:
         assert word in done.stdout
 
 
+@cache
+def schema() -> Any:
+    """What `rti-mpc schema` prints."""
+    return json.loads(rti_mpc("schema").stdout)
+
+
 TYPES: dict[str, Any] = {"number": (int, float), "integer": int, "string": str, "boolean": bool, "array": list, "object": dict, "null": type(None)}
 
 
@@ -228,22 +235,20 @@ def refused(value: Any, schema: Any, root: Any) -> bool:
 
 @pytest.mark.parametrize("path", [SHIPPED, *sorted(TEMPLATES.glob("*.toml"))], ids=lambda path: path.stem)
 def test_schema_for_editors_takes_what_is_shipped_and_refuses_what_the_service_refuses(path: Path) -> None:
-    schema = json.loads(rti_mpc("schema").stdout)
-    document = tomllib.loads(path.read_text())
-    assert not refused(document, schema, schema)
+    ours, document = schema(), tomllib.loads(path.read_text())
+    assert not refused(document, ours, ours)
     weights = document["ocp"]["weights"]
-    assert not refused({**document, "ocp": {**document["ocp"], "weights": {**weights, "delta": 28.0, "lambda": [0.1, 0.2]}}}, schema, schema)
+    assert not refused({**document, "ocp": {**document["ocp"], "weights": {**weights, "delta": 28.0, "lambda": [0.1, 0.2]}}}, ours, ours)
     for wrong in ({"N": "20"}, {"M": 20}, {"weights": {**weights, "delta": "28"}}, {"bounds": {"inputs": {"v": [1.0]}}}):
-        assert refused({**document, "ocp": {**document["ocp"], **wrong}}, schema, schema), wrong
+        assert refused({**document, "ocp": {**document["ocp"], **wrong}}, ours, ours), wrong
 
 
 def test_schema_for_editors_describes_every_table_and_refuses_unknown_keys() -> None:
-    schema = json.loads(rti_mpc("schema").stdout)
-    shipped = tomllib.loads(SHIPPED.read_text())
-    assert shipped.keys() <= schema["properties"].keys()
-    assert schema["additionalProperties"] is False
-    assert schema["title"] == "rti-mpc robot"
-    for table in schema["$defs"].values():
+    ours, shipped = schema(), tomllib.loads(SHIPPED.read_text())
+    assert shipped.keys() <= ours["properties"].keys()
+    assert ours["additionalProperties"] is False
+    assert ours["title"] == "rti-mpc robot"
+    for table in ours["$defs"].values():
         assert table["additionalProperties"] is False
         assert all("description" in field for field in table["properties"].values()), table["title"]
 
