@@ -13,7 +13,7 @@ import importlib.util
 import json
 import shutil
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -37,18 +37,16 @@ PRIVATE = {"bus": True, "model": {"folder"}}
 class Origin:
     """The files of one controller, and the answers to a recorder."""
 
-    def __init__(self, config: Config, model: Model, epoch: Callable[[], int]) -> None:
+    def __init__(self, files: Mapping[str, str], epoch: Callable[[], int]) -> None:
         """
-        Collect the files.
+        Pack the files.
 
         Args:
-            config: Configuration of the controller.
-            model: Its model.
-            epoch: Returns its epoch.
+            files: Their texts by name, see `origin_files`.
+            epoch: Returns the epoch of the controller.
         """
         self._epoch = epoch
-        files = origin_files(config, model)
-        self._bundle = base64.b64encode(zlib.compress(json.dumps(files).encode(), 9)).decode()
+        self._bundle = base64.b64encode(zlib.compress(json.dumps(dict(files)).encode(), 9)).decode()
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """

@@ -56,7 +56,7 @@ from rti_mpc_service.description import controller_info
 from rti_mpc_service.host import realtime
 from rti_mpc_service.latch_file import LatchFile
 from rti_mpc_service.operator_stop import OperatorStop
-from rti_mpc_service.origin import Origin
+from rti_mpc_service.origin import Origin, origin_files
 from rti_mpc_service.warm_up import warm_up
 
 TICK_PERIOD_S = 0.01  # period of the check for silence
@@ -100,6 +100,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
             else:
                 controller.enable()
 
+    origin = Origin(origin_files(config, rti.ocp.model), lambda: leadership.epoch)  # asks git, which must not be real-time
     # After compiling, and before any thread is started, so that all threads inherit the settings.
     outcomes = realtime.attempt(**config.realtime.model_dump(exclude={"rehearse"}))
     with Bus.join(bus_settings, config.keys(), stop=stop, say=log.warning) as bus:
@@ -120,7 +121,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
         daemon = Daemon(config, controller, bus, leadership, params, lock, rti, outcomes, operator_stop, book)
         operator_stop.serve(bus, lambda: leadership.role, daemon.publish_info)
         bus.serve(bus.keys.request, daemon.orders.answer)
-        bus.serve(bus.keys.origin, Origin(config, ocp.model, lambda: leadership.epoch).answer)
+        bus.serve(bus.keys.origin, origin.answer)
         log.info("epoch %d controls %s every %g s" if leadership.leading else "%d stands by %s, every %g s", leadership.epoch, config.robot, ocp.dt)
         if outcomes:
             level = logging.INFO if all(outcome.granted for outcome in outcomes) else logging.WARNING

@@ -68,7 +68,7 @@ def compare(
     begin_s = 1e-9 * int(run.stamp_ns[0])
     said = f"with {', '.join(assignments)}" if assignments else "with the same settings"
     after = f", numbers after {run.transient_s:g} s" if run.transient_s else ""
-    print(f"  in closed loop {said}, {run.time_s[-1]:.1f} s from {begin_s:.1f} s on{after}:")
+    print(f"  in closed loop {said}, {run.time_s[-1]:.1f} s from {begin_s:.3f} s on{after}:")
     for line in (*lines(numbers, run), told_apart(apart, ocp)):
         print(f"    {line}")
     if driven.passage.unsent:

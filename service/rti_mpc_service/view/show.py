@@ -15,7 +15,7 @@ from rti_mpc_service.view.recording import Entry
 from rti_mpc_service.view.scene import Scene
 
 FLUSH_TIMEOUT_S = 60.0
-SEND_NS = 1_000_000_000  # of the robot's time that is sent together: larger chunks open fast
+SEND_NS = 10_000_000_000  # of the robot's time that is sent together: in one frame a viewer takes in chunks for some ms alone, however long it draws
 
 
 def opened(path: Path) -> Recording:

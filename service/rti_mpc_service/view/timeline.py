@@ -13,8 +13,8 @@ class Timeline:
     """
     Places stamps on one axis, in ns.
 
-    The axis is the robot's clock itself. Where a restarted robot's clock begins
-    again, its new life is appended, so that nothing is drawn over the old one.
+    The axis is the robot's clock itself. Where it begins again, as the robot was restarted, or
+    jumps back, what follows is appended, so that nothing is drawn over what was before.
 
     For several robots, whose clocks have nothing in common, it is the local time since a
     common instant: each life of a robot begins when its first state has arrived, and goes on
@@ -42,7 +42,7 @@ class Timeline:
 
     def place_state(self, epoch: int, stamp_ns: int, local_ns: int = 0) -> int:
         """Return the time of a state that has arrived at a local time, and advance the axis to it."""
-        if epoch != self._epoch:
+        if epoch != self._epoch or stamp_ns < self._latest_ns - MAX_APART_NS:  # a clock that jumps back, as a guard judges it, begins again
             if self._begun_ns is not None:
                 self._offset_ns = self._since_begun(local_ns) - stamp_ns
             elif self._epoch is not None and stamp_ns < self._latest_ns:

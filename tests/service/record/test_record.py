@@ -25,7 +25,7 @@ from rti_mpc.wire.received import Received
 from rti_mpc_service.config.build import build_model
 from rti_mpc_service.config.config import load
 from rti_mpc_service.host.pressure import waited_us
-from rti_mpc_service.origin import Origin
+from rti_mpc_service.origin import Origin, origin_files
 from rti_mpc_service.record import record
 from rti_mpc_service.record.inbox import ENTRY_BYTES, Arrived, Inbox
 from rti_mpc_service.record.record import EVERYTHING, Recorder, parse_retention
@@ -211,7 +211,7 @@ def test_origin_of_commands_is_handed_out_in_pieces_without_what_is_private(tmp_
     (tmp_path / "secret.json5").write_text("{}")
     (tmp_path / "robot.toml").write_text(shipped + '\n[bus]\nconfig = "secret.json5"\n')
     config = load(tmp_path / "robot.toml")
-    origin = Origin(config, build_model(config), lambda: (5 << 20) + 42)
+    origin = Origin(origin_files(config, build_model(config)), lambda: (5 << 20) + 42)
     bundle, size = "", 1
     while len(bundle) < size:
         answer = origin.answer({"from": len(bundle)})

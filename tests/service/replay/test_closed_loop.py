@@ -193,7 +193,7 @@ def test_both_drives_are_told_in_numbers_drawn_and_written_into_one_recording(tm
     text = capsys.readouterr().out
     assert status == 0, text
     assert "0 bits differ" in text
-    assert "in closed loop with ocp.weights.R.u_c=30, 5.8 s from 0.0 s on, numbers after 2.9 s" in text
+    assert "in closed loop with ocp.weights.R.u_c=30, 5.8 s from 0.100 s on, numbers after 2.9 s" in text
     (result,) = json.loads((tmp_path / "run.json").read_text())
     loop = result["closed_loop"]
     assert loop["closed_loop"]["distance_mm_rms"] != loop["recorded"]["distance_mm_rms"]

@@ -24,6 +24,15 @@ def test_a_clock_that_begins_again_is_appended() -> None:
     assert timeline.place_state(5, 0) == 22 * SECOND + 2 * GAP_BETWEEN_LIVES_NS
 
 
+def test_a_clock_that_jumps_back_is_appended_but_not_one_that_jitters() -> None:
+    timeline = Timeline()
+    timeline.place_state(3, 20 * SECOND)
+    assert timeline.place_state(3, 20 * SECOND - SECOND // 10) == 20 * SECOND - SECOND // 10
+    assert timeline.place_state(3, 5 * SECOND) == 20 * SECOND + GAP_BETWEEN_LIVES_NS
+    assert timeline.place(5 * SECOND + 7) == timeline.now_ns + 7
+    assert timeline.place_state(3, 6 * SECOND) == 21 * SECOND + GAP_BETWEEN_LIVES_NS
+
+
 def test_a_clock_that_goes_on_through_a_restart_stays_as_it_is() -> None:
     timeline = Timeline()
     timeline.place_state(3, 20 * SECOND)
@@ -74,6 +83,8 @@ def test_a_clock_that_waits_or_jumps_does_not_leave_the_robots_beside_it() -> No
     timeline.place_state(1, 0, SECOND)
     assert timeline.place_state(1, SECOND // 10, 61 * SECOND) == 61 * SECOND - MAX_APART_NS, "its clock has waited for a minute"
     assert timeline.place_state(1, 3600 * SECOND, 61 * SECOND) == 61 * SECOND + MAX_APART_NS, "its clock has jumped by an hour"
+    assert timeline.place_state(1, 0, 62 * SECOND) == 62 * SECOND, "and back"
+    assert timeline.place_state(1, SECOND, 63 * SECOND) == 63 * SECOND
 
 
 def test_what_comes_before_the_first_state_of_one_of_several_robots_is_placed_when_it_has_arrived() -> None:
