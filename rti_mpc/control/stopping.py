@@ -134,7 +134,7 @@ class Stopping:
 
     def stop(self, x: Array, state_ns: int, act_ns: int, u_prev: Array, reach: tuple[Array, Array]) -> tuple[Array, int, Ending]:
         """
-        Return rows that bring the robot to rest, shape ``(n, nu)``, for how long they are valid, in ns, and the way to rest after them.
+        Return rows that bring the robot to rest, shape ``(n, nu)``, for how long they are valid, in ns, their period and the way to rest after them.
 
         Args:
             x: Last state, shape ``(nx,)``.
@@ -166,7 +166,7 @@ class Stopping:
         self.at_rest = bool(max(np.abs(part).max() for part in still_to_move) <= REST_SHARE)
         row = min(max(1, self._valid_ns // self.period_ns), len(way.u) - 1)
         self.rows = way.u[np.minimum(np.arange(len(self.rows)), len(way.u) - 1)]
-        return way.u[:row].copy(), min(row * self.period_ns, self._valid_ns), self._ending(row)
+        return way.u[:row].copy(), min(row * self.period_ns, self._valid_ns), {**self._ending(row), "period_ns": self.period_ns}
 
     def _ending(self, row: int) -> Ending:
         """Return the fields of a command from a row of the way on."""

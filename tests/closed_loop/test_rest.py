@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from rti_mpc.contract.message import Command, End, Reference
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.model.integrator import integrator
+from rti_mpc.rti.rest import find_stop_law
 from rti_mpc.rti.rti import Rti
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
@@ -104,6 +107,25 @@ def test_last_command_of_a_controller_that_dies_brings_the_robot_to_rest(name: s
     assert np.abs(rates(name, x, u)).max() < STILL
     x, u = played(name, last, body.x, body.now_ns, 12.0, heavier=1.01)
     assert np.abs(rates(name, x, 1.01 * u)).max() < STILL, "one that answers 1 % more is held as well"
+
+
+def test_stop_whose_rows_last_several_periods_is_followed_by_the_rest_of_its_way() -> None:
+    """At short periods a way has fewer rows than there are periods: those in the command's plan last as long as the ones that follow."""
+    ocp = replace(ocp_of("car"), dt=0.01)
+    law = find_stop_law(ocp)
+    assert law is not None
+    assert law.substeps > 1
+    controller = Controller(Rti(ocp, compile=False), Timing(), stop_law=law, compile=False)
+    y = np.array([0.0, 0, 0, 1]) + 0.05 * np.arange(400)[:, None] * np.array([1.0, 0, 0, 0])
+    controller.receive_reference(Reference(1, 1, 0, 50 * MS, End.HOLD, y, np.zeros((400, 0))))
+    body = Lockstep(RobotSettings(ocp.model, np.array([0.0, 0, 0, 1]), ocp.ubdu / ocp.dt, state_period_s=ocp.dt))
+    drive(controller, body, 0.5)
+    stop = controller.standstill(body.now_ns)
+    assert stop is not None
+    assert stop.period_ns == stop.rest_period_ns == round(1e9 * law.period_s)
+    assert stop.stamp_ns + len(stop.u) * stop.period_ns == stop.valid_until_ns
+    x, _ = played("car", stop, body.x, body.now_ns, MOTIONS["car"][2])
+    assert abs(x[3]) < STILL
 
 
 @pytest.mark.parametrize("name", MOTIONS)
