@@ -49,6 +49,7 @@ from rti_mpc.control.stopping import Stopping
 from rti_mpc.control.track import Track
 from rti_mpc.control.tuning import Tuning
 from rti_mpc.errors import OcpError
+from rti_mpc.model.model import depends_on
 from rti_mpc.rti.ocp import Ocp, rest_fault
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.way_to_rest import StopLaw
@@ -137,7 +138,6 @@ class Controller:
         self._ways = ways  # to rest; None: its inputs ramp to rest
         balances = stop_law is not None and stop_law.disturbances.size > 0
         self._known = PLANNING_MODES | ({Mode.STOPPED, Mode.BRAKING} if balances else set())  # modes in which disturbances are estimated
-        self._planner = Planner(rti, self._track, self._sent, self._prediction, self.envelope, self._tuning, self._states.d, self.grid.dt_ns)
         self._overran = False  # whether the last sample was over its budget
         self._unreported = False  # whether it was said that the robot does not report its inputs
         self._stopped = ""  # why an operator's stop is latched
@@ -147,6 +147,18 @@ class Controller:
         self._blockage = Blockage(rti, compile=compile)
         self._opinions = second_opinions(rti, second_opinion, self.say)
         self._delay = DelayEstimator(model, self.grid.dt_ns, self.grid.most_ns, compile=compile) if timing.delay_s is None else None
+        predicting = [of.p[: self.np_] for of in (self._prediction, observer, self._delay) if of is not None]
+        self._planner = Planner(
+            rti,
+            self._track,
+            self._sent,
+            self._prediction,
+            self.envelope,
+            self._tuning,
+            self._states.d,
+            tuple(predicting) if depends_on(model.rate_expr, model.p[: self.np_]) else (),
+            self.grid.dt_ns,
+        )
         self._understudy = StateStream(model, self._stale_ns, self.grid.dt_ns, settling_s)  # judges states in rehearsals
 
     @property
@@ -206,7 +218,8 @@ class Controller:
                 return self._give_up(state)
             self._forget(arrival, state)
         surprised = self._hear(state)
-        self._states.estimate(self._sent, known=self.mode in self._known and not surprised)
+        if (lost := self._states.estimate(self._sent, known=self.mode in self._known and not surprised)) is not None:
+            self.say(lost)
         if len(self._states.d):
             self._prediction.p[self.np_ :] = self._states.d
         if surprised and self._planner.loaded and self.grid.running:

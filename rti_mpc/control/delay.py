@@ -45,6 +45,7 @@ class DelayEstimator:
 
     Attributes:
         delay_ns: The estimate, ns.
+        p: Parameters of the model, shape ``(np,)``; nominal unless written.
     """
 
     def __init__(self, model: Model, dt_ns: int, most_ns: int, *, compile: bool = True) -> None:
@@ -64,7 +65,8 @@ class DelayEstimator:
         self._span: Array = np.zeros(1)  # s
         phi = integrator(model)
         integrate = compiled(phi)[0] if compile else phi
-        inputs = {"x": self._x, "u": self._u, "p": np.array(model.p_nominal), "dt": self._span}
+        self.p: Array = np.array(model.p_nominal)
+        inputs = {"x": self._x, "u": self._u, "p": self.p, "dt": self._span}
         self._integrate = bind(integrate, inputs, {"x_next": self._next})
 
     def sent(self, command: Command) -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import isfinite
 
 import casadi as ca
 import numpy as np
@@ -76,6 +77,7 @@ class Observer:
         model: The model with its disturbances, which the controller must predict with.
         x: Estimated state, shape ``(nx,)``.
         d: Estimated disturbances, shape ``(nd,)``: the last parameters of `model`.
+        p: Its other parameters, shape ``(np,)``; nominal unless written.
         frozen: Whether the disturbances keep their values, because it is not known which inputs act.
 
     Raises:
@@ -110,11 +112,11 @@ class Observer:
         self.frozen = False
         self._P: Array = self._initial.copy()
         self._u, self._span, self._y, self._gain = np.zeros(model.nu), np.zeros(1), np.zeros(nx), np.ones(1)
-        p: Array = np.array(model.p_nominal)
+        self.p: Array = np.array(model.p_nominal)
         functions = predict(self.model, nd, np.square(walks)), correct(nx, nd, measured, variances, self._limits)
         made = compiled(*functions) if compile else functions
         z_next, P_next = np.zeros_like(z), np.zeros_like(self._P)
-        before = {"z": z, "P": self._P, "u": self._u, "p": p, "span": self._span}
+        before = {"z": z, "P": self._P, "u": self._u, "p": self.p, "span": self._span}
         self._predict = bind(made[0], before, {"z_next": z_next, "P_next": P_next})
         measured_at = {"z": z_next, "P": P_next, "y": self._y, "gain": self._gain}
         self._correct = bind(made[1], measured_at, {"z_corrected": z, "P_corrected": self._P})
@@ -122,8 +124,9 @@ class Observer:
         self._z = z
 
     def reset(self, x: Array) -> None:
-        """Start from a state, shape ``(nx,)``; the disturbances keep their values, and the covariance starts anew."""
+        """Start from a state, shape ``(nx,)``; the disturbances keep their values if they are finite, and the covariance starts anew."""
         self.x[:] = x
+        np.nan_to_num(self.d, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
         self._P[:] = self._initial
 
     def predict(self, u: Array, span_s: float) -> None:
@@ -139,6 +142,11 @@ class Observer:
         self._y[:] = y
         self._gain[0] = not self.frozen
         self._correct()
+
+    @property
+    def finite(self) -> bool:
+        """Whether the estimate is a number: a model may have none, such as the root of a level, where an estimate falls short of the state."""
+        return isfinite(self._z.sum() + self._P.sum())
 
 
 def predict(model: Model, nd: int, walks: Array) -> ca.Function:
@@ -167,5 +175,5 @@ def correct(nx: int, nd: int, measured: list[int], variances: list[float], limit
         K = acts * column / s
         z = z + K * (y[j] - z[j])
         P = P - K @ column.T - column @ K.T + s * (K @ K.T)
-    bounded = ca.fmax(ca.fmin(z[nx:], ca.DM(limits)), -ca.DM(limits))
+    bounded = ca.fmax(ca.fmin(z[nx:, 0], ca.DM(limits)), -ca.DM(limits))
     return function("observer_correct", inputs, {"z_corrected": ca.vertcat(z[:nx], bounded), "P_corrected": ca.densify((P + P.T) / 2)})

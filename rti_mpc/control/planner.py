@@ -33,7 +33,18 @@ class Planner:
         reach: Lowest and highest first two rows of the plan, each of shape ``(2, nu)``.
     """
 
-    def __init__(self, rti: Rti, track: Track, sent: Sent, prediction: Prediction, envelope: Envelope, tuning: Tuning, d: Array, dt_ns: int) -> None:
+    def __init__(
+        self,
+        rti: Rti,
+        track: Track,
+        sent: Sent,
+        prediction: Prediction,
+        envelope: Envelope,
+        tuning: Tuning,
+        d: Array,
+        robot: tuple[Array, ...],
+        dt_ns: int,
+    ) -> None:
         """
         Begin with no QP.
 
@@ -45,12 +56,13 @@ class Planner:
             envelope: Limits of the inputs.
             tuning: Weights and bounds that act.
             d: Estimated disturbances, shape ``(nd,)``, which are the last parameters of the model; owned by the caller.
+            robot: Parameters of the robot, each of shape ``(np,)``, wherever it is predicted; those of the reference are written into them.
             dt_ns: Period of the commands.
         """
         self.loaded = False
         self._x0 = prediction.x
         self._rti, self._track, self._sent, self._prediction, self._envelope, self._tuning = rti, track, sent, prediction, envelope, tuning
-        self._d, self._np, self._dt_ns = d, rti.ocp.model.np_ - len(d), dt_ns
+        self._d, self._robot, self._np, self._dt_ns = d, robot, rti.ocp.model.np_ - len(d), dt_ns
         self._u = rti.u.reshape(-1)
         # What nothing depends on is neither looked up nor handed on.
         self._p = track.p if rti.ocp.model.np_ else None
@@ -61,15 +73,22 @@ class Planner:
 
     def load(self, act_ns: int, *, shift: bool) -> None:
         """Load the QP of a command that acts at a time, at the last plan, shifted by a stage or as it is."""
-        self._track.look_up(act_ns)
-        if len(self._d):
-            self._track.p[:, self._np :] = self._d
+        self._look_up(act_ns)
         self.reach = self._sent.reach(act_ns)
         u_prev = self._sent.at(act_ns - 1)[0]
         u_before = self._sent.at(act_ns - 1 - self._dt_ns)[0] if self._remembers else None
         self._tuning.follow(u_prev)
         self._rti.prepare(self._track.y_ref, self._p, shift=shift, u_prev=u_prev, u_before=u_before)
         self.loaded = True
+
+    def _look_up(self, act_ns: int) -> None:
+        """Look the reference up, and with it the parameters of the robot."""
+        track = self._track
+        track.look_up(act_ns)
+        if len(self._d):
+            track.p[:, self._np :] = self._d
+        for p in self._robot:
+            p[:] = track.p[0, : self._np]
 
     def plan(self, x: Array, stamp_ns: int, act_ns: int) -> tuple[QpStatus, Array | None]:
         """
@@ -80,6 +99,8 @@ class Planner:
             stamp_ns: Its time.
             act_ns: When the plan begins to act: that of the last `load`, if one is loaded.
         """
+        if not self.loaded:
+            self._look_up(act_ns)
         self._prediction.predict(x, stamp_ns, act_ns)
         status = self._rti.feedback(self._x0) if self.loaded else self._feedback_cold(act_ns)
         if not (status.usable and isfinite(self._u.dot(self._u))):

@@ -105,17 +105,21 @@ class StateStream:
                 self._x[j] -= whole_turns(self._x[j] - turned[j])
         return arrival
 
-    def estimate(self, sent: Sent, *, known: bool) -> None:
+    def estimate(self, sent: Sent, *, known: bool) -> Notice | None:
         """
         Replace the last state by the observer's estimate, if there is one.
 
         Args:
             sent: The inputs that have acted since the state before.
             known: Whether it is certain that they acted; otherwise the disturbances keep their values.
+
+        Returns:
+            Notice of an estimate that was lost, None if there is nothing to report.
         """
         observer, last = self._observer, self.last
         if observer is None or last is None:
-            return
+            return None
+        lost = None
         if self._before_ns is None or last.stamp_ns - self._before_ns > self._stale_ns:
             observer.reset(self.x)
         else:
@@ -125,7 +129,11 @@ class StateStream:
             for j in self._angles:  # a turn between two states is no innovation
                 self.x[j] -= whole_turns(self.x[j] - observer.x[j])
             observer.correct(self.x)
+            if not observer.finite:
+                observer.reset(self.x)
+                lost = Notice(Severity.WARNING, "estimate_lost", "the estimate is not finite: it begins anew at the state that was received")
         self.x[:] = observer.x
+        return lost
 
     def _judge(self, state: State, arrival_ns: int) -> tuple[Arrival, str, str]:
         """Return the verdict on a state, with the code and the text of its notice."""

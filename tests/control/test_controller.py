@@ -8,6 +8,7 @@ import itertools
 from collections.abc import Callable
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -16,9 +17,13 @@ from rti_mpc.contract.message import STAMP_ON_ARRIVAL, End, Reference, State
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.control.ladder import MAX_FALLBACK_SAMPLES
+from rti_mpc.control.observer import Observer, ObserverSettings
+from rti_mpc.model.model import Model
 from rti_mpc.reference.trajectory import circle, eight, positioning, waypoints
+from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import Rti
+from rti_mpc.signals import Signal
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
 from tests.loop import MS, SLEW, Run, drive, reference, robot
@@ -242,6 +247,37 @@ def test_delay_that_is_known_costs_nothing(rti: Rti, delay_s: float, latency_s: 
         controller.receive_reference(reference(circle()))
         errors.append(drive(controller, robot(circle(), state_period_s=0.05), 30.0, latency_s=latency).error_mm(circle())[500:].max())
     assert errors[1] < errors[0] + 0.01
+
+
+@pytest.mark.parametrize("gain", [0.4, 2.5])
+def test_parameters_of_a_reference_are_those_of_the_robot_wherever_it_is_predicted(gain: float) -> None:
+    """A robot whose inputs do more or less than nominal, with a delay and an observer: as if that were nominal."""
+    errors = []
+    for nominal in (gain, 1.0):
+        x, u, p = ca.SX.sym("x"), ca.SX.sym("u"), ca.SX.sym("p")
+        model = Model(
+            "motor",
+            x,
+            u,
+            p * u,
+            p=p,
+            parameters=(Signal("gain", "m/(V s)"),),
+            p_nominal=[nominal],
+            states=(Signal("x", "m"),),
+            inputs=(Signal("u", "V"),),
+            y_expr=x,
+            outputs=(Signal("x", "m"),),
+        )
+        observer = Observer(model, ObserverSettings(), compile=False)
+        rti = Rti(Ocp(observer.model, N=10, dt=0.1, Q=[1.0], R=[1e-3], lbu=[-3.0], ubu=[3.0]), compile=False)
+        controller = Controller(rti, Timing(delay_s=0.3), observer=observer, compile=False)
+        y = np.sin(2.0 * 0.02 * np.arange(1000))[:, None]
+        controller.receive_reference(Reference(1, 1, 0, 20 * MS, End.HOLD, y, np.full_like(y, gain)))
+        plant = dataclasses.replace(model, p_nominal=[gain])
+        run = drive(controller, Lockstep(RobotSettings(plant, np.zeros(1), state_period_s=0.1)), 10.0, latency_s=0.25)
+        t = np.array(run.t_s)
+        errors.append((np.array(run.x)[:, 0] - np.sin(2.0 * t))[t > 3.0])
+    np.testing.assert_allclose(errors[1], errors[0], rtol=0, atol=1e-6)  # solver's tolerance
 
 
 def test_reference_and_prediction_begin_where_the_command_acts(rti: Rti) -> None:

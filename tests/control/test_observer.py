@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.contract.message import State
+from rti_mpc.contract.message import End, Reference, State
 from rti_mpc.contract.status import Mode
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.control.observer import Disturbance, Observer, ObserverSettings
@@ -22,9 +22,10 @@ from rti_mpc.model.robots.pioneer_3dx import NOMINAL_PARAMETERS, pioneer_3dx
 from rti_mpc.reference.trajectory import circle
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
+from rti_mpc.signals import Signal
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
-from tests.loop import SLEW, drive, reference
+from tests.loop import MS, SLEW, drive, reference
 from tests.problems import PAPER
 from tests.problems import SLEW as INCREMENTS
 
@@ -140,3 +141,30 @@ def test_wrong_model_is_tracked_without_offset_by_its_observer(plant: Callable[[
 
 def test_pose_alone_is_enough_to_drive() -> None:
     assert steady_error_mm(wrong_parameters(), ObserverSettings(INPUTS, POSE), hides=(3, 4)) < 1.0
+
+
+def test_estimate_for_which_the_model_has_no_value_begins_anew_at_the_next_state() -> None:
+    """The outflow of a tank is the root of its level: one measurement below zero, and no number follows from it."""
+    h, q = ca.SX.sym("h"), ca.SX.sym("q")
+    tank = Model(
+        "tank",
+        h,
+        q,
+        0.3 * q - 0.5 * ca.sqrt(h),
+        y_expr=h,
+        states=(Signal("h", "m"),),
+        inputs=(Signal("q", "m/s"),),
+        outputs=(Signal("h", "m"),),
+        x_nominal=(0.3,),
+    )
+    observer = Observer(tank, ObserverSettings({"h": Disturbance(drift=0.1, limit=0.2)}), compile=False)
+    rti = Rti(Ocp(observer.model, N=10, dt=DT, Q=[1.0], R=[0.1], lbu=[0.0], ubu=[3.0]), compile=False)
+    controller = Controller(rti, Timing(), observer=observer, compile=False)
+    controller.receive_reference(Reference(1, 1, 0, 100 * MS, End.HOLD, np.full((100, 1), 0.4), np.zeros((100, 0))))
+    body = Lockstep(RobotSettings(tank, np.array([0.3]), state_period_s=DT))
+    run = drive(controller, body, 6.0, sees=lambda state: replace(state, x=np.array([-0.2])) if state.seq == 20 else state)
+    codes = [notice.code for notice in controller.notices()]
+    assert codes.count("estimate_lost") == 1
+    assert np.isfinite(observer.d).all()
+    assert [command.mode for command in run.commands[-5:]] == [Mode.TRACKING] * 5
+    assert run.x[-1] == pytest.approx(0.4, abs=0.01)
