@@ -218,10 +218,30 @@ every parameter, and one TOML file in `deploy/robots`, to begin with for a robot
 Here each follows its own scenario in lockstep, without clock and bus; errors are the largest after the first third.
 `make gallery` makes this page again.
 
-Short programs in `examples/` use them: `race.py` laps three tracks, `quadrotor.py` flies to a point and back,
-`tuning.py` compares weights in a table,
-`obstacles.py` passes discs, `observer.py` estimates the current that the boat is in, `own_planner.py` follows a walker
-whose way nobody knows, by a short reference twice a second:
+Short programs in `examples/` use them, print an error and, given the name of a file, draw a picture:
+`python examples/race.py race.png`. `recording.ipynb` is a notebook that reads [what a demo has recorded](recording.md).
+
+`race.py` laps three tracks with a car that follows a [path](paths.md), beside one that keeps to the centre line:
+
+![Race lines on three tracks](race.png)
+
+`obstacles.py` passes two discs that lie on the way:
+
+![The way around two discs](gallery/obstacles.png)
+
+`observer.py` estimates the current that the boat is in; without that it stays 19 cm off:
+
+![An eight sailed in a current, with and without an observer](gallery/observer.png)
+
+`tuning.py` compares three weights, in a table and as they drive:
+
+![An eight driven with three weights](gallery/tuning.png)
+
+`quadrotor.py` flies to a point and back:
+
+![Position and thrusts of a quadrotor over time](gallery/quadrotor_there_and_back.png)
+
+`own_planner.py` follows a walker whose way nobody knows, by a short reference twice a second:
 
 ![A robot a second behind a walker](gallery/own_planner.png)
 

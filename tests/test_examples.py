@@ -16,6 +16,7 @@ from rti_mpc_service.host.hold_up import Host
 from tests.in_time import explained
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+GALLERY = Path(__file__).parents[1] / "docs" / "gallery.md"
 # The first number that each prints, or the one after a word, and what it must not exceed.
 MOST = {
     "delay": (r"([\d.]+) mm off at most with the delay measured", 1.0),
@@ -34,14 +35,26 @@ def test_every_example_is_run() -> None:
     assert set(MOST) == {path.stem for path in EXAMPLES.glob("*.py")}
 
 
+@pytest.mark.parametrize("name", MOST)
+def test_gallery_has_a_picture_of_each_example(name: str) -> None:
+    page = GALLERY.read_text(encoding="utf-8")
+    told = page.split(f"`{name}.py` ", 1)[1]
+    picture = re.search(r"!\[[^]]+\]\(([^)]+)\)", told)
+    assert picture is not None
+    assert (GALLERY.parent / picture[1]).is_file()
+    assert "`" not in told[: picture.start()].replace("`rti-mpc status --once --json`", ""), "the next picture is another example's"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MOST)
-def test_example_prints_a_small_error(name: str, tmp_path: Path, host: Host) -> None:
+def test_example_prints_a_small_error_and_draws_a_picture(name: str, tmp_path: Path, host: Host) -> None:
     environment = {**os.environ, "PYTHONPATH": str(EXAMPLES.parent)}
-    command = [sys.executable, str(EXAMPLES / f"{name}.py")]
+    picture = tmp_path / "drawn.png"
+    command = [sys.executable, str(EXAMPLES / f"{name}.py"), str(picture)]
     since_ns = time.monotonic_ns()
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
+    assert picture.stat().st_size > 10_000
     pattern, most = MOST[name]
     said = re.search(pattern, done.stdout)
     assert said is not None, done.stdout
