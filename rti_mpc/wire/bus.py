@@ -234,14 +234,21 @@ class Bus:
         """
 
         def wanted() -> str:
-            if heard() or (links := self._session.links) is None:
+            if heard():
                 return ""
-            if links:
+            if links := self._session.links:
                 return f"no {what} of {self.keys.prefix}/{self.keys.robot} yet, from {links} others on the bus: is it running, under this name?"
-            where = self._session.connects_to
-            return f"not connected, no {what} yet: " + (f"no process answers at {where}" if where else "no process has connected yet")
+            return f"not connected, no {what} yet: {why}" if (why := self.unconnected) else ""
 
         remind(self._say, wanted, self._over)
+
+    @property
+    def unconnected(self) -> str:
+        """Why nothing can be heard: no process is linked to this one; empty if one is, or it cannot be known."""
+        if self._session.links != 0:
+            return ""
+        where = self._session.connects_to
+        return f"no process answers at {where}" if where else "no process has connected yet"
 
     def watch_certificate(self, tell: Callable[[Notice], object]) -> None:
         """Warn from `rti_mpc.wire.certificate.WARN_DAYS` before the end of this process's certificate on, once a day, in a thread of its own."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -10,6 +11,7 @@ import typer
 from rti_mpc_service.commands.arguments import StatePath, Timeout
 from rti_mpc_service.commands.on_bus import on_bus
 from rti_mpc_service.config.schema import Config
+from rti_mpc_service.shipped import SHIPPED
 
 if TYPE_CHECKING:
     from rti_mpc.wire.bus import BusSettings
@@ -38,6 +40,7 @@ def enable(config: Config, bus: BusSettings, timeout: Timeout = 2.0, state: Stat
 def status(
     config: Config,
     bus: BusSettings,
+    path: Path,
     once: Annotated[bool, typer.Option("--once", help="Print the table once; without a terminal it always is.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, once, for scripts.")] = False,
     timeout: Timeout = 3.0,
@@ -45,7 +48,7 @@ def status(
     """Show all robots on the bus: mode, error, ages, times, who leads, whether the solvers agree, versions, the last event."""
     from rti_mpc_service.status.status import main
 
-    return main(bus, config.keys(), once=once, as_json=as_json, timeout_s=timeout)
+    return main(bus, config.keys(), named=path != SHIPPED, once=once, as_json=as_json, timeout_s=timeout)
 
 
 @on_bus(operator, with_model=False)

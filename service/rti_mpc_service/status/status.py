@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from threading import Event, Lock
 from typing import Any
 
+from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -17,7 +18,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
-from rti_mpc_service.console import plain_console, table_console
+from rti_mpc_service.console import plain_console, widened
 from rti_mpc_service.redrawn import Redrawn
 from rti_mpc_service.status.survey import Survey
 
@@ -25,33 +26,36 @@ LISTEN_PERIOD_S = 0.05  # resolution of the ages
 DRAW_EACH = 5  # of these periods
 FIND_S = 1.0  # at least, for robots to be found
 MAX_ROBOTS = 100
+MAX_WIDTH = 1000  # columns, more than any table needs
 STALE_S = 1.0  # ages from which on they are marked
 DISAGREEMENT = 1e-3  # of half an input's range, as for the event solvers_disagree
 GOOD, BAD = ("TRACKING", "HOLDING"), ("BRAKING", "STOPPED", "FALLBACK")
-COLUMNS = ("robot", "mode", "error", "age of state", "reference", "times p50/max [us]", "leads", "solvers differ", "versions", "last event")
+COLUMNS = ("mode", "error", "age of state", "reference", "times p50/max [us]", "leads", "solvers differ", "versions")
+ROLES = ("controller", "standby", "robot", "guard", "reference")  # that make a robot; routers, viewers and recorders are there for any
 
 log = logging.getLogger(__name__)
 
 
-def main(bus_settings: BusSettings, keys: Keys, *, once: bool, as_json: bool, timeout_s: float, stop: Event | None = None) -> int:
+def main(bus_settings: BusSettings, keys: Keys, *, named: bool, once: bool, as_json: bool, timeout_s: float, stop: Event | None = None) -> int:
     """
     Show all robots until stopped, or once.
 
     Args:
         bus_settings: How to join the bus.
         keys: Keys of one robot; all others below its prefix that show presence are shown as well.
+        named: Whether the user has asked for that robot: then it is shown as missing, too.
         once: Whether to show them once and end; so it is without a terminal, too.
         as_json: Whether to print JSON in place of a table.
         timeout_s: How long to wait for robots that have not said everything yet, if once.
         stop: Event that stops the process; None: SIGINT and SIGTERM do.
 
     Returns:
-        Exit status: 1 if no process of any robot is there, else 0.
+        Exit status: 1 if no process of any robot is there, or none of that which was named, else 0.
     """
     stop = stop or stop_on_signals()
     with Bus.join(bus_settings, keys, timeout_s=timeout_s, stop=stop) as bus:
-        robots = Robots(bus)
-        with Redrawn(plain_console()) as area:
+        robots, console = Robots(bus, {keys.robot} if named else set()), plain_console()
+        with Redrawn(console) as area:
             if once or as_json or not area.live:
                 robots.gather(timeout_s, stop)
             periods = 0
@@ -59,29 +63,40 @@ def main(bus_settings: BusSettings, keys: Keys, *, once: bool, as_json: bool, ti
                 robots.listen()
                 periods += 1
                 if periods % DRAW_EACH == 0:
-                    area.draw(table(robots.report()))
-        report = robots.report()
+                    area.draw(shown(robots.report(), console))
+        report, unconnected = robots.report(), bus.unconnected
+    there = [robot for robot, of in report.items() if of["present"]]
     if as_json:
         print(json.dumps({"prefix": keys.prefix, "robots": report}, indent=1))
     elif report:
-        table_console().print(table(report))
-    else:
-        print(f"no process of any robot is present at {keys.prefix}/*")
-    return 0 if report else 1
+        console = console if console.is_terminal else widened(console)
+        console.print(shown(report, console))
+    if not there and not as_json:
+        print(f"no process of any robot is present at {keys.prefix}/*" + (f": {unconnected}" if unconnected else ""))
+    return 0 if there and (not named or keys.robot in there) else 1
 
 
 class Robots:
-    """All robots below a prefix."""
+    """
+    All robots below a prefix.
 
-    def __init__(self, bus: Bus) -> None:
+    Args:
+        bus: The bus of any of them.
+        named: Robots that are reported also where they are missing.
+    """
+
+    def __init__(self, bus: Bus, named: set[str]) -> None:
         self._bus = bus
         self._surveys: dict[str, Survey] = {}
         self._lock = Lock()
+        self._named = named
         bus.watch_alive(lambda role, present: self._note(bus.keys.robot, role, present))  # all that an access control list lets through
         bus.watch_robots(self._note)
 
     def _note(self, robot: str, role: str, present: bool) -> None:
         """Note that a process has come or gone; called in threads of the bus."""
+        if role.partition(".")[0] not in ROLES:
+            return
         with self._lock:
             if robot not in self._surveys:
                 if not present or len(self._surveys) >= MAX_ROBOTS:
@@ -112,36 +127,58 @@ class Robots:
                 survey.listen(time.monotonic_ns())
 
     def report(self) -> dict[str, Any]:
-        """Return the report of each robot by its name, those without any process left out."""
+        """Return the report of each robot by its name, those without any process left out unless they were named."""
         self.listen()
         with self._lock:
-            return {robot: survey.report(time.monotonic_ns()) for robot, survey in sorted(self._surveys.items()) if survey.present}
+            for robot in self._named - self._surveys.keys():
+                self._surveys[robot] = Survey(self._bus)
+            now_ns = time.monotonic_ns()
+            return {robot: survey.report(now_ns) for robot, survey in sorted(self._surveys.items()) if survey.present or robot in self._named}
 
 
-def table(reports: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Return the reports as a table."""
-    rows = Table(*COLUMNS, box=None, padding=(0, 2, 0, 0))
-    for robot, report in reports.items():
-        mode, age_s = report["mode"], report["state_age_s"]
-        rows.add_row(
-            robot,
-            mode_text(mode, led=report["leader"] is not None),
-            error_text(report["error"]),
-            Text("never" if age_s is None else f"{age_s:.2f} s", "" if age_s is not None and age_s < STALE_S else "red"),
-            reference_text(report),
-            "\n".join(f"{name} {of['p50']:.0f}/{of['max']:.0f}" for name, of in report["times_us"].items()),
-            leader_text(report),
-            agreement_text(report["agreement"]),
-            versions_text(report["versions"]),
-            event_text(report["event"]),
-        )
-    return rows
+def shown(reports: Mapping[str, Mapping[str, Any]], console: Console) -> RenderableType:
+    """Return the reports with a row for each robot, and their last events below; where the console is too narrow, a line for each value."""
+    rows = {robot: cells(report) for robot, report in reports.items()}
+    events = {robot: event_text(report["event"]) for robot, report in reports.items()}
+    table = Table("robot", *COLUMNS, box=None, padding=(0, 2, 0, 0))
+    for robot, row in rows.items():
+        table.add_row(robot, *row)
+    if console.measure(table, options=console.options.update(width=MAX_WIDTH)).maximum <= console.width:
+        below = Table.grid(padding=(0, 2, 0, 0))
+        for robot, event in events.items():
+            below.add_row(f"{robot}:", event or "no event")
+        return Group(table, "", below)
+    lines = Table.grid(padding=(0, 2, 0, 0))
+    for robot, row in rows.items():
+        for name, cell in (("robot", Text(robot, "bold")), *zip(COLUMNS, row, strict=True), ("last event", events[robot])):
+            if str(cell):
+                lines.add_row(name, cell)
+        lines.add_row("", "")
+    return lines
 
 
-def mode_text(mode: str | None, *, led: bool) -> Text:
+def cells(report: Mapping[str, Any]) -> list[Text]:
+    """Return what is said of a robot in each of the columns."""
+    age_s = report["state_age_s"]
+    return [
+        mode_text(report),
+        Text(error_text(report["error"])),
+        Text("never" if age_s is None else f"{age_s:.2f} s", "" if age_s is not None and age_s < STALE_S else "red"),
+        Text(reference_text(report)),
+        Text("\n".join(f"{name} {of['p50']:.0f}/{of['max']:.0f}" for name, of in report["times_us"].items())),
+        Text(leader_text(report)),
+        agreement_text(report["agreement"]),
+        versions_text(report["versions"]),
+    ]
+
+
+def mode_text(report: Mapping[str, Any]) -> Text:
     """Return the mode of the leader, or what is missing."""
+    mode: str | None = report["mode"]
+    if not report["present"]:
+        return Text("not there", "red")
     if mode is None:
-        return Text("no sample" if led else "no controller", "yellow")
+        return Text("no sample" if report["leader"] is not None else "no controller", "yellow")
     return Text(mode.lower(), "green" if mode in GOOD else "red" if mode in BAD else "yellow")
 
 
@@ -183,4 +220,5 @@ def event_text(event: Mapping[str, Any] | None) -> Text:
     """Return an event with its age."""
     if event is None:
         return Text("")
-    return Text(f"{event['age_s']:.0f} s ago, {event['source']}: {event['text']}", {"ERROR": "red", "WARNING": "yellow"}.get(event["severity"], ""))
+    ago = "" if event["age_s"] is None else f"{event['age_s']:.0f} s ago, "
+    return Text(f"{ago}{event['source']}: {event['text']}", {"ERROR": "red", "WARNING": "yellow"}.get(event["severity"], ""))

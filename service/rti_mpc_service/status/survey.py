@@ -43,7 +43,7 @@ class Survey:
         self._error: dict[str, tuple[float, str]] = {}  # by output, with its unit
         self._state: State | None = None
         self._reference: Reference | None = None
-        self._event: Event | None = None
+        self._events: dict[str, Event] = {}  # the last one by source
         self._heard_ns: dict[str, int] = {}  # local time at which each kind of message came last
         self._doors: dict[str, Intake[Any]] = {}
         self._info_ring = bus.subscriber(keys.infos, capacity=RING_MESSAGES)
@@ -75,7 +75,7 @@ class Survey:
             self._compare(message)
             self._samples.append(message)
         elif isinstance(message, Event):
-            self._event = message
+            self._events[message.source] = message
         elif message.stamp_ns != STAMP_ON_ARRIVAL:  # such a reference follows with its real stamp
             self._reference = message
 
@@ -128,7 +128,7 @@ class Survey:
             "agreement": {"max_difference": max(differences) if differences else None, "judged": len(differences), "samples": len(self._samples)},
             "versions": {role_of(key): said["version"] for key, (_, said) in self._infos.items() if isinstance(said.get("version"), str)},
             "stopped": (self._said(LEADER) or self._said("guard")).get("latch", {}).get("stopped"),
-            "event": self._event_report(now_ns),
+            "event": self._last_event(now_ns),
         }
 
     def _age_s(self, kind: str, now_ns: int) -> float | None:
@@ -141,8 +141,14 @@ class Survey:
         reference = self._reference
         return 1e-9 * (reference.stamp_ns + (len(reference.y) - 1) * reference.period_ns - self._state.stamp_ns)
 
-    def _event_report(self, now_ns: int) -> dict[str, Any] | None:
-        if (event := self._event) is None:
+    def _last_event(self, now_ns: int) -> dict[str, Any] | None:
+        """Return the newest event by the robot's clock: who joins late hears the last one of each source at once. An earlier life's has no age."""
+        age_s = self._age_s("State", now_ns)
+        robot_ns = None if self._state is None or age_s is None else self._state.stamp_ns + round(1e9 * age_s)
+        ages_s = {source: None if robot_ns is None else 1e-9 * (robot_ns - event.stamp_ns) for source, event in self._events.items()}
+        if not ages_s:
             return None
+        source = min(ages_s, key=lambda each: math.inf if (age := ages_s[each]) is None or age < -STALE_S else age)
+        event, age = self._events[source], ages_s[source]
         said = {"source": event.source, "severity": event.severity.name, "code": event.code, "text": event.text}
-        return {**said, "age_s": self._age_s("Event", now_ns)}
+        return {**said, "age_s": None if age is None or age < -STALE_S else max(age, 0.0)}

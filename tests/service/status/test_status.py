@@ -12,7 +12,8 @@ from rich.console import Console
 from rti_mpc.contract.message import End, Event, Reference, Severity, State
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.info import Info
-from rti_mpc_service.status.status import table
+from rti_mpc_service.status.status import Robots
+from rti_mpc_service.status.status import shown as table
 from rti_mpc_service.status.survey import Survey
 from tests.recording.samples import INFO, KEYS, MS, telemetry
 from tests.wire.fake_session import FakeSession
@@ -29,10 +30,10 @@ def survey() -> Survey:
     return survey
 
 
-def shown(reports: dict) -> str:
-    console = Console(width=200, record=True, force_terminal=False, file=open("/dev/null", "w"))
+def shown(reports: dict, width: int = 200) -> str:
+    console = Console(width=width, record=True, force_terminal=False, file=open("/dev/null", "w"))
     with console.file:
-        console.print(table(reports))
+        console.print(table(reports, console))
     return console.export_text()
 
 
@@ -80,3 +81,34 @@ def test_versions_are_listed_where_they_differ(survey: Survey) -> None:
     text = shown({"wheels": survey.report(NOW_NS)})
     assert "controller 0.1.0" in text
     assert "robot 0.0.9" in text
+
+
+def test_router_is_no_robot_and_only_a_robot_that_was_named_is_shown_as_missing() -> None:
+    for named, expected in ((set(), ["ant"]), ({"wheels"}, ["ant", "wheels"])):
+        robots = Robots(Bus(FakeSession(), KEYS), named)
+        for robot, role in (("pioneer", "router"), ("pioneer", "recorder"), ("ant", "robot")):
+            robots._note(robot, role, True)
+        reports = robots.report()
+        assert list(reports) == expected
+        text = shown(reports)
+        assert ("not there" in text) == bool(named), text
+        assert "no controller" in text
+
+
+def test_last_event_is_the_newest_by_the_robots_clock_whichever_was_heard_first(survey: Survey) -> None:
+    for source, stamp_ns in (("controller", 9500 * MS), ("robot", 2000 * MS), ("guard", 99_000 * MS)):
+        survey._take(Event(7, 1, stamp_ns, source, Severity.INFO, "code", f"by {source}"), NOW_NS)
+    survey._take(State(3, 1, 10_000 * MS, np.zeros(2)), NOW_NS)
+    assert survey.report(NOW_NS)["event"]["text"] == "by controller", "the guard's is of an earlier life of the robot's clock"
+    assert survey.report(NOW_NS + 100 * MS)["event"]["age_s"] == pytest.approx(0.6, abs=1e-9)  # rounding
+    survey._take(Event(7, 2, 10_000 * MS, "robot", Severity.INFO, "code", "later"), NOW_NS)
+    assert survey.report(NOW_NS)["event"]["text"] == "later"
+
+
+def test_narrow_terminal_has_a_line_for_each_value(survey: Survey) -> None:
+    survey._take(telemetry(1), NOW_NS)
+    survey._take(Event(7, 1, 0, "controller", Severity.WARNING, "state_old", "states were too old"), NOW_NS)
+    lines = shown({"wheels": survey.report(NOW_NS)}, 60).splitlines()
+    assert max(map(len, lines)) <= 60
+    for name, words in (("robot", "wheels"), ("mode", "tracking"), ("leads", "controller 42"), ("last event", "controller: states were too old")):
+        assert any(line.startswith(f"{name} ") and words in line for line in lines), lines
