@@ -16,12 +16,22 @@ from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.reference.trajectory import Heading
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 from rti_mpc.rti.rti import Rti
-from rti_mpc_service.config.build import build_observer, build_ocp, iterations, retuned, robot_settings, solver_settings, stage_parameters
+from rti_mpc_service.config.build import (
+    build_model,
+    build_observer,
+    build_ocp,
+    iterations,
+    retuned,
+    robot_settings,
+    solver_settings,
+    stage_parameters,
+)
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.rig.scenario import configured
 from rti_mpc_service.rig.summary import TRANSIENT_S
-from rti_mpc_service.scenario import find_scenario
+from rti_mpc_service.scenario import Scenario, find_scenario
 from rti_mpc_service.tune.recorded import is_recording, recorded
+from rti_mpc_service.tune.recorded_robot import RecordedRobot, read
 from rti_mpc_service.tune.varied import with_values
 
 DEFAULT_SEED = 1  # of noise and dropout, as of `rti_mpc_sim.settings.RobotSettings`
@@ -93,6 +103,26 @@ class Driven:
         return bool(np.isfinite([self.error, self.effort]).all())
 
 
+def laid_out(config: Config, course: Course, heard: Mapping[str, RecordedRobot] | None = None) -> tuple[Config, Scenario]:
+    """
+    Return the robot at the start of a course, and the scenario.
+
+    Args:
+        config: The robot's configuration.
+        course: The course.
+        heard: Recordings that have been read, by name.
+
+    Raises:
+        ConfigError: There is no such scenario.
+    """
+    if course.name is None or not is_recording(course.name):
+        return config, find_scenario(config, course.name, course.heading, course.duration_s, course.speed_m_s, course.smooth_m)
+    if course.heading is not None:
+        raise ConfigError(f"--heading is of paths in the plane, it must be left out for {course.name}, got {course.heading}")
+    known = (heard or {}).get(course.name) or read(course.name, config.robot, build_model(config), config.ocp.dt_s)
+    return recorded(config, known, course.part, course.duration_s)
+
+
 class ClosedLoop:
     """
     A robot on one scenario, driven with any values of the keys that a study varies.
@@ -101,18 +131,14 @@ class ClosedLoop:
         config: The robot's configuration, whose Q judges the error whatever is tried.
         course: The scenario.
         make_body: Maker of the simulated robot.
+        laid: What `laid_out` has made of the course, if it has.
 
     Raises:
         ConfigError: There is no such scenario, or no output is weighted.
     """
 
-    def __init__(self, config: Config, course: Course, make_body: MakeBody) -> None:
-        if course.name is not None and is_recording(course.name):
-            if course.heading is not None:
-                raise ConfigError(f"--heading is of paths in the plane, it must be left out for {course.name}, got {course.heading}")
-            config, self.scenario = recorded(config, course.name, course.part, course.duration_s)
-        else:
-            self.scenario = find_scenario(config, course.name, course.heading, course.duration_s, course.speed_m_s, course.smooth_m)
+    def __init__(self, config: Config, course: Course, make_body: MakeBody, laid: tuple[Config, Scenario] | None = None) -> None:
+        config, self.scenario = laid or laid_out(config, course)
         placed = configured(config, self.scenario)
         seed = DEFAULT_SEED if placed.sim.seed is None else placed.sim.seed
         sim = placed.sim.model_copy(update={"seed": seed + course.seed})

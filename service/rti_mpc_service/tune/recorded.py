@@ -7,25 +7,22 @@ What is not known of the robot, `[sim]` in its file, is taken from the recording
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.contract.message import Command, End, State, Telemetry
-from rti_mpc.contract.status import Mode
-from rti_mpc.errors import ConfigError, MessageError
-from rti_mpc.model.model import Model
-from rti_mpc.model.path_following import window_place
+from rti_mpc.contract.message import End
+from rti_mpc.errors import ConfigError
 from rti_mpc_service.config.build import build_model, with_initial_state
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.scenario import Scenario
-from rti_mpc_service.tune.identified import MIN_WINDOWS, ROWS, WINDOW, identified, windows_of
+from rti_mpc_service.tune.identified import identified
+from rti_mpc_service.tune.recorded_robot import RecordedRobot
+from rti_mpc_service.tune.windows import MIN_WINDOWS, ROWS, WINDOW, windows_of
 
-FOLLOWING = (Mode.TRACKING, Mode.HOLDING, Mode.FALLBACK)  # modes whose samples follow a reference; a fallback is followed over
 MIN_SAMPLES = 40  # of a part, half of which is its transient
-MAX_GAP_PERIODS = 2.5  # between two samples of one span
 
 
 def is_recording(name: str | None) -> bool:
@@ -33,28 +30,26 @@ def is_recording(name: str | None) -> bool:
     return name is not None and (Path(name).suffix.lower() == ".mcap" or any(Path(name).glob("*.mcap")))
 
 
-def recorded(config: Config, name: str, part: tuple[float, float], duration_s: float | None) -> tuple[Config, Scenario]:
+def recorded(config: Config, heard: RecordedRobot, part: tuple[float, float], duration_s: float | None) -> tuple[Config, Scenario]:
     """
     Return a part of the longest span over which a robot followed references without a break, and the robot at its start.
 
     Args:
-        config: The robot's configuration, whose `robot` names it in the recording.
-        name: The recording.
+        config: The robot's configuration.
+        heard: The robot in the recording.
         part: Begin and end, as fractions of the span.
-        duration_s: How much of this part is driven at most; None: all.
+        duration_s: How much of this part is taken at most; None: all.
 
     Returns:
         The configuration with the recorded state as the initial one, and the scenario: a row a sample, what the controller followed one period on.
 
     Raises:
-        ConfigError: It is no recording of this robot, or the span is too short.
+        ConfigError: The span is too short.
     """
-    model = build_model(config)
-    states, samples, _ = _read(name, config.robot, model)
-    span = _part(samples, config.ocp.dt_s, part)
-    span = span if duration_s is None else span[: round(duration_s / config.ocp.dt_s)]
+    model, states = build_model(config), heard.states
+    span = heard.part(part, config.ocp.dt_s, duration_s)
     if len(span) < MIN_SAMPLES:
-        raise ConfigError(f"{name} must hold {MIN_SAMPLES} samples that follow a reference without a break in each part, got {len(span)}")
+        raise ConfigError(f"{heard.name} must hold {MIN_SAMPLES} samples that follow a reference without a break in each part, got {len(span)}")
     dt_ns = round(1e9 * config.ocp.dt_s)
     at = np.array([sample.stamp_ns + dt_ns for sample in span], np.int64)  # of row 0 of what was used, which belongs to node 1
     end_ns, ahead = int(at[-1]), span[-1].y_ref[1:]  # what was known at the end lets the controller look ahead there, as it did
@@ -67,104 +62,79 @@ def recorded(config: Config, name: str, part: tuple[float, float], duration_s: f
     y: Array = np.column_stack([np.interp(grid, at, column) for column in rows.T])
     start = max((state for state in states if state.stamp_ns <= at[0]), key=lambda state: state.stamp_ns, default=states[0])
     placed = with_initial_state(config, [f"{signal.name}={value!r}" for signal, value in zip(model.states, start.x.tolist(), strict=True)])
-    begin_s, end_s = (1e-9 * (stamp - samples[0].stamp_ns) for stamp in (at[0], end_ns))
-    title = f"{Path(name).name} from {begin_s:.1f} to {end_s:.1f} s"
-    return placed, Scenario(title, model.nx, lambda x: y, config.ocp.dt_s, 1e-9 * (end_ns - int(at[0])), End.HOLD)
+    begin_s, end_s = (1e-9 * (stamp - heard.begin_ns) for stamp in (at[0], end_ns))
+    title = f"{Path(heard.name).name} from {begin_s:.1f} to {end_s:.1f} s"
+    return placed, Scenario(title, model.nx, partial(_given, y), config.ocp.dt_s, 1e-9 * (end_ns - int(at[0])), End.HOLD)
 
 
-def as_recorded(config: Config, name: str, part: tuple[float, float]) -> tuple[Config, str]:
+def _given(y: Array, x: Array) -> Array:
+    """Return rows that are the same from any state; a function that other processes can be told."""
+    return y
+
+
+def as_recorded(config: Config, heard: RecordedRobot, part: tuple[float, float], duration_s: float | None = None) -> tuple[Config, str]:
     """
     Return the configuration with the noise, delay and lag of a recorded robot in `sim`, as far as the file says nothing of them.
 
     Args:
-        config: The robot's configuration, whose `robot` names it in the recording.
-        name: The recording.
-        part: Begin and end, as fractions of what `recorded` takes.
+        config: The robot's configuration.
+        heard: The robot in the recording.
+        part: Begin and end, as fractions of the span that `recorded` takes.
+        duration_s: How much of this part is taken at most; None: all.
 
     Returns:
         The configuration, and what was taken, in a line.
 
     Raises:
-        ConfigError: It is no recording of this robot.
+        ConfigError: A message of the recording cannot be read.
     """
-    given = config.sim.model_fields_set
+    given, name = config.sim.model_fields_set, Path(heard.name).name
     model = build_model(config).with_parameters(**config.sim.parameters)
-    states, samples, commands = _read(name, config.robot, model)
     if config.observer.measured:
         return config, f"{name}: noise, delay and lag are those of [sim], since some states of {config.robot} are not measured"
-    if span := _part(samples, config.ocp.dt_s, part):
-        begin_ns, end_ns = span[0].state_stamp_ns, span[-1].stamp_ns
-        before_ns = round(1e9 * ROWS * config.ocp.dt_s)  # what still acted when it began
-        commands = [command for command in commands if begin_ns - before_ns <= command.stamp_ns <= end_ns]
-        states = [state for state in states if begin_ns <= state.stamp_ns <= end_ns and commands and state.epoch == commands[-1].state_epoch]
-    windows = windows_of(model, states, commands, config.ocp.dt_s) if len(states) > WINDOW and commands else None
+    span = heard.part(part, config.ocp.dt_s, duration_s)
+    if not span:
+        return config, kept(name)
+    begin_ns, end_ns = span[0].state_stamp_ns, span[-1].stamp_ns
+    commands = heard.commands_between(begin_ns - round(1e9 * ROWS * config.ocp.dt_s), end_ns)  # with what still acted when it began
+    states = [state for state in heard.states if begin_ns <= state.stamp_ns <= end_ns and commands and state.epoch == commands[-1].state_epoch]
+    windows = windows_of(model, states, commands, config.ocp.dt_s) if len(states) > WINDOW else None
     if windows is None or len(windows.x) < MIN_WINDOWS:
-        return config, (
-            f"{name}: noise, delay and lag are those of [sim], since it must hold commands and {WINDOW * MIN_WINDOWS} states without a gap in a part"
-        )
+        return config, kept(name)
     known = {"sensor_delay_s", "actuator_delay_s"} & given
-    delay_s, lag_s, noise = identified(
+    found = identified(
         windows,
         (config.sim.sensor_delay_s or 0.0) + (config.sim.actuator_delay_s or 0.0) if known else None,
         config.sim.actuator_lag_s if "actuator_lag_s" in given else None,
     )
-    noise_std = {signal.name: _rounded(std) for signal, std in zip(model.states, noise, strict=True)}
+    if found is None:
+        return config, (
+            f"{name}: noise, delay and lag are those of [sim], since the model predicts fewer than {MIN_WINDOWS} of {len(windows.x)} windows "
+            f"to a finite end; look at the model and its parameters, or say noise_std, actuator_delay_s and actuator_lag_s there"
+        )
+    noise_std = {signal.name: _rounded(std) for signal, std in zip(model.states, found.noise, strict=True)}
     units = {signal.name: signal.unit for signal in model.states}
-    found = {
+    values = {
         "noise_std": (noise_std, "noise " + ", ".join(f"{signal} {std:g} {units[signal]}" for signal, std in noise_std.items())),
-        "actuator_delay_s": (_rounded(delay_s), f"delay {_rounded(delay_s):g} s"),
-        "actuator_lag_s": (_rounded(lag_s), f"lag {_rounded(lag_s):g} s"),
+        "actuator_delay_s": (_rounded(found.delay_s), f"delay {_rounded(found.delay_s):g} s"),
+        "actuator_lag_s": (_rounded(found.lag_s), f"lag {_rounded(found.lag_s):g} s"),
     }
-    taken = {key: value for key, value in found.items() if key not in given and not (key == "actuator_delay_s" and known)}
+    taken = {key: value for key, value in values.items() if key not in given and not (key == "actuator_delay_s" and known)}
+    if not taken:
+        return config, "simulated robot as in [sim]"
+    words = [said for _, said in taken.values()]
+    if found.left_out:
+        words.append(f"left out {found.left_out} of {len(windows.x)} windows, which the model does not predict to a finite end")
     sim = config.sim.model_copy(update={key: value for key, (value, _) in taken.items()})
-    words = "; ".join(said for _, said in taken.values())
-    return config.model_copy(update={"sim": sim}), f"simulated robot as in {Path(name).name}: {words}" if taken else "simulated robot as in [sim]"
+    return config.model_copy(update={"sim": sim}), f"simulated robot as in {name}: {'; '.join(words)}"
+
+
+def kept(name: str) -> str:
+    """Return what is said where a recording is too short."""
+    least = WINDOW * MIN_WINDOWS
+    return f"{name}: noise, delay and lag are those of [sim], since it must hold commands and {least} states without a gap in a part"
 
 
 def _rounded(value: float) -> float:
     """Return a value as it is told, so that a study is the same on machines that round differently."""
     return float(f"{value:.3g}")
-
-
-def _read(name: str, robot: str, model: Model) -> tuple[list[State], list[Telemetry], list[Command]]:
-    """Return the states, samples and commands of a robot; of the guard that it obeyed, if there was one."""
-    from rti_mpc.recording import Recording  # needs the extra `record`
-
-    if window_place(model) is not None:
-        raise ConfigError(f"--scenario {name} must be of a robot that follows references in time, {robot} follows a path")
-    try:
-        recording = Recording(Path(name))
-        if robot not in recording.robots:
-            raise ConfigError(f"{name} must hold the robot {robot}, got {', '.join(recording.robots) or 'none'}")
-        messages = [(each.stream, each.message) for each in recording.messages(robot, ("state", "telemetry", "command", "actuation"))]
-    except (OSError, MessageError) as error:
-        raise ConfigError(f"{name} must be a recording: {error}") from error
-    of = {stream: [message for each, message in messages if each == stream] for stream in ("state", "telemetry", "command", "actuation")}
-    states = [message for message in of["state"] if len(message.x) == model.nx]
-    samples = [message for message in of["telemetry"] if message.x0.size == model.nx and message.y_ref.shape[-1] == model.ny]
-    if not states or not samples:
-        raise ConfigError(f"{name} must hold states of {model.nx} and telemetry of {model.ny} outputs of {robot}, as its file says, got none")
-    return states, samples, [message for message in of["actuation"] or of["command"] if len(message.u) and message.u.shape[1] == model.nu]
-
-
-def _part(samples: Sequence[Telemetry], dt_s: float, part: tuple[float, float]) -> list[Telemetry]:
-    """Return a part of the longest span."""
-    span = _longest(samples, dt_s)
-    return span[round(part[0] * len(span)) : round(part[1] * len(span))]
-
-
-def _longest(samples: Sequence[Telemetry], dt_s: float) -> list[Telemetry]:
-    """Return the longest run of samples of one controller that follow a reference, in order, without a gap."""
-    best: list[Telemetry] = []
-    span: list[Telemetry] = []
-    for sample in samples:
-        last = span[-1] if span else None
-        joined = last is not None and sample.epoch == last.epoch and 0 < sample.stamp_ns - last.stamp_ns <= 1e9 * MAX_GAP_PERIODS * dt_s
-        if sample.mode not in FOLLOWING or not len(sample.y_ref):
-            span = []
-        elif joined:
-            span.append(sample)
-        else:
-            span = [sample]
-        best = span if len(span) > len(best) else best
-    return best

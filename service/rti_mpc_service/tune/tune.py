@@ -9,12 +9,12 @@ so the same command goes on with it, after Ctrl-C and after SIGKILL.
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from signal import SIGINT
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from rti_mpc.errors import ConfigError
@@ -26,10 +26,12 @@ from rti_mpc_service.console import table_console
 from rti_mpc_service.entry import EXIT_BY_SIGNAL
 from rti_mpc_service.shipped import DEPLOY
 from rti_mpc_service.tune.choice import beats, choose, front
-from rti_mpc_service.tune.closed_loop import ClosedLoop, Course, Driven, MakeBody
+from rti_mpc_service.tune.closed_loop import ClosedLoop, Course, Driven, MakeBody, laid_out
 from rti_mpc_service.tune.edit import commented, edited
 from rti_mpc_service.tune.figure import figure
+from rti_mpc_service.tune.progress import counting, doing
 from rti_mpc_service.tune.recorded import as_recorded, is_recording
+from rti_mpc_service.tune.recorded_robot import read
 from rti_mpc_service.tune.study import STUDIED, Tried, finished, name_of, open_study, run, tried
 from rti_mpc_service.tune.varied import Varied, find_varied, with_values
 from rti_mpc_service.tune.workers import workers
@@ -38,6 +40,7 @@ HELD_OUT = "held out"  # name of its course among the workers'
 OTHER_PATHS = {"circle": "eight"}  # held out for a study of a path; the circle for all others
 OTHER_OUTPUTS = {"steps": "sines"}  # likewise of outputs; steps for all others
 NOTHING_GAINED = 1  # exit status
+LONG_S = 60.0  # time of a study from which on it is told before
 
 
 def main(
@@ -82,17 +85,26 @@ def main(
     model = build_model(config)
     varied = find_varied(config, model, vary)
     course, other = parted(course, held_out, planar=in_plane(model.outputs))
-    robot = ""
-    if course.name is not None and is_recording(course.name):
-        config, robot = as_recorded(config, course.name, course.part)
-        console.print(robot, soft_wrap=True)
-    build_rti(config)  # shows that it compiles
     courses = {STUDIED: course, HELD_OUT: other}
-    loops = {name: ClosedLoop(config, each, make_body) for name, each in courses.items()}
+    robot, heard = "", {}
+    for name in dict.fromkeys(each.name for each in courses.values() if each.name is not None and is_recording(each.name)):
+        with doing(console, f"reading {name}") as tell:
+            heard[name] = read(name, config.robot, model, config.ocp.dt_s, tell)
+    if course.name in heard:
+        with doing(console, f"looking for noise, delay and lag of {config.robot} in {course.name}"):
+            config, robot = as_recorded(config, heard[course.name], course.part, course.duration_s)
+        console.print(robot, soft_wrap=True)
+    laid = {name: laid_out(config, each, heard) for name, each in courses.items()}
+    with doing(console, "building the problem"):
+        build_rti(config)  # shows that it compiles
+        loops = {name: ClosedLoop(config, each, make_body, laid[name]) for name, each in courses.items()}
     titles = {name: loop.scenario.title for name, loop in loops.items()}
     if titles[STUDIED] == titles[HELD_OUT]:
         raise ConfigError(f"--held-out must be another scenario than that of the study, got {titles[HELD_OUT]} for both")
-    today = {name: loop.drive({}) for name, loop in loops.items()}
+    with doing(console, "driving with today's values"):
+        began_s = time.monotonic()
+        today = {name: loop.drive({}) for name, loop in loops.items()}
+        drive_s = (time.monotonic() - began_s) / len(loops)
     if lost := next((titles[name] for name, driven in today.items() if not driven.finite), ""):
         raise ConfigError(f"the values of {path} must drive {lost} to its end, so that others can be compared with them")
     study_name = name_of(config, course, varied)
@@ -101,12 +113,14 @@ def main(
     ranges = ", ".join(f"{each.key} {each.low:g}:{each.high:g}" for each in varied)
     console.print(f"study {study_name} in {without_password(study_url)}, {len(finished(study))} of {trials} trials are there", soft_wrap=True)
     console.print(f"{titles[STUDIED]}, held out {titles[HELD_OUT]}; varied: {ranges}", soft_wrap=True)
-    columns = (TextColumn("trials"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    if (left_s := max(0, trials - len(finished(study))) * drive_s / jobs) > LONG_S:
+        each = f"a drive of {loops[STUDIED].scenario.duration_s:.0f} s takes {drive_s:.1f} s"
+        console.print(f"{each}: about {left_s / 60:.0f} min in all; less with --duration or --trials", soft_wrap=True)
+    kept = {name: laid[name] for name, each in courses.items() if each.name in heard}
     try:
-        with workers(loops, (config, courses, make_body), jobs) as drive_all:
-            with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-                task = progress.add_task("trials", total=trials, completed=len(finished(study)))
-                run(study, varied, trials, seed, drive_all, lambda count: progress.update(task, completed=count))
+        with workers(loops, (config, courses, kept, make_body), jobs) as drive_all:
+            with counting(console, "trials", trials, len(finished(study))) as count:
+                run(study, varied, trials, seed, drive_all, count)
             best, chosen = front(tried(study)), choose(tried(study), today[STUDIED], effort)
             on_held_out = dict(zip((each.number for each in best), drive_all((HELD_OUT, each.values) for each in best), strict=True))
             verdict = None if chosen is None else loops[HELD_OUT].drive(chosen.values)

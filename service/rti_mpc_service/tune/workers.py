@@ -14,22 +14,24 @@ from multiprocessing.connection import wait
 from threading import Thread
 
 from rti_mpc_service.config.schema import Config
+from rti_mpc_service.scenario import Scenario
 from rti_mpc_service.tune.closed_loop import ClosedLoop, Course, Driven, MakeBody, attempted
 
 Values = Mapping[str, float]
+Laid = Mapping[str, tuple[Config, Scenario]]  # by name of the course
 DriveAll = Callable[[Iterable[tuple[str, Values]]], Iterator[Driven | None]]  # of courses by name and values, in order
 
 _loops: dict[str, ClosedLoop] = {}  # of this worker
 
 
 @contextmanager
-def workers(loops: Mapping[str, ClosedLoop], remake: tuple[Config, Mapping[str, Course], MakeBody], jobs: int) -> Iterator[DriveAll]:
+def workers(loops: Mapping[str, ClosedLoop], remake: tuple[Config, Mapping[str, Course], Laid, MakeBody], jobs: int) -> Iterator[DriveAll]:
     """
     Give a function that drives several closed loops.
 
     Args:
         loops: Those of this process, which drive here where one job is enough.
-        remake: What another process makes them from.
+        remake: What another process makes them from; what is laid out already, such as a recording, it need not read again.
         jobs: Number of processes.
     """
     if jobs == 1:
@@ -43,11 +45,11 @@ def workers(loops: Mapping[str, ClosedLoop], remake: tuple[Config, Mapping[str, 
         pool.shutdown(cancel_futures=True)
 
 
-def _begin(config: Config, courses: Mapping[str, Course], make_body: MakeBody) -> None:
+def _begin(config: Config, courses: Mapping[str, Course], laid: Laid, make_body: MakeBody) -> None:
     """Make the closed loops of a worker. Ctrl-C is the starter's alone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_end_with_starter, daemon=True).start()
-    _loops.update({name: ClosedLoop(config, course, make_body) for name, course in courses.items()})
+    _loops.update({name: ClosedLoop(config, course, make_body, laid.get(name)) for name, course in courses.items()})
 
 
 def _end_with_starter() -> None:

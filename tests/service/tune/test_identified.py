@@ -6,28 +6,39 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 
 pytest.importorskip("mcap")
 
-from rti_mpc.contract.message import Reference
+from rti_mpc.contract.message import Command, Reference, State
+from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.model.model import Model
 from rti_mpc.recording.writer import RecordingWriter
 from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.commands.robot import lockstep_robot
-from rti_mpc_service.config.build import build_controller, build_rti, robot_settings
+from rti_mpc_service.config.build import build_controller, build_model, build_rti, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.rig.scenario import configured
 from rti_mpc_service.scenario import find_scenario
 from rti_mpc_service.tune.closed_loop import ClosedLoop, Course
-from rti_mpc_service.tune.identified import noise_of
+from rti_mpc_service.tune.identified import identified, noise_of
 from rti_mpc_service.tune.recorded import as_recorded
+from rti_mpc_service.tune.recorded_robot import RecordedRobot, read
+from rti_mpc_service.tune.windows import WINDOW, Windows, windows_of
 from tests.robots import SHIPPED
 
 NOISE = {"x": 0.005, "y": 0.005, "psi": 0.01, "u": 0.01, "omega": 0.02}
 SIM = {"noise_std": NOISE, "actuator_delay_s": 0.06, "actuator_lag_s": 0.12}
+WHOLE = (0.0, 1.0)
+
+
+def heard(path: Path) -> RecordedRobot:
+    config = load(SHIPPED)
+    return read(str(path), config.robot, build_model(config), config.ocp.dt_s)
 
 
 def with_sim(config: Config, **sim: object) -> Config:
@@ -69,7 +80,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_noise_delay_and_lag_of_a_recorded_robot_are_found_again(run: Path) -> None:
-    config, said = as_recorded(load(SHIPPED), str(run), (0.0, 1.0))
+    config, said = as_recorded(load(SHIPPED), heard(run), WHOLE)
     for name, std in NOISE.items():
         assert config.sim.noise_std[name] == pytest.approx(std, rel=0.15), "5 % is one sigma"
     assert config.sim.actuator_delay_s == pytest.approx(0.06, abs=0.02)  # s: a fifth of a period
@@ -79,24 +90,54 @@ def test_noise_delay_and_lag_of_a_recorded_robot_are_found_again(run: Path) -> N
 
 
 def test_what_the_file_says_of_the_robot_is_kept(run: Path) -> None:
-    config, said = as_recorded(with_sim(load(SHIPPED), actuator_delay_s=0.06, noise_std={}), str(run), (0.0, 1.0))
+    config, said = as_recorded(with_sim(load(SHIPPED), actuator_delay_s=0.06, noise_std={}), heard(run), WHOLE)
     assert (config.sim.actuator_delay_s, config.sim.noise_std) == (0.06, {})
     assert config.sim.actuator_lag_s == pytest.approx(0.12, abs=0.02), "s: found with the delay that is known"
     assert re.fullmatch(r"simulated robot as in run\.mcap: lag 0\.1\d* s", said)
-    config, said = as_recorded(with_sim(load(SHIPPED), **SIM), str(run), (0.0, 1.0))
+    config, said = as_recorded(with_sim(load(SHIPPED), **SIM), heard(run), WHOLE)
     assert (said, config.sim.noise_std) == ("simulated robot as in [sim]", NOISE)
 
 
 def test_robot_that_is_its_model_has_no_noise_delay_or_lag(tmp_path: Path) -> None:
-    config, said = as_recorded(load(SHIPPED), str(record(tmp_path / "ideal.mcap", load(SHIPPED), 15.0)), (0.0, 1.0))
+    config, said = as_recorded(load(SHIPPED), heard(record(tmp_path / "ideal.mcap", load(SHIPPED), 15.0)), WHOLE)
     assert (config.sim.actuator_delay_s, config.sim.actuator_lag_s) == (0.0, 0.0), said
     assert not any(config.sim.noise_std.values()), said
 
 
 def test_recording_that_is_too_short_says_so_and_leaves_the_robot_of_the_file(tmp_path: Path) -> None:
-    config, said = as_recorded(load(SHIPPED), str(record(tmp_path / "short.mcap", load(SHIPPED), 6.0)), (0.0, 1.0))
+    config, said = as_recorded(load(SHIPPED), heard(record(tmp_path / "short.mcap", load(SHIPPED), 6.0)), WHOLE)
     assert config == load(SHIPPED)
     assert "are those of [sim], since it must hold commands and 80 states without a gap" in said
+
+
+def tank(below: int, windows: int = 30, delay: int = 2) -> Windows:
+    """Windows of a tank that flows out with the root of its level; so many of them have a level measured below zero, where that is no number."""
+    rng, ms, steps = np.random.default_rng(1), 1_000_000, WINDOW * windows
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    model = Model("tank", x, u, u - 0.5 * ca.sqrt(x), x, "h", "q", "h")
+    v, level = rng.uniform(0.3, 0.9, steps), np.ones(steps + 1)
+    for k in range(steps):
+        level[k + 1] = level[k]
+        for _ in range(50):  # of 2 ms
+            level[k + 1] += 0.002 * (v[max(k - delay, 0)] - 0.5 * np.sqrt(level[k + 1]))
+    level += 1e-3 * rng.standard_normal(steps + 1)
+    level[3 : WINDOW * below : WINDOW] = -0.5
+    states = [State(3, k + 1, 100 * ms * k, level[[k]]) for k in range(steps + 1)]
+    commands = [
+        Command(7, k + 1, t := 100 * ms * k, 3, k + 1, t, t + 250 * ms, 1, Mode.TRACKING, QpStatus.SOLVED, 100 * ms, np.full((20, 1), v[k]))
+        for k in range(steps)
+    ]
+    return windows_of(model, states, commands, 0.1)
+
+
+def test_windows_that_the_model_does_not_predict_to_a_finite_end_are_left_out_and_counted() -> None:
+    for below in (0, 4):
+        found = identified(tank(below))
+        assert found is not None
+        assert found.left_out == below
+        assert found.delay_s == pytest.approx(0.2, abs=0.01)  # s: a tenth of a period
+        assert found.noise == pytest.approx([1e-3], rel=0.2)  # 5 % is one sigma
+    assert identified(tank(21)) is None, "9 are too few"
 
 
 def test_noise_is_told_from_what_the_model_carries_on() -> None:

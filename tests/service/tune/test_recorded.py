@@ -18,9 +18,12 @@ from rti_mpc.recording.writer import RecordingWriter
 from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.commands.robot import lockstep_robot
+from rti_mpc_service.config.build import build_model
 from rti_mpc_service.config.config import load
+from rti_mpc_service.config.schema import Config
 from rti_mpc_service.tune.closed_loop import ClosedLoop, Course
 from rti_mpc_service.tune.recorded import is_recording, recorded
+from rti_mpc_service.tune.recorded_robot import RecordedRobot, read
 from rti_mpc_service.tune.tune import parted
 from tests.recording.samples import telemetry
 from tests.robots import SHIPPED
@@ -52,8 +55,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def heard(config: Config, path: Path) -> RecordedRobot:
+    return read(str(path), config.robot, build_model(config), config.ocp.dt_s)
+
+
 def test_reference_and_start_are_those_of_the_longest_span_without_a_break(run: Path) -> None:
-    placed, scenario = recorded(load(SHIPPED), str(run), (0.0, 1.0), None)
+    placed, scenario = recorded(load(SHIPPED), heard(load(SHIPPED), run), (0.0, 1.0), None)
     assert placed.sim.x0["y"] == START[1]
     y = scenario.y(np.zeros(5))
     assert len(y) == SAMPLES + 30 - 20 + N - 1, "and what the last sample saw ahead"
@@ -87,7 +94,7 @@ def test_what_is_no_recording_of_this_robot_is_refused(run: Path, tmp_path: Path
         (config, run, 2.0, "40 samples that follow a reference without a break in each part, got 20"),
     ):
         with pytest.raises(ConfigError, match=words):
-            recorded(wrong, str(name), (0.0, 1.0), duration_s)
+            recorded(wrong, heard(wrong, name), (0.0, 1.0), duration_s)
     assert not is_recording("eight")
     assert not is_recording(None)
     with pytest.raises(ConfigError, match="--heading"):
