@@ -229,7 +229,7 @@ class Controller:
             if not len(state.u) and not self._unreported:
                 self._unreported = True
                 self._modes.say(Severity.WARNING, "inputs_unreported", INPUTS_UNREPORTED)
-        if self._track.arriving:
+        if self._track.arriving and self._states.lives.rival is None:
             self._anchor(state)
         grid, period_ns = self.grid, self._states.clock.period_ns
         if not (self._track.loaded or self._stopped) or not self._states.cadence.known or grid.early(state.stamp_ns, period_ns):
@@ -245,14 +245,15 @@ class Controller:
     @reported
     def receive_reference(self, reference: Reference, rows: Array | None = None) -> Reference | None:
         """
-        Follow a reference from the next sample on.
+        Follow a reference from the next sample on; if no state has come yet, or a new life of the robot is heard that is not believed, from
+        the next state on that counts.
 
         Args:
             reference: Message of a planner.
             rows: Result of `lay_out`; None to compute it here.
 
         Returns:
-            The reference with its real stamp, to be published, if it starts on arrival and a state has arrived; else None.
+            The reference with its real stamp if it starts on arrival and is followed at once; else None. `followed` has it in any case.
 
         Raises:
             OcpError: It is no `Reference`; one that does not fit is refused by a notice.
@@ -261,8 +262,11 @@ class Controller:
         if misfit := self._track.misfit(reference, self.np_):
             self._modes.say(Severity.WARNING, "reference_refused", misfit)
             return None
-        self._track.arrive(reference, self._track.lay_out(reference) if rows is None else rows, self._states.lives.rival)
-        anchored = None if self._states.last is None else self._anchor(self._states.last)
+        track, last, rival = self._track, self._states.last, self._states.lives.rival
+        track.arriving, track.arriving_for = (reference, track.lay_out(reference) if rows is None else rows), rival
+        if last is None or rival is not None:
+            return None
+        anchored = self._anchor(last)
         return anchored if reference.stamp_ns == STAMP_ON_ARRIVAL else None
 
     @reported

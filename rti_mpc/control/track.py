@@ -32,6 +32,7 @@ class Track:
         y_ref: Reference at nodes 1 to N of the last `look_up`, shape ``(N, ny)``.
         p: Stage parameters at nodes 0 to N of the last `look_up`, shape ``(N + 1, np)``.
         arriving: A checked reference and its `lay_out`, until `anchor` has a state to start at; else None.
+        arriving_for: Epoch of a new life of the robot that was heard when it came, but not believed yet; None if there was none.
     """
 
     def __init__(self, model: Model, N: int, dt_ns: int, *, compile: bool = True) -> None:
@@ -52,8 +53,7 @@ class Track:
             written = {name: outputs[name] for name in interpolate.name_out()}
             self._interpolate[columns] = bind(interpolate, {"found": found, "at": at, "below": below}, written)
         self.arriving: tuple[Reference, Array] | None = None
-        self._last: tuple[Reference, Array] | None = None  # the last one that has arrived
-        self._last_for: int | None = None  # the life of the robot that was heard then, but not believed yet
+        self.arriving_for: int | None = None
         self._reference: Reference | None = None
         self._rows: Array = np.zeros((1, 2 * model.ny))
 
@@ -88,18 +88,6 @@ class Track:
             rows[:, j] = np.unwrap(rows[:, j])
         return np.hstack([rows, np.diff(rows, axis=0, append=rows[-1:])])
 
-    def arrive(self, reference: Reference, rows: Array, rival: int | None) -> None:
-        """
-        Take a reference in, until `anchor`.
-
-        Args:
-            reference: A checked reference.
-            rows: Its `lay_out`.
-            rival: Epoch of a new life of the robot that is heard, but not believed yet; None if there is none.
-        """
-        self.arriving = self._last = reference, rows
-        self._last_for = rival
-
     def anchor(self, stamp_ns: int) -> Reference:
         """
         Follow the reference that has arrived, and return it: from the state on if it was to start on arrival.
@@ -116,10 +104,10 @@ class Track:
         return reference
 
     def clear(self, life: int | None = None) -> None:
-        """Forget the reference; but one that arrived after a new life of the robot, by its epoch, was first heard is for that life."""
+        """Forget the reference, and one that arrives unless it came after a new life, by its epoch, was first heard: it is for that life."""
         self._reference = None
-        if life is not None and life == self._last_for:
-            self.arriving = self._last
+        if life is None or life != self.arriving_for:
+            self.arriving = None
 
     @property
     def followed(self) -> Reference | None:

@@ -3,8 +3,9 @@
 Intake of references for a controller.
 
 A reference that starts on arrival gets its stamp from the leading controller, which
-publishes it with that stamp. Standbys wait for the stamped reference; otherwise two
-controllers could follow it one sample apart.
+publishes it with that stamp: at once, or with the first state that counts if there was
+none. Standbys wait for the stamped reference; otherwise two controllers could follow it
+one sample apart.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ class References:
         self._last_planned = (0, 0)  # epoch and number of the last reference taken from a planner
         self._publisher = bus.publisher(bus.keys.anchored)
         self._waiting: LaidOut | None = None  # waits for its stamp
-        self._anchored: Reference | None = None
+        self._given: Reference | None = None  # to the controller, as it came
+        self._known: Reference | None = None  # to standbys, with its stamp
         self._leading = False
 
     def from_planner(self, subscriber: Subscriber) -> None:
@@ -59,15 +61,16 @@ class References:
                 self._stamped.append((reference, self._controller.lay_out(reference)))
 
     def hand_over(self, leading: bool) -> None:
-        """Let the controller follow the newest received reference, and publish it if it got its stamp here."""
+        """Let the controller follow the newest received reference, and publish what it follows if that got its stamp here."""
         led, self._leading = self._leading, leading
         newest = self._take(led)
-        if newest is None and leading and not led:
-            newest = self._waiting
-            if newest is None and self._anchored is not None:
-                self._publisher.put(self._anchored)  # its first publisher may be gone
+        if leading and not led:
+            newest = newest or self._waiting
+            self._known = None  # its first publisher may be gone
         if newest is not None:
             self._follow(*newest)
+        if leading:
+            self._publish()
 
     def _take(self, led: bool) -> LaidOut | None:
         """Return the newest received reference; the stamped one, if the same reference came from a planner and from a leader."""
@@ -75,7 +78,7 @@ class References:
         stamped = self._stamped.pop() if self._stamped else None
         if planned is not None:
             self._last_planned = epoch_and_seq(planned[0])
-            if self._anchored is not None and planned[0].stamp_ns == STAMP_ON_ARRIVAL and epoch_and_seq(self._anchored) == self._last_planned:
+            if self._given is not None and planned[0].stamp_ns == STAMP_ON_ARRIVAL and epoch_and_seq(self._given) == self._last_planned:
                 planned = None  # the leader has stamped it before, and it has started already
         if stamped is not None and not led and epoch_and_seq(stamped[0]) >= self._last_planned:
             return stamped
@@ -87,10 +90,18 @@ class References:
         self._waiting = (reference, rows) if arriving and not self._leading else None
         if self._waiting is not None:
             return
-        anchored = self._controller.receive_reference(reference, rows)
-        if anchored is not None:
-            self._publisher.put(anchored)
-        self._anchored = anchored if arriving else reference
+        self._given = reference
+        if not arriving:
+            self._known = reference
+        self._controller.receive_reference(reference, rows)
+
+    def _publish(self) -> None:
+        """Publish what the controller follows, unless it is known, or older than what still waits for a state."""
+        followed, given = self._controller.followed, self._given
+        if followed is None or followed is self._known or given is None or epoch_and_seq(followed) != epoch_and_seq(given):
+            return
+        self._publisher.put(followed)
+        self._known = followed
 
 
 def epoch_and_seq(reference: Reference) -> tuple[int, int]:

@@ -19,7 +19,7 @@ from rti_mpc.wire.bus import Received
 from rti_mpc.wire.cdr import encode, encoding
 from rti_mpc.wire.intake import Intake
 from rti_mpc_service.controller.references import References
-from tests.loop import reference
+from tests.loop import MS, reference
 from tests.problems import pioneer
 
 
@@ -34,15 +34,15 @@ class Followed(SimpleNamespace):
     """A controller that gives a stamp to each reference, and records which one it follows."""
 
     np_ = 7
-    newest: Reference | None = None
+    followed: Reference | None = None
 
     def lay_out(self, reference: Reference) -> None:
         return None
 
     def receive_reference(self, reference: Reference, rows: None) -> Reference | None:
         arriving = reference.stamp_ns == STAMP_ON_ARRIVAL
-        self.newest = replace(reference, stamp_ns=7) if arriving else reference
-        return self.newest if arriving else None
+        self.followed = replace(reference, stamp_ns=7) if arriving else reference
+        return self.followed if arriving else None
 
 
 class Rig:
@@ -63,8 +63,60 @@ class Rig:
     def followed(self, *, leading: bool) -> tuple[int, int, int] | None:
         """Epoch, seq and stamp of what the controller follows after a sample."""
         self.references.hand_over(leading)
-        newest = self.controller.newest
-        return None if newest is None else (newest.epoch, newest.seq, newest.stamp_ns)
+        followed = self.controller.followed
+        return None if followed is None else (followed.epoch, followed.seq, followed.stamp_ns)
+
+
+class Pair:
+    """A leader, a standby and a planner in lockstep, without a bus."""
+
+    def __init__(self, rtis: list[Rti]) -> None:
+        self.published = Published()
+        self.controllers = [Controller(rti, Timing(), compile=False) for rti in rtis]
+        self.controllers[1].stand_by()
+        self.references = []
+        for controller in self.controllers:
+            bus: Any = SimpleNamespace(intake=Intake, keys=SimpleNamespace(anchored="anchored"), publisher=lambda *_, **__: self.published)
+            self.references.append(References(bus, controller, ny=3))
+        self.delivered = 0
+        self.leader: int | None = 0
+
+    def plan(self, *messages: Reference) -> None:
+        for references in self.references:
+            references.from_planner(sent(*messages))
+
+    def hear(self, state: State, local_ns: int) -> None:
+        """Let both answer a state; what the leader publishes comes after the sample."""
+        for i, (controller, references) in enumerate(zip(self.controllers, self.references, strict=True)):
+            if (command := controller.receive_state(state, local_ns)) is not None:
+                controller.commit(command)
+                controller.prepare()
+            references.hand_over(i == self.leader)
+        for references in self.references:
+            references.from_leader(sent(*self.published[self.delivered :]))
+        self.delivered = len(self.published)
+
+    def drive(self, epoch: int, stamps_ms: range, local_ms: int, *, magnitude: float = 0.0) -> None:
+        """Let the robot send states of one life, the first at a local time."""
+        for stamp_ms in stamps_ms:
+            local_ns = (local_ms + stamp_ms - stamps_ms.start) * MS
+            self.hear(State(epoch, 1 + stamp_ms // stamps_ms.step, stamp_ms * MS, np.full(5, magnitude)), local_ns)
+
+    @property
+    def stamps_ms(self) -> list[float | None]:
+        """Since when leader and standby follow their reference, and the last stamp on the bus."""
+        followed = [controller.followed for controller in self.controllers]
+        return [None if message is None else message.stamp_ns / MS for message in (*followed, *self.published[-1:])]
+
+
+@pytest.fixture(scope="module")
+def rtis() -> list[Rti]:
+    return [Rti(pioneer(N=5), compile=False) for _ in range(2)]
+
+
+@pytest.fixture
+def pair(rtis: list[Rti]) -> Pair:
+    return Pair(rtis)
 
 
 def sent(*messages: Reference) -> Any:
@@ -139,9 +191,9 @@ def test_leader_follows_planners_alone() -> None:
     assert rig.followed(leading=True) == (1, 3, 8)
 
 
-def test_controlling_thread_does_nothing_for_each_row_of_a_reference(monkeypatch: pytest.MonkeyPatch) -> None:
-    controller = Controller(Rti(pioneer(N=5), compile=False), Timing(), compile=False)
-    bus: Any = SimpleNamespace(intake=Intake, keys=SimpleNamespace(anchored="anchored"), publisher=lambda *_, **__: None)
+def test_controlling_thread_does_nothing_for_each_row_of_a_reference(rtis: list[Rti], monkeypatch: pytest.MonkeyPatch) -> None:
+    controller = Controller(rtis[0], Timing(), compile=False)
+    bus: Any = SimpleNamespace(intake=Intake, keys=SimpleNamespace(anchored="anchored"), publisher=lambda *_, **__: Published())
     references = References(bus, controller, ny=3)
     message = reference(circle())
     waiting = iter([Received(encode(message), encoding(type(message)), "reference"), None])
@@ -155,3 +207,74 @@ def test_controlling_thread_does_nothing_for_each_row_of_a_reference(monkeypatch
     controller.receive_state(State(1, 1, 0, np.zeros(5)), 0)
     references.hand_over(leading=True)
     assert controller.receive_state(State(1, 2, 100_000_000, np.zeros(5)), 100_000_000) is not None
+
+
+def test_reference_sent_before_a_restart_is_believed_starts_once_for_leader_and_standby(pair: Pair) -> None:
+    pair.plan(planned(1))
+    pair.drive(1, range(100_000, 102_000, 100), 100_000)
+    assert pair.stamps_ms == [100_000] * 3
+    pair.drive(2, range(100, 200, 100), 103_000)
+    pair.plan(planned(2))
+    pair.drive(2, range(200, 400, 100), 103_100)
+    assert [message.seq for message in pair.published] == [1], "no stamp before it is certain on whose clock"
+    pair.drive(2, range(400, 1000, 100), 103_300)
+    assert pair.stamps_ms == [pair.stamps_ms[0]] * 3
+    assert 200 <= (pair.stamps_ms[0] or 0) <= 500
+    pair.leader = 1
+    pair.drive(2, range(1000, 1500, 100), 103_900)
+    assert pair.stamps_ms == [pair.stamps_ms[0]] * 3
+    assert [message.seq for message in pair.published] == [1, 2, 2], "the new leader publishes it for those that come late"
+
+
+def test_standby_that_takes_over_before_a_restart_is_believed_starts_the_reference_itself(pair: Pair) -> None:
+    pair.plan(planned(1))
+    pair.drive(1, range(100_000, 102_000, 100), 100_000)
+    pair.drive(2, range(100, 200, 100), 103_000)
+    pair.plan(planned(2))
+    pair.drive(2, range(200, 300, 100), 103_100)
+    pair.leader = 1
+    pair.drive(2, range(300, 1000, 100), 103_200)
+    assert pair.stamps_ms[1] == pair.stamps_ms[2]
+    assert (pair.published[-1].seq, pair.published[-1].stamp_ns < 1000 * MS) == (2, True)
+
+
+def test_reference_sent_to_a_life_that_ended_before_it_was_believed_is_not_followed_by_the_next(pair: Pair) -> None:
+    pair.drive(1, range(100_000, 101_000, 100), 100_000)
+    pair.drive(2, range(100, 200, 100), 103_000)
+    pair.plan(planned(1))
+    pair.drive(2, range(200, 300, 100), 103_100)
+    pair.drive(3, range(100, 1000, 100), 110_000)
+    assert pair.stamps_ms == [None, None]
+
+
+def test_reference_that_came_with_a_refused_state_starts_once_for_leader_and_standby(pair: Pair) -> None:
+    pair.plan(planned(1))
+    pair.drive(1, range(100_000, 100_100, 100), 100_000, magnitude=1e10)
+    assert pair.stamps_ms == [None, None]
+    pair.drive(1, range(100_100, 101_000, 100), 100_100)
+    assert pair.stamps_ms == [100_100] * 3
+    pair.leader = 1
+    pair.drive(1, range(101_000, 102_000, 100), 101_000)
+    assert pair.stamps_ms == [100_100] * 3
+
+
+def test_reference_sent_while_two_robots_use_the_name_starts_when_one_is_left(pair: Pair) -> None:
+    pair.plan(planned(1))
+    pair.drive(1, range(100_000, 102_000, 100), 100_000)
+    pair.hear(State(9, 1, 5 * MS, np.zeros(5)), 101_950 * MS)
+    pair.plan(planned(2))
+    pair.drive(1, range(102_000, 102_200, 100), 102_000)
+    assert [message.seq for message in pair.published] == [1]
+    pair.drive(1, range(102_200, 105_000, 100), 102_200)
+    assert [message.seq for message in pair.published] == [1, 2]
+    assert pair.stamps_ms == [pair.stamps_ms[0]] * 3
+    assert (pair.stamps_ms[0] or 0) > 102_200
+
+
+def test_reference_that_its_planner_has_stamped_is_not_published_again_before_a_takeover(pair: Pair) -> None:
+    pair.plan(planned(1, stamp_ns=100_000 * MS))
+    pair.drive(1, range(100_000, 101_000, 100), 100_000)
+    assert pair.stamps_ms == [100_000] * 2
+    pair.leader = 1
+    pair.drive(1, range(101_000, 102_000, 100), 101_000)
+    assert pair.stamps_ms == [100_000] * 3
