@@ -33,12 +33,7 @@ from rti_mpc.rti.qp.qp import Guess, Qp, QpData, Step
 from rti_mpc.rti.qp.simultaneous import simultaneous
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.scaled import Scaled
-from rti_mpc.wire import document
-
-FORMAT = "rti_mpc case 1"
-MAX_ABOUT_BYTES = 1 << 24
-MAX_BYTES = 1 << 28  # of all arrays
-MATRICES, VECTORS = ("P", "A"), ("q", "l", "u")
+from rti_mpc_service.case_file import FORMAT, MATRICES, PLACE, VECTORS, check_about, contents
 
 
 @dataclass(frozen=True)
@@ -118,26 +113,7 @@ class QpCase:
         Raises:
             MessageError: They are none.
         """
-        try:
-            with zipfile.ZipFile(BytesIO(content)) as archive:
-                if (size := sum(entry.file_size for entry in archive.infolist())) > MAX_BYTES:
-                    raise ValueError(f"{size} bytes, more than {MAX_BYTES}")
-            with np.load(BytesIO(content), allow_pickle=False) as file:
-                if str(file["format"]) != FORMAT:
-                    raise ValueError(f"format {file['format']}")
-                qp, n, m = QpData(), len(file["q"]), len(file["l"])
-                qp.q, qp.l, qp.u = (file[name] for name in VECTORS)
-                qp.P, qp.A = (
-                    sp.csc_matrix(tuple(file[f"{name}_{part}"] for part in ("data", "indices", "indptr")), shape=(rows, n))
-                    for name, rows in zip(MATRICES, (n, m), strict=True)
-                )
-                guess = {name.removeprefix("guess_"): file[name] for name in file.files if name.startswith("guess_")}
-                case = cls(document.read(str(file["about"]).encode(), most=MAX_ABOUT_BYTES), qp, guess, file["columns"], file["z"])
-            if case.qp.u.shape != (m,) or case.columns.shape != (n,) or case.z.shape != (n,) or guess["x"].size + guess["u"].size > n:
-                raise ValueError("arrays of different lengths")
-        except (OSError, MessageError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            raise MessageError(str(error)) from error
-        return case
+        return cls(*contents(content))
 
     def save(self, path: Path) -> None:
         """
@@ -160,9 +136,11 @@ class QpCase:
             ConfigError: It is no case.
         """
         try:
-            return cls.decode(path.read_bytes())
+            case = cls.decode(path.read_bytes())
+            check_about(case.about, PLACE)
         except (OSError, MessageError) as error:
             raise ConfigError(f"{path} must be a case, as rti-mpc why --case writes it, got {error}") from error
+        return case
 
 
 def take(rti: Rti, about: Mapping[str, Any]) -> QpCase:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,10 @@ import pytest
 from rti_mpc.contract.message import End, Journal, JournalKind, Reference
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.control.observer import Disturbance, Observer, ObserverSettings
+from rti_mpc.errors import JournalError
 from rti_mpc.journal.book import Book
 from rti_mpc.journal.replay import Replay, ReplayOutcome, replay
-from rti_mpc.journal.snapshot import ARRAY, PINNED, Snapshot
+from rti_mpc.journal.snapshot import ARRAY, PINNED, Camera, Snapshot
 from rti_mpc.model.disturbance import with_disturbances
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
@@ -133,6 +134,19 @@ def test_journal_replays_with_no_differing_bit_from_every_snapshot(name: str) ->
     assert samples == sorted(samples, reverse=True)
     assert samples[0] >= len(lived.commands)
     assert samples[-1] < samples[0] - 100
+
+
+def test_snapshot_that_would_change_the_pattern_of_a_matrix_is_refused() -> None:
+    """Compiled code trusts the indices of a sparse matrix: with others it writes beyond its arrays."""
+    camera = Camera(KINDS["osqp"].build()[0])
+    snapshot = camera.take()
+    camera.restore(snapshot)
+    patterns = [i for i, array in enumerate(snapshot.pinned) if array.dtype.kind == "i"]
+    assert len(patterns) > 3
+    wrong: list[Any] = [snapshot.pinned[patterns[-1]] + 2_000_000_000, snapshot.pinned[patterns[-1]].astype(np.float64), 0, None]
+    for other in wrong:
+        with pytest.raises(JournalError, match="must be of a controller built like this one"):
+            camera.restore(replace(snapshot, pinned=[other if i == patterns[-1] else array for i, array in enumerate(snapshot.pinned)]))
 
 
 @pytest.mark.parametrize("name", ["car", pytest.param("quadrotor", marks=pytest.mark.slow)])
