@@ -17,7 +17,7 @@ import numpy as np
 
 from rti_mpc.contract.message import Reference
 from rti_mpc.errors import MessageError
-from rti_mpc.recording.reader import STREAM_OF_NAME, Recording
+from rti_mpc.recording.reader import STREAM_OF_NAME, Recorded, Recording
 from rti_mpc.wire.info import Info, Label
 from rti_mpc.wire.layout import LAYOUTS, STAMP_LIMIT_NS, Field
 
@@ -62,7 +62,7 @@ def table(recording: Recording, stream: str, robot: str | None = None, *, horizo
     if STREAM_OF_NAME[stream].by_role:
         columns.append(("role", "", pa.array([recorded.role for recorded in messages], pa.string())))
     if cls is None:
-        columns.append(("json", "", pa.array([recorded.received.payload.decode() for recorded in messages], pa.string())))
+        columns.append(("json", "", pa.array([text_of(recorded) for recorded in messages], pa.string())))
     else:
         decoded = [recorded.message for recorded in messages]
         if cls is Reference:
@@ -73,6 +73,19 @@ def table(recording: Recording, stream: str, robot: str | None = None, *, horizo
             columns += columns_of(field, [getattr(message, field.name) for message in decoded], labels, horizon=horizon)
     schema = pa.schema([pa.field(name, values.type, metadata={"unit": unit} if unit else None) for name, unit, values in columns])
     return pa.Table.from_arrays([values for _, _, values in columns], schema=schema)
+
+
+def text_of(recorded: Recorded) -> str:
+    """
+    Return the text of a JSON object.
+
+    Raises:
+        MessageError: It is not UTF-8.
+    """
+    try:
+        return recorded.received.payload.decode()
+    except UnicodeDecodeError as error:
+        raise MessageError(f"{recorded.received.key} must be JSON in UTF-8, got {error.reason} at byte {error.start}") from None
 
 
 def robot_s(stamp_ns: int) -> float:
@@ -103,6 +116,7 @@ def export(recording: Recording, folder: Path, *, horizon: bool = False) -> list
     Write every stream of every robot as a Parquet file, ``<folder>/<robot>/<stream>.parquet``; return the files with their rows.
 
     Raises:
+        MessageError: A message is none of its stream.
         OSError: A file cannot be written.
     """
     import pyarrow.parquet as pq
@@ -142,7 +156,7 @@ def labels_of(recording: Recording, robot: str) -> dict[str, Sequence[Label]]:
         if info.states:
             kinds = {kind: getattr(info, kind) for kind in ("states", "inputs", "outputs", "disturbances")}
             with suppress(LookupError, TypeError):
-                kinds["parameters"] = [Label(signal["name"], signal["unit"]) for signal in recorded.message["stage_parameters"]]
+                kinds["parameters"] = [Label(str(signal["name"]), str(signal["unit"])) for signal in recorded.message["stage_parameters"]]
             return kinds
     return {}
 

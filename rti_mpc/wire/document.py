@@ -37,7 +37,7 @@ def read(payload: bytes, size: int | None = None, most: int = MAX_DOCUMENT_BYTES
     if size > most:
         raise Refused("oversized", f"message must have at most {most} bytes, got {size}")
     try:
-        value = json.loads(payload, parse_int=_integer, parse_float=_number, parse_constant=_number)
+        value = json.loads(payload.decode(), parse_int=_integer, parse_float=_number, parse_constant=_number)
         json.dumps(value, ensure_ascii=False).encode()  # raises for half of a surrogate pair
     except Refused:
         raise

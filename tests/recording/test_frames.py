@@ -14,6 +14,7 @@ import pytest
 from rti_mpc.contract.message import Command, State, Telemetry
 from rti_mpc.errors import MessageError
 from rti_mpc.recording import Recording, export, frame, table, units
+from rti_mpc.recording.writer import RecordingWriter
 from rti_mpc.wire.keys import Key, Keys
 from tests.recording.samples import KEYS, REFERENCE, START_NS, write
 from tests.service.test_cli import rti_mpc
@@ -120,6 +121,15 @@ def test_export_prints_what_it_has_written_and_refuses_what_is_no_recording(
     assert f"{tmp_path}/out/wheels/telemetry.parquet: {COUNT} rows\n" in done.stdout
     done = rti_mpc("export", str(tmp_path / "nothing.mcap"), "--parquet", str(tmp_path / "out"))
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+
+
+def test_description_that_is_not_utf_8_is_refused_by_its_key(tmp_path: Path) -> None:
+    """No recorder writes one; any other program can."""
+    writer = RecordingWriter(tmp_path / "run.mcap", START_NS, 0, "0.0")
+    writer.add(KEYS.robot, KEYS.info("controller"), START_NS, '{"a": 1}'.encode("utf-16"))
+    writer.finish({})
+    with pytest.raises(MessageError, match=r"rti_mpc/wheels/info/controller must be JSON in UTF-8"):
+        export(Recording(tmp_path / "run.mcap"), tmp_path)
 
 
 @pytest.mark.slow

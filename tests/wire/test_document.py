@@ -35,6 +35,10 @@ def test_an_object_is_read_as_it_was_written() -> None:
         (b"[]", "JSON object"),
         (b"null", "JSON object"),
         (b"\xff", "JSON object"),
+        ('{"a": 1}'.encode("utf-16"), "JSON object"),
+        ('{"a": 1}'.encode("utf-16-le"), "JSON object"),
+        ('{"a": 1}'.encode("utf-32-be"), "JSON object"),
+        ('{"a": 1}'.encode("utf-8-sig"), "JSON object"),
         (b'{"a": 1', "JSON object"),
         (b'{"a": "\\ud800"}', "JSON object"),  # cannot be printed
         (30_000 * b"[", "JSON object"),
