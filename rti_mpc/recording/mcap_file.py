@@ -16,14 +16,15 @@ from typing import NamedTuple
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Metadata, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk, get_chunk_data_stream
+from mcap.stream_reader import StreamReader, breakup_chunk, get_chunk_data_stream
 from zstandard import ZstdError
 
 from rti_mpc.errors import MessageError
 
 RECORD_HEAD = Struct("<BQ")  # opcode, length
 MESSAGE_HEAD = Struct("<HIQQ")  # channel, sequence number, times of arrival and of publication
-DAMAGES = (McapError, CRCValidationError, ZstdError, error, UnicodeDecodeError, MemoryError, OverflowError)  # raised by a part that is no record
+# Raised by a part that is no record; sums that do not fit and texts that are not UTF-8 are a ValueError.
+DAMAGES = (McapError, ZstdError, error, ValueError, MemoryError, OverflowError)
 
 
 class StoredMessage(NamedTuple):
@@ -97,11 +98,10 @@ class McapFile:
             if isinstance(record, Chunk):
                 try:
                     stream, length = get_chunk_data_stream(record, validate_crc=True)
-                    data = stream.read(length)
+                    yield from messages_in(stream.read(length), channels)
                 except DAMAGES:
                     self.whole = False
                     return
-                yield from messages_in(data, channels)
 
 
 def messages_in(data: bytes, channels: Collection[int] | None) -> Iterator[StoredMessage]:

@@ -3,24 +3,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import re
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mcap.records import Attachment, Channel, Metadata
 
-from rti_mpc.errors import MessageError
+from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.recording.host import HOST
 from rti_mpc.recording.mcap_file import McapFile
 from rti_mpc.recording.ros2 import JSON, read_text
 from rti_mpc.recording.writer import ABOUT, OUTCOME
 from rti_mpc.wire import document
 from rti_mpc.wire.cdr import decode, encoding
+from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.layout import STAMP_LIMIT_NS
 from rti_mpc.wire.received import Received
 from rti_mpc.wire.streams import STREAMS, Kind, Stream
 
 STREAM_OF_NAME: dict[str, Stream[Any]] = {stream.name: stream for stream in (*STREAMS, HOST) if stream.kind is Kind.MESSAGE}
+
+
+TIME = re.compile(r"-?[0-9]{1,19}")
+NAMED = {"robot", "role", "key", "encoding"}  # what each channel says of itself, besides its stream
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +96,7 @@ class Recording:
             self._open(file, abouts)
         if not abouts:
             raise MessageError(f"{path} must be a recording of rti-mpc, or a folder of its segments, got none")
-        self.unix_offset_ns, self.start_ns = (int(abouts[0][name]) for name in ("unix_offset_ns", "start_ns"))
+        self.unix_offset_ns, self.start_ns = (time_of(path, abouts[0], name) for name in ("unix_offset_ns", "start_ns"))
         self.robots = sorted({channel.metadata["robot"] for channels in self._channels.values() for channel, _ in channels.values()})
 
     def _open(self, path: Path, abouts: list[dict[str, str]]) -> None:
@@ -105,8 +112,14 @@ class Recording:
                     self.outcome = content.metadata
             elif isinstance(content, Channel) and (stream := STREAM_OF_NAME.get(content.metadata.get("stream", ""))) is not None:
                 expected = JSON if stream.message is None else encoding(stream.message)
+                if missing := NAMED - content.metadata.keys():
+                    raise MessageError(f"{path} must say the {' and '.join(sorted(missing))} of its channel {content.topic}, got none")
                 if (got := content.metadata["encoding"]) != expected:
                     raise MessageError(f"{path} must hold messages of encoding {expected}, got {got}")
+                try:
+                    Keys(robot=content.metadata["robot"])  # which becomes the name of a folder
+                except ConfigError as error:
+                    raise MessageError(f"{path}: {error}") from error
                 channels[content.id] = content, stream
         self.whole &= file.whole
 
@@ -142,3 +155,16 @@ class Recording:
     def infos(self, robot: str | None = None) -> list[Recorded]:
         """Return all descriptions that robots, controllers and guards have published, oldest first; each message is a dict."""
         return list(self.messages(robot, ("info",)))
+
+
+def time_of(path: Path, about: Mapping[str, str], name: str) -> int:
+    """
+    Return a time that a recording says of itself, ns.
+
+    Raises:
+        MessageError: It does not, or it is no time.
+    """
+    text = about.get(name, "none")
+    if not TIME.fullmatch(text) or abs(int(text)) >= STAMP_LIMIT_NS:
+        raise MessageError(f"{path} must say its {name} as a number of nanoseconds below 2^62, got {text[:30]!r}")
+    return int(text)

@@ -38,18 +38,18 @@ def repair(path: Path, to: Path) -> int:
                     writer.add_metadata(record.name, record.metadata)
                 elif isinstance(record, Chunk):
                     try:
-                        contents = breakup_chunk(record, validate_crc=True)
-                    except DAMAGES:
+                        for content in breakup_chunk(record, validate_crc=True):
+                            if isinstance(content, Schema):
+                                schemas[content.id] = writer.register_schema(content.name, content.encoding, content.data)
+                            elif isinstance(content, Channel):
+                                channel = (content.topic, content.message_encoding, schemas[content.schema_id], content.metadata)
+                                channels[content.id] = writer.register_channel(*channel)
+                            elif isinstance(content, Message):
+                                to_channel = channels[content.channel_id]
+                                writer.add_message(to_channel, content.log_time, content.data, content.publish_time, content.sequence)
+                                count += 1
+                    except (*DAMAGES, KeyError):  # the last one: of a channel that is not there
                         break
-                    for content in contents:
-                        if isinstance(content, Schema):
-                            schemas[content.id] = writer.register_schema(content.name, content.encoding, content.data)
-                        elif isinstance(content, Channel):
-                            channel = (content.topic, content.message_encoding, schemas[content.schema_id], content.metadata)
-                            channels[content.id] = writer.register_channel(*channel)
-                        elif isinstance(content, Message):
-                            writer.add_message(channels[content.channel_id], content.log_time, content.data, content.publish_time, content.sequence)
-                            count += 1
             writer.finish()
         part.replace(to)
     finally:

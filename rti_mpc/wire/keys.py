@@ -12,7 +12,8 @@ from rti_mpc.wire import streams
 from rti_mpc.wire.cdr import M
 from rti_mpc.wire.streams import Stream
 
-RESERVED_CHARS = set("*$?#")  # Zenoh's wildcards and selectors
+RESERVED_CHARS = set("*$?#\0")  # Zenoh's wildcards and selectors, and what no path holds
+NO_WORDS = {"", ".", ".."}  # recordings are exported into a folder by the robot's name
 
 
 class Key(str, Generic[M]):
@@ -48,8 +49,10 @@ class Keys:
     def __post_init__(self) -> None:
         for name in ("prefix", "robot"):
             value = getattr(self, name)
-            if not all(value.split("/")) or value.startswith("@") or RESERVED_CHARS & set(value):
-                raise ConfigError(f"{name} must be words joined by single slashes, without any of * $ ? # or a leading @, got {value!r}")
+            if NO_WORDS & set(value.split("/")) or value.startswith("@") or RESERVED_CHARS & set(value):
+                raise ConfigError(
+                    f"{name} must be words joined by single slashes, none of them . or .., without any of * $ ? #, NUL or a leading @, got {value!r}"
+                )
 
     def below(self, name: str) -> str:
         """Return the key of any name below this robot, such as ``"**"``."""

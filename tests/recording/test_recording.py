@@ -12,15 +12,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
+from rti_mpc.contract.message import State
 from rti_mpc.errors import MessageError
 from rti_mpc.recording import Recording
 from rti_mpc.recording.repair import repair
 from rti_mpc.recording.ros2 import read_text, write_text
-from rti_mpc.recording.writer import RecordingWriter
-from rti_mpc.wire.cdr import encode
+from rti_mpc.recording.writer import ABOUT, RecordingWriter
+from rti_mpc.wire.cdr import encode, encoding
 from rti_mpc.wire.keys import Keys
 from tests.recording.samples import INFO, KEYS, MS, START_NS, UNIX_OFFSET_NS, state, write
 
@@ -158,6 +160,44 @@ def test_messages_of_another_version_are_refused(tmp_path: Path) -> None:
     writer.finish({})
     with pytest.raises(MessageError, match=r"State@2, got application/cdr;State@1"):
         Recording(tmp_path / "other.mcap")
+
+
+def crafted(path: Path, about: dict[str, str] | None = None, **channel: str | None) -> Path:
+    """Write a recording of one state and one description, with other words about itself and about the channel of a state; None: left out."""
+    told = {"robot": "wheels", "stream": "state", "role": "", "key": "rti_mpc/wheels/state", "encoding": encoding(State)} | channel
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_metadata(ABOUT, {"version": "0", "start_ns": "0", "unix_offset_ns": "0"} if about is None else about)
+        number = writer.register_channel("/a", "cdr", 0, {name: text for name, text in told.items() if text is not None})
+        writer.add_message(number, START_NS, encode(state(1)), START_NS)
+        writer.finish()
+    return path
+
+
+def test_crafted_recording_is_read_if_nothing_is_wrong(tmp_path: Path) -> None:
+    assert [recorded.message.seq for recorded in Recording(crafted(tmp_path / "run.mcap")).messages()] == [1]
+
+
+@pytest.mark.parametrize("robot", ["../../evil", "/tmp/evil", "..", ".", "a/../b", "a//b", "", "a\0b"])
+def test_robot_whose_name_would_leave_the_folder_of_an_export_is_refused(robot: str, tmp_path: Path) -> None:
+    with pytest.raises(MessageError, match=r"run\.mcap: robot must be words"):
+        Recording(crafted(tmp_path / "run.mcap", robot=robot))
+
+
+@pytest.mark.parametrize("name", ["robot", "role", "key", "encoding"])
+def test_recording_whose_channel_says_too_little_is_refused_by_what_is_missing(name: str, tmp_path: Path) -> None:
+    with pytest.raises(MessageError, match=rf"run\.mcap must say the {name} of its channel /a"):
+        Recording(crafted(tmp_path / "run.mcap", **{name: None}))
+
+
+@pytest.mark.parametrize("time", [None, "", "x", "1.5", "٣", "9" * 5000, str(2**62)])
+@pytest.mark.parametrize("name", ["start_ns", "unix_offset_ns"])
+def test_recording_without_its_times_is_refused(name: str, time: str | None, tmp_path: Path) -> None:
+    told = {other: text for other, text in {"start_ns": "0", "unix_offset_ns": "0", name: time}.items() if text is not None}
+    with pytest.raises(MessageError, match=rf"run\.mcap must say its {name} as a number of nanoseconds") as refusal:
+        Recording(crafted(tmp_path / "run.mcap", told))
+    assert len(str(refusal.value)) < 200 + len(str(tmp_path))
 
 
 @pytest.mark.parametrize("text", ["", "{}", "µ" * 1000])

@@ -24,9 +24,9 @@ def test_streams_are_distinct() -> None:
     assert len({getattr(keys, name) for name in names}) == len(names)
 
 
-@pytest.mark.parametrize("word", ["", "/a", "a/", "a//b", "a*", "**", "a$*", "a?b", "a#b", "@/a"])
+@pytest.mark.parametrize("word", ["", "/a", "a/", "a//b", "a*", "**", "a$*", "a?b", "a#b", "@/a", "..", ".", "a/../b", "../a", "a/.", "a\0b"])
 @pytest.mark.parametrize("name", ["prefix", "robot"])
-def test_words_zenoh_would_take_for_more_are_refused(name: str, word: str) -> None:
+def test_words_that_zenoh_or_a_path_would_take_for_more_are_refused(name: str, word: str) -> None:
     with pytest.raises(ConfigError, match=name):
         Keys(**{name: word})
 
