@@ -13,7 +13,7 @@ import json
 import logging
 import re
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
@@ -33,7 +33,7 @@ from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.received import Received
-from rti_mpc.wire.streams import CONTROLLER_ROLES, JOURNAL, admitted, role_of
+from rti_mpc.wire.streams import CONTROLLER_ROLES, JOURNAL, KNOWN_ROLES, admitted, role_of
 from rti_mpc_service.announce import announce
 from rti_mpc_service.host.pressure import waited_us
 from rti_mpc_service.record.hearing import fetch_origin, hear
@@ -107,7 +107,8 @@ class Recorder:
     One recording.
 
     Attributes:
-        counts: Numbers of messages: recorded; missing, by their sequence numbers; refused, since they cannot be decoded.
+        counts: Numbers of messages: recorded; missing, by their sequence numbers; refused, since they cannot be decoded or their
+            publisher's role is beyond `MAX_UNKNOWN_ROLES`.
     """
 
     def __init__(self, bus: Bus, segments: Segments) -> None:
@@ -120,7 +121,8 @@ class Recorder:
         self._files: list[tuple[str, Mapping[str, str]]] = []  # of controllers, to be attached, with the beginning of their names
         self._lock = Lock()
         self._doors: dict[type[Any], Intake[Any]] = {}
-        self._keys: dict[str, Key[Any] | None] = {}  # None: of a role beyond the limit of roles
+        self._keys: dict[str, Key[Any]] = {}
+        self._others: defaultdict[tuple[str, str], list[str]] = defaultdict(list)  # those of other roles than `KNOWN_ROLES`, by robot and stream
         self._last: dict[tuple[str, int], int] = {}  # sequence numbers by key and epoch
         self._owners: set[tuple[str, int]] = set()  # controllers whose files were asked for
         self._waited: tuple[int, int] | None = None  # monotonic time, ns, and what the host had waited then, us
@@ -197,12 +199,12 @@ class Recorder:
         """Check a message and add it to the chunk."""
         received, stream = entry.received, entry.stream
         if received.key not in self._keys:
-            heard = not stream.by_role or admitted(received.key, [key for key, other in self._keys.items() if other and other.stream is stream])
-            self._keys[received.key] = Key(received.key, stream) if heard else None
+            if not self._admit(entry):
+                self.counts["refused"] += 1
+                return
+            self._keys[received.key] = Key(received.key, stream)
         key = self._keys[received.key]
         seq = 0
-        if key is None:
-            return
         if stream.message is None:
             try:
                 document.read(received.payload, received.size)
@@ -221,9 +223,18 @@ class Recorder:
         self._segments.keep(entry)
         self.counts["recorded"] += 1
 
-    def _add(self, entry: Arrived, key: Key[Any] | None, seq: int = 0) -> None:
-        if key is not None:
-            self._segments.writer.add(entry.robot, key, entry.local_ns, entry.received.payload, seq)
+    def _admit(self, entry: Arrived) -> bool:
+        """Whether to record the key of a message from now on; one that is refused is not remembered, as any peer can invent roles."""
+        key = entry.received.key
+        if not entry.stream.by_role or role_of(key) in KNOWN_ROLES:
+            return True
+        others = self._others[entry.robot, entry.stream.name]
+        if heard := admitted(key, others):
+            others.append(key)
+        return heard
+
+    def _add(self, entry: Arrived, key: Key[Any], seq: int = 0) -> None:
+        self._segments.writer.add(entry.robot, key, entry.local_ns, entry.received.payload, seq)
 
     def _follow_numbers(self, key: str, epoch: int, seq: int) -> None:
         """Count the sequence numbers that were left out."""
