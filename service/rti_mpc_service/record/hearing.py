@@ -50,16 +50,18 @@ def fetch_origin(bus: Bus, owner: int, give: Callable[[Mapping[str, str]], objec
     """Ask a controller for its files, in a thread of its own, and give them; a line in the log if it has none."""
 
     def ask() -> None:
-        pieces: dict[int, str] = {}
-        size = 1
-        while (begin := sum(map(len, pieces.values()))) < size <= MAX_BUNDLE_BYTES:
-            answers = [answer for answer in bus.answers(bus.keys.origin, {"from": begin}, ASK_TIMEOUT_S) if answer.get("owner") == owner]
-            if not answers or not answers[0].get("piece"):
+        pieces, begin, size = list[str](), 0, 1
+        while begin < size <= MAX_BUNDLE_BYTES:
+            answers = (answer for answer in bus.answers(bus.keys.origin, {"from": begin}, ASK_TIMEOUT_S) if answer.get("owner") == owner)
+            answer = next(answers, {})
+            piece, size = answer.get("piece"), answer.get("size")
+            if not (isinstance(piece, str) and piece and type(size) is int):
                 break
-            size, pieces[begin] = int(answers[0]["size"]), str(answers[0]["piece"])
+            pieces.append(piece)
+            begin += len(piece)
         else:
             with suppress(ValueError, MessageError, zlib.error):
-                bundle = zlib.decompressobj().decompress(base64.b64decode("".join(pieces.values())), MAX_BUNDLE_BYTES)
+                bundle = zlib.decompressobj().decompress(base64.b64decode("".join(pieces)), MAX_BUNDLE_BYTES)
                 give({name: str(text) for name, text in document.read(bundle, most=MAX_BUNDLE_BYTES).items()})
                 return
         log.warning("%s: a controller has not sent its configuration and model: they are missing in the recording", bus.keys.robot)

@@ -9,6 +9,7 @@ import resource
 import zlib
 from pathlib import Path
 from threading import Event as Flag
+from threading import enumerate as enumerate_threads
 from typing import Any
 
 import pytest
@@ -22,15 +23,17 @@ from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.cdr import Message, encode, encoding
 from rti_mpc.wire.keys import Key
 from rti_mpc.wire.received import Received
+from rti_mpc.wire.streams import MAX_UNKNOWN_ROLES
 from rti_mpc_service.config.build import build_model
 from rti_mpc_service.config.config import load
 from rti_mpc_service.host.pressure import waited_us
 from rti_mpc_service.origin import Origin, origin_files
 from rti_mpc_service.record import record
+from rti_mpc_service.record.hearing import fetch_origin
 from rti_mpc_service.record.inbox import ENTRY_BYTES, Arrived, Inbox
 from rti_mpc_service.record.record import EVERYTHING, Recorder, parse_retention
 from rti_mpc_service.record.segments import SEGMENTS, Retention, Segments
-from tests.recording.samples import INFO, KEYS, MS, REFERENCE, START_NS, UNIX_OFFSET_NS, state
+from tests.recording.samples import EVENT, INFO, KEYS, MS, REFERENCE, START_NS, UNIX_OFFSET_NS, state
 from tests.wire.fake_session import FakeSession
 
 STOPPED = Flag()
@@ -163,6 +166,20 @@ def test_size_of_all_segments_is_limited(tmp_path: Path) -> None:
     assert sum(file.stat().st_size for file in (tmp_path / "runs").iterdir()) > limit // 2
 
 
+def test_made_up_roles_are_limited_for_each_robot_and_what_is_refused_is_counted_not_remembered(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "run.mcap")
+    bench.put(KEYS.event("controller"), EVENT)
+    for k in (*range(1000), 0):
+        bench.put(KEYS.event(f"role_{k}"), EVENT)
+        bench.put(KEYS.info(f"role_{k}"), json.dumps(INFO).encode())
+    bench.put(KEYS.event("guard"), EVENT)
+    assert bench.run() == 0
+    assert bench.recorder.counts == {"recorded": 2 + 2 * (MAX_UNKNOWN_ROLES + 1), "missing": 0, "refused": 2 * (1000 - MAX_UNKNOWN_ROLES)}
+    assert len(bench.recorder._keys) == 2 + 2 * MAX_UNKNOWN_ROLES
+    roles = {recorded.role for recorded in Recording(tmp_path / "run.mcap").messages(streams=("event",))}
+    assert roles == {"controller", "guard", *(f"role_{k}" for k in range(MAX_UNKNOWN_ROLES))}
+
+
 class DescribedSession(FakeSession):
     """A session on which one controller describes itself, once."""
 
@@ -188,6 +205,21 @@ def test_controller_is_asked_for_its_files_as_soon_as_it_describes_itself(tmp_pa
     recorder.follow(KEYS.robot)
     assert done.wait(10.0), "it is asked by the thread that hears it; nothing is written in this test"
     assert asked == [9]
+
+
+@pytest.mark.parametrize("size", [None, "x", "9" * 30, 1.5, [], True, 0, -1, 10**9])
+@pytest.mark.parametrize("piece", [None, "", 7, "AAAA", "Ä"])
+def test_controller_whose_files_make_no_sense_is_told_in_one_line(piece: Any, size: Any, caplog: pytest.LogCaptureFixture) -> None:
+    bus = Bus(FakeSession(), KEYS)
+    bus.answers = lambda *_: iter([{"ok": True, "owner": 9, "size": size, "piece": piece}])  # type: ignore[method-assign]
+    given: list[Any] = []
+    before = set(enumerate_threads())
+    fetch_origin(bus, 9, given.append)
+    for thread in set(enumerate_threads()) - before:
+        thread.join(10.0)
+    assert not given
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert "has not sent its configuration and model" in line
 
 
 @pytest.mark.parametrize(
