@@ -164,7 +164,7 @@ def labels_of(recording: Recording, robot: str) -> dict[str, Sequence[Label]]:
 def exploded(columns: Iterable[Column], references: Sequence[Reference]) -> tuple[list[Column], list[Reference]]:
     """Return each row of references as a message of its own, with the time of that row."""
     rows = [(i, k) for i, reference in enumerate(references) for k in range(len(reference.y))]
-    indices = [i for i, _ in rows]
+    indices = np.array([i for i, _ in rows], np.int64)
     single = [
         Reference(r.epoch, r.seq, r.stamp_ns + k * r.period_ns, r.period_ns, r.end, r.y[k : k + 1], r.p[k : k + 1])
         for r, k in ((references[i], k) for i, k in rows)

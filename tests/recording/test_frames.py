@@ -89,6 +89,9 @@ def test_streams_without_messages_are_empty_frames_with_their_columns(written: t
     frames = frame(written[0], "actuation")
     assert frames.empty
     assert {"robot_s", "local_s", "seq", "mode"} <= set(frames)
+    anchored = frame(written[0], "reference/anchored")
+    assert anchored.empty
+    assert {"robot_s", "local_s", "seq", "end"} <= set(anchored)
 
 
 def test_what_is_not_there_is_refused_by_name(tmp_path: Path) -> None:
