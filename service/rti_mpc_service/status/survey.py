@@ -6,11 +6,13 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 from rti_mpc.contract.epoch import NUMBER_BITS
+from rti_mpc.contract.latch import read_latch
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Event, Reference, State, Telemetry
 from rti_mpc.errors import MessageError
 from rti_mpc.signals import plane
@@ -82,7 +84,9 @@ class Survey:
     def _compare(self, sample: Telemetry) -> None:
         """Compare the outputs at a sample with the first row of the reference that the sample before has used, which is for this time."""
         info, before = self._info(LEADER), self._samples[-1] if self._samples else None
-        if info is None or before is None or (sample.epoch, sample.seq) != (before.epoch, before.seq + 1) or sample.y.shape != (len(info.outputs),):
+        if info is None or before is None or (sample.epoch, sample.seq) != (before.epoch, before.seq + 1):
+            return
+        if (1, *sample.y.shape) != before.y_ref[:1].shape or len(sample.y) != len(info.outputs):  # messages of others may be of any width
             return
         error = sample.y - before.y_ref[0]
         values = {
@@ -127,9 +131,15 @@ class Survey:
             "skipped": None if last is None else last.skipped,
             "agreement": {"max_difference": max(differences) if differences else None, "judged": len(differences), "samples": len(self._samples)},
             "versions": {role_of(key): said["version"] for key, (_, said) in self._infos.items() if isinstance(said.get("version"), str)},
-            "stopped": (self._said(LEADER) or self._said("guard")).get("latch", {}).get("stopped"),
+            "stopped": self._stopped(),
             "event": self._last_event(now_ns),
         }
+
+    def _stopped(self) -> bool | None:
+        """Whether the leader says that an operator's stop is latched, or the guard if there is none; None: not said, or not to be understood."""
+        with suppress(MessageError):
+            return read_latch((self._said(LEADER) or self._said("guard")).get("latch")).stopped
+        return None
 
     def _age_s(self, kind: str, now_ns: int) -> float | None:
         return 1e-9 * (now_ns - self._heard_ns[kind]) if kind in self._heard_ns else None

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 from rich.console import Console
 
+from rti_mpc.contract.latch import Latch
 from rti_mpc.contract.message import End, Event, Reference, Severity, State
 from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.info import Info
@@ -25,7 +27,7 @@ NOW_NS = 10**12
 def survey() -> Survey:
     survey = Survey(Bus(FakeSession(), KEYS))
     survey.present |= {"controller", "robot", "standby", "standby.7", "guard"}
-    said = INFO | {"epoch": (5 << 20) + 42, "version": "0.1.0", "latch": {"stopped": False}}
+    said = INFO | {"epoch": (5 << 20) + 42, "version": "0.1.0", "latch": asdict(Latch())}
     survey._infos[KEYS.info("controller")] = Info.from_json(said), said
     return survey
 
@@ -63,6 +65,24 @@ def test_error_is_not_said_across_a_sample_that_is_missing(survey: Survey) -> No
     survey._take(telemetry(1), NOW_NS)
     survey._take(telemetry(3), NOW_NS)
     assert survey.report(NOW_NS)["error"] == {}
+
+
+@pytest.mark.parametrize("latch", ["x", None, 3, [], {"stopped": "yes"}, {**asdict(Latch()), "counter": -1}], ids=str)
+def test_latch_that_is_none_is_shown_as_not_said_and_the_table_goes_on(survey: Survey, latch: object) -> None:
+    assert survey.report(NOW_NS)["stopped"] is False
+    said = INFO | {"latch": latch}
+    survey._infos[KEYS.info("controller")] = Info.from_json(said), said
+    assert survey.report(NOW_NS)["stopped"] is None
+
+
+@pytest.mark.parametrize("rows", [np.zeros((20, 2)), np.zeros((0, 1))], ids=["wider", "none"])
+def test_samples_whose_rows_do_not_fit_one_another_are_not_compared(survey: Survey, rows: np.ndarray) -> None:
+    first, second = telemetry(1), telemetry(2)
+    first.y_ref = rows
+    survey._take(first, NOW_NS)
+    survey._take(second, NOW_NS)
+    report = survey.report(NOW_NS)
+    assert (report["error"], report["agreement"]["samples"]) == ({}, 2)
 
 
 def test_robot_that_nobody_controls_is_shown_as_such(survey: Survey) -> None:
