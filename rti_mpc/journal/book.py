@@ -62,6 +62,10 @@ class Book:
         self._stamp_ns = 0  # of the last state in a message
         controller.on_call = self.note
 
+    @property
+    def _full(self) -> bool:
+        return len(self._queue) >= self._capacity
+
     def note(self, call: Call) -> None:
         """Append an entry; on the thread that controls."""
         self._seq += 1
@@ -72,7 +76,7 @@ class Book:
 
     def keep(self, case: Enclosure) -> bool:
         """Append a case, and return whether there was room for it; on the thread that controls."""
-        if len(self._queue) >= self._capacity:
+        if self._full:
             return False
         self._seq += 1
         self._queue.append((self._seq, case))
@@ -83,7 +87,9 @@ class Book:
         self._asked = True
 
     def due(self, local_ns: int) -> bool:
-        """Whether it is time for a snapshot: at the start, every `PERIOD_NS`, when asked for, and after a drop once there is room again."""
+        """Whether there is room for a snapshot, and it is time: at the start, every `PERIOD_NS`, when asked for, and after a drop."""
+        if self._full:
+            return False
         if self.dropped > self._covered and len(self._queue) < self._capacity // 2:
             return True
         return self._asked or self._last_ns is None or local_ns - self._last_ns >= PERIOD_NS
@@ -94,7 +100,9 @@ class Book:
             self._camera.take()
 
     def photograph(self, local_ns: int) -> None:
-        """Append a snapshot; between two samples, while no other thread calls the controller."""
+        """Append a snapshot if there is room; between two samples, while no other thread calls the controller."""
+        if self._full:
+            return
         self._controller.rewarm()
         self._last_ns, self._covered, self._asked = local_ns, self.dropped, False
         try:
@@ -103,7 +111,12 @@ class Book:
             self.failure = str(error)
             return
         self._seq += 1
-        self._queue.append((self._seq, snapshot))  # there is always room for it: the queue empties in a period, or drops its calls
+        self._queue.append((self._seq, snapshot))
+
+    def end(self) -> None:
+        """Drop what waits and all that follows; on the thread that takes the messages."""
+        self._capacity = 0
+        self._queue.clear()
 
     def messages(self, local_ns: int, pause: Callable[[], object] = lambda: None) -> Iterator[Journal]:
         """

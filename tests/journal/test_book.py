@@ -58,6 +58,29 @@ def test_what_finds_no_room_is_dropped_and_counted_and_a_snapshot_follows() -> N
     assert (gap.first, gap.last) == (13, 28)
 
 
+def test_snapshots_that_nobody_takes_do_not_pile_up() -> None:
+    controller = made()
+    book = Book(controller, capacity=10)
+    for k in range(30):
+        controller.tick(k)
+        book.photograph(k * PERIOD_NS)
+    assert not book.due(30 * PERIOD_NS), "there is no room"
+    assert 0 < sum(message.kind is JournalKind.SNAPSHOT for message in book.messages(0)) <= 5
+    assert book.due(30 * PERIOD_NS)
+
+
+def test_a_journal_that_has_ended_takes_nothing_more() -> None:
+    controller = made()
+    book = Book(controller)
+    controller.tick(0)
+    book.end()
+    controller.tick(1)
+    book.photograph(1)
+    assert not book.due(10 * PERIOD_NS)
+    assert list(book.messages(1)) == []
+    assert book.dropped == 1
+
+
 def test_snapshot_is_due_at_the_start_each_period_and_when_asked_for() -> None:
     book = Book(made())
     assert book.due(5)

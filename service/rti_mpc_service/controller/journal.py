@@ -90,8 +90,12 @@ class JournalPublisher:
             while not self._closing.wait(PUBLISHING_PERIOD_S):
                 self._empty()
             self._empty()
-        except JournalError as error:
-            self._say("journal_failed", f"the journal has ended, no replay goes beyond it: {error}")
+        except Exception as error:
+            if self._bus.closed:
+                return  # by another thread, at the end of the process: the error does not matter
+            self._book.end()
+            why = str(error) if isinstance(error, JournalError) else f"{type(error).__name__}: {error}"
+            self._say("journal_failed", f"the journal has ended, no replay goes beyond it: {why}")
 
     def _empty(self) -> None:
         """Publish what waits."""
