@@ -17,12 +17,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from threading import Event, Lock, Thread
+from typing import Any
 
 import rti_mpc
 from rti_mpc.contract.epoch import NUMBER_BITS, epoch_above
 from rti_mpc.contract.guard import Guard
 from rti_mpc.contract.latch import Latch
-from rti_mpc.contract.message import Command, State
+from rti_mpc.contract.message import Command, Notice, Severity, State
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire import info
 from rti_mpc.wire.announcer import Announcer
@@ -116,7 +117,7 @@ class Process:
         self._operator_stop.serve(bus, lambda: ROLE, self._publish_info)
         self._publish_info()
         self._threads = [
-            Thread(target=self._follow, args=(act, bus.subscriber(key, capacity=RING_MESSAGES)), name=act.__name__, daemon=True)
+            Thread(target=self._guarded, args=(self._follow, act, bus.subscriber(key, capacity=RING_MESSAGES)), name=act.__name__, daemon=True)
             for act, key in ((self._state, keys.state), (self._command, keys.command))
         ]
 
@@ -126,18 +127,22 @@ class Process:
         gc.freeze()
         for thread in self._threads:
             thread.start()
-        while not stop.wait(self._tick_s) and not self._crashed.is_set():
-            self._tick()
+        self._guarded(self._watch, stop)
         with self._lock:
-            self._guard.stop(time.monotonic_ns())
+            self._guarded(self._guard.stop, time.monotonic_ns())
         deadline_s = time.monotonic() + MAX_RAMP_S
         while not self._guard.at_rest and time.monotonic() < deadline_s:
-            self._tick()
+            self._guarded(self._tick)
             time.sleep(self._tick_s)
-        self._tick()
-        self._operator_stop.close()
+        for end in (self._tick, self._operator_stop.close):
+            self._guarded(end)
         log.info("stopped")
         return int(self._crashed.is_set())
+
+    def _watch(self, stop: Event) -> None:
+        """Tick until stopped, or until another loop has ended by an error."""
+        while not stop.wait(self._tick_s) and not self._crashed.is_set():
+            self._tick()
 
     def _obey(self, latch: Latch) -> None:
         """Stop or release the robot, as the latch says."""
@@ -185,12 +190,17 @@ class Process:
                 announce(log, self._announcer, refusal, stamp_ns)
 
     def _follow(self, act: Callable[[Received], None], subscriber: Subscriber) -> None:
-        """Run a receiving loop; an unforeseen error leads to a ramp to rest and exit status 1, so that a supervisor restarts the guard."""
+        """Act on what is received."""
+        for received in iter(subscriber.recv, None):
+            act(received)
+
+    def _guarded(self, act: Callable[..., object], *given: Any) -> None:
+        """Run a loop or a step of the end; an error leads to a ramp to rest and exit status 1, so that a supervisor restarts the guard."""
         try:
-            for received in iter(subscriber.recv, None):
-                act(received)
-        except Exception:
-            if self._bus.closed:
-                return  # by another thread, at the end of the process: the error does not matter
+            act(*given)
+        except Exception as error:
+            if self._bus.closed or self._crashed.is_set():
+                return  # closed by another thread, at the end of the process; or a further error on the way to rest, which goes on
             log.exception("stopping after an unexpected error")
             self._crashed.set()
+            self._guard.notices.append(Notice(Severity.ERROR, "crashed", f"stopping after an unexpected error: {type(error).__name__}: {error}"))

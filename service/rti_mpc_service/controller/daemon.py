@@ -23,7 +23,7 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from threading import Condition, Event, Lock, Thread
 from typing import Any
@@ -208,25 +208,32 @@ class Daemon:
         self._tick()
         for thread in self._threads:
             thread.start()
-        while not stop.wait(TICK_PERIOD_S) and not self._crashed.is_set():
-            self._tick()
+        self._guarded(self._watch, stop)
         with self._lock:
             relieved = self._ending = self._leadership.relieved
-            self._controller.stop("the controller is being stopped")
+            self._guarded(self._controller.stop, "the controller is being stopped")
         deadline_s = time.monotonic() + MAX_RAMP_S
         while not (relieved or self._crashed.is_set() or self._controller.at_rest) and time.monotonic() < deadline_s:
             time.sleep(TICK_PERIOD_S)
         with self._lock:
             self._ending = True
-            # Whatever happened above, the last command makes the robot come to rest and stay there.
-            if not relieved and (command := self._controller.standstill(time.monotonic_ns())) is not None:
-                self._commands.put(command)
-                self._controller.commit(command)
-        self._journal.close()
-        self._announce()
-        self._operator_stop.close()
+            if not relieved:
+                self._guarded(self._stand)
+        for end in (self._journal.close, self._announce, self._operator_stop.close):
+            self._guarded(end)
         log.info("stopped")
         return int(self._crashed.is_set())
+
+    def _watch(self, stop: Event) -> None:
+        """Tick until stopped, or until another loop has ended by an error."""
+        while not stop.wait(TICK_PERIOD_S) and not self._crashed.is_set():
+            self._tick()
+
+    def _stand(self) -> None:
+        """Send the last command: whatever happened before, it makes the robot come to rest and stay there."""
+        if (command := self._controller.standstill(time.monotonic_ns())) is not None:
+            self._commands.put(command)
+            self._controller.commit(command)
 
     def _control(self, subscriber: Subscriber) -> None:
         """Answer states as they arrive: the control loop."""
@@ -311,14 +318,15 @@ class Daemon:
             self._commands.put(command)
         self._controller.commit(command, left_ns)
 
-    def _guarded(self, act: Any, subscriber: Subscriber) -> None:
-        """Run a receiving loop; an unforeseen error leads to a standstill and exit status 1, so that a supervisor restarts the controller."""
+    def _guarded(self, act: Callable[..., object], *given: Any) -> None:
+        """Run a loop or a step of the end; an error leads to a standstill and exit status 1, so that a supervisor restarts the controller."""
         try:
-            act(subscriber)
-        except Exception:
+            act(*given)
+        except Exception as error:
             if self._bus.closed:
                 return  # by another thread, at the end of the process: the error does not matter
             log.exception("stopping after an unexpected error")
+            self._controller.say(Notice(Severity.ERROR, "crashed", f"stopping after an unexpected error: {type(error).__name__}: {error}"))
             self._crashed.set()
 
     def _tick(self) -> None:
