@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from typer.testing import CliRunner
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.session import BusSettings, open_endpoints, zenoh_config
-from rti_mpc.wire.streams import STREAMS, Kind
+from rti_mpc.wire.streams import PING, PONG, RELAY, STREAMS, Kind
 from rti_mpc_service.certs.access import access_control, zenoh_configuration
 from rti_mpc_service.certs.folder import credentials, secured
 from rti_mpc_service.certs.roles import ROLES, ROLES_OF_COMMAND, common_name
@@ -128,6 +129,22 @@ def test_a_role_writes_and_asks_what_the_table_of_streams_says_and_nothing_else(
             assert allowed(role, "query", cache), f"{role} as a late joiner at {key}"
             for message in ("put", "declare_queryable", "liveliness_token"):
                 assert allowed(role, message, cache) is bool(may and stream.qos.cached), f"{role} on {cache}"
+
+
+def test_page_on_security_says_what_the_table_of_streams_says() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "security.md").read_text(encoding="utf-8")
+    rows = {row[0]: row[1:] for row in re.findall(r"^\| `(\w+)` \| (?:[^|]*) \| ([^|]*) \|([^|]*)\|$", page, re.MULTILINE)}
+    assert rows.keys() == ROLES.keys()
+    streams = [stream for stream in STREAMS if stream not in (RELAY, PING, PONG)]  # those are for measurements only
+    for role, (writes, asks) in rows.items():
+        mine = [stream for stream in streams if set(stream.publishers) & set(ROLES[role])]
+        written, _, answered = writes.partition("answers")
+        assert set(re.findall("`(.*?)`", asks)) == {stream.name for stream in streams if set(stream.askers) & set(ROLES[role])}, role
+        if role == "conformance":
+            assert set(re.findall("`(.*?)`", writes)) == set(ROLES[role]) - {"operator"}  # it refers to their rows
+            continue
+        assert set(re.findall("`(.*?)`", written)) == {s.name for s in mine if s.kind is Kind.MESSAGE and not s.by_role}, role
+        assert set(re.findall("`(.*?)`", answered)) == {stream.name for stream in mine if stream.kind is Kind.QUERY}, role
 
 
 @pytest.mark.parametrize("key", ["rti_mpc/pioneer/**", "rti_mpc/*/command", "**", "rti_mpc/other/command", "@/router/local/config"])
