@@ -320,7 +320,7 @@ class Bus:
             request = _object(received, MAX_REQUEST_BYTES)
             try:
                 value = request if request.get("ok") is False else handler(request)
-                return None if value is None else json.dumps(value).encode()
+                return None if value is None else json.dumps(value, allow_nan=False).encode()
             except Exception as error:  # a fault of a handler is reported to the requester, and must not end this process
                 return json.dumps({"ok": False, "error": str(error)}).encode()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import getpass
 import json
+import math
 import os
 import socket
 import sys
@@ -22,6 +23,7 @@ from rti_mpc.wire.keys import Keys
 from rti_mpc_service.config import toml
 from rti_mpc_service.latch_file import LatchFile
 from rti_mpc_service.operator_stop import MAX_NAME_CHARACTERS, utc_now
+from rti_mpc_service.parameter import from_json, to_json
 
 REPEAT_AFTER_S = 0.7  # period at which a request is repeated: the acting process may hang, and another one take over
 GUARD, LEADER = "guard", "controller"  # roles that can act on a stop
@@ -156,13 +158,15 @@ def params(bus_settings: BusSettings, keys: Keys, words: Sequence[str], timeout_
     """
     action, *wanted = words
     if action == "set":
-        return main(bus_settings, keys, "params", timeout_s, set=parse_assignments(wanted))
+        return main(bus_settings, keys, "params", timeout_s, set=to_json(parse_assignments(wanted)))
     if action != "get":
         raise ConfigError(f"params must be followed by get or set, got {action}")
     answer = ask(bus_settings, keys, {"request": "params", "get": True}, timeout_s)
     if answer is None:
         return 1
-    values = {key: value for key, value in answer["values"].items() if not wanted or any(f"{key}.".startswith(f"{want}.") for want in wanted)}
+    values = {
+        key: value for key, value in from_json(answer["values"]).items() if not wanted or any(f"{key}.".startswith(f"{want}.") for want in wanted)
+    }
     if not values:
         print(f"rti-mpc: {' '.join(wanted)} must be among {', '.join(answer['values'])}", file=sys.stderr)
         return 1
@@ -186,4 +190,7 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, Any]:
             (values[key.strip()],) = toml.read(f"value = {value}").values()
         except (ConfigError, ValueError):
             raise ConfigError(f"params must be set by KEY=VALUE, the value as in the file, got {assignment}") from None
+    for key, value in to_json(values).items():
+        if not all(math.isfinite(number) for number in (value if isinstance(value, list) else [value]) if isinstance(number, float)):
+            raise ConfigError(f"{key} must be finite, except for an absent bound, [-inf, upper] or [lower, inf], got {toml.text(values[key])}")
     return values

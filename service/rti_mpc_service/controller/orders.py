@@ -23,6 +23,7 @@ from rti_mpc.wire.info import Leader
 from rti_mpc_service import injection
 from rti_mpc_service.controller.params import Params
 from rti_mpc_service.operator_stop import STOP_REQUESTS, OperatorStop
+from rti_mpc_service.parameter import to_json
 
 
 class Orders:
@@ -50,7 +51,7 @@ class Orders:
 
     def orders_info(self) -> dict[str, Any]:
         """Return the orders as a part of the controller's description."""
-        return {**self._stop.latch_info(), **info.parameters(self._params.version, self._params.changes)}
+        return {**self._stop.latch_info(), **info.parameters(self._params.version, to_json(self._params.changes))}
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any] | None:
         """
@@ -73,7 +74,7 @@ class Orders:
             return self._inject(request)
         answer = self._params.answer(request)
         if "from_seq" in answer:
-            text = ", ".join(f"{key} = {value}" for key, value in request["set"].items())
+            text = ", ".join(f"{key} = {self._params.changes[key]}" for key in request["set"])
             self._say("parameters_changed", f"parameters of version {self._params.version}, from command {answer['from_seq']} on: {text}")
         self._tell()
         return {"ok": True, "request": what, **answer}

@@ -27,10 +27,10 @@ from rti_mpc_service.config.build import build_rti, retuned
 from rti_mpc_service.config.fit import check_names, check_rest, check_tree
 from rti_mpc_service.config.refusal import entries, explain
 from rti_mpc_service.config.schema import Config
+from rti_mpc_service.parameter import BOUND_KEYS, from_json, to_json
 
 WEIGHT_TABLES = ("ocp.weights.Q", "ocp.weights.R", "ocp.weights.R_u")  # of weights, by name
 WEIGHT_KEYS = (*WEIGHT_TABLES, "ocp.weights.delta", "ocp.weights.lambda", "ocp.bounds.soft_weight")
-BOUND_KEYS = ("ocp.bounds.inputs", "ocp.bounds.increments", "ocp.bounds.second_differences", "ocp.bounds.states")
 VERSION_COUNT = 2**32  # telemetry has 32 bits for the version
 SAMPLE_TIMEOUT_PERIODS = 2  # how long to wait for the end of a sample
 SAMPLE_ARRAYS = ("x", "u", "u_prev", "u_before", "y_ref", "p")  # arrays of an `Rti` that hold the present sample
@@ -59,21 +59,22 @@ class Params:
 
     def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """
-        Answer a request, ``{"get": true}`` or ``{"set": {key: value, ...}}``.
+        Answer a request, ``{"get": true}`` or ``{"set": {key: value, ...}}``; a bound that is absent is null.
 
         Raises:
             ConfigError: One line: the key, what must hold, what was got.
         """
         if request.get("get") is True:
-            return {"version": self.version, "live": self._trial is not None, "values": self._values}
+            return {"version": self.version, "live": self._trial is not None, "values": to_json(self._values)}
         given = request.get("set")
         if not isinstance(given, dict) or not given:
             raise ConfigError(f'params must be asked for with "get": true or "set": {{key: value}}, got {dict(request)!r}')
         if self._trial is None:
             raise ConfigError("params.live must be true in the controller's file for a change while it runs, got false")
-        config, ocp = changed_problem(self._file, self.ocp, {**self.changes, **given})
+        changes = {**self.changes, **from_json(given)}
+        config, ocp = changed_problem(self._file, self.ocp, changes)
         self._try(self._trial, ocp)
-        seq = self._take(config, ocp, self.version + 1, {**self.changes, **given})
+        seq = self._take(config, ocp, self.version + 1, changes)
         return {"version": self.version, "from_seq": seq}
 
     def adopt(self, version: int, changes: Mapping[str, Any]) -> None:
@@ -86,7 +87,8 @@ class Params:
         if type(version) is not int or not 0 <= version < VERSION_COUNT:
             raise ConfigError(f"version of parameters must be an integer from 0 to {VERSION_COUNT - 1}, got {version!r}")
         if version != self.version:
-            self._take(*changed_problem(self._file, self.ocp, changes), version, dict(changes))
+            changes = from_json(changes)
+            self._take(*changed_problem(self._file, self.ocp, changes), version, changes)
 
     def _take(self, config: Config, ocp: Ocp, version: int, changes: dict[str, Any]) -> int:
         with self._lock:

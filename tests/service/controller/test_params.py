@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from threading import Condition
 from typing import Any
 
@@ -16,11 +18,15 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.reference.trajectory import circle
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS
 from rti_mpc.rti.rti import Rti
+from rti_mpc.wire import document
+from rti_mpc_service.config import toml
 from rti_mpc_service.config.build import build_ocp, build_rti
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.controller.params import Params, changed_problem, parameter_values
-from rti_mpc_service.shipped import SHIPPED
+from rti_mpc_service.parameter import from_json, to_json
+from rti_mpc_service.request import parse_assignments
+from rti_mpc_service.shipped import ROBOTS, SHIPPED
 from tests.loop import drive, reference, robot
 from tests.service.config.test_config import MINIMAL
 
@@ -174,6 +180,39 @@ def test_a_bound_on_one_side_stays_on_that_side(tmp_path: Any) -> None:
     with pytest.raises(ConfigError, match="finite where that is"):
         changed_problem(config, build_ocp(config), {"ocp.bounds.inputs.u_c": [-1.0, 0.5]})
     assert changed_problem(config, build_ocp(config), {"ocp.bounds.inputs.u_c": [-float("inf"), 0.4]})[1].ubu[0] == 0.4
+
+
+@pytest.mark.parametrize("path", ROBOTS.values(), ids=ROBOTS)
+def test_values_of_every_shipped_robot_travel_to_an_operator_and_back(path: Path) -> None:
+    config = load(path)
+    values = parameter_values(config)
+    told = from_json(document.read(json.dumps(to_json(values)).encode()))
+    assert {key: toml.text(value) for key, value in told.items()} == {key: toml.text(value) for key, value in values.items()}
+    printed = [f"{key}={toml.text(value)}" for key, value in told.items() if value is not None and "R_u" not in key]
+    asked = from_json(document.read(json.dumps(to_json(parse_assignments(printed))).encode()))
+    assert parameter_values(changed_problem(config, build_ocp(config), asked)[0]) == values
+
+
+@pytest.mark.parametrize("words", ["u_c=[inf, 0.5]", "u_c=[-0.5, -inf]", "u_c=inf", "u_c=[nan, 0.5]"])
+def test_infinity_that_stands_for_no_bound_is_refused_with_what_would(words: str) -> None:
+    with pytest.raises(ConfigError, match=r"u_c must be finite, except for an absent bound, \[-inf, upper\] or \[lower, inf\], got"):
+        parse_assignments([f"ocp.bounds.inputs.{words}"])
+
+
+def test_absent_bound_is_null_for_operators_and_standbys(tmp_path: Any) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + "ocp.bounds.states = { u = [-inf, 0.5] }\nparams.live = true\n")
+    config = load(path)
+    rti = build_rti(config)
+    leader, standby = (Params(config, Controller(rti, Timing()), rti, Condition()) for _ in range(2))
+    assert leader.answer({"get": True})["values"]["ocp.bounds.states.u"] == (None, 0.5)
+    assert leader.answer({"set": {"ocp.bounds.states.u": [None, 0.4]}})["version"] == 1
+    said = document.read(json.dumps(to_json(leader.changes)).encode())
+    assert said == {"ocp.bounds.states.u": [None, 0.4]}
+    standby.adopt(1, said)
+    assert standby.changes == leader.changes == {"ocp.bounds.states.u": [-float("inf"), 0.4]}
+    with pytest.raises(ConfigError, match="finite where that is"):
+        leader.answer({"set": {"ocp.bounds.states.u": [None, None]}})
 
 
 FILES = {
