@@ -3,12 +3,18 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from typing import Any
 
 import rti_mpc
+from rti_mpc.errors import ConfigError
 from rti_mpc.model.obstacle import discs_of
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.wire import info
+from rti_mpc.wire.document import MAX_DOCUMENT_BYTES
+
+LIFE_BYTES = 4096  # of what a running controller adds: epoch, latch, real time, parameters that were changed
 
 
 def controller_info(ocp: Ocp, np_: int) -> dict[str, Any]:
@@ -31,3 +37,39 @@ def controller_info(ocp: Ocp, np_: int) -> dict[str, Any]:
         "dt_s": ocp.dt,
         "integrator": ocp.method,
     }
+
+
+def fitting(description: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    """
+    Leave the weights out of a description that nobody would read, because it is too long.
+
+    Returns:
+        The description to publish, and what is to be said of its length; empty if it is whole.
+    """
+    if (size := _size(description)) <= MAX_DOCUMENT_BYTES:
+        return dict(description), ""
+    short = {name: value for name, value in description.items() if name != "weights"}
+    said = f"the description on info has {size} bytes, and may have {MAX_DOCUMENT_BYTES}"
+    if (left := _size(short)) > MAX_DOCUMENT_BYTES:
+        return short, f"{said}; it has {left} without weights, so nobody reads it, and standbys do not take over parameters and stops from it"
+    return short, f"{said}: it is without the weights of each stage, and viewers show no cost by term"
+
+
+def check_length(ocp: Ocp) -> str:
+    """
+    Check that the description of a controller can be read, and return what is to be said of its length; empty if it is whole.
+
+    Raises:
+        ConfigError: It is too long even without weights.
+    """
+    short, said = fitting(controller_info(ocp, ocp.model.np_))
+    if (size := _size(short)) > MAX_DOCUMENT_BYTES - LIFE_BYTES:
+        raise ConfigError(
+            f"the description of the model's signals must have at most {MAX_DOCUMENT_BYTES - LIFE_BYTES} bytes, for viewers and standbys to read it, "
+            f"got {size}: have fewer states, outputs or stage parameters, or shorter names"
+        )
+    return said
+
+
+def _size(description: Mapping[str, Any]) -> int:
+    return len(json.dumps(description))

@@ -38,6 +38,7 @@ from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_stop, unstopped
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.console import table_console
+from rti_mpc_service.description import check_length
 from rti_mpc_service.rig.wave import wave
 
 WAVE_SAMPLES = 200
@@ -92,6 +93,7 @@ def main(path: Path) -> int:
     config = load(path)
     law = check_stop(config)
     console, ocp = table_console(), build_ocp(config)
+    shortened = check_length(ocp)
     try:
         stopped = 'a stop: it coasts, as stop = "coasts" says'
         if config.model.stop == "rests":
@@ -124,6 +126,8 @@ def main(path: Path) -> int:
     reached = f"driven to {report.bounds - len(report.missed)} of {report.bounds} bounds"
     console.print(reached + (f", not to the {', the '.join(report.missed)}" if report.missed else ""), soft_wrap=True)
     console.print(stopped, soft_wrap=True)
+    if shortened:
+        console.print(shortened, soft_wrap=True)
     if config.guard.enabled or (law is not None and not law.holds):
         console.print(f"the model's signals, for a guard or an adapter: {written(path, config)}", soft_wrap=True)
     return 0 if report.agree and all(status.usable for status in report.statuses) else 1

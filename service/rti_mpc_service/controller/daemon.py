@@ -52,7 +52,7 @@ from rti_mpc_service.controller.params import Params
 from rti_mpc_service.controller.references import References
 from rti_mpc_service.controller.rehearsal import Rehearsal
 from rti_mpc_service.controller.slack import Slack
-from rti_mpc_service.description import controller_info
+from rti_mpc_service.description import check_length, controller_info, fitting
 from rti_mpc_service.host import realtime
 from rti_mpc_service.latch_file import LatchFile
 from rti_mpc_service.operator_stop import OperatorStop
@@ -85,6 +85,7 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
     stop_law = check_stop(config)
     stop = stop or stop_on_signals()
     rti = build_rti(config, log.info)
+    check_length(rti.ocp)
     warm_up(rti)
     controller = build_controller(config, rti, stop_law)
     book = Book(controller)
@@ -170,6 +171,7 @@ class Daemon:
         self._lock = lock
         self._telling = Lock()
         self._told = 0  # descriptions published
+        self._said = ""  # of the length of the last one
         self._ending = False
         self._crashed = Event()
         self._announcer: Announcer | None = None
@@ -362,7 +364,11 @@ class Daemon:
             life = {"role": role, "epoch": self._leadership.epoch, "seq": self._told}
             about = {**life, "config_hash": config.config_hash, "stale_s": config.stale_s}
             model = {**controller_info(self._params.ocp, self._controller.np_), "formulation": self._formulation, "realtime": self._granted}
-            self._bus.publish_json(self._bus.keys.info(role), {**model, **about, **self.orders.orders_info()})
+            description, said = fitting({**model, **about, **self.orders.orders_info()})
+            self._bus.publish_json(self._bus.keys.info(role), description)
+            if said not in ("", self._said):
+                self._controller.say(Notice(Severity.WARNING, "description_too_long", said))
+            self._said = said
 
     def _announce(self) -> None:
         """Publish and log mode changes and faults."""
