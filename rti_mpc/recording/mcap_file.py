@@ -64,7 +64,7 @@ class McapFile:
         self._path = path
         with path.open("rb") as file:
             if (head := file.read(8)) != b"\x89MCAP0\r\n":
-                raise MessageError(f"{path} must be an MCAP file, got one that begins with {head!r}")
+                raise MessageError(f"{path} must be an MCAP file, got {f'one that begins with {head!r}' if head else 'an empty one'}")
 
     def records(self) -> Iterator[McapRecord]:
         """Yield what the data holds: chunks, attachments and metadata, up to the first record that is not whole."""

@@ -145,10 +145,13 @@ def test_full_disk_loses_nothing_that_was_written(tmp_path: Path) -> None:
     assert repair(tmp_path / "run.mcap", tmp_path / "run.mcap") == flushed
 
 
-@pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"\x89PNG\r\n\x1a\n" + bytes(100)])
-def test_what_is_no_recording_is_refused(content: bytes, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [(b"", "must be an MCAP file, got an empty one"), (b"\x89MCAP0\r\n", "must be"), (b"\x89PNG\r\n\x1a\n" + bytes(100), "begins with b'.x89PNG")],
+)
+def test_what_is_no_recording_is_refused(content: bytes, said: str, tmp_path: Path) -> None:
     (tmp_path / "run.mcap").write_bytes(content)
-    with pytest.raises(MessageError, match=r"run\.mcap must be"):
+    with pytest.raises(MessageError, match=rf"run\.mcap .*{said}"):
         Recording(tmp_path / "run.mcap")
 
 
