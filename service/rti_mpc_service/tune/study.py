@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import optuna
+from optuna.storages import BaseStorage
 from optuna.trial import FrozenTrial, TrialState
 
 from rti_mpc.errors import ConfigError
@@ -60,28 +61,46 @@ def name_of(config: Config, course: Course, varied: Sequence[Varied]) -> str:
     return f"{config.robot}-{hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]}"
 
 
-def open_study(storage: str, name: str, today: Driven) -> optuna.Study:
+def open_storage(url: str) -> BaseStorage:
     """
-    Open a study, or begin it.
+    Open a storage, or make it.
 
     Args:
-        storage: Optuna's URL.
-        name: Of the study.
-        today: Drive with the values of the file.
+        url: Optuna's.
 
     Raises:
-        ConfigError: The storage cannot be used, or the study was made with another model or version, since today's values lead elsewhere there.
+        ConfigError: It cannot be used.
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     for left in reversed(range(OPENINGS)):
         try:
-            study = optuna.create_study(storage=storage, study_name=name, directions=["minimize", "minimize"], load_if_exists=True)
-            break
+            return optuna.storages.get_storage(url)
         except Exception as error:  # SQLAlchemy's, a database driver's or Optuna's, by the kind of URL
+            if isinstance(driver := error.__cause__ or error.__context__, ModuleNotFoundError):
+                kind = url.partition(":")[0]
+                raise ConfigError(
+                    f"--storage {kind}: needs the Python package {driver.name}, which is not installed: pip install {driver.name}"
+                ) from error
             if not left:
                 reason = (str(error).splitlines() or [type(error).__name__])[0]
-                raise ConfigError(f"--storage must be a storage of Optuna that can be used: {reason}") from error
+                raise ConfigError(f"--storage must be a storage of Optuna that can be used, such as sqlite:///studies.db: {reason}") from error
             time.sleep(REOPENED_S)
+    raise AssertionError("the last opening returns or raises")
+
+
+def open_study(storage: BaseStorage, name: str, today: Driven) -> optuna.Study:
+    """
+    Open a study, or begin it.
+
+    Args:
+        storage: An open one.
+        name: Of the study.
+        today: Drive with the values of the file.
+
+    Raises:
+        ConfigError: The study was made with another model or version, since today's values lead elsewhere there.
+    """
+    study = optuna.create_study(storage=storage, study_name=name, directions=["minimize", "minimize"], load_if_exists=True)
     known = study.user_attrs.get("today")
     if known is None:
         study.set_user_attr("today", [today.error, today.effort])

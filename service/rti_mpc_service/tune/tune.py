@@ -32,7 +32,7 @@ from rti_mpc_service.tune.figure import figure
 from rti_mpc_service.tune.progress import counting, doing
 from rti_mpc_service.tune.recorded import as_recorded, is_recording
 from rti_mpc_service.tune.recorded_robot import read
-from rti_mpc_service.tune.study import STUDIED, Tried, finished, name_of, open_study, run, tried
+from rti_mpc_service.tune.study import STUDIED, Tried, finished, name_of, open_storage, open_study, run, tried
 from rti_mpc_service.tune.varied import Varied, find_varied, with_values
 from rti_mpc_service.tune.workers import workers
 
@@ -85,6 +85,7 @@ def main(
     model = build_model(config)
     varied = find_varied(config, model, vary)
     course, other = parted(course, held_out, planar=in_plane(model.outputs))
+    shared = open_storage(storage) if storage else None  # what was asked for is looked at first
     courses = {STUDIED: course, HELD_OUT: other}
     robot, heard = "", {}
     for name in dict.fromkeys(each.name for each in courses.values() if each.name is not None and is_recording(each.name)):
@@ -109,7 +110,7 @@ def main(
         raise ConfigError(f"the values of {path} must drive {lost} to its end, so that others can be compared with them")
     study_name = name_of(config, course, varied)
     study_url = storage or f"sqlite:///{out.resolve().with_suffix('.study.db')}"
-    study = open_study(study_url, study_name, today[STUDIED])
+    study = open_study(shared or open_storage(study_url), study_name, today[STUDIED])
     ranges = ", ".join(f"{each.key} {each.low:g}:{each.high:g}" for each in varied)
     console.print(f"study {study_name} in {without_password(study_url)}, {len(finished(study))} of {trials} trials are there", soft_wrap=True)
     console.print(f"{titles[STUDIED]}, held out {titles[HELD_OUT]}; varied: {ranges}", soft_wrap=True)

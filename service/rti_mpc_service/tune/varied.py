@@ -146,7 +146,9 @@ def today_of(config: Config, key: str) -> float:
     """
     value: Any = config.model_dump(by_alias=True)
     for step in key.split("."):
-        value = value.get(step) if isinstance(value, dict) else None
+        table, value = value, value.get(step) if isinstance(value, dict) else None
+    if value is None and isinstance(table, dict) and key.rpartition(".")[0] in TABLES:
+        raise ConfigError(f"--vary {key} must name one of {', '.join(table) or 'none: the file has no such table'}, got {step!r}")
     if isinstance(value, list | tuple) and len(value) == 1:
         (value,) = value
     if isinstance(value, bool) or not isinstance(value, int | float):

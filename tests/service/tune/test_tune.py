@@ -23,7 +23,7 @@ from rti_mpc_service.commands.robot import lockstep_robot
 from rti_mpc_service.config.config import load
 from rti_mpc_service.tune.choice import beats, choose, front
 from rti_mpc_service.tune.closed_loop import Body, ClosedLoop, Course, Driven
-from rti_mpc_service.tune.study import Tried, open_study
+from rti_mpc_service.tune.study import Tried, open_storage, open_study
 from rti_mpc_service.tune.tune import main
 from tests.processes.system import until
 from tests.robots import SHIPPED
@@ -171,7 +171,8 @@ def test_interrupted_study_keeps_what_is_done_and_goes_on(tmp_path: Path, capsys
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        ({"storage": "nowhere://x"}, "--storage must be a storage of Optuna that can be used: "),
+        ({"storage": "nowhere://x"}, "--storage must be a storage of Optuna that can be used, such as sqlite:///studies.db: "),
+        ({"storage": "postgresql://u:secret@127.0.0.1:1/s"}, "--storage postgresql: needs the Python package psycopg"),
         ({"held_out": "eight"}, "--held-out must be another scenario than that of the study, got eight, heading consistent for both"),
         ({"out": Path("robot.png")}, "--out must be a TOML file other than"),
         ({"out": Path("/nowhere/robot.toml")}, "--out must be in a folder that exists"),
@@ -205,7 +206,7 @@ def command(path: Path, *options: str) -> list[str]:
 def begin(together: Barrier, storage: str) -> None:
     """Begin a study at the same time as others; a process that cannot ends with another status than 0."""
     together.wait()
-    open_study(storage, "study", Driven(error=1.0, effort=1.0, outputs=(), fallbacks=0))
+    open_study(open_storage(storage), "study", Driven(error=1.0, effort=1.0, outputs=(), fallbacks=0))
 
 
 @pytest.mark.slow
