@@ -6,7 +6,8 @@ The places, which say what is at a bound, are kept from sample to sample and shi
 with the plan, so that one roll-out is usually enough. A plan is certified from the
 problem's own data, and refined where the penalty that holds values at their bounds has
 yielded. When places do not settle, or the plan is not certified, an interior point of
-bounded length makes the plan, and the places of the next sample.
+bounded length makes the plan, and the places of the next sample. The sample's next QP,
+which is nearly the same, starts it from an iterate of this one.
 """
 
 from __future__ import annotations
@@ -29,6 +30,8 @@ START_RANGE = 1.0, 1e16  # limits of the product of distance and multiplier at i
 START_FAR = 1e6  # the same of a second try, after one that gave no numbers
 GAP_SHARES = 1.0, 1e-3  # of MAX_GAP, at which it hands its places back
 LEAST_SHARE = 0.1  # sum of products to which steps lead, relative to the largest gap of a certified plan; with less, digits are lost to stiffness
+KEPT_BELOW = 1e-2  # gap of the iterate from which the sample's next QP starts, relative to COST_FLOOR plus the normalised cost: not yet at the bounds
+NEAR = 0.4  # largest change of an input, relative to its scale, after which a QP starts so; after a larger one a start of its own is often the nearer
 JUDGED_BELOW = 100.0  # times the least product: the plan of a step with a larger one is not judged, because it would fail
 MAX_REFINEMENTS = 2  # of a plan that is not certified yet
 MAX_VIOLATION = 1e-9  # of dynamics, bounds and increments by a certified plan, relative to their scales
@@ -93,6 +96,11 @@ class ActiveSet:
         after, mean = np.zeros_like(interior), np.zeros(1)
         interior_plan = {name: np.zeros_like(array) for name, array in found.items() if name != "changes"}
         self._moved, self._product = (interior.data, after.data), mean.data
+        deviations = guess.plan.x.size + self._places.size
+        self._deviations, self._sides = np.split(interior, [deviations])
+        self._kept_sides = np.zeros_like(self._sides)  # those of an iterate of the sample's last QP that has taken steps
+        self._keeps = False  # whether the sample has such an iterate
+        self._change = guess.plan.change.data
         self._interior_pairs = tuple((found[name], array) for name, array in interior_plan.items())
         entered = {**guess.start, "stages": stages, **guess.weights}
         self.enter = bind(make(functions.enter), {**entered, "x_plan": guess.plan.x, "u_plan": guess.plan.u, "start": start}, {"interior": interior})
@@ -106,6 +114,7 @@ class ActiveSet:
     def begin(self, qps: int) -> None:
         """Begin a sample that may have so many QPs."""
         self._qps, self.steps = qps, 0
+        self._keeps = False
 
     def forget(self) -> None:
         """Start cold, with no bound acting."""
@@ -163,9 +172,10 @@ class ActiveSet:
 
     def solve(self) -> bool:
         """Find the places, and make the plan; return whether there is one."""
+        self._keeps = self._keeps and self._change[0] <= NEAR
         self.roll_out()
         self.iterations, self._stepped = 1, False
-        if self._changes[0] == 0.0 or self._settle(MAX_ROLL_OUTS):
+        if self._changes[0] == 0.0 or self._settle(MAX_ROLL_OUTS) or self._resume():
             return True
         self._lowest = np.inf
         self._judged()
@@ -182,6 +192,23 @@ class ActiveSet:
         self.forget()
         return False
 
+    def _resume(self) -> bool:
+        """
+        Start the interior point from an iterate of the sample's last QP, and return whether that leads to a certified plan.
+
+        This QP is linearized at the plan of that one, so that deviations begin at zero; distances, slacks and multipliers are those kept
+        [Gondzio1998]_. Steps remove by how much the bounds have moved.
+        """
+        if not self._keeps or self._changes[0] < 0.0:
+            return False
+        self._stepped, self._keeps, self._lowest = True, False, np.inf
+        self._judged()  # for the cost, by which products are measured
+        self._deviations[:], self._sides[:] = 0.0, self._kept_sides
+        if self._hands_back() or (self._lowest < np.inf and self._restore_best() is SOLVED):
+            self._places[:] = self._found
+            return True
+        return False
+
     def _step_inside(self) -> QpStatus:
         """Improve the best plan by the interior point until it is certified or no step is left, and return its status."""
         self._stepped = True
@@ -189,26 +216,32 @@ class ActiveSet:
         for start in (min(max(START_RANGE[0], self._verdict[1][0]), START_RANGE[1]), START_FAR):
             self._start[0] = start
             self.enter()
-            for share in GAP_SHARES:
-                if self._take_steps(share * MAX_GAP) and self._hand_back():
-                    return SOLVED
+            if self._hands_back():
+                return SOLVED
             if self._product[0] < np.inf:
                 break  # otherwise it has begun so near to the bounds that rounding decided
             self._restore_best()
         return self._restore_best()
+
+    def _hands_back(self) -> bool:
+        """Take steps from the iterate, and return whether the places found settle."""
+        return any(self._take_steps(share * MAX_GAP) and self._hand_back() for share in GAP_SHARES)
 
     def _take_steps(self, gap: float) -> bool:
         """Take steps of the interior point until the gap of its plan is below one, and return whether it is; the best plan is kept."""
         interior, after = self._moved
         while self.steps < MAX_STEPS * self._qps:
             # To products that are small beside the cost, and no smaller: the stiffer the sides, the more digits are lost.
-            self._least[0] = LEAST_SHARE * gap * (COST_FLOOR + self._verdict[2][0]) / self._places.size
+            unit = (COST_FLOOR + self._verdict[2][0]) / self._places.size
+            self._least[0] = LEAST_SHARE * gap * unit
             self.step()
             self.steps += 1
             self.iterations += 1
             interior[:] = after
             if not self._product[0] < np.inf:
                 break
+            if not self._keeps and self._product[0] <= KEPT_BELOW * unit:
+                self._kept_sides[:], self._keeps = self._sides, True
             if self._product[0] > JUDGED_BELOW * self._least[0]:
                 continue
             for array, inside in self._interior_pairs:

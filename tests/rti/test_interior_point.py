@@ -6,11 +6,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.rti import active_set
 from rti_mpc.rti.active_set import ActiveSet
 from rti_mpc.rti.rti import Rti
-from rti_mpc_service.bench.families import FAMILIES
+from rti_mpc_service.bench.families import FAMILIES, Family
 from tests.rti.test_active_set import PROBLEMS, samples
 
 MOST = 2 * active_set.MAX_ROLL_OUTS + 1 + active_set.MAX_STEPS * 3  # roll-outs and steps of a QP
@@ -61,6 +62,62 @@ def test_without_enough_steps_no_plan_is_told_as_solved(limit: int, monkeypatch:
             assert status is not QpStatus.SOLVED
         assert np.all(rti.u <= ocp.ubu + 1e-3)  # OSQP's tolerance
     assert limited > 0
+
+
+@pytest.fixture(scope="module")
+def restarts() -> Family:
+    """Cold restarts from all over the plane: the problem is constructed once."""
+    return FAMILIES["restarts"][0](20)
+
+
+def steps_and_commands(family: Family) -> tuple[int, Array]:
+    """Drive ten samples, each SOLVED; return the steps of the interior point and the commands."""
+    rti = Rti(family.ocp, compile=False)
+    assert rti.active_set is not None
+    steps, commands = 0, []
+    for k in range(10, 20):
+        if (start := family.start(k)) is not None:
+            x, u = start, family.u0
+            rti.reset(x, u)
+        y_ref, p = family.at(k)
+        rti.prepare(y_ref, p, shift=start is None, u_prev=u)
+        assert rti.feedback(x) is QpStatus.SOLVED
+        steps += rti.active_set.steps
+        u = rti.u[0].copy()
+        x = family.plant(x, u)
+        commands.append(u)
+    return steps, np.array(commands)
+
+
+def test_a_samples_next_qp_starts_from_an_iterate_of_the_last_one_in_fewer_steps_to_the_same_plan(
+    restarts: Family, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps, commands = steps_and_commands(restarts)
+    monkeypatch.setattr(active_set, "NEAR", -1.0)  # no QP is near the last one
+    cold_steps, cold_commands = steps_and_commands(restarts)
+    assert steps < 0.95 * cold_steps
+    # Where places do not settle, a gap of 1e-9 of the cost is left.
+    np.testing.assert_allclose(commands, cold_commands, rtol=0, atol=1e-6)
+
+
+def test_where_a_start_from_the_last_qp_leads_nowhere_the_interior_point_starts_anew(restarts: Family, monkeypatch: pytest.MonkeyPatch) -> None:
+    resume, led = ActiveSet._resume, []
+
+    def spoilt(self: ActiveSet) -> bool:
+        kept = self._keeps
+        self._kept_sides[:] = np.nan
+        found = resume(self)
+        if kept:
+            led.append(found)
+        return found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ActiveSet, "_resume", spoilt)
+        _, commands = steps_and_commands(restarts)
+    assert len(led) >= 3
+    assert not any(led)
+    monkeypatch.setattr(active_set, "NEAR", -1.0)
+    np.testing.assert_array_equal(commands, steps_and_commands(restarts)[1])
 
 
 @pytest.mark.slow
