@@ -25,13 +25,15 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.places import places
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import BUILT_IN_SOLVERS, Rti
+from rti_mpc.rti.simulation import simulate
+from rti_mpc_service.bench.families import quadrotor_model
 from tests.oracle import nlp
 
-TIGHT = SolverSettings(eps=1e-10, max_iter=200_000, scaling=10)
+EXACT = SolverSettings(eps=1e-6, max_iter=200_000, polish=5)  # of OSQP: once the bounds that act are known, polishing solves the rest exactly
 POSE = (Signal("x", "m"), Signal("y", "m"), Signal("psi", "rad", angle=True))
 LIMITS: dict[str, Any] = {"N": 8, "dt": 0.1, "Q": [1.0, 1.0, 0.05], "R": [0.2, 0.1], "lbu": [-0.5, -0.8], "ubu": [0.5, 0.8]}
 LIMITS |= {"lbdu": [-0.25, -0.4], "ubdu": [0.25, 0.4]}
-BENDS: dict[str, Any] = {"lbddu": [-0.06, -0.1], "ubddu": [0.06, 0.12], "zddu": 10.0, "Zddu": 10.0}  # larger penalties take OSQP long
+BENDS: dict[str, Any] = {"lbddu": [-0.06, -0.1], "ubddu": [0.06, 0.12], "zddu": 10.0, "Zddu": 10.0}
 
 
 def lagging_car(lag_s: float = 0.01, **changes: Any) -> Ocp:
@@ -131,6 +133,9 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "bounds of states and increments by block and stage": lambda: sampled_car(blocks=[1, 1, 2, 4], lbdu=NARROWING["lbdu"][::2], **SLOWING),
     "bounds at some stages alone": lambda: sampled_car(**AT_SOME_STAGES, **SLOWING),
     "bounds of a constraint by stage, held inputs": lambda: pulled_car(N_u=3, lh=np.array([[-NONE]] * 4 + [[-0.02]] * 4), uh=FALLING[:, None]),
+    "bounds of a constraint on both sides": lambda: pulled_car(lh=-0.02, uh=0.02),
+    "bounds of a constraint on both sides, held inputs": lambda: pulled_car(N_u=3, lh=-0.02, uh=0.02),
+    "bounds of a constraint on both sides, no bounded states": lambda: pulled_car(lh=-0.02, uh=0.02, lbx=-NONE, ubx=NONE),
     "bounds of states and a constraint by stage, a terminal set": lambda: pulled_car(uh=FALLING[:, None], ubx_e=[NONE] * 3 + [0.1], **SLOWING),
     "slack weights by stage": lambda: sampled_car(lbx=-NONE, ubx=[NONE] * 3 + [0.25], z=PENALTIES, Z=PENALTIES[::-1]),
     "slack weights by stage, held inputs": lambda: sampled_car(N_u=3, lbx=-NONE, ubx=[NONE] * 3 + [0.25], z=PENALTIES, Z=0.0),
@@ -149,6 +154,7 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "fixed input": lambda: sampled_car(lbu=[-0.5, 0.3], ubu=[0.5, 0.3], lbdu=-np.inf, ubdu=np.inf),
     "terminal set": lambda: sampled_car(lbx_e=[-np.inf] * 3 + [-0.05], ubx_e=[np.inf] * 3 + [0.02]),
     "second differences": lambda: sampled_car(N=5, **BENDS),
+    "second differences, large penalties": lambda: sampled_car(N=5, **BENDS | {"zddu": 1e3, "Zddu": 1e3}),
     "second differences, held inputs": lambda: sampled_car(N_u=3, **BENDS),
     "second differences, blocks": lambda: sampled_car(blocks=[1, 1, 2, 4], **BENDS),
     "second differences, blocks, the first one longer": lambda: sampled_car(blocks=[2, 1, 5], **BENDS),
@@ -181,7 +187,7 @@ def around_a_bend(ocp: Ocp, count: int) -> list[tuple[Array, Array, Array]]:
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_problem_is_solved_as_by_ipopt(name: str, formulation: str, solver: str) -> None:
     ocp = PROBLEMS[name]()
-    rti, solve = Rti(ocp, TIGHT, formulation=formulation, solver=solver, compile=False), nlp(ocp)
+    rti, solve = Rti(ocp, EXACT, formulation=formulation, solver=solver, compile=False), nlp(ocp)
     bound = 0
     for x0, y_ref, u_prev in around_a_bend(ocp, 6):
         u_before = u_prev - [0.04, -0.07]
@@ -207,8 +213,8 @@ def test_problem_is_solved_as_by_ipopt(name: str, formulation: str, solver: str)
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_state_bound_with_a_large_penalty_is_hard_in_effect_and_what_exceeds_it_is_told(formulation: str, solver: str) -> None:
     """IPOPT has the bound as such, no slack. From outside it, where IPOPT finds no plan at all, the plan comes back as fast as inputs can."""
-    ocp = sampled_car(z=1e5 if solver == "riccati" else 1e2, Z=0.0)  # OSQP takes long where a penalty is far larger than the multiplier
-    rti = Rti(ocp, TIGHT, formulation=formulation, solver=solver, compile=False)
+    ocp = sampled_car(z=1e5, Z=0.0)
+    rti = Rti(ocp, EXACT, formulation=formulation, solver=solver, compile=False)
     hard = nlp(ocp, slacks=False)
     bound = 0
     for x0, y_ref, u_prev in around_a_bend(ocp, 4):
@@ -411,8 +417,8 @@ def turned(axis: list[float], angle: float) -> Array:
 @pytest.mark.parametrize("solver", BUILT_IN_SOLVERS)
 @pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_quaternion_is_steered_by_its_small_angles_as_by_ipopt(formulation: str, solver: str) -> None:
-    ocp, settings = attitude(N=8), replace(TIGHT, eps=1e-9)  # at 1e-10, or N = 15, OSQP does not converge with states as variables
-    rti, solve = Rti(ocp, settings, formulation=formulation, solver=solver, compile=False), nlp(ocp)
+    ocp = attitude()
+    rti, solve = Rti(ocp, EXACT, formulation=formulation, solver=solver, compile=False), nlp(ocp)
     for axis, angle in (([1.0, 0.5, 0.2], 0.8), ([0.0, 1.0, -1.0], -1.5)):
         x0, y_ref = np.array([1.0, 0, 0, 0, 0.1, -0.2, 0.3]), np.tile([*turned(axis, angle), 0, 0, 0], (ocp.N, 1))
         rti.reset(x0, np.zeros(3))
@@ -449,3 +455,26 @@ def test_quaternion_and_its_negative_are_one_attitude_and_the_shorter_way_round_
             assert 0.1 * np.sum(rates) == pytest.approx(shorter, abs=0.1)
             final.append(rates)
         np.testing.assert_allclose(final[0][:30], final[1][:30], rtol=0, atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_quadrotor_of_13_states_flies_turns_whichever_sign_its_attitude_has(sign: float) -> None:
+    """Its components compared with the reference, as without a quaternion, it would turn over from the other sign."""
+    thirteen = quadrotor_model()
+    names = tuple(signal.name for signal in thirteen.outputs[3:7])
+    level = [0.0, 0.0, 0.0, sign] + 9 * [0.0]
+    model = replace(thirteen, quaternions=names, x_nominal=level)
+    ocp = Ocp(model, N=20, dt=0.03, Q=[1, 1, 1, 0, 0.1, 0.1, 0.1] + [0] * 6, R=[0.002] * 4, lbu=0, ubu=4, lbdu=-3, ubdu=3)
+
+    def eight(t: Array) -> Array:
+        still = np.zeros_like(t)
+        attitude = np.cos(0.6 * t), still, still, np.sin(0.6 * t)  # more than a whole turn in 6 s
+        return np.column_stack([np.sin(0.8 * t), 0.5 * np.sin(1.6 * t), 0.2 * np.sin(t), *attitude, *[still] * 6])
+
+    run = simulate(Rti(ocp, compile=False), ocp.phi(), eight, x0=level, samples=200)
+    assert set(run.status) == {QpStatus.SOLVED}
+    assert np.abs(run.error[100:, :3]).max() < 0.02  # m, where it flies up to 1.1 m/s
+    q, wanted = run.x[100:, 3:7], run.y_ref[100:, 3:7]
+    assert 2 * np.arccos(np.minimum(np.abs(np.sum(q * wanted, axis=1)), 1.0)).max() < 0.2  # rad, by which it must tilt
+    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, rtol=0, atol=1e-6)
