@@ -90,6 +90,9 @@ def check_model(config: Config) -> Ocp:
     model = named("model.name", find_model, config.model.name, config.model.folder)
     check_names(config, model)
     check_solver(config)
+    stages = config.ocp.sim_method_num_stages
+    if stages is not None and (config.ocp.integrator or model.method) != "irk":
+        raise ConfigError(f'ocp.sim_method_num_stages must be left out, or ocp.integrator be "irk": other integrators have their own, got {stages}')
     named("ocp.obstacles", with_obstacles, model, [(0.0, 0.0, 1.0) for _ in config.ocp.obstacles])
     ocp = build_ocp(config)
     check_rest(ocp)

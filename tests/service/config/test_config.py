@@ -71,6 +71,7 @@ WRONG = [
     ("N = 20", "N = 20\nstale_s = 0.1", ["ocp.stale_s", "timing.stale_s"]),
     ("N = 20", "N = 20\nhorizon = 7", ["ocp.horizon", "N, N_u, blocks, dt_s"]),
     ("N = 20", "n = 20", ["ocp.n is unknown", "perhaps ocp.N is meant", "in stages", "20"]),
+    ('integrator = "rk4"', 'integrator = "rk4"\nsim_method_num_stages = 3', ["ocp.sim_method_num_stages", 'ocp.integrator be "irk"', "3"]),
     ('integrator = "rk4"', 'integrator = "rk5"', ["ocp.integrator", "'rk4', 'euler' or 'irk'", "'rk5'"]),
     ("psi = 0.05", "psi = -0.05", ["ocp.weights.Q.psi", "at least 0", "-0.05"]),
     ("psi = 0.05", "phi = 0.05", ["ocp.weights.Q.phi", "no output", "psi [rad]"]),
