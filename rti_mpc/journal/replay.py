@@ -75,7 +75,7 @@ class Gap:
 @dataclass
 class ReplayOutcome:
     """
-    ReplayOutcome of a replay.
+    Outcome of a replay.
 
     Attributes:
         samples: Commands that were compared.
