@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, End, Reference
 from rti_mpc.errors import ConfigError
-from rti_mpc.wire.bus import Bus, BusSettings, unix_s
+from rti_mpc.wire.bus import Bus, BusSettings, new_epoch
 from rti_mpc.wire.keys import Keys
 
 ROLE = "reference"
@@ -38,7 +38,7 @@ class PlannerAdapter:
         """
         self._bus = Bus.join(bus or BusSettings(), Keys(prefix, robot), say=lambda line: print(f"{robot}: {line}", file=sys.stderr))
         self._publisher = self._bus.publisher(self._bus.keys.reference)
-        self._epoch, self._seq = unix_s(), 0
+        self._epoch, self._seq = new_epoch(), 0
         self._bus.alive(ROLE)
 
     def __enter__(self) -> Self:

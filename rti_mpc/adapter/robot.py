@@ -27,7 +27,7 @@ from rti_mpc.contract.schedule import unfit
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.actuator import STALE_NS, Actuator
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, new_epoch
 from rti_mpc.wire.info import Label, labels
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
@@ -83,7 +83,7 @@ class RobotAdapter:
         self.inputs = tuple(inputs)
         lbu, ubu = np.array([inputs[name] for name in self.inputs], dtype=np.float64).T
         lbdu, ubdu = np.array([increments.get(name, NO_LIMIT) for name in self.inputs], dtype=np.float64).T
-        dt_ns, nu, epoch = round(1e9 * dt_s), len(inputs), time.time_ns() // 1_000_000
+        dt_ns, nu, epoch = round(1e9 * dt_s), len(inputs), new_epoch()
         self._epoch, self._seq = epoch, 0
         self._stop = stop or stop_on_signals()
         self._actuator = Actuator(

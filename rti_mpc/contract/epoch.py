@@ -4,8 +4,8 @@ Epochs: the number of one life of a publisher, higher than all epochs it knows o
 
 Epochs of controllers and guards are Unix seconds times ``2 ** NUMBER_BITS``, or above.
 Their low bits are the number of the owner, drawn at its start: whatever two processes
-have heard, they never choose the same epoch. Robots and planners use lower numbers, such
-as the milliseconds or seconds since 1970.
+have heard, they never choose the same epoch. Robots and planners use lower numbers, the
+milliseconds since 1970.
 
 Receivers prefer the highest epoch, so an epoch that nothing can exceed would shut out
 everybody else. `highest_believed` limits epochs by the time of day, which goes on: above

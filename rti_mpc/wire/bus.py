@@ -40,6 +40,16 @@ def unix_s() -> int:
     return time.time_ns() // 1_000_000_000
 
 
+def new_epoch() -> int:
+    """
+    Return an epoch for a new life of a robot, a planner or a listener: the Unix time in ms.
+
+    In seconds, one that is restarted within a second would have the epoch of its last life, and its messages would count as repeated.
+    Controllers and guards choose theirs by `rti_mpc.contract.epoch`.
+    """
+    return time.time_ns() // 1_000_000
+
+
 class Declared(Protocol):
     """A declaration on the bus that lasts until it is undeclared."""
 

@@ -29,7 +29,7 @@ from rti_mpc.reference.speed_profile import SpeedLimits
 from rti_mpc.reference.tracks import TRACKS, track
 from rti_mpc.signals import place, plane
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, new_epoch
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.reference import ROLE, STALE_S
@@ -165,7 +165,7 @@ def main(name: str, model: Model, pieces: Sequence[Path], bus_settings: BusSetti
     Raises:
         ConfigError: The model follows no path.
     """
-    epoch = time.time_ns() // 1_000_000_000
+    epoch = new_epoch()
     references = PathReferences(model, pieces, epoch)
     stop = stop or stop_on_signals()
     with Bus.join(bus_settings, keys, stop=stop, say=logger.warning) as bus:

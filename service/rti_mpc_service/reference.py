@@ -21,7 +21,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.lives import Heard, Lives
 from rti_mpc.contract.message import Notice, Reference, Severity, State
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber, new_epoch
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.scenario import Scenario
@@ -73,7 +73,7 @@ class ReferenceSource:
     def __init__(self, bus: Bus, scenario: Scenario, parameters: Callable[[Array], Array] | None = None) -> None:
         self.anchored = 0
         self._scenario, self._parameters = scenario, parameters
-        self._epoch = time.time_ns() // 1_000_000_000
+        self._epoch = new_epoch()
         self._publisher = bus.publisher(bus.keys.reference)
         self._announcer = Announcer(bus, ROLE, self._epoch)
         self._bus = bus

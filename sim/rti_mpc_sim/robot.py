@@ -29,7 +29,7 @@ from rti_mpc.contract.schedule import unfit
 from rti_mpc.model.model import Model
 from rti_mpc.wire.actuator import STALE_NS, Counters
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber, new_epoch
 from rti_mpc.wire.info import labels
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Key, Keys
@@ -155,7 +155,7 @@ class Robot:
 
     def __init__(self, settings: RobotSettings, bus: Bus, key: Key[Command], speed: float, log: Path | None) -> None:
         # Milliseconds: a robot restarted within a second is another one.
-        self.body = Lockstep(settings, epoch=time.time_ns() // 1_000_000)
+        self.body = Lockstep(settings, epoch=new_epoch())
         self._model = settings.model
         self._log = Log(log, settings.model)
         self._states = bus.publisher(bus.keys.state)

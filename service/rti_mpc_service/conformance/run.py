@@ -24,7 +24,7 @@ from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command, State
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.errors import ConfigError
-from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, unix_s
+from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, new_epoch, unix_s
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Key
 from rti_mpc_service.config.build import build_observer, build_rti, build_signals, guard_limits
@@ -127,7 +127,7 @@ def judge(
     bus.alive("controller")
     if what == "guard":
         bus.alive("robot")
-        yield from judgements(guard.CASES, Stand(bus, limits, epoch=time.time_ns() // 1_000_000, leader=epoch), host)
+        yield from judgements(guard.CASES, Stand(bus, limits, epoch=new_epoch(), leader=epoch), host)
         return
     if config.guard.enabled:
         bus.alive("guard")

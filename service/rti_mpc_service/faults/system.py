@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import resource
 import signal
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import Enum
@@ -19,7 +18,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Reference, Telemetry
 from rti_mpc.contract.status import Mode
-from rti_mpc.wire.bus import Bus
+from rti_mpc.wire.bus import Bus, new_epoch
 from rti_mpc.wire.info import Info, Label
 from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.session import BusSettings
@@ -311,7 +310,7 @@ class System:
 
     def refer(self, reference: Reference) -> None:
         """Publish a reference as a new planner that takes over."""
-        reference = replace(reference, epoch=max(time.time_ns() // 1_000_000_000, self.reference.epoch + 1), seq=1)
+        reference = replace(reference, epoch=max(new_epoch(), self.reference.epoch + 1), seq=1)
         self._references.put(reference)
         self.witness.reference = reference
 

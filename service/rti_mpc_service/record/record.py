@@ -28,7 +28,7 @@ from rti_mpc.recording.host import HOST
 from rti_mpc.recording.repair import repair
 from rti_mpc.wire import document
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.bus import Bus, BusSettings, new_epoch
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Key, Keys
@@ -137,7 +137,7 @@ class Recorder:
             except ConfigError:
                 return
             self._buses[robot] = bus
-            self._announcers.append(Announcer(bus, ROLE, time.time_ns() // 1_000_000_000))
+            self._announcers.append(Announcer(bus, ROLE, new_epoch()))
         hear(bus, self._inbox, self._described)
         bus.alive(ROLE)
         bus.expect("message", lambda: any(entry[0].startswith(f"{bus.keys.prefix}/{robot}/") for entry in list(self._last)))

@@ -14,7 +14,7 @@ from threading import Event
 
 from rti_mpc.contract.message import Notice, Severity
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import Bus, BusSettings
+from rti_mpc.wire.bus import Bus, BusSettings, new_epoch
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.announce import announce
@@ -106,7 +106,7 @@ def main(bus_settings: BusSettings, keys: Keys, screens: Screens, *, robots: Seq
         if screens.shown:
             outlets.append(viewer_outlet(url, title, roots))
         log.info("listening to %s", " and ".join(one.keys.below("*") for one in buses))
-        announcer = Announcer(buses[0], ROLE, time.time_ns() // 1_000_000_000)
+        announcer = Announcer(buses[0], ROLE, new_epoch())
         bus.watch_certificate(lambda notice: announce(log, announcer, notice, listeners[0].now_ns))
         pump(listeners, outlets, spawned, announcer, stop)
     counts = (sum(getattr(listener, name) for listener in listeners) for name in ("received", "lost", "refused"))
