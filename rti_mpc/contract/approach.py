@@ -5,9 +5,10 @@ Slew limits of the inputs that really act: the rows of a plan, approached from t
 A controller that does not know of a lost command starts its plan from an input that
 does not act. Whoever plays the rows, or passes them on, therefore brings them inside the
 slew limits of the inputs that acted: no two inputs within three quarters of a period
-differ by more than one increment. The last quarter is left to transport, as in
-`rti_mpc.control.sent`: with limits over a whole period, commands that arrive some
-milliseconds sooner or later would clip healthy plans.
+differ by more than one increment. The last quarter is left to transport: with limits over
+a whole period, commands that arrive some milliseconds sooner or later would clip healthy
+plans, and no late plan could reverse its direction. `rti_mpc.control.sent` holds late
+commands to the same window.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from rti_mpc.array import Array
 
 SLEW_WINDOW_PERIODS = 0.75  # inputs within this time differ by no more than one increment
-INPUT_ROUNDING = 1e-9  # in the unit of the input: a row that differs by less has not been changed
+UNCHANGED = 1e-9  # in the unit of the input: a row that differs by less has not been changed
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +72,7 @@ def approach(
     share = min(1.0, period_ns / limits.dt_ns)
     lowest, highest = share * limits.lbdu, share * limits.ubdu
     change = np.diff(u, axis=0)
-    even = period_ns >= window_ns and bool((change >= lowest - INPUT_ROUNDING).all() and (change <= highest + INPUT_ROUNDING).all())
+    even = period_ns >= window_ns and bool((change >= lowest - UNCHANGED).all() and (change <= highest + UNCHANGED).all())
     first = max(0, (start_ns - stamp_ns) // period_ns)
     begins_ns = stamp_ns + (first + 1) * period_ns  # when a plan that comes late by less than a row begins
     rows, near, limited = u, list(acted), False
@@ -80,7 +81,7 @@ def approach(
         if even and k > first and not limited and row_ns - window_ns >= start_ns:
             break
         row = within(u[k], near, row_ns - window_ns, limits)
-        was_limited, limited = limited, bool((np.abs(row - u[k]) > INPUT_ROUNDING).any())
+        was_limited, limited = limited, bool((np.abs(row - u[k]) > UNCHANGED).any())
         if limited or was_limited:
             if rows is u:
                 rows = u.copy()
@@ -89,7 +90,7 @@ def approach(
             row = within(u[k], near, row_ns - limits.dt_ns, limits)
             if k > first:
                 row = np.minimum(np.maximum(row, rows[k - 1] + lowest), rows[k - 1] + highest)
-            limited = bool((np.abs(row - u[k]) > INPUT_ROUNDING).any())
+            limited = bool((np.abs(row - u[k]) > UNCHANGED).any())
             rows[k] = row
         if row_ns - limits.dt_ns >= begins_ns:
             near = [(until_ns, before) for until_ns, before in near if until_ns > row_ns - limits.dt_ns]

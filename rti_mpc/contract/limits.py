@@ -19,7 +19,7 @@ from rti_mpc.contract.message import Command
 from rti_mpc.contract.schedule import NO_ANGLES, end_ns
 
 MAX_VALID_NS = 300_000_000  # robot time: a command ends at the latest this long after its state and the delay, whatever its own validity
-INPUT_ROUNDING = 1e-6  # in the unit of the input: above any rounding, single precision included, and below what an actuator resolves
+INPUT_TOLERANCE = 1e-6  # in the unit of the input: above any rounding, single precision included, and below what an actuator resolves
 SETTLED_SHARE = 0.01  # of the range of an input: a way to rest that is this close to its last row counts as rest
 
 
@@ -76,17 +76,17 @@ class Limits:
     def settled(self) -> Array:
         """How far from its last row a way to rest counts as rest, shape ``(nu,)``."""
         span = self.ubu - self.lbu
-        return np.where(np.isfinite(span), SETTLED_SHARE * span, INPUT_ROUNDING)
+        return np.where(np.isfinite(span), SETTLED_SHARE * span, INPUT_TOLERANCE)
 
     def objection(self, command: Command) -> str:
         """Return what is wrong with the rows of a command, as a code and a reason; empty if nothing is."""
         if len(command.K) and len(self.angles) != command.K.shape[1]:
             return f"wrong_shape: its way to rest feeds {command.K.shape[1]} states back, of {len(self.angles)} that are known"
         for u, period_ns, of in judged(command):
-            if (u < self.lbu - INPUT_ROUNDING).any() or (u > self.ubu + INPUT_ROUNDING).any():
+            if (u < self.lbu - INPUT_TOLERANCE).any() or (u > self.ubu + INPUT_TOLERANCE).any():
                 return f"out_of_bounds: inputs{of} reach from {u.min(axis=0).tolist()} to {u.max(axis=0).tolist()}"
             change, share = np.diff(u, axis=0), min(1.0, 1e-9 * period_ns / self.dt_s)
-            if (change < share * self.lbdu - INPUT_ROUNDING).any() or (change > share * self.ubdu + INPUT_ROUNDING).any():
+            if (change < share * self.lbdu - INPUT_TOLERANCE).any() or (change > share * self.ubdu + INPUT_TOLERANCE).any():
                 return f"out_of_slew: rows{of} change by up to {np.abs(change).max(axis=0).tolist()}"
         return ""
 

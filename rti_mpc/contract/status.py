@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from enum import IntEnum
 
+DISAGREEMENT = 1e-3  # difference of two solvers' plans from which on they disagree, relative to half an input's range
+
 
 class QpStatus(IntEnum):
     """Outcome of one QP. Mapped from the solver's own codes in `rti_mpc.rti.qp.osqp` only."""
@@ -33,3 +35,8 @@ class Mode(IntEnum):
     FALLBACK = 4  # no plan for this sample: the shifted previous plan is played
     BRAKING = 5  # ramping to standstill inside the slew limits
     STOPPED = 6  # stopped by an operator until `enable`
+
+    @property
+    def planned(self) -> bool:
+        """Whether each sample has a plan of its own, and it is certain which inputs act."""
+        return self is Mode.TRACKING or self is Mode.HOLDING

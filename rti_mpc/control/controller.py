@@ -57,7 +57,6 @@ from rti_mpc.rti.way_to_rest import StopLaw
 INPUTS_UNREPORTED = (
     "the robot does not report which inputs act: commands are assumed to act, and only the robot itself or a guard can handle lost ones"
 )
-PLANNING_MODES = {Mode.TRACKING, Mode.HOLDING}  # in which each sample has a plan of its own, and it is certain which inputs act
 
 
 class Controller:
@@ -137,7 +136,8 @@ class Controller:
         ways = None if stop_law is None else Stopping(ocp, stop_law, self.envelope.limits, self._prediction, self._valid_ns, compile=compile)
         self._ways = ways  # to rest; None: its inputs ramp to rest
         balances = stop_law is not None and stop_law.disturbances.size > 0
-        self._known = PLANNING_MODES | ({Mode.STOPPED, Mode.BRAKING} if balances else set())  # modes in which disturbances are estimated
+        braking = {Mode.STOPPED, Mode.BRAKING} if balances else set()
+        self._known = braking | {mode for mode in Mode if mode.planned}  # modes in which disturbances are estimated
         self._overran = False  # whether the last sample was over its budget
         self._unreported = False  # whether it was said that the robot does not report its inputs
         self._stopped = ""  # why an operator's stop is latched
@@ -373,7 +373,7 @@ class Controller:
             return None
         if not self._stopped:
             self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "over_budget")
-        self._issued.late = command if command.mode in PLANNING_MODES and now_ns < command.valid_until_ns else None
+        self._issued.late = command if command.mode.planned and now_ns < command.valid_until_ns else None
         counted = command.mode in (Mode.BRAKING, Mode.STOPPED)
         if self._ways is not None and self._ways.feeds_back:  # the last command carries its way, which newer states correct than this sample's
             if not counted:
@@ -405,8 +405,8 @@ class Controller:
         """Prepare the next sample: fix `t_k`, look the reference up, shift, linearize and load the QP."""
         self._record.keep_plan(self._issued.seq)
         if self._opinions is not None:
-            self._opinions.keep(self._issued.seq, planned=self.mode in (Mode.TRACKING, Mode.HOLDING) and not self._standing_by)
-        if self.mode in PLANNING_MODES and self._blockage.judge():
+            self._opinions.keep(self._issued.seq, planned=self.mode.planned and not self._standing_by)
+        if self.mode.planned and self._blockage.judge():
             self.say(self._blockage.notice)
         state = self._states.last
         if not self.grid.running or state is None:
@@ -415,7 +415,7 @@ class Controller:
             self._measure_delay(self._delay, state.stamp_ns)
         self.grid.advance(state.stamp_ns, self._states.clock.period_ns)
         self._planner.loaded = False
-        if self.mode in PLANNING_MODES:
+        if self.mode.planned:
             self.ladder.failed = 0
         elif self._issued.late is None and (self.mode is not Mode.FALLBACK or not np.isfinite(self._rti.x).all()):
             return  # the next sample starts cold; after a late one it does not, as a cold one takes longest and would be late again
@@ -458,7 +458,7 @@ class Controller:
             A command to be encoded and thrown away; None if the next sample does not begin with a feedback that is prepared.
         """
         state, grid = self._states.last, self.grid
-        if state is None or not self._planner.loaded or self._standing_by or self.mode not in PLANNING_MODES:
+        if state is None or not self._planner.loaded or self._standing_by or not self.mode.planned:
             return None
         self._check(state)
         self._understudy.receive(state, local_ns)

@@ -9,11 +9,10 @@ from typing import NamedTuple
 
 from rti_mpc import given
 from rti_mpc.contract.message import Notice, Severity
-from rti_mpc.contract.status import QpStatus
+from rti_mpc.contract.status import DISAGREEMENT, QpStatus
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.second_opinion import SecondOpinion, osqp_solved
 
-DISAGREEMENT = 1e-3  # difference of the plans from which on the solvers disagree, relative to half an input's range
 LASTING = 3  # opinions in a row that disagree before it is told
 RELIABLE = 100  # opinions in a row that agree before that is told: where bounds decide, a wrong gradient makes no difference for a while
 

@@ -14,13 +14,12 @@ from math import inf
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.contract.approach import Increments
+from rti_mpc.contract.approach import SLEW_WINDOW_PERIODS, Increments
 from rti_mpc.contract.belief import Belief
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.schedule import BEFORE_ALL_NS, NO_ANGLES, Plan, Schedule, end_ns
 
 TRANSIT_PERIODS = 0.1  # a command may take this long to arrive; the plan before it acts until then
-SLEW_WINDOW_PERIODS = 0.75  # a late command is held to the slew limits over this time: over a whole period no plan could reverse its direction
 
 
 class Sent:

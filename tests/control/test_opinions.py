@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from rti_mpc.contract.message import Severity, State, Telemetry
-from rti_mpc.contract.status import QpStatus
+from rti_mpc.contract.status import DISAGREEMENT, QpStatus
 from rti_mpc.control.controller import Controller, Timing
-from rti_mpc.control.opinions import DISAGREEMENT, RELIABLE
+from rti_mpc.control.opinions import RELIABLE
 from rti_mpc.errors import OcpError
 from rti_mpc.reference.trajectory import eight
 from rti_mpc.rti import construction, linearization

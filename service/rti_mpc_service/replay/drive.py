@@ -22,15 +22,12 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, Event, Journal, Reference, State, Telemetry
 from rti_mpc.contract.robot_clock import RobotClock
 from rti_mpc.contract.schedule import NO_COMMAND
-from rti_mpc.contract.status import Mode
 from rti_mpc.journal.entry import JournalEntry
 from rti_mpc.journal.replay import Difference, Replay
 from rti_mpc.signals import Signal
 from rti_mpc_service.case import solver_of
 from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, repeat
 from rti_mpc_service.rig.run_data import wanted
-
-PLANNED = (Mode.TRACKING, Mode.HOLDING)  # modes of samples with a plan of their own
 
 
 class PlacedBody(Protocol):
@@ -223,7 +220,7 @@ class Drive(Replay):
         elif entry.name == "in_time":
             self._waits = self.proposal is not None
             mode = None if self.proposal is None else self.proposal.mode
-            passage.solved["none in time" if mode is None else self._solver if mode in PLANNED else mode.name.lower()] += 1
+            passage.solved["none in time" if mode is None else self._solver if mode.planned else mode.name.lower()] += 1
         elif entry.name == "commit":
             self._waits = False
         if controller.followed is not self._followed and (followed := controller.followed) is not None:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rti_mpc.control.opinions import DISAGREEMENT
+from rti_mpc.contract.status import DISAGREEMENT
 from rti_mpc_service.case import QpCase
 from rti_mpc_service.replay.answer import answer, compared
 from rti_mpc_service.replay.trouble import cases_of

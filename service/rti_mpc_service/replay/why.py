@@ -21,8 +21,7 @@ import numpy as np
 
 from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.contract.message import Command, JournalKind, Telemetry
-from rti_mpc.contract.status import Mode, QpStatus
-from rti_mpc.control.opinions import DISAGREEMENT
+from rti_mpc.contract.status import DISAGREEMENT, Mode, QpStatus
 from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.journal.entry import JournalEntry
 from rti_mpc.journal.replay import Difference, Replay
@@ -40,7 +39,6 @@ MAX_EVENTS = 8  # of those, the last ones
 MAX_VALUES = 4  # of a bound that differs by stage, told each by itself
 MIN_COST_SHARE = 0.005  # of the cost, below which a term is left out of the lines
 ROUNDING = 1e-6  # relative: a violation below this is none
-PLANNED = (Mode.TRACKING, Mode.HOLDING)
 RUNGS = {
     Mode.TRACKING: "a plan of its own",
     Mode.HOLDING: "a plan of its own",
@@ -132,7 +130,7 @@ def explained(journal: Journaled, built: Rebuilt, place: Place) -> tuple[dict[st
             facts["events"] = [one for one in told if place.command.stamp_ns - one["stamp_ns"] <= 1e9 * LOOK_BACK_S][-MAX_EVENTS:]
         elif facts and entry.name == "prepare":
             prepared += 1
-            if prepared == 2 or place.command.mode not in PLANNED:
+            if prepared == 2 or not place.command.mode.planned:
                 break
     if not facts:
         raise ConfigError(f"command {place.command.seq} must follow a snapshot without a gap, got {[*map(str, on.outcome.gaps)] or 'none before it'}")
@@ -173,7 +171,7 @@ def facts_of(built: Rebuilt, on: Replay, place: Place, entry: JournalEntry, diff
     """Return what is known of a command before the next sample is prepared."""
     controller, rti, command = built.controller, built.rti, place.command
     sample: Telemetry = controller.telemetry(**NO_TIMES)
-    planned = command.mode in PLANNED
+    planned = command.mode.planned
     changed = changed_weights(built)
     terms = cost_terms(rti, built.config) if planned else {}
     return {

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Event, Reference, Severity, Telemetry
-from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.contract.status import QpStatus
 from rti_mpc.model.model import Model
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.signals import plane
@@ -31,7 +31,6 @@ from rti_mpc_service.scenario import Scenario
 
 TRANSIENT_S = 20.0
 MAX_HELD_UP_S = 1.0  # before the end, in which a busy host may keep a controller from driving, and it is still taken to drive
-DRIVING_MODES = (Mode.TRACKING, Mode.HOLDING)
 ERROR_KEYS = ("max_error_mm", "rms_error_mm", "last_lap_max_error_mm", "final_error_mm", "final_speed_mm_s")
 INCREMENT_ROUNDING = 1e-9  # rounding of a difference of two inputs, in the input's unit; inputs are compared exactly
 
@@ -86,7 +85,7 @@ class Outcome:
         """Whether the robot was driven to the end: it got there, and shortly before a plan for the reference was acting."""
         reached = bool(self.log.stamp_ns.size and self.log.stamp_ns[-1] >= self.end_ns)
         since_ns = self.end_ns - 1e9 * max(MAX_HELD_UP_S * self.speed, 2.5 * self.ocp.dt)
-        return reached and any(sample.state_stamp_ns > since_ns and sample.mode in DRIVING_MODES for sample in self.samples)
+        return reached and any(sample.state_stamp_ns > since_ns and sample.mode.planned for sample in self.samples)
 
     def run(self) -> Run:
         """Return the run between anchor and end for figures; samples whose command never arrived are left out."""

@@ -14,6 +14,7 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from rti_mpc.contract.status import DISAGREEMENT
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.interrupt import stop_on_signals
@@ -28,7 +29,6 @@ FIND_S = 1.0  # at least, for robots to be found
 MAX_ROBOTS = 100
 MAX_WIDTH = 1000  # columns, more than any table needs
 STALE_S = 1.0  # ages from which on they are marked
-DISAGREEMENT = 1e-3  # of half an input's range, as for the event solvers_disagree
 GOOD, BAD = ("TRACKING", "HOLDING"), ("BRAKING", "STOPPED", "FALLBACK")
 COLUMNS = ("mode", "error", "age of state", "reference", "times p50/max [us]", "leads", "solvers differ", "versions")
 ROLES = ("controller", "standby", "robot", "guard", "reference")  # that make a robot; routers, viewers and recorders are there for any

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Telemetry
-from rti_mpc.contract.status import Mode
 from rti_mpc.wire.info import Info
 
 TOUCHING = 1e-4  # distance from a bound at which it acts, relative to half of what its signal ranges over
@@ -19,13 +18,12 @@ FREE, LATER = "free", " later"
 LEVELS, RATES, TOUCHED = ("lower", "upper"), ("falls", "rises"), "touched"
 SIDES = (*LEVELS, *RATES)
 NOW = (TOUCHED, *(", ".join(some) for count in range(1, 5) for some in combinations(SIDES, count)))  # what may act at the first stage
-PLANNED = (Mode.TRACKING, Mode.HOLDING)
 ACTING = (*NOW, *(f"{words}{LATER}" for words in NOW))
 
 
 def is_plan(sample: Telemetry) -> bool:
     """Whether a sample has a plan of its own."""
-    return sample.mode in PLANNED and 0 < len(sample.u) == len(sample.y_ref) == len(sample.x) - 1
+    return sample.mode.planned and 0 < len(sample.u) == len(sample.y_ref) == len(sample.x) - 1
 
 
 def cost_terms(info: Info, sample: Telemetry, u_before: Array | None) -> dict[str, float]:
