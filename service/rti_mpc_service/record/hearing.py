@@ -54,7 +54,7 @@ def fetch_origin(bus: Bus, owner: int, give: Callable[[Mapping[str, str]], objec
         while begin < size <= MAX_BUNDLE_BYTES:
             answers = (answer for answer in bus.answers(bus.keys.origin, {"from": begin}, ASK_TIMEOUT_S) if answer.get("owner") == owner)
             answer = next(answers, {})
-            piece, size = answer.get("piece"), answer.get("size")
+            piece, size = answer.get("piece"), answer.get("size", 0)
             if not (isinstance(piece, str) and piece and type(size) is int):
                 break
             pieces.append(piece)
