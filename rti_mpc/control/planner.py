@@ -88,7 +88,7 @@ class Planner:
         if len(self._d):
             track.p[:, self._np :] = self._d
         for p in self._robot:
-            p[:] = track.p[0, : self._np]
+            p[:] = track.p[0, : len(p)]
 
     def plan(self, x: Array, stamp_ns: int, act_ns: int) -> tuple[QpStatus, Array | None]:
         """
