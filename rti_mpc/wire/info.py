@@ -336,7 +336,9 @@ def _weights(values: Mapping[str, Any], ny: int, nu: int) -> Weights:
 
 
 def _factors(values: Sequence[Any], width: int) -> tuple[float, ...] | tuple[tuple[float, ...], ...]:
-    by_signal = len(values) > 0 and isinstance(values[0], Sequence)
+    if not values:
+        raise ValueError("factors of one stage or more expected, got none")
+    by_signal = isinstance(values[0], Sequence)
     return tuple(_numbers(row, width) for row in values) if by_signal else _numbers(values)
 
 

@@ -40,6 +40,16 @@ def test_null_bounds_are_the_infinity_of_their_side() -> None:
     assert info.ubx[3:] == (0.5, math.inf)
 
 
+@pytest.mark.parametrize("name", ["delta", "lambda_"])
+def test_weights_of_no_stage_are_refused(name: str) -> None:
+    said = {"Q": [[1.0, 0.0], [0.0, 1.0]], "R": [[1.0, 0.0], [0.0, 1.0]], "delta": [1.0, 2.0], "lambda_": [3.0]}
+    info = Info.from_json({**PIONEER, "weights": said})
+    assert info.weights is not None
+    assert (info.weights.delta, info.weights.lambda_) == ((1.0, 2.0), (3.0,))
+    with pytest.raises(MessageError, match="factors of one stage or more expected"):
+        Info.from_json({**PIONEER, "weights": {**said, name: []}})
+
+
 def test_bounds_that_are_not_said_are_infinite() -> None:
     info = Info.from_json({name: value for name, value in PIONEER.items() if name not in ("lbu", "ubu", "dt_s")})
     assert info.lbu == (-math.inf, -math.inf)

@@ -77,6 +77,7 @@ class Outlet:
         self._queue: deque[Entry] = deque(maxlen=capacity)
         self._context: dict[tuple[str, str], Entry] = {}  # by root and role, which a reference has none of
         self._missed = 0
+        self._fault = ""  # the last one that what was received has caused
         self._lock = threading.Lock()
         self._roots = roots
         self._recording: Scene | None = None
@@ -109,26 +110,29 @@ class Outlet:
     def _run(self) -> None:
         while not self._closing.wait(self._period_s):
             self._pump()
-        self._pump()
+        self._pump(last=True)
         if self._recording is not None:
-            self._recording.finish()
             self._recording.stream.disconnect()
 
-    def _pump(self) -> None:
-        """Send the queued entries, through a new stream if the last one failed."""
+    def _pump(self, *, last: bool = False) -> None:
+        """Send the queued entries, through a new stream if the last one failed; with the last ones also what was held back."""
         try:
             new = self._recording is None
             if self._recording is None:
                 self._recording = Scene(self._open_stream(), self._roots)
                 log.info("%s: open", self.name)
             self._recording.send(self._take(new))
+            if last:
+                self._recording.finish()
             self._recording.stream.flush(timeout_sec=self._flush_s)
         except Unavailable:
             return
         except RuntimeError as error:
-            self.failures += 1
-            self._note("outlet_failed", f"{self._epitaph()}: {error}")
-            self._give_up()
+            self._fail(str(error))
+        except Exception as error:  # by an entry that cannot be drawn; said once, since each stream begins with the same context
+            fault = f"{type(error).__name__}: {error}"
+            self._fail(fault if fault != self._fault else "")
+            self._fault = fault
 
     def _take(self, new: bool) -> list[Entry]:
         """Empty the queue; return its entries, after the context if the stream is new or entries were dropped."""
@@ -141,6 +145,13 @@ class Outlet:
         if missed:
             self._note("outlet_slow", f"too slow, {missed} entries dropped")
         return context + entries
+
+    def _fail(self, why: str) -> None:
+        """Count a failed stream and close it; without a reason nothing is said."""
+        self.failures += 1
+        if why:
+            self._note("outlet_failed", f"{self._epitaph()}: {why}")
+        self._give_up()
 
     def _note(self, code: str, text: str) -> None:
         self.notices.append(Notice(Severity.ERROR, code, f"{self.name}: {text}"))

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from threading import Event
 
@@ -194,12 +194,50 @@ def test_a_hung_viewer_delays_neither_offers_nor_closing(viewer: Viewer, host: H
     os.kill(viewer.process.pid, signal.SIGCONT)
 
 
+class Drawing:
+    """Stands in for a scene and its stream: holds what it was sent, and cannot draw numbers that are NaN."""
+
+    def __init__(self, *_: object) -> None:
+        self.stream = self
+        self.drawn: list[float] = []
+        DRAWINGS.append(self)
+
+    def send(self, entries: Iterable[Entry]) -> None:
+        for entry in entries:
+            if isinstance(entry.message, State):
+                self.drawn.append(int(entry.message.x[0]))  # raises ValueError for NaN
+
+    def finish(self) -> None: ...
+
+    def flush(self, timeout_sec: float) -> None: ...
+
+    def disconnect(self) -> None: ...
+
+
+DRAWINGS: list[Drawing] = []
+
+
+def test_an_entry_that_cannot_be_drawn_fails_its_stream_is_said_once_and_ends_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rti_mpc_service.view.outlet.Scene", Drawing)
+    outlet = Outlet("viewer", lambda: None)
+    for failures in (1, 2):
+        outlet.offer([Entry(1, State(1, 1, 1, np.array([np.nan])))])
+        await_(lambda failures=failures: outlet.failures == failures)
+    outlet.offer([state(7)])
+    await_(lambda: DRAWINGS[-1].drawn == [7])
+    assert [(notice.code, notice.text) for notice in outlet.notices] == [
+        ("outlet_failed", "viewer: closed after a failure, entries not yet written are lost: ValueError: cannot convert float NaN to integer")
+    ]
+    outlet.close()
+
+
 LOADING = """
 import sys
 import numpy as np
 from rti_mpc.contract.message import State
 from rti_mpc_service.view.outlet import load_arrow, new_stream
 from rti_mpc_service.view.recording import Entry
+from rti_mpc_service.view.scene import Scene
 from rti_mpc_service.view.scene import Scene
 
 load_arrow()
