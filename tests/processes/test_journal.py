@@ -87,7 +87,7 @@ def test_journal_of_a_run_with_whatever_an_operator_and_a_link_do_replays_withou
     assert why.returncode == 0, why.stderr
     assert why.stdout.startswith("command 20 of pioneer")
     assert "times: preparation " in why.stdout
-    done = rti_mpc("replay", run, "--from", "10s", "--json", tmp_path / "replay.json")
+    done = rti_mpc("replay", run, "--from", f"{1e-9 * last.stamp_ns:.3f}s", "--json", tmp_path / "replay.json")
     (told,) = json.loads((tmp_path / "replay.json").read_text())
     assert (told["differing"], told["not_covered"]) == (0, [])
     assert 0 < told["commands"] < last.seq

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import chain, takewhile
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -166,8 +166,8 @@ def play(journal: Journaled, built: Rebuilt, start_s: float | None = None, assig
 
 def snapshot_before(journal: Journaled, start_s: float | None) -> int:
     """Return the number from which on snapshots are used, so that the replay covers all from a time of the robot's clock on."""
-    before = list(takewhile(lambda message: message.stamp_ns < first_stamp(start_s), journal.messages))
-    return max((message.seq for message in before if message.kind is JournalKind.SNAPSHOT), default=0)
+    before = max((message.seq for message in journal.messages if message.stamp_ns < first_stamp(start_s)), default=0)  # of a clock's last life
+    return max((message.seq for message in journal.messages if message.kind is JournalKind.SNAPSHOT and message.seq <= before), default=0)
 
 
 def overridden(config: Config, ocp: Ocp, assignments: Sequence[str]) -> dict[str, Array]:
