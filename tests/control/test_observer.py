@@ -16,8 +16,10 @@ from rti_mpc.contract.status import Mode
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.control.observer import Disturbance, Observer, ObserverSettings
 from rti_mpc.errors import OcpError
+from rti_mpc.model.disturbance import with_disturbances
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model
+from rti_mpc.model.obstacle import with_obstacles
 from rti_mpc.model.robots.pioneer_3dx import NOMINAL_PARAMETERS, pioneer_3dx
 from rti_mpc.reference.trajectory import circle
 from rti_mpc.rti.ocp import Ocp
@@ -141,6 +143,20 @@ def test_wrong_model_is_tracked_without_offset_by_its_observer(plant: Callable[[
 
 def test_pose_alone_is_enough_to_drive() -> None:
     assert steady_error_mm(wrong_parameters(), ObserverSettings(INPUTS, POSE), hides=(3, 4)) < 1.0
+
+
+def test_observer_has_the_robots_own_parameters_where_the_problem_has_those_of_obstacles_too() -> None:
+    robot = pioneer_3dx()
+    own = 1.01 * np.array(robot.p_nominal)
+    observer = Observer(robot, ObserverSettings(INPUTS), compile=False)
+    model = with_disturbances(with_obstacles(robot, [(3.0, 3.0, 0.2)]), INPUTS)
+    rti = Rti(Ocp(model, **(PAPER | INCREMENTS | {"N": 5, "Q": [1.0, 1.0, 0.0], "z": 100.0})), compile=False)
+    controller = Controller(rti, Timing(), observer=observer, compile=False)
+    y = reference(circle()).y
+    controller.receive_reference(Reference(1, 1, 0, 20 * MS, End.HOLD, y, np.tile([*own, 3.0, 3.0, 0.2], (len(y), 1))))
+    drive(controller, Lockstep(RobotSettings(robot, np.array([*circle().pose0, 0.0, 0.0]), SLEW)), 1.0)
+    assert controller.mode is Mode.TRACKING
+    np.testing.assert_array_equal(observer.p, own)
 
 
 def test_estimate_for_which_the_model_has_no_value_begins_anew_at_the_next_state() -> None:
