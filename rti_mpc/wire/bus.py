@@ -312,7 +312,7 @@ class Bus:
         """Publish a JSON object, which late joiners receive as well."""
         self.publisher(key).put_bytes(json.dumps(value).encode())
 
-    def withdraw_json(self, key: Key[Any]) -> None:
+    def withdraw(self, key: Key[Any]) -> None:
         """Stop publishing on a key, so that late joiners find nothing there."""
         if (publisher := self._publishers.pop(key, None)) is not None:
             publisher.undeclare()

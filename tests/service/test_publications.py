@@ -134,7 +134,7 @@ def test_bus_declares_no_more_however_often_a_role_is_taken() -> None:
             token = bus.alive(role)
             bus.publisher(bus.keys.event(role))
             bus.publish_json(bus.keys.info(role), {})
-            bus.withdraw_json(bus.keys.info(role))
+            bus.withdraw(bus.keys.info(role))
             token.undeclare()
         counts.append(session.living)
     assert counts == [2, 2, 2]

@@ -202,7 +202,7 @@ def test_nothing_grows_when_a_role_is_taken_again_and_again(join: Any) -> None:
             token = robot.alive(role)
             robot.publisher(KEYS.event(role)).put(replace(EVENT, epoch=epoch, source=role))
             robot.publish_json(KEYS.info(role), {"role": role})
-            robot.withdraw_json(KEYS.info(role))
+            robot.withdraw(KEYS.info(role))
             token.undeclare()
     events = join().subscriber(KEYS.events, capacity=16)
     got = [decode(Event, received(events).payload) for _ in range(2)]
@@ -215,7 +215,7 @@ def test_late_joiners_do_not_get_what_was_withdrawn(join: Any) -> None:
     robot = join(robot=True)
     for role in ("controller", "standby"):
         robot.publish_json(KEYS.info(role), {"role": role})
-    robot.withdraw_json(KEYS.info("controller"))
+    robot.withdraw(KEYS.info("controller"))
     infos = join().subscriber(KEYS.infos, capacity=8)
     assert received(infos).payload == b'{"role": "standby"}'
     robot.publish_json(KEYS.info("standby"), {"role": "last"})

@@ -353,7 +353,7 @@ class Daemon:
         """Publish description and events under the present role from now on."""
         role = self._leadership.role
         self.publish_info()
-        self._bus.withdraw_json(self._bus.keys.info(STANDBY if role == LEADER else LEADER))
+        self._bus.withdraw(self._bus.keys.info(STANDBY if role == LEADER else LEADER))
         self._announcer = Announcer(self._bus, role, self._leadership.epoch)
 
     def publish_info(self) -> None:

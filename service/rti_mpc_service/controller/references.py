@@ -5,7 +5,8 @@ Intake of references for a controller.
 A reference that starts on arrival gets its stamp from the leading controller, which
 publishes it with that stamp: at once, or with the first state that counts if there was
 none. Standbys wait for the stamped reference; otherwise two controllers could follow it
-one sample apart.
+one sample apart. It is withdrawn when the leader forgets it, as the robot was restarted:
+a standby that starts later would follow it on another clock.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ class References:
         self._planned: deque[LaidOut] = deque(maxlen=1)  # from a planner; each deque has one writer, the thread of its intake, in order of age
         self._stamped: deque[LaidOut] = deque(maxlen=1)  # from a leader
         self._last_planned = (0, 0)  # epoch and number of the last reference taken from a planner
+        self._bus = bus
         self._publisher = bus.publisher(bus.keys.anchored)
         self._waiting: LaidOut | None = None  # waits for its stamp
         self._given: Reference | None = None  # to the controller, as it came
@@ -96,8 +98,11 @@ class References:
         self._controller.receive_reference(reference, rows)
 
     def _publish(self) -> None:
-        """Publish what the controller follows, unless it is known, or older than what still waits for a state."""
+        """Publish what the controller follows, or withdraw what it has forgotten, unless it is known, or older than what still waits for a state."""
         followed, given = self._controller.followed, self._given
+        if followed is None and self._known is not None:
+            self._bus.withdraw(self._bus.keys.anchored)
+            self._publisher, self._known = self._bus.publisher(self._bus.keys.anchored), None
         if followed is None or followed is self._known or given is None or epoch_and_seq(followed) != epoch_and_seq(given):
             return
         self._publisher.put(followed)

@@ -26,8 +26,20 @@ from tests.problems import pioneer
 class Published(list[Reference]):
     """Published messages, the newest last."""
 
+    cached: Reference | None = None  # what a late joiner gets
+
     def put(self, message: Reference) -> None:
         self.append(message)
+        self.cached = message
+
+    def withdraw(self, _: object) -> None:
+        self.cached = None
+
+
+def bus_of(published: Published) -> Any:
+    return SimpleNamespace(
+        intake=Intake, keys=SimpleNamespace(anchored="anchored"), publisher=lambda *_, **__: published, withdraw=published.withdraw
+    )
 
 
 class Followed(SimpleNamespace):
@@ -50,9 +62,8 @@ class Rig:
 
     def __init__(self) -> None:
         self.published, self.controller = Published(), Followed()
-        bus: Any = SimpleNamespace(intake=Intake, keys=SimpleNamespace(anchored="anchored"), publisher=lambda *_, **__: self.published)
         controller: Any = self.controller
-        self.references = References(bus, controller, ny=3)
+        self.references = References(bus_of(self.published), controller, ny=3)
 
     def planner(self, *messages: Reference) -> None:
         self.references.from_planner(sent(*messages))
@@ -76,8 +87,7 @@ class Pair:
         self.controllers[1].stand_by()
         self.references = []
         for controller in self.controllers:
-            bus: Any = SimpleNamespace(intake=Intake, keys=SimpleNamespace(anchored="anchored"), publisher=lambda *_, **__: self.published)
-            self.references.append(References(bus, controller, ny=3))
+            self.references.append(References(bus_of(self.published), controller, ny=3))
         self.delivered = 0
         self.leader: int | None = 0
 
@@ -193,8 +203,7 @@ def test_leader_follows_planners_alone() -> None:
 
 def test_controlling_thread_does_nothing_for_each_row_of_a_reference(rtis: list[Rti], monkeypatch: pytest.MonkeyPatch) -> None:
     controller = Controller(rtis[0], Timing(), compile=False)
-    bus: Any = SimpleNamespace(intake=Intake, keys=SimpleNamespace(anchored="anchored"), publisher=lambda *_, **__: Published())
-    references = References(bus, controller, ny=3)
+    references = References(bus_of(Published()), controller, ny=3)
     message = reference(circle())
     waiting = iter([Received(encode(message), encoding(type(message)), "reference"), None])
     subscriber: Any = SimpleNamespace(recv=lambda: next(waiting))
@@ -245,6 +254,20 @@ def test_reference_sent_to_a_life_that_ended_before_it_was_believed_is_not_follo
     pair.drive(2, range(200, 300, 100), 103_100)
     pair.drive(3, range(100, 1000, 100), 110_000)
     assert pair.stamps_ms == [None, None]
+
+
+def test_reference_of_the_last_life_is_withdrawn_from_those_that_come_late(pair: Pair) -> None:
+    """Its stamp is of another clock: a standby that starts after the restart would follow it for as long as that clock was ahead."""
+    pair.plan(planned(1))
+    pair.drive(1, range(100_000, 102_000, 100), 100_000)
+    assert pair.published.cached is not None
+    pair.drive(2, range(100, 1000, 100), 103_000)
+    assert pair.stamps_ms[:2] == [None, None]
+    assert pair.published.cached is None
+    pair.plan(planned(2))
+    pair.drive(2, range(1000, 1200, 100), 103_900)
+    assert pair.published.cached is not None
+    assert pair.published.cached.seq == 2
 
 
 def test_reference_that_came_with_a_refused_state_starts_once_for_leader_and_standby(pair: Pair) -> None:
