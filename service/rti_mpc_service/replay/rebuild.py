@@ -164,6 +164,8 @@ def configuration(files: Mapping[str, str], temporary: Path, *, folder: Path, tr
     module, _, function = config.model.name.partition(":")
     if function:
         own = Path(module).stem if module.endswith(".py") else module
+        if "/" in own or not all(own.split(".")):  # before it is made a path
+            raise ConfigError(f"the recorded model must be of a module or of a file FILE.py, got {module!r}")
         attached = next((text for name, text in files.items() if name == f"{own.rpartition('.')[2]}.py"), None)
         if trust and attached is not None:
             source = temporary / f"{own.replace('.', '/')}.py"

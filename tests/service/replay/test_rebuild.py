@@ -21,7 +21,7 @@ from rti_mpc_service.init import main as init
 from rti_mpc_service.replay import replay
 from rti_mpc_service.replay.drive import Drive, drive
 from rti_mpc_service.replay.place import find
-from rti_mpc_service.replay.rebuild import Journaled, rebuild
+from rti_mpc_service.replay.rebuild import CONFIGURATION, Journaled, configuration, rebuild
 from rti_mpc_service.replay.replay import lines, overridden, play
 from rti_mpc_service.replay.why import explain
 from rti_mpc_service.shipped import SHIPPED
@@ -114,6 +114,16 @@ def test_source_of_a_model_of_ones_own_runs_only_if_it_is_here_or_trusted(tmp_pa
     account = play(journal, rebuild(journal, folder=elsewhere, trust=True))
     assert account.on.outcome.samples > 5
     assert not account.on.outcome.differing
+
+
+@pytest.mark.parametrize("module", ["{folder}/evil", "../evil", "..evil", "evil.", "..evil.py"])
+def test_source_that_would_leave_its_folder_is_refused(journal: Journaled, tmp_path: Path, module: str) -> None:
+    named = SHIPPED.read_text().replace('name = "pioneer_3dx"', f'name = "{module.format(folder=tmp_path)}:make"')
+    files = {CONFIGURATION: named, "evil.py": "", "evil..py": "", ".py": ""}
+    (tmp_path / "home").mkdir()
+    with pytest.raises(ConfigError, match=r"must be of a module or of a file FILE\.py"):
+        configuration(files, tmp_path / "home", folder=tmp_path, trust=True)
+    assert not (tmp_path / "evil.py").exists()
 
 
 def with_data(journal: Journaled, kind: JournalKind, change: Callable[[bytes], bytes]) -> Journaled:
