@@ -96,6 +96,13 @@ def viewer(tmp_path: Path) -> Iterator[Viewer]:
     viewer.kill()
 
 
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A busy host may need seconds for what takes milliseconds."""
+    monkeypatch.setattr("rti_mpc_service.view.outlet.FILE_CLOSE_TIMEOUT_S", 60.0)
+
+
+@pytest.mark.usefixtures("patient")
 def test_a_closed_file_holds_everything_offered(tmp_path: Path) -> None:
     outlet = file_outlet(tmp_path / "folder" / "run.rrd", "robot")
     outlet.offer([Entry(0, INFO)])
@@ -105,6 +112,7 @@ def test_a_closed_file_holds_everything_offered(tmp_path: Path) -> None:
     assert values(tmp_path / "folder" / "run.rrd") == list(range(1000))
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_recording_has_no_footer_for_which_to_remember_every_chunk(tmp_path: Path) -> None:
     """Rerun would keep the particulars of each in memory until the end: hundreds of MiB an hour."""
     outlet = file_outlet(tmp_path / "run.rrd", "robot")
@@ -113,6 +121,7 @@ def test_a_recording_has_no_footer_for_which_to_remember_every_chunk(tmp_path: P
     assert not check_for_rrd_footer(str(tmp_path / "run.rrd"))
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_recording_replaces_an_older_one(tmp_path: Path) -> None:
     for k in range(2):
         outlet = file_outlet(tmp_path / "run.rrd", "robot")
