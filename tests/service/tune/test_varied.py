@@ -34,7 +34,7 @@ def test_weights_of_the_position_stay_unless_they_are_asked_for() -> None:
     [
         ("ocp.dt_s", "--vary must name one of ocp.weights.Q.NAME, "),
         ("sim.actuator_lag_s=0:1", "--vary must name one of"),
-        ("ocp.weights.Q.phi", "ocp.weights.Q.phi must be one number in the robot's file, got None"),
+        ("ocp.weights.Q.phi", "--vary ocp.weights.Q.phi must name one of x, y, psi, got 'phi'"),
         ("ocp.weights.Q.psi=1", "--vary must be KEY or KEY=LOW:HIGH, two numbers with LOW < HIGH, got 'ocp.weights.Q.psi=1'"),
         ("ocp.weights.Q.psi=2:1", "two numbers with LOW < HIGH"),
         ("ocp.weights.Q.psi=nan:1", "two numbers with LOW < HIGH"),
