@@ -221,10 +221,12 @@ def test_folder_that_is_a_file_is_refused_before_anything_is_driven(tmp_path: Pa
 
 @pytest.mark.slow
 def test_recording_that_says_too_little_for_a_comparison_is_told_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """From where it has ended, without states, and of a robot that follows nothing after the first half, of which JSON has no NaN."""
+    """From where it has ended or is about to, without states, and of a robot that follows nothing after the first half, of which JSON has no NaN."""
     path = recorded(journal_of(SHIPPED, samples=20, acts={8: stop}), tmp_path / "run.mcap")
-    assert main(path, make_body=lockstep_robot, start_s=7.0) == 0
-    assert "no closed loop: --from must be before this controller's last state, 1.8 s after its first one, got 7 s" in capsys.readouterr().out
+    with pytest.raises(ConfigError, match=r"--from must be a time of the robot's clock in the recording, from 0\.000 s to 1\.900 s, got 7\.000 s"):
+        main(path, make_body=lockstep_robot, start_s=7.0)
+    assert main(path, make_body=lockstep_robot, start_s=1.9) == 0
+    assert "no closed loop: " in capsys.readouterr().out
     with pytest.raises(ConfigError, match=r"--out must have a recording with the states of pioneer, got .* with its journal alone"):
         main(path, make_body=lockstep_robot, out=tmp_path / "out")
     main(path, make_body=lockstep_robot, json_path=tmp_path / "run.json")
