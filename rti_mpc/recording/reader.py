@@ -24,8 +24,6 @@ from rti_mpc.wire.received import Received
 from rti_mpc.wire.streams import STREAMS, Kind, Stream
 
 STREAM_OF_NAME: dict[str, Stream[Any]] = {stream.name: stream for stream in (*STREAMS, HOST) if stream.kind is Kind.MESSAGE}
-
-
 TIME = re.compile(r"-?[0-9]{1,19}")
 NAMED = {"robot", "role", "key", "encoding"}  # what each channel says of itself, besides its stream
 

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 import numpy as np
 import pytest
 
@@ -70,23 +72,28 @@ def restarts() -> Family:
     return FAMILIES["restarts"][0](20)
 
 
-def steps_and_commands(family: Family) -> tuple[int, Array]:
-    """Drive ten samples, each SOLVED; return the steps of the interior point and the commands."""
-    rti = Rti(family.ocp, compile=False)
-    assert rti.active_set is not None
-    steps, commands = 0, []
-    for k in range(10, 20):
+def driven(family: Family, rti: Rti, numbers: Iterable[int]) -> Iterator[Array]:
+    """Drive through samples of a family, each of which is SOLVED; yield the command of each."""
+    x, u = np.zeros(family.ocp.model.nx), family.u0
+    for k in numbers:
         if (start := family.start(k)) is not None:
             x, u = start, family.u0
             rti.reset(x, u)
         y_ref, p = family.at(k)
         rti.prepare(y_ref, p, shift=start is None, u_prev=u)
         assert rti.feedback(x) is QpStatus.SOLVED
-        steps += rti.active_set.steps
         u = rti.u[0].copy()
         x = family.plant(x, u)
-        commands.append(u)
-    return steps, np.array(commands)
+        yield u
+
+
+def steps_and_commands(family: Family) -> tuple[int, Array]:
+    """Drive ten samples; return the steps of the interior point and the commands."""
+    rti = Rti(family.ocp, compile=False)
+    one = rti.active_set
+    assert one is not None
+    steps, commands = zip(*((one.steps, u) for u in driven(family, rti, range(10, 20))), strict=True)
+    return sum(steps), np.array(commands)
 
 
 def test_a_samples_next_qp_starts_from_an_iterate_of_the_last_one_in_fewer_steps_to_the_same_plan(
@@ -125,19 +132,12 @@ def test_where_a_start_from_the_last_qp_leads_nowhere_the_interior_point_starts_
 def test_families_whose_places_do_not_settle_are_solved_in_a_bounded_number_of_roll_outs_and_steps(name: str, N: int) -> None:
     family = FAMILIES[name][0](N)
     rti = Rti(family.ocp, formulation="simultaneous")
-    x, u = np.zeros(family.ocp.model.nx), family.u0
+    one = rti.active_set
+    assert one is not None
     most, stepped = 0, 0
-    for k in range(family.samples):
-        if (start := family.start(k)) is not None:
-            x, u = start, family.u0
-            rti.reset(x, u)
-        y_ref, p = family.at(k)
-        rti.prepare(y_ref, p, shift=start is None, u_prev=u)
-        assert rti.feedback(x) is QpStatus.SOLVED
-        assert rti.solver is rti.active_set
-        most = max(most, rti.solver.iterations)
-        stepped += rti.active_set.steps > 0
-        u = rti.u[0].copy()
-        x = family.plant(x, u)
+    for _ in driven(family, rti, range(family.samples)):
+        assert rti.solver is one
+        most = max(most, one.iterations)
+        stepped += one.steps > 0
     assert most <= MOST
     assert stepped > 0

@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from threading import Event
 
@@ -14,7 +13,6 @@ import pytest
 from rti_mpc.contract.guard import Guard
 from rti_mpc.contract.message import Command
 from rti_mpc.control.controller import Controller
-from rti_mpc.wire import bus as bus_module
 from rti_mpc.wire.bus import BusSettings
 from rti_mpc.wire.cdr import decode
 from rti_mpc_service import guard
@@ -36,13 +34,9 @@ class All(dict[str, bytes]):
 
 
 @pytest.fixture
-def session(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeSession]:
-    session = FakeSession()
+def session(session: FakeSession) -> FakeSession:
     session.put = All()
-    monkeypatch.setattr(bus_module, "ZenohSession", lambda *_, **__: session)
-    yield session
-    gc.enable()  # which a controller disables
-    gc.unfreeze()
+    return session
 
 
 def fail_from(count: int) -> Callable[..., None]:

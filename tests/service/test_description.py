@@ -3,16 +3,13 @@
 
 from __future__ import annotations
 
-import gc
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from threading import Event
 
 import pytest
 
 from rti_mpc.errors import ConfigError
-from rti_mpc.wire import bus as bus_module
 from rti_mpc.wire.bus import BusSettings
 from rti_mpc.wire.document import MAX_DOCUMENT_BYTES, read
 from rti_mpc.wire.info import Info, Leader, latches
@@ -26,15 +23,6 @@ from rti_mpc_service.shipped import SHIPPED
 from tests.wire.fake_session import FakeSession
 
 LONG = 1000  # stages, the most that are allowed
-
-
-@pytest.fixture
-def session(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeSession]:
-    session = FakeSession()
-    monkeypatch.setattr(bus_module, "ZenohSession", lambda *_, **__: session)
-    yield session
-    gc.enable()  # which a controller disables
-    gc.unfreeze()
 
 
 def test_weights_of_each_of_many_stages_are_left_out_and_that_is_said(tmp_path: Path) -> None:

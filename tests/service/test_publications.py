@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from threading import Event
 
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 
 from rti_mpc.contract.message import State
-from rti_mpc.wire import bus as bus_module
 from rti_mpc.wire.bus import Bus, BusSettings, Received
 from rti_mpc.wire.info import Info, Leader, latches
 from rti_mpc.wire.keys import Keys
@@ -38,15 +36,11 @@ STOPPED.set()
 
 
 @pytest.fixture
-def session(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeSession]:
-    session = FakeSession()
-    for module in (bus_module, relay):
-        monkeypatch.setattr(module, "ZenohSession", lambda *_, **__: session)
+def session(session: FakeSession, monkeypatch: pytest.MonkeyPatch) -> FakeSession:
+    monkeypatch.setattr(relay, "ZenohSession", lambda *_, **__: session)
     for module in (echo, relay):
         monkeypatch.setattr(module, "stop_on_signals", lambda: STOPPED)
-    yield session
-    gc.enable()  # which a controller disables
-    gc.unfreeze()
+    return session
 
 
 def may(*roles: str) -> set[Said]:

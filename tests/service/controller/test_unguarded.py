@@ -3,16 +3,13 @@
 
 from __future__ import annotations
 
-import gc
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from threading import Event
 
 import pytest
 
 from rti_mpc.contract.message import Severity
-from rti_mpc.wire import bus as bus_module
 from rti_mpc.wire.bus import BusSettings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_stop
@@ -20,15 +17,6 @@ from rti_mpc_service.controller import daemon
 from rti_mpc_service.shipped import SHIPPED
 from tests.movers import toml
 from tests.wire.fake_session import FakeSession
-
-
-@pytest.fixture
-def session(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeSession]:
-    session = FakeSession()
-    monkeypatch.setattr(bus_module, "ZenohSession", lambda *_, **__: session)
-    yield session
-    gc.enable()  # which a controller disables
-    gc.unfreeze()
 
 
 def test_only_a_robot_that_does_not_hold_and_has_no_guard_is_told_what_a_lost_controller_leaves(tmp_path: Path) -> None:
