@@ -114,6 +114,12 @@ def cross(x: Array) -> list[Array]:
     return [placed(np.array(ends), x[0], x[1], x[5]) for ends in ([(-0.25, 0.0), (0.25, 0.0)], [(0.0, -0.25), (0.0, 0.25)])]
 
 
+def turned_cross(x: Array) -> list[Array]:
+    """Sketch the same arms, turned by the yaw of a quaternion."""
+    w, i, j, k = x[3:7]
+    return cross(np.array([*x[:2], 0.0, 0.0, 0.0, np.arctan2(2 * (w * k + i * j), w**2 + i**2 - j**2 - k**2)]))
+
+
 def plane(sketch: Sketch, **more: tuple[float, ...]) -> View:
     """Return the view of a robot in the plane from above."""
     return View(("x", "y"), lambda x: x[:2], lambda y: y[:2], sketch, **more)
@@ -131,6 +137,7 @@ VIEWS: dict[str, View] = {
     "omnidirectional": plane(body(box(-0.29, 0.29, 0.38), ARROW), times=(0.0, 0.1, 0.2, 0.3, 0.4)),
     "boat": plane(body(np.array([(0.9, 0.0), (0.3, 0.4), (-0.8, 0.4), (-0.8, -0.4), (0.3, -0.4), (0.9, 0.0)])), times=(0.0, 0.3, 0.6, 0.9)),
     "quadrotor": plane(cross),
+    "quadrotor_quaternion": plane(turned_cross),
     "two_link_arm": View(("x", "z"), tip, lambda y: y, arm, (0.0, 0.33, 0.36, 0.39)),
     "cart_pole": View(("x", "z"), pole_end, None, lambda x: [np.array([(x[0], 0.0), pole_end(x)]), np.array([(x[0] - 0.2, 0.0), (x[0] + 0.2, 0.0)])]),
     "chain": View(("y", "z"), lambda x: x[7:9], lambda y: y[1:3], chain, (0.0, 0.08, 0.16, 0.25)),
@@ -177,8 +184,7 @@ def drive(name: str) -> Drive:
     model, times, states = find_model(name), np.array(t), np.array(x)
     y_ref = np.column_stack([np.interp(times, scenario.period_s * np.arange(len(y)), column) for column in y.T])
     outputs = np.array(model.h()(states.T, model.p_nominal)).reshape(model.ny, -1).T
-    error = outputs - y_ref
-    error -= np.array([2 * np.pi * signal.angle for signal in model.outputs]) * np.round(error / (2 * np.pi))
+    error = model.rotations("outputs").difference(outputs, y_ref)
     return Drive(model, scenario.name, times, states, y_ref, error)
 
 

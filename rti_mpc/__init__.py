@@ -39,6 +39,7 @@ References, cited by key throughout:
 * [Irons1969] B. M. Irons, R. C. Tuck, "A version of the Aitken accelerator for computer iteration", Int. J. Numer. Methods Eng. 1(3), 1969.
 * [Ghadimi2015] E. Ghadimi, A. Teixeira, I. Shames, M. Johansson, "Optimal parameter selection for the alternating direction method of
   multipliers (ADMM): quadratic problems", IEEE Trans. Autom. Control 60(3), 2015.
+* [Sola2017] J. Solà, "Quaternion kinematics for the error-state Kalman filter", arXiv:1711.02508, 2017.
 * [Stellato2020] B. Stellato et al., "OSQP: an operator splitting solver for quadratic programs", Math. Prog. Comp. 12, 2020.
 * [FanYuan2005] J. Fan, Y. Yuan, "On the quadratic convergence of the Levenberg-Marquardt method without nonsingularity assumption", Computing 74,
   2005.

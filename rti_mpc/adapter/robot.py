@@ -25,6 +25,7 @@ from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.message import Command, Notice, Severity, State
 from rti_mpc.contract.schedule import unfit
 from rti_mpc.errors import ConfigError
+from rti_mpc.rotation import Rotations
 from rti_mpc.wire.actuator import STALE_NS, Actuator
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, new_epoch
@@ -54,6 +55,7 @@ class RobotAdapter:
         increments: Mapping[str, tuple[float, float]],
         u_rest: Mapping[str, float] | None = None,
         angles: Sequence[bool] = (),
+        quaternions: Sequence[Sequence[int]] = (),
         guarded: bool = False,
         prefix: str = "rti_mpc",
         bus: BusSettings | None = None,
@@ -70,6 +72,7 @@ class RobotAdapter:
             u_rest: Inputs at rest that are not 0.
             angles: Which states are angles, in the order of the model, for a robot that needs feedback to stay at rest: then the states
                 that are sent correct its way to rest. Left out: the rows of the way act as they are.
+            quaternions: Places of w, x, y and z of each attitude among them.
             guarded: Whether a guard runs: then only what it passes on is taken.
             prefix: What all keys begin with.
             bus: How to join; None: a peer that listens on the usual endpoint, where the others look for the robot.
@@ -79,7 +82,8 @@ class RobotAdapter:
             ConfigError: A name or a number does not fit, or the endpoint is taken.
         """
         rest = u_rest or {}
-        check_limits(dt_s, inputs, increments, rest, angles)
+        check_limits(dt_s, inputs, increments, rest)
+        rotations = known_rotations(angles, quaternions)
         self.inputs = tuple(inputs)
         lbu, ubu = np.array([inputs[name] for name in self.inputs], dtype=np.float64).T
         lbdu, ubdu = np.array([increments.get(name, NO_LIMIT) for name in self.inputs], dtype=np.float64).T
@@ -92,9 +96,9 @@ class RobotAdapter:
             epoch,
             bounds=(lbu, ubu),
             increments=Increments(lbdu, ubdu, dt_ns),
-            angles=np.array(angles, dtype=bool),
+            rotations=rotations,
         )
-        self._nx = len(angles)  # 0: no state corrects anything
+        self._nx = rotations.size  # 0: no state corrects anything
         self._measured_ns = 0  # time of the last state that does
         self._played_ns = time.monotonic_ns()
         settings = bus or BusSettings(listen=(RENDEZVOUS_ENDPOINT,))
@@ -195,7 +199,6 @@ def check_limits(
     inputs: Mapping[str, tuple[float, float]],
     increments: Mapping[str, tuple[float, float]],
     u_rest: Mapping[str, float],
-    angles: Sequence[bool],
 ) -> None:
     """
     Check the limits of a robot.
@@ -210,11 +213,25 @@ def check_limits(
     for what, table in (("increments", increments), ("u_rest", u_rest)):
         if unknown := [name for name in table if name not in inputs]:
             raise ConfigError(f"{what}.{unknown[0]} must be one of the inputs {', '.join(inputs)}")
-    if not all(isinstance(angle, bool | np.bool_) for angle in angles):
-        raise ConfigError(f"angles must say of each state whether it is an angle, such as [False, True], got {list(angles)}")
     for name, (lower, upper) in inputs.items():
         if not lower <= (rest := u_rest.get(name, 0.0)) <= upper:
             raise ConfigError(f"inputs.{name} must hold the input at rest, {rest:g}, got {[lower, upper]}")
     for name, (lower, upper) in increments.items():
         if not lower < 0.0 < upper:
             raise ConfigError(f"increments.{name} must go from below 0 to above 0, got {[lower, upper]}")
+
+
+def known_rotations(angles: Sequence[bool], quaternions: Sequence[Sequence[int]]) -> Rotations:
+    """
+    Return the rotations among the states of a robot.
+
+    Raises:
+        ConfigError: One is not among its states.
+    """
+    if not all(isinstance(angle, bool | np.bool_) for angle in angles):
+        raise ConfigError(f"angles must say of each state whether it is an angle, such as [False, True], got {list(angles)}")
+    plain = [i for i, angle in enumerate(angles) if not angle]
+    for places in quaternions:
+        if len(places) != 4 or len(set(places)) < 4 or not all(place in plain for place in places):
+            raise ConfigError(f"quaternions must be places of w, x, y, z among the states, of none that is an angle, got {list(places)}")
+    return Rotations(len(angles), tuple(np.flatnonzero(angles).tolist()), tuple((w, x, y, z) for w, x, y, z in quaternions))

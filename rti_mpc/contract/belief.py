@@ -19,8 +19,9 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
-from rti_mpc.contract.schedule import BEFORE_ALL_NS, NO_ANGLES, Plan, Schedule
+from rti_mpc.contract.schedule import BEFORE_ALL_NS, UNKNOWN, Plan, Schedule
 from rti_mpc.contract.way import Way
+from rti_mpc.rotation import Rotations
 
 START_TOLERANCE_PERIODS = 0.1  # a command may begin to act this much sooner or later than believed
 OVERDUE_PERIODS = 1.0  # a command that does not act this long after its time is missing; until then it is still expected
@@ -42,7 +43,7 @@ class Belief(Schedule):
         slew: Array,
         increments: Increments,
         bounds: tuple[float | Array, float | Array] = (-np.inf, np.inf),
-        angles: Array = NO_ANGLES,
+        rotations: Rotations = UNKNOWN,
     ) -> None:
         """Begin at rest; the arguments are those of `Schedule`."""
         self._missing: deque[Plan] = deque(maxlen=MAX_MISSING_PLANS)
@@ -51,7 +52,7 @@ class Belief(Schedule):
         self._period_ns = increments.dt_ns
         self._overdue_ns = round(OVERDUE_PERIODS * increments.dt_ns)
         self._tolerance_ns = round(START_TOLERANCE_PERIODS * increments.dt_ns)
-        super().__init__(u_rest, slew, increments, bounds, angles)
+        super().__init__(u_rest, slew, increments, bounds, rotations)
 
     def brake(self, u: Array, t_ns: int) -> None:
         """Drop every plan: the inputs ramp to rest from `u`, shape ``(nu,)``, beginning at a time."""

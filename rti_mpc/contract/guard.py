@@ -74,7 +74,7 @@ class Guard:
         self._clock = RobotClock()
         increments = Increments(limits.lbdu, limits.ubdu, self._dt_ns)
         # The plans that were passed to the robot, and its way to rest after them.
-        self._schedule = Belief(limits.u_rest, limits.slew, increments, (limits.lbu, limits.ubu), limits.angles)
+        self._schedule = Belief(limits.u_rest, limits.slew, increments, (limits.lbu, limits.ubu), limits.rotations)
         self._state: State | None = None  # the last one that came in time
         self._heard_ns = 0  # stamp of the last state
         self._late = Backlog()

@@ -9,14 +9,15 @@ of them is held, and from when on.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Command
-from rti_mpc.contract.schedule import NO_ANGLES, end_ns
+from rti_mpc.contract.schedule import UNKNOWN, end_ns
+from rti_mpc.rotation import Rotations
 
 MAX_VALID_NS = 300_000_000  # robot time: a command ends at the latest this long after its state and the delay, whatever its own validity
 INPUT_TOLERANCE = 1e-6  # in the unit of the input: above any rounding, single precision included, and below what an actuator resolves
@@ -37,7 +38,7 @@ class Limits:
         dt_s: Period of the controller, s.
         delay_s: Delay from a state to the time at which its command acts, s.
         stale_s: Age from which neither a state nor a command that answers it is used, s of the robot.
-        angles: Which states are angles, shape ``(nx,)``, for ways to rest that need feedback; empty: none is known, and none of those may pass.
+        rotations: Among the states, for ways to rest that need feedback; of size 0: none is known, and none of those may pass.
     """
 
     u_rest: Array
@@ -48,7 +49,7 @@ class Limits:
     dt_s: float
     delay_s: float = 0.0
     stale_s: float = 0.25
-    angles: Array = field(default_factory=lambda: NO_ANGLES)
+    rotations: Rotations = UNKNOWN
 
     @cached_property
     def slew(self) -> Array:
@@ -80,8 +81,8 @@ class Limits:
 
     def objection(self, command: Command) -> str:
         """Return what is wrong with the rows of a command, as a code and a reason; empty if nothing is."""
-        if len(command.K) and len(self.angles) != command.K.shape[1]:
-            return f"wrong_shape: its way to rest feeds {command.K.shape[1]} states back, of {len(self.angles)} that are known"
+        if len(command.K) and self.rotations.size != command.K.shape[1]:
+            return f"wrong_shape: its way to rest feeds {command.K.shape[1]} states back, of {self.rotations.size} that are known"
         for u, period_ns, of in judged(command):
             if (u < self.lbu - INPUT_TOLERANCE).any() or (u > self.ubu + INPUT_TOLERANCE).any():
                 return f"out_of_bounds: inputs{of} reach from {u.min(axis=0).tolist()} to {u.max(axis=0).tolist()}"

@@ -22,6 +22,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments, approach, segments, within
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.way import Way
+from rti_mpc.rotation import Rotations
 
 RAMP_STEP_NS = 10_000_000  # the ramp to rest is a staircase of steps of this duration
 NEVER_NS = 2**63  # later than every time
@@ -32,7 +33,7 @@ ROWS_AT_ONCE = 32  # rows of a way to rest that are approached at once; later on
 MAX_CORRECTIONS = 16  # per period, of a way to rest by states: each is a plan that is kept
 WAY_ROUNDING = 1e-9  # relative: so that a way to rest of a whole number of steps takes no further one
 NO_COMMAND = (0, 0)  # epoch and sequence number of inputs that come from no command
-NO_ANGLES: Array = np.zeros(0)  # of a robot whose states are not known
+UNKNOWN = Rotations()  # of a robot whose states are not known
 
 
 def unfit(command: Command, nu: int, robot_epoch: int, nx: int | None = None) -> str:
@@ -131,7 +132,7 @@ class Schedule:
         slew: Array,
         increments: Increments | None = None,
         bounds: tuple[float | Array, float | Array] = (-np.inf, np.inf),
-        angles: Array = NO_ANGLES,
+        rotations: Rotations = UNKNOWN,
     ) -> None:
         """
         Begin at rest.
@@ -141,13 +142,13 @@ class Schedule:
             slew: Largest rate of the ramp to rest, shape ``(nu,)``, in the input's unit per s; infinite where there is no limit.
             increments: Slew limits inside which plans are approached; None: their rows act as they are.
             bounds: Of the inputs on a way to rest, with what feedback adds to them, shape ``(nu,)``.
-            angles: Which of the states that are fed back are angles, shape ``(nx,)``.
+            rotations: Among the states that are fed back.
         """
         self.u_rest: Array = np.array(u_rest, dtype=np.float64)
         self._slew = 1e-9 * np.asarray(slew, dtype=np.float64)  # per ns
         self._increments = increments
         self._bounds = bounds
-        self._angles = angles
+        self._rotations = rotations
         self._spacing_ns = 0 if increments is None else increments.dt_ns // MAX_CORRECTIONS
         self._plans: deque[Plan] = deque()  # by start; those of the past as far as `forget` has left them
         self.brake(self.u_rest, BEFORE_ALL_NS)
@@ -247,7 +248,7 @@ class Schedule:
         plan, plans = self.acting(t_ns), self._plans
         if plan is None or plan.way is None or t_ns < plan.end_ns:
             return False
-        way = plan.way.corrected(x, stamp_ns, self._angles)
+        way = plan.way.corrected(x, stamp_ns, self._rotations)
         if way is plan.way or (plan.start_ns == plan.end_ns > t_ns - self._spacing_ns and x is not None):
             return False
         u = self.at(t_ns - 1)[0]

@@ -19,9 +19,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rti_mpc.angle import whole_turns
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Command
+from rti_mpc.rotation import Rotations
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -72,14 +72,14 @@ class Way:
         """Return it with row 0 at another time."""
         return replace(self, stamp_ns=stamp_ns)
 
-    def corrected(self, x: Array | None, t_ns: int, angles: Array) -> Way:
+    def corrected(self, x: Array | None, t_ns: int, rotations: Rotations) -> Way:
         """
         Return it as the state of a time corrects it; itself if that says nothing: it is from before row 0, or of another size.
 
         Args:
-            x: State, shape ``(nx,)``, its angles with any whole turns; None: none is known, and the rows act as they are.
+            x: State, shape ``(nx,)``, its rotations written in any way; None: none is known, and the rows act as they are.
             t_ns: Its time.
-            angles: Which states are angles, shape ``(nx,)``.
+            rotations: Among the states.
         """
         if x is None:
             return replace(self, correction=np.zeros_like(self.correction)) if self.correction.any() else self
@@ -89,12 +89,5 @@ class Way:
         row = min(int(place), len(self.x) - 1)
         after = min(row + 1, len(self.x) - 1)
         share = min(place - row, 1.0)  # of the step to the next row's state
-        along = unturned(self.x[after] - self.x[row], angles)
-        return replace(self, correction=-self.K @ unturned(x - self.x[row] - share * along, angles))
-
-
-def unturned(difference: Array, angles: Array) -> Array:
-    """Return a difference of states, shape ``(nx,)``, without whole turns in those that are angles."""
-    for i in np.flatnonzero(angles):
-        difference[i] -= whole_turns(float(difference[i]))
-    return difference
+        planned = self.x[row] + share * rotations.difference(self.x[after], self.x[row])
+        return replace(self, correction=-self.K @ rotations.difference(x, planned))

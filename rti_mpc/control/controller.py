@@ -128,8 +128,7 @@ class Controller:
         self._states = StateStream(model, self._stale_ns, self.grid.dt_ns, settling_s, observer)
         self.np_ = model.np_ - len(self._states.d)
         self._track = Track(model, ocp.N, self.grid.dt_ns, compile=compile)
-        angles = np.array([signal.angle for signal in model.states])
-        self._sent = Sent(self._u_rest, lbdu, ubdu, self.grid.dt_ns, (lbu, ubu), angles)
+        self._sent = Sent(self._u_rest, lbdu, ubdu, self.grid.dt_ns, (lbu, ubu), model.rotations("states"))
         self._reports = Reports(self._sent, self.envelope.limits)
         self._prediction = Prediction(model, self._sent, compile=compile)
         self._x0 = self._prediction.x

@@ -97,10 +97,14 @@ class Observer:
         for what, table in (("noise", settings.noise), ("process", settings.process)):
             for name, value in table.items():
                 given.number(f"{what} of {name}", value)
+        self._rotations = model.rotations("states")
         self.model = with_disturbances(model, settings.disturbances)
         nx, nd = model.nx, len(settings.disturbances)
         self._limits: Array = np.array([of.limit for of in settings.disturbances.values()])
         measured = [j for j, name in enumerate(states) if not settings.measured or name in settings.measured]
+        for places in self._rotations.quaternions:
+            if not set(places) <= set(measured):
+                raise OcpError(f"measured must have all of a quaternion, {', '.join(states[j] for j in places)}, got {', '.join(settings.measured)}")
         variances = [settings.noise.get(states[j], DEFAULT_NOISE) ** 2 for j in measured]
         if min(variances, default=1.0) <= 0.0:
             raise OcpError(f"the noise of a measured state must be positive, got {dict(settings.noise)}")
@@ -137,11 +141,12 @@ class Observer:
         self._z[:], self._P[:] = self._predicted
 
     def correct(self, y: Array) -> None:
-        """Correct by a state, shape ``(nx,)``, its angles within half a turn of those of `x`; components that are not measured are ignored."""
+        """Correct by a state, shape ``(nx,)``, its rotations written near to those of `x`; components that are not measured are ignored."""
         self._predicted[0][:], self._predicted[1][:] = self._z, self._P
         self._y[:] = y
         self._gain[0] = not self.frozen
         self._correct()
+        self._rotations.normalize(self.x)
 
     @property
     def finite(self) -> bool:

@@ -17,7 +17,8 @@ from rti_mpc.array import Array
 from rti_mpc.contract.approach import SLEW_WINDOW_PERIODS, Increments
 from rti_mpc.contract.belief import Belief
 from rti_mpc.contract.message import Command
-from rti_mpc.contract.schedule import BEFORE_ALL_NS, NO_ANGLES, Plan, Schedule, end_ns
+from rti_mpc.contract.schedule import BEFORE_ALL_NS, UNKNOWN, Plan, Schedule, end_ns
+from rti_mpc.rotation import Rotations
 
 TRANSIT_PERIODS = 0.1  # a command may take this long to arrive; the plan before it acts until then
 
@@ -37,7 +38,7 @@ class Sent:
         ubdu: Array,
         dt_ns: int,
         bounds: tuple[float | Array, float | Array] = (-inf, inf),
-        angles: Array = NO_ANGLES,
+        rotations: Rotations = UNKNOWN,
     ) -> None:
         self.delay_ns = 0
         self._left_ns = BEFORE_ALL_NS  # when the last command left at the earliest
@@ -50,8 +51,8 @@ class Sent:
         self._transit_ns, self._window_ns = round(TRANSIT_PERIODS * dt_ns), round(SLEW_WINDOW_PERIODS * dt_ns)
         slew = 1e9 * np.minimum(-lbdu, ubdu) / dt_ns
         increments = Increments(lbdu, ubdu, dt_ns)
-        self._schedule = Belief(u_rest, slew, increments, bounds, angles)
-        self._slowest = Schedule(u_rest, slew, increments, bounds, angles)  # the same if each command took the longest transit time
+        self._schedule = Belief(u_rest, slew, increments, bounds, rotations)
+        self._slowest = Schedule(u_rest, slew, increments, bounds, rotations)  # the same if each command took the longest transit time
 
     def append(self, command: Command, left_ns: int = BEFORE_ALL_NS) -> None:
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The states of one robot: its life, its clock and its state vector, with angles that do not wrap."""
+"""The states of one robot: its life, its clock and its state vector, with rotations written as near to those of the state before as they can be."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from rti_mpc.angle import whole_turns
 from rti_mpc.array import Array, bounded
 from rti_mpc.contract.cadence import Cadence
 from rti_mpc.contract.lives import Heard, Lives
@@ -47,7 +46,7 @@ class StateStream:
         lives: Lives of the robot that were heard, and which of them is followed.
         cadence: Judge of sequence numbers and of the unit of the stamps.
         last: The newest state, None before the first.
-        x: That state, shape ``(nx,)``, its angles nearest to those of the state before; or the observer's estimate of it.
+        x: That state, shape ``(nx,)``, its rotations written nearest to those of the state before; or the observer's estimate of it.
         d: Estimated disturbances, shape ``(nd,)``; empty without an observer.
         clock: The robot's clock.
         before_ns: Arrival of the newest state in robot time, by the clock as it was before that state.
@@ -78,7 +77,7 @@ class StateStream:
         self._stale_ns = stale_ns
         self._observer = observer
         self._before_ns: int | None = None  # stamp of the state before the last one
-        self._angles = [j for j, signal in enumerate(model.states) if signal.angle]
+        self._rotations = model.rotations("states")
 
     def receive(self, state: State, arrival_ns: int) -> Arrival:
         """
@@ -98,11 +97,13 @@ class StateStream:
             return arrival
         before, self.last = self.last, state
         self._before_ns = None if before is None else before.stamp_ns
-        turned = self._x.tolist()
+        written = self._x.tolist()
         self.x[:] = state.x
-        if before is not None:
-            for j in self._angles:
-                self._x[j] -= whole_turns(self._x[j] - turned[j])
+        self._rotations.normalize(self._x)
+        if before is None:
+            self._rotations.turn_up(self._x)
+        else:
+            self._rotations.bring_near(self._x, written)
         return arrival
 
     def estimate(self, sent: Sent, *, known: bool) -> Notice | None:
@@ -126,8 +127,7 @@ class StateStream:
             observer.frozen = not known
             for u, span_s in sent.spans(self._before_ns, last.stamp_ns):
                 observer.predict(u, span_s)
-            for j in self._angles:  # a turn between two states is no innovation
-                self.x[j] -= whole_turns(self.x[j] - observer.x[j])
+            self._rotations.bring_near(self.x, observer.x)  # a turn between two states is no innovation
             observer.correct(self.x)
             if not observer.finite:
                 observer.reset(self.x)
@@ -139,6 +139,8 @@ class StateStream:
         """Return the verdict on a state, with the code and the text of its notice."""
         if not bounded(state.x, MAX_STATE_MAGNITUDE):
             return Arrival.REFUSED, "state_refused", f"a state must be finite and at most {MAX_STATE_MAGNITUDE:g}, got {state.x.tolist()}"
+        if wrong := self._rotations.misfit(state.x):
+            return Arrival.REFUSED, "state_refused", f"a state is refused: {wrong}"
         heard = self.lives.judge(state.epoch, arrival_ns, self.clock.rate)
         self.notice = self.lives.notice
         if heard is Heard.OTHER:

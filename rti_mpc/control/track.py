@@ -2,8 +2,8 @@
 """
 The reference that is followed, interpolated at the controller's nodes.
 
-Angles are unwrapped along time before they are interpolated, so a reference may cross
-pi. `rti_mpc.rti.turns` decides in which turn all of it is followed. Before its first
+Rotations are written without jumps along time before they are interpolated, so a reference may
+cross pi, or change the sign of a quaternion. `rti_mpc.rti.turns` decides in which turn all of it is followed. Before its first
 row and after its last one a reference is held, never extrapolated.
 
 `Track.lay_out` does the work that grows with the number of rows, and any thread may
@@ -39,7 +39,7 @@ class Track:
         self.y_ref: Array = np.zeros((N, model.ny))
         self._nominal: Array = np.array(model.p_nominal)
         self.p: Array = np.tile(self._nominal, (N + 1, 1))
-        self._angles = [j for j, signal in enumerate(model.outputs) if signal.angle]
+        self._rotations = model.rotations("outputs")
         grid, at, below = np.zeros(3), np.zeros(N + 1), np.zeros(N + 1)
         self._grid, self._below = grid.data, below
         # A reference gives no parameters, or has all of them in its rows.
@@ -75,8 +75,8 @@ class Track:
 
     def lay_out(self, reference: Reference) -> Array:
         """
-        Return the rows of a reference for `anchor`: outputs, with angles unwrapped along time, the parameters if any are given, and after them by how
-        much each of these changes to the next row. Changes no attribute.
+        Return the rows of a reference for `anchor`: outputs, with rotations unwrapped along time, the parameters if any are given, and after them
+        by how much each of these changes to the next row. Changes no attribute.
 
         Args:
             reference: A checked reference, with the model's `ny` and none or the first of its `np`; the other parameters are nominal.
@@ -84,8 +84,7 @@ class Track:
         rows, given = np.hstack([reference.y, reference.p]), reference.p.shape[1]
         if given:
             rows = np.hstack([rows, np.tile(self._nominal[given:], (len(rows), 1))])
-        for j in self._angles:
-            rows[:, j] = np.unwrap(rows[:, j])
+        self._rotations.unwrap(rows)
         return np.hstack([rows, np.diff(rows, axis=0, append=rows[-1:])])
 
     def anchor(self, stamp_ns: int) -> Reference:

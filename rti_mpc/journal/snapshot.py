@@ -37,7 +37,7 @@ MADE_IN = ("rti_mpc.contract.", "rti_mpc.control.", "rti_mpc.rti.")  # modules o
 # Attributes that no command depends on.
 NOT_STATE = {("Controller", "on_call"), ("Controller", "_understudy"), ("Planner", "_kept"), ("ModeMachine", "notices")}
 FIXED_MODULES = ("casadi", "osqp")  # whose objects have no state of their own, or such that `rewarm` sets
-FIXED_CLASSES = {"Model", "Signal", "Timing", "SolverSettings", "Transcription", "StopLaw", "Disturbance", "ObserverSettings"}  # frozen
+FIXED_CLASSES = {"Model", "Signal", "Timing", "SolverSettings", "Transcription", "StopLaw", "Disturbance", "ObserverSettings", "Rotations"}  # frozen
 FIXED_TYPES = (types.FunctionType, types.BuiltinFunctionType, types.MethodType, types.ModuleType, type, slice, range, np.dtype, memoryview)
 ATOMS = frozenset((type(None), bool, int, float, str, bytes))
 MAX_BYTES = 1 << 28  # of a snapshot that is decompressed

@@ -36,6 +36,7 @@ SHIPPED = (
     "omnidirectional",
     "boat",
     "quadrotor",
+    "quadrotor_quaternion",
     "two_link_arm",
     "cart_pole",
     "chain",

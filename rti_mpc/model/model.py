@@ -20,6 +20,7 @@ import numpy as np
 from rti_mpc import given
 from rti_mpc.errors import OcpError
 from rti_mpc.model.expressions import to_sx
+from rti_mpc.rotation import Rotations
 from rti_mpc.signals import ROLES_OF_VECTOR, misplaced, signals
 from rti_mpc.signals import Signal as Signal
 
@@ -63,8 +64,9 @@ class Model:
         method: How the model is integrated by all who predict with it: ``"rk4"``, or ``"irk"`` for a stiff one, which is Radau IIA.
         sim_method_num_stages: Stages of an implicit step, 1 to 3, of order 1, 3 and 5.
         sim_method_num_steps: Steps into which the integrator divides what it integrates over.
-        quaternions: Names of four outputs each, w, x, y, z, that are an attitude. The cost weighs not their differences from the reference, but the
-            small angles between the two, see `residual`: w has no weight, x, y, z those of angles in rad about the axes of the body.
+        quaternions: Names of w, x, y, z of each attitude, of outputs, of states or of both. Of outputs the cost weighs not the differences from the
+            reference, but the small angles between the two, see `residual`: w has no weight, x, y, z those of angles in rad about the axes of the
+            body. Of states, that they have length 1 and may be written with either sign is known to the controller, to the guard and to ways to rest.
 
     Raises:
         OcpError: An argument, a dimension, a name or a free symbol does not fit.
@@ -225,11 +227,19 @@ class Model:
         the angles in rad about the axes of the body. It grows up to half a turn, and the shorter way round is taken.
         """
         e = ca.vertsplit(y - y_ref)
-        for names in self.quaternions:
-            at = [[output.name for output in self.outputs].index(name) for name in names]
-            for i, part in zip(at, ca.vertsplit(small_angles(y[at], y_ref[at])), strict=True):
+        for places in map(list, self.rotations("outputs").quaternions):
+            for i, part in zip(places, ca.vertsplit(small_angles(y[places], y_ref[places])), strict=True):
                 e[i] = part
         return ca.vertcat(*e)
+
+    def rotations(self, vector: str) -> Rotations:
+        """Return the rotations among ``states`` or ``outputs``; states that are outputs belong to a quaternion as those do, whatever their names."""
+        if vector == "outputs":
+            return Rotations.of(self.outputs, self.quaternions)
+        states = {output.name: name for output, name in zip(self.outputs, self.counterparts()["outputs"], strict=True)}
+        known = {state.name for state in self.states}
+        quaternions = [tuple(name if name in known else states.get(name, name) for name in names) for names in self.quaternions]
+        return Rotations.of(self.states, quaternions)
 
     def counterparts(self) -> dict[str, list[str]]:
         """Return, for each of the ``inputs`` and ``outputs``, the name of the state that it commands or is; empty where there is none."""
@@ -258,15 +268,16 @@ def quaternions_of(model: Model) -> tuple[tuple[str, str, str, str], ...]:
     Return the quaternions of a model, checked; one alone may be given without a tuple around it.
 
     Raises:
-        OcpError: One is not the names of four outputs that are no angles.
+        OcpError: One is not the names of four outputs, or four states, that are no angles.
     """
     listed: Any = model.quaternions
     if isinstance(listed, tuple | list) and listed and all(isinstance(name, str) for name in listed):
         listed = (listed,)
-    plain = [output.name for output in model.outputs if not output.angle]
+    vectors = [{signal.name for signal in signals if not signal.angle} for signals in (model.outputs, model.states)]
     for names in listed if isinstance(listed, tuple | list) else (listed,):
-        if not isinstance(names, tuple | list) or len(names) != 4 or len(set(names)) < 4 or not all(name in plain for name in names):
-            raise OcpError(f"model {model.name}: quaternions must be names of four outputs each, w, x, y, z, no angles, got {given.quoted(names)}")
+        if not isinstance(names, tuple | list) or len(names) != 4 or len(set(names)) < 4 or not any(set(names) <= plain for plain in vectors):
+            told = "quaternions must be names of four outputs or of four states each, w, x, y, z, no angles"
+            raise OcpError(f"model {model.name}: {told}, got {given.quoted(names)}")
     return tuple(tuple(names) for names in listed)
 
 

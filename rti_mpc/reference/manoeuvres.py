@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rti_mpc.array import Array
 from rti_mpc.errors import ConfigError
@@ -18,6 +19,9 @@ BAY_APPROACH_M, BAY_TURN_M, BAY_DEPTH_M = 14.0, 20.0, 6.0  # ahead; then backwar
 BAY_TIMES_S = (20.0, 24.0, 70.0)  # when it has come to a stop, when it begins to reverse, and when it is in the bay
 DURATION_S = 60.0
 WIDENING_S = 4.0  # of the eight that is flown
+TURNING_RAD_S = 0.5  # of the yaw in flight
+GRAVITY = 9.81  # m/s^2
+STEP_S = 1e-3  # by which the acceleration of a flight is found
 UPRIGHT_S = 5.0  # before the cart moves to and fro, its pole upright
 
 
@@ -46,6 +50,17 @@ def flown_eight(t: Array) -> Array:
     """Fly an eight that rises and falls, its nose ahead, and that widens at the start: ``x, y, z, psi``."""
     x, y, _ = eight(4.0, 2.0, 8.0)(t).T * smooth(t / WIDENING_S)
     return np.column_stack([x, y, 1.0 + 0.3 * np.sin(2 * np.pi / 16.0 * t), 0.0 * t])
+
+
+def turning_flight(t: Array) -> Array:
+    """Fly the same eight while turning, as the thrust must point for it: ``x, y, z`` and the quaternion ``q_w, q_x, q_y, q_z``."""
+    before, at, after = (flown_eight(t + by)[:, :3] for by in (-STEP_S, 0.0, STEP_S))
+    up = (after - 2 * at + before) / STEP_S**2 + np.array([0.0, 0.0, GRAVITY])
+    yaw = TURNING_RAD_S * t
+    nose = np.column_stack([np.cos(yaw), np.sin(yaw), 0.0 * t])
+    axes = np.stack([np.cross(side := np.cross(up, nose), up), side, up], axis=-1)
+    vector_first = Rotation.from_matrix(axes / np.linalg.norm(axes, axis=1, keepdims=True)).as_quat()
+    return np.column_stack([at, vector_first[:, 3], vector_first[:, :3]])
 
 
 def tip_circle(t: Array) -> Array:
@@ -94,6 +109,7 @@ MANOEUVRES: dict[str, tuple[tuple[str, ...], Rows]] = {  # names of the outputs,
     "bay": (POSE, bay),
     "boat_eight": (POSITION, boat_eight),
     "flown_eight": ((*POSITION, "z", "psi"), flown_eight),
+    "turning_flight": ((*POSITION, "z", "q_w", "q_x", "q_y", "q_z"), turning_flight),
     "tip_circle": (("x_tip", "z_tip"), tip_circle),
     "swing_up": (("x", "theta", "v", "omega"), swing_up),
     "swung_chain": (("x_3", "y_3", "z_3", "vx_2", "vy_2", "vz_2"), swung_chain),

@@ -27,6 +27,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import End
 from rti_mpc.errors import ConfigError
 from rti_mpc.reference.waypoint_file import MAX_CSV_BYTES, SEPARATORS, decimal, is_comment, is_number, split
+from rti_mpc.rotation import Rotations
 from rti_mpc.signals import Signal
 from rti_mpc.text_file import read_text_file
 
@@ -109,12 +110,12 @@ def room(y0: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
     return np.minimum(low, high), np.maximum(low, high)
 
 
-def recorded(path: Path, outputs: Sequence[Signal]) -> OutputReference:
+def recorded(path: Path, outputs: Sequence[Signal], rotations: Rotations) -> OutputReference:
     """
     Read outputs over time from a CSV file: a column ``t`` in s and one for each output, by name, in its unit.
 
-    Columns come in any order and among others, times from any start on. In between outputs are interpolated, angles across
-    whole turns. Empty lines and lines that begin with ``#`` are skipped.
+    Columns come in any order and among others, times from any start on. In between outputs are interpolated, rotations among
+    them without jumps. Empty lines and lines that begin with ``#`` are skipped.
 
     Raises:
         ConfigError: The file cannot be read, an output has no column, or a number is none: file, line and column are named.
@@ -133,7 +134,8 @@ def recorded(path: Path, outputs: Sequence[Signal]) -> OutputReference:
     t = table[:, 0] - table[0, 0]
     if (late := np.diff(t) <= 0.0).any():
         raise ConfigError(f"{path}, line {cells[2 + int(np.argmax(late))][0]}, column t: must be later than in the line before")
-    y = np.column_stack([np.unwrap(table[:, 1 + i]) if output.angle else table[:, 1 + i] for i, output in enumerate(outputs)])
+    y = table[:, 1:]
+    rotations.unwrap(y)
 
     def rows(y0: Array, times: Array) -> Array:
         return np.column_stack([np.interp(times, t, y[:, i]) for i in range(y.shape[1])])

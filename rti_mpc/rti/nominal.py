@@ -47,16 +47,21 @@ def nominal_state(ocp: Ocp) -> Array:
     def regular(x: Array) -> bool:
         return bool(np.isfinite(np.array(values(x, u_rest, model.p_nominal))).all())
 
+    rotations = model.rotations("states")
     if model.x_nominal:
-        if not regular(x := np.array(model.x_nominal)):
+        x = np.array(model.x_nominal)
+        if wrong := rotations.misfit(x):
+            raise OcpError(f"x_nominal must be a state of model {model.name}: {wrong}")
+        if not regular(x):
             raise OcpError(f"x_nominal must be a state at which model {model.name} is finite and differentiable, got {named(ocp, x)}")
         return x
-    if regular(zero := np.clip(np.zeros(model.nx), ocp.widest("lbx"), ocp.widest("ubx"))):
-        return np.asarray(zero)
+    zero = rotations.completed(np.clip(np.zeros(model.nx), ocp.widest("lbx"), ocp.widest("ubx")))
+    if regular(zero):
+        return zero
     rng = np.random.default_rng(1)
     candidates = [np.ones(model.nx), *(size * rng.normal(size=model.nx) for size in np.geomspace(1e-2, 1e4, RANDOM_STATES))]
     for candidate in candidates:
-        if regular(x := np.clip(candidate, ocp.widest("lbx"), ocp.widest("ubx"))):
+        if regular(x := rotations.completed(np.clip(candidate, ocp.widest("lbx"), ocp.widest("ubx")))):
             settled = np.array(ocp.phi().mapaccum(SETTLING_STAGES)(x, u_rest, model.p_nominal))[:, -1]
             return settled if regular(settled) else np.asarray(x)
     told = f"model {model.name} must be finite and differentiable at a nominal state: give one, x_nominal"

@@ -20,6 +20,7 @@ from rti_mpc.rti.ocp import Ocp
 
 SEEDED_CORNERS = 6  # combinations of bounds, beside those where all are low or all high
 UNBOUNDED_DISTANCE = 1.0  # from the nominal state, or the input at rest, that is tried where there is no bound; in its unit
+ROUNDING = 1e-9  # by which a number may exceed its bound
 MAX_DRAWS = 20  # of all states anew, where some are not regular
 
 
@@ -36,6 +37,7 @@ def states_of_operation(ocp: Ocp, count: int, seed: int = 1) -> tuple[Array, Arr
         States, shape ``(count, nx)``, and inputs, shape ``(count, nu)``. The nominal state, at rest, stands in for those that were not found.
     """
     model, rng, is_regular = ocp.model, np.random.default_rng(seed), regular(ocp)
+    attitudes = model.rotations("states")
     nominal, rest = nominal_state(ocp), np.array(model.u_rest)
     lowest, highest = around(ocp.widest("lbx"), ocp.widest("ubx"), nominal)
     low_u, high_u = around(ocp.widest("lbu"), ocp.widest("ubu"), rest)
@@ -43,7 +45,8 @@ def states_of_operation(ocp: Ocp, count: int, seed: int = 1) -> tuple[Array, Arr
     found: list[Array] = []
     drawn = [*corners(*ends, rng, count // 4), *rng.uniform(*ends, size=(count - count // 4 - 2, model.nx + model.nu))]
     for _ in range(MAX_DRAWS):
-        found += [z for z in drawn if is_regular(z[: model.nx], z[model.nx :])]
+        drawn = [attitudes.completed(z) for z in drawn]
+        found += [z for z in drawn if inside(z, *ends) and is_regular(z[: model.nx], z[model.nx :])]
         if len(found) >= count:
             break
         drawn = list(rng.uniform(*ends, size=(count - len(found), model.nx + model.nu)))
@@ -61,6 +64,11 @@ def derivative(model: Model) -> Callable[[Array, Array], Array]:
     """Build the rates of the states, shape ``(nx,)``."""
     f = ca.Function("f", [model.x, model.u, model.p], [ca.densify(model.rate_expr)])
     return lambda x, u: np.array(f(x, u, model.p_nominal)).ravel()
+
+
+def inside(z: Array, lowest: Array, highest: Array) -> bool:
+    """Return whether a vector is inside bounds, all of shape ``(n,)``: an attitude may not be any more, once it has length 1."""
+    return bool((z >= lowest - ROUNDING).all() and (z <= highest + ROUNDING).all())
 
 
 def around(lower: Array, upper: Array, middle: Array) -> tuple[Array, Array]:

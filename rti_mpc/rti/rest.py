@@ -50,6 +50,7 @@ FALLING_SHARE = 0.1  # a robot falls, and does not only drift, if without feedba
 MAX_DRIFT_GROWTH_PER_S = 0.05  # real part of an eigenvalue at rest up to which a robot drifts, and is not unstable
 SEEDED_STATES = 6  # from which the inputs are brought to rest, beside those that inputs at their bounds lead to
 TRIED_STATES = 24  # of operation, from which a way is to lead to rest
+JUDGED_STATES = 100  # the same, of the law that is taken: a sharp one may not bear the corners that were not tried
 FIRST_TRIED_STATES = 4  # of these, tried before the others: most laws that are too slow are so from the corners
 MAX_LINEARIZED_STATES = 50  # at rest, whose eigenvalues are computed
 WAY_DURATIONS_S = (1.0, 2.0, 5.0, 10.0, 20.0)  # tried in this order until one is long enough
@@ -72,14 +73,14 @@ def motion_at_rest(ocp: Ocp) -> str:
     Args:
         ocp: Its model, and the bounds inside which it is operated.
     """
-    model, rng = ocp.model, np.random.default_rng(1)
+    model, rng, attitudes = ocp.model, np.random.default_rng(1), ocp.model.rotations("states")
     u_rest: Array = np.array(model.u_rest)
     move, rate, is_regular = motion(model), derivative(model), regular(ocp)
     inputs = list(corners(*around(ocp.widest("lbu"), ocp.widest("ubu"), u_rest), rng))
     start = np.clip(nominal_state(ocp), ocp.widest("lbx"), ocp.widest("ubx"))
     lowest, highest = around(ocp.widest("lbx"), ocp.widest("ubx"), start)
     states = [np.clip(move(start, u, DRIVEN_S), ocp.widest("lbx"), ocp.widest("ubx")) for u in inputs]
-    states += [rng.uniform(lowest, highest) for _ in range(SEEDED_STATES)]
+    states += [attitudes.completed(rng.uniform(lowest, highest)) for _ in range(SEEDED_STATES)]
     states = [start, *(x for x in states if is_regular(x, u_rest))]
     rates = np.abs([rate(x, u) for x in states for u in (*inputs, u_rest)])
     still = np.maximum(STILL_SHARE * np.max(rates, axis=0, where=np.isfinite(rates), initial=0.0), 1e-9)
@@ -92,6 +93,7 @@ def motion_at_rest(ocp: Ocp) -> str:
         for j in positions:
             aside = settled.copy()
             aside[j] += 0.5 * (highest[j] - lowest[j]) * rng.choice((-0.5, 0.5))
+            attitudes.normalize(aside)
             if moving := moves(model, rate(aside, u_rest), still):
                 return f"where it stands at {model.states[j].name} = {aside[j]:.3g} {model.states[j].unit}, its inputs at rest, {moving}"
     return ""
@@ -219,9 +221,16 @@ def find_stop_law(ocp: Ocp, disturbances: Array = UNDISTURBED, delay_s: float = 
     """
     if not disturbances.size and ocp.model.stop_expr is None and not motion_at_rest(ocp):
         return None
-    law = shaped(ocp, disturbances, delay_s)
-    rest = assess(ocp, law, TRIED_STATES, compile=False)
-    return replace(law, holds=rest.kind is RestClass.HOLDS, alone=rest.alone)
+    failure = None
+    for law in shaped(ocp, disturbances, delay_s):
+        try:
+            rest = assess(ocp, law, JUDGED_STATES, compile=False)
+        except OcpError as error:
+            failure = failure or error
+        else:
+            return replace(law, holds=rest.kind is RestClass.HOLDS, alone=rest.alone)
+    assert failure is not None
+    raise failure
 
 
 def assess(ocp: Ocp, law: StopLaw | None, count: int, *, compile: bool = True) -> Rest:
@@ -273,9 +282,9 @@ def growth_of(eigenvalues: np.ndarray[Any, Any], period_s: float | None) -> floa
     return float(np.log(np.abs(1.0 + period_s * eigenvalues).max(initial=1e-300)) / period_s)
 
 
-def shaped(ocp: Ocp, disturbances: Array, delay_s: float = 0.0) -> StopLaw:
+def shaped(ocp: Ocp, disturbances: Array, delay_s: float = 0.0) -> list[StopLaw]:
     """
-    Find the rows of the way to rest and the weight of its regulator: those with which seeded states of operation are at rest soonest, and stay there.
+    Find rows of the way to rest and weights of its regulator: with the first of them seeded states of operation are at rest soonest, and stay there.
 
     Raises:
         OcpError: From one of them no way leads to rest, or it does not stay there.
@@ -305,7 +314,7 @@ def shaped(ocp: Ocp, disturbances: Array, delay_s: float = 0.0) -> StopLaw:
                 needed = int((moving.any(axis=2) * np.arange(1, rows)).max()) + 1
                 found.append(replace(law, rows=min(rows, whole(math.ceil(ROWS_FACTOR * needed) + 1))))
         if found:
-            return min(found, key=lambda law: law.rows)
+            return sorted(found, key=lambda law: law.rows)
     raise OcpError(wrong)
 
 
@@ -428,7 +437,7 @@ def unrested(model: Model, starts: Starts, moving: np.ndarray[Any, Any], ways: W
     i = int(np.flatnonzero(moving.any(axis=1))[0])
     disturbed = starts.p[i] != np.array(model.p_nominal)
     values = *zip(model.states, starts.x[i], strict=True), *zip(compress(model.parameters, disturbed), starts.p[i][disturbed], strict=True)
-    where = ", ".join(f"{signal.name} = {value:.3g} {signal.unit}" for signal, value in values)
+    where = ", ".join(f"{signal.name} = {value:.3g} {signal.unit}".removesuffix(" 1") for signal, value in values)
     names = ", ".join(signal.name for signal, moves in zip(model.states, moving[i], strict=True) if moves)
     return f"{ways.period_s * ways.x.shape[1]:.3g} s after a stop at {where} it still moves: {names}"
 

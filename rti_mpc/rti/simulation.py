@@ -152,9 +152,7 @@ def simulate(
     acting = np.vstack([u0[None], u])  # the input before each state
     y = np.array(model.outputs_at().map(samples + 1)(x.T, acting.T, p.T)).T.reshape(samples + 1, model.ny)
     y_ref = np.array(at(np.arange(samples + 1)), dtype=np.float64)
-    for j, signal in enumerate(model.outputs):
-        if signal.angle:
-            y_ref[:, j] -= 2 * np.pi * np.round((y_ref[:, j] - y[:, j]) / (2 * np.pi))
+    y_ref = model.rotations("outputs").near(y_ref, y)
     return Simulation(ocp, np.asarray(dt * np.arange(samples + 1), dtype=np.float64), x, u, y, y_ref, tuple(status), u0)
 
 

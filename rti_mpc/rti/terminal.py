@@ -26,6 +26,7 @@ from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.tangent import tangent
 
 MAX_RADIUS = 1.0 - 1e-9  # of the eigenvalues of a regulated robot: slower than 1e9 samples is not at all
 
@@ -48,21 +49,26 @@ def lqr_weight(ocp: Ocp, x: Array, u: Array) -> Array:
     """
     model = given.instance("ocp", ocp, Ocp).model
     x, u = given.array("x", x, (model.nx,)), given.array("u", u, (model.nu,))
-    phi, p = ocp.phi(), np.array(model.p_nominal)
+    phi, p, space = ocp.phi(), np.array(model.p_nominal), tangent(model)
+    y_ref = ca.SX.sym("y_ref", model.ny)
+    changes = phi(model.x, model.u, model.p), model.residual(model.y_expr, y_ref)
     sensitivities = ca.Function(
         "sensitivities",
-        [model.x, model.u, model.p],
-        [ca.jacobian(expr, z) for expr in (phi(model.x, model.u, model.p), model.y_expr) for z in (model.x, model.u)],
+        [model.x, model.u, model.p, y_ref],
+        [*(ca.jacobian(expr, z) for expr in changes for z in (model.x, model.u)), space.basis, space.inverse],
     )
-    A, B, C, D = (np.array(M) for M in sensitivities(x, u, p))
+    at = x, u, p
+    A, B, C, D, basis, inverse = (np.array(M) for M in sensitivities(*at, model.outputs_at()(*at)))
+    A, B, C = inverse @ A @ basis, inverse @ B, C @ basis
+    weighed = [j for j in range(model.ny) if j not in {places[0] for places in model.rotations("outputs").quaternions}]
     nx, nu = B.shape
     F = np.block([[A, B], [np.zeros((nu, nx)), np.eye(nu)]])
     G = np.vstack([B, np.eye(nu)])
-    C = np.hstack([C, D])
+    C, Q = np.hstack([C, D])[weighed], ocp.Q_at(ocp.N - 1)[np.ix_(weighed, weighed)]
     try:
         of_inputs = np.diag([*np.zeros(nx), *np.atleast_2d(ocp.R_u)[-1]])
         R = ocp.R_at(ocp.N_u - 1)
-        S = solve_discrete_are(F, G, C.T @ ocp.Q_at(ocp.N - 1) @ C + of_inputs, R)
+        S = solve_discrete_are(F, G, C.T @ Q @ C + of_inputs, R)
         # Whether an equation without a stabilizing solution is noticed above depends on rounding; its closed loop never contracts.
         radius = abs(np.linalg.eigvals(F - G @ np.linalg.solve(R + G.T @ S @ G, G.T @ S @ F))).max()
         if not radius < MAX_RADIUS:
@@ -70,5 +76,6 @@ def lqr_weight(ocp: Ocp, x: Array, u: Array) -> Array:
     except (LinAlgError, ValueError) as error:
         raise OcpError(f"model {model.name} must be stabilizable where a terminal weight is wanted, at x = {x}, u = {u}: {error}") from error
     # The least of xi' S xi over all xi of one output y is y' (C S^-1 C')^-1 y.
-    weight = np.linalg.inv(C @ np.linalg.pinv(S) @ C.T) - ocp.Q_at(ocp.N - 1)
+    weight: Array = np.zeros((model.ny, model.ny))
+    weight[np.ix_(weighed, weighed)] = np.linalg.inv(C @ np.linalg.pinv(S) @ C.T) - Q
     return np.asarray((weight + weight.T) / 2)

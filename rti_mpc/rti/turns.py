@@ -19,9 +19,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from rti_mpc.angle import whole_turns
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind, function
+from rti_mpc.rotation import whole_turns
 from rti_mpc.rti.ocp import Ocp
 
 HYSTERESIS_RAD = 0.3  # an error must exceed half a turn by this much before the other way round is taken
@@ -59,9 +59,9 @@ class Turns:
         self._x0, self._guess, self._y, self._y_first = views
         output, steps = functions
         self._output = bind(output, {"x": x0, "p": p[0]}, {"y": y})
-        self._states = [j for j, signal in enumerate(model.states) if signal.angle]
-        self._outputs = [j for j, signal in enumerate(model.outputs) if signal.angle]
-        self._bounded = [j for j in self._states if bounds[1][j] - bounds[0][j] <= math.tau]
+        self._rotations = model.rotations("states")
+        self._outputs = model.rotations("outputs").angles
+        self._bounded = [j for j in self._rotations.angles if bounds[1][j] - bounds[0][j] <= math.tau]
         largest: Array = np.zeros(len(self._outputs))
         self._largest = largest.data
         self._measure = bind(steps, {"y_ref": y_ref}, {"largest": largest})
@@ -92,8 +92,7 @@ class Turns:
     def settle(self) -> bool:
         """Bring a new initial state, the guess and the reference into the same turn; return whether guess or reference have changed."""
         changed = False
-        for j in self._states:
-            self._x0[j] -= whole_turns(self._x0[j] - self._guess[j])
+        self._rotations.bring_near(self._x0, self._guess)
         for j in self._bounded:
             beyond = self._x0[j] - 0.5 * float(self._lbx[j] + self._ubx[j])
             if abs(beyond) > MAX_ERROR_RAD:
@@ -120,5 +119,5 @@ def largest_steps(ocp: Ocp) -> ca.Function:
     """Build ``y_ref -> largest``: for each output that is an angle, the largest distance from one row of the reference to the next."""
     y_ref = ca.SX.sym("y_ref", ocp.model.ny, ocp.N)
     change = ca.fabs(y_ref[:, 1:] - y_ref[:, :-1])
-    largest = [reduce(ca.fmax, ca.horzsplit(change[j, :]), ca.SX(0)) for j, signal in enumerate(ocp.model.outputs) if signal.angle]
+    largest = [reduce(ca.fmax, ca.horzsplit(change[j, :]), ca.SX(0)) for j in ocp.model.rotations("outputs").angles]
     return function("largest_steps", {"y_ref": y_ref}, {"largest": ca.densify(ca.vertcat(*largest))})

@@ -35,6 +35,7 @@ from rti_mpc.model.integrator import integrator, sensitivities
 from rti_mpc.model.model import Model, depends_on
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.riccati import cholesky, cholesky_solve
+from rti_mpc.rti.tangent import tangent
 
 NEWTON_STEPS = 8  # to an equilibrium
 SETTLING_STEPS = 2  # to the equilibrium at the end of a way, which is near
@@ -266,12 +267,15 @@ class WayToRest:
 
 def to_equilibrium(model: Model, law: StopLaw, steps: int) -> ca.Function:
     """Build ``(x, u, p) -> (x_e, u_e)``: Newton steps of least length to a state and an input at which the model rests."""
-    z = ca.vertcat(model.x, model.u)
-    size = ca.DM(np.concatenate([law.scale_x, INPUT_FREEDOM_FACTOR * law.scale_u]))
-    f = model.rate_expr / ca.DM(law.rates)
-    J = ca.densify(ca.jacobian(f, z) @ ca.diag(size))
-    step = size * (J.T @ cholesky_solve(cholesky(J @ J.T + DAMPING * ca.SX.eye(model.nx)), f))
-    nearer = ca.Function("nearer", [z, model.p], [ca.cse(ca.densify(z - step))])
+    z, space = ca.vertcat(model.x, model.u), tangent(model)
+    size = ca.DM(np.concatenate([space.measured(law.scale_x), INPUT_FREEDOM_FACTOR * law.scale_u]))
+    f = space.inverse @ model.rate_expr / ca.DM(space.measured(law.rates))
+    J = ca.densify(ca.jacobian(f, z) @ ca.diagcat(space.basis, ca.SX.eye(model.nu)) @ ca.diag(size))
+    step = size * (J.T @ cholesky_solve(cholesky(J @ J.T + DAMPING * ca.SX.eye(f.numel())), f))
+    closer = z - ca.vertcat(space.basis @ step[: f.numel()], step[f.numel() :])
+    for places in map(list, model.rotations("states").quaternions):
+        closer[places] /= ca.norm_2(closer[places])
+    nearer = ca.Function("nearer", [z, model.p], [ca.cse(ca.densify(closer))])
     x, u, p = ca.MX.sym("x", model.nx), ca.MX.sym("u", model.nu), ca.MX.sym("p", model.np_)
     at = ca.vertcat(x, u)
     for _ in range(steps):
@@ -292,18 +296,22 @@ def aiming(model: Model, law: StopLaw) -> ca.Function:
 def regulators(model: Model, law: StopLaw) -> ca.Function:
     """Build ``(x_e, u_e, p) -> (K_stop, K)``: gains of the regulator of the rates, and of the one that holds the state, too."""
     nx, nu = model.nx, model.nu
-    _, A, B, _ = sensitivities(model, law.period_s, substeps=law.substeps)
-    rates = [j for j, driven in enumerate(driven_by_inputs(model, law)) if not driven]  # the others are for the inputs to choose
-    C = ca.densify(ca.jacobian(initial_rates(model)[rates, 0] / ca.DM(law.rates[rates]), model.x))
-    moving, found = C.T @ C, ca.SX(nx, nx)
+    _, A_x, B_x, _ = sensitivities(model, law.period_s, substeps=law.substeps)
+    space = tangent(model)
+    nt, scale, fastest = len(space.states), space.measured(law.scale_x), space.measured(law.rates)
+    A, B = space.inverse @ A_x @ space.basis, space.inverse @ B_x
+    driven = driven_by_inputs(model, law)
+    left = [i for i, j in enumerate(space.states) if not driven[j]]  # the others are for the inputs to choose
+    C = ca.densify(ca.jacobian((space.inverse @ initial_rates(model))[left, 0] / ca.DM(fastest[left]), model.x) @ space.basis)
+    moving, found = C.T @ C, ca.SX(nt, nt)
     if law.disturbances.size:
-        found = unfree(C @ ca.diag(ca.DM(law.scale_x)), law)
-    seen = ca.sum1((C @ ca.diag(ca.DM(law.scale_x))) ** 2).T  # by the regulator of the rates: what it slows down is not to be held as well
-    away = ca.diag(ca.densify(FREE_SHARE**2 / (FREE_SHARE**2 + seen)) / ca.DM((HOLD_S * law.rates) ** 2))
+        found = unfree(C @ ca.diag(ca.DM(scale)), scale, fastest)
+    seen = ca.sum1((C @ ca.diag(ca.DM(scale))) ** 2).T  # by the regulator of the rates: what it slows down is not to be held as well
+    away = ca.diag(ca.densify(FREE_SHARE**2 / (FREE_SHARE**2 + seen)) / ca.DM((HOLD_S * fastest) ** 2))
     weights = moving + found, moving + (HOLD_S / LEAN_S) ** 2 * found + away
-    linear = ca.Function("linear", [model.x, model.u, model.p], [ca.densify(expr) for expr in (A, B, *weights)])
+    linear = ca.Function("linear", [model.x, model.u, model.p], [ca.densify(expr) for expr in (A, B, space.inverse, *weights)])
 
-    S, Q, As, Bs = (ca.SX.sym(name, *shape) for name, shape in (("S", (nx, nx)), ("Q", (nx, nx)), ("A", (nx, nx)), ("B", (nx, nu))))
+    S, Q, As, Bs = (ca.SX.sym(name, *shape) for name, shape in (("S", (nt, nt)), ("Q", (nt, nt)), ("A", (nt, nt)), ("B", (nt, nu))))
     A_s, B_s = (symbol * ca.DM(expr.sparsity(), 1.0) for symbol, expr in ((As, A), (Bs, B)))
     SA, SB = S @ A_s, S @ B_s
     K = cholesky_solve(cholesky(B_s.T @ SB + ca.diag(ca.DM(law.input_weight * law.scale_u**-2.0))), SB.T @ A_s)
@@ -311,9 +319,9 @@ def regulators(model: Model, law: StopLaw) -> ca.Function:
     recursion = ca.Function("recursion", [S, Q, As, Bs], ca.cse([ca.densify((before + before.T) / 2), ca.densify(K)]))
 
     x, u, p = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("p", model.np_)
-    A_e, B_e, *costs = linear(x, u, p)
-    to_go, cost, A_k, B_k = (ca.MX.sym(name, *shape) for name, shape in (("S", (nx, nx)), ("Q", (nx, nx)), ("A", (nx, nx)), ("B", (nx, nu))))
-    earlier, gain = to_go, ca.MX(nu, nx)
+    A_e, B_e, inverse, *costs = linear(x, u, p)
+    to_go, cost, A_k, B_k = (ca.MX.sym(name, *shape) for name, shape in (("S", (nt, nt)), ("Q", (nt, nt)), ("A", (nt, nt)), ("B", (nt, nu))))
+    earlier, gain = to_go, ca.MX(nu, nt)
     for _ in range(BLOCK_ROWS):
         earlier, gain = recursion(earlier, cost, A_k, B_k)
     block = ca.Function("recursions", [to_go, cost, A_k, B_k], [earlier, gain])
@@ -322,7 +330,7 @@ def regulators(model: Model, law: StopLaw) -> ca.Function:
         to_go = cost
         for _ in range(-(-law.horizon // BLOCK_ROWS)):
             to_go, gain = block(to_go, cost, A_e, B_e)
-        gains.append(gain)
+        gains.append(gain @ inverse if nt < nx else gain)
     return ca.Function("regulators", [x, u, p], gains)
 
 
@@ -354,15 +362,15 @@ def driven_by_inputs(model: Model, law: StopLaw) -> list[bool]:
     return [bool(share > DRIVEN_SHARE) for share in np.nan_to_num(shares).max(axis=0)]
 
 
-def unfree(C: ca.SX, law: StopLaw) -> ca.SX:
+def unfree(C: ca.SX, scale: Array, rates: Array) -> ca.SX:
     """
     Build the weight of a deviation from the equilibrium in what the rates depend on, and may so not be as it likes at rest.
 
     In a current that is weak, a boat's rates hardly depend on its heading, and yet it comes to rest in one heading only.
     """
     free = ca.densify(C.T @ cholesky_solve(cholesky(ca.densify(C @ C.T) + FREE_SHARE**2 * ca.SX.eye(C.shape[0])), C))  # a projector, softly
-    away = free @ ca.diag(ca.DM(1.0 / law.scale_x))
-    return away.T @ ca.diag(ca.DM((law.scale_x / (HOLD_S * law.rates)) ** 2)) @ away
+    away = free @ ca.diag(ca.DM(1.0 / scale))
+    return away.T @ ca.diag(ca.DM((scale / (HOLD_S * rates)) ** 2)) @ away
 
 
 def rolling(model: Model, law: StopLaw) -> ca.Function:

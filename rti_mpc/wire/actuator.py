@@ -17,7 +17,8 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.message import Command
-from rti_mpc.contract.schedule import NO_ANGLES, NO_COMMAND, Schedule, end_ns, unfit
+from rti_mpc.contract.schedule import NO_COMMAND, UNKNOWN, Schedule, end_ns, unfit
+from rti_mpc.rotation import Rotations
 from rti_mpc.wire.source import Source
 
 MAX_EARLY_NS = 250_000_000  # how far the stamp of an answered state may be ahead of the robot's clock, which a guard knows no better
@@ -63,7 +64,7 @@ class Actuator:
         delay_ns: int = 0,
         bounds: tuple[float | Array, float | Array] = (-np.inf, np.inf),
         increments: Increments | None = None,
-        angles: Array = NO_ANGLES,
+        rotations: Rotations = UNKNOWN,
     ) -> None:
         """
         Begin at rest.
@@ -75,16 +76,16 @@ class Actuator:
             delay_ns: Time from the arrival of a command to the instant from which it can act.
             bounds: Of the inputs, shape ``(nu,)``: a drive does no more, whatever it is told.
             increments: Slew limits inside which plans are approached; None: their rows are played as they come.
-            angles: Which of the measured states are angles, shape ``(nx,)``; empty: none is measured.
+            rotations: Among the measured states; of size 0: none is measured.
         """
         self.u = np.array(u_rest, dtype=np.float64)
         self.source = NO_COMMAND
         self.counters = Counters()
         self.braking = True
-        self._schedule = Schedule(u_rest, slew, increments, bounds, angles)
+        self._schedule = Schedule(u_rest, slew, increments, bounds, rotations)
         self._now_ns = 0
         self._robot_epoch = epoch
-        self._nx = len(angles) or None
+        self._nx = rotations.size or None
         self._delay_ns = delay_ns
         self._source = Source(STALE_NS)
         self._bounds = bounds  # of the inputs, shape (nu,): a drive does no more, whatever it is told

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rti_mpc.errors import MessageError
+from rti_mpc.rotation import Rotations
 from rti_mpc.signals import Signal, place, plane
 from rti_mpc.wire.document import read
 from rti_mpc.wire.layout import NUMBER_LIMIT
@@ -107,6 +108,7 @@ class Info:
         lbdu: Lower bounds of the increments of the inputs, per sample.
         ubdu: Upper bounds of the increments.
         weights: Weights of the cost; None if not said.
+        quaternions: Names of w, x, y, z of each attitude, of states or outputs.
     """
 
     role: str = field(compare=False)
@@ -126,6 +128,7 @@ class Info:
     lbdu: tuple[float, ...] = ()
     ubdu: tuple[float, ...] = ()
     weights: Weights | None = None
+    quaternions: tuple[tuple[str, ...], ...] = ()
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Info:
@@ -145,6 +148,7 @@ class Info:
                 obstacles=tuple(_obstacle(disc) for disc in _few(document.get("obstacles", ()))),
                 dt_s=float(document.get("dt_s", math.nan)),
                 weights=_weights(document["weights"], len(vectors["outputs"]), len(vectors["inputs"])) if "weights" in document else None,
+                quaternions=tuple(tuple(map(str, _few(names))) for names in _few(document.get("quaternions", ()))),
                 **vectors,
                 **bounds,
             )
@@ -171,6 +175,10 @@ class Info:
         vectors: dict[str, Any] = {name: tuple(Label(f"{name[:-1]}_{i}") for i in range(n)) for name, n in sizes}
         bounds: dict[str, Any] = {name: _bounds(None, sign, len(vectors[vector])) for name, (vector, sign) in INFO_BOUNDS.items()}
         return cls(role="unknown", **vectors, **bounds)
+
+    def rotations(self, vector: str) -> Rotations:
+        """Return the rotations among ``states`` or ``outputs``."""
+        return Rotations.of(getattr(self, vector), self.quaternions)
 
     @property
     def position(self) -> tuple[int, int] | None:

@@ -67,7 +67,13 @@ def _head(stamp: str, also: int | None = None) -> tuple[Field, ...]:
 LAYOUTS: dict[type[Any], tuple[Field, ...]] = {
     State: (
         *_head("time at which the state was measured, ns of the robot's clock"),
-        Field("x", "float64[]", "state, SI units in the order of the model; angles in rad, may wrap", finite=True, filled=True),
+        Field(
+            "x",
+            "float64[]",
+            "state, SI units in the order of the model; angles in rad, may wrap; quaternions of either sign",
+            finite=True,
+            filled=True,
+        ),
         Field("u", "float64[]", "inputs that act at that time, SI units in the order of the model; empty: not reported", finite=True),
         Field("command_epoch", "uint64", "epoch of the command that set these inputs; 0: the robot's own ramp, or not reported"),
         Field("command_seq", "uint64", "sequence number of that command"),
@@ -79,7 +85,7 @@ LAYOUTS: dict[type[Any], tuple[Field, ...]] = {
         Field(
             "y",
             "float64[]",
-            "reference outputs, rows of ny, SI units in the order of the model's outputs; angles in rad, may wrap",
+            "reference outputs, rows of ny, SI units in the order of the model's outputs; angles in rad, may wrap; quaternions of either sign",
             width="ny",
             finite=True,
             filled=True,

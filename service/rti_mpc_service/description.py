@@ -26,6 +26,7 @@ def controller_info(ocp: Ocp, np_: int) -> dict[str, Any]:
     return {
         "version": rti_mpc.__version__,
         "model": ocp.model.name,
+        "quaternions": model.quaternions,
         **info.labels(model.counterparts(), **vectors),
         **info.bounds(**{name: ocp.widest(name).tolist() for name in limits}),
         "p_nominal": list(model.p_nominal[:np_]),

@@ -108,7 +108,7 @@ class Process:
         self._crashed = Event()
         self._announcer = Announcer(bus, ROLE, epoch)
         self._actuation = bus.publisher(keys.actuation)
-        self._states = bus.intake(State, config.stale_s, {"x": len(limits.angles), "u": len(limits.u_rest)})
+        self._states = bus.intake(State, config.stale_s, {"x": limits.rotations.size, "u": len(limits.u_rest)})
         bus.expect("state", lambda: self._guard.heard)
         bus.watch_certificate(self._guard.notices.append)
         self._commands = bus.intake(Command, config.stale_s, {"u": len(limits.u_rest)})

@@ -157,15 +157,17 @@ def offset_ahead(model: Model) -> float | None:
 def of_outputs(config: Config, model: Model, name: str, duration_s: float | None) -> Scenario:
     """Return references of outputs as a scenario of a model."""
     reference: OutputReference
+    rotations = model.rotations("outputs")
     if name in OUTPUT_SCENARIOS:
         lower, upper = bounds(config.ocp.bounds.states, model.counterparts()["outputs"])
-        weighted = [i for i, output in enumerate(model.outputs) if config.ocp.weights.Q[output.name] > 0.0]
+        turning = {i for places in rotations.quaternions for i in places}  # an attitude stays as it is
+        weighted = [i for i, output in enumerate(model.outputs) if config.ocp.weights.Q[output.name] > 0.0 and i not in turning]
         period_s = max(MIN_PERIOD_S, PERIOD_HORIZONS * config.ocp.N * config.ocp.dt_s)
         reference = OUTPUT_SCENARIOS[name](np.array(lower), np.array(upper), weighted[: model.nu], period_s)
     elif name in MANOEUVRES:
         reference = manoeuvre(name, model.outputs)
     else:
-        reference = recorded(Path(name), model.outputs)
+        reference = recorded(Path(name), model.outputs, rotations)
     if duration_s is not None:
         reference = reference.lasting(duration_s)
     period_s = ROW_PERIOD_S if name in MANOEUVRES else min(ROW_PERIOD_S, config.ocp.dt_s)
@@ -173,6 +175,8 @@ def of_outputs(config: Config, model: Model, name: str, duration_s: float | None
     h = model.h()
 
     def y(x: Array) -> Array:
-        return reference.rows(np.array(h(x, model.p_nominal)).ravel(), t)
+        rows = reference.rows(np.array(h(x, model.p_nominal)).ravel(), t)
+        rotations.unwrap(rows)
+        return rows
 
     return Scenario(reference.name, model.nx, y, period_s, reference.duration_s, reference.end)

@@ -39,7 +39,7 @@ class Lockstep:
 
     def __init__(self, settings: RobotSettings, epoch: int = 1, now_ns: int = 0) -> None:
         model = settings.model
-        angles = tuple(i for i, signal in enumerate(model.states) if signal.angle)
+        rotations = model.rotations("states")
         self.now_ns = now_ns
         self.epoch = epoch
         self.period_ns = settings.state_period_ns
@@ -50,9 +50,9 @@ class Lockstep:
             round(1e9 * settings.actuator_delay_s),
             (settings.lbu, settings.ubu),
             settings.increments,
-            np.array([signal.angle for signal in model.states]),
+            rotations,
         )
-        self.sensor = Sensor(epoch, settings.noise_std, angles, round(1e9 * settings.sensor_delay_s), settings.dropout, settings.seed)
+        self.sensor = Sensor(epoch, settings.noise_std, rotations, round(1e9 * settings.sensor_delay_s), settings.dropout, settings.seed)
         self._plant = plant(model, settings.x0, settings.state_period_s, settings.substeps, settings.actuator_lag_s)
         self.x: Array = self._plant.x
         self.u: Array = self._plant.u

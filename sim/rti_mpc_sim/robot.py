@@ -130,6 +130,7 @@ def model_info(model: Model) -> dict[str, Any]:
     return {
         "version": rti_mpc.__version__,
         "model": model.name,
+        "quaternions": model.quaternions,
         **labels(model.counterparts(), states=model.states, inputs=model.inputs, outputs=model.outputs),
         "parameters": {s.name: value for s, value in zip(model.parameters, model.p_nominal, strict=True)},
     }

@@ -9,6 +9,7 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.contract.message import State
+from rti_mpc.rotation import Rotations
 
 UNREPORTED: tuple[Array, int, int] = (np.zeros(0), 0, 0)  # input, command epoch and number of a state that reports no inputs
 
@@ -18,27 +19,27 @@ class Sensor:
     Measures states and hands them out when they are due.
 
     A state that drops out uses up its sequence number, as one lost on a real
-    link would. Angles wrap to (-pi, pi], as a real robot's do.
+    link would. Angles wrap to (-pi, pi], and quaternions have w >= 0, as a real robot's do.
 
     Attributes:
         x: What was measured last, shape ``(nx,)``; the robot itself has it at once, lost or not.
     """
 
-    def __init__(self, epoch: int, noise_std: Array, angles: tuple[int, ...], delay_ns: int = 0, dropout: float = 0.0, seed: int = 1) -> None:
+    def __init__(self, epoch: int, noise_std: Array, rotations: Rotations, delay_ns: int = 0, dropout: float = 0.0, seed: int = 1) -> None:
         """
         Prepare to measure.
 
         Args:
             epoch: Epoch of the states.
             noise_std: Standard deviations, shape ``(nx,)``.
-            angles: Indices of the states that wrap.
+            rotations: Among the states.
             delay_ns: Time from measuring to handing out.
             dropout: Share of states that are lost.
             seed: Seed of noise and dropout.
         """
         self._epoch = epoch
         self._noise_std = noise_std
-        self._angles = list(angles)
+        self._rotations = rotations
         self._delay_ns = delay_ns
         self._dropout = dropout
         self._random = np.random.default_rng(seed)
@@ -67,7 +68,7 @@ class Sensor:
         """
         self._seq += 1
         measured = x + self._noise_std * self._random.standard_normal(len(x))
-        measured[self._angles] = np.pi - np.remainder(np.pi - measured[self._angles], 2 * np.pi)
+        self._rotations.wrap(measured)
         self.x = measured
         if self._random.random() >= self._dropout:
             self._on_the_way.append(State(self._epoch, self._seq, stamp_ns, measured, u.copy(), command_epoch, command_seq))

@@ -225,6 +225,10 @@ def test_state_of_another_size_than_its_angles_is_refused(monkeypatch: pytest.Mo
         ({"u_rest": {"v": 1}}, "u_rest.v must be one of the inputs v_c, kappa"),
         ({"u_rest": {"v_c": 2.0}}, "inputs.v_c must hold the input at rest, 2, got [-1.0, 1.0]"),
         ({"angles": ["psi"]}, "angles must say of each state whether it is an angle, such as [False, True], got ['psi']"),
+        (
+            {"quaternions": [[0, 1, 2]]},
+            "quaternions must be places of w, x, y, z among the states, of none that is an angle, got [0, 1, 2]",
+        ),
         ({"increments": {"v_c": [0.1, 0.2]}}, "increments.v_c must go from below 0 to above 0, got [0.1, 0.2]"),
     ],
 )

@@ -41,6 +41,7 @@ DRIVEN = {
     "kinematic_bicycle": (5.0, 0.001),
     "omnidirectional": (5.0, 0.001),
     "quadrotor": (0.4, 0.005),
+    "quadrotor_quaternion": (0.4, 0.005),
     "truck_trailer": (30.0, 0.005),
     "two_link_arm": (2.0, 0.001),
     "unicycle": (15.0, 0.005),
@@ -76,9 +77,8 @@ def errors(model: Model, run: Run, reference: Reference, from_s: float) -> Array
     late = [i for i, t in enumerate(run.t_s) if t >= from_s]
     y = np.array([np.array(model.h()(run.x[i], model.p_nominal)).ravel() for i in late])
     rows = np.array([run.t_s[i] for i in late]) / (1e-9 * reference.period_ns)
-    error = y - np.stack([np.interp(rows, np.arange(len(reference.y)), column) for column in reference.y.T], axis=-1)
-    turns = 2 * np.pi * np.array([signal.angle for signal in model.outputs])
-    return np.asarray(error - turns * np.round(error / (2 * np.pi)))
+    wanted = np.stack([np.interp(rows, np.arange(len(reference.y)), column) for column in reference.y.T], axis=-1)
+    return model.rotations("outputs").difference(y, wanted)
 
 
 @pytest.mark.parametrize("name", ROBOTS)

@@ -18,6 +18,7 @@ from rti_mpc.contract.guard import Guard
 from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command, State
 from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.rotation import Rotations
 from rti_mpc.wire.actuator import Actuator
 from rti_mpc.wire.cdr import decode, encode
 
@@ -26,7 +27,7 @@ DT = 100 * MS
 BOUND, STEP = np.array([0.5, 0.745]), np.array([0.25, 0.4])  # the latter over 100 ms
 WINDOW_NS = 75 * MS
 ROUNDING = 1e-9
-LIMITS = Limits(np.zeros(2), -BOUND, BOUND, -STEP, STEP, dt_s=0.1, angles=np.array([False, True, False]))
+LIMITS = Limits(np.zeros(2), -BOUND, BOUND, -STEP, STEP, dt_s=0.1, rotations=Rotations(3, (1,)))
 TICK_NS = 10 * MS  # of the guard
 LONG = 20_000 if "CI" in os.environ else 500_000
 
@@ -51,7 +52,7 @@ class Ways:
         self._numbers = count()
         self._guard = Guard(LIMITS, epoch=1 << 40)
         self._played: deque[tuple[int, Array]] = deque()
-        self._actuator = Actuator(np.zeros(2), LIMITS.slew, 1, 0, (-BOUND, BOUND), Increments(-STEP, STEP, DT), LIMITS.angles)
+        self._actuator = Actuator(np.zeros(2), LIMITS.slew, 1, 0, (-BOUND, BOUND), Increments(-STEP, STEP, DT), LIMITS.rotations)
         self._ticked_ns = 0
 
     def step(self) -> None:
@@ -61,7 +62,7 @@ class Ways:
         self.samples += 1
         self.x = 0.9 * self.x + rng.normal(size=3)
         u = self._actuator
-        state = State(1, self.samples, self.now_ns, self.x + 2 * np.pi * rng.integers(-2, 3) * LIMITS.angles, u.u.copy(), *u.source)
+        state = State(1, self.samples, self.now_ns, self.x + 2 * np.pi * rng.integers(-2, 3) * np.array([0.0, 1.0, 0.0]), u.u.copy(), *u.source)
         if rng.random() < 0.9:
             u.measure(state.x, self.now_ns)
         self._send("guard", state)

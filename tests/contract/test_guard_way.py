@@ -15,13 +15,14 @@ from rti_mpc.contract.guard import Guard
 from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command, State
 from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.rotation import Rotations
 from rti_mpc.wire.actuator import Actuator
 
 MS = 1_000_000
 LOCAL_NS = 10**15  # local time when the robot's clock is 0
 DT = 100 * MS
 BOUND, STEP = np.array([1.0]), np.array([0.5])  # acceleration in m/s^2, its increment over 100 ms
-LIMITS = Limits(np.zeros(1), -BOUND, BOUND, -STEP, STEP, dt_s=0.1, angles=np.zeros(2, dtype=bool))
+LIMITS = Limits(np.zeros(1), -BOUND, BOUND, -STEP, STEP, dt_s=0.1, rotations=Rotations(2))
 BRAKES = [-0.5, -1.0, -1.0, -1.0, -1.0, -0.5, 0.0]  # from 0.5 m/s to 0
 GAIN = np.array([[0.0, 2.0]])  # 1/s, of the speed alone
 
@@ -42,7 +43,7 @@ class Mass:
         self.push, self.fall = push, fall  # what an input is worth, and how fast it falls over, in 1/s^2
         self.x = np.zeros(2)
         self.guard = Guard(LIMITS, epoch=10)
-        self.actuator = Actuator(np.zeros(1), LIMITS.slew, 7, 0, (-BOUND, BOUND), Increments(-STEP, STEP, DT), LIMITS.angles)
+        self.actuator = Actuator(np.zeros(1), LIMITS.slew, 7, 0, (-BOUND, BOUND), Increments(-STEP, STEP, DT), LIMITS.rotations)
         self.now_ns = self.seq = self.sent = self.paused_ns = 0
         self.linked = True  # between guard and robot
         self.heard = True  # by the guard
@@ -306,7 +307,7 @@ def test_way_to_rest_is_judged_as_the_plan_is(change: dict[str, Any], why: str) 
 
 def test_way_to_rest_that_needs_feedback_passes_only_where_the_states_are_known() -> None:
     mass = Mass()
-    mass.guard = Guard(replace(LIMITS, angles=np.zeros(0)), epoch=10)
+    mass.guard = Guard(replace(LIMITS, rotations=Rotations()), epoch=10)
     mass.wait(1000)
     assert not mass.send(**mass.fed_back())
     assert "its way to rest feeds 2 states back, of 0 that are known" in mass.refused

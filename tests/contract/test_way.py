@@ -16,6 +16,7 @@ from rti_mpc.contract.message import Command
 from rti_mpc.contract.schedule import NO_COMMAND, Schedule, end_ns, unfit
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.contract.way import Way
+from rti_mpc.rotation import Rotations
 
 MS = 1_000_000
 STEP = np.array([0.25])  # per 100 ms
@@ -23,6 +24,7 @@ SLEW = STEP / 0.1
 LIMITS = Increments(-STEP, STEP, 100 * MS)
 BOUNDS = (np.array([-0.5]), np.array([0.5]))
 BRAKES = [0.0, -0.25, -0.4, -0.4, -0.15, 0.0]  # of a robot whose input is an acceleration: not even on its way to 0
+PLAIN = Rotations(2)
 GAIN = {"x_rest": np.column_stack([np.linspace(1.0, 0.0, 6), np.linspace(3.0, 4.0, 6)]), "K": np.array([[0.5, 0.1]])}
 
 
@@ -34,8 +36,8 @@ def command(u: float = 0.2, rows: list[float] | None = None, stamp_ms: int = 0, 
     return replace(plan, **({"rest_period_ns": period_ms * MS, "u_rest": way} | change))
 
 
-def schedule(*commands: Command, angles: tuple[bool, ...] = (False, False)) -> Schedule:
-    plans = Schedule(np.zeros(1), SLEW, LIMITS, BOUNDS, np.array(angles))
+def schedule(*commands: Command, rotations: Rotations = PLAIN) -> Schedule:
+    plans = Schedule(np.zeros(1), SLEW, LIMITS, BOUNDS, rotations)
     for one in commands:
         plans.add(one, one.stamp_ns, end_ns(one))
     return plans
@@ -161,23 +163,23 @@ def test_deviation_is_that_from_the_state_of_its_time_between_the_rows() -> None
         (750, [0.0, 4.0], 0.0),
         (9750, [0.2, 4.0], -0.1),  # held
     ):
-        np.testing.assert_allclose(way.corrected(np.array(x), t_ms * MS, np.zeros(2)).correction, [u], atol=1e-12)
+        np.testing.assert_allclose(way.corrected(np.array(x), t_ms * MS, PLAIN).correction, [u], atol=1e-12)
 
 
 @pytest.mark.parametrize("turns", [-3, -1, 0, 1, 2])
 def test_angles_are_compared_modulo_a_turn(turns: int) -> None:
     way = Way.of(command(x_rest=np.column_stack([np.linspace(3.1, 3.2, 6), np.zeros(6)]), K=np.array([[1.0, 0.0]])), 0)
     assert way is not None
-    corrected = way.corrected(np.array([3.2 + turns * 2 * np.pi, 0.0]), 0, np.array([True, False]))
+    corrected = way.corrected(np.array([3.2 + turns * 2 * np.pi, 0.0]), 0, Rotations(2, (0,)))
     np.testing.assert_allclose(corrected.correction, [-0.1], atol=1e-12)
 
 
 def test_state_from_before_the_way_or_of_another_size_corrects_nothing() -> None:
     way = Way.of(command(**GAIN), 250 * MS)
     assert way is not None
-    assert way.corrected(np.ones(2), 249 * MS, np.zeros(2)) is way
-    assert way.corrected(np.ones(3), 300 * MS, np.zeros(3)) is way
-    assert way.corrected(None, 300 * MS, np.zeros(2)) is way
+    assert way.corrected(np.ones(2), 249 * MS, PLAIN) is way
+    assert way.corrected(np.ones(3), 300 * MS, Rotations(3)) is way
+    assert way.corrected(None, 300 * MS, PLAIN) is way
 
 
 def test_correction_acts_until_the_next_state_inside_bounds_and_slew_limits() -> None:
@@ -266,7 +268,7 @@ def test_way_to_rest_that_is_not_finite_is_unfit(name: str) -> None:
 
 
 def test_robot_on_its_way_to_rest_is_believed_to_go_on() -> None:
-    belief = Belief(np.zeros(1), SLEW, LIMITS, BOUNDS, np.zeros(2))
+    belief = Belief(np.zeros(1), SLEW, LIMITS, BOUNDS, PLAIN)
     one = command()
     belief.add(one, 0, end_ns(one), approached=False)
     assert not belief.correct(100 * MS, np.array([0.2]), (1, 1))
@@ -277,7 +279,7 @@ def test_robot_on_its_way_to_rest_is_believed_to_go_on() -> None:
 
 
 def test_input_that_nobody_expected_is_believed_to_go_on_along_the_way() -> None:
-    belief = Belief(np.zeros(1), SLEW, LIMITS, BOUNDS, np.zeros(2))
+    belief = Belief(np.zeros(1), SLEW, LIMITS, BOUNDS, PLAIN)
     one = command()
     belief.add(one, 0, end_ns(one), approached=False)
     belief.correct(300 * MS, np.array([0.0]), NO_COMMAND)

@@ -13,6 +13,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.sent import Sent
+from rti_mpc.rotation import Rotations
 from rti_mpc.wire.actuator import Actuator
 
 MS = 1_000_000
@@ -193,7 +194,7 @@ def test_robot_is_known_to_go_the_way_to_rest_of_its_last_command() -> None:
 
 def test_state_that_is_fed_back_is_known_to_change_what_acts() -> None:
     fed_back = {"x_rest": np.zeros((4, 1)), "K": np.array([[0.5], [0.0]])}
-    memory = Sent(np.zeros(2), -SLEW, SLEW, DT, (-np.ones(2), np.ones(2)), np.zeros(1))
+    memory = Sent(np.zeros(2), -SLEW, SLEW, DT, (-np.ones(2), np.ones(2)), Rotations(1))
     memory.append(resting(1, 0, np.full((4, 2), 0.2), **fed_back))
     memory.feed_back(np.array([1.0]), 200 * MS)
     np.testing.assert_allclose(memory.at(300 * MS)[0], [0.1, 0.0])  # a plan acted

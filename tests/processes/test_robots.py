@@ -22,6 +22,7 @@ pytest.importorskip("matplotlib")
 # Robot time in s, and its speed: the shorter the period, the nearer to real time.
 RUNS = {
     "quadrotor": (6, 0.5),
+    "quadrotor_quaternion": (6, 0.5),
     "dynamic_bicycle": (6, 1),
     "two_link_arm": (6, 1),
     "kinematic_bicycle": (8, 2),

@@ -10,6 +10,7 @@ import pytest
 
 from rti_mpc.errors import ConfigError
 from rti_mpc.reference.outputs import OUTPUT_SCENARIOS, names_outputs, recorded
+from rti_mpc.rotation import Rotations
 from rti_mpc.signals import Signal
 
 INFINITE = np.full(3, np.inf)
@@ -49,7 +50,7 @@ def test_file_has_a_column_for_each_output_by_name_and_times_from_any_start_on(t
     """Angles are interpolated across whole turns; the last row holds."""
     path = tmp_path / "wave.csv"
     path.write_text("# a comment\n z , note, t, q1\n\n0.0,a,100.0,3.1\n1.0,b,101.0,-3.1\n2.0,c,103.0,-3.0\n")
-    reference = recorded(path, JOINTS)
+    reference = recorded(path, JOINTS, Rotations.of(JOINTS))
     assert (reference.name, reference.duration_s) == ("wave", 3.0)
     y = reference.rows(np.full(2, np.nan), np.array([0.0, 0.5, 2.0, 9.0]))
     np.testing.assert_allclose(y[:, 1], [0.0, 0.5, 1.5, 2.0])
@@ -74,7 +75,7 @@ def test_what_is_wrong_with_a_file_is_one_line_that_names_line_and_column(text: 
     path = tmp_path / "wave.csv"
     path.write_text(text)
     with pytest.raises(ConfigError) as refusal:
-        recorded(path, JOINTS)
+        recorded(path, JOINTS, Rotations.of(JOINTS))
     assert str(refusal.value).startswith(str(path))
     assert told in str(refusal.value)
 
@@ -82,7 +83,7 @@ def test_what_is_wrong_with_a_file_is_one_line_that_names_line_and_column(text: 
 def test_columns_may_be_separated_as_those_of_waypoints(tmp_path: Path) -> None:
     path = tmp_path / "wave.csv"
     path.write_text("t;q1;z\n0,0;0,5;1\n1,0;1,5;2\n")
-    np.testing.assert_allclose(recorded(path, JOINTS).rows(np.zeros(2), np.array([0.5])), [[1.0, 1.5]])
+    np.testing.assert_allclose(recorded(path, JOINTS, Rotations.of(JOINTS)).rows(np.zeros(2), np.array([0.5])), [[1.0, 1.5]])
 
 
 def test_waypoints_are_told_from_outputs_over_time_by_their_header(tmp_path: Path) -> None:

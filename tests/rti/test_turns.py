@@ -9,13 +9,12 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from rti_mpc.angle import whole_turns
 from rti_mpc.array import Array
 from rti_mpc.model.model import Model, Signal
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.turns import MAX_ERROR_RAD
-from tests.problems import INF, beacon
+from tests.problems import beacon
 
 TURN = 2 * np.pi
 SOLVERS = ("riccati", "osqp", "daqp")
@@ -57,17 +56,6 @@ def held_at(rti: Rti, states: Array, reference: float = 0.0) -> Array:
         rti.feedback(np.atleast_1d(state))
         inputs.append(rti.u[0, 0])
     return np.array(inputs)
-
-
-@pytest.mark.parametrize("angle", [0.0, 3.1, -3.1, 3.2, 9.0, -200.0])
-def test_whole_turns_leave_half_a_turn_at_most(angle: float) -> None:
-    assert whole_turns(angle) / TURN == pytest.approx(round(angle / TURN))
-    assert abs(angle - whole_turns(angle)) <= np.pi
-
-
-@pytest.mark.parametrize("angle", [np.nan, INF, -INF, 1e12, -1e100])
-def test_there_are_no_whole_turns_in_what_is_no_angle(angle: float) -> None:
-    assert whole_turns(angle) == 0.0
 
 
 @pytest.mark.parametrize("solver", SOLVERS)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.rotation import Rotations
 from rti_mpc_sim.sensor import Sensor
 
 STD = np.array([0.01, 0.0])
@@ -21,26 +22,26 @@ def measured(sensor: Sensor, n: int = 2000) -> tuple[list[int], Array]:
 
 
 def test_seeded_noise_and_dropout_repeat() -> None:
-    first, second, other = (measured(Sensor(1, STD, (), dropout=0.1, seed=seed)) for seed in (3, 3, 4))
+    first, second, other = (measured(Sensor(1, STD, Rotations(2), dropout=0.1, seed=seed)) for seed in (3, 3, 4))
     assert first[0] == second[0]
     np.testing.assert_array_equal(first[1], second[1])
     assert first[0] != other[0]
 
 
 def test_noise_has_the_standard_deviation_asked_for() -> None:
-    _, x = measured(Sensor(1, STD, ()))
+    _, x = measured(Sensor(1, STD, Rotations(2)))
     np.testing.assert_allclose(x.std(axis=0), STD, rtol=0.06)
     np.testing.assert_allclose(x.mean(axis=0), [1.0, 4.0], atol=1e-3)
 
 
 def test_lost_states_leave_gaps_in_the_sequence() -> None:
-    seqs, _ = measured(Sensor(1, STD, (), dropout=0.25))
+    seqs, _ = measured(Sensor(1, STD, Rotations(2), dropout=0.25))
     assert 0.7 < len(seqs) / 2000 < 0.8
     assert seqs[-1] > 1990
 
 
 def test_angles_wrap_and_other_states_do_not() -> None:
-    sensor = Sensor(1, np.zeros(4), (1, 2, 3))
+    sensor = Sensor(1, np.zeros(4), Rotations(4, (1, 2, 3)))
     sensor.measure(np.array([4.0, 4.0, np.pi, -np.pi]), 0)
     state = sensor.take(0)
     assert state is not None
@@ -48,7 +49,7 @@ def test_angles_wrap_and_other_states_do_not() -> None:
 
 
 def test_delayed_state_keeps_the_stamp_of_its_measurement() -> None:
-    sensor = Sensor(1, STD, (), delay_ns=30)
+    sensor = Sensor(1, STD, Rotations(2), delay_ns=30)
     sensor.measure(np.zeros(2), 100)
     assert sensor.due_ns == 130
     assert sensor.take(129) is None

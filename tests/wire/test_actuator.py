@@ -14,6 +14,7 @@ from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.schedule import RAMP_STEP_NS
 from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.rotation import Rotations
 from rti_mpc.wire.actuator import Actuator
 
 MS = 1_000_000
@@ -293,7 +294,7 @@ def test_way_to_rest_that_was_interrupted_is_forgotten() -> None:
 
 
 def test_measurements_correct_a_way_to_rest_after_the_delay_inside_the_bounds() -> None:
-    robot = Actuator(np.zeros(2), SLEW, 7, 20 * MS, (np.array([-0.3, -0.3]), np.array([0.3, 0.3])), angles=np.array([False, True]))
+    robot = Actuator(np.zeros(2), SLEW, 7, 20 * MS, (np.array([-0.3, -0.3]), np.array([0.3, 0.3])), rotations=Rotations(2, (1,)))
     fed_back = WAY | {"x_rest": np.zeros((3, 2)), "K": np.array([[1.0, 0.0], [0.0, 0.2]])}
     assert robot.accept(replace(command(), **fed_back), 0) == ""
     robot.measure(np.array([9.0, 9.0]), 100 * MS)  # a plan acts
@@ -307,7 +308,7 @@ def test_measurements_correct_a_way_to_rest_after_the_delay_inside_the_bounds() 
 
 @pytest.mark.parametrize("change", [{"K": np.zeros((2, 3)), "x_rest": np.zeros((3, 3))}, {"u_rest": np.zeros((3, 1))}, {"rest_period_ns": 0}])
 def test_way_to_rest_of_another_robot_is_refused(change: dict[str, Any]) -> None:
-    robot = Actuator(np.zeros(2), SLEW, 7, angles=np.array([False, True]))
+    robot = Actuator(np.zeros(2), SLEW, 7, rotations=Rotations(2, (1,)))
     assert robot.accept(replace(command(), **(WAY | change)), 0) == "wrong_shape"
     assert played(robot, 0, 500) == [(0, 0.0)]
 

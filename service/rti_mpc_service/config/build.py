@@ -232,6 +232,7 @@ def guard_limits(config: Config, signals: Signals) -> Limits:
     """Return the limits of the guard, of a model with these signals; no model is loaded."""
     from rti_mpc.contract.limits import Limits
     from rti_mpc.control.grid import MAX_DELAY_PERIODS
+    from rti_mpc.rotation import Rotations
 
     inputs = names(signals.inputs)
     lbu, ubu = bounds(config.ocp.bounds.inputs, inputs)
@@ -244,7 +245,7 @@ def guard_limits(config: Config, signals: Signals) -> Limits:
         ubdu=np.array(ubdu),
         dt_s=config.ocp.dt_s,
         delay_s=MAX_DELAY_PERIODS * config.ocp.dt_s if config.delay_s is None else config.delay_s,
-        angles=np.array([state.angle for state in signals.states], dtype=bool),
+        rotations=Rotations.of(signals.states, signals.quaternions),
         stale_s=config.timing.valid_s,  # of commands, too: a ramp answers a state that is stale
     )
 

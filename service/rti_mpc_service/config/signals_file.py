@@ -36,18 +36,22 @@ class Signals:
         states: Labels of the states, in the model's order.
         inputs: Labels of the inputs, in the model's order.
         u_rest: Inputs at rest, in the same order.
+        quaternions: Names of w, x, y, z of each attitude among the states.
     """
 
     model: str
     states: tuple[Label, ...]
     inputs: tuple[Label, ...]
     u_rest: tuple[float, ...]
+    quaternions: tuple[tuple[str, ...], ...] = ()
 
     @classmethod
     def of(cls, name: str, model: Model) -> Signals:
         """Return those of a model of this name."""
         states = tuple(Label(signal.name, signal.unit, signal.angle) for signal in model.states)
-        return cls(name, states, tuple(Label(signal.name, signal.unit) for signal in model.inputs), tuple(map(float, model.u_rest)))
+        inputs = tuple(Label(signal.name, signal.unit) for signal in model.inputs)
+        quaternions = tuple(tuple(states[i].name for i in places) for places in model.rotations("states").quaternions)
+        return cls(name, states, inputs, tuple(map(float, model.u_rest)), quaternions)
 
     def to_text(self) -> str:
         """Return the content of the file."""
@@ -58,6 +62,8 @@ class Signals:
             "states": [{"name": label.name, "unit": label.unit, "angle": label.angle} for label in self.states],
             "inputs": [{"name": label.name, "unit": label.unit, "rest": value} for label, value in rest],
         }
+        if self.quaternions:
+            content["quaternions"] = self.quaternions
         return json.dumps(content, indent=1) + "\n"
 
 
@@ -150,4 +156,16 @@ def _signals(content: dict[str, object]) -> Signals:
         tuple(Label(str(state["name"]), str(state["unit"]), state["angle"] is True) for state in states),
         tuple(Label(str(input["name"]), str(input["unit"])) for input in inputs),
         tuple(float(input["rest"]) for input in inputs),
+        quaternions_among(content, states),
     )
+
+
+def quaternions_among(content: dict[str, object], states: list[dict[str, object]]) -> tuple[tuple[str, ...], ...]:
+    """Return the quaternions in the content of a file, none if it has none; what is none of its states raises whatever it raises."""
+    listed, known = content.get("quaternions", []), {str(state["name"]) for state in states}
+    if not isinstance(listed, list):
+        raise TypeError
+    quaternions = tuple(tuple(map(str, names)) for names in listed)
+    if not all(len(names) == 4 and known.issuperset(names) for names in quaternions):
+        raise ValueError
+    return quaternions

@@ -144,7 +144,7 @@ def way(stand: Stand) -> Finding:
 def gain(stand: Stand) -> Finding:
     """Judge a way to rest whose rows alone are the ramp, and which by its gain and the robot's states first holds the inputs."""
     ready(stand)
-    levels, period_ms, nx = stand.levels, stand.period_ns / MS, len(stand.limits.angles)
+    levels, period_ms, nx = stand.levels, stand.period_ns / MS, stand.limits.rotations.size
     held, away = 8 + round(300.0 / period_ms), levels.high - levels.rest
     ramp = np.linspace(1.0, 0.0, len(levels.way(levels.high, 0)) + 1)[1:]  # as shares of the way up from rest
     alone, wanted = np.concatenate([ramp, np.zeros(held)]), np.concatenate([np.ones(held), ramp])

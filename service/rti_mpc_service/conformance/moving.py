@@ -22,7 +22,7 @@ from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command, State
 from rti_mpc.contract.schedule import end_ns
-from rti_mpc.contract.way import Way, unturned
+from rti_mpc.contract.way import Way
 from rti_mpc.control.controller import Controller
 from rti_mpc_service.conformance import robot
 from rti_mpc_service.conformance.finding import Case, Finding, Unseen
@@ -208,7 +208,7 @@ class MovingTrial:
                 way = Way.of(command, ends_ns)
                 assert way is not None
                 felt = [state for state in seen if s_ns - late_ns - 2 * spacing_ns <= state.stamp_ns <= s_ns]
-                ways = [way.corrected(state.x, state.stamp_ns, self.limits.angles) for state in felt] or [way]
+                ways = [way.corrected(state.x, state.stamp_ns, self.limits.rotations) for state in felt] or [way]
                 acting += [np.clip(way.u[way.row(s_ns)] + each.correction, self.limits.lbu, self.limits.ubu) for each in ways]
         if not acting:
             return np.full_like(self.size, -np.inf), np.full_like(self.size, np.inf), self.size
@@ -241,7 +241,7 @@ class MovingTrial:
 
 def states(trial: MovingTrial) -> Finding:
     """Judge the states that come while the robot is held."""
-    return sound(trial.run(STANDS_NS, healthy), len(trial.limits.angles))
+    return sound(trial.run(STANDS_NS, healthy), trial.limits.rotations.size)
 
 
 def plays(trial: MovingTrial) -> Finding:
@@ -383,7 +383,7 @@ def stands(trial: MovingTrial) -> Finding:
         return finding
     before = trial.state
     trial.run(STANDS_NS)
-    away = np.abs(unturned(trial.state.x - before.x, trial.limits.angles))
+    away = np.abs(trial.limits.rotations.difference(trial.state.x, before.x))
     if (away > STILL_SHARE * trial.rates).any():
         return Finding(False, f"within {seconds(STANDS_NS)} of silence its states changed by {shown(away)}")
     return Finding(True, f"it stayed at rest for {seconds(4 * STANDS_NS)} without commands")

@@ -183,7 +183,7 @@ def seconds(ns: float) -> str:
 
 def states(trial: Trial) -> Finding:
     """Judge the states that come while nothing is commanded."""
-    return sound(trial.run(STANDS_NS), len(trial.limits.angles))
+    return sound(trial.run(STANDS_NS), trial.limits.rotations.size)
 
 
 def sound(seen: list[State], nx: int) -> Finding:

@@ -78,7 +78,7 @@ class Stand:
         self.leader += 10
         self._zero_ns = time.monotonic_ns() - BIRTH_NS
         self._played_ns = self._due_ns = BIRTH_NS
-        self.state = State(self.epoch, 0, BIRTH_NS, np.zeros(len(self.limits.angles)))
+        self.state = State(self.epoch, 0, BIRTH_NS, np.zeros(self.limits.rotations.size))
         self.actuator = self._standing()
         self.heard: list[tuple[int, Command]] = []
         self._sent_ns: dict[int, int] = {}  # by number of the state
@@ -100,7 +100,7 @@ class Stand:
         until_ns = self.now_ns + round(ms * MS)
         while self.now_ns < until_ns:
             if self.now_ns >= self._due_ns:
-                self.state = State(self.epoch, self.state.seq + 1, self.now_ns, np.zeros(len(self.limits.angles)))
+                self.state = State(self.epoch, self.state.seq + 1, self.now_ns, np.zeros(self.limits.rotations.size))
                 self._due_ns = max(self._due_ns + self.period_ns, self.now_ns)
                 self.actuator.measure(self.state.x, self.now_ns)
                 if not self.deaf:
@@ -166,7 +166,7 @@ class Stand:
 
     def _standing(self) -> Actuator:
         """Return actuators at rest, which approach nothing: what the guard sends is what acts."""
-        return Actuator(self.limits.u_rest, self.limits.slew, self.epoch, angles=self.limits.angles)
+        return Actuator(self.limits.u_rest, self.limits.slew, self.epoch, rotations=self.limits.rotations)
 
     def _play(self, to_ns: int) -> None:
         for until_ns, u in self.actuator.play(self._played_ns, to_ns):

@@ -11,7 +11,6 @@ for long enough. Robot and controller have priority over all others.
 from __future__ import annotations
 
 import json
-import math
 import re
 import sys
 import time
@@ -301,11 +300,11 @@ def follow(run: DemoPlan, model: Model, witness: Witness, board: Board, children
 
 def error_text(model: Model, sample: Telemetry, reference: Reference) -> str:
     """Return the error of a sample as text: the distance in the plane, or the error of each output."""
-    error, columns = sample.y - wanted(reference, np.array(sample.stamp_ns)), plane(model.outputs)
+    error = model.rotations("outputs").difference(sample.y, wanted(reference, np.array(sample.stamp_ns)))
+    columns = plane(model.outputs)
     if in_plane(model.outputs) and columns is not None:
         return f"{1e3 * float(np.hypot(*error[list(columns)])):.2f} mm"
-    errors = [math.remainder(value, math.tau) if output.angle else value for value, output in zip(error, model.outputs, strict=True)]
-    return "  ".join(f"{output.name} {value:+.3g} {output.unit}" for value, output in zip(errors, model.outputs, strict=True))
+    return "  ".join(f"{output.name} {value:+.3g} {output.unit}" for value, output in zip(error, model.outputs, strict=True))
 
 
 def conclude(run: DemoPlan, outcome: Outcome, console: Console) -> int:

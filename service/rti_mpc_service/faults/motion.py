@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Reference
+from rti_mpc.rotation import Rotations
 from rti_mpc.signals import in_plane, plane
 from rti_mpc_service.rig.run_data import wanted
 
@@ -40,7 +41,7 @@ class Motion:
         units = {output.unit for output in measured}
         self.unit = units.pop() if len(units) == 1 else "1"
         self.driven_speed = DRIVEN_OUTPUT_SPEED if place is None else DRIVEN_SPEED_M_S
-        self._angles = [i for i, output in enumerate(measured) if output.angle]
+        self._rotations = Rotations.of(measured, model.quaternions)
         self._h, self._p = model.h(), model.p_nominal
 
     def position(self, x: Array) -> Array:
@@ -55,7 +56,5 @@ class Motion:
         return np.asarray(wanted(reference, stamp_ns)[..., self._columns])
 
     def distance(self, a: Array, b: Array) -> Array:
-        """Return how far outputs are from each other, both of shape ``(..., k)``, angles within pi; shape ``(...)``."""
-        away = np.array(a - b)
-        away[..., self._angles] = np.remainder(away[..., self._angles] + np.pi, 2 * np.pi) - np.pi
-        return np.asarray(np.linalg.norm(away, axis=-1))
+        """Return how far outputs are from each other, both of shape ``(..., k)``, rotations written near to each other; shape ``(...)``."""
+        return np.asarray(np.linalg.norm(self._rotations.difference(a, b), axis=-1))

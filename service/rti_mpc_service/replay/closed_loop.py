@@ -160,9 +160,8 @@ def phase_times(samples: Sequence[Telemetry]) -> Numbers:
 def distance(recorded: Run, driven: Run) -> dict[str, float]:
     """Return how far the drives are apart at most at samples of the same time, by name of state and input, in their units."""
     _, mine, other = np.intersect1d(recorded.stamp_ns, driven.stamp_ns, return_indices=True)
-    x, u = driven.x[other] - recorded.x[mine], driven.u_applied[other] - recorded.u_applied[mine]
-    angles = [i for i, label in enumerate(recorded.info.states) if label.angle]
-    x[:, angles] = np.remainder(x[:, angles] + np.pi, 2 * np.pi) - np.pi
+    x = recorded.info.rotations("states").difference(driven.x[other], recorded.x[mine])
+    u = driven.u_applied[other] - recorded.u_applied[mine]
     names = [label.name for label in (*recorded.info.states, *recorded.info.inputs)]
     return dict(zip(names, map(largest, np.hstack([x, u]).T), strict=True))
 

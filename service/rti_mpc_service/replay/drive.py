@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -24,7 +24,7 @@ from rti_mpc.contract.robot_clock import RobotClock
 from rti_mpc.contract.schedule import NO_COMMAND
 from rti_mpc.journal.entry import JournalEntry
 from rti_mpc.journal.replay import Difference, Replay
-from rti_mpc.signals import Signal
+from rti_mpc.rotation import Rotations
 from rti_mpc_service.case import solver_of
 from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, repeat
 from rti_mpc_service.rig.run_data import wanted
@@ -224,7 +224,7 @@ class Drive(Replay):
         elif entry.name == "commit":
             self._waits = False
         if controller.followed is not self._followed and (followed := controller.followed) is not None:
-            self._followed, self._rows = followed, unwrapped(followed, self.ocp.model.outputs)
+            self._followed, self._rows = followed, unwrapped(followed, self.ocp.model.rotations("outputs"))
             passage.references.append((max(len(passage.states) - 1, 0), followed))
         if entry.name == "prepare" and self._sent:
             self._sample()
@@ -243,11 +243,10 @@ class Drive(Replay):
         self.passage.wanted.append(nothing if self._rows is None else wanted(self._rows, np.array(sample.stamp_ns, np.int64)))
 
 
-def unwrapped(reference: Reference, outputs: Sequence[Signal]) -> Reference:
-    """Return a reference whose angles do not jump, so that it may be interpolated."""
-    angles = [i for i, signal in enumerate(outputs) if signal.angle]
+def unwrapped(reference: Reference, outputs: Rotations) -> Reference:
+    """Return a reference whose rotations do not jump, so that it may be interpolated."""
     y = reference.y.copy()
-    y[:, angles] = np.unwrap(y[:, angles], axis=0)
+    outputs.unwrap(y)
     return replace(reference, y=y)
 
 

@@ -86,10 +86,7 @@ class Run:
     @property
     def output_error(self) -> Array:
         """True outputs less those asked for at the same stamp, angles within pi, each in its unit; shape ``(M, ny)``."""
-        error = self.y - self.reference
-        angles = [i for i, label in enumerate(self.info.outputs) if label.angle]
-        error[:, angles] = np.remainder(error[:, angles] + np.pi, 2 * np.pi) - np.pi
-        return np.asarray(error)
+        return self.info.rotations("outputs").difference(self.y, self.reference)
 
     def _position(self, y: Array) -> Array:
         columns = plane(self.info.outputs)

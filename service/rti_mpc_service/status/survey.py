@@ -88,11 +88,8 @@ class Survey:
             return
         if (1, *sample.y.shape) != before.y_ref[:1].shape or len(sample.y) != len(info.outputs):  # messages of others may be of any width
             return
-        error = sample.y - before.y_ref[0]
-        values = {
-            label.name: (math.remainder(value, math.tau) if label.angle else value, label.unit)
-            for label, value in zip(info.outputs, error.tolist(), strict=True)
-        }
+        error = info.rotations("outputs").difference(sample.y, before.y_ref[0])
+        values = {label.name: (value, label.unit) for label, value in zip(info.outputs, error.tolist(), strict=True)}
         if (position := plane(info.outputs)) is not None:
             values = {"position": (1e3 * math.hypot(*error[list(position)]), "mm"), **values}
         self._error = values

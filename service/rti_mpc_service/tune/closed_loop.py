@@ -207,10 +207,8 @@ class ClosedLoop:
         p = np.tile(np.array(self.model.p_nominal)[:, None], len(t))
         y = np.array(self.model.h().map(len(t))(x.T, p)).T.reshape(len(t), self.model.ny)
         rows_s = self.scenario.period_s * np.arange(len(rows))
-        e = y - np.column_stack([np.interp(t, rows_s, column) for column in rows.T])
-        for j, output in enumerate(self.model.outputs):
-            if output.angle:
-                e[:, j] -= 2 * np.pi * np.round(e[:, j] / (2 * np.pi))
+        wanted: Array = np.column_stack([np.interp(t, rows_s, column) for column in rows.T])
+        e = self.model.rotations("outputs").difference(y, wanted)
         squares = (e**2).mean(axis=0)
         unit = self._Q[self._Q > 0.0][0]
         increments = np.diff(u[u[:, 0] >= transient_s, 1:], axis=0) / self._range

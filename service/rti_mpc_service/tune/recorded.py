@@ -55,9 +55,7 @@ def recorded(config: Config, heard: RecordedRobot, part: tuple[float, float], du
     end_ns, ahead = int(at[-1]), span[-1].y_ref[1:]  # what was known at the end lets the controller look ahead there, as it did
     at = np.concatenate([at, end_ns + dt_ns * np.arange(1, len(ahead) + 1)])
     rows = np.concatenate([[sample.y_ref[0] for sample in span], ahead])
-    for j, output in enumerate(model.outputs):
-        if output.angle:
-            rows[:, j] = np.unwrap(rows[:, j])
+    model.rotations("outputs").unwrap(rows)
     grid = np.arange(at[0], at[-1] + 1, dt_ns)
     y: Array = np.column_stack([np.interp(grid, at, column) for column in rows.T])
     start = max((state for state in states if state.stamp_ns <= at[0]), key=lambda state: state.stamp_ns, default=states[0])

@@ -79,8 +79,7 @@ def windows_of(model: Model, states: Sequence[State], commands: Sequence[Command
     t = 1e-9 * np.array([state.stamp_ns - begin_ns for state in states])
     every = max(1, round(dt_s / float(np.median(np.diff(t)))))
     t, x = t[::every], np.array([state.x for state in states[::every]])
-    angles = [i for i, signal in enumerate(model.states) if signal.angle]
-    x[:, angles] = np.unwrap(x[:, angles], axis=0)
+    model.rotations("states").unwrap(x)
     step_s = float(np.median(np.diff(t)))
     gaps = np.diff(t) > MAX_GAP * step_s
     firsts = np.array([k for k in range(0, len(gaps) - WINDOW + 1, WINDOW) if not gaps[k : k + WINDOW].any()], np.intp)

@@ -52,8 +52,8 @@ def tracking_error(info: Info, references: Sequence[Reference], stamps: NDArray[
         y: Some of the outputs by their indices, each of shape ``(n,)``.
 
     Returns:
-        By name of each of these outputs: itself minus reference, in its unit, angles within pi; and ``position``, the distance
-        in the plane, in mm, where both its outputs are among them. Shape ``(n,)``; NaN before any row 0, against the last row after it.
+        By name of each of these outputs: itself minus reference, in its unit, rotations written near to it; and ``position``, the
+        distance in the plane, in mm, where both its outputs are among them. Shape ``(n,)``; NaN before any row 0, against the last row after it.
     """
     errors: dict[str, Array] = {}
     for reference in references:
@@ -64,12 +64,14 @@ def tracking_error(info: Info, references: Sequence[Reference], stamps: NDArray[
 
 
 def _error(info: Info, reference: Reference, stamps: NDArray[np.int64], y: Mapping[int, Array]) -> dict[str, Array]:
-    row = (stamps - reference.stamp_ns) / reference.period_ns
-    error, position = {}, plane(info.outputs)
-    for i, values in y.items():
-        label, wanted = info.outputs[i], reference.y[:, i]
-        deviation = values - np.interp(row, np.arange(len(wanted)), np.unwrap(wanted) if label.angle else wanted)
-        error[label.name] = np.remainder(deviation + np.pi, 2 * np.pi) - np.pi if label.angle else deviation
+    row, rows, position = (stamps - reference.stamp_ns) / reference.period_ns, reference.y.copy(), plane(info.outputs)
+    rotations = info.rotations("outputs")
+    rotations.unwrap(rows)
+    wanted = np.column_stack([np.interp(row, np.arange(len(rows)), column) for column in rows.T])
+    values: Array = np.full_like(wanted, np.nan)
+    values[:, list(y)] = np.column_stack(list(y.values()))
+    deviation = rotations.difference(values, wanted)
+    error = {info.outputs[i].name: deviation[:, i] for i in y}
     if position is not None and set(position) <= set(y):
         error["position"] = 1e3 * np.hypot(*(error[info.outputs[i].name] for i in position))
     return error

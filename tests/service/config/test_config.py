@@ -487,7 +487,7 @@ def test_limits_of_the_guard_are_those_of_the_problem_in_the_models_order(tmp_pa
     for name in ("lbu", "ubu", "lbdu", "ubdu"):
         np.testing.assert_array_equal(getattr(limits, name), getattr(ocp, name))
     np.testing.assert_array_equal(limits.u_rest, ocp.model.u_rest)
-    np.testing.assert_array_equal(limits.angles, [state.angle for state in ocp.model.states])
+    assert limits.rotations == ocp.model.rotations("states")
     np.testing.assert_allclose(limits.slew, [2.5, 4.0])
     assert limits.settling_s == pytest.approx(0.3 + 0.2)
     assert config.config_hash == load(SHIPPED).config_hash

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import ConfigError
+from rti_mpc.rotation import Rotations
 from rti_mpc_service.check import check
 from rti_mpc_service.check.agreement import Agreement
 from rti_mpc_service.cli import app
@@ -79,7 +80,7 @@ def test_guard_knows_a_model_from_the_file_that_check_writes_and_does_without_th
     (path.parent / "my_robot.py").unlink()
     config = load(path, with_model=False)
     limits = guard_limits(config, signals_file.read(path, config))
-    assert (limits.angles.tolist(), limits.u_rest.tolist()) == ([False, False, True, False], [0.0, 0.0])
+    assert (limits.rotations, limits.u_rest.tolist()) == (Rotations(4, (2,)), [0.0, 0.0])
     assert (limits.lbu.tolist(), limits.ubu.tolist()) == ([-2.0, -0.5], [2.0, 0.5]), "in the model's order, not in that of the file"
 
 

@@ -38,8 +38,7 @@ class LockstepLink(Link):
 def verdicts(name: str, link: LockstepLink) -> dict[str, tuple[str, str]]:
     ocp, law = ocp_of(name), law_of(name)
     assert law is not None
-    angles = np.array([state.angle for state in ocp.model.states])
-    limits = Limits(np.array(ocp.model.u_rest), ocp.lbu, ocp.ubu, ocp.lbdu, ocp.ubdu, ocp.dt, angles=angles)
+    limits = Limits(np.array(ocp.model.u_rest), ocp.lbu, ocp.ubu, ocp.lbdu, ocp.ubdu, ocp.dt, rotations=ocp.model.rotations("states"))
     controller = Controller(Rti(ocp, compile=False), Timing(), stop_law=law, compile=False)
     trial = MovingTrial(link, limits, controller, law.rates, 5 << NUMBER_BITS)
     found = {judgement.case.name: (judgement.verdict, judgement.finding.seen) for judgement in judgements(CASES, trial, None)}
