@@ -44,7 +44,10 @@ def demo(
             show_default="the scenario's best",
         ),
     ] = None,
-    speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Simulated seconds per second of real time.")] = 4.0,
+    speed: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=100.0, help="Simulated seconds per second of real time.", show_default="4, or less for periods under 40 ms"),
+    ] = None,
     duration: Annotated[
         float | None, typer.Option(metavar="SECONDS", min=1.0, help="Duration of the drive, robot time.", show_default="the scenario's own")
     ] = None,

@@ -59,6 +59,7 @@ END_TIMEOUT_S = 5.0  # a guard may take 3 s to bring the robot to rest
 POLL_PERIOD_S = 0.1
 DRAW_PERIOD_S = 0.25
 REFERENCE_MARGIN_S = 5.0  # reference beyond the last sample's horizon: near the last row a controller slows down
+MAX_USUAL_SPEED, SHORTEST_REAL_PERIOD_S = 4.0, 0.01  # of demos that are not told their speed: controller, robot, guard and watchers share a host
 WATCHER_END_TIMEOUT_S = 8.0  # for viewer and recorder to write what they have received
 WATCHERS = {role: module for role, module in (("viewer", "rerun"), ("recorder", "mcap")) if find_spec(module)}
 # The viewer ends first, so that what it shows ends while the robot is still driven; the recorder ends when all others have said their last.
@@ -98,7 +99,7 @@ def plan(
     waypoint_smoothing_m: float | None,
     path: str | None,
     path_limits: tuple[float, float, float, float] | None,
-    speed: float,
+    speed: float | None,
     duration_s: float | None,
     folder: Path | None,
     viewer: bool,
@@ -127,10 +128,15 @@ def plan(
         scenario=scenario,
         reference=reference,
         duration_s=duration_s or scenario.duration_s,
-        speed=speed,
+        speed=usual_speed(config.ocp.dt_s) if speed is None else speed,
         folder=folder or Path("runs") / f"{scenario.name}-{datetime.now():%Y%m%d-%H%M%S}",
         viewer=viewer,
     )
+
+
+def usual_speed(dt_s: float) -> float:
+    """Return how many times real speed a demo drives a robot of a period in s: as fast as processes on a host keep up with, at least at real speed."""
+    return max(1.0, min(MAX_USUAL_SPEED, dt_s / SHORTEST_REAL_PERIOD_S))
 
 
 def check_no_path(config: Config, path_limits: object) -> None:
@@ -281,7 +287,8 @@ def follow(run: DemoPlan, model: Model, witness: Witness, board: Board, children
     Raises:
         Failed: A process has ended by itself, or the robot was never driven.
     """
-    wait(lambda: witness.listen().begun, children, stop, START_TIMEOUT_S, "the first sample")
+    slower = f" at {run.speed:g} times real speed, which a lower --speed makes easier," if run.speed > 1.0 else ""
+    wait(lambda: witness.listen().begun, children, stop, START_TIMEOUT_S, f"the first sample{slower}")
     heard, heard_s, shown_s = 0, time.monotonic(), 0.0
     while not stop.is_set() and witness.reference is not None and witness.began_ns is not None:
         now_s, last = time.monotonic(), witness.telemetry[-1]
