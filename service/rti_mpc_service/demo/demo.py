@@ -135,7 +135,7 @@ def plan(
 
 
 def usual_speed(dt_s: float) -> float:
-    """Return how many times real speed a demo drives a robot of a period in s: as fast as processes on a host keep up with, at least at real speed."""
+    """Return how many times real speed a demo drives a robot of a period in s: what processes on a host keep up with, at least 1."""
     return max(1.0, min(MAX_USUAL_SPEED, dt_s / SHORTEST_REAL_PERIOD_S))
 
 
