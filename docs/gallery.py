@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
+from itertools import cycle
 from pathlib import Path
 
 import matplotlib as mpl
@@ -203,7 +204,7 @@ def draw(run: Drive, view: View, path: Path) -> None:
         plan.set(aspect="equal", xlabel=f"{view.axes[0]} [m]", ylabel=f"{view.axes[1]} [m]", title=f"{run.model.name}: {run.scenario}")
         plan.set_adjustable("datalim")
         errors.axvspan(0.0, TRANSIENT_SHARE * run.t[-1], color=SHADE_COLOR)
-        for signal, error, color in zip(run.model.outputs, run.error.T, COLORS, strict=False):
+        for signal, error, color in zip(run.model.outputs, run.error.T, cycle(COLORS), strict=False):
             errors.semilogy(run.t, np.maximum(np.abs(error), 1e-6), color=color, linewidth=1.0, label=f"{signal.name} [{signal.unit}]")
         errors.set(title="error", xlabel="robot time [s]", xlim=(0.0, run.t[-1]), ylim=(1e-6, 100.0 * np.abs(run.error).max()))
         errors.legend(loc="upper right", ncols=2)
@@ -212,7 +213,7 @@ def draw(run: Drive, view: View, path: Path) -> None:
 
 def told(run: Drive) -> str:
     """Return the largest errors after the transient in words."""
-    return ", ".join(f"{signal.name} {value:.2g} {signal.unit}" for signal, value in zip(run.model.outputs, run.settled, strict=True))
+    return ", ".join(f"{signal.name} {value:.2g} {signal.unit}".removesuffix(" 1") for signal, value in zip(run.model.outputs, run.settled, strict=True))
 
 
 PAGE = """# Robots that ship

@@ -311,7 +311,7 @@ def error_text(model: Model, sample: Telemetry, reference: Reference) -> str:
     columns = plane(model.outputs)
     if in_plane(model.outputs) and columns is not None:
         return f"{1e3 * float(np.hypot(*error[list(columns)])):.2f} mm"
-    return "  ".join(f"{output.name} {value:+.3g} {output.unit}" for value, output in zip(error, model.outputs, strict=True))
+    return "  ".join(f"{output.name} {value:+.3g} {output.unit}".removesuffix(" 1") for value, output in zip(error, model.outputs, strict=True))
 
 
 def conclude(run: DemoPlan, outcome: Outcome, console: Console) -> int:
