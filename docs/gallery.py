@@ -213,7 +213,8 @@ def draw(run: Drive, view: View, path: Path) -> None:
 
 def told(run: Drive) -> str:
     """Return the largest errors after the transient in words."""
-    return ", ".join(f"{signal.name} {value:.2g} {signal.unit}".removesuffix(" 1") for signal, value in zip(run.model.outputs, run.settled, strict=True))
+    settled = zip(run.model.outputs, run.settled, strict=True)
+    return ", ".join(f"{signal.name} {value:.2g} {signal.unit}".removesuffix(" 1") for signal, value in settled)
 
 
 PAGE = """# Robots that ship

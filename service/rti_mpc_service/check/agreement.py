@@ -14,12 +14,12 @@ import numpy as np
 import scipy.sparse as sp
 
 from rti_mpc.array import Array
-from rti_mpc.rti.active_set import COST_FLOOR
+from rti_mpc.rti.active_set import COST_FLOOR, MAX_GAP
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.case import solution
 
 AGREEMENT_TOLERANCE = 1e-5  # largest difference between two tight solutions of one QP, relative to half the range of each input
-COST_TOLERANCE = 1e-8  # by which the costs of two that differ by more may differ, relative as the gap of a certified plan, which may be 1e-6
+COST_TOLERANCE = MAX_GAP  # by which the costs of two that differ by more may differ: what a certified plan may cost above the optimum
 
 
 @dataclass(frozen=True)

@@ -152,4 +152,5 @@ def start_at(rti: Rti, x0: Array, j: int, wanted: float) -> Array:
         if curvature <= 0.0 or not np.isfinite(curvature):
             return x0
         x = x + squares * slope * (wanted - float(now[0])) / curvature
+    model.rotations("states").normalize(x)
     return x
