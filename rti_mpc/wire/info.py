@@ -148,7 +148,7 @@ class Info:
                 obstacles=tuple(_obstacle(disc) for disc in _few(document.get("obstacles", ()))),
                 dt_s=float(document.get("dt_s", math.nan)),
                 weights=_weights(document["weights"], len(vectors["outputs"]), len(vectors["inputs"])) if "weights" in document else None,
-                quaternions=tuple(tuple(map(str, _few(names))) for names in _few(document.get("quaternions", ()))),
+                quaternions=tuple(_quaternion(names) for names in _few(document.get("quaternions", ()))),
                 **vectors,
                 **bounds,
             )
@@ -334,6 +334,12 @@ def _label(signal: Mapping[str, Any]) -> Label:
         if not 0 < len(text) <= MAX_TEXT_CHARS or not text.isprintable():
             raise ValueError(f"names and units of 1 to {MAX_TEXT_CHARS} printable characters expected, got {text[:MAX_TEXT_CHARS]!r}")
     return label
+
+
+def _quaternion(names: Any) -> tuple[str, ...]:
+    if not isinstance(names, list | tuple) or len(names) != 4 or not all(isinstance(name, str) and len(name) <= MAX_TEXT_CHARS for name in names):
+        raise ValueError(f"names of w, x, y, z expected, got {str(names)[:MAX_TEXT_CHARS]}")
+    return tuple(names)
 
 
 def _weights(values: Mapping[str, Any], ny: int, nu: int) -> Weights:

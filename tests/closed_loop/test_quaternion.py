@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command, End, Reference, State
 from rti_mpc.contract.status import Mode
 from rti_mpc.contract.way import Way
@@ -118,12 +117,6 @@ def test_way_to_rest_is_corrected_alike_by_both_signs_of_the_measured_attitude()
         corrections = [way.corrected(state, t_ms * MS, rotations).correction for state in (x, other)]
         np.testing.assert_array_equal(*corrections)
     np.testing.assert_allclose(way.corrected(other, 0, rotations).correction, -way.K @ (x - states[0]), rtol=0, atol=1e-12)
-
-
-def test_gain_of_a_command_may_pass_a_guard_that_knows_how_many_states_there_are() -> None:
-    ocp = hummingbird()
-    bounds = ocp.lbu, ocp.ubu, ocp.lbdu, ocp.ubdu
-    assert Limits(np.array(ocp.model.u_rest), *bounds, ocp.dt, rotations=ocp.model.rotations("states")).rotations.quaternions == ((3, 4, 5, 6),)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 1.0, 3.0])

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from rti_mpc.errors import MessageError
+from rti_mpc.rotation import Rotations
 from rti_mpc.wire.info import Info, Label, Leader, Obstacle, bounds, labels, obstacles, parameters
 from rti_mpc.wire.received import Received
 from rti_mpc_service.config.build import build_ocp
@@ -54,6 +55,16 @@ def test_bounds_that_are_not_said_are_infinite() -> None:
     info = Info.from_json({name: value for name, value in PIONEER.items() if name not in ("lbu", "ubu", "dt_s")})
     assert info.lbu == (-math.inf, -math.inf)
     assert math.isnan(info.dt_s)
+
+
+def test_rotations_are_the_angles_and_the_quaternions_of_which_all_parts_are_there() -> None:
+    outputs = [{"name": name, "unit": "1", "angle": False} for name in "wijk"]
+    info = Info.from_json({**PIONEER, "outputs": outputs, "quaternions": [["w", "i", "j", "k"]]})
+    assert info.rotations("outputs") == Rotations(4, (), ((0, 1, 2, 3),))
+    assert info.rotations("states") == Rotations(5, (2, 3))
+    for wrong in (["wijk"], [["w", "i", "j"]], [["w", "i", "j", 1]], [3], 3):
+        with pytest.raises(MessageError, match="info must be JSON"):
+            Info.from_json({**PIONEER, "quaternions": wrong})
 
 
 def test_position_heading_and_tracked_states_are_found_by_role_whatever_their_names() -> None:

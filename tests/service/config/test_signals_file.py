@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections import Counter
 from pathlib import Path
 
@@ -18,10 +19,10 @@ from rti_mpc_service.check import check
 from rti_mpc_service.check.agreement import Agreement
 from rti_mpc_service.cli import app
 from rti_mpc_service.config import signals_file
-from rti_mpc_service.config.build import build_signals, guard_limits
+from rti_mpc_service.config.build import build_ocp, build_signals, guard_limits
 from rti_mpc_service.config.config import load
 from rti_mpc_service.controller import daemon
-from rti_mpc_service.shipped import SHIPPED
+from rti_mpc_service.shipped import ROBOTS, SHIPPED
 
 MODEL = """
 import casadi as ca
@@ -82,6 +83,19 @@ def test_guard_knows_a_model_from_the_file_that_check_writes_and_does_without_th
     limits = guard_limits(config, signals_file.read(path, config))
     assert (limits.rotations, limits.u_rest.tolist()) == (Rotations(4, (2,)), [0.0, 0.0])
     assert (limits.lbu.tolist(), limits.ubu.tolist()) == ([-2.0, -0.5], [2.0, 0.5]), "in the model's order, not in that of the file"
+
+
+def test_guard_knows_a_quaternion_from_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "quadrotor.toml"
+    shutil.copy(ROBOTS["quadrotor_quaternion"], path)
+    config = load(path)
+    file = signals_file.write(path, build_signals(config))
+    assert guard_limits(config, signals_file.read(path, config)).rotations == build_ocp(config).model.rotations("states")
+    for wrong in ('["q_w", "q_x", "q_y"]', '["q_w", "q_x", "q_y", "q"]', "3"):
+        content = json.loads(file.read_text())
+        file.write_text(json.dumps(content | {"quaternions": [json.loads(wrong)]}))
+        with pytest.raises(ConfigError, match="must be what rti-mpc check writes, version 1"):
+            signals_file.read(path, config)
 
 
 def test_check_writes_no_file_that_nobody_needs(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -59,3 +59,13 @@ def test_heading_error_is_the_short_way_round(turns: int) -> None:
 
 def test_a_reference_that_crosses_pi_is_interpolated_the_short_way() -> None:
     assert error([[3.1, 0.0, 0.0], [-3.1, 0.0, 0.0]], 500, [0.0, 0.0, np.pi, 0.0])["psi"] == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_error_of_an_attitude_does_not_depend_on_the_sign_of_rows_and_measurement(sign: float) -> None:
+    parts = tuple(Label(name, state=name) for name in "wijk")
+    info = Info(role="controller", states=parts, outputs=parts, quaternions=(tuple("wijk"),))
+    level, turned = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.8, 0.0, 0.0, 0.6])
+    y = {i: np.array([value]) for i, value in enumerate(sign * (level + turned) / 2)}
+    errors = tracking_error(info, [reference([level.tolist(), (-turned).tolist()])], np.array([UNIX_NS + 500]), y)
+    assert [float(errors[name][0]) for name in "wijk"] == pytest.approx([0.0] * 4, abs=1e-12)
