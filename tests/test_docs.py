@@ -27,6 +27,7 @@ def blocks(page: str, language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
 
 
+@pytest.mark.slow
 def test_tutorial_of_your_robot_runs_word_by_word(tmp_path: Path) -> None:
     module, script, compared = blocks("your_robot.md", "python")
     (table,) = blocks("your_robot.md", "toml")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -18,13 +19,13 @@ from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
 from tests.loop import MS, drive
 from tests.rti.test_problem_class import lagging_car, sampled_car
+from tests.slow import slow_but
 
 CARS = {"stiff": lagging_car(method="irk", lbx=-np.inf, ubx=np.inf), "sampled": sampled_car(lbx=-np.inf, ubx=np.inf)}
 SETTINGS = ObserverSettings({"v_c": Disturbance(drift=0.05, limit=0.2)})
 
 
-@pytest.mark.parametrize("delay_s", [0.0, None], ids=["no delay", "measured delay"])
-@pytest.mark.parametrize("name", CARS)
+@pytest.mark.parametrize(("name", "delay_s"), slow_but(product(CARS, (0.0, None)), ("stiff", None), ("sampled", 0.0)))
 def test_car_follows_a_line_with_what_its_model_leaves_out_estimated_and_stops_at_its_end(name: str, delay_s: float | None) -> None:
     own = CARS[name]
     observer = Observer(own.model, SETTINGS, compile=False)

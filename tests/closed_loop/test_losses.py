@@ -18,6 +18,7 @@ from rti_mpc.reference.trajectory import eight
 from rti_mpc.rti.rti import Rti
 from tests.loop import MS, reference, robot
 from tests.problems import pioneer
+from tests.slow import slow_but
 
 DT = 100 * MS
 STEP = np.array([0.25, 0.4])  # slew limit per dt
@@ -95,7 +96,7 @@ LINKS = [(False, "controller"), (True, "controller"), (True, "guard")]
 
 
 @pytest.mark.parametrize(("guarded", "at"), LINKS, ids=["no guard", "to the guard", "from the guard"])
-@pytest.mark.parametrize("state_period_s", [0.1, 0.02])
+@pytest.mark.parametrize("state_period_s", slow_but([0.1, 0.02], 0.02))
 def test_commands_lost_for_most_of_a_second_leave_no_step(guarded: bool, at: str, state_period_s: float) -> None:
     scene = Scene(guarded=guarded, at=at, state_period_s=state_period_s)
     scene.drive(20.0)

@@ -14,14 +14,16 @@ from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.obstacle import with_obstacles
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.ocp import Ocp
-from rti_mpc.rti.rti import Rti
+from rti_mpc.rti.rti import BUILT_IN_SOLVERS, Rti
 from rti_mpc_service.config.build import build_ocp, build_rti, robot_settings, stage_parameters
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
 from tests.loop import drive
+from tests.slow import slow_but
 
 INF = np.inf
 SPEED = 0.25  # m/s, of the reference along the x axis to 4 m
@@ -67,13 +69,15 @@ class Drive:
                     self.worst_m = min(self.worst_m, float(np.hypot(self.x[0] - x - vx * now, self.x[1] - y - vy * now) - r))
 
 
-@pytest.mark.parametrize("formulation", [pytest.param("simultaneous", marks=pytest.mark.slow), "sequential"])
+@pytest.mark.slow  # below it is the service that does
+@pytest.mark.parametrize("formulation", FORMULATIONS)
 def test_robot_passes_three_discs_one_of_them_moving_and_never_enters_one_by_more_than_a_millimetre(formulation: str) -> None:
     drive = Drive([(1.0, 0.05, 0.3), (2.0, -0.1, 0.3), (3.0, 1.0, 0.3)], [(0, 0), (0, 0), (0, -0.07)], formulation, duration_s=20.0)
     assert drive.worst_m > -1e-3
     np.testing.assert_allclose(drive.x[:2], [4.0, 0.0], rtol=0, atol=1e-3)  # and is where it was to go
 
 
+@pytest.mark.slow  # below it is the service that does
 def test_robot_stops_where_all_paths_are_blocked() -> None:
     drive = Drive([(1.5, -0.6, 0.35), (1.5, 0.0, 0.35), (1.5, 0.6, 0.35)], [(0, 0)] * 3, "simultaneous", duration_s=20.0)
     assert drive.worst_m > -1e-3
@@ -101,7 +105,7 @@ def along_the_axis(config: Config, seq: int = 1) -> Reference:
     return Reference(1, seq, 0, round(1e9 * DT), End.HOLD, y, stage_parameters(config, t))
 
 
-@pytest.mark.parametrize("solver", ["riccati", "osqp"])
+@pytest.mark.parametrize("solver", slow_but(BUILT_IN_SOLVERS, "riccati"))
 def test_configured_discs_are_passed_and_nobody_is_told_that_the_way_is_blocked(solver: str, tmp_path: Path) -> None:
     config = configured(tmp_path / "robot.toml", PASSABLE)
     config = config.model_copy(update={"solver": config.solver.model_copy(update={"name": solver})})
@@ -116,7 +120,7 @@ def test_configured_discs_are_passed_and_nobody_is_told_that_the_way_is_blocked(
     assert controller.ladder.fallbacks == 0
 
 
-@pytest.mark.parametrize("noise_m", [0.0, 2e-3])
+@pytest.mark.parametrize("noise_m", slow_but([0.0, 2e-3], 0.0))
 def test_robot_whose_paths_are_all_blocked_says_so_once_and_once_that_it_is_free_again(noise_m: float, tmp_path: Path) -> None:
     config = configured(tmp_path / "robot.toml", BLOCKED)
     controller = Controller(build_rti(config), Timing())

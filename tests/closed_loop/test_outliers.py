@@ -20,6 +20,7 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
 from tests.loop import drive, reference, robot
 from tests.problems import PAPER, SLEW, pioneer
+from tests.slow import slow_but
 
 PATHS: dict[str, Heading] = {"circle": "tangent", "eight": "consistent"}
 DURATION_S = 16.0
@@ -62,7 +63,7 @@ def errors_mm(controller: Controller, path: str, flip: float, at_s: float, sampl
     return run.error_mm(trajectory), float(run.x[-1][2])
 
 
-@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("path", slow_but(PATHS, "eight"))
 def test_one_wrong_heading_is_made_up_for_within_two_seconds(rti: Rti, path: str) -> None:
     """During the initial transient: the undisturbed error is 1 mm and falling."""
     undisturbed, heading = errors_mm(Controller(rti, Timing()), path, 0.0, 10.0, 0)
@@ -73,8 +74,9 @@ def test_one_wrong_heading_is_made_up_for_within_two_seconds(rti: Rti, path: str
         assert ended == pytest.approx(heading, abs=0.01), flip
 
 
-@pytest.mark.parametrize("path", PATHS)
-@pytest.mark.parametrize(("samples", "at_s"), [(2, 11.3), (7, 6.0)])
+@pytest.mark.parametrize(
+    ("path", "samples", "at_s"), slow_but([("circle", 2, 11.3), ("circle", 7, 6.0), ("eight", 2, 11.3), ("eight", 7, 6.0)], ("circle", 7, 6.0))
+)
 def test_robot_never_turns_round_itself_after_wrong_headings(rti: Rti, path: str, samples: int, at_s: float) -> None:
     _, heading = errors_mm(Controller(rti, Timing()), path, 0.0, at_s, 0)
     for flip in (3.1, 3.3, -3.1, -3.3):
@@ -82,7 +84,7 @@ def test_robot_never_turns_round_itself_after_wrong_headings(rti: Rti, path: str
         assert ended == pytest.approx(heading, abs=0.1), flip
 
 
-@pytest.mark.parametrize("flip", [3.1, 3.3, -3.1, -3.3])
+@pytest.mark.parametrize("flip", slow_but([3.1, 3.3, -3.1, -3.3], 3.1, -3.3))
 def test_observer_forgets_a_wrong_heading_too(observed: tuple[Rti, ObserverSettings], flip: float) -> None:
     """Its estimate of the inputs' disturbances takes longer to recover than the heading."""
     rti, settings = observed

@@ -14,6 +14,7 @@ from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import Rti
 from tests.problems import INF, pioneer
+from tests.slow import slow_but
 
 SETTINGS = SolverSettings(eps=1e-6, max_iter=4000)
 
@@ -47,12 +48,12 @@ def closed_loop_cost(trajectory: Trajectory, duration_s: float, formulation: str
     return float(total)
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("formulation", slow_but(FORMULATIONS, "sequential"))
 def test_positioning_costs_what_converged_solvers_reach(formulation: str) -> None:
     assert closed_loop_cost(positioning(), 40.0, formulation) == pytest.approx(324.33, rel=0.005)
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("formulation", slow_but(FORMULATIONS, "sequential"))
 def test_eight_costs_no_more_than_one_exact_iteration_a_sample(formulation: str) -> None:
     """IPOPT, converged at every sample: 292.925; a plain real-time iteration with exact QPs: 293.63."""
     assert 285.0 < closed_loop_cost(eight(), 80.0, formulation) <= 294.4

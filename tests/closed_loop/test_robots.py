@@ -29,6 +29,7 @@ from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
 from tests.loop import Run, drive
 from tests.model.test_robots import derivative
+from tests.slow import slow_but
 
 # For how long each is driven, and within what of its reference its first two outputs are in the last quarter of that, in their units.
 DRIVEN = {
@@ -81,7 +82,7 @@ def errors(model: Model, run: Run, reference: Reference, from_s: float) -> Array
     return model.rotations("outputs").difference(y, wanted)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", slow_but(ROBOTS, "cart_pole", "dynamic_bicycle", "two_link_arm", "unicycle"))
 def test_robot_comes_to_its_reference(name: str) -> None:
     duration_s, tolerance = DRIVEN[name]
     controller, body, reference = controlled(name, duration_s)

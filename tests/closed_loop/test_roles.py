@@ -20,6 +20,7 @@ from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
 from tests.loop import drive
 from tests.robots import toml
+from tests.slow import slow_but
 
 
 @pytest.mark.parametrize(
@@ -49,7 +50,7 @@ def test_the_eight_is_followed_whatever_the_order_and_the_names(name: str, limit
     assert error_mm[settled].max() <= limit_mm
 
 
-@pytest.mark.parametrize("scenario", ["sines", "steps"])
+@pytest.mark.parametrize("scenario", slow_but(["sines", "steps"], "steps"))
 def test_outputs_of_a_robot_that_follows_no_path_are_followed(scenario: str, tmp_path: Path) -> None:
     """An arm, its joints turned at will inside the bounds of their angles."""
     path = tmp_path / "robot.toml"

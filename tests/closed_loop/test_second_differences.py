@@ -16,6 +16,7 @@ from rti_mpc.reference.trajectory import eight
 from rti_mpc.rti.rti import Rti
 from tests.loop import Run, drive, reference, robot
 from tests.problems import pioneer
+from tests.slow import slow_but
 
 BEND = np.array([0.05, 0.1])  # m/s and rad/s per 0.1 s squared; slew limits are 0.25 and 0.4
 BENDS: dict[str, Any] = {"lbddu": -BEND, "ubddu": BEND}
@@ -40,7 +41,7 @@ def bends(run: Run) -> Array:
     return np.asarray(np.abs(np.diff(run.u, 2, axis=0)).max(axis=0))
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.17])
+@pytest.mark.parametrize("delay_s", slow_but([0.0, 0.17], 0.17))
 def test_inputs_that_act_bend_within_their_limits_which_they_exceed_without(delay_s: float) -> None:
     bounded, controller = driven(BENDS, delay_s)
     free, _ = driven({}, delay_s)

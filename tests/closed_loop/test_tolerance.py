@@ -9,9 +9,10 @@ from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.bench.bench import closed_loop_cost, paper_ocp
+from tests.slow import slow_but
 
 
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("formulation", slow_but(FORMULATIONS, "sequential"))
 def test_default_tolerance_of_osqp_costs_the_robot_no_more_than_one_ten_times_tighter(formulation: str) -> None:
     """Eight and positioning, every sample of both; both stop at the default limit of iterations."""
     default, tighter = (

@@ -22,6 +22,7 @@ from rti_mpc.wire.session import BusSettings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.shipped import SHIPPED
+from tests.command import command
 from tests.guarded import write_robot
 from tests.movers import toml
 from tests.processes.system import PATIENCE_S, ROOT, command_line, environment, heard, listening, rti_mpc, until
@@ -115,8 +116,8 @@ def running(folder: Path, config: Path, *program: str) -> Iterator[str]:
     """Run a robot or a guard, of which the endpoint is returned."""
     endpoint = free_endpoint()
     with (folder / "judged.log").open("ab") as log:
-        command = [sys.executable, "-c", *program, str(config), "-l", endpoint]
-        process = subprocess.Popen(command, cwd=ROOT, env=environment(folder / "state"), stdout=log, stderr=subprocess.STDOUT)
+        line = [sys.executable, "-c", *program, str(config), "-l", endpoint]
+        process = subprocess.Popen(line, cwd=ROOT, env=environment(folder / "state"), stdout=log, stderr=subprocess.STDOUT)
     try:
         until(lambda: listening(process.pid), "it listens")
         yield endpoint
@@ -222,7 +223,7 @@ def test_nothing_is_judged_beside_who_commands_or_is_commanded(tmp_path: Path, w
     with Bus.join(BusSettings(listen=(endpoint,), connect=()), load(config).keys()) as bus:
         commands = [bus.subscriber(key) for key in (bus.keys.command, bus.keys.actuation, bus.keys.state)]
         bus.alive(role)
-        done = rti_mpc("conformance", config, what, "-e", endpoint, "--moves-the-robot")
+        done = command("conformance", config, what, "-e", endpoint, "--moves-the-robot")
         assert not any(subscriber.drain() for subscriber in commands)
     said = f"rti-mpc: pioneer has a live {role.partition('.')[0]}: a {what} is judged without, stop it first\n"
     assert (done.returncode, done.stdout, done.stderr) == (1, "", said)
@@ -238,5 +239,5 @@ def test_nothing_is_judged_beside_who_commands_or_is_commanded(tmp_path: Path, w
     ],
 )
 def test_what_cannot_be_judged_is_refused_in_one_line(words: tuple[str, ...], said: str) -> None:
-    done = rti_mpc("conformance", *words)
+    done = command("conformance", *words)
     assert (done.returncode, done.stdout, done.stderr) == (2, "", f"rti-mpc: {said}")

@@ -20,6 +20,7 @@ from rti_mpc_service.config.config import load
 from rti_mpc_service.demo.demo import compiling
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.shipped import SHIPPED
+from tests.command import command
 from tests.in_time import explained
 from tests.processes.system import PATIENCE_S, ROOT, command_line, environment, rti_mpc, until
 
@@ -96,7 +97,7 @@ def test_configuration_used_is_one_that_loads_and_says_what_the_scenario_decided
     assert config.ocp.weights.Q == {**shipped.ocp.weights.Q, "psi": 0.0}
     assert config.sim.x0 == {"x": 0.5, "y": 0.0, "psi": 0.0}
     assert config.ocp.bounds == shipped.ocp.bounds
-    assert rti_mpc("check", folder / "config.toml").returncode == 0
+    assert command("check", folder / "config.toml").returncode == 0
 
 
 def test_folder_holds_record_figure_and_recording(folder: Path) -> None:
@@ -150,8 +151,8 @@ def test_waypoints_of_a_file_are_driven_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("number", "status", "last_words"), [(signal.SIGINT, 1, "not driven to the end"), (signal.SIGKILL, -9, "")])
 def test_demo_that_is_ended_leaves_no_process_behind(tmp_path: Path, number: signal.Signals, status: int, last_words: str) -> None:
     log = (tmp_path / "demo.log").open("wb")
-    command = command_line("demo", "--out", tmp_path / "out")
-    with log, subprocess.Popen(command, cwd=ROOT, env=environment(), stdout=log, stderr=subprocess.STDOUT) as demo:
+    line = command_line("demo", "--out", tmp_path / "out")
+    with log, subprocess.Popen(line, cwd=ROOT, env=environment(), stdout=log, stderr=subprocess.STDOUT) as demo:
         try:
             until(lambda: "mode tracking" in (tmp_path / "demo.log").read_text(), "the robot is driven")
             children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
@@ -166,14 +167,14 @@ def test_demo_that_is_ended_leaves_no_process_behind(tmp_path: Path, number: sig
 
 @pytest.mark.parametrize(("option", "value"), [("--scenario", "spiral"), ("--speed", "0"), ("--duration", "-1"), ("--heading", "left")])
 def test_what_cannot_be_run_is_refused_before_anything_starts(tmp_path: Path, option: str, value: str) -> None:
-    done = rti_mpc("demo", option, value, "--out", tmp_path / "out")
+    done = command("demo", option, value, "--out", tmp_path / "out")
     assert done.returncode == 2
     assert not (tmp_path / "out").exists()
 
 
 def test_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    done = rti_mpc("demo", "--out", tmp_path / "file" / "out")
+    done = command("demo", "--out", tmp_path / "file" / "out")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"rti-mpc: --out must be a folder that can be written, got {tmp_path}/file/out: Not a directory\n"
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from rti_mpc_service.faults.promise import BRAKING
+from tests.command import command
 from tests.movers import CURRENT, path_file, toml
 from tests.processes.system import rti_mpc
 
@@ -48,14 +49,14 @@ def test_robot_stops_in_time_and_drives_again(tmp_path: Path, names: tuple[str, 
 
 
 def test_unknown_fault_is_one_line_that_names_the_nearest() -> None:
-    done = rti_mpc("faults", "--only", "controller_kiled")
+    done = command("faults", "--only", "controller_kiled")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert "perhaps controller_killed is meant" in done.stderr
     assert done.stderr.endswith("got 'controller_kiled'\n")
 
 
 def test_scenario_that_comes_to_rest_is_one_line_before_anything_is_started() -> None:
-    done = rti_mpc("faults", "--scenario", "positioning")
+    done = command("faults", "--scenario", "positioning")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "rti-mpc: --scenario must move the robot for at least 60 s, positioning does for 15.8 s\n"
 

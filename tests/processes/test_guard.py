@@ -22,6 +22,7 @@ from rti_mpc.contract.status import Mode
 from rti_mpc.wire.cdr import decode
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.shipped import SHIPPED
+from tests.command import command
 from tests.guarded import write_robot
 from tests.in_time import explained, in_time
 from tests.processes.record import FAST_STATES, MS, Record, recorded, within_slew
@@ -130,7 +131,7 @@ def test_second_guard_refuses_to_start_beside_a_live_one(driven: System) -> None
 
 
 def test_configuration_without_a_guard_is_one_line_and_exit_status_2() -> None:
-    done = rti_mpc("guard", SHIPPED)
+    done = command("guard", SHIPPED)
     assert (done.returncode, done.stderr) == (2, "rti-mpc: guard.enabled must be true for the robot to take what a guard passes on, got false\n")
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.command import command
 from tests.processes.system import System, rti_mpc
 
 pytestmark = pytest.mark.slow
@@ -84,6 +85,6 @@ def test_path_and_robot_that_do_not_fit_are_refused_before_anything_starts(tmp_p
         (("--path", "oval"), "model pioneer_3dx must be one of path_following for --path, it has no parameter whose role is path_start"),
         (("--path-limits", 1, 1, 1, 1), "--path-limits are those of a --path, which must be given as well"),
     ):
-        done = rti_mpc("demo", *options, "--out", tmp_path / "out")
+        done = command("demo", *options, "--out", tmp_path / "out")
         assert (done.returncode, done.stderr) == (2, f"rti-mpc: {said}\n")
     assert not (tmp_path / "out").exists()

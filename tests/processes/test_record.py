@@ -25,8 +25,9 @@ from rti_mpc.wire.keys import Keys
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.shipped import SHIPPED
+from tests.command import command
 from tests.in_time import PATIENT, in_time
-from tests.processes.system import KEYS, ROOT, System, command_line, environment, rti_mpc, until
+from tests.processes.system import KEYS, ROOT, System, command_line, environment, until
 from tests.recording.test_recording import read_by_others
 
 pytestmark = pytest.mark.slow
@@ -130,6 +131,6 @@ def _robots(path: Path) -> list[str]:
 
 def test_repair_of_something_else_is_refused_in_a_line(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("no recording")
-    done = rti_mpc("record", "--repair", tmp_path / "notes.txt")
+    done = command("record", "--repair", tmp_path / "notes.txt")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "--repair must be a recording" in done.stderr

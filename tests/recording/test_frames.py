@@ -16,8 +16,8 @@ from rti_mpc.errors import MessageError
 from rti_mpc.recording import Recording, export, frame, table, units
 from rti_mpc.recording.writer import RecordingWriter
 from rti_mpc.wire.keys import Key, Keys
+from tests.command import command
 from tests.recording.samples import KEYS, REFERENCE, START_NS, write
-from tests.service.test_cli import rti_mpc
 
 COUNT = 60
 
@@ -119,10 +119,10 @@ def test_every_stream_is_exported_with_its_units(written: tuple[Recording, list[
 def test_export_prints_what_it_has_written_and_refuses_what_is_no_recording(
     written: tuple[Recording, list[tuple[Key, object]]], tmp_path: Path
 ) -> None:
-    done = rti_mpc("export", str(written[0].files[0]), "--parquet", str(tmp_path / "out"))
+    done = command("export", written[0].files[0], "--parquet", tmp_path / "out")
     assert done.returncode == 0
     assert f"{tmp_path}/out/wheels/telemetry.parquet: {COUNT} rows\n" in done.stdout
-    done = rti_mpc("export", str(tmp_path / "nothing.mcap"), "--parquet", str(tmp_path / "out"))
+    done = command("export", tmp_path / "nothing.mcap", "--parquet", tmp_path / "out")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
 
 

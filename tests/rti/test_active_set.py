@@ -15,6 +15,7 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import Rti
 from tests.problems import arc, beacon, double_integrator, fenced, pioneer
+from tests.slow import slow_but
 
 TIGHT = SolverSettings(eps=1e-9, max_iter=200_000, scaling=10)
 
@@ -44,7 +45,7 @@ def samples(ocp: Ocp, count: int) -> list[tuple[Array, Array, Array]]:
     return found
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", slow_but(PROBLEMS, "double_integrator", "beacon", "pioneer_with_held_inputs"))
 def test_plan_is_that_of_the_qp_solved_to_1e_9(name: str) -> None:
     ocp = PROBLEMS[name]()
     rti, exact = (Rti(ocp, solver=solver, formulation="sequential", iterations=1, compile=False) for solver in ("riccati", "daqp"))

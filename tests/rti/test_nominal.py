@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -15,6 +16,7 @@ from rti_mpc.rti.nominal import nominal_state
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
 from tests.problems import INF, pioneer
+from tests.slow import slow_but
 
 
 class Plant(NamedTuple):
@@ -72,8 +74,7 @@ def problem(plant: Plant, **changes: Any) -> Ocp:
     return Ocp(plant.model, **{"N": 10, "Q": [1.0] * plant.model.ny, "R": [0.01] * plant.model.nu} | plant.problem | changes)
 
 
-@pytest.mark.parametrize("name", PLANTS)
-@pytest.mark.parametrize("given", [False, True], ids=["found", "given"])
+@pytest.mark.parametrize(("name", "given"), slow_but(product(PLANTS, (False, True)), *product(PLANTS, (False,)), ("tank", True)))
 def test_model_that_is_singular_at_zero_is_built_and_driven_to_its_set_point(name: str, given: bool) -> None:
     plant = PLANTS[name]()
     if given:

@@ -17,6 +17,7 @@ from rti_mpc.rti.rest import RestClass, assess, find_stop_law, motion_at_rest
 from tests import movers
 from tests.problems import INF, PAPER, beacon, double_integrator, pioneer
 from tests.rti.test_nominal import PLANTS, problem
+from tests.slow import slow_but
 
 
 def robot(names: str, units: str, f: Any, nu: int, **options: Any) -> Ocp:
@@ -91,7 +92,7 @@ def test_robot_that_coasts_or_falls_is_found_and_what_was_seen_is_said(name: str
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("given", [False, True], ids=["found", "given"])
+@pytest.mark.parametrize("given", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["found", "given"])
 @pytest.mark.parametrize(("name", "rests"), [("reactor", True), ("bicycle", True), ("attitude", True), ("tank", False)])
 def test_model_that_is_singular_at_zero_is_judged_around_its_nominal_state(name: str, rests: bool, given: bool) -> None:
     """A tank without inflow drains, and is held at its level instead; the rest need no way."""
@@ -117,10 +118,10 @@ def test_bounds_say_what_operation_is() -> None:
     assert motion_at_rest(Ocp(pioneer().model, **(PAPER | {"ubu": [50.0, 0.7]}))) == ""
 
 
-@pytest.mark.parametrize("name", ["car", *(pytest.param(name, marks=pytest.mark.slow) for name in ("arm", "quadrotor"))])
+@pytest.mark.parametrize("name", slow_but(["mass", "car", "arm", "quadrotor"], "mass"))
 def test_robot_in_discrete_time_comes_to_rest_as_the_same_in_continuous_time(name: str) -> None:
     """Over a period its inputs change positions, too: the way to rest must tell which rates are theirs."""
-    continuous: Ocp = getattr(movers, name)()
+    continuous: Ocp = double_integrator(lbu=-1.0, ubu=1.0) if name == "mass" else getattr(movers, name)()
     model = continuous.model
     same = replace(model, f_expl_expr=None, disc_dyn_expr=continuous.phi()(model.x, model.u, model.p), dt=continuous.dt)
     bounds = {key: getattr(continuous, key) for key in ("lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx")}

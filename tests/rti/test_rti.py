@@ -29,6 +29,7 @@ from rti_mpc.rti.qp.simultaneous import simultaneous
 from rti_mpc.rti.rti import Rti
 from tests.oracle import nlp
 from tests.problems import INF, arc, beacon, double_integrator, pioneer
+from tests.slow import slow_but
 
 TIGHT = SolverSettings(eps=1e-9, max_iter=200_000)
 NARROW = {"lbx": [-INF, -INF, -INF, -0.3, -0.4], "ubx": [INF, INF, INF, 0.3, 0.4]}  # so that state bounds are active, and exceeded
@@ -65,7 +66,7 @@ def unmoving(rti: Rti) -> tuple[Array, ...]:
     ("formulation", "solver", "changes", "states"),
     [
         ("sequential", "riccati", {"method": "euler"}, 50),
-        ("simultaneous", "riccati", NARROW, 50),
+        pytest.param("simultaneous", "riccati", NARROW, 50, marks=pytest.mark.slow),
         ("simultaneous", "riccati", {"N": 10, "N_u": 4} | NARROW, 50),
         ("simultaneous", "osqp", {"N": 10, "N_u": 4} | NARROW, 10),
         pytest.param("simultaneous", "osqp", {"N": 10, "N_u": 4} | NARROW, 50, marks=pytest.mark.slow),
@@ -143,7 +144,11 @@ def test_cost_and_violation_are_those_of_the_plan(formulation: str) -> None:
     assert rti.violation == pytest.approx(s.max(), rel=1e-12)
 
 
-@pytest.mark.parametrize("changes", [{}, NARROW, {"N": 12, "N_u": 5} | NARROW], ids=["bounds", "state_bounds", "held_inputs"])
+@pytest.mark.parametrize(
+    "changes",
+    [{}, NARROW, pytest.param({"N": 12, "N_u": 5} | NARROW, marks=pytest.mark.slow)],
+    ids=["bounds", "state_bounds", "held_inputs"],
+)
 def test_both_formulations_give_the_same_plan(changes: dict[str, Any]) -> None:
     ocp = pioneer(**changes)
     sparse, dense = (Rti(ocp, replace(TIGHT, rho=5.0), formulation=formulation, compile=False) for formulation in FORMULATIONS)
@@ -305,7 +310,7 @@ def test_headings_a_full_turn_on_change_nothing() -> None:
     np.testing.assert_allclose(rti.u, u, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("max_iter", [1, 5, 4000])
+@pytest.mark.parametrize("max_iter", slow_but([1, 5, 4000], 1))
 def test_inputs_are_exactly_inside_bounds_and_increments_whatever_the_solvers_tolerance(max_iter: int) -> None:
     ocp = pioneer(N=20)
     rti = Rti(ocp, SolverSettings(eps=1e-2, max_iter=max_iter, check_termination=1))

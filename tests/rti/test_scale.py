@@ -15,6 +15,7 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.scale import scale
 from tests.problems import INF, cart, double_integrator, pioneer
+from tests.slow import slow_but
 
 NEWTONS = {"N": 1.0, "kN": 1e3, "mN": 1e-3, "rpm": 0.05, "m/s^2": 1500.0}  # newtons of one unit of the input
 
@@ -38,7 +39,7 @@ def driven(ocp: Ocp, solver: str, samples: int = 60) -> tuple[Array, Array, list
     return np.array(commands), np.array(speeds), iterations, statuses
 
 
-@pytest.mark.parametrize("unit", NEWTONS)
+@pytest.mark.parametrize("unit", slow_but(NEWTONS, "N", "mN", "m/s^2"))
 def test_a_speed_bound_that_can_be_kept_is_kept_in_any_unit_of_the_force(unit: str) -> None:
     commands, speeds, iterations, statuses = driven(cart_ocp(NEWTONS[unit]), "riccati")
     theirs, _, their_iterations, _ = driven(cart_ocp(1000.0), "riccati")
@@ -48,7 +49,7 @@ def test_a_speed_bound_that_can_be_kept_is_kept_in_any_unit_of_the_force(unit: s
     assert iterations == their_iterations
 
 
-@pytest.mark.parametrize(("solver", "atol"), [("osqp", 1e-8), ("daqp", 1e-8), ("piqp", 1e-7)])
+@pytest.mark.parametrize(("solver", "atol"), slow_but([("osqp", 1e-8), ("daqp", 1e-8), ("piqp", 1e-7)], ("osqp", 1e-8)))
 @pytest.mark.parametrize("unit", ["N", "mN"])
 def test_other_solvers_are_given_the_same_numbers_in_any_unit(solver: str, atol: float, unit: str) -> None:
     """So that OSQP takes the same steps, in spite of its loose tolerance."""

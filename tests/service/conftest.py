@@ -6,8 +6,29 @@ from collections.abc import Iterator
 
 import pytest
 
+from rti_mpc.rti.ocp import Ocp
 from rti_mpc.wire import bus as bus_module
+from rti_mpc_service.config import build
+from rti_mpc_service.config.schema import Config
 from tests.wire.fake_session import FakeSession
+
+build_ocp = build.build_ocp
+problems: dict[str, Ocp] = {}  # by configuration
+
+
+@pytest.fixture
+def shared_problems(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give controllers of equal configurations one problem, whose expressions are then built once; that of a user's own model is built each time."""
+
+    def of(config: Config) -> Ocp:
+        if ":" in config.model.name:
+            return build_ocp(config)
+        text = repr(config)
+        if text not in problems:
+            problems[text] = build_ocp(config)
+        return problems[text]
+
+    monkeypatch.setattr(build, "build_ocp", of)
 
 
 @pytest.fixture

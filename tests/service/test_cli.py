@@ -19,8 +19,10 @@ from rti_mpc.errors import ConfigError
 from rti_mpc_service.cli import app
 from rti_mpc_service.faults.table import FAULTS
 from rti_mpc_service.shipped import SHIPPED, TEMPLATES
+from tests.command import command
 from tests.in_time import awake_ms
 from tests.robots import toml
+from tests.slow import slow_but
 
 ROOT = Path(__file__).parents[2]
 ZENOH = ("--mode", "--connect", "--listen", "--config", "--cfg", "--no-multicast-scouting")
@@ -37,42 +39,42 @@ def rti_mpc(*arguments: str, **environment: str) -> subprocess.CompletedProcess[
     )
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_of_every_command_explains_every_option(command: str) -> None:
-    parameters = typer.main.get_group(app).commands[command].params
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_every_command_explains_every_option(name: str) -> None:
+    parameters = typer.main.get_group(app).commands[name].params
     for parameter in parameters:
-        assert getattr(parameter, "help", None), f"{command} {parameter.name}"
-    assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0
+        assert getattr(parameter, "help", None), f"{name} {parameter.name}"
+    assert CliRunner().invoke(app, [name, "--help"]).exit_code == 0
 
 
 @pytest.mark.parametrize(
-    "command",
+    "name",
     sorted(set(COMMANDS) - OF_RECORDINGS - {"bench", "certs", "check", "demo", "doctor", "faults", "init", "paper", "robots", "schema", "tune"}),
 )
-def test_every_process_takes_the_options_of_zenoh_programs(command: str) -> None:
-    parameters = typer.main.get_group(app).commands[command].params
+def test_every_process_takes_the_options_of_zenoh_programs(name: str) -> None:
+    parameters = typer.main.get_group(app).commands[name].params
     options = {option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)}
     assert set(ZENOH) | {"-m", "-e", "-l", "-c"} <= options
 
 
-@pytest.mark.parametrize("command", sorted(set(COMMANDS) - OF_RECORDINGS - {"bench", "certs", "demo", "init", "paper", "robots", "schema"}))
-def test_bad_configuration_is_one_line_and_exit_status_2(command: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", sorted(set(COMMANDS) - OF_RECORDINGS - {"bench", "certs", "demo", "init", "paper", "robots", "schema"}))
+def test_bad_configuration_is_one_line_and_exit_status_2(name: str, tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(SHIPPED.read_text().replace("dt_s", "dt_ms"))
-    done = rti_mpc(command, str(path))
+    done = command(name, path)
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith(f"rti-mpc: {path}: ocp.dt_ms is unknown, perhaps ocp.dt_s is meant")
 
 
-@pytest.mark.parametrize("command", ["reference", "demo"])
-def test_outputs_that_no_path_fills_are_refused_by_name_in_the_terminal(command: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", slow_but(["reference", "demo"], "reference"))
+def test_outputs_that_no_path_fills_are_refused_by_name_in_the_terminal(name: str, tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(toml("arm"))
     rti_mpc("reference", "--help")  # what is compiled to bytecode once
     with subprocess.Popen(
-        [*RTI_MPC, command, str(path), "--scenario", "eight"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*RTI_MPC, name, str(path), "--scenario", "eight"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         assert awake_ms(process) < 5000.0
         stdout, stderr = process.communicate()
@@ -82,7 +84,7 @@ def test_outputs_that_no_path_fills_are_refused_by_name_in_the_terminal(command:
 
 
 @pytest.mark.parametrize(
-    "command",
+    "name",
     sorted(
         set(COMMANDS)
         - OF_RECORDINGS
@@ -105,37 +107,37 @@ def test_outputs_that_no_path_fills_are_refused_by_name_in_the_terminal(command:
         }
     ),
 )
-def test_model_that_cannot_be_imported_is_refused_by_every_process_that_loads_it_with_file_and_line(command: str, tmp_path: Path) -> None:
+def test_model_that_cannot_be_imported_is_refused_by_every_process_that_loads_it_with_file_and_line(name: str, tmp_path: Path) -> None:
     (tmp_path / "my_robot.py").write_text("\n\ndef car(:\n")
     path = tmp_path / "robot.toml"
     path.write_text(SHIPPED.read_text().replace('"pioneer_3dx"', '"my_robot:car"'))
-    refused = CliRunner().invoke(app, [command, str(path)]).exception
+    refused = CliRunner().invoke(app, [name, str(path)]).exception
     assert isinstance(refused, ConfigError)
     assert str(refused).startswith(f"{path}: model.name: my_robot must be importable, it raised SyntaxError in {tmp_path}/my_robot.py, line 3: ")
     assert "\n" not in str(refused)
 
 
 def test_bad_option_is_exit_status_2() -> None:
-    assert rti_mpc("sim", "--speed", "-1").returncode == 2
+    assert command("sim", "--speed", -1).returncode == 2
     done = rti_mpc("sim", "--x0", "phi=1")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "sim.x0.phi is no state of the model, perhaps psi [rad] is meant" in done.stderr
 
 
-@pytest.mark.parametrize("command", ["bench", "conformance", "doctor", "faults"])
-def test_file_that_cannot_be_written_is_refused_before_anything_is_measured(command: str, tmp_path: Path) -> None:
-    done = rti_mpc(command, "--json", str(tmp_path / "nowhere" / "found.json"))
+@pytest.mark.parametrize("name", ["bench", "conformance", "doctor", "faults"])
+def test_file_that_cannot_be_written_is_refused_before_anything_is_measured(name: str, tmp_path: Path) -> None:
+    done = command(name, "--json", tmp_path / "nowhere" / "found.json")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert done.stderr.startswith("rti-mpc: --json must be a file that can be written")
 
 
 def test_operator_is_told_in_one_line_that_nobody_has_confirmed_and_what_was_noted(tmp_path: Path) -> None:
     path = tmp_path / "state" / "rti_mpc%2Fpioneer.json"
-    for command, counter in (("enable", 0), ("stop", 1), ("stop", 1), ("enable", 2)):
-        done = rti_mpc(command, "--timeout", "0.3", "-e", "tcp/127.0.0.1:1", "--state", str(path.parent))
+    for word, counter in (("enable", 0), ("stop", 1), ("stop", 1), ("enable", 2)):
+        done = command(word, "--timeout", "0.3", "-e", "tcp/127.0.0.1:1", "--state", path.parent)
         assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
-        assert done.stderr.startswith(f"rti-mpc: pioneer: the controller has not confirmed {command} within 0.3 s; nobody has; ")
-        assert f"processes started later read {path}: {'stopped since' if command == 'stop' else 'released'}" in done.stderr
+        assert done.stderr.startswith(f"rti-mpc: pioneer: the controller has not confirmed {word} within 0.3 s; nobody has; ")
+        assert f"processes started later read {path}: {'stopped since' if word == 'stop' else 'released'}" in done.stderr
         assert path.exists() == (counter > 0)
         assert not counter or json.loads(path.read_text())["counter"] == counter
 
@@ -154,7 +156,7 @@ def test_operator_is_told_in_one_line_that_nothing_could_be_noted_either() -> No
 
 
 def test_check_of_the_shipped_configuration_prints_both_phases_and_the_verdict() -> None:
-    done = rti_mpc("check")
+    done = command("check")
     assert done.returncode == 0, done.stderr
     for words in ("preparation", "feedback", " samples: ", "riccati and daqp agree", "own plans are within"):
         assert words in done.stdout
@@ -182,15 +184,15 @@ for name in ("matplotlib.font_manager", "controller"):
 
 
 def test_list_of_commands_holds_whole_sentences_on_a_narrow_terminal() -> None:
-    done = rti_mpc("--help", COLUMNS="80")
+    done = command("--help", columns=80)
     assert "..." not in done.stdout.partition("Commands:")[2]
-    for command in typer.main.get_group(app).commands.values():
-        assert command.get_short_help_str(limit=1000) in " ".join(done.stdout.split())
+    for each in typer.main.get_group(app).commands.values():
+        assert each.get_short_help_str(limit=1000) in " ".join(done.stdout.split())
     assert max(len(line) for line in done.stdout.splitlines()) <= 80
 
 
 def test_help_of_faults_names_each_with_what_is_done_to_whom() -> None:
-    shown = " ".join(rti_mpc("faults", "--help", COLUMNS="80").stdout.split())
+    shown = " ".join(command("faults", "--help", columns=80).stdout.split())
     for fault in FAULTS:
         assert f"{fault.name} {fault.text}" in shown
 
@@ -205,7 +207,7 @@ def test_version_names_what_decides_what_a_command_does() -> None:
 @cache
 def schema() -> Any:
     """What `rti-mpc schema` prints."""
-    return json.loads(rti_mpc("schema").stdout)
+    return json.loads(command("schema").stdout)
 
 
 TYPES: dict[str, Any] = {"number": (int, float), "integer": int, "string": str, "boolean": bool, "array": list, "object": dict, "null": type(None)}

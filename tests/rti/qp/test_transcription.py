@@ -18,6 +18,7 @@ from rti_mpc.rti.qp.qp import Qp
 from rti_mpc.rti.qp.transcription import INFINITY, SLACK_UNIT
 from rti_mpc.rti.rti import Rti
 from tests.problems import INF, beacon, double_integrator, fenced, pioneer
+from tests.slow import slow_but
 
 PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "pioneer_euler": lambda: pioneer(method="euler", delta=[1, 2, 3, 4, 5, 6, 28]),
@@ -31,6 +32,10 @@ PROBLEMS: dict[str, Callable[[], Ocp]] = {
     "fenced_in_blocks": lambda: fenced(N=6, blocks=[2, 1, 3]),
     "double_integrator": lambda: double_integrator(lbx=[-INF, -0.5]),
 }
+
+NAMES = slow_but(
+    PROBLEMS, "pioneer_rk4", "pioneer_bounded_on_one_side", "fenced_with_held_inputs", "beacon_rk4", "fenced_in_blocks", "double_integrator"
+)
 
 
 @functools.cache
@@ -132,7 +137,7 @@ def hessian(qp: Qp) -> Array:
     return upper + np.triu(upper, k=1).T
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", NAMES)
 def test_constraint_matrix_is_the_jacobian_of_the_constraints(name: str) -> None:
     """With it every A_k and B_k, and where each of them lies."""
     rti = at_random(name, seed=1)
@@ -141,7 +146,7 @@ def test_constraint_matrix_is_the_jacobian_of_the_constraints(name: str) -> None
     np.testing.assert_allclose(whole(rti).A.toarray(), difference, atol=2e-8)  # h^2 and rounding over h
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", NAMES)
 def test_bounds_of_the_qp_are_what_the_guess_leaves_of_the_bounds(name: str) -> None:
     """In deviations: lb - g <= A z <= ub - g. With it the defects b_k."""
     rti = at_random(name, seed=2)
@@ -153,7 +158,7 @@ def test_bounds_of_the_qp_are_what_the_guess_leaves_of_the_bounds(name: str) -> 
     np.testing.assert_allclose(whole(rti).u[nx:], np.where(np.isfinite(ub), ub - g, INFINITY)[nx:], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", NAMES)
 def test_gradient_is_half_that_of_the_cost(name: str) -> None:
     rti = at_random(name, seed=3)
     ocp, problem = rti.ocp, ByHand(rti)
@@ -163,7 +168,7 @@ def test_gradient_is_half_that_of_the_cost(name: str) -> None:
     np.testing.assert_allclose(whole(rti).q, difference, rtol=1e-7, atol=1e-6)  # costs of 1e3 over h
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", NAMES)
 def test_hessian_is_the_gauss_newton_approximation_and_the_damping(name: str) -> None:
     """Outputs that are not linear included: their Hessian follows the guess. Steps in inputs are damped in proportion to the cost."""
     for seed in (4, 5):
@@ -180,7 +185,7 @@ def test_hessian_is_the_gauss_newton_approximation_and_the_damping(name: str) ->
         np.testing.assert_allclose(hessian(whole(rti)), expected, rtol=1e-7, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", NAMES)
 def test_no_entry_is_stored_that_is_never_nonzero(name: str) -> None:
     """Dense blocks would be right, and slow; the condensed problem is dense by its nature."""
     for matrix in "PA":
@@ -188,7 +193,7 @@ def test_no_entry_is_stored_that_is_never_nonzero(name: str) -> None:
         assert np.all(sum(abs(getattr(qp, matrix).data) for qp in qps) > 0)
 
 
-@pytest.mark.parametrize("name", ["pioneer_rk4", "beacon_rk4"])
+@pytest.mark.parametrize("name", slow_but(["pioneer_rk4", "beacon_rk4"], "beacon_rk4"))
 @pytest.mark.parametrize("formulation", ["simultaneous", "sequential"])
 def test_compiled_and_interpreted_functions_fill_the_same_qp(name: str, formulation: str) -> None:
     compiled, interpreted = (whole(at_random(name, seed=7, formulation=formulation, compile=compile)) for compile in (True, False))
@@ -197,7 +202,7 @@ def test_compiled_and_interpreted_functions_fill_the_same_qp(name: str, formulat
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", NAMES)
 def test_sequential_qp_is_the_simultaneous_one_with_the_states_eliminated(name: str) -> None:
     """Number by number: Hessian, gradient, rows and bounds, the initial state embedded in both."""
     sparse, dense = (at_random(name, seed=9, formulation=formulation) for formulation in ("simultaneous", "sequential"))

@@ -12,6 +12,7 @@ import pytest
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.bench.families import FAMILIES, Family
 from rti_mpc_service.bench.yardstick import Ipopt
+from tests.command import command
 from tests.problems import double_integrator
 from tests.processes.system import rti_mpc
 
@@ -75,7 +76,7 @@ def test_the_command_writes_a_row_for_each_family_and_solver(tmp_path: Path) -> 
 
 
 def test_an_unknown_family_is_answered_by_the_nearest() -> None:
-    done = rti_mpc("bench", "--problem", "slalm")
+    done = command("bench", "--problem", "slalm")
     assert done.returncode == 2
     assert "perhaps slalom is meant, got 'slalm'" in done.stderr
     assert "Traceback" not in done.stderr

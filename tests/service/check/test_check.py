@@ -22,9 +22,10 @@ from rti_mpc_service.shipped import SHIPPED
 from tests.movers import law_of, ocp_of
 from tests.problems import pioneer
 from tests.service.config.test_config import MINIMAL
+from tests.slow import slow_but
 
 
-@pytest.mark.parametrize(("first", "second"), [("riccati", "daqp"), ("osqp", "daqp"), ("daqp", "osqp")])
+@pytest.mark.parametrize(("first", "second"), slow_but([("riccati", "daqp"), ("osqp", "daqp"), ("daqp", "osqp")], ("osqp", "daqp")))
 def test_two_solvers_are_compared_tightly_whatever_the_controllers_tolerance(first: str, second: str, tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     loose = "eps = 0.01\n" if first != "daqp" else ""

@@ -16,7 +16,7 @@ from rti_mpc.wire.session import BusSettings, zenoh_config
 from rti_mpc_service.config.config import load
 from rti_mpc_service.request import parse_assignments
 from rti_mpc_service.shipped import SHIPPED
-from tests.processes.system import rti_mpc
+from tests.command import command
 
 TEXT = SHIPPED.read_text()
 NESTING_DEPTH = 30_000
@@ -132,7 +132,7 @@ def test_hostile_file_is_one_line_of_plain_characters_and_status_2(text: str, st
     """Status 2, which the systemd units do not restart."""
     path = tmp_path / "robot.toml"
     path.write_text(text)
-    done = rti_mpc("check", path)
+    done = command("check", path)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (status, "", 1)
     assert told in done.stderr
     assert done.stderr[:-1].isprintable()

@@ -30,6 +30,8 @@ from rti_mpc_service.shipped import ROBOTS, SHIPPED
 from tests.loop import drive, reference, robot
 from tests.service.config.test_config import MINIMAL
 
+pytestmark = pytest.mark.usefixtures("shared_problems")
+
 
 def configuration(folder: Any, live: bool = True) -> Config:
     """The shipped robot, of a short horizon."""

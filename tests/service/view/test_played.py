@@ -18,6 +18,7 @@ from rti_mpc.wire.keys import Keys
 from rti_mpc_service.rig.endpoint import free_port
 from rti_mpc_service.view.played import played
 from rti_mpc_service.view.screen import page
+from tests.command import command
 from tests.processes.system import ROOT, command_line, environment, rti_mpc, until
 from tests.recording.samples import write
 
@@ -70,16 +71,16 @@ def test_several_robots_are_drawn_in_one_view_by_the_time_of_arrival(tmp_path: P
 def test_what_is_no_recording_is_refused_in_a_line(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").write_text("nothing")
     for words in ((tmp_path / "run.mcap",), (tmp_path / "none.mcap",), ("a.mcap", "b.mcap")):
-        done = rti_mpc("view", *words, "--rerun-save", tmp_path / "run.rrd")
+        done = command("view", *words, "--rerun-save", tmp_path / "run.rrd")
         assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
 
 
 @pytest.mark.slow
 def test_page_for_browsers_comes_from_this_machine_on_loopback_alone(run: Path, tmp_path: Path) -> None:
     web, port = free_port(), free_port()
-    command = command_line("view", run, "--web", "--rerun-web-port", web, "--rerun-connect", f"127.0.0.1:{port}")
+    line = command_line("view", run, "--web", "--rerun-web-port", web, "--rerun-connect", f"127.0.0.1:{port}")
     with (tmp_path / "log").open("wb") as log:
-        process = subprocess.Popen(command, cwd=ROOT, env=environment(tmp_path), stdout=log, stderr=subprocess.STDOUT)
+        process = subprocess.Popen(line, cwd=ROOT, env=environment(tmp_path), stdout=log, stderr=subprocess.STDOUT)
     try:
         address = page(f"rerun+http://127.0.0.1:{port}/proxy", web)
         until(lambda: address in (tmp_path / "log").read_text(), "the page is served", pause_s=0.05)
