@@ -10,7 +10,8 @@ import pytest
 
 
 def slow_but(values: Iterable[Any], *fast: Any) -> list[Any]:
-    """Return values as parameters, marked slow but for a few, which must be among them: these show that the statement holds, the rest where else."""
+    """Return the values of a parameter, or the tuples of several, marked slow but for a few of them: those show what is meant, the rest how far."""
     found = list(values)
     assert all(value in found for value in fast), fast
-    return [value if value in fast else pytest.param(value, marks=pytest.mark.slow) for value in found]
+    several = (value if isinstance(value, tuple) else (value,) for value in found)
+    return [pytest.param(*each, marks=() if value in fast else pytest.mark.slow) for value, each in zip(found, several, strict=True)]

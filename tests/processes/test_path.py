@@ -58,6 +58,7 @@ def test_robot_follows_a_file_to_its_end_and_stops_without_its_path(tmp_path: Pa
         assert stopped.text.endswith("the reference ended with STOP")
 
 
+@pytest.mark.slow
 def test_demo_drives_a_path_as_the_whole_system(tmp_path: Path) -> None:
     """To its end, inside its edges, with a summary and a figure."""
     config, out = robot_in(tmp_path), tmp_path / "out"

@@ -531,6 +531,7 @@ def test_robot_that_a_stop_does_not_bring_to_rest_is_refused_with_where_that_is(
         assert words in str(refusal.value)
 
 
+@pytest.mark.slow  # finds two ways to rest
 def test_disturbances_that_go_on_at_rest_are_balanced_by_a_way_to_rest(tmp_path: Path) -> None:
     path, slip = tmp_path / "robot.toml", "disturbances = { u_c = { drift = 0.1, limit = 0.1 } }\n"
     path.write_text(SHIPPED.read_text() + f"[observer]\n{slip}")

@@ -23,6 +23,7 @@ from rti_mpc_service.shipped import SHIPPED
 from rti_mpc_sim.settings import RobotSettings
 from tests.service.conformance.link import EPOCH, MS, as_it_is
 from tests.service.conformance.link import LockstepLink as Link
+from tests.slow import slow_but
 
 CONFIG = load(SHIPPED)
 LIMITS = guard_limits(CONFIG, build_signals(CONFIG))
@@ -48,7 +49,7 @@ def broken(link: LockstepLink) -> set[str]:
     return {name for name, verdict in found.items() if verdict == "NO"}
 
 
-@pytest.mark.parametrize("state_period_s", [0.01, 0.05, 0.1, 0.13])
+@pytest.mark.parametrize("state_period_s", slow_but([0.01, 0.05, 0.1, 0.13], 0.01, 0.13))
 def test_ours_keeps_every_promise(state_period_s: float) -> None:
     assert set(verdicts(LockstepLink(state_period_s=state_period_s)).values()) == {"yes"}
 

@@ -53,9 +53,9 @@ def structure(text: str) -> list[str]:
     return [line for line in lines if line.startswith(("#", "!["))] + heads
 
 
-@pytest.mark.parametrize("between", ["max_mm", "between_mm"])
-def test_best_settings_follow_the_eight_within_a_tenth_of_a_millimetre_at_the_samples_and_between(between: str) -> None:
-    assert drive(lasting(replace(EIGHT, **BEST_SETTINGS), 60.0)).summary()[between] <= 0.1
+def test_best_settings_follow_the_eight_within_a_tenth_of_a_millimetre_at_the_samples_and_between() -> None:
+    found = drive(lasting(replace(EIGHT, **BEST_SETTINGS), 60.0)).summary()
+    assert max(found["max_mm"], found["between_mm"]) <= 0.1
 
 
 def test_best_settings_end_at_the_goal_at_rest() -> None:

@@ -61,6 +61,7 @@ def test_bound_that_acts_is_named_with_its_stages_and_the_cost_is_told_by_term(t
     assert facts["state"]["age_s"] == 0.0
 
 
+@pytest.mark.slow  # compiles a problem of its own
 def test_second_difference_at_its_bound_is_named_and_what_would_be_commanded_without_it(tmp_path: Path) -> None:
     path = tmp_path / "bent.toml"
     path.write_text(SHIPPED.read_text() + "\n[ocp.bounds.second_differences]\nu_c = [-0.05, 0.04]\n")
@@ -72,6 +73,7 @@ def test_second_difference_at_its_bound_is_named_and_what_would_be_commanded_wit
     assert sum(facts["cost_terms"].values()) == pytest.approx(facts["cost"], rel=1e-6)
 
 
+@pytest.mark.slow  # compiles a problem of its own
 def test_bound_that_differs_by_stage_is_told_with_its_value_where_it_acts(tmp_path: Path) -> None:
     path = tmp_path / "staged.toml"
     speeds = [0.45, 0.4, 0.4, 0.4, 0.3, 0.25, 0.24, 0.23, *[0.22] * (N - 8)]  # m/s, at nodes 1 to N

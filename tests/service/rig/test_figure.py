@@ -86,8 +86,10 @@ def test_the_figure_names_what_it_shows_with_units(run: Run, tmp_path: Path) -> 
         assert expected in shown
 
 
-def test_the_figure_is_an_image_of_a_legible_size(run: Run, tmp_path: Path) -> None:
+def test_the_figure_is_an_image_of_a_legible_size_and_leaves_the_callers_settings_alone(run: Run, tmp_path: Path) -> None:
+    before = dict(mpl.rcParams)
     figure(run, tmp_path / "run.png")
+    assert dict(mpl.rcParams) == before
     height, width, _ = imread(tmp_path / "run.png").shape
     assert width > 1500
     assert height > 900
@@ -99,6 +101,7 @@ def test_a_run_shorter_than_its_transient_and_without_error_is_drawn(run: Run, t
     assert (tmp_path / "run.png").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_a_model_with_one_input_and_no_heading_is_drawn(run: Run, tmp_path: Path) -> None:
     info = Info(
         role="controller",
@@ -132,9 +135,3 @@ def test_an_angle_that_is_whole_turns_off_has_no_error(run: Run) -> None:
     error = replace(run, info=arm, y=run.reference + 2 * np.pi).output_error
     assert np.abs(error[:, 0]).max() < 1e-9
     assert error[:, 1] == pytest.approx(2 * np.pi)
-
-
-def test_drawing_leaves_the_callers_settings_alone(run: Run, tmp_path: Path) -> None:
-    before = dict(mpl.rcParams)
-    figure(run, tmp_path / "run.png")
-    assert dict(mpl.rcParams) == before
