@@ -74,6 +74,7 @@ def test_wheel_installs_three_typed_packages_and_nothing_else(wheel: Path) -> No
     assert "rti_mpc_service/deploy/pioneer_3dx.toml" in names
 
 
+@pytest.mark.slow
 def test_sdist_builds_the_same_wheel(sdist: Path, wheel: Path, tmp_path: Path) -> None:
     with tarfile.open(sdist) as archive:
         archive.extractall(tmp_path, filter="data")

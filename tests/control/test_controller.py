@@ -28,6 +28,7 @@ from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
 from tests.loop import MS, SLEW, Run, drive, reference, robot
 from tests.problems import pioneer
+from tests.slow import slow_but
 
 DT = 100 * MS
 STEP = np.array([0.25, 0.4])  # slew limit per dt
@@ -173,7 +174,7 @@ def cost(x: Array, u: Array, y_ref: Array, u_prev: Array) -> float:
 # The grid in time.
 
 
-@pytest.mark.parametrize("period_ms", [100, 50, 20, 10])
+@pytest.mark.parametrize("period_ms", slow_but([100, 50, 20, 10], 100, 10))
 def test_faster_states_neither_skip_nor_double_a_sample(controller: Controller, period_ms: int) -> None:
     controller.receive_reference(reference(circle()))
     run = drive(controller, robot(circle(), state_period_s=1e-3 * period_ms), 5.0)
@@ -215,7 +216,7 @@ def test_grid_follows_a_robot_whose_period_drifts(controller: Controller, drift:
     assert run.error_mm(circle())[150:].max() < 0.3
 
 
-@pytest.mark.parametrize(("delay_s", "latency_s"), [(0.0, 0.0), (0.05, 0.04), (0.1, 0.1), (0.23, 0.2)])
+@pytest.mark.parametrize(("delay_s", "latency_s"), slow_but([(0.0, 0.0), (0.05, 0.04), (0.1, 0.1), (0.23, 0.2)], (0.0, 0.0), (0.23, 0.2)))
 def test_plan_starts_where_the_robot_is_when_it_acts(rti: Rti, delay_s: float, latency_s: float) -> None:
     """Position, heading and speeds alike: predicted over the inputs already sent, in the hardest seconds of the eight."""
     predicted: dict[int, Array] = {}
@@ -239,7 +240,7 @@ def test_plan_starts_where_the_robot_is_when_it_acts(rti: Rti, delay_s: float, l
     assert errors[-1] < errors[0] / 10
 
 
-@pytest.mark.parametrize(("delay_s", "latency_s"), [(0.05, 0.04), (0.1, 0.1), (0.23, 0.2)])
+@pytest.mark.parametrize(("delay_s", "latency_s"), slow_but([(0.05, 0.04), (0.1, 0.1), (0.23, 0.2)], (0.23, 0.2)))
 def test_delay_that_is_known_costs_nothing(rti: Rti, delay_s: float, latency_s: float) -> None:
     errors = []
     for delay, latency in ((0.0, 0.0), (delay_s, latency_s)):
@@ -728,7 +729,7 @@ def test_last_command_of_a_life_is_a_standstill(on_the_circle: tuple[Controller,
 # All commands.
 
 
-@pytest.mark.parametrize("max_iter", [1, 3])
+@pytest.mark.parametrize("max_iter", slow_but([1, 3], 1))
 def test_commands_are_exactly_inside_bounds_and_increments_whatever_the_solver_does(max_iter: int) -> None:
     ocp = pioneer(N=7)
     controller = Controller(Rti(ocp, SolverSettings(max_iter=max_iter, check_termination=1), compile=False), Timing(), compile=False)

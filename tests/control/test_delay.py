@@ -16,6 +16,7 @@ from rti_mpc.rti.rti import Rti
 from rti_mpc.wire.actuator import Actuator
 from tests.loop import MS, SLEW, Run, drive, reference, robot
 from tests.problems import double_integrator, pioneer
+from tests.slow import slow_but
 
 DT = 100 * MS
 NOISE = np.array([1e-3, 1e-3, 2e-3, 5e-3, 5e-3])
@@ -37,7 +38,11 @@ def error_mm(run: Run) -> float:
     return float(run.error_mm(eight())[np.array(run.t_s) > 20.0].max())
 
 
-@pytest.mark.parametrize(("delay_s", "noise"), [(0.2, 0.0), (None, 0.0), (None, 1.0)], ids=["configured", "measured", "measured with noise"])
+@pytest.mark.parametrize(
+    ("delay_s", "noise"),
+    slow_but([(0.2, 0.0), (None, 0.0), (None, 1.0)], (0.2, 0.0), (None, 1.0)),
+    ids=["configured", "measured", "measured with noise"],
+)
 def test_delay_of_two_periods_costs_less_than_twice_the_error_without_delay(rti: Rti, delay_s: float | None, noise: float) -> None:
     undelayed = error_mm(driven(rti, 0.0, 0.0, noise)[1])
     assert error_mm(driven(rti, delay_s, 0.2, noise)[1]) <= 2.0 * undelayed
@@ -45,7 +50,7 @@ def test_delay_of_two_periods_costs_less_than_twice_the_error_without_delay(rti:
         assert error_mm(driven(rti, 0.0, 0.2)[1]) > 10.0 * undelayed  # what it is without compensation
 
 
-@pytest.mark.parametrize("actuator_delay_s", [0.0, 0.05, 0.13, 0.2])
+@pytest.mark.parametrize("actuator_delay_s", slow_but([0.0, 0.05, 0.13, 0.2], 0.0, 0.13))
 def test_delay_is_found_from_the_response(rti: Rti, actuator_delay_s: float) -> None:
     """Within half a candidate's step, in ten seconds; what is added to it covers that."""
     controller, _ = driven(rti, None, actuator_delay_s, duration_s=10.0)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -13,12 +15,14 @@ from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.control.ladder import MAX_FALLBACK_SAMPLES, Ladder
 from rti_mpc.reference.trajectory import circle
 from rti_mpc.rti.qp.osqp import SolverSettings
+from rti_mpc.rti.rti import BUILT_IN_SOLVERS
 from rti_mpc_service.injection import FAILURES, MAX_FAILING_SAMPLES, FaultyRti, answer
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
 from tests.loop import MS, Run, drive, reference, robot
 from tests.movers import law_of, ocp_of
 from tests.problems import double_integrator, pioneer
+from tests.slow import slow_but
 
 DT = 100 * MS
 STEP = np.array([0.25, 0.4])  # slew limit per dt
@@ -126,8 +130,10 @@ def test_model_that_gave_nan_is_forgotten_within_two_samples(driving: tuple[Cont
     assert_applied_inside_slew(controller, body, run)
 
 
-@pytest.mark.parametrize("name", ["car", "quadrotor", "double_integrator"])
-@pytest.mark.parametrize("solver", ["riccati", "osqp"])
+@pytest.mark.parametrize(
+    ("name", "solver"),
+    slow_but(product(("car", "quadrotor", "double_integrator"), BUILT_IN_SOLVERS), ("quadrotor", "riccati"), ("car", "osqp")),
+)
 def test_model_without_parameters_can_give_nan_too(name: str, solver: str) -> None:
     ocp = double_integrator() if name == "double_integrator" else ocp_of(name)
     rti = FaultyRti(ocp, solver=solver, compile=False)
@@ -178,7 +184,7 @@ def test_samples_over_budget_brake_when_no_plan_is_left(driving: tuple[Controlle
     assert controller.mode is again.mode is Mode.TRACKING
 
 
-@pytest.mark.parametrize("name", ["pioneer", "arm", "car"])
+@pytest.mark.parametrize("name", slow_but(["pioneer", "arm", "car"], "pioneer", "car"))
 def test_robot_is_driven_though_only_samples_that_start_cold_take_longer_than_a_period(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Under load a cold sample may take several periods. If the next one started cold again, the robot would never move."""
     ocp, law = ocp_of(name), law_of(name)
@@ -324,7 +330,7 @@ def test_states_that_have_waited_while_the_controller_was_stopped_are_not_acted_
 
 
 @pytest.mark.parametrize("outage_s", [0.15, 0.35, 0.65, 1.5, 4.0])
-@pytest.mark.parametrize("latency_ms", [0, 3, 33, 90])
+@pytest.mark.parametrize("latency_ms", slow_but([0, 3, 33, 90], 3, 90))
 def test_increments_hold_as_they_are_applied_across_any_gap(rti: FaultyRti, outage_s: float, latency_ms: int) -> None:
     """However late the first command comes, and whatever the reference has done meanwhile."""
     controller, body = Controller(rti, Timing(), compile=False), robot(circle(), state_period_s=0.05)

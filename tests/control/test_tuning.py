@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,9 @@ from rti_mpc.errors import OcpError
 from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 from rti_mpc.rti.qp.osqp import SolverSettings
-from rti_mpc.rti.rti import Rti
+from rti_mpc.rti.rti import BUILT_IN_SOLVERS, Rti
 from tests.problems import INF, arc, double_integrator, fenced, pioneer
+from tests.slow import slow_but
 
 TIGHT = SolverSettings(eps=1e-9, max_iter=200_000)
 OTHER: dict[str, Any] = {
@@ -51,8 +53,9 @@ def plan(rti: Rti, samples: int = 12) -> tuple[Array, Array, float]:
     return rti.x.copy(), rti.u.copy(), rti.cost
 
 
-@pytest.mark.parametrize("solver", ["riccati", "osqp"])
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize(
+    ("formulation", "solver"), slow_but(product(FORMULATIONS, BUILT_IN_SOLVERS), ("simultaneous", "riccati"), ("sequential", "osqp"))
+)
 def test_retuned_iteration_plans_like_one_built_so(formulation: str, solver: str) -> None:
     """Nearly: it keeps the scales it was built with, and with them how stiffly bounds hold, when it iterates once more, and where OSQP stops."""
     how: dict[str, Any] = {"formulation": formulation, "solver": solver, "compile": False}

@@ -22,7 +22,11 @@ PERIOD_S = 0.05  # of the rows that the source sends
 
 @pytest.mark.parametrize(
     ("name", "roles", "a"),
-    [("shuffled", ("heading", "x", "y"), 0.2), ("glider", ("x", "y"), None), ("rover", ("x", "y", "heading"), None)],
+    [
+        ("shuffled", ("heading", "x", "y"), 0.2),
+        ("glider", ("x", "y"), None),
+        pytest.param("rover", ("x", "y", "heading"), None, marks=pytest.mark.slow),
+    ],
 )
 def test_reference_has_a_column_for_each_output_by_its_role(name: str, roles: tuple[Role, ...], a: float | None, tmp_path: Path) -> None:
     """The glider's parameter is called `a`, and is negative: taken for the axle's offset it would be refused."""

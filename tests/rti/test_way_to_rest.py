@@ -20,6 +20,7 @@ from rti_mpc.rti.rest import STANDING_S, RestClass, assess, find_stop_law, stand
 from rti_mpc.rti.way_to_rest import StopLaw, WayToRest
 from tests.movers import car, law_of, mover, ocp_of
 from tests.problems import tank
+from tests.slow import slow_but
 
 CLASSES = {
     "pioneer": RestClass.HOLDS,
@@ -30,9 +31,6 @@ CLASSES = {
     "quadrotor": RestClass.UNSTABLE,
     "cart_pole": RestClass.UNSTABLE,
 }
-
-
-BICYCLE = pytest.param("bicycle", marks=pytest.mark.slow)  # to find its law takes 4 s
 
 
 def way_of(name: str) -> WayToRest:
@@ -47,7 +45,7 @@ def rates(way: WayToRest, name: str, row: int) -> Array:
     return np.array(f(way.x[row], way.u[row], model.p_nominal)).ravel()
 
 
-@pytest.mark.parametrize("name", [BICYCLE if name == "bicycle" else name for name in CLASSES])
+@pytest.mark.parametrize("name", slow_but(CLASSES, "pioneer", "car", "quadrotor"))
 def test_robot_is_classified_by_what_it_does_at_rest(name: str) -> None:
     rest = assess(ocp_of(name), law_of(name), 40, compile=False)
     assert rest.kind is CLASSES[name]
@@ -61,7 +59,7 @@ def test_robot_that_its_inputs_at_rest_stop_needs_no_way(name: str) -> None:
     assert law_of(name) is None
 
 
-@pytest.mark.parametrize("name", ["car", BICYCLE, "arm", "quadrotor", "cart_pole"])
+@pytest.mark.parametrize("name", slow_but(["car", "bicycle", "arm", "quadrotor", "cart_pole"], "car", "quadrotor"))
 def test_way_ends_at_rest_and_is_inside_bounds_and_slew_limits(name: str) -> None:
     ocp, way = ocp_of(name), way_of(name)
     for x, u in zip(*states_of_operation(ocp, 8, seed=7), strict=True):
@@ -83,7 +81,7 @@ def test_car_brakes_as_hard_as_it_may_and_keeps_its_heading_free() -> None:
     assert np.allclose(way.K[1], 0.0), "at rest no curvature moves it"
 
 
-@pytest.mark.parametrize("name", ["car", BICYCLE, "arm", "quadrotor"])
+@pytest.mark.parametrize("name", slow_but(["car", "bicycle", "arm", "quadrotor"], "car", "quadrotor"))
 def test_robot_that_has_come_off_its_way_is_back_and_still_soon(name: str) -> None:
     """As after a plan that could not be followed any more: 0.03 m, or rad, off in the first place that it may rest at."""
     ocp, way = ocp_of(name), way_of(name)

@@ -35,6 +35,7 @@ from rti_mpc_service.view.screen import spawn_viewer, viewer_url
 from tests.in_time import MS, PATIENT, in_time
 from tests.processes.system import until
 from tests.service.view.test_view_outlet import Viewer as Screen
+from tests.slow import slow_but
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 60.0
@@ -158,7 +159,7 @@ def changes(path: Path, lane: str) -> list[tuple[int, str]]:
     return rows(path, lane, "StateChange:state")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", slow_but([signal.SIGINT, signal.SIGTERM], signal.SIGINT))
 def test_a_stopped_viewer_leaves_everything_received_in_the_recording(
     children: list[Child], port: int, tmp_path: Path, host: Host, number: signal.Signals
 ) -> None:
