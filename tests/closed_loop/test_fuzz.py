@@ -62,7 +62,7 @@ def test_no_sample_of_a_million_leaves_the_limits_or_raises(seed: int) -> None:
 
 
 LOSSY = [
-    pytest.param(False, True, id="no guard"),
+    pytest.param(False, True, id="no guard", marks=pytest.mark.slow),
     pytest.param(True, True, id="guard"),
     pytest.param(False, False, id="no guard, no reports", marks=pytest.mark.slow),
     pytest.param(True, False, id="guard, no reports", marks=pytest.mark.slow),

@@ -44,6 +44,7 @@ def robot_in(folder: Path) -> Path:
     return folder / "robot.toml"
 
 
+@pytest.mark.slow  # compiles a problem of its own
 def test_robot_follows_a_file_to_its_end_and_stops_without_its_path(tmp_path: Path) -> None:
     config = robot_in(tmp_path)
     path = ("reference", "--path", tmp_path / "track.csv", "--path-limits", 0.4, 0.3, 0.3, 0.3)

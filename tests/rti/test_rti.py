@@ -67,7 +67,7 @@ def unmoving(rti: Rti) -> tuple[Array, ...]:
     [
         ("sequential", "riccati", {"method": "euler"}, 50),
         pytest.param("simultaneous", "riccati", NARROW, 50, marks=pytest.mark.slow),
-        ("simultaneous", "riccati", {"N": 10, "N_u": 4} | NARROW, 50),
+        pytest.param("simultaneous", "riccati", {"N": 10, "N_u": 4} | NARROW, 50, marks=pytest.mark.slow),
         ("simultaneous", "osqp", {"N": 10, "N_u": 4} | NARROW, 10),
         pytest.param("simultaneous", "osqp", {"N": 10, "N_u": 4} | NARROW, 50, marks=pytest.mark.slow),
     ],
@@ -636,7 +636,6 @@ def test_prepare_and_feedback_do_not_grow_the_heap() -> None:
     ("solver", "samples"),
     [
         ("riccati", 8_000),
-        ("osqp", 4_000),
         pytest.param("riccati", 100_000 if "CI" in os.environ else 1_000_000, marks=pytest.mark.slow),
         pytest.param("osqp", 20_000 if "CI" in os.environ else 200_000, marks=pytest.mark.slow),
     ],

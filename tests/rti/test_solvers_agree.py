@@ -76,8 +76,9 @@ def at_bounds(ocp: Ocp, u: Array, u_prev: Array) -> dict[str, bool]:
     }
 
 
-@pytest.mark.parametrize(("structures", "samples"), [(3, 5), pytest.param(8, 25, marks=pytest.mark.slow)])
-def test_all_solvers_give_the_same_plan_in_either_formulation_on_random_problems(structures: int, samples: int) -> None:
+@pytest.mark.slow
+def test_all_solvers_give_the_same_plan_in_either_formulation_on_random_problems() -> None:
+    structures, samples = 8, 25
     rng = np.random.default_rng(3)
     seen: Counter[str] = Counter()
     for structure in range(structures):

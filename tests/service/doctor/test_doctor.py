@@ -27,6 +27,7 @@ def examined(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, str, Any]:
     return done.returncode, done.stdout, json.loads((folder / "report.json").read_text())
 
 
+@pytest.mark.slow
 def test_doctor_measures_what_the_loop_needs_and_says_that_the_period_is_too_short(examined: tuple[int, str, Any]) -> None:
     status, printed, report = examined
     for part in PARTS:
@@ -38,6 +39,7 @@ def test_doctor_measures_what_the_loop_needs_and_says_that_the_period_is_too_sho
     assert "a period of 0.1 ms CANNOT be kept here" in printed
 
 
+@pytest.mark.slow
 def test_doctor_tells_what_the_host_grants_and_has(examined: tuple[int, str, Any]) -> None:
     _, printed, report = examined
     assert set(report["realtime"]) == {"priority", "cores", "lock_memory"}
