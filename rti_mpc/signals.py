@@ -48,7 +48,7 @@ class Signal:
         commands: Of an input, the name of the state that follows it, a speed; empty: none.
 
     Raises:
-        OcpError: A field is of the wrong type, or the name is empty.
+        OcpError: A field is of the wrong type, the name is empty, or an angle is not in rad.
     """
 
     name: str
@@ -65,6 +65,8 @@ class Signal:
                 raise OcpError(f"{field} of the signal {given.quoted(self.name)} must be {words}, got {given.quoted(value)}")
         if not self.name.strip():
             raise OcpError(f"name of a signal must not be empty, got {self.name!r}")
+        if self.angle and self.unit != "rad":
+            raise OcpError(f"unit of the signal {self.name!r} must be rad for angle=True, since a whole turn is 2 pi there, got {self.unit!r}")
 
 
 def signals(vector: str, given_as: Any, alike: Sequence[Signal | None] = ()) -> tuple[Signal, ...]:
