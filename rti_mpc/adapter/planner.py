@@ -3,16 +3,21 @@
 
 from __future__ import annotations
 
+import math
+import struct
 import sys
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rti_mpc import given
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, End, Reference
-from rti_mpc.errors import ConfigError
+from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.wire.bus import Bus, BusSettings, new_epoch
+from rti_mpc.wire.cdr import decode, encode
 from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.layout import most_rows
 
 ROLE = "reference"
 
@@ -63,14 +68,22 @@ class PlannerAdapter:
             p: Stage parameters in the order of the model, shape ``(M, np)``; None: the model's nominal ones.
 
         Raises:
-            ConfigError: The rows are no table of finite numbers, or the period is none.
+            ConfigError: The rows are no table of finite numbers, or too many for a message; or the period, the time or the end is none.
+            OcpError: What must be numbers is none.
         """
-        rows = np.array(y, dtype=np.float64)
-        parameters = np.zeros((len(rows), 0)) if p is None else np.array(p, dtype=np.float64)
+        rows = given.numbers("y", y).copy()
+        parameters = np.zeros((rows.shape[0] if rows.ndim else 0, 0)) if p is None else given.numbers("p", p).copy()
         for name, table in (("y", rows), ("p", parameters)):
-            if table.ndim != 2 or len(table) != len(rows) or not len(table) or not np.isfinite(table).all():
+            if table.ndim != 2 or not rows.size or len(table) != len(rows) or not np.isfinite(table).all():
                 raise ConfigError(f"{name} must be a table of finite numbers, as many rows as y has, got shape {table.shape}")
-        if not period_s > 0.0:
-            raise ConfigError(f"period_s must be above 0, got {period_s}")
+        if len(rows) > (most := most_rows(rows.shape[1], parameters.shape[1])):
+            raise ConfigError(f"y must have at most {most} rows of this length, for a reference to arrive, got {len(rows)}: send the others later")
+        if not 0.0 < given.number("period_s", period_s) < math.inf:
+            raise ConfigError(f"period_s must be above 0 and finite, got {period_s}")
+        reference = Reference(self._epoch, self._seq + 1, stamp_ns, round(1e9 * period_s), end, rows, parameters)
+        try:
+            decode(Reference, encode(reference))  # a receiver would refuse it where nobody hears of it
+        except (MessageError, struct.error) as error:
+            raise ConfigError(f"a reference must be one that receivers take, got: {error}") from error
         self._seq += 1
-        self._publisher.put(Reference(self._epoch, self._seq, stamp_ns, round(1e9 * period_s), end, rows, parameters))
+        self._publisher.put(reference)

@@ -10,6 +10,7 @@ What acts is reported in each state, so that the controller plans from there.
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import rti_mpc
+from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.message import Command, Notice, Severity, State
@@ -131,7 +133,13 @@ class RobotAdapter:
 
         The period is that in which the inputs are renewed: a fraction of `dt_s`, for a command acts from its time on, and comes soon
         after its state. A period that was missed is skipped. Once stopped, no command is taken and the inputs ramp to rest.
+
+        Raises:
+            ConfigError: The period is none.
+            OcpError: It is no number.
         """
+        if not 1e-4 <= given.number("period_s", period_s) <= 10.0:
+            raise ConfigError(f"period_s must be from 0.0001 to 10 s, got {period_s}")
         period_ns = round(1e9 * period_s)
         due_ns = time.monotonic_ns()
         while not (self._stop.is_set() and self._actuator.at_rest):
@@ -148,15 +156,20 @@ class RobotAdapter:
 
         Args:
             x: State in the order of the model, shape ``(nx,)``; angles may wrap.
-            age_s: How long ago it was measured, at most `dt_s`.
+            age_s: How long ago it was measured, at most `dt_s`; less than 0 counts as 0.
 
         Raises:
-            ConfigError: It has not as many components as `angles`.
+            ConfigError: It is no list, or has not as many numbers as `angles`; or its age is none.
+            OcpError: What must be numbers is none.
         """
-        now_ns, state = time.monotonic_ns(), np.array(x, dtype=np.float64)
-        stamp_ns = now_ns - round(1e9 * age_s)
+        now_ns, state = time.monotonic_ns(), np.array(given.numbers("x", x), ndmin=1)
+        if not math.isfinite(given.number("age_s", age_s)):
+            raise ConfigError(f"age_s must be finite, got {age_s}")
+        stamp_ns = now_ns - max(0, round(1e9 * age_s))
         if self._nx and state.shape != (self._nx,):
             raise ConfigError(f"x must have as many components as angles, {self._nx}, got shape {state.shape}")
+        if state.ndim != 1 or not state.size:
+            raise ConfigError(f"x must be a list of the model's states, got shape {state.shape}")
         u, source = self._actuator.acting(stamp_ns)
         if self._nx and np.isfinite(state).all():
             self._actuator.measure(state, stamp_ns, now_ns)

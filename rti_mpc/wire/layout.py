@@ -197,6 +197,7 @@ MAX_PAYLOAD_BYTES: dict[type[Any], int] = {
     Journal: (1 << 23) + (1 << 11),  # a reference of the longest, with its entry
     Event: 1 << 13,
 }
+REFERENCE_HEAD_BYTES = 64  # of a reference, at most: all but its numbers
 MESSAGE_DESCRIPTIONS: dict[type[Any], str] = {
     State: "The robot's state, published by the robot.",
     Reference: "Output reference on a regular time grid. It ends with its last row; it need not be repeated before.",
@@ -206,6 +207,11 @@ MESSAGE_DESCRIPTIONS: dict[type[Any], str] = {
     Event: "A mode change or a fault.",
 }
 WIDTH_DESCRIPTIONS: dict[str, str] = {"nx": "states per row", "nu": "inputs per row", "ny": "outputs per row", "np": "stage parameters per row"}
+
+
+def most_rows(ny: int, np_: int = 0) -> int:
+    """Return how many rows a reference may have; a longer one arrives nowhere, for sessions drop it before it is reassembled."""
+    return (MAX_PAYLOAD_BYTES[Reference] - REFERENCE_HEAD_BYTES) // (8 * (ny + np_))
 
 
 def msg_text(cls: type[Any]) -> str:

@@ -14,10 +14,11 @@ import pytest
 from rti_mpc.adapter import PlannerAdapter, RobotAdapter, robot
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Reference, State
 from rti_mpc.contract.status import Mode, QpStatus
-from rti_mpc.errors import ConfigError
+from rti_mpc.errors import ConfigError, RtiMpcError
 from rti_mpc.wire.bus import Bus, Received
 from rti_mpc.wire.cdr import decode, encode, encoding
 from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES, REFERENCE_HEAD_BYTES, most_rows
 from tests.wire.fake_session import FakeSession
 
 MS = 1_000_000
@@ -246,6 +247,71 @@ def test_planner_sends_references_and_refuses_what_is_none(monkeypatch: pytest.M
         reference = decode(Reference, session.put[KEYS.reference])
         assert (reference.seq, reference.stamp_ns, reference.period_ns, reference.end) == (1, STAMP_ON_ARRIVAL, 50 * MS, End.STOP)
         assert (reference.y.tolist(), reference.p.shape) == ([[0.0, 1.0], [2.0, 3.0]], (2, 0))
-        for y, period_s, p in (([1.0, 2.0], 0.1, None), ([[np.nan]], 0.1, None), ([[1.0]], 0.0, None), ([[1.0]], 0.1, [[1.0], [2.0]])):
+        for y, period_s, p in (
+            (3.0, 0.1, None),
+            ([1.0, 2.0], 0.1, None),
+            ([[np.nan]], 0.1, None),
+            ([[1.0]], 0.0, None),
+            ([[1.0]], 0.1, [[1.0], [2.0]]),
+        ):
             with pytest.raises(ConfigError, match="must be"):
                 planner.send(y, period_s, p=p)
+
+
+WRONG_REFERENCES: dict[str, tuple[dict[str, Any], str]] = {
+    "rows of different lengths": ({"y": [[1.0], [1.0, 2.0]]}, "y must be real numbers"),
+    "text": ({"y": [["a"]]}, "y must be real numbers, got [['a']]"),
+    "no columns": ({"y": [[]]}, "y must be a table of finite numbers, as many rows as y has, got shape (1, 0)"),
+    "numbers that are too large": ({"y": [[1e19]]}, "y must be finite and at most 1e+18, got 1e+19"),
+    "a period of text": ({"period_s": "fast"}, "period_s must be real numbers, got 'fast'"),
+    "a period that is infinite": ({"period_s": np.inf}, "period_s must be above 0 and finite, got inf"),
+    "a period below a nanosecond": ({"period_s": 1e-12}, "period_ns must be from 1 to 3600000000000, got 0"),
+    "a period of two hours": ({"period_s": 7200.0}, "period_ns must be from 1 to 3600000000000, got 7200000000000"),
+    "a time beyond all clocks": ({"stamp_ns": 2**63}, "a reference must be one that receivers take, got"),
+    "an end that is none": ({"end": 7}, "end must be one of [0, 1], got 7"),
+    "more rows than a message holds": (
+        {"y": np.zeros((349_523, 3))},
+        "y must have at most 349522 rows of this length",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", WRONG_REFERENCES)
+def test_reference_that_no_receiver_would_take_is_refused_where_it_is_sent(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    session, (wrong, told) = Session(), WRONG_REFERENCES[what]
+    monkeypatch.setattr(Bus, "join", lambda settings, keys, **_: Bus(session, keys))
+    with PlannerAdapter("car") as planner, pytest.raises(RtiMpcError) as refused:
+        planner.send(**({"y": [[1.0]], "period_s": 0.1} | wrong))
+    assert told in str(refused.value)
+    assert KEYS.reference not in session.put
+
+
+def test_longest_reference_that_may_be_sent_is_one_that_sessions_let_through(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = Session()
+    monkeypatch.setattr(Bus, "join", lambda settings, keys, **_: Bus(session, keys))
+    with PlannerAdapter("car") as planner:
+        for ny, np_ in ((1, 0), (3, 0), (2, 5)):
+            most = most_rows(ny, np_)
+            planner.send(np.zeros((most, ny)), 0.1, p=np.zeros((most, np_)) if np_ else None)
+            assert 0 <= MAX_PAYLOAD_BYTES[Reference] - len(session.put[KEYS.reference]) < 8 * (ny + np_) + REFERENCE_HEAD_BYTES
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda robot: robot.send([[0.0, 1.0]]), r"x must be a list of the model's states, got shape \(1, 2\)"),
+        (lambda robot: robot.send([]), r"x must be a list of the model's states, got shape \(0,\)"),
+        (lambda robot: robot.send("now"), "x must be real numbers, got 'now'"),
+        (lambda robot: robot.send([0.0], age_s=np.nan), "age_s must be finite, got nan"),
+        (lambda robot: next(robot.every(0.0)), "period_s must be from 0.0001 to 10 s, got 0.0"),
+        (lambda robot: next(robot.every("fast")), "period_s must be real numbers, got 'fast'"),
+    ],
+)
+def test_wrong_call_of_a_robot_is_refused_by_name(scene: Scene, call: Any, told: str) -> None:
+    with pytest.raises(RtiMpcError, match=f"^{told}$"):
+        call(scene.robot)
+
+
+def test_state_of_one_number_may_be_that_number_and_one_measured_ahead_of_the_clock_is_of_now(scene: Scene) -> None:
+    scene.robot.send(5.0, age_s=-0.001)
+    assert (scene.state().x.tolist(), scene.state().stamp_ns) == ([5.0], scene.now_ns)
