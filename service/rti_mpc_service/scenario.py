@@ -22,7 +22,8 @@ from rti_mpc.reference.manoeuvres import MANOEUVRES, fitting, manoeuvre
 from rti_mpc.reference.outputs import OUTPUT_SCENARIOS, OutputReference, names_outputs, recorded
 from rti_mpc.reference.trajectory import SCENARIOS, Heading, Trajectory, find_trajectory, followed_roles, rows
 from rti_mpc.signals import in_plane, place
-from rti_mpc_service.config.build import bounds, build_model
+from rti_mpc.wire.layout import most_rows
+from rti_mpc_service.config.build import bounds, build_model, stage_parameters
 from rti_mpc_service.config.schema import Config
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ def find_scenario(
         smooth_m: Path that waypoints are averaged over, see `rti_mpc.reference.trajectory.waypoints`.
 
     Raises:
-        ConfigError: There is no such scenario, it says nothing of an output, or a file is wrong.
+        ConfigError: There is no such scenario, it says nothing of an output, it is too long for a message, or a file is wrong.
         OcpError: No consistent heading repeats on a closed path.
     """
     model = build_model(config)
@@ -117,7 +118,23 @@ def find_scenario(
             raise ConfigError(f"--heading is of paths in the plane, it must be left out for {name}, got {heading}")
         return of_outputs(config, model, name, duration_s)
     trajectory = find_trajectory(name, speed_m_s, smooth_m=smooth_m)
-    return of_path(model, trajectory if duration_s is None else trajectory.lasting(duration_s), heading or "consistent")
+    trajectory = trajectory if duration_s is None else trajectory.lasting(duration_s)
+    check_duration(config, model, trajectory.duration_s, ROW_PERIOD_S)
+    return of_path(model, trajectory, heading or "consistent")
+
+
+def check_duration(config: Config, model: Model, duration_s: float, period_s: float) -> None:
+    """
+    Check that a reference fits into a message, before its rows are made.
+
+    Raises:
+        ConfigError: It does not.
+    """
+    np_ = stage_parameters(config, np.zeros(1)).shape[1]
+    longest_s = period_s * (most_rows(model.ny, np_) - 1)
+    if duration_s > longest_s:
+        rows = f"a reference with rows of {model.ny} outputs and {np_} parameters every {period_s:g} s"
+        raise ConfigError(f"{rows} must last at most {int(longest_s)} s, to fit into a message, got {duration_s:g} s: give it a shorter --duration")
 
 
 def of_path(model: Model, trajectory: Trajectory, heading: Heading) -> Scenario:
@@ -171,6 +188,7 @@ def of_outputs(config: Config, model: Model, name: str, duration_s: float | None
     if duration_s is not None:
         reference = reference.lasting(duration_s)
     period_s = ROW_PERIOD_S if name in MANOEUVRES else min(ROW_PERIOD_S, config.ocp.dt_s)
+    check_duration(config, model, reference.duration_s, period_s)
     t: Array = np.float64(period_s) * np.arange(int(np.ceil(reference.duration_s / period_s - 1e-9)) + 1)
     h = model.h()
 

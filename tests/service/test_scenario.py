@@ -8,8 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rti_mpc.contract.message import End, Reference
 from rti_mpc.errors import ConfigError
 from rti_mpc.reference.trajectory import eight, rows
+from rti_mpc.wire.cdr import encode
+from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
 from rti_mpc_service.config import signals_file
 from rti_mpc_service.config.build import build_signals, with_initial_state
 from rti_mpc_service.config.config import load
@@ -118,3 +121,15 @@ def test_start_at_which_an_output_is_no_number_is_refused_by_its_name(tmp_path: 
     config = with_initial_state(config, ["east=0", "north=0"])
     with pytest.raises(ConfigError, match=r"sim\.x0 must be a state whose outputs are finite, direction is not, got \[0\.0, 0\.0\]"):
         check_start(config)
+
+
+@pytest.mark.parametrize(("robot", "longest_s"), [("glider", 26_214), ("arm", 26_214)])
+def test_scenario_that_no_message_holds_is_refused_before_its_rows_are_made(robot: str, longest_s: int, tmp_path: Path) -> None:
+    """A session drops a longer message before it is put together: the controller would wait for it for ever."""
+    config = config_of(tmp_path, robot)
+    with pytest.raises(ConfigError, match=rf"must last at most {longest_s} s, .*, got 1e\+12 s: give it a shorter --duration"):
+        find_scenario(config, duration_s=1e12)
+    scenario = find_scenario(config, duration_s=float(longest_s))
+    y = scenario.y(np.zeros(2))
+    reference = Reference(1, 1, 0, 1, End.HOLD, y, np.empty((len(y), 0)))
+    assert len(encode(reference)) <= MAX_PAYLOAD_BYTES[Reference]
