@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import struct
 import sys
 from typing import Self
 
@@ -15,7 +14,7 @@ from rti_mpc import given
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, End, Reference
 from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.wire.bus import Bus, BusSettings, new_epoch
-from rti_mpc.wire.cdr import decode, encode
+from rti_mpc.wire.intake import taken
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.layout import most_rows
 
@@ -82,8 +81,8 @@ class PlannerAdapter:
             raise ConfigError(f"period_s must be above 0 and finite, got {period_s}")
         reference = Reference(self._epoch, self._seq + 1, stamp_ns, round(1e9 * period_s), end, rows, parameters)
         try:
-            decode(Reference, encode(reference))  # a receiver would refuse it where nobody hears of it
-        except (MessageError, struct.error) as error:
-            raise ConfigError(f"a reference must be one that receivers take, got: {error}") from error
+            payload = taken(reference)
+        except MessageError as error:
+            raise ConfigError(f"a reference must be one that receivers take: {error}") from error
         self._seq += 1
-        self._publisher.put(reference)
+        self._publisher.put_bytes(payload)

@@ -5,16 +5,32 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from struct import error as StructError
 from typing import Generic, Protocol
 
 from rti_mpc.contract.epoch import EPOCH_LEAD, highest_believed
 from rti_mpc.contract.message import Notice, Reference, Severity, State
-from rti_mpc.wire.cdr import MESSAGE_VERSION, M, Refused, decode, encoding
+from rti_mpc.wire.cdr import MESSAGE_VERSION, M, Message, Refused, decode, encode, encoding
 from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
 from rti_mpc.wire.source import Source, Verdict
 
 OPTIONAL_ARRAYS = {(Reference, "p"), (State, "u")}  # arrays that may be left out: nominal parameters, inputs that are not reported
 MAX_QUOTED_CHARS = 120  # of an encoding that a notice quotes
+
+
+def taken(message: Message) -> bytes:
+    """
+    Return the bytes of a message that receivers take.
+
+    Raises:
+        Refused: They would refuse it, where its sender does not hear of it.
+    """
+    try:
+        payload = encode(message)
+    except StructError as error:
+        raise Refused("value", f"integers must fit into their fields, got: {error}") from None
+    decode(type(message), payload)
+    return payload
 
 
 class Payload(Protocol):

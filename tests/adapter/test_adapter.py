@@ -267,7 +267,7 @@ WRONG_REFERENCES: dict[str, tuple[dict[str, Any], str]] = {
     "a period that is infinite": ({"period_s": np.inf}, "period_s must be above 0 and finite, got inf"),
     "a period below a nanosecond": ({"period_s": 1e-12}, "period_ns must be from 1 to 3600000000000, got 0"),
     "a period of two hours": ({"period_s": 7200.0}, "period_ns must be from 1 to 3600000000000, got 7200000000000"),
-    "a time beyond all clocks": ({"stamp_ns": 2**63}, "a reference must be one that receivers take, got"),
+    "a time beyond all clocks": ({"stamp_ns": 2**63}, "a reference must be one that receivers take: integers must fit into their fields"),
     "an end that is none": ({"end": 7}, "end must be one of [0, 1], got 7"),
     "more rows than a message holds": (
         {"y": np.zeros((349_523, 3))},
