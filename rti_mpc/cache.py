@@ -16,6 +16,8 @@ import os
 import stat
 from pathlib import Path
 
+from rti_mpc.whole_file import replaced
+
 SEAL_BYTES = hashlib.sha256().digest_size
 WRITABLE_BY_OTHERS = stat.S_IWGRP | stat.S_IWOTH  # bits of a file mode
 
@@ -72,20 +74,8 @@ def write_sealed(path: Path, key: str, content: bytes) -> None:
     Raises:
         OSError: The file cannot be written.
     """
-    temporary = path.with_name(f"{path.name}.{os.getpid()}")
-    try:
-        with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o600), "wb") as file:
-            file.write(content + _seal(key, content))
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    with replaced(path, 0o600) as file:
+        file.write(content + _seal(key, content))
 
 
 def _ours(state: os.stat_result) -> bool:

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rti_mpc.errors import ConfigError
+from rti_mpc.whole_file import replaced
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.certs.access import host_and_port, zenoh_configuration
 from rti_mpc_service.certs.authority import Authority, days_left, name_of, new_key, pem, read_certificate
@@ -104,8 +105,8 @@ def renew(authority: Authority, folder: Path, days: float) -> list[Path]:
     contents = {path: pem(authority.renewed(read_certificate(path), days)) for path in paths}
     try:
         for path, content in contents.items():
-            (fresh := path.with_suffix(".new")).write_bytes(content)
-            fresh.replace(path)
+            with replaced(path) as fresh:
+                fresh.write(content)
     except OSError as error:
         raise ConfigError(f"certs: {folder} must be a folder that can be written, got: {error}") from error
     return paths

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.text_file import read_text_file
+from rti_mpc.whole_file import replaced
 from rti_mpc.wire import document
 from rti_mpc.wire.info import Label
 from rti_mpc_service.config.schema import Config
@@ -85,9 +86,8 @@ def write(path: Path, signals: Signals) -> Path:
     file, text = file_beside(path), signals.to_text()
     try:
         if not file.is_file() or file.read_bytes() != text.encode():
-            beside = file.with_name(f"{file.name}.tmp")
-            beside.write_text(text, encoding="utf-8")
-            beside.replace(file)  # a guard that starts meanwhile reads the one or the other
+            with replaced(file) as fresh:  # a guard that starts meanwhile reads the one or the other
+                fresh.write(text.encode())
     except OSError as error:
         cure = f"check a copy of {path.name} in a folder of your own"
         raise ConfigError(f"{file} must be a file that can be written, a guard reads the model's signals there: {error.strerror}; {cure}") from error

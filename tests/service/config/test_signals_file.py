@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 from collections import Counter
 from pathlib import Path
@@ -145,14 +147,18 @@ def test_run_refuses_a_file_of_the_model_as_it_was(checked: Path, monkeypatch: p
     assert CliRunner().invoke(app, ["run", str(checked)]).exit_code == 0
 
 
-def test_file_is_written_only_where_it_differs_and_a_folder_that_cannot_be_written_is_one_line(checked: Path) -> None:
+def test_file_is_written_only_where_it_differs_and_a_disk_that_is_full_is_one_line(checked: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file, signals = signals_file.file_beside(checked), build_signals(load(checked))
-    (checked.parent / "robot.signals.json.tmp").mkdir()  # in the way, for root as well
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
     assert signals_file.write(checked, signals) == file
     file.write_text("{}")
     with pytest.raises(
         ConfigError,
-        match=rf"^{file} must be a file that can be written, a guard reads the model's signals there: Is a directory; check a copy",
+        match=rf"^{file} must be a file that can be written, a guard reads the model's signals there: No space left on device; check a copy",
     ):
         signals_file.write(checked, signals)
     assert json.loads(file.read_text()) == {}, "what was there is not destroyed"
