@@ -5,11 +5,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 
+from rti_mpc import Model
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.rti import second_opinion
+from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.osqp import Solver, SolverSettings
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.second_opinion import SecondOpinion
@@ -116,6 +119,31 @@ def test_opinions_without_softened_bounds_say_nothing_on_standard_output(capsys:
         assert opinion.iterations < 200, "110: it still polishes"
     assert acting == [True, True, False, False, True]
     assert capsys.readouterr().out == ""
+
+
+def integrator(**changes: Any) -> Ocp:
+    """A position that its speed is commanded of, 1 state, 1 input."""
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    model = Model(name="integrator", x=x, u=u, f_expl_expr=u, y_expr=x, states="r", inputs="v", outputs="r")
+    return Ocp(model, **{"dt": 0.1, "Q": 1.0, "R": 0.1, "lbu": -1.0, "ubu": 1.0, "lbdu": -0.5, "ubdu": 0.5} | changes)
+
+
+@pytest.mark.parametrize(
+    "ocp", [double_integrator(), integrator(N=1), integrator(N=4, blocks=[1, 3])], ids=["without bounds", "of one stage", "with blocks"]
+)
+def test_opinions_about_a_robot_that_comes_to_rest_say_nothing_on_standard_output(ocp: Ocp, capfd: pytest.CaptureFixture[str]) -> None:
+    """Nothing acts there any more, or what seems to act has a multiplier that is rounding alone."""
+    rti = Rti(ocp, formulation="sequential", compile=False)
+    opinion, x = SecondOpinion(rti), np.zeros(ocp.model.nx)
+    x[0] = 1.0
+    rti.reset(x, np.zeros(1))
+    for _ in range(60):
+        rti.prepare(np.zeros((ocp.N, ocp.model.ny)))
+        rti.feedback(x)
+        assert form(opinion).status is QpStatus.SOLVED
+        assert opinion.difference < AGREEMENT
+        x = rti.x[1].copy()
+    assert capfd.readouterr() == ("", "")
 
 
 def test_plans_are_the_same_bit_for_bit_with_second_opinions_and_without() -> None:

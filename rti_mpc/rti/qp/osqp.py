@@ -43,7 +43,7 @@ SOLVED, INTERRUPTED = 1, 10
 interrupted = ctypes.PyDLL(osqp.ext_builtin.__file__).osqp_is_interrupted
 
 MAX_ENTRY = 1e7  # of a scaled matrix: beyond it the factorization is rounding alone, and OSQP prints a line on standard output
-ACTING_MULTIPLIER = 1e-6  # a softened bound with a larger multiplier acts; those of the others are exactly zero
+ACTING_MULTIPLIER = 1e-6  # a bound with a larger multiplier acts; those of the others are zero, but for rounding
 ADAPTATION_ITERATIONS = 100  # after so many the step size is the next one, and rows are weighed anew; twice as many in each further round
 ACTING_RESIDUALS = 10.0  # steps of a multiplier by the primal residual: one that is larger does not vanish in a single iteration
 STEP_SIZES = 1.0, 0.1, 10.0  # in turn, relative to that of the settings: where OSQP is slow with one, it mostly converges with another
@@ -306,8 +306,8 @@ class Solver:
                 signal.raise_signal(signal.SIGINT)  # for the handler of the process, without which nobody would be told
 
     def _acts(self) -> bool:
-        """Whether a row acts at the last iterate, and still will after one more iteration."""
-        return float(np.abs(self._solution.y).max()) > ACTING_RESIDUALS * self._step_size * self.res_prim
+        """Whether a row acts at the last iterate, and still will after one more iteration; where that is exact, small multipliers are rounding alone."""
+        return float(np.abs(self._solution.y).max()) > max(ACTING_MULTIPLIER, ACTING_RESIDUALS * self._step_size * self.res_prim)
 
     def _polish(self) -> None:
         """Iterate once more, and polish: OSQP does so only after an iteration."""

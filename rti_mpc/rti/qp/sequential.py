@@ -164,6 +164,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
         row = rows.add(slack, slack, None, by_bound)
         rows.follow(row, ng, sides)
         A.place(row, to_s, sp.eye_array(N * ng))
+    watched = rows.watched_from(first_soft)
     if not rows.count:
         A.place(rows.add(None, ca.MX.zeros(1), None, by_input[:1]), 0, sp.csc_array(np.eye(1)))  # OSQP needs at least one row
 
@@ -203,7 +204,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
         columns=np.concatenate([np.tile(by_input, N_u), np.tile(by_bound[:ng], N)]),
         rows=np.array(rows.scales),
         eliminable=0,
-        watched=rows.watched_from(first_soft),
+        watched=watched,
     )
 
 
