@@ -306,7 +306,7 @@ class Solver:
                 signal.raise_signal(signal.SIGINT)  # for the handler of the process, without which nobody would be told
 
     def _acts(self) -> bool:
-        """Whether a row acts at the last iterate, and still will after one more iteration; where that is exact, small multipliers are rounding alone."""
+        """Whether a row acts at the last iterate, and will after one more iteration; where that is exact, small multipliers are but rounding."""
         return float(np.abs(self._solution.y).max()) > max(ACTING_MULTIPLIER, ACTING_RESIDUALS * self._step_size * self.res_prim)
 
     def _polish(self) -> None:
