@@ -62,7 +62,12 @@ def _table(path: str, values: Mapping[str, Any]) -> list[str]:
 
 def _key(name: str) -> str:
     """Return a bare key where TOML allows it."""
-    return name if name.isascii() and name.replace("_", "").replace("-", "").isalnum() else json.dumps(name)
+    return name if name.isascii() and name.replace("_", "").replace("-", "").isalnum() else _quoted(name)
+
+
+def _quoted(value: str) -> str:
+    """Return text as a string of TOML, which knows JSON's escapes, but neither pairs of surrogates nor a bare DEL; what is no text becomes ``?``."""
+    return json.dumps(value.encode(errors="replace").decode(), ensure_ascii=False).replace("\x7f", r"\u007f")
 
 
 def text(value: Any) -> str:
@@ -73,4 +78,4 @@ def text(value: Any) -> str:
         return f"[{', '.join(map(text, value))}]"
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
-    return json.dumps(value if isinstance(value, bool | int | float) else str(value))
+    return json.dumps(value) if isinstance(value, bool | int | float) else _quoted(str(value))

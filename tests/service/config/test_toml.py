@@ -57,3 +57,16 @@ def test_infinite_bounds_and_a_zenoh_file_are_kept(tmp_path: Path) -> None:
     config = load(path)
     again.write_text(toml.write(config))
     assert load(again) == config
+
+
+@pytest.mark.parametrize(
+    "value", ["runs/\N{RACING CAR}.csv", "\N{GREEK SMALL LETTER PSI}_dot", 'tab\t, "quotes", \\ and\nlines', "".join(map(chr, range(160)))]
+)
+def test_any_text_is_written_as_toml_reads_it(value: str) -> None:
+    """As JSON, a character beyond 16 bits would be two surrogates, which TOML refuses: a demo's children would not load its configuration."""
+    assert toml.read(f"value = {toml.text(value)}") == {"value": value}
+    assert toml.read(f"value = {toml.text({value: 1})}") == {"value": {value: 1}}
+
+
+def test_path_whose_bytes_are_no_text_is_written_without_them() -> None:
+    assert toml.text("run-\udcff.csv").encode() == b'"run-?.csv"'
