@@ -88,6 +88,11 @@ MODEL = {
 
 OCP = {
     "model that is an Ocp": (lambda: Ocp(ocp(), N=3, dt=0.1, Q=1, R=1), "model must be of rti_mpc.model.model.Model, got"),  # type: ignore[arg-type]
+    "model without outputs": (lambda: Ocp(mass(y_expr=[], outputs=()), N=3, dt=0.1, Q=[], R=1), "model mass must have outputs for a problem"),
+    "model without inputs": (
+        lambda: Ocp(mass(u=ca.SX(0, 1), f_expl_expr=[X[1], 0], inputs=()), N=3, dt=0.1, Q=1, R=[]),
+        "model mass must have inputs for a problem, got none",
+    ),
     "N of 2.5": (lambda: ocp(N_u=2.5), "N_u must be a whole number of at least 0, got 2.5"),
     "N that is text": (lambda: double_integrator(N="20"), "N must be a whole number of at least 0, got '20'"),
     "N that is true": (lambda: double_integrator(N=True), "N must be a whole number of at least 0, got True"),

@@ -178,6 +178,8 @@ class Ocp:
         Zddu: ArrayLike = DEFAULT_SLACK_WEIGHT,
     ) -> None:
         given.instance("model", model, Model)
+        if absent := [name for name in ("states", "inputs", "outputs") if not getattr(model, name)]:
+            raise OcpError(f"model {model.name} must have {' and '.join(absent)} for a problem, got none")
         N = given.whole("N", N, 0)
         if blocks is None:
             N_u = N if N_u is None else given.whole("N_u", N_u, 0)
