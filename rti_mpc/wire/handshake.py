@@ -79,7 +79,7 @@ def obstacle(endpoint: str, authority: Path | None = None, certificate: Path | N
         return f"the certificates of this process cannot be used: {error}"
     try:
         link = socket.create_connection((host, int(match["port"])), TIMEOUT_S)
-    except socket.gaierror:
+    except (socket.gaierror, UnicodeError):  # the latter of one that no name can be, such as with a part of more than 63 characters
         return "this host does not know that name"
     except ConnectionRefusedError:
         return "no process listens there, or the address is wrong"

@@ -97,3 +97,9 @@ def test_endpoints_are_tried_side_by_side_and_one_whose_name_server_hangs_keeps_
     monkeypatch.setattr(handshake, "obstacle", lambda endpoint, *_: going.wait(60.0) and "" if endpoint == hanging else "closed")
     assert obstacles([hanging, "tcp/127.0.0.1:9"]) == {"tcp/127.0.0.1:9": "closed"}
     going.set()
+
+
+@pytest.mark.parametrize("host", ["a" * 64 + ".invalid", "a..invalid"])
+def test_name_that_no_host_can_have_is_one_that_this_host_does_not_know(host: str) -> None:
+    """Python raises an error of its own, which would end the thread that looks, with a traceback."""
+    assert obstacle(f"tcp/{host}:7447") == "this host does not know that name"
