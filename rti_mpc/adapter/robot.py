@@ -14,6 +14,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from threading import Event
 from typing import Self
 
@@ -26,17 +27,18 @@ from rti_mpc.array import Array
 from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.message import Command, Notice, Severity, State
 from rti_mpc.contract.schedule import unfit
-from rti_mpc.errors import ConfigError
+from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.rotation import Rotations
 from rti_mpc.wire.actuator import STALE_NS, Actuator
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, new_epoch
-from rti_mpc.wire.info import Label, labels
+from rti_mpc.wire.info import Info, Label, labels
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.received import Received
 from rti_mpc.wire.session import RENDEZVOUS_ENDPOINT
 
-ROLE = "robot"
+ROLE, CONTROLLER = "robot", "controller"
 NO_LIMIT = (-np.inf, np.inf)
 
 
@@ -69,7 +71,8 @@ class RobotAdapter:
         Args:
             robot: Name of the robot, as in its TOML file.
             dt_s: Period of the controller, ``ocp.dt_s`` of that file.
-            inputs: Bounds of each input, ``ocp.bounds.inputs`` of that file, in the order of the model.
+            inputs: Bounds of each input, ``ocp.bounds.inputs`` of that file, in the order of the model: commands of a controller whose model has
+                the same inputs in another order are refused.
             increments: Slew limits over `dt_s`, ``ocp.bounds.increments``; an input that is left out has none.
             u_rest: Inputs at rest that are not 0.
             angles: Which states are angles, in the order of the model, for a robot that needs feedback to stay at rest: then the states
@@ -109,7 +112,9 @@ class RobotAdapter:
         self._bus = Bus.join(settings, keys, stop=self._stop, say=self._say)
         self._states = self._bus.publisher(keys.state)
         self._announcer = Announcer(self._bus, ROLE, epoch)
-        self._intake = self._bus.intake(Command, 1e-9 * STALE_NS, {"u": nu}, unfit=lambda command: unfit(command, nu, epoch))
+        self._misordered = False  # whether the controller's model has these inputs in another order
+        self._infos = self._bus.subscriber(keys.info(CONTROLLER), capacity=RING_MESSAGES)
+        self._intake = self._bus.intake(Command, 1e-9 * STALE_NS, {"u": nu}, unfit=self._objection)
         self._commands = self._bus.subscriber(keys.actuation if guarded else keys.command, capacity=RING_MESSAGES)
         self._bus.expect("command", lambda: self._intake.source.epoch is not None)
         about = {"role": ROLE, "version": rti_mpc.__version__, "epoch": epoch, "speed": 1.0, "reports_inputs": True, "approaches": True}
@@ -180,6 +185,8 @@ class RobotAdapter:
     def act(self) -> Array:
         """Return the inputs to apply now, shape ``(nu,)``."""
         now_ns = time.monotonic_ns()
+        for received in self._infos.drain():
+            self._compare(received)
         for received in self._commands.drain():
             command = self._intake.accept(received, now_ns)
             if command is not None and (reason := self._actuator.accept(command, now_ns)):
@@ -197,6 +204,19 @@ class RobotAdapter:
         for notice in self._intake.notices(now_ns):
             self._announcer.say(notice, now_ns)
         return self._actuator.u.copy()
+
+    def _objection(self, command: Command) -> str:
+        """Return why a command is not for this robot, as a code; empty if it is."""
+        return "misordered" if self._misordered else unfit(command, len(self.inputs), self._epoch)
+
+    def _compare(self, received: Received) -> None:
+        """Take no commands of a controller whose model has the same inputs in another order: each would act as another."""
+        with suppress(MessageError):
+            theirs = tuple(label.name for label in Info.from_received(received).inputs)
+            before, self._misordered = self._misordered, theirs != self.inputs and sorted(theirs) == sorted(self.inputs)
+            if self._misordered and not before:
+                told = f"inputs must be in the order of the model, {', '.join(theirs)}, got {', '.join(self.inputs)}"
+                self._warn(Notice(Severity.ERROR, "inputs_misordered", f"{told}: no command is taken"))
 
     def _warn(self, notice: Notice) -> None:
         """Announce and print what does not come from the control loop; in any thread."""

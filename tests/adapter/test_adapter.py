@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import json
 import time
-from threading import Event
+from threading import Event as Stop
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,11 +13,12 @@ import numpy as np
 import pytest
 
 from rti_mpc.adapter import PlannerAdapter, RobotAdapter, robot
-from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Reference, State
+from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Event, Reference, State
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.errors import ConfigError, RtiMpcError
 from rti_mpc.wire.bus import Bus, Received
 from rti_mpc.wire.cdr import decode, encode, encoding
+from rti_mpc.wire.info import Label, labels
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES, REFERENCE_HEAD_BYTES, most_rows
 from tests.wire.fake_session import FakeSession
@@ -34,17 +36,18 @@ class Session(FakeSession):
         self.waiting: list[Received] = []
 
     def subscriber(self, key: Any, capacity: int, *, history: bool, wakes: bool = False) -> Any:
-        return Waiting(self)
+        return Waiting(self, str(key))
 
 
 class Waiting:
     """Subscriber to what the test has sent."""
 
-    def __init__(self, session: Session) -> None:
-        self._session = session
+    def __init__(self, session: Session, key: str) -> None:
+        self._session, self._key = session, key
 
     def drain(self) -> list[Received]:
-        waiting, self._session.waiting = self._session.waiting, []
+        waiting = [received for received in self._session.waiting if received.key == self._key]
+        self._session.waiting = [received for received in self._session.waiting if received.key != self._key]
         return waiting
 
 
@@ -53,7 +56,7 @@ class Scene:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **limits: Any) -> None:
         self.now_ns = 10**12
-        self.session, self.stop = Session(), Event()
+        self.session, self.stop = Session(), Stop()
         monkeypatch.setattr(Bus, "join", lambda settings, keys, **_: Bus(self.session, keys))
         clock = SimpleNamespace(monotonic_ns=lambda: self.now_ns, time_ns=time.time_ns, sleep=self.sleep)
         monkeypatch.setattr(robot, "time", clock)
@@ -315,3 +318,25 @@ def test_wrong_call_of_a_robot_is_refused_by_name(scene: Scene, call: Any, told:
 def test_state_of_one_number_may_be_that_number_and_one_measured_ahead_of_the_clock_is_of_now(scene: Scene) -> None:
     scene.robot.send(5.0, age_s=-0.001)
     assert (scene.state().x.tolist(), scene.state().stamp_ns) == ([5.0], scene.now_ns)
+
+
+def test_commands_of_a_model_with_the_same_inputs_in_another_order_are_refused_and_the_order_is_told(
+    scene: Scene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As where a TOML file names them in another order than the model, and its table is handed on: speed and curvature would be swapped."""
+
+    def described(*inputs: str) -> None:
+        about = {"role": "controller", **labels(inputs=[Label(name) for name in inputs])}
+        scene.session.waiting.append(Received(json.dumps(about).encode(), "application/json", KEYS.info("controller")))
+
+    described("kappa", "v_c")
+    scene.command([[0.1, 0.2]])
+    assert scene.acts(10) == [0.0, 0.0]
+    event = decode(Event, scene.session.put[KEYS.event("robot")])
+    assert capsys.readouterr().err == "car: inputs must be in the order of the model, kappa, v_c, got v_c, kappa: no command is taken\n"
+    assert event.code in ("inputs_misordered", "command_misordered")
+    for right in (("v_c", "kappa"), ("v", "omega")):
+        described(*right)
+        scene.robot.send(np.zeros(4))
+        scene.command([[0.1, 0.2]])
+        assert scene.acts(10)[0] > 0.0, "names of its own are the robot's own affair"
