@@ -145,7 +145,14 @@ class Controller:
         self._record = Record(rti, self._tuning)
         self._blockage = Blockage(rti, compile=compile)
         self._opinions = second_opinions(rti, second_opinion, self.say)
-        self._delay = DelayEstimator(model, self.grid.dt_ns, self.grid.most_ns, compile=compile) if timing.delay_s is None else None
+        self._delay = None
+        self._seen = self._states.x  # the last state as the delay is measured by it
+        self._unmeasured: list[int] = []
+        if timing.delay_s is None:
+            measured = list(range(model.nx)) if observer is None else observer.measured
+            self._delay = DelayEstimator(model, self.grid.dt_ns, self.grid.most_ns, measured=measured, compile=compile)
+            if observer is not None:
+                self._seen, self._unmeasured = np.zeros(model.nx), [j for j in range(model.nx) if j not in measured]
         predicting = [of.p[: self.np_] for of in (self._prediction, observer, self._delay) if of is not None]
         self._planner = Planner(
             rti,
@@ -217,8 +224,12 @@ class Controller:
                 return self._give_up(state)
             self._forget(arrival, state)
         surprised = self._hear(state)
+        if self._seen is not self._states.x:
+            self._seen[:] = self._states.x
         if (lost := self._states.estimate(self._sent, known=self.mode in self._known and not surprised)) is not None:
             self.say(lost)
+        if self._unmeasured:
+            self._seen[self._unmeasured] = self._states.x[self._unmeasured]
         if len(self._states.d):
             self._prediction.p[self.np_ :] = self._states.d
         if surprised and self._planner.loaded and self.grid.running:
@@ -473,7 +484,7 @@ class Controller:
     def _measure_delay(self, estimator: DelayEstimator, stamp_ns: int) -> None:
         """Learn from the state of the last sample, and let the grid follow."""
         estimator.restore_if_lost(self._sent.confirmed)
-        estimator.observe(self._states.x, stamp_ns)
+        estimator.observe(self._seen, stamp_ns)
         if self._issued.last is not None and not self._standing_by:
             estimator.sent(self._issued.last)
         self._sent.delay_ns = estimator.delay_ns

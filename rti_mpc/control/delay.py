@@ -20,6 +20,7 @@ The estimate is the minimum of a parabola through the best candidate and its nei
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -48,12 +49,23 @@ class DelayEstimator:
         p: Parameters of the model, shape ``(np,)``; nominal unless written.
     """
 
-    def __init__(self, model: Model, dt_ns: int, most_ns: int, *, compile: bool = True) -> None:
+    def __init__(self, model: Model, dt_ns: int, most_ns: int, *, measured: Sequence[int] | None = None, compile: bool = True) -> None:
+        """
+        Begin with no delay.
+
+        Args:
+            model: The model to predict with.
+            dt_ns: Period of the commands.
+            most_ns: Largest delay.
+            measured: Indices of the states by which candidates are compared; None: all.
+            compile: Whether to compile the integrator.
+        """
         self.delay_ns = 0
+        self._measured = list(range(model.nx) if measured is None else measured)
         self._dt_ns = dt_ns
         self._candidates = [round(j * dt_ns / CANDIDATES_PER_PERIOD) for j in range(CANDIDATES_PER_PERIOD * most_ns // dt_ns + 1)]  # ns
         self._costs: Array = np.zeros(len(self._candidates))
-        self._variance: Array = np.zeros(model.nx)
+        self._variance: Array = np.zeros(len(self._measured))
         self._u_rest: Array = np.array(model.u_rest)
         self._commands: deque[Command] = deque(maxlen=5 + most_ns // dt_ns)
         self._last: tuple[Array, int] | None = None  # state and its stamp
@@ -102,7 +114,8 @@ class DelayEstimator:
         Improve the estimate with a state.
 
         Args:
-            x: State, shape ``(nx,)``, each angle within half a turn of the last state's.
+            x: State, shape ``(nx,)``, each angle within half a turn of the last state's. What is measured must be as it was measured: an estimate
+                was predicted with the delay that is believed, and would confirm it.
             stamp_ns: Its stamp.
         """
         last, self._last = self._last, (x.copy(), stamp_ns)
@@ -125,7 +138,7 @@ class DelayEstimator:
         self._estimate()
 
     def _errors(self, x: Array, from_ns: int, x_next: Array, to_ns: int) -> Array:
-        """Return the prediction error of each candidate over one step, shape ``(candidates, nx)``; NaN where at times no plan would have acted."""
+        """Return the error of each candidate over one step, shape ``(candidates, measured)``; NaN where at times no plan would have acted."""
         known: dict[tuple[int, ...], Array] = {}
         errors = []
         for delay_ns in self._candidates:
@@ -133,7 +146,7 @@ class DelayEstimator:
             if starts not in known:
                 known[starts] = x_next - self._x if self._play(starts, x, from_ns, to_ns) else np.full_like(x, np.nan)
             errors.append(known[starts])
-        return np.array(errors)
+        return np.array(errors)[:, self._measured]
 
     def _play(self, starts: tuple[int, ...], x: Array, t_ns: int, to_ns: int) -> bool:
         """Predict with commands that begin to act at these times; return whether one of them acted all the time."""

@@ -78,6 +78,7 @@ class Observer:
         x: Estimated state, shape ``(nx,)``.
         d: Estimated disturbances, shape ``(nd,)``: the last parameters of `model`.
         p: Its other parameters, shape ``(np,)``; nominal unless written.
+        measured: Indices of the states that are measured.
         frozen: Whether the disturbances keep their values, because it is not known which inputs act.
 
     Raises:
@@ -101,7 +102,7 @@ class Observer:
         self.model = with_disturbances(model, settings.disturbances)
         nx, nd = model.nx, len(settings.disturbances)
         self._limits: Array = np.array([of.limit for of in settings.disturbances.values()])
-        measured = [j for j, name in enumerate(states) if not settings.measured or name in settings.measured]
+        self.measured = measured = [j for j, name in enumerate(states) if not settings.measured or name in settings.measured]
         for places in self._rotations.quaternions:
             if not set(places) <= set(measured):
                 raise OcpError(f"measured must have all of a quaternion, {', '.join(states[j] for j in places)}, got {', '.join(settings.measured)}")

@@ -11,11 +11,15 @@ from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.control.delay import DelayEstimator
 from rti_mpc.control.grid import DELAY_MARGIN_PERIODS, DELAY_SLEW_SAMPLES, MAX_DELAY_PERIODS, Grid
+from rti_mpc.control.observer import Disturbance, Observer, ObserverSettings
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.reference.trajectory import eight
+from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
 from rti_mpc.wire.actuator import Actuator
 from tests.loop import MS, SLEW, Run, drive, reference, robot
-from tests.problems import double_integrator, pioneer
+from tests.problems import PAPER, double_integrator, pioneer
+from tests.problems import SLEW as INCREMENTS
 from tests.slow import slow_but
 
 DT = 100 * MS
@@ -58,6 +62,29 @@ def test_delay_is_found_from_the_response(rti: Rti, actuator_delay_s: float) -> 
     assert 1e-9 * controller._delay.delay_ns == pytest.approx(actuator_delay_s, abs=0.0126)
     telemetry = controller.telemetry(prepare_us=0, feedback_us=0, latency_us=0, slack_s=0)
     assert telemetry.delay_s == pytest.approx(1e-9 * controller._delay.delay_ns + 0.1 * DELAY_MARGIN_PERIODS, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_delay_is_found_beside_an_observer_from_what_is_measured(seed: int) -> None:
+    """Its estimate is predicted with the delay that is believed, and would confirm it: 0.15 s, and 18 and 12 mm of error."""
+    observer = Observer(pioneer_3dx(), ObserverSettings({"y": Disturbance(0.05, 0.3)}), compile=False)
+    rti = Rti(Ocp(observer.model, **(PAPER | INCREMENTS | {"N": 12, "Q": [1.0, 1.0, 0.0]})), compile=False)
+    controller = Controller(rti, Timing(delay_s=None), observer=observer, compile=False)
+    body = robot(eight(), actuator_delay_s=0.2, noise_std=NOISE, seed=seed)
+    controller.receive_reference(reference(eight().lasting(35.0)))
+    assert error_mm(drive(controller, body, 30.0)) < 5.0
+    assert controller._delay is not None
+    assert 1e-9 * controller._delay.delay_ns == pytest.approx(0.2, abs=0.0126)
+
+
+def test_estimator_compares_only_what_is_measured() -> None:
+    estimator = DelayEstimator(double_integrator().model, DT, MAX_DELAY_PERIODS * DT, measured=[0], compile=False)
+    one = Command(1, 1, 0, 1, 0, 0, 250 * MS, 0, Mode.TRACKING, QpStatus.SOLVED, DT, np.ones((6, 1)))
+    estimator.sent(one)
+    estimator.observe(np.zeros(2), 0)
+    estimator.observe(np.array([0.005, 9.9]), DT)  # a mass accelerated by 1 m/s^2 at once, whose speed nobody measures
+    assert estimator._costs.argmin() == 0
+    assert estimator._costs[0] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_noise_alone_is_no_delay(rti: Rti) -> None:
