@@ -163,7 +163,6 @@ class Controller:
             self._tuning,
             self._states.d,
             tuple(predicting) if depends_on(model.rate_expr, model.p[: self.np_]) else (),
-            self.grid.dt_ns,
         )
         self._understudy = StateStream(model, self._stale_ns, self.grid.dt_ns, settling_s)  # judges states in rehearsals
 

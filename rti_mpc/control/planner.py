@@ -43,7 +43,6 @@ class Planner:
         tuning: Tuning,
         d: Array,
         robot: tuple[Array, ...],
-        dt_ns: int,
     ) -> None:
         """
         Begin with no QP.
@@ -57,12 +56,11 @@ class Planner:
             tuning: Weights and bounds that act.
             d: Estimated disturbances, shape ``(nd,)``, which are the last parameters of the model; owned by the caller.
             robot: Parameters of the robot, each of shape ``(np,)``, wherever it is predicted; those of the reference are written into them.
-            dt_ns: Period of the commands.
         """
         self.loaded = False
         self._x0 = prediction.x
         self._rti, self._track, self._sent, self._prediction, self._envelope, self._tuning = rti, track, sent, prediction, envelope, tuning
-        self._d, self._robot, self._np, self._dt_ns = d, robot, rti.ocp.model.np_ - len(d), dt_ns
+        self._d, self._robot, self._np, self._dt_ns = d, robot, rti.ocp.model.np_ - len(d), round(1e9 * rti.ocp.dt)
         self._u = rti.u.reshape(-1)
         # What nothing depends on is neither looked up nor handed on.
         self._p = track.p if rti.ocp.model.np_ else None
@@ -72,8 +70,12 @@ class Planner:
         self._kept = Kept((*rti.rehearsed, *prediction.written, *envelope.written))
 
     def load(self, act_ns: int, *, shift: bool) -> None:
-        """Load the QP of a command that acts at a time, at the last plan, shifted by a stage or as it is."""
+        """Look the reference up, and load the QP of a command that acts at a time, at the last plan, shifted by a stage or as it is."""
         self._look_up(act_ns)
+        self._load(act_ns, shift=shift)
+
+    def _load(self, act_ns: int, *, shift: bool) -> None:
+        """Load the QP, with the reference that was looked up."""
         self.reach = self._sent.reach(act_ns)
         u_prev = self._sent.at(act_ns - 1)[0]
         u_before = self._sent.at(act_ns - 1 - self._dt_ns)[0] if self._remembers else None
@@ -108,12 +110,12 @@ class Planner:
         return status, self._envelope.fit(self._rti.u, self.reach)
 
     def _feedback_cold(self, act_ns: int) -> QpStatus:
-        """Solve the first sample: the guess is the present state at all stages, and is iterated on."""
+        """Solve the first sample, whose reference was looked up: the guess is the present state at all stages, and is iterated on."""
         self._rti.reset(self._x0, self._sent.at(act_ns - 1)[0])
         self._tuning.begin()
         status = QpStatus.FAILED
         for _ in range(ITERATIONS_COLD):
-            self.load(act_ns, shift=False)
+            self._load(act_ns, shift=False)
             status = self._rti.feedback(self._x0)
         return status
 
