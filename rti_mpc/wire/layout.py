@@ -141,7 +141,7 @@ LAYOUTS: dict[type[Any], tuple[Field, ...]] = {
         Field(
             "res_dual",
             "float64",
-            "bound on the plan's cost above the optimum, relative to 1 + cost; from other QP solvers than riccati their dual residual",
+            "bound on the plan's cost above the optimum, relative to 0.01 plus the cost, normalised; from others than riccati their dual residual",
         ),
         Field("cost", "float64", "cost of the plan"),
         Field("violation", "float64", "largest slack of a softened bound in the plan, unit of the bounded state or constraint"),

@@ -17,6 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Event, Journal, JournalKind, Reference, Severity, State, Telemetry
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.errors import MessageError
+from rti_mpc.rti.active_set import COST_FLOOR
 from rti_mpc.wire.cdr import MESSAGE_PACKAGE, REFUSAL_REASONS, Message, Refused, decode, encode, encoding, schema
 from rti_mpc.wire.layout import LAYOUTS, msg_text
 
@@ -305,3 +306,8 @@ def test_texts_are_printed_as_one_line_and_cut_to_what_receivers_take() -> None:
 def test_the_wire_loads_neither_casadi_nor_osqp(module: str) -> None:
     check = f"import sys, {module}; assert not {{'casadi', 'osqp', 'qpsolvers', 'scipy'}} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", check], cwd=ROOT, check=True, timeout=20)
+
+
+def test_message_says_what_the_certificate_of_a_plan_is_relative_to() -> None:
+    """Or whoever reads `res_dual` off a recording would take it for a hundred times what it is."""
+    assert f"above the optimum, relative to {COST_FLOOR:g} plus the cost, normalised;" in msg_text(Telemetry)
