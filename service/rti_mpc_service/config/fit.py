@@ -28,6 +28,7 @@ STAGE_TABLES = {  # of ocp.stages by field: what its names are, and what its lis
     "soft_weight": ("state or constraint", "stage"),
     "soft_weight_L2": ("state or constraint", "stage"),
 }
+TRANSIT_S = 0.02  # in which a command is computed and has arrived, on a busy host too
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -124,6 +125,22 @@ def check_rest(ocp: Ocp) -> None:
 
     if wrong := rest_fault(ocp):
         raise ConfigError(f"ocp.bounds: {wrong}")
+
+
+def check_period(config: Config) -> None:
+    """
+    Check that each command lasts until the next one has come, where commands are sent.
+
+    Raises:
+        ConfigError: The robot would go to rest between any two of them.
+    """
+    longest_s = round(config.timing.valid_s - TRANSIT_S, 9)
+    if config.ocp.dt_s > longest_s:
+        raise ConfigError(
+            f"ocp.dt_s must be at most {longest_s:.3g} s for a robot on the bus: a command acts for timing.valid_s = {config.timing.valid_s:g} s "
+            f"after its state, and the robot would go to rest before the next one comes, got {config.ocp.dt_s:g} s: shorten it, with a larger N "
+            "or blocks for the same horizon, or raise timing.valid_s, to at most 0.3 s"
+        )
 
 
 def check_stop(config: Config) -> StopLaw | None:

@@ -42,7 +42,7 @@ from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc_service.announce import announce
 from rti_mpc_service.config.build import build_controller, build_rti
-from rti_mpc_service.config.fit import check_stop
+from rti_mpc_service.config.fit import check_period, check_stop
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.controller.journal import JournalPublisher
 from rti_mpc_service.controller.kept_case import KeptCase
@@ -80,8 +80,10 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
         Exit status: 0 when stopped, 1 when another controller is present or an unforeseen error ended this one.
 
     Raises:
-        ConfigError: A stop would not bring the robot to rest, or the leader has another configuration than its standby.
+        ConfigError: A stop would not bring the robot to rest, a command not last until the next, or the leader has another configuration than its
+            standby.
     """
+    check_period(config)
     stop_law = check_stop(config)
     stop = stop or stop_on_signals()
     rti = build_rti(config, log.info)

@@ -32,7 +32,7 @@ from rti_mpc_service.config.build import (
     stage_parameters,
 )
 from rti_mpc_service.config.config import load
-from rti_mpc_service.config.fit import check_stop
+from rti_mpc_service.config.fit import check_period, check_stop
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.controller import daemon
 from rti_mpc_service.demo import demo
@@ -559,3 +559,19 @@ def test_nothing_is_done_with_a_robot_that_a_stop_does_not_bring_to_rest(monkeyp
     for act in (lambda: check.main(SHIPPED), lambda: daemon.main(config, BusSettings()), lambda: demo.main(config, "eight")):
         with pytest.raises(ConfigError, match="it coasts"):
             act()
+
+
+@pytest.mark.parametrize(
+    ("dt_s", "valid_s", "longest"),
+    [(0.2, 0.25, None), (0.23, 0.25, None), (0.28, 0.3, None), (0.25, 0.25, "0.23"), (0.5, 0.3, "0.28"), (0.1, 0.05, "0.03")],
+)
+def test_period_that_is_longer_than_a_command_acts_is_refused_on_the_bus(tmp_path: Path, dt_s: float, valid_s: float, longest: str | None) -> None:
+    """Or the robot would go to rest between any two commands, in the mode TRACKING, three metres behind its reference after a minute."""
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL.replace("dt_s = 0.1", f"dt_s = {dt_s}") + f"[timing]\nvalid_s = {valid_s}\n")
+    config = load(path, with_model=False)
+    if longest is None:
+        check_period(config)
+        return
+    with pytest.raises(ConfigError, match=rf"^ocp.dt_s must be at most {longest} s for a robot on the bus: .*, got {dt_s:g} s: shorten it"):
+        daemon.main(config, BusSettings())
