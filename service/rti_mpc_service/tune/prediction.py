@@ -11,7 +11,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model
-from rti_mpc_service.tune.windows import WINDOW, Windows
+from rti_mpc_service.tune.windows import Windows
 
 
 class Predictor:
@@ -39,22 +39,22 @@ class Predictor:
         return x
 
     def step_errors(self, windows: Windows, v: Array) -> Array:
-        """Return the error of each single step, shape ``(W, WINDOW, nx)``."""
+        """Return the error of each single step, shape ``(W, S, nx)``."""
         x = windows.x
         flat = self.after(x[:, :-1].reshape(-1, x.shape[2]), v.reshape(-1, *v.shape[2:]), windows.span_s.ravel())
         return np.asarray(x[:, 1:] - flat.reshape(x[:, 1:].shape))
 
     def window_errors(self, windows: Windows, v: Array) -> Array:
-        """Return the errors of the states of each window, predicted from its first one, shape ``(W, WINDOW + 1, nx)``."""
+        """Return the errors of the states of each window, predicted from its first one, shape ``(W, S + 1, nx)``."""
         measured, span = windows.x, windows.span_s
         x, errors = measured[:, 0], [np.zeros_like(measured[:, 0])]
-        for k in range(WINDOW):
+        for k in range(windows.steps):
             x = self.after(x, v[:, k], span[:, k])
             errors.append(measured[:, k + 1] - x)
         return np.stack(errors, axis=1)
 
     def slopes(self, windows: Windows, v: Array) -> Array:
-        """Return the sensitivity of each step to its state, A, shape ``(W, WINDOW, nx, nx)``."""
+        """Return the sensitivity of each step to its state, A, shape ``(W, S, nx, nx)``."""
         x = windows.x[:, :-1]
         rows = self._at(self._A, x.reshape(-1, x.shape[2]), v.mean(axis=2).reshape(-1, v.shape[3]), windows.span_s.ravel())
         return rows.reshape(*x.shape, x.shape[2]).swapaxes(2, 3)

@@ -20,7 +20,7 @@ from rti_mpc_service.config.schema import Config
 from rti_mpc_service.scenario import Scenario
 from rti_mpc_service.tune.identified import identified
 from rti_mpc_service.tune.recorded_robot import RecordedRobot
-from rti_mpc_service.tune.windows import MIN_WINDOWS, ROWS, WINDOW, windows_of
+from rti_mpc_service.tune.windows import MIN_STEPS, MIN_WINDOWS, ROWS, windows_of
 
 MIN_SAMPLES = 40  # of a part, half of which is its transient
 
@@ -96,7 +96,7 @@ def as_recorded(config: Config, heard: RecordedRobot, part: tuple[float, float],
     begin_ns, end_ns = span[0].state_stamp_ns, span[-1].stamp_ns
     commands = heard.commands_between(begin_ns - round(1e9 * ROWS * config.ocp.dt_s), end_ns)  # with what still acted when it began
     states = [state for state in heard.states if begin_ns <= state.stamp_ns <= end_ns and commands and state.epoch == commands[-1].state_epoch]
-    windows = windows_of(model, states, commands, config.ocp.dt_s) if len(states) > WINDOW else None
+    windows = windows_of(model, states, commands, config.ocp.dt_s) if len(states) > MIN_STEPS else None
     if windows is None or len(windows.x) < MIN_WINDOWS:
         return config, kept(name)
     known = {"sensor_delay_s", "actuator_delay_s"} & given
@@ -129,7 +129,7 @@ def as_recorded(config: Config, heard: RecordedRobot, part: tuple[float, float],
 
 def kept(name: str) -> str:
     """Return what is said where a recording is too short."""
-    least = WINDOW * MIN_WINDOWS
+    least = MIN_STEPS * MIN_WINDOWS
     return f"{name}: noise, delay and lag are those of [sim], since it must hold commands and {least} states without a gap in a part"
 
 

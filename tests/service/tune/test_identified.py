@@ -9,6 +9,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 pytest.importorskip("mcap")
 
@@ -28,7 +29,7 @@ from rti_mpc_service.tune.closed_loop import ClosedLoop, Course
 from rti_mpc_service.tune.identified import identified, noise_of
 from rti_mpc_service.tune.recorded import as_recorded
 from rti_mpc_service.tune.recorded_robot import RecordedRobot, read
-from rti_mpc_service.tune.windows import WINDOW, Windows, windows_of
+from rti_mpc_service.tune.windows import MIN_STEPS, MIN_WINDOWS, Windows, windows_of
 from tests.robots import SHIPPED
 
 NOISE = {"x": 0.005, "y": 0.005, "psi": 0.01, "u": 0.01, "omega": 0.02}
@@ -112,7 +113,7 @@ def test_recording_that_is_too_short_says_so_and_leaves_the_robot_of_the_file(tm
 
 def tank(below: int, windows: int = 30, delay: int = 2) -> Windows:
     """Windows of a tank that flows out with the root of its level; so many of them have a level measured below zero, where that is no number."""
-    rng, ms, steps = np.random.default_rng(1), 1_000_000, WINDOW * windows
+    rng, ms, steps = np.random.default_rng(1), 1_000_000, MIN_STEPS * windows
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
     model = Model("tank", x, u, u - 0.5 * ca.sqrt(x), x, "h", "q", "h")
     v, level = rng.uniform(0.3, 0.9, steps), np.ones(steps + 1)
@@ -121,13 +122,54 @@ def tank(below: int, windows: int = 30, delay: int = 2) -> Windows:
         for _ in range(50):  # of 2 ms
             level[k + 1] += 0.002 * (v[max(k - delay, 0)] - 0.5 * np.sqrt(level[k + 1]))
     level += 1e-3 * rng.standard_normal(steps + 1)
-    level[3 : WINDOW * below : WINDOW] = -0.5
+    level[3 : MIN_STEPS * below : MIN_STEPS] = -0.5
     states = [State(3, k + 1, 100 * ms * k, level[[k]]) for k in range(steps + 1)]
     commands = [
         Command(7, k + 1, t := 100 * ms * k, 3, k + 1, t, t + 250 * ms, 1, Mode.TRACKING, QpStatus.SOLVED, 100 * ms, np.full((20, 1), v[k]))
         for k in range(steps)
     ]
     return windows_of(model, states, commands, 0.1)
+
+
+def motor(dt_ms: int, delay_ms: int = 60, lag_ms: float = 120.0, duration_ms: int = 40_000) -> Windows:
+    """Windows of a motor whose torque follows smooth commands late and with a lag, from a noisy speed."""
+    rng, ms = np.random.default_rng(1), 1_000_000
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    model = Model("motor", x, u, u - x, x, "speed", "torque", "speed")
+    asked = gaussian_filter1d(rng.uniform(-1.0, 1.0, duration_ms // 400 + 1).repeat(400), 300.0)
+    speed, torque = np.zeros(duration_ms + 1), 0.0
+    for k in range(duration_ms):
+        torque += (asked[max(k - delay_ms, 0)] - torque) / lag_ms
+        speed[k + 1] = speed[k] + 0.001 * (torque - speed[k])
+    states = [State(3, k + 1, dt_ms * ms * k, speed[[dt_ms * k]] + 0.01 * rng.standard_normal(1)) for k in range(duration_ms // dt_ms)]
+    commands = [
+        Command(7, k + 1, t := dt_ms * ms * k, 3, k + 1, t, t + 250 * ms, 1, Mode.TRACKING, QpStatus.SOLVED, dt_ms * ms, np.full((40, 1), asked[dt_ms * k]))
+        for k in range(len(states))
+    ]
+    return windows_of(model, states, commands, 0.001 * dt_ms)
+
+
+@pytest.mark.parametrize("dt_ms", [20, 10])
+def test_delay_and_lag_are_found_in_seconds_whatever_the_period(dt_ms: int) -> None:
+    """At 100 Hz a delay of 60 ms was found as none: a window lasted 80 ms."""
+    found = identified(motor(dt_ms))
+    assert found is not None
+    assert found.delay_s == pytest.approx(0.06, abs=0.01)
+    assert found.lag_s == pytest.approx(0.12, abs=0.01)
+    assert found.noise == pytest.approx([0.01], rel=0.1)
+
+
+def test_recording_of_a_fast_robot_with_many_gaps_is_cut_into_shorter_windows() -> None:
+    """Of 80 steps in a row one is missing nearly always, of 10 seldom."""
+    whole = motor(10)
+    rng, ms = np.random.default_rng(2), 1_000_000
+    kept = rng.random(4000) > 0.05
+    states = [State(3, k + 1, 10 * ms * k, np.zeros(1)) for k in range(4000) if kept[k]]
+    commands = [Command(7, 1, 0, 3, 1, 0, 250 * ms, 1, Mode.TRACKING, QpStatus.SOLVED, 10 * ms, np.zeros((40, 1)))]
+    windows = windows_of(whole.model, states, commands, 0.01)
+    assert whole.steps == 80
+    assert windows.steps < 80
+    assert len(windows.x) >= MIN_WINDOWS
 
 
 def test_windows_that_the_model_does_not_predict_to_a_finite_end_are_left_out_and_counted() -> None:
