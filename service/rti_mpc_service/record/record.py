@@ -47,6 +47,7 @@ MAX_ROBOTS = 100
 STALE_S = 2.0
 WILD = set("*?[")  # characters of a pattern
 EVERYTHING = Retention()
+ANY_NAME = str.maketrans(dict.fromkeys("*?[]", "x"))  # makes a name of a pattern
 
 MEDIA_TYPES = {".toml": "application/toml", ".py": "text/x-python", ".json": "application/json"}
 UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
@@ -79,11 +80,13 @@ def main(
         Exit status: 1 if the disk did not take everything, else 0.
 
     Raises:
-        ConfigError: The file is there already, or cannot be written.
+        ConfigError: The file is there already, or cannot be written, or a robot cannot have one of the names.
     """
     stop = stop or stop_on_signals()
     names = list(robots) or [keys.robot]
     end = "" if retention else ".mcap"
+    for name in names:
+        Keys(keys.prefix, name.translate(ANY_NAME))  # refuses what no robot can be called
     path = out or Path("runs") / f"{keys.robot if names == [keys.robot] else 'robots'}-{time.strftime('%Y%m%d-%H%M%S')}{end}"
     with Bus.join(bus_settings, keys, stop=stop, say=log.warning) as bus:
         now_ns = time.monotonic_ns()

@@ -98,7 +98,8 @@ def journals(path: Path, robot: str | None = None, owner: int | None = None) -> 
     chosen = {key: messages for key, messages in found.items() if robot in (None, key[0]) and owner in (None, key[1])}
     if not chosen:
         known = ", ".join(f"--robot {name} --controller {number}" for name, number in found) or "none"
-        raise ConfigError(f"{path} must hold the journal of {robot or 'a robot'}{'' if owner is None else f', controller {owner}'}, got {known}")
+        whose = "a robot" if robot is None else repr(robot)
+        raise ConfigError(f"{path} must hold the journal of {whose}{'' if owner is None else f', controller {owner}'}, got {known}")
     heard = heard_commands(recording, robot)
     return [
         Journaled(name, number, in_order(messages), files_of(recording.attachments, f"{name}/{number}/"), heard.get((name, number), {}))

@@ -83,14 +83,15 @@ def main(bus_settings: BusSettings, keys: Keys, screens: Screens, *, robots: Seq
         Exit status: 1 if a received message is missing in the recording, else 0.
 
     Raises:
-        ConfigError: An address or a file is not valid.
+        ConfigError: An address, a file or the name of a robot is not valid.
     """
     url = screens.url
     stop = stop or stop_on_signals()
+    names = [*dict.fromkeys(robots)] or [keys.robot]
+    drawn = [Keys(keys.prefix, name) for name in names]
     with Bus.join(bus_settings, keys, stop=stop, say=log.warning) as bus:
-        names = [*robots] or [keys.robot]
         roots, begun_ns = (names, time.monotonic_ns()) if len(names) > 1 else ((), None)
-        buses = [bus if name == keys.robot else bus.beside(Keys(keys.prefix, name)) for name in names]
+        buses = [bus if one == keys else bus.beside(one) for one in drawn]
         listeners = [Listener(one, root=one.keys.robot if roots else "", begun_ns=begun_ns) for one in buses]
         for one, listener in zip(buses, listeners, strict=True):
             one.expect("message", partial(getattr, listener, "received"))

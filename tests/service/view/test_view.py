@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from queue import Queue
+from threading import Event as Flag
 from threading import Thread
 from typing import Any
 
@@ -32,6 +33,8 @@ from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.view.listener import Listener
 from rti_mpc_service.view.outlet import file_outlet
 from rti_mpc_service.view.screen import spawn_viewer, viewer_url
+from rti_mpc_service.view.view import Screens
+from rti_mpc_service.view.view import main as view
 from tests.in_time import MS, PATIENT, in_time
 from tests.processes.system import until
 from tests.service.view.test_view_outlet import Viewer as Screen
@@ -285,6 +288,13 @@ def test_a_takeover_behind_a_guard_is_seen_in_the_recording(port: int, tmp_path:
     assert changes(path, "lane/leader") == [(1 * 10**8, "epoch 5"), (6 * 10**8, "epoch 6")]
     assert changes(path, "lane/guard") == [(1 * 10**8, "TRACKING"), (4 * 10**8, "BRAKING"), (6 * 10**8, "TRACKING")]
     assert changes(path, "lane/mode") == [(1 * 10**8, "TRACKING")]
+
+
+@pytest.mark.parametrize("name", ["", "ant/", "ant*"])
+def test_a_name_that_no_robot_can_have_is_refused_before_anything_is_joined(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="robot must be words joined by single slashes"):
+        view(BusSettings(), Keys(), Screens(rerun_save=tmp_path / "run.rrd"), robots=["ant", name], stop=Flag())
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("address", ["nowhere", "host:port", "http://127.0.0.1:9876", ":9876"])
