@@ -27,6 +27,7 @@ from rti_mpc_service.record.inbox import Arrived, Inbox
 HEARD: tuple[Stream[Any], ...] = tuple(stream for stream in STREAMS if stream.kind is Kind.MESSAGE and stream not in (PING, PONG))
 ASK_TIMEOUT_S = 2.0
 MAX_BUNDLE_BYTES = 1 << 24  # of a controller's files
+MAX_PIECES = 1000  # of them; a controller sends the longest in 420
 
 log = logging.getLogger(__name__)
 
@@ -50,20 +51,22 @@ def fetch_origin(bus: Bus, owner: int, give: Callable[[Mapping[str, str]], objec
     """Ask a controller for its files, in a thread of its own, and give them; a line in the log if it has none."""
 
     def ask() -> None:
-        pieces, begin, size = list[str](), 0, 1
-        while begin < size <= MAX_BUNDLE_BYTES:
+        pieces, begin = list[str](), 0
+        for _ in range(MAX_PIECES):
             answers = (answer for answer in bus.answers(bus.keys.origin, {"from": begin}, ASK_TIMEOUT_S) if answer.get("owner") == owner)
             answer = next(answers, {})
             piece, size = answer.get("piece"), answer.get("size", 0)
-            if not (isinstance(piece, str) and piece and type(size) is int):
+            if not (isinstance(piece, str) and piece and type(size) is int and size <= MAX_BUNDLE_BYTES):
                 break
             pieces.append(piece)
             begin += len(piece)
-        else:
+            if begin < size:
+                continue
             with suppress(ValueError, MessageError, zlib.error):
                 bundle = zlib.decompressobj().decompress(base64.b64decode("".join(pieces)), MAX_BUNDLE_BYTES)
                 give({name: str(text) for name, text in document.read(bundle, most=MAX_BUNDLE_BYTES).items()})
                 return
+            break
         log.warning("%s: a controller has not sent its configuration and model: they are missing in the recording", bus.keys.robot)
 
     Thread(target=ask, name=f"{bus.keys.robot}/origin", daemon=True).start()

@@ -7,6 +7,7 @@ import base64
 import json
 import resource
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from threading import Event as Flag
 from threading import enumerate as enumerate_threads
@@ -19,17 +20,17 @@ from mcap_ros2.decoder import DecoderFactory
 from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.errors import ConfigError
 from rti_mpc.recording import Recording
-from rti_mpc.wire.bus import Bus
+from rti_mpc.wire.bus import Bus, BusSettings, Declared
 from rti_mpc.wire.cdr import Message, encode, encoding
 from rti_mpc.wire.keys import Key
 from rti_mpc.wire.received import Received
-from rti_mpc.wire.streams import MAX_UNKNOWN_ROLES
+from rti_mpc.wire.streams import MAX_UNKNOWN_ROLES, role_of
 from rti_mpc_service.config.build import build_model
 from rti_mpc_service.config.config import load
 from rti_mpc_service.host.pressure import waited_us
 from rti_mpc_service.origin import Origin, origin_files
 from rti_mpc_service.record import record
-from rti_mpc_service.record.hearing import fetch_origin
+from rti_mpc_service.record.hearing import MAX_BUNDLE_BYTES, MAX_PIECES, fetch_origin
 from rti_mpc_service.record.inbox import ENTRY_BYTES, Arrived, Inbox
 from rti_mpc_service.record.record import EVERYTHING, Recorder, parse_retention
 from rti_mpc_service.record.segments import SEGMENTS, Retention, Segments
@@ -207,6 +208,28 @@ def test_controller_is_asked_for_its_files_as_soon_as_it_describes_itself(tmp_pa
     assert asked == [9]
 
 
+class TokenSession(FakeSession):
+    """A session that keeps the keys of its tokens."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tokens: list[str] = []
+
+    def token(self, key: Key[Any]) -> Declared:
+        self.tokens.append(key)
+        return super().token(key)
+
+
+def test_each_recorder_shows_a_presence_of_its_own(tmp_path: Path) -> None:
+    """A token of a key that another recorder shows already is told to nobody: the controller would take no snapshot for this one."""
+    session = TokenSession()
+    for name in ("a.mcap", "b.mcap"):
+        Recorder(Bus(session, KEYS), Segments(tmp_path / name, EVERYTHING, START_NS, UNIX_OFFSET_NS)).follow(KEYS.robot)
+    roles = [role_of(token) for token in session.tokens]
+    assert roles.count("recorder") == 2
+    assert len({role for role in roles if role.startswith("recorder.")}) == 2
+
+
 @pytest.mark.parametrize("size", [None, "x", "9" * 30, 1.5, [], True, 0, -1, 10**9])
 @pytest.mark.parametrize("piece", [None, "", 7, "AAAA", "Ä"])
 def test_controller_whose_files_make_no_sense_is_told_in_one_line(piece: Any, size: Any, caplog: pytest.LogCaptureFixture) -> None:
@@ -220,6 +243,33 @@ def test_controller_whose_files_make_no_sense_is_told_in_one_line(piece: Any, si
     assert not given
     (line,) = [record.getMessage() for record in caplog.records]
     assert "has not sent its configuration and model" in line
+
+
+def test_controller_that_sends_its_files_in_pieces_without_end_is_asked_no_further(caplog: pytest.LogCaptureFixture) -> None:
+    bus, asked = Bus(FakeSession(), KEYS), 0
+
+    def answers(*_: object) -> Iterator[dict[str, Any]]:
+        nonlocal asked
+        asked += 1
+        assert asked <= MAX_PIECES
+        yield {"ok": True, "owner": 9, "size": MAX_BUNDLE_BYTES, "piece": "A"}
+
+    bus.answers = answers  # type: ignore[method-assign]
+    before = set(enumerate_threads())
+    fetch_origin(bus, 9, pytest.fail)
+    for thread in set(enumerate_threads()) - before:
+        thread.join(10.0)
+    assert asked == MAX_PIECES
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert "has not sent its configuration and model" in line
+
+
+@pytest.mark.parametrize("name", ["", "ant/", "../*", "*//bee", "@*", "ant#"])
+def test_name_that_no_robot_can_have_is_refused_before_anything_is_joined(name: str, tmp_path: Path) -> None:
+    """It was accepted, and nothing was recorded."""
+    with pytest.raises(ConfigError, match="robot must be words joined by single slashes"):
+        record.main(BusSettings(), KEYS, out=tmp_path / "run.mcap", robots=["ant*", name], stop=Flag())
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
