@@ -71,6 +71,10 @@ class Gap:
     last: int
     why: str
 
+    def __str__(self) -> str:
+        """In words."""
+        return f"entries {self.first} to {self.last}: {self.why}"
+
 
 @dataclass
 class ReplayOutcome:

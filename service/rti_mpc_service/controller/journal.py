@@ -14,7 +14,7 @@ from rti_mpc.wire.bus import Bus
 
 PUBLISHING_PERIOD_S = 0.1
 VALUES_AT_ONCE = 8  # values that are encoded before another thread may take the interpreter's lock
-RECORDER = "recorder"  # role
+RECORDER = "recorder"  # role, with a number or without
 SLACK_SHARE = 0.8  # of the slack that a snapshot may take
 UNFIT_SAMPLES = 100  # samples in a row with too little slack, after which that is said
 
@@ -49,7 +49,7 @@ class JournalPublisher:
 
     def _meet(self, role: str, present: bool) -> None:
         """Ask for a snapshot when a recorder appears, so that a replay begins there and not up to ten seconds later."""
-        if present and role == RECORDER:
+        if present and role.partition(".")[0] == RECORDER:
             self._book.ask()
 
     def close(self) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+import secrets
 import time
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -28,7 +29,7 @@ from rti_mpc.recording.host import HOST
 from rti_mpc.recording.repair import repair
 from rti_mpc.wire import document
 from rti_mpc.wire.announcer import Announcer
-from rti_mpc.wire.bus import Bus, BusSettings, new_epoch
+from rti_mpc.wire.bus import MAX_NUMBER, Bus, BusSettings, new_epoch
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Key, Keys
@@ -46,8 +47,8 @@ MAX_NUMBERED = 4096  # publishers whose sequence numbers are followed
 MAX_ROBOTS = 100
 STALE_S = 2.0
 WILD = set("*?[")  # characters of a pattern
-EVERYTHING = Retention()
 ANY_NAME = str.maketrans(dict.fromkeys("*?[]", "x"))  # makes a name of a pattern
+EVERYTHING = Retention()
 
 MEDIA_TYPES = {".toml": "application/toml", ".py": "text/x-python", ".json": "application/json"}
 UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
@@ -84,9 +85,9 @@ def main(
     """
     stop = stop or stop_on_signals()
     names = list(robots) or [keys.robot]
-    end = "" if retention else ".mcap"
     for name in names:
         Keys(keys.prefix, name.translate(ANY_NAME))  # refuses what no robot can be called
+    end = "" if retention else ".mcap"
     path = out or Path("runs") / f"{keys.robot if names == [keys.robot] else 'robots'}-{time.strftime('%Y%m%d-%H%M%S')}{end}"
     with Bus.join(bus_settings, keys, stop=stop, say=log.warning) as bus:
         now_ns = time.monotonic_ns()
@@ -128,6 +129,7 @@ class Recorder:
         self._others: defaultdict[tuple[str, str], list[str]] = defaultdict(list)  # those of other roles than `KNOWN_ROLES`, by robot and stream
         self._last: dict[tuple[str, int], int] = {}  # sequence numbers by key and epoch
         self._owners: set[tuple[str, int]] = set()  # controllers whose files were asked for
+        self._own = f"{ROLE}.{secrets.randbelow(MAX_NUMBER)}"  # a token that nobody else has: one that is there already tells no controller
         self._waited: tuple[int, int] | None = None  # monotonic time, ns, and what the host had waited then, us
 
     def follow(self, robot: str) -> None:
@@ -143,6 +145,7 @@ class Recorder:
             self._announcers.append(Announcer(bus, ROLE, new_epoch()))
         hear(bus, self._inbox, self._described)
         bus.alive(ROLE)
+        bus.alive(self._own)
         bus.expect("message", lambda: any(entry[0].startswith(f"{bus.keys.prefix}/{robot}/") for entry in list(self._last)))
 
     def run(self, stop: Event) -> int:

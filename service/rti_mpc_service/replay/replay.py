@@ -22,7 +22,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import JournalKind
 from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.journal.entry import JournalEntry
-from rti_mpc.journal.replay import Difference, Gap, Replay
+from rti_mpc.journal.replay import Difference, Replay
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 from rti_mpc_service.config import toml
 from rti_mpc_service.config.build import retuned
@@ -207,7 +207,7 @@ def lines(account: Account, limit: float, assignments: Sequence[str]) -> Iterato
     times = [message.local_ns for message in account.journal.messages]
     yield f"{outcome.samples} commands of {1e-9 * (times[-1] - times[0]):.1f} s, {outcome.entries} entries, {len(outcome.snapshots)} snapshots"
     for gap in outcome.gaps:
-        yield f"not covered: {told(gap)}"
+        yield f"not covered: {gap}"
     yield from coverage.told(account.uncovered)
     if assignments:
         yield from open_loop(account, assignments)
@@ -219,11 +219,6 @@ def lines(account: Account, limit: float, assignments: Sequence[str]) -> Iterato
         yield f"{outcome.differing} commands differ, by {outcome.size:.1e} at most"
     else:
         yield f"{outcome.differing} commands differ; the first is {outcome.differences[0]}"
-
-
-def told(gap: Gap) -> str:
-    """Return a gap in words."""
-    return f"entries {gap.first} to {gap.last}: {gap.why}"
 
 
 def open_loop(account: Account, assignments: Sequence[str]) -> Iterator[str]:

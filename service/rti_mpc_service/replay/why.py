@@ -133,7 +133,9 @@ def explained(journal: Journaled, built: Rebuilt, place: Place) -> tuple[dict[st
             if prepared == 2 or not place.command.mode.planned:
                 break
     if not facts:
-        raise ConfigError(f"command {place.command.seq} must follow a snapshot without a gap, got {[*map(str, on.outcome.gaps)] or 'none before it'}")
+        raise ConfigError(
+            f"command {place.command.seq} must follow a snapshot without a gap, got {', '.join(map(str, on.outcome.gaps)) or 'none before it'}"
+        )
     facts["second_opinion"] = second_opinion(controller.telemetry(**NO_TIMES), place.command.seq)
     for bound in facts["bounds"]:  # the replay has ended: the arrays of its controller are free
         bound["without"] = None if case is None else without(case, built.rti, built.config, bound)
