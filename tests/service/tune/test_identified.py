@@ -143,7 +143,20 @@ def motor(dt_ms: int, delay_ms: int = 60, lag_ms: float = 120.0, duration_ms: in
         speed[k + 1] = speed[k] + 0.001 * (torque - speed[k])
     states = [State(3, k + 1, dt_ms * ms * k, speed[[dt_ms * k]] + 0.01 * rng.standard_normal(1)) for k in range(duration_ms // dt_ms)]
     commands = [
-        Command(7, k + 1, t := dt_ms * ms * k, 3, k + 1, t, t + 250 * ms, 1, Mode.TRACKING, QpStatus.SOLVED, dt_ms * ms, np.full((40, 1), asked[dt_ms * k]))
+        Command(
+            7,
+            k + 1,
+            t := dt_ms * ms * k,
+            3,
+            k + 1,
+            t,
+            t + 250 * ms,
+            1,
+            Mode.TRACKING,
+            QpStatus.SOLVED,
+            dt_ms * ms,
+            np.full((40, 1), asked[dt_ms * k]),
+        )
         for k in range(len(states))
     ]
     return windows_of(model, states, commands, 0.001 * dt_ms)
