@@ -36,6 +36,7 @@ from rti_mpc.rti.qp.osqp import Solver
 MADE_IN = ("rti_mpc.contract.", "rti_mpc.control.", "rti_mpc.rti.")  # modules of the classes whose objects are made anew
 # Attributes that no command depends on.
 NOT_STATE = {("Controller", "on_call"), ("Controller", "_understudy"), ("Planner", "_kept"), ("ModeMachine", "notices")}
+GROWING = {("Track", "_rows")}  # arrays with as many rows as a reference has; all others that a controller was built with keep their shape
 FIXED_MODULES = ("casadi", "osqp")  # whose objects have no state of their own, or such that `rewarm` sets
 FIXED_CLASSES = {"Model", "Signal", "Timing", "SolverSettings", "Transcription", "StopLaw", "Disturbance", "ObserverSettings", "Rotations"}  # frozen
 FIXED_TYPES = (types.FunctionType, types.BuiltinFunctionType, types.MethodType, types.ModuleType, type, slice, range, np.dtype, memoryview)
@@ -102,6 +103,7 @@ class Camera:
         self._places: dict[int, int] = {}  # of these objects, by identity
         self._pinned: list[Any] = []
         self._pins: dict[tuple[Any, ...], int] = {}  # places of pinned arrays, by memory
+        self._widths = widths(controller)
         self._survey(controller, "controller")
 
     # Survey of the controller as it was built.
@@ -242,7 +244,11 @@ class Camera:
                 raise TypeError(f"a {full_name(type(made))} instead of a {name}")
             self._objects[number] = made
             for key, child in nodes:
-                object.__setattr__(made, key, self._value(child))
+                value, at = self._value(child), (type(made).__name__, key)
+                check(
+                    f"{name}.{key}", value, alike(getattr(made, key, None), value, rows=at not in GROWING) and has_width(value, self._widths.get(at))
+                )
+                object.__setattr__(made, key, value)
             return made
         if kind == SET:
             items = {self._value(item) for item in content[0]}
@@ -254,9 +260,12 @@ class Camera:
         if made is None:
             made = {} if kind == TABLE else deque(maxlen=content[0]) if kind == QUEUE else []
         self._objects[number] = made
+        before = dict(made) if kind == TABLE else {}
         made.clear()
         if kind == TABLE:
             made.update((self._value(key), self._value(item)) for key, item in content[0])
+            for key, ours in before.items():
+                check(f"{key!r}", theirs := made.get(key), alike(ours, theirs))
         else:
             made.extend(self._value(item) for item in content[-1])
         return made
@@ -272,6 +281,42 @@ def fits(ours: np.ndarray[Any, Any], theirs: Any) -> bool:
     """Whether an array may be written over one that never moves; integers are patterns of sparse matrices, whose indices compiled code trusts."""
     alike = isinstance(theirs, np.ndarray) and theirs.shape == ours.shape and theirs.dtype == ours.dtype
     return alike and (ours.dtype.kind == "f" or np.array_equal(ours, theirs))
+
+
+def widths(controller: Controller) -> dict[tuple[str, str], tuple[int, set[int]]]:
+    """Return the number of axes, and the possible lengths of the last one, of arrays of objects that are made anew, by class and attribute."""
+    (nx,), (nu,), ny = controller._x0.shape, controller._u_rest.shape, controller._track.y_ref.shape[1]
+    plan = {("Plan", "u"): (2, {nu}), ("Plan", "asked"): (2, {nu}), ("Plan", "before"): (1, {nu})}
+    state = {("State", "x"): (1, {nx}), ("State", "u"): (1, {0, nu})}
+    reference = {("Reference", "y"): (2, {ny}), ("Reference", "p"): (2, {0, controller.np_})}
+    rest = {("Command", "u_rest"): (2, {0, nu}), ("Command", "x_rest"): (2, {0, nx}), ("Command", "K"): (2, {0, nx})}
+    return {**plan, **state, **reference, ("Command", "u"): (2, {nu}), **rest}
+
+
+def has_width(value: Any, width: tuple[int, set[int]] | None) -> bool:
+    """Whether a value has a number of axes, and one of some lengths of the last one; anything has if none is known."""
+    return width is None or (isinstance(value, np.ndarray) and value.ndim == width[0] and value.shape[-1] in width[1])
+
+
+def alike(ours: Any, theirs: Any, *, rows: bool = True) -> bool:
+    """Whether arrays, or those in tuples, have the same type and shape, with or without the number of rows; other values are not compared."""
+    if isinstance(ours, np.ndarray) and isinstance(theirs, np.ndarray):
+        skipped = 0 if rows else 1
+        return ours.dtype == theirs.dtype and ours.ndim == theirs.ndim and ours.shape[skipped:] == theirs.shape[skipped:]
+    if isinstance(ours, tuple) and isinstance(theirs, tuple):
+        return all(map(alike, ours, theirs))
+    return True
+
+
+def check(name: str, value: Any, fitting: bool) -> None:
+    """Refuse a value of another size than it can have."""
+    if not fitting:
+        raise JournalError(f"{name} of a snapshot must have the size that it has in a controller built like this one, got {sizes(value)}")
+
+
+def sizes(value: Any) -> Any:
+    """Return the shape of an array, those of a tuple, or what else a value is."""
+    return value.shape if isinstance(value, np.ndarray) else [*map(sizes, value)] if isinstance(value, tuple) else type(value).__name__
 
 
 def root(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:

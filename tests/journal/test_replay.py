@@ -149,6 +149,31 @@ def test_snapshot_that_would_change_the_pattern_of_a_matrix_is_refused() -> None
             camera.restore(replace(snapshot, pinned=[other if i == patterns[-1] else array for i, array in enumerate(snapshot.pinned)]))
 
 
+@pytest.mark.parametrize("change", ["a column more", "an axis more"])
+def test_snapshot_that_would_give_an_object_an_array_of_another_size_is_refused_by_name(change: str) -> None:
+    """As one that somebody has made on purpose: a controller calls compiled code with them."""
+    lived = live(KINDS["observer"], samples=60, snapshots=(0, 40))
+    snapshot = Snapshot.decode(next(message for message in lived.messages if message.seq > 0 and message.kind is JournalKind.SNAPSHOT).data)
+    controller = KINDS["observer"].build()[0]
+    camera = Camera(controller)
+    camera.restore(snapshot)
+    refused = set()
+    for i, array in enumerate(snapshot.arrays):
+        shape = (*array.shape[:-1], array.shape[-1] + 1) if change == "a column more" else (*array.shape, 1)
+
+        def grown(node: Any, i: int = i, shape: tuple[int, ...] = shape) -> Any:
+            """The tree with this array, wherever it is reached, in its new shape."""
+            if isinstance(node, tuple) and len(node) == 3 and node[:2] == (ARRAY, i):
+                return ARRAY, i, shape
+            return type(node)(map(grown, node)) if type(node) in (list, tuple) else node
+
+        arrays = [np.resize(other, shape) if other is array else other for other in snapshot.arrays]
+        with pytest.raises(JournalError, match=r"^\S+ of a snapshot must have the size that it has") as refusal:
+            camera.restore(replace(snapshot, arrays=arrays, tree=grown(snapshot.tree)))
+        refused.add(str(refusal.value).split()[0].rpartition(".")[2].strip("'"))
+    assert refused > {"u", "before", "lbu", "zh", "_rows"}
+
+
 @pytest.mark.parametrize("name", ["car", pytest.param("quadrotor", marks=pytest.mark.slow)])
 def test_robot_with_a_way_to_rest_replays_from_every_snapshot(name: str) -> None:
     """A car follows its way on and on; a quadrotor feeds its states back to it."""

@@ -9,15 +9,17 @@ from pathlib import Path
 import pytest
 
 from rti_mpc_service.rig.endpoint import free_endpoint
-from tests.processes.system import System, rti_mpc
+from tests.processes.system import System, rti_mpc, until
 
 pytestmark = pytest.mark.slow
 pytest.importorskip("mcap")
 
 
 def test_running_controller_is_explained_while_it_drives_on(tmp_path: Path) -> None:
-    with System(tmp_path) as system:
-        system.start("robot", "controller", "reference")
+    """Beside another recorder, as in a demo."""
+    with System(tmp_path, recorder=("record", "--out", tmp_path / "run.mcap")) as system:
+        system.start("robot", "controller", "reference", "recorder")
+        until(lambda: "recorder" in system.lives, "another one records")
         system.tracking()
         done = rti_mpc("why", "-e", system.endpoint, "--json")
         assert done.returncode == 0, done.stdout + done.stderr
