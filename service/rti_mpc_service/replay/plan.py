@@ -11,11 +11,12 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.rti.linearization import constraints, input_reference
 from rti_mpc.rti.ocp import Ocp
-from rti_mpc.rti.rti import COST_WEIGHTS, TOUCHING_DISTANCE, Rti
+from rti_mpc.rti.rti import COST_WEIGHTS, Rti
+from rti_mpc_service.acting import at_bounds, unit
 from rti_mpc_service.config.schema import Config
 
 FIRST = {"state": 1, "constraint": 1, "second difference": 0}  # node, or stage, from which on values are known; others are of the last node
-ACTING_DISTANCE = 1e-6  # from a bound of an input, relative to the input's scale
+SIDES = ("lower", "upper")
 
 
 def acting_bounds(rti: Rti, config: Config) -> list[dict[str, Any]]:
@@ -26,21 +27,20 @@ def acting_bounds(rti: Rti, config: Config) -> list[dict[str, Any]]:
     begin at 1.
     """
     model, weights = rti.problem.model, rti.guess.weights
-    scale_u, scale_g = rti.scale[model.nx : model.nx + model.nu], rti.scale[model.nx + model.nu :]
     increments = np.diff(rti.u, axis=0, prepend=rti.u_prev[None])
+    units = {signal.name: unit(weights["lbu"][..., j], weights["ubu"][..., j]) for j, signal in enumerate(model.inputs)}
     found: list[dict[str, Any]] = []
     for kind, values, lower, upper in (("input", rti.u, "lbu", "ubu"), ("increment", increments, "lbdu", "ubdu")):
         for j, signal in enumerate(model.inputs):
-            for side, name in (("lower", lower), ("upper", upper)):
-                bounds = np.broadcast_to(weights[name], values.shape)[:, j]
-                touching = np.abs(values[:, j] - bounds) <= ACTING_DISTANCE * scale_u[j]
-                found += _acting(kind, signal.name, signal.unit, side, bounds[touching], rti.ocp.starts[touching], 0.0)
-    for soft, scale in zip(softened(rti, config), scale_g, strict=True):
-        for side, bound, sign in (("lower", soft.lower, -1.0), ("upper", soft.upper, 1.0)):
-            over = sign * (soft.values - bound)
-            violation = max(0.0, float(over.max()))
-            touching = np.flatnonzero(over > -TOUCHING_DISTANCE * scale)
-            found += _acting(soft.kind, soft.name, soft.unit, side, bound[touching], soft.first + touching, violation)
+            bounds = [np.broadcast_to(weights[name], values.shape)[:, j] for name in (lower, upper)]
+            for side, bound, acts in zip(SIDES, bounds, at_bounds(values[:, j], *bounds, units[signal.name]), strict=True):
+                found += _acting(kind, signal.name, signal.unit, side, bound[acts], rti.ocp.starts[acts], 0.0)
+    for soft in softened(rti, config):
+        of = units[soft.name] if soft.kind == "second difference" else unit(soft.lower, soft.upper)
+        bounds, over = (soft.lower, soft.upper), (soft.lower - soft.values, soft.values - soft.upper)
+        for side, bound, acts, beyond in zip(SIDES, bounds, at_bounds(soft.values, *bounds, of), over, strict=True):
+            violation = max(0.0, float(beyond.max()))
+            found += _acting(soft.kind, soft.name, soft.unit, side, bound[acts], soft.first + np.flatnonzero(acts), violation)
     return found
 
 

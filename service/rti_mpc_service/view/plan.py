@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
@@ -12,8 +11,8 @@ from numpy.typing import NDArray
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Telemetry
 from rti_mpc.wire.info import Info
+from rti_mpc_service.acting import at_bounds, unit
 
-TOUCHING = 1e-4  # distance from a bound at which it acts, relative to half of what its signal ranges over
 FREE, LATER = "free", " later"
 LEVELS, RATES, TOUCHED = ("lower", "upper"), ("falls", "rises"), "touched"
 SIDES = (*LEVELS, *RATES)
@@ -73,24 +72,18 @@ def acting_bounds(info: Info, sample: Telemetry, u_before: Array | None, discs: 
     """
     rates = np.diff(sample.u, axis=0, prepend=sample.u[:1] if u_before is None else u_before[None])
     along: dict[str, list[tuple[str, NDArray[np.bool_]]]] = {}
-    for labels, values, lower, upper, sides in (
-        (info.states, sample.x[1:], info.lbx, info.ubx, LEVELS),
-        (info.inputs, sample.u, info.lbu, info.ubu, LEVELS),
-        (info.inputs, rates, info.lbdu, info.ubdu, RATES),
+    for labels, values, lower, upper, sides, span in (
+        (info.states, sample.x[1:], info.lbx, info.ubx, LEVELS, (info.lbx, info.ubx)),
+        (info.inputs, sample.u, info.lbu, info.ubu, LEVELS, (info.lbu, info.ubu)),
+        (info.inputs, rates, info.lbdu, info.ubdu, RATES, (info.lbu, info.ubu)),
     ):
         for j, label in enumerate(labels):
-            along.setdefault(label.name, []).extend(_touched(values[:, j], lower[j], upper[j], sides))
+            bounds = lower[j], upper[j]
+            acting = zip(sides, bounds, at_bounds(values[:, j], *bounds, unit(span[0][j], span[1][j])), strict=True)
+            along.setdefault(label.name, []).extend((side, acts) for side, bound, acts in acting if np.isfinite(bound))
     for i, away in enumerate(discs):
-        along[f"obstacle_{i}"] = [(TOUCHED, away <= TOUCHING)]
+        along[f"obstacle_{i}"] = [(TOUCHED, at_bounds(away, 0.0, np.inf, unit(0.0, np.inf))[0])]
     return {name: _said(sides) for name, sides in along.items() if sides}
-
-
-def _touched(values: Array, lower: float, upper: float, sides: tuple[str, str]) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Yield each of the two sides with the stages at which it acts, unless there is no bound there."""
-    half = 0.5 * (upper - lower)
-    for side, bound, sign in zip(sides, (lower, upper), (-1.0, 1.0), strict=True):
-        if np.isfinite(bound):
-            yield side, sign * (values - bound) >= -TOUCHING * (half if np.isfinite(half) else max(1.0, abs(bound)))
 
 
 def _said(sides: list[tuple[str, NDArray[np.bool_]]]) -> str:

@@ -13,6 +13,7 @@ from rti_mpc.contract.message import Telemetry
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.rti.rti import Rti
 from rti_mpc.wire.info import Info
+from rti_mpc_service.acting import DISTANCE
 from rti_mpc_service.config.build import build_rti
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
@@ -78,6 +79,19 @@ def test_the_bounds_that_act_are_those_of_the_controller(pioneer: tuple[Config, 
         for name, words in acting.items():
             assert set(words.removesuffix(" later").split(", ")) <= expected[name]
     assert said["u_c"] != "free", "the far reference is driven to as fast as allowed"
+
+
+@pytest.mark.parametrize(("away", "acts"), [(0.5, True), (2.0, False)])
+def test_a_bound_acts_at_the_same_distance_for_both(pioneer: tuple[Config, Rti], away: float, acts: bool) -> None:
+    """It was a hundredth of it in the controller's view, so that the viewer named bounds that `why` did not."""
+    config, rti = pioneer
+    sample, info = solved(rti, NEAR), info_of(rti)
+    rti.u[:] = sample.u[: len(rti.u)] = rti.u_prev  # so that no increment is at its bound
+    rti.u[2, 1] = sample.u[2, 1] = info.ubu[1] - away * DISTANCE * info.ubu[1]
+    known = [bound["stages"] for bound in held.acting_bounds(rti, config) if (bound["kind"], bound["name"]) == ("input", "omega_c")]
+    wide = replace(info, lbdu=(-np.inf,) * 2, ubdu=(np.inf,) * 2)
+    assert known == [[2]] * acts
+    assert acting_bounds(wide, sample, rti.u_prev)["omega_c"] == ("upper later" if acts else "free")
 
 
 def test_a_bound_acts_now_or_later_in_the_plan(pioneer: tuple[Config, Rti]) -> None:
