@@ -32,13 +32,13 @@ def acting_bounds(rti: Rti, config: Config) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
     for kind, values, lower, upper in (("input", rti.u, "lbu", "ubu"), ("increment", increments, "lbdu", "ubdu")):
         for j, signal in enumerate(model.inputs):
-            bounds = [np.broadcast_to(weights[name], values.shape)[:, j] for name in (lower, upper)]
-            for side, bound, acts in zip(SIDES, bounds, at_bounds(values[:, j], *bounds, units[signal.name]), strict=True):
+            low, high = (np.broadcast_to(weights[name], values.shape)[:, j] for name in (lower, upper))
+            for side, bound, acts in zip(SIDES, (low, high), at_bounds(values[:, j], low, high, units[signal.name]), strict=True):
                 found += _acting(kind, signal.name, signal.unit, side, bound[acts], rti.ocp.starts[acts], 0.0)
     for soft in softened(rti, config):
         of = units[soft.name] if soft.kind == "second difference" else unit(soft.lower, soft.upper)
-        bounds, over = (soft.lower, soft.upper), (soft.lower - soft.values, soft.values - soft.upper)
-        for side, bound, acts, beyond in zip(SIDES, bounds, at_bounds(soft.values, *bounds, of), over, strict=True):
+        acting, over = at_bounds(soft.values, soft.lower, soft.upper, of), (soft.lower - soft.values, soft.values - soft.upper)
+        for side, bound, acts, beyond in zip(SIDES, (soft.lower, soft.upper), acting, over, strict=True):
             violation = max(0.0, float(beyond.max()))
             found += _acting(soft.kind, soft.name, soft.unit, side, bound[acts], soft.first + np.flatnonzero(acts), violation)
     return found

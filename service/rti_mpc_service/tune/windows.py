@@ -56,7 +56,7 @@ class Windows:
     @property
     def steps(self) -> int:
         """Number of steps of each window, S."""
-        return self.x.shape[1] - 1
+        return int(self.x.shape[1]) - 1
 
     @property
     def unit_s(self) -> float:
