@@ -108,7 +108,8 @@ def find_scenario(
     model = build_model(config)
     if name is None or name == config.reference.scenario:
         name, duration_s = config.reference.scenario, duration_s or config.reference.duration_s
-    name = name or ("eight" if in_plane(model.outputs) else "sines")
+    if name is None:
+        name = "eight" if in_plane(model.outputs) else "sines"
     timed = (*OUTPUT_SCENARIOS, *MANOEUVRES)
     if name not in (*SCENARIOS, *timed) and Path(name).suffix.lower() != ".csv":
         known = ", ".join((*SCENARIOS, *OUTPUT_SCENARIOS, *fitting(model.outputs)))

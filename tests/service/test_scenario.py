@@ -66,6 +66,7 @@ def test_outputs_over_time_in_a_file_are_followed_by_a_robot_in_the_plane_too(tm
             None,
             "eight, circle, positioning, sines, steps or a FILE.csv of waypoints or of outputs over time",
         ),
+        ("glider", "", None, "or a FILE.csv of waypoints or of outputs over time, got ''"),
         ("arm", "waypoints.csv", None, "waypoints.csv, line 1: the header must name t and every output of the model, t is missing, got x, y"),
         ("arm", "nowhere.csv", None, "nowhere.csv: must be a readable file"),
         ("glider", "nowhere.csv", None, "nowhere.csv: must be a readable file"),

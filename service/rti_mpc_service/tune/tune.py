@@ -85,7 +85,7 @@ def main(
     model = build_model(config)
     varied = find_varied(config, model, vary)
     course, other = parted(course, held_out, planar=in_plane(model.outputs))
-    shared = open_storage(storage) if storage else None  # what was asked for is looked at first
+    shared = None if storage is None else open_storage(storage)  # what was asked for is looked at first
     courses = {STUDIED: course, HELD_OUT: other}
     robot, heard = "", {}
     for name in dict.fromkeys(each.name for each in courses.values() if each.name is not None and is_recording(each.name)):
@@ -109,7 +109,7 @@ def main(
     if lost := next((titles[name] for name, driven in today.items() if not driven.finite), ""):
         raise ConfigError(f"the values of {path} must drive {lost} to its end, so that others can be compared with them")
     study_name = name_of(config, course, varied)
-    study_url = storage or f"sqlite:///{out.resolve().with_suffix('.study.db')}"
+    study_url = f"sqlite:///{out.resolve().with_suffix('.study.db')}" if storage is None else storage
     study = open_study(shared or open_storage(study_url), study_name, today[STUDIED])
     ranges = ", ".join(f"{each.key} {each.low:g}:{each.high:g}" for each in varied)
     console.print(f"study {study_name} in {without_password(study_url)}, {len(finished(study))} of {trials} trials are there", soft_wrap=True)
@@ -188,7 +188,7 @@ def parted(course: Course, held_out: str | None, *, planar: bool) -> tuple[Cours
     """Return the course of the study and the held-out one, with other noise: of a recording its first and second half if none was asked for."""
     if is_recording(course.name) and held_out in (None, course.name):
         return replace(course, part=(0.0, 0.5)), replace(course, part=(0.5, 1.0), seed=course.seed + 1)
-    return course, replace(course, name=held_out or default_held_out(course.name, planar=planar), seed=course.seed + 1)
+    return course, replace(course, name=default_held_out(course.name, planar=planar) if held_out is None else held_out, seed=course.seed + 1)
 
 
 def default_held_out(studied: str | None, *, planar: bool) -> str:

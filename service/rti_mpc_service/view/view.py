@@ -55,7 +55,7 @@ class Screens:
         Raises:
             ConfigError: The address is none.
         """
-        return viewer_url(self.rerun_connect or RERUN_ADDRESS)
+        return viewer_url(RERUN_ADDRESS if self.rerun_connect is None else self.rerun_connect)
 
     @property
     def spawned(self) -> bool:

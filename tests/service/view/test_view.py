@@ -297,10 +297,10 @@ def test_a_name_that_no_robot_can_have_is_refused_before_anything_is_joined(name
     assert not any(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("address", ["nowhere", "host:port", "http://127.0.0.1:9876", ":9876"])
+@pytest.mark.parametrize("address", ["", "nowhere", "host:port", "http://127.0.0.1:9876", ":9876"])
 def test_an_address_that_is_none_is_refused(address: str) -> None:
     with pytest.raises(ConfigError, match="HOST:PORT"):
-        viewer_url(address)
+        assert Screens(rerun_connect=address).url
 
 
 def test_an_address_becomes_a_url_of_reruns() -> None:
