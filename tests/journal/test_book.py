@@ -122,10 +122,10 @@ def test_attribute_that_is_added_is_part_of_the_snapshot_without_being_named() -
 
     one, other = grown(), grown()
     camera, camera_of_other = Camera(one), Camera(other)
-    one.grid.added[1]["b"] = np.array([4.0, 5.0])
+    one.grid.added[1]["b"] = np.array([4.0, 5.0, 6.0])
     one.grid.added.append("late")
     camera_of_other.restore(Snapshot.decode(camera.take().encode()))
-    np.testing.assert_array_equal(other.grid.added[1]["b"], [4.0, 5.0])
+    np.testing.assert_array_equal(other.grid.added[1]["b"], [4.0, 5.0, 6.0])
     assert other.grid.added[2] == "late"
 
 
