@@ -76,7 +76,7 @@ class StateStream:
         self.before_ns = 0
         self._stale_ns = stale_ns
         self._observer = observer
-        self._before_ns: int | None = None  # stamp of the state before the last one
+        self._estimated_ns: int | None = None  # stamp of the state that the observer was given last
         self._rotations = model.rotations("states")
 
     def receive(self, state: State, arrival_ns: int) -> Arrival:
@@ -96,7 +96,6 @@ class StateStream:
         if arrival in UNKEPT:
             return arrival
         before, self.last = self.last, state
-        self._before_ns = None if before is None else before.stamp_ns
         written = self._x.tolist()
         self.x[:] = state.x
         self._rotations.normalize(self._x)
@@ -111,7 +110,7 @@ class StateStream:
         Replace the last state by the observer's estimate, if there is one.
 
         Args:
-            sent: The inputs that have acted since the state before.
+            sent: The inputs that have acted since the last estimate.
             known: Whether it is certain that they acted; otherwise the disturbances keep their values.
 
         Returns:
@@ -121,11 +120,12 @@ class StateStream:
         if observer is None or last is None:
             return None
         lost = None
-        if self._before_ns is None or last.stamp_ns - self._before_ns > self._stale_ns:
+        before_ns, self._estimated_ns = self._estimated_ns, last.stamp_ns  # states that were late lie between them
+        if before_ns is None or not 0 < last.stamp_ns - before_ns <= self._stale_ns:
             observer.reset(self.x)
         else:
             observer.frozen = not known
-            for u, span_s in sent.spans(self._before_ns, last.stamp_ns):
+            for u, span_s in sent.spans(before_ns, last.stamp_ns):
                 observer.predict(u, span_s)
             self._rotations.bring_near(self.x, observer.x)  # a turn between two states is no innovation
             observer.correct(self.x)
@@ -147,7 +147,7 @@ class StateStream:
             return Arrival.FOREIGN, "", ""
         began = heard is Heard.BEGINS and self.last is not None
         if heard is Heard.BEGINS:
-            self.last = None
+            self.last = self._estimated_ns = None
             self.clock.reset()
             self.cadence.reset()
         untimed = bool(self.cadence.fault)
@@ -168,7 +168,7 @@ class StateStream:
             if back_ns <= self._stale_ns:
                 return Arrival.REPEATED, "", ""
             judged = Arrival.JUMPED_BACK, "clock_jumped", f"the robot's clock went back {1e-9 * back_ns:.3f} s: starting cold"
-            self.last = None
+            self.last = self._estimated_ns = None
             self.clock.jump()
             self.cadence.jump()
         if not self.clock.observe(state.seq, state.stamp_ns, arrival_ns):

@@ -65,7 +65,10 @@ class Track:
             reference: The message as it came.
             right_np: Number of parameters that a row may have.
         """
-        (rows, ny), np_, right_ny = reference.y.shape, reference.p.shape[1], self.y_ref.shape[1]
+        right_ny = self.y_ref.shape[1]
+        if reference.y.ndim != 2 or reference.p.ndim != 2 or len(reference.p) != len(reference.y):
+            return f"a reference must have as many rows of parameters as of outputs, got shapes {reference.p.shape} and {reference.y.shape}"
+        (rows, ny), np_ = reference.y.shape, reference.p.shape[1]
         if rows >= 1 and ny == right_ny and np_ in (0, right_np) and reference.period_ns > 0:
             return ""
         return (

@@ -15,6 +15,8 @@ from rti_mpc.contract.message import End, Reference, State
 from rti_mpc.contract.status import Mode
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.control.observer import Disturbance, Observer, ObserverSettings
+from rti_mpc.control.sent import Sent
+from rti_mpc.control.state_stream import Arrival, StateStream
 from rti_mpc.errors import OcpError
 from rti_mpc.model.disturbance import with_disturbances
 from rti_mpc.model.integrator import integrator
@@ -28,7 +30,7 @@ from rti_mpc.signals import Signal
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
 from tests.loop import MS, SLEW, drive, reference
-from tests.problems import PAPER
+from tests.problems import PAPER, double_integrator
 from tests.problems import SLEW as INCREMENTS
 
 POSE = ("x", "y", "psi")
@@ -184,3 +186,21 @@ def test_estimate_for_which_the_model_has_no_value_begins_anew_at_the_next_state
     assert np.isfinite(observer.d).all()
     assert [command.mode for command in run.commands[-5:]] == [Mode.TRACKING] * 5
     assert run.x[-1] == pytest.approx(0.4, abs=0.01)
+
+
+def test_estimate_goes_on_from_its_own_last_state_where_states_between_were_late() -> None:
+    """At 1 m/s and 100 Hz; eight states that have waited 0.4 s are not answered, and nothing is estimated from them."""
+    model = double_integrator().model
+    observer = Observer(model, ObserverSettings({model.inputs[0].name: Disturbance(0.1, 5.0)}), compile=False)
+    stream = StateStream(model, 225 * MS, 100 * MS, 1.0, observer)
+    sent = Sent(np.zeros(1), -np.ones(1), np.ones(1), 100 * MS)
+    seen = []
+    for k in range(200):
+        stamp_ns, late_ns = 10 * MS * k, 400 * MS if 150 <= k < 158 else 0
+        seen.append(stream.receive(State(1, k + 1, stamp_ns, np.array([1e-9 * stamp_ns, 1.0])), 10**9 + stamp_ns + late_ns))
+        if seen[-1] in (Arrival.FRESH, Arrival.NEW_LIFE):
+            stream.estimate(sent, known=True)
+            np.testing.assert_allclose(stream.x, [1e-9 * stamp_ns, 1.0], rtol=0, atol=1e-6)
+            np.testing.assert_allclose(stream.d, 0.0, rtol=0, atol=1e-6)
+    assert Arrival.OLD in seen[150:158]
+    assert seen[-1] is Arrival.FRESH

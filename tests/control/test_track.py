@@ -125,3 +125,9 @@ def test_compiled_and_interpreted_rows_are_the_same_bit_for_bit() -> None:
             for track in tracks:
                 track.look_up(int(t_ns))
             assert all(track.y_ref.tobytes() + track.p.tobytes() == tracks[0].y_ref.tobytes() + tracks[0].p.tobytes() for track in tracks)
+
+
+@pytest.mark.parametrize(("y", "p"), [(np.zeros((4, 3)), np.zeros((3, 7))), (np.zeros(3), np.zeros((1, 0))), (np.zeros((4, 3)), np.zeros(0))])
+def test_rows_that_do_not_fit_each_other_are_told(y: Array, p: Array) -> None:
+    track = Track(pioneer_3dx(), N, 100 * MS, compile=False)
+    assert track.misfit(Reference(1, 1, 0, 20 * MS, End.HOLD, y, p), 7).startswith("a reference must have as many rows of parameters as of outputs")
