@@ -18,7 +18,8 @@ import numpy as np
 
 from rti_mpc.array import Array
 
-MAX_ANGLE_RAD = 1e9  # the direction of a larger angle is lost in rounding
+TURNS = {"rad": math.tau, "deg": 360.0}  # a whole turn in the units that an angle may have
+MAX_TURNS = 1e8  # the direction of a larger angle is lost in rounding
 LENGTHS = 0.9, 1.1  # of a measured quaternion: one that was never written is 0, and noise of a sensor is far less
 
 Quaternion = tuple[int, int, int, int]  # places of w, x, y, z
@@ -30,6 +31,10 @@ class Component(Protocol):
     @property
     def name(self) -> str:
         """Its name, unique within the vector."""
+
+    @property
+    def unit(self) -> str:
+        """Its unit."""
 
     @property
     def angle(self) -> bool:
@@ -45,23 +50,31 @@ class Rotations:
         size: Number of components; 0 if they are not known.
         angles: Places of the angles.
         quaternions: Places of w, x, y and z of each attitude.
+        turns: A whole turn of each of the angles in its unit; in rad if left out.
     """
 
     size: int = 0
     angles: tuple[int, ...] = ()
     quaternions: tuple[Quaternion, ...] = ()
+    turns: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Fill in the turns that were left out."""
+        if not self.turns:
+            object.__setattr__(self, "turns", (math.tau,) * len(self.angles))
 
     @classmethod
     def of(cls, components: Sequence[Component], quaternions: Iterable[Sequence[str]] = ()) -> Self:
         """Find them among components; of the quaternions, names of w, x, y and z each, those count of which all names are there."""
         places = {component.name: i for i, component in enumerate(components)}
         whole = [tuple(places[name] for name in names) for names in quaternions if all(name in places for name in names)]
-        return cls(len(components), tuple(i for i, component in enumerate(components) if component.angle), tuple(whole))  # type: ignore[arg-type]
+        angles = {i: TURNS.get(component.unit, math.tau) for i, component in enumerate(components) if component.angle}
+        return cls(len(components), tuple(angles), tuple(whole), tuple(angles.values()))  # type: ignore[arg-type]
 
     def bring_near(self, x: Any, to: Any) -> None:
         """Write the rotations of a vector as near to those of another one as they can be written; both of `size` floats, arrays or views of them."""
-        for j in self.angles:
-            x[j] -= whole_turns(float(x[j] - to[j]))
+        for j, turn in zip(self.angles, self.turns, strict=True):
+            x[j] -= whole_turns(float(x[j] - to[j]), turn)
         for places in self.quaternions:
             if sum(x[j] * to[j] for j in places) < 0.0:
                 for j in places:
@@ -92,17 +105,17 @@ class Rotations:
         return whole
 
     def wrap(self, x: Array) -> None:
-        """Write the rotations of a vector, shape ``(size,)``, as sensors do: angles in (-pi, pi], quaternions of length 1 with w >= 0."""
-        angles = list(self.angles)
-        x[angles] = np.pi - np.remainder(np.pi - x[angles], 2 * np.pi)
+        """Write the rotations of a vector, shape ``(size,)``, as sensors do: angles up to half a turn, quaternions of length 1 with w >= 0."""
+        angles, turns = list(self.angles), np.array(self.turns)
+        x[angles] = turns / 2 - np.remainder(turns / 2 - x[angles], turns)
         self.normalize(x)
         self.turn_up(x)
 
     def near(self, a: Array, b: Array) -> Array:
         """Return a vector written as near to another one as it can be, both of shape ``(..., size)``."""
         written = np.array(a)
-        for j in self.angles:
-            written[..., j] -= 2 * np.pi * np.round((a[..., j] - b[..., j]) / (2 * np.pi))
+        for j, turn in zip(self.angles, self.turns, strict=True):
+            written[..., j] -= turn * np.round((a[..., j] - b[..., j]) / turn)
         for places in map(list, self.quaternions):
             opposite = (a[..., places] * b[..., places]).sum(axis=-1, keepdims=True) < 0.0
             written[..., places] *= np.where(opposite, -1.0, 1.0)
@@ -114,8 +127,8 @@ class Rotations:
 
     def unwrap(self, rows: Array) -> None:
         """Write each row near to the one before, shape ``(n, size)`` or with further columns: no angle jumps, no quaternion changes its sign."""
-        for j in self.angles:
-            rows[:, j] = np.unwrap(rows[:, j])
+        for j, turn in zip(self.angles, self.turns, strict=True):
+            rows[:, j] = np.unwrap(rows[:, j], period=turn)
         for places in map(list, self.quaternions):
             q = rows[:, places]
             signs = np.where((q[1:] * q[:-1]).sum(axis=1) < 0.0, -1.0, 1.0)
@@ -130,6 +143,6 @@ class Rotations:
         return ""
 
 
-def whole_turns(angle: float) -> float:
-    """Return the multiple of a turn nearest to an angle, in rad; 0 if the angle is not finite or beyond `MAX_ANGLE_RAD`."""
-    return math.tau * round(angle / math.tau) if abs(angle) < MAX_ANGLE_RAD else 0.0
+def whole_turns(angle: float, turn: float = math.tau) -> float:
+    """Return the multiple of a turn nearest to an angle, in its unit; 0 if the angle is not finite or beyond `MAX_TURNS`."""
+    return turn * round(angle / turn) if abs(angle) < MAX_TURNS * turn else 0.0

@@ -16,6 +16,7 @@ from typing import Any, Literal, Protocol
 
 from rti_mpc import given
 from rti_mpc.errors import OcpError
+from rti_mpc.rotation import TURNS
 
 Role = Literal["", "x", "y", "heading", "axle_offset", "disc_x", "disc_y", "disc_radius", "progress", "path_start", "path_x"]
 
@@ -41,14 +42,15 @@ class Signal:
     Attributes:
         name: Unique within its vector; what configuration and viewers call it.
         unit: SI unit, ``"1"`` if none.
-        angle: Whether it is an angle in rad whose whole turns do not matter: it may wrap at :math:`\pm\pi`, and the dynamics repeat with each turn.
+        angle: Whether it is an angle whose whole turns do not matter: it may wrap at half a turn, and the dynamics repeat with each turn. Its unit,
+            rad or deg, says how large a turn is.
         role: Of states and outputs ``"x"``, ``"y"`` (position in the plane, m) and ``"heading"`` (an angle, from the x axis to the left); of a
             parameter ``"axle_offset"``: distance in m from the axle ahead to the point whose position this is. Those of discs and of a followed
             path are set by `rti_mpc.model.obstacle` and `rti_mpc.model.path_following`. Empty: none of these.
         commands: Of an input, the name of the state that follows it, a speed; empty: none.
 
     Raises:
-        OcpError: A field is of the wrong type, the name is empty, or an angle is not in rad.
+        OcpError: A field is of the wrong type, the name is empty, or an angle is in neither rad nor deg.
     """
 
     name: str
@@ -65,8 +67,8 @@ class Signal:
                 raise OcpError(f"{field} of the signal {given.quoted(self.name)} must be {words}, got {given.quoted(value)}")
         if not self.name.strip():
             raise OcpError(f"name of a signal must not be empty, got {self.name!r}")
-        if self.angle and self.unit != "rad":
-            raise OcpError(f"unit of the signal {self.name!r} must be rad for angle=True, since a whole turn is 2 pi there, got {self.unit!r}")
+        if self.angle and self.unit not in TURNS:
+            raise OcpError(f"unit of the signal {self.name!r} must be {' or '.join(TURNS)} for angle=True, to know a whole turn, got {self.unit!r}")
 
 
 def signals(vector: str, given_as: Any, alike: Sequence[Signal | None] = ()) -> tuple[Signal, ...]:

@@ -99,3 +99,18 @@ def test_attitudes_are_completed_by_their_real_part_and_shortened_only_where_the
     whole = BODY.completed(np.array([5.0, 9.0, -3.0, 0.6, 0.0, 0.0]))
     np.testing.assert_allclose(whole, [5.0, 9.0, -0.8, 0.6, 0.0, 0.0], rtol=0, atol=1e-15)
     np.testing.assert_allclose(BODY.completed(np.array([0.0, 0.0, 1.0, 3.0, 4.0, 0.0]))[2:], [0.0, 0.6, 0.8, 0.0], rtol=0, atol=1e-15)
+
+
+def test_an_angle_in_degrees_is_the_same_after_360_of_them() -> None:
+    joint = Rotations.of([Signal("q", "deg", angle=True), Signal("r", "rad", angle=True)])
+    a, b = np.array([[170.0, 3.0]]), np.array([[-170.0, -3.0]])
+    np.testing.assert_allclose(joint.difference(a, b), [[-20.0, 6.0 - 2 * np.pi]], rtol=0, atol=1e-12)
+    near = a[0].copy()
+    joint.bring_near(near, b[0])
+    np.testing.assert_allclose(near, [-190.0, 3.0 - 2 * np.pi], rtol=0, atol=1e-12)
+    measured = np.array([540.0 + 1.0, 0.0])
+    joint.wrap(measured)
+    assert measured[0] == pytest.approx(-179.0)
+    rows = np.array([[179.0, 0.0], [-179.0, 0.0], [-177.0, 0.0]])
+    joint.unwrap(rows)
+    assert rows[:, 0].tolist() == [179.0, 181.0, 183.0]

@@ -82,7 +82,10 @@ MODEL = {
     "Signal of a number": (lambda: Signal(3, "m"), "name of the signal 3 must be text, got 3"),  # type: ignore[arg-type]
     "Signal without a unit": (lambda: Signal("x", None), "unit of the signal 'x' must be text, got None"),  # type: ignore[arg-type]
     "Signal whose angle is text": (lambda: Signal("x", "rad", angle="yes"), "angle of the signal 'x' must be true or false"),  # type: ignore[arg-type]
-    "Signal that is an angle in degrees": (lambda: Signal("psi", "deg", angle=True), "unit of the signal 'psi' must be rad for angle=True"),
+    "Signal that is an angle in revolutions": (
+        lambda: Signal("psi", "rev", angle=True),
+        "unit of the signal 'psi' must be rad or deg for angle=True",
+    ),
     "Signal without a name": (lambda: Signal(" ", "m"), "name of a signal must not be empty"),
 }
 

@@ -28,7 +28,7 @@ from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.message import Command, Notice, Severity, State
 from rti_mpc.contract.schedule import unfit
 from rti_mpc.errors import ConfigError, MessageError
-from rti_mpc.rotation import Rotations
+from rti_mpc.rotation import TURNS, Rotations
 from rti_mpc.wire.actuator import STALE_NS, Actuator
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, new_epoch
@@ -58,7 +58,7 @@ class RobotAdapter:
         inputs: Mapping[str, tuple[float, float]],
         increments: Mapping[str, tuple[float, float]],
         u_rest: Mapping[str, float] | None = None,
-        angles: Sequence[bool] = (),
+        angles: Sequence[bool | str] = (),
         quaternions: Sequence[Sequence[int]] = (),
         guarded: bool = False,
         prefix: str = "rti_mpc",
@@ -75,8 +75,8 @@ class RobotAdapter:
                 the same inputs in another order are refused.
             increments: Slew limits over `dt_s`, ``ocp.bounds.increments``; an input that is left out has none.
             u_rest: Inputs at rest that are not 0.
-            angles: Which states are angles, in the order of the model, for a robot that needs feedback to stay at rest: then the states
-                that are sent correct its way to rest. Left out: the rows of the way act as they are.
+            angles: Which states are angles, in the order of the model, in rad or by their unit, rad or deg, for a robot that needs feedback to
+                stay at rest: then the states that are sent correct its way to rest. Left out: the rows of the way act as they are.
             quaternions: Places of w, x, y and z of each attitude among them.
             guarded: Whether a guard runs: then only what it passes on is taken.
             prefix: What all keys begin with.
@@ -254,17 +254,18 @@ def check_limits(
             raise ConfigError(f"increments.{name} must go from below 0 to above 0, got {[lower, upper]}")
 
 
-def known_rotations(angles: Sequence[bool], quaternions: Sequence[Sequence[int]]) -> Rotations:
+def known_rotations(angles: Sequence[bool | str], quaternions: Sequence[Sequence[int]]) -> Rotations:
     """
     Return the rotations among the states of a robot.
 
     Raises:
         ConfigError: One is not among its states.
     """
-    if not all(isinstance(angle, bool | np.bool_) for angle in angles):
-        raise ConfigError(f"angles must say of each state whether it is an angle, such as [False, True], got {list(angles)}")
+    if not all(isinstance(angle, bool | np.bool_) or angle in TURNS for angle in angles):
+        raise ConfigError(f"angles must say of each state whether it is an angle, such as [False, True] or [False, 'deg'], got {list(angles)}")
     plain = [i for i, angle in enumerate(angles) if not angle]
     for places in quaternions:
         if len(places) != 4 or len(set(places)) < 4 or not all(place in plain for place in places):
             raise ConfigError(f"quaternions must be places of w, x, y, z among the states, of none that is an angle, got {list(places)}")
-    return Rotations(len(angles), tuple(np.flatnonzero(angles).tolist()), tuple((w, x, y, z) for w, x, y, z in quaternions))
+    turns = {i: TURNS[angle if isinstance(angle, str) else "rad"] for i, angle in enumerate(angles) if angle}
+    return Rotations(len(angles), tuple(turns), tuple((w, x, y, z) for w, x, y, z in quaternions), tuple(turns.values()))

@@ -25,7 +25,7 @@ from rti_mpc.rotation import whole_turns
 from rti_mpc.rti.ocp import Ocp
 
 HYSTERESIS_RAD = 0.3  # an error must exceed half a turn by this much before the other way round is taken
-MAX_ERROR_RAD = math.pi + HYSTERESIS_RAD
+MAX_ERROR_TURNS = 0.5 + HYSTERESIS_RAD / math.tau
 
 
 class Turns:
@@ -60,8 +60,9 @@ class Turns:
         output, steps = functions
         self._output = bind(output, {"x": x0, "p": p[0]}, {"y": y})
         self._rotations = model.rotations("states")
-        self._outputs = model.rotations("outputs").angles
-        self._bounded = [j for j in self._rotations.angles if bounds[1][j] - bounds[0][j] <= math.tau]
+        outputs, states = model.rotations("outputs"), self._rotations
+        self._outputs = dict(zip(outputs.angles, outputs.turns, strict=True))  # a whole turn of each output that is an angle
+        self._bounded = {j: turn for j, turn in zip(states.angles, states.turns, strict=True) if bounds[1][j] - bounds[0][j] <= turn}
         largest: Array = np.zeros(len(self._outputs))
         self._largest = largest.data
         self._measure = bind(steps, {"y_ref": y_ref}, {"largest": largest})
@@ -77,9 +78,9 @@ class Turns:
         if not self._outputs:
             return
         self._measure()
-        for j, largest in zip(self._outputs, self._largest, strict=True):
-            if largest >= math.pi:
-                self._y_ref[:, j] = np.unwrap(self._y_ref[:, j])
+        for (j, turn), largest in zip(self._outputs.items(), self._largest, strict=True):
+            if largest >= turn / 2:
+                self._y_ref[:, j] = np.unwrap(self._y_ref[:, j], period=turn)
             if self._added[j]:
                 self._y_ref[:, j] += self._added[j]
 
@@ -93,20 +94,20 @@ class Turns:
         """Bring a new initial state, the guess and the reference into the same turn; return whether guess or reference have changed."""
         changed = False
         self._rotations.bring_near(self._x0, self._guess)
-        for j in self._bounded:
+        for j, turn in self._bounded.items():
             beyond = self._x0[j] - 0.5 * float(self._lbx[j] + self._ubx[j])
-            if abs(beyond) > MAX_ERROR_RAD:
-                turns = whole_turns(beyond)
+            if abs(beyond) > MAX_ERROR_TURNS * turn:
+                turns = whole_turns(beyond, turn)
                 self._x0[j] -= turns
                 self._x[:, j] -= turns
                 changed = True
         if self._outputs:
             self._output()
-        for j in self._outputs:
+        for j, turn in self._outputs.items():
             error = self._y[j] - self._y_first[j]
-            turns = whole_turns(error - self._errors[j])
-            if abs(error - turns) > MAX_ERROR_RAD:
-                turns = whole_turns(error)
+            turns = whole_turns(error - self._errors[j], turn)
+            if abs(error - turns) > MAX_ERROR_TURNS * turn:
+                turns = whole_turns(error, turn)
             if turns:
                 self._y_ref[:, j] += turns
                 self._added[j] += turns

@@ -33,6 +33,7 @@ from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled, function
 from rti_mpc.model.integrator import integrator, sensitivities
 from rti_mpc.model.model import Model, depends_on
+from rti_mpc.rotation import TURNS
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.riccati import cholesky, cholesky_solve
 from rti_mpc.rti.tangent import tangent
@@ -280,8 +281,8 @@ def to_equilibrium(model: Model, law: StopLaw, steps: int) -> ca.Function:
     at = ca.vertcat(x, u)
     for _ in range(steps):
         at = nearer(at, p)
-    turns = ca.DM([2.0 * np.pi if signal.angle else 0.0 for signal in (*model.states, *model.inputs)])
-    at -= turns * ca.floor((at - ca.vertcat(x, u)) / (2.0 * np.pi) + 0.5)
+    turns = np.array([TURNS[signal.unit] if signal.angle else np.inf for signal in (*model.states, *model.inputs)])
+    at -= ca.DM(np.where(np.isfinite(turns), turns, 0.0)) * ca.floor((at - ca.vertcat(x, u)) / ca.DM(turns) + 0.5)
     return function("equilibrium", {"x": x, "u": u, "p": p}, {"x_e": at[: model.nx], "u_e": at[model.nx :]})
 
 

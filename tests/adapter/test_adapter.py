@@ -196,6 +196,15 @@ def test_way_to_rest_with_a_gain_is_corrected_by_what_the_robot_measures_angles_
     assert scene.acts(300) == [0.0, 0.0], "the last state is too old"
 
 
+def test_angles_in_degrees_are_corrected_modulo_360_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = Scene(monkeypatch, angles=[False, "deg"])
+    scene.robot.send([0.0, 0.0])
+    scene.command([[0.1, 0.1]], valid_until_ns=scene.now_ns + 100 * MS, **way())
+    assert [scene.acts(50), scene.acts(150)] == [[0.1, 0.1], [0.0, 0.0]]
+    scene.robot.send([0.0, 0.5 - 720.0])
+    assert scene.acts(10) == pytest.approx([0.0, -0.1])
+
+
 def test_robot_that_drifts_is_kept_where_it_rests_once_its_controller_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
     """A mass that something pushes, driven by its acceleration: only with its states does it stay, within what the gain leaves."""
     found = {}
@@ -228,7 +237,7 @@ def test_state_of_another_size_than_its_angles_is_refused(monkeypatch: pytest.Mo
         ({"increments": {"v": [-1, 1]}}, "increments.v must be one of the inputs v_c, kappa"),
         ({"u_rest": {"v": 1}}, "u_rest.v must be one of the inputs v_c, kappa"),
         ({"u_rest": {"v_c": 2.0}}, "inputs.v_c must hold the input at rest, 2, got [-1.0, 1.0]"),
-        ({"angles": ["psi"]}, "angles must say of each state whether it is an angle, such as [False, True], got ['psi']"),
+        ({"angles": ["psi"]}, "angles must say of each state whether it is an angle, such as [False, True] or [False, 'deg'], got ['psi']"),
         (
             {"quaternions": [[0, 1, 2]]},
             "quaternions must be places of w, x, y, z among the states, of none that is an angle, got [0, 1, 2]",

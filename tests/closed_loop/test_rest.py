@@ -58,7 +58,7 @@ def driven(name: str) -> tuple[Controller, Lockstep, Run]:
     return controller, body, run
 
 
-@pytest.mark.parametrize("name", slow_but(MOTIONS, "car", "quadrotor"))
+@pytest.mark.parametrize("name", slow_but(MOTIONS, "car", "arm"))
 def test_stop_brings_the_robot_to_rest_and_it_stays_there(name: str) -> None:
     controller, body, run = driven(name)
     assert np.abs(rates(name, body.x, body.u)).max() > 0.2, "it moves"
@@ -97,7 +97,7 @@ def played(name: str, command: Command, x: Array, from_ns: int, span_s: float, h
     return x, u
 
 
-@pytest.mark.parametrize("name", slow_but(MOTIONS, "car", "quadrotor"))
+@pytest.mark.parametrize("name", slow_but(MOTIONS, "car", "arm"))
 def test_last_command_of_a_controller_that_dies_brings_the_robot_to_rest(name: str) -> None:
     _, body, run = driven(name)
     last = run.commands[-1]
@@ -129,7 +129,7 @@ def test_stop_whose_rows_last_several_periods_is_followed_by_the_rest_of_its_way
     assert abs(x[3]) < STILL
 
 
-@pytest.mark.parametrize("name", slow_but(MOTIONS, "car", "quadrotor"))
+@pytest.mark.parametrize("name", slow_but(MOTIONS, "car", "arm"))
 def test_controller_that_is_late_leaves_the_robot_on_the_way_that_its_states_correct(name: str) -> None:
     """A way from a state of 0.2 s ago would replace one that newer states correct: a quadrotor tumbles then."""
     controller, body, _ = driven(name)

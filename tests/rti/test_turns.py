@@ -13,10 +13,11 @@ from rti_mpc.array import Array
 from rti_mpc.model.model import Model, Signal
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
-from rti_mpc.rti.turns import MAX_ERROR_RAD
+from rti_mpc.rti.turns import MAX_ERROR_TURNS
 from tests.problems import beacon
 
 TURN = 2 * np.pi
+MAX_ERROR_RAD = MAX_ERROR_TURNS * TURN
 SOLVERS = ("riccati", "osqp", "daqp")
 
 
@@ -156,3 +157,27 @@ def test_angle_with_bounds_is_taken_in_the_turn_of_its_bounds(solver: str, middl
     assert rti.x[0, 0] == pytest.approx(middle + 1.0)
     assert rti.violation == 0.0
     assert rti.u[0, 0] > 0.1  # rad/s, the short way
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_angle_in_degrees_turns_at_360(solver: str) -> None:
+    """A turret commanded in degrees, its states and references wrapped there, does what one in rad does."""
+    degrees = 180 / np.pi
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    psi = (Signal("psi", "deg", angle=True),)
+    model = Model(name="turret", x=x, u=u, f_expl_expr=u, y_expr=x, states=psi, inputs=(Signal("w", "deg/s"),), outputs=psi)
+    scaled = {"Q": [degrees**-2], "R": [0.05 * degrees**-2], "lbu": -degrees, "ubu": degrees}
+    plain = Rti(turret(), solver=solver, compile=False)
+    other = Rti(Ocp(model, N=8, dt=0.1, **scaled), solver=solver, compile=False)
+    start, state = 3.0, 3.0
+    plain.reset(np.array([start]), np.zeros(1))
+    other.reset(np.array([start * degrees]), np.zeros(1))
+    for k in range(40):
+        rows = 3.0 + 0.08 * np.arange(k + 1, k + 9)[:, None]  # through half a turn, and on
+        plain.prepare(rows)
+        other.prepare(degrees * wrap(rows))
+        plain.feedback(np.array([state]))
+        other.feedback(degrees * wrap(np.array([state])))
+        np.testing.assert_allclose(other.u / degrees, plain.u, rtol=0, atol=1e-6)
+        state += 0.1 * plain.u[0, 0]
+    assert state > np.pi + 1.0

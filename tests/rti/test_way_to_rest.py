@@ -45,7 +45,7 @@ def rates(way: WayToRest, name: str, row: int) -> Array:
     return np.array(f(way.x[row], way.u[row], model.p_nominal)).ravel()
 
 
-@pytest.mark.parametrize("name", slow_but(CLASSES, "pioneer", "car", "quadrotor"))
+@pytest.mark.parametrize("name", slow_but(CLASSES, "pioneer", "car", "arm"))
 def test_robot_is_classified_by_what_it_does_at_rest(name: str) -> None:
     rest = assess(ocp_of(name), law_of(name), 40, compile=False)
     assert rest.kind is CLASSES[name]

@@ -31,6 +31,7 @@ from rti_mpc_service.tune.recorded import as_recorded
 from rti_mpc_service.tune.recorded_robot import RecordedRobot, read
 from rti_mpc_service.tune.windows import MIN_STEPS, MIN_WINDOWS, Windows, windows_of
 from tests.robots import SHIPPED
+from tests.slow import slow_but
 
 NOISE = {"x": 0.005, "y": 0.005, "psi": 0.01, "u": 0.01, "omega": 0.02}
 SIM = {"noise_std": NOISE, "actuator_delay_s": 0.06, "actuator_lag_s": 0.12}
@@ -162,7 +163,7 @@ def motor(dt_ms: int, delay_ms: int = 60, lag_ms: float = 120.0, duration_ms: in
     return windows_of(model, states, commands, 0.001 * dt_ms)
 
 
-@pytest.mark.parametrize("dt_ms", [20, 10])
+@pytest.mark.parametrize("dt_ms", slow_but([20, 10], 20))
 def test_delay_and_lag_are_found_in_seconds_whatever_the_period(dt_ms: int) -> None:
     """At 100 Hz a delay of 60 ms was found as none: a window lasted 80 ms."""
     found = identified(motor(dt_ms))
