@@ -65,16 +65,16 @@ class Track:
             reference: The message as it came.
             right_np: Number of parameters that a row may have.
         """
-        right_ny = self.y_ref.shape[1]
-        if reference.y.ndim != 2 or reference.p.ndim != 2 or len(reference.p) != len(reference.y):
-            return f"a reference must have as many rows of parameters as of outputs, got shapes {reference.p.shape} and {reference.y.shape}"
+        right_ny, shapes = self.y_ref.shape[1], f"{reference.y.shape} and {reference.p.shape}"
+        if reference.y.ndim != 2 or reference.p.ndim != 2:
+            return f"a reference must be tables of outputs and of parameters, got shapes {shapes}"
         (rows, ny), np_ = reference.y.shape, reference.p.shape[1]
-        if rows >= 1 and ny == right_ny and np_ in (0, right_np) and reference.period_ns > 0:
-            return ""
-        return (
-            f"a reference must have rows of {right_ny} outputs and of 0 or {right_np} parameters, and a positive period, "
-            f"got {rows} rows of {ny} and {np_}, {reference.period_ns} ns"
-        )
+        if rows < 1 or ny != right_ny or np_ not in (0, right_np) or reference.period_ns <= 0:
+            return (
+                f"a reference must have rows of {right_ny} outputs and of 0 or {right_np} parameters, and a positive period, "
+                f"got {rows} rows of {ny} and {np_}, {reference.period_ns} ns"
+            )
+        return "" if len(reference.p) == rows else f"a reference must have as many rows of parameters as of outputs, got shapes {shapes}"
 
     def lay_out(self, reference: Reference) -> Array:
         """

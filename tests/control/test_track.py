@@ -127,7 +127,14 @@ def test_compiled_and_interpreted_rows_are_the_same_bit_for_bit() -> None:
             assert all(track.y_ref.tobytes() + track.p.tobytes() == tracks[0].y_ref.tobytes() + tracks[0].p.tobytes() for track in tracks)
 
 
-@pytest.mark.parametrize(("y", "p"), [(np.zeros((4, 3)), np.zeros((3, 7))), (np.zeros(3), np.zeros((1, 0))), (np.zeros((4, 3)), np.zeros(0))])
-def test_rows_that_do_not_fit_each_other_are_told(y: Array, p: Array) -> None:
+@pytest.mark.parametrize(
+    ("y", "p", "said"),
+    [
+        (np.zeros((4, 3)), np.zeros((3, 7)), "as many rows of parameters as of outputs, got shapes (4, 3) and (3, 7)"),
+        (np.zeros(3), np.zeros((1, 0)), "tables of outputs and of parameters, got shapes (3,) and (1, 0)"),
+        (np.zeros((4, 3)), np.zeros(0), "tables of outputs and of parameters, got shapes (4, 3) and (0,)"),
+    ],
+)
+def test_tables_that_do_not_fit_each_other_are_told(y: Array, p: Array, said: str) -> None:
     track = Track(pioneer_3dx(), N, 100 * MS, compile=False)
-    assert track.misfit(Reference(1, 1, 0, 20 * MS, End.HOLD, y, p), 7).startswith("a reference must have as many rows of parameters as of outputs")
+    assert said in track.misfit(Reference(1, 1, 0, 20 * MS, End.HOLD, y, p), 7)
