@@ -51,6 +51,7 @@ ANY_NAME = str.maketrans(dict.fromkeys("*?[]", "x"))  # makes a name of a patter
 EVERYTHING = Retention()
 
 MEDIA_TYPES = {".toml": "application/toml", ".py": "text/x-python", ".json": "application/json"}
+MIN_LAST_S = 30.0  # that a ring of segments keeps: a controller takes a snapshot every 10 s, or later if it has no slack
 UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
 UNITS_BYTES = {"KB": 10**3, "MB": 10**6, "GB": 10**9}
 
@@ -299,10 +300,12 @@ def parse_retention(last: str | None, max_size: str | None) -> Retention:
     Return limits as they are written on the command line.
 
     Raises:
-        ConfigError: They are no time such as ``10min``, or no size such as ``2GB``.
+        ConfigError: They are no time such as ``10min``, or one in which no snapshot may lie, or no size such as ``2GB``.
     """
-    size = _quantity("max-size", max_size, UNITS_BYTES, "2GB")
-    return Retention(_quantity("last", last, UNITS_S, "10min"), None if size is None else round(size))
+    last_s, size = _quantity("last", last, UNITS_S, "10min"), _quantity("max-size", max_size, UNITS_BYTES, "2GB")
+    if last_s is not None and last_s < MIN_LAST_S:
+        raise ConfigError(f"--last must be at least {MIN_LAST_S:g}s, for a replay to begin at a snapshot of the controller, got {last!r}")
+    return Retention(last_s, None if size is None else round(size))
 
 
 def _quantity(option: str, text: str | None, units: Mapping[str, float], example: str) -> float | None:

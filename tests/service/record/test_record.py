@@ -281,7 +281,16 @@ def test_limits_are_read(words: tuple[str | None, str | None], expected: tuple[f
     assert (retention.last_s, retention.max_bytes) == expected
 
 
-@pytest.mark.parametrize(("last", "size", "said"), [("10", None, "--last"), ("0s", None, "--last"), (None, "2", "--max-size"), (None, "-1GB", "2GB")])
+@pytest.mark.parametrize(
+    ("last", "size", "said"),
+    [
+        ("10", None, "--last"),
+        ("0s", None, "--last"),
+        ("10s", None, "--last must be at least 30s, for a replay to begin at a snapshot"),
+        (None, "2", "--max-size"),
+        (None, "-1GB", "2GB"),
+    ],
+)
 def test_limits_that_are_none_are_refused(last: str | None, size: str | None, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         parse_retention(last, size)
