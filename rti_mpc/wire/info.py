@@ -300,12 +300,14 @@ class Leader:
         seq: Sequence number of the description.
         config_hash: Hash of its configuration.
         parameters: Version and changes of its parameters as they came, see `parameters`; None if the description has none.
+        model_hash: Hash of its model's equations, text; empty if the description has none.
     """
 
     epoch: int
     seq: int
     config_hash: int
     parameters: Any = None
+    model_hash: str = ""
 
     @classmethod
     def from_received(cls, received: Received, highest: int) -> Leader | None:
@@ -318,7 +320,9 @@ class Leader:
         if not all(type(number) is int and number >= 0 for number in numbers):
             return None
         epoch, seq, config_hash = numbers
-        return cls(epoch, seq, config_hash, document.get("parameters")) if epoch <= highest else None
+        model_hash = document.get("model_hash")
+        known = model_hash if isinstance(model_hash, str) and len(model_hash) <= MAX_TEXT_CHARS else ""
+        return cls(epoch, seq, config_hash, document.get("parameters"), known) if epoch <= highest else None
 
 
 def _few(values: Sequence[Any]) -> Sequence[Any]:

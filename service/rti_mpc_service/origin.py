@@ -106,6 +106,12 @@ def model_equations(model: Model) -> str:
     return "\n".join([f"model: {model.name}", *names, *equations, f"y: {model.y_expr}", f"p: {list(model.p_nominal)}", ""])
 
 
+def model_hash(model: Model) -> str:
+    """Return the hash of all that a controller knows of its model: of one name, two hosts may have other code."""
+    content = f"{model_equations(model)}h: {model.h_expr}\nstop: {model.stop_expr}\nat rest: {model.u_rest}\n"
+    return sha256(content.encode()).hexdigest()[:16]
+
+
 def code_hash() -> str:
     """Return the hash of the library's Python files: two processes with the same one run the same code."""
     folder, digest = Path(rti_mpc.__file__).parent, sha256()

@@ -29,7 +29,6 @@ from threading import Condition, Event, Lock, Thread
 from typing import Any
 
 from rti_mpc.contract.latch import Latch
-from rti_mpc.contract.leadership import differ
 from rti_mpc.contract.message import Command, Notice, Severity, State
 from rti_mpc.control.controller import Controller
 from rti_mpc.errors import ConfigError
@@ -56,7 +55,7 @@ from rti_mpc_service.description import check_length, controller_info, fitting
 from rti_mpc_service.host import realtime
 from rti_mpc_service.latch_file import LatchFile
 from rti_mpc_service.operator_stop import OperatorStop
-from rti_mpc_service.origin import Origin, origin_files
+from rti_mpc_service.origin import Origin, model_hash, origin_files
 from rti_mpc_service.warm_up import warm_up
 
 TICK_PERIOD_S = 0.01  # period of the check for silence
@@ -111,8 +110,8 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
         operator_stop = OperatorStop(LatchFile(bus.keys, state), obey, controller.say)
         operator_stop.listen(bus)
         others = hear_others(bus, stop)
-        if standby and others.config_hash not in (None, config.config_hash):
-            raise ConfigError(differ(others.config_hash, config.config_hash))
+        if standby and (misfit := others.misfit(config.config_hash, model_hash(rti.ocp.model))):
+            raise ConfigError(misfit)
         if not standby and bus.is_alive(LEADER, LISTEN_BEFORE_START_S):
             print(
                 f"rti-mpc: {config.robot} already has a controller: stop it first, run this one with --standby, or give this robot another name",
@@ -164,6 +163,7 @@ class Daemon:
         keys, model = bus.keys, rti.ocp.model
         self._config = config
         self._formulation = rti.formulation
+        self._model_hash = model_hash(rti.ocp.model)
         self._controller = controller
         self._bus = bus
         self._leadership = leadership
@@ -364,7 +364,7 @@ class Daemon:
             role, config = self._leadership.role, self._config
             self._told += 1
             life = {"role": role, "epoch": self._leadership.epoch, "seq": self._told}
-            about = {**life, "config_hash": config.config_hash, "stale_s": config.stale_s}
+            about = {**life, "config_hash": config.config_hash, "model_hash": self._model_hash, "stale_s": config.stale_s}
             model = {**controller_info(self._params.ocp, self._controller.np_), "formulation": self._formulation, "realtime": self._granted}
             description, said = fitting({**model, **about, **self.orders.orders_info()})
             self._bus.publish_json(self._bus.keys.info(role), description)

@@ -16,7 +16,7 @@ from threading import Event
 from typing import Any
 
 from rti_mpc.contract.epoch import NUMBER_BITS, highest_believed
-from rti_mpc.contract.leadership import MIN_SILENCE_S, Leadership
+from rti_mpc.contract.leadership import MIN_SILENCE_S, Leadership, differ
 from rti_mpc.contract.message import Command, State
 from rti_mpc.contract.status import Mode
 from rti_mpc.control.controller import Controller
@@ -38,11 +38,22 @@ class Others:
 
     Attributes:
         epoch: Highest epoch of a controller or a guard, 0 if there is none.
-        config_hash: Configuration hash of the leading controller, None if there is none.
+        leader: Description of the leading controller, None if there is none.
     """
 
     epoch: int
-    config_hash: int | None
+    leader: Leader | None = None
+
+    def misfit(self, config_hash: int, model_hash: str) -> str:
+        """Return why a controller with these hashes cannot stand by the leader; empty if it can, or if nobody leads."""
+        leader = self.leader
+        if leader is None:
+            return ""
+        if leader.config_hash != config_hash:
+            return differ(leader.config_hash, config_hash)
+        if leader.model_hash in ("", model_hash):
+            return ""
+        return f"a standby needs the leader's model: the hash of its equations is {leader.model_hash}, this standby's {model_hash}"
 
 
 def hear_others(bus: Bus, stop: Event) -> Others:
@@ -55,7 +66,7 @@ def hear_others(bus: Bus, stop: Event) -> Others:
     highest = highest_believed(unix_s(), epoch, choosing=True)
     leaders = [leader for received in infos.drain() if (leader := Leader.from_received(received, highest)) is not None]
     leader = max(leaders, key=lambda leader: (leader.epoch, leader.seq), default=None)
-    return Others(epoch, None) if leader is None else Others(max(epoch, leader.epoch), leader.config_hash)
+    return Others(epoch if leader is None else max(epoch, leader.epoch), leader)
 
 
 class Candidate:

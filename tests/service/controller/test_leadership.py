@@ -14,11 +14,14 @@ import pytest
 from rti_mpc.contract.epoch import highest_believed
 from rti_mpc.contract.message import Command, Notice, State
 from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.wire.bus import Received, unix_s
 from rti_mpc.wire.cdr import encode, encoding
+from rti_mpc.wire.info import Leader
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.controller.leadership import MAX_BYTES_PER_LOOK, MAX_MESSAGES_PER_LOOK, Candidate, Others
+from rti_mpc_service.origin import model_hash
 
 DT_S = 0.1
 DT_NS = 100_000_000
@@ -112,7 +115,7 @@ class One:
     def __init__(self, wire: Wire, *, standby: bool) -> None:
         self.bus, self.puppet, self.wire = WireBus(wire), Puppet(), wire
         bus, puppet = cast(Any, self.bus), cast(Any, self.puppet)
-        self.leadership = Candidate(bus, puppet, Others(0, None), config_hash=HASH, dt_s=DT_S, nu=1, standby=standby)
+        self.leadership = Candidate(bus, puppet, Others(0), config_hash=HASH, dt_s=DT_S, nu=1, standby=standby)
         self.leadership.declare()
         self._seq = 0
 
@@ -232,3 +235,17 @@ def test_leader_that_slept_finds_out_within_the_time_it_listens_though_all_that_
     assert not leader.see(7)
     leader.leadership.listen(7 * DT_NS + 10_000_000)
     assert leader.leadership.role == "standby"
+
+
+def test_standby_fits_a_leader_of_the_same_configuration_whose_model_has_the_same_equations() -> None:
+    ours = model_hash(pioneer_3dx())
+    longer = model_hash(pioneer_3dx().with_parameters(a=0.3))
+    assert ours == model_hash(pioneer_3dx()) != longer
+    assert Others(0).misfit(1, ours) == ""
+    for leader, said in (
+        (Leader(9, 1, 1, None, ours), ""),
+        (Leader(9, 1, 1), ""),  # of a version that does not tell
+        (Leader(9, 1, 2, None, ours), "a standby needs the leader's configuration: its hash is 0000000000000002, this standby's 0000000000000001"),
+        (Leader(9, 1, 1, None, longer), f"a standby needs the leader's model: the hash of its equations is {longer}, this standby's {ours}"),
+    ):
+        assert Others(9, leader).misfit(1, ours) == said
