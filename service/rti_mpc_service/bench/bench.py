@@ -12,7 +12,6 @@ instead of as a whole.
 from __future__ import annotations
 
 import gc
-import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -37,6 +36,7 @@ from rti_mpc_service.bench.parts import PARTS, Parts
 from rti_mpc_service.bench.yardstick import Ipopt
 from rti_mpc_service.console import table_console
 from rti_mpc_service.host import machine
+from rti_mpc_service.json_text import json_text
 
 DEFAULT_HORIZONS = (7, 20, 50, 100, 200)
 DEFAULT_ENTRIES = (("riccati", "simultaneous"), ("osqp", "simultaneous"), ("osqp", "sequential"))
@@ -254,7 +254,7 @@ def main(
             result += found
     print_tables(console, result, costs=costs)
     if path is not None:
-        path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+        path.write_text(json_text(result) + "\n", encoding="utf-8")
     return 0
 
 

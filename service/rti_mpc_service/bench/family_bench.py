@@ -10,7 +10,6 @@ do not matter. Times are CPU times of this thread.
 from __future__ import annotations
 
 import gc
-import json
 import os
 import resource
 import tempfile
@@ -36,6 +35,7 @@ from rti_mpc_service.bench.families import FAMILIES, Family
 from rti_mpc_service.bench.yardstick import Ipopt
 from rti_mpc_service.console import table_console
 from rti_mpc_service.host import machine
+from rti_mpc_service.json_text import json_text
 
 COPIES_PER_SAMPLE = 5  # controllers that solve the same sample, whose shortest time counts
 DEFAULT_SOLVERS = ("riccati", "osqp")
@@ -161,7 +161,7 @@ def main(names: Sequence[str], horizons: Sequence[int], solvers: Sequence[str], 
                     rows.append({"problem": name, "N": N, "solver": solver, **row})
     print_table(console, rows)
     if path is not None:
-        path.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        path.write_text(json_text(rows) + "\n", encoding="utf-8")
     return 0
 
 

@@ -9,7 +9,6 @@ use the name meanwhile.
 
 from __future__ import annotations
 
-import json
 import secrets
 import time
 from collections.abc import Iterator, Sequence
@@ -37,6 +36,7 @@ from rti_mpc_service.conformance.stand import Stand
 from rti_mpc_service.console import plain_console
 from rti_mpc_service.entry import EXIT_FAILED, say
 from rti_mpc_service.host.hold_up import Host, Unwitnessed
+from rti_mpc_service.json_text import json_text
 
 WHAT = ("robot", "guard")
 LISTEN_BEFORE_START_S = 1.0  # how long a test listens for others before it moves anything
@@ -103,7 +103,7 @@ def main(config: Config, bus_settings: BusSettings, words: Sequence[str], path: 
                 return EXIT_FAILED
     conclude(console, f"{what} of {config.robot}", found)
     if path is not None:
-        path.write_text(json.dumps([judgement.to_json() for judgement in found], indent=1) + "\n", encoding="utf-8")
+        path.write_text(json_text([judgement.to_json() for judgement in found]) + "\n", encoding="utf-8")
     return 0 if len(found) == count and all(judgement.verdict in ("yes", "host") for judgement in found) else EXIT_FAILED
 
 

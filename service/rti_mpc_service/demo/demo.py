@@ -10,7 +10,6 @@ for long enough. Robot and controller have priority over all others.
 
 from __future__ import annotations
 
-import json
 import re
 import sys
 import time
@@ -43,6 +42,7 @@ from rti_mpc_service.demo.board import Board, print_summary
 from rti_mpc_service.host import machine
 from rti_mpc_service.host.echo import ROLE as ECHO
 from rti_mpc_service.host.echo import Echo
+from rti_mpc_service.json_text import json_text
 from rti_mpc_service.path_reference import path_of_options, path_scenario
 from rti_mpc_service.rig import robot_log
 from rti_mpc_service.rig.children import Children
@@ -317,7 +317,7 @@ def error_text(model: Model, sample: Telemetry, reference: Reference) -> str:
 def conclude(run: DemoPlan, outcome: Outcome, console: Console) -> int:
     """Write and print the summary of a run, draw it, and print how to view it; return the exit status."""
     summary = {**summarize(outcome), "heading": run.scenario.heading, "machine": machine.machine_info()}
-    (run.folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    (run.folder / "summary.json").write_text(json_text(summary) + "\n", encoding="utf-8")
     if not summary["samples"]:
         console.print(f"rti-mpc: nothing was driven, see {run.folder / 'logs'}", soft_wrap=True)
         return 1

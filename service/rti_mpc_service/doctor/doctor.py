@@ -10,7 +10,6 @@ this configuration take after a pause, with caches as cold as in a service.
 from __future__ import annotations
 
 import gc
-import json
 import shutil
 import subprocess
 import tempfile
@@ -41,6 +40,7 @@ from rti_mpc_service.host import machine, realtime
 from rti_mpc_service.host.echo import ROLE as ECHO
 from rti_mpc_service.host.echo import Pinger
 from rti_mpc_service.host.jitter import bare_timer
+from rti_mpc_service.json_text import json_text
 from rti_mpc_service.rig.children import Children
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.rig.summary import quantiles
@@ -65,7 +65,7 @@ def main(path: Path, json_path: Path | None = None) -> int:
     with console.status("measuring"):
         report = examine(config)
     if json_path is not None:
-        json_path.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+        json_path.write_text(json_text(report) + "\n", encoding="utf-8")
     table = Table("what", "here", "which means", box=None, padding=(0, 2, 0, 0))
     for row in finding_rows(report):
         table.add_row(*row)

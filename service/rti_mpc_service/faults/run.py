@@ -9,7 +9,6 @@ a new system is started.
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 import time
@@ -42,6 +41,7 @@ from rti_mpc_service.faults.report import MatrixReport, MatrixRow
 from rti_mpc_service.faults.system import System, Wiring
 from rti_mpc_service.faults.table import FAULTS, Fault
 from rti_mpc_service.host.hold_up import Host, Unwitnessed
+from rti_mpc_service.json_text import json_text
 from rti_mpc_service.rig.company import Failed
 from rti_mpc_service.rig.robot_log import RobotLog
 from rti_mpc_service.rig.scenario import BEST_HEADINGS, configured, reference_options
@@ -128,7 +128,7 @@ def main(
     else:
         console.print(f"what the processes said and the robot recorded: {folder}", soft_wrap=True)
     if path is not None:
-        path.write_text(json.dumps([row.to_json() for row in report.rows], indent=1) + "\n", encoding="utf-8")
+        path.write_text(json_text([row.to_json() for row in report.rows]) + "\n", encoding="utf-8")
     return 0 if report.kept and not stop.is_set() else 1
 
 

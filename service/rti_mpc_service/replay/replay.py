@@ -8,7 +8,6 @@ said first, and commands are compared within a tolerance.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
@@ -29,6 +28,7 @@ from rti_mpc_service.config.build import retuned
 from rti_mpc_service.config.fit import check_names, check_tree
 from rti_mpc_service.config.refusal import explain
 from rti_mpc_service.config.schema import Config
+from rti_mpc_service.json_text import json_text
 from rti_mpc_service.replay import coverage
 from rti_mpc_service.replay.closed_loop import compare
 from rti_mpc_service.replay.coverage import uncovered
@@ -141,7 +141,7 @@ def main(
     if json_path is not None:
         driven = closed_loops or [None] * len(accounts)
         results = [summary(account) | ({} if loop is None else {"closed_loop": loop}) for account, loop in zip(accounts, driven, strict=True)]
-        json_path.write_text(json.dumps(results, indent=1))
+        json_path.write_text(json_text(results))
     return status
 
 

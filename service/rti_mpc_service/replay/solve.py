@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rti_mpc.contract.status import DISAGREEMENT
 from rti_mpc_service.case import QpCase
+from rti_mpc_service.json_text import json_text
 from rti_mpc_service.replay.answer import answer, compared
 from rti_mpc_service.replay.trouble import cases_of
 from rti_mpc_service.replay.why import count
@@ -43,7 +43,7 @@ def main(path: Path, solvers: Sequence[str], *, folder: Path = Path(), trust: bo
             print("\n".join(lines(result)))
         results.append(result)
     if as_json:
-        print(json.dumps(results, indent=1))
+        print(json_text(results))
     elif not results:
         print("no sample has failed, and none was late")
     return int(any(one["status"] not in ("SOLVED", "INACCURATE") for result in results for one in result["answers"]))

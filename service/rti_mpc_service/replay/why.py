@@ -9,7 +9,6 @@ held, bit for bit.
 
 from __future__ import annotations
 
-import json
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -28,6 +27,7 @@ from rti_mpc.journal.replay import Difference, Replay
 from rti_mpc.recording.reader import Recording
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS
 from rti_mpc_service.case import QpCase, about_sample, solver_of, take
+from rti_mpc_service.json_text import json_text
 from rti_mpc_service.replay.place import Place, choose
 from rti_mpc_service.replay.plan import acting_bounds, cost_terms
 from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, journals, rebuild, repeat
@@ -92,7 +92,7 @@ def main(
     facts["times"], arrived_ns = phase_times(path, journal, place.command)
     facts["host"] = host_meanwhile(path, journal, arrived_ns)
     facts["other_controllers"] = [other.owner for other in found if other is not journal]
-    print(json.dumps(facts, indent=1) if as_json else "\n".join(lines(facts)))
+    print(json_text(facts) if as_json else "\n".join(lines(facts)))
     return 0
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import time
 from collections.abc import Mapping
@@ -20,6 +19,7 @@ from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.console import plain_console, widened
+from rti_mpc_service.json_text import json_text
 from rti_mpc_service.redrawn import Redrawn
 from rti_mpc_service.status.survey import Survey
 
@@ -67,7 +67,7 @@ def main(bus_settings: BusSettings, keys: Keys, *, named: bool, once: bool, as_j
         report, unconnected = robots.report(), bus.unconnected
     there = [robot for robot, of in report.items() if of["present"]]
     if as_json:
-        print(json.dumps({"prefix": keys.prefix, "robots": report}, indent=1))
+        print(json_text({"prefix": keys.prefix, "robots": report}))
     elif report:
         console = console if console.is_terminal else widened(console)
         console.print(shown(report, console))
