@@ -25,6 +25,7 @@ from rti_mpc.rti.qp.qp import Guess
 
 MAX_ROLL_OUTS = 6  # from the places of the last sample; more are needed only when many places change at once
 MAX_STEPS = 50  # of the interior point, for each QP that a sample may have; all of its QPs share the sum
+STEPS_TO_GO_ON = 5.5  # the same, after which a sample begins no other QP, which would take as many
 MAX_ROLL_OUTS_HANDED_BACK = 2  # from places that the interior point has found
 START_RANGE = 1.0, 1e16  # limits of the product of distance and multiplier at its start, otherwise the duality gap: with less, first steps are short
 START_FAR = 1e6  # the same of a second try, after one that gave no numbers
@@ -115,6 +116,11 @@ class ActiveSet:
         """Begin a sample that may have so many QPs."""
         self._qps, self.steps = qps, 0
         self._keeps = False
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether the sample may begin another QP."""
+        return self.steps <= STEPS_TO_GO_ON * self._qps
 
     def forget(self) -> None:
         """Start cold, with no bound acting."""

@@ -140,6 +140,7 @@ class Rti:
         self.status = QpStatus.NONE
         self.retuned = 0
         self._pending = False  # whether a sample was prepared and has had no feedback
+        self._settled = False  # whether a sample since the last start has ended with a small step
         self._violation: Array = np.zeros(2)  # of softened bounds, as it is and relative to their scales
         change: Array = np.zeros(1)
         self._change = change.data
@@ -226,7 +227,7 @@ class Rti:
         self.u_prev[:] = self.u_before[:] = given.array("u_prev", u_prev, self.u_prev.shape)
         self.u[:] = np.clip(self.u_prev, self.ocp.lbu, self.ocp.ubu)
         self._stay_at(x0)
-        self._pending = False
+        self._pending = self._settled = False
         self._turns.forget()
         self._backup = self.solvers[0]
         self._loaded = False
@@ -421,6 +422,7 @@ class Rti:
             self._iterate()
         if self.status is SOLVED and self.active_set is not None:
             self.status = self._certified(self.active_set)
+        self._settled |= self._change[0] <= self.tolerance
         return self.status
 
     @property
@@ -467,6 +469,8 @@ class Rti:
     def _iterate(self) -> None:
         """Iterate at the plan while the step is large; an iteration that fails leaves the plan of the one before."""
         while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
+            if self._settled and self.active_set is not None and not self.active_set.goes_on:
+                break  # the next sample goes on; after a start, a plan that is left early may lead nowhere
             self._relinearize()
             if not (status := self.solve()).usable:
                 self.status = INACCURATE  # the plan comes from an earlier QP, which cannot be certified any more

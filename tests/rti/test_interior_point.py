@@ -14,6 +14,7 @@ from rti_mpc.rti import active_set
 from rti_mpc.rti.active_set import ActiveSet
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.bench.families import FAMILIES, Family
+from tests.problems import pioneer
 from tests.rti.test_active_set import PROBLEMS, samples
 
 MOST = 2 * active_set.MAX_ROLL_OUTS + 1 + active_set.MAX_STEPS * 3  # roll-outs and steps of a QP
@@ -141,3 +142,24 @@ def test_families_whose_places_do_not_settle_are_solved_in_a_bounded_number_of_r
         stepped += one.steps > 0
     assert most <= MOST
     assert stepped > 0
+
+
+@pytest.mark.parametrize(("limit", "after_a_start", "later"), [(active_set.STEPS_TO_GO_ON, 3, 3), (-1.0, 3, 1)])
+def test_sample_begins_no_other_qp_after_more_steps_than_the_limit_unless_it_follows_a_start(
+    limit: float, after_a_start: int, later: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A limit below the 0 steps that these samples take, so that nothing else decides; a jump of the reference moves the plan far."""
+    monkeypatch.setattr(active_set, "STEPS_TO_GO_ON", limit)
+    rti = Rti(pioneer(), compile=False)
+    x0, near, far = np.zeros(5), np.zeros((rti.ocp.N, 3)), np.tile([0.3, 0.4, 0.5], (rti.ocp.N, 1))
+    rti.reset(x0, np.zeros(2))
+
+    def taken(y_ref: Array) -> int:
+        rti.prepare(y_ref, shift=False)
+        assert rti.feedback(x0) is QpStatus.SOLVED
+        return rti.taken
+
+    assert taken(far) == after_a_start
+    while taken(near) > 1 or rti._change[0] > rti.tolerance:
+        pass
+    assert taken(far) == later
