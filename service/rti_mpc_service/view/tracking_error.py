@@ -69,7 +69,8 @@ def _error(info: Info, reference: Reference, stamps: NDArray[np.int64], y: Mappi
     rotations.unwrap(rows)
     wanted = np.column_stack([np.interp(row, np.arange(len(rows)), column) for column in rows.T])
     values: Array = np.full_like(wanted, np.nan)
-    values[:, list(y)] = np.column_stack(list(y.values()))
+    for i, column in y.items():
+        values[:, i] = column
     deviation = rotations.difference(values, wanted)
     error = {info.outputs[i].name: deviation[:, i] for i in y}
     if position is not None and set(position) <= set(y):

@@ -69,3 +69,8 @@ def test_error_of_an_attitude_does_not_depend_on_the_sign_of_rows_and_measuremen
     y = {i: np.array([value]) for i, value in enumerate(sign * (level + turned) / 2)}
     errors = tracking_error(info, [reference([level.tolist(), (-turned).tolist()])], np.array([UNIX_NS + 500]), y)
     assert [float(errors[name][0]) for name in "wijk"] == pytest.approx([0.0] * 4, abs=1e-12)
+
+
+def test_without_any_output_that_is_known_there_is_no_error() -> None:
+    """As long as no telemetry has told the outputs of an arm, which are no states."""
+    assert tracking_error(INFO, [reference([[0.0, 0.0, 0.0]])], np.array([UNIX_NS]), {}) == {}
