@@ -27,6 +27,7 @@ from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.model.find import SHIPPED_MODELS, find_model
 from rti_mpc.model.model import Model
 from rti_mpc.model.robots.truck_trailer import PARAMETERS
+from rti_mpc.signals import quantity
 from rti_mpc_service.config.build import build_observer, build_rti, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.outline import placed
@@ -214,7 +215,7 @@ def draw(run: Drive, view: View, path: Path) -> None:
 def told(run: Drive) -> str:
     """Return the largest errors after the transient in words."""
     settled = zip(run.model.outputs, run.settled, strict=True)
-    return ", ".join(f"{signal.name} {value:.2g} {signal.unit}".removesuffix(" 1") for signal, value in settled)
+    return ", ".join(f"{signal.name} {quantity(value, signal.unit, '.2g')}" for signal, value in settled)
 
 
 PAGE = """# Robots that ship

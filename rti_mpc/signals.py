@@ -71,6 +71,11 @@ class Signal:
             raise OcpError(f"unit of the signal {self.name!r} must be {' or '.join(TURNS)} for angle=True, to know a whole turn, got {self.unit!r}")
 
 
+def quantity(value: float, unit: str, form: str = ".3g") -> str:
+    """Return a number with its unit as text, alone if the unit is 1."""
+    return f"{value:{form}}" + ("" if unit == "1" else f" {unit}")
+
+
 def signals(vector: str, given_as: Any, alike: Sequence[Signal | None] = ()) -> tuple[Signal, ...]:
     """
     Return signals from these, or from their names alone; from one of them for a vector of one.

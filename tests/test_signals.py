@@ -14,7 +14,7 @@ from rti_mpc.errors import OcpError
 from rti_mpc.model.model import Model, Signal
 from rti_mpc.model.obstacle import discs_of, with_obstacles
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
-from rti_mpc.signals import place, plane
+from rti_mpc.signals import place, plane, quantity
 from tests.robots import arm, glider, shuffled
 
 
@@ -75,3 +75,7 @@ def test_a_parameter_of_a_disc_s_name_is_no_disc() -> None:
     assert discs_of(named) == []
     assert discs_of(with_obstacles(named, [])) == []
     assert discs_of(with_obstacles(glider(), [(1.0, 2.0, 0.5)])) == [(1, 1.0, 2.0, 0.5)]
+
+
+def test_number_is_told_with_its_unit_unless_that_is_1() -> None:
+    assert (quantity(0.12345, "m"), quantity(-2.0, "rad", "+.2f"), quantity(0.5, "1")) == ("0.123 m", "-2.00 rad", "0.5")

@@ -44,6 +44,7 @@ from rti_mpc.errors import OcpError
 from rti_mpc.model.expressions import column
 from rti_mpc.model.integrator import TABLEAUS, steps
 from rti_mpc.model.model import IRK, Model
+from rti_mpc.signals import quantity
 
 DISCRETE = "discrete"  # method of a problem whose model is in discrete time
 PAIRS = (("lbu", "ubu"), ("lbdu", "ubdu"), ("lbx", "ubx"), ("lh", "uh"))  # bounds that may differ from stage to stage, both of them then
@@ -392,7 +393,8 @@ def rest_fault(ocp: Ocp) -> str:
     for signal, rest, *limits in zip(ocp.model.inputs, ocp.model.u_rest, *bounds, strict=True):
         lower, upper, falling, rising = map(float, limits)
         if not lower <= rest <= upper:
-            return f"the bounds of input {signal.name} must hold its rest, {rest:g} {signal.unit}, or it could not be stopped, got {[lower, upper]}"
+            at = quantity(rest, signal.unit, "g")
+            return f"the bounds of input {signal.name} must hold its rest, {at}, or it could not be stopped, got {[lower, upper]}"
         if not falling < 0.0 < rising:
             return f"the increments of input {signal.name} must hold lower < 0 < upper, or it could not be stopped, got {[falling, rising]}"
     return ""

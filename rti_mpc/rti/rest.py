@@ -41,6 +41,7 @@ from rti_mpc.rti.nominal import nominal_state
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.operation import around, corners, derivative, regular, states_of_operation
 from rti_mpc.rti.way_to_rest import StopLaw, WayToRest, whole
+from rti_mpc.signals import quantity
 
 SETTLING_S = 10.0  # after its inputs have come to rest a robot must stand still
 DRIVEN_S = 2.0  # for which inputs at their bounds drive the robot, to see which states it gets into
@@ -80,8 +81,8 @@ def motion_at_rest(ocp: Ocp) -> str:
     start = np.clip(nominal_state(ocp), ocp.widest("lbx"), ocp.widest("ubx"))
     lowest, highest = around(ocp.widest("lbx"), ocp.widest("ubx"), start)
     states = [np.clip(move(start, u, DRIVEN_S), ocp.widest("lbx"), ocp.widest("ubx")) for u in inputs]
-    states += [attitudes.completed(rng.uniform(lowest, highest)) for _ in range(SEEDED_STATES)]
-    states = [start, *(x for x in states if is_regular(x, u_rest))]
+    states += [rng.uniform(lowest, highest) for _ in range(SEEDED_STATES)]
+    states = [start, *(x for x in map(attitudes.completed, states) if is_regular(x, u_rest))]
     rates = np.abs([rate(x, u) for x in states for u in (*inputs, u_rest)])
     still = np.maximum(STILL_SHARE * np.max(rates, axis=0, where=np.isfinite(rates), initial=0.0), 1e-9)
     positions = [j for j in range(model.nx) if not depends_on(model.rate_expr[j], model.x[j])]
@@ -95,7 +96,7 @@ def motion_at_rest(ocp: Ocp) -> str:
             aside[j] += 0.5 * (highest[j] - lowest[j]) * rng.choice((-0.5, 0.5))
             attitudes.normalize(aside)
             if moving := moves(model, rate(aside, u_rest), still):
-                return f"where it stands at {model.states[j].name} = {aside[j]:.3g} {model.states[j].unit}, its inputs at rest, {moving}"
+                return f"where it stands at {model.states[j].name} = {quantity(aside[j], model.states[j].unit)}, its inputs at rest, {moving}"
     return ""
 
 
@@ -105,7 +106,7 @@ def moves(model: Model, rates: Array, still: Array) -> str:
     signal = model.states[j]
     if np.isnan(rates[j]):
         return f"{signal.name} has come to where the model is not finite"
-    return "" if abs(rates[j]) <= still[j] else f"{signal.name} changes by {rates[j]:.3g} {signal.unit} per second"
+    return "" if abs(rates[j]) <= still[j] else f"{signal.name} changes by {quantity(rates[j], signal.unit)} per second"
 
 
 def motion(model: Model) -> Motion:
@@ -428,7 +429,7 @@ def unaided(model: Model, law: StopLaw, rates: Array, shares: Array) -> str:
     """Say how fast a robot moves after its way to rest, from the fastest rates of its states there as shares of those in operation."""
     j = int(np.argmax(shares))
     signal, rate = model.states[j], shares[j] * rates[j]
-    how = f"changes by up to {rate:.3g} {signal.unit} per second" if np.isfinite(rate) else "is beyond every bound"
+    how = f"changes by up to {quantity(rate, signal.unit)} per second" if np.isfinite(rate) else "is beyond every bound"
     return f"{law.rows * law.period_s + STANDING_S:.3g} s after a stop {signal.name} {how}"
 
 
@@ -437,7 +438,7 @@ def unrested(model: Model, starts: Starts, moving: np.ndarray[Any, Any], ways: W
     i = int(np.flatnonzero(moving.any(axis=1))[0])
     disturbed = starts.p[i] != np.array(model.p_nominal)
     values = *zip(model.states, starts.x[i], strict=True), *zip(compress(model.parameters, disturbed), starts.p[i][disturbed], strict=True)
-    where = ", ".join(f"{signal.name} = {value:.3g} {signal.unit}".removesuffix(" 1") for signal, value in values)
+    where = ", ".join(f"{signal.name} = {quantity(value, signal.unit)}" for signal, value in values)
     names = ", ".join(signal.name for signal, moves in zip(model.states, moving[i], strict=True) if moves)
     return f"{ways.period_s * ways.x.shape[1]:.3g} s after a stop at {where} it still moves: {names}"
 

@@ -27,6 +27,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, Notice, Severity
 from rti_mpc.contract.schedule import unfit
 from rti_mpc.model.model import Model
+from rti_mpc.signals import quantity
 from rti_mpc.wire.actuator import STALE_NS, Counters
 from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber, new_epoch
@@ -142,7 +143,7 @@ def standing(model: Model, rate: Array) -> str:
     if abs(rate[fastest]) < STANDSTILL_RATE:
         return "stands"
     state = model.states[fastest]
-    return f"coasts with its inputs at rest: {state.name} changes by {rate[fastest]:.3g} {state.unit} per s"
+    return f"coasts with its inputs at rest: {state.name} changes by {quantity(rate[fastest], state.unit)} per s"
 
 
 class Robot:

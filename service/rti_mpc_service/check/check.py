@@ -29,6 +29,7 @@ from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import BUILT_IN_SOLVERS, Rti
+from rti_mpc.signals import quantity
 from rti_mpc_service.check.agreement import AGREEMENT_TOLERANCE, COST_TOLERANCE, Agreement, agreement
 from rti_mpc_service.check.excursion import Bounds, excursions
 from rti_mpc_service.check.rest import stop_from_everywhere
@@ -112,7 +113,7 @@ def main(path: Path) -> int:
         f"{sum(report.statuses.values())} samples: " + ", ".join(f"{count} {status.name}" for status, count in sorted(report.statuses.items()))
     )
     if report.failed_at is not None:
-        where = ", ".join(f"{state.name} = {value:.3g} {state.unit}" for state, value in zip(ocp.model.states, report.failed_at, strict=True))
+        where = ", ".join(f"{state.name} = {quantity(value, state.unit)}" for state, value in zip(ocp.model.states, report.failed_at, strict=True))
         advice = "if the model is not finite or not differentiable near it, bound in ocp.bounds.states where the robot operates"
         console.print(f"the first sample without a plan began at {where}: {advice}", soft_wrap=True)
     verdict = "agree" if report.agree else "DISAGREE"

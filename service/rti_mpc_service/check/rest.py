@@ -7,6 +7,7 @@ from rti_mpc.model.model import Model
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rest import Rest, RestClass, assess
 from rti_mpc.rti.way_to_rest import StopLaw
+from rti_mpc.signals import quantity
 
 STATES = 1000  # of operation from which a robot is stopped
 LETTERS = {RestClass.HOLDS: "a", RestClass.DRIFTS: "b", RestClass.UNSTABLE: "c"}
@@ -31,7 +32,7 @@ def stop_from_everywhere(ocp: Ocp, law: StopLaw | None, count: int = STATES, *, 
 
 def rest_line(model: Model, law: StopLaw | None, rest: Rest) -> str:
     """Return in one line what a stop does to a robot."""
-    moved = [f"{signal.name} by {value:.3g} {signal.unit}" for signal, value in zip(model.states, rest.moved, strict=True) if value > 0.0]
+    moved = [f"{signal.name} by {quantity(value, signal.unit)}" for signal, value in zip(model.states, rest.moved, strict=True) if value > 0.0]
     way = f", which moves {', '.join(moved)} at most" if moved else ""
     carried = "its inputs ramp to rest"
     if law is not None:

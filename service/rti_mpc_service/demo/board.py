@@ -14,6 +14,7 @@ from rich.text import Text
 
 from rti_mpc.contract.message import Event, Severity, Telemetry
 from rti_mpc.model.model import Signal
+from rti_mpc.signals import quantity
 from rti_mpc_service.redrawn import Redrawn
 
 MEDIAN_SAMPLES = 200  # the shown medians are over the last samples
@@ -63,7 +64,9 @@ class Board(Redrawn):
         return {
             "mode": last.mode.name.lower(),
             "error": error,
-            "command": "  ".join(f"{signal.name} {value:+.3f} {signal.unit}" for signal, value in zip(self._inputs, last.u[0], strict=True)),
+            "command": "  ".join(
+                f"{signal.name} {quantity(value, signal.unit, '+.3f')}" for signal, value in zip(self._inputs, last.u[0], strict=True)
+            ),
             "preparation": f"{medians['prepare_us']:.0f} us",
             "feedback": f"{medians['feedback_us']:.0f} us",
             "in period": f"{np.mean([sample.slack_s >= 0.0 for sample in telemetry]):.2%}",

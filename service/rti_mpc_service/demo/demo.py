@@ -30,7 +30,7 @@ from rti_mpc.model.model import Model
 from rti_mpc.model.path_following import window_place
 from rti_mpc.reference.tracks import TRACKS
 from rti_mpc.reference.trajectory import Heading
-from rti_mpc.signals import in_plane, plane
+from rti_mpc.signals import in_plane, plane, quantity
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.interrupt import stop_on_signals
@@ -311,7 +311,7 @@ def error_text(model: Model, sample: Telemetry, reference: Reference) -> str:
     columns = plane(model.outputs)
     if in_plane(model.outputs) and columns is not None:
         return f"{1e3 * float(np.hypot(*error[list(columns)])):.2f} mm"
-    return "  ".join(f"{output.name} {value:+.3g} {output.unit}".removesuffix(" 1") for value, output in zip(error, model.outputs, strict=True))
+    return "  ".join(f"{output.name} {quantity(value, output.unit, '+.3g')}" for value, output in zip(error, model.outputs, strict=True))
 
 
 def conclude(run: DemoPlan, outcome: Outcome, console: Console) -> int:

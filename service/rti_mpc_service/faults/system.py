@@ -18,6 +18,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Reference, Telemetry
 from rti_mpc.contract.status import Mode
+from rti_mpc.signals import quantity
 from rti_mpc.wire.bus import Bus, new_epoch
 from rti_mpc.wire.info import Info, Label
 from rti_mpc.wire.keys import Key, Keys
@@ -253,7 +254,7 @@ class System:
         if (speed := self.observer.speed_m_s()) <= self.motion.driven_speed:
             return f"the robot moves by {speed:.2g} {self.motion.unit}/s, and must by {self.motion.driven_speed:g}"
         if (away := self.error_m()) >= error_m:
-            return f"the robot is {away:.2g} {self.motion.unit} from its reference, and must be within {error_m:g}"
+            return f"the robot is {quantity(away, self.motion.unit, '.2g')} from its reference, and must be within {error_m:g}"
         return ""
 
     def estimated(self) -> bool:

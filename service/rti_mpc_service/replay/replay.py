@@ -23,6 +23,7 @@ from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.journal.entry import JournalEntry
 from rti_mpc.journal.replay import Difference, Replay
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
+from rti_mpc.signals import quantity
 from rti_mpc_service.config import toml
 from rti_mpc_service.config.build import retuned
 from rti_mpc_service.config.fit import check_names, check_tree
@@ -231,7 +232,8 @@ def open_loop(account: Account, assignments: Sequence[str]) -> Iterator[str]:
     for j, signal in enumerate(account.built.rti.ocp.model.inputs):
         apart = np.abs(other[:, j] - was[:, j])
         rms, most = float(np.sqrt((apart**2).mean())), int(apart.argmax())
-        yield f"  {signal.name}: {rms:.3g} {signal.unit} away on average (rms), at most {apart[most]:.3g} {signal.unit}, at {times[most]:.3f} s"
+        average, largest = (quantity(away, signal.unit) for away in (rms, apart[most]))
+        yield f"  {signal.name}: {average} away on average (rms), at most {largest}, at {times[most]:.3f} s"
 
 
 def summary(account: Account) -> dict[str, Any]:
