@@ -103,12 +103,19 @@ class Guard:
         """Whether a state of the robot has come."""
         return self._state is not None
 
-    @property
-    def at_rest(self) -> bool:
-        """Whether the last command leads to rest and the robot, which has heard of braking, is believed to rest by then; or was never commanded."""
+    def at_rest(self, local_ns: int) -> bool:
+        """
+        Whether the last command leads to rest and the robot is believed to rest by its end; or the robot was never commanded.
+
+        A robot that is heard must also have heard of braking. One that has fallen silent says nothing of that.
+        """
         if self._state is None or not self._engaged:
             return True
-        return self._told_rest and not self._unheard(self._state) and self._schedule.rests(self._told_ns - 1)
+        now_ns = self._clock.now_ns(local_ns)
+        if self._left_to_itself(now_ns):
+            return True
+        heard = self._blind(now_ns) or not self._unheard(self._state)
+        return self._told_rest and heard and self._schedule.rests(self._told_ns - 1)
 
     # Incoming messages.
 
@@ -217,15 +224,15 @@ class Guard:
         self._schedule.forget(now_ns - 2 * self._dt_ns)
         if self.passing:
             self._watch(now_ns)
-        blind = now_ns - self._state.stamp_ns > self._stale_ns
+        blind = self._blind(now_ns)
         if blind:
             self._feed_back(None, now_ns, now_ns)
         if self._told_ns - now_ns > RAMP_LEAD_NS * self._clock.rate and not self._corrected:
             return None
         start_ns = now_ns if self._corrected else max(self._told_ns, now_ns)
+        if self._left_to_itself(now_ns):
+            return None
         way = self._schedule.way(start_ns)
-        if blind and way is not None and way.feeds_back and not (self._corrected or self._untold):
-            return None  # the robot has this way, and may still know its state
         valid_ns = RAMP_STEPS_PER_COMMAND * RAMP_STEP_NS if way is None else piece_ns(way, start_ns)
         u = np.array([self._schedule.at(start_ns + i * RAMP_STEP_NS)[0] for i in range(-(-valid_ns // RAMP_STEP_NS))])
         period_ns = RAMP_STEP_NS
@@ -234,6 +241,15 @@ class Guard:
                 return None  # no robot is there that could be told to stand
             u, period_ns = u[:1], valid_ns
         return self._tell(start_ns, valid_ns, period_ns, u, self._state, None if way is None else way.ahead(start_ns + valid_ns))
+
+    def _blind(self, now_ns: int) -> bool:
+        """Whether the last state is stale."""
+        return self._state is None or now_ns - self._state.stamp_ns > self._stale_ns
+
+    def _left_to_itself(self, now_ns: int) -> bool:
+        """Whether a robot that is not heard has been sent a way that needs feedback, for which it may still know its state."""
+        way = self._schedule.way(max(self._told_ns, now_ns))
+        return self._blind(now_ns) and way is not None and way.feeds_back and not (self._corrected or self._untold)
 
     def _unheard(self, state: State) -> bool:
         """Whether a report names an older command than the one to brake, which may still come: the ramp is then not to begin later."""

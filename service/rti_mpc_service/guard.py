@@ -131,7 +131,7 @@ class Process:
         with self._lock:
             self._guarded(self._guard.stop, time.monotonic_ns())
         deadline_s = time.monotonic() + MAX_RAMP_S
-        while not self._guard.at_rest and time.monotonic() < deadline_s:
+        while not self._guard.at_rest(time.monotonic_ns()) and time.monotonic() < deadline_s:
             self._guarded(self._tick)
             time.sleep(self._tick_s)
         for end in (self._tick, self._operator_stop.close):

@@ -200,7 +200,7 @@ def test_silence_is_answered_by_a_ramp_told_in_time_and_then_by_standing(scene: 
     last = scene.published[-1]
     assert (last.u.any(), last.mode) == (False, Mode.BRAKING)
     assert last.valid_until_ns - scene.now_ns <= 200 * MS
-    assert scene.guard.at_rest
+    assert scene.guard.at_rest(scene.local_ns)
 
 
 def test_ramp_is_that_of_the_robot_itself(scene: Scene) -> None:
@@ -516,16 +516,16 @@ def test_starting_guard_learns_who_leads_before_anything_passes() -> None:
 def test_nothing_is_told_to_a_robot_that_was_never_commanded(scene: Scene) -> None:
     scene.wait(3000)
     assert not scene.published
-    assert scene.guard.at_rest
+    assert scene.guard.at_rest(scene.local_ns)
 
 
 def test_stopped_guard_ramps_to_rest_and_takes_no_command(scene: Scene) -> None:
     scene.drive(1000)
     scene.wait(30)
     scene.guard.stop(scene.local_ns)
-    assert not scene.guard.at_rest
+    assert not scene.guard.at_rest(scene.local_ns)
     assert scene.send() is None
-    while not scene.guard.at_rest:
+    while not scene.guard.at_rest(scene.local_ns):
         scene.step()
     scene.wait(400)
     assert not scene.actuator.u.any()
@@ -554,7 +554,7 @@ def end_late(scene: Scene, late_ms: int, *, always: bool, states_ms: int = 10, l
             scene.states, (epoch, seq) = scene.states + 1, scene.actuator.source
             state = State(scene.epoch, scene.states, scene.now_ns, np.zeros(5), u=u.copy(), command_epoch=epoch, command_seq=seq)
             scene.guard.receive_state(state, scene.local_ns)
-        ended |= scene.guard.at_rest  # then its process hears nothing more, whatever comes
+        ended |= scene.guard.at_rest(scene.local_ns)  # then its process hears nothing more, whatever comes
         if not ended:
             coming.append((scene.now_ns, scene.guard.tick(scene.local_ns)))
         while coming and scene.now_ns - (coming[0][0] if always else stopped_ns) >= late_ms * MS:
@@ -584,6 +584,20 @@ def test_stopped_guard_goes_on_until_the_robot_has_heard_that_it_brakes(scene: S
     last = end_late(scene, 0, always=False, lost=lost)
     assert not last.u[-1].any()
     assert scene.actuator.source[1] in (last.seq - 1, last.seq), "it obeys the last command, or the one before until that begins, not its own ramp"
+
+
+def test_stopped_guard_does_not_wait_for_a_robot_that_has_fallen_silent_to_say_that_it_brakes(scene: Scene) -> None:
+    """Its process would be killed by a supervisor that is told how long an end may take; and the whole ramp has been sent."""
+    scene.drive(1000)
+    reported = State(scene.epoch, scene.states + 1, scene.now_ns + MS, np.zeros(5), u=scene.actuator.u.copy())
+    reported.command_epoch, reported.command_seq = scene.actuator.source
+    scene.guard.receive_state(reported, scene.local_ns)
+    scene.guard.stop(scene.local_ns)
+    scene.heard = False
+    ramp_s = max(FULL / LIMITS.slew)
+    scene.wait(round(1e3 * (LIMITS.stale_s + ramp_s)))
+    assert scene.guard.at_rest(scene.local_ns)
+    assert not scene.published[-1].u[-1].any()
 
 
 @pytest.mark.parametrize("states_ms", [10, 50])
@@ -756,7 +770,7 @@ def test_simulated_time_runs_at_its_own_rate(rate: float) -> None:
     scene.send()
     scene.wait(1000)
     assert scene.actuator.counters.starved == 0
-    assert scene.guard.at_rest
+    assert scene.guard.at_rest(scene.local_ns)
 
 
 def test_inputs_without_slew_limits_rest_at_once() -> None:

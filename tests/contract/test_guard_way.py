@@ -154,7 +154,7 @@ def test_robot_whose_inputs_coast_stands_after_the_last_command(guarded: bool, p
     assert abs(mass.x[1]) < 1e-9
     assert inside(mass.acted)
     assert [u for i, u in enumerate(mass.acted) if i and u != mass.acted[i - 1]] == [-0.5, -1.0, -0.5, 0.0]
-    assert mass.guard.at_rest
+    assert mass.guard.at_rest(mass.local_ns)
     assert mass.actuator.at_rest == (not guarded)
 
 
@@ -396,10 +396,21 @@ def test_nothing_pushes_a_robot_that_stands_while_a_stop_is_latched(u: float) ->
     assert not mass.actuator.u.any()
 
 
+def test_stopped_guard_does_not_wait_for_a_silent_robot_that_plays_its_way_by_itself() -> None:
+    mass = Mass().drive()
+    assert mass.send(**mass.fed_back()), mass.refused
+    mass.guard.stop(mass.local_ns)
+    mass.heard = False
+    mass.wait(round(1e3 * LIMITS.stale_s) + 20)
+    assert mass.guard.at_rest(mass.local_ns)
+    mass.wait(2000)
+    assert abs(mass.x[1]) < 1e-3
+
+
 def test_guard_that_is_stopped_brings_the_robot_to_rest_by_the_way_it_knows() -> None:
     mass = Mass().drive()
     mass.guard.stop(mass.local_ns)
-    while not mass.guard.at_rest:
+    while not mass.guard.at_rest(mass.local_ns):
         mass.wait(10)
     mass.wait(200)
     mass.linked = False
