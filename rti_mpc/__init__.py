@@ -45,9 +45,8 @@ References, cited by key throughout:
   2005.
 * [Hintermueller2003] M. Hintermüller, K. Ito, K. Kunisch, "The primal-dual active set strategy as a semismooth Newton method", SIAM J. Optim. 13(3),
   2003.
-* [Judice1994] J. J. Júdice, F. M. Pires, "A block principal pivoting algorithm for large-scale strictly monotone linear complementarity problems",
-  Comput. Oper. Res. 21(5), 1994.
-* [Gondzio1998] J. Gondzio, "Warm start of the primal-dual method applied in the cutting plane scheme", Mathematical Programming 83, 1998.
+* [Ferreau2008] H. J. Ferreau, H. G. Bock, M. Diehl, "An online active set strategy to overcome the limitations of explicit MPC", Int. J. Robust and
+  Nonlinear Control 18(8), 2008.
 * [Mehrotra1992] S. Mehrotra, "On the implementation of a primal-dual interior point method", SIAM J. Optim. 2(4), 1992.
 * [Kapania2016] N. Kapania, J. Subosits, J. C. Gerdes, "A sequential two-step algorithm for fast generation of vehicle racing trajectories",
   J. Dyn. Sys. Meas. Control 138(9), 2016.

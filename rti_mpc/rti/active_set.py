@@ -3,11 +3,11 @@
 Active-set solver on the Riccati recursion. Solves nearly every sample without a QP solver.
 
 The places, which say what is at a bound, are kept from sample to sample and shifted
-with the plan, so that one roll-out is usually enough. A plan is certified from the
-problem's own data, and refined where the penalty that holds values at their bounds has
-yielded. When places do not settle, or the plan is not certified, an interior point of
-bounded length makes the plan, and the places of the next sample. The sample's next QP,
-which is nearly the same, starts it from an iterate of this one.
+with the plan, so that one roll-out is usually enough. Where places change, they first do
+so all at once, then one by one along a homotopy. A plan is certified from the problem's
+own data, and refined where the penalty that holds values at their bounds has yielded.
+When places do not settle, or the plan is not certified, an interior point of bounded
+length makes the plan, and the places of the next sample.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from rti_mpc.contract.status import QpStatus
 from rti_mpc.rti.places import Places
 from rti_mpc.rti.qp.qp import Guess
 
-MAX_ROLL_OUTS = 6  # from the places of the last sample; more are needed only when many places change at once
+MAX_ROLL_OUTS = 6  # after the first, as long as fewer places change than in that one
+MAX_CHANGES = 45  # of places in the first roll-out from which they change one at a time: with more, the way to the solution is long
+MAX_MOVES = 20  # roll-outs on that way
 MAX_STEPS = 50  # of the interior point, for each QP that a sample may have; all of its QPs share the sum
-STEPS_TO_GO_ON = 5.5  # the same, after which a sample begins no other QP, which would take as many
+ROLL_OUTS_TO_GO_ON = 10  # the same of roll-outs with gains, a step counted as two: a sample that has taken more begins no other QP
 MAX_ROLL_OUTS_HANDED_BACK = 2  # from places that the interior point has found
 START_RANGE = 1.0, 1e16  # limits of the product of distance and multiplier at its start, otherwise the duality gap: with less, first steps are short
 START_FAR = 1e6  # the same of a second try, after one that gave no numbers
 GAP_SHARES = 1.0, 1e-3  # of MAX_GAP, at which it hands its places back
 LEAST_SHARE = 0.1  # sum of products to which steps lead, relative to the largest gap of a certified plan; with less, digits are lost to stiffness
-KEPT_BELOW = 1e-2  # gap of the iterate from which the sample's next QP starts, relative to COST_FLOOR plus the normalised cost: not yet at the bounds
-NEAR = 0.4  # largest change of an input, relative to its scale, after which a QP starts so; after a larger one a start of its own is often the nearer
 JUDGED_BELOW = 100.0  # times the least product: the plan of a step with a larger one is not judged, because it would fail
 MAX_REFINEMENTS = 2  # of a plan that is not certified yet
 MAX_VIOLATION = 1e-9  # of dynamics, bounds and increments by a certified plan, relative to their scales
@@ -40,7 +40,6 @@ MAX_GAP = 1e-6  # by which a certified plan may cost more than the optimum, rela
 COST_FLOOR = 1e-2  # normalised cost, in half ranges squared, below which a plan is as good as its reference
 MAX_VIOLATION_INACCURATE, MAX_GAP_INACCURATE = 1e-6, 1e-2  # the same limits of a plan that may be commanded as inaccurate
 SOLVED, INACCURATE, FAILED = QpStatus.SOLVED, QpStatus.INACCURATE, QpStatus.FAILED  # read faster than a member of the enumeration
-MAX_STALLED_ROLL_OUTS = 3  # roll-outs without fewer changes before places change one at a time
 
 
 class ActiveSet:
@@ -52,9 +51,10 @@ class ActiveSet:
         linearize: Call that linearizes at the guess as it is.
         gain: Call that computes the gains; with it, after one of the former two, preparation is complete.
         roll_out: Call that makes the plan, and finds the places; `certify` judges that plan, `refine` improves it.
+        begin_homotopy: Call that starts the homotopy at the places rolled out last; `move`, the way to its next change of a place.
         enter: Call that starts the interior point at the plan; `step`, one step of it.
         written: The arrays that `roll_out` and `certify` write.
-        steps: Steps of the interior point that the sample has taken.
+        steps: Steps of the interior point that the sample has taken; `roll_outs`, roll-outs with gains that differ from the prepared ones.
         iterations: Roll-outs and steps of the interior point of the last solve.
         res_prim: Largest violation of dynamics, bounds and increments by the plan that was judged last, relative to their scales.
         res_dual: Bound on the cost of that plan above the optimum, relative to `COST_FLOOR` plus its normalised cost.
@@ -77,17 +77,25 @@ class ActiveSet:
         moved = guess.arguments | {"x": guess.plan.x, "u": guess.plan.u, "places": self._found}
         fixed = {"stages": stages, "gains": gains, **guess.weights, "places": self._places}
         plan = {"x_plan": guess.plan.x, "u_plan": guess.plan.u, "multipliers": multipliers}
+        targets, self._point = np.zeros_like(self._places), np.zeros_like(self._places)
+        self._places_next, self._point_next = np.zeros_like(self._places), np.zeros_like(self._point)
         found = {**guess.plan.outputs(), "changes": changes, "places_found": self._found, "multipliers": multipliers}
+        rolled_out = {**found, "targets": targets}
         self.advance = bind(make(functions.advance), moved, {"x_next": x, "u_next": u, "places_next": self._places, "stages": stages})
         self.linearize = bind(make(functions.linearize), guess.arguments, {"stages": stages})
         self.gain = bind(make(functions.gains), {"stages": stages, "u": u, **guess.weights, "places": self._places}, {"gains": gains})
-        self.roll_out = bind(make(functions.roll_out), {**guess.start, "x0": guess.x0, **fixed}, found)
+        self.roll_out = bind(make(functions.roll_out), {**guess.start, "x0": guess.x0, **fixed}, rolled_out)
+        rows = {**guess.weights, "targets": targets, "places": self._places}
+        self.begin_homotopy = bind(make(functions.begin), {"u": u, "stages": stages, **rows}, {"point": self._point})
+        moving = rows | {"places_found": self._found, "point": self._point}
+        self._first = tuple((np.zeros_like(array), array) for array in (self._places, self._found, targets))
+        self.move = bind(make(functions.move), moving, {"places_next": self._places_next, "point_next": self._point_next})
         judged = {**guess.start, "x0": guess.x0, "stages": stages, **plan, **guess.weights}
         self.certify = bind(make(certificate), judged, {"r": slopes, **verdict})
         refined = {f"{name.removesuffix('_plan')}_refined": array for name, array in plan.items()}
         self.refine = bind(make(functions.refine), {**guess.start, **fixed, "r": slopes, **plan}, refined)
         self._best = tuple((np.zeros_like(array), array) for name, array in found.items() if name != "changes")
-        self.written = (*found.values(), slopes, *verdict.values())
+        self.written = (*rolled_out.values(), slopes, *verdict.values())
         self._lowest = np.inf  # gap of the best plan, relative as `res_dual`
         self._stepped = False  # whether the interior point has been used for this QP
 
@@ -97,30 +105,24 @@ class ActiveSet:
         after, mean = np.zeros_like(interior), np.zeros(1)
         interior_plan = {name: np.zeros_like(array) for name, array in found.items() if name != "changes"}
         self._moved, self._product = (interior.data, after.data), mean.data
-        deviations = guess.plan.x.size + self._places.size
-        self._deviations, self._sides = np.split(interior, [deviations])
-        self._kept_sides = np.zeros_like(self._sides)  # those of an iterate of the sample's last QP that has taken steps
-        self._keeps = False  # whether the sample has such an iterate
-        self._change = guess.plan.change.data
         self._interior_pairs = tuple((found[name], array) for name, array in interior_plan.items())
         entered = {**guess.start, "stages": stages, **guess.weights}
         self.enter = bind(make(functions.enter), {**entered, "x_plan": guess.plan.x, "u_plan": guess.plan.u, "start": start}, {"interior": interior})
         self._least = np.zeros(1)
         stepped = {"interior_after": after, "product": mean, **interior_plan}
         self.step = bind(make(functions.step), {**entered, "x0": guess.x0, "interior": interior, "least": self._least}, stepped)
-        self._qps = self.steps = 0
+        self._qps = self.steps = self.roll_outs = 0
         self.iterations = 0
         self.res_prim = self.res_dual = 0.0
 
     def begin(self, qps: int) -> None:
         """Begin a sample that may have so many QPs."""
-        self._qps, self.steps = qps, 0
-        self._keeps = False
+        self._qps, self.steps, self.roll_outs = qps, 0, 0
 
     @property
     def goes_on(self) -> bool:
         """Whether the sample may begin another QP."""
-        return self.steps <= STEPS_TO_GO_ON * self._qps
+        return self.roll_outs + 2 * self.steps <= ROLL_OUTS_TO_GO_ON * self._qps
 
     def forget(self) -> None:
         """Start cold, with no bound acting."""
@@ -178,18 +180,15 @@ class ActiveSet:
 
     def solve(self) -> bool:
         """Find the places, and make the plan; return whether there is one."""
-        self._keeps = self._keeps and self._change[0] <= NEAR
         self.roll_out()
         self.iterations, self._stepped = 1, False
-        if self._changes[0] == 0.0 or self._settle(MAX_ROLL_OUTS) or self._resume():
+        if self._changes[0] == 0.0 or (self._changes[0] > 0.0 and self._settle()):
             return True
         self._lowest = np.inf
         self._judged()
         self._keep_better()
         self._places[:] = 0.0  # a plan that heeds no bound is often nearer to the optimum than one that heeds wrong ones
-        self.gain()
-        self.roll_out()
-        self.iterations += 1
+        self._roll_out_again()
         self._judged()
         self._keep_better()
         if self._lowest < np.inf and self._step_inside().usable:
@@ -198,22 +197,42 @@ class ActiveSet:
         self.forget()
         return False
 
-    def _resume(self) -> bool:
+    def _settle(self) -> bool:
         """
-        Start the interior point from an iterate of the sample's last QP, and return whether that leads to a certified plan.
+        Find the places, and return whether that gave a plan.
 
-        This QP is linearized at the plan of that one, so that deviations begin at zero; distances, slacks and multipliers are those kept
-        [Gondzio1998]_. Steps remove by how much the bounds have moved.
+        All places change at once first. Where more and more of them do, or they go in circles, they change one at a time, on the way from the guess.
         """
-        if not self._keeps or self._changes[0] < 0.0:
-            return False
-        self._stepped, self._keeps, self._lowest = True, False, np.inf
-        self._judged()  # for the cost, by which products are measured
-        self._deviations[:], self._sides[:] = 0.0, self._kept_sides
-        if self._hands_back() or (self._lowest < np.inf and self._restore_best() is SOLVED):
+        for first, array in self._first:
+            first[:] = array
+        changes = self._changes[0]
+        for _ in range(MAX_ROLL_OUTS):
             self._places[:] = self._found
-            return True
-        return False
+            self._roll_out_again()
+            if not 0.0 < self._changes[0] < changes:
+                break
+        if self._changes[0] > 0.0 and changes <= MAX_CHANGES:
+            self._follow()
+        return self._changes[0] == 0.0
+
+    def _follow(self) -> None:
+        """Follow the homotopy from the guess, on the curves of the places rolled out first, to this QP: see `rti_mpc.rti.homotopy`."""
+        for first, array in self._first:
+            array[:] = first
+        self.begin_homotopy()
+        for _ in range(MAX_MOVES):
+            self.move()
+            self._places[:], self._point[:] = self._places_next, self._point_next
+            self._roll_out_again()
+            if self._changes[0] <= 0.0:
+                break
+
+    def _roll_out_again(self) -> None:
+        """Roll out with the gains of other places."""
+        self.gain()
+        self.roll_out()
+        self.iterations += 1
+        self.roll_outs += 1
 
     def _step_inside(self) -> QpStatus:
         """Improve the best plan by the interior point until it is certified or no step is left, and return its status."""
@@ -246,8 +265,6 @@ class ActiveSet:
             interior[:] = after
             if not self._product[0] < np.inf:
                 break
-            if not self._keeps and self._product[0] <= KEPT_BELOW * unit:
-                self._kept_sides[:], self._keeps = self._sides, True
             if self._product[0] > JUDGED_BELOW * self._least[0]:
                 continue
             for array, inside in self._interior_pairs:
@@ -259,32 +276,9 @@ class ActiveSet:
 
     def _hand_back(self) -> bool:
         """Roll out from the places of a certified plan, and return whether that is a better plan: it is exact, if they settle."""
-        self._places[:] = self._found
-        self.gain()
-        self.roll_out()
-        self.iterations += 1
-        return self._settle(MAX_ROLL_OUTS_HANDED_BACK) and self._judged() is SOLVED and self.res_dual < self._lowest
-
-    def _settle(self, most: int) -> bool:
-        """
-        Roll out until no place changes, `most` times at most, and return whether that gave a plan.
-
-        All places change at once as long as fewer and fewer of them do. After that
-        only the first one changes, which cannot cycle [Judice1994]_.
-        """
-        fewest, patience = np.inf, MAX_STALLED_ROLL_OUTS
-        for _ in range(most - 1):
-            changes = self._changes[0]
-            if changes <= 0.0:
+        for _ in range(MAX_ROLL_OUTS_HANDED_BACK):
+            self._places[:] = self._found
+            self._roll_out_again()
+            if self._changes[0] <= 0.0:
                 break
-            patience = MAX_STALLED_ROLL_OUTS if changes < fewest else patience - 1
-            fewest = min(fewest, changes)
-            if patience >= 0:
-                self._places[:] = self._found
-            else:
-                first = int(np.argmax(self._places != self._found))
-                self._places[first] = self._found[first]
-            self.gain()
-            self.roll_out()
-            self.iterations += 1
-        return self._changes[0] == 0.0
+        return self._changes[0] == 0.0 and self._judged() is SOLVED and self.res_dual < self._lowest

@@ -23,7 +23,7 @@ import numpy as np
 
 from rti_mpc.codegen import function
 from rti_mpc.rti.blocks import all_inputs, at_each
-from rti_mpc.rti.linearization import Forms, Linearization, change, divided
+from rti_mpc.rti.linearization import Forms, Linearization, along_rows, change, divided
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.riccati import Riccati, Rows, Stage, softened_steps
@@ -57,9 +57,6 @@ class Sides:
         N, N_u, w = ocp.N, ocp.N_u, lin.w
         first = 2 * N_u * ocp.model.nu  # row with a softened bound
 
-        def along(inputs: ca.MX, increments: ca.MX, softened: ca.MX) -> ca.MX:
-            return ca.MX(ca.veccat(at_each(inputs, N_u), at_each(increments, N_u), at_each(softened, N)))
-
         tables = (ocp.lbu, ocp.lbdu, ocp.lg), (ocp.ubu, ocp.ubdu, ocp.ug)
         counts = (N_u, N_u, N)
         rows_of = [[np.broadcast_to(of, (n, of.shape[-1])).ravel() for of, n in zip(table, counts, strict=True)] for table in tables]
@@ -71,14 +68,14 @@ class Sides:
         number = {side: count for count, side in enumerate(sides)}
         rows = range(first + ocp.ng * N)
         self._lower, self._upper = ([number.get((row, sign), len(sides)) for row in rows] for sign in (-1.0, 1.0))  # beyond them: none
-        self.scale = along(lin.scale_u, lin.scale_u, lin.scale_g)
+        self.scale = along_rows(ocp, lin.scale_u, lin.scale_u, lin.scale_g)
         self.scale_side = self.scale[self._rows]
         self.per_scale = 1 / self.scale
         self._per_scale = self._sign * self.per_scale[self._rows]
         zero = ca.MX.zeros(lin.scale_u.shape)
         soft, scale = self._rows[self.hard :], self.scale_side[self.hard :]
-        self.z, self.Z = along(zero, zero, lin.zg)[soft] * scale / 2, along(zero, zero, lin.Zg)[soft] * scale**2 / 2
-        lower, upper = along(w["lbu"], w["lbdu"], lin.lg)[self._rows], along(w["ubu"], w["ubdu"], lin.ug)[self._rows]
+        self.z, self.Z = along_rows(ocp, zero, zero, lin.zg)[soft] * scale / 2, along_rows(ocp, zero, zero, lin.Zg)[soft] * scale**2 / 2
+        lower, upper = along_rows(ocp, w["lbu"], w["lbdu"], lin.lg)[self._rows], along_rows(ocp, w["ubu"], w["ubdu"], lin.ug)[self._rows]
         bound = ca.if_else(self._sign > 0, upper, lower)
         self._room = self._per_scale * (bound - ca.veccat(lin.u, forms.increments, forms.g)[self._rows])
 

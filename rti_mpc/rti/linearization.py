@@ -327,6 +327,11 @@ def constraints(ocp: Ocp) -> tuple[ca.Function, ca.Sparsity, ca.Sparsity]:
     return ca.Function("constraint", [model.x, model.u, model.p], [out]), G_x.sparsity(), G_u.sparsity()
 
 
+def along_rows(ocp: Ocp, inputs: Any, increments: Any, softened: Any) -> ca.MX:
+    """Return numbers of all bounded rows, in the order of the places, from columns of inputs, increments and expressions with softened bounds."""
+    return ca.MX(ca.veccat(at_each(inputs, ocp.N_u), at_each(increments, ocp.N_u), at_each(softened, ocp.N)))
+
+
 def softened(ocp: Ocp, w: dict[str, Any], of_states: str, of_constraints: str, of_end: str) -> Any:
     """Return what the rows of `constraints` have by these names of weights or bounds, shape ``(ng, 1)``, or ``(ng, N)`` if any has rows."""
     if max(w[name].shape[1] for name in (of_states, of_constraints, of_end)) > 1:

@@ -6,9 +6,9 @@ A value at its bound is held there by a penalty too stiff to yield noticeably; a
 beyond a softened bound pays the penalty of its slack; any other value is free. In a
 roll-out from the initial state, a value that crosses a bound is placed at it, and a
 bound whose multiplier has changed its sign is released: a primal-dual active-set method
-[Hintermueller2003]_. A roll-out that changes no place is the solution, up to the small
-amount by which the penalty yields; a refinement, one sweep over vectors with the same
-gains, removes that.
+[Hintermueller2003]_. It may go in circles, which `rti_mpc.rti.homotopy` does not. A
+roll-out that changes no place is the solution, up to the small amount by which the
+penalty yields; a refinement, one sweep over vectors with the same gains, removes that.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.codegen import function
-from rti_mpc.rti import interior_point
+from rti_mpc.rti import homotopy, interior_point
 from rti_mpc.rti.blocks import all_inputs, at_each, moved_on, repeated
 from rti_mpc.rti.linearization import Forms, Linearization, change, divided, partly, shift, where_bounded
 from rti_mpc.rti.ocp import Ocp
@@ -48,11 +48,14 @@ class Places:
             the plan shifted by one stage.
         gains: ``(stages, u, *ARGUMENTS, scale, places) -> gains``.
         roll_out: ``(x, u, u_prev, x0, stages, gains, *ARGUMENTS, scale, places) -> (x_plan, u_plan, violation, change, changes,
-            places_found, multipliers)``: the plan after the full step, its largest violation of softened bounds, in their unit and relative to
-            their scale, the size of the step, and how many places change: -1 if data, gains or plan are not finite.
+            places_found, multipliers, targets)``: the plan after the full step, its largest violation of softened bounds, in their unit and
+            relative to their scale, the size of the step, and how many places change: -1 if data, gains or plan are not finite. Targets are the
+            coordinates of the rows, see `rti_mpc.rti.homotopy`.
         refine: ``(x, u, u_prev, stages, gains, *ARGUMENTS, scale, places, r, x_plan, u_plan, multipliers) -> (x_refined,
             u_refined, multipliers_refined)``: plan and multipliers after a Newton step that removes the remaining gradient r of the Lagrangian,
             see `rti_mpc.rti.certificate`.
+        begin: The start of the homotopy; see `rti_mpc.rti.homotopy`.
+        move: The way to its next change of a place.
         enter: The start of the interior point; see `rti_mpc.rti.interior_point`.
         step: A step of the interior point.
     """
@@ -62,6 +65,8 @@ class Places:
     gains: ca.Function
     roll_out: ca.Function
     refine: ca.Function
+    begin: ca.Function
+    move: ca.Function
     enter: ca.Function
     step: ca.Function
 
@@ -115,6 +120,8 @@ def places(ocp: Ocp) -> Places:
         function("gains", {"stages": stages, "u": lin.u, **lin.weights, "places": flat}, {"gains": gains}),
         function("roll_out", {**guess, "x0": x0, **fixed}, rolled),
         function("refine", {**guess, **fixed, **plan}, refine(ocp, recursion, at, stages, **plan)),
+        homotopy.begin(ocp, lin, stages),
+        homotopy.move(ocp, lin, flat.numel()),
         interior_point.enter(ocp, lin, stages),
         interior_point.step(ocp, lin, recursion, stages, x0),
     )
@@ -161,7 +168,8 @@ def roll_out(ocp: Ocp, at: Sample, x0: ca.MX) -> dict[str, ca.MX]:
         "before": lin.u_prev,
     }
     carried = {"s": "s_after", "slip": "slip_after", "verdict": "verdict_after", "before": "u_plan"}
-    outputs = ["x_plan", "u_plan", "verdict_after", "place_u_found", "place_du_found", "place_g_found", "force", "paid"]
+    found, targets = ([f"{what}_{row}" for row in ("u", "du", "g")] for what in ("found", "target"))
+    outputs = ["x_plan", "u_plan", "verdict_after", *found, *targets, "force", "paid"]
     rolling = repeated(roll_free(ocp, lin), roll_held(ocp, lin), ocp.blocks)
     along = recur("rolled_out", rolling, carried, outputs, shared=[name for name, e in (limits | bounds).items() if e.size2() == 1])(
         A=forms.A,
@@ -189,8 +197,9 @@ def roll_out(ocp: Ocp, at: Sample, x0: ca.MX) -> dict[str, ca.MX]:
         "violation": verdict[1:],
         "change": change(lin, u_plan),
         "changes": ca.if_else(ca.fabs(finite) < np.inf, verdict[0], -1),
-        "places_found": ca.veccat(along["place_u_found"], along["place_du_found"], along["place_g_found"]),
+        "places_found": ca.veccat(*(along[name] for name in found)),
         "multipliers": ca.veccat(along["force"], along["paid"]),
+        "targets": ca.veccat(*(along[name] for name in targets)),
     }
 
 
@@ -231,7 +240,7 @@ def softened_rows(ocp: Ocp, of: Stage, s: ca.SX, slip: ca.SX, du: ca.SX, slipped
     end = ca.vertcat(dx, du)
     value = g + of.G @ end
     planned = value + of.G @ ca.vertcat(drift, slipped)
-    found, paid = ca.SX(of.ng, 1), ca.SX(of.ng, 1)
+    found, paid, target = (ca.SX(of.ng, 1) for _ in range(3))
     lb, ub = ocp.tightest("lg"), ocp.tightest("ug")
     for j in range(of.ng):
         over, under = excess_of(value[j], lg[j], ug[j], lb[j], ub[j])
@@ -240,11 +249,13 @@ def softened_rows(ocp: Ocp, of: Stage, s: ca.SX, slip: ca.SX, du: ca.SX, slipped
         found[j] = new_place(place_g[j], stiff_g[j], scale_g[j], over, under, zg[j] / 2)
         changes += found[j] != place_g[j]
         by = ca.if_else(place_g[j] > 0, over, under)
+        target[j] = ca.if_else(ca.fabs(place_g[j]) == 1, stiff_g[j] * by, value[j])
         paid[j] = ca.sign(place_g[j]) * ca.if_else(ca.fabs(place_g[j]) == 2, (zg[j] + Zg[j] * by) / 2, stiff_g[j] * by)
     symbols = {**of.dynamics, **of.defect, **of.softened, **dict(zip(names, own, strict=True))}
     symbols |= {"x_next": x_next, "s": s, "slip": slip, "verdict": verdict}
     outputs = {"x_plan": x_next + dx + drift, "s_after": end, "slip_after": ca.vertcat(drift, slipped)}
-    return Softened(symbols, outputs | {"place_g_found": ca.densify(found), "paid": ca.densify(paid)}, [changes, worst, share])
+    outputs |= {"found_g": ca.densify(found), "paid": ca.densify(paid), "target_g": ca.densify(target)}
+    return Softened(symbols, outputs, [changes, worst, share])
 
 
 def simplified(name: str, inputs: dict[str, ca.SX], outputs: dict[str, ca.SX]) -> ca.Function:
@@ -275,11 +286,16 @@ def roll_free(ocp: Ocp, lin: Linearization) -> ca.Function:
         now = [new_place(place[j], stiff[j], scale[j], *excess_of(value[j], lower[j], upper[j], lb[j], ub[j]), INFINITY) for j in range(nu)]
         return ca.densify(ca.vertcat(*now))
 
+    def targets(value: ca.SX, place: ca.SX, lower: ca.SX, upper: ca.SX) -> ca.SX:
+        by = ca.if_else(place > 0, value - upper, lower - value)
+        return ca.densify(ca.if_else(ca.fabs(place) == 1, stiff * by, value))
+
     planned = increment + du - s[of.nx :]
-    outputs["place_u_found"] = placed(u + du, place_u, lbu, ubu, ocp.tightest("lbu"), ocp.tightest("ubu"))
-    outputs["place_du_found"] = placed(planned, place_du, lbdu, ubdu, ocp.tightest("lbdu"), ocp.tightest("ubdu"))
-    verdict[0] += ca.sum1(outputs["place_u_found"] != place_u)
-    verdict[0] += ca.sum1(outputs["place_du_found"] != place_du)
+    outputs["found_u"] = placed(u + du, place_u, lbu, ubu, ocp.tightest("lbu"), ocp.tightest("ubu"))
+    outputs["found_du"] = placed(planned, place_du, lbdu, ubdu, ocp.tightest("lbdu"), ocp.tightest("ubdu"))
+    verdict[0] += ca.sum1(outputs["found_u"] != place_u)
+    verdict[0] += ca.sum1(outputs["found_du"] != place_du)
+    outputs["target_u"], outputs["target_du"] = targets(u + du, place_u, lbu, ubu), targets(planned, place_du, lbdu, ubdu)
     outputs["force"] = ca.densify(stiff * (ca.fabs(place_du) == 1) * (planned - ca.if_else(place_du > 0, ubdu, lbdu)))
     inputs = {**symbols, "gain": gain.column, **dict(zip(names, own, strict=True))}
     return simplified("forward", inputs, {**outputs, "u_plan": u_plan, "verdict_after": ca.vertcat(*verdict)})

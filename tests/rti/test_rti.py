@@ -686,7 +686,7 @@ def test_list_of_what_is_compiled_leaves_the_qp_behind_an_active_set_out() -> No
     transcription = simultaneous(ocp, softened=False)
     assert natives([transcription], None) == [transcription.data, transcription.embed, transcription.step]
     listed = [function.name() for function in natives([transcription], (places(ocp), certificate(ocp)))]
-    assert listed == ["linearize", "advance", "gains", "roll_out", "refine", "enter", "step", "certificate"]
+    assert listed == ["linearize", "advance", "gains", "roll_out", "refine", "begin", "move", "enter", "step", "certificate"]
 
 
 def resident() -> int:

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+r"""
+Homotopy of the parametric active-set method [Ferreau2008]_: from a QP whose solution is known to that of the sample.
+
+A solution has a value and a multiplier for each bounded row. Both together are on a
+curve of up to five *segments*, and the place of the row says on which: between its
+bounds, where only the value is free; at a bound, where only the multiplier is, up to
+the linear penalty of its slack; beyond a softened bound, where only the value is. So a
+row is at one number, its *coordinate* on its segment.
+
+Any point on the curves is the solution of some QP. On the line from the data of that QP
+to those of the sample's, all coordinates move straight towards those that are rolled
+out with the same places, until the first of them comes to the end of its segment. That
+row goes on to the next segment, and the next roll-out gives the new direction: one
+change of a place for each roll-out with its gains. As the QP is convex, the way ends.
+It begins at the guess.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from rti_mpc.codegen import function
+from rti_mpc.rti.linearization import Linearization, along_rows
+from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.qp.transcription import INFINITY
+
+
+def limits(ocp: Ocp, lin: Linearization) -> list[ca.MX]:
+    """Return the lower and the upper bound of each row, and the largest multiplier that it has at one: half the linear penalty, as of the cost."""
+    w, hard = lin.w, ca.MX(ca.DM.zeros(ocp.model.nu) + INFINITY)
+    lower, upper = along_rows(ocp, w["lbu"], w["lbdu"], lin.lg), along_rows(ocp, w["ubu"], w["ubdu"], lin.ug)
+    return [lower, upper, along_rows(ocp, hard, hard, lin.zg / 2)]
+
+
+class Row:
+    """
+    Symbols of a row.
+
+    Attributes:
+        place: Its place; `found`, that which the roll-out has found.
+        now: Its coordinate, a value, or the multiplier at its bound; `target`, that of the roll-out with its place.
+        symbols: These, and the row's `limits`.
+        held: Whether it is at its bound.
+        bound: The bound from which, or to which, it goes.
+        most: Its largest multiplier.
+    """
+
+    def __init__(self) -> None:
+        names = ("place", "found", "now", "target", "lower", "upper", "most")
+        self.symbols = [ca.SX.sym(name) for name in names]
+        self.place, self.found, self.now, self.target, self.lower, self.upper, self.most = self.symbols
+        self.held = ca.fabs(self.place) == 1
+        self.bound = ca.if_else(self.place + self.found > 0, self.upper, self.lower)
+
+    @property
+    def start(self) -> ca.SX:
+        """
+        The coordinate at which a row begins.
+
+        That is its guess, `now`, on its segment. A multiplier outside it begins inside: as large with the other sign, or at half of the largest one.
+        Otherwise all rows that change would do so at the very beginning, in an order that means nothing.
+        """
+        beyond = ca.if_else(self.place > 0, ca.fmax(self.now, self.upper), ca.fmin(self.now, self.lower))
+        inside = ca.if_else(self.target > self.most, self.most / 2, ca.fmin(ca.fabs(self.target), self.most))
+        return ca.if_else(self.held, inside, ca.if_else(self.place == 0, ca.fmax(self.lower, ca.fmin(self.now, self.upper)), beyond))
+
+    @property
+    def share(self) -> ca.SX:
+        """The share of the way to its target after which it comes to the end of its segment."""
+        end = ca.if_else(self.held, ca.if_else(self.found == 0, 0, self.most), self.bound)
+        return ca.if_else(self.found == self.place, INFINITY, ca.fmax((end - self.now) / (self.target - self.now), 0))
+
+    def after(self, share: ca.SX, least: ca.SX) -> list[ca.SX]:
+        """Return place and coordinate after the least share of all rows."""
+        first = ca.if_else(ca.fabs(self.found) == 1, ca.if_else(self.place == 0, 0, self.most), self.bound)
+        changes = share == least
+        return [ca.if_else(changes, self.found, self.place), ca.if_else(changes, first, self.now + least * (self.target - self.now))]
+
+
+def begin(ocp: Ocp, lin: Linearization, stages: ca.MX) -> ca.Function:
+    """Build ``(u, stages, *ARGUMENTS, scale, places, targets) -> point``: where the homotopy begins, from the guess and a roll-out with places."""
+    row, forms = Row(), lin.forms_in(stages)
+    guess = ca.veccat(lin.u, forms.increments, forms.g)
+    places, targets = ca.MX.sym("places", guess.numel()), ca.MX.sym("targets", guess.numel())
+    start = ca.Function("start", [row.place, row.now, row.target, row.lower, row.upper, row.most], [row.start]).map(guess.numel())
+    point = start(*(of.T for of in (places, guess, targets, *limits(ocp, lin)))).T
+    return function("begin", {"u": lin.u, "stages": stages, **lin.weights, "places": places, "targets": targets}, {"point": point})
+
+
+def move(ocp: Ocp, lin: Linearization, size: int) -> ca.Function:
+    """
+    Build ``(*ARGUMENTS, scale, places, places_found, point, targets) -> (places_next, point_next)``: the way to the first change of a place.
+
+    Args:
+        ocp: The problem.
+        lin: Expressions of the sample.
+        size: Number of rows.
+    """
+    row = Row()
+    names = "places", "places_found", "point", "targets"
+    given = {name: ca.MX.sym(name, size) for name in names}
+    of_rows = [of.T for of in (*given.values(), *limits(ocp, lin))]
+    shares = ca.Function("share", row.symbols, [row.share]).map(size)(*of_rows)
+    share, least = ca.SX.sym("share"), ca.SX.sym("least")
+    after = ca.Function("after", [*row.symbols, share, least], row.after(share, least)).map(size)
+    places, point = after(*of_rows, shares, ca.repmat(ca.fmin(ca.mmin(shares), 1), 1, size))
+    return function("move", {**lin.weights, **given}, {"places_next": places.T, "point_next": point.T})

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Homotopy of the active set: against QPs solved by DAQP, one place at a time, and where changing all places at once goes in circles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rti_mpc.array import Array
+from rti_mpc.contract.status import QpStatus
+from rti_mpc.rti import active_set
+from rti_mpc.rti.active_set import ActiveSet
+from rti_mpc.rti.rti import Rti
+from rti_mpc_service.bench.families import paper
+from tests.rti.test_active_set import PROBLEMS, samples
+
+
+@pytest.fixture
+def alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let places change by the homotopy only, as often as they have to."""
+    monkeypatch.setattr(active_set, "MAX_ROLL_OUTS", 0)
+    monkeypatch.setattr(active_set, "MAX_CHANGES", np.inf)
+    monkeypatch.setattr(active_set, "MAX_MOVES", 500)
+
+
+@pytest.mark.usefixtures("alone")
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_homotopy_ends_at_the_plan_of_the_qp_solved_by_another_solver(name: str) -> None:
+    ocp = PROBLEMS[name]()
+    rti, exact = (Rti(ocp, solver=solver, formulation="sequential", iterations=1, compile=False) for solver in ("riccati", "daqp"))
+    moved = 0
+    for x0, y_ref, u_prev in samples(ocp, 30):
+        for one in (rti, exact):
+            one.reset(x0, u_prev)
+            one.prepare(y_ref, shift=False)
+            assert one.feedback(x0).usable
+        assert rti.active_set is not None
+        assert rti.solver is rti.active_set
+        assert rti.active_set.steps == 0, "no way goes in circles"
+        moved += rti.active_set.roll_outs > 0
+        np.testing.assert_allclose(rti.u, exact.u, rtol=0, atol=1e-5)
+    assert moved >= (10 if name != "beacon" else 0), "whose bounds hardly act at the start"
+
+
+@pytest.mark.usefixtures("alone")
+@pytest.mark.parametrize("name", ["pioneer", "fenced"])
+def test_each_move_leads_to_the_next_segment_of_one_row_and_leaves_all_others_on_theirs(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[Array, Array]] = []
+    again = ActiveSet._roll_out_again
+
+    def watched(self: ActiveSet) -> None:
+        seen.append((self._places.copy(), self._point.copy()))
+        again(self)
+
+    monkeypatch.setattr(ActiveSet, "_roll_out_again", watched)
+    ocp = PROBLEMS[name]()
+    rti = Rti(ocp, iterations=1, compile=False)
+    for x0, y_ref, u_prev in samples(ocp, 10):
+        rti.reset(x0, u_prev)
+        rti.prepare(y_ref, shift=False)
+        before = np.zeros(0)
+        seen.clear()
+        assert rti.feedback(x0).usable
+        for places, point in seen:
+            assert np.isfinite(point).all()
+            assert (point[np.abs(places) == 1] >= 0.0).all(), "a multiplier has its sign on the whole way"
+            if before.size:
+                changed = places != before
+                assert 1 <= changed.sum() <= 3, "rows that come to their ends at once change at once"
+                assert (np.abs(places - before)[changed] == 1).all(), "segments meet their neighbours only"
+            before = places
+
+
+def test_places_that_go_in_circles_when_all_change_at_once_settle_one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The paper's second trajectory from its start, in a short horizon: without the homotopy these samples are left to the interior point."""
+    family = paper(7)
+
+    def steps() -> int:
+        rti = Rti(family.ocp, compile=False)
+        x, u, taken = np.zeros(5), family.u0, 0
+        for k in range(800, 830):
+            if (start := family.start(k)) is not None:
+                x, u = start, family.u0
+                rti.reset(x, u)
+            y_ref, p = family.at(k)
+            rti.prepare(y_ref, p, shift=start is None, u_prev=u)
+            assert rti.feedback(x) is QpStatus.SOLVED
+            assert rti.active_set is not None
+            taken += rti.active_set.steps
+            u = rti.u[0].copy()
+            x = family.plant(x, u)
+        return taken
+
+    assert steps() == 0
+    monkeypatch.setattr(active_set, "MAX_CHANGES", 0)
+    assert steps() > 20
