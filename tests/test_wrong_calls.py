@@ -62,11 +62,11 @@ MODEL = {
         lambda: mass(x=MX_X, u=MX_U, f_expl_expr=[MX_X[1], ca.MX.sym("wind")], y_expr=MX_X[0]),
         "f_expl_expr must depend only on x, u, p, also has wind",
     ),
-    "f_expl_expr that is a row": (lambda: mass(f_expl_expr=ca.horzcat(X[1], U)), "f_expl_expr must have 2 entries, in a column"),
+    "f_expl_expr that is a row": (lambda: mass(f_expl_expr=ca.horzcat(X[1], U)), "f_expl_expr must be a column, of shape (2, 1), got shape (1, 2)"),
     "y_expr of None": (lambda: mass(y_expr=None), "model mass: y_expr must be an expression"),
     "states that are a number": (lambda: mass(states=2), "model mass: states must be signals or their names, got 2"),
     "states with a number among them": (lambda: mass(states=["r", 2]), "model mass: states must be signals or their names, got 2 among them"),
-    "states that are too few": (lambda: mass(states="r"), "model mass: states must have 2 entries"),
+    "states that are too few": (lambda: mass(states="r"), "model mass: states must have 2 entries, as x has, got 1"),
     "output that is an angle of a state that is none": (
         lambda: mass(outputs=Signal("psi", "rad", angle=True)),
         "output psi is the state r, both or none must be an angle, got angle=True and angle=False",
@@ -163,6 +163,7 @@ REFERENCE = {
     "rows of a period of None": (lambda: rows(eight(), None), "period_s must be real numbers, got None"),  # type: ignore[arg-type]
     "rows from a heading of text": (lambda: rows(eight(), 0.1, psi0="east"), "psi0 must be real numbers, got 'east'"),  # type: ignore[arg-type]
     "a circle of no size": (lambda: circle(0.0), "k must be finite and above 0, got 0.0"),
+    "find_trajectory of a scenario misspelt": (lambda: find_trajectory("eigth"), "or a FILE.csv of waypoints, got 'eigth', perhaps eight is meant"),
     "find_trajectory(None)": (lambda: find_trajectory(None), "a scenario must be one of eight, circle, positioning or a FILE.csv"),  # type: ignore[arg-type]
 }
 

@@ -107,21 +107,25 @@ class Model:
         if not self.u_rest:
             object.__setattr__(self, "u_rest", (0.0,) * len(self.inputs))
         object.__setattr__(self, "quaternions", quaternions_of(self))
-        stop_expr = ca.SX(0, 1) if self.stop_expr is None else self.stop_expr
-        for label, expr, length in (
-            ("states", self.x, len(self.states)),
-            *((name, expr, len(self.states)) for name, expr in self.dynamics.items()),
-            ("inputs", self.u, len(self.inputs)),
-            ("outputs", self.y_expr, len(self.outputs)),
-            ("parameters", self.p, len(self.parameters)),
-            ("constraints", self.h_expr, len(self.constraints)),
-            ("p_nominal", self.p, len(self.p_nominal)),
-            ("u_rest", self.u, len(self.u_rest)),
-            ("stop_expr", stop_expr, 0 if self.stop_expr is None else len(self.inputs)),
-            ("x_nominal", self.x, len(self.x_nominal) or self.nx),
+        laws = self.dynamics if self.stop_expr is None else {**self.dynamics, "stop_expr": self.stop_expr}
+        expressions = {**laws, "y_expr": self.y_expr, "h_expr": self.h_expr}
+        columns = {"x": self.x, "u": self.u, "p": self.p, **expressions}
+        for name, expr in columns.items():
+            if expr.numel() and expr.shape[1] != 1:
+                raise OcpError(f"model {self.name}: {name} must be a column, of shape {(expr.numel(), 1)}, got shape {expr.shape}")
+        for label, got, like in (
+            ("states", len(self.states), "x"),
+            ("inputs", len(self.inputs), "u"),
+            ("outputs", len(self.outputs), "y_expr"),
+            ("parameters", len(self.parameters), "p"),
+            ("constraints", len(self.constraints), "h_expr"),
+            *((name, expr.numel(), "u" if name == "stop_expr" else "x") for name, expr in laws.items()),
+            ("p_nominal", len(self.p_nominal), "p"),
+            ("u_rest", len(self.u_rest), "u"),
+            ("x_nominal", len(self.x_nominal) or self.nx, "x"),
         ):
-            if expr.numel() != length or (length and expr.shape != (length, 1)):
-                raise OcpError(f"model {self.name}: {label} must have {expr.numel()} entries, in a column, got {length} for shape {expr.shape}")
+            if got != columns[like].numel():
+                raise OcpError(f"model {self.name}: {label} must have {columns[like].numel()} entries, as {like} has, got {got}")
         for vector in ROLES_OF_VECTOR:
             signals: tuple[Signal, ...] = getattr(self, vector)
             names = [signal.name for signal in signals]
@@ -136,12 +140,8 @@ class Model:
         for output, y_i in zip(self.outputs, ca.vertsplit(self.y_expr), strict=True):
             if output.angle and depends_on(y_i, self.u):
                 raise OcpError(f"model {self.name}: output {output.name} is an angle and must not depend on u, got {y_i}")
-        for label, expr, known in (
-            *((name, expr, (self.x, self.u, self.p)) for name, expr in self.dynamics.items()),
-            ("y_expr", self.y_expr, (self.x, self.u, self.p)),
-            ("h_expr", self.h_expr, (self.x, self.u, self.p)),
-            ("stop_expr", stop_expr, (self.x, self.u, self.p)),
-        ):
+        known = (self.x, self.u, self.p)
+        for label, expr in expressions.items():
             free = [str(s) for s in ca.symvar(expr) if not any(ca.depends_on(k, s) for k in known)]
             if free:
                 raise OcpError(f"model {self.name}: {label} must depend only on x, u, p, also has {', '.join(free)}")
