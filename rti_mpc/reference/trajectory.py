@@ -182,7 +182,8 @@ def find_trajectory(scenario: str | Path, speed_m_s: float = 0.25, corner_m: flo
         return SCENARIOS[str(named)]()
     path = Path(named)
     if path.suffix.lower() != ".csv":
-        raise ConfigError(f"a scenario must be one of {', '.join(SCENARIOS)} or a FILE.csv of waypoints, got {scenario!r}")
+        meant = given.nearest(scenario, SCENARIOS)
+        raise ConfigError(f"a scenario must be one of {', '.join(SCENARIOS)} or a FILE.csv of waypoints, got {scenario!r}{meant}")
     points = read_csv(path)
     try:
         return waypoints(points, speed_m_s, corner_m, name=path.stem, smooth_m=smooth_m)

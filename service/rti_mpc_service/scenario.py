@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.contract.message import End
 from rti_mpc.errors import ConfigError
@@ -112,8 +113,9 @@ def find_scenario(
         name = "eight" if in_plane(model.outputs) else "sines"
     timed = (*OUTPUT_SCENARIOS, *MANOEUVRES)
     if name not in (*SCENARIOS, *timed) and Path(name).suffix.lower() != ".csv":
-        known = ", ".join((*SCENARIOS, *OUTPUT_SCENARIOS, *fitting(model.outputs)))
-        raise ConfigError(f"a scenario must be one of {known} or a FILE.csv of waypoints or of outputs over time, got {name!r}")
+        known = (*SCENARIOS, *OUTPUT_SCENARIOS, *fitting(model.outputs))
+        told = f"a scenario must be one of {', '.join(known)} or a FILE.csv of waypoints or of outputs over time"
+        raise ConfigError(f"{told}, got {name!r}{given.nearest(name, known)}")
     if name not in SCENARIOS and (name in timed or not in_plane(model.outputs) or names_outputs(Path(name), model.outputs)):
         if heading is not None:
             raise ConfigError(f"--heading is of paths in the plane, it must be left out for {name}, got {heading}")

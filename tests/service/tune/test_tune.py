@@ -175,6 +175,7 @@ def test_interrupted_study_keeps_what_is_done_and_goes_on(tmp_path: Path, capsys
         ({"storage": "postgresql://u:secret@127.0.0.1:1/s"}, "--storage postgresql: needs the Python package psycopg"),
         ({"storage": ""}, "--storage must be a storage of Optuna that can be used"),
         ({"held_out": ""}, "a scenario must be one of"),
+        ({"held_out": "circel"}, "of outputs over time, got 'circel', perhaps circle is meant"),
         ({"held_out": "eight"}, "--held-out must be another scenario than that of the study, got eight, heading consistent for both"),
         ({"out": Path("robot.png")}, "--out must be a TOML file other than"),
         ({"out": Path("/nowhere/robot.toml")}, "--out must be in a folder that exists"),
