@@ -32,9 +32,13 @@ def test_running_controller_is_explained_while_it_drives_on(tmp_path: Path) -> N
         then = json.loads(rti_mpc("why", "-e", system.endpoint, "--json").stdout)
         assert then["seq"] > first["seq"]
         assert rti_mpc("why", "-e", system.endpoint).stdout.startswith("command ")
+        other = rti_mpc("why", "-e", system.endpoint, "--controller", "1")
+        assert other.stderr.startswith("rti-mpc: the last 4 s of pioneer must hold the journal of a robot, controller 1, got --robot pioneer ")
 
 
 def test_controller_that_does_not_run_is_explained_by_one_line() -> None:
-    done = rti_mpc("why", "-e", free_endpoint())
+    endpoint = free_endpoint()
+    done = rti_mpc("why", "-e", endpoint)
     assert (done.returncode, done.stdout.count("INFO")) == (2, 0)
-    assert "must hold the journal of a robot, got none" in done.stderr
+    needed = "rti-mpc: why needs a running controller, or a recording, RUN.mcap: in 4 s none of rti_mpc/pioneer was heard at "
+    assert done.stderr == f"{needed}{endpoint}\n"

@@ -9,6 +9,8 @@ from pathlib import Path
 from threading import Event, Timer
 from typing import Any
 
+from rti_mpc.errors import ConfigError
+from rti_mpc.recording import Recording
 from rti_mpc.wire.bus import BusSettings
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.record import record
@@ -32,12 +34,20 @@ def main(bus_settings: BusSettings, keys: Keys, **choice: Any) -> int:
     Raises:
         ConfigError: No controller was heard, or its model is not here.
     """
+    heard = f"the last {LISTENED_S:g} s of {keys.robot}"  # as messages name it, without its temporary folder
     logging.getLogger(record.__name__).setLevel(logging.ERROR)  # what is missing is said where it matters
     over = Event()
     with tempfile.TemporaryDirectory(prefix="rti-mpc-why-") as folder:
-        path = Path(folder) / f"the last {LISTENED_S:g} s of {keys.robot}"
+        path = Path(folder) / heard
         timer = Timer(LISTENED_S, over.set)
         timer.daemon = True
         timer.start()
         record.main(bus_settings, keys, out=path, stop=over)
-        return why.main(path, **choice)
+        if not any(Recording(path).messages(keys.robot, ("journal",))):
+            where = " or ".join(bus_settings.connect) or "any endpoint that it listens at"
+            none = f"in {LISTENED_S:g} s none of {keys.prefix}/{keys.robot} was heard at {where}"
+            raise ConfigError(f"why needs a running controller, or a recording, RUN.mcap: {none}")
+        try:
+            return why.main(path, **choice)
+        except ConfigError as error:
+            raise ConfigError(str(error).replace(f"{path}", heard)) from error
