@@ -29,8 +29,9 @@ def test_running_controller_is_explained_while_it_drives_on(tmp_path: Path) -> N
         assert set(first["inputs"]) == {"u_c", "omega_c"}
         assert first["times"]["feedback_us"] > 0
         system.tracking()
-        then = json.loads(rti_mpc("why", "-e", system.endpoint, "--json").stdout)
-        assert then["seq"] > first["seq"]
+        done = rti_mpc("why", "-e", system.endpoint, "--json")
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert json.loads(done.stdout)["seq"] > first["seq"]
         assert rti_mpc("why", "-e", system.endpoint).stdout.startswith("command ")
         other = rti_mpc("why", "-e", system.endpoint, "--controller", "1")
         assert other.stderr.startswith("rti-mpc: the last 4 s of pioneer must hold the journal of a robot, controller 1, got --robot pioneer ")

@@ -19,6 +19,7 @@ from rti_mpc_service.redrawn import Redrawn
 
 MEDIAN_SAMPLES = 200  # the shown medians are over the last samples
 MAX_SHOWN_EVENTS = 3
+MAX_TOLD = 10  # misses, and events, at the end: on a busy host hundreds of lines would hide the summary
 PROGRESS_LINES = 10  # per run, where there is no terminal
 MISSING_TEXT = "none"
 
@@ -101,14 +102,17 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
     for row in rows:
         table.add_row(*row)
     console.print(table)
-    for miss in summary["misses"]:
-        console.print(
-            "missed its period: the sample at {at_s:.1f} s, by {late:.1f} ms of the robot; "
-            "preparation {prepare_us:.0f}, feedback {feedback_us:.0f} us".format(late=-1e3 * miss["slack_s"], **miss),
-            soft_wrap=True,
-        )
-    for fault in summary["events"]:
-        console.print("{severity} of the {source} at {at_s:.1f} s: {text}".format(**fault), soft_wrap=True)
+    misses = [
+        "missed its period: the sample at {at_s:.1f} s, by {late:.1f} ms of the robot; "
+        "preparation {prepare_us:.0f}, feedback {feedback_us:.0f} us".format(late=-1e3 * miss["slack_s"], **miss)
+        for miss in summary["misses"]
+    ]
+    events = ["{severity} of the {source} at {at_s:.1f} s: {text}".format(**fault) for fault in summary["events"]]
+    for name, lines in {"misses": misses, "events": events}.items():
+        for line in lines[:MAX_TOLD]:
+            console.print(line, soft_wrap=True)
+        if (more := len(lines) - MAX_TOLD) > 0:
+            console.print(f"and {more} more {name}, in summary.json", soft_wrap=True)
 
 
 def path_text(path: Mapping[str, Any]) -> str:

@@ -56,6 +56,16 @@ def test_summary_loses_no_number_and_no_word(columns: str, monkeypatch: pytest.M
     assert "…" not in printed
 
 
+def test_summary_of_a_busy_host_is_not_hidden_by_its_faults(capsys: pytest.CaptureFixture[str]) -> None:
+    miss = {"slack_s": -0.02, "prepare_us": 100.0, "feedback_us": 200.0}
+    misses, events = [{"at_s": float(k), **miss} for k in range(72)], [{**SUMMARY["events"][0], "at_s": float(k)} for k in range(10)]
+    print_summary(widened(plain_console()), SUMMARY | {"misses": misses, "events": events})
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.startswith("missed its period: the sample at 9.0 s")]
+    assert not [line for line in lines if line.startswith("missed its period: the sample at 10.0 s")]
+    assert [line for line in lines if line.startswith("and ")] == ["and 62 more misses, in summary.json"]
+
+
 def test_progress_in_a_pipe_is_one_whole_line_each(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setenv("COLUMNS", "20")
     numbers = (5, 0.0, 0.0, 1.0, 0.0, LARGE, LARGE, 30.0, 0.0, 0.0, 0, 0, 1)
