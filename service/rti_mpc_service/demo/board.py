@@ -107,12 +107,17 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
         "preparation {prepare_us:.0f}, feedback {feedback_us:.0f} us".format(late=-1e3 * miss["slack_s"], **miss)
         for miss in summary["misses"]
     ]
-    events = ["{severity} of the {source} at {at_s:.1f} s: {text}".format(**fault) for fault in summary["events"]]
+    events = ["{severity} of the {source}{when}: {text}".format(when=when_text(fault["at_s"]), **fault) for fault in summary["events"]]
     for name, lines in {"misses": misses, "events": events}.items():
         for line in lines[:MAX_TOLD]:
             console.print(line, soft_wrap=True)
         if (more := len(lines) - MAX_TOLD) > 0:
             console.print(f"and {more} more {name}, in summary.json", soft_wrap=True)
+
+
+def when_text(at_s: float) -> str:
+    """Return a time of the robot's clock; empty for that of a process that does not know it, such as a recorder, whose stamps are zero."""
+    return f" at {at_s:.1f} s" if at_s else ""
 
 
 def path_text(path: Mapping[str, Any]) -> str:

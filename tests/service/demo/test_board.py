@@ -56,6 +56,12 @@ def test_summary_loses_no_number_and_no_word(columns: str, monkeypatch: pytest.M
     assert "…" not in printed
 
 
+def test_event_of_a_process_that_does_not_know_the_robots_time_has_none(capsys: pytest.CaptureFixture[str]) -> None:
+    event = {"severity": "WARNING", "source": "recorder", "at_s": 0.0, "text": "4 messages are missing"}
+    print_summary(widened(plain_console()), SUMMARY | {"events": [event]})
+    assert capsys.readouterr().out.splitlines()[-1] == "WARNING of the recorder: 4 messages are missing"
+
+
 def test_summary_of_a_busy_host_is_not_hidden_by_its_faults(capsys: pytest.CaptureFixture[str]) -> None:
     miss = {"slack_s": -0.02, "prepare_us": 100.0, "feedback_us": 200.0}
     misses, events = [{"at_s": float(k), **miss} for k in range(72)], [{**SUMMARY["events"][0], "at_s": float(k)} for k in range(10)]
