@@ -9,13 +9,15 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.host.hold_up import Host, Threads
 
 MS = 1_000_000
 WAIT_BEFORE_DROP = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"  # us
 WAIT_BEFORE_CLOSE = "transport/link/tx/queue/congestion_control/block/wait_before_close"  # us
 PATIENT = (f"{WAIT_BEFORE_DROP}:60000000",)  # settings of a bus that waits rather than drop a message where a busy host holds up the link
 SEEN = 0.8  # share of a delay that the witness sees at least, where the host is the reason
+LOOK_MS = 20.0  # between two looks at a process that ends
+PATIENCE_S = 120.0  # for an end: a busy host takes its time
 BEFORE_NS = 50 * MS  # what has just been sent when something begins may be held up already
 
 
@@ -48,6 +50,55 @@ def computed_ms(process: subprocess.Popen[bytes]) -> float:
     """Return for how long a process and the children it has waited for have computed: what a start takes of it is the host's speed."""
     fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
     return sum(map(int, fields[11:15])) * 1000.0 / os.sysconf("SC_CLK_TCK")
+
+
+def ends_in_time(process: subprocess.Popen[bytes], what: str, limit_ms: float, patience_s: float = PATIENCE_S) -> int:
+    """
+    Hold a process that was just asked to end to a time, less that in which its own threads waited for a core; return its exit status.
+
+    What others wait for meanwhile excuses nothing: where many end at once, that alone would excuse any end.
+
+    Raises:
+        subprocess.TimeoutExpired: It does not end.
+    """
+    since_ns = time.monotonic_ns()
+    waits = OwnWaits(process.pid)
+    while process.poll() is None:
+        waits.look()
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(1e-3 * LOOK_MS)
+        if time.monotonic_ns() - since_ns > 1e9 * patience_s:
+            raise subprocess.TimeoutExpired(what, patience_s)
+    took_ms = (time.monotonic_ns() - since_ns) / MS
+    waits.look()  # which closes what it has opened
+    assert waits.explain(took_ms - limit_ms), (
+        f"{what} took {took_ms:.0f} ms of {limit_ms:.0f}, of which its threads waited {waits.ms:.0f} ms for a core"
+    )
+    return process.returncode
+
+
+class OwnWaits:
+    """
+    For how long the threads of one process have waited for a core, at most the time that passed.
+
+    Attributes:
+        ms: The sum until the last look.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self.ms = 0.0
+        self._threads, self._looked_ns = Threads(pid), time.monotonic_ns()
+
+    def look(self) -> None:
+        """Add what has passed since the last look; to be called every few tens of milliseconds, while the process lives."""
+        self._threads.find()
+        now_ns = time.monotonic_ns()
+        self.ms += min(self._threads.waited_ns(), now_ns - self._looked_ns) / MS
+        self._looked_ns = now_ns
+
+    def explain(self, late_ms: float) -> bool:
+        """Whether the process has been late by no more than its own waits explain."""
+        return SEEN * late_ms <= self.ms
 
 
 def awake_ms(process: subprocess.Popen[str]) -> float:

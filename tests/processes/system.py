@@ -24,10 +24,9 @@ from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import M, decode
 from rti_mpc_service.certs.folder import secured
 from rti_mpc_service.config.config import load
-from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.shipped import SHIPPED
-from tests.in_time import in_time
+from tests.in_time import ends_in_time
 
 ROOT = Path(__file__).parents[2]
 CONFIG = load(SHIPPED)
@@ -106,14 +105,14 @@ class System:
             self.running[role].send_signal(number)
         return now_ns
 
-    def interrupt(self, role: str) -> int:
-        """Press Ctrl-C; return the exit status."""
+    def interrupt(self, role: str, limit_ms: float = 1e3 * PATIENCE_S) -> int:
+        """Press Ctrl-C, hold the process to a time for its end, and return its exit status."""
         process = self.running.pop(role)
         until(lambda: handles(process.pid, signal.SIGTERM) or process.poll() is not None, f"{role} handles signals")
         self.fault_at_ns = time.monotonic_ns()
         process.send_signal(signal.SIGINT)
         try:
-            return process.wait(PATIENCE_S)
+            return ends_in_time(process, f"the end of the {role}", limit_ms, PATIENCE_S)
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGABRT)  # where every thread is, to its log
             process.wait(PATIENCE_S)
@@ -155,13 +154,6 @@ def owner(log: str) -> int:
     texts = (json.loads(line)["text"] for line in log.splitlines())
     found = next(match for text in texts if (match := re.match(r"(?:epoch )?(\d+) (?:controls|stands by)", text)))
     return int(found[1]) % (1 << NUMBER_BITS)
-
-
-def interrupted_in_time(host: Host, system: System, role: str, limit_ms: float = 1000.0) -> int:
-    """Press Ctrl-C, hold the process to a time for its end, and return its exit status."""
-    status = system.interrupt(role)
-    in_time(host, f"the end of the {role}", 1e-6 * (time.monotonic_ns() - system.fault_at_ns), limit_ms, system.fault_at_ns)
-    return status
 
 
 def heard(subscriber: Subscriber, cls: type[M], condition: Callable[[M], bool]) -> M:

@@ -30,6 +30,7 @@ from rerun.chunk import RrdReader
 
 SPEED = 3
 HELD_UP_MS = 0.5 * 100.0 / SPEED  # half a period: what a sample that is missed has met, at least
+MAX_MISSED = 60  # of 241, on the busiest host
 QUANTILES = ("prepare_us", "feedback_us", "latency_us", "echo_us")
 ASKED_FOR = {
     *("scenario", "samples", "max_error_mm", "rms_error_mm", "final_error_mm", "final_speed_mm_s"),
@@ -81,9 +82,12 @@ def test_robot_is_driven_onto_its_path_at_every_sample_that_the_host_leaves_us(s
     """Twelve seconds after its start half a metre away; the demo itself measures two laps, on an idle machine."""
     assert summary["transient_s"] == 12.0
     missed = 241 - 6 - summary["samples"] + summary["fallbacks"]  # before its first sample a controller has to hear of the robot
-    if missed > 0 or summary["rms_error_mm"] >= 5.0:
-        what = f"{missed} samples are missing, and the error is {summary['rms_error_mm']:.1f} mm rms"
-        assert explained(host, what, max(missed, 1) * HELD_UP_MS, demo.from_ns, demo.to_ns)
+    what = f"{missed} samples are missing, and the error is {summary['rms_error_mm']:.1f} mm rms"
+    assert missed < MAX_MISSED, f"{what}: the start of its processes alone would explain as much"
+    if missed > 0:
+        assert explained(host, what, missed * HELD_UP_MS, demo.from_ns, demo.to_ns)
+    else:
+        assert summary["rms_error_mm"] < 5.0
 
 
 def test_inputs_stay_inside_their_bounds(summary: Any) -> None:

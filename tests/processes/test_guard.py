@@ -26,7 +26,7 @@ from tests.command import command
 from tests.guarded import write_robot
 from tests.in_time import explained, in_time
 from tests.processes.record import FAST_STATES, MS, Record, recorded, within_slew
-from tests.processes.system import CONFIG, KEYS, System, heard, interrupted_in_time, rti_mpc, until
+from tests.processes.system import CONFIG, KEYS, System, heard, rti_mpc, until
 
 SPEED_M_S = 0.5
 LINK_MS = 100.0  # a link drops a message of the guard only where it was held up for longer: two wait there, one each 70 ms
@@ -139,7 +139,7 @@ def test_ctrl_c_ends_the_guard_with_a_ramp_to_rest(driven: System, host: Host) -
     """The last test: the robot stays where it is."""
     actuation = driven.bus.subscriber(KEYS.actuation, capacity=4096)
     stopped_ns = driven.state(lambda _: True).stamp_ns
-    assert interrupted_in_time(host, driven, "guard") == 0
+    assert driven.interrupt("guard", 1000.0) == 0
     until(lambda: "guard" not in driven.lives, "the guard is gone")
     last = decode(Command, actuation.drain()[-1].payload)
     assert last.mode is Mode.BRAKING

@@ -23,9 +23,10 @@ from rti_mpc.wire.session import BusSettings
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.shipped import SHIPPED
 from tests.in_time import MS, in_time, on_time
-from tests.processes.system import CONFIG, KEYS, SPEED, System, heard, interrupted_in_time, rti_mpc, until
+from tests.processes.system import CONFIG, KEYS, SPEED, System, heard, rti_mpc, until
 
 STANDSTILL_SPEED = 1e-3  # m/s, rad/s
+END_MS = 1000.0  # from Ctrl-C to the end of a process
 PERIOD_MS = 1e3 * CONFIG.ocp.dt_s / SPEED
 OTHER_VERSION = f"@{cdr.MESSAGE_VERSION + 1}"  # in a refusal
 
@@ -65,7 +66,7 @@ def test_processes_start_in_any_order(system: System, order: tuple[str, ...]) ->
     until(lambda: set(order) <= system.lives, "all have met")
 
 
-def test_ctrl_c_ends_each_process_within_a_second_and_the_last_command_is_a_standstill(system: System, host: Host) -> None:
+def test_ctrl_c_ends_each_process_within_a_second_and_the_last_command_is_a_standstill(system: System) -> None:
     pytest.importorskip("rerun")
     commands = system.bus.subscriber(KEYS.command, capacity=4096)
     order = ("viewer", "reference", "controller", "robot")  # whoever is needed comes last; `make test-slow` has other orders
@@ -75,15 +76,15 @@ def test_ctrl_c_ends_each_process_within_a_second_and_the_last_command_is_a_stan
     system.tracking()
     system.state(moves)
     until(lambda: set(order) <= system.lives, "all have met")
-    assert interrupted_in_time(host, system, "viewer", 2000.0) == 0  # it has a recording to finish
-    assert interrupted_in_time(host, system, "reference") == 0
+    assert system.interrupt("viewer", 2000.0) == 0  # it has a recording to finish
+    assert system.interrupt("reference", END_MS) == 0
     system.tracking()  # the reference was published whole, and outlives its source
-    assert interrupted_in_time(host, system, "controller") == 0
+    assert system.interrupt("controller", END_MS) == 0
     until(lambda: "controller" not in system.lives, "the controller is gone")
     last = decode(Command, commands.drain()[-1].payload)
     assert (last.mode, np.abs(last.u).max()) == (Mode.STOPPED, 0.0)
     system.state(rests)
-    assert interrupted_in_time(host, system, "robot") == 0
+    assert system.interrupt("robot", END_MS) == 0
     assert "Traceback" not in "".join(map(system.said, ("controller", "robot", "reference", "viewer")))
 
 

@@ -29,7 +29,7 @@ from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_sim import robot
 from rti_mpc_sim.settings import RobotSettings
-from tests.in_time import MS, explained, in_time
+from tests.in_time import MS, ends_in_time, explained, in_time
 from tests.robots import pushed
 
 ROOT = Path(__file__).parents[2]
@@ -96,12 +96,10 @@ def next_state(states: Subscriber) -> State:
     return decode(State, received.payload)
 
 
-def interrupted(process: subprocess.Popen[bytes], host: Host) -> None:
+def interrupted(process: subprocess.Popen[bytes]) -> None:
     """Press Ctrl-C, and hold the process to a second."""
-    since_ns = time.monotonic_ns()
     process.send_signal(signal.SIGINT)
-    assert process.wait(PATIENCE_S) == 0
-    in_time(host, "the end", (time.monotonic_ns() - since_ns) / MS, 1000.0, since_ns)
+    assert ends_in_time(process, "the end", 1000.0) == 0
 
 
 def command(state: State, seq: int, u: list[float], epoch: int = 5) -> Command:
@@ -124,7 +122,7 @@ def test_robot_publishes_at_the_rate_asked_for_and_stands_still_without_commands
         assert wall_ms > 0.9 * due_ms or explained(host, "the first state came late", 0.9 * due_ms - wall_ms, since_ns, time.monotonic_ns())
         in_time(host, "forty periods", wall_ms, 1.1 * due_ms, since_ns)
         assert all(state.x.tolist() == [0.5, 0.0, 0.0, 0.0, 0.0] for state in heard)
-        interrupted(process, host)
+        interrupted(process)
 
 
 def test_commanded_robot_moves_stops_on_silence_and_ends_on_ctrl_c_standing(endpoint: str, tmp_path: Path, host: Host) -> None:
@@ -149,7 +147,7 @@ def test_commanded_robot_moves_stops_on_silence_and_ends_on_ctrl_c_standing(endp
             received = events.recv()
             assert received is not None, f"only {codes}"
             codes.add(decode(Event, received.payload).code)
-        interrupted(process, host)
+        interrupted(process)
     with log.open(newline="") as file:
         lines = list(csv.DictReader(file))
     latencies = [float(line["latency_us"]) for line in lines if line["latency_us"]]
@@ -163,7 +161,7 @@ def test_commanded_robot_moves_stops_on_silence_and_ends_on_ctrl_c_standing(endp
     assert abs(float(lines[-1]["u"])) < 1e-5
 
 
-def test_robot_that_is_stopped_sends_each_state_of_its_way_to_rest(endpoint: str, tmp_path: Path, host: Host) -> None:
+def test_robot_that_is_stopped_sends_each_state_of_its_way_to_rest(endpoint: str, tmp_path: Path) -> None:
     """Its numbers have no gap, so that a recorder misses nothing."""
     with running(ROBOT, endpoint, 1.0, 0.05, tmp_path / "log.csv") as process, peer(endpoint) as bus:
         states, events, commands = bus.subscriber(KEYS.state, capacity=1024), bus.subscriber(KEYS.events, capacity=16), bus.publisher(KEYS.command)
@@ -171,7 +169,7 @@ def test_robot_that_is_stopped_sends_each_state_of_its_way_to_rest(endpoint: str
         while heard[-1].x[3] < 0.3:
             commands.put(command(heard[-1], next(seqs), [0.4, 0.2]))
             heard.append(next_state(states))
-        interrupted(process, host)
+        interrupted(process)
         for received in iter(events.recv, None):
             if decode(Event, received.payload).code == "robot_stopped":
                 break
@@ -180,7 +178,7 @@ def test_robot_that_is_stopped_sends_each_state_of_its_way_to_rest(endpoint: str
         assert np.abs(heard[-1].x[3:]).max() < 1e-5
 
 
-def test_what_is_no_command_is_counted_and_published_and_stops_nothing(endpoint: str, tmp_path: Path, host: Host) -> None:
+def test_what_is_no_command_is_counted_and_published_and_stops_nothing(endpoint: str, tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
     with running(ROBOT, endpoint, 1.0, 0.02, log) as process, peer(endpoint) as bus:
         states = bus.subscriber(KEYS.state)
@@ -196,7 +194,7 @@ def test_what_is_no_command_is_counted_and_published_and_stops_nothing(endpoint:
         assert decode(Event, received.payload).code == "message_refused"
         seq = next_state(states).seq
         assert next_state(states).seq > seq
-        interrupted(process, host)
+        interrupted(process)
     with log.open(newline="") as file:
         last = list(csv.DictReader(file))[-1]
     assert (last["refused"], last["u_c"], last["x"]) == ("5", "0.0", "0.5")
@@ -217,7 +215,7 @@ def test_clock_of_a_robot_whose_process_is_held_up_waits_with_it(endpoint: str, 
         assert [next_state(states).stamp_ns - first.stamp_ns for _ in range(20)] == [20 * MS * k for k in range(1, 21)]
 
 
-def test_source_anchors_its_reference_to_every_new_robot_and_keeps_it_for_late_joiners(endpoint: str, tmp_path: Path, host: Host) -> None:
+def test_source_anchors_its_reference_to_every_new_robot_and_keeps_it_for_late_joiners(endpoint: str, tmp_path: Path) -> None:
     with running(SOURCE, endpoint) as source, peer(endpoint) as bus:
         references = bus.subscriber(KEYS.reference, capacity=4)
         heard = []
@@ -230,7 +228,7 @@ def test_source_anchors_its_reference_to_every_new_robot_and_keeps_it_for_late_j
         assert [reference.stamp_ns % (20 * MS) for reference in heard] == [0, 0]
         assert (heard[0].period_ns, heard[0].end, heard[0].p.shape[1]) == (50 * MS, End.STOP, 0)
         np.testing.assert_array_equal(heard[1].y, rows(eight(), 0.05, "consistent"))
-        interrupted(source, host)
+        interrupted(source)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,8 @@ Witness of the host: for how long a process and its descendants were ready to ru
 A bare timer on each core, which computes nothing, measures when that core stood still.
 One of the timers adds up how long each thread of the watched processes was ready to run
 and had no core (`schedstat` in `proc(5)`). Where processes wait for each other, the sum
-over all of them is an upper bound on the delay of the chain.
+over all of them is an upper bound on the delay of the chain; so is the time itself, however
+many wait at once.
 
 `python -m rti_mpc_service.host.hold_up FILE CORE PID` is one such timer; with PID 0 it watches no process.
 """
@@ -49,8 +50,8 @@ class Row(NamedTuple):
 
     @property
     def held_up_ns(self) -> int:
-        """Lateness and waiting time together."""
-        return self.late_ns + self.waited_ns
+        """Lateness and waiting time together, at most the time that passed: threads that wait at once hold up nobody for longer."""
+        return min(self.late_ns + self.waited_ns, self.until_ns - self.since_ns)
 
 
 class Host:
@@ -69,7 +70,7 @@ class Host:
 
     def held_up_ms(self, from_ns: int, to_ns: int) -> float:
         """
-        Return for how long the host held the watched processes up in a past interval, summed over all cores and threads, ms.
+        Return for how long the host held the watched processes up in a past interval, ms: at most for all of it.
 
         Args:
             from_ns: Start of the interval, by the monotonic clock.
@@ -78,7 +79,7 @@ class Host:
         Raises:
             Unwitnessed: A timer has ended, or has not recorded the interval within ten seconds.
         """
-        return 1e-6 * sum(row.held_up_ns for timer in self._timers for row in timer.rows(from_ns, to_ns))
+        return 1e-6 * min(to_ns - from_ns, sum(row.held_up_ns for timer in self._timers for row in timer.rows(from_ns, to_ns)))
 
     def worst_ms(self, from_ns: int, to_ns: int, within_ns: int) -> float:
         """

@@ -29,13 +29,12 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
-from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.view.listener import Listener
 from rti_mpc_service.view.outlet import file_outlet
 from rti_mpc_service.view.screen import spawn_viewer, viewer_url
 from rti_mpc_service.view.view import Screens
 from rti_mpc_service.view.view import main as view
-from tests.in_time import MS, PATIENT, in_time
+from tests.in_time import PATIENT, ends_in_time
 from tests.processes.system import until
 from tests.service.view.test_view_outlet import Viewer as Screen
 from tests.slow import slow_but
@@ -125,13 +124,6 @@ class Child:
         self.process.stdout.close()
 
 
-def ended_in_time(child: Child, host: Host, limit_ms: float, *, status: int) -> None:
-    """Wait for a process that was asked to end."""
-    since_ns = time.monotonic_ns()
-    assert child.process.wait(PATIENCE_S) == status
-    in_time(host, "the end", (time.monotonic_ns() - since_ns) / MS, limit_ms, since_ns)
-
-
 @pytest.fixture
 def children() -> Iterator[list[Child]]:
     children: list[Child] = []
@@ -164,13 +156,13 @@ def changes(path: Path, lane: str) -> list[tuple[int, str]]:
 
 @pytest.mark.parametrize("number", slow_but([signal.SIGINT, signal.SIGTERM], signal.SIGINT))
 def test_a_stopped_viewer_leaves_everything_received_in_the_recording(
-    children: list[Child], port: int, tmp_path: Path, host: Host, number: signal.Signals
+    children: list[Child], port: int, tmp_path: Path, number: signal.Signals
 ) -> None:
     children += [Child(PUBLISHER, port, 1), Child(VIEWER, port, tmp_path / "run.rrd")]
     publisher, viewer = children
     publisher.wait_for("100\n")
     viewer.process.send_signal(number)
-    ended_in_time(viewer, host, 2000.0, status=0)
+    assert ends_in_time(viewer.process, "the end", 2000.0) == 0
     received, lost, refused = map(int, re.findall(r"\d+", viewer.wait_for(" messages, ").rpartition("INFO")[2]))
     samples = {entity: len(rows(tmp_path / "run.rrd", entity)) for entity in ("state/y", "command/f", "telemetry/cost")}
     assert min(samples.values()) > 0  # how many of the hundred have come when it ends is up to the host
@@ -200,9 +192,7 @@ def test_a_robot_killed_and_started_again_goes_on_in_the_recording(children: lis
 
 
 @pytest.mark.skipif(not hasattr(resource, "prlimit"), reason="filling the disk of one process needs prlimit")
-def test_a_disk_that_fills_up_ends_the_recording_but_neither_the_viewer_nor_what_it_shows(
-    children: list[Child], port: int, tmp_path: Path, host: Host
-) -> None:
+def test_a_disk_that_fills_up_ends_the_recording_but_neither_the_viewer_nor_what_it_shows(children: list[Child], port: int, tmp_path: Path) -> None:
     screen = Screen(tmp_path)
     screen.start()
     children += [Child(PUBLISHER, port, 1), Child(VIEWER, port, tmp_path / "run.rrd", screen.url)]
@@ -220,7 +210,7 @@ def test_a_disk_that_fills_up_ends_the_recording_but_neither_the_viewer_nor_what
             shown = screen.shown
             until(lambda: screen.shown > shown, "the screen goes on")
             viewer.process.send_signal(signal.SIGINT)
-            ended_in_time(viewer, host, 3000.0, status=1)
+            assert ends_in_time(viewer.process, "the end", 3000.0) == 1
     finally:
         screen.kill()
     assert re.search(r" messages, \d+ lost, 0 refused", viewer.wait_for(" messages, "))  # a busy machine drops some
