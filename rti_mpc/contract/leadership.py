@@ -47,11 +47,19 @@ class Leadership:
         number: Low bits of the controller's epochs.
         epoch: Epoch of its commands.
         leading: Whether it leads.
-        misfit: Why it takes over from nobody: the leader has another configuration, and none of ours has led. Empty if it may take over.
     """
 
     def __init__(
-        self, number: int, epoch: int, *, config_hash: int, dt_s: float, standby: bool, say: Callable[[Notice], None], local_ns: int = 0
+        self,
+        number: int,
+        epoch: int,
+        *,
+        config_hash: int,
+        dt_s: float,
+        standby: bool,
+        say: Callable[[Notice], None],
+        local_ns: int = 0,
+        model_hash: str = "",
     ) -> None:
         """
         Begin to lead, or to stand by.
@@ -64,12 +72,16 @@ class Leadership:
             standby: Whether it stands by at first.
             say: Receiver of notices.
             local_ns: Local monotonic time.
+            model_hash: Hash of its model's equations; empty if it fits any.
         """
         self.number = number
         self.epoch = epoch_above(epoch - 1, number)
         self.leading = not standby
-        self.misfit = ""
         self._config_hash = config_hash
+        self._model_hash = model_hash
+        self._other_config = ""  # why it takes over from nobody, in words: the leader has another configuration
+        self._described = (0, "")  # epoch and model of the leader that has described itself last
+        self._told_misfit = ""
         self._say = say
         self._dt_ns = round(1e9 * dt_s)
         self._silence_ns = round(1e9 * max(SILENCE_PERIODS * dt_s, MIN_SILENCE_S))
@@ -102,6 +114,13 @@ class Leadership:
     def replaced(self) -> int | None:
         """Epoch of the leader that was replaced, until this controller's first command; else None."""
         return None if self._took_over is None or self.acting is None else self._replaced[0]
+
+    @property
+    def misfit(self) -> str:
+        """Why it takes over from nobody: the leader has another configuration, and none of ours has led, or another model. Empty if it may."""
+        epoch, model_hash = self._described
+        foreign = epoch >= self.known and "" not in (model_hash, self._model_hash) and model_hash != self._model_hash
+        return self._other_config or (differ_in_model(model_hash, self._model_hash) if foreign else "")
 
     @property
     def relieved(self) -> bool:
@@ -201,10 +220,23 @@ class Leadership:
     def fit(self, config_hash: int) -> None:
         """Compare the leader's configuration: unless one of ours has ever led, this controller takes over from none of another configuration."""
         self._belongs |= config_hash == self._config_hash
-        misfit = "" if self._belongs else differ(config_hash, self._config_hash)
-        if misfit and misfit != self.misfit:
+        self._other_config = "" if self._belongs else differ(config_hash, self._config_hash)
+        self._tell_misfit()
+
+    def fit_model(self, epoch: int, model_hash: str) -> None:
+        """
+        Compare the model of the leader of an epoch: from one with other equations this controller never takes over, whoever has led before.
+
+        Of one configuration, its plans would be those of another robot. The next leader is judged by its own model.
+        """
+        self._described = epoch, model_hash
+        self._tell_misfit()
+
+    def _tell_misfit(self) -> None:
+        misfit = self.misfit
+        if misfit and misfit != self._told_misfit:
             self._say(Notice(Severity.ERROR, "misfit", f"{misfit}: this standby does not take over"))
-        self.misfit = misfit
+        self._told_misfit = misfit
 
     def _take_over(self, silent_ns: int) -> None:
         self._replaced = self._last
@@ -227,3 +259,8 @@ class Leadership:
 def differ(leader: int, ours: int) -> str:
     """Return the text that two configurations differ."""
     return f"a standby needs the leader's configuration: its hash is {leader:016x}, this standby's {ours:016x}"
+
+
+def differ_in_model(leader: str, ours: str) -> str:
+    """Return the text that two models differ."""
+    return f"a standby needs the leader's model: the hash of its equations is {leader}, this standby's {ours}"

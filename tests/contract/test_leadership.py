@@ -25,13 +25,17 @@ Wire = list["One"]  # who hears each other
 class One:
     """One controller of several that hear each other."""
 
-    def __init__(self, wire: Wire, *, standby: bool, number: int | None = None, dt_s: float = DT_S, config_hash: int = HASH) -> None:
+    def __init__(
+        self, wire: Wire, *, standby: bool, number: int | None = None, dt_s: float = DT_S, config_hash: int = HASH, model_hash: str = ""
+    ) -> None:
         self.inbox: deque[Command] = deque()
         self.heard: list[Command] = []
         self.notices: list[Notice] = []
         self.ready = True
         number = 100 + len(wire) if number is None else number
-        self.leadership = Leadership(number, EPOCH, config_hash=config_hash, dt_s=dt_s, standby=standby, say=self.notices.append)
+        self.leadership = Leadership(
+            number, EPOCH, config_hash=config_hash, model_hash=model_hash, dt_s=dt_s, standby=standby, say=self.notices.append
+        )
         self.wire = wire
         wire.append(self)
         self._seq = 0
@@ -270,6 +274,32 @@ def test_one_that_stands_by_takes_over_from_no_leader_of_another_configuration_a
     assert f"{HASH:016x}" in standby.leadership.misfit
     assert [standby.see(k) for k in range(6, 10)] == [False] * 4
     assert codes(standby) == ["misfit"]
+
+
+def test_one_that_stands_by_takes_over_from_no_leader_that_has_come_back_with_another_model_until_it_has_its_own_again() -> None:
+    wire: Wire = []
+    leader, standby = One(wire, standby=False), One(wire, standby=True, model_hash="ours")
+    standby.leadership.fit_model(leader.leadership.epoch, "ours")
+    lives = {}
+    for life, model_hash in enumerate(("ours", "theirs", "ours", "")):  # the last one of a version that does not tell
+        leader.leadership.epoch = standby.leadership.known + 256
+        standby.leadership.fit_model(leader.leadership.epoch, model_hash)
+        for k in range(20 * life + 1, 20 * life + 6):
+            leader.see(k)
+            standby.see(k)
+        lives[life] = standby.leadership.misfit
+    assert [bool(misfit) for misfit in lives.values()] == [False, True, False, False]
+    assert lives[1] == "a standby needs the leader's model: the hash of its equations is theirs, this standby's ours"
+    assert codes(standby) == ["misfit"]
+    leader.leadership.epoch += 256
+    standby.leadership.fit_model(leader.leadership.epoch, "theirs")
+    for k in range(81, 86):
+        leader.see(k)
+        standby.see(k)
+    assert [standby.see(k) for k in range(86, 92)] == [False] * 6, "though a controller with its model has led before"
+    assert codes(standby) == ["misfit", "misfit"]
+    standby.inbox.append(replace(leader.made(92), epoch=leader.leadership.epoch + 256))  # another leads, whose model is not known yet
+    assert [standby.see(k) for k in range(92, 96)] == [False, False, True, True]
 
 
 def test_a_command_of_another_configuration_ends_neither_leader_nor_standby(pair: tuple[One, One]) -> None:

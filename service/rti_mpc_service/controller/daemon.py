@@ -110,7 +110,8 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
         operator_stop = OperatorStop(LatchFile(bus.keys, state), obey, controller.say)
         operator_stop.listen(bus)
         others = hear_others(bus, stop)
-        if standby and (misfit := others.misfit(config.config_hash, model_hash(rti.ocp.model))):
+        model = model_hash(rti.ocp.model)
+        if standby and (misfit := others.misfit(config.config_hash, model)):
             raise ConfigError(misfit)
         if not standby and bus.is_alive(LEADER, LISTEN_BEFORE_START_S):
             print(
@@ -119,7 +120,9 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
             )
             return 1
         ocp = rti.ocp
-        leadership = Candidate(bus, controller, others, config_hash=config.config_hash, dt_s=ocp.dt, nu=ocp.model.nu, standby=standby)
+        leadership = Candidate(
+            bus, controller, others, config_hash=config.config_hash, model_hash=model, dt_s=ocp.dt, nu=ocp.model.nu, standby=standby
+        )
         daemon = Daemon(config, controller, bus, leadership, params, lock, rti, outcomes, operator_stop, book)
         operator_stop.serve(bus, lambda: leadership.role, daemon.publish_info)
         bus.serve(bus.keys.request, daemon.orders.answer)

@@ -16,7 +16,7 @@ from threading import Event
 from typing import Any
 
 from rti_mpc.contract.epoch import NUMBER_BITS, highest_believed
-from rti_mpc.contract.leadership import MIN_SILENCE_S, Leadership, differ
+from rti_mpc.contract.leadership import MIN_SILENCE_S, Leadership, differ, differ_in_model
 from rti_mpc.contract.message import Command, State
 from rti_mpc.contract.status import Mode
 from rti_mpc.control.controller import Controller
@@ -53,7 +53,7 @@ class Others:
             return differ(leader.config_hash, config_hash)
         if leader.model_hash in ("", model_hash):
             return ""
-        return f"a standby needs the leader's model: the hash of its equations is {leader.model_hash}, this standby's {model_hash}"
+        return differ_in_model(leader.model_hash, model_hash)
 
 
 def hear_others(bus: Bus, stop: Event) -> Others:
@@ -77,17 +77,27 @@ class Candidate:
         commands_in: Intake of other controllers' commands.
     """
 
-    def __init__(self, bus: Bus, controller: Controller, others: Others, *, config_hash: int, dt_s: float, nu: int, standby: bool) -> None:
+    def __init__(
+        self, bus: Bus, controller: Controller, others: Others, *, config_hash: int, model_hash: str, dt_s: float, nu: int, standby: bool
+    ) -> None:
         self.commands_in = bus.intake(Command, MIN_SILENCE_S, {"u": nu}, choosing=True)
         number, epoch = secrets.randbits(NUMBER_BITS), max(others.epoch, unix_s() << NUMBER_BITS) + 1
         self._decision = Leadership(
-            number, epoch, config_hash=config_hash, dt_s=dt_s, standby=standby, say=controller.say, local_ns=time.monotonic_ns()
+            number,
+            epoch,
+            config_hash=config_hash,
+            model_hash=model_hash,
+            dt_s=dt_s,
+            standby=standby,
+            say=controller.say,
+            local_ns=time.monotonic_ns(),
         )
         self._bus = bus
         self._controller = controller
         self._acting: int | None = None  # epoch with which the controller's commands act; None: they do not
         self._infos = bus.subscriber(bus.keys.info(LEADER), capacity=RING_MESSAGES)
         self._told = (0, -1)  # epoch and sequence number of the last description of a leader that was read
+        self._news: Leader | None = None  # the last description, until it is returned
         self._commands = bus.subscriber(bus.keys.command, capacity=RING_MESSAGES)
         self._tokens: dict[str, Any] = {}
         controller.stand_by()
@@ -144,20 +154,21 @@ class Candidate:
         self._follow(self._decision.known)
 
     def leader(self) -> Leader | None:
-        """Return the leader's last description, each one once; None while this controller leads."""
-        waiting = self._look(self._infos)
-        if self.leading:
-            for _ in waiting:
-                pass
-            return None
+        """Return the leader's last description, each one once; while this controller leads None, and the next leader's is kept."""
         known = self._decision.known
-        news, highest = None, highest_believed(unix_s(), known, choosing=True)
-        for received in waiting:
+        least = known + 1 if self.leading else known
+        highest = highest_believed(unix_s(), known, choosing=True)
+        for received in self._look(self._infos):
             leader = Leader.from_received(received, highest)
-            if leader is not None and leader.epoch >= known and (leader.epoch, leader.seq) > self._told:
-                news, self._told = leader, (leader.epoch, leader.seq)
-        if news is not None:
-            self._decision.fit(news.config_hash)
+            if leader is not None and leader.epoch >= least and (leader.epoch, leader.seq) > self._told:
+                self._news, self._told = leader, (leader.epoch, leader.seq)
+        if self.leading or self._news is None:
+            return None
+        news, self._news = self._news, None
+        if news.epoch < known:
+            return None
+        self._decision.fit_model(news.epoch, news.model_hash)
+        self._decision.fit(news.config_hash)
         return news
 
     def declare(self) -> bool:

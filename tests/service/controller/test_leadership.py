@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -26,6 +27,7 @@ from rti_mpc_service.origin import model_hash
 DT_S = 0.1
 DT_NS = 100_000_000
 HASH = 7
+MODEL = "00000000000000aa"
 
 
 @dataclass
@@ -50,12 +52,13 @@ class WireBus:
     def __init__(self, wire: Wire) -> None:
         self.keys = Keys()
         self.commands: deque[Received] = deque()
+        self.infos: deque[Received] = deque()
         self.watch: Callable[[str, bool], None] = lambda role, present: None
         self._wire = wire
         wire.buses.append(self)
 
     def subscriber(self, key: str, **_: object) -> Any:
-        inbox = self.commands if key == self.keys.command else deque()
+        inbox = {self.keys.command: self.commands, self.keys.info("controller"): self.infos}.get(key, deque())
 
         class Subscriber:
             def try_recv(self) -> Received | None:
@@ -115,7 +118,7 @@ class One:
     def __init__(self, wire: Wire, *, standby: bool) -> None:
         self.bus, self.puppet, self.wire = WireBus(wire), Puppet(), wire
         bus, puppet = cast(Any, self.bus), cast(Any, self.puppet)
-        self.leadership = Candidate(bus, puppet, Others(0), config_hash=HASH, dt_s=DT_S, nu=1, standby=standby)
+        self.leadership = Candidate(bus, puppet, Others(0), config_hash=HASH, model_hash=MODEL, dt_s=DT_S, nu=1, standby=standby)
         self.leadership.declare()
         self._seq = 0
 
@@ -249,3 +252,32 @@ def test_standby_fits_a_leader_of_the_same_configuration_whose_model_has_the_sam
         (Leader(9, 1, 1, None, longer), f"a standby needs the leader's model: the hash of its equations is {longer}, this standby's {ours}"),
     ):
         assert Others(9, leader).misfit(1, ours) == said
+
+
+def described(one: One, epoch: int, model_hash: str, seq: int = 1) -> Received:
+    """Description of a leader, and its receipt."""
+    document = {"role": "controller", "epoch": epoch, "seq": seq, "config_hash": HASH, "model_hash": model_hash}
+    received = Received(json.dumps(document).encode(), "", "")
+    one.bus.infos.append(received)
+    return received
+
+
+def test_standby_hears_that_its_leader_has_come_back_with_another_model_and_does_not_take_over(pair: tuple[One, One]) -> None:
+    leader, standby = pair
+    described(standby, epoch := leader.leadership.epoch, "00000000000000bb")
+    assert standby.leadership.leader() == Leader(epoch, 1, HASH, None, "00000000000000bb")
+    assert [standby.see(k) for k in range(5, 12)] == [False] * 7
+    assert [notice.code for notice in standby.puppet.said] == ["misfit"]
+    described(standby, epoch, MODEL, seq=2)
+    standby.leadership.leader()
+    assert [standby.see(k) for k in range(12, 15)] == [True] * 3
+
+
+def test_controller_that_leads_keeps_the_description_of_the_one_that_relieves_it(pair: tuple[One, One]) -> None:
+    leader, _ = pair
+    described(leader, epoch := leader.leadership.epoch + 256, "00000000000000bb")
+    assert leader.leadership.leader() is None
+    leader.wire.put(WireBus(leader.wire), encode(replace(leader.made(4), epoch=epoch)))
+    assert not leader.see(5)
+    assert leader.leadership.leader() == Leader(epoch, 1, HASH, None, "00000000000000bb")
+    assert [leader.see(k) for k in range(6, 12)] == [False] * 6
