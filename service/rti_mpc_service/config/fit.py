@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ParamSpec, TypeVar
 from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc_service.config.build import build_ocp, disturbances_at_rest
 from rti_mpc_service.config.refusal import quoted, unknown_name
-from rti_mpc_service.config.schema import OWN_KEYS, Config, RegulatorSection
+from rti_mpc_service.config.schema import OWN_KEYS, RAMP_LEAD_S, Config, RegulatorSection
 
 if TYPE_CHECKING:
     from rti_mpc.model.model import Model, Signal
@@ -70,10 +70,38 @@ def check_tree(config: Config) -> None:
             raise ConfigError(f"ocp.stages.{key}.{name} must be left out, or {name} bounded: it has no softened bound in ocp.bounds or ocp.stages")
     if config.bus.config is not None and not config.bus.config.is_file():
         raise ConfigError(f"bus.config must be a file, got {config.bus.config}")
+    check_times(config)
     if config.guard.enabled:
         for name in ocp.weights.R:
             if name not in ocp.bounds.inputs:
                 raise ConfigError(f"ocp.bounds.inputs must bound every input where a guard is enabled, {name} is missing")
+
+
+def check_times(config: Config) -> None:
+    """
+    Check that a state becomes stale neither after the end of its plan nor before the next one comes.
+
+    Raises:
+        ConfigError: One of two times would have to be shorter than the other.
+    """
+    timing, sim, dt_s = config.timing, config.sim, config.ocp.dt_s
+    longest_s = round(max(timing.valid_s - RAMP_LEAD_S, dt_s), 9)
+    if config.stale_s > longest_s:
+        raise ConfigError(
+            f"timing.stale_s must be at most {longest_s:g} s, {RAMP_LEAD_S:g} s less than timing.valid_s = {timing.valid_s:g} s, so that the ramp "
+            f"of a robot whose states are stale arrives before its last plan ends, got {config.stale_s:g} s: lower it, or leave it out"
+        )
+    if sim.state_period_s is not None and sim.state_period_s > config.stale_s:
+        which = "timing.stale_s" if timing.stale_s else "timing.stale_s, left out,"
+        raise ConfigError(
+            f"sim.state_period_s must be at most {which} = {config.stale_s:g} s, or each state is stale before the next one comes, "
+            f"got {sim.state_period_s:g} s"
+        )
+    if sim.state_period_s is None and dt_s > config.stale_s:
+        raise ConfigError(
+            f"timing.stale_s must be at least {dt_s:g} s, the time between two states, which is ocp.dt_s where sim.state_period_s is left out, "
+            f"got {config.stale_s:g} s: raise it, or say in sim.state_period_s how much more often states come"
+        )
 
 
 def check_model(config: Config) -> Ocp:
@@ -134,12 +162,27 @@ def check_period(config: Config) -> None:
     Raises:
         ConfigError: The robot would go to rest between any two of them.
     """
+    if config.ocp.N < 2:
+        raise ConfigError(
+            f"ocp.N must be at least 2 for a robot on the bus: a plan of one stage lasts for ocp.dt_s = {config.ocp.dt_s:g} s, "
+            "and the robot would go to rest before the next one comes, got 1"
+        )
     longest_s = round(config.timing.valid_s - TRANSIT_S, 9)
     if config.ocp.dt_s > longest_s:
         raise ConfigError(
             f"ocp.dt_s must be at most {longest_s:.3g} s for a robot on the bus: a command acts for timing.valid_s = {config.timing.valid_s:g} s "
             f"after its state, and the robot would go to rest before the next one comes, got {config.ocp.dt_s:g} s: shorten it, with a larger N "
             "or blocks for the same horizon, or raise timing.valid_s, to at most 0.3 s"
+        )
+    if config.sim.sensor_delay_s is None or config.delay_s is None:
+        return
+    period_s = max(config.ocp.dt_s, config.sim.state_period_s or 0.0)
+    latest_s = round(config.timing.valid_s + config.delay_s - period_s - TRANSIT_S, 9)
+    if config.sim.sensor_delay_s > latest_s:
+        raise ConfigError(
+            f"sim.sensor_delay_s must be at most {latest_s:.3g} s: a command acts until timing.valid_s + timing.delay_s = "
+            f"{config.timing.valid_s + config.delay_s:g} s after its state was measured, and the next one comes {period_s:g} s later, "
+            f"got {config.sim.sensor_delay_s:g} s: raise timing.delay_s, which is to cover it, or set it to measured"
         )
 
 

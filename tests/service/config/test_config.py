@@ -167,6 +167,24 @@ WRONG = [
     ("[ocp]", "[timing]\ndelay_s = -0.01\n[ocp]", ["timing.delay_s", "at least 0", "-0.01"]),
     ("[ocp]", "[timing]\nvalid_s = 0.5\n[ocp]", ["timing.valid_s", "in seconds", "at most 0.3", "0.5"]),
     ("[ocp]", "[timing]\nstale_s = 0\n[ocp]", ["timing.stale_s", "at least 0.0001", "0"]),
+    (
+        "[ocp]",
+        "[timing]\nstale_s = 0.3\n[ocp]",
+        ["timing.stale_s must be at most 0.225 s, 0.025 s less than timing.valid_s = 0.25 s", "got 0.3 s: lower it, or leave it out"],
+    ),
+    ("[ocp]", "[timing]\nstale_s = 0.23\n[ocp]", ["timing.stale_s must be at most 0.225 s", "got 0.23 s"]),
+    ("[ocp]", "[timing]\nstale_s = 0.12\nvalid_s = 0.13\n[ocp]", ["timing.stale_s must be at most 0.105 s", "timing.valid_s = 0.13 s", "got 0.12 s"]),
+    (
+        "[ocp]",
+        "[timing]\nstale_s = 0.05\n[ocp]",
+        ["timing.stale_s must be at least 0.1 s", "ocp.dt_s where sim.state_period_s is left out", "got 0.05 s: raise it, or say"],
+    ),
+    (
+        "[ocp]",
+        "[timing]\nstale_s = 0.05\n[sim]\nstate_period_s = 0.06\n[ocp]",
+        ["sim.state_period_s must be at most timing.stale_s = 0.05 s", "got 0.06 s"],
+    ),
+    ("[ocp]", "[sim]\nstate_period_s = 0.3\n[ocp]", ["sim.state_period_s must be at most timing.stale_s, left out, = 0.225 s", "got 0.3 s"]),
     ("[ocp]", "[observer]\nmeasured = 'x'\n[ocp]", ["observer.measured", "states that are measured", "list", "'x'"]),
     ("[ocp]", "[observer]\nnoise = { x = 0.0 }\n[ocp]", ["observer.noise.x", "greater than 0", "0.0"]),
     ("[ocp]", "[observer]\nprocess = { w = 0.1 }\n[ocp]", ["observer.process.w", "no state", "x [m]"]),
@@ -559,6 +577,44 @@ def test_nothing_is_done_with_a_robot_that_a_stop_does_not_bring_to_rest(monkeyp
     for act in (lambda: check.main(SHIPPED), lambda: daemon.main(config, BusSettings()), lambda: demo.main(config, "eight")):
         with pytest.raises(ConfigError, match="it coasts"):
             act()
+
+
+def test_states_may_come_more_often_than_samples_and_be_stale_after_less_than_a_period(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + "[timing]\nstale_s = 0.05\n[sim]\nstate_period_s = 0.01\n")
+    assert load(path, with_model=False).stale_s == 0.05
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ("[sim]\nsensor_delay_s = 0.13\n", ""),
+        (
+            "[sim]\nsensor_delay_s = 0.14\n",
+            "sim.sensor_delay_s must be at most 0.13 s: a command acts until timing.valid_s + timing.delay_s = 0.25",
+        ),
+        ("[sim]\nsensor_delay_s = 0.14\n[timing]\ndelay_s = 0.14\n", ""),
+        ("[sim]\nsensor_delay_s = 0.14\n[timing]\ndelay_s = 'measured'\n", ""),
+        ("[sim]\nsensor_delay_s = 0.05\nstate_period_s = 0.2\n", "and the next one comes 0.2 s later, got 0.05 s: raise timing.delay_s"),
+    ],
+)
+def test_states_that_are_measured_longer_ago_than_their_commands_act_are_refused_on_the_bus(tmp_path: Path, changes: str, said: str) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL + changes)
+    config = load(path, with_model=False)
+    if not said:
+        check_period(config)
+        return
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        check_period(config)
+
+
+def test_plan_of_one_stage_is_refused_on_the_bus(tmp_path: Path) -> None:
+    """It ends when the next one begins to be computed: the robot's inputs ran out at 48 of 50 samples."""
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL.replace("ocp.N = 3", "ocp.N = 1").replace("delta = [1, 2, 3]", "delta = 1"))
+    with pytest.raises(ConfigError, match=r"^ocp\.N must be at least 2 for a robot on the bus: a plan of one stage lasts for ocp\.dt_s = 0\.1 s"):
+        check_period(load(path, with_model=False))
 
 
 @pytest.mark.parametrize(
