@@ -29,6 +29,7 @@ infeasible. Outputs, constraints, bounds and slack weights have the names of aca
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -254,6 +255,8 @@ class Ocp:
             bounds = getattr(self, lower), getattr(self, upper)
             if wrong := where(bounds[0] >= bounds[1], *bounds):
                 raise OcpError(f"{lower} must lie below {upper}, got {wrong}")
+        if wrong := sign_fault(self):
+            raise OcpError(wrong)
         if any(self.model.u_rest) and (wrong := rest_fault(self)):
             raise OcpError(wrong)
         if wrong := where((self.lbdu > 0) | (self.ubdu < 0), self.lbdu, self.ubdu):
@@ -397,6 +400,22 @@ def rest_fault(ocp: Ocp) -> str:
             return f"the bounds of input {signal.name} must hold its rest, {at}, or it could not be stopped, got {[lower, upper]}"
         if not falling < 0.0 < rising:
             return f"the increments of input {signal.name} must hold lower < 0 < upper, or it could not be stopped, got {[falling, rising]}"
+    return ""
+
+
+def sign_fault(ocp: Ocp) -> str:
+    """Return which bounds of a quaternion a state breaks that is the same attitude with the other sign; empty if none."""
+    for j in itertools.chain(*ocp.model.rotations("states").quaternions):
+        for lower, upper in (("lbx", "ubx"), ("lbx_e", "ubx_e")):
+            bounds = np.atleast_2d(np.column_stack([getattr(ocp, name)[..., j] for name in (lower, upper)]))
+            for least, most in bounds.tolist():
+                if least != -most:
+                    of = "terminal bounds" if lower == "lbx_e" else "bounds"
+                    right = min(abs(least), abs(most))
+                    return (
+                        f"{of} of state {ocp.model.states[j].name} of a quaternion must be as far from 0 on both sides, such as "
+                        f"[{-right:g}, {right:g}], since q and -q are one attitude, got [{least:g}, {most:g}]"
+                    )
     return ""
 
 

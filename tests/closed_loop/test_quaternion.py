@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,7 @@ from rti_mpc.contract.way import Way
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.control.observer import Disturbance, Observer, ObserverSettings
 from rti_mpc.control.track import Track
-from rti_mpc.errors import OcpError
+from rti_mpc.errors import OcpError, RtiMpcError
 from rti_mpc.model.robots.quadrotor_quaternion import quadrotor_quaternion
 from rti_mpc.reference.manoeuvres import turning_flight
 from rti_mpc.rti.nominal import nominal_state
@@ -26,6 +28,8 @@ from rti_mpc.rti.rest import find_stop_law
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.terminal import lqr_weight
 from rti_mpc.rti.way_to_rest import StopLaw, WayToRest
+from rti_mpc_service.config.config import load
+from rti_mpc_service.shipped import ROBOTS
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
 from tests.loop import MS, drive
@@ -203,3 +207,35 @@ def test_estimate_keeps_the_length_of_an_attitude_which_must_be_measured_as_a_wh
         assert np.linalg.norm(observer.x[ATTITUDE]) == pytest.approx(1.0, abs=1e-12)
     with pytest.raises(OcpError, match="measured must have all of a quaternion, q_w, q_x, q_y, q_z, got x, q_w"):
         Observer(quadrotor_quaternion(), ObserverSettings(wind, ("x", "q_w")), compile=False)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "said"),
+    [
+        ({"lbx": -0.3, "ubx": 0.5}, "bounds of state {} of a quaternion must be as far from 0 on both sides, such as [-0.3, 0.3], "),
+        ({"ubx": 0.5}, "since q and -q are one attitude, got [-inf, 0.5]"),
+        ({"lbx": [-0.5, -0.5, -0.4], "ubx": [0.5] * 3}, "such as [-0.4, 0.4], since q and -q are one attitude, got [-0.4, 0.5]"),
+        ({"lbx_e": -0.1, "ubx_e": 0.2}, "terminal bounds of state {} of a quaternion must be as far from 0 on both sides, such as [-0.1, 0.1]"),
+    ],
+)
+@pytest.mark.parametrize("name", ["q_w", "q_x", "q_z"])
+def test_bounds_that_an_attitude_keeps_with_one_sign_and_breaks_with_the_other_are_refused(name: str, bounds: dict[str, Any], said: str) -> None:
+    model, N = quadrotor_quaternion(), 3
+    j = [state.name for state in model.states].index(name)
+    symmetric = Ocp(model, N=N, dt=0.04, Q=[1, 1, 1, 0, 0.1, 0.1, 0.1], R=[0.002] * 4, lbu=0, ubu=6, lbx=-0.5, ubx=0.5, lbx_e=-0.2, ubx_e=0.2)
+    changed = {key: np.full((N, 13) if np.ndim(bound) else 13, np.inf if key.startswith("u") else -np.inf) for key, bound in bounds.items()}
+    for key, bound in bounds.items():
+        changed[key][..., j] = bound
+    free = {"lbx": -np.inf, "ubx": np.inf, "lbx_e": -np.inf, "ubx_e": np.inf}
+    for make in (lambda **values: replace(symmetric, **values), symmetric.retuned):
+        with pytest.raises(OcpError, match=re.escape(said.format(name))):
+            make(**{**free, **changed})
+
+
+def test_file_whose_bounds_an_attitude_breaks_with_the_other_sign_is_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    text = ROBOTS["quadrotor_quaternion"].read_text()
+    assert re.search(r"q_x = \[[^]]*\]", text)
+    path.write_text(re.sub(r"q_x = \[[^]]*\]", "q_x = [-0.2, 0.3]", text, count=1))
+    with pytest.raises(RtiMpcError, match=r"bounds of state q_x of a quaternion must be as far from 0 on both sides, such as \[-0\.2, 0\.2\]"):
+        load(path)
