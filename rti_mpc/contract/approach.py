@@ -14,14 +14,14 @@ commands to the same window.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from rti_mpc.array import Array
 
 SLEW_WINDOW_PERIODS = 0.75  # inputs within this time differ by no more than one increment
-UNCHANGED = 1e-9  # in the unit of the input: a row that differs by less has not been changed
+UNCHANGED_SHARE = 1e-9  # of the largest increment: a row that differs by less has not been changed
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +33,25 @@ class Increments:
         lbdu: Lower bound of an input's change over `dt_ns`, shape ``(nu,)``, at most 0.
         ubdu: Upper bound of an input's change, at least 0.
         dt_ns: The period.
+        unchanged: By how much a row may differ from itself, approached, by rounding, shape ``(nu,)``; 0 without limits, which change nothing.
     """
 
     lbdu: Array
     ubdu: Array
     dt_ns: int
+    unchanged: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Work out what is rounding."""
+        largest = np.maximum(-self.lbdu, self.ubdu)
+        object.__setattr__(self, "unchanged", np.where(np.isfinite(largest), UNCHANGED_SHARE * largest, 0.0))
+
+
+def magnitudes(lbu: float | Array, ubu: float | Array, lbdu: Array, ubdu: Array) -> Array:
+    """Return what the rounding of each input is relative to, shape ``(nu,)``: its largest value; its largest increment without bounds; or else 1."""
+    largest, increment = np.maximum(np.abs(lbu), np.abs(ubu)), np.maximum(-lbdu, ubdu)
+    known = np.where(np.isfinite(increment) & (increment > 0.0), increment, 1.0)
+    return np.where(np.isfinite(largest) & (largest > 0.0), largest, known)
 
 
 def segments(at: Callable[[int], tuple[Array, int, bool]], from_ns: int, to_ns: int) -> list[tuple[int, Array]]:
@@ -72,7 +86,7 @@ def approach(
     share = min(1.0, period_ns / limits.dt_ns)
     lowest, highest = share * limits.lbdu, share * limits.ubdu
     change = np.diff(u, axis=0)
-    even = period_ns >= window_ns and bool((change >= lowest - UNCHANGED).all() and (change <= highest + UNCHANGED).all())
+    even = period_ns >= window_ns and bool((change >= lowest - limits.unchanged).all() and (change <= highest + limits.unchanged).all())
     first = max(0, (start_ns - stamp_ns) // period_ns)
     begins_ns = stamp_ns + (first + 1) * period_ns  # when a plan that comes late by less than a row begins
     rows, near, limited = u, list(acted), False
@@ -81,7 +95,7 @@ def approach(
         if even and k > first and not limited and row_ns - window_ns >= start_ns:
             break
         row = within(u[k], near, row_ns - window_ns, limits)
-        was_limited, limited = limited, bool((np.abs(row - u[k]) > UNCHANGED).any())
+        was_limited, limited = limited, bool((np.abs(row - u[k]) > limits.unchanged).any())
         if limited or was_limited:
             if rows is u:
                 rows = u.copy()
@@ -90,7 +104,7 @@ def approach(
             row = within(u[k], near, row_ns - limits.dt_ns, limits)
             if k > first:
                 row = np.minimum(np.maximum(row, rows[k - 1] + lowest), rows[k - 1] + highest)
-            limited = bool((np.abs(row - u[k]) > UNCHANGED).any())
+            limited = bool((np.abs(row - u[k]) > limits.unchanged).any())
             rows[k] = row
         if row_ns - limits.dt_ns >= begins_ns:
             near = [(until_ns, before) for until_ns, before in near if until_ns > row_ns - limits.dt_ns]

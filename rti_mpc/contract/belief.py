@@ -18,14 +18,14 @@ from dataclasses import replace
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.contract.approach import Increments
+from rti_mpc.contract.approach import Increments, magnitudes
 from rti_mpc.contract.schedule import BEFORE_ALL_NS, UNKNOWN, Plan, Schedule
 from rti_mpc.contract.way import Way
 from rti_mpc.rotation import Rotations
 
 START_TOLERANCE_PERIODS = 0.1  # a command may begin to act this much sooner or later than believed
 OVERDUE_PERIODS = 1.0  # a command that does not act this long after its time is missing; until then it is still expected
-INPUT_TOLERANCE = 1e-6  # in the unit of the input, and relative to it: above the rounding of single precision
+TOLERANCE_SHARE = 1e-6  # of the largest value of an input, and relative to its own: above the rounding of single precision
 MAX_MISSING_PLANS = 8  # missing plans that are remembered, since each may still arrive
 
 
@@ -48,6 +48,7 @@ class Belief(Schedule):
         """Begin at rest; the arguments are those of `Schedule`."""
         self._missing: deque[Plan] = deque(maxlen=MAX_MISSING_PLANS)
         self.confirmed = 0
+        self._magnitudes: list[float] = magnitudes(*bounds, increments.lbdu, increments.ubdu).tolist()
         self._reported_ns = BEFORE_ALL_NS  # stamp of the last report
         self._period_ns = increments.dt_ns
         self._overdue_ns = round(OVERDUE_PERIODS * increments.dt_ns)
@@ -117,7 +118,7 @@ class Belief(Schedule):
         times = (t_ns - 1, t_ns, t_ns - self._tolerance_ns, t_ns + self._tolerance_ns) if or_after else (t_ns - 1, t_ns - self._tolerance_ns)
         reported = u.tolist()
         for t in times:
-            if alike(self.at(t)[0].tolist(), reported):
+            if alike(self.at(t)[0].tolist(), reported, self._magnitudes):
                 return True
         return False
 
@@ -165,9 +166,9 @@ class Belief(Schedule):
             self._put(replace(newest, start_ns=t_ns), self._increments)
 
 
-def alike(believed: list[float], reported: list[float]) -> bool:
-    """Return whether two inputs are equal but for rounding."""
-    for one, other in zip(believed, reported, strict=True):  # a loop: a generator takes twice as long for a few numbers
-        if not abs(one - other) <= INPUT_TOLERANCE * (1.0 + abs(other)):  # false for NaN, too
+def alike(believed: list[float], reported: list[float], largest: list[float]) -> bool:
+    """Return whether two inputs are equal but for rounding, which is relative to the largest value of each."""
+    for one, other, most in zip(believed, reported, largest, strict=True):  # a loop: a generator takes twice as long for a few numbers
+        if not abs(one - other) <= TOLERANCE_SHARE * (most + abs(other)):  # false for NaN, too
             return False
     return True

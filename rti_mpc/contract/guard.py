@@ -27,7 +27,7 @@ from rti_mpc.contract.approach import Increments
 from rti_mpc.contract.belief import Belief
 from rti_mpc.contract.cadence import Cadence
 from rti_mpc.contract.epoch import MAX_SEQ_GAP, epoch_above
-from rti_mpc.contract.limits import INPUT_TOLERANCE, MAX_VALID_NS, Limits
+from rti_mpc.contract.limits import MAX_VALID_NS, Limits
 from rti_mpc.contract.lives import Heard, Lives
 from rti_mpc.contract.message import Command, Notice, Severity, State
 from rti_mpc.contract.robot_clock import Backlog, RobotClock
@@ -191,7 +191,7 @@ class Guard:
         u_rest = np.clip(command.u_rest, self._limits.lbu, self._limits.ubu) if len(command.u_rest) else command.u_rest
         passed = self._numbered(replace(command, valid_until_ns=min(command.valid_until_ns, until_ns), u=u, u_rest=u_rest))
         passed.u = self._schedule.add(passed, start_ns, until_ns)
-        if (np.abs(passed.u - u) > INPUT_TOLERANCE).any():
+        if (np.abs(passed.u - u) > self._limits.tolerance).any():
             text = f"command {command.seq} of epoch {command.epoch} begins too far from the acting inputs: it is approached inside the slew limits"
             self._say(Severity.WARNING, "slew_limited", text)
         self._waits = ""
@@ -383,14 +383,14 @@ class Guard:
             settles_ns = self._limits.settles_ns(command, now_ns)
             if now_ns < self._rest_by_ns:
                 return settles_ns <= self._rest_by_ns
-            here = np.abs(command.u_rest[-1] - self._schedule.rest(now_ns)) <= self._settled(now_ns) + INPUT_TOLERANCE
+            here = np.abs(command.u_rest[-1] - self._schedule.rest(now_ns)) <= self._settled(now_ns) + self._limits.tolerance
             return settles_ns <= now_ns and bool(here.all())
         start_ns = max(command.stamp_ns, now_ns)
         first = (start_ns - command.stamp_ns) // command.period_ns
         before = self._limits.u_rest if now_ns >= self._rest_by_ns else self._schedule.at(start_ns - 1)[0]
         way = np.vstack([before, self._approach(command, start_ns)[first:]]) - self._limits.u_rest
-        lower, upper = np.minimum(way[:-1], 0.0) - INPUT_TOLERANCE, np.maximum(way[:-1], 0.0) + INPUT_TOLERANCE
-        return bool((np.abs(way[-1]) <= INPUT_TOLERANCE).all() and ((way[1:] >= lower) & (way[1:] <= upper)).all())
+        lower, upper = np.minimum(way[:-1], 0.0) - self._limits.tolerance, np.maximum(way[:-1], 0.0) + self._limits.tolerance
+        return bool((np.abs(way[-1]) <= self._limits.tolerance).all() and ((way[1:] >= lower) & (way[1:] <= upper)).all())
 
     def _follow(self, command: Command) -> None:
         """Take the sender of a command in order as the leader: no lower epoch passes again in this life of the robot."""

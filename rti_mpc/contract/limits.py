@@ -15,12 +15,13 @@ from functools import cached_property
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.contract.approach import magnitudes
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.schedule import UNKNOWN, end_ns
 from rti_mpc.rotation import Rotations
 
 MAX_VALID_NS = 300_000_000  # robot time: a command ends at the latest this long after its state and the delay, whatever its own validity
-INPUT_TOLERANCE = 1e-6  # in the unit of the input: above any rounding, single precision included, and below what an actuator resolves
+TOLERANCE_SHARE = 1e-6  # of the largest value of an input: above any rounding, single precision included, and below what an actuator resolves
 SETTLED_SHARE = 0.01  # of the range of an input: a way to rest that is this close to its last row counts as rest
 
 
@@ -74,20 +75,25 @@ class Limits:
         return max(0.0, 1e-9 * len(command.u_rest) * command.rest_period_ns - self.ramp_s)
 
     @cached_property
+    def tolerance(self) -> Array:
+        """By how much an input may be beyond a limit, or differ, by rounding, shape ``(nu,)``."""
+        return np.asarray(TOLERANCE_SHARE * magnitudes(self.lbu, self.ubu, self.lbdu, self.ubdu))
+
+    @cached_property
     def settled(self) -> Array:
         """How far from its last row a way to rest counts as rest, shape ``(nu,)``."""
         span = self.ubu - self.lbu
-        return np.where(np.isfinite(span), SETTLED_SHARE * span, INPUT_TOLERANCE)
+        return np.where(np.isfinite(span), SETTLED_SHARE * span, self.tolerance)
 
     def objection(self, command: Command) -> str:
         """Return what is wrong with the rows of a command, as a code and a reason; empty if nothing is."""
         if len(command.K) and self.rotations.size != command.K.shape[1]:
             return f"wrong_shape: its way to rest feeds {command.K.shape[1]} states back, of {self.rotations.size} that are known"
         for u, period_ns, of in judged(command):
-            if (u < self.lbu - INPUT_TOLERANCE).any() or (u > self.ubu + INPUT_TOLERANCE).any():
+            if (u < self.lbu - self.tolerance).any() or (u > self.ubu + self.tolerance).any():
                 return f"out_of_bounds: inputs{of} reach from {u.min(axis=0).tolist()} to {u.max(axis=0).tolist()}"
             change, share = np.diff(u, axis=0), min(1.0, 1e-9 * period_ns / self.dt_s)
-            if (change < share * self.lbdu - INPUT_TOLERANCE).any() or (change > share * self.ubdu + INPUT_TOLERANCE).any():
+            if (change < share * self.lbdu - self.tolerance).any() or (change > share * self.ubdu + self.tolerance).any():
                 return f"out_of_slew: rows{of} change by up to {np.abs(change).max(axis=0).tolist()}"
         return ""
 

@@ -20,7 +20,7 @@ from rti_mpc.rti.ocp import Ocp
 
 SEEDED_CORNERS = 6  # combinations of bounds, beside those where all are low or all high
 UNBOUNDED_DISTANCE = 1.0  # from the nominal state, or the input at rest, that is tried where there is no bound; in its unit
-ROUNDING = 1e-9  # by which a number may exceed its bound
+ROUNDING = 1e-9  # by which a number may exceed its bound, relative to the larger one of its two
 MAX_DRAWS = 20  # of all states anew, where some are not regular
 
 
@@ -68,7 +68,8 @@ def derivative(model: Model) -> Callable[[Array, Array], Array]:
 
 def inside(z: Array, lowest: Array, highest: Array) -> bool:
     """Return whether a vector is inside bounds, all of shape ``(n,)``: an attitude may not be any more, once it has length 1."""
-    return bool((z >= lowest - ROUNDING).all() and (z <= highest + ROUNDING).all())
+    rounding = ROUNDING * np.maximum(np.abs(lowest), np.abs(highest))
+    return bool((z >= lowest - rounding).all() and (z <= highest + rounding).all())
 
 
 def around(lower: Array, upper: Array, middle: Array) -> tuple[Array, Array]:

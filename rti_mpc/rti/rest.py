@@ -84,7 +84,8 @@ def motion_at_rest(ocp: Ocp) -> str:
     states += [rng.uniform(lowest, highest) for _ in range(SEEDED_STATES)]
     states = [start, *(x for x in map(attitudes.completed, states) if is_regular(x, u_rest))]
     rates = np.abs([rate(x, u) for x in states for u in (*inputs, u_rest)])
-    still = np.maximum(STILL_SHARE * np.max(rates, axis=0, where=np.isfinite(rates), initial=0.0), 1e-9)
+    fastest = np.max(rates, axis=0, where=np.isfinite(rates), initial=0.0)
+    still = np.where(fastest > 0.0, STILL_SHARE * fastest, 1e-9)
     positions = [j for j in range(model.nx) if not depends_on(model.rate_expr[j], model.x[j])]
     ends = [move(x, u_rest, SETTLING_S) for x in states]
     for settled in ends:

@@ -40,8 +40,8 @@ from rti_mpc_sim.log import Log
 from rti_mpc_sim.settings import RobotSettings
 
 ROLE = "robot"
-STANDSTILL_CHANGE = 1e-6  # nothing moves any more if no state changes by more in a period, in any unit
-STANDSTILL_RATE = 1e-3  # the robot stands if no state changes faster, in any unit per s
+STANDSTILL_CHANGE_S = 1e-6  # nothing moves any more if no state changes by more in a period than in operation in this time
+STANDSTILL_SHARE = 1e-3  # of the rates in operation: the robot stands if no state changes faster
 MAX_COAST_NS = 10_000_000_000  # robot time with the inputs at rest after which it is decided whether the robot stands
 COAST_SHARE = 0.05  # of its robot time that this takes in real time: many states at once would be dropped as congestion
 MAX_WAY_NS = 120_000_000_000  # robot time that the inputs may take to come to rest
@@ -137,10 +137,10 @@ def model_info(model: Model) -> dict[str, Any]:
     }
 
 
-def standing(model: Model, rate: Array) -> str:
-    """Say whether a robot stands, whose states change at a rate, shape ``(nx,)``, per s; if it does not, which of them changes most."""
-    fastest = int(np.argmax(np.abs(rate)))
-    if abs(rate[fastest]) < STANDSTILL_RATE:
+def standing(model: Model, rate: Array, rates: Array) -> str:
+    """Say whether a robot stands, by how fast its states change, now and in operation, shape ``(nx,)``, per s; if not, which of them does most."""
+    fastest = int(np.argmax(np.abs(rate) / rates))
+    if abs(rate[fastest]) < STANDSTILL_SHARE * rates[fastest]:
         return "stands"
     state = model.states[fastest]
     return f"coasts with its inputs at rest: {state.name} changes by {quantity(rate[fastest], state.unit)} per s"
@@ -158,7 +158,7 @@ class Robot:
     def __init__(self, settings: RobotSettings, bus: Bus, key: Key[Command], speed: float, log: Path | None) -> None:
         # Milliseconds: a robot restarted within a second is another one.
         self.body = Lockstep(settings, epoch=new_epoch())
-        self._model = settings.model
+        self._model, self._rates = settings.model, settings.rates
         self._log = Log(log, settings.model)
         self._states = bus.publisher(bus.keys.state)
         self._announcer = Announcer(bus, ROLE, self.body.epoch)
@@ -194,17 +194,17 @@ class Robot:
         """Go the way to rest and coast until the robot stands, ahead of the clock, and sum up."""
         body = self.body
         body.actuator.switch_off()
-        x, moved, rate = body.x.copy(), np.inf, np.zeros_like(body.x)
+        x, moved_s, rate = body.x.copy(), np.inf, np.zeros_like(body.x)
         begun_ns = rested_ns = body.now_ns
-        while body.now_ns < min(begun_ns + MAX_WAY_NS, rested_ns + MAX_COAST_NS) and not (body.actuator.at_rest and moved < STANDSTILL_CHANGE):
+        while body.now_ns < min(begun_ns + MAX_WAY_NS, rested_ns + MAX_COAST_NS) and not (body.actuator.at_rest and moved_s < STANDSTILL_CHANGE_S):
             x[:], before_ns = body.x, body.now_ns
             self._advance(body.due_ns)
-            moved = np.abs(body.x - x).max()
+            moved_s = (np.abs(body.x - x) / self._rates).max()
             rate[:] = (body.x - x) / (1e-9 * max(1, body.now_ns - before_ns))
             rested_ns = rested_ns if body.actuator.at_rest else body.now_ns
             self._send_due()
             time.sleep(1e-9 * COAST_SHARE * body.period_ns)
-        how = standing(self._model, rate)
+        how = standing(self._model, rate, self._rates)
         stands = how == "stands"
         self._announcer.say(Notice(Severity.INFO if stands else Severity.WARNING, "robot_stopped", f"the robot was stopped and {how}"), body.now_ns)
         logger.log(logging.INFO if stands else logging.WARNING, "stopped, and %s", how)

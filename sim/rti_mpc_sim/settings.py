@@ -35,6 +35,7 @@ class RobotSettings:
         actuator_delay_s: Time from the arrival of a command to the instant from which it can act.
         actuator_lag_s: Time constant of the inputs, first order; 0: none.
         seed: Seed of noise and dropout.
+        rates: How fast each state changes in operation, shape ``(nx,)``, per s, by which is judged whether it stands; 1 in its unit by default.
 
     Raises:
         ConfigError: A size or a number does not fit.
@@ -56,11 +57,13 @@ class RobotSettings:
     actuator_delay_s: float = 0.0
     actuator_lag_s: float = 0.0
     seed: int = 1
+    rates: Array = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
         """Fill in defaults that depend on the model, and check."""
         nx, nu = given.instance("model", self.model, Model).nx, self.model.nu
-        for name, length, default in (("x0", nx, 0.0), ("slew", nu, np.inf), ("lbu", nu, -np.inf), ("ubu", nu, np.inf), ("noise_std", nx, 0.0)):
+        lengths = (("x0", nx, 0.0), ("slew", nu, np.inf), ("lbu", nu, -np.inf), ("ubu", nu, np.inf), ("noise_std", nx, 0.0), ("rates", nx, 1.0))
+        for name, length, default in lengths:
             values = np.array(given.numbers(name, getattr(self, name)))
             value = values if values.size or name == "x0" else np.full(length, default)
             if value.shape != (length,) or np.isnan(value).any():
@@ -74,6 +77,7 @@ class RobotSettings:
             ("slew", "above 0", bool((self.slew > 0.0).all())),
             ("lbu", "at most the input at rest, and that at most ubu", self._reach_rest()),
             ("noise_std", "finite and at least 0", bool(np.isfinite(self.noise_std).all() and (self.noise_std >= 0.0).all())),
+            ("rates", "finite and above 0", bool(np.isfinite(self.rates).all() and (self.rates > 0.0).all())),
             ("state_period_s", "from 0.0001 to 10 s", 1e-4 <= self.state_period_s <= 10.0),
             ("substeps", "from 1 to 1000", 1 <= self.substeps <= 1000),
             ("sensor_delay_s", "from 0 to 10 s", 0.0 <= self.sensor_delay_s <= 10.0),

@@ -240,3 +240,14 @@ def test_robot_says_that_it_stands_only_if_it_does(endpoint: str, caplog: pytest
     with caplog.at_level("INFO", logger="robot"):
         robot.main(settings, BusSettings(listen=(endpoint,), connect=()), KEYS, duration_s=0.1, stop=threading.Event())
     assert caplog.messages[-1] == said
+
+
+@pytest.mark.parametrize(("share", "stands"), [(0.0, True), (5e-4, True), (2e-3, False), (1.0, False)])
+def test_robot_stands_by_its_rates_in_operation_in_m_as_in_km(share: float, stands: bool) -> None:
+    rates = np.array([0.5, 2.0])
+    for unit in (1.0, 1e-3, 1e6):
+        for j in range(2):
+            rate = np.where(np.arange(2) == j, share * unit * rates, 0.0)
+            said = robot.standing(pushed(), rate, unit * rates)
+            assert (said == "stands") == stands
+            assert stands or pushed().states[j].name in said

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rti_mpc_service.commands.on_bus import on_bus
-from rti_mpc_service.config.build import robot_settings, with_initial_state
+from rti_mpc_service.config.build import operating_rates, robot_settings, with_initial_state
 from rti_mpc_service.config.schema import Config
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def sim(
     from rti_mpc_sim.settings import RobotSettings
 
     listen = bus.listen or config.bus.listen or (bus.connect if bus.mode == "peer" and bus.config is None else ())
-    settings = RobotSettings(**robot_settings(with_initial_state(config, x0 or [])))
+    settings = RobotSettings(**robot_settings(with_initial_state(config, x0 or [])), rates=operating_rates(config))
     main(settings, replace(bus, listen=listen), config.keys(), speed=speed, log=log, duration_s=duration, guarded=config.guard.enabled)
 
 

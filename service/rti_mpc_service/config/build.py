@@ -228,6 +228,14 @@ def robot_settings(config: Config) -> dict[str, Any]:
     }
 
 
+def operating_rates(config: Config) -> Array:
+    """Return how fast each state of the simulated robot changes in operation, shape ``(nx,)``, per s."""
+    from rti_mpc.rti.rest import TRIED_STATES, rates_of_operation, starts_of
+
+    ocp = build_ocp(config)
+    return rates_of_operation(ocp.model, starts_of(ocp, TRIED_STATES, np.empty(0)))
+
+
 def guard_limits(config: Config, signals: Signals) -> Limits:
     """Return the limits of the guard, of a model with these signals; no model is loaded."""
     from rti_mpc.contract.limits import Limits

@@ -16,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.contract.approach import magnitudes
 from rti_mpc.contract.limits import MAX_VALID_NS
 from rti_mpc.contract.message import Command
 from rti_mpc.wire.cdr import encode
@@ -31,7 +32,7 @@ LATE_MS = 60.0  # that the end of the ramp may be late: steps of 10 ms, and two 
 STANDS_MS = 1000.0  # for which the robot is seen to stand
 REFUSAL_MS = 50.0  # in which a command would have passed
 HELD_UP_MS = 150.0  # that a host may hold up what follows a healthy command; after 250 ms of silence numbers may begin anywhere
-SLEW_ROUNDING = 1e-5  # that a guard may forgive, in the unit of the input
+SLEW_ROUNDING = 1e-5  # that a guard may forgive, relative to the largest value of an input
 STOP_TIMEOUT_S = 5.0  # for the answer to a stop
 LEADER = 1 << 20  # between epochs of two controllers
 
@@ -191,7 +192,9 @@ def slew(stand: Stand) -> Finding:
             if time.monotonic() > deadline_s:
                 raise Unseen(f"commands that begin at {shown(level)} at once did not bring the inputs there, but to {shown(stand.actuator.u)}")
             stand.run(stand.period_ns / MS, at_once(stand, level))
-    most = float((np.abs(np.diff(stand.inputs[before:], axis=0)) / (levels.step + SLEW_ROUNDING)).max())
+    limits = stand.limits
+    allowed = levels.step + SLEW_ROUNDING * magnitudes(limits.lbu, limits.ubu, limits.lbdu, limits.ubdu)
+    most = float((np.abs(np.diff(stand.inputs[before:], axis=0)) / allowed).max())
     text = f"the inputs changed at once by {100 * most:.0f} % of what the slew limits allow in a period"
     return Finding(most <= 1.0, text, 0.5 * stand.period_ns / MS if most <= 2.0 else 0.0)  # no guard knows that a message is still on its way
 

@@ -27,7 +27,7 @@ from rti_mpc.contract.schedule import RAMP_STEP_NS
 from rti_mpc_service.rig.robot_log import RobotLog
 
 STANDSTILL_SPEED_M_S = 1e-3
-REST_TOLERANCE = 1e-9  # largest deviation of an input from rest, in its unit
+REST_SHARE = 1e-3  # of what rounding may do to an input, by which it deviates from rest at most: robots ramp to it exactly
 MAX_RAMP_LATENESS_S = 0.02  # how far a ramp may lag behind one that began in time: two steps of 10 ms
 MAX_RAMP_STRETCH = 1.5  # a ramp composed of several may take this factor longer than the slew limits need
 MIN_RAMP_STEP_SHARE = 0.09  # least first step of a ramp, as a share of a period's largest change: just under a step of 10 ms in a period of 0.1 s
@@ -98,7 +98,7 @@ def measure(log: RobotLog, position: Array, error: Array, incident: Incident, li
     t = log.stamp_ns
     broken = (t >= incident.fault_ns) & (t <= incident.mend_ns)
     seen = (t >= incident.fault_ns) & (t <= incident.end_ns)
-    moving: Mask = np.abs(log.u - limits.u_rest).max(axis=1) > REST_TOLERANCE
+    moving: Mask = np.any(np.abs(log.u - limits.u_rest) > REST_SHARE * limits.tolerance, axis=1)
     way: Array = np.linalg.norm(np.diff(position, axis=0, prepend=position[:1]), axis=1)
     speed: Array = way / (1e-9 * np.diff(t, prepend=t[0] - 1))
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rti_mpc.array import Array
+from rti_mpc.contract.approach import magnitudes
 from rti_mpc.contract.message import Event, Reference, Severity, Telemetry
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.model.model import Model
@@ -32,7 +33,7 @@ from rti_mpc_service.scenario import Scenario
 TRANSIENT_S = 20.0
 MAX_HELD_UP_S = 1.0  # before the end, in which a busy host may keep a controller from driving, and it is still taken to drive
 ERROR_KEYS = ("max_error_mm", "rms_error_mm", "last_lap_max_error_mm", "final_error_mm", "final_speed_mm_s")
-INCREMENT_ROUNDING = 1e-9  # rounding of a difference of two inputs, in the input's unit; inputs are compared exactly
+INCREMENT_ROUNDING = 1e-9  # rounding of a difference of two inputs, relative to their largest value; inputs are compared exactly
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,10 +206,12 @@ def limits(outcome: Outcome, samples: Sequence[Telemetry]) -> dict[str, Any]:
     ocp, log = outcome.ocp, outcome.log
     commanded = np.vstack([sample.u for sample in samples])
     steps = np.vstack([np.diff(sample.u, axis=0) for sample in samples])
+    lbu, ubu, lbdu, ubdu = (ocp.widest(name) for name in ("lbu", "ubu", "lbdu", "ubdu"))
+    rounding = INCREMENT_ROUNDING * magnitudes(lbu, ubu, lbdu, ubdu)
     return {
-        "commanded_inputs_in_bounds": not excess(commanded, ocp.widest("lbu"), ocp.widest("ubu")).any(),
-        "commanded_increments_in_bounds": not (excess(steps, ocp.widest("lbdu"), ocp.widest("ubdu")) > INCREMENT_ROUNDING).any(),
-        "applied_inputs_in_bounds": not excess(log.u, ocp.widest("lbu"), ocp.widest("ubu")).any(),
+        "commanded_inputs_in_bounds": not excess(commanded, lbu, ubu).any(),
+        "commanded_increments_in_bounds": not (excess(steps, lbdu, ubdu) > rounding).any(),
+        "applied_inputs_in_bounds": not excess(log.u, lbu, ubu).any(),
         "states_over_share": float(excess_share(log.x, ocp.widest("lbx"), ocp.widest("ubx")).max()),
     }
 
