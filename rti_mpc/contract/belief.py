@@ -118,7 +118,8 @@ class Belief(Schedule):
         times = (t_ns - 1, t_ns, t_ns - self._tolerance_ns, t_ns + self._tolerance_ns) if or_after else (t_ns - 1, t_ns - self._tolerance_ns)
         reported = u.tolist()
         for t in times:
-            if alike(self.at(t)[0].tolist(), reported, self._magnitudes):
+            believed = self.at(t)[0].tolist()
+            if believed == reported or alike(believed, reported, self._magnitudes):
                 return True
         return False
 

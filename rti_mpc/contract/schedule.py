@@ -220,9 +220,10 @@ class Schedule:
 
     def forget(self, t_ns: int) -> None:
         """Drop plans that are over before a time, and count against no slew limit any more."""
+        plans = self._plans
         t_ns -= self._increments.dt_ns if self._increments is not None else 0
-        while len(self._plans) > 1 and self._plans[1].start_ns <= t_ns:
-            self._plans.popleft()
+        while len(plans) > 1 and plans[1].start_ns <= t_ns:
+            plans.popleft()
 
     def approached(self, command: Command, start_ns: int) -> Array:
         """Return the rows of a command, shape ``(n, nu)``, as they would act from a time on."""
@@ -309,6 +310,25 @@ class Schedule:
             return plan.before, change_ns, True  # a time that is forgotten
         u, step_ns = self.after(plan, t_ns)
         return u, step_ns if step_ns < change_ns else change_ns, t_ns >= plan.end_ns
+
+    def acted(self, from_ns: int, to_ns: int) -> list[list[float]]:
+        """Return the inputs that act in an interval, oldest first, each as a list: for a few numbers, plain floats are faster than arrays."""
+        rows: list[list[float]] = []
+        until_ns = to_ns
+        for plan in reversed(self._plans):
+            begins_ns, stamp_ns, period_ns = plan.start_ns, plan.stamp_ns, plan.period_ns
+            if begins_ns < from_ns:
+                begins_ns = from_ns
+            if begins_ns >= until_ns:
+                continue
+            row, last = (begins_ns - stamp_ns) // period_ns, (until_ns - 1 - stamp_ns) // period_ns
+            if row < 0 or last >= len(plan.u) or until_ns > plan.end_ns:
+                break
+            rows = plan.u[row : last + 1].tolist() + rows
+            if begins_ns == from_ns:
+                return rows
+            until_ns = begins_ns
+        return [u.tolist() for _, u in segments(self.at, from_ns, to_ns)]  # a row is held, a ramp or a way to rest acts, or a time is forgotten
 
     def after(self, plan: Plan, t_ns: int) -> tuple[Array, int]:
         """Return the input that acts at a time of a plan, or after it, if no other plan comes, and until when it does."""

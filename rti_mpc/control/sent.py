@@ -44,6 +44,7 @@ class Sent:
         self._left_ns = BEFORE_ALL_NS  # when the last command left at the earliest
         self._alone: tuple[int, Array] = (BEFORE_ALL_NS, u_rest)  # when the robot last stopped braking on its own, and from which input
         self._went: Plan | None = None  # the plan whose way to rest it went until then, if it had one
+        self._feeds_back = False  # whether any command had a way to rest that states correct
         # Per dt. Lists: for a few numbers, plain floats are several times faster than arrays.
         self._falling, self._rising = lbdu.tolist(), ubdu.tolist()
         self._nu = len(u_rest)
@@ -62,6 +63,7 @@ class Sent:
             command: The command.
             left_ns: Earliest robot time at which it left, if that is known: the command before acts at least until then.
         """
+        self._feeds_back |= len(command.K) > 0
         self._left_ns = max(self._left_ns + 1, left_ns)  # commands leave one after the other, whatever our idea of the robot's clock
         start_ns, over_ns = max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, self._left_ns), end_ns(command)
         if start_ns < over_ns:
@@ -88,8 +90,9 @@ class Sent:
 
     def feed_back(self, x: Array, t_ns: int) -> None:
         """Take note of a state, shape ``(nx,)``: it corrects a way to rest that needs feedback, as whoever plays it does, from its time on."""
-        for schedule in (self._schedule, self._slowest):
-            schedule.feed_back(x, t_ns, t_ns)
+        if self._feeds_back:
+            for schedule in (self._schedule, self._slowest):
+                schedule.feed_back(x, t_ns, t_ns)
 
     @property
     def confirmed(self) -> int:
@@ -135,8 +138,7 @@ class Sent:
         Where the robot brakes on its own, this leaves it the speed that it has. The plan
         that ended the braking may itself be late, and the robot have braked further.
         """
-        acted: list[list[float]] = []
-        self._add(acted, self._schedule, t_ns, t_ns + self._dt_ns)
+        acted = self._schedule.acted(t_ns, t_ns + self._dt_ns)
         ended_ns, u = self._alone
         if abs(t_ns - ended_ns) < self._dt_ns:
             way, share = self._schedule.u_rest - u, (t_ns + self._dt_ns - ended_ns) / self._dt_ns
@@ -147,18 +149,13 @@ class Sent:
         lowest, highest, later = [-inf] * self._nu, [inf] * self._nu, len(acted)
         self._narrow(lowest, highest, acted)
         second = lowest.copy(), highest.copy()
-        self._add(acted, self._schedule, t_ns - self._dt_ns + 1, t_ns)  # the input of `t_ns` has narrowed them already
-        self._add(acted, self._slowest, t_ns - self._window_ns, t_ns + self._transit_ns + 1)
+        before = self._schedule.acted(t_ns - self._dt_ns + 1, t_ns)  # the input of `t_ns` has narrowed them already
+        for values in before + self._slowest.acted(t_ns - self._window_ns, t_ns + self._transit_ns + 1):
+            if values not in acted:  # a second time it would narrow no interval
+                acted.append(values)
         self._narrow(lowest, highest, acted[later:])
         rows = np.array(lowest + second[0] + highest + second[1]).reshape(2, 2, self._nu)
         return rows[0], rows[1]
-
-    def _add(self, acted: list[list[float]], schedule: Schedule, from_ns: int, to_ns: int) -> None:
-        """Add the inputs that act before a time, each of them once: a second time it would narrow no interval."""
-        while from_ns < to_ns:
-            u, from_ns, _ = schedule.at(from_ns)
-            if (values := u.tolist()) not in acted:
-                acted.append(values)
 
     def _narrow(self, lowest: list[float], highest: list[float], acted: list[list[float]]) -> None:
         """Narrow intervals to what is within the slew limits of all inputs; where that leaves nothing, to the nearest value."""

@@ -87,6 +87,19 @@ def test_braking_from_an_input_begins_at_once_and_ends_at_rest() -> None:
     assert not plans.at(140 * MS)[0].any()
 
 
+@pytest.mark.parametrize("forgets_ms", [None, 150])
+def test_inputs_that_acted_in_an_interval_are_those_of_each_of_its_times(forgets_ms: int | None) -> None:
+    rows = 0.01 * np.arange(8.0).reshape(4, 2)
+    plans = schedule(command(rows), command(rows + 0.1, stamp_ms=130, valid_ms=350), command(rows + 0.2, stamp_ms=230, valid_ms=150))
+    if forgets_ms is not None:
+        plans.forget(forgets_ms * MS)
+    every = trace(plans, -50, 700).tolist()
+    for from_ms in range(-50, 650, 10):
+        for to_ms in range(from_ms, min(from_ms + 250, 700), 10):
+            acted = [u for u, before in zip(every[from_ms + 50 : to_ms + 50], [None, *every[from_ms + 50 :]], strict=False) if u != before]
+            assert plans.acted(from_ms * MS, to_ms * MS) == acted, (from_ms, to_ms)
+
+
 def test_what_is_forgotten_was_over() -> None:
     plans = schedule(*(command(np.full((4, 2), 0.01 * i), stamp_ms=100 * i) for i in range(20)))
     before = trace(plans, 1500, 2600)
