@@ -9,6 +9,8 @@ that is inside already passes unchanged.
 
 from __future__ import annotations
 
+from math import isfinite
+
 import casadi as ca
 import numpy as np
 
@@ -39,10 +41,17 @@ class Envelope:
         self._u: Array = np.zeros((ocp.N_u, nu))
         self._rows: Array = np.zeros((ocp.N, nu))
         self._reach: tuple[Array, Array] = (np.zeros((2, nu)), np.zeros((2, nu)))
-        self.written = (self._u, *self._reach, self._rows)
+        square: Array = np.zeros(1)  # of the plan
+        self._square = square.data
+        self.written = (self._u, *self._reach, self._rows, square)
         fit = clipping(ocp)
         inputs = {"u": self._u, "lowest": self._reach[0], "highest": self._reach[1], **self.bounds}
-        self._fit = bind(compiled(fit)[0] if compile else fit, inputs, {"rows": self._rows})
+        self._fit = bind(compiled(fit)[0] if compile else fit, inputs, {"rows": self._rows, "square": square})
+
+    @property
+    def finite(self) -> bool:
+        """Whether the plan that was fitted last was finite."""
+        return isfinite(self._square[0])
 
     def take(self, name: str, bound: Array) -> None:
         """Take another bound of inputs, of the shape that it has in the problem."""
@@ -52,7 +61,7 @@ class Envelope:
 
     def fit(self, u: Array, reach: tuple[Array, Array]) -> Array:
         """
-        Bring a finite plan inside, each row as near to the planned one as the rows before it allow.
+        Bring a plan inside, each row as near to the planned one as the rows before it allow; what was not `finite` is inside, too, and no plan.
 
         Args:
             u: Inputs, shape ``(N_u, nu)``.
@@ -90,7 +99,7 @@ class Envelope:
 
 
 def clipping(ocp: Ocp) -> ca.Function:
-    """Build ``(u, lowest, highest, *INPUT_BOUNDS) -> rows``, columns being stages."""
+    """Build ``(u, lowest, highest, *INPUT_BOUNDS) -> (rows, square)``, columns being stages; `square` is the sum of all u squared."""
     nu = ocp.model.nu
     u = ca.SX.sym("u", nu, ocp.N_u)
     lowest, highest = ca.SX.sym("lowest", nu, 2), ca.SX.sym("highest", nu, 2)
@@ -107,4 +116,4 @@ def clipping(ocp: Ocp) -> ca.Function:
         wanted = ca.fmin(ca.fmax(u[:, j], lbu), ubu)
         rows.append(ca.fmin(ca.fmax(wanted, lower), upper))
     inputs = {"u": u, "lowest": lowest, "highest": highest, **bounds}
-    return function("clipping", inputs, {"rows": ca.densify(ca.horzcat(*rows))})
+    return function("clipping", inputs, {"rows": ca.densify(ca.horzcat(*rows)), "square": ca.sumsqr(u)})

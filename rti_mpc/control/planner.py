@@ -7,8 +7,6 @@ The plan is brought inside the envelope of the inputs before anyone else sees it
 
 from __future__ import annotations
 
-from math import isfinite
-
 import numpy as np
 
 from rti_mpc.array import Array
@@ -61,7 +59,6 @@ class Planner:
         self._x0 = prediction.x
         self._rti, self._track, self._sent, self._prediction, self._envelope, self._tuning = rti, track, sent, prediction, envelope, tuning
         self._d, self._robot, self._np, self._dt_ns = d, robot, rti.ocp.model.np_ - len(d), round(1e9 * rti.ocp.dt)
-        self._u = rti.u.reshape(-1)
         # What nothing depends on is neither looked up nor handed on.
         self._p = track.p if rti.ocp.model.np_ else None
         self._remembers = len(rti.ocp.soft_ddu) > 0
@@ -105,9 +102,10 @@ class Planner:
             self._look_up(act_ns)
         self._prediction.predict(x, stamp_ns, act_ns)
         status = self._rti.feedback(self._x0) if self.loaded else self._feedback_cold(act_ns)
-        if not (status.usable and isfinite(self._u.dot(self._u))):
+        if not status.usable:
             return status, None
-        return status, self._envelope.fit(self._rti.u, self.reach)
+        rows = self._envelope.fit(self._rti.u, self.reach)
+        return status, rows if self._envelope.finite else None
 
     def _feedback_cold(self, act_ns: int) -> QpStatus:
         """Solve the first sample, whose reference was looked up: the guess is the present state at all stages, and is iterated on."""

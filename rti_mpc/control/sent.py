@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from math import inf
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +49,9 @@ class Sent:
         # Per dt. Lists: for a few numbers, plain floats are several times faster than arrays.
         self._falling, self._rising = lbdu.tolist(), ubdu.tolist()
         self._nu = len(u_rest)
+        rows: Array = np.zeros((2, 2, self._nu))
+        self._reach = rows[0], rows[1]
+        self._rows: Any = rows.reshape(-1).data  # written faster than an array
         self._dt_ns = dt_ns
         self._transit_ns, self._window_ns = round(TRANSIT_PERIODS * dt_ns), round(SLEW_WINDOW_PERIODS * dt_ns)
         slew = 1e9 * np.minimum(-lbdu, ubdu) / dt_ns
@@ -128,7 +132,7 @@ class Sent:
 
     def reach(self, t_ns: int) -> tuple[Array, Array]:
         """
-        Return the lowest and the highest first two rows of a plan, each of shape ``(2, nu)``.
+        Return the lowest and the highest first two rows of a plan, each of shape ``(2, nu)``; the next call overwrites them.
 
         Row 0 takes over at `t_ns`, or up to one period later. It must be within the slew
         limits of every input that acts in the period before, and of those that act until
@@ -154,8 +158,9 @@ class Sent:
             if values not in acted:  # a second time it would narrow no interval
                 acted.append(values)
         self._narrow(lowest, highest, acted[later:])
-        rows = np.array(lowest + second[0] + highest + second[1]).reshape(2, 2, self._nu)
-        return rows[0], rows[1]
+        for i, value in enumerate(lowest + second[0] + highest + second[1]):
+            self._rows[i] = value
+        return self._reach
 
     def _narrow(self, lowest: list[float], highest: list[float], acted: list[list[float]]) -> None:
         """Narrow intervals to what is within the slew limits of all inputs; where that leaves nothing, to the nearest value."""
