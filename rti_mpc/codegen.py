@@ -172,7 +172,7 @@ def function_in_c(name: str, inputs: Mapping[str, Any], outputs: Mapping[str, An
     return function(unique, inputs, outputs)
 
 
-CALL = re.compile(r"\w+(?=\()")
+CALL = re.compile(r"casadi_f\d+(?=\()")  # of a static function, as CasADi names them; what it exports is declared otherwise
 
 
 def with_bodies(source: str) -> str:
