@@ -197,6 +197,7 @@ def test_what_peers_send_is_read_in_one_place(name: str) -> None:
         ("rti_mpc.rti.rti", {"zenoh", "rerun", "qpsolvers", "pydantic"}),
         ("rti_mpc_service.config.config", {"casadi", "osqp", "scipy", "zenoh", "rerun"}),
         ("rti_mpc_service.guard", {"casadi", "osqp", "scipy", "rerun", "qpsolvers"}),
+        ("rti_mpc_service.demo.demo", {"osqp", "scipy", "rerun", "matplotlib"}),
         ("rti_mpc_service.cli", {"casadi", "osqp", "scipy", "zenoh", "rerun", "rti_mpc_sim"}),
     ],
 )

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from rti_mpc.array import Array
 from rti_mpc.errors import ConfigError
@@ -54,6 +53,8 @@ def flown_eight(t: Array) -> Array:
 
 def turning_flight(t: Array) -> Array:
     """Fly the same eight while turning, as the thrust must point for it: ``x, y, z`` and the quaternion ``q_w, q_x, q_y, q_z``."""
+    from scipy.spatial.transform import Rotation  # which takes as long to load as all else that a source of references needs
+
     before, at, after = (flown_eight(t + by)[:, :3] for by in (-STEP_S, 0.0, STEP_S))
     up = (after - 2 * at + before) / STEP_S**2 + np.array([0.0, 0.0, GRAVITY])
     yaw = TURNING_RAD_S * t

@@ -23,8 +23,6 @@ from pathlib import Path as File
 from typing import Literal
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.linalg import solve_banded, solve_circulant
 
 from rti_mpc import given
 from rti_mpc.array import Array
@@ -206,6 +204,8 @@ def smooth_path(
         ConfigError: There are fewer than two distinct points, or a number is out of range.
         OcpError: What must be numbers is none.
     """
+    from scipy.interpolate import CubicSpline  # which takes half a second to load, that of a program without a path, too
+
     given_points = distinct(points)
     along = smoothed(given_points, smooth_m).points
     closed = len(along) > 3 and bool(np.all(along[0] == along[-1]))
@@ -247,6 +247,8 @@ def at_knots(name: str, value: Array | float, s_given: Array, s: Array, *, close
 
 def control_points(nodes: Array, *, closed: bool) -> Array:
     """Return the control points of the cubic B-spline that passes through its knots there, shape ``(n, 2)``; straight at the ends of an open one."""
+    from scipy.linalg import solve_banded, solve_circulant
+
     n = len(nodes)
     if closed:
         column = np.zeros(n)

@@ -8,7 +8,6 @@ Each is a closed cubic B-spline of a few control points, with the same width eve
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import BSpline
 
 from rti_mpc.array import Array
 from rti_mpc.reference.path import Path, smooth_path
@@ -46,6 +45,8 @@ def track(name: str, speed_m_s: float = 1.0) -> Path:
 
 def centre_line(name: str) -> Array:
     """Return points of the centre line of one of `TRACKS`, the first also as the last, shape ``(n, 2)``, in m."""
+    from scipy.interpolate import BSpline  # as in `smooth_path`
+
     control = np.array(CONTROL_POINTS_M[name], dtype=np.float64)
     n = len(control)
     curve = BSpline(np.arange(-3.0, n + 4.0), np.vstack([control, control[:3]]), 3)
