@@ -24,7 +24,7 @@ import numpy as np
 
 from rti_mpc.codegen import function
 from rti_mpc.rti.blocks import all_inputs, at_each, summed
-from rti_mpc.rti.linearization import Linearization, divided, partly, where_bounded
+from rti_mpc.rti.linearization import Linearization, divided, linearization, partly, where_bounded
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.recursion import recur
@@ -41,7 +41,7 @@ def certificate(ocp: Ocp) -> ca.Function:
     largest violation of dynamics, bounds and increments relative to their scales. `gap` is a bound on the cost above the optimum, and `cost` the
     cost of the plan, penalties included, both normalised.
     """
-    lin = Linearization(ocp)
+    lin = linearization(ocp)
     N, N_u, nx, nu, ng = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu, ocp.ng
     x_plan, u_plan, x0 = ca.MX.sym("x_plan", nx, N + 1), ca.MX.sym("u_plan", nu, N_u), ca.MX.sym("x0", nx)
     stages, multipliers = ca.MX.sym("stages", lin.stages.numel()), ca.MX.sym("multipliers", nu * N_u + ng * N)

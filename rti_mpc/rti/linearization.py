@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -263,6 +264,16 @@ class Linearization:
         return diagonal, None if last else beside
 
 
+_linearizations: WeakKeyDictionary[Ocp, Linearization] = WeakKeyDictionary()
+
+
+def linearization(ocp: Ocp) -> Linearization:
+    """Return the linearization of a problem, which all its functions share, built at the first call."""
+    if ocp not in _linearizations:
+        _linearizations[ocp] = Linearization(ocp)
+    return _linearizations[ocp]
+
+
 def input_reference(ocp: Ocp) -> ca.Function:
     """Build ``p -> u_ref`` for the first stages of all blocks, columns are blocks."""
     return ca.Function("u_ref", [ocp.model.p], [ca.densify(ocp.u_ref)]).map(ocp.N_u)
@@ -403,7 +414,7 @@ def damping(ocp: Ocp) -> float:
 
 def plan_cost(ocp: Ocp) -> ca.Function:
     """Build ``(x, u, u_prev, y_ref, p, *ARGUMENTS, scale) -> cost``: the cost (4) of a plan and its penalties, nothing of it linearized."""
-    lin = Linearization(ocp)
+    lin = linearization(ocp)
     lg, ug, zg, Zg = (at_each(e, ocp.N) for e in (lin.lg, lin.ug, lin.zg, lin.Zg))
     s = ca.fmax(0, ca.fmax(lin.g - ug, lg - lin.g))
     return function("cost", lin.arguments, {"cost": lin.cost + ca.dot(zg, s) + ca.dot(Zg, s**2) / 2})

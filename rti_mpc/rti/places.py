@@ -22,7 +22,7 @@ import numpy as np
 from rti_mpc.codegen import function
 from rti_mpc.rti import homotopy, interior_point
 from rti_mpc.rti.blocks import all_inputs, at_each, moved_on, repeated
-from rti_mpc.rti.linearization import Forms, Linearization, change, divided, partly, shift, where_bounded
+from rti_mpc.rti.linearization import Forms, Linearization, change, divided, linearization, partly, shift, where_bounded
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.recursion import recur
@@ -90,7 +90,7 @@ class Sample(NamedTuple):
 
 def places(ocp: Ocp) -> Places:
     """Build the functions of an OCP."""
-    lin = Linearization(ocp)
+    lin = linearization(ocp)
     linearize = function("linearize", lin.arguments, {"stages": lin.stages})
     recursion = Riccati(ocp, lin)
     stages = ca.MX.sym("stages", linearize.numel_out("stages"))

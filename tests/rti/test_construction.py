@@ -10,7 +10,7 @@ import weakref
 import numpy as np
 import pytest
 
-from rti_mpc.rti import construction
+from rti_mpc.rti import construction, linearization
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
 from tests.problems import arc
@@ -51,6 +51,16 @@ def test_further_rti_of_a_problem_builds_no_expressions(monkeypatch: pytest.Monk
         Rti(further, compile=False)
     Rti(ocp, solver="osqp", compile=False)
     assert [args[0] is ocp for args in built] == [True, False, True], "once for the problem, once for the retuned one, once for another solver"
+
+
+def test_problem_is_linearized_once_for_all_its_functions(monkeypatch: pytest.MonkeyPatch) -> None:
+    built = []
+    linearize = linearization.Linearization
+    monkeypatch.setattr(linearization, "Linearization", lambda ocp: built.append(ocp) or linearize(ocp))
+    ocp = pioneer()
+    Rti(ocp, compile=False)
+    Rti(ocp, solver="osqp", compile=False)
+    assert [each is ocp for each in built] == [True]
 
 
 def test_further_rti_of_a_problem_takes_less_than_a_tenth_of_the_first() -> None:

@@ -26,7 +26,7 @@ import scipy.sparse as sp
 
 from rti_mpc.codegen import function
 from rti_mpc.rti.blocks import all_inputs, stacked
-from rti_mpc.rti.linearization import Linearization, change
+from rti_mpc.rti.linearization import Linearization, change, linearization
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import (
     KIND_NAMES,
@@ -127,7 +127,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
         ocp: The problem.
         softened: Whether the softened bounds, on states and general constraints, and their slacks are there.
     """
-    lin = Linearization(ocp)
+    lin = linearization(ocp)
     condensed = Condensing(ocp, lin)
     N, N_u, nu = ocp.N, ocp.N_u, ocp.model.nu
     ng = ocp.ng if softened else 0

@@ -19,7 +19,7 @@ import scipy.sparse as sp
 
 from rti_mpc.codegen import function
 from rti_mpc.rti.blocks import at_each, stacked
-from rti_mpc.rti.linearization import Linearization, change, nonzeros
+from rti_mpc.rti.linearization import Linearization, change, linearization, nonzeros
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import (
     KIND_NAMES,
@@ -47,7 +47,7 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
         ocp: The problem.
         softened: Whether the softened bounds, on states and general constraints, and their slacks are there.
     """
-    lin = Linearization(ocp)
+    lin = linearization(ocp)
     N, N_u, nx, nu, held = ocp.N, ocp.N_u, ocp.model.nx, ocp.model.nu, ocp.held.tolist()
     ng = ocp.ng if softened else 0
     kind = KIND_NAMES[softened]
