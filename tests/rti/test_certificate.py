@@ -97,6 +97,7 @@ def test_plan_of_a_penalty_that_gives_way_is_made_by_the_interior_point_or_told(
     exact = Rti(ocp, iterations=1, compile=False)
     assert status(exact) is QpStatus.SOLVED
     monkeypatch.setattr("rti_mpc.rti.places.PENALTY", 10.0)
+    monkeypatch.setattr("rti_mpc.rti.active_set.MAX_MOVES", 0)
     monkeypatch.setattr("rti_mpc.rti.active_set.MAX_REFINEMENTS", 0)
     monkeypatch.setattr("rti_mpc.rti.active_set.MAX_STEPS", steps)
     rti = Rti(ocp, iterations=1, compile=False)
