@@ -104,8 +104,14 @@ class Sent:
         return self._schedule.confirmed
 
     def brake(self, before_ns: int, now_ns: int) -> None:
-        """Assume that the robot, whose clock has jumped from one time to another, brakes from the input that acted."""
+        """
+        Assume that the robot, whose clock has jumped from one time to another, brakes from the input that acted.
+
+        If it was no jump, but a clock that is faster than known yet, the commands went on to act: the next plan is near to either input.
+        """
         self._left_ns = BEFORE_ALL_NS
+        if now_ns > before_ns:
+            self._alone, self._went = (now_ns, self._schedule.at(now_ns)[0].copy()), None
         for schedule in (self._schedule, self._slowest):
             schedule.cut(before_ns, now_ns)
 

@@ -96,6 +96,19 @@ def test_cleared_memory_is_rest() -> None:
     np.testing.assert_array_equal(memory.reach(50 * MS), [[-SLEW, -SLEW], [SLEW, SLEW]])
 
 
+def test_first_plan_after_a_jump_ahead_is_near_to_what_acts_if_the_clock_is_only_faster_than_known() -> None:
+    """Either the robot brakes from the command now, or its command was over long ago, and it has braked since."""
+    jumped = command(1, 0, np.tile([0.5, -0.7], (5, 1)), valid_ms=200)
+    memory = sent(jumped)
+    braked = memory.at(350 * MS)[0].copy()
+    memory.brake(100 * MS, 350 * MS)
+    np.testing.assert_array_equal(memory.at(350 * MS - 1)[0], [0.5, -0.7])
+    lowest, highest = memory.reach(350 * MS)
+    assert (highest[0] - braked)[0] <= SLEW[0] + 1e-12
+    assert (braked - lowest[0])[1] <= SLEW[1] + 1e-12
+    assert (memory.at(350 * MS)[0] - lowest[0])[0] <= SLEW[0] + 1e-12
+
+
 def test_reach_keeps_to_all_inputs_of_the_period_before_and_after() -> None:
     """Row 0 acts before, row 1 until the next command arrives, so the next input must be near both."""
     lowest, highest = sent(command(1, 0, np.array([[0.3, 0.0], [0.4, -0.2], [0.9, 0.9]]))).reach(DT)
