@@ -4,6 +4,7 @@ from __future__ import annotations
 import gc
 import os
 import shutil
+import signal
 import tempfile
 from collections import Counter
 from collections.abc import Generator, Iterator
@@ -36,6 +37,9 @@ def pytest_configure(config: pytest.Config) -> None:
     state = tempfile.mkdtemp(prefix="rti-mpc-state-")  # a test neither forgets a user's stop nor makes one
     config.add_cleanup(lambda: shutil.rmtree(state, ignore_errors=True))
     os.environ["STATE_DIRECTORY"] = state
+    for number in (signal.SIGINT, signal.SIGHUP):  # ignored in the background and under nohup, and then by the processes that tests start, too
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
     compiler = shutil.which("cc")
     if compiler is not None and "not slow" in config.getoption("markexpr") and not os.environ.get("PATH", os.defpath).startswith(UNOPTIMIZED):
         # Most of what tests compile serves once. Slow tests and benchmarks, whose figures are the product's, compile as it does.

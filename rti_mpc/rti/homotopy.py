@@ -33,7 +33,7 @@ def limits(ocp: Ocp, lin: Linearization) -> list[ca.MX]:
     return [lower, upper, along_rows(ocp, hard, hard, lin.zg / 2)]
 
 
-class Row:
+class BoundedRow:
     """
     Symbols of a row.
 
@@ -80,7 +80,7 @@ class Row:
 
 def begin(ocp: Ocp, lin: Linearization, stages: ca.MX) -> ca.Function:
     """Build ``(u, stages, *ARGUMENTS, scale, places, targets) -> point``: where the homotopy begins, from the guess and a roll-out with places."""
-    row, forms = Row(), lin.forms_in(stages)
+    row, forms = BoundedRow(), lin.forms_in(stages)
     guess = ca.veccat(lin.u, forms.increments, forms.g)
     places, targets = ca.MX.sym("places", guess.numel()), ca.MX.sym("targets", guess.numel())
     start = ca.Function("start", [row.place, row.now, row.target, row.lower, row.upper, row.most], [row.start]).map(guess.numel())
@@ -97,7 +97,7 @@ def move(ocp: Ocp, lin: Linearization, size: int) -> ca.Function:
         lin: Expressions of the sample.
         size: Number of rows.
     """
-    row = Row()
+    row = BoundedRow()
     names = "places", "places_found", "point", "targets"
     given = {name: ca.MX.sym(name, size) for name in names}
     of_rows = [of.T for of in (*given.values(), *limits(ocp, lin))]

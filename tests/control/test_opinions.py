@@ -111,6 +111,7 @@ def misled(build: Callable[..., Any]) -> Callable[..., Any]:
     def built(*args: Any, **kwargs: Any) -> Any:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(linearization, "gauss_newton", wrong)
+            patch.setattr(linearization, "_linearizations", WeakKeyDictionary())
             return build(*args, **kwargs)
 
     return built
