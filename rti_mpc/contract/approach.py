@@ -21,6 +21,7 @@ import numpy as np
 from rti_mpc.array import Array
 
 SLEW_WINDOW_PERIODS = 0.75  # inputs within this time differ by no more than one increment
+TOLERANCE_SHARE = 1e-6  # of the largest value of an input: above any rounding, single precision included, and below what an actuator resolves
 UNCHANGED_SHARE = 1e-9  # of the largest increment: a row that differs by less has not been changed
 
 

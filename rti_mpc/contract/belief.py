@@ -18,14 +18,13 @@ from dataclasses import replace
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.contract.approach import Increments, magnitudes
+from rti_mpc.contract.approach import TOLERANCE_SHARE, Increments, magnitudes
 from rti_mpc.contract.schedule import BEFORE_ALL_NS, UNKNOWN, Plan, Schedule
 from rti_mpc.contract.way import Way
 from rti_mpc.rotation import Rotations
 
 START_TOLERANCE_PERIODS = 0.1  # a command may begin to act this much sooner or later than believed
 OVERDUE_PERIODS = 1.0  # a command that does not act this long after its time is missing; until then it is still expected
-TOLERANCE_SHARE = 1e-6  # of the largest value of an input, and relative to its own: above the rounding of single precision
 MAX_MISSING_PLANS = 8  # missing plans that are remembered, since each may still arrive
 
 
@@ -168,7 +167,7 @@ class Belief(Schedule):
 
 
 def alike(believed: list[float], reported: list[float], largest: list[float]) -> bool:
-    """Return whether two inputs are equal but for rounding, which is relative to the largest value of each."""
+    """Return whether two inputs are equal but for rounding, which is relative to the largest value of each, and to its own."""
     for one, other, most in zip(believed, reported, largest, strict=True):  # a loop: a generator takes twice as long for a few numbers
         if not abs(one - other) <= TOLERANCE_SHARE * (most + abs(other)):  # false for NaN, too
             return False

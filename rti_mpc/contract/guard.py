@@ -224,8 +224,7 @@ class Guard:
         self._schedule.forget(now_ns - 2 * self._dt_ns)
         if self.passing:
             self._watch(now_ns)
-        blind = self._blind(now_ns)
-        if blind:
+        if self._blind(now_ns):
             self._feed_back(None, now_ns, now_ns)
         if self._told_ns - now_ns > RAMP_LEAD_NS * self._clock.rate and not self._corrected:
             return None
@@ -248,8 +247,10 @@ class Guard:
 
     def _left_to_itself(self, now_ns: int) -> bool:
         """Whether a robot that is not heard has been sent a way that needs feedback, for which it may still know its state."""
+        if self._corrected or self._untold or not self._blind(now_ns):
+            return False
         way = self._schedule.way(max(self._told_ns, now_ns))
-        return self._blind(now_ns) and way is not None and way.feeds_back and not (self._corrected or self._untold)
+        return way is not None and way.feeds_back
 
     def _unheard(self, state: State) -> bool:
         """Whether a report names an older command than the one to brake, which may still come: the ramp is then not to begin later."""

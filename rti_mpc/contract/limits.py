@@ -15,13 +15,12 @@ from functools import cached_property
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.contract.approach import magnitudes
+from rti_mpc.contract.approach import TOLERANCE_SHARE, magnitudes
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.schedule import UNKNOWN, end_ns
 from rti_mpc.rotation import Rotations
 
 MAX_VALID_NS = 300_000_000  # robot time: a command ends at the latest this long after its state and the delay, whatever its own validity
-TOLERANCE_SHARE = 1e-6  # of the largest value of an input: above any rounding, single precision included, and below what an actuator resolves
 SETTLED_SHARE = 0.01  # of the range of an input: a way to rest that is this close to its last row counts as rest
 
 

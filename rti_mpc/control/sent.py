@@ -118,6 +118,7 @@ class Sent:
     def clear(self) -> None:
         """Forget everything: the robot was restarted, and is at rest."""
         self._left_ns = BEFORE_ALL_NS
+        self._alone, self._went = (BEFORE_ALL_NS, self._schedule.u_rest), None
         for schedule in (self._schedule, self._slowest):
             schedule.brake(schedule.u_rest, BEFORE_ALL_NS)
 

@@ -81,6 +81,7 @@ class ActiveSet:
         self._places_next, self._point_next = np.zeros_like(self._places), np.zeros_like(self._point)
         found = {**guess.plan.outputs(), "changes": changes, "places_found": self._found, "multipliers": multipliers}
         rolled_out = {**found, "targets": targets}
+        self._first = tuple((np.zeros_like(array), array) for array in (self._places, self._found, targets))  # of the QP's first roll-out
         self.advance = bind(make(functions.advance), moved, {"x_next": x, "u_next": u, "places_next": self._places, "stages": stages})
         self.linearize = bind(make(functions.linearize), guess.arguments, {"stages": stages})
         self.gain = bind(make(functions.gains), {"stages": stages, "u": u, **guess.weights, "places": self._places}, {"gains": gains})
@@ -88,7 +89,6 @@ class ActiveSet:
         rows = {**guess.weights, "targets": targets, "places": self._places}
         self.begin_homotopy = bind(make(functions.begin), {"u": u, "stages": stages, **rows}, {"point": self._point})
         moving = rows | {"places_found": self._found, "point": self._point}
-        self._first = tuple((np.zeros_like(array), array) for array in (self._places, self._found, targets))
         self.move = bind(make(functions.move), moving, {"places_next": self._places_next, "point_next": self._point_next})
         judged = {**guess.start, "x0": guess.x0, "stages": stages, **plan, **guess.weights}
         self.certify = bind(make(certificate), judged, {"r": slopes, **verdict})

@@ -30,7 +30,6 @@ RUNS = {
     "truck_trailer": (30, 10),
 }
 RUN = (12, 4)
-MAX_TRIES = 3  # where the host is busy: the start of processes alone holds them up for long, and what fails each time fails by itself
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -51,12 +50,9 @@ def test_robot_bears_the_death_of_its_controller_as_its_class_promises(name: str
     """One that drifts, one that falls, one that coasts; `test_faults` has one that holds at rest."""
     valid_ms = 1e3 * load(ROBOTS[name], with_model=False).timing.valid_s
     with Host() as host:
-        for tries_left in reversed(range(MAX_TRIES)):
-            since_ns = time.monotonic_ns()
-            done = rti_mpc("faults", "--robot", name, "--only", "controller_killed", timeout_s=900.0)  # a busy host is waited for
-            held_up_ms = host.worst_ms(since_ns, time.monotonic_ns(), round(2 * valid_ms * MS))
-            if done.returncode == 0:
-                return
-            assert tries_left, done.stdout + done.stderr
-            assert held_up_ms > valid_ms, done.stdout + done.stderr
-            print(f"the host held processes up for {held_up_ms:.0f} ms, longer than a plan of {name} is valid: {done.stdout}")
+        since_ns = time.monotonic_ns()
+        done = rti_mpc("faults", "--robot", name, "--only", "controller_killed", timeout_s=900.0)  # a busy host is waited for
+        held_up_ms = host.worst_ms(since_ns, time.monotonic_ns(), round(2 * valid_ms * MS))
+    if done.returncode != 0 and held_up_ms > valid_ms:
+        pytest.skip(f"the host held processes up for {held_up_ms:.0f} ms, longer than a plan of {name} is valid: {done.stdout}")
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.contract.status import QpStatus
 from rti_mpc.rti import active_set
 from rti_mpc.rti.active_set import ActiveSet
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.bench.families import paper
 from tests.rti.test_active_set import PROBLEMS, samples
+from tests.rti.test_interior_point import driven
 
 
 @pytest.fixture
@@ -77,19 +77,9 @@ def test_places_that_go_in_circles_when_all_change_at_once_settle_one_at_a_time(
 
     def steps() -> int:
         rti = Rti(family.ocp, compile=False)
-        x, u, taken = np.zeros(5), family.u0, 0
-        for k in range(800, 830):
-            if (start := family.start(k)) is not None:
-                x, u = start, family.u0
-                rti.reset(x, u)
-            y_ref, p = family.at(k)
-            rti.prepare(y_ref, p, shift=start is None, u_prev=u)
-            assert rti.feedback(x) is QpStatus.SOLVED
-            assert rti.active_set is not None
-            taken += rti.active_set.steps
-            u = rti.u[0].copy()
-            x = family.plant(x, u)
-        return taken
+        one = rti.active_set
+        assert one is not None
+        return sum(one.steps for _ in driven(family, rti, range(800, 830)))
 
     assert steps() == 0
     monkeypatch.setattr(active_set, "MAX_CHANGES", 0)
