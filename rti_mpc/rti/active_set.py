@@ -20,12 +20,13 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind
 from rti_mpc.contract.status import QpStatus
+from rti_mpc.rti.homotopy import LIMITS
 from rti_mpc.rti.places import Places
 from rti_mpc.rti.qp.qp import Guess
 
 MAX_ROLL_OUTS = 6  # after the first, as long as fewer places change than in that one
 MAX_CHANGES = 45  # of places in the first roll-out from which they change one at a time: with more, the way to the solution is long
-MAX_MOVES = 20  # roll-outs on that way
+MAX_MOVES = 40  # roll-outs on that way; a step of the interior point takes as long as two or three
 MAX_STEPS = 50  # of the interior point, for each QP that a sample may have; all of its QPs share the sum
 ROLL_OUTS_TO_GO_ON = 14  # the same of roll-outs with gains, a step counted as two: a sample that has taken more begins no other QP
 MAX_ROLL_OUTS_HANDED_BACK = 2  # from places that the interior point has found
@@ -49,7 +50,7 @@ class ActiveSet:
     Attributes:
         advance: Call that shifts the last plan by one stage into the guess, and linearizes there.
         linearize: Call that linearizes at the guess as it is.
-        gain: Call that computes the gains; with it, after one of the former two, preparation is complete.
+        gain: Call that computes the gains; with it, after one of the former two, preparation is complete. `regain` computes those of other places.
         roll_out: Call that makes the plan, and finds the places; `certify` judges that plan, `refine` improves it.
         begin_homotopy: Call that starts the homotopy at the places rolled out last; `move`, the way to its next change of a place.
         enter: Call that starts the interior point at the plan; `step`, one step of it.
@@ -84,11 +85,17 @@ class ActiveSet:
         self._first = tuple((np.zeros_like(array), array) for array in (self._places, self._found, targets))  # of the QP's first roll-out
         self.advance = bind(make(functions.advance), moved, {"x_next": x, "u_next": u, "places_next": self._places, "stages": stages})
         self.linearize = bind(make(functions.linearize), guess.arguments, {"stages": stages})
-        self.gain = bind(make(functions.gains), {"stages": stages, "u": u, **guess.weights, "places": self._places}, {"gains": gains})
+        sizes = {name: functions.gains.numel_out(name) for name in functions.gains.name_out()}
+        of_places = {name: gains if name == "gains" else np.zeros(size) for name, size in sizes.items()}
+        known = {f"{name}_known": array for name, array in of_places.items()}
+        made, placed = make(functions.gains), {"stages": stages, "u": u, **guess.weights, "places": self._places}
+        self.regain = bind(made, {**placed, **known}, of_places)  # reads and writes the same arrays: nothing is written before all is computed
+        self.gain = bind(made, {**placed, **known, "places_of_known": np.full_like(self._places, np.nan)}, of_places)
         self.roll_out = bind(make(functions.roll_out), {**guess.start, "x0": guess.x0, **fixed}, rolled_out)
-        rows = {**guess.weights, "targets": targets, "places": self._places}
-        self.begin_homotopy = bind(make(functions.begin), {"u": u, "stages": stages, **rows}, {"point": self._point})
-        moving = rows | {"places_found": self._found, "point": self._point}
+        rows = {"targets": targets, "places": self._places}
+        of_rows = {"point": self._point} | {name: np.zeros_like(self._point) for name in LIMITS}
+        self.begin_homotopy = bind(make(functions.begin), {"u": u, "stages": stages, **guess.weights, **rows}, of_rows)
+        moving = {**rows, "places_found": self._found, **of_rows}
         self.move = bind(make(functions.move), moving, {"places_next": self._places_next, "point_next": self._point_next})
         judged = {**guess.start, "x0": guess.x0, "stages": stages, **plan, **guess.weights}
         self.certify = bind(make(certificate), judged, {"r": slopes, **verdict})
@@ -229,7 +236,7 @@ class ActiveSet:
 
     def _roll_out_again(self) -> None:
         """Roll out with the gains of other places."""
-        self.gain()
+        self.regain()
         self.roll_out()
         self.iterations += 1
         self.roll_outs += 1

@@ -18,13 +18,18 @@ import casadi as ca
 from rti_mpc.codegen import BEFORE_BODY
 from rti_mpc.rti.linearization import Linearization
 from rti_mpc.rti.ocp import Ocp
-from rti_mpc.rti.recursion import block_table, stage_in_c
+from rti_mpc.rti.recursion import block_table, resume, stage_in_c
 
 LEAST_SIZE = 12  # states and inputs from which on loops are faster
 PADDED = 4  # columns are padded to multiples of this, the numbers in the longest vector that is used
 SHORTEST = 2  # numbers in a vector of any processor
 INPUT_WEIGHTS = ("R", "damping")  # arguments of a stage that are the same at every one, mostly
 MOST_VECTORS = 12  # sums that fit into its registers
+
+KEEP = """
+    if (res[1]) for (e = SIZE_P * k, j = 0; j < NX + NU; ++j) for (i = 0; i <= j; ++i) res[1][e++] = M[i + 1][j + 1];
+    if (res[2]) for (j = 0; j < NX + NU; ++j) res[2][(NX + NU) * k + j] = M[0][j + 1];
+"""
 
 BODY = """
   vector M_[SIZE][VECTORS], T_[SIZE][VECTORS], S_[NU][VECTORS], G_[NU][VECTORS], column_[VECTORS];
@@ -42,7 +47,7 @@ BODY = """
     for (i = 0; i <= j; ++i) M[i + 1][j + 1] = M[j + 1][i + 1] = *arg_P++;
     M[0][j + 1] = arg_p[j];
   }
-  for (k = STAGES - 1; k >= 0; --k) {
+  for (k = UNTIL - 1; k >= 0; --k) {
     STAGE_ARGUMENTS
     casadi_real *gain = res[0] ? res[0] + GAIN * OF_BLOCK : spare;
 
@@ -115,12 +120,13 @@ BODY = """
       for (j = 1; j < SIZE; ++j) add(j / LANES + 1, M_[j], gain + NU * (j - 1), in_order, NU, S_[0]);
     }
     for (j = 1; j < SIZE; ++j) for (i = 0; i < j; ++i) M[i][j] = M[j][i];
+    KEEP
   }
   return 0;
 """
 
 
-def backward_in_c(ocp: Ocp, lin: Linearization, free: ca.Function, held: ca.Function) -> str | None:
+def backward_in_c(ocp: Ocp, lin: Linearization, free: ca.Function, held: ca.Function, *, resumed: bool = False) -> str | None:
     """
     Return the recursion whose stages are `rti_mpc.rti.riccati.backward_free` and `backward_held` in C, see `function_in_c`; None for few states.
 
@@ -129,6 +135,7 @@ def backward_in_c(ocp: Ocp, lin: Linearization, free: ca.Function, held: ca.Func
         lin: Its linearization.
         free: A stage with an input, for its arguments.
         held: A stage without.
+        resumed: Whether it may go on from an earlier call, and returns P and p before each stage: see `rti_mpc.rti.recursion.recur`.
     """
     nx, nu = ocp.model.nx, ocp.model.nu
     if nx + nu < LEAST_SIZE:
@@ -139,7 +146,7 @@ def backward_in_c(ocp: Ocp, lin: Linearization, free: ca.Function, held: ca.Func
     Phi = [[*range(nx + 1)], *([1 + i for i in column] for column in rows_by_column(A))]
     Phi += [[*(1 + i for i in column), 1 + nx + j] for j, column in enumerate(rows_by_column(B))]
     by_row = [[(e, j) for e, (i, j) in enumerate(zip(*G.get_triplet(), strict=True)) if i == r] for r in range(G.size1())]
-    sizes = {"NX": nx, "NU": nu, "NG": ocp.ng, "SIZE": size}
+    sizes = {"NX": nx, "NU": nu, "NG": ocp.ng, "SIZE": size, "SIZE_P": (size - 1) * size // 2}
     sizes |= {"STAGES": ocp.N, "FREE": ocp.N_u, "NONZEROS": sum(map(len, Phi)), "GAIN": free.size1_out("gain")}
     sizes |= {f"NONZEROS_{name}": pattern.nnz() for name, pattern in {"A": A, "H": H, "R": R, "G": G, "G_X": lin.G_x}.items()}
     tables = {
@@ -166,13 +173,19 @@ def backward_in_c(ocp: Ocp, lin: Linearization, free: ca.Function, held: ca.Func
         for i, name in enumerate(names)
         if name not in shared
     ]
+    if resumed:
+        once += resume(ocp.N, len(names), [free.size1_out("gain") * ocp.N_u, sizes["SIZE_P"] * ocp.N, (size - 1) * ocp.N])
+        known = {"P": ("SIZE_P", len(names) + 2), "p": ("(NX + NU)", len(names) + 3)}
+        once += [f"if (until < STAGES) arg_{name} = arg[{at}] + {numbers} * until;" for name, (numbers, at) in known.items()]
     lines = [f"enum {{ {', '.join(f'{name} = {number}' for name, number in sizes.items())} }};"]
     lines += [block_table(block)] if of_block != "k" else []
     lines += [f"static const int {name}[] = {{ {', '.join(map(str, numbers or [0]))} }};" for name, numbers in tables.items()]
     body = BODY.strip("\n").replace("STAGE_ARGUMENTS", "\n    ".join(each)).replace("OF_OUTPUTS", "NX" if H.size1() == nx else "NX + NU")
+    body = body.replace("UNTIL", "until" if resumed else "STAGES").replace("    KEEP\n", KEEP.lstrip("\n") if resumed else "")
     body = body if "lambda_k" in names else body.replace(" * lambda_k[0]", "")
     body = body.replace("IS_FREE", "k < FREE" if of_block == "k" else is_free).replace("OF_BLOCK", of_block)
-    return "\n".join([*additions(width), BEFORE_BODY, *(f"  {line}" for line in lines + once), body])
+    before = ["#ifndef LANES", *additions(width), "#endif"]  # once for all recursions of a problem
+    return "\n".join([*before, BEFORE_BODY, *(f"  {line}" for line in lines + once), body])
 
 
 def input_weights_shared(ocp: Ocp) -> list[str]:
@@ -184,9 +197,9 @@ def additions(width: int) -> Iterator[str]:
     """Return functions that add multiples of columns to a column, its numbers in registers: one for each number of vectors."""
     arguments = "vector *sum, const casadi_real *factor, const int *of, int count, const vector *columns"
     yield "#ifdef __AVX__"
-    yield f"enum {{ LANES = {PADDED} }};"
+    yield f"#define LANES {PADDED}"
     yield "#else"
-    yield f"enum {{ LANES = {SHORTEST} }};"
+    yield f"#define LANES {SHORTEST}"
     yield "#endif"
     yield f"enum {{ WIDTH = {width}, VECTORS = WIDTH / LANES }};"
     yield "typedef casadi_real vector __attribute__((vector_size(sizeof(casadi_real) * LANES), may_alias));"

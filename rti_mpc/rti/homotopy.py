@@ -20,10 +20,12 @@ from __future__ import annotations
 
 import casadi as ca
 
-from rti_mpc.codegen import function
+from rti_mpc.codegen import function, function_in_c
 from rti_mpc.rti.linearization import Linearization, along_rows
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
+
+LIMITS = "lower", "upper", "most"
 
 
 def limits(ocp: Ocp, lin: Linearization) -> list[ca.MX]:
@@ -79,30 +81,63 @@ class BoundedRow:
 
 
 def begin(ocp: Ocp, lin: Linearization, stages: ca.MX) -> ca.Function:
-    """Build ``(u, stages, *ARGUMENTS, scale, places, targets) -> point``: where the homotopy begins, from the guess and a roll-out with places."""
+    """
+    Build ``(u, stages, *ARGUMENTS, scale, places, targets) -> (point, lower, upper, most)``.
+
+    That is where the homotopy begins, from the guess and a roll-out with places, and the `limits` of its rows.
+    """
     row, forms = BoundedRow(), lin.forms_in(stages)
     guess = ca.veccat(lin.u, forms.increments, forms.g)
-    places, targets = ca.MX.sym("places", guess.numel()), ca.MX.sym("targets", guess.numel())
+    given, of_rows = {name: ca.MX.sym(name, guess.numel()) for name in ("places", "targets")}, limits(ocp, lin)
     start = ca.Function("start", [row.place, row.now, row.target, row.lower, row.upper, row.most], [row.start]).map(guess.numel())
-    point = start(*(of.T for of in (places, guess, targets, *limits(ocp, lin)))).T
-    return function("begin", {"u": lin.u, "stages": stages, **lin.weights, "places": places, "targets": targets}, {"point": point})
+    point = start(*(of.T for of in (given["places"], guess, given["targets"], *of_rows))).T
+    return function("begin", {"u": lin.u, "stages": stages, **lin.weights, **given}, {"point": point, **dict(zip(LIMITS, of_rows, strict=True))})
 
 
-def move(ocp: Ocp, lin: Linearization, size: int) -> ca.Function:
+# The same as `BoundedRow` says, without the division for rows that do not change.
+MOVE = """
+  const casadi_real *place = arg[0], *found = arg[1], *now = arg[2], *target = arg[3], *lower = arg[4], *upper = arg[5], *most = arg[6];
+  casadi_real *place_next = res[0], *share = res[1], *now_next = res[1], least = 1;
+  casadi_int i;
+  for (i = 0; i < ROWS; ++i) {
+    share[i] = INFINITE;
+    if (found[i] != place[i]) {
+      const casadi_real bound = place[i] + found[i] > 0 ? upper[i] : lower[i];
+      const casadi_real end = fabs(place[i]) != 1 ? bound : found[i] == 0 ? 0 : most[i];
+      const casadi_real way = (end - now[i]) / (target[i] - now[i]);
+      share[i] = way > 0 ? way : 0;
+      if (share[i] < least) least = share[i];
+    }
+  }
+  for (i = 0; i < ROWS; ++i) {
+    if (share[i] == least) {
+      const casadi_real bound = place[i] + found[i] > 0 ? upper[i] : lower[i];
+      place_next[i] = found[i];
+      now_next[i] = fabs(found[i]) != 1 ? bound : place[i] == 0 ? 0 : most[i];
+    } else {
+      place_next[i] = place[i];
+      now_next[i] = now[i] + least * (target[i] - now[i]);
+    }
+  }
+  return 0;
+"""
+
+
+def move(size: int) -> ca.Function:
     """
-    Build ``(*ARGUMENTS, scale, places, places_found, point, targets) -> (places_next, point_next)``: the way to the first change of a place.
+    Build ``(places, places_found, point, targets, lower, upper, most) -> (places_next, point_next)``: the way to the first change of a place.
 
     Args:
-        ocp: The problem.
-        lin: Expressions of the sample.
         size: Number of rows.
     """
     row = BoundedRow()
-    names = "places", "places_found", "point", "targets"
-    given = {name: ca.MX.sym(name, size) for name in names}
-    of_rows = [of.T for of in (*given.values(), *limits(ocp, lin))]
+    names = "places", "places_found", "point", "targets", *LIMITS
+    given, here = ({name: ca.MX.sym(name, size) for name in names} for _ in range(2))
+    of_rows = [of.T for of in given.values()]
     shares = ca.Function("share", row.symbols, [row.share]).map(size)(*of_rows)
     share, least = ca.SX.sym("share"), ca.SX.sym("least")
     after = ca.Function("after", [*row.symbols, share, least], row.after(share, least)).map(size)
     places, point = after(*of_rows, shares, ca.repmat(ca.fmin(ca.mmin(shares), 1), 1, size))
-    return function("move", {**lin.weights, **given}, {"places_next": places.T, "point_next": point.T})
+    sizes = f"enum {{ ROWS = {size} }};"
+    moved = function_in_c("moved", given, {"places_next": places.T, "point_next": point.T}, sizes + MOVE.replace("INFINITE", f"{INFINITY:.1e}"))
+    return function("move", here, moved(**here))  # with other symbols, or it would be the expressions

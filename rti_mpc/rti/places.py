@@ -19,18 +19,31 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from rti_mpc.codegen import function
+from rti_mpc.codegen import function, function_in_c
 from rti_mpc.rti import homotopy, interior_point
 from rti_mpc.rti.blocks import all_inputs, at_each, moved_on, repeated
 from rti_mpc.rti.linearization import Forms, Linearization, change, divided, linearization, partly, shift, where_bounded
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
-from rti_mpc.rti.recursion import recur
+from rti_mpc.rti.recursion import block_table, recur, stage_in_c
 from rti_mpc.rti.riccati import Gain, Riccati, Rows, Stage, softened_steps
 
 PENALTY = 3e9  # weight that holds values at their bounds, in units of their scale; with a larger one digits are lost
 BOUND_TOLERANCE = 1e-9  # a bound acts when it is exceeded by more than this, relative to its scale, so that rounding does not decide
 RELEASE_MULTIPLIER = 1e-6  # a bound is released when its multiplier has the wrong sign and is larger, in normalised cost per scale of what is bounded
+
+UNTIL = """
+  const casadi_real *now = arg[0], *of = arg[1];
+  casadi_int j, k, differs = 0;
+  for (k = STAGES - 1; k >= 0; --k) {
+    const casadi_int u = NU * BLOCK, du = NU * (FREE + BLOCK), g = NU * 2 * FREE + NG * k;
+    for (j = 0; j < NG; ++j) differs |= now[g + j] != of[g + j];
+    if (IS_FREE) for (j = 0; j < NU; ++j) differs |= now[u + j] != of[u + j] || now[du + j] != of[du + j];
+    if (differs) break;
+  }
+  *res[0] = k + 1;
+  return 0;
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +59,9 @@ class Places:
         linearize: ``(x, u, u_prev, y_ref, p, *ARGUMENTS, scale) -> stages``.
         advance: ``(x, u, u_prev, y_ref, p, *ARGUMENTS, scale, places) -> (x_next, u_next, places_next, stages)``: the same at
             the plan shifted by one stage.
-        gains: ``(stages, u, *ARGUMENTS, scale, places) -> gains``.
+        gains: ``(stages, u, *ARGUMENTS, scale, places, gains_known, P_known, p_known, places_of_known) -> (gains, P, p, places_of)``: gains, and the
+            cost-to-go before each stage, all of these places. With the known ones of other places, but of the same linearization, compiled code goes
+            only over the stages up to the last one whose places differ. Places that are NaN differ at all stages.
         roll_out: ``(x, u, u_prev, x0, stages, gains, *ARGUMENTS, scale, places) -> (x_plan, u_plan, violation, change, changes,
             places_found, multipliers, targets)``: the plan after the full step, its largest violation of softened bounds, in their unit and
             relative to their scale, the size of the step, and how many places change: -1 if data, gains or plan are not finite. Targets are the
@@ -108,7 +123,10 @@ def places(ocp: Ocp) -> Places:
     linearized = linearize(**(lin.arguments | {"x": x, "u": u}))["stages"]
     advance = {"x_next": x, "u_next": u, "places_next": moved, "stages": linearized}
 
-    gains = recursion.gains(stages, *penalties(ocp, at))
+    known = [ca.MX.sym(name, *shape) for name, shape in recursion.shapes.items()]
+    places_of = ca.MX.sym("places_of", flat.numel())
+    gains = recursion.gains_again(at.forms, *penalties(ocp, at), stages_until(ocp, flat.numel())(flat, places_of), known)
+    before = {f"{name}_known": one for name, one in zip(recursion.shapes, known, strict=True)}
     guess = {"x": lin.x, "u": lin.u, "u_prev": lin.u_prev}
     fixed = {"stages": stages, "gains": found, **lin.weights, "places": flat}
     rolled = roll_out(ocp, at, x0)
@@ -117,36 +135,85 @@ def places(ocp: Ocp) -> Places:
     return Places(
         linearize,
         function("advance", {**lin.arguments, "places": flat}, advance),
-        function("gains", {"stages": stages, "u": lin.u, **lin.weights, "places": flat}, {"gains": gains}),
+        function(
+            "gains",
+            {"stages": stages, "u": lin.u, **lin.weights, "places": flat, **before, "places_of_known": places_of},
+            {**dict(zip(recursion.shapes, gains, strict=True)), "places_of": flat},
+        ),
         function("roll_out", {**guess, "x0": x0, **fixed}, rolled),
         function("refine", {**guess, **fixed, **plan}, refine(ocp, recursion, at, stages, **plan)),
         homotopy.begin(ocp, lin, stages),
-        homotopy.move(ocp, lin, flat.numel()),
+        homotopy.move(flat.numel()),
         interior_point.enter(ocp, lin, stages),
         interior_point.step(ocp, lin, recursion, stages, x0),
     )
 
 
+def stages_until(ocp: Ocp, size: int) -> ca.Function:
+    """
+    Build ``(places, places_of) -> until``: the number of stages up to the last one whose places differ; interpreted, that of all stages.
+
+    Args:
+        ocp: The problem.
+        size: Number of rows.
+    """
+    block = ocp.held.tolist()
+    is_first, of_block = stage_in_c(block)
+    body = UNTIL.replace("IS_FREE", is_first).replace("BLOCK", of_block)
+    sizes = f"enum {{ STAGES = {ocp.N}, FREE = {ocp.N_u}, NU = {ocp.model.nu}, NG = {ocp.ng} }};"
+    rows = {name: ca.MX.sym(name, size) for name in ("places", "places_of")}
+    return function_in_c("until", rows, {"until": ca.MX(ocp.N)}, "\n".join([sizes, block_table(block) if of_block != "k" else "", body]))
+
+
 def penalties(ocp: Ocp, at: Sample) -> tuple[Rows, Rows]:
     """Return the weight and the pull of each row, which follow from its place."""
-    lin, w, nu, ng = at.lin, at.lin.w, ocp.model.nu, ocp.ng
-    place, value, lower, upper, weight = (ca.SX.sym(name, nu) for name in ("place", "value", "lower", "upper", "weight"))
-    held = ca.Function("hold", [place, value, lower, upper, weight], [*hold(place, value, lower, upper, weight)]).map(ocp.N_u)
-    place, value, lower, upper, weight, z, Z = (ca.SX.sym(name, ng) for name in ("place", "value", "lower", "upper", "weight", "z", "Z"))
-    weighs, pulls = hold(place, value, lower, upper, weight)
-    beyond = ca.fabs(place) == 2
-    pulls += beyond / 2 * (Z * (value - ca.if_else(place > 0, upper, lower)) + ca.sign(place) * z)
-    softened = ca.Function("hold_softened", [place, value, lower, upper, weight, z, Z], [weighs + beyond * Z / 2, pulls]).map(ocp.N)
+    lin, w = at.lin, at.lin.w
+    stiff_u, stiff_g = PENALTY / lin.scale_u**2, PENALTY / lin.scale_g**2
+    limits = {name: w[name] for name in ("lbu", "ubu", "lbdu", "ubdu")} | {"lg": lin.lg, "ug": lin.ug, "zg": lin.zg, "Zg": lin.Zg}
+    rows = "u", "du", "g"
+    outputs = [f"{what}_{row}" for what in ("weight", "pull") for row in rows]
+    along = recur(
+        "penalties",
+        repeated(penalties_free(ocp), penalties_held(ocp), ocp.blocks),
+        {},
+        outputs,
+        shared=["stiff_u", "stiff_g", *(name for name, limit in limits.items() if limit.size2() == 1)],
+    )
+    found = along(
+        place_u=at.place.u,
+        u=lin.u,
+        place_du=at.place.du,
+        increment=at.forms.increments,
+        place_g=at.place.g,
+        g=at.forms.g,
+        stiff_u=stiff_u,
+        stiff_g=stiff_g,
+        **limits,
+    )
+    weight, pull = (Rows(*(found[f"{what}_{row}"] for row in rows)) for what in ("weight", "pull"))
+    return weight, pull
 
-    def of_all(*rows: ca.MX, times: int) -> list[ca.MX]:
-        return [at_each(row, times) for row in rows]
 
-    stiff_u = PENALTY / lin.scale_u**2
-    weight_u, pull_u = held(at.place.u, lin.u, *of_all(w["lbu"], w["ubu"], stiff_u, times=ocp.N_u))
-    weight_du, pull_du = held(at.place.du, at.forms.increments, *of_all(w["lbdu"], w["ubdu"], stiff_u, times=ocp.N_u))
-    limits = of_all(lin.lg, lin.ug, PENALTY / lin.scale_g**2, lin.zg, lin.Zg, times=ocp.N)
-    weight_g, pull_g = softened(at.place.g, at.forms.g, *limits)
-    return Rows(weight_u, weight_du, weight_g), Rows(pull_u, pull_du, pull_g)
+def penalties_held(ocp: Ocp) -> ca.Function:
+    """Build ``(place_g, g, lg, ug, stiff_g, zg, Zg) -> (weight_g, pull_g)`` of a stage whose input is that of the stage before."""
+    names = "place_g", "g", "lg", "ug", "stiff_g", "zg", "Zg"
+    place, value, lower, upper, stiff, z, Z = own = [ca.SX.sym(name, ocp.ng) for name in names]
+    weight, pull = hold(place, value, lower, upper, stiff)
+    beyond = (ca.fabs(place) == 2) / 2
+    pull += beyond * (Z * (value - ca.if_else(place > 0, upper, lower)) + ca.sign(place) * z)
+    return function("penalties_held", dict(zip(names, own, strict=True)), {"weight_g": weight + beyond * Z, "pull_g": pull})
+
+
+def penalties_free(ocp: Ocp) -> ca.Function:
+    """Build the same of a stage with an input, with the weights and pulls of the input and its increment."""
+    softened = penalties_held(ocp)
+    inputs = {name: ca.SX.sym(name, ocp.ng) for name in softened.name_in()}
+    names = "place_u", "u", "lbu", "ubu", "place_du", "increment", "lbdu", "ubdu", "stiff_u"
+    place_u, u, lbu, ubu, place_du, increment, lbdu, ubdu, stiff = own = [ca.SX.sym(name, ocp.model.nu) for name in names]
+    weight_u, pull_u = hold(place_u, u, lbu, ubu, stiff)
+    weight_du, pull_du = hold(place_du, increment, lbdu, ubdu, stiff)
+    of_inputs = {"weight_u": weight_u, "pull_u": pull_u, "weight_du": weight_du, "pull_du": pull_du}
+    return function("penalties_free", {**dict(zip(names, own, strict=True)), **inputs}, of_inputs | softened(**inputs))
 
 
 def hold(place: ca.SX, value: ca.SX, lower: ca.SX, upper: ca.SX, weight: ca.SX) -> tuple[ca.SX, ca.SX]:

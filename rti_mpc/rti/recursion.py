@@ -30,6 +30,7 @@ def recur(
     *,
     shared: Collection[str] = (),
     backward: bool = False,
+    resumed: bool = False,
     in_c: str | None = None,
 ) -> ca.Function:
     """
@@ -43,10 +44,12 @@ def recur(
         outputs: Results to be returned, a column per stage that has them.
         shared: Arguments that are the same at every stage. Of any other one the caller gives a column for each stage that has it.
         backward: Whether the last stage comes first.
+        resumed: Whether it may go on from an earlier call, the last stage first, with other arguments of the first stages only. It then takes their
+            number, ``until``, and as ``known_<output>`` the outputs of that call, among which must be all that is carried.
         in_c: Body of an equal function in C, instead of a loop; see `function_in_c`.
 
     Returns:
-        A function with the arguments of the first of the stages, and with these outputs.
+        A function with the arguments of the first of the stages, and those to go on from, and with these outputs.
     """
     first = stages[0][0]
     stages = [(stage, count) for stage, count in stages if count]
@@ -70,7 +73,10 @@ def recur(
         for output in set(outputs) & set(after):
             found[output].append(after[output])
     results = {output: ca.horzcat(*(reversed(parts) if backward else parts)) for output, parts in found.items()}
-    return function_in_c(name, given, results, in_c or "\n".join(_loop(stages, [*kinds.values()], block, given, carried, outputs, backward)))
+    if resumed:
+        given["until"] = ca.MX.sym("until")
+        given |= {f"known_{output}": ca.MX.sym(f"known_{output}", *result.shape) for output, result in results.items()}
+    return function_in_c(name, given, results, in_c or "\n".join(_loop(stages, [*kinds.values()], block, given, carried, outputs, backward, resumed)))
 
 
 def _loop(
@@ -81,6 +87,7 @@ def _loop(
     carried: Mapping[str, str],
     outputs: Sequence[str],
     backward: bool,
+    resumed: bool,
 ) -> Iterator[str]:
     """Return the body of the same recursion in C: results that are carried on lie in their column or, by turns, in two buffers."""
     place: dict[str, int] = {argument: i for i, argument in enumerate(given)}
@@ -97,7 +104,12 @@ def _loop(
     for argument in carried:
         yield f"const casadi_real *now_{argument} = arg[{place[argument]}];"
         yield f"casadi_real {argument}[2][{max(1, given[argument].size1())}];"
-    yield f"for (k = {len(block) - 1}; k >= 0; --k) {{" if backward else f"for (k = 0; k < {len(block)}; ++k) {{"
+    if resumed:
+        sizes = {output: given[f"known_{output}"].shape for output in outputs}
+        yield from resume(len(block), len(given) - len(outputs) - 1, [rows * width for rows, width in sizes.values()])
+        for argument, result in carried.items():
+            yield f"if (until < {len(block)}) now_{argument} = arg[{place[f'known_{result}']}] + {sizes[result][0]} * until;"
+    yield f"for (k = {'until' if resumed else len(block)} - 1; k >= 0; --k) {{" if backward else f"for (k = 0; k < {len(block)}; ++k) {{"
     for i, stage in enumerate(kinds):
         yield f"  {'else ' if i else ''}{f'if ({is_first}) ' if i + 1 < len(kinds) else ''}{{"
         for j, argument in enumerate(stage.name_in()):
@@ -113,6 +125,20 @@ def _loop(
         yield "  }"
     yield "}"
     yield "return 0;"
+
+
+def resume(stages: int, at: int, sizes: Sequence[int]) -> Iterator[str]:
+    """
+    Return in C how a recursion goes on from an earlier call: the stages that have changed, and what it takes over of all others.
+
+    Args:
+        stages: Number of stages.
+        at: Position of ``until`` among the arguments, which the outputs of the earlier call follow.
+        sizes: Numbers in each of the outputs.
+    """
+    yield f"const casadi_int until = (casadi_int) *arg[{at}];"
+    for i, size in enumerate(sizes):
+        yield f"if (until < {stages}) casadi_copy(arg[{at + 1 + i}], {size}, res[{i}]);"
 
 
 def stage_in_c(block: Sequence[int]) -> tuple[str, str]:

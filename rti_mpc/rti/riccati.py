@@ -21,6 +21,7 @@ the input before is *held*, after the control horizon or the first stage of a bl
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -56,6 +57,7 @@ class Riccati:
 
     Attributes:
         size: Entries of the gains of one stage: K and kappa of ``du = -K s - kappa``, and the Cholesky factor of ``Q_uu``.
+        shapes: Those of gains and of the cost-to-go before each stage, its matrix as upper triangle, by name: what `gains_again` returns.
         factorize: ``(stages, R, lambda_, weight_u, weight_du, weight_g, pull_u, pull_du, pull_g) -> gains``; compiled once for all.
         respond: ``(stages, gains, pull_u, pull_du, pull_g) -> (states, u, du, g)``: the change of states and rows that pulls alone cause.
     """
@@ -70,8 +72,11 @@ class Riccati:
             repeated(free(ocp, lin), held(ocp, lin), ocp.blocks)
             for free, held in ((backward_free, backward_held), (sweep_free, sweep_held), (forward_free, forward_held))
         )
-        dense, costs = backward_in_c(ocp, lin, *(stage for stage, _ in backward[:2])), {"P": "P_before", "p": "p_before"}
-        self._backward = recur("backward", backward, costs, ["gain"], shared=input_weights_shared(ocp), backward=True, in_c=dense)
+        self.shapes = {"gains": (self.size, ocp.N_u), "P": (n * (n + 1) // 2, ocp.N), "p": (n, ocp.N)}
+        carried, shared, kinds = {"P": "P_before", "p": "p_before"}, input_weights_shared(ocp), [stage for stage, _ in backward[:2]]
+        self._backward = recur("backward", backward, carried, ["gain"], shared=shared, backward=True, in_c=backward_in_c(ocp, lin, *kinds))
+        outputs, again = ["gain", *carried.values()], backward_in_c(ocp, lin, *kinds, resumed=True)
+        self._again = recur("again", backward, carried, outputs, shared=shared, backward=True, resumed=True, in_c=again)
         self._sweep = recur("sweep", sweep, {"p": "p_before"}, ["kappa"], backward=True)
         self._forward = recur("forward", forward, {"s": "s_after"}, ["s_after", "g", "increment"])
         stages, gains, start = ca.MX.sym("stages", lin.stages.numel()), ca.MX.sym("gains", self.size, ocp.N_u), ca.MX.zeros(n)
@@ -80,20 +85,19 @@ class Riccati:
         )
         weights, pulls = ({f"{name}_{of}": number for of, number in vars(rows).items()} for name, rows in (("weight", weight), ("pull", pull)))
         forms, matrices = lin.forms_in(stages), {name: lin.w[name] for name in ("R", "lambda_")}
-        self.factorize = function("factorize", {"stages": stages, **matrices, **weights, **pulls}, {"gains": self._gains(forms, weight, pull)})
+        found = self._backward(**self._data(forms, weight, pull))["gain"]
+        self.factorize = function("factorize", {"stages": stages, **matrices, **weights, **pulls}, {"gains": found})
         states, _, rows = self.rolled(forms, self._corrected(forms, gains, pull), start, defects=False)
         self.respond = function("respond", {"stages": stages, "gains": gains, **pulls}, {"states": states, **vars(rows)})
 
-    def _gains(self, forms: Forms, weight: Rows, pull: Rows) -> ca.MX:
-        """Return the gains of all free stages, one column per stage, shape ``(size, N_u)``."""
+    def _data(self, forms: Forms, weight: Rows, pull: Rows) -> dict[str, ca.MX]:
+        """Return the arguments of the recursion backwards, by name."""
         n, lin = self._n, self._lin
         data = {"A": forms.A, "B": forms.B, "b": forms.b, "H": forms.H, "h": forms.h, "g_x": forms.g_x, "g_u": forms.g_u}
         rows = {"weight_u": weight.u, "pull_u": pull.u, "weight_du": weight.du, "pull_du": pull.du, "weight_g": weight.g, "pull_g": pull.g}
         R = {"R": nonzeros(lin.R), "lambda_k": lin.w["lambda_"].T} if self._ocp.lambda_.ndim == 1 else {"R": lin.R_k}
         cost = {**R, "damping": forms.damping, "force": forms.force}
-        end = {"P": ca.MX.zeros(n * (n + 1) // 2), "p": ca.MX.zeros(n)}
-        found: ca.MX = self._backward(**data, **rows, **cost, **end)["gain"]
-        return found
+        return {**data, **rows, **cost, "P": ca.MX.zeros(n * (n + 1) // 2), "p": ca.MX.zeros(n)}
 
     def _corrected(self, forms: Forms, gains: ca.MX, pull: Rows) -> ca.MX:
         """Return gains whose kappa comes from pulls only: rolled out from s = 0 without defects, they give the change that these pulls cause."""
@@ -111,6 +115,22 @@ class Riccati:
             "gains"
         ]
         return found
+
+    def gains_again(self, forms: Forms, weight: Rows, pull: Rows, until: ca.MX, known: Sequence[ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
+        """
+        Return gains and the cost-to-go before each stage, with `shapes`, from those of other weights and pulls.
+
+        Args:
+            forms: Linearization.
+            weight: Weights of all rows.
+            pull: Their pulls.
+            until: Number of stages from the first one on whose weights and pulls are others: the recursion goes over these.
+            known: What it has returned with those others.
+        """
+        names = "gain", "P_before", "p_before"
+        before = {f"known_{name}": one for name, one in zip(names, known, strict=True)}
+        found = self._again(**self._data(forms, weight, pull), until=until, **before)
+        return found["gain"], found["P_before"], found["p_before"]
 
     def response(self, stages: ca.MX, gains: ca.MX, pull: Rows) -> tuple[ca.MX, Rows]:
         """Return the change of states, shape ``(nx, N + 1)``, and of rows, that pulls alone cause."""

@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
+from rti_mpc.codegen import compiled
 from rti_mpc.rti import active_set
 from rti_mpc.rti.active_set import ActiveSet
+from rti_mpc.rti.homotopy import move
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.bench.families import paper
 from tests.rti.test_active_set import PROBLEMS, samples
 from tests.rti.test_interior_point import driven
+from tests.rti.test_recursion import needs_compiler
 
 
 @pytest.fixture
@@ -69,6 +72,20 @@ def test_each_move_leads_to_the_next_segment_of_one_row_and_leaves_all_others_on
                 assert 1 <= changed.sum() <= 3, "rows that come to their ends at once change at once"
                 assert (np.abs(places - before)[changed] == 1).all(), "segments meet their neighbours only"
             before = places
+
+
+@needs_compiler
+def test_compiled_move_is_that_of_the_expressions() -> None:
+    rng, rows = np.random.default_rng(3), 40
+    way = move(rows)
+    (fast,) = compiled(way)
+    for _ in range(200):
+        places = rng.choice([-2.0, -1.0, 0.0, 1.0, 2.0], rows)
+        found = np.where(rng.random(rows) < 0.1, places + np.where(places == 0, rng.choice([-1.0, 1.0], rows), -np.sign(places)), places)
+        numbers = {name: rng.normal(size=rows) for name in ("point", "targets")}
+        given = {"places": places, "places_found": found, **numbers, "lower": -np.ones(rows), "upper": np.ones(rows), "most": np.full(rows, 2.0)}
+        for name, expected in way(**given).items():
+            np.testing.assert_array_equal(np.array(fast(**given)[name]), np.array(expected), err_msg=name)
 
 
 def test_places_that_go_in_circles_when_all_change_at_once_settle_one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from rti_mpc import codegen
+from rti_mpc.array import Array
 from rti_mpc.codegen import compiled, function, with_bodies
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import OcpError
@@ -113,6 +114,40 @@ def test_compiled_recursions_equal_the_expressions(nx: int, nu: int, N: int, wit
     assert np.isfinite(np.array(known["gains"])).all()
     for of, compiled_of in zip((functions.roll_out, functions.refine, judged), fast[1:], strict=True):
         assert_equal(of, compiled_of, arguments(of, ocp, rng, known))
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("nx", "within"),
+    [(3, 4), (LEAST_SIZE - 2, 4), (3, [1, 2, 1, 2]), pytest.param(13, [2, 1, 3], marks=pytest.mark.slow), pytest.param(3, 6, marks=pytest.mark.slow)],
+)
+def test_gains_of_other_places_go_on_from_the_last_stage_whose_places_differ(nx: int, within: int | list[int]) -> None:
+    """To the last bit as if they were computed anew, and nothing after that stage is computed again."""
+    ocp = problem(nx, 2, 6, within)
+    rng, functions = np.random.default_rng(7), places(ocp)
+    (fast,) = compiled(functions.gains)
+    known = {"stages": functions.linearize(**arguments(functions.linearize, ocp, rng, {}))["stages"]}
+    known["places"] = ca.DM(rng.choice([0.0, 1.0], fast.numel_in("places")))
+    given = arguments(fast, ocp, rng, known)
+
+    def of(placed: Array, before: dict[str, ca.DM]) -> dict[str, ca.DM]:
+        return dict(fast(**given | {"places": ca.DM(placed)} | {f"{name}_known": value for name, value in before.items()}))
+
+    none = {name: ca.DM(value.shape[0], value.shape[1]) for name, value in fast(**given).items()} | {"places_of": ca.DM.nan(given["places"].shape)}
+    first = of(np.array(given["places"]).ravel(), none)
+    nu, ng, N_u = 2, ocp.ng, ocp.N_u
+    starts = [ocp.held.tolist().index(block) for block in range(N_u)]
+    rows = [*np.repeat(starts, nu), *np.repeat(starts, nu), *np.repeat(range(ocp.N), ng)]  # the stage of each
+    for row, stage in enumerate(rows):
+        placed = np.array(given["places"]).ravel()
+        placed[row] = 1.0 - placed[row]
+        anew, again = of(placed, none), of(placed, first)
+        assert all((np.array(again[name]) == np.array(value)).all() for name, value in anew.items()), f"row {row}"
+        marked = {name: value if name == "places_of" else 1.0 + value for name, value in first.items()}
+        after = of(placed, marked)
+        for name, last in (("gains", ocp.held[stage]), ("P", stage), ("p", stage)):
+            assert (np.array(after[name] == marked[name]).all(axis=0)[last + 1 :]).all(), f"{name}, row {row}"
+            assert not np.array(after[name] == marked[name]).all(axis=0)[: last + 1].any(), f"{name}, row {row}"
 
 
 @needs_compiler
