@@ -11,6 +11,7 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, Reference, State
+from rti_mpc.contract.status import Mode
 from rti_mpc.control.controller import Controller
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.reference.trajectory import Heading, Trajectory, rows
@@ -19,6 +20,7 @@ from rti_mpc_sim.settings import RobotSettings
 
 MS = 1_000_000
 SLEW = np.array([2.5, 4.0])  # 1/s: the controller's increments per 0.1 s
+STEP = np.array([0.25, 0.4])  # slew limit per 0.1 s
 
 
 def robot(trajectory: Trajectory, **changes: Any) -> Lockstep:
@@ -89,3 +91,17 @@ def drive(
             while not controller.second_opinion():
                 pass
     return run
+
+
+def codes(controller: Controller) -> list[str]:
+    return [notice.code for notice in controller.notices()]
+
+
+def modes(run: Run) -> list[Mode]:
+    return [command.mode for command in run.commands]
+
+
+def assert_inside_slew(run: Run, excess: float = 1e-12) -> None:
+    """What acts changes by no more than the slew limits from sample to sample, nor do the rows of any plan."""
+    for inputs in (np.array(run.u).reshape(-1, 2), *(command.u for command in run.commands)):
+        assert np.all(np.abs(np.diff(inputs, axis=0)) <= (1 + excess) * STEP)

@@ -9,47 +9,37 @@ reference from there on, shifts and linearizes. Feedback starts with the state t
 due. It integrates that state to :math:`t_k` with the inputs already sent, embeds it and
 solves. Reference, plan and command all start at :math:`t_k`.
 
-When a plan cannot be computed, or is too late, the ladder of fallbacks
-(`rti_mpc.control.ladder`) replaces it. Every command passes the
-`rti_mpc.control.envelope.Envelope`. After a gap the controller starts cold, and the
-first command acts late enough to arrive in time.
+Here messages come in and commands go out. The two phases have a file each,
+`rti_mpc.control.preparation` and `rti_mpc.control.feedback`. When a plan cannot be
+computed, or is too late, a fallback (`rti_mpc.control.fallback`) replaces it. After a gap,
+or in another life of the robot (`rti_mpc.control.interruption`), the controller starts
+cold, and the first command acts late enough to arrive in time. Every command passes the
+`rti_mpc.control.envelope.Envelope`. The parts are built in `rti_mpc.control.assembly`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-
 from rti_mpc import given
 from rti_mpc.array import Array
-from rti_mpc.contract.limits import Limits
-from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Notice, Reference, Severity, State, Telemetry
+from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, Notice, Reference, Severity, State, Telemetry
 from rti_mpc.contract.schedule import BEFORE_ALL_NS
 from rti_mpc.contract.status import Mode, QpStatus
-from rti_mpc.control.blockage import Blockage
+from rti_mpc.control.assembly import assemble
 from rti_mpc.control.call import Call, reported
-from rti_mpc.control.delay import DelayEstimator
-from rti_mpc.control.envelope import INPUT_BOUNDS, Envelope
 from rti_mpc.control.fallback import Fallback
-from rti_mpc.control.grid import Grid
+from rti_mpc.control.feedback import Feedback
 from rti_mpc.control.grid import Timing as Timing
-from rti_mpc.control.issued import NO_ENDING, Issued
-from rti_mpc.control.ladder import Ladder
-from rti_mpc.control.mode import ModeMachine
+from rti_mpc.control.interruption import Interruption
 from rti_mpc.control.observer import Observer
 from rti_mpc.control.opinions import Opinion, second_opinions
 from rti_mpc.control.planner import Planner
-from rti_mpc.control.prediction import Prediction
+from rti_mpc.control.preparation import Preparation
 from rti_mpc.control.record import Record
-from rti_mpc.control.report import Reports
-from rti_mpc.control.sent import Sent
-from rti_mpc.control.state_stream import Arrival, StateStream
-from rti_mpc.control.stopping import Stopping
-from rti_mpc.control.track import Track
-from rti_mpc.control.tuning import Tuning
+from rti_mpc.control.state_stream import Arrival
+from rti_mpc.control.understudy import Understudy
 from rti_mpc.errors import OcpError
-from rti_mpc.model.model import depends_on
 from rti_mpc.rti.ocp import Ocp, rest_fault
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.way_to_rest import StopLaw
@@ -73,7 +63,6 @@ class Controller:
 
     Attributes:
         on_call: Receiver of each call that may change a command, before it is made; None for no receiver.
-        skipped: Samples skipped since start.
         ladder: Samples without a plan of their own, by what replaced it.
         np_: Parameters that a row of a reference may carry: the model's, without the disturbances that an observer estimates.
         envelope: Limits of the inputs.
@@ -106,65 +95,33 @@ class Controller:
         compile: bool = True,
     ) -> None:
         given.instance("timing", timing, Timing)
-        ocp, model = given.instance("rti", rti, Rti).ocp, rti.ocp.model
-        if wrong := rest_fault(ocp):
+        if wrong := rest_fault(given.instance("rti", rti, Rti).ocp):
             raise OcpError(wrong)
-        self._rti = rti
-        self._stale_ns = round(1e9 * timing.stale_s)
-        self._valid_ns = round(1e9 * timing.valid_s)
-        self._u_rest: Array = np.array(model.u_rest)
-
+        parts = assemble(rti, timing, epoch=epoch, config_hash=config_hash, observer=observer, stop_law=stop_law, compile=compile)
         self.on_call: Callable[[Call], object] | None = None
-        self._standing_by = False
-        self._modes = ModeMachine()
-        self.skipped = 0
-        self.ladder = Ladder()
-        self.envelope = Envelope(ocp, compile=compile)
-        self._tuning = Tuning(rti, self.envelope)
-        self.grid = Grid(ocp.dt, timing)
-        lbu, ubu, lbdu, ubdu = (ocp.widest(name) for name in INPUT_BOUNDS)
-        limits = Limits(self._u_rest, lbu, ubu, lbdu, ubdu, ocp.dt, 1e-9 * self.grid.most_ns)
-        settling_s = limits.settling_s + (0.0 if stop_law is None else stop_law.rows * stop_law.period_s)
-        self._states = StateStream(model, self._stale_ns, self.grid.dt_ns, settling_s, observer)
-        self.np_ = model.np_ - len(self._states.d)
-        self._track = Track(model, ocp.N, self.grid.dt_ns, compile=compile)
-        self._sent = Sent(self._u_rest, lbdu, ubdu, self.grid.dt_ns, (lbu, ubu), model.rotations("states"))
-        self._reports = Reports(self._sent, self.envelope.limits)
-        self._prediction = Prediction(model, self._sent, compile=compile)
-        self._x0 = self._prediction.x
-        ways = None if stop_law is None else Stopping(ocp, stop_law, self.envelope.limits, self._prediction, self._valid_ns, compile=compile)
-        self._ways = ways  # to rest; None: its inputs ramp to rest
+        self.ladder, self.envelope, self.grid = parts.ladder, parts.envelope, parts.grid
+        self.np_ = rti.ocp.model.np_ - len(parts.states.d)
+        self._rti, self._stale_ns = rti, parts.stale_ns
+        self._modes, self._states, self._track, self._tuning, self._blockage = parts.modes, parts.states, parts.track, parts.tuning, parts.blockage
+        self._sent, self._reports, self._prediction, self._delay, self._issued = (
+            parts.sent,
+            parts.reports,
+            parts.prediction,
+            parts.delay,
+            parts.issued,
+        )
+        self._planner = Planner(parts)
+        self._fallback = Fallback(parts, self._planner)
+        self._interruption = Interruption(parts, self._planner)
+        self._understudy = Understudy(parts, self._planner)
+        self._record = Record(parts)
+        self._opinions = second_opinions(rti, second_opinion, self.say)
+        self._preparation = Preparation(parts, self._planner, self._record, self._opinions)
+        self._feedback = Feedback(parts, self._planner, self._fallback)
         balances = stop_law is not None and stop_law.disturbances.size > 0
         braking = {Mode.STOPPED, Mode.BRAKING} if balances else set()
         self._known = braking | {mode for mode in Mode if mode.planned}  # modes in which disturbances are estimated
-        self._overran = False  # whether the last sample was over its budget
         self._unreported = False  # whether it was said that the robot does not report its inputs
-        self._stopped = ""  # why an operator's stop is latched
-        self._issued = Issued(epoch, config_hash, self.grid.dt_ns)
-        self._fallback = Fallback(self.ladder, self.envelope, self._sent, self._issued, ways, self._u_rest, self._valid_ns)
-        self._record = Record(rti, self._tuning)
-        self._blockage = Blockage(rti, compile=compile)
-        self._opinions = second_opinions(rti, second_opinion, self.say)
-        self._delay = None
-        self._seen = self._states.x  # the last state as the delay is measured by it
-        self._unmeasured: list[int] = []
-        if timing.delay_s is None:
-            measured = list(range(model.nx)) if observer is None else observer.measured
-            self._delay = DelayEstimator(model, self.grid.dt_ns, self.grid.most_ns, measured=measured, compile=compile)
-            if observer is not None:
-                self._seen, self._unmeasured = np.zeros(model.nx), [j for j in range(model.nx) if j not in measured]
-        predicting = [of.p[: self.np_] for of in (self._prediction, observer, self._delay) if of is not None]
-        self._planner = Planner(
-            rti,
-            self._track,
-            self._sent,
-            self._prediction,
-            self.envelope,
-            self._tuning,
-            self._states.d,
-            tuple(predicting) if depends_on(model.rate_expr, model.p[: self.np_]) else (),
-        )
-        self._understudy = StateStream(model, self._stale_ns, self.grid.dt_ns, settling_s)  # judges states in rehearsals
 
     @property
     def mode(self) -> Mode:
@@ -182,7 +139,7 @@ class Controller:
     @property
     def standing_by(self) -> bool:
         """Whether the commands of another controller act, those handed to `overhear`, and not those of this one."""
-        return self._standing_by
+        return self._modes.standing_by
 
     # Incoming messages.
 
@@ -212,25 +169,22 @@ class Controller:
             OcpError: It is no `State`; one from the bus has been checked.
             ShapeError: Its vectors are not the model's.
         """
-        self._check(state)
-        arrival = self._states.receive(state, arrival_ns)
-        if (notice := self._states.notice) is not None:
+        states = self._states
+        states.check(state)
+        arrival = states.receive(state, arrival_ns)
+        if (notice := states.notice) is not None:
             self.say(notice)
         if arrival is not Arrival.FRESH:
             if arrival in (Arrival.REPEATED, Arrival.REFUSED, Arrival.FOREIGN, Arrival.OLD):
                 return None
             if arrival is Arrival.UNTIMED:
-                return self._give_up(state)
-            self._forget(arrival, state)
+                return self._fallback.give_up(state)
+            self._interruption.forget(arrival, state)
         surprised = self._hear(state)
-        if self._seen is not self._states.x:
-            self._seen[:] = self._states.x
-        if (lost := self._states.estimate(self._sent, known=self.mode in self._known and not surprised)) is not None:
+        if (lost := states.estimate(self._sent, known=self.mode in self._known and not surprised)) is not None:
             self.say(lost)
-        if self._unmeasured:
-            self._seen[self._unmeasured] = self._states.x[self._unmeasured]
-        if len(self._states.d):
-            self._prediction.p[self.np_ :] = self._states.d
+        if len(states.d):
+            self._prediction.p[self.np_ :] = states.d
         if surprised and self._planner.loaded and self.grid.running:
             self._planner.load(self.grid.act_ns, shift=False)
         if self.mode is Mode.IDLE:
@@ -238,14 +192,14 @@ class Controller:
             if not len(state.u) and not self._unreported:
                 self._unreported = True
                 self._modes.say(Severity.WARNING, "inputs_unreported", INPUTS_UNREPORTED)
-        if self._track.arriving and self._states.lives.rival is None:
+        if self._track.arriving and states.lives.rival is None:
             self._anchor(state)
-        grid, period_ns = self.grid, self._states.clock.period_ns
-        if not (self._track.loaded or self._stopped) or not self._states.cadence.known or grid.early(state.stamp_ns, period_ns):
+        grid, period_ns = self.grid, states.clock.period_ns
+        if not (self._track.loaded or self._modes.stopped) or not states.cadence.known or grid.early(state.stamp_ns, period_ns):
             return None
         if (behind := grid.behind(state.stamp_ns)) or not grid.running:
-            self._rejoin(state.stamp_ns, behind)
-        return self._act(state) if grid.running else None
+            self._interruption.rejoin(state.stamp_ns, behind)
+        return self._feedback.answer(state) if grid.running else None
 
     def lay_out(self, reference: Reference) -> Array | None:
         """Do the part of `receive_reference` whose duration grows with the rows, in any thread; None if the reference will be refused."""
@@ -281,15 +235,15 @@ class Controller:
     @reported
     def stop(self, reason: str) -> None:
         """Ramp to rest and stay there until `enable`."""
-        if not self._stopped:
-            self._stopped = reason
+        if not self._modes.stopped:
+            self._modes.stopped = reason
             self._modes.say(Severity.INFO, "stop", f"stop: {reason}")
 
     @reported
     def enable(self) -> None:
         """Release a `stop`, and start cold from the input that acts."""
-        if self._stopped:
-            self._stopped = ""
+        if self._modes.stopped:
+            self._modes.stopped = ""
             self._modes.say(Severity.INFO, "enable", "released by an operator")
             if self.mode is Mode.STOPPED:
                 self.grid.running = False
@@ -324,12 +278,12 @@ class Controller:
     @reported
     def stand_by(self) -> None:
         """Stand by: compute commands that do not act, since those handed to `overhear` do."""
-        self._standing_by = True
+        self._modes.standing_by = True
 
     @reported
     def lead(self, epoch: int) -> None:
         """Let the commands of this controller act from the next one on; it continues from the inputs that have acted so far."""
-        self._issued.epoch, self._standing_by = epoch, False
+        self._issued.epoch, self._modes.standing_by = epoch, False
         if self._planner.loaded:
             self._planner.load(self.grid.act_ns, shift=False)
 
@@ -345,13 +299,7 @@ class Controller:
         if state is None or not self.grid.running:
             return None
         now_ns = self._states.clock.now_ns(local_ns)
-        age_ns = now_ns - state.stamp_ns
-        if age_ns <= self._stale_ns:
-            return None
-        self.grid.running = False
-        mode = Mode.STOPPED if self._stopped else Mode.BRAKING
-        self._modes.enter(mode, f"no state for {1e-9 * age_ns:.3f} s", Severity.ERROR, "state_stale")
-        return self._brake(state, now_ns + self.grid.delay_ns, QpStatus.NONE)
+        return None if now_ns - state.stamp_ns <= self._stale_ns else self._fallback.silence(state, now_ns)
 
     @reported
     def in_time(self, command: Command, local_ns: int) -> Command | None:
@@ -371,26 +319,12 @@ class Controller:
             return command  # its lateness is unknown, and no other command follows
         now_ns = self._states.clock.latest_ns(local_ns)
         if not self.grid.too_late(now_ns - command.stamp_ns):
-            if self._overran:
-                self._overran = False
+            if self._issued.overran:
+                self._issued.overran = False
                 self._modes.enter(command.mode, "commands are ready in time again")
             return command
-        self._overran = True
-        failure = f"a command was ready {1e-9 * (now_ns - command.stamp_ns):.3f} s late"
-        if self._fallback.plays_on(now_ns, counted=command.mode is Mode.FALLBACK):
-            self._modes.enter(Mode.FALLBACK, f"{failure}: the previous plan is continued", Severity.WARNING, "over_budget")
-            return None
-        if not self._stopped:
-            self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "over_budget")
-        self._issued.late = command if command.mode.planned and now_ns < command.valid_until_ns else None
-        counted = command.mode in (Mode.BRAKING, Mode.STOPPED)
-        if self._ways is not None and self._ways.feeds_back:  # the last command carries its way, which newer states correct than this sample's
-            if not counted:
-                self.ladder.brake(at_rest=False)
-            self._issued.plan, self._planner.loaded = None, False
-            return None
         assert self._states.last is not None
-        return self._brake(self._states.last, now_ns + self.grid.delay_ns, command.status, wanted=counted)
+        return self._fallback.overrun(command, self._states.last, now_ns)
 
     @reported
     def commit(self, command: Command, left_ns: int | None = None) -> None:
@@ -402,7 +336,7 @@ class Controller:
             left_ns: Earliest local monotonic time at which it left; None if it answers no state, so that robot time is a guess.
         """
         self._issued.commit(command)
-        if self._standing_by:
+        if self._modes.standing_by:
             return
         clock = self._states.clock
         self._sent.append(command, BEFORE_ALL_NS if left_ns is None or self._states.cadence.fault else clock.latest_ns(left_ns))
@@ -412,26 +346,7 @@ class Controller:
     @reported
     def prepare(self) -> None:
         """Prepare the next sample: fix `t_k`, look the reference up, shift, linearize and load the QP."""
-        self._record.keep_plan(self._issued.seq)
-        if self._opinions is not None:
-            self._opinions.keep(self._issued.seq, planned=self.mode.planned and not self._standing_by)
-        if self.mode.planned and self._blockage.judge():
-            self.say(self._blockage.notice)
-        state = self._states.last
-        if not self.grid.running or state is None:
-            return
-        if self._delay is not None:
-            self._measure_delay(self._delay, state.stamp_ns)
-        self.grid.advance(state.stamp_ns, self._states.clock.period_ns)
-        self._planner.loaded = False
-        if self.mode.planned:
-            self.ladder.failed = 0
-        elif self._issued.late is None and (self.mode is not Mode.FALLBACK or not np.isfinite(self._rti.x).all()):
-            return  # the next sample starts cold; after a late one it does not, as a cold one takes longest and would be late again
-        self._tuning.begin()
-        self._planner.load(self.grid.act_ns, shift=True)
-        if self._ways is not None:
-            self._ways.prepare()
+        self._preparation.prepare()
 
     @reported
     def second_opinion(self) -> bool:
@@ -466,111 +381,7 @@ class Controller:
         Returns:
             A command to be encoded and thrown away; None if the next sample does not begin with a feedback that is prepared.
         """
-        state, grid = self._states.last, self.grid
-        if state is None or not self._planner.loaded or self._standing_by or not self.mode.planned:
-            return None
-        self._check(state)
-        self._understudy.receive(state, local_ns)
-        due_ns = grid.act_ns - min(grid.delay_ns, grid.dt_ns - 1)  # or the first time at which `prepare` has asked for the inputs
-        if len(state.u):
-            self._reports.expects(state, due_ns)
-        if grid.early(due_ns, self._states.clock.period_ns) or self._track.ended(grid.act_ns):
-            return None
-        rows = self._planner.rehearse(self._states.x, due_ns, grid.act_ns)
-        self._modes.enter(self.mode, "nothing is said")
-        return self._issued.build(state, grid.act_ns, grid.act_ns + self._valid_ns, self.mode, self._rti.status, rows)
-
-    def _measure_delay(self, estimator: DelayEstimator, stamp_ns: int) -> None:
-        """Learn from the state of the last sample, and let the grid follow."""
-        estimator.restore_if_lost(self._sent.confirmed)
-        estimator.observe(self._seen, stamp_ns)
-        if self._issued.last is not None and not self._standing_by:
-            estimator.sent(self._issued.last)
-        self._sent.delay_ns = estimator.delay_ns
-        self.grid.adapt(estimator.delay_ns)
-
-    def _rejoin(self, stamp_ns: int, behind: int) -> None:
-        """Move plan and grid to a state that the grid did not expect: a late one, or the first one after a gap."""
-        self.skipped += behind
-        late, act_ns = self._issued.late, stamp_ns + self.grid.delay_ns
-        if late is not None and act_ns >= late.valid_until_ns:
-            self._planner.loaded = False  # it would have run out: this sample starts cold
-        if behind and self._issued.lasts(act_ns):
-            self.grid.catch_up(behind, stamp_ns)
-            if self._planner.loaded:
-                for _ in range(behind - 1):
-                    self._rti.shift()
-                self._planner.load(self.grid.act_ns, shift=True)
-            return
-        if behind:
-            self._modes.say(Severity.WARNING, "gap", f"no sample for {behind} periods: starting cold")
-        self._planner.loaded = False
-        self._issued.plan = None
-        if self._ways is not None:
-            self._ways.forget()
-        self.ladder.failed = 0
-        clock = self._states.clock
-        if not self.grid.too_late(clock.late_ns + clock.doubt_ns):
-            self.grid.start(stamp_ns)
-        else:  # this state may have waited on its way for too long to be answered: the next one will show
-            self.grid.running = False
-
-    def _act(self, state: State) -> Command:
-        """Feedback: from a due state to the command that acts at `t_k`."""
-        act_ns = self.grid.act_ns
-        ending = self._track.ended(act_ns)
-        disputed = self._states.lives.disputed
-        if self._stopped or disputed or ending is End.STOP:
-            why = "two robots use this name" if disputed else "the reference ended with STOP"
-            self._modes.enter(*((Mode.STOPPED, self._stopped) if self._stopped else (Mode.BRAKING, why)))
-            return self._brake(state, act_ns, QpStatus.NONE, wanted=True)
-        status, u = self._planner.plan(self._states.x, state.stamp_ns, act_ns)
-        if u is None:
-            return self._fall_back(state, status)
-        self.ladder.softened += self._rti.solver is not (self._rti.active_set or self._rti.solvers[0])
-        mode, reason = (Mode.TRACKING, "following the reference") if ending is None else (Mode.HOLDING, "the reference has ended")
-        if not self._overran:
-            self._modes.enter(mode, reason)
-        valid_until_ns = min(act_ns + self._rti.ocp.N * self.grid.dt_ns, state.stamp_ns + self.grid.delay_ns + self._valid_ns)
-        after = NO_ENDING
-        if self._ways is not None:
-            u, after = self._ways.after(u, act_ns, valid_until_ns)
-        return self._issued.propose(state, act_ns, valid_until_ns, mode, status, u, plan=True, ending=after)
-
-    # Fallbacks.
-
-    def _fall_back(self, state: State, status: QpStatus) -> Command:
-        """Replace a plan that could not be computed."""
-        act_ns, failure = self.grid.act_ns, f"the QP is {status.name.lower()}"
-        if self._fallback.plays_on(act_ns):
-            self._modes.enter(Mode.FALLBACK, f"{failure}: the previous plan is continued", Severity.WARNING, "qp_failed")
-            return self._fallback.play_on(state, act_ns, status, self._planner.reach)
-        self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "no_plan")
-        return self._brake(state, act_ns, status)
-
-    def _brake(self, state: State, act_ns: int, status: QpStatus, *, wanted: bool = False) -> Command:
-        """Propose the brake law, see `Fallback.brake`; the next sample starts cold."""
-        self._planner.loaded = False
-        return self._fallback.brake(state, self._states.x, act_ns, self.mode, status, wanted=wanted)
-
-    def _give_up(self, state: State) -> Command | None:
-        """
-        Stop commanding a robot whose stamps are no clock: send one last command, each of whose rows is the next step to rest.
-
-        Whichever of its rows acts, and for however long, the inputs stay inside the slew limits.
-        """
-        if self.mode is Mode.IDLE:
-            return None
-        command = None
-        ramps = self._ways is None  # the way to rest of the last command is better than anything that is made without a clock
-        if ramps and self._issued.last is not None and (self._sent.at(state.stamp_ns)[0] != self._u_rest).any():
-            self._modes.enter(Mode.STOPPED if self._stopped else Mode.BRAKING, self._states.cadence.fault)
-            valid_ns = max(1, round(self._valid_ns * min(1.0, self._states.cadence.rate)))  # as long as it should act, in the unit of the stamps
-            command = self._fallback.step(state, state.stamp_ns + self.grid.delay_ns, self.mode, valid_ns)
-        self._issued.plan = None
-        self._overran = self._planner.loaded = self.grid.running = False
-        self._modes.enter(Mode.IDLE, self._states.cadence.fault)
-        return command
+        return self._understudy.rehearse(local_ns)
 
     @reported
     def standstill(self, local_ns: int) -> Command | None:
@@ -578,7 +389,7 @@ class Controller:
         state = self._states.last
         if self._issued.last is None or state is None or self._states.cadence.fault:
             return None
-        return self._brake(state, self.robot_now_ns(local_ns) + self.grid.delay_ns, QpStatus.NONE, wanted=True)
+        return self._fallback.brake(state, self.robot_now_ns(local_ns) + self.grid.delay_ns, QpStatus.NONE, wanted=True)
 
     # Outgoing messages.
 
@@ -612,21 +423,10 @@ class Controller:
 
     def telemetry(self, *, prepare_us: float, feedback_us: float, latency_us: float, slack_s: float, second_us: float = 0.0) -> Telemetry:
         """Return the telemetry of the last sample; the times come from the caller, who has a clock."""
-        assert self._issued.last is not None
-        times = prepare_us, feedback_us, latency_us, slack_s, second_us
-        last, opinion = self._issued.last, Opinion() if self._opinions is None else self._opinions.last
-        rows = last.u if self._ways is None else np.concatenate([last.u, self._ways.rows[len(last.u) :]])
-        return self._record.telemetry(
-            last, rows, self._x0, self._states.d, times, opinion, delay_s=1e-9 * self.grid.delay_ns, skipped=self.skipped, ladder=self.ladder
-        )
+        opinion = Opinion() if self._opinions is None else self._opinions.last
+        return self._record.telemetry((prepare_us, feedback_us, latency_us, slack_s, second_us), opinion)
 
     # Small parts.
-
-    def _check(self, state: State) -> None:
-        """Refuse what is no state of the model."""
-        given.array("state.x", given.instance("state", state, State).x, self._x0.shape)
-        if len(state.u):
-            given.array("state.u", state.u, self._u_rest.shape)
 
     def _hear(self, state: State) -> bool:
         """Learn which input acts, from a report and, on a way to rest with feedback, from the state; return whether the report was not expected."""
@@ -640,21 +440,3 @@ class Controller:
         if self._planner.loaded and self.grid.running:
             self._planner.load(self.grid.act_ns, shift=False)
         return anchored
-
-    def _forget(self, arrival: Arrival, state: State) -> None:
-        """Forget the robot's last life; or, after a jump of its clock, all but the inputs from which it has braked since then."""
-        self._issued.late = None
-        if arrival is Arrival.NEW_LIFE:
-            self._sent.clear()
-        else:
-            self._sent.brake(self._states.before_ns, state.stamp_ns)
-        if arrival is not Arrival.JUMPED_AHEAD:
-            self._modes.enter(Mode.IDLE, "the robot was restarted, or its clock has jumped")
-            self._track.clear(state.epoch if arrival is Arrival.NEW_LIFE else None)
-            self._blockage.clear()
-        if self._delay is not None:
-            self._delay.clear()
-        if self._ways is not None:
-            self._ways.forget()
-        self._issued.plan = None
-        self._overran = self._planner.loaded = self.grid.running = False

@@ -91,6 +91,22 @@ class DelayEstimator:
         self._commands.clear()
         self._last = None
 
+    def learn(self, x: Array, stamp_ns: int, command: Command | None, confirmed: int) -> int:
+        """
+        Learn from one sample, and return the estimate, ns.
+
+        Args:
+            x: Its state, as `observe` takes it.
+            stamp_ns: Stamp of that state.
+            command: The last command that acts, None if there is none.
+            confirmed: As `restore_if_lost` takes it.
+        """
+        self.restore_if_lost(confirmed)
+        self.observe(x, stamp_ns)
+        if command is not None:
+            self.sent(command)
+        return self.delay_ns
+
     def restore_if_lost(self, confirmed: int) -> None:
         """
         Restore the last good estimate after commands were lost: what was learnt meanwhile is wrong.

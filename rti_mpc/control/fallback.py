@@ -2,7 +2,8 @@
 """
 Commands without a plan of their own: the previous plan, continued, or the brake law.
 
-The ladder (`rti_mpc.control.ladder`) says which of them it is, and counts them.
+The ladder (`rti_mpc.control.ladder`) says which of them it is, and counts them; the mode
+says why.
 """
 
 from __future__ import annotations
@@ -10,32 +11,21 @@ from __future__ import annotations
 import numpy as np
 
 from rti_mpc.array import Array
-from rti_mpc.contract.message import Command, State
+from rti_mpc.contract.message import Command, Severity, State
 from rti_mpc.contract.status import Mode, QpStatus
-from rti_mpc.control.envelope import Envelope
-from rti_mpc.control.issued import ENDING, NO_ENDING, Issued
-from rti_mpc.control.ladder import Ladder
-from rti_mpc.control.sent import Sent
-from rti_mpc.control.stopping import Stopping
+from rti_mpc.control.assembly import Assembly
+from rti_mpc.control.issued import ENDING, NO_ENDING
+from rti_mpc.control.planner import Planner
 
 
 class Fallback:
-    """
-    Fallbacks of one controller.
+    """Fallbacks of one controller."""
 
-    Args:
-        ladder: Counts of the samples without a plan of their own.
-        envelope: Limits of the inputs.
-        sent: Inputs that were sent.
-        issued: Commands.
-        ways: Ways to rest; None where the inputs ramp to rest.
-        u_rest: Input at which the robot rests, shape ``(nu,)``.
-        valid_ns: How long a command is valid, robot time.
-    """
-
-    def __init__(self, ladder: Ladder, envelope: Envelope, sent: Sent, issued: Issued, ways: Stopping | None, u_rest: Array, valid_ns: int) -> None:
-        self._ladder, self._envelope, self._sent, self._issued, self._ways = ladder, envelope, sent, issued, ways
-        self._u_rest, self._valid_ns = u_rest, valid_ns
+    def __init__(self, parts: Assembly, planner: Planner) -> None:
+        self._planner, self._modes, self._states, self._grid = planner, parts.modes, parts.states, parts.grid
+        self._ladder, self._envelope, self._sent, self._issued, self._ways = parts.ladder, parts.envelope, parts.sent, parts.issued, parts.ways
+        self._u_rest: Array = np.array(parts.rti.ocp.model.u_rest)
+        self._valid_ns = parts.valid_ns
 
     @property
     def at_rest(self) -> bool:
@@ -43,23 +33,54 @@ class Fallback:
         last = self._issued.last
         return last is None or (np.array_equal(last.u[0], self._u_rest) if self._ways is None else self._ways.at_rest)
 
-    def plays_on(self, now_ns: int, *, counted: bool = False) -> bool:
-        """Whether the previous plan may serve a sample that has none of its own."""
-        plan = self._issued.plan
-        left = plan is not None and now_ns < plan.valid_until_ns
-        return left if counted else self._ladder.fall(plan_left=left)
+    def replace(self, state: State, status: QpStatus) -> Command:
+        """Replace a plan that could not be computed."""
+        act_ns, failure = self._grid.act_ns, f"the QP is {status.name.lower()}"
+        if self._ladder.fall(plan_left=self._plan_lasts(act_ns)):
+            self._modes.enter(Mode.FALLBACK, f"{failure}: the previous plan is continued", Severity.WARNING, "qp_failed")
+            return self._play_on(state, act_ns, status)
+        self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "no_plan")
+        return self.brake(state, act_ns, status)
 
-    def play_on(self, state: State, act_ns: int, status: QpStatus, reach: tuple[Array, Array]) -> Command:
-        """Propose the rest of the previous plan, which must be there."""
-        plan = self._issued.plan
-        assert plan is not None
-        rows = self._envelope.refit(plan.u, round((act_ns - plan.stamp_ns) / plan.period_ns), reach)
-        ending = {name: getattr(plan, name) for name in ENDING}  # it begins when that plan ends, and so does this one
-        return self._issued.propose(state, act_ns, plan.valid_until_ns, Mode.FALLBACK, status, rows, ending=ending)
+    def silence(self, state: State, now_ns: int) -> Command:
+        """Replace the plans that no state asks for any more, at a robot time."""
+        self._grid.running = False
+        mode = Mode.STOPPED if self._modes.stopped else Mode.BRAKING
+        self._modes.enter(mode, f"no state for {1e-9 * (now_ns - state.stamp_ns):.3f} s", Severity.ERROR, "state_stale")
+        return self.brake(state, now_ns + self._grid.delay_ns, QpStatus.NONE)
 
-    def brake(self, state: State, x: Array, act_ns: int, mode: Mode, status: QpStatus, *, wanted: bool = False) -> Command:
+    def overrun(self, command: Command, state: State, now_ns: int) -> Command | None:
         """
-        Propose the brake law, because a stop is `wanted` or because there is no plan.
+        Replace a proposal that was ready too late to be sent.
+
+        Args:
+            command: The proposal.
+            state: The last state.
+            now_ns: Robot time.
+
+        Returns:
+            What to publish; None if the robot goes on with the previous plan, or with the way to rest that it corrects by its states.
+        """
+        self._issued.overran = True
+        failure = f"a command was ready {1e-9 * (now_ns - command.stamp_ns):.3f} s late"
+        left = self._plan_lasts(now_ns)
+        if left if command.mode is Mode.FALLBACK else self._ladder.fall(plan_left=left):  # a fallback is counted already
+            self._modes.enter(Mode.FALLBACK, f"{failure}: the previous plan is continued", Severity.WARNING, "over_budget")
+            return None
+        if not self._modes.stopped:
+            self._modes.enter(Mode.BRAKING, f"{failure} and no plan is left", Severity.ERROR, "over_budget")
+        self._issued.late = command if command.mode.planned and now_ns < command.valid_until_ns else None
+        counted = command.mode in (Mode.BRAKING, Mode.STOPPED)
+        if self._ways is not None and self._ways.feeds_back:  # the last command carries its way, which newer states correct than this sample's
+            if not counted:
+                self._ladder.brake(at_rest=False)
+            self._issued.plan, self._planner.loaded = None, False
+            return None
+        return self.brake(state, now_ns + self._grid.delay_ns, command.status, wanted=counted)
+
+    def brake(self, state: State, act_ns: int, status: QpStatus, *, wanted: bool = False) -> Command:
+        """
+        Propose the brake law, because a stop is `wanted` or because there is no plan; the next sample starts cold.
 
         Its validity counts from its own time, not from its state's: a ramp depends on past
         commands only, and never leads further from rest than they do; a way to rest goes
@@ -67,26 +88,56 @@ class Fallback:
 
         Args:
             state: The last state.
-            x: That state as it is believed, shape ``(nx,)``.
             act_ns: When the command acts.
-            mode: What the controller is doing.
             status: Outcome of the QP.
             wanted: Whether this is no failure.
         """
+        self._planner.loaded = False
         reach, valid_ns, ending = self._sent.reach(act_ns), self._valid_ns, NO_ENDING
         if self._ways is None:
             rows = self._envelope.ramp(reach)
             at_rest = bool((rows[0] == self._u_rest).all())
         else:
             u_prev = self._sent.at(act_ns - 1)[0]
-            rows, valid_ns, ending = self._ways.stop(x, state.stamp_ns, act_ns, u_prev, reach)
+            rows, valid_ns, ending = self._ways.stop(self._states.x, state.stamp_ns, act_ns, u_prev, reach)
             at_rest = self._ways.at_rest
         if not wanted:
             self._ladder.brake(at_rest=at_rest)
         self._issued.plan = None
-        return self._issued.propose(state, act_ns, act_ns + valid_ns, mode, status, rows, ending=ending)
+        return self._issued.propose(state, act_ns, act_ns + valid_ns, self._modes.mode, status, rows, ending=ending)
 
-    def step(self, state: State, act_ns: int, mode: Mode, valid_ns: int) -> Command:
-        """Propose one command to a robot without a clock, each of whose rows is the next step to rest: however long each acts, slew limits hold."""
-        rows = self._envelope.ramp(self._sent.reach(act_ns))
-        return self._issued.propose(state, act_ns, act_ns + valid_ns, mode, QpStatus.NONE, np.tile(rows[0], (len(rows), 1)))
+    def give_up(self, state: State) -> Command | None:
+        """
+        Stop commanding a robot whose stamps are no clock: send one last command, each of whose rows is the next step to rest.
+
+        Whichever of its rows acts, and for however long, the inputs stay inside the slew limits.
+        """
+        modes, cadence = self._modes, self._states.cadence
+        if modes.mode is Mode.IDLE:
+            return None
+        command = None
+        ramps = self._ways is None  # the way to rest of the last command is better than anything that is made without a clock
+        if ramps and self._issued.last is not None and (self._sent.at(state.stamp_ns)[0] != self._u_rest).any():
+            modes.enter(Mode.STOPPED if modes.stopped else Mode.BRAKING, cadence.fault)
+            act_ns = state.stamp_ns + self._grid.delay_ns
+            valid_ns = max(1, round(self._valid_ns * min(1.0, cadence.rate)))  # as long as it should act, in the unit of the stamps
+            rows = self._envelope.ramp(self._sent.reach(act_ns))
+            rows = np.tile(rows[0], (len(rows), 1))
+            command = self._issued.propose(state, act_ns, act_ns + valid_ns, modes.mode, QpStatus.NONE, rows)
+        self._issued.plan = None
+        self._issued.overran = self._planner.loaded = self._grid.running = False
+        modes.enter(Mode.IDLE, cadence.fault)
+        return command
+
+    def _plan_lasts(self, now_ns: int) -> bool:
+        """Whether there is a previous plan, and it is valid at a time."""
+        plan = self._issued.plan
+        return plan is not None and now_ns < plan.valid_until_ns
+
+    def _play_on(self, state: State, act_ns: int, status: QpStatus) -> Command:
+        """Propose the rest of the previous plan, which must be there."""
+        plan = self._issued.plan
+        assert plan is not None
+        rows = self._envelope.refit(plan.u, round((act_ns - plan.stamp_ns) / plan.period_ns), self._planner.reach)
+        ending = {name: getattr(plan, name) for name in ENDING}  # it begins when that plan ends, and so does this one
+        return self._issued.propose(state, act_ns, plan.valid_until_ns, Mode.FALLBACK, status, rows, ending=ending)

@@ -59,6 +59,7 @@ class Grid:
         dt_ns: Period of the commands.
         most_ns: Largest delay.
         running: Whether there is a grid: not before the first sample, nor after a gap.
+        skipped: Samples skipped since start.
     """
 
     def __init__(self, dt_s: float, timing: Timing) -> None:
@@ -67,6 +68,7 @@ class Grid:
         self.most_ns = self.delay_ns if timing.delay_s is not None else MAX_DELAY_PERIODS * self.dt_ns
         self.act_ns = 0
         self.running = False
+        self.skipped = 0
 
     def early(self, stamp_ns: int, period_ns: float) -> bool:
         """Whether a state comes before the one that the next sample is due with; `period_ns` is the period of the states."""

@@ -26,6 +26,7 @@ class Issued:
         last: The last command that has left; None before the first.
         plan: The last command with a plan of its own, as long as that plan may be continued; else None.
         late: The last proposal, if it is a plan that was ready too late to be sent: the next plan begins from it; else None.
+        overran: Whether the last proposal was ready too late.
     """
 
     def __init__(self, epoch: int, config_hash: int, period_ns: int) -> None:
@@ -34,6 +35,7 @@ class Issued:
         self.last: Command | None = None
         self.plan: Command | None = None
         self.late: Command | None = None
+        self.overran = False
         self._config_hash = config_hash
         self._period_ns = period_ns
         self._planned: Command | None = None  # the last one proposed, if it has a plan of its own

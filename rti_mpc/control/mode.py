@@ -28,11 +28,15 @@ class ModeMachine:
 
     Attributes:
         mode: What the controller is doing.
+        stopped: Why an operator's stop is latched; empty if none is.
+        standing_by: Whether the commands of another controller act, and not those of this one.
         notices: Notices of mode changes and faults that have not been taken yet; when it is full the oldest is dropped.
     """
 
     def __init__(self) -> None:
         self.mode = Mode.IDLE
+        self.stopped = ""
+        self.standing_by = False
         self.notices: deque[Notice] = deque(maxlen=64)
 
     def take(self) -> list[Notice]:

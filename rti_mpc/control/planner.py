@@ -11,13 +11,8 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
-from rti_mpc.control.envelope import Envelope
-from rti_mpc.control.prediction import Prediction
-from rti_mpc.control.sent import Sent
-from rti_mpc.control.track import Track
-from rti_mpc.control.tuning import Tuning
+from rti_mpc.control.assembly import Assembly
 from rti_mpc.kept import Kept
-from rti_mpc.rti.rti import Rti
 
 ITERATIONS_COLD = 3  # iterations of the first sample, whose guess is one state and one input at all stages
 
@@ -31,34 +26,21 @@ class Planner:
         reach: Lowest and highest first two rows of the plan, each of shape ``(2, nu)``.
     """
 
-    def __init__(
-        self,
-        rti: Rti,
-        track: Track,
-        sent: Sent,
-        prediction: Prediction,
-        envelope: Envelope,
-        tuning: Tuning,
-        d: Array,
-        robot: tuple[Array, ...],
-    ) -> None:
-        """
-        Begin with no QP.
-
-        Args:
-            rti: Real-time iteration.
-            track: Reference.
-            sent: Inputs that act before the plan.
-            prediction: Prediction of the state in which the plan begins.
-            envelope: Limits of the inputs.
-            tuning: Weights and bounds that act.
-            d: Estimated disturbances, shape ``(nd,)``, which are the last parameters of the model; owned by the caller.
-            robot: Parameters of the robot, each of shape ``(np,)``, wherever it is predicted; those of the reference are written into them.
-        """
+    def __init__(self, parts: Assembly) -> None:
+        """Begin with no QP."""
+        rti, track, prediction, envelope = parts.rti, parts.track, parts.prediction, parts.envelope
         self.loaded = False
         self._x0 = prediction.x
-        self._rti, self._track, self._sent, self._prediction, self._envelope, self._tuning = rti, track, sent, prediction, envelope, tuning
-        self._d, self._robot, self._np, self._dt_ns = d, robot, rti.ocp.model.np_ - len(d), round(1e9 * rti.ocp.dt)
+        self._rti, self._track, self._sent, self._prediction, self._envelope, self._tuning = (
+            rti,
+            track,
+            parts.sent,
+            prediction,
+            envelope,
+            parts.tuning,
+        )
+        self._d, self._robot = parts.states.d, parts.robot
+        self._np, self._dt_ns = rti.ocp.model.np_ - len(self._d), parts.grid.dt_ns  # the last parameters of the model are estimated disturbances
         # What nothing depends on is neither looked up nor handed on.
         self._p = track.p if rti.ocp.model.np_ else None
         self._remembers = len(rti.ocp.soft_ddu) > 0

@@ -5,21 +5,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from rti_mpc.array import Array
 from rti_mpc.codegen import bind
-from rti_mpc.contract.message import Command, Telemetry
-from rti_mpc.control.ladder import Ladder
+from rti_mpc.contract.message import Telemetry
+from rti_mpc.control.assembly import Assembly
 from rti_mpc.control.opinions import Opinion
-from rti_mpc.control.tuning import Tuning
-from rti_mpc.rti.rti import Rti
 
 
 class Record:
     """The plan behind the last command, kept before preparation overwrites it."""
 
-    def __init__(self, rti: Rti, tuning: Tuning) -> None:
-        self._rti = rti
-        self._tuning = tuning
+    def __init__(self, parts: Assembly) -> None:
+        rti = parts.rti
+        self._rti, self._tuning, self._issued, self._ways, self._states = rti, parts.tuning, parts.issued, parts.ways, parts.states
+        self._grid, self._ladder, self._embedded = parts.grid, parts.ladder, parts.prediction.x
         self._seq = 0  # of the command whose plan is kept
         self._plan = (rti.x.copy(), rti.y_ref.copy(), 0.0)  # states, reference, cost
         self._version = 0  # of the parameters
@@ -34,35 +32,19 @@ class Record:
             self._seq, self._version = seq, self._tuning.version
             self._p[:], self._u_prev[:] = self._rti.p[0], self._rti.u_prev
 
-    def telemetry(
-        self,
-        command: Command,
-        rows: Array,
-        x0: Array,
-        d: Array,
-        times: tuple[float, float, float, float, float],
-        opinion: Opinion,
-        *,
-        delay_s: float,
-        skipped: int,
-        ladder: Ladder,
-    ) -> Telemetry:
+    def telemetry(self, times: tuple[float, float, float, float, float], opinion: Opinion) -> Telemetry:
         """
         Return the telemetry of the last command's sample.
 
         Args:
-            command: Command of the sample, as it was sent.
-            rows: All rows of its plan, shape ``(N, nu)``, also those that were not sent.
-            x0: State embedded at stage 0, shape ``(nx,)``.
-            d: Estimated disturbances, shape ``(nd,)``.
             times: Preparation, feedback and latency, us, slack, s, and second opinion, us.
             opinion: Second opinion about the plan before.
-            delay_s: Delay from a state to the time at which its command acts, s.
-            skipped: Samples skipped since start.
-            ladder: Samples without a plan of their own.
         """
+        command, grid, ladder = self._issued.last, self._grid, self._ladder
+        assert command is not None
+        rows = command.u if self._ways is None else np.concatenate([command.u, self._ways.rows[len(command.u) :]])  # also those that were not sent
         self.keep_plan(command.seq)
-        self._x0[:] = x0
+        self._x0[:] = self._embedded
         self._outputs()
         solver = self._rti.solver
         prepare_us, feedback_us, latency_us, slack_s, second_us = times
@@ -84,15 +66,15 @@ class Record:
             latency_us=latency_us,
             state_age_s=1e-9 * (command.stamp_ns - command.state_stamp_ns),
             slack_s=slack_s,
-            skipped=skipped,
+            skipped=grid.skipped,
             fallbacks=ladder.fallbacks,
             parameter_version=self._version,
-            x0=x0.copy(),
+            x0=self._x0.copy(),
             x=self._plan[0],
             u=rows,
             y_ref=self._plan[1],
-            d=d.copy(),
-            delay_s=delay_s,
+            d=self._states.d.copy(),
+            delay_s=1e-9 * grid.delay_ns,
             softened=ladder.softened,
             shifted=ladder.shifted,
             braked=ladder.braked,

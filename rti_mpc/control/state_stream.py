@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rti_mpc import given
 from rti_mpc.array import Array, bounded
 from rti_mpc.contract.cadence import Cadence
 from rti_mpc.contract.lives import Heard, Lives
@@ -47,13 +48,16 @@ class StateStream:
         cadence: Judge of sequence numbers and of the unit of the stamps.
         last: The newest state, None before the first.
         x: That state, shape ``(nx,)``, its rotations written nearest to those of the state before; or the observer's estimate of it.
+        seen: That state with what is measured as it was measured; the same array as `x` unless `as_measured` is asked for.
         d: Estimated disturbances, shape ``(nd,)``; empty without an observer.
         clock: The robot's clock.
         before_ns: Arrival of the newest state in robot time, by the clock as it was before that state.
         notice: Notice about the last state, None if there is nothing new to report.
     """
 
-    def __init__(self, model: Model, stale_ns: int, late_ns: int, settling_s: float, observer: Observer | None = None) -> None:
+    def __init__(
+        self, model: Model, stale_ns: int, late_ns: int, settling_s: float, observer: Observer | None = None, *, as_measured: bool = False
+    ) -> None:
         """
         Begin with no state.
 
@@ -63,12 +67,16 @@ class StateStream:
             late_ns: Robot time by which a state may be late and still be fresh.
             settling_s: Robot time for which any command may still move the robot after the state that it answers.
             observer: Estimator of disturbances, None for none.
+            as_measured: Whether `seen` is needed apart from the estimate.
         """
         self.lives = Lives(1e-9 * stale_ns, settling_s)
         self.cadence = Cadence()
         self.last: State | None = None
         self.x: Array = np.zeros(model.nx)
         self._x: Any = self.x.data  # read and written faster than an array
+        apart = observer is not None and as_measured
+        self.seen: Array = np.zeros(model.nx) if apart else self.x
+        self._unmeasured = [j for j in range(model.nx) if j not in observer.measured] if observer is not None and as_measured else []
         self.d: Array = np.zeros(0) if observer is None else observer.d
         self.clock = RobotClock(late_ns)
         self.notice: Notice | None = None
@@ -78,6 +86,19 @@ class StateStream:
         self._observer = observer
         self._estimated_ns: int | None = None  # stamp of the state that the observer was given last
         self._rotations = model.rotations("states")
+        self._x_shape, self._u_shape = (model.nx,), (model.nu,)
+
+    def check(self, state: State) -> None:
+        """
+        Refuse what is no state of the model.
+
+        Raises:
+            OcpError: It is no `State`.
+            ShapeError: Its vectors are not the model's.
+        """
+        given.array("state.x", given.instance("state", state, State).x, self._x_shape)
+        if len(state.u):
+            given.array("state.u", state.u, self._u_shape)
 
     def receive(self, state: State, arrival_ns: int) -> Arrival:
         """
@@ -119,6 +140,8 @@ class StateStream:
         observer, last = self._observer, self.last
         if observer is None or last is None:
             return None
+        if self.seen is not self.x:
+            self.seen[:] = self.x
         lost = None
         before_ns, self._estimated_ns = self._estimated_ns, last.stamp_ns  # states that were late lie between them
         if before_ns is None or not 0 < last.stamp_ns - before_ns <= self._stale_ns:
@@ -133,6 +156,8 @@ class StateStream:
                 observer.reset(self.x)
                 lost = Notice(Severity.WARNING, "estimate_lost", "the estimate is not finite: it begins anew at the state that was received")
         self.x[:] = observer.x
+        if self._unmeasured:
+            self.seen[self._unmeasured] = self.x[self._unmeasured]
         return lost
 
     def _judge(self, state: State, arrival_ns: int) -> tuple[Arrival, str, str]:

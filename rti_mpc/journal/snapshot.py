@@ -285,7 +285,7 @@ def fits(ours: np.ndarray[Any, Any], theirs: Any) -> bool:
 
 def widths(controller: Controller) -> dict[tuple[str, str], tuple[int, set[int]]]:
     """Return the number of axes, and the possible lengths of the last one, of arrays of objects that are made anew, by class and attribute."""
-    (nx,), (nu,), ny = controller._x0.shape, controller._u_rest.shape, controller._track.y_ref.shape[1]
+    (nx,), (nu,), ny = controller._states.x.shape, controller.envelope.limits["lbu"].shape, controller._track.y_ref.shape[1]
     plan = {("Plan", "u"): (2, {nu}), ("Plan", "asked"): (2, {nu}), ("Plan", "before"): (1, {nu})}
     state = {("State", "x"): (1, {nx}), ("State", "u"): (1, {0, nu})}
     reference = {("Reference", "y"): (2, {ny}), ("Reference", "p"): (2, {0, controller.np_})}

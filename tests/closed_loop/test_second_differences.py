@@ -45,7 +45,7 @@ def bends(run: Run) -> Array:
 def test_inputs_that_act_bend_within_their_limits_which_they_exceed_without(delay_s: float) -> None:
     bounded, controller = driven(BENDS, delay_s)
     free, _ = driven({}, delay_s)
-    assert controller.skipped == len(LOST)
+    assert controller.grid.skipped == len(LOST)
     assert {command.mode for command in bounded.commands} == {Mode.TRACKING}
     assert np.all(bends(bounded) <= BEND + ROUNDING)
     assert np.all(bends(bounded) >= BEND - ROUNDING), "the limits act"

@@ -45,7 +45,7 @@ def drive_shipped(name: str, **changes: Any) -> tuple[Run, Trajectory, Ocp]:
     body = robot(trajectory, **changes)
     controller.receive_reference(reference(trajectory.lasting(140.0), heading))  # it goes on, or the robot would slow down for its end
     run = drive(controller, body, duration_s)
-    assert controller.ladder.fallbacks == controller.skipped == 0
+    assert controller.ladder.fallbacks == controller.grid.skipped == 0
     assert not run.refused
     return run, trajectory, ocp
 

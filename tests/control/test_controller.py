@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller: its grid in time, its angles, its ladder of fallbacks, all in lockstep."""
+"""The controller: its grid in time, its angles and an operator, all in lockstep."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, End, Reference, State
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.controller import Controller, Timing
-from rti_mpc.control.ladder import MAX_FALLBACK_SAMPLES
 from rti_mpc.control.observer import Observer, ObserverSettings
 from rti_mpc.model.model import Model
 from rti_mpc.reference.trajectory import circle, eight, positioning, waypoints
@@ -26,40 +25,11 @@ from rti_mpc.rti.rti import Rti
 from rti_mpc.signals import Signal
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
-from tests.loop import MS, SLEW, Run, drive, reference, robot
+from tests.loop import MS, STEP, Run, assert_inside_slew, codes, drive, modes, reference, robot
 from tests.problems import pioneer
 from tests.slow import slow_but
 
 DT = 100 * MS
-STEP = np.array([0.25, 0.4])  # slew limit per dt
-
-
-@pytest.fixture(scope="module")
-def rti() -> Rti:
-    """One for all: a controller's first sample starts cold, whatever came before. No weight on headings: then the circle can be followed exactly."""
-    return Rti(pioneer(N=12, Q=[1.0, 1.0, 0.0]), SolverSettings(eps=1e-6, max_iter=4000), compile=False)
-
-
-@pytest.fixture
-def controller(rti: Rti) -> Controller:
-    return Controller(rti, Timing(), compile=False)
-
-
-@pytest.fixture
-def on_the_circle(controller: Controller) -> tuple[Controller, Lockstep]:
-    """A robot that has followed the circle for 15 s."""
-    body = robot(circle())
-    controller.receive_reference(reference(circle()))
-    drive(controller, body, 15.0)
-    return controller, body
-
-
-def codes(controller: Controller) -> list[str]:
-    return [notice.code for notice in controller.notices()]
-
-
-def modes(run: Run) -> list[Mode]:
-    return [command.mode for command in run.commands]
 
 
 def to_go(point: tuple[float, float, float], rows: int = 1, end: End = End.HOLD, stamp_ns: int = 0, epoch: int = 1) -> Reference:
@@ -182,7 +152,7 @@ def test_faster_states_neither_skip_nor_double_a_sample(controller: Controller, 
     assert first_ns == -(-50 // period_ms) * period_ms * MS, "the first states show how fast the clock runs"
     assert [command.stamp_ns for command in run.commands] == [first_ns + k * DT for k in range(len(run.commands))]
     assert len(run.commands) == pytest.approx(50, abs=1)
-    assert controller.skipped == 0
+    assert controller.grid.skipped == 0
 
 
 @pytest.mark.parametrize("period_ms", [100, 20])
@@ -199,7 +169,7 @@ def test_jitter_of_the_robots_clock_neither_skips_nor_doubles_a_sample(controlle
             controller.commit(command)
             controller.prepare()
     gaps = np.diff(stamps) / DT
-    assert controller.skipped == 0
+    assert controller.grid.skipped == 0
     assert len(stamps) == pytest.approx(50, abs=2)
     assert gaps.min() > 0.5
     assert gaps.max() < 1.5
@@ -211,7 +181,7 @@ def test_grid_follows_a_robot_whose_period_drifts(controller: Controller, drift:
     controller.receive_reference(reference(circle()))
     run = drive(controller, robot(circle(), state_period_s=0.1 * drift), 20.0)
     assert len(run.commands) == len(run.t_s) - 1, "the first two states show how fast the clock runs"
-    assert controller.skipped == 0
+    assert controller.grid.skipped == 0
     np.testing.assert_allclose(1e-9 * np.array([c.stamp_ns for c in run.commands]), np.array(run.t_s[1:]), atol=0.1 * 0.03 + 1e-9)
     assert run.error_mm(circle())[150:].max() < 0.3
 
@@ -225,7 +195,7 @@ def test_plan_starts_where_the_robot_is_when_it_acts(rti: Rti, delay_s: float, l
     propose = controller._issued.propose
 
     def noted(*args: Any, **kwargs: Any) -> Any:
-        predicted[controller.grid.act_ns] = controller._x0.copy()
+        predicted[controller.grid.act_ns] = controller._prediction.x.copy()
         return propose(*args, **kwargs)
 
     controller._issued.propose = noted  # type: ignore[method-assign]
@@ -293,77 +263,6 @@ def test_reference_and_prediction_begin_where_the_command_acts(rti: Rti) -> None
     assert command.valid_until_ns == command.state_stamp_ns + 420 * MS
 
 
-@pytest.mark.parametrize("missed", [1, 2])
-def test_missed_samples_shift_the_plan_by_the_stages_elapsed(rti: Rti, monkeypatch: pytest.MonkeyPatch, missed: int) -> None:
-    """As long as the plan sent last still acts."""
-    controller, body = Controller(rti, Timing(valid_s=0.35), compile=False), robot(circle())
-    controller.receive_reference(reference(circle()))
-    drive(controller, body, 15.0)
-    plan = controller.telemetry(prepare_us=0, feedback_us=0, latency_us=0, slack_s=0)
-    shifts: list[int] = []
-    shift = rti.shift
-    monkeypatch.setattr(rti, "shift", lambda: shifts.append(1) or shift())
-    monkeypatch.setattr(rti, "reset", lambda *_: pytest.fail("it started anew"))
-    for _ in range(missed):
-        body.tick()
-    state = body.tick()
-    x = plan.x[missed + 1]  # where the plan would have the robot now, had it been played to the end
-    command = controller.receive_state(dataclasses.replace(state, x=x), body.now_ns)
-    assert command is not None
-    assert len(shifts) == missed - 1  # and one more by the preparation
-    assert controller.skipped == missed
-    assert command.stamp_ns == state.stamp_ns
-    np.testing.assert_array_equal(rti.u_prev, plan.u[missed])
-    np.testing.assert_allclose(command.u[:8], plan.u[1 + missed : 9 + missed], atol=1e-2)  # the horizon has moved on
-
-
-@pytest.mark.parametrize("missed", [2, 5])
-def test_gap_in_which_the_plan_has_run_out_is_followed_by_a_cold_start(
-    on_the_circle: tuple[Controller, Lockstep], rti: Rti, monkeypatch: pytest.MonkeyPatch, missed: int
-) -> None:
-    controller, body = on_the_circle
-    monkeypatch.setattr(rti, "shift", lambda: pytest.fail("a plan that has run out was gone on with"))
-    for _ in range(missed):
-        body.tick()
-    state = body.tick()
-    command = controller.receive_state(state, body.now_ns)
-    assert command is not None
-    notice = controller.notices()[-1]
-    assert notice.code == "gap"
-    assert f"no sample for {missed} periods" in notice.text
-    assert controller.skipped == missed
-    assert command.stamp_ns == state.stamp_ns
-    assert np.all(np.abs(command.u[0] - body.actuator.u) <= STEP)
-
-
-@pytest.mark.parametrize("missed", [7, 50])
-def test_first_state_after_a_long_gap_is_not_answered_for_it_may_have_waited(on_the_circle: tuple[Controller, Lockstep], missed: int) -> None:
-    """How late it is only the robot's clock tells, as far as that is known after so long."""
-    controller, body = on_the_circle
-    for _ in range(missed):
-        body.tick()
-    assert controller.receive_state(body.tick(), body.now_ns) is None
-    assert controller.notices()[-1].code == "gap"
-    state = body.tick()
-    command = controller.receive_state(state, body.now_ns)
-    assert command is not None
-    assert command.stamp_ns == state.stamp_ns
-
-
-@pytest.mark.parametrize("outage_s", [0.5, 1.1, 1.5, 4.0])
-def test_outage_recovers_within_three_samples(on_the_circle: tuple[Controller, Lockstep], outage_s: float) -> None:
-    """Of the robot's states; one longer than the horizon too."""
-    controller, body = on_the_circle
-    start = 1e-9 * body.now_ns
-    lost = drive(controller, body, start + outage_s, sees=lambda _: None)
-    assert [c.mode for c in lost.commands] == ([] if outage_s < 0.25 else [Mode.BRAKING])
-    run = drive(controller, body, start + outage_s + 0.5)
-    assert all(mode is Mode.TRACKING for mode in modes(run)[:3])
-    assert not run.refused
-    later = drive(controller, body, start + outage_s + 12.0)
-    assert later.error_mm(circle())[-10:].max() < 0.5
-
-
 def test_states_that_go_back_a_little_are_not_used(on_the_circle: tuple[Controller, Lockstep]) -> None:
     controller, body = on_the_circle
     state = body.tick()
@@ -374,42 +273,6 @@ def test_states_that_go_back_a_little_are_not_used(on_the_circle: tuple[Controll
     for back_ms in (0, 100, 220):
         assert controller.receive_state(dataclasses.replace(state, seq=state.seq + 1, stamp_ns=state.stamp_ns - back_ms * MS), body.now_ns) is None
     assert controller.mode is Mode.TRACKING
-
-
-# The robot's lives.
-
-
-def test_robot_that_is_restarted_is_another_robot(on_the_circle: tuple[Controller, Lockstep]) -> None:
-    """Its clock starts again: a reference with stamps of the old clock is not followed."""
-    controller, _ = on_the_circle
-    controller.notices()
-    again = Restarted(epoch=2)
-    assert again.drive(controller, 0.6).commands == []
-    assert controller.mode is Mode.WAITING
-    assert "robot_restarted" in codes(controller)
-    assert again.drive(controller, 1.0).commands == []
-    controller.receive_reference(reference(circle(), stamp_ns=again.body.now_ns))
-    run = again.drive(controller, 2.0)
-    assert set(modes(run)) == {Mode.TRACKING}
-    assert run.commands[0].state_epoch == 2
-
-
-class Restarted:
-    """Another life of the robot, long after the one before."""
-
-    def __init__(self, epoch: int) -> None:
-        self.body = Lockstep(RobotSettings(pioneer().model, np.array([*circle().pose0, 0.0, 0.0]), SLEW), epoch=epoch)
-
-    def drive(self, controller: Controller, duration_s: float) -> Run:
-        return drive(controller, self.body, duration_s, local_0_ns=10**12)
-
-
-def test_clock_that_jumps_back_is_another_life_too(on_the_circle: tuple[Controller, Lockstep]) -> None:
-    controller, body = on_the_circle
-    state = body.tick()
-    assert controller.receive_state(dataclasses.replace(state, stamp_ns=state.stamp_ns - 3000 * MS), body.now_ns) is None
-    assert "clock_jumped" in codes(controller)
-    assert controller.mode is Mode.WAITING
 
 
 # References.
@@ -494,12 +357,6 @@ def test_reference_that_ends_with_stop_is_braked_after_inside_the_slew_limits(on
     assert set(modes(drive(controller, body, 21.0))) == {Mode.TRACKING}
 
 
-def assert_inside_slew(run: Run, excess: float = 1e-12) -> None:
-    """What acts changes by no more than the slew limits from sample to sample, nor do the rows of any plan."""
-    for rows in (np.array(run.u).reshape(-1, 2), *(command.u for command in run.commands)):
-        assert np.all(np.abs(np.diff(rows, axis=0)) <= (1 + excess) * STEP)
-
-
 def wrapped(psi: Array) -> Array:
     return np.pi - np.remainder(np.pi - psi, 2 * np.pi)
 
@@ -535,152 +392,6 @@ def test_angles_that_wrap_change_nothing() -> None:
         np.testing.assert_allclose(commands(of_state, of_reference), expected, atol=1e-6)
 
 
-# Failures.
-
-
-@pytest.fixture
-def failing(rti: Rti, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
-    """Let the next QPs fail."""
-    left = 0
-    assert rti.active_set is not None
-    solve, solve_qp = rti.active_set.solve, rti.solve_qp
-
-    def gives_up() -> bool:
-        return left == 0 and solve()
-
-    def fails() -> QpStatus:
-        nonlocal left
-        if left == 0:
-            return solve_qp()
-        left -= 1
-        return QpStatus.INFEASIBLE
-
-    def fail(times: int) -> None:
-        nonlocal left
-        left = times
-
-    monkeypatch.setattr(rti.active_set, "solve", gives_up)
-    monkeypatch.setattr(rti, "solve_qp", fails)
-    return fail
-
-
-def test_failed_qps_play_the_shifted_plan_and_then_brake(on_the_circle: tuple[Controller, Lockstep], failing: Callable[[int], None]) -> None:
-    controller, body = on_the_circle
-    good = drive(controller, body, 15.1).commands[-1]
-    failing(100)
-    run = drive(controller, body, 16.0)
-    assert modes(run) == [Mode.FALLBACK] * 2 + [Mode.BRAKING] * 7  # the third would act when the plan has expired
-    for i, command in enumerate(run.commands[:2]):
-        np.testing.assert_array_equal(command.u[0], good.u[i + 1])
-        np.testing.assert_array_equal(command.u[-1], good.u[-1])
-        assert command.valid_until_ns == good.valid_until_ns  # never renewed
-        assert command.status is QpStatus.INFEASIBLE
-    assert [n.code for n in controller.notices() if n.code != "mode"] == ["qp_failed", "no_plan"]
-    assert controller.ladder.fallbacks == 9
-    ramp = run.commands[2]
-    assert_inside_slew(run, excess=0.1)  # the robot brakes in steps of 10 ms
-    np.testing.assert_array_equal(ramp.u[-1], 0.0)
-
-
-def test_shifted_plan_serves_three_samples_at_most(failing: Callable[[int], None], rti: Rti) -> None:
-    """However long it might still act."""
-    controller = Controller(rti, Timing(valid_s=1.0), compile=False)
-    controller.receive_reference(reference(circle()))
-    body = robot(circle())
-    drive(controller, body, 5.0)
-    failing(100)
-    run = drive(controller, body, 6.6)
-    assert MAX_FALLBACK_SAMPLES == 3
-    assert modes(run) == [Mode.FALLBACK] * 3 + [Mode.BRAKING] * 13
-    assert_inside_slew(run)
-    ladder = controller.ladder
-    assert (ladder.shifted, ladder.braked + ladder.rested, ladder.fallbacks) == (3, 13, 16)
-    assert ladder.rested == sum(not command.u.any() for command in run.commands)
-    np.testing.assert_array_equal(run.commands[-1].u, 0.0)
-
-
-def test_robot_and_controller_agree_on_what_acts_after_the_last_valid_plan(
-    on_the_circle: tuple[Controller, Lockstep], failing: Callable[[int], None]
-) -> None:
-    """The plan of a fallback expires; the ramp starts from where the robot's own braking has come to."""
-    controller, body = on_the_circle
-    failing(100)
-    run = drive(controller, body, 15.4)
-    at_the_end = body.u.copy()
-    command = drive(controller, body, 15.5, run=run).commands[-1]
-    assert command.mode is Mode.BRAKING
-    assert np.all(np.abs(command.u[0] - at_the_end) <= STEP + 0.1 * STEP + 1e-12)  # the robot brakes in steps of 10 ms
-
-
-@pytest.mark.parametrize("failures", [1, 3, 4, 30])
-def test_after_failures_one_good_qp_is_enough(on_the_circle: tuple[Controller, Lockstep], failing: Callable[[int], None], failures: int) -> None:
-    controller, body = on_the_circle
-    failing(failures)
-    run = drive(controller, body, 20.0)
-    first = next(i for i, command in enumerate(run.commands) if command.mode is Mode.TRACKING)
-    assert all(mode is Mode.TRACKING for mode in modes(run)[first:])
-    assert first <= (failures if failures <= MAX_FALLBACK_SAMPLES else MAX_FALLBACK_SAMPLES + -(-(failures - MAX_FALLBACK_SAMPLES) // 3))
-    assert_inside_slew(run, excess=0.1)
-    later = drive(controller, body, 30.0)
-    assert later.error_mm(circle())[-10:].max() < 0.5
-
-
-def test_failures_are_counted_anew_after_a_success(on_the_circle: tuple[Controller, Lockstep], failing: Callable[[int], None]) -> None:
-    controller, body = on_the_circle
-    until_s = 15.0
-    for _ in range(4):
-        failing(2)
-        until_s += 0.3
-        run = drive(controller, body, until_s)
-        assert modes(run) == [Mode.FALLBACK] * 2 + [Mode.TRACKING]
-    assert controller.ladder.fallbacks == 8
-
-
-def test_first_qp_that_fails_leaves_the_robot_at_rest(controller: Controller, failing: Callable[[int], None]) -> None:
-    controller.receive_reference(reference(circle()))
-    body = robot(circle())
-    failing(6)
-    run = drive(controller, body, 1.0)
-    assert modes(run)[:2] == [Mode.BRAKING] * 2
-    np.testing.assert_array_equal(run.commands[0].u, 0.0)
-    assert set(modes(run)[2:]) == {Mode.TRACKING}
-
-
-def test_stale_state_is_answered_by_one_ramp(controller: Controller, rti: Rti) -> None:
-    controller = Controller(rti, Timing(stale_s=0.12), compile=False)
-    body = robot(circle())
-    controller.receive_reference(reference(circle()))
-    last = drive(controller, body, 4.0).commands[-1]
-    assert controller.tick(body.now_ns + 120 * MS) is None
-    command = controller.tick(body.now_ns + 125 * MS)
-    assert command is not None
-    assert controller.tick(body.now_ns + 130 * MS) is None
-    assert controller.tick(body.now_ns + 900 * MS) is None
-    assert (command.mode, command.status) == (Mode.BRAKING, QpStatus.NONE)
-    assert command.valid_until_ns == command.stamp_ns + 250 * MS  # a ramp is as right without a state
-    assert command.stamp_ns < last.valid_until_ns  # so that it takes over from a plan that still acts
-    assert command.stamp_ns == pytest.approx(body.now_ns + 125 * MS, abs=MS)
-    assert np.all(np.abs(command.u[0] - last.u[1]) <= STEP)
-    assert_inside_slew(Run(commands=[command]))
-    np.testing.assert_array_equal(command.u[-1], 0.0)
-    notice = controller.notices()[-1]
-    assert (notice.code, notice.severity.name) == ("state_stale", "ERROR")
-    assert "no state for 0.12" in notice.text
-
-
-def test_ramps_are_built_from_commands_never_from_measured_speeds(on_the_circle: tuple[Controller, Lockstep]) -> None:
-    """A speed sensor that lies must not make the robot brake from there."""
-    controller, body = on_the_circle
-    controller.stop("test")
-    state = body.tick()
-    state.x[3:] = 30.0, -30.0
-    sent = controller._sent.at(state.stamp_ns - 1)[0].copy()
-    command = controller.receive_state(state, body.now_ns)
-    assert command is not None
-    assert np.all(np.abs(command.u[0] - sent) <= STEP)
-    assert np.all(np.abs(command.u[0]) <= np.abs(sent))
-
-
 # An operator.
 
 
@@ -703,17 +414,6 @@ def test_stop_is_latched_until_enable(on_the_circle: tuple[Controller, Lockstep]
     assert run.error_mm(circle())[-10:].max() < 0.5
     said = codes(controller)
     assert said.count("stop") == said.count("enable") == 1
-
-
-def test_stop_outlasts_a_restart_of_the_robot(on_the_circle: tuple[Controller, Lockstep]) -> None:
-    controller, _ = on_the_circle
-    controller.stop("by hand")
-    again = Restarted(epoch=2)
-    again.drive(controller, 0.6)
-    controller.receive_reference(reference(circle(), stamp_ns=again.body.now_ns))
-    run = again.drive(controller, 2.0)
-    assert set(modes(run)) == {Mode.STOPPED}
-    assert all(not command.u.any() for command in run.commands)
 
 
 def test_last_command_of_a_life_is_a_standstill(on_the_circle: tuple[Controller, Lockstep]) -> None:
