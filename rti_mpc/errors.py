@@ -24,6 +24,11 @@ class RtiMpcError(Exception):
     """Base class of every error this package raises on purpose."""
 
 
+def reason(error: Exception) -> str:
+    """Return why a file was refused, for a line that names it: without the number and the path that an error of the system repeats."""
+    return str((isinstance(error, OSError) and error.strerror) or error)
+
+
 class OcpError(RtiMpcError):
     """The model or the optimal control problem is ill-posed."""
 

@@ -27,7 +27,7 @@ import scipy.sparse as sp
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.status import QpStatus
-from rti_mpc.errors import ConfigError, MessageError
+from rti_mpc.errors import ConfigError, MessageError, reason
 from rti_mpc.rti.qp.osqp import Solver
 from rti_mpc.rti.qp.qp import Guess, Qp, QpData, Step
 from rti_mpc.rti.qp.simultaneous import simultaneous
@@ -139,7 +139,7 @@ class QpCase:
             case = cls.decode(path.read_bytes())
             check_about(case.about, PLACE)
         except (OSError, MessageError) as error:
-            raise ConfigError(f"{path} must be a case, as rti-mpc why --case writes it, got {error}") from error
+            raise ConfigError(f"{path} must be a case, as rti-mpc why --case writes it: {reason(error)}") from error
         return case
 
 

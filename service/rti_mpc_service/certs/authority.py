@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from rti_mpc.errors import ConfigError
+from rti_mpc.errors import ConfigError, reason
 
 SKEW = timedelta(hours=1)  # by which clocks of two hosts may differ when a certificate is new
 
@@ -65,7 +65,7 @@ class Authority:
             certificate = x509.load_pem_x509_certificate((folder / "authority.pem").read_bytes())
             return cls(certificate, serialization.load_pem_private_key((folder / "authority.key").read_bytes(), None))
         except (OSError, ValueError, TypeError) as error:
-            raise ConfigError(f"certs: --authority must be a folder with authority.pem and authority.key, got {folder}: {error}") from error
+            raise ConfigError(f"certs: --authority must be a folder with authority.pem and authority.key, got {folder}: {reason(error)}") from error
 
     def certify(self, name: str, public_key: Any, days: float, addresses: Iterable[str] = (), now: datetime | None = None) -> Any:
         """
@@ -128,7 +128,7 @@ def read_certificate(path: Path) -> Any:
     try:
         return x509.load_pem_x509_certificate(path.read_bytes())
     except (OSError, ValueError) as error:
-        raise ConfigError(f"certs: {path} must be a certificate, PEM, got: {error}") from error
+        raise ConfigError(f"certs: {path} must be a certificate, PEM: {reason(error)}") from error
 
 
 def name_of(certificate: Any) -> str:

@@ -8,7 +8,7 @@ import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rti_mpc.errors import ConfigError
+from rti_mpc.errors import ConfigError, reason
 from rti_mpc.whole_file import replaced
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.certs.access import host_and_port, zenoh_configuration
@@ -85,7 +85,7 @@ def write(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
             with os.fdopen(os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
                 file.write(content)
     except OSError as error:
-        raise ConfigError(f"certs: {folder} must be a folder that can be written, got: {error}") from error
+        raise ConfigError(f"certs: {folder} must be a folder that can be written: {reason(error)}") from error
     return [folder / name for name in files]
 
 
@@ -108,7 +108,7 @@ def renew(authority: Authority, folder: Path, days: float) -> list[Path]:
             with replaced(path) as fresh:
                 fresh.write(content)
     except OSError as error:
-        raise ConfigError(f"certs: {folder} must be a folder that can be written, got: {error}") from error
+        raise ConfigError(f"certs: {folder} must be a folder that can be written: {reason(error)}") from error
     return paths
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rti_mpc.errors import ConfigError, MessageError
-from rti_mpc.recording import Recording, export
+from rti_mpc.errors import ConfigError
+from rti_mpc.recording import export
+from rti_mpc_service.opened import opened
 
 
 def main(path: Path, folder: Path, *, horizon: bool) -> int:
@@ -16,10 +17,7 @@ def main(path: Path, folder: Path, *, horizon: bool) -> int:
     Raises:
         ConfigError: It is no recording, or the files cannot be written.
     """
-    try:
-        recording = Recording(path)
-    except (OSError, MessageError) as error:
-        raise ConfigError(f"export needs a recording: {error}") from error
+    recording = opened(path)
     try:
         written = export(recording, folder, horizon=horizon)
     except OSError as error:

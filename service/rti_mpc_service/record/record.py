@@ -24,7 +24,7 @@ from typing import Any
 
 from rti_mpc.contract.epoch import MAX_SEQ_GAP, NUMBER_BITS
 from rti_mpc.contract.message import Notice, Severity
-from rti_mpc.errors import ConfigError, MessageError
+from rti_mpc.errors import ConfigError, MessageError, reason
 from rti_mpc.recording.host import HOST
 from rti_mpc.recording.repair import repair
 from rti_mpc.wire import document
@@ -290,7 +290,7 @@ def repaired(path: Path, to: Path) -> int:
     try:
         count = repair(path, to)
     except (OSError, MessageError) as error:
-        raise ConfigError(f"--repair must be a recording that can be read and written: {error}") from error
+        raise ConfigError(f"--repair must be a recording that can be read and written, got {path}: {reason(error)}") from error
     print(f"{to}: {count} messages")
     return 0
 

@@ -13,6 +13,10 @@ from rti_mpc_service.replay.rebuild import Journaled, entries
 from rti_mpc_service.replay.robot_time import check_time, first_stamp
 
 
+class Unreached(ConfigError):
+    """No replay reaches a command: the recording lacks a snapshot before it, or an entry since then."""
+
+
 @dataclass(frozen=True)
 class Place:
     """
@@ -27,18 +31,19 @@ class Place:
     command: Command
 
 
-def choose(path: Path, journals: Sequence[Journaled], at_s: float | None, seq: int | None) -> tuple[Journaled, Place]:
+def choose(name: str | Path, journals: Sequence[Journaled], at_s: float | None, seq: int | None) -> tuple[Journaled, Place]:
     """
     Return the command that is asked for, and the journal of the controller that led then.
 
     Args:
-        path: The recording.
+        name: What a refusal calls the recording.
         journals: Controllers of the recording that are asked about.
         at_s: Time of the robot's clock; the first command from then on is meant.
         seq: Number of the command instead; None without a time: the last one whose sample is followed by another.
 
     Raises:
         ConfigError: There is no such command, or there are several: of several robots, or of the same number by several controllers.
+        Unreached: There are not two commands, and neither a time nor a number is given.
     """
     robots = sorted({journal.robot for journal in journals})
     if len(robots) > 1:
@@ -49,7 +54,8 @@ def choose(path: Path, journals: Sequence[Journaled], at_s: float | None, seq: i
     if not found:
         what = "two commands" if at_s is None else f"a command that acts from {at_s:.3f} s on"
         what = what if seq is None else f"a command {seq}"
-        raise ConfigError(f"{path} must hold {what}, in the journal of a controller that led then")
+        refused = Unreached if at_s is None and seq is None else ConfigError
+        raise refused(f"{name} must hold {what}, in the journal of a controller that led then")
     if seq is not None and len(found) > 1:
         each = ", ".join(f"{journal.owner} at {1e-9 * place.command.stamp_ns:.3f} s" for journal, place in found)
         raise ConfigError(f"--controller must say whose command {seq} is explained: {each}")

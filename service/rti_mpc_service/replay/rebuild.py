@@ -22,12 +22,12 @@ from rti_mpc.control.controller import Controller
 from rti_mpc.errors import ConfigError
 from rti_mpc.journal.entry import JournalEntry, decode_entries
 from rti_mpc.journal.replay import Difference, Replay, replay
-from rti_mpc.recording.reader import Recording
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.config.build import build_controller, build_ocp, build_rti, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.fit import check_model, check_stop
 from rti_mpc_service.config.schema import Config
+from rti_mpc_service.opened import opened
 from rti_mpc_service.origin import model_equations, model_source
 from rti_mpc_service.replay.coverage import Heard, heard_commands
 from rti_mpc_service.replay.maker import changes, fitting, versions
@@ -75,7 +75,7 @@ class Rebuilt:
     others: list[str]
 
 
-def journals(path: Path, robot: str | None = None, owner: int | None = None) -> list[Journaled]:
+def journals(path: Path, robot: str | None = None, owner: int | None = None, *, name: str = "") -> list[Journaled]:
     """
     Return the controllers of a recording, in the order in which they appear.
 
@@ -83,14 +83,12 @@ def journals(path: Path, robot: str | None = None, owner: int | None = None) -> 
         path: The recording.
         robot: Name of a robot; None: all.
         owner: Number of a controller; None: all.
+        name: What a refusal calls the recording; empty: its path.
 
     Raises:
         ConfigError: There is none, or the recording cannot be read.
     """
-    try:
-        recording = Recording(path)
-    except OSError as error:
-        raise ConfigError(f"{path} must be a recording that can be read: {error.strerror}") from error
+    recording = opened(path)
     found: dict[tuple[str, int], list[Journal]] = {}
     for recorded in recording.messages(None, ("journal",)):
         message = recorded.message
@@ -99,7 +97,7 @@ def journals(path: Path, robot: str | None = None, owner: int | None = None) -> 
     if not chosen:
         known = ", ".join(f"--robot {name} --controller {number}" for name, number in found) or "none"
         whose = "a robot" if robot is None else repr(robot)
-        raise ConfigError(f"{path} must hold the journal of {whose}{'' if owner is None else f', controller {owner}'}, got {known}")
+        raise ConfigError(f"{name or path} must hold the journal of {whose}{'' if owner is None else f', controller {owner}'}, got {known}")
     heard = heard_commands(recording, robot)
     return [
         Journaled(name, number, in_order(messages), files_of(recording.attachments, f"{name}/{number}/"), heard.get((name, number), {}))

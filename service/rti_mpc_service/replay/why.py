@@ -28,7 +28,7 @@ from rti_mpc.recording.reader import Recording
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS
 from rti_mpc_service.case import QpCase, about_sample, solver_of, take
 from rti_mpc_service.json_text import json_text
-from rti_mpc_service.replay.place import Place, choose
+from rti_mpc_service.replay.place import Place, Unreached, choose
 from rti_mpc_service.replay.plan import acting_bounds, cost_terms
 from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, journals, rebuild, repeat
 from rti_mpc_service.replay.trouble import placed
@@ -59,6 +59,7 @@ def main(
     trust: bool = False,
     as_json: bool = False,
     case_path: Path | None = None,
+    name: str = "",
 ) -> int:
     """
     Explain one command of a recording: the last one whose sample is followed by another, if neither a time nor a number is given.
@@ -73,17 +74,19 @@ def main(
         trust: Whether to run the attached source of a model.
         as_json: Whether to print JSON.
         case_path: File for the sample's QP as a case; None: none.
+        name: What a refusal calls the recording; empty: its path.
 
     Returns:
         Exit status 0.
 
     Raises:
         ConfigError: There is no such command, there are several, or it cannot be repeated here.
+        Unreached: No replay reaches it.
     """
     if at_s is not None and seq is not None:
         raise ConfigError("why must be asked with --at TIME or with --seq NUMBER, not with both")
-    found = journals(path, robot, owner)
-    journal, place = choose(path, found, at_s, seq)
+    found = journals(path, robot, owner, name=name)
+    journal, place = choose(name or path, found, at_s, seq)
     facts, case = explained(journal, rebuild(journal, folder=folder, trust=trust), place)
     if case_path is not None:
         if case is None:
@@ -101,7 +104,7 @@ def explain(journal: Journaled, built: Rebuilt, place: Place) -> dict[str, Any]:
     Return the facts about a command.
 
     Raises:
-        ConfigError: No replay reaches it.
+        Unreached: No replay reaches it.
     """
     return explained(journal, built, place)[0]
 
@@ -111,7 +114,7 @@ def explained(journal: Journaled, built: Rebuilt, place: Place) -> tuple[dict[st
     Return the facts about a command, and the QP of its sample, if it had one.
 
     Raises:
-        ConfigError: No replay reaches it.
+        Unreached: No replay reaches it.
     """
     controller, on = built.controller, Replay(built.controller, built.rti)
     told: deque[dict[str, Any]] = deque(maxlen=64)
@@ -133,9 +136,9 @@ def explained(journal: Journaled, built: Rebuilt, place: Place) -> tuple[dict[st
             if prepared == 2 or not place.command.mode.planned:
                 break
     if not facts:
-        raise ConfigError(
-            f"command {place.command.seq} must follow a snapshot without a gap, got {', '.join(map(str, on.outcome.gaps)) or 'none before it'}"
-        )
+        missing = ", ".join(map(str, on.outcome.gaps)) or "no snapshot before it"
+        needed = "a replay begins at a snapshot of the controller, and needs every entry of its journal from there on"
+        raise Unreached(f"command {place.command.seq} cannot be repeated: {needed}, got {missing}")
     facts["second_opinion"] = second_opinion(controller.telemetry(**NO_TIMES), place.command.seq)
     for bound in facts["bounds"]:  # the replay has ended: the arrays of its controller are free
         bound["without"] = None if case is None else without(case, built.rti, built.config, bound)

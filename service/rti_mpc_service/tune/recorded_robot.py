@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, State, Telemetry
 from rti_mpc.contract.status import Mode
-from rti_mpc.errors import ConfigError, MessageError
+from rti_mpc.errors import ConfigError, MessageError, reason
 from rti_mpc.model.model import Model
 from rti_mpc.model.path_following import window_place
 from rti_mpc.wire.cdr import HEADER_BYTES
@@ -95,7 +95,7 @@ def read(name: str, robot: str, model: Model, dt_s: float, tell: Callable[[str],
     Raises:
         ConfigError: It is no recording of this robot.
     """
-    from rti_mpc.recording import Recording  # needs the extra `record`
+    from rti_mpc_service.opened import opened  # needs the extra `record`
 
     if window_place(model) is not None:
         raise ConfigError(f"--scenario {name} must be of a robot that follows references in time, {robot} follows a path")
@@ -103,7 +103,7 @@ def read(name: str, robot: str, model: Model, dt_s: float, tell: Callable[[str],
     samples: list[Followed] = []
     sent: dict[str, list[Recorded]] = {"command": [], "actuation": []}
     try:
-        recording = Recording(Path(name))
+        recording = opened(Path(name))
         if robot not in recording.robots:
             raise ConfigError(f"{name} must hold the robot {robot}, got {', '.join(recording.robots) or 'none'}")
         for count, each in enumerate(recording.messages(robot, ("state", "telemetry", *sent))):
@@ -116,7 +116,7 @@ def read(name: str, robot: str, model: Model, dt_s: float, tell: Callable[[str],
             elif isinstance(message, Telemetry) and message.x0.size == model.nx and message.y_ref.shape[-1] == model.ny:
                 samples.append(Followed(message.epoch, message.stamp_ns, message.state_stamp_ns, message.mode, message.y_ref))
     except (OSError, MessageError) as error:
-        raise ConfigError(f"{name} must be a recording: {error}") from error
+        raise ConfigError(f"{name} must be a recording that can be read: {reason(error)}") from error
     if not states or not samples:
         raise ConfigError(f"{name} must hold states of {model.nx} and telemetry of {model.ny} outputs of {robot}, as its file says, got none")
     return RecordedRobot(name, model.nu, samples[0].stamp_ns, states, longest(samples, dt_s), sent["actuation"] or sent["command"])

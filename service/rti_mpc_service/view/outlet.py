@@ -17,7 +17,7 @@ import pyarrow as pa
 import rerun as rr
 
 from rti_mpc.contract.message import Notice, Reference, Severity
-from rti_mpc.errors import ConfigError
+from rti_mpc.errors import ConfigError, reason
 from rti_mpc.wire.info import Info
 from rti_mpc_service.view.recording import Entry
 from rti_mpc_service.view.scene import Scene
@@ -176,7 +176,7 @@ def file_outlet(path: Path, name: str, roots: Sequence[str] = ()) -> Outlet:
         path.write_bytes(b"")
         stream.save(path, write_footer=False)  # a footer would make Rerun keep data of every chunk in memory until the end
     except (OSError, RuntimeError) as error:
-        raise ConfigError(f"rerun-save must be a file that can be written, got {str(path)!r} ({error})") from error
+        raise ConfigError(f"rerun-save must be a file that can be written, got {str(path)!r} ({reason(error)})") from error
     once = iter([stream])
 
     def open_stream() -> rr.RecordingStream:

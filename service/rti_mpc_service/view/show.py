@@ -7,7 +7,7 @@ from pathlib import Path
 
 import rerun as rr
 
-from rti_mpc.errors import ConfigError, MessageError
+from rti_mpc.errors import ConfigError, reason
 from rti_mpc.recording import Recording
 from rti_mpc_service.view.outlet import new_stream
 from rti_mpc_service.view.played import played
@@ -16,19 +16,6 @@ from rti_mpc_service.view.scene import Scene
 
 FLUSH_TIMEOUT_S = 60.0
 SEND_NS = 10_000_000_000  # of the robot's time that is sent together: in one frame a viewer takes in chunks for some ms alone, however long it draws
-
-
-def opened(path: Path) -> Recording:
-    """
-    Open a recording.
-
-    Raises:
-        ConfigError: It is none, or cannot be read.
-    """
-    try:
-        return Recording(path)
-    except (OSError, MessageError) as error:
-        raise ConfigError(f"view needs a recording: {error}") from error
 
 
 def draw_into_file(recording: Recording, path: Path) -> None:
@@ -44,7 +31,7 @@ def draw_into_file(recording: Recording, path: Path) -> None:
         path.write_bytes(b"")
         stream.save(path)
     except (OSError, RuntimeError) as error:
-        raise ConfigError(f"rerun-save must be a file that can be written, got {str(path)!r} ({error})") from error
+        raise ConfigError(f"rerun-save must be a file that can be written, got {str(path)!r} ({reason(error)})") from error
     draw(recording, stream)
 
 

@@ -161,7 +161,8 @@ def show(path: Path, screens: Screens, *, stop: Event | None = None) -> int:
     Raises:
         ConfigError: It is no recording, an address or a file is not valid, or no viewer answers.
     """
-    from rti_mpc_service.view.show import draw_in_viewer, draw_into_file, opened  # needs the extra `record`
+    from rti_mpc_service.opened import opened  # needs the extra `record`
+    from rti_mpc_service.view.show import draw_in_viewer, draw_into_file
 
     recording, url = opened(path), screens.url
     if screens.rerun_save is not None:

@@ -90,7 +90,7 @@ def test_what_is_no_recording_of_this_robot_is_refused(run: Path, tmp_path: Path
     (tmp_path / "none.mcap").write_bytes(b"nothing")
     for wrong, name, duration_s, words in (
         (config.model_copy(update={"robot": "ant"}), run, None, "must hold the robot ant, got pioneer"),
-        (config, tmp_path / "none.mcap", None, "must be a recording"),
+        (config, tmp_path / "none.mcap", None, r"none\.mcap must be an MCAP file, got one that begins with b'nothing'"),
         (config, run, 2.0, "40 samples that follow a reference without a break in each part, got 20"),
     ):
         with pytest.raises(ConfigError, match=words):
