@@ -35,9 +35,9 @@ CANDIDATES_PER_PERIOD = 4
 FORGETTING_FACTOR = 0.98  # gamma, applied at each informative step: about the last fifty of them count
 MIN_ERROR_SPREAD = 0.1  # a step is informative if the normalised squared errors of the candidates differ by more than this
 MIN_COST_ADVANTAGE = 20.0  # another candidate is taken if its cost J is lower by this much: noise alone would have to be 4.5 sigma
-MAX_STATE_ERROR = 1e6  # in the unit of the state: a prediction error this large is not used
+MAX_STATE_ERROR = 1e6  # relative to the scale of the state: a prediction error this large is not used
 CONFIRMED_REPORTS = 10  # after this many confirmed reports in a row the estimate is kept as a good one
-MIN_STATE_DEVIATION = 1e-4  # lower limit of sigma_i, in the unit of the state: smaller errors do not tell candidates apart
+MIN_STATE_DEVIATION = 1e-4  # lower limit of sigma_i, relative to the scale of the state: smaller errors do not tell candidates apart
 
 
 class DelayEstimator:
@@ -49,7 +49,7 @@ class DelayEstimator:
         p: Parameters of the model, shape ``(np,)``; nominal unless written.
     """
 
-    def __init__(self, model: Model, dt_ns: int, most_ns: int, *, measured: Sequence[int] | None = None, compile: bool = True) -> None:
+    def __init__(self, model: Model, dt_ns: int, most_ns: int, *, scale: Array, measured: Sequence[int] | None = None, compile: bool = True) -> None:
         """
         Begin with no delay.
 
@@ -57,11 +57,13 @@ class DelayEstimator:
             model: The model to predict with.
             dt_ns: Period of the commands.
             most_ns: Largest delay.
+            scale: Scale of each state, see `rti_mpc.rti.scale`, shape ``(nx,)``: what its errors are relative to.
             measured: Indices of the states by which candidates are compared; None: all.
             compile: Whether to compile the integrator.
         """
         self.delay_ns = 0
         self._measured = list(range(model.nx) if measured is None else measured)
+        self._scale: Array = scale[self._measured]
         self._dt_ns = dt_ns
         self._candidates = [round(j * dt_ns / CANDIDATES_PER_PERIOD) for j in range(CANDIDATES_PER_PERIOD * most_ns // dt_ns + 1)]  # ns
         self._costs: Array = np.zeros(len(self._candidates))
@@ -154,7 +156,7 @@ class DelayEstimator:
         self._estimate()
 
     def _errors(self, x: Array, from_ns: int, x_next: Array, to_ns: int) -> Array:
-        """Return the error of each candidate over one step, shape ``(candidates, measured)``; NaN where at times no plan would have acted."""
+        """Return the relative errors of the candidates over one step, shape ``(candidates, measured)``; NaN where no plan would have acted."""
         known: dict[tuple[int, ...], Array] = {}
         errors = []
         for delay_ns in self._candidates:
@@ -162,7 +164,7 @@ class DelayEstimator:
             if starts not in known:
                 known[starts] = x_next - self._x if self._play(starts, x, from_ns, to_ns) else np.full_like(x, np.nan)
             errors.append(known[starts])
-        return np.array(errors)[:, self._measured]
+        return np.array(errors)[:, self._measured] / self._scale
 
     def _play(self, starts: tuple[int, ...], x: Array, t_ns: int, to_ns: int) -> bool:
         """Predict with commands that begin to act at these times; return whether one of them acted all the time."""

@@ -9,12 +9,13 @@ weights, or after a difference.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
 
+from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, Journal, JournalKind
 from rti_mpc.control.controller import Controller
 from rti_mpc.errors import JournalError, RtiMpcError
@@ -38,7 +39,7 @@ class Difference:
         field: Name of the first field that differs; empty if one of the two commands does not exist.
         recorded: Recorded value, of an array the first element that differs.
         replayed: Value of the replay.
-        size: Largest difference of an element, relative to 1 + its magnitude; infinity where values cannot be compared.
+        size: Largest difference of an element, relative to its scale + its magnitude; infinity where values cannot be compared.
     """
 
     seq: int
@@ -123,6 +124,7 @@ class Replay:
         self.outcome = ReplayOutcome()
         self.wanted: tuple[Command, Command] | None = None
         self._rti = rti
+        self._scales = scales(rti)
         self._camera = Camera(controller)
         self._override: dict[str, Any] = {}
         self._proposal: Command | None = None
@@ -189,7 +191,7 @@ class Replay:
         """Compare the proposal with the recorded command, which then counts as sent."""
         proposal, self._proposal = self._proposal, None
         self.outcome.samples += 1
-        found = difference(recorded, proposal)
+        found = difference(recorded, proposal, self._scales)
         if proposal is None:
             proposal = recorded
         self.wanted = copy_of(proposal), recorded
@@ -261,8 +263,15 @@ def copy_of(command: Command) -> Command:
     return Command(*(getattr(command, name) for name in FIELDS))
 
 
-def difference(recorded: Command, replayed: Command | None) -> Difference | None:
-    """Return the first difference of two commands in any bit; None if they are the same."""
+def scales(rti: Rti) -> dict[str, Array]:
+    """Return what differences of the arrays of a command are relative to, by field: the solvers' scales of states and inputs."""
+    nx, nu, solved_nx = rti.ocp.model.nx, rti.ocp.model.nu, rti.problem.model.nx
+    x, u = rti.scale[:nx], rti.scale[solved_nx : solved_nx + nu]
+    return {"u": u, "u_rest": u, "x_rest": x, "K": u[:, None] / x}
+
+
+def difference(recorded: Command, replayed: Command | None, scales: Mapping[str, Array]) -> Difference | None:
+    """Return the first difference of two commands in any bit, its size relative to scales by field; None if they are the same."""
     if replayed is None:
         return Difference(recorded.seq, recorded.stamp_ns, "", "a command", "none", np.inf)
     for name in FIELDS:
@@ -278,7 +287,7 @@ def difference(recorded: Command, replayed: Command | None) -> Difference | None
         unequal = np.ascontiguousarray(ours).view(np.uint64) != np.ascontiguousarray(theirs).view(np.uint64)
         if unequal.any():
             first = tuple(int(i) for i in np.argwhere(unequal)[0])
-            size = float((np.abs(ours - theirs) / (1.0 + np.abs(theirs))).max())
+            size = float((np.abs(ours - theirs) / (scales[name] + np.abs(theirs))).max())
             place = f"{name}[{', '.join(map(str, first))}]"
             return Difference(recorded.seq, recorded.stamp_ns, place, float(theirs[first]), float(ours[first]), size)
     return None

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -78,7 +81,7 @@ def test_delay_is_found_beside_an_observer_from_what_is_measured(seed: int) -> N
 
 
 def test_estimator_compares_only_what_is_measured() -> None:
-    estimator = DelayEstimator(double_integrator().model, DT, MAX_DELAY_PERIODS * DT, measured=[0], compile=False)
+    estimator = DelayEstimator(double_integrator().model, DT, MAX_DELAY_PERIODS * DT, scale=np.ones(2), measured=[0], compile=False)
     one = Command(1, 1, 0, 1, 0, 0, 250 * MS, 0, Mode.TRACKING, QpStatus.SOLVED, DT, np.ones((6, 1)))
     estimator.sent(one)
     estimator.observe(np.zeros(2), 0)
@@ -123,25 +126,41 @@ def played(actuator: Actuator, x: np.ndarray, from_ns: int, to_ns: int) -> np.nd
     return x
 
 
-@pytest.mark.parametrize("delay_ms", [0, 30, 75, 140])
-@pytest.mark.parametrize("noise", [0.0, 2e-3])
-def test_estimator_by_itself_finds_the_delay_of_random_inputs(delay_ms: int, noise: float) -> None:
+def estimated(delay_ms: int, noise: float, unit: float = 1.0) -> DelayEstimator:
+    """What is learnt from 100 states of a mass under random inputs, all in units of which 1 m/s^2 is so many."""
     rng = np.random.default_rng(delay_ms)
-    estimator = DelayEstimator(double_integrator().model, DT, MAX_DELAY_PERIODS * DT, compile=False)
+    model = double_integrator().model
+    model = replace(model, f_expl_expr=ca.vertcat(model.x[1], unit * model.u))
+    estimator = DelayEstimator(model, DT, MAX_DELAY_PERIODS * DT, scale=np.full(2, unit), compile=False)
     actuator = Actuator(np.zeros(1), np.full(1, np.inf), epoch=1, delay_ns=delay_ms * MS)
     x = np.zeros(2)
     for k in range(100):
         now_ns = k * DT
-        estimator.observe(x + noise * rng.standard_normal(2), now_ns)
+        estimator.observe(unit * (x + noise * rng.standard_normal(2)), now_ns)
         command = Command(1, k + 1, now_ns, 1, k, now_ns, now_ns + 250 * MS, 0, Mode.TRACKING, QpStatus.SOLVED, DT, rng.uniform(-1, 1, (6, 1)))
         estimator.sent(command)
         actuator.accept(command, now_ns)
         x = played(actuator, x, now_ns, now_ns + DT)
-    assert 1e-6 * estimator.delay_ns == pytest.approx(delay_ms, abs=10.0)
+    return estimator
+
+
+@pytest.mark.parametrize("delay_ms", [0, 30, 75, 140])
+@pytest.mark.parametrize("noise", [0.0, 2e-3])
+def test_estimator_by_itself_finds_the_delay_of_random_inputs(delay_ms: int, noise: float) -> None:
+    assert 1e-6 * estimated(delay_ms, noise).delay_ns == pytest.approx(delay_ms, abs=10.0)
+
+
+@pytest.mark.parametrize("unit", [2.0**-20, 2.0**10], ids=["2^-20", "2^10"])
+@pytest.mark.parametrize("noise", [0.0, 2e-3])
+def test_same_is_learnt_in_any_unit(noise: float, unit: float) -> None:
+    """Factors are powers of two, so that nothing is rounded."""
+    one, other = estimated(75, noise), estimated(75, noise, unit)
+    np.testing.assert_array_equal(one._costs, other._costs)
+    assert one.delay_ns == other.delay_ns
 
 
 def test_inputs_that_do_not_change_say_nothing() -> None:
-    estimator = DelayEstimator(double_integrator().model, DT, MAX_DELAY_PERIODS * DT, compile=False)
+    estimator = DelayEstimator(double_integrator().model, DT, MAX_DELAY_PERIODS * DT, scale=np.ones(2), compile=False)
     for k in range(100):
         estimator.observe(np.array([0.01 * k, 0.1]), k * DT)
         estimator.sent(Command(1, k + 1, k * DT, 1, k, k * DT, k * DT + 250 * MS, 0, Mode.TRACKING, QpStatus.SOLVED, DT, np.zeros((6, 1))))
@@ -149,7 +168,7 @@ def test_inputs_that_do_not_change_say_nothing() -> None:
 
 
 def test_another_life_of_the_robot_keeps_what_was_learnt() -> None:
-    estimator = DelayEstimator(double_integrator().model, DT, MAX_DELAY_PERIODS * DT, compile=False)
+    estimator = DelayEstimator(double_integrator().model, DT, MAX_DELAY_PERIODS * DT, scale=np.ones(2), compile=False)
     estimator.delay_ns = 75 * MS
     estimator.observe(np.zeros(2), 10**12)
     estimator.clear()

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rti_mpc.contract.message import End, Journal, JournalKind, Reference
+from rti_mpc.contract.message import Command, End, Journal, JournalKind, Reference
+from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.control.observer import Disturbance, Observer, ObserverSettings
 from rti_mpc.errors import JournalError
 from rti_mpc.journal.book import Book
-from rti_mpc.journal.replay import Replay, ReplayOutcome, replay
+from rti_mpc.journal.replay import Replay, ReplayOutcome, difference, replay
 from rti_mpc.journal.snapshot import ARRAY, PINNED, Camera, Snapshot
 from rti_mpc.model.disturbance import with_disturbances
 from rti_mpc.rti.ocp import Ocp
@@ -216,3 +217,20 @@ def test_weight_changed_by_a_billionth_is_found_at_its_first_sample_and_open_loo
     assert outcome.samples == len(lived.commands)
     assert outcome.differing > 20
     assert outcome.size < 1.0, "each sample goes on from the recorded commands"
+
+
+@pytest.mark.parametrize("unit", [2.0**-20, 2.0**10], ids=["2^-20", "2^10"])
+def test_difference_has_the_same_size_in_any_unit(unit: float) -> None:
+    """Of inputs, and of a way to rest with its gain, whose unit is the input's over the state's."""
+    x, u, K = np.full((3, 2), 0.3), np.full((3, 1), 0.1), np.full((1, 2), 2.0)
+
+    def size(name: str, one: float) -> float:
+        given = {"u": one * u, "u_rest": one * u, "x_rest": x, "K": one * K}
+        recorded = Command(1, 1, 0, 1, 1, 0, 250 * MS, 0, Mode.TRACKING, QpStatus.SOLVED, 100 * MS, rest_period_ns=100 * MS, **given)
+        scales = {"u": np.full(1, one), "u_rest": np.full(1, one), "x_rest": np.ones(2), "K": np.full((1, 2), one)}
+        found = difference(recorded, replace(recorded, **{name: 1.25 * given[name]}), scales)
+        assert found is not None
+        return found.size
+
+    for name in ("u", "u_rest", "x_rest", "K"):
+        assert 0.0 < size(name, 1.0) == size(name, unit)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.contract.approach import TOLERANCE_SHARE
 from rti_mpc.rti.linearization import constraints, input_reference
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import COST_WEIGHTS, Rti
@@ -35,11 +36,12 @@ def acting_bounds(rti: Rti, config: Config) -> list[dict[str, Any]]:
             low, high = (np.broadcast_to(weights[name], values.shape)[:, j] for name in (lower, upper))
             for side, bound, acts in zip(SIDES, (low, high), at_bounds(values[:, j], low, high, units[signal.name]), strict=True):
                 found += _acting(kind, signal.name, signal.unit, side, bound[acts], rti.ocp.starts[acts], 0.0)
-    for soft in softened(rti, config):
+    scales = rti.scale[-rti.problem.ng :] if rti.problem.ng else ()
+    for soft, scale in zip(softened(rti, config), scales, strict=True):
         of = units[soft.name] if soft.kind == "second difference" else unit(soft.lower, soft.upper)
         acting, over = at_bounds(soft.values, soft.lower, soft.upper, of), (soft.lower - soft.values, soft.values - soft.upper)
         for side, bound, acts, beyond in zip(SIDES, (soft.lower, soft.upper), acting, over, strict=True):
-            violation = max(0.0, float(beyond.max()))
+            violation = most if (most := float(beyond.max())) > TOLERANCE_SHARE * scale else 0.0
             found += _acting(soft.kind, soft.name, soft.unit, side, bound[acts], soft.first + np.flatnonzero(acts), violation)
     return found
 

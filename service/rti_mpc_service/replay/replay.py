@@ -37,7 +37,7 @@ from rti_mpc_service.replay.drive import Drive, MakePlacedBody, drive
 from rti_mpc_service.replay.rebuild import CONFIGURATION, Journaled, Rebuilt, journals, rebuild, repeat
 from rti_mpc_service.replay.robot_time import check_time, first_stamp
 
-TOLERANCE = 1e-6  # of commands on another machine, relative to 1 + their magnitude
+TOLERANCE = 1e-6  # of commands on another machine, relative to their scale + their magnitude
 TUNABLE = ("ocp.weights.", "ocp.bounds.")  # beginnings of the keys that `--set` takes
 
 
@@ -93,7 +93,7 @@ def main(
         assignments: Other weights and bounds, each ``key=value`` as in the TOML file.
         folder: Where a model of the user's own is looked for.
         trust: Whether to run the attached source of a model.
-        tolerance: Largest difference on another machine, relative to 1 + the magnitude.
+        tolerance: Largest difference on another machine, relative to scale + magnitude.
         json_path: File for the results.
         make_body: Maker of the simulated robot that is driven in closed loop, with `assignments`, if any; None: open loop.
         out: Folder for a figure and a recording of each closed loop beside the recorded one.
@@ -124,7 +124,7 @@ def main(
         for line in built.others:
             print(f"  {line}")
         if built.others and not changed:
-            print(f"  so commands are compared within {tolerance:g}, relative to 1 + their magnitude, not bit by bit")
+            print(f"  so commands are compared within {tolerance:g}, relative to half their range + their magnitude, not bit by bit")
         override = overridden(built.config, built.rti.ocp, assignments)  # refused before anything is replayed
         recorded = None if make_body is None else Drive(built, first_stamp(start_s))
         account = play(journal, built, start_s, changed, recorded)

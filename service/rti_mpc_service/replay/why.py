@@ -38,7 +38,6 @@ LOOK_BACK_S = 10.0  # of the robot's time, over which the events before a comman
 MAX_EVENTS = 8  # of those, the last ones
 MAX_VALUES = 4  # of a bound that differs by stage, told each by itself
 MIN_COST_SHARE = 0.005  # of the cost, below which a term is left out of the lines
-ROUNDING = 1e-6  # relative: a violation below this is none
 RUNGS = {
     Mode.TRACKING: "a plan of its own",
     Mode.HOLDING: "a plan of its own",
@@ -351,8 +350,7 @@ def bound_text(bound: Mapping[str, Any]) -> str:
         way = "rises" if bound["side"] == "upper" else "falls"
         return f"{bound['name']} {way} as fast as it may, {where}"
     name = f"the second difference of {bound['name']}" if second else bound["name"]
-    over = bound["violation"] > ROUNDING * max(1.0, *map(abs, bound["bound"]))
-    return f"{name} at its {bound['side']} bound, {where}" + (f", exceeded by {bound['violation']:.3g} {bound['unit']}" if over else "")
+    return f"{name} at its {bound['side']} bound, {where}" + (f", exceeded by {bound['violation']:.3g} {bound['unit']}" if bound["violation"] else "")
 
 
 def values_at(values: Sequence[float], stages: Sequence[int], unit: str) -> str:
