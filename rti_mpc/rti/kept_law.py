@@ -5,12 +5,15 @@ Laws of ways to rest, kept between starts beside the compiled code.
 Finding one takes long, 15 s of CPU time for a quadrotor, for which a robot whose
 controller was killed would stand. A law is kept under a hash of everything that it is
 found from: the whole problem, the disturbances, the delay, and this library's own code.
+That a robot needs none is kept likewise: to let it come to rest from many states takes
+70 ms for the one of the paper.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, fields
 from functools import cache
 from importlib.metadata import version
@@ -48,26 +51,23 @@ def find_kept_stop_law(ocp: Ocp, disturbances: Array = UNDISTURBED, delay_s: flo
     except OSError:
         return find_stop_law(ocp, disturbances, delay_s)
     law = find_stop_law(ocp, disturbances, delay_s)
-    if law is not None:
-        try:
-            write_sealed(path, key, content_of(law))
-        except OSError:
-            return law
+    with suppress(OSError):
+        write_sealed(path, key, content_of(law))
     return law
 
 
-def content_of(law: StopLaw) -> bytes:
-    """Return a law as the bytes of a file of arrays."""
+def content_of(law: StopLaw | None) -> bytes:
+    """Return a law as the bytes of a file of arrays, of none for a robot that needs none."""
     held = BytesIO()
-    np.savez(held, **asdict(law))
+    np.savez(held, **({} if law is None else asdict(law)))
     return held.getvalue()
 
 
-def law_of(content: bytes) -> StopLaw:
+def law_of(content: bytes) -> StopLaw | None:
     """Return the law of `content_of`."""
     with np.load(BytesIO(content), allow_pickle=False) as held:
         values: dict[str, Any] = {name: held[name] if held[name].ndim else held[name].item() for name in held.files}
-    return StopLaw(**values)
+    return StopLaw(**values) if values else None
 
 
 def fingerprint(ocp: Ocp, disturbances: Array, delay_s: float) -> str:
