@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from rti_mpc.contract.message import Command
@@ -71,10 +73,10 @@ def find(journal: Journaled, at_s: float | None, seq: int | None) -> Place | Non
         at_s: Time of the robot's clock, from which on the first command is meant.
         seq: Its number instead; None without a time: the last command but one.
     """
-    places = list(acted(journal))
     if at_s is None and seq is None:
-        return places[-2] if len(places) > 1 else None
-    for place in places:
+        last = deque(acted(journal), 2)
+        return last[0] if len(last) == 2 else None
+    for place in acted(journal):
         if place.command.seq == seq or (at_s is not None and place.command.stamp_ns >= first_stamp(at_s)):
             return place
     return None
@@ -87,8 +89,9 @@ def acted(journal: Journaled) -> Iterator[Place]:
     A recording that begins later than the controller does not say whether it led: it did if it stands by from some entry on, which follows the
     first command that it hears of another leader; it did not if it leads from some entry on, or only hears another leader.
     """
-    roles = [entry.name for entry in entries(journal) if entry.name in ("stand_by", "lead", "overhear")]
-    standing_by = next((role for role in roles if role != "overhear"), roles[0] if roles else "stand_by") != "stand_by"
+    roles = (entry.name for entry in entries(journal) if entry.name in ("stand_by", "lead", "overhear"))
+    first = next(roles, "stand_by")
+    standing_by = next((role for role in chain((first,), roles) if role != "overhear"), first) != "stand_by"
     for entry in entries(journal):
         standing_by = entry.name == "stand_by" or (standing_by and entry.name != "lead")
         if entry.name == "commit" and not standing_by:
