@@ -140,9 +140,9 @@ class Model:
         for output, y_i in zip(self.outputs, ca.vertsplit(self.y_expr), strict=True):
             if output.angle and depends_on(y_i, self.u):
                 raise OcpError(f"model {self.name}: output {output.name} is an angle and must not depend on u, got {y_i}")
-        known = (self.x, self.u, self.p)
+        known = {symbol.element_hash() for symbol in ca.symvar(ca.vertcat(self.x, self.u, self.p))}
         for label, expr in expressions.items():
-            free = [str(s) for s in ca.symvar(expr) if not any(ca.depends_on(k, s) for k in known)]
+            free = [str(s) for s in ca.symvar(expr) if s.element_hash() not in known]
             if free:
                 raise OcpError(f"model {self.name}: {label} must depend only on x, u, p, also has {', '.join(free)}")
 
@@ -299,5 +299,5 @@ def states_among(y_expr: ca.SX, x: ca.SX, states: Sequence[Signal]) -> list[Sign
     """Return for each output the state that it is, None for one that is something else; nothing where shapes do not fit."""
     if not (x.is_column() and y_expr.is_column()):
         return []
-    named = list(zip(ca.vertsplit(x), states, strict=False))
-    return [next((state for x_j, state in named if ca.is_equal(y_i, x_j)), None) for y_i in ca.vertsplit(ca.densify(y_expr))]
+    named = {x_j.element_hash(): state for x_j, state in zip(ca.vertsplit(x), states, strict=False)}
+    return [named.get(y_i.element_hash()) for y_i in ca.vertsplit(ca.densify(y_expr))]
