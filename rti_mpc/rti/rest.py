@@ -34,6 +34,7 @@ import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.codegen import at_points
 from rti_mpc.errors import OcpError
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model, depends_on
@@ -343,7 +344,7 @@ def ramps(ocp: Ocp, starts: Starts) -> Ways:
         u = u + np.clip(rest - u, falling, rising)
         states.append(x)
         inputs.append(u)
-        x = np.array(phi(x.T, u.T, P.T, ocp.dt)).T
+        x = at_points(phi, x, u, P, np.full(len(x), ocp.dt))
     return Ways(np.stack(inputs, axis=1), np.stack(states, axis=1), np.zeros((len(X), model.nu, model.nx)), ocp.dt)
 
 
@@ -362,7 +363,7 @@ def played(ocp: Ocp, law: StopLaw, ways: Ways, starts: Starts, feedback: float, 
     Returns:
         States at the beginning of each row and in the end, shape ``(n, rows + 1, nx)``, and what the plant then answers, shape ``(n, nu)``.
     """
-    model, U, p = ocp.model, starts.u, starts.p.T
+    model, U = ocp.model, starts.u
     lbu, ubu, lbdu, ubdu = (ocp.widest(name) for name in ("lbu", "ubu", "lbdu", "ubdu"))
     phi = integrator(model, substeps=law.substeps)
     rows_late, late_s = divmod(DELAY_S + law.delay_s, law.period_s)
@@ -374,7 +375,7 @@ def played(ocp: Ocp, law: StopLaw, ways: Ways, starts: Starts, feedback: float, 
         u = np.clip(np.clip(u, lbu, ubu), before + lbdu, before + ubdu)
         before, past = u, [*past[1:], u]
         for acting, span_s in ((past[0], late_s), (past[1], law.period_s - late_s)):
-            x = np.array(phi(x.T, answer * acting.T, p, span_s)).T
+            x = at_points(phi, x, answer * acting, starts.p, np.full(len(x), span_s))
         states.append(x)
     return np.stack(states, axis=1), answer * before
 
@@ -422,7 +423,7 @@ def rates_along(model: Model, ways: Ways, starts: Starts) -> Array:
 def rates_at(model: Model, X: Array, U: Array, P: Array) -> Array:
     """Return the rates of the states, shape ``(n, nx)``; infinite where there are none."""
     f = ca.Function("f", [model.x, model.u, model.p], [ca.densify(model.rate_expr)])
-    rates = np.array(f(X.T, U.T, P.T)).T
+    rates = at_points(f, X, U, P)
     return np.where(np.isfinite(rates), rates, np.inf)
 
 

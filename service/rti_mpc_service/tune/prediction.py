@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
+from rti_mpc.codegen import at_points
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model
 from rti_mpc_service.tune.windows import Windows
@@ -24,13 +25,13 @@ class Predictor:
 
     def __init__(self, model: Model) -> None:
         self._phi = integrator(model)
-        self._A = self._phi.factory("A", ["x", "u", "p", "dt"], ["jac:x_next:x"])
-        self._p = np.array(model.p_nominal)[:, None]
-        self._map = cache(lambda function, count: function.map(count))
+        x, u, p, dt = symbols = self._phi.sx_in()
+        self._A = ca.Function("A", symbols, [ca.densify(ca.jacobian(self._phi(x, u, p, dt), x))])
+        self._p = np.array(model.p_nominal)
 
     def _at(self, function: Any, x: Array, v: Array, span: Array) -> Array:
         """Evaluate a function of x, u, p and dt at many points, shapes ``(n, nx)``, ``(n, nu)`` and ``(n,)``; a row per column of its result."""
-        return np.array(self._map(function, len(x))(x.T, v.T, np.tile(self._p, len(x)), span[None])).T
+        return at_points(function, x, v, np.tile(self._p, (len(x), 1)), span)
 
     def after(self, x: Array, v: Array, span: Array) -> Array:
         """Return the states after a step, from states ``(n, nx)``, inputs ``(n, parts, nu)`` and durations ``(n,)``."""
