@@ -14,8 +14,8 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.model.model import Model, Signal
+from rti_mpc.rti.kept_law import find_kept_stop_law
 from rti_mpc.rti.ocp import Ocp
-from rti_mpc.rti.rest import find_stop_law
 from rti_mpc.rti.way_to_rest import StopLaw
 from tests.problems import INF, pioneer
 
@@ -154,8 +154,8 @@ def ocp_of(name: str) -> Ocp:
 
 @cache
 def law_of(name: str) -> StopLaw | None:
-    """The law of one of these, found once."""
-    return find_stop_law(ocp_of(name))
+    """The law of one of these, found once for all processes of tests."""
+    return find_kept_stop_law(ocp_of(name))
 
 
 def following(name: str) -> Model:

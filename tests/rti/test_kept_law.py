@@ -23,11 +23,11 @@ NONE = np.zeros(0)
 @pytest.fixture
 def found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Ocp]:
     """Problems whose laws are found, not read; in an empty cache."""
-    problems = list[Ocp]()
+    problems, law = list[Ocp](), law_of("arm")
 
     def find(ocp: Ocp, disturbances: object, delay_s: float) -> StopLaw | None:
         problems.append(ocp)
-        return law_of("arm") if ocp.model.name == "arm" else None
+        return law if ocp.model.name == "arm" else None
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(kept_law, "find_stop_law", find)
