@@ -11,11 +11,10 @@ import sys
 from pathlib import Path
 
 import pytest
-import typer
 
-from rti_mpc_service.cli import app
 from rti_mpc_service.conformance import guard, robot
 from rti_mpc_service.rig.endpoint import free_endpoint
+from tests.command import built
 from tests.processes.system import until
 
 ROOT = Path(__file__).parents[1]
@@ -108,7 +107,7 @@ def commands() -> list[str]:
 @pytest.mark.parametrize("line", commands())
 def test_every_command_of_a_page_exists_with_its_options(line: str) -> None:
     command, *rest = line.partition("#")[0].partition("rti-mpc ")[2].split()
-    known = typer.main.get_command(app).commands[command]  # type: ignore[attr-defined]
+    known = built().commands[command]
     known = known.commands[rest[0]] if command == "certs" else known
     options = {name for parameter in known.params for name in parameter.opts}
     assert {word for word in rest if word.startswith("--")} <= options

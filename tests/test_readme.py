@@ -10,9 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
-import typer
 
-from rti_mpc_service.cli import app
+from tests.command import built
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -35,7 +34,7 @@ def test_every_command_shown_exists_with_its_options(line: str) -> None:
     if program == "make":
         assert re.search(rf"^{command}:", (ROOT / "Makefile").read_text(), flags=re.MULTILINE), line
         return
-    known = typer.main.get_command(app).commands[command]  # type: ignore[attr-defined]
+    known = built().commands[command]
     options = {name for parameter in known.params for name in parameter.opts}
     assert {word for word in rest if word.startswith("--")} <= options, line
 

@@ -12,14 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer.main
 from typer.testing import CliRunner
 
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.cli import app
 from rti_mpc_service.faults.table import FAULTS
 from rti_mpc_service.shipped import SHIPPED, TEMPLATES
-from tests.command import command
+from tests.command import built, command
 from tests.in_time import awake_ms
 from tests.robots import toml
 from tests.slow import slow_but
@@ -27,7 +26,7 @@ from tests.slow import slow_but
 ROOT = Path(__file__).parents[2]
 ZENOH = ("--mode", "--connect", "--listen", "--config", "--cfg", "--no-multicast-scouting")
 RTI_MPC = (sys.executable, "-c", "from rti_mpc_service.cli import main; main()")
-COMMANDS = sorted(typer.main.get_group(app).commands)
+COMMANDS = sorted(built().commands)
 OF_RECORDINGS = {"export", "replay", "solve-case"}  # commands that read a recording, or a case of one, and no bus
 IN_PLACE = "--path is followed in place of a scenario and says nothing of time"
 
@@ -41,10 +40,10 @@ def rti_mpc(*arguments: str, **environment: str) -> subprocess.CompletedProcess[
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_of_every_command_explains_every_option(name: str) -> None:
-    parameters = typer.main.get_group(app).commands[name].params
+    parameters = built().commands[name].params
     for parameter in parameters:
         assert getattr(parameter, "help", None), f"{name} {parameter.name}"
-    assert CliRunner().invoke(app, [name, "--help"]).exit_code == 0
+    assert command(name, "--help").returncode == 0
 
 
 @pytest.mark.parametrize(
@@ -52,7 +51,7 @@ def test_help_of_every_command_explains_every_option(name: str) -> None:
     sorted(set(COMMANDS) - OF_RECORDINGS - {"bench", "certs", "check", "demo", "doctor", "faults", "init", "paper", "robots", "schema", "tune"}),
 )
 def test_every_process_takes_the_options_of_zenoh_programs(name: str) -> None:
-    parameters = typer.main.get_group(app).commands[name].params
+    parameters = built().commands[name].params
     options = {option for parameter in parameters for option in (*parameter.opts, *parameter.secondary_opts)}
     assert set(ZENOH) | {"-m", "-e", "-l", "-c"} <= options
 
@@ -186,7 +185,7 @@ for name in ("matplotlib.font_manager", "controller"):
 def test_list_of_commands_holds_whole_sentences_on_a_narrow_terminal() -> None:
     done = command("--help", columns=80)
     assert "..." not in done.stdout.partition("Commands:")[2]
-    for each in typer.main.get_group(app).commands.values():
+    for each in built().commands.values():
         assert each.get_short_help_str(limit=1000) in " ".join(done.stdout.split())
     assert max(len(line) for line in done.stdout.splitlines()) <= 80
 
