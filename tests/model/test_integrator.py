@@ -8,7 +8,6 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
@@ -33,6 +32,8 @@ def step(method: str, dt: float, substeps: int = 1) -> Array:
 
 
 def truth(dt: float) -> Array:
+    from scipy.integrate import solve_ivp
+
     return solve_ivp(lambda _, x: f(x), (0.0, dt), X, rtol=1e-12, atol=1e-13).y[:, -1]
 
 
@@ -65,6 +66,8 @@ def test_error_of_radau_shrinks_with_its_order(stages: int, order: int) -> None:
 
 @pytest.mark.parametrize(("stages", "error"), [(1, 0.03), (2, 6e-3), (3, 4e-4)])
 def test_radau_follows_a_stiff_model_over_ten_time_constants(stages: int, error: float) -> None:
+    from scipy.integrate import solve_ivp
+
     model, x, u = stiff(stages), np.array([0.3, -0.2, 0.7]), np.array([1.0])
     f = ca.Function("f", [model.x, model.u], [model.f_expl_expr])
     true = solve_ivp(lambda _, x: np.array(f(x, u)).ravel(), (0.0, 0.1), x, method="Radau", rtol=1e-10, atol=1e-12).y[:, -1]

@@ -5,9 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import nbformat
 import pytest
-from nbclient import NotebookClient
 
 from tests.processes.system import ROOT, rti_mpc
 
@@ -16,6 +14,9 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::RuntimeWarning", "ignore::UserWarning")  # of the kernel's packages
 def test_notebook_of_a_recording_runs_to_its_end(tmp_path: Path) -> None:
+    import nbformat
+    from nbclient import NotebookClient
+
     done = rti_mpc("demo", "--duration", 8, "--speed", 4, "--out", tmp_path / "runs" / "eight")
     assert done.returncode == 0, done.stdout + done.stderr
     notebook = nbformat.read(ROOT / "examples" / "recording.ipynb", as_version=4)

@@ -24,7 +24,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.stats
 
 from rti_mpc.contract.message import Command, Telemetry
 from rti_mpc.wire.cdr import decode
@@ -117,7 +116,9 @@ class Commands(threading.Thread):
 
 def growth(times_s: np.ndarray, mib: np.ndarray) -> float:
     """Fitted (Theil 1950, Sen 1968: the median of all slopes, which a single step does not move), in MiB per hour."""
-    return 3600.0 * float(scipy.stats.theilslopes(mib, times_s).slope)
+    from scipy.stats import theilslopes
+
+    return 3600.0 * float(theilslopes(mib, times_s).slope)
 
 
 @dataclass

@@ -7,8 +7,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import polars as pl
-import pyarrow.parquet as pq
 import pytest
 
 from rti_mpc.contract.message import Command, State, Telemetry
@@ -79,6 +77,8 @@ def test_events_and_descriptions_are_frames_too(written: tuple[Recording, list[t
 
 
 def test_polars_takes_a_table(written: tuple[Recording, list[tuple[Key, object]]]) -> None:
+    import polars as pl
+
     taken = pl.from_arrow(table(written[0], "telemetry", horizon=True))
     assert isinstance(taken, pl.DataFrame)
     assert taken.height == COUNT
@@ -108,10 +108,12 @@ def test_what_is_not_there_is_refused_by_name(tmp_path: Path) -> None:
 
 
 def test_every_stream_is_exported_with_its_units(written: tuple[Recording, list[tuple[Key, object]]], tmp_path: Path) -> None:
+    from pyarrow.parquet import read_table
+
     files = export(written[0], tmp_path)
     assert dict(files)[tmp_path / "wheels" / "state.parquet"] == COUNT
     assert {path.stem for path, _ in files} == {"state", "command", "telemetry", "reference", "event", "info"}
-    read = pq.read_table(tmp_path / "wheels" / "state.parquet")
+    read = read_table(tmp_path / "wheels" / "state.parquet")
     assert read.equals(table(written[0], "state"))
     assert units(read)["x.psi"] == "rad"
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from rti_mpc.array import Array
 from rti_mpc.contract.message import End
@@ -119,6 +118,8 @@ def test_consistent_heading_satisfies_its_differential_equation(build) -> None:
 @pytest.mark.parametrize("build", [circle, eight, positioning, square])
 def test_point_ahead_of_the_axle_follows_its_path_exactly_with_the_consistent_heading(build) -> None:
     """Speeds computed from path and heading alone drive the unicycle of equation (9) along both."""
+    from scipy.integrate import solve_ivp
+
     trajectory = build().lasting(15.0)
     y = rows(trajectory, 0.01, "consistent", A)
 

@@ -8,7 +8,6 @@ import tracemalloc
 import casadi as ca
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from rti_mpc.array import Array
 from rti_mpc.model.model import Model
@@ -21,6 +20,8 @@ U = np.array([0.4, 0.6])
 
 
 def solved(model, x0: Array, u: Array, duration_s: float) -> Array:
+    from scipy.integrate import solve_ivp
+
     f = ca.Function("f", [model.x, model.u, model.p], [model.f_expl_expr])
     return solve_ivp(lambda t, x: f(x, u, model.p_nominal).full().ravel(), (0.0, duration_s), x0, rtol=1e-11, atol=1e-12).y[:, -1]
 

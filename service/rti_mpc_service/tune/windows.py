@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, State
@@ -132,6 +131,8 @@ def inputs(windows: Windows, delay_s: float, lag_s: float) -> Array:
     row = np.clip((cells.reshape(newest.shape) - stamps[newest]) / windows.row_s, 0, windows.rows.shape[1] - 1).astype(int)
     v = windows.rows[newest, row]
     if lag_s > 0.0:
+        from scipy.signal import lfilter  # here, as it takes longer to import than all the rest
+
         left = float(np.exp(-step_s / count / lag_s))  # of the difference, after a cell
         ends = lfilter([1.0 - left], [1.0, -left], v, axis=1, zi=left * v[:, :1])[0]
         v = (np.concatenate([v[:, :1], ends[:, :-1]], axis=1) + ends) / 2

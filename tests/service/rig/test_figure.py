@@ -9,11 +9,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip("matplotlib")
-import matplotlib as mpl
-from matplotlib.image import imread
 
 from rti_mpc.wire.info import Info, Label
-from rti_mpc_service.rig.figure import figure
 from rti_mpc_service.rig.run_data import Run
 
 SECOND = 1_000_000_000
@@ -52,6 +49,12 @@ def run() -> Run:
     )
 
 
+def figure(run: Run, path: Path) -> None:
+    from rti_mpc_service.rig import figure  # with matplotlib
+
+    figure.figure(run, path)
+
+
 def words(path: Path) -> str:
     return " ".join(text for element in ElementTree.parse(path).iter() for text in element.itertext())
 
@@ -67,6 +70,8 @@ def test_there_is_less_wall_time_for_a_sample_at_a_higher_speed(run: Run) -> Non
 
 
 def test_the_figure_names_what_it_shows_with_units(run: Run, tmp_path: Path) -> None:
+    import matplotlib as mpl
+
     with mpl.rc_context({"svg.fonttype": "none"}):
         figure(run, tmp_path / "run.svg")
     shown = words(tmp_path / "run.svg")
@@ -87,6 +92,9 @@ def test_the_figure_names_what_it_shows_with_units(run: Run, tmp_path: Path) -> 
 
 
 def test_the_figure_is_an_image_of_a_legible_size_and_leaves_the_callers_settings_alone(run: Run, tmp_path: Path) -> None:
+    import matplotlib as mpl
+    from matplotlib.image import imread
+
     before = dict(mpl.rcParams)
     figure(run, tmp_path / "run.png")
     assert dict(mpl.rcParams) == before
@@ -117,6 +125,8 @@ def test_a_model_with_one_input_and_no_heading_is_drawn(run: Run, tmp_path: Path
 
 
 def test_a_model_without_position_is_drawn_by_its_outputs_against_their_references(run: Run, tmp_path: Path) -> None:
+    import matplotlib as mpl
+
     joints = (Label("q1", "rad", True), Label("z", "m"))
     arm = replace(run.info, states=tuple(replace(label, role="") for label in run.info.states), outputs=joints)
     turned = run.reference + np.array([2 * np.pi, 0.25])

@@ -9,7 +9,6 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter1d
 
 pytest.importorskip("mcap")
 
@@ -134,6 +133,8 @@ def tank(below: int, windows: int = 30, delay: int = 2) -> Windows:
 
 def motor(dt_ms: int, delay_ms: int = 60, lag_ms: float = 120.0, duration_ms: int = 40_000) -> Windows:
     """Windows of a motor whose torque follows smooth commands late and with a lag, from a noisy speed."""
+    from scipy.ndimage import gaussian_filter1d
+
     rng, ms = np.random.default_rng(1), 1_000_000
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
     model = Model("motor", x, u, u - x, x, "speed", "torque", "speed")

@@ -16,7 +16,6 @@ from threading import Barrier
 
 import optuna
 import pytest
-from sqlalchemy.exc import SQLAlchemyError
 
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.commands.robot import lockstep_robot
@@ -54,6 +53,8 @@ def loop_of(path: Path, course: Course = SHORT) -> ClosedLoop:
 
 
 def trials_of(path: Path) -> list[optuna.trial.FrozenTrial]:
+    from sqlalchemy.exc import SQLAlchemyError
+
     try:
         storage = optuna.storages.get_storage(f"sqlite:///{path}")
     except SQLAlchemyError:
