@@ -19,6 +19,7 @@ Feedback adds the terms in :math:`\Delta x_0`.
 from __future__ import annotations
 
 from itertools import pairwise
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -100,6 +101,16 @@ class Condensing:
         self.M, self.m = ca.vertcat(*M), ca.vertcat(*m)
 
 
+_condensings: WeakKeyDictionary[Ocp, Condensing] = WeakKeyDictionary()
+
+
+def condensing(ocp: Ocp) -> Condensing:
+    """Return the condensed problem, which its transcriptions with and without softened bounds share, built at the first call."""
+    if ocp not in _condensings:
+        _condensings[ocp] = Condensing(ocp, linearization(ocp))
+    return _condensings[ocp]
+
+
 def kernels(lin: Linearization, width: int) -> tuple[ca.Function, ca.Function, ca.Function, ca.Function]:
     """Return ``A X``, ``H X + A' W`` and ``B' W`` for `width` columns, and B; from nonzeros, with every structural zero left out."""
     a, b, h = (ca.SX.sym(name, pattern.nnz()) for name, pattern in (("a", lin.A_k), ("b", lin.B_k), ("h", lin.H_i)))
@@ -128,7 +139,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
         softened: Whether the softened bounds, on states and general constraints, and their slacks are there.
     """
     lin = linearization(ocp)
-    condensed = Condensing(ocp, lin)
+    condensed = condensing(ocp)
     N, N_u, nu = ocp.N, ocp.N_u, ocp.model.nu
     ng = ocp.ng if softened else 0
     kind = KIND_NAMES[softened]
