@@ -28,7 +28,6 @@ from rti_mpc_service.shipped import DEPLOY
 from rti_mpc_service.tune.choice import beats, choose, front
 from rti_mpc_service.tune.closed_loop import ClosedLoop, Course, Driven, MakeBody, laid_out
 from rti_mpc_service.tune.edit import commented, edited
-from rti_mpc_service.tune.figure import figure
 from rti_mpc_service.tune.progress import counting, doing
 from rti_mpc_service.tune.recorded import as_recorded, is_recording
 from rti_mpc_service.tune.recorded_robot import read
@@ -79,6 +78,8 @@ def main(
     Raises:
         ConfigError: An option does not fit.
     """
+    from rti_mpc_service.tune.figure import figure  # before anything is driven: Matplotlib may be missing
+
     config, console = load(path), table_console()
     out = written_to(path, config, out)
     course = replace(course, name=course.name or config.reference.scenario)
