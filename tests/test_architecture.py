@@ -208,6 +208,13 @@ def test_import_loads_only_what_it_needs(module: str, absent: set[str]) -> None:
     assert not loaded & absent
 
 
+def test_module_of_tests_imports_what_takes_long_only_where_it_is_used() -> None:
+    """Each worker imports every module: these would take a third of the time to find tests."""
+    slow = r"^(?:import|from) (?:matplotlib|nbclient|polars|sqlalchemy|scipy\.(?:integrate|ndimage|signal|stats))\b.*"
+    found = {path.name: re.findall(slow, path.read_text(encoding="utf-8"), re.MULTILINE) for path in (ROOT / "tests").rglob("*.py")}
+    assert {name: lines for name, lines in found.items() if lines} == {}
+
+
 def test_file_names_its_licence_first() -> None:
     for path in every_file():
         assert path.read_text().startswith("# SPDX-License-Identifier: Apache-2.0\n"), path
