@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -35,8 +36,10 @@ def load(path: Path, *, with_model: bool = True) -> Config:
         ConfigError: One line: the file, the key, what must hold, what was got.
     """
     content = read_text_file(path, "TOML")
+    document: dict[str, Any] = {}
     try:
-        config = Config.model_validate(toml.read(content))
+        document = toml.read(content)
+        config = Config.model_validate(document)
         beside = {name: path.parent / value for name in ("config", "tls") if (value := getattr(config.bus, name)) is not None}
         if beside:
             config = config.model_copy(update={"bus": config.bus.model_copy(update=beside)})
@@ -50,7 +53,7 @@ def load(path: Path, *, with_model: bool = True) -> Config:
         if with_model:
             check_model(config)
     except ValidationError as error:
-        raise ConfigError(f"{path}: {explain(error, Config)}") from error
+        raise ConfigError(f"{path}: {explain(error, Config, document)}") from error
     except (ConfigError, OcpError) as error:
         raise ConfigError(f"{path}: {error}") from error
     return config

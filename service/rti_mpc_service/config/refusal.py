@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -30,19 +30,36 @@ REWORDINGS = (
 )
 
 
-def explain(error: ValidationError, tree: type[BaseModel]) -> str:
-    """Return one complaint as text; an unknown key comes first, since it is often the reason why another one is missing."""
-    complaint = min(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden")
-    loc, got, keys = complaint["loc"], complaint["input"], dict(entries(tree))
+def explain(error: ValidationError, tree: type[BaseModel], document: Mapping[str, Any]) -> str:
+    """Return one complaint about a document as text; an unknown key comes first, since it is often the reason why another one is missing."""
+    complaints = sorted(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden")
+    complaint, keys = complaints[0], dict(entries(tree))
+    got, missing = complaint["input"], complaint["type"] == "missing"
+    loc = complaint["loc"] if missing else written(complaint["loc"], document)
     key, what = dotted(loc), description_of(loc, keys)
     if complaint["type"] == "extra_forbidden":
-        return f"{key} is unknown, {suggestion(tree_key(loc), keys)}, got {quoted(got)}"
-    if complaint["type"] == "missing":
+        return f"{key} is unknown, {suggestion(loc, keys)}, got {quoted(got)}"
+    if missing:
         return f"{key} is missing: {what}"
-    must = complaint["msg"]
-    for pattern, words in REWORDINGS:
-        must = re.sub(pattern, words, must)
+    first, *others = (reworded(one["msg"]) for one in complaints if written(one["loc"], document) == loc)  # one for each kind of value that it may be
+    must = " or ".join((first, *(other.removeprefix("must be ") for other in others)))
     return f"{key} ({what}) {must}, got {quoted(got)}"
+
+
+def written(loc: tuple[int | str, ...], document: Any) -> tuple[int | str, ...]:
+    """Return the part of a location that is in the document: Pydantic's also has the kind of a value, and the place of a number that stands for a list."""
+    for n, step in enumerate(loc):
+        if not (step in document if isinstance(document, Mapping) else isinstance(document, list | tuple)):
+            return loc[:n]
+        document = document[step]
+    return loc
+
+
+def reworded(message: str) -> str:
+    """Return a message of Pydantic's in the words of a TOML file."""
+    for pattern, words in REWORDINGS:
+        message = re.sub(pattern, words, message)
+    return message
 
 
 def quoted(value: object) -> str:
@@ -97,13 +114,16 @@ def description_of(loc: Sequence[int | str], tree: dict[str, str]) -> str:
     return next((tree[key] for n in range(len(loc), 0, -1) if (key := tree_key(loc[:n])) in tree), "")
 
 
-def suggestion(key: str, tree: dict[str, str]) -> str:
+def suggestion(loc: Sequence[int | str], tree: dict[str, str]) -> str:
     """Return the same key in another table, else the most similar key of the same table, else all keys of that table."""
-    section, _, name = key.rpartition(".")
+    section, _, name = tree_key(loc).rpartition(".")
     beside = {other.rpartition(".")[2]: other for other in tree if other.rpartition(".")[0] == section}
     near = [other for other in tree if other.rpartition(".")[2] == name]
     near += [other for n, other in beside.items() if n.lower() == name.lower()] + [beside[n] for n in get_close_matches(name, beside, 1)]
-    return f"perhaps {near[0]} is meant ({tree[near[0]]})" if near else list_known(beside)
+    if not near:
+        return list_known(beside)
+    key = next((dotted((*loc[:-1], n)) for n, other in beside.items() if other == near[0]), near[0])  # with the index of a table in a list
+    return f"perhaps {key} is meant ({tree[near[0]]})"
 
 
 def list_known(names: Iterable[str]) -> str:

@@ -160,7 +160,7 @@ def changed_problem(file: Config, ocp: Ocp, changes: Mapping[str, Any]) -> tuple
         ocp = retuned(config, ocp)
         check_rest(ocp)
     except ValidationError as error:
-        raise ConfigError(explain(error, Config)) from error
+        raise ConfigError(explain(error, Config, document)) from error
     except OcpError as error:
         raise ConfigError(str(error)) from error
     for wrong in wider_bounds(file, config, changes):

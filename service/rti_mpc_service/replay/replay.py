@@ -196,7 +196,7 @@ def overridden(config: Config, ocp: Ocp, assignments: Sequence[str]) -> dict[str
         check_names(changed, ocp.model)
         other = retuned(changed, ocp)
     except ValidationError as error:
-        raise ConfigError(f"--set: {explain(error, Config)}") from error
+        raise ConfigError(f"--set: {explain(error, Config, document)}") from error
     except OcpError as error:
         raise ConfigError(f"--set: {error}") from error
     return {name: getattr(other, name) for name in WEIGHTS_AND_BOUNDS if not np.array_equal(getattr(other, name), getattr(ocp, name))}

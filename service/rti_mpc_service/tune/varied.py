@@ -174,5 +174,5 @@ def with_values(config: Config, values: Mapping[str, float]) -> Config:
         changed = Config.model_validate(document)
         check_tree(changed)
     except ValidationError as error:
-        raise ConfigError(explain(error, Config)) from error
+        raise ConfigError(explain(error, Config, document)) from error
     return changed

@@ -112,7 +112,7 @@ WRONG = [
     ("[ocp.bounds]", "[ocp.terminal]\nlqr = {}\nQ = { x = 1, y = 1, psi = 0 }\n[ocp.bounds]", ["ocp.terminal", "Q or lqr, not both"]),
     ("[model]", DISC + "radius_m = -0.3\n[model]", ["ocp.obstacles[0].radius_m", "in m", "greater than 0", "-0.3"]),
     ("[model]", DISC + "[model]", ["ocp.obstacles[0].radius_m", "missing", "in m"]),
-    ("[model]", DISC + "radius = 0.3\n[model]", ["ocp.obstacles[0].radius", "ocp.obstacles.radius_m", "in m"]),
+    ("[model]", DISC + "radius = 0.3\n[model]", ["ocp.obstacles[0].radius", "perhaps ocp.obstacles[0].radius_m is meant (radius", "in m"]),
     ("[model]", DISC + "radius_m = 0.3\nvelocity_m_s = 0.1\n[model]", ["ocp.obstacles[0].velocity_m_s", "[x, y]", "m/s", "0.1"]),
     ("[model]", DISC + "radius_m = 0.3\nmargin_m = -0.1\n[model]", ["ocp.obstacles[0].margin_m", "in m", "at least 0", "-0.1"]),
     (
@@ -147,7 +147,7 @@ WRONG = [
     ("N = 20", "N = 20\nN_u = 0", ["ocp.N_u", "at least 1", "0"]),
     ("N = 20", 'N = 20\nformulation = "condensed"', ["ocp.formulation", "'auto', 'simultaneous' or 'sequential'", "'condensed'"]),
     ("dt_s = 0.1", "dt_s = [0.1]", ["ocp.dt_s", "must be a number", "[0.1]"]),
-    ("delta = 28.0", 'delta = "28"', ["ocp.weights.delta[0]", "must be a number", "'28'"]),
+    ("delta = 28.0", 'delta = "28"', ["ocp.weights.delta (", "must be a number", "'28'"]),
     ("lambda = 0.8", "lambda = [0.8, 0.8, 0.8]", ["ocp.weights.lambda", "list of 20", "[0.8, 0.8, 0.8]"]),
     ("u_c = [-0.5, 0.5]", "u_c = [-0.5, 0.0, 0.5]", ["ocp.bounds.inputs.u_c", "two numbers", "[-0.5, 0.0, 0.5]"]),
     ("u_c = [-0.5, 0.5]", "v_c = [-0.5, 0.5]", ["ocp.bounds.inputs.v_c", "no input", "perhaps u_c [m/s]"]),
@@ -163,8 +163,8 @@ WRONG = [
     ("[ocp]", "[solver]\niterations = 101\n[ocp]", ["solver.iterations", "at most 100", "101"]),
     ("[ocp]", "[solver]\ntolerance = -0.1\n[ocp]", ["solver.tolerance", "at least 0", "-0.1"]),
     ("[ocp]", "[solver]\nname = ['osqp']\n[ocp]", ["solver.name", "must be text", "['osqp']"]),
-    ("[ocp]", "[timing]\ndelay_s = 'auto'\n[ocp]", ["timing.delay_s", "measured", "'auto'"]),
-    ("[ocp]", "[timing]\ndelay_s = -0.01\n[ocp]", ["timing.delay_s", "at least 0", "-0.01"]),
+    ("[ocp]", "[timing]\ndelay_s = 'auto'\n[ocp]", ["timing.delay_s (", "must be a number or 'measured'", "'auto'"]),
+    ("[ocp]", "[timing]\ndelay_s = -0.01\n[ocp]", ["timing.delay_s (", "at least 0 or 'measured'", "-0.01"]),
     ("[ocp]", "[timing]\nvalid_s = 0.5\n[ocp]", ["timing.valid_s", "in seconds", "at most 0.3", "0.5"]),
     ("[ocp]", "[timing]\nstale_s = 0\n[ocp]", ["timing.stale_s", "at least 0.0001", "0"]),
     (
