@@ -56,16 +56,25 @@ def answer(case: QpCase, solver: str, *, folder: Path = Path(), trust: bool = Fa
         trust: Whether to run the attached source of the model instead.
 
     Raises:
-        ConfigError: The solver is not known, or the model of the case is not here.
+        ConfigError: The model of the case is not here.
     """
-    if solver not in (OURS, "osqp"):
-        try:
-            check_name(solver)
-        except OcpError as error:
-            raise ConfigError(f"--solver: {error}") from error
     if not case.sound:
         return Answer(solver, QpStatus.FAILED)
     return of_ours(case, rebuilt(case, folder=folder, trust=trust)) if solver == OURS else of_other(case.qp, solver)
+
+
+def check_solver(name: str) -> None:
+    """
+    Refuse a solver that `answer` cannot ask.
+
+    Raises:
+        ConfigError: It is neither our own one, nor OSQP, nor one that is installed for qpsolvers.
+    """
+    if name not in (OURS, "osqp"):
+        try:
+            check_name(name)
+        except OcpError as error:
+            raise ConfigError(f"--solver: {error}") from error
 
 
 def of_other(qp: QpData, solver: str) -> Answer:

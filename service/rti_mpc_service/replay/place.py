@@ -55,9 +55,11 @@ def choose(name: str | Path, journals: Sequence[Journaled], at_s: float | None, 
     found = [(journal, place) for journal in journals if (place := find(journal, at_s, seq)) is not None]
     if not found:
         what = "two commands" if at_s is None else f"a command that acts from {at_s:.3f} s on"
+        numbers = sorted(place.command.seq for journal in journals for place in acted(journal))
+        held = f", got commands {numbers[0]} to {numbers[-1]}" if numbers else ", got none"
         what = what if seq is None else f"a command {seq}"
         refused = Unreached if at_s is None and seq is None else ConfigError
-        raise refused(f"{name} must hold {what}, in the journal of a controller that led then")
+        raise refused(f"{name} must hold {what}, in the journal of a controller that led then{held}")
     if seq is not None and len(found) > 1:
         each = ", ".join(f"{journal.owner} at {1e-9 * place.command.stamp_ns:.3f} s" for journal, place in found)
         raise ConfigError(f"--controller must say whose command {seq} is explained: {each}")

@@ -10,7 +10,7 @@ from typing import Any
 from rti_mpc.contract.status import DISAGREEMENT
 from rti_mpc_service.case import QpCase
 from rti_mpc_service.json_text import json_text
-from rti_mpc_service.replay.answer import answer, compared
+from rti_mpc_service.replay.answer import answer, check_solver, compared
 from rti_mpc_service.replay.trouble import cases_of
 from rti_mpc_service.replay.why import count
 
@@ -34,6 +34,8 @@ def main(path: Path, solvers: Sequence[str], *, folder: Path = Path(), trust: bo
     Raises:
         ConfigError: It is neither, or a solver is not known.
     """
+    for solver in solvers:  # also where there is no case to solve
+        check_solver(solver)
     recorded = path.is_dir() or path.suffix == ".mcap"
     cases = cases_of(path, folder=folder, trust=trust) if recorded else iter([QpCase.load(path)])
     results = []

@@ -179,9 +179,10 @@ def test_file_that_is_no_case_is_refused_in_one_line(content: bytes | None, tmp_
     assert "\n" not in str(refusal.value)
 
 
-def test_solver_that_is_not_installed_is_refused(cases: list[QpCase]) -> None:
+def test_solver_that_is_not_installed_is_refused_whether_or_not_there_is_a_case(tmp_path: Path) -> None:
+    path = recorded(journal_of(SHIPPED, samples=5, follows=straight(5.0)), tmp_path / "run.mcap")
     with pytest.raises(ConfigError, match=r"--solver: solver must be riccati, osqp, or one that is installed.*'cplex'"):
-        answer(cases[0], "cplex")
+        main(path, ["riccati", "cplex"])
 
 
 @pytest.mark.slow  # builds a controller again

@@ -89,7 +89,7 @@ def test_number_that_two_controllers_have_given_needs_the_controller(leader: Jou
     with pytest.raises(ConfigError, match=r"--controller must say whose command 3 is explained: 5 at 0\.300 s, 6 at 0\.300 s"):
         choose(PATH, both, None, seq)
     assert choose(PATH, both[1:], None, seq)[0].owner == 6
-    with pytest.raises(ConfigError, match=r"run\.mcap must hold a command 400, in the journal of a controller that led then"):
+    with pytest.raises(ConfigError, match=r"run\.mcap must hold a command 400, in the journal of a controller that led then, got commands 1 to 29"):
         choose(PATH, [leader, standby], None, 400)
 
 
