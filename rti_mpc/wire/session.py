@@ -145,7 +145,8 @@ def _tls(settings: BusSettings) -> dict[str, Any]:
 
 
 def _brief(error: Exception) -> str:
-    return " ".join(str(error).split(" at /")[0].split())
+    """Return the innermost cause that Zenoh tells, without the place in its source."""
+    return " ".join(str(error).split(" at /")[0].rpartition(": [")[2].split())
 
 
 def endpoints(config: zenoh.Config) -> str:
@@ -218,7 +219,8 @@ def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event 
                 return zenoh.open(config)
             except zenoh.ZError as error:
                 if "Unable to connect" not in str(error):
-                    raise ConfigError(f"bus: endpoints must be free and valid, got: {_brief(error)}") from None
+                    given = ", ".join(_ends(config, "listen") + _ends(config, "connect"))  # Zenoh does not always name the one that is wrong
+                    raise ConfigError(f"bus: endpoints must be valid, and no other process listen there, got {given} ({_brief(error)})") from None
                 if stop is not None and stop.is_set():
                     raise Stopped("stopped before a router was there") from None
                 if time.monotonic() > deadline_s:

@@ -75,8 +75,9 @@ def test_what_zenoh_refuses_is_named(settings: BusSettings, word: str) -> None:
 
 
 @pytest.mark.parametrize("listen", ["tcp/127.0.0.1:99999", "carrier/pigeon", "tcp/192.0.2.1:7447"])
-def test_endpoints_that_cannot_be_listened_on_are_refused(listen: str) -> None:
-    with pytest.raises(ConfigError, match="endpoints"):
+def test_endpoint_that_cannot_be_listened_on_is_refused_by_its_name(listen: str) -> None:
+    """Zenoh says `invalid port value`, and not where."""
+    with pytest.raises(ConfigError, match=rf"bus: endpoints must be valid, and no other process listen there, got {listen} \("):
         Bus.join(BusSettings(listen=(listen,), connect=()), Keys())
 
 
@@ -84,8 +85,9 @@ def test_an_endpoint_already_taken_is_refused() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        with pytest.raises(ConfigError, match="in use"):
-            Bus.join(BusSettings(listen=(f"tcp/127.0.0.1:{taken.getsockname()[1]}",), connect=()), Keys())
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(ConfigError, match=re.escape(f"got tcp/{address} ({address}: Address already in use (os error 98))")):
+            Bus.join(BusSettings(listen=(f"tcp/{address}",), connect=()), Keys())
 
 
 @pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1", "127.0.0.1:7447", "tcp/", "tls/robot.local", ""])
