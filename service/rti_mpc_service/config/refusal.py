@@ -47,7 +47,7 @@ def explain(error: ValidationError, tree: type[BaseModel], document: Mapping[str
 
 
 def written(loc: tuple[int | str, ...], document: Any) -> tuple[int | str, ...]:
-    """Return the part of a location that is in the document: Pydantic's also has the kind of a value, and the place of a number that stands for a list."""
+    """Return the part of a location that is in the document: Pydantic adds the kind of a value, and the place of a number that stands for a list."""
     for n, step in enumerate(loc):
         if not (step in document if isinstance(document, Mapping) else isinstance(document, list | tuple)):
             return loc[:n]
