@@ -99,9 +99,7 @@ def renew(authority: Authority, folder: Path, days: float) -> list[Path]:
     Raises:
         ConfigError: There is no certificate, one is of another authority, or cannot be replaced.
     """
-    paths = [path for path in sorted(folder.glob("*.pem")) if path.name != AUTHORITY]
-    if not paths:
-        raise ConfigError(f"certs: renew needs a folder with certificates, got {folder}")
+    paths = [path for path in certificates_in(folder) if path.name != AUTHORITY]
     contents = {path: pem(authority.renewed(read_certificate(path), days)) for path in paths}
     try:
         for path, content in contents.items():
@@ -113,6 +111,24 @@ def renew(authority: Authority, folder: Path, days: float) -> list[Path]:
 
 
 def lives(folder: Path) -> list[tuple[str, str, float]]:
-    """Return file, name and days left of each certificate in a folder."""
-    certificates = {path: read_certificate(path) for path in sorted(folder.glob("*.pem"))}
+    """
+    Return file, name and days left of each certificate in a folder.
+
+    Raises:
+        ConfigError: There is none, or one is none.
+    """
+    certificates = {path: read_certificate(path) for path in certificates_in(folder)}
     return [(path.name, name_of(certificate), days_left(certificate)) for path, certificate in certificates.items()]
+
+
+def certificates_in(folder: Path) -> list[Path]:
+    """
+    Return the certificates in a folder.
+
+    Raises:
+        ConfigError: There is none: a timer that asks how long certificates live must not be told by silence that all is well.
+    """
+    paths = sorted(folder.glob("*.pem"))
+    if not paths:
+        raise ConfigError(f"certs: a folder must hold certificates, ROLE.pem, got none in {folder}")
+    return paths

@@ -91,6 +91,16 @@ def test_commands_make_bundles_and_show_what_ends_soon(tmp_path: Path, monkeypat
     assert f"desk/controller.pem: {common_name('controller', load(SHIPPED, with_model=False).keys())}, valid for 29.0 days" in shown
 
 
+@pytest.mark.parametrize("command", ["show", "renew"])
+def test_folder_without_certificates_is_refused_by_name(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A timer that looks for certificates in a misspelt folder must not be told that they live."""
+    monkeypatch.chdir(tmp_path)
+    run = CliRunner()
+    assert run.invoke(app, ["certs", "authority"]).exit_code == 0
+    refusal = run.invoke(app, ["certs", command, "dsek"]).exception
+    assert str(refusal) == "certs: a folder must hold certificates, ROLE.pem, got none in dsek"
+
+
 @pytest.mark.parametrize(
     ("role", "router", "keys", "words"),
     [
