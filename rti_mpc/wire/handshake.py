@@ -76,7 +76,8 @@ def obstacle(endpoint: str, authority: Path | None = None, certificate: Path | N
     try:
         context = client(authority, certificate, key) if tls and authority is not None else stranger()
     except OSError as error:
-        return f"the certificates of this process cannot be used: {error}"
+        files = ", ".join(str(path) for path in (authority, certificate, key) if path is not None)  # the error does not say which
+        return f"the certificates of this process cannot be used, {files}: {error}"
     try:
         link = socket.create_connection((host, int(match["port"])), TIMEOUT_S)
     except (socket.gaierror, UnicodeError):  # the latter of one that no name can be, such as with a part of more than 63 characters

@@ -111,7 +111,10 @@ def zenoh_config(settings: BusSettings) -> zenoh.Config:
         config.insert_json5(name, json.dumps(mode))
         for name, value in _tls(settings).items():
             config.insert_json5(name, json.dumps(value))
-        for name, _, text in (setting.partition(":") for setting in settings.cfg):
+        for setting in settings.cfg:
+            name, _, text = setting.partition(":")
+            if not text:
+                raise ConfigError(f"bus: a setting of Zenoh must be KEY:VALUE, such as transport/link/tx/lease:1000, got {setting!r}")
             config.insert_json5(name, text)
     except zenoh.ZError as error:
         raise ConfigError(f"bus: {name} must be what Zenoh takes, got: {_brief(error)}") from None
@@ -145,8 +148,10 @@ def _tls(settings: BusSettings) -> dict[str, Any]:
 
 
 def _brief(error: Exception) -> str:
-    """Return the innermost cause that Zenoh tells, without the place in its source."""
-    return " ".join(str(error).split(" at /")[0].rpartition(": [")[2].split())
+    """Return the innermost cause that Zenoh tells, without the places in its source: of ``what: [why at PLACE] at PLACE`` the why."""
+    text = str(error).split(" at /")[0]
+    inside = text.count("[") > text.count("]")
+    return " ".join((text.rpartition(": [")[2] if inside else text).split())
 
 
 def endpoints(config: zenoh.Config) -> str:

@@ -91,6 +91,15 @@ def test_router_at_another_address_or_process_that_is_no_router_is_named_as_the_
         assert said(false, folder) == "what listens there has no certificate of a router"
 
 
+def test_certificates_that_cannot_be_used_are_named(tmp_path: Path) -> None:
+    """Python's own error says `[SSL] PEM lib`, and not of which file."""
+    authority = Authority.make("authority", 1.0)
+    folder = bundle(tmp_path / "desk", authority, "tls/127.0.0.1:7447")
+    (folder / FILES[1]).write_text("junk")
+    files = ", ".join(str(folder / name) for name in FILES)
+    assert said("tls/127.0.0.1:7447", folder).startswith(f"the certificates of this process cannot be used, {files}: ")
+
+
 def test_endpoints_are_tried_side_by_side_and_one_whose_name_server_hangs_keeps_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
     hanging, going = "tcp/hangs.invalid:7447", Event()
     monkeypatch.setattr(handshake, "DEADLINE_S", 0.5)

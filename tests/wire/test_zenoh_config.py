@@ -66,6 +66,7 @@ def test_given_settings_win_over_the_file_and_the_file_over_defaults(tmp_path: P
         (BusSettings(mode="peeer"), "mode"),
         (BusSettings(cfg=("no/such/key:1",)), "no/such/key"),
         (BusSettings(cfg=("transport/link/tx/lease:soon",)), "transport/link/tx/lease"),
+        (BusSettings(cfg=("transport/link/tx/lease",)), "must be KEY:VALUE, such as transport/link/tx/lease:1000, got 'transport/link/tx/lease'"),
         (BusSettings(config=Path("missing.json5")), "missing.json5"),
     ],
 )
