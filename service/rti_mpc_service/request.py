@@ -187,8 +187,8 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, Any]:
     for assignment in assignments:
         key, _, value = assignment.partition("=")
         try:
-            (values[key.strip()],) = toml.read(f"value = {value}").values()
-        except (ConfigError, ValueError):
+            values[key.strip()] = toml.read_value(value)
+        except ConfigError:
             raise ConfigError(f"params must be set by KEY=VALUE, the value as in the file, got {assignment}") from None
     for key, value in to_json(values).items():
         if not all(math.isfinite(number) for number in (value if isinstance(value, list) else [value]) if isinstance(number, float)):

@@ -35,6 +35,20 @@ def read(text: str) -> dict[str, Any]:
     return content
 
 
+def read_value(text: str) -> Any:
+    """
+    Return one value, such as the right side of an assignment on the command line.
+
+    Raises:
+        ConfigError: The text is not one value of TOML.
+    """
+    try:
+        (value,) = read(f"value = {text}").values()
+    except (ConfigError, ValueError):  # the latter of text that goes on with another key
+        raise ConfigError(f"must be a value as in the file, got {text}") from None
+    return value
+
+
 def too_deep(content: dict[str, Any]) -> bool:
     """Whether more than `MAX_NESTING` tables and lists are inside each other."""
     level: list[Any] = [content]

@@ -189,7 +189,10 @@ def overridden(config: Config, ocp: Ocp, assignments: Sequence[str]) -> dict[str
             table = table.get(step) if isinstance(table, dict) else None
         if not isinstance(table, dict):
             raise ConfigError(f"--set must name a key of the configuration, got {key}")
-        table[name] = toml.read(f"value = {value}")["value"]
+        try:
+            table[name] = toml.read_value(value)
+        except ConfigError:
+            raise ConfigError(f"--set must be KEY=VALUE, the value as in the file, got {assignment!r}") from None
     try:
         changed = Config.model_validate(document)
         check_tree(changed)

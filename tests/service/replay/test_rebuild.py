@@ -75,7 +75,8 @@ def test_what_is_not_as_it_was_is_said_and_the_first_difference_told(journal: Jo
         ("ocp.weights.Q.psi", "must be KEY=VALUE"),
         ("ocp.weights.Q.phi=1", "phi"),
         ("ocp.weights.R.u_c=-1", "u_c"),
-        ("ocp.weights.R.u_c=fast", "TOML"),
+        ("ocp.weights.R.u_c=fast", "--set must be KEY=VALUE, the value as in the file, got 'ocp.weights.R.u_c=fast'"),
+        ("ocp.weights.R.u_c=1\nN = 3", "the value as in the file, got 'ocp.weights.R.u_c=1"),
         ("ocp.weights.S.u_c=1", "a key of the configuration"),
     ],
 )
