@@ -206,12 +206,15 @@ def at_points(function: ca.Function, *points: Array) -> Array:
     Evaluate a function at many points at once, ten times as fast as CasADi, which converts arrays number by number.
 
     Args:
-        function: A CasADi function with one dense result.
+        function: A CasADi function with one result.
         points: A row per point of each argument, shapes ``(n, size)``.
 
     Returns:
         A row per column of the results, shape ``(n * columns, rows)``.
     """
+    if not function.sparsity_out(0).is_dense():
+        symbols = function.mx_in()
+        function = ca.Function(function.name(), symbols, [ca.densify(function(*symbols))])
     many = function.map(len(points[0]))
     found: Array = np.empty(many.size_out(0)[::-1])
     given = (np.ascontiguousarray(rows, dtype=float) for rows in points)

@@ -83,6 +83,20 @@ def test_process_ends_well_while_its_threads_are_inside_zenoh() -> None:
     assert (done.returncode, done.stderr) == (0, b"")
 
 
+def test_ctrl_c_while_modules_load_ends_the_process_without_a_traceback() -> None:
+    """At once, or, where the host was busy and they have loaded meanwhile, with the status of an interrupt."""
+    command = [sys.executable, "-X", "importtime", "-m", "rti_mpc_service", "robots", "--help"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as child:
+        assert child.stderr is not None
+        said = []
+        for line in child.stderr:  # as they are loaded
+            said.append(line)
+            if "rti_mpc.errors" in line:
+                child.send_signal(signal.SIGINT)
+    assert child.returncode in (-signal.SIGINT, 0)
+    assert all(line.startswith("import time:") for line in said), said
+
+
 @pytest.mark.parametrize(
     ("step", "status", "said"),
     [

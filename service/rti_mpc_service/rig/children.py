@@ -10,6 +10,8 @@ import sys
 from pathlib import Path
 from types import TracebackType
 
+from rti_mpc_service.entry import EXIT_BY_SIGNAL
+
 END_TIMEOUT_S = 3.0  # between Ctrl-C and SIGKILL
 
 
@@ -90,12 +92,17 @@ class Children:
         return self._running[name].pid if name in self._running else None
 
     def end(self, name: str, patience_s: float = END_TIMEOUT_S) -> int:
-        """End a process by SIGINT, after `patience_s` by SIGKILL, and return its exit status."""
+        """
+        End a process by SIGINT, after `patience_s` by SIGKILL, and return its exit status.
+
+        That is 0 also where this SIGINT has ended it while it was loading: then it had nothing to end.
+        """
         child = self._running.pop(name)
-        if child.poll() is None:
+        if runs := child.poll() is None:
             child.send_signal(signal.SIGINT)
         try:
-            return child.wait(patience_s)
+            status = child.wait(patience_s)
+            return 0 if runs and status in (-signal.SIGINT, EXIT_BY_SIGNAL + signal.SIGINT) else status
         except subprocess.TimeoutExpired:
             child.kill()
             return child.wait()

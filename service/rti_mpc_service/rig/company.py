@@ -9,7 +9,7 @@ from threading import Event
 
 from rti_mpc_service.rig.children import Children
 
-CLI_MODULE = "rti_mpc_service.cli"  # module of the command line, as children are started with it
+CLI_MODULE = "rti_mpc_service"  # the command line, as children are started with it
 WATCHER_NICENESS = 10  # niceness of processes that only watch
 START_TIMEOUT_S = 300.0  # for processes to come up: the first controller on a machine compiles, and watchers start last on a busy one
 POLL_PERIOD_S = 0.05  # period at which a condition is checked

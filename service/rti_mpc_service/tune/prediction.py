@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from rti_mpc.array import Array
@@ -25,8 +24,7 @@ class Predictor:
 
     def __init__(self, model: Model) -> None:
         self._phi = integrator(model)
-        x, u, p, dt = symbols = self._phi.sx_in()
-        self._A = ca.Function("A", symbols, [ca.densify(ca.jacobian(self._phi(x, u, p, dt), x))])
+        self._A = self._phi.factory("A", ["x", "u", "p", "dt"], ["jac:x_next:x"])
         self._p = np.array(model.p_nominal)
 
     def _at(self, function: Any, x: Array, v: Array, span: Array) -> Array:
