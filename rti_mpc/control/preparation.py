@@ -16,14 +16,8 @@ class Preparation:
     """First phase of one controller's samples."""
 
     def __init__(self, parts: Assembly, planner: Planner, record: Record, opinions: Opinions | None) -> None:
-        self._planner, self._record, self._opinions, self._rti, self._ladder, self._grid = (
-            planner,
-            record,
-            opinions,
-            parts.rti,
-            parts.ladder,
-            parts.grid,
-        )
+        self._planner, self._record, self._opinions = planner, record, opinions
+        self._rti, self._ladder, self._grid = parts.rti, parts.ladder, parts.grid
         self._modes, self._states, self._sent, self._issued, self._ways = parts.modes, parts.states, parts.sent, parts.issued, parts.ways
         self._tuning, self._delay, self._blockage = parts.tuning, parts.delay, parts.blockage
 
