@@ -103,13 +103,8 @@ class Controller:
         self.np_ = rti.ocp.model.np_ - len(parts.states.d)
         self._rti, self._stale_ns = rti, parts.stale_ns
         self._modes, self._states, self._track, self._tuning, self._blockage = parts.modes, parts.states, parts.track, parts.tuning, parts.blockage
-        self._sent, self._reports, self._prediction, self._delay, self._issued = (
-            parts.sent,
-            parts.reports,
-            parts.prediction,
-            parts.delay,
-            parts.issued,
-        )
+        self._sent, self._reports, self._prediction = parts.sent, parts.reports, parts.prediction
+        self._delay, self._issued = parts.delay, parts.issued
         self._planner = Planner(parts)
         self._fallback = Fallback(parts, self._planner)
         self._interruption = Interruption(parts, self._planner)

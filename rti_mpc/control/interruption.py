@@ -33,7 +33,7 @@ class Interruption:
                 planner.load(grid.act_ns, shift=True)
             return
         if behind:
-            self._modes.say(Severity.WARNING, "gap", f"no sample for {behind} periods: starting cold")
+            self._modes.say(Severity.WARNING, "gap", f"no sample for {behind} period{'s' * (behind > 1)}: starting cold")
         self._forget_plan()
         self._ladder.failed = 0
         clock = self._states.clock

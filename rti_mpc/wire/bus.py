@@ -247,7 +247,8 @@ class Bus:
             if heard():
                 return ""
             if links := self._session.links:
-                return f"no {what} of {self.keys.prefix}/{self.keys.robot} yet, from {links} others on the bus: is it running, under this name?"
+                others = f"{links} other{'s' * (links > 1)} on the bus"
+                return f"no {what} of {self.keys.prefix}/{self.keys.robot} yet, from {others}: is it running, under this name?"
             return f"not connected, no {what} yet: {why}" if (why := self.unconnected) else ""
 
         remind(self._say, wanted, self._over)

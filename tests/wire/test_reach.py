@@ -71,7 +71,7 @@ def test_process_that_is_linked_says_what_does_not_come_until_it_has_come() -> N
         Bus.join(BusSettings(connect=(endpoint,)), KEYS, say=said.put) as bus,
     ):
         heard = expecting(bus)
-        text = "no state of rti_mpc/test yet, from 1 others on the bus: is it running, under this name?"
+        text = "no state of rti_mpc/test yet, from 1 other on the bus: is it running, under this name?"
         while said.get(timeout=PATIENCE_S) != text:  # the link is made in its own time
             pass
         states, seq, deadline_s = robot.publisher(KEYS.state), 0, time.monotonic() + PATIENCE_S
