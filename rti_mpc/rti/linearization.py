@@ -118,6 +118,7 @@ class Linearization:
         model, N, N_u = ocp.model, ocp.N, ocp.N_u
         nx, nu = model.nx, model.nu
         self._blocks = ocp.blocks
+        self._by_input = ocp.lambda_.ndim > 1  # whether the penalty on increments has a number for each input
         self.x = ca.MX.sym("x", nx, N + 1)
         self.u = ca.MX.sym("u", nu, N_u)
         self.u_prev = ca.MX.sym("u_prev", nu)
@@ -220,7 +221,8 @@ class Linearization:
 
     def weighed(self, increments: ca.MX) -> ca.MX:
         """Return ``R_k du_k`` of increments, a column per block, shape ``(nu, N_u)``."""
-        if (lambda_ := self.w["lambda_"]).size2() == 1:
+        lambda_ = self.w["lambda_"]
+        if not self._by_input:
             return ca.MX((self.R @ increments) * ca.repmat(lambda_.T, increments.size1(), 1))
         root = ca.sqrt(lambda_)
         return ca.MX(root * (self.R @ (root * increments)))
@@ -250,7 +252,8 @@ class Linearization:
         The former has what outputs cost by their inputs as well.
         """
         last = k == self.u.shape[1] - 1
-        if (lambda_ := self.w["lambda_"]).size2() == 1:
+        lambda_ = self.w["lambda_"]
+        if not self._by_input:
             following = 0 if last else lambda_[k + 1]
             weight, beside = self.R * (lambda_[k] + following), -self.R * following
         else:

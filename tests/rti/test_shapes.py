@@ -81,3 +81,14 @@ def test_the_shipped_robot_has_any_number_of_discs_with_and_without_bounds_on_st
     ocp = Ocp(model, **PAPER | {"lh": 0.0, "lbx": -INF, "ubx": [INF, INF, INF, speed_bound, INF]})
     plan = solved(ocp, "riccati", "auto")
     np.testing.assert_allclose(solved(ocp, "daqp", "simultaneous"), plan, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("solver", "formulation"), [("riccati", "auto"), ("daqp", "sequential"), ("daqp", "simultaneous")])
+def test_numbers_by_stage_and_input_of_a_single_stage_are_those_of_its_inputs(solver: str, formulation: str) -> None:
+    """A row for the only stage is one column, as is a number for each stage."""
+    alike = {"R_u": [0.1, 0.2], "lbu": [-0.4, -0.6], "ubu": [0.4, 0.6], "lbdu": [-0.2, -0.3], "ubdu": [0.2, 0.3]}
+    by_stage: dict[str, Any] = {name: [numbers] for name, numbers in alike.items()}
+    plan = solved(Ocp(pioneer_3dx(), **PAPER | {"N_u": 1, "lambda_": 0.8} | alike), solver, formulation)
+    same = solved(Ocp(pioneer_3dx(), **PAPER | {"N_u": 1, "lambda_": [[0.8, 0.8]]} | by_stage), solver, formulation)
+    np.testing.assert_allclose(same, plan, rtol=0, atol=1e-9)  # rounding
+    assert np.abs(plan).max() > 0.1, "the robot is driven"
