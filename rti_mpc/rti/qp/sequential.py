@@ -101,14 +101,14 @@ class Condensing:
         self.M, self.m = ca.vertcat(*M), ca.vertcat(*m)
 
 
-_condensings: WeakKeyDictionary[Ocp, Condensing] = WeakKeyDictionary()
+_condensings: WeakKeyDictionary[Linearization, Condensing] = WeakKeyDictionary()
 
 
-def condensing(ocp: Ocp) -> Condensing:
+def condensing(ocp: Ocp, lin: Linearization) -> Condensing:
     """Return the condensed problem, which its transcriptions with and without softened bounds share, built at the first call."""
-    if ocp not in _condensings:
-        _condensings[ocp] = Condensing(ocp, linearization(ocp))
-    return _condensings[ocp]
+    if lin not in _condensings:
+        _condensings[lin] = Condensing(ocp, lin)
+    return _condensings[lin]
 
 
 def kernels(lin: Linearization, width: int) -> tuple[ca.Function, ca.Function, ca.Function, ca.Function]:
@@ -139,7 +139,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
         softened: Whether the softened bounds, on states and general constraints, and their slacks are there.
     """
     lin = linearization(ocp)
-    condensed = condensing(ocp)
+    condensed = condensing(ocp, lin)
     N, N_u, nu = ocp.N, ocp.N_u, ocp.model.nu
     ng = ocp.ng if softened else 0
     kind = KIND_NAMES[softened]
