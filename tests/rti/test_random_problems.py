@@ -22,7 +22,7 @@ MAX_DIFFERENCE = 1e-6  # of the oracles' costs, relative; otherwise the plan is 
 def test_random_problems_are_solved_and_no_plan_is_wrong(request: pytest.FixtureRequest) -> None:
     structures, sets = request.config.getoption("--structures"), request.config.getoption("--sets")
     seen: Counter[str] = Counter()
-    wrong, disputed = [], []
+    wrong, disputed, unsolved = [], [], []
     for number in range(structures):
         rng = np.random.default_rng([SEED, number])
         structure = random_structure(rng)
@@ -38,6 +38,7 @@ def test_random_problems_are_solved_and_no_plan_is_wrong(request: pytest.Fixture
             status = rti.feedback(x0)
             seen[status.name] += 1
             if status is not QpStatus.SOLVED:
+                unsolved.append(f"{number}, {which} by {type(rti.solver).__name__}: {status.name} after {rti.solver.iterations} iterations")
                 continue
             truth, x, u = Truth(structure, data), rti.x / structure.unit_x, rti.u / structure.unit_u
             solutions = truth.solutions()
@@ -49,6 +50,7 @@ def test_random_problems_are_solved_and_no_plan_is_wrong(request: pytest.Fixture
             if truth.broken(x, u) > MAX_BROKEN or not cost <= (1.0 + MAX_EXCESS) * least:
                 wrong.append((number, which, truth.broken(x, u), cost, costs))
     print(f"\n{structures} structures of {sets} problems: {dict(seen)}")
+    print(*unsolved, sep="\n")
     for number, which, costs, cost, excess in disputed:
         proved = "at most" if excess <= MAX_EXCESS else "not proved to be less than"
         print(f"the oracles differ on {number}, {which}: {costs}; the plan costs {cost}, {proved} {excess:.1e} of it above the least")
