@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import subprocess
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -52,28 +53,32 @@ def computed_ms(process: subprocess.Popen[bytes]) -> float:
     return sum(map(int, fields[11:15])) * 1000.0 / os.sysconf("SC_CLK_TCK")
 
 
-def ends_in_time(process: subprocess.Popen[bytes], what: str, limit_ms: float, patience_s: float = PATIENCE_S) -> int:
+def ends_in_time(
+    process: subprocess.Popen[bytes], what: str, limit_ms: float, patience_s: float = PATIENCE_S, asked: Sequence[subprocess.Popen[bytes]] = ()
+) -> int:
     """
     Hold a process that was just asked to end to a time, less that in which its own threads waited for a core; return its exit status.
 
-    What others wait for meanwhile excuses nothing: where many end at once, that alone would excuse any end.
+    What others wait for meanwhile excuses nothing, but for those whose answer the end takes: where many end at once, that alone would excuse any end.
 
     Raises:
         subprocess.TimeoutExpired: It does not end.
     """
     since_ns = time.monotonic_ns()
-    waits = OwnWaits(process.pid)
+    waits = [OwnWaits(one.pid) for one in (process, *asked)]
     while process.poll() is None:
-        waits.look()
+        for one in waits:
+            one.look()
         with suppress(subprocess.TimeoutExpired):
             process.wait(1e-3 * LOOK_MS)
         if time.monotonic_ns() - since_ns > 1e9 * patience_s:
             raise subprocess.TimeoutExpired(what, patience_s)
     took_ms = (time.monotonic_ns() - since_ns) / MS
-    waits.look()  # which closes what it has opened
-    assert waits.explain(took_ms - limit_ms), (
-        f"{what} took {took_ms:.0f} ms of {limit_ms:.0f}, of which its threads waited {waits.ms:.0f} ms for a core"
-    )
+    for one in waits:
+        one.look()  # which closes what it has opened
+    waited_ms = [round(one.ms) for one in waits]
+    late = f"{what} took {took_ms:.0f} ms of {limit_ms:.0f}, of which its threads waited {waited_ms[0]} ms for a core"
+    assert SEEN * (took_ms - limit_ms) <= sum(waited_ms), late + "".join(f", those of a process that it asks {ms} ms" for ms in waited_ms[1:])
     return process.returncode
 
 

@@ -59,6 +59,12 @@ def test_end_that_is_late_by_itself_is_late_however_many_others_wait_for_a_core(
 
 
 @pytest.mark.usefixtures("others")
+def test_end_that_asks_another_is_late_by_what_that_one_waits_for_its_core() -> None:
+    with asked_to_end(WORKER, available()[0], 60.0) as other, asked_to_end(SLEEPER, 0.5) as process:
+        assert ends_in_time(process, "the end", 200.0, asked=[other]) == 0
+
+
+@pytest.mark.usefixtures("others")
 def test_end_that_computes_beside_others_is_late_by_what_it_waits_for_its_core() -> None:
     with asked_to_end(WORKER, available()[0], 0.2) as process:
         assert ends_in_time(process, "the end", 600.0) == 0

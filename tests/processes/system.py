@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TypeVar
@@ -105,14 +105,14 @@ class System:
             self.running[role].send_signal(number)
         return now_ns
 
-    def interrupt(self, role: str, limit_ms: float = 1e3 * PATIENCE_S) -> int:
-        """Press Ctrl-C, hold the process to a time for its end, and return its exit status."""
+    def interrupt(self, role: str, limit_ms: float = 1e3 * PATIENCE_S, asked: Sequence[str] = ()) -> int:
+        """Press Ctrl-C, hold the process to a time for its end, in which it may ask others, and return its exit status."""
         process = self.running.pop(role)
         until(lambda: handles(process.pid, signal.SIGTERM) or process.poll() is not None, f"{role} handles signals")
         self.fault_at_ns = time.monotonic_ns()
         process.send_signal(signal.SIGINT)
         try:
-            return ends_in_time(process, f"the end of the {role}", limit_ms, PATIENCE_S)
+            return ends_in_time(process, f"the end of the {role}", limit_ms, PATIENCE_S, [self.running[other] for other in asked])
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGABRT)  # where every thread is, to its log
             process.wait(PATIENCE_S)

@@ -139,7 +139,7 @@ def test_ctrl_c_ends_the_guard_with_a_ramp_to_rest(driven: System, host: Host) -
     """The last test: the robot stays where it is."""
     actuation = driven.bus.subscriber(KEYS.actuation, capacity=4096)
     stopped_ns = driven.state(lambda _: True).stamp_ns
-    assert driven.interrupt("guard", 1000.0) == 0
+    assert driven.interrupt("guard", 1000.0, asked=["robot"]) == 0, "it waits for the robot to have heard of braking"
     until(lambda: "guard" not in driven.lives, "the guard is gone")
     last = decode(Command, actuation.drain()[-1].payload)
     assert last.mode is Mode.BRAKING
