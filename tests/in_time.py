@@ -75,7 +75,8 @@ def ends_in_time(
             raise subprocess.TimeoutExpired(what, patience_s)
     took_ms = (time.monotonic_ns() - since_ns) / MS
     for one in waits:
-        one.look()  # which closes what it has opened
+        one.look()
+        one.close()
     waited_ms = [round(one.ms) for one in waits]
     late = f"{what} took {took_ms:.0f} ms of {limit_ms:.0f}, of which its threads waited {waited_ms[0]} ms for a core"
     assert SEEN * (took_ms - limit_ms) <= sum(waited_ms), late + "".join(f", those of a process that it asks {ms} ms" for ms in waited_ms[1:])
@@ -100,6 +101,10 @@ class OwnWaits:
         now_ns = time.monotonic_ns()
         self.ms += min(self._threads.waited_ns(), now_ns - self._looked_ns) / MS
         self._looked_ns = now_ns
+
+    def close(self) -> None:
+        """Close what was opened of threads that live on."""
+        self._threads.close()
 
     def explain(self, late_ms: float) -> bool:
         """Whether the process has been late by no more than its own waits explain."""

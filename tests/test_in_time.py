@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -38,8 +39,10 @@ def asked_to_end(code: str, *arguments: object) -> Iterator[subprocess.Popen[byt
         assert process.stdout is not None
         assert process.stdout.readline() == b"\n"
         process.stdin.close()
-        yield process
-        process.kill()
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 @pytest.fixture
@@ -61,7 +64,9 @@ def test_end_that_is_late_by_itself_is_late_however_many_others_wait_for_a_core(
 @pytest.mark.usefixtures("others")
 def test_end_that_asks_another_is_late_by_what_that_one_waits_for_its_core() -> None:
     with asked_to_end(WORKER, available()[0], 60.0) as other, asked_to_end(SLEEPER, 0.5) as process:
+        before = len(os.listdir("/proc/self/fd"))
         assert ends_in_time(process, "the end", 200.0, asked=[other]) == 0
+        assert len(os.listdir("/proc/self/fd")) == before, "nothing is left open of a process that lives on"
 
 
 @pytest.mark.usefixtures("others")

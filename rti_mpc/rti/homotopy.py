@@ -25,7 +25,7 @@ from rti_mpc.rti.linearization import Linearization, along_rows
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
 
-LIMITS = "lower", "upper", "most"
+LIMITS = "lower", "upper", "most"  # names of what `limits` returns
 
 
 def limits(ocp: Ocp, lin: Linearization) -> list[ca.MX]:

@@ -177,6 +177,11 @@ class Threads:
         self._looked_ns = now_ns
         return total_ns
 
+    def close(self) -> None:
+        """Close the files in proc of all threads that live."""
+        while self._open:
+            self._open.popitem()[1].close()
+
 
 class Waits:
     """How long one thread has waited for a core."""
