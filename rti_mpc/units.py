@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 
 LONG = 1000  # lines from which a function without loops is a unit of its own
-FEWER_PASSES = ("-O2", "-fno-tree-pre", "-fno-gcse")  # for such a unit, if the compiler knows them: as fast a code in two thirds of the time
+FEWER_PASSES = ("-O2", "-fno-tree-pre", "-fno-code-hoisting", "-fno-gcse")  # for these, if the compiler knows them: half of the time
 
 FUNCTION = re.compile(r"^/\* (?P<name>\w+):\(.*\*/\nstatic (?P<head>int (?P<symbol>\w+)\(.*\)) \{\n(?P<body>(?:.*\n)*?)\}\n", flags=re.MULTILINE)
 LOOP_OR_CALL = re.compile(r"for \(|casadi_f\d")

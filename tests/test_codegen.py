@@ -193,6 +193,23 @@ def test_compiler_that_fails_or_lies_is_no_error(cache: Path, tmp_path: Path, mo
     assert not any("\n" in str(warning.message) for warning in warned)
 
 
+def test_no_compiler_is_left_when_another_one_beside_it_fails(tmp_path: Path) -> None:
+    begun, compiler = tmp_path / "begun", tmp_path / "cc"
+    os.mkfifo(begun)
+    compiler.write_text(f"""#!/bin/sh
+case "$*" in
+  *-E*) exit 1 ;;
+  *function_1.c) echo > {begun}; sleep 20; echo > {tmp_path}/ended ;;
+  *) read _ < {begun}; echo no such type >&2; exit 1 ;;
+esac
+""")
+    compiler.chmod(0o755)
+    with pytest.raises(subprocess.CalledProcessError) as raised:
+        codegen.build([str(compiler)], ["first", "second"])
+    assert raised.value.stderr == b"no such type\n"
+    assert not (tmp_path / "ended").exists()
+
+
 @needs_compiler
 def test_cache_that_cannot_be_written_is_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
