@@ -16,6 +16,7 @@ import casadi as ca
 
 from rti_mpc.array import Array
 from rti_mpc.codegen import compiled
+from rti_mpc.rti.acceleration import relaxation
 from rti_mpc.rti.certificate import certificate
 from rti_mpc.rti.linearization import plan_cost, shift
 from rti_mpc.rti.nominal import check_stiffness, nominal_state
@@ -39,6 +40,7 @@ class Construction:
         transcriptions: The QPs: without softened bounds and, if there are any, with them.
         structured: Functions of the active-set method and its certificate; None for another solver.
         shift: See `rti_mpc.rti.linearization.shift`.
+        relaxation: See `rti_mpc.rti.acceleration.relaxation`.
         cost: See `rti_mpc.rti.linearization.plan_cost`.
         output: Outputs at a node, ``(x, p) -> y``.
         steps: See `rti_mpc.rti.turns.largest_steps`.
@@ -50,6 +52,7 @@ class Construction:
     transcriptions: tuple[Transcription, ...]
     structured: tuple[Places, ca.Function] | None
     shift: ca.Function
+    relaxation: ca.Function
     cost: ca.Function
     output: ca.Function
     steps: ca.Function
@@ -90,10 +93,10 @@ def construct(ocp: Ocp, formulation: str, structured: bool, build: str | None) -
     check_stiffness(ocp, x_nominal)
     transcriptions = tuple(FORMULATIONS[formulation](ocp, softened=softened) for softened in (False, True)[: 2 if ocp.ng else 1])
     active_set = (places(ocp), certificate(ocp)) if structured else None
-    moves, cost, output, steps = shift(ocp), plan_cost(ocp), ocp.model.h(), largest_steps(ocp)
-    native = [moves, cost, output, steps, *natives(transcriptions, active_set)]
+    moves, relaxed, cost, output, steps = shift(ocp), relaxation(ocp), plan_cost(ocp), ocp.model.h(), largest_steps(ocp)
+    native = [moves, relaxed, cost, output, steps, *natives(transcriptions, active_set)]
     made = dict(zip((f.name() for f in native), compiled(*native, build=build) if build else native, strict=True))
-    return Construction(x_nominal, transcriptions, active_set, moves, cost, output, steps, made)
+    return Construction(x_nominal, transcriptions, active_set, moves, relaxed, cost, output, steps, made)
 
 
 def natives(transcriptions: tuple[Transcription, ...], structured: tuple[Places, ca.Function] | None) -> list[ca.Function]:

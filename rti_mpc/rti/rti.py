@@ -6,8 +6,9 @@ Preparation needs no state: it shifts the guess, linearizes there and prepares t
 solver, factorization included. Feedback embeds the initial state, solves and takes
 the full step. Only feedback is on the path from sensor to actuator
 [Diehl2005]_ [Gros2020]_. If that step is large, one linearization was not enough, and
-feedback iterates a few times at most. With at most one iteration this is the plain
-scheme; with many, and a small tolerance, it is sequential quadratic programming.
+feedback iterates a few times at most, the last times from guesses that are ahead. With
+at most one iteration this is the plain scheme; with many, and a small tolerance, it is
+sequential quadratic programming.
 
 `ActiveSet` solves nearly every QP; a QP solver takes over when it fails. Softened bounds
 rarely act, so the QP solver first solves the QP without them. A plan that keeps them
@@ -28,6 +29,7 @@ from rti_mpc.array import Array
 from rti_mpc.codegen import BUILDS, bind
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import OcpError
+from rti_mpc.rti.acceleration import Acceleration
 from rti_mpc.rti.active_set import ActiveSet
 from rti_mpc.rti.construction import FORMULATIONS, construction
 from rti_mpc.rti.ocp import ARGUMENTS, Ocp
@@ -156,6 +158,7 @@ class Rti:
         )
 
         make = built.make
+        self._acceleration = Acceleration(built.relaxation, self.guess, make)
         self.advance = bind(make(built.shift), {"x": x_plan, "u": self.u, "p": p}, {"x_next": x, "u_next": u})
         bounds = np.atleast_2d(self._weights["lbx"])[0], np.atleast_2d(self._weights["ubx"])[0]
         self._turns = Turns(self.problem, (make(built.output), make(built.steps)), x, x0, self.y_ref, p, bounds)
@@ -452,6 +455,8 @@ class Rti:
         status = active_set.certified()
         if not status.usable:
             self.keep_guess()
+            if self.taken > 1:
+                self._acceleration.restore()
             active_set.forget()
         return status
 
@@ -467,12 +472,15 @@ class Rti:
         return status
 
     def _iterate(self) -> None:
-        """Iterate at the plan while the step is large; an iteration that fails leaves the plan of the one before."""
+        """Iterate while the step is large; an iteration that fails leaves the plan of the one before."""
+        self._acceleration.begin()
         while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
             if self._settled and self.active_set is not None and not self.active_set.goes_on:
                 break  # the next sample goes on; after a start, a plan that is left early may lead nowhere
-            self._relinearize()
+            self._acceleration.advance()
+            self._linearize()
             if not (status := self.solve()).usable:
+                self._acceleration.restore()
                 self.status = INACCURATE  # the plan comes from an earlier QP, which cannot be certified any more
                 break
             self.status = status

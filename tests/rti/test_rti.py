@@ -198,18 +198,17 @@ def test_many_iterations_a_sample_are_converged_nmpc() -> None:
 
 def test_sample_is_iterated_on_only_while_the_step_is_large() -> None:
     ocp = pioneer()
-    rti, plain = Rti(ocp, iterations=4, tolerance=1e-6), Rti(ocp, iterations=1)
+    rti, plain = Rti(ocp, iterations=2, tolerance=1e-6), Rti(ocp, iterations=1)
     ((x0, y_ref, u_prev),) = near_the_eight(ocp, seed=24, count=1)
     for one in (rti, plain):
         one.reset(x0, u_prev)
         one.prepare(y_ref, shift=False)
         one.feedback(x0)
-    assert rti.taken == 4
+    assert rti.taken == 2
     assert plain.taken == 1
-    for _ in range(3):
-        plain.prepare(y_ref, shift=False)
-        plain.feedback(x0)
-    np.testing.assert_array_equal(rti.u, plain.u)  # bit for bit what four samples without a shift are
+    plain.prepare(y_ref, shift=False)
+    plain.feedback(x0)
+    np.testing.assert_array_equal(rti.u, plain.u)  # bit for bit what two samples without a shift are: from the third iteration on, guesses are ahead
     rti.tolerance = 0.01
     for _ in range(10):
         rti.prepare(y_ref, shift=False)
