@@ -13,11 +13,12 @@ allocated for a declared length before that many bytes are there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from itertools import groupby
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache, partial
 from math import inf
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from struct import Struct
+from struct import error as StructError
 from typing import Any, TypeVar
 
 import numpy as np
@@ -39,12 +40,11 @@ HEADER_BYTES = len(HEADER)  # alignment is counted from the end of the header
 STRUCT_FORMATS = {"uint8": "B", "uint32": "I", "uint64": "Q", "int64": "q", "float64": "d"}  # key: type of a scalar in .msg files
 LITTLE_ENDIAN = np.dtype("<f8")
 FLOAT64 = np.dtype(np.float64)
-UINT32 = Struct("<I")
+MAX_LAYOUTS = 64  # of whole messages of one class that are kept, by their sizes
 
-# Both continue at an offset from the end of the header. A writer returns the bytes of its fields; a reader appends their
-# values to a list and returns the offset after them.
-Writer = Callable[[Any, int], bytes]
-Reader = Callable[[bytes, int, list[Any]], int]
+# A message is read piece by piece: a run of scalars, and the array, text or bytes behind it, whose length is unpacked with them. What takes those
+# replaces the last values of a list, the length and before it a row width where there is one. It begins at an offset, and returns the one behind.
+Taker = Callable[[bytes, int, list[Any]], int]
 
 
 class Refused(MessageError):
@@ -78,12 +78,17 @@ def encoding(cls: type[Any]) -> str:
 
 def encode(message: Message) -> bytes:
     """Bytes of a message."""
-    parts, offset = [HEADER], 0
-    for write in WRITERS[type(message)]:
-        part = write(message, offset)
-        parts.append(part)
-        offset += len(part)
-    return b"".join(parts)
+    writer = WRITERS[type(message)]
+    slots = list(writer.slots(message))
+    for i in writer.widths:
+        slots[i] = slots[i][1]
+    for i in writer.arrays:
+        array: Array = slots[i]
+        slots[i] = (array if array.dtype is LITTLE_ENDIAN else array.astype(LITTLE_ENDIAN)).tobytes()
+    for i, written in writer.texts:
+        slots[i] = written(slots[i])
+        slots[i - 1] = len(slots[i])
+    return writer.layout(writer.sizes(slots)).pack(HEADER, *slots)
 
 
 def decode(cls: type[M], payload: bytes) -> M:
@@ -95,12 +100,25 @@ def decode(cls: type[M], payload: bytes) -> M:
     """
     if payload[:HEADER_BYTES] != HEADER:
         raise _header_error(payload)
-    values: list[Any] = []
-    offset = 0
-    for read in READERS[cls]:
-        offset = read(payload, offset, values)
-    if len(payload) != HEADER_BYTES + offset:
-        raise Refused("oversized", f"message must end after {HEADER_BYTES + offset} bytes, got {len(payload)}")
+    reader, values, offset = READERS[cls], list[Any](), HEADER_BYTES
+    try:
+        for layouts, take in reader.pieces:
+            layout = layouts[offset % 8]
+            values += layout.unpack_from(payload, offset)
+            offset += layout.size
+            if take is not None:
+                offset = take(payload, offset, values)
+    except StructError:
+        raise Refused("truncated", f"message must hold at least {offset + layout.size} bytes, got {len(payload)}") from None
+    if len(payload) != offset:
+        raise Refused("oversized", f"message must end after {offset} bytes, got {len(payload)}")
+    for i, name, known in reader.members:
+        if values[i] not in known:
+            raise Refused("value", f"{name} must be one of {sorted(known)}, got {values[i]}")
+        values[i] = known[values[i]]
+    for i, low, high, field in reader.ranges:
+        if not low <= values[i] <= high and values[i] != field.also:
+            raise Refused("value", f"{field.name} must be from {field.low} to {field.high}, got {values[i]}")
     message: M = cls(*values)
     if (check := FIELD_RELATIONS.get(cls)) is not None:
         check(message)
@@ -118,204 +136,202 @@ def _header_error(payload: bytes) -> Refused:
     return Refused("header", f"payload must begin with the CDR header {HEADER.hex(' ')}, got {got}")
 
 
-# Scalars: one call for each run of them.
+# Layouts of what one call of `struct` packs or unpacks.
 
 
-def _layouts(fields: Sequence[Field]) -> tuple[Struct, ...]:
-    """Layouts of a run of scalars, one for each offset modulo 8 at which it may begin."""
-    layouts = []
-    for start in range(8):
-        text, offset = "<", start
+def _layout(parts: Iterable[tuple[str, int]], start: int) -> Struct:
+    """Layout of parts, each a format and what it is aligned to, counted from the end of the header, with the padding before each of them."""
+    text, offset = "<", start
+    for code, unit in parts:
+        padding = (HEADER_BYTES - offset) % unit
+        text += f"{padding}x{code}"
+        offset += padding + Struct("<" + code).size
+    return Struct(text)
+
+
+def _scalar(kind: str) -> tuple[str, int]:
+    return STRUCT_FORMATS[kind], Struct("<" + STRUCT_FORMATS[kind]).size
+
+
+def _words(field: Field, widths: set[str]) -> int:
+    """Return how many words stand before the content of a field, 2 for the first matrix of each row width; `widths` is completed."""
+    first = bool(field.width) and field.width not in widths
+    widths.add(field.width)
+    return 1 + first
+
+
+# Writing: all at once, since what has a length tells it.
+
+
+class Writer:
+    """
+    How messages of one class are written, from a list of what is packed: a slot for each scalar, word and content.
+
+    Attributes:
+        slots: Returns what a message has for each slot.
+        widths: Places of row widths, where `slots` finds the shape of the matrix.
+        arrays: Places of the contents that are arrays, each behind its size.
+        texts: Places of those that are texts or bytes, each with what makes bytes of it; `slots` finds no size of them.
+        sizes: Returns the sizes among the slots.
+        layout: Returns the layout for sizes.
+    """
+
+    def __init__(self, fields: Sequence[Field]) -> None:
+        self.widths, self.arrays, self.texts = list[int](), list[int](), list[tuple[int, Callable[[Any], bytes]]]()
+        names, sizes, widths = list[str](), list[int](), set[str]()
         for field in fields:
-            size = Struct("<" + STRUCT_FORMATS[field.kind]).size
-            text += f"{-offset % size}x{STRUCT_FORMATS[field.kind]}"
-            offset += -offset % size + size
-        layouts.append(Struct(text))
-    return tuple(layouts)
+            if field.kind not in STRUCT_FORMATS:
+                if _words(field, widths) == 2:
+                    self.widths.append(len(names))
+                    names.append(f"{field.name}.shape")
+                sizes.append(len(names))
+                if field.kind == "float64[]":
+                    names.append(f"{field.name}.size")
+                    self.arrays.append(len(names))
+                else:
+                    names.append(field.name)
+                    self.texts.append((len(names), partial(_line, most=field.high) if field.kind == "string" else bytes))
+            names.append(field.name)
+        self.slots: Callable[[Any], tuple[Any, ...]] = attrgetter(*names)
+        self.sizes: Callable[[list[Any]], Any] = itemgetter(*sizes)
+        self.layout = lru_cache(maxsize=MAX_LAYOUTS)(partial(_whole, fields))
 
 
-def _scalar_writer(fields: Sequence[Field]) -> Writer:
-    layouts = _layouts(fields)
-    if len(fields) == 1:
-        name = fields[0].name
-        return lambda message, offset: layouts[offset % 8].pack(getattr(message, name))
-    values = attrgetter(*(field.name for field in fields))
-    return lambda message, offset: layouts[offset % 8].pack(*values(message))
+def _whole(fields: Sequence[Field], sizes: int | tuple[int, ...]) -> Struct:
+    """Layout of a whole message, with the header, for sizes of its arrays, in numbers, and of its texts and bytes."""
+    left, widths = iter((sizes,) if isinstance(sizes, int) else sizes), set[str]()
+    parts = [(f"{HEADER_BYTES}s", 1)]
+    for field in fields:
+        if field.kind in STRUCT_FORMATS:
+            parts.append(_scalar(field.kind))
+            continue
+        size = next(left)
+        parts += _words(field, widths) * [_scalar("uint32")]
+        parts.append((f"{8 * size}s", 8 if size else 1) if field.kind == "float64[]" else (f"{size}s", 1))
+    return _layout(parts, 0)
 
 
-def _scalar_reader(fields: Sequence[Field]) -> Reader:
-    layouts = _layouts(fields)
-    members = [(i, field.name, {int(member): member for member in enum}) for i, field in enumerate(fields) if (enum := field.member_of) is not None]
-    ranges = [
-        (i, -inf if field.low is None else field.low, inf if field.high is None else field.high, field)
-        for i, field in enumerate(fields)
-        if field.low is not None or field.high is not None
-    ]
-
-    def read(payload: bytes, offset: int, values: list[Any]) -> int:
-        layout = layouts[offset % 8]
-        end = offset + layout.size
-        if len(payload) < HEADER_BYTES + end:
-            raise Refused("truncated", f"message must hold at least {HEADER_BYTES + end} bytes, got {len(payload)}")
-        first = len(values)
-        values += layout.unpack_from(payload, HEADER_BYTES + offset)
-        for i, name, known in members:
-            value = values[first + i]
-            if value not in known:
-                raise Refused("value", f"{name} must be one of {sorted(known)}, got {value}")
-            values[first + i] = known[value]
-        for i, low, high, field in ranges:
-            if not low <= (value := values[first + i]) <= high and value != field.also:
-                raise Refused("value", f"{field.name} must be from {field.low} to {field.high}, got {value}")
-        return end
-
-    return read
+def _line(text: str, most: int | None) -> bytes:
+    """Return a text as one line of printable characters with a zero byte behind them, cut to the most bytes that it may have."""
+    if not text.isprintable():  # for example a line break in a quoted text
+        text = "".join(c if c.isprintable() else " " for c in text)
+    return text.encode("utf-8", "replace")[: most and most - 1].decode("utf-8", "ignore").encode() + b"\x00"
 
 
-# Arrays.
+# Reading: piece by piece, since each length tells where the next piece begins.
 
 
-def _heads(words: int, *, filled: bool) -> tuple[Struct, ...]:
-    """Layouts of the words before an array's numbers, and the padding before and after them, one for each offset modulo 8."""
-    layouts = []
-    for start in range(8):
-        before = -start % 4
-        after = -(start + before + UINT32.size * words) % 8 if filled else 0  # numbers are aligned to eight
-        layouts.append(Struct(f"<{before}x{words}I{after}x"))
-    return tuple(layouts)
-
-
-def _array_writer(field: Field, *, with_width: bool) -> Writer:
-    name = field.name
-    empty, filled = (_heads(1 + with_width, filled=filled) for filled in (False, True))
-
-    def write(message: Any, offset: int) -> bytes:
-        array: Array = getattr(message, name)
-        size = array.size
-        if array.dtype is not LITTLE_ENDIAN:
-            array = array.astype(LITTLE_ENDIAN)
-        head = (filled if size else empty)[offset % 8]
-        words = head.pack(array.shape[1], size) if with_width else head.pack(size)
-        return words + array.tobytes() if size else words
-
-    return write
-
-
-def _array_reader(field: Field, *, width_at: int | None) -> Reader:
+class Reader:
     """
-    Reader of an array.
+    How messages of one class are read.
 
-    Args:
-        field: Field of the array.
-        width_at: Index, among the values read, of an earlier matrix with the same row width; None if the width is stored before this array.
+    Attributes:
+        pieces: Layouts of each run of scalars and the words behind it, one for each offset modulo 8 at which it may begin; and what takes those.
+        members: Fields that are of an enumeration: their place, name and members by number.
+        ranges: Fields with limits: their place, limits and field.
     """
-    name, has_rows = field.name, bool(field.width)
-    finite, filled = field.finite, field.filled
 
-    def read(payload: bytes, offset: int, values: list[Any]) -> int:
-        width = 0
-        if has_rows and width_at is None:
-            width, offset = _word(payload, offset, field.width)
-        elif width_at is not None:
-            width = values[width_at].shape[1]
-        size, offset = _word(payload, offset, name)
+    def __init__(self, fields: Sequence[Field]) -> None:
+        self.pieces: list[tuple[tuple[Struct, ...], Taker | None]] = []
+        self.members = [(i, field.name, {int(m): m for m in enum}) for i, field in enumerate(fields) if (enum := field.member_of) is not None]
+        self.ranges = [
+            (i, -inf if field.low is None else field.low, inf if field.high is None else field.high, field)
+            for i, field in enumerate(fields)
+            if field.kind in STRUCT_FORMATS and (field.low is not None or field.high is not None)
+        ]
+        widths, known = dict[str, int](), set[str]()  # position of the first matrix with each row width
+        run: list[tuple[str, int]] = []
+        for position, field in enumerate(fields):
+            if field.kind in STRUCT_FORMATS:
+                run.append(_scalar(field.kind))
+                continue
+            self._add(run + _words(field, known) * [_scalar("uint32")], _taker(field, widths.get(field.width)))
+            widths.setdefault(field.width, position)
+            run = []
+        if run:
+            self._add(run, None)
+
+    def _add(self, parts: list[tuple[str, int]], take: Taker | None) -> None:
+        self.pieces.append((tuple(_layout(parts, start) for start in range(8)), take))
+
+
+def _taker(field: Field, width_at: int | None) -> Taker:
+    if field.kind != "float64[]":
+        return _bytes_taker(field)
+    return _matrix_taker(field, width_at) if field.width else _array_taker(field)
+
+
+def _array_taker(field: Field) -> Taker:
+    name, finite, filled = field.name, field.finite, field.filled
+
+    def take(payload: bytes, offset: int, values: list[Any]) -> int:
+        size = values.pop()
         if size:
-            offset += -offset % 8
-        end = offset + 8 * size
-        if HEADER_BYTES + end > len(payload):
-            raise Refused("truncated", f"{name} must hold the {size} numbers it declares, got {max(0, len(payload) - HEADER_BYTES - offset) // 8}")
-        array = np.frombuffer(payload, LITTLE_ENDIAN, size, HEADER_BYTES + offset).astype(FLOAT64)
-        if filled and not size:
+            offset += (HEADER_BYTES - offset) % 8
+        elif filled:
             raise Refused("length", f"{name} must hold at least one row, got none")
+        end: int = offset + 8 * size
+        if end > len(payload):
+            raise Refused("truncated", f"{name} must hold the {size} numbers it declares, got {max(0, len(payload) - offset) // 8}")
+        array = np.frombuffer(payload, LITTLE_ENDIAN, size, offset).astype(FLOAT64)
         if finite and not bounded(array, NUMBER_LIMIT):
             wrong = array[~(np.abs(array) <= NUMBER_LIMIT)][0]
             raise Refused("not_finite", f"{name} must be finite and at most {NUMBER_LIMIT:g}, got {wrong} among {size} numbers")
-        values.append(_rows(array, width, name) if has_rows else array)
+        values.append(array)
         return end
 
-    return read
+    return take
 
 
-def _word(payload: bytes, offset: int, name: str) -> tuple[int, int]:
-    offset += -offset % 4
-    if len(payload) < HEADER_BYTES + offset + 4:
-        raise Refused("truncated", f"{name} must begin at byte {HEADER_BYTES + offset}, got {len(payload)} bytes")
-    value: int = UINT32.unpack_from(payload, HEADER_BYTES + offset)[0]
-    return value, offset + 4
+def _matrix_taker(field: Field, width_at: int | None) -> Taker:
+    """
+    Taker of a matrix.
 
+    Args:
+        field: Field of the matrix.
+        width_at: Index, among the values read, of an earlier matrix with the same row width; None if the width is stored before this one.
+    """
+    take = _array_taker(field)
 
-def _counted(payload: bytes, offset: int, name: str) -> tuple[bytes, int]:
-    """Return the bytes whose number is at an offset, and the offset after them."""
-    size, offset = _word(payload, offset, name)
-    content = payload[HEADER_BYTES + offset : HEADER_BYTES + offset + size]
-    if len(content) < size:
-        raise Refused("truncated", f"{name} must hold the {size} bytes it declares, got {len(content)}")
-    return content, offset + size
-
-
-def _rows(flat: Array, width: int, name: str) -> Array:
-    if flat.size % width if width else flat.size:
-        raise Refused("length", f"{name} must hold whole rows of {width} numbers, got {flat.size}")
-    return flat.reshape(flat.size // width if width else 0, width)
-
-
-# Strings.
-
-
-def _string_writer(field: Field) -> Writer:
-    def write(message: Any, offset: int) -> bytes:
-        text: str = getattr(message, field.name)
-        if not text.isprintable():  # for example a line break in a quoted text
-            text = "".join(c if c.isprintable() else " " for c in text)
-        encoded = text.encode("utf-8", "replace")[: field.high and field.high - 1].decode("utf-8", "ignore").encode() + b"\x00"
-        return bytes(-offset % 4) + UINT32.pack(len(encoded)) + encoded
-
-    return write
-
-
-def _string_reader(field: Field) -> Reader:
-    name = field.name
-
-    def read(payload: bytes, offset: int, values: list[Any]) -> int:
-        encoded, end = _counted(payload, offset, name)
-        if field.high is not None and len(encoded) > field.high:
-            raise Refused("text", f"{name} must have at most {field.high} bytes, got {len(encoded)}")
-        if encoded[-1:] != b"\x00":
-            raise Refused("text", f"{name} must end with a zero byte")
-        try:
-            text = encoded[:-1].decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise Refused("text", f"{name} must be UTF-8, got {error.reason} at byte {error.start}") from None
-        if not text.isprintable():
-            raise Refused("text", f"{name} must hold characters that can be printed, got {text[:MAX_QUOTED_CHARS]!r}")
-        values.append(text)
+    def take_rows(payload: bytes, offset: int, values: list[Any]) -> int:
+        width = values.pop(-2) if width_at is None else values[width_at].shape[1]
+        end = take(payload, offset, values)
+        flat: Array = values[-1]
+        if flat.size % width if width else flat.size:
+            raise Refused("length", f"{field.name} must hold whole rows of {width} numbers, got {flat.size}")
+        values[-1] = flat.reshape(flat.size // width if width else 0, width)
         return end
 
-    return read
+    return take_rows
 
 
-# Bytes.
+def _bytes_taker(field: Field) -> Taker:
+    name, is_text = field.name, field.kind == "string"
+
+    def take(payload: bytes, offset: int, values: list[Any]) -> int:
+        size = values.pop()
+        content = payload[offset : offset + size]
+        if len(content) < size:
+            raise Refused("truncated", f"{name} must hold the {size} bytes it declares, got {len(content)}")
+        values.append(_text(content, field) if is_text else content)
+        return offset + len(content)
+
+    return take
 
 
-def _bytes_writer(field: Field) -> Writer:
+def _text(encoded: bytes, field: Field) -> str:
     name = field.name
-
-    def write(message: Any, offset: int) -> bytes:
-        content: bytes = getattr(message, name)
-        return bytes(-offset % 4) + UINT32.pack(len(content)) + content
-
-    return write
-
-
-def _bytes_reader(field: Field) -> Reader:
-    name = field.name
-
-    def read(payload: bytes, offset: int, values: list[Any]) -> int:
-        content, end = _counted(payload, offset, name)
-        values.append(content)
-        return end
-
-    return read
+    if field.high is not None and len(encoded) > field.high:
+        raise Refused("text", f"{name} must have at most {field.high} bytes, got {len(encoded)}")
+    if encoded[-1:] != b"\x00":
+        raise Refused("text", f"{name} must end with a zero byte")
+    try:
+        text = encoded[:-1].decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise Refused("text", f"{name} must be UTF-8, got {error.reason} at byte {error.start}") from None
+    if not text.isprintable():
+        raise Refused("text", f"{name} must hold characters that can be printed, got {text[:MAX_QUOTED_CHARS]!r}")
+    return text
 
 
 # Conditions on several fields of one message.
@@ -348,35 +364,5 @@ def _check_telemetry(message: Telemetry) -> None:
 FIELD_RELATIONS: dict[type[Any], Callable[[Any], None]] = {Reference: _check_reference, Command: _check_command, Telemetry: _check_telemetry}
 
 
-def _codec(fields: Sequence[Field]) -> tuple[tuple[Writer, ...], tuple[Reader, ...]]:
-    """Writers and readers of a message, one for each run of scalars, array, string and sequence of bytes."""
-    writers: list[Writer] = []
-    readers: list[Reader] = []
-    first: dict[str, int] = {}  # position of the first array with each row width
-    position = 0
-    for scalar, run in groupby(fields, key=lambda field: field.kind in STRUCT_FORMATS):
-        group = list(run)
-        if scalar:
-            writers.append(_scalar_writer(group))
-            readers.append(_scalar_reader(group))
-            position += len(group)
-            continue
-        for field in group:
-            if field.kind == "string":
-                writers.append(_string_writer(field))
-                readers.append(_string_reader(field))
-            elif field.kind == "uint8[]":
-                writers.append(_bytes_writer(field))
-                readers.append(_bytes_reader(field))
-            else:
-                writers.append(_array_writer(field, with_width=bool(field.width) and field.width not in first))
-                readers.append(_array_reader(field, width_at=first.get(field.width)))
-                if field.width:
-                    first.setdefault(field.width, position)
-            position += 1
-    return tuple(writers), tuple(readers)
-
-
-CODECS = {cls: _codec(fields) for cls, fields in LAYOUTS.items()}
-WRITERS = {cls: writers for cls, (writers, _) in CODECS.items()}
-READERS = {cls: readers for cls, (_, readers) in CODECS.items()}
+WRITERS = {cls: Writer(fields) for cls, fields in LAYOUTS.items()}
+READERS = {cls: Reader(fields) for cls, fields in LAYOUTS.items()}
