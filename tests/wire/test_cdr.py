@@ -18,7 +18,7 @@ from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Event, Jour
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.errors import MessageError
 from rti_mpc.rti.active_set import COST_FLOOR
-from rti_mpc.wire.cdr import MESSAGE_PACKAGE, REFUSAL_REASONS, Message, Refused, decode, encode, encoding, schema
+from rti_mpc.wire.cdr import MAX_LAYOUTS, MESSAGE_PACKAGE, REFUSAL_REASONS, WRITERS, Message, Refused, decode, encode, encoding, schema
 from rti_mpc.wire.layout import LAYOUTS, msg_text
 
 ROOT = Path(__file__).parents[2]
@@ -138,6 +138,16 @@ def test_strided_arrays_are_encoded_by_value() -> None:
     u = np.arange(24.0).reshape(6, 4)
     strided = replace(COMMAND, u=u[::2, ::2])
     assert np.array_equal(decode(Command, encode(strided)).u, u[::2, ::2])
+
+
+def test_layouts_are_kept_for_a_few_sizes_only() -> None:
+    for size in range(MAX_LAYOUTS + 10):
+        assert decode(Journal, encode(replace(JOURNAL, data=bytes(size)))).data == bytes(size)
+    assert WRITERS[Journal].layout.cache_info().currsize == MAX_LAYOUTS
+
+
+def test_numbers_of_another_type_are_encoded_by_value() -> None:
+    assert np.array_equal(decode(State, encode(replace(STATE, x=np.arange(3)))).x, [0.0, 1.0, 2.0])
 
 
 def test_encoding_names_the_schema_and_its_major_version() -> None:
