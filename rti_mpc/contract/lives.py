@@ -28,6 +28,9 @@ class Heard(Enum):
     OTHER = "other"  # another robot, or a life that is not believed yet
 
 
+OURS, BEGINS, OTHER = Heard  # read faster than a member of the enumeration
+
+
 @dataclass(slots=True)
 class Life:
     """
@@ -93,7 +96,7 @@ class Lives:
                 self._dispute(life.epoch, rival.epoch)
             elif rival is not None and (not self.disputed or local_ns - rival.heard_ns > settling_ns):
                 self._rival, self.disputed = None, False
-            return Heard.OURS
+            return OURS
         beside = life if rival is None or rival.epoch == epoch or life.heard_ns > rival.heard_ns else rival  # the other life that was heard last
         if rival is None or rival.epoch != epoch:
             self._rival = rival = Life(epoch, local_ns, local_ns)
@@ -103,11 +106,11 @@ class Lives:
         alone_ns = local_ns - max(life.heard_ns, rival.since_ns)
         if alone_ns > (settling_ns if self.disputed else stale_ns):
             return self._believe(rival)
-        return Heard.OTHER
+        return OTHER
 
     def _believe(self, life: Life) -> Heard:
         self._life, self._rival, self.disputed = life, None, False
-        return Heard.BEGINS
+        return BEGINS
 
     def _dispute(self, one: int, other: int) -> None:
         self.disputed = True

