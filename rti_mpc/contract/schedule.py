@@ -149,7 +149,8 @@ class Schedule:
         self._increments = increments
         self._bounds = bounds
         self._rotations = rotations
-        self._spacing_ns = 0 if increments is None else increments.dt_ns // MAX_CORRECTIONS
+        self._kept_ns = 0 if increments is None else increments.dt_ns  # for how long what has acted counts against slew limits
+        self._spacing_ns = self._kept_ns // MAX_CORRECTIONS
         self._plans: deque[Plan] = deque()  # by start; those of the past as far as `forget` has left them
         self.brake(self.u_rest, BEFORE_ALL_NS)
 
@@ -197,15 +198,17 @@ class Schedule:
         u = command.u.copy()
         source, way = (command.epoch, command.seq), Way.of(command, end_ns)
         plan = Plan(start_ns, end_ns, command.stamp_ns, command.period_ns, u, u, u[0], source, way)
-        return self._put(plan, self._increments if approached else None)
+        return self._put(plan, self._increments) if approached else self._insert(plan)
 
     def _put(self, plan: Plan, limits: Increments | None) -> Array:
         """Add a plan, approached inside the limits from the inputs that act before it."""
-        plans, start_ns = self._plans, plan.start_ns
-        plan.u = plan.asked
         plan.forget_end()
-        if limits is not None:
-            plan.u = self._approach(plan.asked, plan.stamp_ns, plan.period_ns, start_ns, limits)
+        plan.u = self._approach(plan.asked, plan.stamp_ns, plan.period_ns, plan.start_ns, limits)
+        return self._insert(plan)
+
+    def _insert(self, plan: Plan) -> Array:
+        """Add a plan as it is, and return its rows."""
+        plans, start_ns = self._plans, plan.start_ns
         plan.before = self.at(start_ns - 1)[0].copy()
         while plans and plans[-1].start_ns >= start_ns:
             plans.pop()
@@ -221,7 +224,7 @@ class Schedule:
     def forget(self, t_ns: int) -> None:
         """Drop plans that are over before a time, and count against no slew limit any more."""
         plans = self._plans
-        t_ns -= self._increments.dt_ns if self._increments is not None else 0
+        t_ns -= self._kept_ns
         while len(plans) > 1 and plans[1].start_ns <= t_ns:
             plans.popleft()
 

@@ -39,7 +39,7 @@ class Planner:
             envelope,
             parts.tuning,
         )
-        self._d, self._robot = parts.states.d, parts.robot
+        self._d, self._robot, self._estimates = parts.states.d, parts.robot, parts.states.estimates
         self._np, self._dt_ns = rti.ocp.model.np_ - len(self._d), parts.grid.dt_ns  # the last parameters of the model are estimated disturbances
         # What nothing depends on is neither looked up nor handed on.
         self._p = track.p if rti.ocp.model.np_ else None
@@ -56,7 +56,7 @@ class Planner:
     def _load(self, act_ns: int, *, shift: bool) -> None:
         """Load the QP, with the reference that was looked up."""
         self.reach = self._sent.reach(act_ns)
-        u_prev = self._sent.at(act_ns - 1)[0]
+        u_prev = self._sent.u_prev
         u_before = self._sent.at(act_ns - 1 - self._dt_ns)[0] if self._remembers else None
         self._tuning.follow(u_prev)
         self._rti.prepare(self._track.y_ref, self._p, shift=shift, u_prev=u_prev, u_before=u_before)
@@ -66,7 +66,7 @@ class Planner:
         """Look the reference up, and with it the parameters of the robot."""
         track = self._track
         track.look_up(act_ns)
-        if len(self._d):
+        if self._estimates:
             track.p[:, self._np :] = self._d
         for p in self._robot:
             p[:] = track.p[0, : len(p)]

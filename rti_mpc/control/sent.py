@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from math import inf
-from typing import Any
+from struct import Struct
 
 import numpy as np
 
@@ -30,6 +30,7 @@ class Sent:
 
     Attributes:
         delay_ns: A command acts no earlier than this long after the state that it answers, even if its own time is earlier.
+        u_prev: Input that acts before the time of the last `reach`, shape ``(nu,)``; overwritten by the next one.
     """
 
     def __init__(
@@ -48,10 +49,9 @@ class Sent:
         self._feeds_back = False  # whether any command had a way to rest that states correct
         # Per dt. Lists: for a few numbers, plain floats are several times faster than arrays.
         self._falling, self._rising = lbdu.tolist(), ubdu.tolist()
-        self._nu = len(u_rest)
-        rows: Array = np.zeros((2, 2, self._nu))
-        self._reach = rows[0], rows[1]
-        self._rows: Any = rows.reshape(-1).data  # written faster than an array
+        rows: Array = np.zeros((5, len(u_rest)))
+        self._reach, self.u_prev = (rows[:2], rows[2:4]), rows[4]
+        self._rows, self._write = rows.data, Struct(f"{rows.size}d").pack_into  # by one call
         self._dt_ns = dt_ns
         self._transit_ns, self._window_ns = round(TRANSIT_PERIODS * dt_ns), round(SLEW_WINDOW_PERIODS * dt_ns)
         slew = 1e9 * np.minimum(-lbdu, ubdu) / dt_ns
@@ -68,14 +68,14 @@ class Sent:
             left_ns: Earliest robot time at which it left, if that is known: the command before acts at least until then.
         """
         self._feeds_back |= len(command.K) > 0
-        self._left_ns = max(self._left_ns + 1, left_ns)  # commands leave one after the other, whatever our idea of the robot's clock
-        start_ns, over_ns = max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, self._left_ns), end_ns(command)
+        self._left_ns = left_ns = max(self._left_ns + 1, left_ns)  # commands leave one after the other, whatever our idea of the robot's clock
+        start_ns, over_ns = max(command.stamp_ns, command.state_stamp_ns + self.delay_ns, left_ns), end_ns(command)
         if start_ns < over_ns:
             acting = self._schedule.acting(start_ns - 1)
             if acting is None or acting.end_ns < start_ns:
                 self._alone, self._went = (start_ns, self._schedule.at(start_ns - 1)[0].copy()), acting
             self._schedule.add(command, start_ns, over_ns, approached=False)
-        start_ns = max(start_ns, self._left_ns + self._transit_ns)
+        start_ns = max(start_ns, left_ns + self._transit_ns)
         if start_ns < over_ns:
             self._slowest.add(command, start_ns, over_ns, approached=False)
         self._slowest.forget(command.state_stamp_ns - self._dt_ns)  # `reach` looks back by less, from the time of a later command
@@ -157,16 +157,19 @@ class Sent:
             if self._went is not None and self._went.way is not None:
                 further = self._schedule.after(self._went, t_ns + self._dt_ns)[0]
             acted.append(further.tolist())
-        lowest, highest, later = [-inf] * self._nu, [inf] * self._nu, len(acted)
-        self._narrow(lowest, highest, acted)
+        later = len(acted)
+        lowest = [value + fall for value, fall in zip(acted[0], self._falling, strict=True)]
+        highest = [value + rise for value, rise in zip(acted[0], self._rising, strict=True)]
+        if later > 1:
+            self._narrow(lowest, highest, acted[1:])
         second = lowest.copy(), highest.copy()
         before = self._schedule.acted(t_ns - self._dt_ns + 1, t_ns)  # the input of `t_ns` has narrowed them already
         for values in before + self._slowest.acted(t_ns - self._window_ns, t_ns + self._transit_ns + 1):
             if values not in acted:  # a second time it would narrow no interval
                 acted.append(values)
-        self._narrow(lowest, highest, acted[later:])
-        for i, value in enumerate(lowest + second[0] + highest + second[1]):
-            self._rows[i] = value
+        if len(acted) > later:
+            self._narrow(lowest, highest, acted[later:])
+        self._write(self._rows, 0, *lowest, *second[0], *highest, *second[1], *before[-1])
         return self._reach
 
     def _narrow(self, lowest: list[float], highest: list[float], acted: list[list[float]]) -> None:

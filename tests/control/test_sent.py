@@ -126,6 +126,13 @@ def test_reach_keeps_to_a_row_that_acts_while_the_next_command_is_on_its_way() -
     np.testing.assert_allclose(highest[0], [0.2 + 0.2, 0.0 + 0.3])
 
 
+@pytest.mark.parametrize("t_ms", [0, 50, 100, 150, 249, 250, 260, 400, 900])
+def test_reach_tells_the_input_that_acts_before_its_time(t_ms: int) -> None:
+    memory = sent(command(1, 0, plan(0.3)), command(2, 100, plan(0.1), valid_ms=150))
+    memory.reach(t_ms * MS)
+    np.testing.assert_array_equal(memory.u_prev, memory.at(t_ms * MS - 1)[0])
+
+
 def test_robot_that_brakes_on_its_own_is_taken_over_at_the_speed_it_has() -> None:
     """Whenever in the period the command arrives, the robot has not to take back more than its braking."""
     memory = sent(command(1, 0, np.tile([0.8, -1.2], (5, 1)), valid_ms=100))
