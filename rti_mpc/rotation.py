@@ -74,7 +74,8 @@ class Rotations:
     def bring_near(self, x: Any, to: Any) -> None:
         """Write the rotations of a vector as near to those of another one as they can be written; both of `size` floats, arrays or views of them."""
         for j, turn in zip(self.angles, self.turns, strict=True):
-            x[j] -= whole_turns(float(x[j] - to[j]), turn)
+            if not abs(apart := float(x[j] - to[j])) <= turn / 2:  # mostly it is: the call is left out then
+                x[j] -= whole_turns(apart, turn)
         for places in self.quaternions:
             if sum(x[j] * to[j] for j in places) < 0.0:
                 for j in places:

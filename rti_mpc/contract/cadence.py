@@ -69,21 +69,19 @@ class Cadence:
             local_ns: Local monotonic time.
         """
         self.notice = None
-        if not self._count(seq, stamp_ns, local_ns):
+        if not self.counts(seq) and (seq == self._seq or local_ns - self._counted_ns <= STANDSTILL_NS):
+            self._doubt(seq, stamp_ns, local_ns - self._counted_ns)
             return False
+        self._seq, self._counted_ns, self._uncounted = seq, local_ns, 0
         self._advance(stamp_ns, local_ns)
         return True
 
-    def _count(self, seq: int, stamp_ns: int, local_ns: int) -> bool:
-        last, silent_ns = self._seq, local_ns - self._counted_ns
-        if self.counts(seq) or (seq != last and silent_ns > STANDSTILL_NS):
-            self._seq, self._counted_ns, self._uncounted = seq, local_ns, 0
-            return True
+    def _doubt(self, seq: int, stamp_ns: int, silent_ns: int) -> None:
+        """Note a state whose number does not count, as none has for some local time."""
         self._uncounted += self._moved is not None and stamp_ns > self._moved[0]  # a state that is sent twice has no stamp of its own
         if self._uncounted >= STANDSTILL_STATES and silent_ns >= STANDSTILL_NS:
-            text = f"seq must be above the one before in every state, got {seq} after {last} for {1e-9 * silent_ns:.1f} s: nothing is commanded"
+            text = f"seq must be above the one before in every state, got {seq} after {self._seq} for {1e-9 * silent_ns:.1f} s: nothing is commanded"
             self._tell("seq_stands_still", text)
-        return False
 
     def _advance(self, stamp_ns: int, local_ns: int) -> None:
         if self._moved is not None and stamp_ns <= self._moved[0]:

@@ -70,7 +70,7 @@ class RobotClock:
         Args:
             late_ns: Robot time by which a state may be late and still be fresh.
         """
-        self._most_ns = late_ns
+        self._most_ns, self._leap_ns = late_ns, max(late_ns, CLOCK_LEAP_NS)
         self.reset()
 
     def reset(self) -> None:
@@ -106,7 +106,7 @@ class RobotClock:
         """
         ahead_ns = stamp_ns - self.now_ns(arrival_ns)
         since_ns = self.arrival_ns or arrival_ns
-        leaps = self._measured and ahead_ns > max(self._most_ns, CLOCK_LEAP_NS) and not self.leapt
+        leaps = self._measured and ahead_ns > self._leap_ns and not self.leapt
         if self._anchor is None or leaps:
             self._anchor = (stamp_ns, arrival_ns)
             self._recent.clear()
@@ -123,10 +123,11 @@ class RobotClock:
             self.rate_most = max(self.rate_most, self.rate)
             self._anchor = (stamp_ns, arrival_ns)
         elif stamp_ns > self.stamp_ns:
-            period_ns = (stamp_ns - self.stamp_ns) / max(1, seq - self._seq)
-            self.period_ns += (min(period_ns, 2.0 * self.period_ns) - self.period_ns) * 0.1 if self.period_ns else period_ns
+            period_ns, known_ns = (stamp_ns - self.stamp_ns) / max(1, seq - self._seq), self.period_ns
+            self.period_ns = known_ns + (min(period_ns, 2.0 * known_ns) - known_ns) * 0.1 if known_ns else period_ns
             self._measure(stamp_ns, arrival_ns, *self._anchor)
-        self._late.clear()
+        if self._late.last is not None:
+            self._late.clear()
         self.leapt = leaps
         self.late_ns = self._late_ns(stamp_ns, arrival_ns)
         self.doubt_ns = round(RATE_UNCERTAINTY * self.rate * (arrival_ns - since_ns))
@@ -145,18 +146,22 @@ class RobotClock:
         self._in_a_row = self._in_a_row + 1 if self._late_ns(stamp_ns, arrival_ns) > self.period_ns / 4 else 0
         if (0 < self._in_a_row < RECENT_STATES and not self._settling) or elapsed_ns < RATE_WINDOW_NS // 4:
             return
-        self._settling = max(0, self._settling - 1)
-        self.rate = min(max(rate, self.rate / RATE_FACTOR_PER_STATE), self.rate * RATE_FACTOR_PER_STATE) if self._measured else rate
-        self.rate_most, self._measured = self.rate, True
+        if self._settling:
+            self._settling -= 1
+        if self._measured:
+            rate = min(max(rate, self.rate / RATE_FACTOR_PER_STATE), self.rate * RATE_FACTOR_PER_STATE)
+        self.rate = self.rate_most = rate
+        self._measured = True
         if elapsed_ns >= RATE_WINDOW_NS:
             self._anchor = (stamp_ns, arrival_ns)
 
     def _late_ns(self, stamp_ns: int, arrival_ns: int) -> int:
         """Return the lateness of a state compared with the least late of those before it, robot time."""
-        late_ns, rate = 0, self.rate
+        earliest_ns, rate = stamp_ns, self.rate
         for stamp, arrival in self._recent:
-            late_ns = max(late_ns, stamp + round((arrival_ns - arrival) * rate) - stamp_ns)
-        return late_ns
+            if (expected_ns := stamp + round((arrival_ns - arrival) * rate)) > earliest_ns:
+                earliest_ns = expected_ns
+        return earliest_ns - stamp_ns
 
     def _rate(self, robot_ns: int, local_ns: int) -> float:
         return min(max(robot_ns / local_ns, 1e-3), 1e3)

@@ -37,13 +37,14 @@ from rti_mpc.control.opinions import Opinion, second_opinions
 from rti_mpc.control.planner import Planner
 from rti_mpc.control.preparation import Preparation
 from rti_mpc.control.record import Record
-from rti_mpc.control.state_stream import Arrival
+from rti_mpc.control.state_stream import FRESH, Arrival
 from rti_mpc.control.understudy import Understudy
 from rti_mpc.errors import OcpError
 from rti_mpc.rti.ocp import Ocp, rest_fault
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.way_to_rest import StopLaw
 
+IDLE = Mode.IDLE  # read faster than a member of the enumeration
 INPUTS_UNREPORTED = (
     "the robot does not report which inputs act: commands are assumed to act, and only the robot itself or a guard can handle lost ones"
 )
@@ -169,20 +170,20 @@ class Controller:
         arrival = states.receive(state, arrival_ns)
         if (notice := states.notice) is not None:
             self.say(notice)
-        if arrival is not Arrival.FRESH:
+        if arrival is not FRESH:
             if arrival in (Arrival.REPEATED, Arrival.REFUSED, Arrival.FOREIGN, Arrival.OLD):
                 return None
             if arrival is Arrival.UNTIMED:
                 return self._fallback.give_up(state)
             self._interruption.forget(arrival, state)
         surprised = self._hear(state)
-        if (lost := states.estimate(self._sent, known=self.mode in self._known and not surprised)) is not None:
-            self.say(lost)
-        if len(states.d):
+        if states.estimates:
+            if (lost := states.estimate(self._sent, known=self.mode in self._known and not surprised)) is not None:
+                self.say(lost)
             self._prediction.p[self.np_ :] = states.d
         if surprised and self._planner.loaded and self.grid.running:
             self._planner.load(self.grid.act_ns, shift=False)
-        if self.mode is Mode.IDLE:
+        if self._modes.mode is IDLE:
             self._modes.enter(Mode.WAITING, "first state")
             if not len(state.u) and not self._unreported:
                 self._unreported = True

@@ -11,7 +11,7 @@ import numpy as np
 from rti_mpc import given
 from rti_mpc.array import Array, bounded
 from rti_mpc.contract.cadence import Cadence
-from rti_mpc.contract.lives import Heard, Lives
+from rti_mpc.contract.lives import BEGINS, OTHER, Lives
 from rti_mpc.contract.message import Notice, Severity, State
 from rti_mpc.contract.robot_clock import RobotClock
 from rti_mpc.control.observer import Observer
@@ -35,8 +35,9 @@ class Arrival(Enum):
     JUMPED_BACK = "jumped back"  # the first state after the robot's clock has gone back: earlier stamps mean nothing any more
 
 
+FRESH = Arrival.FRESH  # read faster than a member of the enumeration
 UNKEPT = Arrival.REPEATED, Arrival.REFUSED, Arrival.FOREIGN  # states of which nothing is kept
-NOTHING_SAID = Arrival.FRESH, "", ""
+NOTHING_SAID = FRESH, "", ""
 
 
 class StateStream:
@@ -49,6 +50,7 @@ class StateStream:
         last: The newest state, None before the first.
         x: That state, shape ``(nx,)``, its rotations written nearest to those of the state before; or the observer's estimate of it.
         seen: That state with what is measured as it was measured; the same array as `x` unless `as_measured` is asked for.
+        estimates: Whether there is an observer.
         d: Estimated disturbances, shape ``(nd,)``; empty without an observer.
         clock: The robot's clock.
         before_ns: Arrival of the newest state in robot time, by the clock as it was before that state.
@@ -80,10 +82,10 @@ class StateStream:
         self.d: Array = np.zeros(0) if observer is None else observer.d
         self.clock = RobotClock(late_ns)
         self.notice: Notice | None = None
-        self._said = Arrival.FRESH
+        self._said = FRESH
         self.before_ns = 0
         self._stale_ns = stale_ns
-        self._observer = observer
+        self._observer, self.estimates = observer, observer is not None
         self._estimated_ns: int | None = None  # stamp of the state that the observer was given last
         self._rotations = model.rotations("states")
         self._x_shape, self._u_shape = (model.nx,), (model.nu,)
@@ -168,10 +170,10 @@ class StateStream:
             return Arrival.REFUSED, "state_refused", f"a state is refused: {wrong}"
         heard = self.lives.judge(state.epoch, arrival_ns, self.clock.rate)
         self.notice = self.lives.notice
-        if heard is Heard.OTHER:
+        if heard is OTHER:
             return Arrival.FOREIGN, "", ""
-        began = heard is Heard.BEGINS and self.last is not None
-        if heard is Heard.BEGINS:
+        began = heard is BEGINS and self.last is not None
+        if heard is BEGINS:
             self.last = self._estimated_ns = None
             self.clock.reset()
             self.cadence.reset()

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from struct import Struct
 
 import casadi as ca
 import numpy as np
@@ -41,7 +42,7 @@ class Track:
         self.p: Array = np.tile(self._nominal, (N + 1, 1))
         self._rotations = model.rotations("outputs")
         grid, at, below = np.zeros(3), np.zeros(N + 1), np.zeros(N + 1)
-        self._grid, self._below = grid.data, below
+        self._grid, self._write, self._below = grid.data, Struct("3d").pack_into, below
         # A reference gives no parameters, or has all of them in its rows.
         self._found = {columns: np.zeros((N + 1, 2 * columns)) for columns in (model.ny, model.ny + model.np_)}
         functions = [placing(N, dt_ns), *(interpolation(N, model.ny, columns) for columns in self._found)]
@@ -131,9 +132,9 @@ class Track:
     def look_up(self, t_ns: int) -> None:
         """Write the reference from `t_ns` on, node 0 included for `p`, into `y_ref` and `p`."""
         assert self._reference is not None
-        rows, grid = self._rows, self._grid
+        rows = self._rows
         columns = rows.shape[1] // 2
-        grid[0], grid[1], grid[2] = t_ns - self._reference.stamp_ns, self._reference.period_ns, len(rows) - 1
+        self._write(self._grid, 0, t_ns - self._reference.stamp_ns, self._reference.period_ns, len(rows) - 1)
         self._place()
         rows.take(self._below.astype(np.intp), axis=0, out=self._found[columns], mode="clip")
         self._interpolate[columns]()

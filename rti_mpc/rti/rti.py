@@ -308,7 +308,8 @@ class Rti:
             self.u_prev[...] = u_prev
         elif shift:
             self.u_prev[...] = self.u[0]
-        self._remember()
+        if self._bounded:
+            self._remember()
         self._pending = True
         if not shift:
             self._relinearize()
@@ -324,8 +325,7 @@ class Rti:
 
     def _remember(self) -> None:
         """Embed the last two inputs before the plan; nothing depends on the one before them."""
-        if self._bounded:
-            self._remembered[0], self._remembered[1:] = self.u_prev[self._bounded], self.u_before[self._bounded]
+        self._remembered[0], self._remembered[1:] = self.u_prev[self._bounded], self.u_before[self._bounded]
 
     def _stay_at(self, x: Array) -> None:
         """Let the states of the plan be those of a robot that stays in a state, shape ``(nx,)``, with the input before the plan."""
