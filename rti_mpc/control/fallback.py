@@ -98,8 +98,7 @@ class Fallback:
             rows = self._envelope.ramp(reach)
             at_rest = bool((rows[0] == self._u_rest).all())
         else:
-            u_prev = self._sent.at(act_ns - 1)[0]
-            rows, valid_ns, ending = self._ways.stop(self._states.x, state.stamp_ns, act_ns, u_prev, reach)
+            rows, valid_ns, ending = self._ways.stop(self._states.x, state.stamp_ns, act_ns, self._sent.u_prev, reach)
             at_rest = self._ways.at_rest
         if not wanted:
             self._ladder.brake(at_rest=at_rest)
