@@ -3,7 +3,8 @@
 What rehearsals are worth.
 
 In one process: decode, feedback and encode right after the sample before, after a pause,
-and after a pause with a rehearsal at its end; in random order on one controller. With
+after a pause with a rehearsal at its end, and after one whose thread stays awake from the
+rehearsal on; in random order on one controller. With
 real processes: from a state sent to its command received, of a controller that rehearses
 and one that does not, each with a robot of its own, in turn.
 """
@@ -33,7 +34,7 @@ from tests.bench.test_sample import COLD_SAMPLES, follower, recorded
 pytestmark = pytest.mark.benchmark
 
 SHORT = "CI" in os.environ
-PAUSES = ("hot", "cold", "rehearsed")
+PAUSES = ("hot", "cold", "rehearsed", "awake")
 MAX_SAMPLES = {10: 150, 50: 300, 100: 300}  # by rate in Hz
 SAMPLES = {10: 150, 50: 600, 100: 1200}
 WAKING_S = 0.15e-3  # of the lead, before a rehearsal begins
@@ -52,14 +53,17 @@ def feedback_us(rate: int, payloads: list[tuple[bytes, int]]) -> dict[str, np.nd
             before = chance.choice(PAUSES) if k >= COLD_SAMPLES else "hot"
             if before == "cold":
                 time.sleep(1 / rate)
-            elif before == "rehearsed":
+            elif before != "hot":
                 time.sleep(1 / rate - LEAD_S + WAKING_S)
                 began_s, began_ns = time.monotonic(), time.thread_time_ns()
                 intake.rehearse()
                 if (rehearsed := controller.rehearse(now_ns)) is not None:
                     encode(rehearsed)
                 took["rehearsal"].append(time.thread_time_ns() - began_ns)
-                time.sleep(max(0.0, LEAD_S - WAKING_S - (time.monotonic() - began_s)))
+                if before == "rehearsed":
+                    time.sleep(max(0.0, LEAD_S - WAKING_S - (time.monotonic() - began_s)))
+                while time.monotonic() < began_s + LEAD_S - WAKING_S:
+                    pass
             received = Received(payload, encoding(State), "state")
             began_ns = time.thread_time_ns()
             (state,) = intake.newest_of_each((received,), controller.continues)
