@@ -86,7 +86,9 @@ class System:
     def start(self, *roles: str) -> None:
         for role in roles:
             command, *options = self.arguments[role]
-            options += ["--log", self.folder / "robot.csv"] if role == "robot" else []
+            if role == "robot":
+                (self.folder / "robot.csv").unlink(missing_ok=True)  # of its last life
+                options += ["--log", self.folder / "robot.csv"]
             with (self.folder / f"{role}.log").open("ab") as log:
                 arguments, state = command_line(command, self.config, *self.meeting, *options), self.folder / "state"
                 self.running[role] = subprocess.Popen(arguments, cwd=ROOT, env=environment(state), stdout=log, stderr=subprocess.STDOUT)

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.cli import app
+from rti_mpc_service.commands.arguments import new_file
 from rti_mpc_service.faults.table import FAULTS
 from rti_mpc_service.shipped import SHIPPED, TEMPLATES
 from tests.command import built, command
@@ -128,6 +129,48 @@ def test_file_that_cannot_be_written_is_refused_before_anything_is_measured(name
     done = command(name, "--json", tmp_path / "nowhere" / "found.json")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert done.stderr.startswith("rti-mpc: --json must be a file that can be written")
+
+
+READ = {"config", "zenoh", "tls", "state", "folder", "recording", "repair", "authority", "at", "folders"}  # parameters that name what is read or kept
+REPLACED = {"--json"}  # the present state of something, which monitors ask for again and again
+ADDED_TO = {"replay --out", "certs issue --out", "certs authority folder"}  # each has a test that it overwrites no file
+NEEDED = {"export": ("run.mcap",)}
+
+
+def outputs() -> list[tuple[str, str]]:
+    """All options and arguments for a file or folder that a command writes, each with its command."""
+    commands = {**built().commands, **{f"certs {name}": each for name, each in built().commands["certs"].commands.items()}}
+    found = [
+        (name, next((option for option in parameter.opts if option.startswith("--")), parameter.name))
+        for name, each in commands.items()
+        for parameter in each.params
+        if parameter.type_descriptor.annotation is Path and parameter.name not in READ and (name, parameter.name) != ("solve-case", "case")
+    ]
+    return [(name, option) for name, option in found if option not in REPLACED and f"{name} {option}" not in ADDED_TO]
+
+
+@pytest.mark.parametrize(("name", "option"), outputs())
+def test_no_command_overwrites_what_an_earlier_one_has_written(name: str, option: str, tmp_path: Path) -> None:
+    file, folder = tmp_path / "robot.toml", tmp_path / "earlier"
+    (folder / "paper").mkdir(parents=True)
+    kept = [file, folder / "config.toml", folder / "paper.md", folder / "paper" / "run.json"]
+    for path in kept:
+        path.write_text("precious")
+    before = sorted(tmp_path.rglob("*"))
+    for given in (file, folder):
+        done = command(name, *NEEDED.get(name, ()), option, given)
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done
+        assert done.stderr.startswith(f"rti-mpc: {option} must ")
+        assert str(given) in done.stderr
+    assert sorted(tmp_path.rglob("*")) == before
+    assert all(path.read_text() == "precious" for path in kept)
+
+
+def test_what_is_written_may_go_into_a_pipe(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (parameter,) = (each for each in built().commands["sim"].params if each.name == "log")
+    for path in (tmp_path / "pipe", Path("/dev/null"), tmp_path / "new"):
+        assert new_file(parameter, path) == path
 
 
 def test_operator_is_told_in_one_line_that_nobody_has_confirmed_and_what_was_noted(tmp_path: Path) -> None:

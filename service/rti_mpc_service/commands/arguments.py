@@ -12,8 +12,38 @@ from rti_mpc.errors import ConfigError
 from rti_mpc_service.shipped import SHIPPED, robot_file
 
 
+def new_file(param: typer.CallbackParam, path: Path | None) -> Path | None:
+    """
+    Check that a command would overwrite nothing, before it does anything: a device or a pipe may be there.
+
+    Raises:
+        ConfigError: A file or folder exists there.
+    """
+    if path is not None and (path.is_file() or path.is_dir()):
+        raise ConfigError(f"{param.opts[0]} must not overwrite a file, got {path}, which exists")
+    return path
+
+
+def new_folder(param: typer.CallbackParam, path: Path | None) -> Path | None:
+    """
+    Check that a command would overwrite nothing, and mix nothing with what is older, before it does anything.
+
+    Raises:
+        ConfigError: The folder holds something, or is a file.
+    """
+    try:
+        held = None if path is None else next(path.iterdir(), None)
+    except FileNotFoundError:
+        return path
+    except OSError as error:
+        raise ConfigError(f"{param.opts[0]} must be a folder that can be written, got {path}: {error.strerror}") from error
+    if held is not None:
+        raise ConfigError(f"{param.opts[0]} must be a folder that is new or empty, got {path} with {held.name}")
+    return path
+
+
 def claimed(path: Path | None) -> Path | None:
-    """Check that a file can be written, before its content is computed for minutes."""
+    """Check that a file can be written, before its content is computed for minutes; scripts ask for it again and again, so it is replaced."""
     try:
         if path is not None:
             path.touch()

@@ -19,6 +19,7 @@ from rti_mpc_service.commands.arguments import (
     WaypointSmoothing,
     WaypointSpeed,
     file_of,
+    new_folder,
 )
 from rti_mpc_service.commands.on_bus import on_bus
 from rti_mpc_service.config.config import load
@@ -52,7 +53,13 @@ def demo(
         float | None, typer.Option(metavar="SECONDS", min=1.0, help="Duration of the drive, robot time.", show_default="the scenario's own")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder for configuration, summary, figure and recording.", show_default="runs/SCENARIO-TIME")
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="New folder for configuration, summary, figure and recording.",
+            show_default="runs/SCENARIO-TIME",
+            callback=new_folder,
+        ),
     ] = None,
     viewer: Annotated[bool, typer.Option("--viewer", help="Show the drive live in Rerun.")] = False,
     guard: Annotated[bool, typer.Option("--guard", help="Run a guard between controller and robot.")] = False,
@@ -105,7 +112,8 @@ def faults(
     waypoint_speed: WaypointSpeed = 0.25,
     waypoint_smoothing: WaypointSmoothing = None,
     record: Annotated[
-        Path | None, typer.Option("--record", metavar="DIR", help="Record all streams into a new folder, to replay what each controller did.")
+        Path | None,
+        typer.Option("--record", metavar="DIR", help="New folder in which to record all streams, to replay each controller.", callback=new_folder),
     ] = None,
 ) -> None:
     """Inject faults into a running system, one after the other, and print what the robot did: the fault matrix."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from rti_mpc.errors import ConfigError
-from rti_mpc_service.commands.arguments import PathLimits, PathName, ScenarioName, StatePath, WaypointSmoothing, WaypointSpeed
+from rti_mpc_service.commands.arguments import PathLimits, PathName, ScenarioName, StatePath, WaypointSmoothing, WaypointSpeed, new_file
 from rti_mpc_service.commands.on_bus import on_bus
 from rti_mpc_service.config.build import build_model, build_signals, stage_parameters
 from rti_mpc_service.config.schema import Config
@@ -93,7 +93,7 @@ def view(
     rerun_connect: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Draw in a Rerun viewer at this address, also if it starts later.")
     ] = None,
-    rerun_save: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Record to a file.")] = None,
+    rerun_save: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Record to a new file.", callback=new_file)] = None,
     rerun_memory_limit: Annotated[
         str, typer.Option(metavar="SIZE", help="Memory of a spawned viewer, beyond which it drops the oldest data.")
     ] = "25%",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rti_mpc.errors import ConfigError
-from rti_mpc_service.commands.arguments import JsonPath
+from rti_mpc_service.commands.arguments import JsonPath, new_file, new_folder
 from rti_mpc_service.commands.on_bus import on_bus
 from rti_mpc_service.commands.robot import lockstep_robot
 from rti_mpc_service.config.schema import Config
@@ -26,7 +26,8 @@ def record(
     config: Config,
     bus: BusSettings,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE.mcap", help="File to write; with a limit, a folder.", show_default="runs/ROBOT-TIME.mcap")
+        Path | None,
+        typer.Option(metavar="FILE.mcap", help="New file to write; with a limit, a folder.", show_default="runs/ROBOT-TIME.mcap", callback=new_file),
     ] = None,
     robot: Annotated[
         list[str] | None,
@@ -49,7 +50,7 @@ def record(
 @recordings.command()
 def export(
     recording: Annotated[Path, typer.Argument(metavar="RUN.mcap", help="Recording, or the folder of its segments.")],
-    parquet: Annotated[Path, typer.Option(metavar="DIR", help="Folder for a Parquet file a stream, in a folder a robot.")],
+    parquet: Annotated[Path, typer.Option(metavar="DIR", help="New folder for a Parquet file a stream, in a folder a robot.", callback=new_folder)],
     horizon: Annotated[bool, typer.Option("--horizon", help="Also all rows of plans and references used, as lists.")] = False,
 ) -> None:
     """Write a recording as tables, with columns named by signal, and units in their metadata."""
@@ -103,7 +104,10 @@ def why(
     at: Annotated[str | None, typer.Option("--at", metavar="TIME", help="Time of the robot's clock, such as 72.5s.")] = None,
     seq: Annotated[int | None, typer.Option("--seq", metavar="NUMBER", help="Number of the command.", show_default="the last command")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
-    case: Annotated[Path | None, typer.Option(metavar="FILE.npz", help="Also write the sample's QP as a case, for `rti-mpc solve-case`.")] = None,
+    case: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.npz", help="Also write the sample's QP, a case for `rti-mpc solve-case`, to a new file.", callback=new_file),
+    ] = None,
     robot: RecordedRobot = None,
     owner: Owner = None,
     folder: ModelFolder = Path(),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rti_mpc_service.commands.arguments import new_file
 from rti_mpc_service.commands.on_bus import on_bus
 from rti_mpc_service.config.build import operating_rates, robot_settings, with_initial_state
 from rti_mpc_service.config.schema import Config
@@ -27,7 +28,9 @@ def sim(
     speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Simulated seconds per second of real time.")] = 1.0,
     x0: Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE", help="Initial state, instead of the configuration's; repeatable.")] = None,
     duration: Annotated[float | None, typer.Option(metavar="SECONDS", min=0.0, help="Stop after this robot time.")] = None,
-    log: Annotated[Path | None, typer.Option(metavar="FILE.csv", help="Write each state with its input and the time of its answer.")] = None,
+    log: Annotated[
+        Path | None, typer.Option(metavar="FILE.csv", help="New file for each state with its input and the time of its answer.", callback=new_file)
+    ] = None,
 ) -> None:
     """Simulate the robot: a plant with its own parameters, which stops when it receives no valid commands."""
     from rti_mpc_sim.robot import main

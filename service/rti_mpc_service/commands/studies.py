@@ -9,11 +9,29 @@ from typing import Annotated, Literal
 
 import typer
 
-from rti_mpc_service.commands.arguments import ConfigPath, JsonPath, RobotName, ScenarioName, WaypointSmoothing, WaypointSpeed, file_of
+from rti_mpc_service.commands.arguments import (
+    ConfigPath,
+    JsonPath,
+    RobotName,
+    ScenarioName,
+    WaypointSmoothing,
+    WaypointSpeed,
+    file_of,
+    new_file,
+    new_folder,
+)
 from rti_mpc_service.commands.robot import lockstep_robot
 from rti_mpc_service.shipped import SHIPPED
 
 studies = typer.Typer()
+
+
+def new_paper(param: typer.CallbackParam, out: Path | None) -> Path | None:
+    """Check that a folder has no paper yet, see `new_file`."""
+    if out is not None:
+        new_file(param, out / "paper.md")
+        new_folder(param, out / "paper")
+    return out
 
 
 @studies.command()
@@ -46,7 +64,13 @@ def bench(
 @studies.command()
 def paper(
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder for paper.md and its folder of figures and run.json.", show_default="runs/paper-TIME")
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for paper.md and its folder of figures and run.json.",
+            show_default="runs/paper-TIME",
+            callback=new_paper,
+        ),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A short run: three seconds of every experiment, few points of each sweep.")] = False,
 ) -> None:
@@ -94,7 +118,7 @@ def tune(
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE.toml", help="File to write; figure and study go beside it.", show_default="CONFIG.tuned.toml")
+        Path | None, typer.Option(metavar="FILE.toml", help="New file to write; figure and study go beside it.", show_default="CONFIG.tuned.toml")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the proposals.")] = 1,
     waypoint_speed: WaypointSpeed = 0.25,

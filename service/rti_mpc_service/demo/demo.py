@@ -181,7 +181,6 @@ def main(config: Config, scenario: str | None, **options: Any) -> int:
     try:
         run.folder.mkdir(parents=True, exist_ok=True)
         write_files(run.folder / "config.toml", run.config)
-        (run.folder / "run.mcap").unlink(missing_ok=True)  # of an earlier run: a recorder overwrites none
     except OSError as error:
         raise ConfigError(f"--out must be a folder that can be written, got {run.folder}: {error.strerror}") from error
     if run.scenario.note:

@@ -103,7 +103,7 @@ def main(
     """
     faults = chosen(only)
     if record is not None:
-        check_folder(record)
+        make_folder(record)
     config = load(config_path)
     heading = BEST_HEADINGS.get(scenario or "")
     followed = find_scenario(config, scenario, heading, REFERENCE_DURATION_S, waypoint_speed_m_s, waypoint_smoothing_m)
@@ -132,23 +132,20 @@ def main(
     return 0 if report.kept and not stop.is_set() else 1
 
 
-def check_folder(record: Path) -> None:
+def make_folder(record: Path) -> None:
     """
     Make the folder of the recordings.
 
     Raises:
-        ConfigError: It cannot be made, or holds recordings, which a recorder does not overwrite.
+        ConfigError: It cannot be made.
         ModuleNotFoundError: The extra that records is not installed.
     """
     if find_spec("mcap") is None:
         raise ModuleNotFoundError(name="mcap")
     try:
         record.mkdir(parents=True, exist_ok=True)
-        held = sorted(path.name for path in record.glob("*.mcap"))
     except OSError as error:
         raise ConfigError(f"--record must be a folder that can be written, got {record}: {error.strerror}") from error
-    if held:
-        raise ConfigError(f"--record must be a folder without recordings, got {record} with {held[0]}")
 
 
 def chosen(only: Sequence[str]) -> list[Fault]:

@@ -13,6 +13,7 @@ from typing import Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from rti_mpc import __version__
+from rti_mpc.errors import ConfigError
 from rti_mpc_service.console import plain_console
 from rti_mpc_service.host import machine
 from rti_mpc_service.paper import readings
@@ -119,8 +120,16 @@ def main(out: Path | None = None, *, quick: bool = False) -> int:
     Args:
         out: Folder to leave ``paper.md`` in, and everything else in its folder ``paper``; one below ``runs`` if None.
         quick: A first look: a few seconds of every experiment after its transient.
+
+    Raises:
+        ConfigError: The folder cannot be written.
     """
     out = out or Path("runs") / f"paper-{datetime.now():%Y%m%d-%H%M%S}"
+    folder = out / "paper"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out must be a folder that can be written, got {out}: {error.strerror}") from error
     console = plain_console()
     began_ns = time.monotonic_ns()
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn()
@@ -128,8 +137,6 @@ def main(out: Path | None = None, *, quick: bool = False) -> int:
         study = Study(quick, progress)
         study.everything()
     run = rounded(study.run | {"took_s": 1e-9 * (time.monotonic_ns() - began_ns)})
-    folder = out / "paper"
-    folder.mkdir(parents=True, exist_ok=True)
     (folder / "run.json").write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
     draw(study.races, run, folder)
     (out / "paper.md").write_text(report(run), encoding="utf-8")

@@ -53,7 +53,6 @@ def write_both(out: Path, path: Path, journal: Journaled, recorded: Passage, dri
     stamps, locals_ns = (np.array(column, np.float64) for column in zip(*sorted(heard), strict=True))
     begin_ns, end_ns = (float(np.interp(state.stamp_ns, stamps, locals_ns)) for state in (recorded.states[0], recorded.states[-1]))
     messages = [*of_recorded(copied, begin_ns, end_ns), *of_driven(copied, journal, driven, stamps, locals_ns)]
-    out.unlink(missing_ok=True)
     writer = RecordingWriter(out, round(begin_ns), recording.unix_offset_ns, rti_mpc.__version__)
     for local_ns, robot, key, payload in sorted(messages, key=lambda message: message[0]):
         writer.add(robot, key, local_ns, payload)

@@ -172,7 +172,7 @@ def written_to(path: Path, config: Config, out: Path | None) -> Path:
     Return the file to write.
 
     Raises:
-        ConfigError: It is the robot's own, or what that finds beside itself would be missing beside this one.
+        ConfigError: It is the robot's own, or there already, or what that finds beside itself would be missing beside this one.
     """
     tuned = f"{path.stem}.tuned.toml"
     out = out or (Path(tuned) if DEPLOY.resolve() in path.resolve().parents else path.with_name(tuned))
@@ -180,6 +180,8 @@ def written_to(path: Path, config: Config, out: Path | None) -> Path:
         raise ConfigError(f"--out must be a TOML file other than {path}, got {out}")
     if (":" in config.model.name or config.bus.config or config.bus.tls) and out.resolve().parent != path.resolve().parent:
         raise ConfigError(f"--out must be beside {path}, whose model or bus is found from there, got {out}")
+    if out.exists():
+        raise ConfigError(f"--out must not overwrite a file, got {out}, which exists")
     if not out.resolve().parent.is_dir():
         raise ConfigError(f"--out must be in a folder that exists, got {out}")
     return out
