@@ -17,6 +17,7 @@ from rti_mpc.wire.bus import Bus, BusSettings, new_epoch
 from rti_mpc.wire.intake import taken
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.layout import most_rows
+from rti_mpc.wire.rival import Rival
 
 ROLE = "reference"
 
@@ -40,9 +41,11 @@ class PlannerAdapter:
         Raises:
             ConfigError: The name is none for a key, or Zenoh refuses a setting.
         """
-        self._bus = Bus.join(bus or BusSettings(), Keys(prefix, robot), say=lambda line: print(f"{robot}: {line}", file=sys.stderr))
+        self._robot = robot
+        self._bus = Bus.join(bus or BusSettings(), Keys(prefix, robot), say=self._say)
         self._publisher = self._bus.publisher(self._bus.keys.reference)
         self._epoch, self._seq = new_epoch(), 0
+        self._rival = Rival(self._bus, self._epoch)
         self._bus.alive(ROLE)
 
     def __enter__(self) -> Self:
@@ -57,7 +60,7 @@ class PlannerAdapter:
 
     def send(self, y: ArrayLike, period_s: float, *, stamp_ns: int = STAMP_ON_ARRIVAL, end: End = End.HOLD, p: ArrayLike | None = None) -> None:
         """
-        Send a reference, which takes the place of the last one.
+        Send a reference, which takes the place of the last one. A line tells of another source for the same robot, once.
 
         Args:
             y: Rows of outputs in the order of the model, shape ``(M, ny)``; angles may wrap.
@@ -86,3 +89,8 @@ class PlannerAdapter:
             raise ConfigError(f"a reference must be one that receivers take: {error}") from error
         self._seq += 1
         self._publisher.put_bytes(payload)
+        if (notice := self._rival.notice()) is not None:
+            self._say(notice.text)
+
+    def _say(self, line: str) -> None:
+        print(f"{self._robot}: {line}", file=sys.stderr)

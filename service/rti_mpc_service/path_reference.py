@@ -32,7 +32,9 @@ from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, new_epoch
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
-from rti_mpc_service.reference import ROLE, STALE_S
+from rti_mpc.wire.rival import Rival
+from rti_mpc_service.announce import announce
+from rti_mpc_service.reference import ROLE, STALE_S, has_source
 from rti_mpc_service.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -150,7 +152,7 @@ class PathReferences:
         return Reference(self._epoch, self._seq, stamp_ns, LASTS_NS, End.STOP, self._y, np.tile(p, (2, 1)))
 
 
-def main(name: str, model: Model, pieces: Sequence[Path], bus_settings: BusSettings, keys: Keys, *, stop: Event | None = None) -> None:
+def main(name: str, model: Model, pieces: Sequence[Path], bus_settings: BusSettings, keys: Keys, *, stop: Event | None = None) -> int:
     """
     Publish the path around the robot until stopped.
 
@@ -162,6 +164,9 @@ def main(name: str, model: Model, pieces: Sequence[Path], bus_settings: BusSetti
         keys: Where the robot's streams are.
         stop: Event that stops the source; None: SIGINT and SIGTERM do.
 
+    Returns:
+        Exit status: 0 when stopped, 1 when another source is present.
+
     Raises:
         ConfigError: The model follows no path.
     """
@@ -169,9 +174,11 @@ def main(name: str, model: Model, pieces: Sequence[Path], bus_settings: BusSetti
     references = PathReferences(model, pieces, epoch)
     stop = stop or stop_on_signals()
     with Bus.join(bus_settings, keys, stop=stop, say=logger.warning) as bus:
+        if has_source(bus):
+            return 1
         publisher, states = bus.publisher(keys.reference), bus.subscriber(keys.state, capacity=RING_MESSAGES)
         announcer, intake = Announcer(bus, ROLE, epoch), bus.intake(State, STALE_S, {"x": model.nx})
-        lives = Lives(STALE_S, STALE_S)
+        lives, rival = Lives(STALE_S, STALE_S), Rival(bus, epoch)
         begun = 0
         bus.expect("state", lambda: begun)
         bus.alive(ROLE)
@@ -179,6 +186,8 @@ def main(name: str, model: Model, pieces: Sequence[Path], bus_settings: BusSetti
         logger.info("%s for %s", text, keys.robot)
         while not stop.wait(LOOK_PERIOD_S):
             now_ns = time.monotonic_ns()
+            if (notice := rival.notice()) is not None:
+                announce(logger, announcer, notice, 0)
             for state in intake.newest_of_each(states.drain()):
                 heard = lives.judge(state.epoch, now_ns)
                 if heard is Heard.BEGINS:
@@ -189,3 +198,4 @@ def main(name: str, model: Model, pieces: Sequence[Path], bus_settings: BusSetti
                     publisher.put(reference)
             for notice in intake.notices(now_ns):
                 announcer.say(notice, 0)
+    return 0

@@ -5,12 +5,14 @@ Reference source as a process: one scenario, anchored to the robot's clock.
 It waits for a state, publishes the whole reference from that state's stamp on, and
 publishes it again whenever the robot restarts. Processes that join late get the
 last reference while the source lives. A second robot of the same name, or a forged
-state, gets no reference while the first robot lives.
+state, gets no reference while the first robot lives. A second source for the same robot
+does not start beside the first.
 """
 
 from __future__ import annotations
 
 import logging
+import sys
 import time
 from collections.abc import Callable
 from threading import Event
@@ -24,11 +26,14 @@ from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import RING_MESSAGES, Bus, BusSettings, Subscriber, new_epoch
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.rival import Rival
+from rti_mpc_service.announce import announce
 from rti_mpc_service.scenario import Scenario
 
 ROLE = "reference"
 LOOK_PERIOD_S = 0.02  # period of reading states: waking at every state would take processor time from the controller
 RESTART_CHECK_NS = 500_000_000  # period of checking whether the robot was restarted
+LISTEN_BEFORE_START_S = 0.5  # how long a starting source listens for another one
 STALE_S = 1.0  # silence of the robot, and time for which only another one is heard, before the reference is anchored to that one
 
 logger = logging.getLogger(ROLE)
@@ -48,10 +53,12 @@ def main(
         stop: Event that stops the source; None: SIGINT and SIGTERM do.
 
     Returns:
-        How many robots the reference was anchored to.
+        Exit status: 0 when stopped, 1 when another source is present.
     """
     stop = stop or stop_on_signals()
     with Bus.join(bus_settings, keys, stop=stop, say=logger.warning) as bus:
+        if has_source(bus):
+            return 1
         source = ReferenceSource(bus, scenario, parameters)
         bus.alive(ROLE)
         logger.info("%s for %s", scenario.title, keys.robot)
@@ -59,7 +66,15 @@ def main(
             logger.warning("%s", scenario.note)
         while not stop.wait(LOOK_PERIOD_S):
             source.publish_if_restarted()
-    return source.anchored
+    return 0
+
+
+def has_source(bus: Bus) -> bool:
+    """Whether another source publishes references for the robot; it is told if one does."""
+    present = bus.is_alive(ROLE, LISTEN_BEFORE_START_S)
+    if present:
+        print(f"rti-mpc: {bus.keys.robot} already has a source of references: stop it first, or give this robot another name", file=sys.stderr)
+    return present
 
 
 class ReferenceSource:
@@ -76,6 +91,7 @@ class ReferenceSource:
         self._epoch = new_epoch()
         self._publisher = bus.publisher(bus.keys.reference)
         self._announcer = Announcer(bus, ROLE, self._epoch)
+        self._rival = Rival(bus, self._epoch)
         self._bus = bus
         self._states: Subscriber | None = None
         self._look_again_ns = 0
@@ -94,6 +110,8 @@ class ReferenceSource:
         robot and controller need the processor.
         """
         now_ns = time.monotonic_ns()
+        if (notice := self._rival.notice()) is not None:
+            announce(logger, self._announcer, notice, self._stamp_ns)
         if self._states is None:
             if now_ns < self._look_again_ns:
                 return

@@ -50,6 +50,9 @@ class Waiting:
         self._session.waiting = [received for received in self._session.waiting if received.key != self._key]
         return waiting
 
+    def undeclare(self) -> None:
+        pass
+
 
 class Scene:
     """A robot that is adapted, and its clock."""
@@ -268,6 +271,20 @@ def test_planner_sends_references_and_refuses_what_is_none(monkeypatch: pytest.M
         ):
             with pytest.raises(ConfigError, match="must be"):
                 planner.send(y, period_s, p=p)
+
+
+def test_planner_beside_another_source_is_told_so_in_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    session = Session()
+    monkeypatch.setattr(Bus, "join", lambda settings, keys, **_: Bus(session, keys))
+    with PlannerAdapter("car") as planner:
+        planner.send([[0.0], [1.0]], 0.05)
+        assert capsys.readouterr().err == ""
+        other = Reference(1, 1, 0, 50 * MS, End.HOLD, np.zeros((2, 1)), np.zeros((2, 0)))
+        session.waiting.append(Received(encode(other), encoding(Reference), KEYS.reference))
+        for _ in range(2):
+            planner.send([[0.0], [1.0]], 0.05)
+    said = "another source publishes references for car: its controller follows this one from now on, not that one; stop one of the two"
+    assert capsys.readouterr().err == f"car: {said}\n"
 
 
 WRONG_REFERENCES: dict[str, tuple[dict[str, Any], str]] = {

@@ -65,7 +65,7 @@ def reference(
     waypoint_smoothing: WaypointSmoothing = None,
     track: PathName = None,
     path_limits: PathLimits = None,
-) -> None:
+) -> int:
     """Publish a reference that starts at the robot's current state, and again after each restart of the robot."""
     from rti_mpc_service.reference import main
     from rti_mpc_service.scenario import find_scenario
@@ -76,12 +76,11 @@ def reference(
         pieces = path_reference.path_of_options(
             track, path_limits, waypoint_speed, waypoint_smoothing, scenario=scenario, heading=heading, duration=duration
         )
-        path_reference.main(track, build_model(config), pieces, bus, config.keys())
-        return
+        return path_reference.main(track, build_model(config), pieces, bus, config.keys())
     if path_limits is not None:
         raise ConfigError("--path-limits are those of a --path, which must be given as well")
     followed = find_scenario(config, scenario, heading, duration, waypoint_speed, waypoint_smoothing)
-    main(followed, bus, config.keys(), parameters=partial(stage_parameters, config))
+    return main(followed, bus, config.keys(), parameters=partial(stage_parameters, config))
 
 
 @on_bus(processes)
