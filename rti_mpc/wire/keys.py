@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any, Generic
 
@@ -12,8 +13,13 @@ from rti_mpc.wire import streams
 from rti_mpc.wire.cdr import M
 from rti_mpc.wire.streams import Stream
 
-RESERVED_CHARS = set("*$?#\0")  # Zenoh's wildcards and selectors, and what no path holds
-NO_WORDS = {"", ".", ".."}  # recordings are exported into a folder by the robot's name
+# No wildcards and selectors of Zenoh's; and no . at the beginning, since recordings are exported into a folder by the robot's name.
+WORD = r"[A-Za-z0-9_-][A-Za-z0-9_.-]*"
+PATTERNS = {"robot": rf"^{WORD}$", "prefix": rf"^{WORD}(/{WORD})*$"}
+NAMES = {
+    "robot": "a word of letters, digits, _ . -, without a . at its beginning",
+    "prefix": "words of letters, digits, _ . -, without a . at their beginning, joined by single slashes",
+}
 
 
 class Key(str, Generic[M]):
@@ -39,20 +45,21 @@ class Keys:
     Keys of one robot.
 
     Attributes:
-        prefix: Common prefix, one or more chunks.
-        robot: Name of the robot, one or more chunks.
+        prefix: Common prefix, one or more words, see `NAMES`.
+        robot: Name of the robot, a word.
+
+    Raises:
+        ConfigError: One of them is none.
     """
 
     prefix: str = "rti_mpc"
     robot: str = "pioneer"
 
     def __post_init__(self) -> None:
-        for name in ("prefix", "robot"):
+        for name, pattern in PATTERNS.items():
             value = getattr(self, name)
-            if NO_WORDS & set(value.split("/")) or value.startswith("@") or RESERVED_CHARS & set(value):
-                raise ConfigError(
-                    f"{name} must be words joined by single slashes, none of them . or .., without any of * $ ? #, NUL or a leading @, got {value!r}"
-                )
+            if not isinstance(value, str) or not re.fullmatch(pattern, value):
+                raise ConfigError(f"{name} must be {NAMES[name]}, got {value!r}")
 
     def below(self, name: str) -> str:
         """Return the key of any name below this robot, such as ``"**"``."""

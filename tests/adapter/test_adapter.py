@@ -273,6 +273,14 @@ def test_planner_sends_references_and_refuses_what_is_none(monkeypatch: pytest.M
                 planner.send(y, period_s, p=p)
 
 
+@pytest.mark.parametrize("name", ["my robot", "", "a/b", None])
+def test_name_that_no_robots_file_may_have_is_refused_before_the_bus_is_joined(name: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Bus, "join", None)
+    for adapt in (PlannerAdapter, lambda name: RobotAdapter(name, stop=Stop(), **LIMITS)):
+        with pytest.raises(ConfigError, match="robot must be a word of letters, digits"):
+            adapt(name)
+
+
 def test_planner_beside_another_source_is_told_so_in_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     session = Session()
     monkeypatch.setattr(Bus, "join", lambda settings, keys, **_: Bus(session, keys))

@@ -184,7 +184,7 @@ def test_crafted_recording_is_read_if_nothing_is_wrong(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("robot", ["../../evil", "/tmp/evil", "..", ".", "a/../b", "a//b", "", "a\0b"])
 def test_robot_whose_name_would_leave_the_folder_of_an_export_is_refused(robot: str, tmp_path: Path) -> None:
-    with pytest.raises(MessageError, match=r"run\.mcap: robot must be words"):
+    with pytest.raises(MessageError, match=r"run\.mcap: robot must be a word of letters, digits"):
         Recording(crafted(tmp_path / "run.mcap", robot=robot))
 
 

@@ -43,7 +43,7 @@ def test_latch_is_read_as_it_was_written_in_a_folder_that_is_made_for_it(file: L
 
 
 def test_each_prefix_and_robot_has_a_file_of_its_own(tmp_path: Path) -> None:
-    keys = [Keys(), Keys("rti_mpc", "other"), Keys("a/b", "c"), Keys("a", "b/c/d"), Keys("...", "..."), Keys("a%2Fb", "c")]
+    keys = [Keys(), Keys("rti_mpc", "other"), Keys("a/b", "c"), Keys("a", "b-c"), Keys("a/b/c", "d"), Keys("a", "b.c"), Keys("a_b", "c")]
     paths = {path(LatchFile(key, tmp_path)) for key in keys}
     assert len(paths) == len(keys)
     assert {path.parent for path in paths} == {tmp_path}

@@ -1,11 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import json
+import re
+import tomllib
+from contextlib import suppress
+from typing import Any
+
 import pytest
+from pydantic import ValidationError
 
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.streams import KNOWN_ROLES, role_of
+from rti_mpc_service.config.schema import Config
+from rti_mpc_service.shipped import SHIPPED
 
 
 def test_streams_lie_below_prefix_and_robot() -> None:
@@ -24,11 +33,27 @@ def test_streams_are_distinct() -> None:
     assert len({getattr(keys, name) for name in names}) == len(names)
 
 
-@pytest.mark.parametrize("word", ["", "/a", "a/", "a//b", "a*", "**", "a$*", "a?b", "a#b", "@/a", "..", ".", "a/../b", "../a", "a/.", "a\0b"])
+REFUSED = ["", "/a", "a/", "a//b", "a*", "**", "a$*", "a?b", "a#b", "@/a", "..", ".", "a/../b", "../a", "a/.", "a\0b", "a b", "a\n", "ä", 5, None]
+
+
+@pytest.mark.parametrize("word", REFUSED)
 @pytest.mark.parametrize("name", ["prefix", "robot"])
-def test_words_that_zenoh_or_a_path_would_take_for_more_are_refused(name: str, word: str) -> None:
-    with pytest.raises(ConfigError, match=name):
+def test_words_that_zenoh_or_a_path_would_take_for_more_are_refused(name: str, word: Any) -> None:
+    with pytest.raises(ConfigError, match=f"{name} must be (a word|words) of letters, digits, .*, got {re.escape(repr(word))}"):
         Keys(**{name: word})
+
+
+def test_name_is_refused_by_the_keys_where_the_robots_file_refuses_it() -> None:
+    text = SHIPPED.read_text()
+    for word in ["a", "A_1.b-c", "-", "a.", *(word for word in REFUSED if isinstance(word, str))]:
+        for name, line in (("robot", 'robot = "pioneer"'), ("prefix", "")):
+            document = tomllib.loads(text.replace(line, f"{name} = {json.dumps(word)}", 1) if line else f"{name} = {json.dumps(word)}\n{text}")
+            with suppress(ConfigError):
+                Keys(**{name: word})
+                Config.model_validate(document)
+                continue
+            with pytest.raises(ValidationError, match=name):
+                Config.model_validate(document)
 
 
 @pytest.mark.parametrize("role", [*KNOWN_ROLES, "standby.7", "standby.1048575", "viewer_2"])

@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, AllowInfNan, BaseModel, BeforeValidator, ConfigDict, Field
 
-from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.keys import NAMES, PATTERNS, Keys
 
 
 def interval(value: object) -> object:
@@ -378,8 +378,8 @@ class SimSection(Section):
 class Config(Section):
     """Configuration of one robot."""
 
-    robot: str = Field(pattern=r"^[A-Za-z0-9_.-]+$", description="the robot's name in keys: letters, digits, _ . -")
-    prefix: str = Field(default="rti_mpc", pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$", description="first part of all keys")
+    robot: str = Field(pattern=PATTERNS["robot"], description=f"the robot's name in keys: {NAMES['robot']}")
+    prefix: str = Field(default="rti_mpc", pattern=PATTERNS["prefix"], description=f"first part of all keys: {NAMES['prefix']}")
     model: ModelSection = Field(description="the robot's model")
     ocp: OcpSection = Field(description="the optimal control problem")
     solver: SolverSection = Field(default=SolverSection(), description="the QP solver and its settings")

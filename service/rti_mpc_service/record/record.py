@@ -47,7 +47,7 @@ MAX_NUMBERED = 4096  # publishers whose sequence numbers are followed
 MAX_ROBOTS = 100
 STALE_S = 2.0
 WILD = set("*?[")  # characters of a pattern
-ANY_NAME = str.maketrans(dict.fromkeys("*?[]", "x"))  # makes a name of a pattern
+ANY_NAME = str.maketrans(dict.fromkeys("*?[!]", "x"))  # makes a name of a pattern
 EVERYTHING = Retention()
 
 MEDIA_TYPES = {".toml": "application/toml", ".py": "text/x-python", ".json": "application/json"}
@@ -87,7 +87,7 @@ def main(
     stop = stop or stop_on_signals()
     names = list(robots) or [keys.robot]
     for name in names:
-        Keys(keys.prefix, name.translate(ANY_NAME))  # refuses what no robot can be called
+        Keys(keys.prefix, name.translate(ANY_NAME) if WILD & set(name) else name)  # refuses what no robot can be called
     end = "" if retention else ".mcap"
     path = out or Path("runs") / f"{keys.robot if names == [keys.robot] else 'robots'}-{time.strftime('%Y%m%d-%H%M%S')}{end}"
     with Bus.join(bus_settings, keys, stop=stop, say=log.warning) as bus:
