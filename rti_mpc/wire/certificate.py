@@ -91,6 +91,8 @@ def ends(path: Path) -> datetime:
 def _first(text: str) -> str:
     """Return the first certificate of a PEM file, which may hold a chain and remarks."""
     begin, end = "-----BEGIN CERTIFICATE-----", "-----END CERTIFICATE-----"
+    if not 0 <= text.find(begin) < text.rfind(end):
+        raise ValueError(f"no lines {begin} and {end}")
     return text[text.index(begin) : text.index(end) + len(end)]
 
 

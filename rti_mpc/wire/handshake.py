@@ -115,7 +115,7 @@ def client(authority: Path, certificate: Path | None, key: Path | None) -> ssl.S
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.load_verify_locations(authority)
     if certificate is not None:
-        context.load_cert_chain(certificate, key)
+        context.load_cert_chain(certificate, key, password="")  # an empty one: otherwise OpenSSL asks for it at the terminal
     return context
 
 

@@ -27,6 +27,7 @@ import zenoh
 from rti_mpc.contract.message import Reference
 from rti_mpc.errors import ConfigError, Stopped
 from rti_mpc.text_file import read_text_file
+from rti_mpc.wire import credentials
 from rti_mpc.wire.handshake import obstacles
 from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
 from rti_mpc.wire.reach import remind
@@ -35,6 +36,7 @@ RENDEZVOUS_ENDPOINT = "tcp/127.0.0.1:7447"
 # Protocols that need a port; whether an endpoint of another protocol is valid is left to Zenoh.
 ENDPOINT_PATTERN = re.compile(r"(tcp|tls|udp|quic|ws)/.+:\d+([?#].*)?$|(?!(tcp|tls|udp|quic|ws)/)[a-z_-]+/.+")
 OPEN_PATTERN = re.compile(r"(tcp|udp|ws)/(?!127\.|localhost:|\[::1\])")  # an endpoint beyond the loopback without TLS
+TLS_PROTOCOLS = ("tls/", "quic/")
 CLIENT_TIMEOUT_MS = 500  # of one attempt to reach a router
 MAX_CONFIG_BYTES = 1 << 16  # of Zenoh's configuration file: its parser recurses at every bracket
 RETRY_INTERVAL_S = 0.1  # between two attempts to reach a router
@@ -172,6 +174,18 @@ def certificate(config: zenoh.Config) -> Path | None:
     return _tls_file(config, "connect_certificate") or _tls_file(config, "listen_certificate")
 
 
+def check_credentials(config: zenoh.Config) -> None:
+    """
+    Check the files of TLS of a process that has an endpoint of TLS.
+
+    Raises:
+        ConfigError: One is none, or does not fit the others.
+    """
+    for side in ("connect", "listen"):
+        if any(end.startswith(TLS_PROTOCOLS) for end in _ends(config, side)):
+            credentials.check(*(_tls_file(config, name) for name in ("root_ca_certificate", f"{side}_certificate", f"{side}_private_key")))
+
+
 def _tls_file(config: zenoh.Config, name: str) -> Path | None:
     path = json.loads(config.get_json(f"transport/link/tls/{name}"))
     return Path(path) if path else None
@@ -179,7 +193,7 @@ def _tls_file(config: zenoh.Config, name: str) -> Path | None:
 
 def _guess(endpoint: str) -> str:
     """Return what may be wrong at an endpoint."""
-    certificate = ", the address is wrong, or a certificate is" if endpoint.startswith(("tls/", "quic/")) else ", or the address is wrong"
+    certificate = ", the address is wrong, or a certificate is" if endpoint.startswith(TLS_PROTOCOLS) else ", or the address is wrong"
     return f"no process listens there{certificate}"
 
 
@@ -212,12 +226,13 @@ def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event 
     Open a session; a client waits for its router, and reports that.
 
     Raises:
-        ConfigError: Zenoh refuses a setting, or no router was there in time.
+        ConfigError: Zenoh refuses a setting, a file of TLS is none or does not fit the others, or no router was there in time.
         Stopped: The wait was ended.
     """
     deadline_s = time.monotonic() + timeout_s
     os.environ.setdefault("ZENOH_RUNTIME", ZENOH_THREADS)
     config, opened, told = zenoh_config(settings), threading.Event(), False
+    check_credentials(config)
     try:
         while True:
             try:

@@ -22,7 +22,7 @@ from tests.processes.system import PATIENCE_S, heard, rti_mpc, until
 
 pytest.importorskip("cryptography", reason="the extra certs is not installed: certificates were NOT tried")
 
-from tests.processes.secured import PROGRAMS, Secured
+from tests.processes.secured import PROGRAMS, Secured, join_unchecked
 
 pytestmark = pytest.mark.slow
 
@@ -102,7 +102,7 @@ def test_late_joiner_gets_a_reference_and_nobody_but_the_planner_gives_one(bus: 
 def test_certificate_of_no_or_of_another_authority_expired_or_plain_tcp_is_refused(bus: Secured) -> None:
     for settings in bus.outsiders().values():
         with pytest.raises(ConfigError, match="none has answered"):
-            Bus.join(settings, bus.keys, timeout_s=3.0)
+            join_unchecked(settings, bus.keys, 3.0)
     assert bus.join("robot")  # the router lives, and takes a good one
 
 

@@ -127,8 +127,10 @@ def read_certificate(path: Path) -> Any:
     """
     try:
         return x509.load_pem_x509_certificate(path.read_bytes())
-    except (OSError, ValueError) as error:
+    except OSError as error:
         raise ConfigError(f"certs: {path} must be a certificate, PEM: {reason(error)}") from error
+    except ValueError as error:
+        raise ConfigError(f"certs: {path} must be a certificate, PEM, got a file of something else") from error
 
 
 def name_of(certificate: Any) -> str:
