@@ -166,6 +166,13 @@ def test_no_command_overwrites_what_an_earlier_one_has_written(name: str, option
     assert all(path.read_text() == "precious" for path in kept)
 
 
+@pytest.mark.parametrize("vary", ["ocp.weights.q.psi", "ocp.M=1:3", "ocp.N=3:1", "ocp.N=1.5:3", "ocp.weights.Q.psi=-1:5", "timing.delay_s=0:nan"])
+def test_key_that_cannot_be_varied_is_refused_before_the_robots_file_is_read(vary: str, tmp_path: Path) -> None:
+    done = command("tune", tmp_path / "nowhere.toml", "--vary", vary)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert done.stderr.startswith("rti-mpc: --vary ")
+
+
 def test_what_is_written_may_go_into_a_pipe(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (parameter,) = (each for each in built().commands["sim"].params if each.name == "log")

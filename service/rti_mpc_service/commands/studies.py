@@ -26,6 +26,15 @@ from rti_mpc_service.shipped import SHIPPED
 studies = typer.Typer()
 
 
+def known_keys(vary: list[str] | None) -> list[str] | None:
+    """Check what is to be varied, before the robot's file and all that drives it are loaded."""
+    from rti_mpc_service.tune.varied import asked_for
+
+    for text in vary or ():
+        asked_for(text)
+    return vary
+
+
 def new_paper(param: typer.CallbackParam, out: Path | None) -> Path | None:
     """Check that a folder has no paper yet, see `new_file`."""
     if out is not None:
@@ -106,6 +115,7 @@ def tune(
             metavar="KEY[=LOW:HIGH]",
             help="Key of the file to vary, such as ocp.weights.Q.psi=0.001:1, ocp.N or timing.delay_s; repeatable.",
             show_default="weights above 0 except those of the position, two decades up and down",
+            callback=known_keys,
         ),
     ] = None,
     trials: Annotated[int, typer.Option(metavar="N", min=1, max=100_000, help="Number of trials of the study, with those it has already.")] = 100,

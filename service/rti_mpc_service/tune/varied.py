@@ -96,18 +96,32 @@ def default_keys(config: Config, model: Model) -> list[str]:
     ]
 
 
-def parse(config: Config, text: str) -> Varied:
-    """Return one key with its range, from ``KEY`` or ``KEY=LOW:HIGH``."""
+def asked_for(text: str) -> tuple[str, tuple[float, float] | None]:
+    """
+    Return a key and its range, None if it has none, from ``KEY`` or ``KEY=LOW:HIGH``, as far as they can be judged without the robot's file.
+
+    Raises:
+        ConfigError: There is no such key, or the range is none.
+    """
     key, given, span = text.partition("=")
     if key not in (HORIZON, DELAY, *WEIGHTS) and key.rpartition(".")[0] not in TABLES:
         known = ", ".join((*(f"{table}.NAME" for table in TABLES), *WEIGHTS, HORIZON, DELAY))
         raise ConfigError(f"--vary must name one of {known}, got {key!r}")
-    today = today_of(config, key)
-    low, high = limits(text, span) if given else default_range(config, key, today)
+    if not given:
+        return key, None
+    low, high = limits(text, span)
     if key == HORIZON and not (low.is_integer() and high.is_integer()):
         raise ConfigError(f"--vary {HORIZON} must have a range of whole numbers, got {span!r}")
     if key != DELAY and low <= 0.0:
         raise ConfigError(f"--vary {key} must have a range above 0, got {span!r}")
+    return key, (low, high)
+
+
+def parse(config: Config, text: str) -> Varied:
+    """Return one key with its range, from ``KEY`` or ``KEY=LOW:HIGH``."""
+    key, span = asked_for(text)
+    today = today_of(config, key)
+    low, high = span or default_range(config, key, today)
     varied = Varied(key, low, high, today)
     for value in (low, high):
         with_values(config, {key: value})
