@@ -171,10 +171,7 @@ def sequential(ocp: Ocp, *, softened: bool = True) -> Transcription:
             sides.append((rows.count - N * len(at), at))
     end_soft = rows.count
     if ng:
-        slack = ca.MX.zeros(ng, N)
-        row = rows.add(slack, slack, None, by_bound)
-        rows.follow(row, ng, sides)
-        A.place(row, to_s, sp.eye_array(N * ng))
+        A.place(rows.add_slacks(ng, N, by_bound, sides), to_s, sp.eye_array(N * ng))
     watched = rows.watched_from(first_soft)
     if not rows.count:
         A.place(rows.add(None, ca.MX.zeros(1), None, by_input[:1]), 0, sp.csc_array(np.eye(1)))  # OSQP needs at least one row

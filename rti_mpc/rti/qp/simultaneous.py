@@ -84,10 +84,7 @@ def simultaneous(ocp: Ocp, *, softened: bool = True) -> Transcription:
             rows.chain(row, len(at))
             sides.append((row, at))
     if ng:
-        slack = ca.MX.zeros(ng, N)
-        row = rows.add(slack, slack, None, by_bound)
-        rows.follow(row, ng, sides)
-        A.place(row, to_s, sp.eye_array(N * ng))
+        A.place(rows.add_slacks(ng, N, by_bound, sides), to_s, sp.eye_array(N * ng))
 
     P = Blocks()
     in_upper = [i for i, (row, col) in enumerate(zip(*lin.H_i.get_triplet(), strict=True)) if row <= col < nx]

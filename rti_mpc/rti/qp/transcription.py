@@ -135,13 +135,20 @@ class BoundRows:
         """Return the rows that the rows from `first` on watch, counted from `first`."""
         return np.array(self.watched[first : self.count], dtype=np.intp).reshape(-1, 4) - first
 
-    def follow(self, first: int, ng: int, sides: list[tuple[int, list[int]]]) -> None:
-        """Let the rows ``s >= 0``, ng per node from `first` on, watch the bounds that the slacks soften, each ``(first row, which of the ng)``."""
+    def add_slacks(self, ng: int, N: int, scales: np.ndarray[Any, Any], sides: list[tuple[int, list[int]]]) -> int:
+        """
+        Append the rows ``s >= 0``, ng for each of N nodes, and return the index of the first one.
+
+        They watch the bounds that the slacks soften, each ``(first row, which of the ng)``.
+        """
+        none = ca.MX.zeros(ng, N)
+        first = self.add(none, none, None, scales)
         for row in range(first, self.count):
             i, j = divmod(row - first, ng)
             watched = [start + i * len(at) + at.index(j) for start, at in sides if j in at]
             seen = [seen for bound in watched for seen in self.watched[bound][:2]]
             self.watched[row] = (seen * (2 if len(watched) == 1 else 1)) or [row] * 4  # a general constraint may have no bound
+        return first
 
 
 def input_rows(ocp: Ocp, lin: Linearization, rows: BoundRows, A: Blocks, to_du: int) -> None:
