@@ -13,6 +13,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 import casadi as ca
 
 from rti_mpc.codegen import function_in_c
+from rti_mpc.errors import OcpError
 
 Columns = list[ca.MX]  # one expression per stage
 
@@ -50,7 +51,12 @@ def recur(
 
     Returns:
         A function with the arguments of the first of the stages, and those to go on from, and with these outputs.
+
+    Raises:
+        OcpError: It is to go on from an earlier call, but does not begin with the last stage, or does not return all that is carried.
     """
+    if resumed and not (backward and set(carried.values()) <= set(outputs)):
+        raise OcpError(f"recursion {name} must be backward and return {', '.join(carried.values())} to be resumed, got outputs {', '.join(outputs)}")
     first = stages[0][0]
     stages = [(stage, count) for stage, count in stages if count]
     kinds = {stage.name(): stage for stage, _ in stages}

@@ -227,3 +227,12 @@ def test_native_code_is_kept_by_what_compiler_and_processor_make_of_it(tmp_path:
 def test_unknown_build_is_refused() -> None:
     with pytest.raises(OcpError, match="build must be one of portable, native, got 'fast'"):
         Rti(problem(3, 2, 3, 3), build="fast")
+
+
+@pytest.mark.parametrize(("outputs", "backward"), [(["s_next"], False), (["y"], True)], ids=["forward", "without what is carried"])
+def test_recursion_that_cannot_go_on_from_an_earlier_call_is_refused(outputs: list[str], backward: bool) -> None:
+    s, a = ca.SX.sym("s"), ca.SX.sym("a")
+    stage = ca.Function("stage", [s, a], [s + a, s * a], ["s", "a"], ["s_next", "y"])
+    assert recur("sums", [(stage, 3)], {"s": "s_next"}, ["s_next"], backward=True, resumed=True).n_in() == 4
+    with pytest.raises(OcpError, match="recursion sums must be backward and return s_next to be resumed, got outputs"):
+        recur("sums", [(stage, 3)], {"s": "s_next"}, outputs, backward=backward, resumed=True)
