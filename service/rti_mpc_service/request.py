@@ -21,6 +21,7 @@ from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.wire.bus import RETRY_INTERVAL_S, Bus, BusSettings
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.config import toml
+from rti_mpc_service.config.assignments import assigned
 from rti_mpc_service.latch_file import LatchFile
 from rti_mpc_service.operator_stop import MAX_NAME_CHARACTERS, utc_now
 from rti_mpc_service.parameter import from_json, to_json
@@ -184,12 +185,12 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, Any]:
         ConfigError: An assignment is not valid.
     """
     values = {}
-    for assignment in assignments:
-        key, _, value = assignment.partition("=")
+    rule = "params must be set by KEY=VALUE, the value as in the file"
+    for key, value in assigned(rule, assignments).items():
         try:
-            values[key.strip()] = toml.read_value(value)
+            values[key] = toml.read_value(value)
         except ConfigError:
-            raise ConfigError(f"params must be set by KEY=VALUE, the value as in the file, got {assignment}") from None
+            raise ConfigError(f"{rule}, got {f'{key}={value}'!r}") from None
     for key, value in to_json(values).items():
         if not all(math.isfinite(number) for number in (value if isinstance(value, list) else [value]) if isinstance(number, float)):
             raise ConfigError(f"{key} must be finite, except for an absent bound, [-inf, upper] or [lower, inf], got {toml.text(values[key])}")

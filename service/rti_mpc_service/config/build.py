@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rti_mpc.errors import ConfigError
+from rti_mpc_service.config.assignments import assigned_numbers
 from rti_mpc_service.config.refusal import unknown_name
 from rti_mpc_service.config.schema import ITERATION_KEYS, OWN_KEYS, Config
 
@@ -269,10 +270,7 @@ def with_initial_state(config: Config, assignments: Sequence[str]) -> Config:
     Raises:
         ConfigError: An assignment is not valid, or the model has no such state.
     """
-    try:
-        given = {name: float(value) for name, _, value in (assignment.partition("=") for assignment in assignments)}
-    except ValueError as error:
-        raise ConfigError(f"--x0 must be NAME=VALUE, got {' '.join(assignments)}") from error
+    given = assigned_numbers("--x0 must be NAME=VALUE, the value a finite number in the state's unit", assignments)
     if wrong := unknown_name("sim.x0", given, "state", build_model(config).states, complete=False):
         raise ConfigError(wrong)
     return config.model_copy(update={"sim": config.sim.model_copy(update={"x0": {**config.sim.x0, **given}})})

@@ -25,6 +25,7 @@ from rti_mpc.journal.replay import Difference, Replay
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 from rti_mpc.signals import quantity
 from rti_mpc_service.config import toml
+from rti_mpc_service.config.assignments import assigned
 from rti_mpc_service.config.build import retuned
 from rti_mpc_service.config.fit import check_names, check_tree
 from rti_mpc_service.config.refusal import explain
@@ -179,12 +180,12 @@ def overridden(config: Config, ocp: Ocp, assignments: Sequence[str]) -> dict[str
         ConfigError: A key is none of a weight or a bound, or its value does not fit.
     """
     document = config.model_dump(by_alias=True)
-    for assignment in assignments:
-        key, equals, value = assignment.partition("=")
-        if not equals or not key.startswith(TUNABLE):
-            raise ConfigError(f"--set must be KEY=VALUE with a key below {' or '.join(TUNABLE)}, whose values are not compiled in, got {assignment}")
+    rule = f"--set must be KEY=VALUE with a key below {' or '.join(TUNABLE)}, whose values are not compiled in"
+    for key, value in assigned(rule, assignments).items():
+        if not key.startswith(TUNABLE):
+            raise ConfigError(f"{rule}, got {f'{key}={value}'!r}")
         table: Any = document
-        *steps, name = key.strip().split(".")
+        *steps, name = key.split(".")
         for step in steps:
             table = table.get(step) if isinstance(table, dict) else None
         if not isinstance(table, dict):
@@ -192,7 +193,7 @@ def overridden(config: Config, ocp: Ocp, assignments: Sequence[str]) -> dict[str
         try:
             table[name] = toml.read_value(value)
         except ConfigError:
-            raise ConfigError(f"--set must be KEY=VALUE, the value as in the file, got {assignment!r}") from None
+            raise ConfigError(f"--set must be KEY=VALUE, the value as in the file, got {f'{key}={value}'!r}") from None
     try:
         changed = Config.model_validate(document)
         check_tree(changed)
