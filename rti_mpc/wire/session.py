@@ -34,9 +34,10 @@ from rti_mpc.wire.reach import remind
 
 RENDEZVOUS_ENDPOINT = "tcp/127.0.0.1:7447"
 # Protocols that need a port; whether an endpoint of another protocol is valid is left to Zenoh.
-ENDPOINT_PATTERN = re.compile(r"(tcp|tls|udp|quic|ws)/.+:\d+([?#].*)?$|(?!(tcp|tls|udp|quic|ws)/)[a-z_-]+/.+")
+ENDPOINT_PATTERN = re.compile(r"(tcp|tls|udp|quic|ws)/.+:(?P<port>\d+)([?#].*)?$|(?!(tcp|tls|udp|quic|ws)/)[a-z_-]+/.+")
 OPEN_PATTERN = re.compile(r"(tcp|udp|ws)/(?!127\.|localhost:|\[::1\])")  # an endpoint beyond the loopback without TLS
 TLS_PROTOCOLS = ("tls/", "quic/")
+MAX_PORT = 65535
 CLIENT_TIMEOUT_MS = 500  # of one attempt to reach a router
 MAX_CONFIG_BYTES = 1 << 16  # of Zenoh's configuration file: its parser recurses at every bracket
 RETRY_INTERVAL_S = 0.1  # between two attempts to reach a router
@@ -96,7 +97,7 @@ def zenoh_config(settings: BusSettings) -> zenoh.Config:
         ConfigError: An endpoint is malformed, a file of TLS is missing, or Zenoh refuses a value or cannot read its file.
     """
     for endpoint in (*settings.listen, *settings.connect):
-        if not ENDPOINT_PATTERN.match(endpoint):
+        if (match := ENDPOINT_PATTERN.match(endpoint)) is None or int(match["port"] or 0) > MAX_PORT:
             raise ConfigError(f"bus: an endpoint must be a protocol, an address and a port, such as {RENDEZVOUS_ENDPOINT}, got {endpoint!r}")
     name = str(settings.config)
     if settings.config is not None:

@@ -75,9 +75,9 @@ def test_what_zenoh_refuses_is_named(settings: BusSettings, word: str) -> None:
         zenoh_config(settings)
 
 
-@pytest.mark.parametrize("listen", ["tcp/127.0.0.1:99999", "carrier/pigeon", "tcp/192.0.2.1:7447"])
+@pytest.mark.parametrize("listen", ["carrier/pigeon", "tcp/192.0.2.1:7447"])
 def test_endpoint_that_cannot_be_listened_on_is_refused_by_its_name(listen: str) -> None:
-    """Zenoh says `invalid port value`, and not where."""
+    """Zenoh says what is wrong, and not where."""
     with pytest.raises(ConfigError, match=rf"bus: endpoints must be valid, and no other process listen there, got {listen} \("):
         Bus.join(BusSettings(listen=(listen,), connect=()), Keys())
 
@@ -91,7 +91,9 @@ def test_an_endpoint_already_taken_is_refused() -> None:
             Bus.join(BusSettings(listen=(f"tcp/{address}",), connect=()), Keys())
 
 
-@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1", "127.0.0.1:7447", "tcp/", "tls/robot.local", ""])
+@pytest.mark.parametrize(
+    "endpoint", ["tcp/127.0.0.1", "127.0.0.1:7447", "tcp/", "tls/robot.local", "tcp/127.0.0.1:65536", "tls/robot.local:74470", ""]
+)
 def test_endpoint_that_is_none_is_refused_with_one_that_would_be(endpoint: str) -> None:
     """Zenoh would try to reach it for ever."""
     for settings in (BusSettings(connect=(endpoint,)), BusSettings(listen=(endpoint,))):
@@ -100,7 +102,15 @@ def test_endpoint_that_is_none_is_refused_with_one_that_would_be(endpoint: str) 
 
 
 @pytest.mark.parametrize(
-    "endpoint", [RENDEZVOUS_ENDPOINT, "tcp/[::1]:7447", "tls/robot.local:7447#iface=eth0", "unixsock-stream//run/zenoh.sock", "serial//dev/tty0"]
+    "endpoint",
+    [
+        RENDEZVOUS_ENDPOINT,
+        "tcp/[::1]:7447",
+        "tls/robot.local:7447#iface=eth0",
+        "unixsock-stream//run/zenoh.sock",
+        "serial//dev/tty0",
+        "tcp/127.0.0.1:65535",
+    ],
 )
 def test_endpoints_of_every_kind_are_taken(endpoint: str) -> None:
     assert value(BusSettings(connect=(endpoint,)), "connect/endpoints") == [endpoint]

@@ -143,6 +143,8 @@ def switches(subject: Examined) -> Iterator[Opening]:
 
 def certificates(subject: Examined) -> Iterator[Opening]:
     """Which certificates end soon or have ended, and who may read private keys."""
+    if subject.tls is not None and not any(subject.tls.glob("*.pem")):
+        yield Opening("certificates", f"{subject.tls} has none: no process of this host starts with it", CERTIFY)
     for path in sorted(subject.tls.glob("*.pem")) if subject.tls else ():
         cure = "make a new authority and new bundles" if path.name == "authority.pem" else "`rti-mpc certs renew`, then restart its process"
         try:

@@ -54,6 +54,14 @@ def test_bundle_as_it_is_issued_leaves_nothing_open(secured: Path) -> None:
     assert examine(secured) == (0, f"{secured}: nothing is open here\n", [])
 
 
+def test_folder_without_certificates_is_a_finding(secured: Path) -> None:
+    """A misspelt folder was told, by status 0, that nothing is open."""
+    secured.write_text(secured.read_text().replace('tls = "tls"', 'tls = "tsl"'))
+    status, _, found = examine(secured)
+    told = [finding["here"] for finding in found if finding["what"] == "certificates"]
+    assert (status, told) == (1, [f"{secured.parent / 'tsl'} has none: no process of this host starts with it"])
+
+
 def test_each_thing_that_is_open_is_a_finding_of_its_own_with_what_to_do(secured: Path) -> None:
     tls, state = secured.parent / "tls", secured.parent / "state"
     text = secured.read_text().replace("live = false", "live = true") + 'listen = ["tcp/0.0.0.0:7447"]\n\n[debug]\ninject = true\n'
