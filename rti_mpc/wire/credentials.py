@@ -23,7 +23,7 @@ HANDSHAKE_TURNS = 4  # of each side, more than any handshake of TLS has
 FOREIGN = frozenset((2, 7, 18, 19, 20, 21))  # verdicts of OpenSSL, X509_V_ERR_...: no issuer that is known, or a signature of somebody else
 
 
-def check(authority: Path | None, certificate: Path | None, key: Path | None) -> None:
+def check(authority: Path | None, certificate: Path | None, key: Path | None, *, bundled: bool = True) -> None:
     """
     Check the files of TLS of a process, each None if it has none.
 
@@ -31,6 +31,7 @@ def check(authority: Path | None, certificate: Path | None, key: Path | None) ->
         authority: Certificate of the authority, PEM.
         certificate: Certificate of this process, PEM, and those between it and the authority.
         key: Its private key, PEM.
+        bundled: Whether they are of a folder of `rti-mpc certs`, in which one authority issues all; elsewhere, routers may have one of their own.
 
     Raises:
         ConfigError: A file is not what it should be, the certificate has ended or is of another authority, or the key of another certificate.
@@ -44,7 +45,7 @@ def check(authority: Path | None, certificate: Path | None, key: Path | None) ->
         until = f"{end:%Y-%m-%d} at {end:%H:%M} UTC"
         raise ConfigError(f"tls: {certificate} must be a certificate that is valid, it has ended on {until}: `rti-mpc certs renew`")
     _check_key(certificate, key)
-    if authority is not None and any(_foreign(authority, certificate, key, listens=listens) for listens in (False, True)):
+    if bundled and authority is not None and any(_foreign(authority, certificate, key, listens=listens) for listens in (False, True)):
         raise ConfigError(f"tls: {certificate} must be issued by the authority of {authority}, got one of another authority")
 
 

@@ -175,16 +175,18 @@ def certificate(config: zenoh.Config) -> Path | None:
     return _tls_file(config, "connect_certificate") or _tls_file(config, "listen_certificate")
 
 
-def check_credentials(config: zenoh.Config) -> None:
+def check_credentials(config: zenoh.Config, *, bundled: bool) -> None:
     """
-    Check the files of TLS of a process that has an endpoint of TLS.
+    Check the files of TLS of a process that has an endpoint of TLS, see `rti_mpc.wire.credentials.check`.
 
     Raises:
         ConfigError: One is none, or does not fit the others.
     """
     for side in ("connect", "listen"):
         if any(end.startswith(TLS_PROTOCOLS) for end in _ends(config, side)):
-            credentials.check(*(_tls_file(config, name) for name in ("root_ca_certificate", f"{side}_certificate", f"{side}_private_key")))
+            credentials.check(
+                *(_tls_file(config, name) for name in ("root_ca_certificate", f"{side}_certificate", f"{side}_private_key")), bundled=bundled
+            )
 
 
 def _tls_file(config: zenoh.Config, name: str) -> Path | None:
@@ -233,7 +235,7 @@ def open_session(settings: BusSettings, timeout_s: float, stop: threading.Event 
     deadline_s = time.monotonic() + timeout_s
     os.environ.setdefault("ZENOH_RUNTIME", ZENOH_THREADS)
     config, opened, told = zenoh_config(settings), threading.Event(), False
-    check_credentials(config)
+    check_credentials(config, bundled=settings.certificate is not None)
     try:
         while True:
             try:

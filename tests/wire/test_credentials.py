@@ -117,3 +117,14 @@ def test_good_files_and_those_that_only_others_can_judge_are_taken(tmp_path: Pat
     check(authority, folder / "planner.pem", folder / "planner.key")  # the clock of a robot may be set later
     authority.write_bytes(pem(Authority.make("theirs", 10.0).certificate) + pem(AUTHORITY.certificate))
     check(authority, folder / "planner.pem", folder / "planner.key")  # two authorities, while one takes the other's place
+
+
+def test_authority_of_routers_alone_is_taken_outside_of_a_bundle(tmp_path: Path) -> None:
+    """As in a Zenoh configuration of the user's own: clients and routers may have certificates of two authorities."""
+    folder = bundle(tmp_path / "tls")
+    authority = folder / "authority.pem"
+    authority.write_bytes(pem(Authority.make("theirs", 10.0).certificate))
+    check(authority, folder / "planner.pem", folder / "planner.key", bundled=False)
+    (folder / "planner.key").write_bytes((folder / "viewer.key").read_bytes())
+    with pytest.raises(ConfigError, match="must be the private key of"):
+        check(authority, folder / "planner.pem", folder / "planner.key", bundled=False)
