@@ -23,6 +23,7 @@ from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import OcpError
+from rti_mpc.rti.qp.polish import polished
 from rti_mpc.rti.qp.qp import Qp
 from rti_mpc.rti.scaled import Scaled
 
@@ -38,6 +39,7 @@ STATUS_BY_OSQP_CODE = {
     8: QpStatus.TIME_LIMIT,
 }
 SOLVED, INTERRUPTED = 1, 10
+POLISH_REFUSED = -1  # what it came to was no better than the solution
 # During a solve OSQP's own handler takes Ctrl-C. It ends with the status above only before an iteration, so that one that
 # comes later, in the last iteration or while polishing, is in no status. This tells of both until the next solve.
 interrupted = ctypes.PyDLL(osqp.ext_builtin.__file__).osqp_is_interrupted
@@ -61,7 +63,8 @@ class SolverSettings:
         check_termination: Iterations between two checks of the residuals.
         scaling: Sweeps of Ruiz scaling; none by default, since they break the symmetry of the problem and cost more time than they save.
         alpha: Over-relaxation, between 0 and 2.
-        polish: Refinements of a solution on the bounds that it holds, once it has converged; 0: it is left as it is.
+        polish: Refinements of a solution on the bounds that it holds, once it has converged, see `rti_mpc.rti.qp.polish` for where OSQP refuses its
+            own; 0: it is left as it is.
         acting_scale: Factor on the row of a softened bound that acts, whose step size is larger by its square: more than 10 finds the multipliers of
             obstacles sooner, and those of many bounds on states later.
 
@@ -108,7 +111,7 @@ class Solver:
         self._adapts_at = ADAPTATION_ITERATIONS  # iterations at which the next one comes
         self._sound = True
         self._start: tuple[Array, Array] | None = None  # of the next `load`, its multipliers of rows as they are; None: the last solution
-        self._held: tuple[Array, Array] | None = None  # iterate of the last `rewarm` until the next solve, as `solution`
+        self._held: tuple[Array, Array] | None = None  # what the last `rewarm` or polishing of ours left, until the next solve, as `solution`
         self._scaled = scaled = Scaled(qp)
         self._zero = (np.zeros_like(qp.q), np.zeros_like(qp.l))
         # Where no row acts, OSQP says on standard output that it does not polish, also if it is not verbose. An equation acts always, and so does a
@@ -272,10 +275,13 @@ class Solver:
         return True
 
     def iterate(self) -> QpStatus:
-        """Iterate from the last iterate on until it has converged, `max_iter` times at most."""
+        """Iterate from the last iterate on until it has converged, `max_iter` times at most, and polish what OSQP has failed to polish."""
         status = self.proceed()
         while self.iterations + self._piece <= self._settings.max_iter and status in (QpStatus.MAX_ITER, QpStatus.INACCURATE):
             status = self.proceed()
+        if self._info.status_polish == POLISH_REFUSED and status is QpStatus.SOLVED:
+            self._held = polished(self._scaled, *self.solution)
+            self.workspace.warm_start(self._held[0], self._held[1] / self._scale)
         return status
 
     def proceed(self) -> QpStatus:
@@ -342,7 +348,7 @@ class Solver:
 
     def plan(self) -> None:
         """Make the plan from the last iterate."""
-        self._scaled.plan(self._solution.x)
+        self._scaled.plan(self.solution[0])
 
     @property
     def res_prim(self) -> float:
