@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rti_mpc import Model, Ocp, Rti, simulate
-from rti_mpc.model.path_following import path_following, window_place
+from rti_mpc.model.path_following import path_following, window_place, with_drift
 from rti_mpc.model.robots.dynamic_bicycle import dynamic_bicycle
 from rti_mpc.reference.path import Path
 from rti_mpc.reference.path_source import PathSource
@@ -56,8 +56,8 @@ class Lap:
 
 
 def race_car() -> Model:
-    """Return the model of a race car that follows a path."""
-    return path_following(dynamic_bicycle())
+    """Return the model of a race car that follows a path, and tells how fast it moves across it."""
+    return with_drift(path_following(dynamic_bicycle()))
 
 
 def worn(model: Model) -> Model:
@@ -73,7 +73,7 @@ def racing() -> Rti:
         model,
         N=N,
         dt=DT_S,
-        Q=[0.02, 20.0, 1.0],  # contour, lag, pace
+        Q=[0.02, 20.0, 4.0, 8.0],  # contour, lag, pace, drift
         R=[0.02, 0.02, 0.02],
         lbu=[-6.0, -6.0, 0.0],
         ubu=[5.0, 6.0, 9.0],
@@ -107,7 +107,7 @@ def follow(rti: Rti, path: Path, laps: int = 2) -> Lap:
     run = simulate(
         rti,
         worn(rti.ocp.model),
-        lambda t: np.zeros((len(t), 3)),  # contour, lag and error of the pace are to be zero
+        lambda t: np.zeros((len(t), rti.ocp.model.ny)),  # contour, lag, error of the pace and drift are to be zero
         x0=[*standing(path), 0.0, 0.0],
         samples=samples,
         parameters=lambda x: source.parameters(x[-2], x[-1]),

@@ -111,6 +111,36 @@ def path_following(model: Model, knots: int = KNOTS, lag_s: float = LAG_S) -> Mo
     )
 
 
+def with_drift(model: Model) -> Model:
+    r"""
+    Let a model that follows a path also tell how fast its robot moves across the path.
+
+    A robot that is slower than the speed profile is pulled ahead. Turning aside then costs progress, which lag and pace tell in second order only, by
+    :math:`\cos`: a Gauss-Newton step does not see it, and turns too far, this way in one step and that way in the next. The drift, which has the
+    :math:`\sin`, is what it sees. Where little else keeps the robot straight, as with a small weight on the contour, the steps do not converge
+    without.
+
+    Args:
+        model: What `path_following` returns.
+
+    Returns:
+        The model with the output ``drift``, the robot's velocity to the left of the path's direction, in m/s, after its own outputs. Its reference
+        is zero.
+
+    Raises:
+        OcpError: The model follows no path.
+    """
+    window, of_states, progress = window_place(given.instance("model", model, Model)), plane(model.states), place(model.states, "progress")
+    if window is None or of_states is None or progress is None:
+        raise OcpError(f"model {model.name} must be one of path_following to have a drift, it has no parameter whose role is path_start")
+    first, knots = window
+    knot = ca.reshape(model.p[first + 2 : first + 2 + len(KNOT_PARTS) * knots], len(KNOT_PARTS), knots)
+    _, tangent, _ = spline(model.x[progress], model.p[first], model.p[first + 1], knot)
+    velocity = model.f_expl_expr[list(of_states), 0]
+    drift = tangent[0] * velocity[1] - tangent[1] * velocity[0]
+    return replace(model, y_expr=ca.vertcat(model.y_expr, drift), outputs=(*model.outputs, Signal("drift", "m/s")))
+
+
 def spline(s: ca.SX, start: ca.SX, step: ca.SX, knot: ca.SX) -> tuple[ca.SX, ca.SX, tuple[ca.SX, ca.SX, ca.SX]]:
     """
     Return point, unit tangent, and widths and speed of a path at arc length `s`, from its knots, shape ``(5, n)``; held beyond its knots.

@@ -13,7 +13,7 @@ import pytest
 from rti_mpc.array import Array
 from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.model.model import Model, Signal
-from rti_mpc.model.path_following import KNOTS, KNOTS_BEHIND, path_following, window_place
+from rti_mpc.model.path_following import KNOTS, KNOTS_BEHIND, path_following, window_place, with_drift
 from rti_mpc.model.robots.dynamic_bicycle import dynamic_bicycle
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.reference.path import Path, pieces, smooth_path
@@ -23,6 +23,7 @@ from rti_mpc.reference.tracks import track
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.simulation import Simulation, simulate
+from tests.slow import slow_but
 
 LIMITS = SpeedLimits(speed=1.5, lateral=1.0, acceleration=1.0, braking=1.0)
 FREE = np.inf
@@ -150,6 +151,43 @@ def test_edges_of_a_track_that_narrows_lead_in_a_car_without_weight_on_the_conto
     narrow = kept[:, 0] > 3.0
     assert free[free[:, 0] > 3.0, 1].min() > 0.4  # m to the left
     assert kept[narrow].size and kept[narrow, 1].max() < 0.21  # 0.3 less 0.1, and a centimetre between nodes
+
+
+def changes_of_iterates(model: Model, Q: list[float], speed: float) -> Array:
+    """Return by how much each step changes the steering rate, rad/s: a race car begins beside a straight, by 1 nm, far below its profile."""
+    path = smooth_path(np.array([[0.0, 0.0], [60.0, 0.0]])).limited(SpeedLimits(speed=7.0, lateral=5.0, acceleration=40.0, braking=40.0))
+    steering = {"lbx": [-FREE] * 6 + [-0.42, -FREE, -FREE], "ubx": [FREE] * 6 + [0.42, FREE, FREE]}
+    rti = Rti(Ocp(model, N=40, dt=0.02, Q=Q, R=[0.02] * 3, lbu=[-6, -6, 0], ubu=[5, 6, 9], **steering), compile=False, iterations=1)
+    x0 = np.array([5.0, 1e-9, 0.0, speed, 0.0, 0.0, 0.0, 5.0, speed])
+    rti.reset(x0, np.zeros(3))
+    p = np.tile(source(model, path).parameters(5.0), (41, 1))
+    found = []
+    for _ in range(20):
+        before = rti.u.copy()
+        rti.prepare(np.zeros((40, model.ny)), p, shift=False)
+        rti.feedback(x0)
+        found.append(float(np.abs(rti.u - before)[:, 1].max()))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("speed", slow_but([0.0, 1.0, 3.0], 0.0))
+def test_steps_of_a_car_below_its_profile_converge_where_its_drift_has_a_weight(speed: float) -> None:
+    """Without, steering that costs progress in second order alone goes too far in each step, from rounding on to its bounds; also at 3 m/s."""
+    model = path_following(dynamic_bicycle())
+    assert changes_of_iterates(model, [0.02, 20.0, 4.0], speed)[-5:].max() > 1.0  # rad/s, of 6
+    assert changes_of_iterates(with_drift(model), [0.02, 20.0, 4.0, 8.0], speed)[-5:].max() < 1e-6  # of rounding
+
+
+def test_drift_is_the_velocity_to_the_left_of_the_path() -> None:
+    path = track("hairpin").limited(LIMITS)
+    model = with_drift(path_following(car()))
+    p = source(model, path).parameters(7.3)
+    tangent = path.tangent(np.array(7.3))
+    x = np.array([0.0, 0.0, np.arctan2(tangent[1], tangent[0]) + 0.3, 1.2, 0.1, 7.3, 0.9])
+    assert float(model.h()(x, p)[3]) == pytest.approx(1.2 * np.sin(0.3), abs=1e-9)
+    assert model.outputs[3] == Signal("drift", "m/s")
+    with pytest.raises(OcpError, match="model car must be one of path_following to have a drift"):
+        with_drift(car())
 
 
 def reversing() -> tuple[Path, ...]:
