@@ -34,7 +34,7 @@ TABLEAUS: dict[str, tuple[list[list[float]], list[float]]] = {
     "rk4": ([[], [1 / 2], [0, 1 / 2], [0, 0, 1]], [1 / 6, 1 / 3, 1 / 3, 1 / 6]),
 }
 NEWTON_STEPS = 5  # of an implicit step
-NEWTON_TOLERANCE = 1e-6  # on what a stage's rates do not fulfil of its equations over the step, relative to the state, or to 1 in its unit
+NEWTON_TOLERANCE = 1e-6  # on what a stage's rates do not fulfil of its equations, relative to the magnitude of their terms, which knows no unit
 
 
 def integrator(model: Model, method: str | None = None, substeps: int = 1) -> ca.Function:
@@ -149,21 +149,26 @@ def implicit_step(model: Model, h: ca.SX, *, derivatives: bool) -> list[ca.SX]:
     rates = ca.Function("rates", [x, u, p], [model.rate_expr, *(ca.jacobian(model.rate_expr, symbol) for symbol in (x, u, p))])
     span = ca.fabs(h)
 
-    def equations(K: ca.SX) -> tuple[Any, Any, Any]:
-        """Return the residual of the stages, their matrix, and the sensitivities of their rates to x, u and p at fixed K."""
+    def equations(K: ca.SX) -> tuple[Any, Any, Any, Any]:
+        """Return the residual of the stages, their matrix, the sensitivities of their rates to x, u and p at fixed K, and the size of their terms."""
         K_i = ca.horzsplit(ca.reshape(K, nx, stages))
-        at = [rates(x + span * sum((a[i, j] * K_i[j] for j in range(stages)), start=ca.SX(0)), u, p) for i in range(stages)]
+        x_i = [x + span * sum((a[i, j] * K_i[j] for j in range(stages)), start=ca.SX(0)) for i in range(stages)]
+        at = [rates(x_i[i], u, p) for i in range(stages)]
         residual = ca.vertcat(*(K_i[i] - at[i][0] for i in range(stages)))
         blocks = [[ca.SX.eye(nx) * (i == j) - span * a[i, j] * at[i][1] for j in range(stages)] for i in range(stages)]
-        return residual, ca.sparsify(ca.blockcat(blocks)), ca.vertcat(*(ca.horzcat(*at[i][1:]) for i in range(stages)))
+        sizes = [
+            sum((ca.fabs(J) @ ca.fabs(of) for J, of in zip(at[i][1:], (x_i[i], u, p), strict=True)), start=ca.fabs(K_i[i])) for i in range(stages)
+        ]
+        terms = ca.vertcat(*(ca.fabs(x) + span * size for size in sizes))
+        return residual, ca.sparsify(ca.blockcat(blocks)), ca.vertcat(*(ca.horzcat(*at[i][1:]) for i in range(stages))), terms
 
     K = ca.SX.zeros(nx * stages)
     for _ in range(NEWTON_STEPS):
-        residual, matrix, _ = equations(K)
+        residual, matrix, _, _ = equations(K)
         K = K - eliminated(matrix, residual)
-    residual, matrix, by = equations(K)
+    residual, matrix, by, terms = equations(K)
     weights = ca.sparsify(ca.DM(np.kron(a[-1:], np.eye(nx))))
-    failed = span * ca.mmax(ca.fabs(ca.reshape(residual, nx, stages)) / ca.repmat(1 + ca.fabs(x), 1, stages)) > NEWTON_TOLERANCE
+    failed = ca.mmax(span * ca.fabs(residual) - NEWTON_TOLERANCE * terms) > 0
     found = [x + h * (weights @ K) + ca.if_else(failed, np.nan, 0.0)]
     if derivatives:
         S = h * (weights @ eliminated(matrix, by))

@@ -92,10 +92,22 @@ def test_sensitivities_are_those_of_finite_differences(method: str, substeps: in
         np.testing.assert_allclose(np.array(found), np.array(differences).T, rtol=0, atol=1e-8)
 
 
-def test_model_that_newton_does_not_solve_is_not_finite() -> None:
+@pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
+def test_model_that_newton_does_not_solve_is_not_finite_in_any_unit(unit: float) -> None:
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
-    model = Model("wild", x, u, 1e3 * (1 + x**2) + u, x, "x", "u", "x", method="irk")  # at its end there is no state
-    assert np.isnan(float(integrator(model)(0.3, 0.0, [], 0.1)))
+    model = Model("wild", x, u, unit * 20 * (1 + (x / unit) ** 2) + u, x, "x", "u", "x", method="irk")  # at its end there is no state
+    assert np.isnan(float(integrator(model)(0.3 * unit, 0.0, [], 0.1)))
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1e12])
+@pytest.mark.parametrize("x", [[0.3, -0.2, 0.7], [0.0, 0.0, 0.0]])
+def test_implicit_steps_are_the_same_in_any_unit(x: list[float], unit: float) -> None:
+    """From rest as well, where the state says nothing of what is small."""
+    model = stiff(3)
+    scaled = {"x": model.x, "f_expl_expr": unit * ca.substitute(model.f_expl_expr, model.x, model.x / unit)}
+    steps, theirs = integrator(model), integrator(replace(model, **scaled))
+    for u in (0.0, 1.0):
+        np.testing.assert_allclose(np.array(theirs(unit * np.array(x), u, [], 0.02)) / unit, np.array(steps(x, u, [], 0.02)), rtol=1e-12, atol=1e-15)
 
 
 def test_implicit_step_back_does_not_blow_errors_up() -> None:

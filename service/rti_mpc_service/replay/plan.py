@@ -13,7 +13,7 @@ from rti_mpc.contract.approach import TOLERANCE_SHARE
 from rti_mpc.rti.linearization import constraints, input_reference
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import COST_WEIGHTS, Rti
-from rti_mpc_service.acting import at_bounds, unit
+from rti_mpc_service.acting import at_bounds
 from rti_mpc_service.config.schema import Config
 
 FIRST = {"state": 1, "constraint": 1, "second difference": 0}  # node, or stage, from which on values are known; others are of the last node
@@ -29,17 +29,16 @@ def acting_bounds(rti: Rti, config: Config) -> list[dict[str, Any]]:
     """
     model, weights = rti.problem.model, rti.guess.weights
     increments = np.diff(rti.u, axis=0, prepend=rti.u_prev[None])
-    units = {signal.name: unit(weights["lbu"][..., j], weights["ubu"][..., j]) for j, signal in enumerate(model.inputs)}
+    inputs = rti.scale[model.nx :]
     found: list[dict[str, Any]] = []
     for kind, values, lower, upper in (("input", rti.u, "lbu", "ubu"), ("increment", increments, "lbdu", "ubdu")):
         for j, signal in enumerate(model.inputs):
             low, high = (np.broadcast_to(weights[name], values.shape)[:, j] for name in (lower, upper))
-            for side, bound, acts in zip(SIDES, (low, high), at_bounds(values[:, j], low, high, units[signal.name]), strict=True):
+            for side, bound, acts in zip(SIDES, (low, high), at_bounds(values[:, j], low, high, inputs[j]), strict=True):
                 found += _acting(kind, signal.name, signal.unit, side, bound[acts], rti.ocp.starts[acts], 0.0)
     scales = rti.scale[-rti.problem.ng :] if rti.problem.ng else ()
     for soft, scale in zip(softened(rti, config), scales, strict=True):
-        of = units[soft.name] if soft.kind == "second difference" else unit(soft.lower, soft.upper)
-        acting, over = at_bounds(soft.values, soft.lower, soft.upper, of), (soft.lower - soft.values, soft.values - soft.upper)
+        acting, over = at_bounds(soft.values, soft.lower, soft.upper, scale), (soft.lower - soft.values, soft.values - soft.upper)
         for side, bound, acts, beyond in zip(SIDES, (soft.lower, soft.upper), acting, over, strict=True):
             violation = most if (most := float(beyond.max())) > TOLERANCE_SHARE * scale else 0.0
             found += _acting(soft.kind, soft.name, soft.unit, side, bound[acts], soft.first + np.flatnonzero(acts), violation)
