@@ -20,8 +20,9 @@ from rti_mpc.reference.path import Path, pieces, smooth_path
 from rti_mpc.reference.path_source import BEHIND, PathSource
 from rti_mpc.reference.speed_profile import SpeedLimits
 from rti_mpc.reference.tracks import track
+from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.ocp import Ocp
-from rti_mpc.rti.rti import Rti
+from rti_mpc.rti.rti import BUILT_IN_SOLVERS, Rti
 from rti_mpc.rti.simulation import Simulation, simulate
 from tests.slow import slow_but
 
@@ -130,11 +131,16 @@ def test_closed_piece_before_another_is_refused() -> None:
         source(model, track("oval"), track("oval"))
 
 
-def test_constraints_without_bounds_are_left_alone() -> None:
-    ocp = Ocp(path_following(pioneer_3dx()), N=4, dt=0.1, Q=[1, 1, 1], R=[1, 1, 1], lbu=-0.5, ubu=0.5, lh=[0.1, -FREE, -FREE])
-    rti = Rti(ocp, compile=False)
-    rti.prepare(np.zeros((4, 3)))
-    assert rti.feedback(np.zeros(7)).usable
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("left", [0.1, -FREE])
+def test_constraints_without_bounds_are_left_alone(left: float, formulation: str) -> None:
+    """Also if none of them has one."""
+    ocp = Ocp(path_following(pioneer_3dx()), N=4, dt=0.1, Q=[1, 1, 1], R=[1, 1, 1], lbu=-0.5, ubu=0.5, lh=[left, -FREE, -FREE])
+    for solver in BUILT_IN_SOLVERS:
+        rti = Rti(ocp, formulation=formulation, solver=solver, compile=False)
+        rti.prepare(np.zeros((4, 3)))
+        assert rti.feedback(np.zeros(7)).usable
+        assert rti.violation == 0.0
 
 
 def test_car_follows_a_straight_at_the_speed_of_its_profile_and_rests_at_the_end() -> None:

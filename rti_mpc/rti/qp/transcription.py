@@ -209,14 +209,14 @@ class Remembered:
         Negative if the plan keeps all of them.
         """
         ocp, lin = self._ocp, self._lin
-        ng, N = ocp.ng, ocp.N
-        if not ng:
+        N = ocp.N
+        above, below = finite(ocp.tightest("ug")), finite(ocp.tightest("lg"))
+        if not (above or below):  # a general constraint may have no bound
             return ca.MX(ca.DM([-INFINITY, -INFINITY]))
         names = ("g", "g_x", "g_u", "lg", "ug", "scale")
         g, g_x, g_u, lg, ug, scale = (ca.SX.sym(n, e.shape[0]) for n, e in zip(names, (*head(lin), lin.lg, lin.ug, lin.scale_g), strict=True))
         dx_i, du_i = ca.SX.sym("dx", dx.shape[0]), ca.SX.sym("du", du.shape[0])
         value = g + ca.SX(lin.G_x, g_x) @ dx_i + ca.SX(lin.G_u, g_u) @ du_i
-        above, below = finite(ocp.tightest("ug")), finite(ocp.tightest("lg"))
         excess = [(value - ug)[j] for j in above] + [(lg - value)[j] for j in below]
         scales = [scale[j] for j in (*above, *below)]
         shares = [by / one for by, one in zip(excess, scales, strict=True)]
