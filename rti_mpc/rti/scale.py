@@ -5,9 +5,10 @@ Scale of each variable: its unit inside the solvers, so that the units of a mode
 The scale of an input is half the range between its bounds, or the sum of its largest
 increments over the control horizon, or follows from the curvature of the cost. The
 scale of a state is half the range between its bounds, or its reach: how far the inputs
-can move it over the horizon. The same holds for general constraints. A second difference
-has the scale of its input, as an increment has. Every tolerance is relative to these
-scales.
+can move it over the horizon. A general constraint has half its range, or what states and
+inputs, each as far as it reaches, change it by in whichever direction does most: along the
+one motion at which this is computed it may hardly change. A second difference has the
+scale of its input, as an increment has. Every tolerance is relative to these scales.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
     ng = ocp.ng
     columns = np.array(constraint.map(N)(x[1:].T, held.T, p[1:].T)).reshape(-1, N)[ng:]
     by_x, by_u = dense(G_x, columns[: G_x.nnz()]), dense(G_u, columns[G_x.nnz() :])
-    reach_g = np.abs((by_x @ response + by_u) * reach_u).sum(axis=2).max(axis=0, initial=0.0)
+    reach_g = np.linalg.norm(np.concatenate([by_x * reach, by_u * reach_u], axis=2), axis=2).max(axis=0, initial=0.0)
     scale_g = first(half(ocp.widest("lg"), ocp.widest("ug")), reach_g, beyond(ocp.widest("lg"), ocp.widest("ug"), np.zeros(ng)))
     scale_g[: len(ocp.soft)], scale_g[ocp.ng_path :] = scale_x[list(ocp.soft)], scale_x[list(ocp.soft_e)]
     if isinstance(ocp, Remembering):

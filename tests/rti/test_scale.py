@@ -10,8 +10,11 @@ import pytest
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.model.model import Model, Signal
+from rti_mpc.model.path_following import path_following
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.ocp import Ocp
+from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.scale import scale
 from tests.problems import INF, cart, double_integrator, pioneer
@@ -101,6 +104,30 @@ def test_scale_of_what_has_no_bounds_is_the_reach_of_the_inputs() -> None:
     ocp = double_integrator(lbu=-2.0, ubu=2.0)
     found = scale(ocp, np.zeros((11, 2)), np.zeros((10, 1)), np.zeros((10, 2)), np.zeros((11, 0)))
     np.testing.assert_allclose(found, [1.0, 2.0, 2.0], rtol=1e-12)
+
+
+def test_scale_of_a_constraint_is_how_far_its_states_are_moved_in_any_direction() -> None:
+    """A robot that drives along x hardly reaches sideways within two stages; that position has the scale of the other one all the same."""
+    model = pioneer_3dx()
+    away = 3.0 * model.x[1] - 4.0 * model.x[0]  # m
+    rti = Rti(Ocp(model, N=2, dt=0.1, Q=[1, 1, 1], R=[1, 1], lbu=-0.5, ubu=0.5, h_expr=ca.vertcat(model.x[1], away), uh=[0.3, 0.3]), compile=False)
+    _, of_y = rti.scale[:2]  # that of x
+    np.testing.assert_allclose(rti.scale[-2:], [of_y, 5.0 * of_y], rtol=1e-12)
+
+
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("N", [1, 2])
+def test_osqp_solves_a_problem_whose_few_stages_hardly_reach_the_edges_of_a_path(N: int, formulation: str) -> None:
+    """Its rows were relative to what these stages reach sideways, and so far from the others that 200,000 iterations were not enough."""
+    ocp = Ocp(path_following(pioneer_3dx()), N=N, dt=0.1, Q=[1, 5, 1], R=[0.1] * 3, lbu=-0.5, ubu=0.5, lh=[0.05, 0.05, -np.inf])
+    x0, found = np.array([0.1, 0.97, 0.4, 0.2, -0.3, 0.0, 0.1]), []  # beyond the edge that it must keep away from
+    for solver, settings in (("riccati", None), ("osqp", SolverSettings(eps=1e-6, max_iter=100_000))):
+        rti = Rti(ocp, settings, formulation=formulation, solver=solver, iterations=1, compile=False)
+        rti.reset(x0, np.zeros(3))
+        rti.prepare(np.zeros((N, 3)))
+        assert rti.feedback(x0) is QpStatus.SOLVED
+        found.append(rti.u.copy())
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-3 * 0.5)  # of half an input's range, what a second opinion has
 
 
 def test_inputs_without_bounds_are_measured_by_their_increments_or_by_the_cost() -> None:
