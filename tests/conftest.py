@@ -101,6 +101,15 @@ def optimizing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", os.environ["PATH"].removeprefix(UNOPTIMIZED))
 
 
+@pytest.fixture(scope="module")
+def interpreted() -> Iterator[None]:
+    """Hide the compiler from tests that drive less than it takes: a plan is the same to rounding, see `tests.rti.test_rti`."""
+    folders = os.environ["PATH"].split(os.pathsep)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PATH", os.pathsep.join(folder for folder in folders if shutil.which("cc", path=folder) is None))
+        yield
+
+
 @pytest.fixture(scope="module")  # its timers take a tenth of a core
 def host() -> Iterator[Host]:
     """The witness of the host: a promise in milliseconds is held with `tests.in_time`."""

@@ -29,6 +29,8 @@ INF = np.inf
 SPEED = 0.25  # m/s, of the reference along the x axis to 4 m
 N, DT = 20, 0.1
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 
 class Drive:
     """One drive along the axis, with discs (x, y, radius) that move by (vx, vy)."""

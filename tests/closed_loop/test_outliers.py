@@ -26,6 +26,8 @@ PATHS: dict[str, Heading] = {"circle": "tangent", "eight": "consistent"}
 DURATION_S = 16.0
 DISTURBANCES = {"u_c": Disturbance(drift=0.1, limit=0.3), "omega_c": Disturbance(drift=0.1, limit=0.3)}
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 
 @pytest.fixture(scope="module")
 def rti() -> Rti:

@@ -22,6 +22,8 @@ from tests.loop import drive
 from tests.robots import toml
 from tests.slow import slow_but
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 
 @pytest.mark.parametrize(
     ("name", "limit_mm"),

@@ -11,6 +11,8 @@ from rti_mpc.rti.rti import Rti
 from rti_mpc_service.bench.bench import closed_loop_cost, paper_ocp
 from tests.slow import slow_but
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 
 @pytest.mark.parametrize("formulation", slow_but(FORMULATIONS, "sequential"))
 def test_default_tolerance_of_osqp_costs_the_robot_no_more_than_one_ten_times_tighter(formulation: str) -> None:

@@ -497,7 +497,7 @@ def test_parameters_out_of_all_proportion_fail_without_a_word_on_stdout(capfd: p
         rti.prepare(y_ref, 1e-200 * huge, shift=False)
         return rti.feedback(x0)
 
-    fails_and_recovers(Rti(ocp, TIGHT, solver="osqp", formulation="simultaneous"), bad, good)
+    fails_and_recovers(Rti(ocp, TIGHT, solver="osqp", formulation="simultaneous", compile=False), bad, good)
     assert not "".join(capfd.readouterr())
 
 
@@ -552,14 +552,14 @@ def test_infeasible_qp_leaves_the_plan_and_the_next_solve_is_right(formulation: 
         contradict(rti)
         return rti.feedback(x0)
 
-    fails_and_recovers(Rti(ocp, TIGHT, formulation=formulation, solver="osqp"), bad, held(x0, y_ref))
+    fails_and_recovers(Rti(ocp, TIGHT, formulation=formulation, solver="osqp", compile=False), bad, held(x0, y_ref))
 
 
 def test_failed_solve_never_seeds_the_next() -> None:
     """The next samples are those after a cold start, bit for bit."""
     ocp = pioneer()
     ((x0, y_ref, _),) = near_the_eight(ocp, seed=16, count=1)
-    failed, cold = Rti(ocp, solver="osqp"), Rti(ocp, solver="osqp")
+    failed, cold = (Rti(ocp, solver="osqp", compile=False) for _ in range(2))
     good = held(x0, y_ref)
     for rti in (failed, cold):
         good(rti)
@@ -584,7 +584,7 @@ def contradict(rti: Rti) -> None:
 
 def test_feedback_touches_only_the_initial_state_rows() -> None:
     ocp = pioneer()
-    rti = Rti(ocp, formulation="simultaneous", solver="osqp", iterations=1)
+    rti = Rti(ocp, formulation="simultaneous", solver="osqp", iterations=1, compile=False)
     ((x0, y_ref, _),) = near_the_eight(ocp, seed=17, count=1)
     x0[3:] = 0.1, 0.2
     rti.reset(x0 - 0.01, np.zeros(2))

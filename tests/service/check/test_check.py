@@ -24,6 +24,8 @@ from tests.problems import pioneer
 from tests.service.config.test_config import MINIMAL
 from tests.slow import slow_but
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 
 @pytest.mark.parametrize(("first", "second"), slow_but([("riccati", "daqp"), ("osqp", "daqp"), ("daqp", "osqp")], ("osqp", "daqp")))
 def test_two_solvers_are_compared_tightly_whatever_the_controllers_tolerance(first: str, second: str, tmp_path: Path) -> None:

@@ -50,6 +50,8 @@ ocp.integrator = "euler"
 ocp.weights = { Q = { x = 1, y = 2, psi = 0 }, R = { u_c = 1, omega_c = 3 }, delta = [1, 2, 3], lambda = 0.5 }
 """
 
+pytestmark = pytest.mark.usefixtures("interpreted")
+
 HERE = "tests.service.config.test_config"
 DISC = "[[ocp.obstacles]]\ncentre_m = [1.0, 0.5]\n"
 

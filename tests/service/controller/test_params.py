@@ -30,7 +30,7 @@ from rti_mpc_service.shipped import ROBOTS, SHIPPED
 from tests.loop import drive, reference, robot
 from tests.service.config.test_config import MINIMAL
 
-pytestmark = pytest.mark.usefixtures("shared_problems")
+pytestmark = pytest.mark.usefixtures("interpreted", "shared_problems")
 
 
 def configuration(folder: Any, live: bool = True) -> Config:
