@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -28,8 +29,16 @@ def robot(trajectory: Trajectory, **changes: Any) -> Lockstep:
     return Lockstep(RobotSettings(pioneer_3dx(), np.array([*trajectory.pose0, 0.0, 0.0]), SLEW, **changes))
 
 
+@cache
+def sampled(trajectory: Trajectory, period_s: float, heading: Heading) -> Array:
+    """Rows of one trajectory, whose consistent heading is integrated once for all who follow it."""
+    y = rows(trajectory, period_s, heading, psi0=trajectory.pose0[2])
+    y.setflags(write=False)
+    return y
+
+
 def reference(trajectory: Trajectory, heading: Heading = "none", *, period_ms: int = 20, stamp_ns: int = 0, epoch: int = 1) -> Reference:
-    y = rows(trajectory, 1e-3 * period_ms, heading, psi0=trajectory.pose0[2])
+    y = sampled(trajectory, 1e-3 * period_ms, heading)
     return Reference(epoch, 1, stamp_ns, period_ms * MS, trajectory.end, y, np.zeros((len(y), 0)))
 
 

@@ -21,6 +21,7 @@ from tests.problems import pioneer
 from tests.slow import slow_but
 
 DT = 100 * MS
+EIGHT = eight()
 STEP = np.array([0.25, 0.4])  # slew limit per dt
 BOUND = np.array([0.5, 0.745])
 LOSS_DURATION_NS = 800 * MS
@@ -39,10 +40,10 @@ class Scene:
 
     def __init__(self, *, guarded: bool, at: str, reports: bool = True, state_period_s: float = 0.1, delay_s: float | None = 0.0) -> None:
         self.controller = Controller(Rti(pioneer(N=10), compile=False), Timing(delay_s=delay_s), compile=False)
-        self.controller.receive_reference(reference(eight(), "consistent"))
+        self.controller.receive_reference(reference(EIGHT, "consistent"))
         limits = Limits(np.zeros(2), -BOUND, BOUND, -STEP, STEP, dt_s=0.1)
         self.guard = Guard(limits, epoch=10) if guarded else None
-        self.body = robot(eight(), increments=Increments(-STEP, STEP, DT), reports_inputs=reports, state_period_s=state_period_s)
+        self.body = robot(EIGHT, increments=Increments(-STEP, STEP, DT), reports_inputs=reports, state_period_s=state_period_s)
         self.at = at  # the link that loses
         self.inputs: list[Array] = []  # every 10 ms
         self.jumps: list[float] = []  # by which the first row of what reached the robot was further from what acted than allowed, as a share
@@ -89,7 +90,7 @@ class Scene:
         return max(float((np.abs(u[k:] - u[:-k]) / STEP).max()) for k in range(1, 8))
 
     def error_m(self) -> float:
-        return float(np.hypot(*(self.body.x[:2] - eight().position(np.array([1e-9 * self.body.now_ns]))[0])))
+        return float(np.hypot(*(self.body.x[:2] - EIGHT.position(np.array([1e-9 * self.body.now_ns]))[0])))
 
 
 LINKS = [(False, "controller"), (True, "controller"), (True, "guard")]

@@ -14,6 +14,7 @@ from rti_mpc.contract.belief import Belief
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.schedule import NO_COMMAND, end_ns
 from rti_mpc.contract.status import Mode, QpStatus
+from tests.slow import slow_but
 
 MS = 1_000_000
 STEP = np.array([0.25, 0.4])
@@ -111,7 +112,7 @@ def test_robot_that_moves_before_anything_was_sent_is_where_it_says() -> None:
     np.testing.assert_array_equal(fresh.at(10**12 - 1)[0], FULL)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", slow_but(range(3), 0))
 def test_whatever_is_reported_nothing_is_raised_and_what_is_reported_is_believed(seed: int) -> None:
     rng = np.random.default_rng(seed)
     made = Belief(np.zeros(2), STEP / 0.1, Increments(-STEP, STEP, 100 * MS))

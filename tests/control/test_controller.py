@@ -363,14 +363,15 @@ def wrapped(psi: Array) -> Array:
 
 def test_angles_that_wrap_change_nothing() -> None:
     """Of states, as robots send them, and of references, as planners do; nor does it matter how often either has gone round."""
-    rti = Rti(pioneer(), SolverSettings(eps=1e-8, max_iter=4000), compile=False)
+    rti, path = Rti(pioneer(), SolverSettings(eps=1e-8, max_iter=4000), compile=False), circle().lasting(45.0)
 
     def commands(of_state: Callable[[Array], Array], of_reference: Callable[[Array], Array]) -> Array:
         controller = Controller(rti, Timing(), compile=False)
         body = robot(circle())
-        message = reference(circle().lasting(45.0), "consistent")
-        message.y[:, 2] = of_reference(message.y[:, 2])
-        controller.receive_reference(message)
+        message = reference(path, "consistent")
+        y = message.y.copy()
+        y[:, 2] = of_reference(y[:, 2])
+        controller.receive_reference(dataclasses.replace(message, y=y))
 
         def sees(state: State) -> State:
             state.x[2] = of_state(body.x[2])

@@ -20,6 +20,7 @@ from tests.loop import MS, drive, reference, robot
 from tests.problems import pioneer
 
 DT = 100 * MS
+EIGHT = eight()
 STEP = np.array([0.05, 0.1])  # slew limit per dt
 ROUNDING = 1e-9
 
@@ -36,7 +37,7 @@ def rti(role: str) -> Rti:
 
 def controller(role: str, delay_s: float = 0.0) -> Controller:
     one = Controller(Rti(problem(), compile=False) if role == "retuned" else rti(role), Timing(delay_s=delay_s), compile=False)
-    one.receive_reference(reference(eight(), "consistent"))
+    one.receive_reference(reference(EIGHT, "consistent"))
     return one
 
 
@@ -51,7 +52,7 @@ def take_over(
     """
     leader, standby = controller("leader", delay_s), controller("standby", delay_s)
     standby.stand_by()
-    body = robot(eight(), reports_inputs=reports)
+    body = robot(EIGHT, reports_inputs=reports)
     applied, taken = [], []
     for k in range(samples):
         state = body.tick()
@@ -115,7 +116,7 @@ def test_standby_that_hears_nothing_continues_from_what_the_robot_reports() -> N
 
 
 def test_change_acts_from_the_sample_told_and_is_told_in_telemetry() -> None:
-    one, body = controller("retuned"), robot(eight())
+    one, body = controller("retuned"), robot(EIGHT)
     run = drive(one, body, 2.0)
     seq = one.retune(problem(Q=[0.0, 0.0, 0.0]), 3)
     assert seq == run.commands[-1].seq + 2
@@ -133,7 +134,7 @@ def test_change_acts_from_the_sample_told_and_is_told_in_telemetry() -> None:
 
 
 def test_change_before_the_first_sample_acts_from_it_on() -> None:
-    one, body = controller("retuned"), robot(eight())
+    one, body = controller("retuned"), robot(EIGHT)
     seq = one.retune(problem(ubu=[0.1, 0.745]), 1)
     run = drive(one, body, 3.0)
     assert (seq, run.commands[0].seq) == (1, 1)
@@ -141,7 +142,7 @@ def test_change_before_the_first_sample_acts_from_it_on() -> None:
 
 
 def test_tighter_bounds_are_reached_within_slew_limits_as_applied() -> None:
-    one, body = controller("retuned"), robot(eight())
+    one, body = controller("retuned"), robot(EIGHT)
     run = drive(one, body, 3.0)
     assert np.abs(run.u[-1][0]) > 0.15
     one.retune(problem(lbu=[-0.1, -0.745], ubu=[0.1, 0.745], lbdu=[-0.03, -0.1], ubdu=[0.03, 0.1]), 1)
@@ -154,7 +155,7 @@ def test_tighter_bounds_are_reached_within_slew_limits_as_applied() -> None:
 
 def test_stop_brakes_by_the_limits_it_was_built_with() -> None:
     """Tuned to move gently, a robot still stops as fast as it can."""
-    one, body = controller("retuned"), robot(eight())
+    one, body = controller("retuned"), robot(EIGHT)
     drive(one, body, 3.0)
     one.retune(problem(lbdu=[-0.01, -0.01], ubdu=[0.01, 0.01]), 1)
     run = drive(one, body, 3.5)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,12 @@ from tests.problems import PAPER, SLEW, pioneer
 S = 1_000_000_000
 
 
+@cache
+def disturbed() -> Ocp:
+    """One problem for all observers, whose expressions are then built once."""
+    return Ocp(with_disturbances(pioneer(N=6, N_u=4).model, ["u_c"]), **(PAPER | SLEW | {"N": 6, "N_u": 4}))
+
+
 @dataclass
 class Kind:
     """One way to build a controller."""
@@ -44,7 +51,7 @@ class Kind:
         if self.observed:
             settings = ObserverSettings({"u_c": Disturbance(0.1, 0.3)}, ())
             observer = Observer(problem.model, settings, compile=False)
-            problem = Ocp(with_disturbances(problem.model, ["u_c"]), **(PAPER | SLEW | {"N": 6, "N_u": 4}))
+            problem = disturbed()
         rti = Rti(problem, compile=False, **self.rti)
         timing = Timing(delay_s=self.delay_s)
         return Controller(rti, timing, observer=observer, second_opinion=self.second_opinion, compile=False), rti
@@ -150,11 +157,16 @@ def test_snapshot_that_would_change_the_pattern_of_a_matrix_is_refused() -> None
             camera.restore(replace(snapshot, pinned=[other if i == patterns[-1] else array for i, array in enumerate(snapshot.pinned)]))
 
 
+@cache
+def observed_life() -> Life:
+    """A short life with an observer, which has arrays of its own."""
+    return live(KINDS["observer"], samples=60, snapshots=(0, 40))
+
+
 @pytest.mark.parametrize("change", ["a column more", "an axis more"])
 def test_snapshot_that_would_give_an_object_an_array_of_another_size_is_refused_by_name(change: str) -> None:
     """As one that somebody has made on purpose: a controller calls compiled code with them."""
-    lived = live(KINDS["observer"], samples=60, snapshots=(0, 40))
-    snapshot = Snapshot.decode(next(message for message in lived.messages if message.seq > 0 and message.kind is JournalKind.SNAPSHOT).data)
+    snapshot = Snapshot.decode(next(message for message in observed_life().messages if message.seq > 0 and message.kind is JournalKind.SNAPSHOT).data)
     controller = KINDS["observer"].build()[0]
     camera = Camera(controller)
     camera.restore(snapshot)

@@ -15,6 +15,7 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.turns import MAX_ERROR_TURNS
 from tests.problems import beacon
+from tests.slow import slow_but
 
 TURN = 2 * np.pi
 MAX_ERROR_RAD = MAX_ERROR_TURNS * TURN
@@ -99,8 +100,8 @@ def turned(request: pytest.FixtureRequest) -> Rti:
     return Rti(turret(), solver=request.param, compile=False)
 
 
-@pytest.mark.parametrize("flip", [3.1, 3.3, -3.1, -3.3, TURN, -TURN, 2 * TURN])
-@pytest.mark.parametrize("samples", [1, 2, 5])
+@pytest.mark.parametrize("flip", slow_but([3.1, 3.3, -3.1, -3.3, TURN, -TURN, 2 * TURN], 3.1, -3.3, -TURN, 2 * TURN))
+@pytest.mark.parametrize("samples", slow_but([1, 2, 5], 1, 5))
 def test_wrong_angles_are_forgotten_when_they_are_over(turned: Rti, flip: float, samples: int) -> None:
     """For any direction of the robot's motion, and any turn that the wrong samples have led to."""
     rti = turned

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import casadi as ca
 import numpy as np
@@ -33,7 +34,9 @@ CLASSES = {
 }
 
 
+@cache
 def way_of(name: str) -> WayToRest:
+    """One for all of a robot: each search begins anew."""
     law = law_of(name)
     assert law is not None
     return WayToRest(ocp_of(name), law, compile=False)
