@@ -16,8 +16,8 @@ build_ocp = build.build_ocp
 problems: dict[str, Ocp] = {}  # by configuration
 
 
-@pytest.fixture
-def shared_problems(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module")  # recordings that a module shares have these problems, too
+def shared_problems() -> Iterator[None]:
     """Give controllers of equal configurations one problem, whose expressions are then built once; that of a user's own model is built each time."""
 
     def of(config: Config) -> Ocp:
@@ -28,7 +28,9 @@ def shared_problems(monkeypatch: pytest.MonkeyPatch) -> None:
             problems[text] = build_ocp(config)
         return problems[text]
 
-    monkeypatch.setattr(build, "build_ocp", of)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "build_ocp", of)
+        yield
 
 
 @pytest.fixture

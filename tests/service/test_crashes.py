@@ -23,6 +23,8 @@ from tests.guarded import write_robot
 from tests.recording.samples import command
 from tests.wire.fake_session import FakeSession
 
+pytestmark = pytest.mark.usefixtures("shared_problems")
+
 REST = command(9)
 
 

@@ -28,6 +28,8 @@ from rti_mpc_sim.settings import RobotSettings
 from tests.guarded import write_robot
 from tests.wire.fake_session import FakeSession, Said
 
+pytestmark = pytest.mark.usefixtures("shared_problems")
+
 CONFIG = load(Path(__file__).parents[2] / "deploy" / "pioneer_3dx.toml")
 KEYS, SETTINGS = CONFIG.keys(), BusSettings()
 

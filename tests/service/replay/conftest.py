@@ -4,6 +4,6 @@ from __future__ import annotations
 import pytest
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="module")
 def one_problem(shared_problems: None) -> None:
     """Every recorded controller of a configuration and every one that is built again have one problem."""

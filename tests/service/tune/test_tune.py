@@ -27,6 +27,8 @@ from rti_mpc_service.tune.tune import main
 from tests.processes.system import until
 from tests.robots import SHIPPED
 
+pytestmark = pytest.mark.usefixtures("shared_problems")
+
 NERVOUS = {"u_c = 1.0, omega_c = 1.0 }": "u_c = 0.003, omega_c = 0.003 }"}  # answers every noise of the sensors
 NOISE = "\n[sim]\nnoise_std = { x = 0.005, y = 0.005, psi = 0.01, u = 0.01, omega = 0.02 }\nactuator_lag_s = 0.1\n"
 WIDE = ("ocp.weights.R.u_c=0.001:100", "ocp.weights.R.omega_c=0.001:100")
