@@ -21,7 +21,7 @@ from rti_mpc_service.host.hold_up import Host
 
 SHORT_FORM = 3
 TESTS = Path(__file__).parent
-WAITING = {"processes", "service", "test_docs.py"}  # files and folders of tests that wait for processes
+WAITING = {"guard_conformance", "processes", "service", "sim", "test_docs.py", "wire"}  # files and folders of tests that wait for processes
 UNOPTIMIZED = f"{TESTS / 'compiler'}{os.pathsep}"  # first in the path, for processes that tests start, too
 
 
