@@ -24,6 +24,7 @@ from rti_mpc.rti.qp.qp import Guess
 
 MIN_RELAXATION = 1.5  # that is worth it: below, each step is less than a third of the one before
 MAX_RELAXATION = 4.0  # for steps of three quarters of the one before, and more
+LARGE_STEP = 0.25  # of an input, in half ranges: after such a one, as from a cold start, the factor tells nothing yet
 BOUNDS = "lbx", "ubx", "lbu", "ubu"
 
 
@@ -38,8 +39,8 @@ def relaxation(ocp: Ocp) -> ca.Function:
 
         \omega = \frac{\omega_- \, s_-^T s_-}{s_-^T (s_- - s)}, \qquad x_{next} = x + \omega \, (x_{plan} - x),
 
-    likewise the inputs. It is at most `MAX_RELAXATION`, also where steps grow, and 1 instead of less than `MIN_RELAXATION`, or if there was no step:
-    then the guess is the plan. No guess is ahead of its plan beyond a bound, where the model may not be defined.
+    likewise the inputs. It is at most `MAX_RELAXATION`, also where steps grow. It is 1 instead of less than `MIN_RELAXATION`, after a `LARGE_STEP`,
+    and if there was no step before: then the guess is the plan. No guess is ahead of its plan beyond a bound, where the model may not be defined.
     """
     lin = linearization(ocp)
     bounds = {name: lin.w[name] for name in BOUNDS}
@@ -49,7 +50,8 @@ def relaxation(ocp: Ocp) -> ca.Function:
     square = ca.dot(step, step)
     rest = square - ca.dot(step, step_next)
     omega_next = ca.if_else(MAX_RELAXATION * rest > omega * square, omega * square / rest, MAX_RELAXATION)
-    omega_next = ca.if_else(ca.logic_and(square > 0, omega_next > MIN_RELAXATION), omega_next, 1)
+    near = ca.logic_and(square > 0, ca.mmax(ca.fabs(step_next)) < LARGE_STEP)
+    omega_next = ca.if_else(ca.logic_and(near, omega_next > MIN_RELAXATION), omega_next, 1)
 
     def ahead(plan: ca.MX, guess: ca.MX, of: str) -> ca.MX:
         lower, upper = (at_each(bounds[bound + of], plan.shape[1]) for bound in ("lb", "ub"))

@@ -8,10 +8,10 @@ import pytest
 
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
-from rti_mpc.rti.acceleration import MAX_RELAXATION, MIN_RELAXATION, relaxation
+from rti_mpc.rti.acceleration import LARGE_STEP, MAX_RELAXATION, MIN_RELAXATION, relaxation
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
-from rti_mpc_service.bench.families import discs_passed
+from rti_mpc_service.bench.families import cart_pole, discs_passed
 from tests.problems import pioneer
 
 ROUNDING = 1e-12  # relative
@@ -58,6 +58,30 @@ def test_second_guess_of_a_sample_is_the_plan_to_the_last_bit(ocp: Ocp) -> None:
     np.testing.assert_array_equal(u_next, u_plan)
 
 
+def test_guess_after_a_large_step_is_the_plan(ocp: Ocp) -> None:
+    x, u, du = np.zeros((4, 5)), np.zeros((3, 2)), np.full((3, 2), 0.01)
+    for size, omega in ((0.9 * LARGE_STEP, MAX_RELAXATION), (1.1 * LARGE_STEP, 1.0)):
+        du[-1] = size
+        assert next_guess(ocp, x, u, x, du, du)[3] == omega
+
+
+@pytest.mark.parametrize("iterations", [5, 10])
+def test_cart_pole_swings_up_with_more_iterations_a_sample_as_well(iterations: int) -> None:
+    """From a state at which guesses ahead of the first, large steps lead to no plan."""
+    family = cart_pole(40)
+    rti, x = Rti(family.ocp, iterations=iterations), family.start(200)
+    assert x is not None
+    u = family.u0
+    rti.reset(x, u)
+    for k in range(200, 300):
+        y_ref, p = family.at(k)
+        rti.prepare(y_ref, p, shift=k > 200, u_prev=u)
+        assert rti.feedback(x) is QpStatus.SOLVED
+        u = rti.u[0].copy()
+        x = family.plant(x, u)
+    assert abs(np.cos(x[1]) - 1.0) < 1e-3
+
+
 def test_factor_of_a_step_that_was_relaxed_is_that_of_steps_that_are_not(ocp: Ocp) -> None:
     """Steps that would shrink to 0.7 shrink to 1 - 2 * 0.3 where they are doubled."""
     u, du = np.zeros((3, 2)), np.full((3, 2), 0.01)
@@ -71,8 +95,8 @@ def test_guess_is_not_ahead_beyond_a_bound_where_a_model_may_not_be_defined(ocp:
     x_plan[-1] = 0.05
     x_next = next_guess(ocp, x, np.zeros((3, 2)), x_plan, 0.9 * du, du, lbx=np.full(5, 0.1))[0]
     np.testing.assert_array_equal(x_next, [[0.2] * 5, [0.1] * 5, [0.1] * 5, [0.05] * 5])
-    u_next = next_guess(ocp, x, np.full((3, 2), 0.1), x, np.full((3, 2), 0.45), du * 30)[1]
-    np.testing.assert_array_equal(u_next, np.tile(np.minimum(ocp.ubu, 0.1 + MAX_RELAXATION * 0.35), (3, 1)))
+    u_next = next_guess(ocp, x, np.full((3, 2), 0.25), x, np.full((3, 2), 0.45), du * 20)[1]
+    np.testing.assert_array_equal(u_next, np.tile(np.minimum(ocp.ubu, 0.25 + MAX_RELAXATION * 0.2), (3, 1)))
 
 
 def drive(iterations: int, tolerance: float, samples: int = 90) -> tuple[float, Rti]:
