@@ -15,6 +15,7 @@ import math
 import os
 import secrets
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -183,6 +184,7 @@ class ZenohSession:
         self._settings = settings
         self._config = zenoh_config(settings)
         self._session = open_session(settings, timeout_s, stop, say)
+        self._following: list[threading.Thread] = []
 
     def __enter__(self) -> ZenohSession:
         return self
@@ -191,10 +193,17 @@ class ZenohSession:
         self.close()
 
     def close(self) -> None:
-        """Close the session within half a second, even where Zenoh takes longer; every `recv` then returns None."""
+        """
+        Close the session within half a second, even where Zenoh takes longer; every `recv` then returns None.
+
+        Threads that follow are over by then: one that comes back from Zenoh while the interpreter ends would abort the process.
+        """
         closing = threading.Thread(target=self._session.close, daemon=True)
         closing.start()
-        closing.join(CLOSE_TIMEOUT_S)
+        over_s = time.monotonic() + CLOSE_TIMEOUT_S
+        for thread in (closing, *self._following):
+            if thread is not threading.current_thread():
+                thread.join(max(0.0, over_s - time.monotonic()))
 
     @property
     def routers(self) -> frozenset[str]:
@@ -271,7 +280,7 @@ class ZenohSession:
                 if payload is not None:
                     query.reply(key, payload, encoding=JSON_ENCODING)
 
-        _follow(queryable.handler, act)
+        self._following.append(_follow(queryable.handler, act))
         return queryable
 
     def ask(self, key: Key[Any], payload: bytes, timeout_s: float) -> Iterator[Received]:
@@ -302,7 +311,7 @@ class ZenohSession:
         """Report, in a thread of its own, each key with whether its owner is present, for all now and then at every change."""
         ring: Any = zenoh.handlers.RingChannel(RING_TOKENS)
         subscriber = self._session.liveliness().declare_subscriber(key, ring, history=True)
-        _follow(subscriber.handler, lambda sample: tell(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
+        self._following.append(_follow(subscriber.handler, lambda sample: tell(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)))
         return subscriber
 
 
@@ -312,8 +321,8 @@ def _withheld(payload: zenoh.ZBytes | None, key: str, max_bytes: int) -> Receive
     return Received(b"" if payload is None or size > max_bytes else payload.to_bytes(), JSON_ENCODING, key, withheld=size if size > max_bytes else 0)
 
 
-def _follow(handler: Any, act: Callable[[Any], None]) -> None:
-    """Act on each item of a handler, in a thread of its own, until the session is closed."""
+def _follow(handler: Any, act: Callable[[Any], None]) -> threading.Thread:
+    """Act on each item of a handler, in a thread of its own, which is returned, until the session is closed."""
 
     def follow() -> None:
         while True:
@@ -326,4 +335,6 @@ def _follow(handler: Any, act: Callable[[Any], None]) -> None:
             except zenoh.ZError:  # the requester or the session is gone
                 continue
 
-    threading.Thread(target=follow, daemon=True).start()
+    thread = threading.Thread(target=follow, daemon=True)
+    thread.start()
+    return thread

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -351,6 +351,35 @@ def test_close_unblocks_whoever_waits(join: Any) -> None:
     assert results == [None, None]
     assert subscribers[0].try_recv() is None
     assert subscribers[0].recv() is None
+
+
+def test_close_waits_for_the_threads_that_answer_and_watch(join: Any) -> None:
+    """One that came back from Zenoh while the interpreter ends would abort the process."""
+    robot, before, asked, answered = join(robot=True), set(threading.enumerate()), threading.Event(), threading.Event()
+
+    def answer(_: dict[str, Any]) -> dict[str, Any]:
+        asked.set()
+        time.sleep(0.1)
+        answered.set()
+        return {}
+
+    robot.serve(KEYS.request, answer)
+    robot.watch_alive(lambda *_: None)
+    own = set(threading.enumerate()) - before
+    other = join()
+
+    def ask() -> None:
+        with suppress(TimeoutError):  # the answer comes while its sender leaves
+            other.request(KEYS.request, {}, 1.0)
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    assert asked.wait(TIMEOUT_S)
+    robot.close()
+    assert answered.is_set()
+    assert len(own) >= 2
+    assert not any(thread.is_alive() for thread in own)
+    asking.join(TIMEOUT_S)
 
 
 def test_one_session_speaks_for_two_robots(join: Any, endpoint: str) -> None:
