@@ -12,7 +12,7 @@ import pytest
 from tests.closed_loop.fuzz import Fuzz
 from tests.closed_loop.lossy import Lossy
 
-SHORT_SAMPLES = 1_500
+SHORT_SAMPLES = 2_500
 MANY_SAMPLES = 20_000 if "CI" in os.environ else 1_000_000
 
 
@@ -27,7 +27,7 @@ def run(fuzz: Fuzz, samples: int) -> None:
 
 @pytest.mark.parametrize("measured", [pytest.param(False, marks=pytest.mark.slow, id="no delay"), pytest.param(True, id="measured delay")])
 def test_no_fuzzed_sample_leaves_the_limits_or_raises(measured: bool) -> None:
-    fuzz = Fuzz(seed=8, measured=measured)  # a seed that brings all of what follows in so few samples
+    fuzz = Fuzz(seed=1, measured=measured)
     run(fuzz, SHORT_SAMPLES if measured else 2 * SHORT_SAMPLES)
     happened = set(fuzz.seen)
     assert {"TRACKING", "HOLDING", "FALLBACK", "BRAKING", "STOPPED", "over budget", "reference", "jump", "refused at the door"} <= happened
@@ -71,7 +71,7 @@ LOSSY = [
 
 @pytest.mark.parametrize(("guarded", "reports"), LOSSY)
 def test_no_input_leaves_its_limits_whatever_is_lost_late_repeated_or_reordered_on_any_link(guarded: bool, reports: bool) -> None:
-    fuzz = Lossy(seed=8, guarded=guarded, reports=reports)  # a seed in whose few samples the clock jumps, which one in a thousand brings
+    fuzz = Lossy(seed=4, guarded=guarded, reports=reports)  # a seed in whose few samples the clock jumps, which one in a thousand brings
     run(fuzz, SHORT_SAMPLES)
     assert {"TRACKING", "BRAKING", "accepted", "lost to robot", "lost to standby", "lost to controller", "takeover", "jump"} <= set(fuzz.seen)
 

@@ -783,7 +783,7 @@ def test_inputs_without_slew_limits_rest_at_once() -> None:
     assert not scene.published[-1].u.any()
 
 
-@pytest.mark.parametrize("samples", [1_500, pytest.param(10_000 if "CI" in os.environ else 50_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("samples", [3_000, pytest.param(10_000 if "CI" in os.environ else 50_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("regular", [True, False])
 def test_no_command_whatsoever_moves_the_robot_outside_bounds_and_slew_limits(samples: int, regular: bool) -> None:
     """Random plans, epochs, times, gaps and silences, healthy ones among them; from sample to sample where stamps and periods are a controller's."""
