@@ -54,7 +54,7 @@ def test_race_car_laps_a_track_faster_than_at_the_best_constant_speed_and_never_
 def test_car_that_may_not_cut_corners_takes_as_long_as_the_profile_of_the_centre_line(race: ModuleType) -> None:
     path = track("chicane").limited(race.SpeedLimits(7.0, race.LATERAL, 4.0, 5.0))
     following = race.racing()
-    following.retune({"Q": race.np.diag([5.0, 20.0, 1.0])})
+    following.retune({"Q": race.np.diag([5.0, 20.0, 1.0, 0.0])})  # contour, lag, pace, no drift
     lap = race.follow(following, path)
     assert lap.time_s == pytest.approx(path.time_s, rel=0.03)
     assert lap.contour_m < 0.15  # m
