@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 from rich.console import Console
+from rich.table import Table
 
+MAX_WIDTH_COLUMNS = 1000  # more than any table has
 MIN_WIDTH_COLUMNS = 140  # a narrower terminal wraps lines, which loses nothing; a narrower table would cut numbers off
 
 
@@ -22,3 +24,9 @@ def widened(console: Console) -> Console:
     """Give a console at least `MIN_WIDTH_COLUMNS` columns from now on; not while something is redrawn on it, which must fit the terminal."""
     console.width = max(console.width, MIN_WIDTH_COLUMNS)
     return console
+
+
+def print_whole(console: Console, table: Table) -> None:
+    """Print a table whose cells do not wrap, from now on on a console that is as wide."""
+    console.width = max(console.width, console.measure(table, options=console.options.update(max_width=MAX_WIDTH_COLUMNS)).maximum)
+    console.print(table)

@@ -33,7 +33,7 @@ from rti_mpc.rti.rti import Rti
 from rti_mpc_service.bench.bench import quantiles_us
 from rti_mpc_service.bench.families import FAMILIES, Family
 from rti_mpc_service.bench.yardstick import Ipopt
-from rti_mpc_service.console import table_console
+from rti_mpc_service.console import print_whole, table_console
 from rti_mpc_service.host import machine
 from rti_mpc_service.json_text import json_text
 
@@ -43,12 +43,16 @@ QUICK_SAMPLES = 40  # per family, with --quick
 
 
 def drive_family(family: Family, solver: str, samples: int, tick: Callable[[], None]) -> dict[str, Any]:
-    """Drive one closed loop by one solver; return times, us, counts and the cost."""
+    """
+    Drive one closed loop by one solver; return times, us, counts, the cost, and the largest residual of any plan.
+
+    Residuals are those of the certificate, see docs/engine.md, or of a solver that has none, its own.
+    """
     ocp = family.ocp
     copies = [Rti(ocp, solver=solver, formulation="simultaneous") for _ in range(COPIES_PER_SAMPLE)]
     step: Array = np.zeros((samples, COPIES_PER_SAMPLE))
     feedback: Array = np.zeros((samples, COPIES_PER_SAMPLE))
-    unsolved, iterations, cost = 0, [], 0.0
+    unsolved, iterations, residuals, cost = 0, [], [], 0.0
     x, u = np.zeros(ocp.model.nx), family.u0
     gc.collect()
     gc.disable()
@@ -68,6 +72,7 @@ def drive_family(family: Family, solver: str, samples: int, tick: Callable[[], N
                 step[k, c], feedback[k, c] = 1e-3 * (done_ns - began_ns), 1e-3 * (done_ns - prepared_ns)
             unsolved += status is not QpStatus.SOLVED
             iterations.append(rti.solver.iterations)
+            residuals.append(max(rti.solver.res_prim, rti.solver.res_dual))
             x, u, cost = advance(family, x, u, rti.u[0].copy(), y_ref, p, cost)
             tick()
     finally:
@@ -77,6 +82,7 @@ def drive_family(family: Family, solver: str, samples: int, tick: Callable[[], N
         "feedback_us": quantiles_us(feedback.min(axis=1)),
         "unsolved": unsolved,
         "iterations": {"p50": int(np.median(iterations)), "max": max(iterations)},
+        "certificate_max": max(residuals),
         "cost": cost,
     }
 
@@ -106,14 +112,19 @@ def advance(family: Family, x: Array, u_prev: Array, u: Array, y_ref: Array, p: 
 
 
 def build(name: str, N: int, solver: str) -> tuple[float, float]:
-    """Build a problem with an empty cache; return the time, s, and the peak memory of this process or its compiler, MiB."""
+    """Build a problem with an empty cache; return the time, s, and the peak memory of this process or of a compiler, MiB."""
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder
         began_s = time.monotonic()
         Rti(FAMILIES[name][0](N).ocp, solver=solver, formulation="simultaneous")
         took_s = time.monotonic() - began_s
-    peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return took_s, peak / 1024
+    return took_s, max(peak_kib(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss) / 1024
+
+
+def peak_kib() -> int:
+    """Return the peak memory of this process; that of `getrusage` begins with what the process had that has started it."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
 
 
 def build_alone(name: str, N: int, solver: str) -> tuple[float, float]:
@@ -168,7 +179,7 @@ def main(names: Sequence[str], horizons: Sequence[int], solvers: Sequence[str], 
 def print_table(console: Console, rows: list[dict[str, Any]]) -> None:
     """Print the rows."""
     table = Table(title="CPU time per sample, us: median / p99 / most")
-    for heading in ("problem", "N", "solver", "step", "feedback", "IPOPT", "unsolved", "iterations", "cost", "compile"):
+    for heading in ("problem", "N", "solver", "step", "feedback", "IPOPT", "unsolved", "iterations", "certificate", "cost", "compile"):
         table.add_column(heading, justify="left" if heading in ("problem", "solver") else "right", no_wrap=True)
     for row in rows:
         times = ["{p50:.0f} / {p99:.0f} / {max:.0f}".format(**row[key]) for key in ("cpu_us", "feedback_us", "ipopt_us")]
@@ -179,7 +190,8 @@ def print_table(console: Console, rows: list[dict[str, Any]]) -> None:
             *times,
             f"{row['unsolved']} of {row['samples']}",
             "{p50} / {max}".format(**row["iterations"]),
+            f"{row['certificate_max']:.1e}",
             f"{row['cost_over_converged']:+.2%}",
             f"{row['compile_s']:.1f} s, {row['compile_mib']} MiB",
         )
-    console.print(table)
+    print_whole(console, table)

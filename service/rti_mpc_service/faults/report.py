@@ -12,7 +12,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from rti_mpc_service.console import widened
+from rti_mpc_service.console import print_whole, widened
 from rti_mpc_service.faults.measure import Measured
 from rti_mpc_service.faults.table import Fault
 from rti_mpc_service.host import machine
@@ -159,7 +159,7 @@ class MatrixReport(Redrawn):
 
     def conclude(self) -> None:
         """Print the whole table, and the broken or excused limits."""
-        widened(self.console).print(self._table())
+        print_whole(widened(self.console), self._table())
         for row in self.rows:
             if words := [*row.broken, *row.excused]:
                 self.console.print(f"{row.fault.name}: {row.fault.promise.text}: {'; '.join(words)}", soft_wrap=True)
