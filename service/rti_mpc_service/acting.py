@@ -18,11 +18,11 @@ from rti_mpc.array import Array
 DISTANCE = 1e-4  # from a bound at which it acts, in units of its signal; past a disc, of 87 nodes that were held 76 are nearer, of others 7
 
 
-def unit(lower: Array | float, upper: Array | float, values: Array) -> float:
-    """Return what a signal ranges over: half of what is between its widest bounds; with one bound its magnitude, or the largest one along a plan."""
+def unit(lower: Array | float, upper: Array | float) -> float:
+    """Return what a signal ranges over: half of what is between its widest bounds; with one bound its magnitude, 1 at least."""
     low, high = float(np.min(lower)), float(np.max(upper))
     ends = [abs(end) for end in (low, high) if isfinite(end)]
-    return 0.5 * (high - low) if len(ends) == 2 else max([float(np.abs(values).max()), *ends])
+    return 0.5 * (high - low) if len(ends) == 2 else max([1.0, *ends])
 
 
 def at_bounds(values: Array, lower: Array | float, upper: Array | float, of: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -33,7 +33,7 @@ def at_bounds(values: Array, lower: Array | float, upper: Array | float, of: flo
         values: Along a plan.
         lower: Lower bound, or that of each stage; minus infinity where there is none.
         upper: Upper bound, likewise.
-        of: What the signal ranges over, as `unit` returns it, or its scale in the solvers; of an increment that of its input.
+        of: What `unit` returns for the signal; of an increment that of its input.
     """
     near = DISTANCE * of
     return np.asarray(values <= lower + near), np.asarray(values >= upper - near)

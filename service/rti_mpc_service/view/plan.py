@@ -72,19 +72,17 @@ def acting_bounds(info: Info, sample: Telemetry, u_before: Array | None, discs: 
     """
     rates = np.diff(sample.u, axis=0, prepend=sample.u[:1] if u_before is None else u_before[None])
     along: dict[str, list[tuple[str, NDArray[np.bool_]]]] = {}
-    of_states = [unit(*of) for of in zip(info.lbx, info.ubx, sample.x.T, strict=True)]
-    of_inputs = [unit(*of) for of in zip(info.lbu, info.ubu, sample.u.T, strict=True)]
-    for labels, values, lower, upper, sides, units in (
-        (info.states, sample.x[1:], info.lbx, info.ubx, LEVELS, of_states),
-        (info.inputs, sample.u, info.lbu, info.ubu, LEVELS, of_inputs),
-        (info.inputs, rates, info.lbdu, info.ubdu, RATES, of_inputs),
+    for labels, values, lower, upper, sides, span in (
+        (info.states, sample.x[1:], info.lbx, info.ubx, LEVELS, (info.lbx, info.ubx)),
+        (info.inputs, sample.u, info.lbu, info.ubu, LEVELS, (info.lbu, info.ubu)),
+        (info.inputs, rates, info.lbdu, info.ubdu, RATES, (info.lbu, info.ubu)),
     ):
         for j, label in enumerate(labels):
             bounds = lower[j], upper[j]
-            acting = zip(sides, bounds, at_bounds(values[:, j], *bounds, units[j]), strict=True)
+            acting = zip(sides, bounds, at_bounds(values[:, j], *bounds, unit(span[0][j], span[1][j])), strict=True)
             along.setdefault(label.name, []).extend((side, acts) for side, bound, acts in acting if np.isfinite(bound))
     for i, away in enumerate(discs):
-        along[f"obstacle_{i}"] = [(TOUCHED, at_bounds(away, 0.0, np.inf, unit(0.0, np.inf, away))[0])]
+        along[f"obstacle_{i}"] = [(TOUCHED, at_bounds(away, 0.0, np.inf, unit(0.0, np.inf))[0])]
     return {name: _said(sides) for name, sides in along.items() if sides}
 
 
