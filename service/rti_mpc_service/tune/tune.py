@@ -8,6 +8,7 @@ so the same command goes on with it, after Ctrl-C and after SIGKILL.
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from collections.abc import Mapping, Sequence
@@ -110,7 +111,7 @@ def main(
     if lost := next((titles[name] for name, driven in today.items() if not driven.finite), ""):
         raise ConfigError(f"the values of {path} must drive {lost} to its end, so that others can be compared with them")
     study_name = name_of(config, course, varied)
-    study_url = f"sqlite:///{out.resolve().with_suffix('.study.db')}" if storage is None else storage
+    study_url = f"sqlite:///{study_file(out.resolve())}" if storage is None else storage
     study = open_study(shared or open_storage(study_url), study_name, today[STUDIED])
     ranges = ", ".join(f"{each.key} {each.low:g}:{each.high:g}" for each in varied)
     console.print(f"study {study_name} in {without_password(study_url)}, {len(finished(study))} of {trials} trials are there", soft_wrap=True)
@@ -167,12 +168,17 @@ def without_password(url: str) -> str:
     return re.sub(r"(//[^/@:]*:)[^/]*@", r"\1***@", url)
 
 
+def study_file(out: Path) -> Path:
+    """Return where the study of a file is kept, unless a storage is given."""
+    return out.with_suffix(".study.db")
+
+
 def written_to(path: Path, config: Config, out: Path | None) -> Path:
     """
     Return the file to write.
 
     Raises:
-        ConfigError: It is the robot's own, or there already, or what that finds beside itself would be missing beside this one.
+        ConfigError: It is the robot's own, or there already without its study, or what that finds beside itself would be missing beside this one.
     """
     tuned = f"{path.stem}.tuned.toml"
     out = out or (Path(tuned) if DEPLOY.resolve() in path.resolve().parents else path.with_name(tuned))
@@ -180,8 +186,8 @@ def written_to(path: Path, config: Config, out: Path | None) -> Path:
         raise ConfigError(f"--out must be a TOML file other than {path}, got {out}")
     if (":" in config.model.name or config.bus.config or config.bus.tls) and out.resolve().parent != path.resolve().parent:
         raise ConfigError(f"--out must be beside {path}, whose model or bus is found from there, got {out}")
-    if out.exists():
-        raise ConfigError(f"--out must not overwrite a file, got {out}, which exists")
+    if os.path.exists(out) and not os.path.exists(study_file(out)):
+        raise ConfigError(f"--out must not overwrite a file but of the study beside it, got {out}, which exists without {study_file(out).name}")
     if not out.resolve().parent.is_dir():
         raise ConfigError(f"--out must be in a folder that exists, got {out}")
     return out

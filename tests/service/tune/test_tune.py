@@ -23,7 +23,7 @@ from rti_mpc_service.config.config import load
 from rti_mpc_service.tune.choice import beats, choose, front
 from rti_mpc_service.tune.closed_loop import Body, ClosedLoop, Course, Driven
 from rti_mpc_service.tune.study import Tried, open_storage, open_study
-from rti_mpc_service.tune.tune import main
+from rti_mpc_service.tune.tune import main, written_to
 from tests.processes.system import until
 from tests.robots import SHIPPED
 
@@ -169,6 +169,16 @@ def test_interrupted_study_keeps_what_is_done_and_goes_on(tmp_path: Path, capsys
     assert "3 of 5 trials are there" in capsys.readouterr().out
     assert [trial.values for trial in trials_of(study)][:3] == kept
     assert len(trials_of(study)) == 5
+
+
+def test_file_that_is_there_is_written_again_only_by_its_own_study(tmp_path: Path) -> None:
+    path, out = nervous_robot(tmp_path), tmp_path / "robot.tuned.toml"
+    assert written_to(path, load(path), None) == out
+    out.write_text("")
+    with pytest.raises(ConfigError, match=r"--out must not overwrite a file .* which exists without robot\.tuned\.study\.db"):
+        written_to(path, load(path), None)
+    (tmp_path / "robot.tuned.study.db").write_text("")
+    assert written_to(path, load(path), None) == out
 
 
 @pytest.mark.parametrize(
