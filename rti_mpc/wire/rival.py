@@ -2,8 +2,8 @@
 """
 Rival of a source of references: another one that publishes for the same robot.
 
-Controllers follow the one of the higher epoch, see `rti_mpc.wire.source`. Neither is told by
-them, so each listens to the other.
+Controllers follow the one of the higher epoch, see `rti_mpc.wire.source`. They tell neither
+of the two, so each listens to the other.
 """
 
 from __future__ import annotations
@@ -25,17 +25,16 @@ class Rival:
             bus: Bus of the source, whose own references do not come back.
             epoch: Epoch of the source.
         """
-        self._robot, self._epoch, self._told = bus.keys.robot, epoch, epoch
+        self._robot, self._epoch, self._highest = bus.keys.robot, epoch, 0
         self._references = bus.subscriber(bus.keys.reference, capacity=RING_MESSAGES)
         self._intake = bus.intake(Reference, STALE_S)
 
     def notice(self) -> Notice | None:
-        """Return the notice about another source that was heard since the last call; None if there is none, or of one that was told last."""
-        epochs = [reference.epoch for reference in self._intake.newest_of_each(self._references.drain())]
-        other = max(epochs, default=self._told)
-        if other == self._told:
+        """Return the notice about another source, once, and again about one of a higher epoch; None if there is nothing new."""
+        highest = max((reference.epoch for reference in self._intake.newest_of_each(self._references.drain())), default=0)
+        if highest <= self._highest:
             return None
-        self._told = other
-        follows = "that one from now on, not this one" if other > self._epoch else "this one from now on, not that one"
+        self._highest = highest
+        follows = "that one, not this one" if highest > self._epoch else "this one, not that one, while this one publishes"
         text = f"another source publishes references for {self._robot}: its controller follows {follows}; stop one of the two"
         return Notice(Severity.WARNING, "reference_rival", text)

@@ -70,10 +70,10 @@ def main(
 
 
 def has_source(bus: Bus) -> bool:
-    """Whether another source publishes references for the robot; it is told if one does."""
+    """Whether another source publishes references for the robot; a line says so if one does."""
     present = bus.is_alive(ROLE, LISTEN_BEFORE_START_S)
     if present:
-        print(f"rti-mpc: {bus.keys.robot} already has a source of references: stop it first, or give this robot another name", file=sys.stderr)
+        print(f"rti-mpc: {bus.keys.robot} already has a source of references: stop it first", file=sys.stderr)
     return present
 
 

@@ -291,7 +291,7 @@ def test_planner_beside_another_source_is_told_so_in_a_line(monkeypatch: pytest.
         session.waiting.append(Received(encode(other), encoding(Reference), KEYS.reference))
         for _ in range(2):
             planner.send([[0.0], [1.0]], 0.05)
-    said = "another source publishes references for car: its controller follows this one from now on, not that one; stop one of the two"
+    said = "another source publishes references for car: its controller follows this one, not that one, while this one publishes; stop one of the two"
     assert capsys.readouterr().err == f"car: {said}\n"
 
 

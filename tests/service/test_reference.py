@@ -38,7 +38,7 @@ def test_source_does_not_start_beside_another_one_of_the_same_robot(
     monkeypatch.setattr(session, "present", present)
     stop = Event()  # nobody sets it: a source that starts would go on
     assert SOURCES[what](stop) == 1
-    said = "car already has a source of references: stop it first, or give this robot another name"
+    said = "car already has a source of references: stop it first"
     assert capsys.readouterr().err == f"rti-mpc: {said}\n"
     assert (asked, session.put, session.said) == ([KEYS.alive("reference")], {}, set())
 

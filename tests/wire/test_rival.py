@@ -38,7 +38,7 @@ def test_source_is_told_once_that_another_one_publishes_and_which_is_followed() 
     session = Session()
     rival = Rival(Bus(session, KEYS), 100)
     assert rival.notice() is None
-    for epoch, followed in ((90, "this one from now on, not that one"), (110, "that one from now on, not this one")):
+    for epoch, followed in ((90, "this one, not that one, while this one publishes"), (110, "that one, not this one")):
         for _ in range(2):
             session.hear(epoch)
         notice = rival.notice()
@@ -46,6 +46,16 @@ def test_source_is_told_once_that_another_one_publishes_and_which_is_followed() 
         assert notice.text == f"another source publishes references for car: its controller follows {followed}; stop one of the two"
         session.hear(epoch)
         assert rival.notice() is None
+
+
+def test_two_others_that_take_turns_are_told_once_each() -> None:
+    session = Session()
+    rival, told = Rival(Bus(session, KEYS), 100), 0
+    for _ in range(5):
+        for epoch in (7, 9):
+            session.hear(epoch)
+            told += rival.notice() is not None
+    assert told == 2
 
 
 def test_bytes_that_are_no_reference_are_no_rival() -> None:
