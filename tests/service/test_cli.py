@@ -9,7 +9,8 @@ import tomllib
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from typer.testing import CliRunner
@@ -164,6 +165,11 @@ def test_no_command_overwrites_what_an_earlier_one_has_written(name: str, option
         assert str(given) in done.stderr
     assert sorted(tmp_path.rglob("*")) == before
     assert all(path.read_text() == "precious" for path in kept)
+
+
+def test_name_that_no_file_can_have_is_left_to_whoever_writes() -> None:
+    path = Path("a" * 300)
+    assert new_file(cast(Any, SimpleNamespace(opts=["--out"])), path) == path
 
 
 @pytest.mark.parametrize("vary", ["ocp.weights.q.psi", "ocp.M=1:3", "ocp.N=3:1", "ocp.N=1.5:3", "ocp.weights.Q.psi=-1:5", "timing.delay_s=0:nan"])

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +20,7 @@ def new_file(param: typer.CallbackParam, path: Path | None) -> Path | None:
     Raises:
         ConfigError: A file or folder exists there.
     """
-    if path is not None and (path.is_file() or path.is_dir()):
+    if path is not None and (os.path.isfile(path) or os.path.isdir(path)):  # false also for a name that cannot be: writing tells
         raise ConfigError(f"{param.opts[0]} must not overwrite a file, got {path}, which exists")
     return path
 
