@@ -19,6 +19,8 @@ from rti_mpc.wire.certificate import ends, now
 if TYPE_CHECKING:
     import ssl
 
+OF_ANOTHER = frozenset(("KEY_VALUES_MISMATCH", "KEY_TYPE_MISMATCH", "NO_CERTIFICATE_ASSIGNED"))  # OpenSSL's reasons to refuse a key
+NO_KEY = frozenset(("NO_START_LINE", "PEM_LIB", "BAD_DECRYPT", "UNSUPPORTED", "BAD_END_LINE", "BAD_BASE64_DECODE", None))
 HANDSHAKE_TURNS = 4  # of each side, more than any handshake of TLS has
 FOREIGN = frozenset((2, 7, 18, 19, 20, 21))  # verdicts of OpenSSL, X509_V_ERR_...: no issuer that is known, or a signature of somebody else
 
@@ -63,11 +65,17 @@ def _check_key(certificate: Path, key: Path) -> None:
     import ssl
 
     try:
-        _context(ssl.PROTOCOL_TLS_CLIENT, certificate, key)
+        key.read_bytes()
     except OSError as error:
-        if getattr(error, "reason", "") == "KEY_VALUES_MISMATCH":
+        raise ConfigError(f"tls: {key} must be a private key, PEM, that can be read: {error.strerror}") from None
+    try:
+        _context(ssl.PROTOCOL_TLS_CLIENT, certificate, key)
+    except ssl.SSLError as error:
+        if error.reason in OF_ANOTHER:
             raise ConfigError(f"tls: {key} must be the private key of {certificate}, got that of another certificate") from None
-        raise ConfigError(f"tls: {key} must be a private key, PEM, without a password, got a file of something else") from error
+        if error.reason in NO_KEY:
+            raise ConfigError(f"tls: {key} must be a private key, PEM, without a password, got a file of something else") from None
+        raise ConfigError(f"tls: {certificate} with {key} must be what OpenSSL takes, it says {error.reason}") from None
 
 
 def _foreign(authority: Path, certificate: Path, key: Path, *, listens: bool) -> bool:

@@ -18,6 +18,7 @@ from rti_mpc_service.rig.endpoint import free_endpoint
 pytest.importorskip("cryptography", reason="the extra certs is not installed: certificates were NOT tried")
 
 from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import rsa
 
 from rti_mpc_service.certs.authority import Authority, new_key, pem
 from rti_mpc_service.certs.issue import issue
@@ -70,6 +71,14 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
     "key of another certificate": (
         lambda folder: (folder / "planner.key").write_bytes((folder / "viewer.key").read_bytes()),
         "tls: {folder}/planner.key must be the private key of {folder}/planner.pem, got that of another certificate",
+    ),
+    "key of another type": (
+        lambda folder: (folder / "planner.key").write_bytes(pem(rsa.generate_private_key(65537, 2048))),
+        "tls: {folder}/planner.key must be the private key of {folder}/planner.pem, got that of another certificate",
+    ),
+    "folder in the place of the key": (
+        lambda folder: ((folder / "planner.key").unlink(), (folder / "planner.key").mkdir()),
+        "tls: {folder}/planner.key must be a private key, PEM, that can be read: Is a directory",
     ),
     "authority that is none": (
         lambda folder: (folder / "authority.pem").write_text("junk"),
