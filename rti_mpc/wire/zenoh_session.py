@@ -196,7 +196,7 @@ class ZenohSession:
         """
         Close the session within half a second, even where Zenoh takes longer; every `recv` then returns None.
 
-        Threads that follow are over by then: one that comes back from Zenoh while the interpreter ends would abort the process.
+        Unless it does, threads that follow are over by then: one that comes back from Zenoh while the interpreter ends would abort the process.
         """
         closing = threading.Thread(target=self._session.close, daemon=True)
         closing.start()
