@@ -111,6 +111,7 @@ class Solver:
         self._adapts_at = ADAPTATION_ITERATIONS  # iterations at which the next one comes
         self._sound = True
         self._start: tuple[Array, Array] | None = None  # of the next `load`, its multipliers of rows as they are; None: the last solution
+        self._polishes = False  # whether the last solve did; OSQP keeps what it said of an earlier one
         self._held: tuple[Array, Array] | None = None  # what the last `rewarm` or polishing of ours left, until the next solve, as `solution`
         self._scaled = scaled = Scaled(qp)
         self._zero = (np.zeros_like(qp.q), np.zeros_like(qp.l))
@@ -279,7 +280,7 @@ class Solver:
         status = self.proceed()
         while self.iterations + self._piece <= self._settings.max_iter and status in (QpStatus.MAX_ITER, QpStatus.INACCURATE):
             status = self.proceed()
-        if self._info.status_polish == POLISH_REFUSED and status is QpStatus.SOLVED:
+        if self._polishes and self._info.status_polish == POLISH_REFUSED and status is QpStatus.SOLVED:
             self._held = polished(self._scaled, *self.solution)
             self.workspace.warm_start(self._held[0], self._held[1] / self._scale)
         return status
@@ -294,7 +295,8 @@ class Solver:
                 return QpStatus.FAILED
         self._held = None
         self._solve()
-        if self._polishes_later and self._info.status_val == SOLVED and self._acts():
+        self._polishes = not self._polishes_later or (self._info.status_val == SOLVED and self._acts())
+        if self._polishes_later and self._polishes:
             self._polish()
         status = STATUS_BY_OSQP_CODE.get(self._info.status_val, QpStatus.FAILED)
         if not status.usable:

@@ -8,10 +8,12 @@ import pytest
 import scipy.sparse as sp
 
 from rti_mpc.contract.status import QpStatus
+from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.qp.polish import polished
 from rti_mpc.rti.qp.qp import QpData
 from rti_mpc.rti.rti import Rti
 from tests.oracle import nlp
+from tests.problems import pioneer
 from tests.rti.test_problem_class import EXACT, PROBLEMS, around_a_bend
 
 
@@ -45,6 +47,19 @@ def test_rough_solution_stays_where_no_step_is_better(monkeypatch: pytest.Monkey
     same_x, same_y = polished(corner([1.0, -0.5]), x, y)
     np.testing.assert_array_equal(same_x, x)
     np.testing.assert_array_equal(same_y, y)
+
+
+def test_a_refusal_of_an_earlier_sample_polishes_no_later_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OSQP keeps what it said until it polishes again, which it is not asked for where no row acts."""
+    calls = []
+    monkeypatch.setattr("rti_mpc.rti.qp.osqp.polished", lambda qp, x, y: calls.append(1) or (x, y))
+    monkeypatch.setattr("rti_mpc.rti.qp.osqp.POLISH_REFUSED", 0)  # what it says of a solve without
+    rti = Rti(pioneer(N=5), SolverSettings(polish=5), formulation="sequential", solver="osqp", compile=False)
+    rti.reset(np.zeros(5), np.zeros(2))
+    for _ in range(3):
+        rti.prepare(np.zeros((5, 3)))
+        assert rti.feedback(np.zeros(5)) is QpStatus.SOLVED
+    assert not calls
 
 
 @pytest.mark.parametrize(
