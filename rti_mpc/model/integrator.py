@@ -168,7 +168,8 @@ def implicit_step(model: Model, h: ca.SX, *, derivatives: bool) -> list[ca.SX]:
         K = K - eliminated(matrix, residual)
     residual, matrix, by, terms = equations(K)
     weights = ca.sparsify(ca.DM(np.kron(a[-1:], np.eye(nx))))
-    failed = ca.mmax(span * ca.fabs(residual) - NEWTON_TOLERANCE * terms) > 0
+    solved = ca.logic_and(ca.mmax(span * ca.fabs(residual) - NEWTON_TOLERANCE * terms) <= 0, ca.sum1(terms) < np.inf)
+    failed = ca.logic_not(solved)
     found = [x + h * (weights @ K) + ca.if_else(failed, np.nan, 0.0)]
     if derivatives:
         S = h * (weights @ eliminated(matrix, by))

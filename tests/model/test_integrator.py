@@ -99,6 +99,12 @@ def test_model_that_newton_does_not_solve_is_not_finite_in_any_unit(unit: float)
     assert np.isnan(float(integrator(model)(0.3 * unit, 0.0, [], 0.1)))
 
 
+def test_implicit_step_whose_terms_overflow_is_not_taken_for_solved() -> None:
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    model = Model("fast", x, u, ca.vertcat(ca.exp(x[0]), u), x, ("x", "y"), "u", ("x", "y"), method="irk")
+    assert np.isnan(np.array(integrator(model)([709.0, 0.0], 0.0, [], 1.0))).any()
+
+
 @pytest.mark.parametrize("unit", [1e-12, 1e12])
 @pytest.mark.parametrize("x", [[0.3, -0.2, 0.7], [0.0, 0.0, 0.0]])
 def test_implicit_steps_are_the_same_in_any_unit(x: list[float], unit: float) -> None:
