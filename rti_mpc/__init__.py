@@ -36,6 +36,7 @@ References, cited by key throughout:
 * [Altafini2001] C. Altafini, A. Speranzon, B. Wahlberg, "A feedback control scheme for reversing a truck and trailer vehicle", IEEE Trans. Robot.
   Autom. 17(6), 2001.
 * [Andersson2013] J. Andersson, "A general-purpose software framework for dynamic optimization", PhD thesis, KU Leuven, 2013.
+* [Barzilai1988] J. Barzilai, J. M. Borwein, "Two-point step size gradient methods", IMA J. Numer. Anal. 8(1), 1988.
 * [Irons1969] B. M. Irons, R. C. Tuck, "A version of the Aitken accelerator for computer iteration", Int. J. Numer. Methods Eng. 1(3), 1969.
 * [Ghadimi2015] E. Ghadimi, A. Teixeira, I. Shames, M. Johansson, "Optimal parameter selection for the alternating direction method of
   multipliers (ADMM): quadratic problems", IEEE Trans. Autom. Control 60(3), 2015.

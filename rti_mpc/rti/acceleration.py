@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Acceleration of the iterations within a sample, by Aitken's relaxation [Irons1969]_.
+Acceleration of the iterations within a sample, by the long step of [Barzilai1988]_.
 
 Gauss-Newton neglects curvature, so its steps do not shrink quadratically but by a
 factor: along an obstacle, whose curvature they overestimate, each is two thirds of the
 one before. Two steps tell the factor, and with it the sum of all that would follow. The
-next guess is ahead of the plan by as much.
+next guess is ahead of the plan by as much. For steps in one direction that is Aitken's
+formula.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ def relaxation(ocp: Ocp) -> ca.Function:
         \omega = \frac{\omega_- \, s_-^T s_-}{s_-^T (s_- - s)}, \qquad x_{next} = x + \omega \, (x_{plan} - x),
 
     likewise the inputs. It is at most `MAX_RELAXATION`, also where steps grow. It is 1 instead of less than `MIN_RELAXATION`, after a `LARGE_STEP`,
-    and if there was no step before: then the guess is the plan. No guess is ahead of its plan beyond a bound, where the model may not be defined.
+    and if there was no step before: then the guess is the plan. No guess is ahead of its plan beyond `lbx`, `ubx`, `lbu` or `ubu`, where the model
+    may not be defined.
     """
     lin = linearization(ocp)
     bounds = {name: lin.w[name] for name in BOUNDS}

@@ -49,6 +49,12 @@ def test_guess_is_ahead_by_all_the_steps_that_would_follow(ocp: Ocp, ratio: floa
     np.testing.assert_array_equal(x_next[0], (x + ratio * dx)[0])  # the measured state
 
 
+def test_factor_of_steps_in_different_directions_is_that_along_the_first_one(ocp: Ocp) -> None:
+    x, step, across = np.zeros((4, 5)), np.full((3, 2), 0.01), np.tile([0.01, -0.01], (3, 1))
+    relaxed = next_guess(ocp, x, np.zeros((3, 2)), x, 0.5 * step + 0.9 * across, step)[3]
+    assert relaxed == pytest.approx(2.0, rel=ROUNDING)
+
+
 def test_second_guess_of_a_sample_is_the_plan_to_the_last_bit(ocp: Ocp) -> None:
     rng = np.random.default_rng(2)
     x, u, x_plan, u_plan = (rng.normal(size=shape) for shape in ((4, 5), (3, 2), (4, 5), (3, 2)))
