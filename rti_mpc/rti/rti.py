@@ -158,7 +158,8 @@ class Rti:
         )
 
         make = built.make
-        self._acceleration = Acceleration(built.relaxation, self.guess, make)
+        # OSQP starts from its last iterate, in deviations from the guess: one that is ahead would be a worse start.
+        self._acceleration = None if built.structured is None else Acceleration(built.relaxation, self.guess, make)
         self.advance = bind(make(built.shift), {"x": x_plan, "u": self.u, "p": p}, {"x_next": x, "u_next": u})
         bounds = np.atleast_2d(self._weights["lbx"])[0], np.atleast_2d(self._weights["ubx"])[0]
         self._turns = Turns(self.problem, (make(built.output), make(built.steps)), x, x0, self.y_ref, p, bounds)
@@ -455,7 +456,7 @@ class Rti:
         status = active_set.certified()
         if not status.usable:
             self.keep_guess()
-            if self.taken > 1:
+            if self.taken > 1 and self._acceleration is not None:
                 self._acceleration.restore()
             active_set.forget()
         return status
@@ -473,14 +474,20 @@ class Rti:
 
     def _iterate(self) -> None:
         """Iterate while the step is large; an iteration that fails leaves the plan of the one before."""
-        self._acceleration.begin()
+        acceleration = self._acceleration
+        if acceleration is not None:
+            acceleration.begin()
         while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
             if self._settled and self.active_set is not None and not self.active_set.goes_on:
                 break  # the next sample goes on; after a start, a plan that is left early may lead nowhere
-            self._acceleration.advance()
-            self._linearize()
+            if acceleration is None:
+                self._relinearize()
+            else:
+                acceleration.advance()
+                self._linearize()
             if not (status := self.solve()).usable:
-                self._acceleration.restore()
+                if acceleration is not None:
+                    acceleration.restore()
                 self.status = INACCURATE  # the plan comes from an earlier QP, which cannot be certified any more
                 break
             self.status = status
