@@ -43,17 +43,23 @@ def test_process_with_a_wrong_certificate_says_once_that_it_is_not_heard_and_oth
         "sim": disguised(system, system.tls, "planner", "robot"),
     }
     intruders = []
+
+    def intrude(command: str) -> None:
+        with (tmp_path / f"wrong {command}.log").open("wb") as log:
+            line = command_line(command, system.config, "--tls", wrong[command])
+            state = environment(tmp_path / "another state")
+            intruders.append(subprocess.Popen(line, cwd=ROOT, env=state, stdout=log, stderr=subprocess.STDOUT))
+
     try:
         system.start("router")
         until(lambda: "routing" in system.said("router"), "the router routes")
+        intrude("reference")  # beside one that is heard it would not start
+        until(lambda: UNHEARD in system.said("wrong reference"), "the wrong reference says that it is not heard")
         system.start("reference", "sim", "guard", "run")
         commands = system.join("viewer").subscriber(system.keys.actuation)
         heard(commands, Command, lambda command: command.mode.name == "TRACKING")
-        for command, folder in wrong.items():
-            with (tmp_path / f"wrong {command}.log").open("wb") as log:
-                line = command_line(command, system.config, "--tls", folder)
-                state = environment(tmp_path / "another state")
-                intruders.append(subprocess.Popen(line, cwd=ROOT, env=state, stdout=log, stderr=subprocess.STDOUT))
+        intrude("run")
+        intrude("sim")
         for command, role in (("reference", "reference"), ("run", "controller"), ("sim", "robot")):
             until(lambda command=command: UNHEARD in system.said(f"wrong {command}"), f"the wrong {command} says that it is not heard")
             said = [text for line in system.said(f"wrong {command}").splitlines() if UNHEARD in (text := json.loads(line)["text"])]

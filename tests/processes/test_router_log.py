@@ -20,7 +20,7 @@ pytest.importorskip("cryptography", reason="the extra certs is not installed: ce
 
 from rti_mpc_service.certs.authority import Authority, new_key, pem
 from rti_mpc_service.certs.issue import issue
-from tests.processes.test_secured import Secured
+from tests.processes.test_secured import Secured, join_unchecked
 
 pytestmark = pytest.mark.slow
 
@@ -55,7 +55,7 @@ def test_refused_connections_and_denials_are_a_line_each(system: Secured, tmp_pa
     (tmp_path / "foreign" / "authority.pem").write_bytes((system.tls / "authority.pem").read_bytes())
     for folder in ("ended", "foreign"):
         with pytest.raises(ConfigError, match="none has answered"):
-            system.join("robot", tmp_path / folder)
+            join_unchecked(system.settings("robot", tmp_path / folder), system.keys, 3.0)
     plain = {"connect": (system.endpoint.replace("tls/", "tcp/"),), "mode": "client", "config": None}
     with pytest.raises(ConfigError, match="none has answered"):
         system.join("robot", **plain, authority=None, certificate=None, key=None)
