@@ -3,7 +3,7 @@
 Rival of a source of references: another one that publishes for the same robot.
 
 Controllers follow the one of the higher epoch, see `rti_mpc.wire.source`. They tell neither
-of the two, so each listens to the other.
+of the two, so each listens to the other. What one has published before the other came is not asked for.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Rival:
             epoch: Epoch of the source.
         """
         self._robot, self._epoch, self._highest = bus.keys.robot, epoch, 0
-        self._references = bus.subscriber(bus.keys.reference, capacity=RING_MESSAGES)
+        self._references = bus.subscriber(bus.keys.reference, capacity=RING_MESSAGES, history=False)
         self._intake = bus.intake(Reference, STALE_S)
 
     def notice(self) -> Notice | None:
