@@ -159,7 +159,7 @@ class Rti:
 
         make = built.make
         # OSQP starts from its last iterate, in deviations from the guess: one that is ahead would be a worse start.
-        self._acceleration = None if built.structured is None else Acceleration(built.relaxation, self.guess, make)
+        self._acceleration = None if built.relaxation is None else Acceleration(built.relaxation, self.guess, make)
         self.advance = bind(make(built.shift), {"x": x_plan, "u": self.u, "p": p}, {"x_next": x, "u_next": u})
         bounds = np.atleast_2d(self._weights["lbx"])[0], np.atleast_2d(self._weights["ubx"])[0]
         self._turns = Turns(self.problem, (make(built.output), make(built.steps)), x, x0, self.y_ref, p, bounds)
