@@ -50,9 +50,10 @@ class ActiveSet:
     Attributes:
         advance: Call that shifts the last plan by one stage into the guess, and linearizes there.
         linearize: Call that linearizes at the guess as it is.
-        gain: Call that computes the gains; with it, after one of the former two, preparation is complete. `regain` computes those of other places.
-        roll_out: Call that makes the plan, and finds the places; `certify` judges that plan, `refine` improves it.
-        begin_homotopy: Call that starts the homotopy at the places rolled out last; `move`, the way to its next change of a place.
+        gain: Call that computes the gains; with it, after one of the former two, preparation is complete.
+        roll_out: Call that makes the plan, and finds the places; `roll_out_again`, with the gains of these places.
+        begin_homotopy: Call that starts the homotopy at the first roll-out; `move_on`, the way to its next change of a place, and the plan there.
+        certify: Call that judges the plan; `refine` improves it.
         enter: Call that starts the interior point at the plan; `step`, one step of it.
         written: The arrays that `roll_out` and `certify` write.
         steps: Steps of the interior point that the sample has taken; `roll_outs`, roll-outs with gains that differ from the prepared ones.
@@ -78,25 +79,25 @@ class ActiveSet:
         moved = guess.arguments | {"x": guess.plan.x, "u": guess.plan.u, "places": self._found}
         fixed = {"stages": stages, "gains": gains, **guess.weights, "places": self._places}
         plan = {"x_plan": guess.plan.x, "u_plan": guess.plan.u, "multipliers": multipliers}
-        targets, self._point = np.zeros_like(self._places), np.zeros_like(self._places)
-        self._places_next, self._point_next = np.zeros_like(self._places), np.zeros_like(self._point)
+        targets, way, self._point = (np.zeros_like(self._places) for _ in range(3))
         found = {**guess.plan.outputs(), "changes": changes, "places_found": self._found, "multipliers": multipliers}
         rolled_out = {**found, "targets": targets}
-        self._first = tuple((np.zeros_like(array), array) for array in (self._places, self._found, targets))  # of the QP's first roll-out
+        first = tuple(np.zeros_like(self._places) for _ in range(3))  # of the QP's first roll-out, where the homotopy begins
+        self._keep_first = tuple(zip(first, (self._places, self._found, targets), strict=True))
+        self._take_first = tuple(zip((way, self._found, targets), first, strict=True))
         self.advance = bind(make(functions.advance), moved, {"x_next": x, "u_next": u, "places_next": self._places, "stages": stages})
         self.linearize = bind(make(functions.linearize), guess.arguments, {"stages": stages})
-        sizes = {name: functions.gains.numel_out(name) for name in functions.gains.name_out()}
-        of_places = {name: gains if name == "gains" else np.zeros(size) for name, size in sizes.items()}
-        known = {f"{name}_known": array for name, array in of_places.items()}
-        made, placed = make(functions.gains), {"stages": stages, "u": u, **guess.weights, "places": self._places}
-        self.regain = bind(made, {**placed, **known}, of_places)  # reads and writes the same arrays: nothing is written before all is computed
-        self.gain = bind(made, {**placed, **known, "places_of_known": np.full_like(self._places, np.nan)}, of_places)
-        self.roll_out = bind(make(functions.roll_out), {**guess.start, "x0": guess.x0, **fixed}, rolled_out)
-        rows = {"targets": targets, "places": self._places}
-        of_rows = {"point": self._point} | {name: np.zeros_like(self._point) for name in LIMITS}
-        self.begin_homotopy = bind(make(functions.begin), {"u": u, "stages": stages, **guess.weights, **rows}, of_rows)
-        moving = {**rows, "places_found": self._found, **of_rows}
-        self.move = bind(make(functions.move), moving, {"places_next": self._places_next, "point_next": self._point_next})
+        weighed, embedded = {"stages": stages, "u": u, **guess.weights}, {**guess.start, "x0": guess.x0}
+        of_gains = {"gains": gains, "places_of": self._places} | {name: np.zeros(functions.gains.numel_out(name)) for name in ("P", "p")}
+        known = _known(of_gains)
+        anew = known | {"places_of_known": np.full_like(self._places, np.nan)}
+        self.gain = bind(make(functions.gains), {**weighed, "places": self._places, **anew}, of_gains)
+        self.roll_out = bind(make(functions.roll_out), {**embedded, **fixed}, rolled_out)
+        self.roll_out_again = bind(make(functions.roll_out_again), {**embedded, **weighed, "places": self._found, **known}, of_gains | rolled_out)
+        on_way, limits = {"places": way, "point": self._point}, {name: np.zeros_like(way) for name in LIMITS}
+        self.begin_homotopy = bind(make(functions.begin), {**weighed, "places": way, "targets": targets}, {"point": self._point, **limits})
+        known |= _known(on_way | {"places_found": self._found, "targets": targets})
+        self.move_on = bind(make(functions.move_on), {**embedded, **weighed, **limits, **known}, on_way | of_gains | rolled_out)
         judged = {**guess.start, "x0": guess.x0, "stages": stages, **plan, **guess.weights}
         self.certify = bind(make(certificate), judged, {"r": slopes, **verdict})
         refined = {f"{name.removesuffix('_plan')}_refined": array for name, array in plan.items()}
@@ -194,8 +195,9 @@ class ActiveSet:
         self._lowest = np.inf
         self._judged()
         self._keep_better()
-        self._places[:] = 0.0  # a plan that heeds no bound is often nearer to the optimum than one that heeds wrong ones
-        self._roll_out_again()
+        self._found[:] = 0.0  # a plan that heeds no bound is often nearer to the optimum than one that heeds wrong ones
+        self.roll_out_again()
+        self._count()
         self._judged()
         self._keep_better()
         if self._lowest < np.inf and self._step_inside().usable:
@@ -210,12 +212,12 @@ class ActiveSet:
 
         All places change at once first. Where more and more of them do, or they go in circles, they change one at a time, on the way from the guess.
         """
-        for first, array in self._first:
+        for first, array in self._keep_first:
             first[:] = array
         changes = self._changes[0]
         for _ in range(MAX_ROLL_OUTS):
-            self._places[:] = self._found
-            self._roll_out_again()
+            self.roll_out_again()
+            self._count()
             if not 0.0 < self._changes[0] < changes:
                 break
         if self._changes[0] > 0.0 and changes <= MAX_CHANGES:
@@ -224,20 +226,17 @@ class ActiveSet:
 
     def _follow(self) -> None:
         """Follow the homotopy from the guess, on the curves of the places rolled out first, to this QP: see `rti_mpc.rti.homotopy`."""
-        for first, array in self._first:
+        for array, first in self._take_first:
             array[:] = first
         self.begin_homotopy()
         for _ in range(MAX_MOVES):
-            self.move()
-            self._places[:], self._point[:] = self._places_next, self._point_next
-            self._roll_out_again()
+            self.move_on()
+            self._count()
             if self._changes[0] <= 0.0:
                 break
 
-    def _roll_out_again(self) -> None:
-        """Roll out with the gains of other places."""
-        self.regain()
-        self.roll_out()
+    def _count(self) -> None:
+        """Count a roll-out with other gains."""
         self.iterations += 1
         self.roll_outs += 1
 
@@ -284,8 +283,13 @@ class ActiveSet:
     def _hand_back(self) -> bool:
         """Roll out from the places of a certified plan, and return whether that is a better plan: it is exact, if they settle."""
         for _ in range(MAX_ROLL_OUTS_HANDED_BACK):
-            self._places[:] = self._found
-            self._roll_out_again()
+            self.roll_out_again()
+            self._count()
             if self._changes[0] <= 0.0:
                 break
         return self._changes[0] == 0.0 and self._judged() is SOLVED and self.res_dual < self._lowest
+
+
+def _known(arrays: dict[str, Array]) -> dict[str, Array]:
+    """Return the arrays of results as the arguments in which a function finds those of its last call."""
+    return {f"{name}_known": array for name, array in arrays.items()}

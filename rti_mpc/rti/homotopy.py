@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from rti_mpc.codegen import function, function_in_c
+from rti_mpc.codegen import BEFORE_BODY, function, function_in_c
 from rti_mpc.rti.linearization import Linearization, along_rows
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
@@ -95,28 +95,32 @@ def begin(ocp: Ocp, lin: Linearization, stages: ca.MX) -> ca.Function:
 
 
 # The same as `BoundedRow` says, without the division for rows that do not change.
+SHARE = """
+static casadi_real share_of(casadi_real place, casadi_real found, casadi_real now, casadi_real target, casadi_real bound, casadi_real most) {
+  const casadi_real end = fabs(place) != 1 ? bound : found == 0 ? 0 : most;
+  const casadi_real share = (end - now) / (target - now);
+  return share > 0 ? share : 0;
+}
+"""
 MOVE = """
-  const casadi_real *place = arg[0], *found = arg[1], *now = arg[2], *target = arg[3], *lower = arg[4], *upper = arg[5], *most = arg[6];
-  casadi_real *place_next = res[0], *share = res[1], *now_next = res[1], least = 1;
+  const casadi_real *place = arg[0], *found = arg[1], *point = arg[2], *target = arg[3], *lower = arg[4], *upper = arg[5], *most = arg[6];
+  casadi_real least = 1;
   casadi_int i;
   for (i = 0; i < ROWS; ++i) {
-    share[i] = INFINITE;
     if (found[i] != place[i]) {
       const casadi_real bound = place[i] + found[i] > 0 ? upper[i] : lower[i];
-      const casadi_real end = fabs(place[i]) != 1 ? bound : found[i] == 0 ? 0 : most[i];
-      const casadi_real way = (end - now[i]) / (target[i] - now[i]);
-      share[i] = way > 0 ? way : 0;
-      if (share[i] < least) least = share[i];
+      const casadi_real share = share_of(place[i], found[i], point[i], target[i], bound, most[i]);
+      if (share < least) least = share;
     }
   }
-  for (i = 0; i < ROWS; ++i) {
-    if (share[i] == least) {
-      const casadi_real bound = place[i] + found[i] > 0 ? upper[i] : lower[i];
-      place_next[i] = found[i];
-      now_next[i] = fabs(found[i]) != 1 ? bound : place[i] == 0 ? 0 : most[i];
+  for (i = 0; i < ROWS; ++i) {  /* a row is read before it is written: it may lie where it lay */
+    const casadi_real of = place[i], to = found[i], now = point[i], bound = of + to > 0 ? upper[i] : lower[i];
+    if (of != to && share_of(of, to, now, target[i], bound, most[i]) == least) {
+      res[0][i] = to;
+      res[1][i] = fabs(to) != 1 ? bound : of == 0 ? 0 : most[i];
     } else {
-      place_next[i] = place[i];
-      now_next[i] = now[i] + least * (target[i] - now[i]);
+      res[0][i] = of;
+      res[1][i] = now + least * (target[i] - now);
     }
   }
   return 0;
@@ -127,17 +131,18 @@ def move(size: int) -> ca.Function:
     """
     Build ``(places, places_found, point, targets, lower, upper, most) -> (places_next, point_next)``: the way to the first change of a place.
 
+    Compiled, the results may be in the memory of places and point.
+
     Args:
         size: Number of rows.
     """
     row = BoundedRow()
     names = "places", "places_found", "point", "targets", *LIMITS
-    given, here = ({name: ca.MX.sym(name, size) for name in names} for _ in range(2))
+    given = {name: ca.MX.sym(name, size) for name in names}
     of_rows = [of.T for of in given.values()]
     shares = ca.Function("share", row.symbols, [row.share]).map(size)(*of_rows)
     share, least = ca.SX.sym("share"), ca.SX.sym("least")
     after = ca.Function("after", [*row.symbols, share, least], row.after(share, least)).map(size)
     places, point = after(*of_rows, shares, ca.repmat(ca.fmin(ca.mmin(shares), 1), 1, size))
-    sizes = f"enum {{ ROWS = {size} }};"
-    moved = function_in_c("moved", given, {"places_next": places.T, "point_next": point.T}, sizes + MOVE.replace("INFINITE", f"{INFINITY:.1e}"))
-    return function("move", here, moved(**here))  # with other symbols, or it would be the expressions
+    body = f"{SHARE}{BEFORE_BODY}enum {{ ROWS = {size} }};{MOVE}"
+    return function_in_c("move", given, {"places_next": places.T, "point_next": point.T}, body)

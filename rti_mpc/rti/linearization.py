@@ -219,6 +219,11 @@ class Linearization:
         """Return the forms from a column like `stages`."""
         return Forms(*divided(stages, self.forms))
 
+    def begins(self) -> dict[str, int]:
+        """Return where each form begins in a column like `stages`, by name."""
+        ends = np.cumsum([form.numel() for form in self.forms]).tolist()
+        return dict(zip(Forms._fields, [0, *ends], strict=False))
+
     def weighed(self, increments: ca.MX) -> ca.MX:
         """Return ``R_k du_k`` of increments, a column per block, shape ``(nu, N_u)``."""
         lambda_ = self.w["lambda_"]

@@ -22,6 +22,7 @@ import numpy as np
 from rti_mpc.codegen import function, function_in_c
 from rti_mpc.rti import homotopy, interior_point
 from rti_mpc.rti.blocks import all_inputs, at_each, moved_on, repeated
+from rti_mpc.rti.composition import Names, compose
 from rti_mpc.rti.linearization import Forms, Linearization, change, divided, linearization, partly, shift, where_bounded
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
@@ -42,6 +43,7 @@ UNTIL = """
     if (differs) break;
   }
   *res[0] = k + 1;
+  casadi_copy(now, ROWS, res[1]);
   return 0;
 """
 
@@ -61,16 +63,19 @@ class Places:
             the plan shifted by one stage.
         gains: ``(stages, u, *ARGUMENTS, scale, places, gains_known, P_known, p_known, places_of_known) -> (gains, P, p, places_of)``: gains, and the
             cost-to-go before each stage, all of these places. With the known ones of other places, but of the same linearization, compiled code goes
-            only over the stages up to the last one whose places differ. Places that are NaN differ at all stages.
+            only over the stages up to the last one whose places differ. What is known may be in the memory of the results. Places that are NaN
+            differ at all stages.
         roll_out: ``(x, u, u_prev, x0, stages, gains, *ARGUMENTS, scale, places) -> (x_plan, u_plan, violation, change, changes,
             places_found, multipliers, targets)``: the plan after the full step, its largest violation of softened bounds, in their unit and
             relative to their scale, the size of the step, and how many places change: -1 if data, gains or plan are not finite. Targets are the
             coordinates of the rows, see `rti_mpc.rti.homotopy`.
+        roll_out_again: Gains of other places, then their roll-out, ``roll_out`` with the places ``places_of``.
+        move_on: The way along the homotopy to the next change of a place, see `rti_mpc.rti.homotopy.move`, then the same of its ``places``. Of the
+            change and the roll-out before, it takes ``places_known``, ``point_known``, ``places_found_known`` and ``targets_known``.
         refine: ``(x, u, u_prev, stages, gains, *ARGUMENTS, scale, places, r, x_plan, u_plan, multipliers) -> (x_refined,
             u_refined, multipliers_refined)``: plan and multipliers after a Newton step that removes the remaining gradient r of the Lagrangian,
             see `rti_mpc.rti.certificate`.
         begin: The start of the homotopy; see `rti_mpc.rti.homotopy`.
-        move: The way to its next change of a place.
         enter: The start of the interior point; see `rti_mpc.rti.interior_point`.
         step: A step of the interior point.
     """
@@ -79,9 +84,10 @@ class Places:
     advance: ca.Function
     gains: ca.Function
     roll_out: ca.Function
+    roll_out_again: ca.Function
+    move_on: ca.Function
     refine: ca.Function
     begin: ca.Function
-    move: ca.Function
     enter: ca.Function
     step: ca.Function
 
@@ -123,35 +129,46 @@ def places(ocp: Ocp) -> Places:
     linearized = linearize(**(lin.arguments | {"x": x, "u": u}))["stages"]
     advance = {"x_next": x, "u_next": u, "places_next": moved, "stages": linearized}
 
-    known = [ca.MX.sym(name, *shape) for name, shape in recursion.shapes.items()]
-    places_of = ca.MX.sym("places_of", flat.numel())
-    gains = recursion.gains_again(at.forms, *penalties(ocp, at), stages_until(ocp, flat.numel())(flat, places_of), known)
-    before = {f"{name}_known": one for name, one in zip(recursion.shapes, known, strict=True)}
     guess = {"x": lin.x, "u": lin.u, "u_prev": lin.u_prev}
     fixed = {"stages": stages, "gains": found, **lin.weights, "places": flat}
     rolled = roll_out(ocp, at, x0)
+    gains, rolling = gains_of(ocp, recursion, at, stages, flat), function("roll_out", {**guess, "x0": x0, **fixed}, rolled)
+    again: list[tuple[ca.Function, Names]] = [(gains, {}), (rolling, {"places": "places_of"})]
+    on_way = {name: f"{name}_known" for name in ("places", "places_found", "point", "targets")} | {"places_next": "places", "point_next": "point"}
     plan = {"r": lin.u, "x_plan": lin.x, "u_plan": lin.u, "multipliers": rolled["multipliers"]}
     plan = {name: ca.MX.sym(name, *like.shape) for name, like in plan.items()}
     return Places(
         linearize,
         function("advance", {**lin.arguments, "places": flat}, advance),
-        function(
-            "gains",
-            {"stages": stages, "u": lin.u, **lin.weights, "places": flat, **before, "places_of_known": places_of},
-            {**dict(zip(recursion.shapes, gains, strict=True)), "places_of": flat},
-        ),
-        function("roll_out", {**guess, "x0": x0, **fixed}, rolled),
+        gains,
+        rolling,
+        compose("roll_out_again", again),
+        compose("move_on", [(homotopy.move(flat.numel()), on_way), *again]),
         function("refine", {**guess, **fixed, **plan}, refine(ocp, recursion, at, stages, **plan)),
         homotopy.begin(ocp, lin, stages),
-        homotopy.move(flat.numel()),
         interior_point.enter(ocp, lin, stages),
         interior_point.step(ocp, lin, recursion, stages, x0),
     )
 
 
+def gains_of(ocp: Ocp, recursion: Riccati, at: Sample, stages: ca.MX, flat: ca.MX) -> ca.Function:
+    """Build `Places.gains`."""
+    lin, until, begins = at.lin, ca.MX.sym("until"), at.lin.begins()
+    given = {"stages": stages, "u": lin.u, **lin.weights, "places": flat}
+    data = recursion.data(at.forms, *penalties(ocp, at, until))
+    own = {name: expression for name, expression in data.items() if name not in begins}
+    terms = function("terms", {**given, "until": until}, {f"{name}_term": expression for name, expression in own.items()})
+    names: dict[str, str | tuple[str, int]] = {name: f"{name}_term" if name in own else ("stages", begins[name]) for name in data}
+    results = dict(zip(("gain", "P_before", "p_before"), ("gains", "P", "p"), strict=True))
+    names |= results | {f"known_{result}": f"{name}_known" for result, name in results.items()}
+    return compose("gains", [(stages_until(ocp, flat.numel()), {}), (terms, {}), (recursion.again, names)], [*results.values(), "places_of"])
+
+
 def stages_until(ocp: Ocp, size: int) -> ca.Function:
     """
-    Build ``(places, places_of) -> until``: the number of stages up to the last one whose places differ; interpreted, that of all stages.
+    Build ``(places, places_of_known) -> (until, places_of)``: the number of stages up to the last one whose places differ, and the places.
+
+    Interpreted, that is the number of all stages.
 
     Args:
         ocp: The problem.
@@ -160,13 +177,14 @@ def stages_until(ocp: Ocp, size: int) -> ca.Function:
     block = ocp.held.tolist()
     is_first, of_block = stage_in_c(block)
     body = UNTIL.replace("IS_FREE", is_first).replace("BLOCK", of_block)
-    sizes = f"enum {{ STAGES = {ocp.N}, FREE = {ocp.N_u}, NU = {ocp.model.nu}, NG = {ocp.ng} }};"
-    rows = {name: ca.MX.sym(name, size) for name in ("places", "places_of")}
-    return function_in_c("until", rows, {"until": ca.MX(ocp.N)}, "\n".join([sizes, block_table(block) if of_block != "k" else "", body]))
+    sizes = f"enum {{ STAGES = {ocp.N}, FREE = {ocp.N_u}, NU = {ocp.model.nu}, NG = {ocp.ng}, ROWS = {size} }};"
+    rows = {name: ca.MX.sym(name, size) for name in ("places", "places_of_known")}
+    found = {"until": ca.MX(ocp.N), "places_of": rows["places"]}
+    return function_in_c("until", rows, found, "\n".join([sizes, block_table(block) if of_block != "k" else "", body]))
 
 
-def penalties(ocp: Ocp, at: Sample) -> tuple[Rows, Rows]:
-    """Return the weight and the pull of each row, which follow from its place."""
+def penalties(ocp: Ocp, at: Sample, until: ca.MX) -> tuple[Rows, Rows]:
+    """Return the weight and the pull of each row of the first stages, which follow from its place."""
     lin, w = at.lin, at.lin.w
     stiff_u, stiff_g = PENALTY / lin.scale_u**2, PENALTY / lin.scale_g**2
     limits = {name: w[name] for name in ("lbu", "ubu", "lbdu", "ubdu")} | {"lg": lin.lg, "ug": lin.ug, "zg": lin.zg, "Zg": lin.Zg}
@@ -178,6 +196,7 @@ def penalties(ocp: Ocp, at: Sample) -> tuple[Rows, Rows]:
         {},
         outputs,
         shared=["stiff_u", "stiff_g", *(name for name, limit in limits.items() if limit.size2() == 1)],
+        limited=True,
     )
     found = along(
         place_u=at.place.u,
@@ -189,6 +208,7 @@ def penalties(ocp: Ocp, at: Sample) -> tuple[Rows, Rows]:
         stiff_u=stiff_u,
         stiff_g=stiff_g,
         **limits,
+        until=until,
     )
     weight, pull = (Rows(*(found[f"{what}_{row}"] for row in rows)) for what in ("weight", "pull"))
     return weight, pull

@@ -32,6 +32,7 @@ def recur(
     shared: Collection[str] = (),
     backward: bool = False,
     resumed: bool = False,
+    limited: bool = False,
     in_c: str | None = None,
 ) -> ca.Function:
     """
@@ -46,7 +47,9 @@ def recur(
         shared: Arguments that are the same at every stage. Of any other one the caller gives a column for each stage that has it.
         backward: Whether the last stage comes first.
         resumed: Whether it may go on from an earlier call, the last stage first, with other arguments of the first stages only. It then takes their
-            number, ``until``, and as ``known_<output>`` the outputs of that call, among which must be all that is carried.
+            number, ``until``, and as ``known_<output>`` the outputs of that call, among which must be all that is carried. These may be in the memory
+            of the outputs: then what stays is not touched.
+        limited: Whether compiled code goes over the first stages only, whose number it takes, ``until``. It writes no columns of the others.
         in_c: Body of an equal function in C, instead of a loop; see `function_in_c`.
 
     Returns:
@@ -79,10 +82,12 @@ def recur(
         for output in set(outputs) & set(after):
             found[output].append(after[output])
     results = {output: ca.horzcat(*(reversed(parts) if backward else parts)) for output, parts in found.items()}
-    if resumed:
+    if resumed or limited:
         given["until"] = ca.MX.sym("until")
+    if resumed:
         given |= {f"known_{output}": ca.MX.sym(f"known_{output}", *result.shape) for output, result in results.items()}
-    return function_in_c(name, given, results, in_c or "\n".join(_loop(stages, [*kinds.values()], block, given, carried, outputs, backward, resumed)))
+    code = in_c or "\n".join(_loop(stages, [*kinds.values()], block, given, carried, outputs, backward, resumed, limited))
+    return function_in_c(name, given, results, code)
 
 
 def _loop(
@@ -94,6 +99,7 @@ def _loop(
     outputs: Sequence[str],
     backward: bool,
     resumed: bool,
+    limited: bool,
 ) -> Iterator[str]:
     """Return the body of the same recursion in C: results that are carried on lie in their column or, by turns, in two buffers."""
     place: dict[str, int] = {argument: i for i, argument in enumerate(given)}
@@ -115,7 +121,10 @@ def _loop(
         yield from resume(len(block), len(given) - len(outputs) - 1, [rows * width for rows, width in sizes.values()])
         for argument, result in carried.items():
             yield f"if (until < {len(block)}) now_{argument} = arg[{place[f'known_{result}']}] + {sizes[result][0]} * until;"
-    yield f"for (k = {'until' if resumed else len(block)} - 1; k >= 0; --k) {{" if backward else f"for (k = 0; k < {len(block)}; ++k) {{"
+    if limited:
+        yield f"const casadi_int until = (casadi_int) *arg[{len(given) - 1}];"
+    count = "until" if resumed or limited else len(block)
+    yield f"for (k = {count} - 1; k >= 0; --k) {{" if backward else f"for (k = 0; k < {count}; ++k) {{"
     for i, stage in enumerate(kinds):
         yield f"  {'else ' if i else ''}{f'if ({is_first}) ' if i + 1 < len(kinds) else ''}{{"
         for j, argument in enumerate(stage.name_in()):
@@ -144,7 +153,7 @@ def resume(stages: int, at: int, sizes: Sequence[int]) -> Iterator[str]:
     """
     yield f"const casadi_int until = (casadi_int) *arg[{at}];"
     for i, size in enumerate(sizes):
-        yield f"if (until < {stages}) casadi_copy(arg[{at + 1 + i}], {size}, res[{i}]);"
+        yield f"if (until < {stages} && res[{i}] != arg[{at + 1 + i}]) casadi_copy(arg[{at + 1 + i}], {size}, res[{i}]);"
 
 
 def stage_in_c(block: Sequence[int]) -> tuple[str, str]:

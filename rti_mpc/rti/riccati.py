@@ -21,7 +21,6 @@ the input before is *held*, after the control horizon or the first stage of a bl
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -57,7 +56,8 @@ class Riccati:
 
     Attributes:
         size: Entries of the gains of one stage: K and kappa of ``du = -K s - kappa``, and the Cholesky factor of ``Q_uu``.
-        shapes: Those of gains and of the cost-to-go before each stage, its matrix as upper triangle, by name: what `gains_again` returns.
+        again: ``(*data, until, known_gain, known_P_before, known_p_before) -> (gain, P_before, p_before)``: gains, and the cost-to-go before each
+            stage, its matrix as upper triangle, from those of other weights and pulls at the first stages; see `rti_mpc.rti.recursion.recur`.
         factorize: ``(stages, R, lambda_, weight_u, weight_du, weight_g, pull_u, pull_du, pull_g) -> gains``; compiled once for all.
         respond: ``(stages, gains, pull_u, pull_du, pull_g) -> (states, u, du, g)``: the change of states and rows that pulls alone cause.
     """
@@ -72,11 +72,10 @@ class Riccati:
             repeated(free(ocp, lin), held(ocp, lin), ocp.blocks)
             for free, held in ((backward_free, backward_held), (sweep_free, sweep_held), (forward_free, forward_held))
         )
-        self.shapes = {"gains": (self.size, ocp.N_u), "P": (n * (n + 1) // 2, ocp.N), "p": (n, ocp.N)}
         carried, shared, kinds = {"P": "P_before", "p": "p_before"}, input_weights_shared(ocp), [stage for stage, _ in backward[:2]]
         self._backward = recur("backward", backward, carried, ["gain"], shared=shared, backward=True, in_c=backward_in_c(ocp, lin, *kinds))
         outputs, again = ["gain", *carried.values()], backward_in_c(ocp, lin, *kinds, resumed=True)
-        self._again = recur("again", backward, carried, outputs, shared=shared, backward=True, resumed=True, in_c=again)
+        self.again = recur("again", backward, carried, outputs, shared=shared, backward=True, resumed=True, in_c=again)
         self._sweep = recur("sweep", sweep, {"p": "p_before"}, ["kappa"], backward=True)
         self._forward = recur("forward", forward, {"s": "s_after"}, ["s_after", "g", "increment"])
         stages, gains, start = ca.MX.sym("stages", lin.stages.numel()), ca.MX.sym("gains", self.size, ocp.N_u), ca.MX.zeros(n)
@@ -85,13 +84,13 @@ class Riccati:
         )
         weights, pulls = ({f"{name}_{of}": number for of, number in vars(rows).items()} for name, rows in (("weight", weight), ("pull", pull)))
         forms, matrices = lin.forms_in(stages), {name: lin.w[name] for name in ("R", "lambda_")}
-        found = self._backward(**self._data(forms, weight, pull))["gain"]
+        found = self._backward(**self.data(forms, weight, pull))["gain"]
         self.factorize = function("factorize", {"stages": stages, **matrices, **weights, **pulls}, {"gains": found})
         states, _, rows = self.rolled(forms, self._corrected(forms, gains, pull), start, defects=False)
         self.respond = function("respond", {"stages": stages, "gains": gains, **pulls}, {"states": states, **vars(rows)})
 
-    def _data(self, forms: Forms, weight: Rows, pull: Rows) -> dict[str, ca.MX]:
-        """Return the arguments of the recursion backwards, by name."""
+    def data(self, forms: Forms, weight: Rows, pull: Rows) -> dict[str, ca.MX]:
+        """Return the arguments of the recursion backwards, by name; those in `Forms` are these."""
         n, lin = self._n, self._lin
         data = {"A": forms.A, "B": forms.B, "b": forms.b, "H": forms.H, "h": forms.h, "g_x": forms.g_x, "g_u": forms.g_u}
         rows = {"weight_u": weight.u, "pull_u": pull.u, "weight_du": weight.du, "pull_du": pull.du, "weight_g": weight.g, "pull_g": pull.g}
@@ -115,22 +114,6 @@ class Riccati:
             "gains"
         ]
         return found
-
-    def gains_again(self, forms: Forms, weight: Rows, pull: Rows, until: ca.MX, known: Sequence[ca.MX]) -> tuple[ca.MX, ca.MX, ca.MX]:
-        """
-        Return gains and the cost-to-go before each stage, with `shapes`, from those of other weights and pulls.
-
-        Args:
-            forms: Linearization.
-            weight: Weights of all rows.
-            pull: Their pulls.
-            until: Number of stages from the first one on whose weights and pulls are others: the recursion goes over these.
-            known: What it has returned with those others.
-        """
-        names = "gain", "P_before", "p_before"
-        before = {f"known_{name}": one for name, one in zip(names, known, strict=True)}
-        found = self._again(**self._data(forms, weight, pull), until=until, **before)
-        return found["gain"], found["P_before"], found["p_before"]
 
     def response(self, stages: ca.MX, gains: ca.MX, pull: Rows) -> tuple[ca.MX, Rows]:
         """Return the change of states, shape ``(nx, N + 1)``, and of rows, that pulls alone cause."""

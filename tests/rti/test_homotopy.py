@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
-from rti_mpc.codegen import compiled
+from rti_mpc.codegen import bind, compiled
 from rti_mpc.rti import active_set
-from rti_mpc.rti.active_set import ActiveSet
 from rti_mpc.rti.homotopy import move
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.bench.families import paper
@@ -49,15 +48,17 @@ def test_homotopy_ends_at_the_plan_of_the_qp_solved_by_another_solver(name: str)
 @pytest.mark.parametrize("name", ["pioneer", "fenced"])
 def test_each_move_leads_to_the_next_segment_of_one_row_and_leaves_all_others_on_theirs(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[tuple[Array, Array]] = []
-    again = ActiveSet._roll_out_again
-
-    def watched(self: ActiveSet) -> None:
-        seen.append((self._places.copy(), self._point.copy()))
-        again(self)
-
-    monkeypatch.setattr(ActiveSet, "_roll_out_again", watched)
     ocp = PROBLEMS[name]()
     rti = Rti(ocp, iterations=1, compile=False)
+    one = rti.active_set
+    assert one is not None
+    move_on = one.move_on
+
+    def watched() -> None:
+        move_on()
+        seen.append((one._places.copy(), one._point.copy()))
+
+    monkeypatch.setattr(one, "move_on", watched)
     for x0, y_ref, u_prev in samples(ocp, 10):
         rti.reset(x0, u_prev)
         rti.prepare(y_ref, shift=False)
@@ -79,13 +80,15 @@ def test_compiled_move_is_that_of_the_expressions() -> None:
     rng, rows = np.random.default_rng(3), 40
     way = move(rows)
     (fast,) = compiled(way)
-    for _ in range(200):
+    for _ in range(200):  # into the memory of the places and of the point, as on the way
         places = rng.choice([-2.0, -1.0, 0.0, 1.0, 2.0], rows)
         found = np.where(rng.random(rows) < 0.1, places + np.where(places == 0, rng.choice([-1.0, 1.0], rows), -np.sign(places)), places)
         numbers = {name: rng.normal(size=rows) for name in ("point", "targets")}
         given = {"places": places, "places_found": found, **numbers, "lower": -np.ones(rows), "upper": np.ones(rows), "most": np.full(rows, 2.0)}
-        for name, expected in way(**given).items():
-            np.testing.assert_array_equal(np.array(fast(**given)[name]), np.array(expected), err_msg=name)
+        expected = way(**given)
+        bind(fast, given, {"places_next": places, "point_next": numbers["point"]})()
+        np.testing.assert_array_equal(places, np.array(expected["places_next"]).ravel())
+        np.testing.assert_array_equal(numbers["point"], np.array(expected["point_next"]).ravel())
 
 
 def test_places_that_go_in_circles_when_all_change_at_once_settle_one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
