@@ -423,6 +423,9 @@ def refine(
     weight = ca.repmat(PENALTY / lin.scale_g**2, 1, N) * (ca.fabs(place.g) == 1)
     lower, upper = (at_each(e, N) for e in (lin.lg, lin.ug))
     excess = values - ca.if_else(place.g > 0, upper, lower)
+    # A row that no free input moves stays where it is: its multiplier would grow with each refinement, and with it those that hold the inputs.
+    movable = recur("movable", repeated(movable_free(nu), movable_held(), ocp.blocks), {"before": "moves"}, ["moves"])
+    weight *= ca.repmat(movable(place_u=place.u, place_du=place.du, before=ca.MX(0))["moves"], ocp.ng, 1)
     zero = ca.MX.zeros(nu, N_u)
     _, rows = recursion.response(stages, at.gains, Rows(r * (place.u == 0), zero, weight * excess))
     step = rows.u
@@ -447,6 +450,19 @@ def refine(
     )
     states = ca.horzcat(x_plan[:, 0], amended["x_refined"])
     return {"x_refined": states, "u_refined": amended["u_refined"], "multipliers_refined": ca.veccat(force, paid)}
+
+
+def movable_free(nu: int) -> ca.Function:
+    """Build ``(place_u, place_du, before) -> moves``: whether the input of a stage, or one before, moves what comes after it."""
+    place_u, place_du, before = ca.SX.sym("place_u", nu), ca.SX.sym("place_du", nu), ca.SX.sym("before")
+    free = ca.sum1(ca.logic_and(place_u == 0, place_du == 0)) > 0
+    return function("movable_free", {"place_u": place_u, "place_du": place_du, "before": before}, {"moves": ca.logic_or(before, free)})
+
+
+def movable_held() -> ca.Function:
+    """Build the same of a stage whose input is that of the stage before."""
+    before = ca.SX.sym("before")
+    return function("movable_held", {"before": before}, {"moves": before})
 
 
 def amended_stage(lin: Linearization, du: ca.SX) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:

@@ -85,6 +85,15 @@ def driven(family: Family, rti: Rti, numbers: Iterable[int]) -> Iterator[Array]:
         yield u
 
 
+def test_row_that_no_free_input_moves_leaves_no_plan_to_the_interior_point() -> None:
+    """With both inputs at bounds, a state is at its bound as well after the first stage of a robot in front of discs that block its way."""
+    family = FAMILIES["discs_blocked"][0](20)
+    rti = Rti(family.ocp, formulation="simultaneous", compile=False)
+    one = rti.active_set
+    assert one is not None
+    assert sum(one.steps for _ in driven(family, rti, range(82))) == 0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "N", "most_changes"), [("slalom", 20, 0), ("tight", 50, 0), ("restarts", 20, 0), ("slalom", 50, active_set.MAX_CHANGES)]
