@@ -281,13 +281,13 @@ class ActiveSet:
         return False
 
     def _hand_back(self) -> bool:
-        """Roll out from the places of a certified plan, and return whether that is a better plan: it is exact, if they settle."""
+        """Roll out from the places of a certified plan, and return whether that gives the plan: it is exact, if they settle."""
         for _ in range(MAX_ROLL_OUTS_HANDED_BACK):
             self.roll_out_again()
             self._count()
             if self._changes[0] <= 0.0:
                 break
-        return self._changes[0] == 0.0 and self._judged() is SOLVED and self.res_dual < self._lowest
+        return self._changes[0] == 0.0 and self._judged() is SOLVED
 
 
 def _known(arrays: dict[str, Array]) -> dict[str, Array]:

@@ -94,6 +94,30 @@ def test_row_that_no_free_input_moves_leaves_no_plan_to_the_interior_point() -> 
     assert sum(one.steps for _ in driven(family, rti, range(82))) == 0
 
 
+def test_interior_point_ends_where_its_places_settle() -> None:
+    """From a cold start with many bounds, whose first two QPs are left to it."""
+    family = FAMILIES["tight"][0](50)
+    rti = Rti(family.ocp, formulation="simultaneous", compile=False)
+    one = rti.active_set
+    assert one is not None
+    called: list[str] = []
+
+    def watched(name: str) -> None:
+        call = getattr(one, name)
+
+        def watch() -> None:
+            call()
+            called.append("settled" if name == "roll_out_again" and one._changes[0] == 0.0 else name)
+
+        setattr(one, name, watch)
+
+    for name in ("linearize", "step", "roll_out_again"):
+        watched(name)
+    for _ in driven(family, rti, range(1)):
+        after = [called[i + 1] for i, name in enumerate(called[:-1]) if name == "settled" and called[i - 1] == "step"]
+        assert after == ["linearize", "linearize"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "N", "most_changes"), [("slalom", 20, 0), ("tight", 50, 0), ("restarts", 20, 0), ("slalom", 50, active_set.MAX_CHANGES)]
