@@ -16,7 +16,6 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 
-from rti_mpc.array import Array
 from rti_mpc.codegen import bind, function
 from rti_mpc.rti.blocks import at_each
 from rti_mpc.rti.linearization import linearization
@@ -41,8 +40,8 @@ def relaxation(ocp: Ocp) -> ca.Function:
         \omega = \frac{\omega_- \, s_-^T s_-}{s_-^T (s_- - s)}, \qquad x_{next} = x + \omega \, (x_{plan} - x),
 
     likewise the inputs. It is at most `MAX_RELAXATION`, also where steps grow. It is 1 instead of less than `MIN_RELAXATION`, after a `LARGE_STEP`,
-    and if there was no step before: then the guess is the plan. No guess is ahead of its plan beyond `lbx`, `ubx`, `lbu` or `ubu`, where the model
-    may not be defined.
+    and if there was no step before, which is then 0: the guess is the plan. No guess is ahead of its plan beyond `lbx`, `ubx`, `lbu` or `ubu`,
+    where the model may not be defined. Results may be in the memory of the guess, the step and its relaxation.
     """
     lin = linearization(ocp)
     bounds = {name: lin.w[name] for name in BOUNDS}
@@ -78,26 +77,20 @@ class Acceleration:
     def __init__(self, built: ca.Function, guess: Guess, make: Callable[[ca.Function], ca.Function]) -> None:
         x, u, plan = guess.sample["x"], guess.sample["u"], guess.plan
         self._step, self._omega = np.zeros_like(u), np.ones(1)
-        found: dict[str, Array] = {"x_next": np.zeros_like(x), "u_next": np.zeros_like(u), "step_next": np.zeros_like(u), "omega_next": np.ones(1)}
         weights = {name: guess.weights[name] for name in (*BOUNDS, "scale")}
         given = {"x": x, "u": u, "x_plan": plan.x, "u_plan": plan.u, "step": self._step, "omega": self._omega, **weights}
-        self._relax = bind(make(built), given, found)
+        self._relax = bind(make(built), given, {"x_next": x, "u_next": u, "step_next": self._step, "omega_next": self._omega})
         self._plan = tuple((np.zeros_like(array).reshape(-1).data, array.reshape(-1).data) for array in (plan.x, plan.u))
-        taken = zip((x, u, self._step, self._omega), found.values(), strict=True)
-        self._taken = tuple((array.reshape(-1).data, next_.reshape(-1).data) for array, next_ in taken)
 
     def begin(self) -> None:
         """Begin a sample, whose second guess is the first plan."""
-        self._step[:] = 0.0
-        self._omega[:] = 1.0
+        self._step.fill(0.0)
 
     def advance(self) -> None:
         """Make the next guess, and keep the plan, which an iteration that fails must `restore`."""
         self._relax()
         for kept, plan in self._plan:
             kept[:] = plan
-        for array, next_ in self._taken:
-            array[:] = next_
 
     def restore(self) -> None:
         """Take the plan before the guess back."""

@@ -72,8 +72,9 @@ class ActiveSet:
         self._changes = changes.data
         multipliers: Array = np.zeros(functions.roll_out.numel_out("multipliers"))
         slopes = np.zeros_like(guess.plan.u)
-        verdict: dict[str, Array] = {name: np.zeros(1) for name in ("primal", "gap", "cost")}
-        self._verdict = tuple(array.data for array in verdict.values())
+        verdict: Array = np.zeros(3)
+        self._verdict = verdict.data
+        parts = {name: verdict[i : i + 1] for i, name in enumerate(("primal", "gap", "cost"))}
 
         x, u = guess.sample["x"], guess.sample["u"]
         moved = guess.arguments | {"x": guess.plan.x, "u": guess.plan.u, "places": self._found}
@@ -99,11 +100,11 @@ class ActiveSet:
         known |= _known(on_way | {"places_found": self._found, "targets": targets})
         self.move_on = bind(make(functions.move_on), {**embedded, **weighed, **limits, **known}, on_way | of_gains | rolled_out)
         judged = {**guess.start, "x0": guess.x0, "stages": stages, **plan, **guess.weights}
-        self.certify = bind(make(certificate), judged, {"r": slopes, **verdict})
+        self.certify = bind(make(certificate), judged, {"r": slopes, **parts})
         refined = {f"{name.removesuffix('_plan')}_refined": array for name, array in plan.items()}
         self.refine = bind(make(functions.refine), {**guess.start, **fixed, "r": slopes, **plan}, refined)
         self._best = tuple((np.zeros_like(array), array) for name, array in found.items() if name != "changes")
-        self.written = (*rolled_out.values(), slopes, *verdict.values())
+        self.written = (*rolled_out.values(), slopes, verdict)
         self._lowest = np.inf  # gap of the best plan, relative as `res_dual`
         self._stepped = False  # whether the interior point has been used for this QP
 
@@ -165,7 +166,7 @@ class ActiveSet:
     def _judged(self) -> QpStatus:
         """Certify the plan as it is."""
         self.certify()
-        primal, gap, cost = (part[0] for part in self._verdict)
+        primal, gap, cost = self._verdict
         self.res_prim, self.res_dual = primal, gap / (COST_FLOOR + cost)
         if primal <= MAX_VIOLATION and self.res_dual <= MAX_GAP:
             return SOLVED
@@ -244,7 +245,7 @@ class ActiveSet:
         """Improve the best plan by the interior point until it is certified or no step is left, and return its status."""
         self._stepped = True
         self._restore_best()
-        for start in (min(max(START_RANGE[0], self._verdict[1][0]), START_RANGE[1]), START_FAR):
+        for start in (min(max(START_RANGE[0], self._verdict[1]), START_RANGE[1]), START_FAR):
             self._start[0] = start
             self.enter()
             if self._hands_back():
@@ -263,7 +264,7 @@ class ActiveSet:
         interior, after = self._moved
         while self.steps < MAX_STEPS * self._qps:
             # To products that are small beside the cost, and no smaller: the stiffer the sides, the more digits are lost.
-            unit = (COST_FLOOR + self._verdict[2][0]) / self._places.size
+            unit = (COST_FLOOR + self._verdict[2]) / self._places.size
             self._least[0] = LEAST_SHARE * gap * unit
             self.step()
             self.steps += 1

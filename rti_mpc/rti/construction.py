@@ -25,7 +25,7 @@ from rti_mpc.rti.places import Places, places
 from rti_mpc.rti.qp.sequential import sequential
 from rti_mpc.rti.qp.simultaneous import simultaneous
 from rti_mpc.rti.qp.transcription import Transcription
-from rti_mpc.rti.turns import largest_steps
+from rti_mpc.rti.turns import largest_steps, unsettled
 
 FORMULATIONS = {"simultaneous": simultaneous, "sequential": sequential}
 
@@ -44,6 +44,7 @@ class Construction:
         cost: See `rti_mpc.rti.linearization.plan_cost`.
         output: Outputs at a node, ``(x, p) -> y``.
         steps: See `rti_mpc.rti.turns.largest_steps`.
+        unsettled: See `rti_mpc.rti.turns.unsettled`.
         made: The compiled functions by name.
         normalised: Arrays and factor of the cost by name as the first `Rti` has normalised the problem; empty until then.
     """
@@ -56,6 +57,7 @@ class Construction:
     cost: ca.Function
     output: ca.Function
     steps: ca.Function
+    unsettled: ca.Function
     made: dict[str, ca.Function]
     normalised: dict[str, Any] = field(default_factory=dict)
 
@@ -94,10 +96,11 @@ def construct(ocp: Ocp, formulation: str, structured: bool, build: str | None) -
     transcriptions = tuple(FORMULATIONS[formulation](ocp, softened=softened) for softened in (False, True)[: 2 if ocp.ng else 1])
     active_set = (places(ocp), certificate(ocp)) if structured else None
     moves, cost, output, steps = shift(ocp), plan_cost(ocp), ocp.model.h(), largest_steps(ocp)
+    turned = unsettled(ocp, output)
     relaxed = relaxation(ocp) if structured else None
-    native = [moves, cost, output, steps, *([] if relaxed is None else [relaxed]), *natives(transcriptions, active_set)]
+    native = [moves, cost, output, steps, turned, *([] if relaxed is None else [relaxed]), *natives(transcriptions, active_set)]
     made = dict(zip((f.name() for f in native), compiled(*native, build=build) if build else native, strict=True))
-    return Construction(x_nominal, transcriptions, active_set, moves, relaxed, cost, output, steps, made)
+    return Construction(x_nominal, transcriptions, active_set, moves, relaxed, cost, output, steps, turned, made)
 
 
 def natives(transcriptions: tuple[Transcription, ...], structured: tuple[Places, ca.Function] | None) -> list[ca.Function]:

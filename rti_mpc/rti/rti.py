@@ -162,7 +162,7 @@ class Rti:
         self._acceleration = None if built.relaxation is None else Acceleration(built.relaxation, self.guess, make)
         self.advance = bind(make(built.shift), {"x": x_plan, "u": self.u, "p": p}, {"x_next": x, "u_next": u})
         bounds = np.atleast_2d(self._weights["lbx"])[0], np.atleast_2d(self._weights["ubx"])[0]
-        self._turns = Turns(self.problem, (make(built.output), make(built.steps)), x, x0, self.y_ref, p, bounds)
+        self._turns = Turns(self.problem, (make(built.output), make(built.steps), make(built.unsettled)), x, x0, self.y_ref, p, bounds)
         self._cost: Array = np.zeros(1)
         self.evaluate = bind(make(built.cost), self.guess.arguments | {"x": x_plan, "u": self.u}, {"cost": self._cost})
         qps = [Qp(transcription, self.guess, make) for transcription in built.transcriptions]

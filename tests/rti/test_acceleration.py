@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 from rti_mpc.array import Array
+from rti_mpc.codegen import bind, compiled
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.rti.acceleration import LARGE_STEP, MAX_RELAXATION, MIN_RELAXATION, relaxation
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.bench.families import cart_pole, discs_passed
 from tests.problems import pioneer
+from tests.rti.test_recursion import needs_compiler
 
 ROUNDING = 1e-12  # relative
 
@@ -53,6 +55,21 @@ def test_factor_of_steps_in_different_directions_is_that_along_the_first_one(ocp
     x, step, across = np.zeros((4, 5)), np.full((3, 2), 0.01), np.tile([0.01, -0.01], (3, 1))
     relaxed = next_guess(ocp, x, np.zeros((3, 2)), x, 0.5 * step + 0.9 * across, step)[3]
     assert relaxed == pytest.approx(2.0, rel=ROUNDING)
+
+
+@pytest.mark.parametrize("machine", ["virtual", pytest.param("own", marks=needs_compiler)])
+def test_next_guess_may_lie_where_the_guess_lay(ocp: Ocp, machine: str) -> None:
+    rng, relax = np.random.default_rng(3), relaxation(ocp)
+    (fast,) = compiled(relax) if machine == "own" else [relax]
+    given = {name: 0.1 * rng.normal(size=relax.size_in(name)[::-1]) for name in relax.name_in()}
+    given |= {"omega": np.array([1.2]), "scale": np.ones(relax.size_in("scale")[0])}
+    given |= {bound: np.full(relax.size_in(bound)[::-1], side) for bound, side in (("lbx", -9.0), ("lbu", -9.0), ("ubx", 9.0), ("ubu", 9.0))}
+    apart = {name: np.zeros(relax.size_out(name)[::-1]) for name in relax.name_out()}
+    bind(fast, given, apart)()
+    bind(fast, given, {name: given[name.removesuffix("_next")] for name in apart})()
+    for name, expected in apart.items():
+        np.testing.assert_array_equal(given[name.removesuffix("_next")].ravel(), expected.ravel(), err_msg=name)
+    assert apart["omega_next"] > 1.0
 
 
 def test_second_guess_of_a_sample_is_the_plan_to_the_last_bit(ocp: Ocp) -> None:

@@ -160,6 +160,29 @@ def test_angle_with_bounds_is_taken_in_the_turn_of_its_bounds(solver: str, middl
     assert rti.u[0, 0] > 0.1  # rad/s, the short way
 
 
+@pytest.mark.parametrize("bounds", [{}, {"lbx": [-1.5, -np.inf, -np.inf], "ubx": [1.5, np.inf, np.inf]}], ids=["free", "bounded"])
+def test_nothing_is_turned_where_all_is_near_and_then_the_errors_are_the_same(bounds: dict[str, Any]) -> None:
+    """The compiled look at a sample, which spares turning, against turning."""
+    rng, rti, settled = np.random.default_rng(4), Rti(arm(**bounds), compile=False), 0
+    turns = rti._turns
+    for _ in range(300):
+        rti.x0[:], rti.guess.sample["x"][0], rti.y_ref[0] = rng.uniform(-3.0, 3.0, 3), rng.uniform(-3.0, 3.0, 3), rng.uniform(-6.0, 6.0, 2)
+        known = turns._errors[:] = [rng.uniform(-4.0, 4.0), 0.0]
+        kept = rti.x0.copy(), rti.y_ref.copy()
+        turns._look()
+        seen = turns._errors.copy()
+        if turns._unsettled[0]:
+            np.testing.assert_array_equal(seen, known)
+            continue
+        settled += 1
+        turns._errors[:] = known
+        assert not turns._turn()
+        for array, before in zip((rti.x0, rti.y_ref), kept, strict=True):
+            np.testing.assert_array_equal(array, before)
+        assert turns._errors[0] == seen[0]
+    assert 20 < settled < 280
+
+
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_angle_in_degrees_turns_at_360(solver: str) -> None:
     """A turret commanded in degrees, its states and references wrapped there, does what one in rad does."""
