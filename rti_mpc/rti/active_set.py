@@ -20,7 +20,6 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.codegen import bind
 from rti_mpc.contract.status import QpStatus
-from rti_mpc.rti.homotopy import LIMITS
 from rti_mpc.rti.places import Places
 from rti_mpc.rti.qp.qp import Guess
 
@@ -63,63 +62,51 @@ class ActiveSet:
     """
 
     def __init__(self, functions: Places, certificate: ca.Function, guess: Guess, make: Callable[[ca.Function], ca.Function]) -> None:
-        stages: Array = np.zeros(functions.linearize.numel_out("stages"))
-        gains: Array = np.zeros(functions.gains.numel_out("gains"))
-        # As with guess and plan: a roll-out reads the places and writes those found, and `advance` shifts the found ones by a stage.
-        self._places: Array = np.zeros(functions.roll_out.numel_out("places_found"))
-        self._found = np.zeros_like(self._places)
-        changes: Array = np.zeros(1)
-        self._changes = changes.data
-        multipliers: Array = np.zeros(functions.roll_out.numel_out("multipliers"))
-        slopes = np.zeros_like(guess.plan.u)
         verdict: Array = np.zeros(3)
-        self._verdict = verdict.data
         parts = {name: verdict[i : i + 1] for i, name in enumerate(("primal", "gap", "cost"))}
+        arrays = guess.arguments | guess.plan.outputs() | parts | {"x0": guess.x0, "start": np.zeros(1), "least": np.zeros(1)}
+        for function in (*vars(functions).values(), certificate):
+            arrays |= {name: np.zeros(function.numel_out(name)) for name in function.name_out() if name not in arrays}
+        found = {name: arrays[name] for name in ("x_plan", "u_plan", "violation", "change", "places_found", "multipliers")}
+        inside = {f"{name}_inside": np.zeros_like(array) for name, array in found.items()}  # the same of the interior point
+        first = {f"{name}_first": np.zeros_like(arrays[name]) for name in ("places", "places_found", "targets")}  # of the QP's first roll-out
+        arrays |= inside | first | {"way": np.zeros_like(arrays["places"]), "nowhere": np.full_like(arrays["places"], np.nan)}
+        arrays["gradient"] = np.zeros(functions.gains.numel_out("p"))  # of the cost-to-go; p alone is that of the stages
 
-        x, u = guess.sample["x"], guess.sample["u"]
-        moved = guess.arguments | {"x": guess.plan.x, "u": guess.plan.u, "places": self._found}
-        fixed = {"stages": stages, "gains": gains, **guess.weights, "places": self._places}
-        plan = {"x_plan": guess.plan.x, "u_plan": guess.plan.u, "multipliers": multipliers}
-        targets, way, self._point = (np.zeros_like(self._places) for _ in range(3))
-        found = {**guess.plan.outputs(), "changes": changes, "places_found": self._found, "multipliers": multipliers}
-        rolled_out = {**found, "targets": targets}
-        first = tuple(np.zeros_like(self._places) for _ in range(3))  # of the QP's first roll-out, where the homotopy begins
-        self._keep_first = tuple(zip(first, (self._places, self._found, targets), strict=True))
-        self._take_first = tuple(zip((way, self._found, targets), first, strict=True))
-        self.advance = bind(make(functions.advance), moved, {"x_next": x, "u_next": u, "places_next": self._places, "stages": stages})
-        self.linearize = bind(make(functions.linearize), guess.arguments, {"stages": stages})
-        weighed, embedded = {"stages": stages, "u": u, **guess.weights}, {**guess.start, "x0": guess.x0}
-        of_gains = {"gains": gains, "places_of": self._places} | {name: np.zeros(functions.gains.numel_out(name)) for name in ("P", "p")}
-        known = _known(of_gains)
-        anew = known | {"places_of_known": np.full_like(self._places, np.nan)}
-        self.gain = bind(make(functions.gains), {**weighed, "places": self._places, **anew}, of_gains)
-        self.roll_out = bind(make(functions.roll_out), {**embedded, **fixed}, rolled_out)
-        self.roll_out_again = bind(make(functions.roll_out_again), {**embedded, **weighed, "places": self._found, **known}, of_gains | rolled_out)
-        on_way, limits = {"places": way, "point": self._point}, {name: np.zeros_like(way) for name in LIMITS}
-        self.begin_homotopy = bind(make(functions.begin), {**weighed, "places": way, "targets": targets}, {"point": self._point, **limits})
-        known |= _known(on_way | {"places_found": self._found, "targets": targets})
-        self.move_on = bind(make(functions.move_on), {**embedded, **weighed, **limits, **known}, on_way | of_gains | rolled_out)
-        judged = {**guess.start, "x0": guess.x0, "stages": stages, **plan, **guess.weights}
-        self.certify = bind(make(certificate), judged, {"r": slopes, **parts})
-        refined = {f"{name.removesuffix('_plan')}_refined": array for name, array in plan.items()}
-        self.refine = bind(make(functions.refine), {**guess.start, **fixed, "r": slopes, **plan}, refined)
-        self._best = tuple((np.zeros_like(array), array) for name, array in found.items() if name != "changes")
-        self.written = (*rolled_out.values(), slopes, verdict)
+        def call(function: ca.Function, **elsewhere: str) -> Callable[[], None]:
+            """Bind a function to the arrays of its names, or to others; what it takes as known is what it has written last."""
+            inputs, outputs = (
+                {name: arrays[elsewhere.get(name, name.removesuffix("_known"))] for name in names}
+                for names in (function.name_in(), function.name_out())
+            )
+            return bind(make(function), inputs, outputs)
+
+        # As with guess and plan: a roll-out reads the places and writes those found, and `advance` shifts the found ones by a stage.
+        shifted = {"x_next": "x", "u_next": "u", "places_next": "places"}
+        self.advance = call(functions.advance, x="x_plan", u="u_plan", places="places_found", **shifted)
+        self.linearize = call(functions.linearize)
+        of_gains = {"places_of_known": "places", "places_of": "places", "p_known": "gradient", "p": "gradient"}
+        self.gain = call(functions.gains, **of_gains | {"places_of_known": "nowhere"})
+        self.roll_out = call(functions.roll_out)
+        self.roll_out_again = call(functions.roll_out_again, places="places_found", **of_gains)
+        self.begin_homotopy = call(functions.begin, places="way")
+        self.move_on = call(functions.move_on, places_known="way", places="way", **of_gains)
+        self.certify = call(certificate)
+        self.refine = call(functions.refine, **{f"{name.removesuffix('_plan')}_refined": name for name in ("x_plan", "u_plan", "multipliers")})
+        self.enter = call(functions.enter)
+        self.step = call(functions.step, **{name: f"{name}_inside" for name in found})
+
+        self._places, self._found, self._point = arrays["places"], arrays["places_found"], arrays["point"]
+        self._start, self._least = arrays["start"], arrays["least"]
+        self._changes, self._product, self._verdict = arrays["changes"].data, arrays["product"].data, verdict.data  # read faster than arrays
+        self._moved = arrays["interior"].data, arrays["interior_after"].data
+        self._keep_first = tuple((array, arrays[name.removesuffix("_first")]) for name, array in first.items())
+        self._take_first = tuple(zip((arrays["way"], self._found, arrays["targets"]), first.values(), strict=True))
+        self._interior_pairs = tuple(zip(found.values(), inside.values(), strict=True))
+        self._best = tuple((np.zeros_like(array), array) for array in found.values())
+        self.written = (*found.values(), arrays["changes"], arrays["targets"], arrays["r"], verdict)
         self._lowest = np.inf  # gap of the best plan, relative as `res_dual`
         self._stepped = False  # whether the interior point has been used for this QP
-
-        start: Array = np.zeros(1)
-        self._start = start
-        interior: Array = np.zeros(functions.enter.numel_out("interior"))
-        after, mean = np.zeros_like(interior), np.zeros(1)
-        interior_plan = {name: np.zeros_like(array) for name, array in found.items() if name != "changes"}
-        self._moved, self._product = (interior.data, after.data), mean.data
-        self._interior_pairs = tuple((found[name], array) for name, array in interior_plan.items())
-        entered = {**guess.start, "stages": stages, **guess.weights}
-        self.enter = bind(make(functions.enter), {**entered, "x_plan": guess.plan.x, "u_plan": guess.plan.u, "start": start}, {"interior": interior})
-        self._least = np.zeros(1)
-        stepped = {"interior_after": after, "product": mean, **interior_plan}
-        self.step = bind(make(functions.step), {**entered, "x0": guess.x0, "interior": interior, "least": self._least}, stepped)
         self._qps = self.steps = self.roll_outs = 0
         self.iterations = 0
         self.res_prim = self.res_dual = 0.0
@@ -289,8 +276,3 @@ class ActiveSet:
             if self._changes[0] <= 0.0:
                 break
         return self._changes[0] == 0.0 and self._judged() is SOLVED
-
-
-def _known(arrays: dict[str, Array]) -> dict[str, Array]:
-    """Return the arrays of results as the arguments in which a function finds those of its last call."""
-    return {f"{name}_known": array for name, array in arrays.items()}
