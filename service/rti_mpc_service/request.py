@@ -190,7 +190,7 @@ def parse_assignments(assignments: Sequence[str]) -> dict[str, Any]:
         try:
             values[key] = toml.read_value(value)
         except ConfigError:
-            raise ConfigError(f"{rule}, got {f'{key}={value}'!r}") from None
+            raise ConfigError(f"{rule}, got {f'{key}={value}'!r}{toml.advice(f'{key}={value}')}") from None
     for key, value in to_json(values).items():
         if not all(math.isfinite(number) for number in (value if isinstance(value, list) else [value]) if isinstance(number, float)):
             raise ConfigError(f"{key} must be finite, except for an absent bound, [-inf, upper] or [lower, inf], got {toml.text(values[key])}")

@@ -1,20 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""TOML: reading with a limit on nesting, and writing a configuration, so that a run can store its own."""
+"""TOML: reading with a limit on nesting and advice on common slips, and writing a configuration, so that a run can store its own."""
 
 from __future__ import annotations
 
 import json
 import math
+import re
 import tomllib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from rti_mpc.errors import ConfigError
+from rti_mpc.given import quoted
 
 if TYPE_CHECKING:
     from rti_mpc_service.config.schema import Config
 
 MAX_NESTING = 16  # levels of tables and lists inside each other; a configuration has five
+POSITION = re.compile(r" \(at (line (\d+), column \d+)\)$")  # at the end of the parser's words
+
+# Slips, as they are common in other formats, and what TOML has there: the parser's words tell only where it gave up.
+SLIPS = (
+    (r"^Cannot (declare|overwrite)", "each key and each table stands once"),  # this one in the parser's words, all others in the line
+    (r"=\s*[-+]?\d+,\d", "decimals take a point, as in 0.5"),
+    (r"=\s*[-+]?(\.\d|\d+\.(?!\d))", "a number has a digit on both sides of its point"),
+    (r"(?i)=\s*(true|false|yes|no|on|off|none|null)\b", "a switch is true or false, in small letters, and a key without a value is left out"),
+    (r"=\s*\(", "a list is in square brackets"),
+    (r"\{[^}]*$", "a table in braces ends on the line on which it begins"),
+    (r",\s*\}", "a table in braces has no comma at its end"),
+    (r"""^[^"'=]*=\s*(["'])(?!.*\1)""", "text ends with the quote with which it began"),
+    (r"=\s*[^\W\d]|[\u2018-\u201f]", "text is in straight quotes"),
+    (r"=\s*[-+]?\d[\d.]*\s*[^\W\d]", "a number has no unit"),
+    (r"^\s*[\w.-]+\s*:", "a key and its value are joined by ="),
+)
 
 
 def read(text: str) -> dict[str, Any]:
@@ -27,12 +45,27 @@ def read(text: str) -> dict[str, Any]:
     try:
         content = tomllib.loads(text)
     except ValueError as error:  # of a number with thousands of digits, too
-        raise ConfigError(f"must be TOML, got {error}") from None
+        raise ConfigError(f"must be TOML, got {located(str(error), text)}") from None
     except RecursionError:
         content = None
     if content is None or too_deep(content):
         raise ConfigError(f"must be TOML of at most {MAX_NESTING} tables and lists inside each other")
     return content
+
+
+def located(complaint: str, text: str) -> str:
+    """Return a complaint of the parser with the line that it is about, and advice on it."""
+    if (position := POSITION.search(complaint)) is None:
+        return complaint
+    place, number = position.groups()
+    words, line = complaint[: position.start()], text.split("\n")[int(number) - 1]
+    content = line.partition("#")[0].strip() or line.strip()
+    return f"{quoted(content)} at {place}{advice(words) or advice(content) or f': {words}'}"
+
+
+def advice(text: str) -> str:
+    """Return what TOML has in place of a slip, to be appended; empty if none is known."""
+    return next((f": {rule}" for slip, rule in SLIPS if re.search(slip, text)), "")
 
 
 def read_value(text: str) -> Any:

@@ -193,7 +193,7 @@ def overridden(config: Config, ocp: Ocp, assignments: Sequence[str]) -> dict[str
         try:
             table[name] = toml.read_value(value)
         except ConfigError:
-            raise ConfigError(f"--set must be KEY=VALUE, the value as in the file, got {f'{key}={value}'!r}") from None
+            raise ConfigError(f"--set must be KEY=VALUE, the value as in the file, got {f'{key}={value}'!r}{toml.advice(f'{key}={value}')}") from None
     try:
         changed = Config.model_validate(document)
         check_tree(changed)

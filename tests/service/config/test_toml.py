@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from rti_mpc.errors import ConfigError
 from rti_mpc_service.config import toml
 from rti_mpc_service.config.config import load
 from rti_mpc_service.shipped import SHIPPED
@@ -70,3 +71,36 @@ def test_any_text_is_written_as_toml_reads_it(value: str) -> None:
 
 def test_path_whose_bytes_are_no_text_is_written_without_them() -> None:
     assert toml.text("run-\udcff.csv").encode() == b'"run-?.csv"'
+
+
+SLIPS = {
+    "dt_s = 0,05  # of a stage": "decimals take a point",
+    "Q = { x = 1,0, y = 2,0 }": "decimals take a point",
+    "dt_s = .05": "a digit on both sides",
+    "dt_s = 1.": "a digit on both sides",
+    "dt_s = 50ms": "a number has no unit",
+    "dt_s: 0.05": "are joined by =",
+    "enabled = True": "a switch is true or false",
+    "path = none": "a key without a value is left out",
+    "robot = pioneer": "text is in straight quotes",
+    "robot = “pioneer”": "text is in straight quotes",
+    'robot = "pioneer': "with which it began",
+    "u = (-0.5, 0.5)": "a list is in square brackets",
+    "Q = { x = 1.0,": "ends on the line on which it begins",
+    "Q = { x = 1.0, }": "has no comma at its end",
+    "robot = 'twice'": "each key and each table stands once",
+}
+
+
+@pytest.mark.parametrize("line", SLIPS)
+def test_slip_is_told_with_its_line_and_with_what_toml_has_there(line: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        toml.read(f"robot = 'first'\n\n[ocp]\n{line}\ny = 2.0 }}\n" if "twice" not in line else f"robot = 'first'\n\n\n{line}\n")
+    content = line.partition("  #")[0]
+    assert str(refused.value).startswith(f"must be TOML, got {content!r} at line 4, column ")
+    assert SLIPS[line] in str(refused.value)
+
+
+@pytest.mark.parametrize("line", ["u = [1,2,3] 4", "[ocp", "text = 'a, b' 'c'", "x = 1 # 0,5 } {"])
+def test_no_advice_is_given_on_what_is_no_known_slip(line: str) -> None:
+    assert toml.advice(line.partition("#")[0].rstrip()) == ""
