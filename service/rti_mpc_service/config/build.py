@@ -17,7 +17,7 @@ import numpy as np
 
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.config.assignments import assigned_numbers
-from rti_mpc_service.config.refusal import unknown_name
+from rti_mpc_service.config.refusal import unknown_signal
 from rti_mpc_service.config.schema import ITERATION_KEYS, OWN_KEYS, Config
 
 if TYPE_CHECKING:
@@ -271,8 +271,10 @@ def with_initial_state(config: Config, assignments: Sequence[str]) -> Config:
         ConfigError: An assignment is not valid, or the model has no such state.
     """
     given = assigned_numbers("--x0 must be NAME=VALUE, the value a finite number in the state's unit", assignments)
-    if wrong := unknown_name("sim.x0", given, "state", build_model(config).states, complete=False):
-        raise ConfigError(wrong)
+    states = build_model(config).states
+    if unknown := given.keys() - {state.name for state in states}:
+        name = min(unknown, key=list(given).index)
+        raise ConfigError(f"--x0 {name} is {unknown_signal(name, 'state', states)}, got {given[name]:g}")
     return config.model_copy(update={"sim": config.sim.model_copy(update={"x0": {**config.sim.x0, **given}})})
 
 

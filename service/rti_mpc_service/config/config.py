@@ -11,6 +11,7 @@ against the model (`rti_mpc_service.config.fit`), which ends with building the `
 from __future__ import annotations
 
 import os
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from rti_mpc_service.config import toml
 from rti_mpc_service.config.fit import check_model, check_tree
 from rti_mpc_service.config.refusal import explain
 from rti_mpc_service.config.schema import Config
+from rti_mpc_service.shipped import ROBOTS
 
 
 def load(path: Path, *, with_model: bool = True) -> Config:
@@ -35,7 +37,10 @@ def load(path: Path, *, with_model: bool = True) -> Config:
     Raises:
         ConfigError: One line: the file, the key, what must hold, what was got.
     """
-    content = read_text_file(path, "TOML")
+    try:
+        content = read_text_file(path, "TOML")
+    except ConfigError as error:
+        raise ConfigError(f"{error}{meant_by(path)}") from error
     document: dict[str, Any] = {}
     try:
         document = toml.read(content)
@@ -57,3 +62,12 @@ def load(path: Path, *, with_model: bool = True) -> Config:
     except (ConfigError, OcpError) as error:
         raise ConfigError(f"{path}: {error}") from error
     return config
+
+
+def meant_by(path: Path) -> str:
+    """Return which file was probably meant by one that is missing, in the same folder or of a robot that ships, to be appended; empty if none was."""
+    if os.path.lexists(path):
+        return ""
+    beside = {file.stem: file for file in sorted(path.parent.glob("*.toml"))}
+    near = [beside[stem] for stem in get_close_matches(path.stem, beside, 1)] or [ROBOTS[name] for name in ROBOTS if name == path.stem]
+    return f", perhaps {near[0]} is meant" if near else ""

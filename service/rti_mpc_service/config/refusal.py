@@ -19,7 +19,7 @@ MAX_QUOTED_CHARACTERS = 200  # of a value in a refusal
 REWORDINGS = (
     (r"^Value error, ", ""),
     (r"^(Input|String) should ", "must "),
-    (r"be a valid dictionary.*", "be a table"),
+    (r"be a valid dictionary.*", "be a table, such as { name = 1.0 }"),
     (r"be a valid tuple", "be a list"),
     (r"be a valid string", "be text"),
     (r"be a valid integer", "be a whole number"),
@@ -27,6 +27,7 @@ REWORDINGS = (
     (r"be a valid boolean", "be true or false"),
     (r"greater than or equal to", "at least"),
     (r"less than or equal to", "at most"),
+    (r"match pattern .*", "be written so"),  # as its description says
 )
 
 
@@ -82,11 +83,16 @@ def unknown_name(key: str, table: Mapping[str, object], kind: str, signals: Sequ
     units = {signal.name: f"{signal.name} [{signal.unit}]" for signal in signals}
     for name, got in table.items():
         if name not in units:
-            near = [units[n] for n in get_close_matches(name, units, 1)]
-            meaning = f"perhaps {near[0]} is meant" if near else list_known(units.values())
-            return f"{key}.{name} is no {kind} of the model, {meaning}, got {quoted(got)}"
+            return f"{key}.{name} is {unknown_signal(name, kind, signals)}, got {quoted(got)}"
     missing = [unit for name, unit in units.items() if complete and name not in table]
     return f"{key} must name every {kind} of the model, {missing[0]} is missing, got {quoted(dict(table))}" if missing else None
+
+
+def unknown_signal(name: str, kind: str, signals: Sequence[Signal]) -> str:
+    """Return what a name is instead of that of a signal: `no state of the model`, and what was probably meant."""
+    units = {signal.name: f"{signal.name} [{signal.unit}]" for signal in signals}
+    near = [units[n] for n in get_close_matches(name, units, 1)]
+    return f"no {kind} of the model, {f'perhaps {near[0]} is meant' if near else list_known(units.values())}"
 
 
 def entries(tree: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str]]:

@@ -43,3 +43,15 @@ def test_parameter_without_a_key_is_refused() -> None:
     with pytest.raises(ConfigError, match="params must be set by KEY=VALUE, the value as in the file, got '=3'"):
         parse_assignments(["=3"])
     assert parse_assignments(["ocp.bounds.states.u=[-inf, 1.0]"]) == {"ocp.bounds.states.u": [-math.inf, 1.0]}
+
+
+def test_decimal_comma_of_a_parameter_is_told() -> None:
+    with pytest.raises(ConfigError, match=r"got 'ocp\.weights\.Q\.x=0,5': decimals take a point"):
+        parse_assignments(["ocp.weights.Q.x=0,5"])
+
+
+@pytest.mark.parametrize(("given", "meant"), [("phi=1", "perhaps psi [rad] is meant, got 1"), ("q=2", "known: x [m], y [m], psi [rad], u [m/s]")])
+def test_initial_state_that_the_model_lacks_is_told_by_the_option_as_it_was_typed(given: str, meant: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        with_initial_state(load(SHIPPED), ["x=1", given])
+    assert str(refused.value).startswith(f"--x0 {given.partition('=')[0]} is no state of the model, {meant}")

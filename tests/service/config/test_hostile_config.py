@@ -15,7 +15,7 @@ from rti_mpc.reference.trajectory import find_trajectory
 from rti_mpc.wire.session import BusSettings, zenoh_config
 from rti_mpc_service.config.config import load
 from rti_mpc_service.request import parse_assignments
-from rti_mpc_service.shipped import SHIPPED
+from rti_mpc_service.shipped import ROBOTS, SHIPPED
 from tests.command import command
 
 TEXT = SHIPPED.read_text()
@@ -48,7 +48,7 @@ FILES: dict[str, tuple[Callable[[Path], object], str]] = {
     "huge": (huge, "must be TOML of at most 131072 bytes, got 1099511627776"),
     "not UTF-8": (lambda path: path.write_bytes(TEXT.encode() + b"# J\xfcrgen"), "must be TOML in UTF-8, got byte 0xfc after"),
     "UTF-16": (lambda path: path.write_text(TEXT, encoding="utf-16"), "must be TOML in UTF-8, got byte 0xff after 0 others"),
-    "zeros": (lambda path: path.write_bytes(bytes(4096)), "must be TOML, got Invalid statement"),
+    "zeros": (lambda path: path.write_bytes(bytes(4096)), "at line 1, column 1: Invalid statement"),
     "deep list": (
         lambda path: path.write_text(f"a = {'[' * NESTING_DEPTH}{']' * NESTING_DEPTH}"),
         "must be TOML of at most 16 tables and lists inside each other",
@@ -56,7 +56,7 @@ FILES: dict[str, tuple[Callable[[Path], object], str]] = {
     "open list": (lambda path: path.write_text(f"a = {'[' * NESTING_DEPTH}"), "must be TOML of at most 16 tables and lists inside each other"),
     "deep table": (lambda path: path.write_text("a" + ".a" * 2000 + " = 1"), "must be TOML of at most 16 tables and lists inside each other"),
     "deep inside": (lambda path: path.write_text(TEXT + "\n[sim]\nx0.x = " + "[" * 20 + "]" * 20), "at most 16 tables and lists"),
-    "twice": (lambda path: path.write_text(TEXT + '\n[model]\nname = "pioneer_3dx"\n'), "must be TOML, got Cannot declare"),
+    "twice": (lambda path: path.write_text(TEXT + '\n[model]\nname = "pioneer_3dx"\n'), "must be TOML, got '[model]' at line"),
 }
 
 
@@ -92,6 +92,17 @@ VALUES = [
     ("u_c = [-0.5, 0.5]", f"u_c = [-1, 1{'0' * 400}]", ["ocp.bounds.inputs.u_c"]),
     ("u_c = [-0.5, 0.5]", "u_c = [true, false]", ["ocp.bounds.inputs.u_c", "two numbers"]),
     ('robot = "pioneer"', 'robot = ""', ["robot", "letters, digits"]),
+    ('robot = "pioneer"', 'robot = "my robot"', ["robot (", "letters, digits", "must be written so, got 'my robot'"]),
+    (
+        'robot = "pioneer"',
+        'robot = "pioneer"\n[bus]\nconnect = ["tcp://127.0.0.1:7447"]',
+        ["bus.connect[0]", "such as tcp/127.0.0.1:7447) must be written so"],
+    ),
+    (
+        "Q = { x = 1.0, y = 1.0, psi = 0.05 }",
+        "Q = [1.0, 1.0, 0.05]",
+        ["ocp.weights.Q (", "must be a table, such as { name = 1.0 }, got [1.0, 1.0, 0.05]"],
+    ),
     ('robot = "pioneer"', 'robot = "a\\u0000b"', ["robot", "letters, digits"]),
     ('robot = "pioneer"', f'robot = "{"a" * 50_000}!"', ["robot", "letters, digits", "..."]),
     ('robot = "pioneer"', 'robot = "pioneer"\n"a\\nb\\u001b[2J" = 1', ["is unknown"]),
@@ -160,3 +171,18 @@ def test_zenoh_file_of_many_brackets_is_refused_and_ends_no_process(tmp_path: Pa
 def test_parameter_that_is_no_value_is_one_line(value: str) -> None:
     with pytest.raises(ConfigError, match="params must be set by KEY=VALUE"):
         parse_assignments([f"ocp.weights.Q.x={value}"])
+
+
+@pytest.mark.parametrize("typed", ["my_robot", "my-robot.toml", "my_robt.toml", "my_robot.py"])
+def test_file_that_was_probably_meant_is_told(typed: str, tmp_path: Path) -> None:
+    for name in ("car.toml", "my_robot.toml"):
+        (tmp_path / name).write_text(TEXT)
+    with pytest.raises(ConfigError) as refusal:
+        load(tmp_path / typed)
+    assert str(refusal.value).startswith(f"{tmp_path / typed}: must be a readable file, got No such file or directory, ")
+    assert str(refusal.value).endswith(f", perhaps {tmp_path / 'my_robot.toml'} is meant")
+
+
+def test_robot_that_ships_is_told_by_its_file() -> None:
+    with pytest.raises(ConfigError, match=f"got No such file or directory, perhaps {ROBOTS['boat']} is meant"):
+        load(Path("boat"))
