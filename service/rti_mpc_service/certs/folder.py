@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rti_mpc.errors import ConfigError
+from rti_mpc.wire.credentials import check
 from rti_mpc_service.certs.roles import ROLES_OF_COMMAND
 
 if TYPE_CHECKING:
@@ -45,3 +46,18 @@ def secured(settings: BusSettings, folder: Path, command: str) -> BusSettings:
         raise ConfigError(f"tls: a private key must be for its owner alone (chmod 600), got {key}, which everybody may use")
     config = settings.config or (zenoh if zenoh.exists() else None)
     return replace(settings, config=config, authority=folder / AUTHORITY, certificate=folder / f"{role}.pem", key=key)
+
+
+def renewal(path: Path) -> str:
+    """Return how a certificate that ends is renewed."""
+    return "make a new authority and new bundles" if path.name == AUTHORITY else "`rti-mpc certs renew`, then restart its process"
+
+
+def misfit(path: Path) -> str:
+    """Return why a certificate does not fit the private key and the authority beside it, as far as this user may read them; empty if it does."""
+    authority, key = path.with_name(AUTHORITY), path.with_suffix(".key")
+    try:
+        check(authority if path != authority and authority.exists() else None, path, key if os.access(key, os.R_OK) else None)
+    except ConfigError as error:
+        return str(error).removeprefix("tls: ")
+    return ""

@@ -10,10 +10,11 @@ from pathlib import Path
 
 from rti_mpc.errors import ConfigError, reason
 from rti_mpc.whole_file import replaced
+from rti_mpc.wire.certificate import WARN_DAYS
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.certs.access import host_and_port, zenoh_configuration
 from rti_mpc_service.certs.authority import Authority, days_left, name_of, new_key, pem, read_certificate
-from rti_mpc_service.certs.folder import AUTHORITY
+from rti_mpc_service.certs.folder import AUTHORITY, misfit, renewal
 from rti_mpc_service.certs.roles import common_name
 
 LOCAL = ("localhost", "127.0.0.1", "::1")  # at which processes on the router's own host reach it
@@ -110,15 +111,24 @@ def renew(authority: Authority, folder: Path, days: float) -> list[Path]:
     return paths
 
 
-def lives(folder: Path) -> list[tuple[str, str, float]]:
+def shown(folder: Path) -> list[tuple[str, bool]]:
     """
-    Return file, name and days left of each certificate in a folder.
+    Return a line about each certificate in a folder, and whether it is to be replaced: it ends soon, or does not fit its key, authority or role.
 
     Raises:
         ConfigError: There is none, or one is none.
     """
-    certificates = {path: read_certificate(path) for path in certificates_in(folder)}
-    return [(path.name, name_of(certificate), days_left(certificate)) for path, certificate in certificates.items()]
+    lines = []
+    for path in certificates_in(folder):
+        certificate = read_certificate(path)
+        name, days = name_of(certificate), days_left(certificate)
+        when = f"{certificate.not_valid_after_utc:%Y-%m-%d at %H:%M} UTC"
+        left = f"valid for {days:.1f} days, until {when}" if days > 0.0 else f"has ended on {when}"
+        role = "" if path.name == AUTHORITY or name.startswith(f"{path.stem}@") else f"it is for another role than {path.stem}"
+        soon = "" if days >= WARN_DAYS else renewal(path)
+        faults = [fault for fault in (role, misfit(path) if days > 0.0 else "", soon) if fault]
+        lines.append((": ".join((f"{path}: {name}, {left}", *faults)), bool(faults)))
+    return lines
 
 
 def certificates_in(folder: Path) -> list[Path]:

@@ -67,13 +67,10 @@ def certs_renew(
 
 @certs.command("show")
 def certs_show(folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Folders with certificates.")]) -> None:
-    """Print until when certificates are valid; the status is 1 if one of them ends within 30 days."""
-    from rti_mpc.wire.certificate import WARN_DAYS
-    from rti_mpc_service.certs.issue import lives
+    """Print until when certificates are valid; the status is 1 if one ends within 30 days, or does not fit its key, authority or role."""
+    from rti_mpc_service.certs.issue import shown
 
-    left_days = [float("inf")]
-    for folder in folders:
-        for file, name, days in lives(folder):
-            typer.echo(f"{folder / file}: {name}, " + (f"valid for {days:.1f} days" if days > 0.0 else "expired"))
-            left_days.append(days)
-    raise typer.Exit(int(min(left_days) < WARN_DAYS))
+    lines = [line for folder in folders for line in shown(folder)]
+    for text, _ in lines:
+        typer.echo(text)
+    raise typer.Exit(int(any(to_do for _, to_do in lines)))

@@ -23,7 +23,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.wire.certificate import WARN_DAYS, ends
 from rti_mpc.wire.handshake import ADDRESS, openness
 from rti_mpc.wire.session import BusSettings, all_endpoints, denies, open_endpoints
-from rti_mpc_service.certs.folder import credentials
+from rti_mpc_service.certs.folder import credentials, misfit, renewal
 from rti_mpc_service.config.build import bus_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
@@ -142,19 +142,20 @@ def switches(subject: Examined) -> Iterator[Opening]:
 
 
 def certificates(subject: Examined) -> Iterator[Opening]:
-    """Which certificates end soon or have ended, and who may read private keys."""
+    """Which certificates end soon, have ended or do not fit, and who may read private keys."""
     if subject.tls is not None and not any(subject.tls.glob("*.pem")):
         yield Opening("certificates", f"{subject.tls} has none: no process of this host starts with it", CERTIFY)
     for path in sorted(subject.tls.glob("*.pem")) if subject.tls else ():
-        cure = "make a new authority and new bundles" if path.name == "authority.pem" else "`rti-mpc certs renew`, then restart its process"
         try:
             left = ends(path) - datetime.now(UTC)
         except ConfigError as error:
-            yield Opening("certificate", str(error), cure)
+            yield Opening("certificate", str(error), renewal(path))
             continue
         if left < timedelta(days=WARN_DAYS):
             when = f"ends in {left / timedelta(days=1):.1f} days" if left > timedelta() else "has ended"
-            yield Opening("certificate", f"{path} {when}", cure)
+            yield Opening("certificate", f"{path} {when}", renewal(path))
+        if left > timedelta() and (fault := misfit(path)):
+            yield Opening("certificate", fault, "no process starts with it: take all files of a role from one `rti-mpc certs issue`")
     for path in sorted(subject.tls.glob("*.key")) if subject.tls else ():
         if others := may(path, 0o077):
             yield Opening("private key", f"{path} is for {others}, too", f"chmod 600 {path}; make a new one if others may have read it")

@@ -23,7 +23,9 @@ from rti_mpc_service.shipped import SHIPPED
 
 pytest.importorskip("cryptography", reason="the extra certs is not installed: certificates were NOT tried")
 
-from rti_mpc_service.certs.authority import Authority, addresses_of, days_left, name_of, read_certificate
+from cryptography.hazmat.primitives import serialization
+
+from rti_mpc_service.certs.authority import Authority, addresses_of, days_left, name_of, pem, read_certificate
 from rti_mpc_service.certs.issue import issue, make_authority, renew
 
 KEYS = Keys()
@@ -34,6 +36,11 @@ ROUTER = "tls/robot.local:7447"
 def authority(tmp_path: Path) -> Authority:
     make_authority(tmp_path / "authority", 100.0)
     return Authority.read(tmp_path / "authority")
+
+
+def key_of(path: Path) -> Any:
+    """Return the public half of a private key."""
+    return serialization.load_pem_private_key(path.read_bytes(), None).public_key()
 
 
 def make(authority: Authority, folder: Path, *roles: str, days: float = 10.0) -> Path:
@@ -89,6 +96,40 @@ def test_commands_make_bundles_and_show_what_ends_soon(tmp_path: Path, monkeypat
     assert status("show", "desk") == 1
     shown = run.invoke(app, ["certs", "show", "desk"]).output
     assert f"desk/controller.pem: {common_name('controller', load(SHIPPED, with_model=False).keys())}, valid for 29.0 days" in shown
+
+
+def test_certificate_that_no_process_can_use_is_told_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    host, other = Path("host"), Path("other")
+    authority = Authority.make("authority", 100.0)
+    make(authority, host, "router", "guard", "robot", "controller", days=90.0)
+    make(Authority.make("another", 100.0), other, "controller", days=90.0)
+    (host / "guard.key").write_bytes((host / "robot.key").read_bytes())
+    (host / "robot.pem").write_bytes(pem(authority.certify(common_name("viewer", KEYS), key_of(host / "robot.key"), 90.0)))
+    for name in ("controller.pem", "controller.key"):
+        (host / name).write_bytes((other / name).read_bytes())
+    (host / "router.key").unlink()  # on the authority's computer there are no private keys
+    result = CliRunner().invoke(app, ["certs", "show", "host"])
+    lines = dict(line.split(": ", 1) for line in result.output.splitlines())
+    until = f"until {read_certificate(host / 'guard.pem').not_valid_after_utc:%Y-%m-%d at %H:%M} UTC"
+    assert result.exit_code == 1
+    assert lines["host/router.pem"] == f"router@rti_mpc/pioneer, valid for 90.0 days, {until}"
+    assert lines["host/guard.pem"].endswith(f"{until}: host/guard.key must be the private key of host/guard.pem, got that of another certificate")
+    assert lines["host/robot.pem"].endswith(f"{until}: it is for another role than robot")
+    assert lines["host/controller.pem"].endswith(
+        f"{until}: host/controller.pem must be issued by the authority of host/authority.pem, got one of another authority"
+    )
+
+
+@pytest.mark.parametrize(("days", "told"), [(12.0, "valid for 12.0 days, until "), (-0.01, "has ended on ")])
+def test_end_of_a_certificate_is_told_with_its_day_and_what_to_do(days: float, told: str, authority: Authority, tmp_path: Path) -> None:
+    host = make(authority, tmp_path / "host", "viewer", days=days)
+    result = CliRunner().invoke(app, ["certs", "show", str(host)])
+    end = read_certificate(host / "viewer.pem").not_valid_after_utc
+    assert result.exit_code == 1
+    assert (
+        f"viewer.pem: viewer@rti_mpc/pioneer, {told}{end:%Y-%m-%d at %H:%M} UTC: `rti-mpc certs renew`, then restart its process\n" in result.output
+    )
 
 
 @pytest.mark.parametrize("command", ["show", "renew"])

@@ -114,6 +114,13 @@ def test_certificate_that_has_ended_and_one_that_cannot_be_read_are_told(secured
     assert unreadable.startswith(f"certificate: {secured.parent / 'tls' / 'guard.pem'}: must be a certificate, PEM")
 
 
+def test_certificate_of_another_private_key_is_told(secured: Path) -> None:
+    tls = secured.parent / "tls"
+    (tls / "guard.key").write_bytes((tls / "router.key").read_bytes())
+    told = f"certificate: {tls / 'guard.key'} must be the private key of {tls / 'guard.pem'}, got that of another certificate"
+    assert list(opened(secured)) == [told]
+
+
 def test_process_of_ours_that_takes_everybody_beyond_the_loopback_is_a_finding_and_others_are_none(
     secured: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
