@@ -11,7 +11,7 @@ from __future__ import annotations
 from rti_mpc.contract.message import Notice, Reference, Severity
 from rti_mpc.wire.bus import RING_MESSAGES, Bus
 
-STALE_S = 60.0  # as of a controller's intake of references
+PLANNER_STALE_S = 60.0  # silence of a planner after which one of a lower epoch may take over; a restarted planner has a higher epoch
 
 
 class Rival:
@@ -27,7 +27,7 @@ class Rival:
         """
         self._robot, self._epoch, self._highest = bus.keys.robot, epoch, 0
         self._references = bus.subscriber(bus.keys.reference, capacity=RING_MESSAGES, history=False)
-        self._intake = bus.intake(Reference, STALE_S)
+        self._intake = bus.intake(Reference, PLANNER_STALE_S)
 
     def notice(self) -> Notice | None:
         """Return the notice about another source, once, and again about one of a higher epoch; None if there is nothing new."""

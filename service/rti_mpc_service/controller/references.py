@@ -18,8 +18,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Reference
 from rti_mpc.control.controller import Controller
 from rti_mpc.wire.bus import Bus, Subscriber
-
-STALE_S = 60.0  # silence of a planner after which one of a lower epoch may take over; a restarted planner has a higher epoch
+from rti_mpc.wire.rival import PLANNER_STALE_S
 
 LaidOut = tuple[Reference, Array | None]  # a reference and its rows from `Controller.lay_out`
 
@@ -37,7 +36,7 @@ class References:
 
     def __init__(self, bus: Bus, controller: Controller, ny: int) -> None:
         widths = {"y": ny, "p": controller.np_}
-        self.planners, self.leaders = bus.intake(Reference, STALE_S, widths), bus.intake(Reference, STALE_S, widths)
+        self.planners, self.leaders = bus.intake(Reference, PLANNER_STALE_S, widths), bus.intake(Reference, PLANNER_STALE_S, widths)
         self._controller = controller
         self._planned: deque[LaidOut] = deque(maxlen=1)  # from a planner; each deque has one writer, the thread of its intake, in order of age
         self._stamped: deque[LaidOut] = deque(maxlen=1)  # from a leader
