@@ -13,14 +13,13 @@ its tolerance.
 
 from __future__ import annotations
 
+import sys
 import time
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from rich.progress import track
 from rich.table import Table
 
 from rti_mpc.array import Array
@@ -33,6 +32,7 @@ from rti_mpc.signals import quantity
 from rti_mpc_service.check.agreement import AGREEMENT_TOLERANCE, COST_TOLERANCE, Agreement, agreement
 from rti_mpc_service.check.excursion import Bounds, excursions
 from rti_mpc_service.check.rest import stop_from_everywhere
+from rti_mpc_service.compiling import work_shown
 from rti_mpc_service.config import signals_file
 from rti_mpc_service.config.build import build_ocp, build_rti, build_signals, robot_settings
 from rti_mpc_service.config.config import load
@@ -92,16 +92,20 @@ class CheckReport:
 def main(path: Path) -> int:
     """Check a configuration, print what was found, and return the exit status: 0 if every sample was usable and both solvers agree."""
     config = load(path)
-    law = check_stop(config)
+    with work_shown("finding how the robot comes to rest", say):
+        law = check_stop(config)
     console, ocp = table_console(), build_ocp(config)
     shortened = check_length(ocp)
     try:
         stopped = 'a stop: it coasts, as stop = "coasts" says'
         if config.model.stop == "rests":
-            stopped = stop_from_everywhere(ocp, law, disturbed=bool(config.observer.disturbances))
+            with work_shown("stopping it from wherever it operates", say):
+                stopped = stop_from_everywhere(ocp, law, disturbed=bool(config.observer.disturbances))
     except OcpError as error:
         raise ConfigError(unstopped(config, error)) from error
-    report = check(config, track(range(WAVE_SAMPLES), "solving", console=console, transient=True, disable=not console.is_terminal))
+    rti = build_rti(config, say)
+    with work_shown("solving samples along a wave and at all bounds, some by a second solver", say):
+        report = check(config, rti)
     table = Table("phase, us", "p50", "p99", "max")
     for phase, times in (("preparation", report.prepare_us), ("feedback", report.feedback_us)):
         table.add_row(phase, *(f"{np.percentile(times, share):.0f}" for share in (50, 99, 100)))
@@ -149,9 +153,13 @@ def written(path: Path, config: Config) -> str:
         return f"not written, {error}"
 
 
-def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> CheckReport:
-    """Solve one QP for each of the samples, and drive to the bounds."""
-    rti = build_rti(config)
+def say(text: str) -> None:
+    """Print what `main` waits for, where no terminal shows it."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def check(config: Config, rti: Rti) -> CheckReport:
+    """Solve the samples of the wave, and drive to the bounds."""
     ocp = rti.ocp
     model, N = ocp.model, ocp.N
     first, second = config.solver.name, SECOND_SOLVER if config.solver.name != SECOND_SOLVER else "osqp"
@@ -190,7 +198,7 @@ def check(config: Config, samples: Iterable[int] = range(WAVE_SAMPLES)) -> Check
 
     start = x
     rti.reset(x, np.array(model.u_rest))
-    for k in samples:
+    for k in range(WAVE_SAMPLES):
         prepare_us[k], feedback_us[k] = sample(x, reference(k + 1 + np.arange(N)), asked=k % (WAVE_SAMPLES // COMPARED_WAVE_SAMPLES) == 0)
         x = rti.x[1] + disturbance * rng.standard_normal(model.nx)
     for excursion in excursions(rti, start):

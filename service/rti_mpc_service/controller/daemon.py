@@ -40,6 +40,7 @@ from rti_mpc.wire.bus import RING_MESSAGES, WOKEN, Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc_service.announce import announce
+from rti_mpc_service.compiling import work_shown
 from rti_mpc_service.config.build import build_controller, build_rti
 from rti_mpc_service.config.fit import check_period, check_stop
 from rti_mpc_service.config.schema import Config
@@ -83,7 +84,8 @@ def main(config: Config, bus_settings: BusSettings, *, standby: bool = False, st
             standby.
     """
     check_period(config)
-    stop_law = check_stop(config)
+    with work_shown("finding how the robot comes to rest", log.info):
+        stop_law = check_stop(config)
     stop = stop or stop_on_signals()
     rti = build_rti(config, log.info)
     check_length(rti.ocp)

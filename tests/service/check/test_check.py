@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +16,11 @@ import pytest
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import ConfigError
 from rti_mpc.rti.rest import Rest, RestClass, assess
+from rti_mpc_service import compiling
 from rti_mpc_service.check import check, rest
 from rti_mpc_service.check.agreement import Agreement
 from rti_mpc_service.check.rest import rest_line
+from rti_mpc_service.config.build import build_rti
 from rti_mpc_service.config.config import load
 from rti_mpc_service.shipped import SHIPPED
 from tests.movers import law_of, ocp_of
@@ -27,12 +31,17 @@ from tests.slow import slow_but
 pytestmark = pytest.mark.usefixtures("interpreted")
 
 
+def checked(path: Path) -> check.CheckReport:
+    config = load(path)
+    return check.check(config, build_rti(config))
+
+
 @pytest.mark.parametrize(("first", "second"), slow_but([("riccati", "daqp"), ("osqp", "daqp"), ("daqp", "osqp")], ("osqp", "daqp")))
 def test_two_solvers_are_compared_tightly_whatever_the_controllers_tolerance(first: str, second: str, tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     loose = "eps = 0.01\n" if first != "daqp" else ""
     path.write_text(MINIMAL + f"[ocp.bounds]\ninputs = {{ u_c = [-0.2, 0.2] }}\n[solver]\nname = '{first}'\n{loose}")
-    report = check.check(load(path))
+    report = checked(path)
     assert report.second == second
     assert len(report.opinions) > check.COMPARED_WAVE_SAMPLES, "those at the bounds are asked about, too"
     assert report.agree
@@ -45,7 +54,7 @@ def test_a_qp_that_is_not_the_other_formulations_is_noticed(tmp_path: Path, monk
     path.write_text(MINIMAL + "[ocp.bounds]\ninputs = { u_c = [-1, 1], omega_c = [-1, 1] }\n")
     right = check.solution
     monkeypatch.setattr(check, "solution", lambda one, *sample: right(one, *sample) + (1e-4 if one.formulation == "simultaneous" else 0.0))
-    report = check.check(load(path))
+    report = checked(path)
     assert not report.agree
     np.testing.assert_allclose(report.difference, 1e-4, rtol=0.01)
 
@@ -82,7 +91,7 @@ states = { v = [-3, 3] }
 def test_every_bound_is_driven_to(tmp_path: Path) -> None:
     path = tmp_path / "robot.toml"
     path.write_text(CART)
-    report = check.check(load(path))
+    report = checked(path)
     assert (report.bounds, report.missed) == (6, [])
     assert report.agree
 
@@ -93,7 +102,7 @@ def test_a_bound_that_gives_way_is_told(tmp_path: Path, monkeypatch: pytest.Monk
     path.write_text(CART)
     monkeypatch.setattr("rti_mpc.rti.places.PENALTY", 10.0)
     monkeypatch.setattr("rti_mpc.rti.active_set.MAX_STEPS", 0)  # of the interior point, which would hold them
-    report = check.check(load(path))
+    report = checked(path)
     assert not report.agree or sum(report.statuses.values()) > report.statuses[QpStatus.SOLVED]
 
 
@@ -113,7 +122,7 @@ def test_model_that_ends_near_its_bounds_is_driven_to_them_from_where_it_is_regu
     """Half a range below the lower level there is none, and no inflow at all empties the tank within the horizon."""
     path = tmp_path / "robot.toml"
     path.write_text(TANK + "states = { h = [0.2, 3] }\n")
-    report = check.check(load(path))
+    report = checked(path)
     assert report.statuses == Counter({QpStatus.SOLVED: 216})
     assert (report.missed, report.failed_at) == ([], None)
     assert report.agree
@@ -137,7 +146,7 @@ def test_no_number_is_cut_off_in_a_narrow_terminal(monkeypatch: pytest.MonkeyPat
     report = check.CheckReport(times, times, Counter({QpStatus.SOLVED: 1}), "daqp", [Agreement(0.0, 0.0)], 0.0, 0, [])
     monkeypatch.setenv("COLUMNS", "20")
     monkeypatch.setattr(check, "check_stop", lambda config: None)
-    monkeypatch.setattr(check, "check", lambda config, samples: report)
+    monkeypatch.setattr(check, "check", lambda *_: report)
     assert check.main(SHIPPED) == 0
     assert capsys.readouterr().out.count("123456789") == 6
 
@@ -167,3 +176,34 @@ def test_robot_whose_observer_estimates_what_may_be_a_current_is_told_of(monkeyp
     line = rest.stop_from_everywhere(robot, replace(law, disturbances=np.ones(2)), disturbed=True)
     assert "from 1000 states, disturbed up to its observer's limits, within 1 s" in line
     assert told not in line
+
+
+def test_what_is_waited_for_is_said_where_no_terminal_shows_it(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """The quadrotor took a minute and a half at its first check, in a silence that looked like a hang."""
+    times = np.array([1.0])
+    report = check.CheckReport(times, times, Counter({QpStatus.SOLVED: 1}), "daqp", [Agreement(0.0, 0.0)], 0.0, 0, [])
+    monkeypatch.setattr(compiling, "Timer", At)
+    monkeypatch.setattr(check, "check", lambda *_: report)
+    monkeypatch.setattr(check, "check_stop", lambda config: None)
+    monkeypatch.setattr(check, "stop_from_everywhere", lambda ocp, law, **options: "")
+    assert check.main(SHIPPED) == 0
+    assert capsys.readouterr().err.splitlines() == [
+        "finding how the robot comes to rest",
+        "stopping it from wherever it operates",
+        "solving samples along a wave and at all bounds, some by a second solver",
+    ]
+
+
+class At:
+    """Timer that is over at once."""
+
+    daemon = False
+
+    def __init__(self, interval: float, function: Callable[[str], object], args: tuple[str]) -> None:
+        self._call = partial(function, *args)
+
+    def start(self) -> None:
+        self._call()
+
+    def cancel(self) -> None:
+        pass

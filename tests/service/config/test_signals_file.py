@@ -74,7 +74,7 @@ def test_guard_knows_a_model_from_the_file_that_check_writes_and_does_without_th
 ) -> None:
     times = np.array([1.0])
     report = check.CheckReport(times, times, Counter({QpStatus.SOLVED: 1}), "daqp", [Agreement(0.0, 0.0)], 0.0, 0, [])
-    monkeypatch.setattr(check, "check", lambda config, samples: report)
+    monkeypatch.setattr(check, "check", lambda *_: report)
     monkeypatch.setattr(check, "stop_from_everywhere", lambda ocp, law, **_: "")
     path.write_text(TOML.replace("enabled = true", "enabled = false"))
     assert check.main(path) == 0
@@ -105,7 +105,7 @@ def test_check_writes_no_file_that_nobody_needs(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(signals_file, "write", lambda *_: pytest.fail("was to be written"))
     monkeypatch.setattr(check, "stop_from_everywhere", lambda ocp, law, **_: "")
     times = np.array([1.0])
-    monkeypatch.setattr(check, "check", lambda config, samples: check.CheckReport(times, times, Counter(), "daqp", [Agreement(0.0, 0.0)], 0.0, 0, []))
+    monkeypatch.setattr(check, "check", lambda *_: check.CheckReport(times, times, Counter(), "daqp", [Agreement(0.0, 0.0)], 0.0, 0, []))
     assert check.main(SHIPPED) == 0
 
 
