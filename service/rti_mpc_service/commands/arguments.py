@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -51,6 +52,11 @@ def claimed(path: Path | None) -> Path | None:
     except OSError as error:
         raise ConfigError(f"--json must be a file that can be written, got {path}: {error.strerror}") from error
     return path
+
+
+def folder_of_run(text: str, name: str, check: Callable[..., Path | None]) -> Any:
+    """Return the option of a folder for what a command writes, by default below `runs`, by name and time."""
+    return typer.Option(metavar="DIR", help=text, show_default=f"runs/{name}-TIME", callback=check)
 
 
 ConfigPath = Annotated[Path, typer.Argument(metavar="CONFIG", help="The robot's TOML file.", show_default="the shipped pioneer_3dx.toml")]

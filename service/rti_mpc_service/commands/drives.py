@@ -19,6 +19,7 @@ from rti_mpc_service.commands.arguments import (
     WaypointSmoothing,
     WaypointSpeed,
     file_of,
+    folder_of_run,
     new_folder,
 )
 from rti_mpc_service.commands.on_bus import on_bus
@@ -52,15 +53,7 @@ def demo(
     duration: Annotated[
         float | None, typer.Option(metavar="SECONDS", min=1.0, help="Duration of the drive, robot time.", show_default="the scenario's own")
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="New folder for configuration, summary, figure and recording.",
-            show_default="runs/SCENARIO-TIME",
-            callback=new_folder,
-        ),
-    ] = None,
+    out: Annotated[Path | None, folder_of_run("New folder for configuration, summary, figure and recording.", "SCENARIO", new_folder)] = None,
     viewer: Annotated[bool, typer.Option("--viewer", help="Show the drive live in Rerun.")] = False,
     guard: Annotated[bool, typer.Option("--guard", help="Run a guard between controller and robot.")] = False,
     waypoint_speed: WaypointSpeed = 0.25,

@@ -17,6 +17,7 @@ from rti_mpc_service.commands.arguments import (
     WaypointSmoothing,
     WaypointSpeed,
     file_of,
+    folder_of_run,
     new_file,
     new_folder,
 )
@@ -72,15 +73,7 @@ def bench(
 
 @studies.command()
 def paper(
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Folder for paper.md and its folder of figures and run.json.",
-            show_default="runs/paper-TIME",
-            callback=new_paper,
-        ),
-    ] = None,
+    out: Annotated[Path | None, folder_of_run("Folder for paper.md and its folder of figures and run.json.", "paper", new_paper)] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A short run: three seconds of every experiment, few points of each sweep.")] = False,
 ) -> None:
     """Reproduce the paper's study: its algorithms, real-time iteration and converged NMPC, and the effect of each setting."""
