@@ -56,11 +56,17 @@ def ask(bus_settings: BusSettings, keys: Keys, request: dict[str, Any], timeout_
         try:
             answer = bus.request(keys.request, request, timeout_s)
         except TimeoutError:
-            answer = {"error": f"{keys.robot} has no controller that answers within {timeout_s} s: nothing was changed"}
+            unchanged = "; nothing was changed" if "set" in request else ""
+            answer = {"error": f"{keys.robot} has no controller that answers within {timeout_s:g} s{unreached(bus)}{unchanged}"}
     if answer.get("ok") is True:
         return answer
     print(f"rti-mpc: {answer.get('error', 'refused without a reason')}", file=sys.stderr)
     return None
+
+
+def unreached(bus: Bus) -> str:
+    """Return why nobody can answer, to be appended; empty if somebody is on the bus."""
+    return f": {bus.unconnected}" if bus.unconnected else ""
 
 
 def stop_or_enable(bus_settings: BusSettings, keys: Keys, what: str, timeout_s: float, *, guarded: bool, state: Path | None) -> int:
@@ -89,6 +95,7 @@ def stop_or_enable(bus_settings: BusSettings, keys: Keys, what: str, timeout_s: 
                 answers[str(answer.get("role", "somebody"))] = answer
                 if answers.get(acting, {}).get("ok") is True:
                     break
+            why = "" if answers else unreached(bus)
     except ConfigError as error:  # for example, there is no router
         raise ConfigError(f"{error}; nobody was asked to {what}; {note_for_later(LatchFile(keys, state), what)}") from error
     confirmed = [role for role, answer in answers.items() if answer.get("ok") is True]
@@ -98,7 +105,7 @@ def stop_or_enable(bus_settings: BusSettings, keys: Keys, what: str, timeout_s: 
             print(f"rti-mpc: the {acting} obeys, but will not know of it after a restart: {fault}", file=sys.stderr)
         return 0
     print(
-        f"rti-mpc: {keys.robot}: the {acting} has not confirmed {what} within {timeout_s:g} s; {' and '.join(confirmed) or 'nobody'} has",
+        f"rti-mpc: {keys.robot}: the {acting} has not confirmed {what} within {timeout_s:g} s; {' and '.join(confirmed) or 'nobody'} has{why}",
         *(f"{role}: {answer['error']}" for role, answer in answers.items() if "error" in answer),
         *([] if answers else [note_for_later(LatchFile(keys, state), what)]),
         sep="; ",

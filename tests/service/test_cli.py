@@ -132,6 +132,7 @@ def test_file_that_cannot_be_written_is_refused_before_anything_is_measured(name
     assert done.stderr.startswith("rti-mpc: --json must be a file that can be written")
 
 
+NOBODY = ": no process answers at tcp/127.0.0.1:1: no process listens there, or the address is wrong"
 READ = {"config", "zenoh", "tls", "state", "folder", "recording", "repair", "authority", "at", "folders"}  # parameters that name what is read or kept
 REPLACED = {"--json"}  # the present state of something, which monitors ask for again and again
 ADDED_TO = {"replay --out", "certs issue --out", "certs authority folder"}  # each has a test that it overwrites no file
@@ -191,7 +192,7 @@ def test_operator_is_told_in_one_line_that_nobody_has_confirmed_and_what_was_not
     for word, counter in (("enable", 0), ("stop", 1), ("stop", 1), ("enable", 2)):
         done = command(word, "--timeout", "0.3", "-e", "tcp/127.0.0.1:1", "--state", path.parent)
         assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
-        assert done.stderr.startswith(f"rti-mpc: pioneer: the controller has not confirmed {word} within 0.3 s; nobody has; ")
+        assert done.stderr.startswith(f"rti-mpc: pioneer: the controller has not confirmed {word} within 0.3 s; nobody has{NOBODY}; ")
         assert f"processes started later read {path}: {'stopped since' if word == 'stop' else 'released'}" in done.stderr
         assert path.exists() == (counter > 0)
         assert not counter or json.loads(path.read_text())["counter"] == counter
@@ -207,7 +208,14 @@ def test_stop_that_meets_no_router_is_noted_all_the_same(tmp_path: Path) -> None
 def test_operator_is_told_in_one_line_that_nothing_could_be_noted_either() -> None:
     done = rti_mpc("stop", "--timeout", "0.3", "-e", "tcp/127.0.0.1:1", "--state", "/proc/none")
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
-    assert "nobody has; it could not be stored for later either: " in done.stderr
+    assert f"nobody has{NOBODY}; it could not be stored for later either: " in done.stderr
+
+
+@pytest.mark.parametrize(("words", "changes"), [(["params", "get"], ""), (["params", "set", "ocp.N=3"], "; nothing was changed"), (["snapshot"], "")])
+def test_request_that_meets_nobody_says_why_and_speaks_of_changes_only_where_one_was_asked_for(words: list[str], changes: str) -> None:
+    done = command(*words, "--timeout", "0.3", "-e", "tcp/127.0.0.1:1")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == f"rti-mpc: pioneer has no controller that answers within 0.3 s{NOBODY}{changes}\n"
 
 
 def test_check_of_the_shipped_configuration_prints_both_phases_and_the_verdict() -> None:
