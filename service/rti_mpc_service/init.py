@@ -18,6 +18,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc_service.shipped import DEPLOY, TEMPLATES
 
 TEMPLATE_NAME = "my_robot"
+MODULE_NAME = r"[a-z][a-z0-9_]*"
 KINDS = tuple(sorted(path.stem for path in TEMPLATES.glob("*.toml")))
 SHARED = {"robot.test": f"test_{TEMPLATE_NAME}.py", "next_steps.md": f"{TEMPLATE_NAME}.md"}  # template: file
 
@@ -65,8 +66,11 @@ def robot_files(name: str, kind: str) -> dict[str, str]:
     Raises:
         ConfigError: The name is none for a module, or there is no such template.
     """
-    if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
-        raise ConfigError(f"init must be given a name of small letters, digits and _, for it is that of a Python module, too, got {name!r}")
+    if not re.fullmatch(MODULE_NAME, name) or keyword.iskeyword(name):
+        meant = re.sub(r"[^a-z0-9_]+", "_", name.lower())
+        near = f", perhaps {meant} is meant" if re.fullmatch(MODULE_NAME, meant) and not keyword.iskeyword(meant) else ""
+        rule = "of small letters, digits and _, with a letter first, and no word of Python's"
+        raise ConfigError(f"init must be given a name {rule}, for it is that of a module, too, got {name!r}{near}")
     if kind not in KINDS:
         raise ConfigError(f"--like must be {' or '.join(KINDS)}, got {kind!r}")
     templates = {f"{kind}.toml": f"{TEMPLATE_NAME}.toml", f"{kind}.model": f"{TEMPLATE_NAME}.py", **SHARED}

@@ -13,6 +13,8 @@ from rti_mpc_service.config.config import load
 from rti_mpc_service.init import KINDS, main
 from rti_mpc_service.shipped import DEPLOY
 
+RULE = "init must be given a name of small letters, digits and _, with a letter first, and no word of Python's, for it is that of a module, too"
+
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_files_of_a_robot_load_and_bear_its_name(kind: str, tmp_path: Path) -> None:
@@ -36,8 +38,10 @@ def test_nothing_is_overwritten_and_nothing_written_beside_what_exists(tmp_path:
     ("name", "kind", "refusal"),
     [
         (None, "unicycle", "init must be given the name of a robot, such as my_robot, or --deploy"),
-        ("my robot", "unicycle", "init must be given a name of small letters, digits and _, for it is that of a Python module, too, got 'my robot'"),
-        ("class", "unicycle", "init must be given a name of small letters, digits and _, for it is that of a Python module, too, got 'class'"),
+        ("my robot", "unicycle", f"{RULE}, got 'my robot', perhaps my_robot is meant"),
+        ("class", "unicycle", f"{RULE}, got 'class'"),
+        ("My-Robot", "unicycle", f"{RULE}, got 'My-Robot', perhaps my_robot is meant"),
+        ("3dx", "unicycle", f"{RULE}, got '3dx'"),
         ("casadi", "unicycle", "init must be given a name that no installed module has, got 'casadi'"),
         ("robby", "tricycle", "--like must be bicycle or unicycle, got 'tricycle'"),
     ],
