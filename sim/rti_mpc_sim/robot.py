@@ -105,7 +105,7 @@ def main(
         bus.publish_json(keys.info(ROLE), {**model_info(settings.model), **(info or {}), **life})
         bus.alive(ROLE)
         bus.watch_certificate(robot.warn)
-        logger.info("epoch %d of %s, %s, at %g times real speed", robot.body.epoch, keys.robot, settings.model.name, speed)
+        logger.info("epoch %d of %s, model %s, at %g times real speed", robot.body.epoch, keys.robot, settings.model.name, speed)
         gc.collect()
         gc.freeze()
         robot.run(stop, None if duration_s is None else round(1e9 * duration_s))

@@ -165,8 +165,10 @@ def show(path: Path, screens: Screens, *, stop: Event | None = None) -> int:
     from rti_mpc_service.view.show import draw_in_viewer, draw_into_file
 
     recording, url = opened(path), screens.url
+    log.info("drawing %s", path)
     if screens.rerun_save is not None:
         draw_into_file(recording, screens.rerun_save)
+        log.info("drawn into %s, which `rerun %s` shows", screens.rerun_save, screens.rerun_save)
     if not screens.shown:
         return 0
     stop = stop or stop_on_signals()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import urllib.request
 from collections import Counter
@@ -44,6 +45,8 @@ def test_recording_is_played_whole_in_the_robot_s_time(run: Path) -> None:
 def test_recording_is_drawn_into_a_file(run: Path, tmp_path: Path) -> None:
     done = rti_mpc("view", run, "--rerun-save", tmp_path / "run.rrd")
     assert done.returncode == 0, done.stderr
+    said = [json.loads(line)["text"] for line in done.stdout.splitlines()]
+    assert said == [f"drawing {run}", f"drawn into {tmp_path / 'run.rrd'}, which `rerun {tmp_path / 'run.rrd'}` shows"]
     rows: Counter[str] = Counter()
     for chunk in RrdReader(tmp_path / "run.rrd").stream().to_chunks():
         rows[chunk.entity_path] += chunk.num_rows
