@@ -79,6 +79,7 @@ MODEL = {
     "name that is none": (lambda: mass(name=None), "name of a model must be text, got None"),
     "parameter that is text": (lambda: pioneer_3dx().with_parameters(a="0.2"), "parameter a of model pioneer_3dx must be real numbers, got '0.2'"),
     "find_model(None)": (lambda: find_model(None), "a model must be one of pioneer_3dx, "),  # type: ignore[arg-type]
+    "model that is misspelt": (lambda: find_model("pionner_3dx"), "got 'pionner_3dx', perhaps pioneer_3dx is meant"),
     "Signal of a number": (lambda: Signal(3, "m"), "name of the signal 3 must be text, got 3"),  # type: ignore[arg-type]
     "Signal without a unit": (lambda: Signal("x", None), "unit of the signal 'x' must be text, got None"),  # type: ignore[arg-type]
     "Signal whose angle is text": (lambda: Signal("x", "rad", angle="yes"), "angle of the signal 'x' must be true or false"),  # type: ignore[arg-type]

@@ -24,6 +24,7 @@ from types import CodeType, ModuleType
 
 import rti_mpc
 from rti_mpc.errors import OcpError
+from rti_mpc.given import nearest
 from rti_mpc.model.model import Model
 
 SHIPPED = (
@@ -60,7 +61,7 @@ def find_model(name: str, folder: Path | None = None) -> Model:
     wanted = f"a model must be one of {', '.join(SHIPPED_MODELS)} or an importable package.module:function of your own, got {name!r}"
     match = MODEL_NAME_PATTERN.fullmatch(SHIPPED_MODELS.get(name, name)) if isinstance(name, str) else None
     if match is None:
-        raise OcpError(wanted)
+        raise OcpError(wanted + nearest(name, SHIPPED_MODELS))
     module_name, function_name = match.groups()
     if module_name.endswith(".py"):
         file = Path(folder or "", module_name)
