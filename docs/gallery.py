@@ -280,7 +280,7 @@ def main(names: list[str]) -> None:
         draw(run, VIEWS[name], DOCS / "gallery" / f"{name}.png")
         size, period = f"{run.model.nx}, {run.model.nu}", f"{1e3 * config.ocp.dt_s:g} ms"
         table.append(f"| [{name}](#{name}) | {size} | {period} | {config.ocp.N} stages | {module.REST} | {told(run)} |")
-        summary = (module.__doc__ or "").strip().split("\n\n")[0].replace("\n", " ").replace("[Wirsching2006]_", "").strip()
+        summary = (module.__doc__ or "").strip().split("\n\n")[0].replace("\n", " ").replace(" [Wirsching2006]_", "")
         pictures.append(f"## {name}\n\n{summary[0].upper()}{summary[1:]}\n\n![{name} follows {run.scenario}](gallery/{name}.png)")
     if not names:
         (DOCS / "gallery.md").write_text(PAGE + "\n".join(table) + "\n\n" + "\n\n".join(pictures) + "\n", encoding="utf-8")
