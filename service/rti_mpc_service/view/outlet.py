@@ -19,6 +19,7 @@ import rerun as rr
 from rti_mpc.contract.message import Notice, Reference, Severity
 from rti_mpc.errors import ConfigError, reason
 from rti_mpc.wire.info import Info
+from rti_mpc.wire.reach import remind
 from rti_mpc_service.view.recording import Entry
 from rti_mpc_service.view.scene import Scene
 
@@ -51,6 +52,7 @@ class Outlet:
         dropped: Number of entries that the queue had no room for.
         failures: Number of failed streams.
         notices: Faults since the owner last emptied it.
+        closing: Set once it is being closed.
     """
 
     def __init__(
@@ -81,7 +83,7 @@ class Outlet:
         self._lock = threading.Lock()
         self._roots = roots
         self._recording: Scene | None = None
-        self._closing = threading.Event()
+        self.closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"outlet {name}", daemon=True)
         self._thread.start()
 
@@ -103,12 +105,12 @@ class Outlet:
 
     def close(self) -> bool:
         """Write the queued entries and end the stream within a bounded time; return whether no entry was lost."""
-        self._closing.set()
+        self.closing.set()
         self._thread.join(min(self._close_s, VIEWER_CLOSE_TIMEOUT_S) if self.failures else self._close_s)
         return not (self._thread.is_alive() or self._queue or self.dropped or self.failures)
 
     def _run(self) -> None:
-        while not self._closing.wait(self._period_s):
+        while not self.closing.wait(self._period_s):
             self._pump()
         self._pump(last=True)
         if self._recording is not None:
@@ -199,7 +201,7 @@ def file_outlet(path: Path, name: str, roots: Sequence[str] = ()) -> Outlet:
 
 
 def viewer_outlet(url: str, name: str, roots: Sequence[str] = ()) -> Outlet:
-    """Return an outlet to the viewer at a URL, which connects whenever a viewer listens there."""
+    """Return an outlet to the viewer at a URL, which connects whenever a viewer listens there, and says so until the first one does."""
     address = urlsplit(url)
     where = (address.hostname or "127.0.0.1", address.port or 9876)
     recording_id = uuid.uuid4()  # the same for each connection, so that a viewer that only hung continues its recording
@@ -213,7 +215,9 @@ def viewer_outlet(url: str, name: str, roots: Sequence[str] = ()) -> Outlet:
         stream.connect_grpc(url)
         return stream
 
-    return Outlet(url, open_stream, roots=roots)
+    outlet = Outlet(url, open_stream, roots=roots)
+    remind(log.warning, lambda: "" if outlet.connected else f"no viewer answers yet at {url}", outlet.closing)
+    return outlet
 
 
 def load_arrow() -> None:

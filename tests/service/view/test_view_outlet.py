@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from queue import Queue
 from threading import Event
 
 import numpy as np
@@ -21,6 +22,7 @@ from rerun_bindings import check_for_rrd_footer
 
 from rti_mpc.contract.message import State
 from rti_mpc.errors import ConfigError
+from rti_mpc.wire import reach
 from rti_mpc.wire.info import Info
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_port
@@ -167,6 +169,16 @@ def test_without_a_viewer_closing_does_not_wait(viewer: Viewer, host: Host) -> N
     since_ns = time.monotonic_ns()
     assert not outlet.close()
     in_time(host, "closing", (time.monotonic_ns() - since_ns) / MS, 1000.0, since_ns)
+
+
+def test_viewer_that_does_not_listen_is_told_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = Queue[str]()
+    monkeypatch.setattr(reach, "FIRST_REMINDER_S", 0.01)
+    monkeypatch.setattr("rti_mpc_service.view.outlet.log.warning", said.put)
+    url = f"rerun+http://127.0.0.1:{free_port()}/proxy"
+    outlet = viewer_outlet(url, "robot")
+    assert said.get(timeout=PATIENCE_S) == f"no viewer answers yet at {url}"
+    outlet.close()
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # it is still being written
