@@ -132,7 +132,7 @@ def with_drift(model: Model) -> Model:
     """
     window, of_states, progress = window_place(given.instance("model", model, Model)), plane(model.states), place(model.states, "progress")
     if window is None or of_states is None or progress is None:
-        raise OcpError(f"model {model.name} must be one of path_following to have a drift, it has no parameter whose role is path_start")
+        raise OcpError(f"model {model.name} must be made by path_following to have a drift: it has no parameter whose role is path_start")
     first, knots = window
     knot = ca.reshape(model.p[first + 2 : first + 2 + len(KNOT_PARTS) * knots], len(KNOT_PARTS), knots)
     _, tangent, _ = spline(model.x[progress], model.p[first], model.p[first + 1], knot)

@@ -114,7 +114,9 @@ def path_source(model: Model, pieces: Sequence[Path]) -> tuple[PathSource, list[
 
     window, position, progress = window_place(model), plane(model.states), place(model.states, "progress")
     if window is None or position is None or progress is None:
-        raise ConfigError(f"model {model.name} must be one of path_following for --path, it has no parameter whose role is path_start")
+        raise ConfigError(
+            f"model {model.name} must be made by path_following for --path, see docs/paths.md: it has no parameter whose role is path_start"
+        )
     return PathSource(pieces, model.p_nominal, *window), list(position), progress
 
 

@@ -192,7 +192,7 @@ def test_drift_is_the_velocity_to_the_left_of_the_path() -> None:
     x = np.array([0.0, 0.0, np.arctan2(tangent[1], tangent[0]) + 0.3, 1.2, 0.1, 7.3, 0.9])
     assert float(model.h()(x, p)[3]) == pytest.approx(1.2 * np.sin(0.3), abs=1e-9)
     assert model.outputs[3] == Signal("drift", "m/s")
-    with pytest.raises(OcpError, match="model car must be one of path_following to have a drift"):
+    with pytest.raises(OcpError, match="model car must be made by path_following to have a drift"):
         with_drift(car())
 
 

@@ -84,7 +84,10 @@ def test_path_and_robot_that_do_not_fit_are_refused_before_anything_starts(tmp_p
             (config, "--path", "oval", "--scenario", "eight"),
             "--path is followed in place of a scenario and says nothing of time: --scenario must be left out",
         ),
-        (("--path", "oval"), "model pioneer_3dx must be one of path_following for --path, it has no parameter whose role is path_start"),
+        (
+            ("--path", "oval"),
+            "model pioneer_3dx must be made by path_following for --path, see docs/paths.md: it has no parameter whose role is path_start",
+        ),
         (("--path-limits", 1, 1, 1, 1), "--path-limits are those of a --path, which must be given as well"),
     ):
         done = command("demo", *options, "--out", tmp_path / "out")

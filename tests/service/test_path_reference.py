@@ -94,7 +94,7 @@ def test_references_are_due_by_the_robots_time_and_again_after_its_clock_was_set
 
 
 def test_model_that_follows_no_path_is_refused() -> None:
-    with pytest.raises(ConfigError, match="model pioneer_3dx must be one of path_following for --path"):
+    with pytest.raises(ConfigError, match="model pioneer_3dx must be made by path_following for --path"):
         PathReferences(pioneer_3dx(), [bend()], 1)
 
 
