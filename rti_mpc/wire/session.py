@@ -150,11 +150,18 @@ def _tls(settings: BusSettings) -> dict[str, Any]:
     return {"transport/link/protocols": ["tls", "quic"]} | {f"transport/link/tls/{name}": value for name, value in asked.items()}
 
 
+TOLD_IN_RUST = re.compile(r'(?:Str\(|msg: )"((?:[^"\\]|\\.)*)"')  # the text in a value of Rust that Zenoh prints as such
+PLACE_DRAWN = re.compile(r"^--> (\d+):(\d+) .* = (.*)$")  # of a fault in JSON5, in one line
+
+
 def _brief(error: Exception) -> str:
     """Return the innermost cause that Zenoh tells, without the places in its source: of ``what: [why at PLACE] at PLACE`` the why."""
     text = str(error).split(" at /")[0]
     inside = text.count("[") > text.count("]")
-    return " ".join((text.rpartition(": [")[2] if inside else text).split())
+    text = text.rpartition(": [")[2] if inside else text
+    if (told := TOLD_IN_RUST.search(text)) is not None:
+        text = told[1].replace("\\n", " ").replace('\\"', '"')
+    return PLACE_DRAWN.sub(r"\3, at line \1, column \2", " ".join(text.split()))
 
 
 def endpoints(config: zenoh.Config) -> str:

@@ -114,3 +114,32 @@ def test_endpoint_that_is_none_is_refused_with_one_that_would_be(endpoint: str) 
 )
 def test_endpoints_of_every_kind_are_taken(endpoint: str) -> None:
     assert value(BusSettings(connect=(endpoint,)), "connect/endpoints") == [endpoint]
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("foo:1", "foo must be what Zenoh takes, got: unknown key"),
+        ("connect/endpoints:tcp/127.0.0.1:1", "got: expected array, boolean, null, number, object, or string, at line 1, column 1"),
+        ("mode:5", "got: invalid type: integer `5`, expected either 'router', 'peer' or 'client'"),
+    ],
+)
+def test_setting_that_zenoh_refuses_is_told_in_its_words_without_its_own_values(setting: str, told: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        zenoh_config(BusSettings(cfg=(setting,)))
+    assert str(refused.value).endswith(told)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('{connect: {endpoint: ["tcp/127.0.0.1:1"]}}', "got: unknown field `endpoint`, expected one of `timeout_ms`, `endpoints`, "),
+        ('{mode: "client", ', "got: expected identifier or string, at line 1, column "),
+    ],
+)
+def test_file_that_zenoh_refuses_is_told_with_the_place(text: str, told: str, tmp_path: Path) -> None:
+    (tmp_path / "zenoh.json5").write_text(text)
+    with pytest.raises(ConfigError) as refused:
+        zenoh_config(BusSettings(config=tmp_path / "zenoh.json5"))
+    assert told in str(refused.value)
+    assert "Message" not in str(refused.value)
