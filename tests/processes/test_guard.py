@@ -8,6 +8,7 @@ robot stands within 2.5 s, and it stays so.
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import time
@@ -15,10 +16,12 @@ from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from rti_mpc.contract.message import Command, Event
+from rti_mpc.contract.message import Command, End, Reference, Telemetry
 from rti_mpc.contract.status import Mode
+from rti_mpc.wire.bus import new_epoch
 from rti_mpc.wire.cdr import decode
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.shipped import SHIPPED
@@ -29,31 +32,37 @@ from tests.processes.record import FAST_STATES, MS, Record, recorded, within_sle
 from tests.processes.system import CONFIG, KEYS, System, heard, rti_mpc, until
 
 SPEED_M_S = 0.5
+LINE_S, PERIOD_S = 400.0, 0.1  # of a reference, and between its rows
+AHEAD_M = 0.2  # at most, of the robot on a line that has just begun
+EPOCH, NUMBERS = new_epoch(), itertools.count(1)  # of the references
 LINK_MS = 100.0  # a link drops a message of the guard only where it was held up for longer: two wait there, one each 70 ms
 
 
 @pytest.fixture(scope="module")
 def system(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
-    """A robot on a long straight line at its full speed, and its guard."""
+    """A robot and its guard."""
     folder = tmp_path_factory.mktemp("guarded")
     write_robot(folder / "robot.toml", FAST_STATES)
-    line = ("reference", "--scenario", folder / "line.csv", "--waypoint-speed", SPEED_M_S)
-    with System(folder, folder / "robot.toml", robot=("sim",), reference=line) as system:
+    with System(folder, folder / "robot.toml", robot=("sim",)) as system:
         system.start("robot", "guard", "controller")
         yield system
 
 
 @pytest.fixture
 def driven(system: System) -> System:
-    """The system, when the robot is at its full speed, along a line that begins where the robot is."""
-    if "reference" in system.running:
-        system.interrupt("reference")
-    x, y = system.state(lambda _: True).x[:2]
-    (system.folder / "line.csv").write_text(f"x,y\n{x},{y}\n{x + 200.0},{y}\n")
-    events = system.bus.subscriber(KEYS.event("reference"), capacity=64, history=False)
-    system.start("reference")
-    heard(events, Event, lambda event: event.code == "reference_published")  # the robot may still follow the last one
-    system.tracking()
+    """The system, when the robot is at its full speed, along a line that begins where the robot is and that this process publishes."""
+    begin = system.state(lambda _: True)
+    times_s = np.arange(0.0, LINE_S, PERIOD_S)
+    y = begin.x[:3] * [1.0, 1.0, 0.0] + np.outer(times_s, [SPEED_M_S, 0.0, 0.0])
+    system.bus.publisher(KEYS.reference).put(
+        Reference(EPOCH, next(NUMBERS), begin.stamp_ns, round(1e9 * PERIOD_S), End.HOLD, y, np.empty((len(y), 0)))
+    )
+
+    def follows(sample: Telemetry) -> bool:  # this line, not the one of the test before
+        ahead_m = sample.y_ref[0, 0] - begin.x[0] - 1e-9 * SPEED_M_S * (sample.stamp_ns - begin.stamp_ns)
+        return sample.mode is Mode.TRACKING and abs(ahead_m) < AHEAD_M
+
+    heard(system.bus.subscriber(KEYS.telemetry), Telemetry, follows)
     system.state(lambda state: bool(state.x[3] > 0.95 * SPEED_M_S))
     return system
 
@@ -118,15 +127,15 @@ def test_guard_says_why_it_intervened(driven: System) -> None:
     until(lambda: any(b"guard_passing" in received.payload for received in events.drain()), "the guard says that commands pass again")
 
 
-def test_guard_process_loads_no_solver_and_no_model(driven: System) -> None:
-    maps = Path(f"/proc/{driven.running['guard'].pid}/maps").read_text()
+def test_guard_process_loads_no_solver_and_no_model(system: System) -> None:
+    maps = Path(f"/proc/{system.running['guard'].pid}/maps").read_text()
     assert "numpy" in maps
     for package in ("casadi", "osqp", "scipy"):
         assert f"/{package}/" not in maps, package
 
 
-def test_second_guard_refuses_to_start_beside_a_live_one(driven: System) -> None:
-    done = rti_mpc("guard", driven.config, "-e", driven.endpoint)
+def test_second_guard_refuses_to_start_beside_a_live_one(system: System) -> None:
+    done = rti_mpc("guard", system.config, "-e", system.endpoint)
     assert (done.returncode, "pioneer already has a guard" in done.stderr) == (1, True), done.stderr
 
 

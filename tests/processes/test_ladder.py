@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real processes: a controller whose samples fail on request, and one that is stopped for a while."""
+"""Real processes: a controller whose samples fail on request, and one that is stopped for a while; `tests.control.test_ladder` holds the ladder."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.shipped import SHIPPED
 from tests.in_time import explained, on_time
 from tests.processes.system import CONFIG, KEYS, SPEED, System, heard
+
+pytestmark = pytest.mark.slow
 
 SLEW = np.array([0.25, 0.4]) / CONFIG.ocp.dt_s  # per s
 STOPPED_S = 1.5
@@ -64,7 +66,7 @@ def test_other_solver_takes_over_without_anybody_noticing(driven: System, host: 
         assert (after.softened - before.softened, after.fallbacks) == (10, before.fallbacks)
 
 
-@pytest.mark.parametrize(("failure", "samples"), [("qp", 8), pytest.param("nan_model", 8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("failure", "samples"), [("qp", 8), ("nan_model", 8)])
 def test_failures_lead_down_the_ladder_and_up_again(driven: System, host: Host, failure: str, samples: int) -> None:
     before, begun_ns = recovered(driven, 50), time.monotonic_ns()  # a second: no more often is one kind of fault published
     events = driven.bus.subscriber(KEYS.event("controller"), capacity=64, history=False)
@@ -85,7 +87,6 @@ def test_failures_lead_down_the_ladder_and_up_again(driven: System, host: Host, 
     assert {"qp_failed", "no_plan"} <= set(codes(events))
 
 
-@pytest.mark.slow
 def test_samples_over_budget_are_not_sent_and_leave_the_loop_in_phase(driven: System, host: Host) -> None:
     before, begun_ns = recovered(driven, 50), time.monotonic_ns()  # a second: no more often is one kind of fault published
     events = driven.bus.subscriber(KEYS.event("controller"), capacity=64, history=False)
@@ -151,7 +152,6 @@ def test_failure_that_cannot_be_injected_is_refused_with_what_can(driven: System
     assert "must be" in answer["error"]
 
 
-@pytest.mark.slow
 def test_nothing_fails_on_request_unless_the_configuration_says_so(tmp_path: Path) -> None:
     with System(tmp_path) as system:
         system.start("robot", "controller")

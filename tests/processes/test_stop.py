@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Operator's stop among real processes: the restarts that it survives, and the processes that confirm it."""
+"""
+Operator's stop among real processes: the restarts that it survives, and the processes that confirm it.
+
+That it outlives a controller which is killed is among the tests of `tests.processes.test_system`, which has one.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +26,8 @@ from rti_mpc.contract.status import Mode
 from tests.guarded import write_robot
 from tests.processes.record import FAST_STATES
 from tests.processes.system import KEYS, System, heard, rti_mpc, until
+
+pytestmark = pytest.mark.slow
 
 REQUESTS_PER_S = 300
 STANDSTILL_SPEED = 1e-3  # m/s, rad/s
@@ -66,23 +72,6 @@ def guarded(tmp_path: Path) -> Iterator[Operated]:
         yield system
 
 
-def test_stop_outlives_a_controller_that_is_killed(system: Operated) -> None:
-    system.start("robot", "controller", "reference")
-    system.tracking()
-    system.state(moves)
-    done = system.says("stop")
-    assert (done.returncode, json.loads(done.stdout)["role"]) == (0, "controller"), done.stderr
-    system.state(rests)
-    system.kill("controller")
-    system.start("controller")
-    system.commanded_to_stand()
-    assert "stopped since" in system.said("controller")
-    assert system.says("enable").returncode == 0
-    system.tracking()
-    system.state(moves)
-
-
-@pytest.mark.slow
 def test_stop_said_to_nobody_is_noted_and_outlives_every_restart_until_it_is_released(system: Operated) -> None:
     system.start("robot", "reference")
     done = system.says("stop", "--timeout", 0.3)
@@ -124,7 +113,6 @@ def flood(endpoint: str) -> Iterator[list[float]]:
             thread.join()
 
 
-@pytest.mark.slow
 def test_stop_is_answered_beside_300_requests_a_second(system: Operated) -> None:
     system.start("robot", "controller", "reference")
     system.tracking()
@@ -140,7 +128,6 @@ def test_stop_is_answered_beside_300_requests_a_second(system: Operated) -> None
     system.tracking()
 
 
-@pytest.mark.slow
 def test_stop_outlives_all_processes_of_a_guarded_robot_and_the_guard_tells_a_controller_of_another_host(guarded: Operated) -> None:
     system, state = guarded, guarded.folder / "state"
     system.start("robot", "guard", "controller", "reference")

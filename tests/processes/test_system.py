@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import csv
+import json
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
@@ -31,16 +33,20 @@ PERIOD_MS = 1e3 * CONFIG.ocp.dt_s / SPEED
 OTHER_VERSION = f"@{cdr.MESSAGE_VERSION + 1}"  # in a refusal
 
 
+def with_viewer(folder: Path) -> System:
+    return System(folder, viewer=("view", "--rerun-save", folder / "run.rrd"))
+
+
 @pytest.fixture
 def system(tmp_path: Path) -> Iterator[System]:
-    with System(tmp_path, viewer=("view", "--rerun-save", tmp_path / "run.rrd")) as system:
+    with with_viewer(tmp_path) as system:
         yield system
 
 
 @pytest.fixture(scope="module")
 def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
-    """A robot that is being driven, and that every test leaves so."""
-    with System(tmp_path_factory.mktemp("driven")) as system:
+    """A robot that is being driven, and that every test but the last leaves so."""
+    with with_viewer(tmp_path_factory.mktemp("driven")) as system:
         system.start("robot", "controller", "reference")
         system.tracking()
         yield system
@@ -64,28 +70,6 @@ def test_processes_start_in_any_order(system: System, order: tuple[str, ...]) ->
     system.tracking()
     system.state(moves)
     until(lambda: set(order) <= system.lives, "all have met")
-
-
-def test_ctrl_c_ends_each_process_within_a_second_and_the_last_command_is_a_standstill(system: System) -> None:
-    pytest.importorskip("rerun")
-    commands = system.bus.subscriber(KEYS.command, capacity=4096)
-    order = ("viewer", "reference", "controller", "robot")  # whoever is needed comes last; `make test-slow` has other orders
-    for role in order:
-        system.start(role)
-        system.opened(role)
-    system.tracking()
-    system.state(moves)
-    until(lambda: set(order) <= system.lives, "all have met")
-    assert system.interrupt("viewer", 2000.0) == 0  # it has a recording to finish
-    assert system.interrupt("reference", END_MS) == 0
-    system.tracking()  # the reference was published whole, and outlives its source
-    assert system.interrupt("controller", END_MS) == 0
-    until(lambda: "controller" not in system.lives, "the controller is gone")
-    last = decode(Command, commands.drain()[-1].payload)
-    assert (last.mode, np.abs(last.u).max()) == (Mode.STOPPED, 0.0)
-    system.state(rests)
-    assert system.interrupt("robot", END_MS) == 0
-    assert "Traceback" not in "".join(map(system.said, ("controller", "robot", "reference", "viewer")))
 
 
 @pytest.mark.slow
@@ -134,9 +118,13 @@ def test_of_several_planners_a_controller_that_starts_after_them_follows_the_lat
     assert samples.y_ref[:, :2] == pytest.approx(0.1 * latest)
 
 
-def test_stop_is_latched_until_enable(driven: System) -> None:
+def test_stop_is_latched_until_enable_and_outlives_a_controller_that_is_killed(driven: System) -> None:
+    def says(word: str) -> CompletedProcess[str]:
+        return rti_mpc(word, SHIPPED, "-e", driven.endpoint, "--state", driven.folder / "state")  # an operator on the same host
+
     driven.state(moves)
-    assert rti_mpc("stop", SHIPPED, "-e", driven.endpoint).returncode == 0
+    done = says("stop")
+    assert (done.returncode, json.loads(done.stdout)["role"]) == (0, "controller"), done.stderr
     stopped = heard(driven.bus.subscriber(KEYS.command), Command, lambda command: command.mode is Mode.STOPPED and not command.u.any())
     stood = driven.state(rests)
     driven.interrupt("reference")
@@ -144,9 +132,15 @@ def test_stop_is_latched_until_enable(driven: System) -> None:
     heard(driven.bus.subscriber(KEYS.reference), Reference, lambda reference: True)
     later = heard(driven.bus.subscriber(KEYS.command), Command, lambda command: command.seq > stopped.seq + 40)
     assert later.mode is Mode.STOPPED
-    assert driven.state(lambda state: state.seq > stood.seq + 40).x[:2] == pytest.approx(stood.x[:2], abs=1e-3)
-    assert rti_mpc("enable", SHIPPED, "-e", driven.endpoint).returncode == 0
-    assert driven.tracking().seq > later.seq
+    driven.kill("controller")
+    driven.start("controller")
+    again = heard(driven.bus.subscriber(KEYS.command), Command, lambda command: command.epoch > later.epoch)
+    assert (again.mode, again.u.any()) == (Mode.STOPPED, False)
+    assert "stopped since" in driven.said("controller")
+    here = driven.state(lambda _: True)
+    assert driven.state(lambda state: state.seq > here.seq + 40).x[:2] == pytest.approx(stood.x[:2], abs=1e-3)
+    assert says("enable").returncode == 0
+    assert driven.tracking().epoch == again.epoch
     driven.state(moves)
 
 
@@ -244,3 +238,23 @@ def test_inputs_stayed_inside_their_bounds_through_all_of_it(driven: System) -> 
         rows = list(csv.DictReader(file))
     u = np.array([[float(row["u_c"]), float(row["omega_c"])] for row in rows])
     assert np.all(np.abs(u) <= [0.5, 0.745])
+
+
+def test_ctrl_c_ends_each_process_within_a_second_and_the_last_command_is_a_standstill(driven: System) -> None:
+    """The last test of this system; whoever is needed comes last, `make test-slow` has other orders."""
+    pytest.importorskip("rerun")
+    commands = driven.bus.subscriber(KEYS.command, capacity=4096)
+    driven.start("viewer")
+    driven.tracking()
+    driven.state(moves)
+    until(lambda: {"viewer", "reference", "controller", "robot"} <= driven.lives, "all have met")
+    assert driven.interrupt("viewer", 2000.0) == 0  # it has a recording to finish
+    assert driven.interrupt("reference", END_MS) == 0
+    driven.tracking()  # the reference was published whole, and outlives its source
+    assert driven.interrupt("controller", END_MS) == 0
+    until(lambda: "controller" not in driven.lives, "the controller is gone")
+    last = decode(Command, commands.drain()[-1].payload)
+    assert (last.mode, np.abs(last.u).max()) == (Mode.STOPPED, 0.0)
+    driven.state(rests)
+    assert driven.interrupt("robot", END_MS) == 0
+    assert "Traceback" not in "".join(map(driven.said, ("controller", "robot", "reference", "viewer")))
