@@ -20,6 +20,7 @@ from rti_mpc.wire.bus import Bus, BusSettings, Subscriber
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc_service.certs.folder import secured
+from rti_mpc_service.entry import enter
 from tests.processes.system import KEYS
 
 STREAMS: dict[str, tuple[str, type[Any], tuple[str, ...]]] = {
@@ -74,4 +75,4 @@ def main(where: str, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]))
+    enter(lambda: main(sys.argv[1], Path(sys.argv[2])))

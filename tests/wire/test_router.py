@@ -25,8 +25,9 @@ TIMEOUT_S = 60.0
 ROUTER = """
 from rti_mpc.wire.bus import BusSettings
 from rti_mpc.wire.keys import Keys
+from rti_mpc_service.entry import enter
 from rti_mpc_service.router import main
-main(BusSettings(listen=({!r},)), Keys(robot="test"))
+enter(lambda: main(BusSettings(listen=({!r},)), Keys(robot="test")))
 """
 
 

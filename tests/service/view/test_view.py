@@ -81,11 +81,12 @@ import logging, sys
 from pathlib import Path
 from rti_mpc.wire.bus import BusSettings
 from rti_mpc.wire.keys import Keys
+from rti_mpc_service.entry import enter
 from rti_mpc_service.view.view import Screens, main
 
 logging.basicConfig(level=logging.INFO)
 bus, live = BusSettings(connect=(f"tcp/127.0.0.1:{sys.argv[1]}",)), sys.argv[3] if len(sys.argv) > 3 else None
-sys.exit(main(bus, Keys(robot="r"), Screens(rerun_save=Path(sys.argv[2]), rerun_connect=live)))
+enter(lambda: sys.exit(main(bus, Keys(robot="r"), Screens(rerun_save=Path(sys.argv[2]), rerun_connect=live))))
 """
 
 
