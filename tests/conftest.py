@@ -32,7 +32,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--ends", type=int, default=5, metavar="COUNT", help="how often each kind of process is ended (default: 5)")
     parser.addoption("--kills", type=int, default=3, metavar="COUNT", help="how often the recorder is killed (default: 3)")
     parser.addoption("--structures", type=int, default=6, metavar="COUNT", help="how many structures random problems have (default: 6)")
-    parser.addoption("--sets", type=int, default=20, metavar="COUNT", help="how many random problems there are of each structure (default: 20)")
+    parser.addoption("--sets", type=int, default=8, metavar="COUNT", help="how many random problems there are of each structure (default: 8)")
 
 
 def pytest_configure(config: pytest.Config) -> None:

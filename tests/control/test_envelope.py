@@ -9,6 +9,7 @@ import pytest
 from rti_mpc.array import Array
 from rti_mpc.control.envelope import Envelope
 from tests.problems import pioneer
+from tests.slow import slow_but
 
 STEP = np.array([0.25, 0.4])
 BOUND = np.array([0.5, 0.745])
@@ -36,10 +37,11 @@ def test_inputs_are_held_over_their_blocks(blocks: list[int]) -> None:
     np.testing.assert_array_equal(envelope.fit(plan, around(np.zeros(2))), np.repeat(plan, blocks, axis=0))
 
 
+@pytest.mark.parametrize("plans", slow_but([400, 2000], 400))
 @pytest.mark.parametrize("blocks", [[1, 1, 1, 1, 1, 3], [3, 1, 1, 1, 1, 1]])
-def test_any_plan_comes_out_inside(blocks: list[int]) -> None:
+def test_any_plan_comes_out_inside(blocks: list[int], plans: int) -> None:
     envelope, rng = Envelope(pioneer(N=8, blocks=blocks), compile=False), np.random.default_rng(1)
-    for _ in range(2000):
+    for _ in range(plans):
         acting = rng.uniform(-BOUND, BOUND)
         plan = rng.choice([0.0, 1.0, 1e300]) * rng.standard_normal((6, 2))
         for rows in (

@@ -15,6 +15,7 @@ from rti_mpc.rti.rti import Rti
 from rti_mpc_service.bench.families import cart_pole, discs_passed
 from tests.problems import pioneer
 from tests.rti.test_recursion import needs_compiler
+from tests.slow import slow_but
 
 ROUNDING = 1e-12  # relative
 
@@ -88,7 +89,7 @@ def test_guess_after_a_large_step_is_the_plan(ocp: Ocp) -> None:
         assert next_guess(ocp, x, u, x, du, du)[3] == omega
 
 
-@pytest.mark.parametrize("iterations", [5, 10])
+@pytest.mark.parametrize("iterations", slow_but([5, 10], 5))
 def test_cart_pole_swings_up_with_more_iterations_a_sample_as_well(iterations: int) -> None:
     """From a state at which guesses ahead of the first, large steps lead to no plan."""
     family = cart_pole(40)

@@ -32,6 +32,7 @@ CLASSES = {
     "quadrotor": RestClass.UNSTABLE,
     "cart_pole": RestClass.UNSTABLE,
 }
+FEW = ("pioneer", 12), ("car", 12), ("arm", 12)  # with how many states of operation
 
 
 @cache
@@ -48,12 +49,12 @@ def rates(way: WayToRest, name: str, row: int) -> Array:
     return np.array(f(way.x[row], way.u[row], model.p_nominal)).ravel()
 
 
-@pytest.mark.parametrize("name", slow_but(CLASSES, "pioneer", "car", "arm"))
-def test_robot_is_classified_by_what_it_does_at_rest(name: str) -> None:
-    rest = assess(ocp_of(name), law_of(name), 40, compile=False)
+@pytest.mark.parametrize(("name", "states"), slow_but([*((name, 40) for name in CLASSES), *FEW], *FEW))
+def test_robot_is_classified_by_what_it_does_at_rest(name: str, states: int) -> None:
+    rest = assess(ocp_of(name), law_of(name), states, compile=False)
     assert rest.kind is CLASSES[name]
     assert 0.0 < rest.time_s < 10.0
-    assert rest.states == 40
+    assert rest.states == states
     assert bool(rest.alone) is (CLASSES[name] is not RestClass.HOLDS), "only of one that does not hold it is said how fast it moves alone"
 
 
@@ -62,10 +63,15 @@ def test_robot_that_its_inputs_at_rest_stop_needs_no_way(name: str) -> None:
     assert law_of(name) is None
 
 
-@pytest.mark.parametrize("name", slow_but(["car", "bicycle", "arm", "quadrotor", "cart_pole"], "car", "quadrotor"))
-def test_way_ends_at_rest_and_is_inside_bounds_and_slew_limits(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "states"),
+    slow_but(
+        [*((name, 8) for name in ("car", "bicycle", "arm", "quadrotor", "cart_pole")), ("car", 3), ("quadrotor", 3)], ("car", 3), ("quadrotor", 3)
+    ),
+)
+def test_way_ends_at_rest_and_is_inside_bounds_and_slew_limits(name: str, states: int) -> None:
     ocp, way = ocp_of(name), way_of(name)
-    for x, u in zip(*states_of_operation(ocp, 8, seed=7), strict=True):
+    for x, u in zip(*states_of_operation(ocp, states, seed=7), strict=True):
         assert way.find(x, u)
         assert np.array_equal(way.x[0], x)
         assert np.abs(rates(way, name, -1)).max() < 1e-6, "its last row is an equilibrium"
@@ -166,16 +172,16 @@ def test_way_that_is_followed_leads_back_to_where_it_ended_from_beside_it() -> N
         assert np.array_equal(way.x[-1], end)
 
 
-def test_gain_holds_what_does_not_stay_by_itself() -> None:
+@pytest.mark.parametrize("name", slow_but(["arm", "quadrotor", "cart_pole"], "arm", "quadrotor"))
+def test_gain_holds_what_does_not_stay_by_itself(name: str) -> None:
     """Linear, over a row: what the gain leaves of the motion at rest decays; x and heading of a car's side do not move at all."""
-    for name in ("arm", "quadrotor", "cart_pole"):
-        way = way_of(name)
-        ocp = ocp_of(name)
-        assert way.find(np.zeros(ocp.model.nx), np.array(ocp.model.u_rest))
-        phi = ocp.phi()
-        z = [ocp.model.x, ocp.model.u, ocp.model.p]
-        A, B = (np.array(ca.Function("J", z, [ca.jacobian(phi(*z), wanted)])(way.x[-1], way.u[-1], [])) for wanted in z[:2])
-        assert np.abs(np.linalg.eigvals(A - B @ way.K)).max() < 1.0
+    way = way_of(name)
+    ocp = ocp_of(name)
+    assert way.find(np.zeros(ocp.model.nx), np.array(ocp.model.u_rest))
+    phi = ocp.phi()
+    z = [ocp.model.x, ocp.model.u, ocp.model.p]
+    A, B = (np.array(ca.Function("J", z, [ca.jacobian(phi(*z), wanted)])(way.x[-1], way.u[-1], [])) for wanted in z[:2])
+    assert np.abs(np.linalg.eigvals(A - B @ way.K)).max() < 1.0
 
 
 def test_law_that_a_model_gives_is_rolled_out_instead() -> None:

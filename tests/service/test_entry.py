@@ -151,11 +151,11 @@ FULL = f"rti-mpc: standard output must take what is printed, got: {os.strerror(e
         ("$run --help <&- >&- 2>&-", 0, "", ""),
         ("$run robots > /dev/full", 1, "", FULL),
         pytest.param("$run check > /dev/full", 1, "", FULL, marks=pytest.mark.slow),
-        ("$run --help > /dev/full", 1, "", FULL),
+        pytest.param("$run --help > /dev/full", 1, "", FULL, marks=pytest.mark.slow),
         ("$run --help > /dev/full 2>&1", 1, "", ""),
         ("$run check nowhere.toml 2> /dev/full", 2, "", ""),
         ("$run check nowhere.toml 2>&-", 2, "", ""),
-        ("$run stop --timeout 0.1 -e tcp/127.0.0.1:1 >&- 2>&-", 1, "", ""),
+        pytest.param("$run stop --timeout 0.1 -e tcp/127.0.0.1:1 >&- 2>&-", 1, "", "", marks=pytest.mark.slow),
     ],
 )
 def test_output_that_is_closed_full_or_not_read_to_its_end_is_one_line_at_most(command: str, status: int, stdout: str, stderr: str) -> None:

@@ -17,6 +17,7 @@ from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.rti import Rti
 from tests.problems import INF, arc, beacon, double_integrator, pioneer
+from tests.slow import slow_but
 
 TIGHT = SolverSettings(eps=1e-9, max_iter=200_000)
 OTHERS = {  # with their own tolerances, and how far inputs may differ
@@ -57,11 +58,12 @@ def built(name: str, formulation: str) -> Rti:
 @pytest.mark.parametrize("name", PROBLEMS)
 @pytest.mark.parametrize("solver", OTHERS)
 @pytest.mark.parametrize("formulation", ["simultaneous", "sequential"])
-def test_qp_agrees_with_other_solvers_to_1e_6(name: str, solver: str, formulation: str) -> None:
+@pytest.mark.parametrize("states", slow_but([2, 8], 2))
+def test_qp_agrees_with_other_solvers_to_1e_6(name: str, solver: str, formulation: str, states: int) -> None:
     options, atol = OTHERS[solver]
     rti = built(name, formulation)
     rng = np.random.default_rng(1)
-    for _ in range(4):
+    for _ in range(states):
         x0, y_ref, u_prev = sample(rti.ocp, rng)
         rti.reset(x0, u_prev)
         for _ in range(3):
