@@ -24,9 +24,12 @@ SLEW = np.array([2.5, 4.0])  # 1/s: the controller's increments per 0.1 s
 STEP = np.array([0.25, 0.4])  # slew limit per 0.1 s
 
 
+PIONEER = pioneer_3dx()  # one for all robots, whose plants are then built once
+
+
 def robot(trajectory: Trajectory, **changes: Any) -> Lockstep:
     """The scenario's robot at its start, at rest; its plant is the model."""
-    return Lockstep(RobotSettings(pioneer_3dx(), np.array([*trajectory.pose0, 0.0, 0.0]), SLEW, **changes))
+    return Lockstep(RobotSettings(PIONEER, np.array([*trajectory.pose0, 0.0, 0.0]), SLEW, **changes))
 
 
 @cache

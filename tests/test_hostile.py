@@ -18,7 +18,6 @@ from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Reference, State
 from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.control.controller import Controller, Timing
-from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.reference.trajectory import circle
 from rti_mpc.rti.rti import Rti
 from rti_mpc.wire.bus import Received
@@ -26,7 +25,7 @@ from rti_mpc.wire.cdr import M, encode, encoding
 from rti_mpc.wire.intake import Intake
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
-from tests.loop import MS, SLEW, drive, reference
+from tests.loop import MS, PIONEER, SLEW, drive, reference
 from tests.problems import pioneer
 
 NUMBERS = np.array([0.0, -0.0, 5e-324, -2e-308, 1e-18, 0.1, 1.0, -1.0, np.pi, 3.5, 1e3, 1e9, -1e9, 1.1e9, 1e12, 1e18, -1e18])
@@ -69,7 +68,7 @@ class Hostile:
 
 def life(epoch: int) -> Lockstep:
     """A robot at the start of the circle."""
-    return Lockstep(RobotSettings(pioneer_3dx(), np.array([*circle().pose0, 0.0, 0.0]), SLEW, lbu=-BOUND, ubu=BOUND), epoch)
+    return Lockstep(RobotSettings(PIONEER, np.array([*circle().pose0, 0.0, 0.0]), SLEW, lbu=-BOUND, ubu=BOUND), epoch)
 
 
 def honest(stamp_ns: int, seq: int, state_epoch: int, epoch: int = 5) -> Command:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -19,6 +20,17 @@ from rti_mpc.array import Array
 from rti_mpc.codegen import bind
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model, Signal
+
+_steps: WeakKeyDictionary[Model, dict[tuple[int, float], ca.Function]] = WeakKeyDictionary()  # of plants: robots of one model share them
+
+
+def step(model: Model, substeps: int, lag_s: float) -> ca.Function:
+    """Return the integration step of a plant, ``(x, u, p, dt) -> x_next``, built once for all robots of a model."""
+    known = _steps.setdefault(model, {})
+    key = substeps, lag_s
+    if key not in known:
+        known[key] = integrator(lagging(model, lag_s) if lag_s > 0.0 else model, substeps=substeps)
+    return known[key]
 
 
 def lagging(model: Model, lag_s: float) -> Model:
@@ -57,8 +69,8 @@ class Plant:
         self._dt = np.zeros(1)
         self.x = self._state[: model.nx]
         self.u = self._state[model.nx :] if lag_s > 0.0 else self._input
-        phi = integrator(lagging(model, lag_s) if lag_s > 0.0 else model, substeps=substeps)
-        self._evaluate = bind(phi, {"x": self._state, "u": self._input, "p": self._p, "dt": self._dt}, {"x_next": self._next})
+        given = {"x": self._state, "u": self._input, "p": self._p, "dt": self._dt}
+        self._evaluate = bind(step(model, substeps, lag_s), given, {"x_next": self._next})
 
     def place(self, x: Array) -> None:
         """Go on from another state, shape ``(nx,)``; inputs that lag go on from what they are."""

@@ -14,11 +14,10 @@ from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command, End, Notice, Reference, State
 from rti_mpc.contract.status import Mode
 from rti_mpc.control.controller import Controller, Timing
-from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.rti.rti import Rti
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
-from tests.loop import MS, SLEW
+from tests.loop import MS, PIONEER, SLEW
 from tests.problems import pioneer
 from tests.slow import slow_but
 
@@ -61,7 +60,7 @@ class Scene:
     def begin(self, epoch: int) -> None:
         """Begin a life of the robot."""
         self.robot_ns = 0.0
-        self.body = Lockstep(RobotSettings(pioneer_3dx(), np.zeros(5), SLEW), epoch=epoch)
+        self.body = Lockstep(RobotSettings(PIONEER, np.zeros(5), SLEW), epoch=epoch)
 
     def state(self, **change: object) -> State:
         self.states += 1

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from rti_mpc.array import Array
 from rti_mpc.model.model import Model
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
-from rti_mpc_sim.plant import Plant, SampledPlant, lagging, plant
+from rti_mpc_sim.plant import Plant, SampledPlant, lagging, plant, step
 
 MODEL = pioneer_3dx().with_parameters(theta_1=0.3, a=0.15)
 X0 = np.array([0.5, -0.2, 0.3, 0.1, -0.4])
@@ -60,6 +61,20 @@ def test_cutting_an_interval_changes_nothing() -> None:
     for duration_s in (0.0137, 0.05, 0.0363):
         cut.advance(U, duration_s)
     np.testing.assert_allclose(cut.x, whole.x, atol=1e-11)
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.05])
+def test_plants_of_one_model_share_its_equations_and_no_state(lag_s: float) -> None:
+    """As robots that are started many times in lockstep: to build the expressions takes as long as to drive for seconds."""
+    alone = Plant(replace(MODEL), X0, 0.1, 20, lag_s)  # of another object
+    one, other = (Plant(MODEL, x0, 0.1, 20, lag_s) for x0 in (X0, -X0))
+    for sign in (1.0, -1.0):
+        alone.advance(sign * U, 0.03)
+        one.advance(sign * U, 0.03)
+        other.advance(-2.0 * sign * U, 0.07)
+    np.testing.assert_array_equal(one.x, alone.x)
+    assert step(MODEL, 20, lag_s) is step(MODEL, 20, lag_s)
+    assert step(MODEL, 20, lag_s) is not step(MODEL, 10, lag_s)
 
 
 def test_plant_does_not_grow_the_heap() -> None:
