@@ -33,6 +33,7 @@ CONFIG = load(SHIPPED)
 KEYS = CONFIG.keys()
 PATIENCE_S = 60.0  # to start processes and hear of them on a host that is busy; the first controller on a machine compiles
 SPEED = 4.0
+MAX_SAID = 2000  # characters of a log that a failure shows
 STATE = Path(tempfile.mkdtemp(prefix="rti-mpc-state-"))  # of commands that belong to no system; never the user's own
 ARGUMENTS: dict[str, tuple[object, ...]] = {
     "robot": ("sim", "--speed", SPEED, "--x0", "x=0.5"),
@@ -148,7 +149,11 @@ class System:
         return until(look, f"{source} says {code}", pause_s=0.05)
 
     def state(self, condition: Callable[[State], bool]) -> State:
-        return heard(self.bus.subscriber(self.keys.state), State, condition)
+        try:
+            return heard(self.bus.subscriber(self.keys.state), State, condition)
+        except AssertionError as error:
+            said = "\n".join(f"{role}: {self.said(role)[-MAX_SAID:]}" for role in self.running)
+            raise AssertionError(f"{error}\n{said}") from None
 
 
 def owner(log: str) -> int:
