@@ -98,13 +98,14 @@ class ActiveSet:
 
         self._places, self._found, self._point = arrays["places"], arrays["places_found"], arrays["point"]
         self._start, self._least = arrays["start"], arrays["least"]
-        self._changes, self._product, self._verdict = arrays["changes"].data, arrays["product"].data, verdict.data  # read faster than arrays
+        self._changes, self._stiff = arrays["changes"].data, arrays["stiff"].data  # read faster than arrays
+        self._product, self._verdict = arrays["product"].data, verdict.data
         self._moved = arrays["interior"].data, arrays["interior_after"].data
         self._keep_first = tuple((array, arrays[name.removesuffix("_first")]) for name, array in first.items())
         self._take_first = tuple(zip((arrays["way"], self._found, arrays["targets"]), first.values(), strict=True))
         self._interior_pairs = tuple(zip(found.values(), inside.values(), strict=True))
         self._best = tuple((np.zeros_like(array), array) for array in found.values())
-        self.written = (*found.values(), arrays["changes"], arrays["targets"], arrays["r"], verdict)
+        self.written = (*found.values(), arrays["changes"], arrays["stiff"], arrays["targets"], arrays["r"], verdict)
         self._lowest = np.inf  # gap of the best plan, relative as `res_dual`
         self._stepped = False  # whether the interior point has been used for this QP
         self._qps = self.steps = self.roll_outs = 0
@@ -131,8 +132,12 @@ class ActiveSet:
     def certified(self) -> QpStatus:
         """Improve the last plan until it is certified, and return its status; the certificate uses the problem's own data only."""
         status = self._judged()
+        if status is SOLVED:
+            if not self._stepped:
+                self._sharpen()
+            return SOLVED
         self._lowest = np.inf
-        if status is SOLVED or not self._keep_better():
+        if not self._keep_better():
             return status
         for _ in range(MAX_REFINEMENTS):
             self.refine()
@@ -141,6 +146,28 @@ class ActiveSet:
             if not self._keep_better():  # with degenerate places a refinement may make the plan worse
                 break
         return self._restore_best() if self._stepped else self._step_inside()
+
+    def sharpen(self) -> None:
+        """Make the last plan exact to rounding where bounds are held, because the next QP is linearized there."""
+        if self._stiff[0] > 0.0 and not self._stepped:
+            self._judged()
+            self._sharpen()
+
+    def _sharpen(self) -> None:
+        """
+        Refine the plan rolled out last, which has been judged, unless its gap grows, as with degenerate places it may.
+
+        Increments and softened bounds are held by a penalty that cancels in the cost-to-go, and takes as many digits with it as it is large. A small
+        gap is no small distance where the cost is flat: without this, the units of the model decide 1e-7 of an input's range, or more.
+        """
+        if self._stiff[0] <= 0.0:
+            return
+        gap = self.res_dual
+        self.refine()
+        self._judged()
+        if not (self.res_prim <= MAX_VIOLATION and self.res_dual < gap):
+            self.roll_out()
+            self._judged()
 
     def rehearse(self) -> None:
         """Make the plan once and judge it; the caller puts `written` back."""
@@ -275,4 +302,7 @@ class ActiveSet:
             self._count()
             if self._changes[0] <= 0.0:
                 break
-        return self._changes[0] == 0.0 and self._judged() is SOLVED
+        if self._changes[0] != 0.0 or self._judged() is not SOLVED:
+            return False
+        self._sharpen()
+        return True

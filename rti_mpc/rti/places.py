@@ -65,10 +65,11 @@ class Places:
             cost-to-go before each stage, all of these places. With the known ones of other places, but of the same linearization, compiled code goes
             only over the stages up to the last one whose places differ. What is known may be in the memory of the results. Places that are NaN
             differ at all stages.
-        roll_out: ``(x, u, u_prev, x0, stages, gains, *ARGUMENTS, scale, places) -> (x_plan, u_plan, violation, change, changes,
+        roll_out: ``(x, u, u_prev, x0, stages, gains, *ARGUMENTS, scale, places) -> (x_plan, u_plan, violation, change, changes, stiff,
             places_found, multipliers, targets)``: the plan after the full step, its largest violation of softened bounds, in their unit and
-            relative to their scale, the size of the step, and how many places change: -1 if data, gains or plan are not finite. Targets are the
-            coordinates of the rows, see `rti_mpc.rti.homotopy`.
+            relative to their scale, the size of the step, and how many places change: -1 if data, gains or plan are not finite. `stiff` is the
+            number of increments and softened bounds that are held, whose penalties the cost-to-go carries. Targets are the coordinates of the
+            rows, see `rti_mpc.rti.homotopy`.
         roll_out_again: Gains of other places, then their roll-out, ``roll_out`` with the places ``places_of``.
         move_on: The way along the homotopy to the next change of a place, see `rti_mpc.rti.homotopy.move`, then the same of its ``places``. Of the
             change and the roll-out before, it takes ``places_known``, ``point_known``, ``places_found_known`` and ``targets_known``.
@@ -251,7 +252,7 @@ def roll_out(ocp: Ocp, at: Sample, x0: ca.MX) -> dict[str, ca.MX]:
     start = {
         "s": ca.vertcat(x0 - lin.x[:, 0], ca.MX.zeros(nu)),
         "slip": ca.MX.zeros(nx + nu),
-        "verdict": ca.MX(ca.DM([0, -INFINITY, -INFINITY])),  # changes, violation, violation relative to scale
+        "verdict": ca.MX(ca.DM([0, 0, -INFINITY, -INFINITY])),  # changes, stiff rows, violation, violation relative to scale
         "before": lin.u_prev,
     }
     carried = {"s": "s_after", "slip": "slip_after", "verdict": "verdict_after", "before": "u_plan"}
@@ -281,9 +282,10 @@ def roll_out(ocp: Ocp, at: Sample, x0: ca.MX) -> dict[str, ca.MX]:
     return {
         "x_plan": x_plan,
         "u_plan": u_plan,
-        "violation": verdict[1:],
+        "violation": verdict[2:],
         "change": change(lin, u_plan),
         "changes": ca.if_else(ca.fabs(finite) < np.inf, verdict[0], -1),
+        "stiff": verdict[1],
         "places_found": ca.veccat(*(along[name] for name in found)),
         "multipliers": ca.veccat(along["force"], along["paid"]),
         "targets": ca.veccat(*(along[name] for name in targets)),
@@ -297,7 +299,7 @@ class Softened(NamedTuple):
     Attributes:
         symbols: Symbols that it depends on, by name.
         outputs: Expressions that it returns, by name, without the verdict.
-        verdict: Number of places changed so far, largest violation of a softened bound, and the same relative to its scale.
+        verdict: Number of places changed so far, and of stiff rows, largest violation of a softened bound, and the same relative to its scale.
     """
 
     symbols: dict[str, ca.SX]
@@ -318,10 +320,10 @@ def softened_rows(ocp: Ocp, of: Stage, s: ca.SX, slip: ca.SX, du: ca.SX, slipped
         slipped: Difference between the clipped input and the input with that deviation.
     """
     nx = of.nx
-    x_next, verdict = ca.SX.sym("x_next", nx), ca.SX.sym("verdict", 3)
+    x_next, verdict = ca.SX.sym("x_next", nx), ca.SX.sym("verdict", 4)
     names = ("g", "place_g", "lg", "ug", "zg", "Zg", "stiff_g", "scale_g")
     g, place_g, lg, ug, zg, Zg, stiff_g, scale_g = own = [ca.SX.sym(name, of.ng) for name in names]
-    changes, worst, share = ca.vertsplit(verdict)
+    changes, stiff_rows, worst, share = ca.vertsplit(verdict)
     drift = of.A @ slip[:nx] + of.B @ slipped
     dx = of.A @ s[:nx] + of.B @ du + of.b
     end = ca.vertcat(dx, du)
@@ -335,6 +337,7 @@ def softened_rows(ocp: Ocp, of: Stage, s: ca.SX, slip: ca.SX, du: ca.SX, slipped
         worst, share = ca.fmax(worst, exceeds), ca.fmax(share, exceeds / scale_g[j])
         found[j] = new_place(place_g[j], stiff_g[j], scale_g[j], over, under, zg[j] / 2)
         changes += found[j] != place_g[j]
+        stiff_rows += ca.fabs(place_g[j]) == 1
         by = ca.if_else(place_g[j] > 0, over, under)
         target[j] = ca.if_else(ca.fabs(place_g[j]) == 1, stiff_g[j] * by, value[j])
         paid[j] = ca.sign(place_g[j]) * ca.if_else(ca.fabs(place_g[j]) == 2, (zg[j] + Zg[j] * by) / 2, stiff_g[j] * by)
@@ -342,7 +345,7 @@ def softened_rows(ocp: Ocp, of: Stage, s: ca.SX, slip: ca.SX, du: ca.SX, slipped
     symbols |= {"x_next": x_next, "s": s, "slip": slip, "verdict": verdict}
     outputs = {"x_plan": x_next + dx + drift, "s_after": end, "slip_after": ca.vertcat(drift, slipped)}
     outputs |= {"found_g": ca.densify(found), "paid": ca.densify(paid), "target_g": ca.densify(target)}
-    return Softened(symbols, outputs, [changes, worst, share])
+    return Softened(symbols, outputs, [changes, stiff_rows, worst, share])
 
 
 def simplified(name: str, inputs: dict[str, ca.SX], outputs: dict[str, ca.SX]) -> ca.Function:
@@ -382,6 +385,7 @@ def roll_free(ocp: Ocp, lin: Linearization) -> ca.Function:
     outputs["found_du"] = placed(planned, place_du, lbdu, ubdu, ocp.tightest("lbdu"), ocp.tightest("ubdu"))
     verdict[0] += ca.sum1(outputs["found_u"] != place_u)
     verdict[0] += ca.sum1(outputs["found_du"] != place_du)
+    verdict[1] += ca.sum1(ca.fabs(place_du) == 1)
     outputs["target_u"], outputs["target_du"] = targets(u + du, place_u, lbu, ubu), targets(planned, place_du, lbdu, ubdu)
     outputs["force"] = ca.densify(stiff * (ca.fabs(place_du) == 1) * (planned - ca.if_else(place_du > 0, ubdu, lbdu)))
     inputs = {**symbols, "gain": gain.column, **dict(zip(names, own, strict=True))}

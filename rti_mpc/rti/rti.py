@@ -480,6 +480,8 @@ class Rti:
         while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
             if self._settled and self.active_set is not None and not self.active_set.goes_on:
                 break  # the next sample goes on; after a start, a plan that is left early may lead nowhere
+            if self.active_set is not None and self.solver is self.active_set:
+                self.active_set.sharpen()
             if acceleration is None:
                 self._relinearize()
             else:

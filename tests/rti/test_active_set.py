@@ -97,3 +97,47 @@ def test_without_bounds_one_roll_out_is_exact() -> None:
             one.feedback(x0)
         assert rti.solver.iterations == 1
         np.testing.assert_allclose(rti.u, exact.u, rtol=0, atol=1e-7)
+
+
+def held(refine: Callable[[Rti], None] | None = None) -> tuple[Rti, int]:
+    """Solve one QP with increments at their bounds, perhaps with another refinement; return the solver and how often that was called."""
+    ocp, calls = pioneer(N=15), 0
+    rti = Rti(ocp, iterations=1, compile=False)
+    assert rti.active_set is not None
+    own = rti.active_set.refine
+
+    def counted() -> None:
+        nonlocal calls
+        calls += 1
+        if refine is None:
+            own()
+        else:
+            refine(rti)
+
+    rti.active_set.refine = counted
+    x0, u_prev = np.array([0.1, 0.2, 0.2, 0.45, -0.7]), np.zeros(2)
+    rti.reset(x0, u_prev)
+    rti.prepare(arc(np.linspace(0.1, 1.5, 15)), shift=False)
+    assert rti.feedback(x0) is QpStatus.SOLVED
+    assert np.isclose(np.abs(np.diff(rti.u, axis=0, prepend=u_prev[None])), ocp.ubdu, rtol=0, atol=1e-12).any()
+    return rti, calls
+
+
+def test_plan_with_bounds_that_are_held_is_exact_to_rounding() -> None:
+    """Its certificate would be content with 1e-6 of the cost."""
+    rti, _ = held()
+    assert rti.active_set is not None
+    assert rti.active_set.res_dual < 1e-14
+
+
+def test_refinement_that_makes_the_plan_worse_is_taken_back() -> None:
+    def spoil(rti: Rti) -> None:
+        rti.u += 0.01
+
+    rti, calls = held(spoil)
+    assert calls == 1
+    planned = rti.u.copy(), rti.x.copy()
+    assert rti.active_set is not None
+    rti.active_set.roll_out()
+    np.testing.assert_array_equal(planned[0], rti.u)
+    np.testing.assert_array_equal(planned[1], rti.x)
