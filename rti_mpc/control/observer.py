@@ -7,7 +7,8 @@ The state is augmented by disturbances that walk at random, :math:`z = (x, d)`,
 the estimate tracks without offset although its model is wrong
 [Pannocchia2003]_. The filter is corrected by one measured state after the other, in
 Joseph's form, which holds for any gain: the gain of the disturbances is set to zero
-where they are frozen. The disturbances are clipped to their limits.
+where they are frozen. The disturbances are clipped to their limits. Noises that nobody
+has configured are shares of the scales of the states, so that units mean nothing.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from rti_mpc.model.disturbance import with_disturbances
 from rti_mpc.model.integrator import sensitivities
 from rti_mpc.model.model import Model
 
-DEFAULT_NOISE = 1e-3  # standard deviation of a measured state, in its unit
-DEFAULT_PROCESS_NOISE = 1e-3  # standard deviation of the random walk that is added to a state, in its unit / sqrt(s)
+DEFAULT_NOISE = 1e-3  # standard deviation of a measured state, relative to its scale
+DEFAULT_PROCESS_NOISE = 1e-3  # standard deviation of the random walk that is added to a state, relative to its scale, 1 / sqrt(s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +54,9 @@ class ObserverSettings:
     Attributes:
         disturbances: Settings of each disturbance, by the name of an input or a state.
         measured: Names of the states that are measured, or of the only one; empty if all are.
-        noise: Standard deviation of measured states by name, in the state's unit; `DEFAULT_NOISE` if left out.
+        noise: Standard deviation of measured states by name, in the state's unit; `DEFAULT_NOISE` of its scale if left out.
         process: Standard deviation of the random walk that is added to states, by name, in the state's unit / sqrt(s);
-            `DEFAULT_PROCESS_NOISE` if left out.
+            `DEFAULT_PROCESS_NOISE` of its scale if left out.
     """
 
     disturbances: Mapping[str, Disturbance] = field(default_factory=dict)
@@ -72,6 +73,8 @@ class ObserverSettings:
 class Observer:
     """
     The filter of one robot.
+
+    The scales of its states are those of the problem once it belongs to a `rti_mpc.control.controller.Controller`, until then one unit each.
 
     Attributes:
         model: The model with its disturbances, which the controller must predict with.
@@ -106,27 +109,41 @@ class Observer:
         for places in self._rotations.quaternions:
             if not set(places) <= set(measured):
                 raise OcpError(f"measured must have all of a quaternion, {', '.join(states[j] for j in places)}, got {', '.join(settings.measured)}")
-        variances = [settings.noise.get(states[j], DEFAULT_NOISE) ** 2 for j in measured]
-        if min(variances, default=1.0) <= 0.0:
+        if min((settings.noise[states[j]] for j in measured if states[j] in settings.noise), default=1.0) <= 0.0:
             raise OcpError(f"the noise of a measured state must be positive, got {dict(settings.noise)}")
-        walks = [settings.process.get(name, DEFAULT_PROCESS_NOISE) for name in states] + [of.drift for of in settings.disturbances.values()]
-        self._initial: Array = np.diag([*(variances[measured.index(j)] if j in measured else 1.0 for j in range(nx)), *self._limits**2])
+        self._settings = settings
+        self._variances, self._walks = np.zeros(len(measured)), np.zeros(nx + nd)
+        self._initial, self._P = np.zeros((nx + nd, nx + nd)), np.zeros((nx + nd, nx + nd))
+        self.take_scales(np.ones(nx))
 
         z: Array = np.zeros(nx + nd)
         self.x, self.d = z[:nx], z[nx:]
         self.frozen = False
-        self._P: Array = self._initial.copy()
         self._u, self._span, self._y, self._gain = np.zeros(model.nu), np.zeros(1), np.zeros(nx), np.ones(1)
         self.p: Array = np.array(model.p_nominal)
-        functions = predict(self.model, nd, np.square(walks)), correct(nx, nd, measured, variances, self._limits)
+        functions = predict(self.model, nd), correct(nx, nd, measured, self._limits)
         made = compiled(*functions) if compile else functions
         z_next, P_next = np.zeros_like(z), np.zeros_like(self._P)
-        before = {"z": z, "P": self._P, "u": self._u, "p": self.p, "span": self._span}
+        before = {"z": z, "P": self._P, "u": self._u, "p": self.p, "span": self._span, "walks": self._walks}
         self._predict = bind(made[0], before, {"z_next": z_next, "P_next": P_next})
-        measured_at = {"z": z_next, "P": P_next, "y": self._y, "gain": self._gain}
+        measured_at = {"z": z_next, "P": P_next, "y": self._y, "gain": self._gain, "variances": self._variances}
         self._correct = bind(made[1], measured_at, {"z_corrected": z, "P_corrected": self._P})
         self._predicted = (z_next, P_next)
         self._z = z
+
+    def take_scales(self, scale: Array) -> None:
+        """Take the scales of the states, shape ``(nx,)``: noises that the settings leave out are shares of them. The covariance starts anew."""
+        settings, model = self._settings, self.model
+        names = [signal.name for signal in model.states]
+        noise, process = (
+            np.array([configured.get(name, share * of) for name, of in zip(names, scale, strict=True)])
+            for configured, share in ((settings.noise, DEFAULT_NOISE), (settings.process, DEFAULT_PROCESS_NOISE))
+        )
+        self._variances[:] = noise[self.measured] ** 2
+        self._walks[:] = np.square([*process, *(of.drift for of in settings.disturbances.values())])
+        at_start = np.where(np.isin(np.arange(model.nx), self.measured), noise, scale)  # what is not measured may be anywhere
+        np.fill_diagonal(self._initial, np.square([*at_start, *self._limits]))
+        self._P[:] = self._initial
 
     def reset(self, x: Array) -> None:
         """Start from a state, shape ``(nx,)``; the disturbances keep their values if they are finite, and the covariance starts anew."""
@@ -155,27 +172,27 @@ class Observer:
         return isfinite(self._z.sum() + self._P.sum())
 
 
-def predict(model: Model, nd: int, walks: Array) -> ca.Function:
-    """Build ``(z, P, u, p, span) -> (z_next, P_next)``: one step of the dynamics and of the covariance."""
+def predict(model: Model, nd: int) -> ca.Function:
+    """Build ``(z, P, u, p, span, walks) -> (z_next, P_next)``: one step of the dynamics and of the covariance, which the walks' variances enlarge."""
     nx, n = model.nx, model.nx + nd
-    P, span = ca.SX.sym("P", n, n), ca.SX.sym("span")
+    P, span, walks = ca.SX.sym("P", n, n), ca.SX.sym("span"), ca.SX.sym("walks", n)
     p, d = model.p[: model.np_ - nd], model.p[model.np_ - nd :]
     z = ca.vertcat(model.x, d)
     x_next, A_x, _, A_p = sensitivities(model, span)
     z_next = ca.vertcat(x_next, d)
     A = ca.blockcat([[A_x, A_p[:, model.np_ - nd :]], [ca.SX(nd, nx), ca.SX.eye(nd)]])
-    P_next = ca.densify(A @ P @ A.T + span * ca.diag(ca.DM(walks)))
-    inputs = {"z": z, "P": P, "u": model.u, "p": p, "span": span}
+    P_next = ca.densify(A @ P @ A.T + span * ca.diag(walks))
+    inputs = {"z": z, "P": P, "u": model.u, "p": p, "span": span, "walks": walks}
     return function("observer_predict", inputs, {"z_next": z_next, "P_next": P_next})
 
 
-def correct(nx: int, nd: int, measured: list[int], variances: list[float], limits: Array) -> ca.Function:
-    """Build ``(z, P, y, gain) -> (z_corrected, P_corrected)``; a `gain` of 0 freezes the disturbances, 1 does not."""
+def correct(nx: int, nd: int, measured: list[int], limits: Array) -> ca.Function:
+    """Build ``(z, P, y, gain, variances) -> (z_corrected, P_corrected)``; a `gain` of 0 freezes the disturbances, 1 does not."""
     z, P = ca.SX.sym("z", nx + nd), ca.SX.sym("P", nx + nd, nx + nd)
-    y, gain = ca.SX.sym("y", nx), ca.SX.sym("gain")
-    inputs = {"z": z, "P": P, "y": y, "gain": gain}
+    y, gain, variances = ca.SX.sym("y", nx), ca.SX.sym("gain"), ca.SX.sym("variances", len(measured))
+    inputs = {"z": z, "P": P, "y": y, "gain": gain, "variances": variances}
     acts = ca.vertcat(ca.SX.ones(nx), gain * ca.SX.ones(nd))
-    for j, variance in zip(measured, variances, strict=True):
+    for j, variance in zip(measured, ca.vertsplit(variances), strict=True):
         column = P[:, j]
         s = P[j, j] + variance
         K = acts * column / s

@@ -30,8 +30,9 @@ from rti_mpc.signals import Signal
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
 from tests.loop import MS, SLEW, drive, reference
-from tests.problems import PAPER, double_integrator
+from tests.problems import PAPER, double_integrator, pioneer
 from tests.problems import SLEW as INCREMENTS
+from tests.units import PIONEER_UNITS, in_other_units
 
 POSE = ("x", "y", "psi")
 INPUTS = {"u_c": Disturbance(drift=0.1, limit=0.3), "omega_c": Disturbance(drift=0.1, limit=0.3)}
@@ -111,6 +112,35 @@ def test_compiled_observer_is_the_interpreted_one() -> None:
 def test_settings_that_do_not_fit_are_refused(settings: ObserverSettings, words: str) -> None:
     with pytest.raises(OcpError, match=words):
         Observer(pioneer_3dx(), settings, compile=False)
+
+
+def estimates(x_units: Array, u_units: Array, noise: float | None = None) -> Array:
+    """Return states and disturbances, in the old units, that a controller's observer finds from the pose of the robot in other units."""
+    ocp = in_other_units(pioneer(N=7), x_units, u_units)
+    units = dict(zip((signal.name for signal in (*ocp.model.inputs, *ocp.model.states)), (*u_units, *x_units), strict=True))
+    disturbances = {name: Disturbance(of.drift / units[name], of.limit / units[name]) for name, of in (INPUTS | SLIP).items()}
+    configured = {} if noise is None else {"x": noise / units["x"]}
+    observer = Observer(ocp.model, ObserverSettings(disturbances, POSE, configured, configured), compile=False)
+    Controller(Rti(replace(ocp, model=observer.model), compile=False), Timing(), observer=observer, compile=False)
+    rng, phi = np.random.default_rng(1), integrator(slipping(), "rk4", 4)
+    x: Array = np.array([1.0, 2.0, 0.5, 0.3, 0.2])
+    observer.reset(x / x_units)
+    found = []
+    for _ in range(60):
+        u = rng.uniform([-0.5, -0.7], [0.5, 0.7])
+        x = np.array(phi(x, u + np.array([0.05, -0.1]), slipping().p_nominal, DT)).ravel()
+        observer.predict(u / u_units, DT)
+        observer.correct((x + rng.normal(size=5) * 1e-3) / x_units)
+        found.append([*observer.x * x_units, *observer.d * [units[name] for name in disturbances]])
+    return np.array(found)
+
+
+@pytest.mark.parametrize("noise", [None, 0.005])
+def test_same_robot_in_other_units_has_the_same_estimates(noise: float | None) -> None:
+    """Noises that are left out follow from the problem's scales; one that is configured is what it is, in the state's unit. Here mm, degrees, rpm."""
+    x_units, u_units = PIONEER_UNITS
+    plain, other = estimates(np.ones(5), np.ones(2), noise), estimates(np.array([1e-3, 1e-3, *x_units[2:]]), u_units, noise)
+    np.testing.assert_allclose(other, plain, rtol=0, atol=1e-8)  # m, rad, and per second: all range over about one
 
 
 # In closed loop: the circle, after 20 s.

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -13,7 +12,6 @@ import pytest
 
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
-from rti_mpc.model.model import Model, Signal
 from rti_mpc.model.path_following import path_following
 from rti_mpc.model.robots.boat import boat
 from rti_mpc.model.robots.cart_pole import cart_pole
@@ -26,6 +24,7 @@ from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.scale import scale
 from tests.problems import INF, cart, double_integrator, fenced, pioneer
 from tests.slow import slow_but
+from tests.units import PIONEER_UNITS, in_other_units
 
 NEWTONS = {"N": 1.0, "kN": 1e3, "mN": 1e-3, "rpm": 0.05, "m/s^2": 1500.0}  # newtons of one unit of the input
 
@@ -69,36 +68,6 @@ def test_other_solvers_are_given_the_same_numbers_in_any_unit(solver: str, atol:
     assert iterations == their_iterations
 
 
-def model_in_other_units(model: Model, x_units: Array, u_units: Array) -> Model:
-    """Return a model whose states and inputs count so many of the old units each; its outputs are the old ones."""
-    x, u = ca.SX.sym("x", model.nx), ca.SX.sym("u", model.nu)
-    old = (ca.DM(x_units) * x, ca.DM(u_units) * u)
-    f, y, h = (ca.substitute([expr], [model.x, model.u], [*old])[0] for expr in (model.f_expl_expr, model.y_expr, model.h_expr))
-    states, inputs = (
-        tuple(Signal(signal.name, f"{unit:g} {signal.unit}") for signal, unit in zip(signals, units, strict=True))
-        for signals, units in ((model.states, x_units), (model.inputs, u_units))
-    )
-    outputs = tuple(Signal(signal.name, signal.unit) for signal in model.outputs)
-    given: dict[str, Any] = {
-        "p": model.p,
-        "parameters": model.parameters,
-        "p_nominal": model.p_nominal,
-        "u_rest": tuple(np.array(model.u_rest) / u_units),
-    }
-    return Model(model.name, x, u, f / ca.DM(x_units), y, states, inputs, outputs, h_expr=h, constraints=model.constraints, **given)
-
-
-def in_other_units(ocp: Ocp, x_units: Array, u_units: Array) -> Ocp:
-    """Return the same problem, whose states and inputs count so many of the old units each; with units of 1 its signals are no angles either."""
-    constrained = replace(ocp.model, h_expr=ocp.h_expr, constraints=tuple(Signal(f"h_{i}", "1") for i in range(ocp.h_expr.numel())))
-    bounds = {name: getattr(ocp, name) / u_units for name in ("lbu", "ubu", "lbdu", "ubdu")}
-    bounds |= {name: getattr(ocp, name) / x_units for name in ("lbx", "ubx")} | {"lh": ocp.lh, "uh": ocp.uh}
-    weights = {name: getattr(ocp, name) for name in ("Q", "Q_e", "delta", "lambda_", "zh", "Zh")}
-    weights |= {"R": ocp.R * np.outer(u_units, u_units), "R_u": ocp.R_u * u_units**2, "z": ocp.z * x_units, "Z": ocp.Z * x_units**2}
-    model = model_in_other_units(constrained, x_units, u_units)
-    return Ocp(model, N=ocp.N, blocks=ocp.blocks, dt=ocp.dt, method=ocp.method, **bounds, **weights)
-
-
 def differences(one: Rti, other: Rti, units: tuple[Array, Array], x: Array, y_ref: Callable[[int], Array], samples: int) -> Array:
     """
     Drive both from a state, and from the same guess in each sample.
@@ -133,9 +102,6 @@ def wave(N: int, outputs: int, dt: float = 0.1) -> Callable[[int], Array]:
         return np.column_stack([0.4 * t, 0.3 * np.sin(t), 0 * t])[:, :outputs]
 
     return at
-
-
-PIONEER_UNITS = np.array([1e3, 1e-3, np.pi / 180, 1e-2, 2 * np.pi / 60]), np.array([1e-3, 2 * np.pi / 60])
 
 
 def pioneer_start(seed: int) -> Array:

@@ -282,8 +282,12 @@ class ObserverSection(Section):
         description="whether disturbances go on while the robot stands, as wind and current do, slip and friction do not: a stop then balances them",
     )
     measured: Annotated[tuple[str, ...], Field(strict=False)] = Field(default=(), description="states that are measured; all if left out")
-    noise: dict[str, Positive] = Field(default={}, description="standard deviation of the measurement noise of states, by name, in the state's unit")
-    process: dict[str, Weight] = Field(default={}, description="intensity of the process noise of states, by name, in the state's unit / sqrt(s)")
+    noise: dict[str, Positive] = Field(
+        default={}, description="standard deviation of the measurement noise of states, by name, in the state's unit; of others 1e-3 of their scale"
+    )
+    process: dict[str, Weight] = Field(
+        default={}, description="intensity of the process noise of states, by name, in the state's unit / sqrt(s); of others 1e-3 of their scale"
+    )
 
 
 class GuardSection(Section):
