@@ -107,6 +107,8 @@ class Info:
         ubx: Upper bounds of the states.
         lbdu: Lower bounds of the increments of the inputs, per sample.
         ubdu: Upper bounds of the increments.
+        scale_x: What each state ranges over, its scale inside the solver, see `rti_mpc.rti.scale`; empty if not said.
+        scale_u: The same of the inputs.
         weights: Weights of the cost; None if not said.
         quaternions: Names of w, x, y, z of each attitude, of states or outputs.
     """
@@ -127,6 +129,8 @@ class Info:
     ubx: tuple[float, ...] = ()
     lbdu: tuple[float, ...] = ()
     ubdu: tuple[float, ...] = ()
+    scale_x: tuple[float, ...] = ()
+    scale_u: tuple[float, ...] = ()
     weights: Weights | None = None
     quaternions: tuple[tuple[str, ...], ...] = ()
 
@@ -141,6 +145,8 @@ class Info:
         try:
             vectors: dict[str, Any] = {name: tuple(_label(signal) for signal in _few(document.get(name, ()))) for name in INFO_VECTORS}
             bounds: dict[str, Any] = {name: _bounds(document.get(name), sign, len(vectors[vector])) for name, (vector, sign) in INFO_BOUNDS.items()}
+            told = [(name, vector) for name, vector in INFO_SCALES.items() if name in document]
+            scales: dict[str, Any] = {name: _scale(document[name], len(vectors[vector])) for name, vector in told}
             return cls(
                 role=str(document["role"]),
                 document=json.dumps(document, indent=2),
@@ -151,6 +157,7 @@ class Info:
                 quaternions=tuple(_quaternion(names) for names in _few(document.get("quaternions", ()))),
                 **vectors,
                 **bounds,
+                **scales,
             )
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             raise MessageError(f"info must be JSON of role, states, inputs, outputs, bounds as documented, got a fault at {error}") from error
@@ -236,6 +243,8 @@ INFO_BOUNDS = {
     "ubdu": ("inputs", 1),
 }
 
+INFO_SCALES = {"scale_x": "states", "scale_u": "inputs"}
+
 
 def labels(counterparts: Mapping[str, Sequence[str]] | None = None, /, **vectors: Sequence[Signal | Label]) -> dict[str, Any]:
     """
@@ -257,6 +266,11 @@ def labels(counterparts: Mapping[str, Sequence[str]] | None = None, /, **vectors
 def bounds(**vectors: Iterable[float]) -> dict[str, Any]:
     """Write bounds, such as ``lbu``, as a part of a description: null where there is none."""
     return {name: [value if math.isfinite(value) else None for value in values] for name, values in vectors.items()}
+
+
+def scales(*, scale_x: Iterable[float], scale_u: Iterable[float]) -> dict[str, Any]:
+    """Write what states and inputs range over as a part of a description."""
+    return {"scale_x": [*scale_x], "scale_u": [*scale_u]}
 
 
 def weights(**values: Sequence[Any]) -> dict[str, Any]:
@@ -364,6 +378,13 @@ def _numbers(values: Sequence[Any], length: int | None = None) -> tuple[float, .
     numbers = tuple(map(float, values))
     if length not in (None, len(numbers)) or not all(map(math.isfinite, numbers)):
         raise ValueError(f"{length or 'some'} finite numbers expected, got {numbers[:MAX_COMPONENTS]}")
+    return numbers
+
+
+def _scale(values: Sequence[Any], length: int) -> tuple[float, ...]:
+    numbers = _numbers(values, length)
+    if not min(numbers, default=1.0) > 0.0:
+        raise ValueError(f"positive numbers expected, got {numbers[:MAX_COMPONENTS]}")
     return numbers
 
 

@@ -19,7 +19,7 @@ DISTANCE = 1e-4  # from a bound at which it acts, in units of its signal; past a
 
 
 def unit(lower: Array | float, upper: Array | float) -> float:
-    """Return what a signal ranges over: half of what is between its widest bounds; with one bound its magnitude, 1 at least."""
+    """Return what a signal ranges over whose scale is not known: half of what is between its widest bounds; with one its magnitude, 1 at least."""
     low, high = float(np.min(lower)), float(np.max(upper))
     ends = [abs(end) for end in (low, high) if isfinite(end)]
     return 0.5 * (high - low) if len(ends) == 2 else max([1.0, *ends])
@@ -33,7 +33,7 @@ def at_bounds(values: Array, lower: Array | float, upper: Array | float, of: flo
         values: Along a plan.
         lower: Lower bound, or that of each stage; minus infinity where there is none.
         upper: Upper bound, likewise.
-        of: What `unit` returns for the signal; of an increment that of its input.
+        of: Scale of the signal, of an increment that of its input; where nobody has told it, what `unit` returns.
     """
     near = DISTANCE * of
     return np.asarray(values <= lower + near), np.asarray(values >= upper - near)

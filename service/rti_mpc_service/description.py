@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import rti_mpc
+from rti_mpc.array import Array
 from rti_mpc.errors import ConfigError
 from rti_mpc.model.obstacle import discs_of
 from rti_mpc.rti.ocp import Ocp
@@ -17,9 +18,17 @@ from rti_mpc.wire.document import MAX_DOCUMENT_BYTES
 LIFE_BYTES = 4096  # of what a running controller adds: epoch, latch, real time, parameters that were changed
 
 
-def controller_info(ocp: Ocp, np_: int) -> dict[str, Any]:
-    """Return names, units and limits, null where there is no limit. Parameters from index `np_` on are disturbances."""
+def controller_info(ocp: Ocp, np_: int, scale: Array | None = None) -> dict[str, Any]:
+    """
+    Return names, units and limits, null where there is no limit.
+
+    Args:
+        ocp: The problem.
+        np_: Index of the first parameter that is a disturbance.
+        scale: Scales of states and inputs, the first entries of `rti_mpc.rti.rti.Rti.scale`; None: they are not told.
+    """
     model = ocp.model
+    ends = model.nx, model.nx + model.nu
     vectors = {"states": model.states, "inputs": model.inputs, "outputs": model.outputs}
     vectors |= {"stage_parameters": model.parameters[:np_], "disturbances": model.parameters[np_:]}
     limits = ("lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx")
@@ -29,6 +38,7 @@ def controller_info(ocp: Ocp, np_: int) -> dict[str, Any]:
         "quaternions": model.quaternions,
         **info.labels(model.counterparts(), **vectors),
         **info.bounds(**{name: ocp.widest(name).tolist() for name in limits}),
+        **({} if scale is None else info.scales(scale_x=scale[: ends[0]].tolist(), scale_u=scale[ends[0] : ends[1]].tolist())),
         "p_nominal": list(model.p_nominal[:np_]),
         **info.weights(Q=ocp.Q.tolist(), R=ocp.R.tolist(), delta=ocp.delta.tolist(), lambda_=ocp.lambda_[ocp.held].tolist()),
         **info.obstacles(discs_of(model)),

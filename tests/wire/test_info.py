@@ -146,6 +146,8 @@ def test_a_robot_never_described_has_numbered_components() -> None:
         {**PIONEER, "states": [{"name": "x" * 65, "unit": "m", "angle": False}]},
         {**PIONEER, "states": [{"name": "a\x1b[31m", "unit": "m", "angle": False}]},
         {**PIONEER, "states": [{"name": 7, "unit": "m", "angle": False}]},
+        {**PIONEER, "scale_u": [0.5]},
+        {**PIONEER, "scale_u": [0.5, 0.0]},
         {**PIONEER, "obstacles": [{"at": -1, "x": 0.0, "y": 0.0, "r": 1.0}]},
         {**PIONEER, "obstacles": [{"at": float("inf"), "x": 0.0, "y": 0.0, "r": 1.0}]},
         {**PIONEER, "obstacles": [{"at": 0, "x": 1e300, "y": 0.0, "r": 1.0}]},

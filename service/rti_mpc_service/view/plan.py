@@ -72,14 +72,17 @@ def acting_bounds(info: Info, sample: Telemetry, u_before: Array | None, discs: 
     """
     rates = np.diff(sample.u, axis=0, prepend=sample.u[:1] if u_before is None else u_before[None])
     along: dict[str, list[tuple[str, NDArray[np.bool_]]]] = {}
-    for labels, values, lower, upper, sides, span in (
-        (info.states, sample.x[1:], info.lbx, info.ubx, LEVELS, (info.lbx, info.ubx)),
-        (info.inputs, sample.u, info.lbu, info.ubu, LEVELS, (info.lbu, info.ubu)),
-        (info.inputs, rates, info.lbdu, info.ubdu, RATES, (info.lbu, info.ubu)),
+    # Descriptions of controllers that do not tell scales yet are in recordings.
+    scale_x = info.scale_x or tuple(map(unit, info.lbx, info.ubx))
+    scale_u = info.scale_u or tuple(map(unit, info.lbu, info.ubu))
+    for labels, values, lower, upper, sides, scale in (
+        (info.states, sample.x[1:], info.lbx, info.ubx, LEVELS, scale_x),
+        (info.inputs, sample.u, info.lbu, info.ubu, LEVELS, scale_u),
+        (info.inputs, rates, info.lbdu, info.ubdu, RATES, scale_u),
     ):
         for j, label in enumerate(labels):
             bounds = lower[j], upper[j]
-            acting = zip(sides, bounds, at_bounds(values[:, j], *bounds, unit(span[0][j], span[1][j])), strict=True)
+            acting = zip(sides, bounds, at_bounds(values[:, j], *bounds, scale[j]), strict=True)
             along.setdefault(label.name, []).extend((side, acts) for side, bound, acts in acting if np.isfinite(bound))
     for i, away in enumerate(discs):
         along[f"obstacle_{i}"] = [(TOUCHED, at_bounds(away, 0.0, np.inf, unit(0.0, np.inf))[0])]

@@ -6,11 +6,14 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 
 from rti_mpc.contract.message import Telemetry
 from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.model.model import Model
+from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
 from rti_mpc.wire.info import Info
 from rti_mpc_service.acting import DISTANCE
@@ -46,7 +49,7 @@ def solved(rti: Rti, away_m: float) -> Telemetry:
 
 
 def info_of(rti: Rti) -> Info:
-    document = {"role": "controller", **controller_info(rti.ocp, rti.ocp.model.np_)}
+    document = {"role": "controller", **controller_info(rti.ocp, rti.ocp.model.np_, rti.scale)}
     return Info.from_json(json.loads(json.dumps(document)))
 
 
@@ -137,3 +140,27 @@ def test_a_path_s_window_is_where_the_path_is() -> None:
     assert [width.min() > 0.1 for width in widths] == [True, True]
     (along_x, along_y), (left_x, left_y) = np.diff(edges[0], axis=0).T, (edges[2] - edges[0])[:-1].T
     assert (along_x * left_y - along_y * left_x > 0.0).all(), "the left edge is to the left"
+
+
+@pytest.mark.parametrize("of", [1e-6, 1.0, 1e6])
+def test_an_input_with_one_bound_is_at_it_in_any_unit(of: float) -> None:
+    """A cart that may only be pushed ahead; at a bound of zero there is nothing else to tell 0.01 N from far away."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    model = Model(name="cart", x=x, u=u, f_expl_expr=ca.vertcat(x[1], u / of - x[1]), y_expr=x[0], states=("r", "v"), inputs="F", outputs="r")
+    rti = Rti(Ocp(model, N=8, dt=0.1, Q=1.0, R=1e-3 / of**2, lbu=0.0, ubu=np.inf), compile=False)
+    info, sample = info_of(rti), solved(rti, NEAR)
+    unit, far = rti.scale[2], np.full((8, 1), rti.scale[2])
+    assert acting_bounds(info, replace(sample, u=far), None) == {"F": "free"}
+    far[3] = 0.5 * DISTANCE * unit
+    assert acting_bounds(info, replace(sample, u=far), None) == {"F": "lower later"}
+    far[3] = 2.0 * DISTANCE * unit
+    assert acting_bounds(info, replace(sample, u=far), None) == {"F": "free"}
+
+
+def test_a_description_without_scales_names_bounds_all_the_same(pioneer: tuple[Config, Rti]) -> None:
+    """As in recordings of earlier versions: half the range between two bounds is their scale."""
+    _, rti = pioneer
+    info, sample = info_of(rti), solved(rti, FAR)
+    assert info.scale_u
+    old = replace(info, scale_x=(), scale_u=())
+    assert acting_bounds(old, sample, rti.u_prev) == acting_bounds(info, sample, rti.u_prev)
