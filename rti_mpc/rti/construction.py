@@ -40,7 +40,7 @@ class Construction:
         transcriptions: The QPs: without softened bounds and, if there are any, with them.
         structured: Functions of the active-set method and its certificate; None for another solver.
         shift: See `rti_mpc.rti.linearization.shift`.
-        relaxation: See `rti_mpc.rti.acceleration.relaxation`; None for another solver.
+        relaxation: See `rti_mpc.rti.acceleration.relaxation`.
         cost: See `rti_mpc.rti.linearization.plan_cost`.
         output: Outputs at a node, ``(x, p) -> y``.
         steps: See `rti_mpc.rti.turns.largest_steps`.
@@ -53,7 +53,7 @@ class Construction:
     transcriptions: tuple[Transcription, ...]
     structured: tuple[Places, ca.Function] | None
     shift: ca.Function
-    relaxation: ca.Function | None
+    relaxation: ca.Function
     cost: ca.Function
     output: ca.Function
     steps: ca.Function
@@ -95,10 +95,9 @@ def construct(ocp: Ocp, formulation: str, structured: bool, build: str | None) -
     check_stiffness(ocp, x_nominal)
     transcriptions = tuple(FORMULATIONS[formulation](ocp, softened=softened) for softened in (False, True)[: 2 if ocp.ng else 1])
     active_set = (places(ocp), certificate(ocp)) if structured else None
-    moves, cost, output, steps = shift(ocp), plan_cost(ocp), ocp.model.h(), largest_steps(ocp)
+    moves, relaxed, cost, output, steps = shift(ocp), relaxation(ocp), plan_cost(ocp), ocp.model.h(), largest_steps(ocp)
     turned = unsettled(ocp, output)
-    relaxed = relaxation(ocp) if structured else None
-    native = [moves, cost, output, steps, turned, *([] if relaxed is None else [relaxed]), *natives(transcriptions, active_set)]
+    native = [moves, relaxed, cost, output, steps, turned, *natives(transcriptions, active_set)]
     made = dict(zip((f.name() for f in native), compiled(*native, build=build) if build else native, strict=True))
     return Construction(x_nominal, transcriptions, active_set, moves, relaxed, cost, output, steps, turned, made)
 

@@ -158,8 +158,7 @@ class Rti:
         )
 
         make = built.make
-        # OSQP starts from its last iterate, in deviations from the guess: one that is ahead would be a worse start.
-        self._acceleration = None if built.relaxation is None else Acceleration(built.relaxation, self.guess, make)
+        self._acceleration = Acceleration(built.relaxation, self.guess, make)
         self.advance = bind(make(built.shift), {"x": x_plan, "u": self.u, "p": p}, {"x_next": x, "u_next": u})
         bounds = np.atleast_2d(self._weights["lbx"])[0], np.atleast_2d(self._weights["ubx"])[0]
         self._turns = Turns(self.problem, (make(built.output), make(built.steps), make(built.unsettled)), x, x0, self.y_ref, p, bounds)
@@ -456,7 +455,7 @@ class Rti:
         status = active_set.certified()
         if not status.usable:
             self.keep_guess()
-            if self.taken > 1 and self._acceleration is not None:
+            if self.taken > 1:
                 self._acceleration.restore()
             active_set.forget()
         return status
@@ -474,22 +473,16 @@ class Rti:
 
     def _iterate(self) -> None:
         """Iterate while the step is large; an iteration that fails leaves the plan of the one before."""
-        acceleration = self._acceleration
-        if acceleration is not None:
-            acceleration.begin()
+        self._acceleration.begin()
         while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
             if self._settled and self.active_set is not None and not self.active_set.goes_on:
                 break  # the next sample goes on; after a start, a plan that is left early may lead nowhere
-            if self.active_set is not None and self.solver is self.active_set:
-                self.active_set.sharpen()
-            if acceleration is None:
-                self._relinearize()
-            else:
-                acceleration.advance()
-                self._linearize()
+            if isinstance(self.solver, ActiveSet):
+                self.solver.sharpen()
+            self._acceleration.advance()
+            self._linearize()
             if not (status := self.solve()).usable:
-                if acceleration is not None:
-                    acceleration.restore()
+                self._acceleration.restore()
                 self.status = INACCURATE  # the plan comes from an earlier QP, which cannot be certified any more
                 break
             self.status = status

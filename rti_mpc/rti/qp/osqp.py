@@ -45,6 +45,7 @@ POLISH_REFUSED = -1  # what it came to was no better than the solution
 interrupted = ctypes.PyDLL(osqp.ext_builtin.__file__).osqp_is_interrupted
 
 MAX_ENTRY = 1e7  # of a scaled matrix: beyond it the factorization is rounding alone, and OSQP prints a line on standard output
+EQUATION_SCALE = 5.0  # factor on the rows of the dynamics, whose step size is larger by its square: that of the others takes it that they hold
 ACTING_MULTIPLIER = 1e-6  # a bound with a larger multiplier acts; those of the others are zero, but for rounding
 ADAPTATION_ITERATIONS = 100  # after so many the step size is the next one, and rows are weighed anew; twice as many in each further round
 ACTING_RESIDUALS = 10.0  # steps of a multiplier by the primal residual: one that is larger does not vanish in a single iteration
@@ -118,13 +119,23 @@ class Solver:
         # Where no row acts, OSQP says on standard output that it does not polish, also if it is not verbose. An equation acts always, and so does a
         # slack, at zero or by its softened row. Without either polishing is off until a row acts, see `_polish`.
         self._polishes_later = settings.polish > 0 and not len(qp.watched) and not qp.sides()[0].any()
+        # Rows are scaled once more, of the dynamics always, softened ones, which are the last, by whether they act; OSQP receives the scaled rows.
+        self._soft = slice(len(qp.l) - len(qp.watched), None)
+        self._active = np.zeros(len(qp.watched), dtype=bool)
+        self._scale = np.ones_like(qp.l)
+        self._scale[: qp.equations] = EQUATION_SCALE
+        A = scaled.A.copy()
+        self._A_x, self._l, self._u = (np.zeros_like(array) for array in (A.data, scaled.l, scaled.u))
+        self._weigh_matrix()
+        self._weigh_vectors()
+        A.data[:] = self._A_x
         public = osqp.OSQP(algebra="builtin")
         public.setup(
             scaled.P.copy(),  # OSQP keeps its arguments, and writes into them
             scaled.q,
-            scaled.A.copy(),
-            scaled.l,
-            scaled.u,
+            A,
+            self._l,
+            self._u,
             verbose=False,
             eps_abs=settings.eps,
             eps_rel=settings.eps,
@@ -142,15 +153,9 @@ class Solver:
         self._osqp_settings = public.settings
         self._info = self.workspace.info
         self._solution = self.workspace.solution
-        refused = self.workspace.update_data_mat(P_x=scaled.P.data, P_i=None, A_x=scaled.A.data, A_i=None)
+        refused = self.workspace.update_data_mat(P_x=scaled.P.data, P_i=None, A_x=self._A_x, A_i=None)
         assert not refused, "OSQP must have kept the patterns it was given"
         self._P_x = scaled.P.data if qp.varies_P else None
-        # The softened rows, which are the last ones, are scaled by whether they act; OSQP receives the scaled rows.
-        self._soft = slice(len(qp.l) - len(qp.watched), None)
-        self._active = np.zeros(len(qp.watched), dtype=bool)
-        self._scale = np.ones_like(qp.l)
-        weighed = len(qp.watched) > 0
-        self._A_x, self._l, self._u = (array.copy() if weighed else array for array in (scaled.A.data, scaled.l, scaled.u))
 
     def load(self) -> None:
         """Linearize at the guess, and load the new matrices, factorization included; off the path from state to command."""
@@ -168,8 +173,7 @@ class Solver:
             return
         changed = qp.varies_A or self._P_x is not None
         start = self._zero if self.cold else self._start
-        if self._A_x is not scaled.A.data:
-            changed |= self._weigh(start)
+        changed |= self._weigh(start)
         if changed:
             self._load_matrices()
         if start is not None:
@@ -178,9 +182,17 @@ class Solver:
 
     def _load_matrices(self) -> None:
         """Load the matrices, factorization included."""
-        if self._A_x is not self._scaled.A.data:
-            np.multiply(self._scaled.A.data, self._scale[self.qp.A.indices], out=self._A_x)
+        self._weigh_matrix()
         self._sound = not self.workspace.update_data_mat(P_x=self._P_x, P_i=None, A_x=self._A_x, A_i=None)  # refused: no factorization
+
+    def _weigh_matrix(self) -> None:
+        """Scale the rows of the constraint matrix."""
+        np.multiply(self._scaled.A.data, self._scale[self.qp.A.indices], out=self._A_x)
+
+    def _weigh_vectors(self) -> None:
+        """Scale the bounds likewise."""
+        np.multiply(self._scaled.l, self._scale, out=self._l)
+        np.multiply(self._scaled.u, self._scale, out=self._u)
 
     def refill(self) -> None:
         """After a change of weights: let the next `load` also update the data that no sample changes."""
@@ -235,11 +247,9 @@ class Solver:
         """Bring the workspace, which may be a new one, into the state that `rewarm` left it in."""
         if self._held is None:  # never rewarmed
             return
-        scaled, weighed = self._scaled, self._A_x is not self._scaled.A.data
-        if weighed:
-            np.multiply(scaled.l, self._scale, out=self._l)
-            np.multiply(scaled.u, self._scale, out=self._u)
-            np.multiply(scaled.A.data, self._scale[self.qp.A.indices], out=self._A_x)
+        scaled = self._scaled
+        self._weigh_matrix()
+        self._weigh_vectors()
         self._take_step_size()
         refused = self.workspace.update_data_vec(q=scaled.q, l=self._l, u=self._u)
         if refused or not self._sound or self.workspace.update_data_mat(P_x=scaled.P.data, P_i=None, A_x=self._A_x, A_i=None):
@@ -266,11 +276,8 @@ class Solver:
 
     def _load_vectors(self) -> bool:
         """Load gradient and bounds, and return whether they were taken."""
-        scaled = self._scaled
-        if self._l is not scaled.l:
-            np.multiply(scaled.l, self._scale, out=self._l)
-            np.multiply(scaled.u, self._scale, out=self._u)
-        if self.workspace.update_data_vec(q=scaled.q, l=self._l, u=self._u):  # refused: the workspace then holds another problem
+        self._weigh_vectors()
+        if self.workspace.update_data_vec(q=self._scaled.q, l=self._l, u=self._u):  # refused: the workspace then holds another problem
             self.cold = True
             return False
         return True
@@ -354,7 +361,7 @@ class Solver:
 
     @property
     def res_prim(self) -> float:
-        """Primal residual of the last solve, infinity norm, relative to the scales."""
+        """Primal residual of the last solve, infinity norm, relative to the scales; rows that `Solver` scales count by that."""
         return float(self._info.prim_res)
 
     @property

@@ -125,6 +125,7 @@ class Qp(QpData):
         cost: The cost (4) at the guess, shape ``(1,)``.
         checksum: Sum of all data, finite if and only if all of it is, shape ``(1,)``.
         watched: For each softened row the rows that show whether it acts, see `Transcription`; shape ``(rows, 4)``.
+        equations: Number of first rows, those of the dynamics, which determine as many first variables, the states; 0 if these are eliminated.
         varies_P: Whether the Hessian changes from sample to sample.
         varies_A: Whether the constraint matrix changes from sample to sample.
         fill: Call that writes all but `z` from the guess; slow and not compiled, for a change of weights.
@@ -149,7 +150,7 @@ class Qp(QpData):
         self.cost: Array = np.zeros(1)
         self.checksum: Array = np.zeros(1)
         memory: Array = np.zeros(transcription.everything.numel_out("memory"))
-        self._eliminable = transcription.eliminable
+        self.equations = transcription.eliminable
 
         self._scale, self._columns, self._rows = guess.weights["scale"], transcription.columns, transcription.rows
         self.watched = transcription.watched
@@ -181,7 +182,7 @@ class Qp(QpData):
 
     def reduced_hessian(self) -> Array:
         """Return the scaled Hessian in the inputs only, with the states eliminated by the dynamics; for a QP without slacks."""
-        k = self._eliminable
+        k = self.equations
         P = (self.P + sp.triu(self.P, k=1).T).toarray()
         A = self.A.toarray()
         response = -np.linalg.solve(A[:k, :k], A[:k, k:])
