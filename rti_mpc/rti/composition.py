@@ -54,7 +54,7 @@ def compose(name: str, calls: Sequence[tuple[ca.Function, Names]], outputs: Sequ
         found = function(**taken)
         for i, result in enumerate(function.name_out()):
             to = str(names.get(result, result))
-            now[to] = found[result]
+            now[to] = ca.project(found[result], function.sparsity_out(result))  # the graph of a constant may have fewer nonzeros
             if to not in outputs:
                 lies[to] = f"(w + {kept})"
                 kept += function.nnz_out(i)
