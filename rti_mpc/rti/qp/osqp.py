@@ -45,7 +45,6 @@ POLISH_REFUSED = -1  # what it came to was no better than the solution
 interrupted = ctypes.PyDLL(osqp.ext_builtin.__file__).osqp_is_interrupted
 
 MAX_ENTRY = 1e7  # of a scaled matrix: beyond it the factorization is rounding alone, and OSQP prints a line on standard output
-EQUATION_SCALE = 5.0  # factor on the rows of the dynamics, whose step size is larger by its square: that of the others takes it that they hold
 ACTING_MULTIPLIER = 1e-6  # a bound with a larger multiplier acts; those of the others are zero, but for rounding
 ADAPTATION_ITERATIONS = 100  # after so many the step size is the next one, and rows are weighed anew; twice as many in each further round
 ACTING_RESIDUALS = 10.0  # steps of a multiplier by the primal residual: one that is larger does not vanish in a single iteration
@@ -68,6 +67,8 @@ class SolverSettings:
             own; 0: it is left as it is.
         acting_scale: Factor on the row of a softened bound that acts, whose step size is larger by its square: more than 10 finds the multipliers of
             obstacles sooner, and those of many bounds on states later.
+        dynamics_scale: The same on the rows of the dynamics. The step size of other rows takes it that these hold exactly; what they are off by adds
+            up along the horizon.
 
     Raises:
         OcpError: One is no number, or out of range.
@@ -81,12 +82,13 @@ class SolverSettings:
     alpha: float = 1.6
     polish: int = 0
     acting_scale: float = 10.0
+    dynamics_scale: float = 5.0
 
     def __post_init__(self) -> None:
         """Check the settings: OSQP itself says on standard output what it does not take."""
         for name, least in (("max_iter", 1), ("check_termination", 0), ("scaling", 0), ("polish", 0)):
             given.whole(name, getattr(self, name), least)
-        for name, most in (("eps", math.inf), ("rho", math.inf), ("alpha", 2.0), ("acting_scale", math.inf)):
+        for name, most in (("eps", math.inf), ("rho", math.inf), ("alpha", 2.0), ("acting_scale", math.inf), ("dynamics_scale", math.inf)):
             if not 0.0 < given.number(name, value := getattr(self, name)) < most:
                 raise OcpError(f"{name} must lie between 0 and {most:g}, got {value}")
 
@@ -123,7 +125,7 @@ class Solver:
         self._soft = slice(len(qp.l) - len(qp.watched), None)
         self._active = np.zeros(len(qp.watched), dtype=bool)
         self._scale = np.ones_like(qp.l)
-        self._scale[: qp.equations] = EQUATION_SCALE
+        self._scale[: qp.equations] = settings.dynamics_scale
         A = scaled.A.copy()
         self._A_x, self._l, self._u = (np.zeros_like(array) for array in (A.data, scaled.l, scaled.u))
         self._weigh_matrix()
