@@ -131,13 +131,9 @@ class ActiveSet:
 
     def certified(self) -> QpStatus:
         """Improve the last plan until it is certified, and return its status; the certificate uses the problem's own data only."""
-        status = self._judged()
-        if status is SOLVED:
-            if not self._stepped:
-                self._sharpen()
-            return SOLVED
+        status = self._judged() if self._stepped else self._sharpened()
         self._lowest = np.inf
-        if not self._keep_better():
+        if status is SOLVED or not self._keep_better():
             return status
         for _ in range(MAX_REFINEMENTS):
             self.refine()
@@ -150,24 +146,24 @@ class ActiveSet:
     def sharpen(self) -> None:
         """Make the last plan exact to rounding where bounds are held, because the next QP is linearized there."""
         if self._stiff[0] > 0.0 and not self._stepped:
-            self._judged()
-            self._sharpen()
+            self._sharpened()
 
-    def _sharpen(self) -> None:
+    def _sharpened(self) -> QpStatus:
         """
-        Refine the plan rolled out last, which has been judged, unless its gap grows, as with degenerate places it may.
+        Judge the plan rolled out last, refine it where bounds are held, and return its status; with degenerate places, it may be better as it was.
 
         Increments and softened bounds are held by a penalty that cancels in the cost-to-go, and takes as many digits with it as it is large. A small
         gap is no small distance where the cost is flat: without this, the units of the model decide 1e-7 of an input's range, or more.
         """
+        status, gap = self._judged(), self.res_dual
         if self._stiff[0] <= 0.0:
-            return
-        gap = self.res_dual
+            return status
         self.refine()
-        self._judged()
-        if not (self.res_prim <= MAX_VIOLATION and self.res_dual < gap):
-            self.roll_out()
-            self._judged()
+        status = self._judged()
+        if self.res_prim <= MAX_VIOLATION and self.res_dual < gap:
+            return status
+        self.roll_out()
+        return self._judged()
 
     def rehearse(self) -> None:
         """Make the plan once and judge it; the caller puts `written` back."""
@@ -302,7 +298,4 @@ class ActiveSet:
             self._count()
             if self._changes[0] <= 0.0:
                 break
-        if self._changes[0] != 0.0 or self._judged() is not SOLVED:
-            return False
-        self._sharpen()
-        return True
+        return self._changes[0] == 0.0 and self._sharpened() is SOLVED
