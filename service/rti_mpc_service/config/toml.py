@@ -24,13 +24,17 @@ SLIPS = (
     (r"^Cannot (declare|overwrite)", "each key and each table stands once"),  # this one in the parser's words, all others in the line
     (r"=\s*[-+]?\d+,\d", "decimals take a point, as in 0.5"),
     (r"=\s*[-+]?(\.\d|\d+\.(?!\d))", "a number has a digit on both sides of its point"),
-    (r"(?i)=\s*(true|false|yes|no|on|off|none|null)\b", "a switch is true or false, in small letters, and a key without a value is left out"),
+    (
+        r"=\s*(?!(?:true|false)\b)(?i:true|false|yes|no|on|off|none|null)(?![\w-])",
+        "a switch is true or false, in small letters, and a key without a value is left out",
+    ),
     (r"=\s*\(", "a list is in square brackets"),
     (r"\{[^}]*$", "a table in braces ends on the line on which it begins"),
     (r",\s*\}", "a table in braces has no comma at its end"),
     (r"""^[^"'=]*=\s*(["'])(?!.*\1)""", "text ends with the quote with which it began"),
-    (r"=\s*[^\W\d]|[\u2018-\u201f]", "text is in straight quotes"),
-    (r"=\s*[-+]?\d[\d.]*\s*[^\W\d]", "a number has no unit"),
+    (r"=\s*[-+]?(?!(?:inf|nan)\b)(?i:inf|infinity|nan)\b", "infinity is inf and no number is nan, in small letters"),
+    (r"=\s*(?!(?:true|false|inf|nan)\b)[^\W\d]|[\u2018-\u201f]", "text is in straight quotes"),
+    (r"=\s*[-+]?\d[\d.]*(?:\s+|(?![_eEbox]))[^\W\d]", "a number has no unit"),
     (r"^\s*[\w.-]+\s*:", "a key and its value are joined by ="),
 )
 

@@ -88,6 +88,13 @@ SLIPS = {
     "u = (-0.5, 0.5)": "a list is in square brackets",
     "Q = { x = 1.0,": "ends on the line on which it begins",
     "Q = { x = 1.0, }": "has no comma at its end",
+    "guard = { enabled = true, }": "has no comma at its end",
+    "guard = { enabled = true,": "ends on the line on which it begins",
+    "ub = Inf": "infinity is inf",
+    "ub = -Infinity": "infinity is inf",
+    "y = NaN": "no number is nan",
+    "name = on-board": "text is in straight quotes",
+    "length = 5 bar": "a number has no unit",
     "robot = 'twice'": "each key and each table stands once",
 }
 
@@ -101,6 +108,8 @@ def test_slip_is_told_with_its_line_and_with_what_toml_has_there(line: str) -> N
     assert SLIPS[line] in str(refused.value)
 
 
-@pytest.mark.parametrize("line", ["u = [1,2,3] 4", "[ocp", "text = 'a, b' 'c'", "x = 1 # 0,5 } {"])
+@pytest.mark.parametrize(
+    "line", ["u = [1,2,3] 4", "[ocp", "text = 'a, b' 'c'", "x = 1 # 0,5 } {", "enabled = true;", "x = 1_000_", "x = 1e", "x = 0xZZ"]
+)
 def test_no_advice_is_given_on_what_is_no_known_slip(line: str) -> None:
     assert toml.advice(line.partition("#")[0].rstrip()) == ""
