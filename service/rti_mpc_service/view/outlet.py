@@ -83,6 +83,7 @@ class Outlet:
         self._lock = threading.Lock()
         self._roots = roots
         self._recording: Scene | None = None
+        self.answered = False  # whether a stream has ever been open
         self.closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"outlet {name}", daemon=True)
         self._thread.start()
@@ -122,6 +123,7 @@ class Outlet:
             new = self._recording is None
             if self._recording is None:
                 self._recording = Scene(self._open_stream(), self._roots)
+                self.answered = True
                 log.info("%s: open", self.name)
             self._recording.send(self._take(new))
             if last:
@@ -216,7 +218,7 @@ def viewer_outlet(url: str, name: str, roots: Sequence[str] = ()) -> Outlet:
         return stream
 
     outlet = Outlet(url, open_stream, roots=roots)
-    remind(log.warning, lambda: "" if outlet.connected else f"no viewer answers yet at {url}", outlet.closing)
+    remind(log.warning, lambda: "" if outlet.answered else f"no viewer answers yet at {url}", outlet.closing)
     return outlet
 
 

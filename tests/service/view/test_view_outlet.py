@@ -188,6 +188,7 @@ def test_a_viewer_killed_and_started_again_is_shown_the_robot_again(viewer: View
     await_(lambda: outlet.connected and viewer.shown > 0)
     viewer.kill()
     await_(lambda: outlet.failures == 1)
+    assert outlet.answered  # so nothing more is said of a viewer that does not answer
     outlet.offer([state(1)])
     viewer.start()
     await_(lambda: outlet.connected)
