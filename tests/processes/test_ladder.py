@@ -21,8 +21,6 @@ from rti_mpc_service.shipped import SHIPPED
 from tests.in_time import explained, on_time
 from tests.processes.system import CONFIG, KEYS, SPEED, System, heard
 
-pytestmark = pytest.mark.slow
-
 SLEW = np.array([0.25, 0.4]) / CONFIG.ocp.dt_s  # per s
 STOPPED_S = 1.5
 PERIOD_MS = 1e3 * CONFIG.ocp.dt_s / SPEED
@@ -56,6 +54,7 @@ def recovered(system: System, samples: int = 10) -> Telemetry:
     return heard(stream, Telemetry, lambda sample: sample.seq > start.seq + samples and sample.mode is Mode.TRACKING)
 
 
+@pytest.mark.slow
 def test_other_solver_takes_over_without_anybody_noticing(driven: System, host: Host) -> None:
     before, begun_ns = recovered(driven), time.monotonic_ns()
     inject(driven, "solver", 10)
@@ -66,6 +65,7 @@ def test_other_solver_takes_over_without_anybody_noticing(driven: System, host: 
         assert (after.softened - before.softened, after.fallbacks) == (10, before.fallbacks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("failure", "samples"), [("qp", 8), ("nan_model", 8)])
 def test_failures_lead_down_the_ladder_and_up_again(driven: System, host: Host, failure: str, samples: int) -> None:
     before, begun_ns = recovered(driven, 50), time.monotonic_ns()  # a second: no more often is one kind of fault published
@@ -87,6 +87,7 @@ def test_failures_lead_down_the_ladder_and_up_again(driven: System, host: Host, 
     assert {"qp_failed", "no_plan"} <= set(codes(events))
 
 
+@pytest.mark.slow
 def test_samples_over_budget_are_not_sent_and_leave_the_loop_in_phase(driven: System, host: Host) -> None:
     before, begun_ns = recovered(driven, 50), time.monotonic_ns()  # a second: no more often is one kind of fault published
     events = driven.bus.subscriber(KEYS.event("controller"), capacity=64, history=False)
@@ -145,6 +146,7 @@ def test_inputs_stayed_inside_bounds_and_slew_limits_through_all_of_it(driven: S
     assert beyond[2:][in_time].max() <= 1e-9, rows[2 + int(beyond[2:].max(axis=1).argmax())]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("request_", [{"request": "inject", "failure": "flood"}, {"request": "inject", "failure": "qp", "samples": 0}])
 def test_failure_that_cannot_be_injected_is_refused_with_what_can(driven: System, request_: dict[str, object]) -> None:
     answer = driven.bus.request(KEYS.request, request_, 5.0)
@@ -152,6 +154,7 @@ def test_failure_that_cannot_be_injected_is_refused_with_what_can(driven: System
     assert "must be" in answer["error"]
 
 
+@pytest.mark.slow
 def test_nothing_fails_on_request_unless_the_configuration_says_so(tmp_path: Path) -> None:
     with System(tmp_path) as system:
         system.start("robot", "controller")

@@ -145,6 +145,28 @@ def test_three_iterations_a_sample_cost_as_much_as_thirty_among_discs() -> None:
     assert drive(3, 0.015)[0] == pytest.approx(drive(30, 1e-4)[0], rel=1e-3)
 
 
+@pytest.mark.parametrize("solver", ["riccati", "osqp"])
+def test_guesses_are_ahead_whichever_solver_commands(solver: str) -> None:
+    family, ahead = discs_passed(20), []
+    rti, x, u = Rti(family.ocp, solver=solver, compile=False), family.start(0), family.u0
+    assert x is not None
+    advance = rti._acceleration.advance
+
+    def watched() -> None:
+        advance()
+        ahead.append(bool((rti.guess.sample["u"] != rti.u).any()))
+
+    rti._acceleration.advance = watched  # type: ignore[method-assign]
+    rti.reset(x, u)
+    for k in range(30):
+        rti.prepare(*family.at(k), shift=k > 0, u_prev=u)
+        assert rti.feedback(x).usable
+        u = rti.u[0].copy()
+        x = family.plant(x, u)
+    assert any(ahead)
+    assert not all(ahead)  # the second guess of a sample is its first plan
+
+
 @pytest.mark.parametrize("certified", [False, True], ids=["not solved", "solved, but not certified"])
 def test_iteration_that_fails_from_a_guess_ahead_leaves_the_plan_of_the_one_before(monkeypatch: pytest.MonkeyPatch, certified: bool) -> None:
     kept = drive(2, 0.015, samples=25)[1]

@@ -183,6 +183,23 @@ def test_nothing_is_turned_where_all_is_near_and_then_the_errors_are_the_same(bo
     assert 20 < settled < 280
 
 
+def test_what_has_been_turned_once_needs_no_turn_in_the_samples_after_it() -> None:
+    """Nor is a turn of a rehearsal one: after it, the sample itself is turned."""
+    rti = Rti(turret(), compile=False)
+    rti.reset(np.zeros(1), np.zeros(1))
+    turns, turned = rti._turns, []
+    for k in range(4):
+        rti.prepare(np.full((rti.ocp.N, 1), 4.0), shift=k > 0)
+        kept = rti.y_ref.copy(), rti.guess.sample["x"].copy()
+        turns.rehearse()
+        rti.y_ref[:], rti.guess.sample["x"][:] = kept
+        rti.x0[:] = 0.0
+        turned.append(turns.settle())
+        rti.feedback(np.zeros(1))
+    assert turned == [True, False, False, False]
+    assert rti.y_ref[0, 0] == pytest.approx(4.0 - 2.0 * np.pi, abs=1e-12)  # rounding
+
+
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_angle_in_degrees_turns_at_360(solver: str) -> None:
     """A turret commanded in degrees, its states and references wrapped there, does what one in rad does."""
