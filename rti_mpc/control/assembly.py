@@ -93,10 +93,10 @@ def assemble(
     delay = None
     if timing.delay_s is None:
         measured = list(range(model.nx)) if observer is None else observer.measured
-        delay = DelayEstimator(model, grid.dt_ns, grid.most_ns, scale=rti.scale[: model.nx], measured=measured, compile=compile)
+        delay = DelayEstimator(model, grid.dt_ns, grid.most_ns, scale=rti.scale_x, measured=measured, compile=compile)
     states = StateStream(model, stale_ns, grid.dt_ns, settling_s, observer, as_measured=delay is not None)
     if observer is not None:
-        observer.take_scales(rti.scale[: model.nx])
+        observer.take_scales(rti.scale_x)
     given_np = model.np_ - len(states.d)
     predicting = tuple(of.p[:given_np] for of in (prediction, observer, delay) if of is not None)
     return Assembly(

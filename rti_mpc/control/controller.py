@@ -260,6 +260,11 @@ class Controller:
         return self._issued.seq + 1 + self._planner.loaded
 
     @property
+    def scales(self) -> tuple[Array, Array]:
+        """Scales of states and inputs, shapes ``(nx,)`` and ``(nu,)``, see `rti_mpc.rti.scale`."""
+        return self._rti.scale_x, self._rti.scale_u
+
+    @property
     def wanted(self) -> Ocp:
         """The problem with the weights and bounds of the last `retune`."""
         return self._tuning.wanted

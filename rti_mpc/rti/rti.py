@@ -210,6 +210,16 @@ class Rti:
             )
 
     @property
+    def scale_x(self) -> Array:
+        """Scales of the states, shape ``(nx,)``."""
+        return self.scale[: self.ocp.model.nx]
+
+    @property
+    def scale_u(self) -> Array:
+        """Scales of the inputs, shape ``(nu,)``."""
+        return self.scale[self.problem.model.nx :][: self.ocp.model.nu]
+
+    @property
     def qp(self) -> Qp:
         """The QP of the current sample; filled if its solver is a QP solver."""
         return self._backup.qp if isinstance(self.solver, ActiveSet) else self.solver.qp

@@ -55,7 +55,7 @@ class SecondOpinion:
         qp.fill()
         self._solver = Solver(qp, SETTINGS)
         self._rti, self._retuned = rti, rti.retuned
-        self._u, self._scale = ours["plan"], rti.scale[rti.problem.model.nx :][: rti.ocp.model.nu]
+        self._u, self._scale = ours["plan"], rti.scale_u
         # Copied through memory views that are made once, as in `Rti`.
         pairs = {name: (array.reshape(-1).data, theirs[name].reshape(-1).data) for name, array in ours.items()}
         self._weights = tuple(pairs.pop(name) for name in weights)

@@ -7,6 +7,8 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 import rti_mpc
 from rti_mpc.array import Array
 from rti_mpc.errors import ConfigError
@@ -15,20 +17,20 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.wire import info
 from rti_mpc.wire.document import MAX_DOCUMENT_BYTES
 
+LONGEST = 2.2250738585072014e-308  # a number with as many characters as one has
 LIFE_BYTES = 4096  # of what a running controller adds: epoch, latch, real time, parameters that were changed
 
 
-def controller_info(ocp: Ocp, np_: int, scale: Array | None = None) -> dict[str, Any]:
+def controller_info(ocp: Ocp, np_: int, scales: tuple[Array, Array] | None = None) -> dict[str, Any]:
     """
     Return names, units and limits, null where there is no limit.
 
     Args:
         ocp: The problem.
         np_: Index of the first parameter that is a disturbance.
-        scale: Scales of states and inputs, the first entries of `rti_mpc.rti.rti.Rti.scale`; None: they are not told.
+        scales: Those of states and inputs, see `rti_mpc.rti.scale`; None: they are not told.
     """
     model = ocp.model
-    ends = model.nx, model.nx + model.nu
     vectors = {"states": model.states, "inputs": model.inputs, "outputs": model.outputs}
     vectors |= {"stage_parameters": model.parameters[:np_], "disturbances": model.parameters[np_:]}
     limits = ("lbu", "ubu", "lbdu", "ubdu", "lbx", "ubx")
@@ -38,7 +40,7 @@ def controller_info(ocp: Ocp, np_: int, scale: Array | None = None) -> dict[str,
         "quaternions": model.quaternions,
         **info.labels(model.counterparts(), **vectors),
         **info.bounds(**{name: ocp.widest(name).tolist() for name in limits}),
-        **({} if scale is None else info.scales(scale_x=scale[: ends[0]].tolist(), scale_u=scale[ends[0] : ends[1]].tolist())),
+        **({} if scales is None else info.scales(scale_x=scales[0].tolist(), scale_u=scales[1].tolist())),
         "p_nominal": list(model.p_nominal[:np_]),
         **info.weights(Q=ocp.Q.tolist(), R=ocp.R.tolist(), delta=ocp.delta.tolist(), lambda_=ocp.lambda_[ocp.held].tolist()),
         **info.obstacles(discs_of(model)),
@@ -73,7 +75,8 @@ def check_length(ocp: Ocp) -> str:
     Raises:
         ConfigError: It is too long even without weights.
     """
-    short, said = fitting(controller_info(ocp, ocp.model.np_))
+    scales = np.full(ocp.model.nx, LONGEST), np.full(ocp.model.nu, LONGEST)
+    short, said = fitting(controller_info(ocp, ocp.model.np_, scales))
     if (size := _size(short)) > MAX_DOCUMENT_BYTES - LIFE_BYTES:
         raise ConfigError(
             f"the description of the model's signals must have at most {MAX_DOCUMENT_BYTES - LIFE_BYTES} bytes, for viewers and standbys to read it, "

@@ -7,9 +7,11 @@ import json
 from pathlib import Path
 from threading import Event
 
+import numpy as np
 import pytest
 
 from rti_mpc.errors import ConfigError
+from rti_mpc.rti.rti import Rti
 from rti_mpc.wire.bus import BusSettings
 from rti_mpc.wire.document import MAX_DOCUMENT_BYTES, read
 from rti_mpc.wire.info import Info, Leader, latches
@@ -20,6 +22,7 @@ from rti_mpc_service.config.config import load
 from rti_mpc_service.controller import daemon
 from rti_mpc_service.description import check_length, controller_info, fitting
 from rti_mpc_service.shipped import SHIPPED
+from tests.problems import pioneer
 from tests.wire.fake_session import FakeSession
 
 LONG = 1000  # stages, the most that are allowed
@@ -47,6 +50,14 @@ def test_weights_that_fit_are_described() -> None:
     assert fitting(controller_info(ocp, 0)) == (controller_info(ocp, 0), "")
 
 
+def test_scales_of_inputs_are_told_where_the_solvers_remember_inputs_as_further_states() -> None:
+    rti = Rti(pioneer(N=7, lbddu=[-0.1, -np.inf]), compile=False)
+    info = Info.from_json({"role": "controller", **controller_info(rti.ocp, 0, (rti.scale_x, rti.scale_u))})
+    assert rti.problem.model.nx > rti.ocp.model.nx
+    assert info.scale_u == (0.5, 0.745)  # half the ranges
+    assert info.scale_x == tuple(rti.scale[:5])
+
+
 def test_signals_too_long_for_a_description_are_refused_at_the_door(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(description, "MAX_DOCUMENT_BYTES", 5000)
     with pytest.raises(ConfigError, match=r"must have at most 904 bytes, for viewers and standbys to read it, got .*: have fewer states"):
@@ -66,6 +77,7 @@ def test_controller_with_too_many_weights_is_still_read_by_standbys_and_says_wha
     received = Received(session.put[key], "application/json", key)
     assert Info.from_received(received).weights is None
     assert len(latches(received)) == 1
+    assert Info.from_received(received).scale_u == (0.5, 0.745)  # half the ranges
     leader = Leader.from_received(received, 2**63)
     assert leader is not None
     assert leader.parameters == {"version": 0, "changes": {}}

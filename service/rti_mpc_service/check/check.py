@@ -166,8 +166,8 @@ def check(config: Config, rti: Rti) -> CheckReport:
     other = next(name for name in FORMULATIONS if name != rti.formulation)
     tight, judge = (tight_copy(rti, solver, formulation) for solver, formulation in ((first, rti.formulation), (second, other)))
     condensed = next(one for one in (tight, judge) if one.formulation == "sequential")
-    bounds, scale = Bounds(rti), rti.scale[rti.problem.model.nx :][: model.nu]
-    disturbance = np.minimum(DISTURBANCE_SCALES * rti.scale[: model.nx], MAX_DISTURBANCE)
+    bounds, scale = Bounds(rti), rti.scale_u
+    disturbance = np.minimum(DISTURBANCE_SCALES * rti.scale_x, MAX_DISTURBANCE)
     rng = np.random.default_rng(1)
     x = np.array(robot_settings(config)["x0"])
     reference = wave(ocp, x, rng)

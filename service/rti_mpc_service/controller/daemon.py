@@ -168,7 +168,6 @@ class Daemon:
         keys, model = bus.keys, rti.ocp.model
         self._config = config
         self._formulation = rti.formulation
-        self._scale = rti.scale
         self._model_hash = model_hash(rti.ocp.model)
         self._controller = controller
         self._bus = bus
@@ -371,7 +370,7 @@ class Daemon:
             self._told += 1
             life = {"role": role, "epoch": self._leadership.epoch, "seq": self._told}
             about = {**life, "config_hash": config.config_hash, "model_hash": self._model_hash, "stale_s": config.stale_s}
-            known = controller_info(self._params.ocp, self._controller.np_, self._scale)
+            known = controller_info(self._params.ocp, self._controller.np_, self._controller.scales)
             model = {**known, "formulation": self._formulation, "realtime": self._granted}
             description, said = fitting({**model, **about, **self.orders.orders_info()})
             self._bus.publish_json(self._bus.keys.info(role), description)

@@ -92,7 +92,7 @@ def of_driven(copied: list[Recorded], journal: Journaled, driven: Drive, stamps:
         return round(float(np.interp(stamp_ns, stamps, locals_ns)))
 
     begin_ns, epoch = at(passage.states[0].stamp_ns), passage.commands[0].epoch
-    about = {"role": "controller", "epoch": epoch, "seq": 1, **controller_info(controller.wanted, controller.np_)}
+    about = {"role": "controller", "epoch": epoch, "seq": 1, **controller_info(controller.wanted, controller.np_, controller.scales)}
     yield begin_ns, name, keys.info("controller"), json.dumps(about).encode()
     for seq, (place, reference) in enumerate(passage.references, 1):
         yield at(passage.states[place].stamp_ns), name, keys.anchored, encode(replace(reference, epoch=epoch, seq=seq))

@@ -49,7 +49,7 @@ def solved(rti: Rti, away_m: float) -> Telemetry:
 
 
 def info_of(rti: Rti) -> Info:
-    document = {"role": "controller", **controller_info(rti.ocp, rti.ocp.model.np_, rti.scale)}
+    document = {"role": "controller", **controller_info(rti.ocp, rti.ocp.model.np_, (rti.scale_x, rti.scale_u))}
     return Info.from_json(json.loads(json.dumps(document)))
 
 
