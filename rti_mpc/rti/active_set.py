@@ -212,7 +212,7 @@ class ActiveSet:
         self._judged()
         self._keep_better()
         if self._lowest < np.inf and self._step_inside().usable:
-            self._places[:] = self._found
+            self._places[:] = self._found  # of this QP; their gains are not needed any more
             return True
         self.forget()
         return False
