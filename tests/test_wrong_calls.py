@@ -211,6 +211,10 @@ SAMPLE: dict[str, tuple[Callable[[Rti], object], str]] = {
     "feedback(symbols)": (lambda rti: rti.feedback(X), "x0 must be real numbers, got SX("),
     "retune(an unknown name)": (lambda rti: rti.retune({"Qe": np.eye(2)}), "the name of a weight or bound must be one of Q, R"),
     "retune(another shape)": (lambda rti: rti.retune({"Q": np.eye(3)}), "Q must be an array of shape (2, 2), got float64 of shape (3, 3)"),
+    "retune(a weight that is NaN)": (lambda rti: rti.retune({"Q": np.diag([1.0, np.nan])}), "Q must be finite, symmetric and positive semidefinite"),
+    "retune(a negative weight)": (lambda rti: rti.retune({"delta": -np.ones(rti.ocp.N)}), "delta must be finite and not negative, got [-1.0"),
+    "retune(a bound that is NaN)": (lambda rti: rti.retune({"lbu": np.full(1, np.nan)}), "lbu must not be NaN"),
+    "retune(a bound where there is none)": (lambda rti: rti.retune({"lbx": np.zeros(2)}), "lbx must be finite exactly where it was when compiled"),
 }
 
 

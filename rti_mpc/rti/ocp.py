@@ -234,13 +234,22 @@ class Ocp:
         other._take(values)
         return other
 
+    def checked(self, name: str, value: ArrayLike) -> Array:
+        """
+        Return a copy of a weight or bound in the shape that it has here, checked by itself.
+
+        Raises:
+            OcpError: The name is none, or the value wrong by itself, as at construction.
+        """
+        sizes = {"nx": self.model.nx, "nu": self.model.nu, "ny": self.model.ny, "nh": self.h_expr.numel(), "N": self.N, "N_u": self.N_u}
+        check, size, *each = WEIGHTS_AND_BOUNDS[given.one_of("the name of a weight or bound", name, WEIGHTS_AND_BOUNDS)]
+        shape = [sizes[one] for one in each]
+        return by_stage(name, value, check, sizes[size], *shape) if shape else check(name, value, sizes[size])
+
     def _take(self, values: Mapping[str, ArrayLike]) -> None:
         """Check and copy weights and bounds; only for an object that nobody reads yet."""
-        sizes = {"nx": self.model.nx, "nu": self.model.nu, "ny": self.model.ny, "nh": self.h_expr.numel(), "N": self.N, "N_u": self.N_u}
         for name, value in values.items():
-            check, size, *each = WEIGHTS_AND_BOUNDS[given.one_of("the name of a weight or bound", name, WEIGHTS_AND_BOUNDS)]
-            shape = [sizes[one] for one in each]
-            array = by_stage(name, value, check, sizes[size], *shape) if shape else check(name, value, sizes[size])
+            array = self.checked(name, value)
             array.setflags(write=False)
             object.__setattr__(self, name, array)
         for pair in PAIRS:

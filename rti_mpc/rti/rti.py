@@ -269,11 +269,14 @@ class Rti:
             values: Weights and bounds by the names in `WEIGHTS_AND_BOUNDS`, shapes as in `Ocp`. Which bounds are finite is compiled in.
 
         Raises:
-            OcpError: A name is none of them, or a value no array of real numbers.
+            OcpError: A name is none of them, or a value is wrong by itself, as at construction, or finite elsewhere; nothing has changed then.
             ShapeError: A shape does not fit.
         """
         known = {name: np.shape(getattr(self.ocp, given.one_of("the name of a weight or bound", name, self._parts))) for name in values}
-        taken = {name: given.array(name, value, known[name]) for name, value in values.items()}
+        taken = {name: self.ocp.checked(name, given.array(name, value, known[name])) for name, value in values.items()}
+        for name, value in taken.items():
+            if not np.array_equal(np.isfinite(value), np.isfinite(getattr(self.ocp, name))):
+                raise OcpError(f"{name} must be finite exactly where it was when compiled, got {value.tolist()}")
         for name, value in taken.items():
             part, entries = self._parts[name]
             np.clip(value[..., entries], -INFINITY, INFINITY, out=part)
