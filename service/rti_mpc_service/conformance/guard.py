@@ -97,7 +97,7 @@ def expiry(stand: Stand) -> Finding:
     stand.run(allowed_ms + STANDS_MS)
     times, inputs = stand.acting(fault_ns)
     levels = stand.levels
-    moves = [t for t, u in zip(times, inputs, strict=True) if (np.abs(u - levels.high) > 1e-6).any()]
+    moves = [t for t, u in zip(times, inputs, strict=True) if not levels.at(u, levels.high)]
     rest = np.array([levels.at(u, levels.rest) for u in inputs])
     if not moves or not rest[-1]:
         return Finding(False, f"{1e-3 * (allowed_ms + STANDS_MS):.2f} s after the last answered state the inputs still were {shown(inputs[-1])}")
