@@ -106,9 +106,10 @@ def one_of(name: str, value: Any, names: Collection[str]) -> str:
 
 
 def nearest(value: Any, names: Iterable[str]) -> str:
-    """Return what was probably meant, to be appended; empty if nothing is near."""
-    near = get_close_matches(value, names, 1) if isinstance(value, str) else []
-    return f", perhaps {near[0]} is meant" if near else ""
+    """Return what was probably meant, in small or in large letters, to be appended; empty if nothing is near."""
+    known = {name.lower(): name for name in names}
+    near = get_close_matches(value.lower(), known, 1) if isinstance(value, str) else []
+    return f", perhaps {known[near[0]]} is meant" if near else ""
 
 
 def instance(name: str, value: Any, cls: type[T]) -> T:

@@ -134,6 +134,7 @@ CONTROL = {
     "Rti with 2.5 iterations": (lambda: Rti(ocp(), iterations=2.5), "iterations must be a whole number of at least 1"),  # type: ignore[arg-type]
     "Rti with a tolerance of text": (lambda: Rti(ocp(), tolerance="1e-3"), "tolerance must be real numbers, got '1e-3'"),  # type: ignore[arg-type]
     "Rti of no formulation": (lambda: Rti(ocp(), formulation=None), "formulation must be one of auto, simultaneous, "),  # type: ignore[arg-type]
+    "Rti of a solver in large letters": (lambda: Rti(ocp(), solver="OSQP"), "got 'OSQP', perhaps osqp is meant; pip install"),
     "Rti of an unknown solver": (lambda: Rti(ocp(), solver="ipopt"), "solver must be riccati, osqp, or one that is installed"),
     "SolverSettings of eps 0": (lambda: SolverSettings(eps=0.0), "eps must lie between 0 and inf, got 0.0"),
     "SolverSettings of half an iteration": (lambda: SolverSettings(max_iter=0.5), "max_iter must be a whole number of at least 1"),  # type: ignore[arg-type]

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.sparse as sp
 
+from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import OcpError
@@ -133,7 +134,8 @@ def check_name(name: str) -> None:
     if name not in here:
         others = sorted(set(metadata("qpsolvers").get_all("Provides-Extra") or ()) - {*here, "osqp", "open-source-solvers", "wheels-only"})
         raise OcpError(
-            f"solver must be riccati, osqp, or one that is installed, {', '.join(here)}, got {name!r}; "
+            f"solver must be riccati, osqp, or one that is installed, {', '.join(here)}, got {name!r}"
+            f"{given.nearest(name, ('riccati', 'osqp', *here))}; "
             f"pip install 'qpsolvers[NAME]' brings {', '.join(others)}"
         )
 
