@@ -140,6 +140,15 @@ def shell(command: str, *arguments: object, pass_fds: tuple[int, ...] = (), **en
     )
 
 
+# How a command that takes long begins to say what it waits for, where there is no terminal.
+WAITS = "compiling the model, once, ", "finding how the robot comes to rest", "stopping it from wherever", "solving samples along a wave"
+
+
+def faults(stderr: str) -> str:
+    """Return what was said of faults: not what is waited for."""
+    return "".join(line for line in stderr.splitlines(keepends=True) if not line.startswith(WAITS))
+
+
 FULL = f"rti-mpc: standard output must take what is printed, got: {os.strerror(errno.ENOSPC)}\n"
 
 
@@ -160,7 +169,7 @@ FULL = f"rti-mpc: standard output must take what is printed, got: {os.strerror(e
 )
 def test_output_that_is_closed_full_or_not_read_to_its_end_is_one_line_at_most(command: str, status: int, stdout: str, stderr: str) -> None:
     done = shell(command)
-    assert (done.returncode, done.stdout, done.stderr) == (status, stdout, stderr)
+    assert (done.returncode, done.stdout, faults(done.stderr)) == (status, stdout, stderr)
 
 
 @pytest.mark.parametrize("command", slow_but(["robots", "check"], "robots"))
@@ -169,7 +178,7 @@ def test_output_whose_reader_has_gone_ends_it_as_it_does_other_commands(command:
     os.close(reader)
     done = shell(f"$run {command} >&{writer}; exit $?", pass_fds=(writer,))
     os.close(writer)
-    assert (done.returncode, done.stdout, done.stderr) == (128 + signal.SIGPIPE, "", "")
+    assert (done.returncode, done.stdout, faults(done.stderr)) == (128 + signal.SIGPIPE, "", "")
 
 
 @pytest.mark.parametrize("output", ["> /dev/full", ">&-", "| true"])
@@ -196,7 +205,7 @@ def test_path_with_an_umlaut_is_printed_as_it_is_where_only_ascii_is_known(tmp_p
     folder.mkdir()
     (folder / "röbot.toml").write_bytes(SHIPPED.read_bytes())
     done = shell('$run check "$1"', folder / "röbot.toml", XDG_CACHE_HOME=str(folder))
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (done.returncode, faults(done.stderr)) == (0, "")
     assert done.stdout.startswith(f"{folder}/röbot.toml: N = 20")
     assert list((folder / "rti_mpc").glob("*.so"))
     done = shell('$run check "$1"', folder / "nö.toml")
