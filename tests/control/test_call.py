@@ -27,7 +27,7 @@ REPORTED_CALLS = {
 }
 READING_CALLS = {  # change nothing that a command depends on
     *("at_rest", "blocked", "continues", "followed", "heard", "lay_out", "mode", "notices", "rehearse", "robot_now_ns", "robot_rate"),
-    *("say", "standing_by", "slack_s", "telemetry", "wanted"),
+    *("say", "scales", "standing_by", "slack_s", "telemetry", "wanted"),
 }
 
 
