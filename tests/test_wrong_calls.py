@@ -215,6 +215,7 @@ SAMPLE: dict[str, tuple[Callable[[Rti], object], str]] = {
     "retune(a weight that is NaN)": (lambda rti: rti.retune({"Q": np.diag([1.0, np.nan])}), "Q must be finite, symmetric and positive semidefinite"),
     "retune(a negative weight)": (lambda rti: rti.retune({"delta": -np.ones(rti.ocp.N)}), "delta must be finite and not negative, got [-1.0"),
     "retune(a bound that is NaN)": (lambda rti: rti.retune({"lbu": np.full(1, np.nan)}), "lbu must not be NaN"),
+    "retune(weights of inputs where there were none)": (lambda rti: rti.retune({"R_u": np.ones(1)}), "R_u must stay zero, as it was when compiled"),
     "retune(a bound where there is none)": (lambda rti: rti.retune({"lbx": np.zeros(2)}), "lbx must be finite exactly where it was when compiled"),
 }
 

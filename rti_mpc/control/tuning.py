@@ -19,8 +19,6 @@ from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp, rest_fault
 from rti_mpc.rti.rti import Rti
 
 COMPILED_FIELDS = ("N", "N_u", "blocks", "dt", "method")  # attributes of the Ocp that are compiled in
-# Bounds of the Ocp: which of them are finite is compiled in.
-COMPILED_BOUNDS = (*INPUT_BOUNDS, "lbx", "ubx", "lh", "uh", "lbx_e", "ubx_e", "lbddu", "ubddu")
 
 
 class Tuning:
@@ -62,15 +60,7 @@ class Tuning:
             if getattr(ocp, name) != getattr(built, name):
                 raise OcpError(f"{name} must stay {getattr(built, name)}, got {getattr(ocp, name)}: it is part of the compiled code")
         for name in WEIGHTS_AND_BOUNDS:
-            if (shape := np.shape(getattr(ocp, name))) != (compiled := np.shape(getattr(built, name))):
-                raise OcpError(
-                    f"{name} must keep its shape {compiled}, got {shape}: whether it differs from stage to stage is part of the compiled code"
-                )
-        for name in COMPILED_BOUNDS:
-            if not np.array_equal(np.isfinite(getattr(ocp, name)), np.isfinite(getattr(built, name))):
-                raise OcpError(f"{name} must be finite exactly where it was when compiled, got {getattr(ocp, name)}")
-        if ocp.R_u.any() and not built.R_u.any():
-            raise OcpError(f"R_u must stay zero, as it was when compiled, got {ocp.R_u}")
+            built.check_compiled(name, getattr(ocp, name))
         if wrong := rest_fault(ocp):
             raise OcpError(wrong)
         self.wanted, self._wanted_version = ocp, version

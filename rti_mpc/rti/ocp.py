@@ -246,6 +246,22 @@ class Ocp:
         shape = [sizes[one] for one in each]
         return by_stage(name, value, check, sizes[size], *shape) if shape else check(name, value, sizes[size])
 
+    def check_compiled(self, name: str, value: Array) -> None:
+        """
+        Refuse a weight or bound that changes what the code of this problem was compiled for.
+
+        Raises:
+            OcpError: Its shape is another, it is finite elsewhere, or inputs are to have weights that had none.
+        """
+        mine = getattr(self, name)
+        if value.shape != mine.shape:
+            what = "whether it differs from stage to stage is part of the compiled code"
+            raise OcpError(f"{name} must keep its shape {mine.shape}, got {value.shape}: {what}")
+        if not np.array_equal(np.isfinite(value), np.isfinite(mine)):
+            raise OcpError(f"{name} must be finite exactly where it was when compiled, got {value.tolist()}")
+        if name == "R_u" and value.any() and not mine.any():
+            raise OcpError(f"R_u must stay zero, as it was when compiled, got {value.tolist()}")
+
     def _take(self, values: Mapping[str, ArrayLike]) -> None:
         """Check and copy weights and bounds; only for an object that nobody reads yet."""
         for name, value in values.items():

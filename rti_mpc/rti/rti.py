@@ -220,6 +220,11 @@ class Rti:
         return self.scale[self.problem.model.nx :][: self.ocp.model.nu]
 
     @property
+    def scale_g(self) -> Array:
+        """Scales of what has softened bounds in `problem`, shape ``(ng,)``."""
+        return self.scale[self.problem.model.nx + self.problem.model.nu :]
+
+    @property
     def qp(self) -> Qp:
         """The QP of the current sample; filled if its solver is a QP solver."""
         return self._backup.qp if isinstance(self.solver, ActiveSet) else self.solver.qp
@@ -266,17 +271,17 @@ class Rti:
         Take other weights and bounds from the next `prepare` on; `ocp` keeps those it was built with.
 
         Args:
-            values: Weights and bounds by the names in `WEIGHTS_AND_BOUNDS`, shapes as in `Ocp`. Which bounds are finite is compiled in.
+            values: Weights and bounds by the names in `WEIGHTS_AND_BOUNDS`, shapes as in `Ocp`. What is compiled in must stay, see
+                `Ocp.check_compiled`.
 
         Raises:
-            OcpError: A name is none of them, or a value is wrong by itself, as at construction, or finite elsewhere; nothing has changed then.
+            OcpError: A name is none of them, or a value wrong by itself, as at construction, or changes what is compiled in: nothing has changed then.
             ShapeError: A shape does not fit.
         """
         known = {name: np.shape(getattr(self.ocp, given.one_of("the name of a weight or bound", name, self._parts))) for name in values}
         taken = {name: self.ocp.checked(name, given.array(name, value, known[name])) for name, value in values.items()}
         for name, value in taken.items():
-            if not np.array_equal(np.isfinite(value), np.isfinite(getattr(self.ocp, name))):
-                raise OcpError(f"{name} must be finite exactly where it was when compiled, got {value.tolist()}")
+            self.ocp.check_compiled(name, value)
         for name, value in taken.items():
             part, entries = self._parts[name]
             np.clip(value[..., entries], -INFINITY, INFINITY, out=part)

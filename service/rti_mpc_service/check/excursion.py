@@ -48,7 +48,7 @@ class Bounds:
     def __init__(self, rti: Rti) -> None:
         self._rti, ocp = rti, rti.ocp
         model = ocp.model
-        self._scale_u, self._scale_g = rti.scale[rti.problem.model.nx :][: model.nu], rti.scale[rti.problem.model.nx + model.nu :][: ocp.ng_path]
+        self._scale_u, self._scale_g = rti.scale_u, rti.scale_g[: ocp.ng_path]
         lg, ug = (ocp.tightest(name)[: ocp.ng_path] for name in ("lg", "ug"))
         lbu, ubu, lbdu, ubdu = (ocp.tightest(name) for name in ("lbu", "ubu", "lbdu", "ubdu"))
         inputs = [signal.name for signal in model.inputs]
@@ -97,7 +97,7 @@ def excursions(rti: Rti, x0: Array) -> Iterator[Excursion]:
                 way[j] = reach * (bounds[j] - rest[j])
                 yield Excursion(x0, held(nominal + REFERENCE_DISTANCE_FACTOR * displacement(ocp, x0, nominal, way), ocp.N))
     regular = regular_at(ocp)
-    scale_g = rti.scale[rti.problem.model.nx + ocp.model.nu :]
+    scale_g = rti.scale_g
     for bounds, outward in ((ocp.tightest("lg")[: ocp.ng_path], -START_EXCESS_SCALES), (ocp.tightest("ug")[: ocp.ng_path], START_EXCESS_SCALES)):
         for j in np.flatnonzero(np.isfinite(bounds)):
             starts = (start_at(rti, x0, int(j), bounds[j] + share * outward * scale_g[j]) for share in SHARES)
@@ -144,7 +144,7 @@ def start_at(rti: Rti, x0: Array, j: int, wanted: float) -> Array:
     model = ocp.model
     g = ca.vertcat(model.x[list(ocp.soft), 0], ocp.h_expr)[j]
     value = ca.Function("value", [model.x, model.u, model.p], [g, ca.densify(ca.gradient(g, model.x))])
-    squares = rti.scale[: model.nx] ** 2
+    squares = rti.scale_x**2
     x = x0.copy()
     for _ in range(NEWTON_STEPS):
         now, slope = (np.array(part).ravel() for part in value(x, model.u_rest, model.p_nominal))

@@ -29,15 +29,13 @@ def acting_bounds(rti: Rti, config: Config) -> list[dict[str, Any]]:
     """
     model, weights = rti.problem.model, rti.guess.weights
     increments = np.diff(rti.u, axis=0, prepend=rti.u_prev[None])
-    inputs = rti.scale[model.nx :]
     found: list[dict[str, Any]] = []
     for kind, values, lower, upper in (("input", rti.u, "lbu", "ubu"), ("increment", increments, "lbdu", "ubdu")):
         for j, signal in enumerate(model.inputs):
             low, high = (np.broadcast_to(weights[name], values.shape)[:, j] for name in (lower, upper))
-            for side, bound, acts in zip(SIDES, (low, high), at_bounds(values[:, j], low, high, inputs[j]), strict=True):
+            for side, bound, acts in zip(SIDES, (low, high), at_bounds(values[:, j], low, high, rti.scale_u[j]), strict=True):
                 found += _acting(kind, signal.name, signal.unit, side, bound[acts], rti.ocp.starts[acts], 0.0)
-    scales = rti.scale[-rti.problem.ng :] if rti.problem.ng else ()
-    for soft, scale in zip(softened(rti, config), scales, strict=True):
+    for soft, scale in zip(softened(rti, config), rti.scale_g, strict=True):
         acting, over = at_bounds(soft.values, soft.lower, soft.upper, scale), (soft.lower - soft.values, soft.values - soft.upper)
         for side, bound, acts, beyond in zip(SIDES, (soft.lower, soft.upper), acting, over, strict=True):
             violation = most if (most := float(beyond.max())) > TOLERANCE_SHARE * scale else 0.0

@@ -45,12 +45,12 @@ def moved(case: QpCase, rti: Rti, config: Config, bound: Mapping[str, Any]) -> d
     rows = {(soft.kind, soft.name): i for i, soft in enumerate(softened(rti, config))}
     kind, name = bound["kind"], bound["name"]
     if (kind, name) in rows:
-        scale = rti.scale[model.nx + model.nu + rows[kind, name]]
+        scale = rti.scale_g[rows[kind, name]]
         among = [row for row in rows if BOUNDS[row[0]] == BOUNDS["constraint"]]
         at = among.index((kind, name)) if (kind, name) in among else [s.name for s in model.states].index(name)
     else:
         at = [signal.name for signal in model.inputs].index(name)
-        scale = rti.scale[model.nx + at]
+        scale = rti.scale_u[at]
     array = BOUNDS[kind][upper]
     values = case.guess[array].copy()
     values[..., at] += FAR * scale * (1.0 if upper else -1.0)

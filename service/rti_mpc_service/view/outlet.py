@@ -52,6 +52,7 @@ class Outlet:
         dropped: Number of entries that the queue had no room for.
         failures: Number of failed streams.
         notices: Faults since the owner last emptied it.
+        answered: Whether a stream has ever been open.
         closing: Set once it is being closed.
     """
 
@@ -83,7 +84,7 @@ class Outlet:
         self._lock = threading.Lock()
         self._roots = roots
         self._recording: Scene | None = None
-        self.answered = False  # whether a stream has ever been open
+        self.answered = False
         self.closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"outlet {name}", daemon=True)
         self._thread.start()
