@@ -275,7 +275,8 @@ class Rti:
                 `Ocp.check_compiled`.
 
         Raises:
-            OcpError: A name is none of them, or a value wrong by itself, as at construction, or changes what is compiled in: nothing has changed then.
+            OcpError: A name is none of them, or a value is wrong by itself, as at construction, or changes what is compiled in. Nothing has
+                changed then.
             ShapeError: A shape does not fit.
         """
         known = {name: np.shape(getattr(self.ocp, given.one_of("the name of a weight or bound", name, self._parts))) for name in values}
