@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from math import hypot
 
 import numpy as np
@@ -17,3 +18,14 @@ def bounded(vector: Array, limit: float) -> bool:
     if vector.size <= FEW and hypot(*vector.tolist()) <= 0.5 * limit:  # then each of them is, however it was rounded; false for NaN
         return True
     return bool((np.abs(vector) <= limit).all())
+
+
+def memories(pairs: Iterable[tuple[Array, Array]]) -> tuple[tuple[memoryview, memoryview], ...]:
+    """Return pairs of arrays as their memory, for `copy`: NumPy decides at each copy how to do it, which takes longer than the copy."""
+    return tuple((to.reshape(-1).data, of.reshape(-1).data) for to, of in pairs)
+
+
+def copy(pairs: Iterable[tuple[memoryview, memoryview]]) -> None:
+    """Copy the second of each pair of `memories` into the first."""
+    for to, of in pairs:
+        to[:] = of

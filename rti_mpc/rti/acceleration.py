@@ -16,6 +16,7 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 
+from rti_mpc.array import copy, memories
 from rti_mpc.codegen import bind, function
 from rti_mpc.rti.blocks import at_each
 from rti_mpc.rti.linearization import linearization
@@ -80,7 +81,7 @@ class Acceleration:
         weights = {name: guess.weights[name] for name in (*BOUNDS, "scale")}
         given = {"x": x, "u": u, "x_plan": plan.x, "u_plan": plan.u, "step": self._step, "omega": self._omega, **weights}
         self._relax = bind(make(built), given, {"x_next": x, "u_next": u, "step_next": self._step, "omega_next": self._omega})
-        self._plan = tuple((np.zeros_like(array).reshape(-1).data, array.reshape(-1).data) for array in (plan.x, plan.u))
+        self._plan = memories((np.zeros_like(array), array) for array in (plan.x, plan.u))
 
     def begin(self) -> None:
         """Begin a sample, whose second guess is the first plan."""
@@ -89,8 +90,7 @@ class Acceleration:
     def advance(self) -> None:
         """Make the next guess, and keep the plan, which an iteration that fails must `restore`."""
         self._relax()
-        for kept, plan in self._plan:
-            kept[:] = plan
+        copy(self._plan)
 
     def restore(self) -> None:
         """Take the plan before the guess back."""

@@ -17,13 +17,14 @@ from collections.abc import Callable
 import casadi as ca
 import numpy as np
 
-from rti_mpc.array import Array
+from rti_mpc.array import Array, copy, memories
 from rti_mpc.codegen import bind
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.rti.places import Places
 from rti_mpc.rti.qp.qp import Guess
 
-MAX_ROLL_OUTS = 6  # after the first, as long as fewer places change than in that one
+MAX_ROLL_OUTS = 6  # after the first, as long as fewer places change from one to the next, or at most `FEW` of those in the first
+FEW = 0.5  # where so few change, it may be more than in the one before: they settle soon
 MAX_CHANGES = 45  # of places in the first roll-out from which they change one at a time: with more, the way to the solution is long
 MAX_MOVES = 40  # roll-outs on that way; a step of the interior point takes as long as two or three
 MAX_STEPS = 50  # of the interior point, for each QP that a sample may have; all of its QPs share the sum
@@ -101,10 +102,10 @@ class ActiveSet:
         self._changes, self._stiff = arrays["changes"].data, arrays["stiff"].data  # read faster than arrays
         self._product, self._verdict = arrays["product"].data, verdict.data
         self._moved = arrays["interior"].data, arrays["interior_after"].data
-        self._keep_first = tuple((array, arrays[name.removesuffix("_first")]) for name, array in first.items())
-        self._take_first = tuple(zip((arrays["way"], self._found, arrays["targets"]), first.values(), strict=True))
-        self._interior_pairs = tuple(zip(found.values(), inside.values(), strict=True))
-        self._best = tuple((np.zeros_like(array), array) for array in found.values())
+        self._keep_first = memories((array, arrays[name.removesuffix("_first")]) for name, array in first.items())
+        self._take_first = memories(zip((arrays["way"], self._found, arrays["targets"]), first.values(), strict=True))
+        self._interior_pairs = memories(zip(found.values(), inside.values(), strict=True))
+        self._best = memories((np.zeros_like(array), array) for array in found.values())
         self.written = (*found.values(), arrays["changes"], arrays["stiff"], arrays["targets"], arrays["r"], verdict)
         self._lowest = np.inf  # gap of the best plan, relative as `res_dual`
         self._stepped = False  # whether the interior point has been used for this QP
@@ -187,8 +188,7 @@ class ActiveSet:
         better = self.res_prim <= MAX_VIOLATION_INACCURATE and self.res_dual < self._lowest
         if better:
             self._lowest = self.res_dual
-            for best, array in self._best:
-                best[:] = array
+            copy(self._best)
         return better
 
     def _restore_best(self) -> QpStatus:
@@ -223,22 +223,22 @@ class ActiveSet:
 
         All places change at once first. Where more and more of them do, or they go in circles, they change one at a time, on the way from the guess.
         """
-        for first, array in self._keep_first:
-            first[:] = array
-        changes = self._changes[0]
+        copy(self._keep_first)
+        first = before = self._changes[0]
         for _ in range(MAX_ROLL_OUTS):
             self.roll_out_again()
             self._count()
-            if not 0.0 < self._changes[0] < changes:
+            changes = self._changes[0]
+            if changes <= 0.0 or (changes >= before and changes > FEW * first):
                 break
-        if self._changes[0] > 0.0 and changes <= MAX_CHANGES:
+            before = changes
+        if self._changes[0] > 0.0 and first <= MAX_CHANGES:
             self._follow()
         return self._changes[0] == 0.0
 
     def _follow(self) -> None:
         """Follow the homotopy from the guess, on the curves of the places rolled out first, to this QP: see `rti_mpc.rti.homotopy`."""
-        for array, first in self._take_first:
-            array[:] = first
+        copy(self._take_first)
         self.begin_homotopy()
         for _ in range(MAX_MOVES):
             self.move_on()
@@ -284,8 +284,7 @@ class ActiveSet:
                 break
             if self._product[0] > JUDGED_BELOW * self._least[0]:
                 continue
-            for array, inside in self._interior_pairs:
-                array[:] = inside
+            copy(self._interior_pairs)
             status, better = self._judged(), self._keep_better()
             if status is SOLVED and (self.res_dual <= gap or not better):
                 return self.res_dual <= gap

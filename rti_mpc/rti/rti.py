@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from rti_mpc import given
-from rti_mpc.array import Array
+from rti_mpc.array import Array, copy, memories
 from rti_mpc.codegen import BUILDS, bind
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.errors import OcpError
@@ -125,8 +125,7 @@ class Rti:
         x_plan: Array = np.zeros((N + 1, model.nx))
         self.u: Array = np.zeros((N_u, model.nu))
         x, u = np.zeros_like(x_plan), np.zeros_like(self.u)
-        # Copied through memory views that are made once: numpy decides at each copy how to do it, which takes longer than the copy.
-        self._pairs = tuple((guess.reshape(-1).data, plan.reshape(-1).data) for guess, plan in ((x, x_plan), (u, self.u)))
+        self._pairs = memories(((x, x_plan), (u, self.u)))
         self.u_prev: Array = np.array(model.u_rest, dtype=np.float64)
         self.u_before = self.u_prev.copy()
         self.y_ref: Array = np.zeros((N, model.ny))
@@ -354,8 +353,7 @@ class Rti:
 
     def _relinearize(self) -> None:
         """Linearize at the plan itself, and prepare the solver."""
-        for guess, plan in self._pairs:
-            guess[:] = plan
+        copy(self._pairs)
         self._linearize()
 
     def _linearize(self) -> None:
@@ -394,8 +392,7 @@ class Rti:
         self.u_prev[:] = self.ocp.model.u_rest
         self.u[:] = np.clip(self.u_prev, self.ocp.lbu, self.ocp.ubu)
         self._stay_at(self.x_nominal)
-        for guess, plan in self._pairs:
-            guess[:] = plan
+        copy(self._pairs)
         self._meet_reference()
 
     def _meet_reference(self) -> None:

@@ -12,10 +12,10 @@ compared with, or there is none.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 
 import numpy as np
 
+from rti_mpc.array import copy, memories
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.rti.qp.osqp import Solver, SolverSettings
 from rti_mpc.rti.qp.qp import Guess, Step
@@ -56,10 +56,8 @@ class SecondOpinion:
         self._solver = Solver(qp, SETTINGS)
         self._rti, self._retuned = rti, rti.retuned
         self._u, self._scale = ours["plan"], rti.scale_u
-        # Copied through memory views that are made once, as in `Rti`.
-        pairs = {name: (array.reshape(-1).data, theirs[name].reshape(-1).data) for name, array in ours.items()}
-        self._weights = tuple(pairs.pop(name) for name in weights)
-        self._sample = tuple(pairs.values())
+        self._weights = memories((ours.pop(name), theirs[name]) for name in weights)
+        self._sample = memories((array, theirs[name]) for name, array in ours.items())
         self._loaded = False
         self.done = True
         self.status = QpStatus.NONE
@@ -119,9 +117,3 @@ class SecondOpinion:
 def osqp_solved(rti: Rti) -> bool:
     """Return whether OSQP solved the last sample, or is prepared for the next one."""
     return isinstance(rti.solver, Solver)
-
-
-def copy(pairs: Iterable[tuple[memoryview, memoryview]]) -> None:
-    """Copy the second array of each pair into the first one."""
-    for into, source in pairs:
-        into[:] = source

@@ -78,7 +78,7 @@ def test_multiplier_toward_a_bound_that_does_not_exist_is_none() -> None:
     certify, verdict = one.certify, one._verdict
     certify()
     before = verdict[1]
-    multipliers = one._best[-1][1]
+    multipliers = np.asarray(one._best[-1][1])
     multipliers[:] = -1.0  # toward a lower bound
     certify()
     assert verdict[1] == pytest.approx(before, abs=1e-12), "rounding of the gap of an optimum"

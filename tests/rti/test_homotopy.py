@@ -104,3 +104,31 @@ def test_places_that_go_in_circles_when_all_change_at_once_settle_one_at_a_time(
     assert steps() == 0
     monkeypatch.setattr(active_set, "MAX_CHANGES", 0)
     assert steps() > 20
+
+
+def test_places_change_one_at_a_time_as_soon_as_more_change_at_once_than_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From rest, far off the path, 17 places change at once, then 14, 8 and 9; from there on they would go in circles."""
+    family = paper(20)
+    rti = Rti(family.ocp, compile=False)
+    one = rti.active_set
+    assert one is not None
+    changed: list[list[float]] = []
+
+    def watched(name: str) -> None:
+        call = getattr(one, name)
+
+        def watch() -> None:
+            call()
+            if name == "roll_out":
+                changed.append([])
+            changed[-1].append(one._changes[0])
+
+        monkeypatch.setattr(one, name, watch)
+
+    for name in ("roll_out", "roll_out_again"):
+        watched(name)
+    (_,) = driven(family, rti, [800])
+    assert len(changed) >= 3, "roll-outs of each QP"
+    for first, *later in changed:
+        for before, now in zip([first, *later], later[:-1], strict=False):
+            assert now < before or now <= active_set.FEW * first, "a roll-out follows only while they settle"
