@@ -11,10 +11,10 @@ from rich.table import Table
 from rti_mpc_service.console import MIN_WIDTH_COLUMNS, print_whole, widened
 
 
-def test_a_table_whose_cells_do_not_wrap_is_printed_whole_however_wide_it_is() -> None:
+def test_each_row_of_a_table_is_printed_in_one_line_however_wide_it_is() -> None:
     table, cells = Table(), [f"{number} / {number} / {number}" for number in range(100_000, 100_012)]
     for heading in range(len(cells)):
-        table.add_column(f"column {heading}", no_wrap=True)
+        table.add_column(f"column {heading}")
     table.add_row(*cells)
     console = widened(Console(file=StringIO(), width=80))
     print_whole(console, table)

@@ -34,7 +34,7 @@ from rti_mpc.rti.qp.qpsolvers import check_name
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.bench.parts import PARTS, Parts
 from rti_mpc_service.bench.yardstick import Ipopt
-from rti_mpc_service.console import table_console
+from rti_mpc_service.console import print_whole, table_console
 from rti_mpc_service.host import machine
 from rti_mpc_service.json_text import json_text
 
@@ -291,7 +291,7 @@ def print_tables(console: Console, result: list[dict[str, Any]], *, costs: bool)
             f"{row['capped_share']:.1%}",
             *([f"{row['over_exact']:+.3%} exact, {row['over_converged']:+.3%} converged"] if costs else []),
         )
-    console.print(table)
+    print_whole(console, table)
     made = Table(title="parts of a step, medians, us")
     for name in ("N", "solver", "formulation", *PARTS, "Python around"):
         made.add_column(name, justify="right")
@@ -299,7 +299,7 @@ def print_tables(console: Console, result: list[dict[str, Any]], *, costs: bool)
         head = str(row["N"]), row["solver"], row["formulation"] + ("" if row["compiled"] else ", interpreted")
         share = row["python_us"] / row["step_us"]["p50"]
         made.add_row(*head, *(f"{row['parts_us'][part]:.0f}" for part in PARTS), f"{row['python_us']:.0f}, {share:.0%}")
-    console.print(made)
+    print_whole(console, made)
     for solver in dict.fromkeys(row["solver"] for row in result):
         sparse = [row for row in result if (row["solver"], row["formulation"]) == (solver, "simultaneous") and row["compiled"] and row["N"] >= 20]
         if len(sparse) > 1:

@@ -2,9 +2,9 @@
 """
 Benchmark over problem families: CPU time per sample, unsolved samples, and closed-loop cost relative to converged NMPC.
 
-Each solver drives a closed loop of its own. Five equal copies solve every sample in
-turn, and the shortest of the five times counts, so that other programs on the machine
-do not matter. Times are CPU times of this thread.
+Each solver drives a closed loop of its own, five times from the same starts. The
+shortest of the five times of each sample counts, so that other programs on the machine,
+and seconds in which it is slow, do not matter. Times are CPU times of this thread.
 """
 
 from __future__ import annotations
@@ -37,39 +37,45 @@ from rti_mpc_service.console import print_whole, table_console
 from rti_mpc_service.host import machine
 from rti_mpc_service.json_text import json_text
 
-COPIES_PER_SAMPLE = 5  # controllers that solve the same sample, whose shortest time counts
+RUNS = 5  # of the same closed loop, of which the shortest time of each sample counts
 DEFAULT_SOLVERS = ("riccati", "osqp")
 QUICK_SAMPLES = 40  # per family, with --quick
 
 
 def drive_family(family: Family, solver: str, samples: int, tick: Callable[[], None]) -> dict[str, Any]:
     """
-    Drive one closed loop by one solver; return times, us, counts, the cost, and the largest residual of any plan.
+    Drive the same closed loop several times by one solver; return times, us, counts, the cost, and the largest residual of any plan.
 
     Residuals are those of the certificate, see docs/engine.md, or of a solver that has none, its own.
     """
-    ocp = family.ocp
-    copies = [Rti(ocp, solver=solver, formulation="simultaneous") for _ in range(COPIES_PER_SAMPLE)]
-    step: Array = np.zeros((samples, COPIES_PER_SAMPLE))
-    feedback: Array = np.zeros((samples, COPIES_PER_SAMPLE))
+    runs = [Rti(family.ocp, solver=solver, formulation="simultaneous") for _ in range(RUNS)]
+    driven = [drive(family, rti, samples, tick) for rti in runs]
+    step, feedback = (np.min([run.pop(phase) for run in driven], axis=0) for phase in ("step", "feedback"))
+    median = np.median(step)
+    in_medians = {name: round(float(us / median), 1) for name, us in (("p99", np.percentile(step, 99)), ("max", step.max()))}
+    return {"cpu_us": quantiles_us(step), "feedback_us": quantiles_us(feedback), "in_medians": in_medians, **driven[0]}
+
+
+def drive(family: Family, rti: Rti, samples: int, tick: Callable[[], None]) -> dict[str, Any]:
+    """Drive one closed loop; return the times of each sample, us, counts, the cost, and the largest residual."""
+    step: Array = np.zeros(samples)
+    feedback: Array = np.zeros(samples)
     unsolved, iterations, residuals, cost = 0, [], [], 0.0
-    x, u = np.zeros(ocp.model.nx), family.u0
+    x, u = np.zeros(family.ocp.model.nx), family.u0
     gc.collect()
     gc.disable()
     try:
         for k in range(samples):
             if (start := family.start(k)) is not None:
                 x, u = start, family.u0
-                for rti in copies:
-                    rti.reset(x, u)
+                rti.reset(x, u)
             y_ref, p = family.at(k)
-            for c, rti in enumerate(copies):
-                began_ns = time.thread_time_ns()
-                rti.prepare(y_ref, p, shift=start is None, u_prev=u)
-                prepared_ns = time.thread_time_ns()
-                status = rti.feedback(x)
-                done_ns = time.thread_time_ns()
-                step[k, c], feedback[k, c] = 1e-3 * (done_ns - began_ns), 1e-3 * (done_ns - prepared_ns)
+            began_ns = time.thread_time_ns()
+            rti.prepare(y_ref, p, shift=start is None, u_prev=u)
+            prepared_ns = time.thread_time_ns()
+            status = rti.feedback(x)
+            done_ns = time.thread_time_ns()
+            step[k], feedback[k] = 1e-3 * (done_ns - began_ns), 1e-3 * (done_ns - prepared_ns)
             unsolved += status is not QpStatus.SOLVED
             iterations.append(rti.solver.iterations)
             residuals.append(max(rti.solver.res_prim, rti.solver.res_dual))
@@ -78,8 +84,8 @@ def drive_family(family: Family, solver: str, samples: int, tick: Callable[[], N
     finally:
         gc.enable()
     return {
-        "cpu_us": quantiles_us(step.min(axis=1)),
-        "feedback_us": quantiles_us(feedback.min(axis=1)),
+        "step": step,
+        "feedback": feedback,
         "unsolved": unsolved,
         "iterations": {"p50": int(np.median(iterations)), "max": max(iterations)},
         "certificate_max": max(residuals),
@@ -161,7 +167,7 @@ def main(names: Sequence[str], horizons: Sequence[int], solvers: Sequence[str], 
             for N in horizons or usual:
                 family = make(N)
                 samples = min(QUICK_SAMPLES, family.samples) if quick else family.samples
-                task = progress.add_task(f"{name}, N = {N}", total=samples * (1 + len(solvers)))
+                task = progress.add_task(f"{name}, N = {N}", total=samples * (1 + RUNS * len(solvers)))
                 tick = lambda t=task: progress.advance(t)  # noqa: E731
                 converged = converge(family, samples, tick)
                 for solver in solvers:
@@ -179,15 +185,17 @@ def main(names: Sequence[str], horizons: Sequence[int], solvers: Sequence[str], 
 def print_table(console: Console, rows: list[dict[str, Any]]) -> None:
     """Print the rows."""
     table = Table(title="CPU time per sample, us: median / p99 / most")
-    for heading in ("problem", "N", "solver", "step", "feedback", "IPOPT", "unsolved", "iterations", "certificate", "cost", "compile"):
-        table.add_column(heading, justify="left" if heading in ("problem", "solver") else "right", no_wrap=True)
+    for heading in ("problem", "N", "solver", "step", "in medians", "feedback", "IPOPT", "unsolved", "iterations", "certificate", "cost", "compile"):
+        table.add_column(heading, justify="left" if heading in ("problem", "solver") else "right")
     for row in rows:
-        times = ["{p50:.0f} / {p99:.0f} / {max:.0f}".format(**row[key]) for key in ("cpu_us", "feedback_us", "ipopt_us")]
+        step, *others = ("{p50:.0f} / {p99:.0f} / {max:.0f}".format(**row[key]) for key in ("cpu_us", "feedback_us", "ipopt_us"))
         table.add_row(
             row["problem"],
             str(row["N"]),
             row["solver"],
-            *times,
+            step,
+            "{p99} / {max}".format(**row["in_medians"]),
+            *others,
             f"{row['unsolved']} of {row['samples']}",
             "{p50} / {max}".format(**row["iterations"]),
             f"{row['certificate_max']:.1e}",

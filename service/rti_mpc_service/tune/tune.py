@@ -23,7 +23,7 @@ from rti_mpc.signals import in_plane
 from rti_mpc_service.config.build import build_model, build_rti
 from rti_mpc_service.config.config import load
 from rti_mpc_service.config.schema import Config
-from rti_mpc_service.console import table_console
+from rti_mpc_service.console import print_whole, table_console
 from rti_mpc_service.entry import EXIT_BY_SIGNAL
 from rti_mpc_service.shipped import DEPLOY
 from rti_mpc_service.tune.choice import beats, choose, front
@@ -131,7 +131,7 @@ def main(
         console.print(f"interrupted: {len(finished(study))} of {trials} trials are kept, the same command goes on", soft_wrap=True)
         return EXIT_BY_SIGNAL + SIGINT
     unit = unit_of(loops[STUDIED])
-    console.print(front_table(unit, best, chosen, today, on_held_out, varied))
+    print_whole(console, front_table(unit, best, chosen, today, on_held_out, varied))
     picture = out.with_suffix(".png")
     held = [driven for driven in on_held_out.values() if driven is not None]
     figure(

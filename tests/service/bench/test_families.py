@@ -12,6 +12,7 @@ import pytest
 from rti_mpc.rti.active_set import MAX_GAP
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.bench.families import FAMILIES, Family
+from rti_mpc_service.bench.family_bench import drive
 from rti_mpc_service.bench.yardstick import Ipopt
 from tests.command import command
 from tests.problems import double_integrator
@@ -62,6 +63,15 @@ def test_a_period_costs_what_the_problem_says() -> None:
     assert cost == pytest.approx(5 * 2 * 1.5**2 + 7 * 3 * 0.1**2 + 10 * 0.5 + 0.5 * 4 * 0.5**2, rel=1e-12)
 
 
+@pytest.mark.parametrize("solver", ["riccati", "osqp"])
+def test_each_run_of_a_family_drives_the_same_closed_loop(solver: str) -> None:
+    """So the shortest of their times is that of one sample."""
+    family = FAMILIES["tight"][0](N)
+    first, second = (drive(family, Rti(family.ocp, solver=solver, compile=False), 20, lambda: None) for _ in range(2))
+    for same in ("cost", "iterations", "certificate_max", "unsolved"):
+        assert first[same] == second[same]
+
+
 @pytest.mark.slow
 def test_the_command_writes_a_row_for_each_family_and_solver(tmp_path: Path) -> None:
     path = tmp_path / "rows.json"
@@ -71,6 +81,7 @@ def test_the_command_writes_a_row_for_each_family_and_solver(tmp_path: Path) -> 
     assert [(row["problem"], row["N"], row["solver"]) for row in rows] == [("tight", 7, "riccati"), ("tight", 7, "osqp")]
     for row in rows:
         assert row["cpu_us"].keys() == {"p50", "p99", "max"}
+        assert 1.0 <= row["in_medians"]["p99"] <= row["in_medians"]["max"]
         assert row["samples"] == 40
         assert {"cost_over_converged", "unsolved", "iterations", "compile_s", "compile_mib", "ipopt_us"} <= row.keys()
         assert 0.0 < row["certificate_max"] < (MAX_GAP if row["solver"] == "riccati" else np.inf)  # OSQP may stop at its limit
