@@ -41,7 +41,7 @@ class Signal:
 
     Attributes:
         name: Unique within its vector; what configuration and viewers call it.
-        unit: SI unit, ``"1"`` if none.
+        unit: SI unit, or another one that `rti_mpc.si` knows, ``"1"`` if none.
         angle: Whether it is an angle whose whole turns do not matter: it may wrap at half a turn, and the dynamics repeat with each turn. Its unit,
             rad or deg, says how large a turn is.
         role: Of states and outputs ``"x"``, ``"y"`` (position in the plane, m) and ``"heading"`` (an angle, from the x axis to the left); of a

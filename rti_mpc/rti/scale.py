@@ -5,13 +5,15 @@ Scale of each variable: its unit inside the solvers, so that the units of a mode
 The scale of an input is half the range between its bounds, or the sum of its largest
 increments over the control horizon, or follows from the curvature of the cost. The
 scale of a state is half the range between its bounds, or its reach: how far the inputs
-can move it over the horizon. A general constraint has half its range, or what states and
+can move it over the horizon; one SI unit where nothing moves it. A general constraint has half its range, or what states and
 inputs, each as far as it reaches, change it by in whichever direction does most: along the
 one motion at which this is computed it may hardly change. A second difference has the
 scale of its input, as an increment has. Every tolerance is relative to these scales.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
@@ -20,6 +22,7 @@ from rti_mpc.array import Array
 from rti_mpc.rti.linearization import constraints, gauss_newton, linearize
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.second_difference import Remembering
+from rti_mpc.si import HasUnit, ones, read
 
 
 def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
@@ -56,9 +59,11 @@ def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
         half(ocp.widest("lbdu"), ocp.widest("ubdu")) * ocp.N_u,
         beyond(ocp.widest("lbu"), ocp.widest("ubu"), np.array(model.u_rest)),
         1.0 / np.sqrt(curvature),
+        ones(model.inputs),
     )
-    reach = shared(np.abs(response * reach_u).sum(axis=2).max(axis=0), [state.unit for state in model.states])
-    scale_x = first(half(ocp.widest("lbx"), ocp.widest("ubx")), reach, beyond(ocp.widest("lbx"), ocp.widest("ubx"), np.zeros(model.nx)))
+    reach = shared(np.abs(response * reach_u).sum(axis=2).max(axis=0), model.states)
+    lbx, ubx = ocp.widest("lbx"), ocp.widest("ubx")
+    scale_x = first(half(lbx, ubx), reach, beyond(lbx, ubx, np.zeros(model.nx)), ones(model.states))
 
     constraint, G_x, G_u = constraints(ocp)
     ng = ocp.ng
@@ -73,10 +78,16 @@ def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
     return np.concatenate([scale_x, reach_u, scale_g])
 
 
-def shared(reach: Array, units: list[str]) -> Array:
-    """Return for each state the largest reach of all states of its unit: x and y of a position have one scale, whichever way the robot faces."""
-    alike = np.array([[a == b and a not in ("", "1") for b in units] for a in units]) | np.eye(len(units), dtype=bool)
-    return np.asarray(np.where(alike, reach, 0.0).max(axis=1))
+def shared(reach: Array, states: Sequence[HasUnit]) -> Array:
+    """
+    Return for each state the largest reach of all states of its kind of unit: x and y of a position have one scale, whichever way the robot faces.
+
+    Kilometres and millimetres are of one kind.
+    """
+    units = [read(state.unit) for state in states]
+    size = np.array([unit.size for unit in units])
+    alike = np.array([[a.dimension == b.dimension != () for b in units] for a in units]) | np.eye(len(units), dtype=bool)
+    return np.asarray(np.where(alike, size * reach, 0.0).max(axis=1) / size)
 
 
 def half(lower: Array, upper: Array) -> Array:

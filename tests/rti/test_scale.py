@@ -12,6 +12,7 @@ import pytest
 
 from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
+from rti_mpc.model.model import Model, Signal
 from rti_mpc.model.path_following import path_following
 from rti_mpc.model.robots.boat import boat
 from rti_mpc.model.robots.cart_pole import cart_pole
@@ -22,9 +23,10 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import Rti
 from rti_mpc.rti.scale import scale
+from rti_mpc.si import read
 from tests.problems import INF, cart, double_integrator, fenced, pioneer
 from tests.slow import slow_but
-from tests.units import PIONEER_UNITS, in_other_units
+from tests.units import PIONEER_UNITS, in_other_units, with_units
 
 NEWTONS = {"N": 1.0, "kN": 1e3, "mN": 1e-3, "rpm": 0.05, "m/s^2": 1500.0}  # newtons of one unit of the input
 
@@ -195,6 +197,23 @@ def test_scale_of_what_has_no_bounds_is_the_reach_of_the_inputs() -> None:
     ocp = double_integrator(lbu=-2.0, ubu=2.0)
     found = scale(ocp, np.zeros((11, 2)), np.zeros((10, 1)), np.zeros((10, 2)), np.zeros((11, 0)))
     np.testing.assert_allclose(found, [1.0, 2.0, 2.0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("x", "y"), [("km", "mm"), ("m", "km"), ("m", "m")])
+def test_position_has_one_scale_although_its_coordinates_are_in_two_units(x: str, y: str) -> None:
+    """Kilometres beside millimetres had a scale each: the robot hardly reaches sideways within two stages."""
+    ocp = Ocp(with_units(pioneer_3dx(), {"x": x, "y": y}), N=2, dt=0.1, Q=[1, 1, 1], R=[1, 1], lbu=-0.5, ubu=0.5)
+    of_x, of_y = Rti(ocp, compile=False).scale_x[:2]
+    assert of_x * read(x).size == pytest.approx(of_y * read(y).size, rel=1e-12)
+
+
+@pytest.mark.parametrize("units", [{}, {"r": "km", "drift": "mm/s"}])
+def test_state_that_nothing_moves_has_the_scale_of_one_si_unit(units: dict[str, str]) -> None:
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    signals = (Signal("r", "m"), Signal("drift", "m/s")), (Signal("v", "m/s"),), (Signal("r", "m"),)
+    model = with_units(Model("carried", x, u, ca.vertcat(u + x[1], 0), x[0], *signals), units)
+    rti = Rti(Ocp(model, N=3, dt=0.1, Q=1.0, R=1.0, lbu=-1.0, ubu=1.0), compile=False)
+    assert rti.scale_x[1] * read(model.states[1].unit).size == pytest.approx(1.0, rel=1e-12)
 
 
 def test_scale_of_a_constraint_is_how_far_its_states_are_moved_in_any_direction() -> None:

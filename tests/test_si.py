@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Units read from their text."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from rti_mpc.si import BASE, DERIVED, ones, read
+from rti_mpc.signals import Signal
+
+SIZES = {
+    "m": 1.0,
+    "km": 1e3,
+    "mm": 1e-3,
+    "µm": 1e-6,
+    "km/h": 1 / 3.6,
+    "m/s^2": 1.0,
+    "m s⁻²": 1.0,
+    "1/m": 1.0,
+    "1/mm": 1e3,
+    "cm**2": 1e-4,
+    "deg/s": math.pi / 180,
+    "rpm": math.pi / 30,
+    "rev/min": math.pi / 30,
+    "mN": 1e-3,
+    "kN m": 1e3,
+    "N·mm": 1e-3,
+    "s m/rad^2": 1.0,
+    "1000 m": 1e3,
+    "1e-3 rad": 1e-3,
+    "%": 0.01,
+    "1": 1.0,
+    "": 1.0,
+}
+
+
+@pytest.mark.parametrize("text", SIZES)
+def test_size_of_a_unit_is_how_many_si_units_it_is(text: str) -> None:
+    assert read(text).size == pytest.approx(SIZES[text], rel=1e-15)
+
+
+@pytest.mark.parametrize("text", ["m", "rad", "m/s", "rad/s", "m/s^2", "N", "Nm", "s m/rad^2", "1", "1/m"])
+def test_an_si_unit_has_size_one_to_the_last_bit(text: str) -> None:
+    """So that nothing is rounded for a robot in SI units."""
+    assert read(text).size == 1.0
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "alike"),
+    [
+        ("km", "mm", True),
+        ("km/h", "m/s", True),
+        ("rpm", "rad/s", True),
+        ("deg", "rad", True),
+        ("N m", "Nm", True),
+        ("rpm", "Hz", False),
+        ("min", "m", False),
+        ("m", "m^2", False),
+        ("rad", "1", False),
+    ],
+)
+def test_units_of_one_quantity_have_one_dimension(one: str, other: str, alike: bool) -> None:
+    assert (read(one).dimension == read(other).dimension) is alike
+
+
+@pytest.mark.parametrize("text", ["counts", "N/(m/s)", "m//s", "m/", "mkg", "0 m", "1e999 m", "1e90 1e90 m", "m^99", "10m", "_", "furlong/s"])
+def test_a_text_that_is_no_known_unit_is_one_of_its_own(text: str) -> None:
+    assert read(text) == (1.0, ((text, 1),))
+
+
+def test_every_unit_of_the_table_is_made_of_base_units() -> None:
+    for symbol in DERIVED:
+        assert {base for base, _ in read(symbol).dimension} <= set(BASE), symbol
+
+
+def test_one_si_unit_is_told_in_the_unit_of_each_signal() -> None:
+    np.testing.assert_allclose(ones([Signal("x", "km"), Signal("psi", "deg"), Signal("n", "1")]), [1e-3, 180 / math.pi, 1.0], rtol=1e-15)
+    assert ones([]).shape == (0,)
