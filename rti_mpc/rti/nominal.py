@@ -5,7 +5,7 @@ Nominal state of a problem: where the model is finite and differentiable, so tha
 Many models of the field are singular at zero, a state they never see: slip angles
 divide by the speed, outflows are roots of a level, reaction rates have
 :math:`\exp(-E / RT)`. Of a model that gives no `x_nominal`, zero is tried first, brought
-inside the bounds, then ones, then states at random; what is found so says little of
+inside the bounds, then one SI unit of each, then states at random; what is found so says little of
 where the robot operates, and is left to come to rest.
 
 Where a model is regular and its plans explode all the same, it is stiff: a stage
@@ -25,8 +25,9 @@ from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
 from rti_mpc.model.model import IRK
 from rti_mpc.rti.ocp import Ocp
+from rti_mpc.si import ones
 
-RANDOM_STATES = 40  # states at random, from a hundredth to ten thousand in size
+RANDOM_STATES = 40  # states at random, from a hundredth to ten thousand SI units in size
 SETTLING_STAGES = 1000  # from a state that was found to where the model takes it with its inputs at rest
 GROWTH = {"euler": (1.0, 1.0), "rk4": (1 / 24, 1 / 6, 1 / 2, 1.0, 1.0)}  # R(z) of a scheme, highest power first
 FAST_RATE_STAGES = 2.0  # |lambda| dt from which on a motion is faster than a stage can follow
@@ -58,8 +59,8 @@ def nominal_state(ocp: Ocp) -> Array:
     zero = rotations.completed(np.clip(np.zeros(model.nx), ocp.widest("lbx"), ocp.widest("ubx")))
     if regular(zero):
         return zero
-    rng = np.random.default_rng(1)
-    candidates = [np.ones(model.nx), *(size * rng.normal(size=model.nx) for size in np.geomspace(1e-2, 1e4, RANDOM_STATES))]
+    rng, one = np.random.default_rng(1), ones(model.states)
+    candidates = [one, *(one * size * rng.normal(size=model.nx) for size in np.geomspace(1e-2, 1e4, RANDOM_STATES))]
     for candidate in candidates:
         if regular(x := rotations.completed(np.clip(candidate, ocp.widest("lbx"), ocp.widest("ubx")))):
             settled = np.array(ocp.phi().mapaccum(SETTLING_STAGES)(x, u_rest, model.p_nominal))[:, -1]

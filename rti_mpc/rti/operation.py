@@ -17,9 +17,10 @@ from rti_mpc.array import Array
 from rti_mpc.model.model import Model
 from rti_mpc.rti.nominal import model_and_derivatives, nominal_state
 from rti_mpc.rti.ocp import Ocp
+from rti_mpc.si import ones
 
 SEEDED_CORNERS = 6  # combinations of bounds, beside those where all are low or all high
-UNBOUNDED_DISTANCE = 1.0  # from the nominal state, or the input at rest, that is tried where there is no bound; in its unit
+UNBOUNDED_DISTANCE = 1.0  # from the nominal state, or the input at rest, that is tried where there is no bound; in its SI unit
 ROUNDING = 1e-9  # by which a number may exceed its bound, relative to the larger one of its two
 MAX_DRAWS = 20  # of all states anew, where some are not regular
 
@@ -39,8 +40,7 @@ def states_of_operation(ocp: Ocp, count: int, seed: int = 1) -> tuple[Array, Arr
     model, rng, is_regular = ocp.model, np.random.default_rng(seed), regular(ocp)
     attitudes = model.rotations("states")
     nominal, rest = nominal_state(ocp), np.array(model.u_rest)
-    lowest, highest = around(ocp.widest("lbx"), ocp.widest("ubx"), nominal)
-    low_u, high_u = around(ocp.widest("lbu"), ocp.widest("ubu"), rest)
+    (lowest, highest), (low_u, high_u) = range_of_states(ocp, nominal), range_of_inputs(ocp)
     ends = np.concatenate([lowest, low_u]), np.concatenate([highest, high_u])
     found: list[Array] = []
     drawn = [*corners(*ends, rng, count // 4), *rng.uniform(*ends, size=(count - count // 4 - 2, model.nx + model.nu))]
@@ -72,10 +72,21 @@ def inside(z: Array, lowest: Array, highest: Array) -> bool:
     return bool((z >= lowest - rounding).all() and (z <= highest + rounding).all())
 
 
-def around(lower: Array, upper: Array, middle: Array) -> tuple[Array, Array]:
-    """Return bounds, and where there are none `UNBOUNDED_DISTANCE` to that side of a middle; each of shape ``(n,)``."""
-    lowest = np.where(np.isfinite(lower), lower, np.minimum(middle, upper) - UNBOUNDED_DISTANCE)
-    return lowest, np.where(np.isfinite(upper), upper, np.maximum(middle, lower) + UNBOUNDED_DISTANCE)
+def range_of_states(ocp: Ocp, nominal: Array) -> tuple[Array, Array]:
+    """Return between which values states are driven around a nominal one, each of shape ``(nx,)``."""
+    return around(ocp.widest("lbx"), ocp.widest("ubx"), nominal, ones(ocp.model.states))
+
+
+def range_of_inputs(ocp: Ocp) -> tuple[Array, Array]:
+    """Return between which values inputs drive the robot, each of shape ``(nu,)``."""
+    return around(ocp.widest("lbu"), ocp.widest("ubu"), np.array(ocp.model.u_rest), ones(ocp.model.inputs))
+
+
+def around(lower: Array, upper: Array, middle: Array, one: Array) -> tuple[Array, Array]:
+    """Return bounds, and where there are none `UNBOUNDED_DISTANCE` of `one` SI unit to that side of a middle; each of shape ``(n,)``."""
+    distance = UNBOUNDED_DISTANCE * one
+    lowest = np.where(np.isfinite(lower), lower, np.minimum(middle, upper) - distance)
+    return lowest, np.where(np.isfinite(upper), upper, np.maximum(middle, lower) + distance)
 
 
 def corners(lowest: Array, highest: Array, rng: np.random.Generator, seeded: int = SEEDED_CORNERS) -> Iterator[Array]:

@@ -40,13 +40,15 @@ from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model, depends_on
 from rti_mpc.rti.nominal import nominal_state
 from rti_mpc.rti.ocp import Ocp
-from rti_mpc.rti.operation import around, corners, derivative, regular, states_of_operation
+from rti_mpc.rti.operation import corners, derivative, range_of_inputs, range_of_states, regular, states_of_operation
 from rti_mpc.rti.way_to_rest import StopLaw, WayToRest, whole
+from rti_mpc.si import ones
 from rti_mpc.signals import quantity
 
 SETTLING_S = 10.0  # after its inputs have come to rest a robot must stand still
 DRIVEN_S = 2.0  # for which inputs at their bounds drive the robot, to see which states it gets into
 STILL_SHARE = 0.01  # a state stands still that changes more slowly than this share of its fastest rate in operation
+STILL_RATE = 1e-9  # the same of a state that does not change in operation, in its SI unit / s
 COUNTED_STILL_SHARE = 1e-3  # the same, where the rows that a way needs are counted: in operation it may need more than in the states tried
 FALLING_SHARE = 0.1  # a robot falls, and does not only drift, if without feedback a state changes faster than this share of that rate
 MAX_DRIFT_GROWTH_PER_S = 0.05  # real part of an eigenvalue at rest up to which a robot drifts, and is not unstable
@@ -78,15 +80,15 @@ def motion_at_rest(ocp: Ocp) -> str:
     model, rng, attitudes = ocp.model, np.random.default_rng(1), ocp.model.rotations("states")
     u_rest: Array = np.array(model.u_rest)
     move, rate, is_regular = motion(model), derivative(model), regular(ocp)
-    inputs = list(corners(*around(ocp.widest("lbu"), ocp.widest("ubu"), u_rest), rng))
+    inputs = list(corners(*range_of_inputs(ocp), rng))
     start = np.clip(nominal_state(ocp), ocp.widest("lbx"), ocp.widest("ubx"))
-    lowest, highest = around(ocp.widest("lbx"), ocp.widest("ubx"), start)
+    lowest, highest = range_of_states(ocp, start)
     states = [np.clip(move(start, u, DRIVEN_S), ocp.widest("lbx"), ocp.widest("ubx")) for u in inputs]
     states += [rng.uniform(lowest, highest) for _ in range(SEEDED_STATES)]
     states = [start, *(x for x in map(attitudes.completed, states) if is_regular(x, u_rest))]
     rates = np.abs([rate(x, u) for x in states for u in (*inputs, u_rest)])
     fastest = np.max(rates, axis=0, where=np.isfinite(rates), initial=0.0)
-    still = np.where(fastest > 0.0, STILL_SHARE * fastest, 1e-9)
+    still = np.where(fastest > 0.0, STILL_SHARE * fastest, STILL_RATE * ones(model.states))
     positions = [j for j in range(model.nx) if not depends_on(model.rate_expr[j], model.x[j])]
     ends = [move(x, u_rest, SETTLING_S) for x in states]
     for settled in ends:
@@ -124,13 +126,15 @@ def motion(model: Model) -> Motion:
         period_s = model.dt
         return sampled
 
+    one = ones(model.states)  # states are integrated in SI units, for the tolerance of the integrator is absolute, too
+    z = ca.SX.sym("z", model.nx)
     t = ca.SX.sym("t")  # as a parameter: of time 1, one integrator serves all
-    dae = {"x": model.x, "p": ca.vertcat(model.u, model.p, t), "ode": t * model.rate_expr}
+    dae = {"x": z, "p": ca.vertcat(model.u, model.p, t), "ode": t * ca.substitute(model.rate_expr, model.x, one * z) / one}
     integrate = ca.integrator("motion", "cvodes", dae, 0.0, 1.0, {"show_eval_warnings": False, "disable_internal_warnings": True})
 
     def move(x: Array, u: Array, span_s: float) -> Array:
         try:
-            return np.array(integrate(x0=x, p=[*u, *model.p_nominal, span_s])["xf"]).ravel()
+            return np.asarray(one * np.array(integrate(x0=x / one, p=[*u, *model.p_nominal, span_s])["xf"]).ravel())
         except RuntimeError:  # it diverges
             return np.full(len(x), np.nan)
 
@@ -294,7 +298,10 @@ def shaped(ocp: Ocp, disturbances: Array, delay_s: float = 0.0) -> list[StopLaw]
     """
     model, starts = ocp.model, starts_of(ocp, TRIED_STATES, disturbances)
     rates = rates_of_operation(model, starts)
-    scale_x, scale_u = (np.where((half := 0.5 * np.ptp(values, axis=0)) > 0.0, half, 1.0) for values in starts[:2])
+    scale_x, scale_u = (
+        np.where((half := 0.5 * np.ptp(values, axis=0)) > 0.0, half, ones(signals))
+        for values, signals in zip(starts[:2], (model.states, model.inputs), strict=True)
+    )
     wrong = ""
     for duration_s, still in (*((duration_s, COUNTED_STILL_SHARE) for duration_s in WAY_DURATIONS_S), (WAY_DURATIONS_S[-1], STILL_SHARE)):
         substeps = max(1, math.ceil(duration_s / (MAX_WAY_ROWS * ocp.dt)))
@@ -407,10 +414,10 @@ def standing_s(ocp: Ocp, law: StopLaw, place: Callable[[Array], Array], speed: f
 
 
 def rates_of_operation(model: Model, starts: Starts) -> Array:
-    """Return the fastest that each state changes in operation, shape ``(nx,)``, positive."""
+    """Return the fastest that each state changes in operation, shape ``(nx,)``, positive: one SI unit / s of a state that does not."""
     rates = np.abs(rates_at(model, *starts))
     rates = rates.max(axis=0, where=np.isfinite(rates), initial=0.0)
-    return np.where(rates > 0.0, rates, 1.0)
+    return np.where(rates > 0.0, rates, ones(model.states))
 
 
 def rates_along(model: Model, ways: Ways, starts: Starts) -> Array:

@@ -11,12 +11,27 @@ import numpy as np
 import pytest
 
 from rti_mpc.errors import OcpError
-from rti_mpc.model.model import Model
+from rti_mpc.model.model import Model, Signal
 from rti_mpc.rti.nominal import nominal_state
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
+from rti_mpc.si import read
 from tests.problems import INF, pioneer
 from tests.slow import slow_but
+from tests.units import with_units
+
+
+def test_state_that_is_found_where_a_model_is_regular_is_the_same_in_any_units() -> None:
+    """A level, of which one metre is tried: it was one micrometre of a level in micrometres."""
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    level, inflow = Signal("h", "m"), Signal("q", "m/s")
+    tank = Model("tank", x, u, u * ca.sqrt(x - 0.01), x, level, inflow, level)  # none below its bottom outlet
+    found = []
+    for units in ({}, {"h": "um", "q": "mm/s"}):
+        model = with_units(tank, units)
+        ocp = Ocp(model, N=3, dt=0.1, Q=1.0, R=1.0)
+        found.append(float(nominal_state(ocp)[0]) * read(model.states[0].unit).size)
+    assert found[1] == pytest.approx(found[0], rel=1e-9)
 
 
 class Plant(NamedTuple):

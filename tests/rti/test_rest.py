@@ -13,11 +13,13 @@ import pytest
 from rti_mpc.model.model import Model, Signal
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.operation import states_of_operation
-from rti_mpc.rti.rest import RestClass, assess, find_stop_law, motion_at_rest
+from rti_mpc.rti.rest import RestClass, assess, find_stop_law, motion, motion_at_rest
+from rti_mpc.si import read
 from tests import movers
 from tests.problems import INF, PAPER, beacon, double_integrator, pioneer
 from tests.rti.test_nominal import PLANTS, problem
 from tests.slow import slow_but
+from tests.units import PIONEER_TEXTS, size, with_units
 
 
 def robot(names: str, units: str, f: Any, nu: int, **options: Any) -> Ocp:
@@ -111,6 +113,27 @@ def test_states_of_operation_are_those_where_the_model_is_regular() -> None:
     assert (X.shape, U.shape) == ((40, 1), (40, 1))
     assert X.min() > 0.0
     assert len(np.unique(X)) > 20
+
+
+def test_states_of_operation_are_the_same_in_any_units() -> None:
+    """Of the paper's robot, whose position and heading have no bounds: they were tried within one kilometre, and one degree."""
+    bounds = {"lbu": np.array([-0.5, -INF]), "ubu": np.array([0.5, INF])}
+    found = []
+    for units in ({}, PIONEER_TEXTS):
+        model = with_units(pioneer().model, units)
+        sizes = [np.array([read(signal.unit).size for signal in signals]) for signals in (model.states, model.inputs)]
+        ocp = Ocp(model, N=5, dt=0.1, Q=[1, 1, 1], R=[1, 1], **{name: bound / sizes[1] for name, bound in bounds.items()})
+        found.append([values * of for values, of in zip(states_of_operation(ocp, 40), sizes, strict=True)])
+    for theirs, mine in zip(*found, strict=True):
+        np.testing.assert_allclose(theirs, mine, rtol=0, atol=1e-12)
+
+
+def test_motion_by_which_rest_is_judged_is_the_same_in_any_units() -> None:
+    """As it is integrated to the same tolerance: it was 1e-8 of a kilometre."""
+    plain, other = pioneer().model, with_units(pioneer().model, PIONEER_TEXTS)
+    x, u = np.array([1.0, 2.0, 0.5, 0.3, 0.2]), np.array([0.4, -0.5])
+    x_sizes, u_sizes = (np.array([size(signal, PIONEER_TEXTS) for signal in signals]) for signals in (plain.states, plain.inputs))
+    np.testing.assert_allclose(motion(other)(x / x_sizes, u / u_sizes, 10.0) * x_sizes, motion(plain)(x, u, 10.0), rtol=0, atol=1e-10)
 
 
 def test_bounds_say_what_operation_is() -> None:
