@@ -10,6 +10,7 @@ import casadi as ca
 
 from rti_mpc.model.model import Model, Signal
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from tests.units import PIONEER_TEXTS, with_units
 
 OUTPUTS = (2, 0, 1)  # psi, x, y
 SHIPPED = Path(__file__).parents[1] / "deploy" / "pioneer_3dx.toml"
@@ -31,6 +32,16 @@ def shuffled() -> Model:
         states=tuple(model.states[j] for j in STATES),
         outputs=tuple(model.outputs[i] for i in OUTPUTS),
     )
+
+
+def pioneer() -> Model:
+    """The paper's robot without roles, as one must be whose position is not in m."""
+    return with_units(pioneer_3dx(), {})
+
+
+def pioneer_in_other_units() -> Model:
+    """The same in kilometres, millimetres, degrees and revolutions per minute."""
+    return with_units(pioneer_3dx(), PIONEER_TEXTS)
 
 
 def glider() -> Model:

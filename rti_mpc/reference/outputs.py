@@ -3,11 +3,11 @@ r"""
 References of outputs, for robots that follow no path in the plane: sines, steps, or a CSV file with a column for each output.
 
 Sines and steps begin at the outputs that the robot has, and stay inside bounds: output
-:math:`i` moves in what lies within `REACH` of its start :math:`y_{0,i}`,
+:math:`i` moves in what lies within its reach :math:`r_i`, `REACH` in its SI unit, of its start :math:`y_{0,i}`,
 
 .. math::
 
-    [\max(\underline y_i, y_{0,i} - r), \min(\overline y_i, y_{0,i} + r)] .
+    [\max(\underline y_i, y_{0,i} - r_i), \min(\overline y_i, y_{0,i} + r_i)] .
 
 A robot cannot follow more outputs at will than it has inputs, so others than those that
 are to move keep their start.
@@ -31,7 +31,7 @@ from rti_mpc.rotation import Rotations
 from rti_mpc.signals import Signal
 from rti_mpc.text_file import read_text_file
 
-REACH = 0.5  # from its start that an output moves at most, in its unit
+REACH = 0.5  # from its start that an output moves at most, in its SI unit
 ROOM_SHARE = 0.9  # of the room inside bounds that is used
 PERIODS = 6  # of the slowest reference that is followed
 
@@ -60,7 +60,7 @@ class OutputReference:
         return replace(self, duration_s=duration_s)
 
 
-def sines(lower: Array, upper: Array, moving: Sequence[int], period_s: float = 10.0) -> OutputReference:
+def sines(lower: Array, upper: Array, moving: Sequence[int], period_s: float = 10.0, reach: float | Array = REACH) -> OutputReference:
     """
     Build a sine in each output that moves, each slower than the one before, so that not all turn back at once.
 
@@ -69,12 +69,13 @@ def sines(lower: Array, upper: Array, moving: Sequence[int], period_s: float = 1
         upper: Their upper bounds.
         moving: Indices of the outputs that move.
         period_s: Of the first of them.
+        reach: How far from its start each output moves at most, shape ``(ny,)``, or one number for all, in their units.
     """
     periods_s = period_s * (1.0 + 0.5 * np.arange(len(moving)))
 
     def rows(y0: Array, t: Array) -> Array:
         y = np.tile(y0, (len(t), 1))
-        low, high = room(y0, lower, upper)
+        low, high = room(y0, lower, upper, reach)
         middle, amplitude = 0.5 * (low + high), 0.5 * ROOM_SHARE * (high - low)
         for i, turn_s in zip(moving, periods_s, strict=True):
             if amplitude[i] > 0.0:
@@ -85,12 +86,12 @@ def sines(lower: Array, upper: Array, moving: Sequence[int], period_s: float = 1
     return OutputReference("sines", rows, PERIODS * period_s)
 
 
-def steps(lower: Array, upper: Array, moving: Sequence[int], period_s: float = 10.0) -> OutputReference:
+def steps(lower: Array, upper: Array, moving: Sequence[int], period_s: float = 10.0, reach: float | Array = REACH) -> OutputReference:
     """Build steps there and back, of one output after another, every half period; arguments as of `sines`."""
 
     def rows(y0: Array, t: Array) -> Array:
         y = np.tile(y0, (len(t), 1))
-        low, high = room(y0, lower, upper)
+        low, high = room(y0, lower, upper, reach)
         step = ROOM_SHARE * np.where(high - y0 >= y0 - low, high - y0, low - y0)
         steps_so_far = np.floor(2 * t / period_s).astype(int)
         for k, i in enumerate(moving):
@@ -104,9 +105,9 @@ def steps(lower: Array, upper: Array, moving: Sequence[int], period_s: float = 1
 OUTPUT_SCENARIOS = {"sines": sines, "steps": steps}
 
 
-def room(y0: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+def room(y0: Array, lower: Array, upper: Array, reach: float | Array) -> tuple[Array, Array]:
     """Return between which values outputs may move that start at `y0`, all of shape ``(ny,)``; at a bound that the start exceeds, not at all."""
-    low, high = np.maximum(lower, y0 - REACH), np.minimum(upper, y0 + REACH)
+    low, high = np.maximum(lower, y0 - reach), np.minimum(upper, y0 + reach)
     return np.minimum(low, high), np.maximum(low, high)
 
 

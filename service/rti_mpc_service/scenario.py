@@ -20,8 +20,9 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import End
 from rti_mpc.errors import ConfigError
 from rti_mpc.reference.manoeuvres import MANOEUVRES, fitting, manoeuvre
-from rti_mpc.reference.outputs import OUTPUT_SCENARIOS, OutputReference, names_outputs, recorded
+from rti_mpc.reference.outputs import OUTPUT_SCENARIOS, REACH, OutputReference, names_outputs, recorded
 from rti_mpc.reference.trajectory import SCENARIOS, Heading, Trajectory, find_trajectory, followed_roles, rows
+from rti_mpc.si import ones
 from rti_mpc.signals import in_plane, place
 from rti_mpc.wire.layout import most_rows
 from rti_mpc_service.config.build import bounds, build_model, stage_parameters
@@ -183,7 +184,7 @@ def of_outputs(config: Config, model: Model, name: str, duration_s: float | None
         turning = {i for places in rotations.quaternions for i in places}  # an attitude stays as it is
         weighted = [i for i, output in enumerate(model.outputs) if config.ocp.weights.Q[output.name] > 0.0 and i not in turning]
         period_s = max(MIN_PERIOD_S, PERIOD_HORIZONS * config.ocp.N * config.ocp.dt_s)
-        reference = OUTPUT_SCENARIOS[name](np.array(lower), np.array(upper), weighted[: model.nu], period_s)
+        reference = OUTPUT_SCENARIOS[name](np.array(lower), np.array(upper), weighted[: model.nu], period_s, REACH * ones(model.outputs))
     elif name in MANOEUVRES:
         reference = manoeuvre(name, model.outputs)
     else:

@@ -28,6 +28,7 @@ from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import BUILT_IN_SOLVERS, Rti
+from rti_mpc.si import ones
 from rti_mpc.signals import quantity
 from rti_mpc_service.check.agreement import AGREEMENT_TOLERANCE, COST_TOLERANCE, Agreement, agreement
 from rti_mpc_service.check.excursion import Bounds, excursions
@@ -48,7 +49,7 @@ EXCURSION_SAMPLES = 4  # per excursion to a bound; the second solver solves the 
 SECOND_SOLVER = "daqp"  # OSQP is the second solver where daqp is the first
 TIGHT_SETTINGS = SolverSettings(eps=1e-9, max_iter=100_000, scaling=10)  # Ruiz scaling helps where bounds are far exceeded
 DISTURBANCE_SCALES = 0.01  # standard deviation of the disturbance, in scales of each state
-MAX_DISTURBANCE = 0.01  # of it, in the unit of each state: the scale of one without bounds, which grows by itself, says little
+MAX_DISTURBANCE = 0.01  # of it, in the SI unit of each state: the scale of one without bounds, which grows by itself, says little
 
 
 @dataclass(frozen=True)
@@ -167,7 +168,7 @@ def check(config: Config, rti: Rti) -> CheckReport:
     tight, judge = (tight_copy(rti, solver, formulation) for solver, formulation in ((first, rti.formulation), (second, other)))
     condensed = next(one for one in (tight, judge) if one.formulation == "sequential")
     bounds, scale = Bounds(rti), rti.scale_u
-    disturbance = np.minimum(DISTURBANCE_SCALES * rti.scale_x, MAX_DISTURBANCE)
+    disturbance = np.minimum(DISTURBANCE_SCALES * rti.scale_x, MAX_DISTURBANCE * ones(model.states))
     rng = np.random.default_rng(1)
     x = np.array(robot_settings(config)["x0"])
     reference = wave(ocp, x, rng)

@@ -16,6 +16,7 @@ from rti_mpc.contract.status import Mode
 from rti_mpc.errors import ConfigError
 from rti_mpc.recording.reader import Recording
 from rti_mpc.rti.ocp import Ocp
+from rti_mpc.si import ones
 from rti_mpc.wire.info import Info
 from rti_mpc_service.description import controller_info
 from rti_mpc_service.replay.beside import write_both
@@ -131,7 +132,7 @@ def numbers_of(passage: Passage, run: Run, ocp: Ocp) -> Numbers:
     settled = run.settled & follows & np.isfinite(run.reference).all(axis=1)
     e, du = run.output_error[settled], np.diff(run.u_applied, axis=0, prepend=run.u_applied[:1])[settled]
     half = 0.5 * (ocp.widest("ubu") - ocp.widest("lbu"))
-    relative = du / np.where(np.isfinite(half) & (half > 0.0), half, 1.0)
+    relative = du / np.where(np.isfinite(half) & (half > 0.0), half, ones(ocp.model.inputs))
     found: Numbers = {}
     for i, output in enumerate(ocp.model.outputs):
         found |= {f"{output.name}_rms": rms(e[:, i]), f"{output.name}_max": largest(e[:, i])}

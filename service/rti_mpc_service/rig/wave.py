@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from rti_mpc.array import Array
 from rti_mpc.rti.ocp import Ocp
+from rti_mpc.si import ones
 
 WAVE_PERIOD_S = 40.0
-WAVE_SPAN = 2.0  # from its start that an output moves at most, in its unit, where no bound is nearer
+WAVE_SPAN = 2.0  # from its start that an output moves at most, in its SI unit, where no bound is nearer
 BOUND_DISTANCE_SHARE = 0.1  # of what lies between the bounds, or within the span: the wave keeps this distance from a bound
 
 
@@ -21,8 +22,8 @@ def wave(ocp: Ocp, x: Array, rng: np.random.Generator) -> Callable[[NDArray[np.i
     model = ocp.model
     phases = rng.uniform(-np.pi, np.pi, model.ny)
     start = np.array(model.h()(x, model.p_nominal)).ravel()
-    low, high = inside(ocp, start)
-    return lambda k: np.clip(start + np.sin(2 * np.pi / WAVE_PERIOD_S * ocp.dt * k[:, None] + phases) - np.sin(phases), low, high)
+    one, (low, high) = ones(model.outputs), inside(ocp, start)
+    return lambda k: np.clip(start + one * np.sin(2 * np.pi / WAVE_PERIOD_S * ocp.dt * k[:, None] + phases) - one * np.sin(phases), low, high)
 
 
 def inside(ocp: Ocp, start: Array) -> tuple[Array, Array]:
@@ -32,5 +33,6 @@ def inside(ocp: Ocp, start: Array) -> tuple[Array, Array]:
     lower, upper = (
         np.array([none if j is None else bounds[j] for j in places]) for bounds, none in ((ocp.widest("lbx"), -np.inf), (ocp.widest("ubx"), np.inf))
     )
-    distance = BOUND_DISTANCE_SHARE * (np.minimum(upper, start + WAVE_SPAN) - np.maximum(lower, start - WAVE_SPAN))
-    return np.where(lower > start - WAVE_SPAN, lower + distance, -np.inf), np.where(upper < start + WAVE_SPAN, upper - distance, np.inf)
+    span = WAVE_SPAN * ones(ocp.model.outputs)
+    distance = BOUND_DISTANCE_SHARE * (np.minimum(upper, start + span) - np.maximum(lower, start - span))
+    return np.where(lower > start - span, lower + distance, -np.inf), np.where(upper < start + span, upper - distance, np.inf)

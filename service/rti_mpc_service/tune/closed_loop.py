@@ -16,6 +16,7 @@ from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.reference.trajectory import Heading
 from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 from rti_mpc.rti.rti import Rti
+from rti_mpc.si import ones
 from rti_mpc_service.config.build import (
     build_model,
     build_observer,
@@ -152,7 +153,7 @@ class ClosedLoop:
         if not self._Q.any():
             raise ConfigError(f"ocp.weights.Q must weight an output that {self.scenario.title} leads, got none above 0")
         half = 0.5 * (ocp.widest("ubu") - ocp.widest("lbu"))
-        self._range = np.where(np.isfinite(half) & (half > 0.0), half, 1.0)
+        self._range = np.where(np.isfinite(half) & (half > 0.0), half, ones(ocp.model.inputs))
 
     def _problem(self, config: Config) -> Ocp:
         if (ocp := self._problems.get(config.ocp.N)) is None:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize, nnls
 
 from rti_mpc.array import Array
+from rti_mpc.si import ones
 from rti_mpc_service.tune.prediction import Predictor
 from rti_mpc_service.tune.windows import MIN_WINDOWS, Windows, inputs
 
@@ -30,7 +31,7 @@ DELAYS = np.arange(7) / 4  # units of time of the windows, beyond the delay that
 LAGS = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0])  # likewise
 MIN_ADVANTAGE = 12.0  # of twice the log-likelihood: noise alone would have to be 3.5 sigma
 NEGLIGIBLE = 1e-5  # error, relative to the range that the state went through
-TINY = 1e-12  # in the unit of a state, of one that does not move at all
+TINY = 1e-12  # in the SI unit of a state, of one that does not move at all; also of a mean square relative to noise
 
 
 class Identified(NamedTuple):
@@ -78,7 +79,7 @@ def identified(windows: Windows, delay_s: float | None = None, lag_s: float | No
         delay_s: The delay, where it is known, in s.
         lag_s: The lag, where it is known, in s.
     """
-    predict, unit_s, least = Predictor(windows.model), windows.unit_s, np.maximum(NEGLIGIBLE * windows.range, TINY)
+    predict, unit_s, least = Predictor(windows.model), windows.unit_s, np.maximum(NEGLIGIBLE * windows.range, TINY * ones(windows.model.states))
     none = np.array([windows.assumed_delay_s if delay_s is None else delay_s, lag_s or 0.0])
     delays = none[0] + (DELAYS * unit_s if delay_s is None else np.zeros(1))
     lags = LAGS * unit_s if lag_s is None else none[1:]
