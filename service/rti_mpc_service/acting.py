@@ -18,11 +18,11 @@ from rti_mpc.array import Array
 DISTANCE = 1e-4  # from a bound at which it acts, in units of its signal; past a disc, of 87 nodes that were held 76 are nearer, of others 7
 
 
-def unit(lower: Array | float, upper: Array | float) -> float:
-    """Return what a signal ranges over whose scale is not known: half of what is between its widest bounds; with one its magnitude, 1 at least."""
+def unit(lower: Array | float, upper: Array | float, one: float = 1.0) -> float:
+    """Return what a signal ranges over whose scale is not known: half its range; with one bound its magnitude, `one` SI unit of it at least."""
     low, high = float(np.min(lower)), float(np.max(upper))
     ends = [abs(end) for end in (low, high) if isfinite(end)]
-    return 0.5 * (high - low) if len(ends) == 2 else max([1.0, *ends])
+    return 0.5 * (high - low) if len(ends) == 2 else max([one, *ends])
 
 
 def at_bounds(values: Array, lower: Array | float, upper: Array | float, of: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Telemetry
+from rti_mpc.si import ones
 from rti_mpc.wire.info import Info
 from rti_mpc_service.acting import at_bounds, unit
 
@@ -73,8 +74,8 @@ def acting_bounds(info: Info, sample: Telemetry, u_before: Array | None, discs: 
     rates = np.diff(sample.u, axis=0, prepend=sample.u[:1] if u_before is None else u_before[None])
     along: dict[str, list[tuple[str, NDArray[np.bool_]]]] = {}
     # Descriptions of controllers that do not tell scales yet are in recordings.
-    scale_x = info.scale_x or tuple(map(unit, info.lbx, info.ubx))
-    scale_u = info.scale_u or tuple(map(unit, info.lbu, info.ubu))
+    scale_x = info.scale_x or tuple(map(unit, info.lbx, info.ubx, ones(info.states)))
+    scale_u = info.scale_u or tuple(map(unit, info.lbu, info.ubu, ones(info.inputs)))
     for labels, values, lower, upper, sides, scale in (
         (info.states, sample.x[1:], info.lbx, info.ubx, LEVELS, scale_x),
         (info.inputs, sample.u, info.lbu, info.ubu, LEVELS, scale_u),
@@ -84,8 +85,9 @@ def acting_bounds(info: Info, sample: Telemetry, u_before: Array | None, discs: 
             bounds = lower[j], upper[j]
             acting = zip(sides, bounds, at_bounds(values[:, j], *bounds, scale[j]), strict=True)
             along.setdefault(label.name, []).extend((side, acts) for side, bound, acts in acting if np.isfinite(bound))
+    of_discs = unit(0.0, np.inf) if info.position is None or not info.scale_x else max(info.scale_x[j] for j in info.position)
     for i, away in enumerate(discs):
-        along[f"obstacle_{i}"] = [(TOUCHED, at_bounds(away, 0.0, np.inf, unit(0.0, np.inf))[0])]
+        along[f"obstacle_{i}"] = [(TOUCHED, at_bounds(away, 0.0, np.inf, of_discs)[0])]
     return {name: _said(sides) for name, sides in along.items() if sides}
 
 

@@ -111,6 +111,17 @@ def test_a_bound_acts_now_or_later_in_the_plan(pioneer: tuple[Config, Rti]) -> N
     assert acting_bounds(wide, sample, None, (away,))["obstacle_0"] == "touched later"
 
 
+@pytest.mark.parametrize("share", [1e-3, 1.0, 1e3])
+def test_an_obstacle_is_touched_at_a_share_of_what_the_position_ranges_over(pioneer: tuple[Config, Rti], share: float) -> None:
+    """Within 0.1 mm it was, of a robot that moves by millimetres as of one that moves by kilometres."""
+    _, rti = pioneer
+    info, sample = info_of(rti), solved(rti, NEAR)
+    info = replace(info, scale_x=tuple(share * scale for scale in info.scale_x))
+    for away, said in ((0.5, "touched"), (2.0, "free")):
+        distances = np.full(len(sample.u), away * DISTANCE * info.scale_x[0])
+        assert acting_bounds(info, sample, None, (distances,))["obstacle_0"] == said
+
+
 def test_a_sample_without_a_plan_has_no_terms(pioneer: tuple[Config, Rti]) -> None:
     _, rti = pioneer
     sample = solved(rti, NEAR)
