@@ -67,6 +67,11 @@ class Unit(NamedTuple):
     size: float
     dimension: tuple[tuple[str, int], ...]
 
+    @property
+    def in_si(self) -> str:
+        """The SI unit of this dimension, as text; ``"1"`` of a number."""
+        return " ".join(base if power == 1 else f"{base}^{power}" for base, power in self.dimension) or "1"
+
 
 class HasUnit(Protocol):
     """A signal, or its label on the bus."""

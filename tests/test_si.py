@@ -76,6 +76,12 @@ def test_every_unit_of_the_table_is_made_of_base_units() -> None:
         assert {base for base, _ in read(symbol).dimension} <= set(BASE), symbol
 
 
+@pytest.mark.parametrize(("text", "si"), [("km", "m"), ("rpm", "rad s^-1"), ("mN", "kg m s^-2"), ("%", "1"), ("counts", "counts")])
+def test_si_unit_of_a_unit_is_told(text: str, si: str) -> None:
+    assert read(text).in_si == si
+    assert read(si) == (1.0, read(text).dimension)
+
+
 def test_one_si_unit_is_told_in_the_unit_of_each_signal() -> None:
     np.testing.assert_allclose(ones([Signal("x", "km"), Signal("psi", "deg"), Signal("n", "1")]), [1e-3, 180 / math.pi, 1.0], rtol=1e-15)
     assert ones([]).shape == (0,)

@@ -23,7 +23,8 @@ from rti_mpc_service.rig.robot_log import RobotLog
 from rti_mpc_service.scenario import find_scenario
 from rti_mpc_service.shipped import ROBOTS
 from tests import movers
-from tests.robots import SHIPPED, arm, polar, shuffled, toml
+from tests.robots import SHIPPED, arm, glider, polar, shuffled, toml
+from tests.units import with_units
 
 X = np.arange(5.0)
 
@@ -45,6 +46,18 @@ def test_any_other_robot_is_measured_by_its_outputs_in_their_unit_angles_within_
     assert motion.position(np.array([0.1, 0.2])) == pytest.approx([0.1, 0.2])
     assert motion.distance(np.array([0.3, 2 * np.pi]), np.array([0.0, 0.4])) == pytest.approx(0.5)
     assert Motion(polar()).unit == "1"
+
+
+def test_robot_in_other_units_is_measured_in_si_units_as_its_promises_are() -> None:
+    """An arm in degrees counted as driven at 0.02 degrees per second, and had to be within 0.01 degrees of its reference."""
+    plain, other = Motion(arm()), Motion(with_units(arm(), {"x": "deg"}))
+    x, sizes = np.array([0.3, 2 * np.pi]), np.array([np.pi / 180, 1.0])
+    assert (other.unit, other.driven_speed) == (plain.unit, plain.driven_speed) == ("rad", 0.02)
+    np.testing.assert_allclose(other.position(x / sizes), plain.position(x), rtol=1e-12)
+    assert other.distance(other.position(x / sizes), np.array([0.0, 0.4])) == pytest.approx(0.5)
+    reference = Reference(1, 1, 0, 10, End.HOLD, np.array([[0.1, 0.2], [0.2, 0.3]]) / sizes, np.zeros((2, 0)))
+    np.testing.assert_allclose(other.wanted(reference, np.array([0, 10])), [[0.1, 0.2], [0.2, 0.3]], rtol=1e-12)
+    assert Motion(with_units(glider(), {"psi": "km"})).unit == "m", "km and m have one SI unit"
 
 
 def test_error_that_a_robot_has_without_a_fault_is_not_held_against_it() -> None:
