@@ -77,5 +77,7 @@ def lqr_weight(ocp: Ocp, x: Array, u: Array) -> Array:
         raise OcpError(f"model {model.name} must be stabilizable where a terminal weight is wanted, at x = {x}, u = {u}: {error}") from error
     # The least of xi' S xi over all xi of one output y is y' (C S^-1 C')^-1 y.
     weight: Array = np.zeros((model.ny, model.ny))
-    weight[np.ix_(weighed, weighed)] = np.linalg.inv(C @ np.linalg.pinv(S) @ C.T) - Q
+    size = np.sqrt(np.where(np.diag(S) > 0.0, np.diag(S), 1.0))  # the pseudo-inverse leaves out what is small, whatever its unit
+    C = C / size
+    weight[np.ix_(weighed, weighed)] = np.linalg.inv(C @ np.linalg.pinv(S / np.outer(size, size)) @ C.T) - Q
     return np.asarray((weight + weight.T) / 2)
