@@ -18,7 +18,7 @@ import re
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -205,6 +205,18 @@ def _guess(endpoint: str) -> str:
     """Return what may be wrong at an endpoint."""
     certificate = ", the address is wrong, or a certificate is" if endpoint.startswith(TLS_PROTOCOLS) else ", or the address is wrong"
     return f"no process listens there{certificate}"
+
+
+def meets(config: zenoh.Config) -> bool:
+    """Whether a process is a peer, which meets others by gossip."""
+    return bool(json.loads(config.get_json("mode")) == "peer")
+
+
+def guest_config(settings: BusSettings) -> zenoh.Config:
+    """Return the configuration of a peer that joins where a process with these settings did: nobody connects to it, and opening waits for nobody."""
+    waits = ("connect_scouted", "declares")
+    cfg = ("listen/endpoints:[]", *(f"open/return_conditions/{what}:false" for what in waits))
+    return zenoh_config(replace(settings, listen=(), cfg=(*settings.cfg, *cfg)))
 
 
 def open_endpoints(settings: BusSettings) -> list[str]:

@@ -29,13 +29,15 @@ from zenoh import ext
 
 from rti_mpc.wire import document
 from rti_mpc.wire.cdr import M, encode, encoding
+from rti_mpc.wire.introduction import Introduction
 from rti_mpc.wire.keys import Key
 from rti_mpc.wire.received import WOKEN, Received
-from rti_mpc.wire.session import BusSettings, certificate, endpoints, open_session, zenoh_config
+from rti_mpc.wire.session import BusSettings, certificate, endpoints, guest_config, meets, open_session, zenoh_config
 
 CLOSE_TIMEOUT_S = 0.5
 HEARTBEAT_S = 1.0  # period at which a cached publisher sends the number of its last message
 MAX_ENCODING_CHARS = 256  # of an encoding that are read
+RING_LINKS = 1024  # links made or lost that wait for their receiver
 RING_TOKENS = 1024  # changes of presence that wait for their receiver
 WAKE_BYTES = 16  # of the message by which a process wakes its own receiver
 RING_QUERIES = 16  # requests that wait for their answer
@@ -184,7 +186,13 @@ class ZenohSession:
         self._settings = settings
         self._config = zenoh_config(settings)
         self._session = open_session(settings, timeout_s, stop, say)
+        self._over = threading.Event()
         self._following: list[threading.Thread] = []
+        if meets(self._config):
+            self._introduction = Introduction(self._peers, lambda: zenoh.open(guest_config(settings)), self._over)
+            listener = self._session.info.declare_link_events_listener(zenoh.handlers.RingChannel(RING_LINKS), history=True)
+            self._following.append(threading.Thread(target=self._introduction.follow, args=(listener,), name="introduction", daemon=True))
+            self._following[-1].start()
 
     def __enter__(self) -> ZenohSession:
         return self
@@ -198,6 +206,7 @@ class ZenohSession:
 
         Unless it does, threads that follow are over by then: one that comes back from Zenoh while the interpreter ends would abort the process.
         """
+        self._over.set()
         closing = threading.Thread(target=self._session.close, daemon=True)
         closing.start()
         over_s = time.monotonic() + CLOSE_TIMEOUT_S
@@ -234,6 +243,10 @@ class ZenohSession:
             return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
         except zenoh.ZError:
             return None
+
+    def _peers(self) -> set[str]:
+        """Return the numbers of the peers that this process is linked to."""
+        return {str(peer) for peer in self._session.info.peers_zid()}
 
     def publisher(self, key: Key[M]) -> ZenohPublisher[M]:
         """Publisher of a stream, with the quality of service that the table gives it."""
