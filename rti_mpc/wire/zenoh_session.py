@@ -11,6 +11,7 @@ Zenoh session of one process, which carries the buses of its robots (`rti_mpc.wi
 
 from __future__ import annotations
 
+import atexit
 import math
 import os
 import secrets
@@ -193,6 +194,7 @@ class ZenohSession:
             listener = self._session.info.declare_link_events_listener(zenoh.handlers.RingChannel(RING_LINKS), history=True)
             self._following.append(threading.Thread(target=self._introduction.follow, args=(listener,), name="introduction", daemon=True))
             self._following[-1].start()
+        atexit.register(self.close)  # where nobody closes it: a thread that waits in Zenoh while the interpreter ends would abort the process
 
     def __enter__(self) -> ZenohSession:
         return self
@@ -206,6 +208,7 @@ class ZenohSession:
 
         Unless it does, threads that follow are over by then: one that comes back from Zenoh while the interpreter ends would abort the process.
         """
+        atexit.unregister(self.close)
         self._over.set()
         closing = threading.Thread(target=self._session.close, daemon=True)
         closing.start()
