@@ -120,7 +120,7 @@ class RobotAdapter:
         about = {"role": ROLE, "version": rti_mpc.__version__, "epoch": epoch, "speed": 1.0, "reports_inputs": True, "approaches": True}
         self._bus.publish_json(keys.info(ROLE), {**about, **labels(inputs=[Label(name) for name in self.inputs])})
         self._bus.alive(ROLE)
-        self._bus.watch_certificate(self._warn)
+        self._bus.watch_connection(self._warn)
 
     def __enter__(self) -> Self:
         return self

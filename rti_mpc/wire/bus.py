@@ -16,7 +16,7 @@ from weakref import WeakSet
 
 from rti_mpc.contract.message import Notice
 from rti_mpc.errors import MessageError
-from rti_mpc.wire import document, presence
+from rti_mpc.wire import connection, document, presence
 from rti_mpc.wire.cdr import M, Message
 from rti_mpc.wire.certificate import warn_of_end
 from rti_mpc.wire.intake import Intake
@@ -261,8 +261,19 @@ class Bus:
         where = self._session.connects_to
         return f"no process answers at {where}" if where else "no process has connected yet"
 
-    def watch_certificate(self, tell: Callable[[Notice], object]) -> None:
-        """Warn from `rti_mpc.wire.certificate.WARN_DAYS` before the end of this process's certificate on, once a day, in a thread of its own."""
+    def watch_connection(self, tell: Callable[[Notice], object]) -> None:
+        """
+        Report what becomes of the connection, in threads of its own.
+
+        That all links are lost, unless this process waits for others to connect, and that there are links again; and from
+        `rti_mpc.wire.certificate.WARN_DAYS` before it on, once a day, the end of this process's certificate.
+        """
+
+        def why() -> str:
+            where = self._session.connects_to
+            return f"no process answers at {where}" if where else ""
+
+        connection.watch(lambda: self._session.links, why, tell, self._over)
         if (path := self._session.certificate) is not None:
             warn_of_end(path, tell, self._over)
 

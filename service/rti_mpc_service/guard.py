@@ -110,7 +110,7 @@ class Process:
         self._actuation = bus.publisher(keys.actuation)
         self._states = bus.intake(State, config.stale_s, {"x": limits.rotations.size, "u": len(limits.u_rest)})
         bus.expect("state", lambda: self._guard.heard)
-        bus.watch_certificate(self._guard.notices.append)
+        bus.watch_connection(self._guard.notices.append)
         self._commands = bus.intake(Command, config.stale_s, {"u": len(limits.u_rest)})
         self._operator_stop = OperatorStop(file, self._obey, self._guard.notices.append)
         self._operator_stop.listen(bus)

@@ -99,7 +99,7 @@ class ReferenceSource:
         self._intake = bus.intake(State, STALE_S, {"x": scenario.nx})
         self._lives = Lives(STALE_S, STALE_S)
         bus.expect("state", lambda: self.anchored)
-        bus.watch_certificate(self._warn)
+        bus.watch_connection(self._warn)
 
     def publish_if_restarted(self) -> None:
         """

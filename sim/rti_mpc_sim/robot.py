@@ -104,7 +104,7 @@ def main(
         life |= {"reports_inputs": settings.reports_inputs, "approaches": settings.increments is not None}
         bus.publish_json(keys.info(ROLE), {**model_info(settings.model), **(info or {}), **life})
         bus.alive(ROLE)
-        bus.watch_certificate(robot.warn)
+        bus.watch_connection(robot.warn)
         logger.info("epoch %d of %s, model %s, at %g times real speed", robot.body.epoch, keys.robot, settings.model.name, speed)
         gc.collect()
         gc.freeze()

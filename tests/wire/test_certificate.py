@@ -64,9 +64,9 @@ def test_process_warns_once_a_day_from_thirty_days_before_the_end_on_and_after_i
 def test_process_warns_of_the_certificate_with_which_it_has_joined_and_of_none_without_tls(tmp_path: Path) -> None:
     told = Queue[str]()
     session = FakeSession()
-    Bus(session, Keys()).watch_certificate(lambda notice: told.put(notice.text))
+    Bus(session, Keys()).watch_connection(lambda notice: told.put(notice.text))
     session.certificate = tmp_path / "guard.pem"
     session.certificate.write_bytes(pem(Authority.make("rti-mpc authority", 5.0).certificate))
-    Bus(session, Keys()).watch_certificate(lambda notice: told.put(notice.text))
+    Bus(session, Keys()).watch_connection(lambda notice: told.put(notice.text))
     assert told.get(timeout=30.0).startswith(f"{session.certificate} ends in 5.0 days")
     assert told.empty()

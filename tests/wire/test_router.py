@@ -9,11 +9,12 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from queue import Queue
 
 import numpy as np
 import pytest
 
-from rti_mpc.contract.message import State
+from rti_mpc.contract.message import Notice, Severity, State
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.rig.endpoint import free_endpoint
@@ -55,6 +56,22 @@ def test_clients_wait_for_the_router_and_reach_each_other_through_it(router: sub
             states.put(State(1, 1, 0, np.zeros(5)))
             waiting.join(0.01)
         assert not waiting.is_alive()
+
+
+def test_clients_say_that_their_router_is_gone_and_that_it_is_back(router: subprocess.Popen[bytes], endpoint: str) -> None:
+    told: Queue[Notice] = Queue()
+    with Bus.join(BusSettings(mode="client", connect=(endpoint,)), KEYS) as client:
+        client.watch_connection(told.put)
+        router.kill()
+        lost = told.get(timeout=TIMEOUT_S)
+        text = f"all links to other processes are lost: no process answers at {endpoint}: no process listens there, or the address is wrong"
+        assert (lost.severity, lost.code, lost.text) == (Severity.ERROR, "unlinked", text)
+        with subprocess.Popen([sys.executable, "-c", ROUTER.format(endpoint)], env={**os.environ, "PYTHONPATH": str(ROOT)}) as another:
+            try:
+                back = told.get(timeout=TIMEOUT_S)
+            finally:
+                another.kill()
+        assert (back.severity, back.code) == (Severity.INFO, "linked")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

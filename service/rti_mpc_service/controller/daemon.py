@@ -188,7 +188,7 @@ class Daemon:
         self._journal = JournalPublisher(bus, controller, book)
         self._case = KeptCase(rti, book)
         self._states_in = bus.intake(State, config.stale_s, {"x": model.nx, "u": model.nu})
-        bus.watch_certificate(controller.say)
+        bus.watch_connection(controller.say)
         self._references = References(bus, controller, model.ny)
         self._prepare_us = 0.0
         self._slack = Slack()

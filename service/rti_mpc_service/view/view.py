@@ -108,7 +108,7 @@ def main(bus_settings: BusSettings, keys: Keys, screens: Screens, *, robots: Seq
             outlets.append(viewer_outlet(url, title, roots))
         log.info("listening to %s", " and ".join(one.keys.below("*") for one in buses))
         announcer = Announcer(buses[0], ROLE, new_epoch())
-        bus.watch_certificate(lambda notice: announce(log, announcer, notice, listeners[0].now_ns))
+        bus.watch_connection(lambda notice: announce(log, announcer, notice, listeners[0].now_ns))
         pump(listeners, outlets, spawned, announcer, stop)
     counts = (sum(getattr(listener, name) for listener in listeners) for name in ("received", "lost", "refused"))
     log.info("%d messages, %d lost, %d refused", *counts)
