@@ -41,6 +41,7 @@ LIVING = {  # what each process says once it can be ended, and the words that st
     "controller": ("waiting to tracking", ("run",)),
     "reference": ("s of the robot on", ("reference",)),
     "standby": ("waiting to tracking", ("run", "--standby")),
+    "recorder": ("recording", ("record",)),
     **({"viewer": ("open", ("view",))} if find_spec("rerun") else {}),
 }
 
@@ -150,7 +151,10 @@ class Round:
 
     def _start(self, role: str) -> subprocess.Popen[bytes]:
         _, (command, *options) = LIVING[role]
-        options += ["--rerun-save", str(self.folder / "run.rrd")] if role == "viewer" else []
+        written = {"viewer": ("--rerun-save", "run.rrd"), "recorder": ("--out", "run.mcap")}
+        if role in written:
+            option, name = written[role]
+            options += [option, str(self.folder / name)]
         options += ["-l", self._endpoint] if role == "router" else ["-m", "client" if self._before.router else "peer", "-e", self._endpoint]
         inside = ["ip", "netns", "exec", self._namespace] if self._namespace else []
         with (self.folder / f"{role}.log").open("wb") as log:
