@@ -31,6 +31,8 @@ from rti_mpc.wire.zenoh_session import CLOSE_TIMEOUT_S, ZenohSession
 RING_MESSAGES = 1024  # messages that wait for a receiver: those of half a second at 2000 per second
 MAX_NUMBER = 10_000_000  # below it are the numbers of processes that share a role
 RETRY_INTERVAL_S = 0.1  # between two attempts to reach a process that is not there yet
+SETTLED_S = 0.5  # without a new link, after which all others are taken to be met
+SETTLING_S = 5.0  # for which that is waited for at most, where others come and go
 
 Sent = TypeVar("Sent", bound=Message, contravariant=True)
 
@@ -383,12 +385,22 @@ class Bus:
         self._say(f"connected, but not heard as {role}: see the router's log; is {self._session.certificate} for this role and this robot?")
 
     def is_alive(self, role: str, timeout_s: float = 0.5) -> bool:
-        """Whether anybody shows presence in a role, this process included; it may take a moment after the start to meet the others."""
-        deadline_s = time.monotonic() + timeout_s
+        """
+        Whether anybody shows presence in a role, this process included.
+
+        It may take a moment after the start to meet the others, and longer on a busy host: while links are still made, the wait
+        goes on, for `SETTLING_S` at most.
+        """
+        begun_s = time.monotonic()
+        deadline_s, links = begun_s + timeout_s, self._session.links
         while True:
             left_s = deadline_s - time.monotonic()
             if self._session.present(self.keys.alive(role), max(left_s, 0.01)):
                 return True
+            if (now := self._session.links) != links:
+                links, settled_s = now, time.monotonic() + SETTLED_S
+                deadline_s = max(deadline_s, min(settled_s, begun_s + SETTLING_S))
+                left_s = deadline_s - time.monotonic()
             if left_s <= 0.0:
                 return False
             time.sleep(min(RETRY_INTERVAL_S, left_s))

@@ -19,16 +19,18 @@ import pytest
 import zenoh
 
 from rti_mpc.contract.message import Command, End, Event, Reference, Severity, State
+from rti_mpc.wire import bus as bus_module
 from rti_mpc.wire.bus import RING_MESSAGES, WOKEN, Bus, BusSettings, Received, Subscriber
 from rti_mpc.wire.cdr import decode, encoding
 from rti_mpc.wire.intake import Intake
-from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
 from rti_mpc.wire.streams import MAX_RING_BYTES
 from rti_mpc.wire.zenoh_session import ZenohSession
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.in_time import MS, PATIENT, WAIT_BEFORE_CLOSE, WAIT_BEFORE_DROP, explained, in_time
+from tests.wire.fake_session import FakeSession
 
 ROOT = Path(__file__).parents[2]
 KEYS = Keys(robot="test")
@@ -579,3 +581,26 @@ def test_presence_is_seen_and_a_killed_process_is_missed(join: Any, start: Any) 
     controller.kill()
     eventually(lambda: ("controller", False) in changes)
     assert not robot.is_alive("controller")
+
+
+class Settling(FakeSession):
+    """A session that is linked to one more process at each look, and sees presence at the last."""
+
+    def __init__(self, looks: int) -> None:
+        super().__init__()
+        self.links: int = 0
+        self._looks = looks
+
+    def present(self, key: Key[Any], timeout_s: float) -> bool:
+        self.links = min(self.links + 1, self._looks)
+        return self.links == self._looks
+
+
+def test_look_for_another_process_goes_on_while_others_are_still_met() -> None:
+    """On a busy host the first link may be there long before the one to the process that is looked for."""
+    assert Bus(Settling(looks=4), KEYS).is_alive("reference", 0.0)
+
+
+def test_look_for_another_process_ends_though_others_come_and_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bus_module, "SETTLING_S", 0.3)
+    assert not Bus(Settling(looks=1_000_000), KEYS).is_alive("reference", 0.0)
