@@ -5,7 +5,7 @@ Settings with which a process joins the bus, and the Zenoh session made from the
 Peers find each other by gossip. The robot listens on the rendezvous endpoint, the others
 on a free loopback port. Those connect to the robot, trying until it is there, learn of
 one another and link directly. So processes may start and restart in any order, and those
-already linked stay so without the robot. Multicast is off. Across hosts, name the
+already linked stay so without the robot; `rti_mpc.wire.introduction` makes links that are lost again. Multicast is off. Across hosts, name the
 endpoint to listen on. Across a security boundary, use ``mode="client"`` and a router: a
 peer never forwards, and never passes a router's access control.
 """
