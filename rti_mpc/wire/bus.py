@@ -157,19 +157,21 @@ class Bus:
         closed: Whether `close` was called.
     """
 
-    def __init__(self, session: Session, keys: Keys, *, say: Callable[[str], object] = lambda _: None) -> None:
+    def __init__(self, session: Session, keys: Keys, *, stop: threading.Event | None = None, say: Callable[[str], object] = lambda _: None) -> None:
         """
         Open the streams of one robot on a session, which may carry those of other robots as well.
 
         Args:
             session: The connection of the process; `close` leaves it open.
             keys: Keys of the robot's streams.
+            stop: Ends waits for others when set.
             say: Receiver of a line about processes that are not reached.
         """
         self.keys = keys
         self.closed = False
         self._session = session
         self._leave: Callable[[], None] = self._undeclare
+        self._stop = stop or threading.Event()
         self._say = say
         self._over = threading.Event()
         self._publishers: dict[str, Publisher[Any]] = {}  # by key, kept so that a process which changes its role and back uses the same one
@@ -194,7 +196,7 @@ class Bus:
             settings: Settings of the session.
             keys: Keys of the robot's streams.
             timeout_s: Time for which a client waits for its router.
-            stop: Ends that wait when set.
+            stop: Ends that wait, and later ones for others, when set.
             say: Receiver of a line about processes that are not reached.
 
         Raises:
@@ -202,7 +204,7 @@ class Bus:
             Stopped: The wait was ended by `stop`.
         """
         session = ZenohSession(settings, timeout_s=timeout_s, stop=stop, say=say)
-        bus = cls(session, keys, say=say)
+        bus = cls(session, keys, stop=stop, say=say)
         bus._leave = session.close
         return bus
 
@@ -234,7 +236,7 @@ class Bus:
 
     def beside(self, keys: Keys) -> Bus:
         """Return the bus of another robot on the same session, which ends with this one."""
-        return Bus(self._session, keys, say=self._say)
+        return Bus(self._session, keys, stop=self._stop, say=self._say)
 
     def expect(self, what: str, heard: Callable[[], object]) -> None:
         """
@@ -389,7 +391,7 @@ class Bus:
         Whether anybody shows presence in a role, this process included.
 
         It may take a moment after the start to meet the others, and longer on a busy host: while links are still made, the wait
-        goes on, for `SETTLING_S` at most.
+        goes on, for `SETTLING_S` at most, or until this process is to end.
         """
         begun_s = time.monotonic()
         deadline_s, links = begun_s + timeout_s, self._session.links
@@ -403,7 +405,8 @@ class Bus:
                 left_s = deadline_s - time.monotonic()
             if left_s <= 0.0:
                 return False
-            time.sleep(min(RETRY_INTERVAL_S, left_s))
+            if self._stop.wait(min(RETRY_INTERVAL_S, left_s)):
+                return False
 
     def watch_alive(self, callback: Callable[[str, bool], None]) -> None:
         """Call back in a thread of its own, with a role and whether it is present: for all roles present now, then at every change."""

@@ -601,6 +601,14 @@ def test_look_for_another_process_goes_on_while_others_are_still_met() -> None:
     assert Bus(Settling(looks=4), KEYS).is_alive("reference", 0.0)
 
 
+def test_look_for_another_process_ends_when_this_one_is_to_end() -> None:
+    stop = threading.Event()
+    stop.set()
+    session = Settling(looks=1_000_000)
+    assert not Bus(session, KEYS, stop=stop).is_alive("reference")
+    assert session.links == 1, "looks"
+
+
 def test_look_for_another_process_ends_though_others_come_and_go(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bus_module, "SETTLING_S", 0.3)
     assert not Bus(Settling(looks=1_000_000), KEYS).is_alive("reference", 0.0)
