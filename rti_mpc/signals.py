@@ -67,8 +67,15 @@ class Signal:
                 raise OcpError(f"{field} of the signal {given.quoted(self.name)} must be {words}, got {given.quoted(value)}")
         if not self.name.strip():
             raise OcpError(f"name of a signal must not be empty, got {self.name!r}")
+        if not (self.name + self.unit).isprintable():
+            raise OcpError(f"name and unit of a signal must be printable, in one line, got {self.name!r} in {self.unit!r}")
         if self.angle and self.unit not in TURNS:
             raise OcpError(f"unit of the signal {self.name!r} must be {' or '.join(TURNS)} for angle=True, to know a whole turn, got {self.unit!r}")
+
+
+def as_label(text: str) -> str:
+    """Return a name or a unit as Matplotlib draws it in a figure: a dollar sign begins no formula."""
+    return text.replace("$", r"\$")
 
 
 def quantity(value: float, unit: str, form: str = ".3g") -> str:

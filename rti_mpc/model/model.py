@@ -99,6 +99,8 @@ class Model:
         """Take what is given in other forms, and check that names, dimensions and symbols fit together."""
         if not isinstance(self.name, str):
             raise OcpError(f"name of a model must be text, got {given.quoted(self.name)}")
+        if not (self.name.strip() and self.name.isprintable()):
+            raise OcpError(f"name of a model must be printable, in one line, got {self.name!r}")
         try:
             for name, value in (self._taken() | self._checked_integration()).items():
                 object.__setattr__(self, name, value)

@@ -10,7 +10,7 @@ import numpy as np
 from rti_mpc import given
 from rti_mpc.errors import RtiMpcError
 from rti_mpc.rti.simulation import Simulation
-from rti_mpc.signals import plane
+from rti_mpc.signals import as_label, plane
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -64,7 +64,7 @@ def draw_path(axes: Axes, run: Simulation, position: tuple[int, int]) -> None:
     axes.plot(*run.y[:, position].T, color=DRIVEN, label="driven")
     axes.plot(*run.y[0, list(position)], "o", color=DRIVEN, markerfacecolor="white", label="start")
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set(title=run.ocp.model.name, xlabel="x [m]", ylabel="y [m]")
+    axes.set(title=as_label(run.ocp.model.name), xlabel="x [m]", ylabel="y [m]")
     axes.legend(frameon=False)
 
 
@@ -72,8 +72,8 @@ def draw_output(axes: Axes, run: Simulation, i: int) -> None:
     """Draw an output and its reference."""
     signal = run.ocp.model.outputs[i]
     axes.plot(run.t, run.y_ref[:, i], color=REFERENCE, linewidth=3.0, alpha=0.6, label="reference")
-    axes.plot(run.t, run.y[:, i], color=DRIVEN, label=signal.name)
-    axes.set_ylabel(f"{signal.name} [{signal.unit}]")
+    axes.plot(run.t, run.y[:, i], color=DRIVEN, label=as_label(signal.name))
+    axes.set_ylabel(as_label(f"{signal.name} [{signal.unit}]"))
     axes.legend(frameon=False, ncols=2)
 
 
@@ -84,4 +84,4 @@ def draw_input(axes: Axes, run: Simulation, i: int) -> None:
         if np.isfinite(bound):
             axes.axhline(bound, color=BOUND, linewidth=1.0, linestyle="--")
     axes.step(run.t, np.append(run.u[:, i], run.u[-1, i]), where="post", color=INPUT)
-    axes.set_ylabel(f"{signal.name} [{signal.unit}]")
+    axes.set_ylabel(as_label(f"{signal.name} [{signal.unit}]"))

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
+from io import BytesIO
 
 import numpy as np
 import pytest
@@ -102,6 +104,17 @@ def test_page_shows_the_path_every_output_and_every_input_between_its_bounds(dri
     np.testing.assert_allclose(panels[0].lines[1].get_ydata(), driven.y[:, 0])
     assert [line.get_ydata()[0] for line in panels[3].lines[:2]] == [-0.5, 0.5]
     assert [axes.get_ylabel() for axes in plot(run).axes] == ["r [m]", "v [m/s]", "a [m/s^2]"], "no plane where there is no position"
+
+
+def test_page_shows_names_and_units_as_they_are_written_dollar_signs_included(run: Simulation) -> None:
+    """Two of them would begin and end a formula, which cannot be drawn where it is none."""
+    pytest.importorskip("matplotlib")
+    model = run.ocp.model
+    named = replace(model, name=r"$\price$", outputs=[replace(signal, name=rf"$\{signal.name}$") for signal in model.outputs])
+    ocp = Ocp(named, N=5, dt=0.1, Q=[1, 1], R=1)
+    page = plot(simulate(Rti(ocp, compile=False), ocp.phi(), [[1.0, 0.0]] * 3))
+    page.savefig(BytesIO())
+    assert page.axes[0].get_ylabel() == r"\$\r\$ [m]", "a dollar sign behind a backslash is drawn as one"
 
 
 def test_plot_without_matplotlib_says_how_to_get_it(run: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 
-from rti_mpc.signals import plane
+from rti_mpc.signals import as_label, plane
 from rti_mpc_service.outline import outline, placed
 from rti_mpc_service.rig.run_data import Run
 
@@ -103,7 +103,7 @@ def _path(axes: Axes, run: Run) -> None:
     axes.plot(*run.position[-1], "o", color=MEASURED_COLOR, zorder=4, label="end")
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.08)
-    axes.set(title=f"Path: {run.scenario}", xlabel="x [m]", ylabel="y [m]")
+    axes.set(title=as_label(f"Path: {run.scenario}"), xlabel="x [m]", ylabel="y [m]")
     axes.legend(loc="upper center", ncols=4, bbox_to_anchor=(0.5, -0.07))
 
 
@@ -127,7 +127,7 @@ def _output(axes: Axes, run: Run, i: int) -> None:
     said = f", then within {settled.max():.3g}" if settled.size else ""
     axes.plot(run.time_s, run.reference[:, i] + run.output_error[:, i], color=MEASURED_COLOR, label=f"true{said}")
     axes.margins(y=0.12)
-    axes.set(title=f"Output {label.name}" if i else f"Output {label.name}: {run.scenario}", ylabel=f"[{label.unit}]")
+    axes.set(title=as_label(f"Output {label.name}" if i else f"Output {label.name}: {run.scenario}"), ylabel=as_label(f"[{label.unit}]"))
     _legend_above(axes)
 
 
@@ -137,12 +137,12 @@ def _command(axes: Axes, run: Run, i: int) -> None:
     for bound in (run.info.lbu[i], run.info.ubu[i]):
         if np.isfinite(bound):
             axes.axhline(bound, color=LIMIT_COLOR, linewidth=1.0, linestyle="--")
-    axes.step(run.time_s, run.u_applied[:, i], where="post", color=COMMAND_COLOR, label=f"{label.name}, applied")
+    axes.step(run.time_s, run.u_applied[:, i], where="post", color=COMMAND_COLOR, label=as_label(f"{label.name}, applied"))
     if measured is not None:
-        axes.plot(run.time_s, run.x[:, measured], color=MEASURED_COLOR, linewidth=1.2, label=f"{run.info.states[measured].name}, true")
+        axes.plot(run.time_s, run.x[:, measured], color=MEASURED_COLOR, linewidth=1.2, label=as_label(f"{run.info.states[measured].name}, true"))
     axes.plot([], [], color=LIMIT_COLOR, linewidth=1.0, linestyle="--", label="limits")
     axes.margins(y=0.12)
-    axes.set(title=f"Command {label.name}", ylabel=f"[{label.unit}]")
+    axes.set(title=as_label(f"Command {label.name}"), ylabel=as_label(f"[{label.unit}]"))
     _legend_above(axes)
 
 

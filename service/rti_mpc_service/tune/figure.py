@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from rti_mpc.signals import as_label
 from rti_mpc_service.rig.figure import COMMAND_COLOR, ERROR_COLOR, LIMIT_COLOR, MEASURED_COLOR, PLOT_STYLE, REFERENCE_COLOR
 from rti_mpc_service.tune.closed_loop import Driven
 from rti_mpc_service.tune.study import Tried
@@ -75,5 +76,5 @@ def _finish(axes: Axes, title: str, unit: str, limit: float, today: Driven, chos
         seen = np.array([value, *(each for each in values if each <= MAX_DRAWN * value)])
         margin = 0.15 * (np.ptp(seen) or value)
         (axes.set_xlim if axis == "x" else axes.set_ylim)(max(seen.min() - margin, 0.0), seen.max() + 2 * margin)
-    axes.set(title=title, xlabel="effort: rms increment [% of half an input's range]", ylabel=f"error: rms [{unit}]")
+    axes.set(title=as_label(title), xlabel="effort: rms increment [% of half an input's range]", ylabel=as_label(f"error: rms [{unit}]"))
     axes.legend(loc="best")
