@@ -11,7 +11,9 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Collection, Iterable
+from decimal import Decimal
 from difflib import get_close_matches
+from numbers import Real
 from typing import Any, TypeVar
 
 import numpy as np
@@ -35,13 +37,14 @@ def numbers(name: str, value: Any) -> Array:
     Return real numbers as an array of any shape, not owned.
 
     Raises:
-        OcpError: They are none: text, symbols, complex numbers, nothing, or rows of different lengths.
+        OcpError: They are none: text, symbols, complex numbers, nothing, masked, or rows of different lengths.
     """
     try:
         array = np.asarray(value.full() if hasattr(value, "full") else value)  # CasADi's DM
-        if array.dtype.kind in "fiub":
+        exact = array.dtype.kind == "O" and array.size > 0 and all(isinstance(number, Real | Decimal) for number in array.flat)
+        if (exact or array.dtype.kind in "fiub") and not np.ma.is_masked(value):
             return np.asarray(array, dtype=np.float64, order="C")
-    except Exception:  # whatever a foreign type raises where it is no array
+    except Exception:  # whatever a foreign type raises where it is no array, or an integer that no float64 can hold
         pass
     raise OcpError(f"{name} must be real numbers, got {quoted(value)}") from None
 
@@ -74,7 +77,9 @@ def number(name: str, value: Any) -> float:
     Raises:
         OcpError: It is none.
     """
-    return float(array(name, value, ()))
+    if (given := numbers(name, value)).size != 1 or (given.ndim and not hasattr(value, "full")):
+        raise OcpError(f"{name} must be one number, got {quoted(value)}")
+    return float(given.item())
 
 
 def whole(name: str, value: Any, least: int) -> int:

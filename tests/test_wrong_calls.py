@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from decimal import Decimal
+from fractions import Fraction
 from typing import Any
 
 import casadi as ca
@@ -23,7 +25,7 @@ from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.reference.trajectory import circle, eight, find_trajectory, rows, waypoints
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.terminal import lqr_weight
-from tests.problems import double_integrator, pioneer
+from tests.problems import INF, double_integrator, pioneer
 
 X, U = ca.SX.sym("x", 2), ca.SX.sym("u")
 MASS: dict[str, Any] = {
@@ -87,6 +89,16 @@ MODEL = {
         lambda: Signal("psi", "rev", angle=True),
         "unit of the signal 'psi' must be rad or deg for angle=True",
     ),
+    "Signal of two lines": (lambda: Signal("v\n", "m/s"), "name and unit of a signal must be printable, in one line, got 'v\\n' in 'm/s'"),
+    "name of two lines": (lambda: mass(name="mass\n"), "name of a model must be printable, in one line, got 'mass\\n'"),
+    "quaternions of a list within": (
+        lambda: mass(quaternions=[["r", ["v"], "a", "b"]]),
+        "quaternions must be names of four outputs or of four states each, w, x, y, z, no angles, got ['r', ['v'], 'a', 'b']",
+    ),
+    "MX with a solution of linear equations": (
+        lambda: mass(x=MX_X, u=MX_U, f_expl_expr=[MX_X[1], ca.solve(1 + MX_X @ MX_X.T, MX_X)[0]], y_expr=MX_X[0]),
+        "got .../casadi/core/linsol_internal.cpp:65: eval_sx not defined for LinsolQr, for which solve(A, b, 'symbolicqr', {}) can stand",
+    ),
     "Signal without a name": (lambda: Signal(" ", "m"), "name of a signal must not be empty"),
 }
 
@@ -97,12 +109,19 @@ OCP = {
         lambda: Ocp(mass(u=ca.SX(0, 1), f_expl_expr=[X[1], 0], inputs=()), N=3, dt=0.1, Q=1, R=[]),
         "model mass must have inputs for a problem, got none",
     ),
-    "N of 2.5": (lambda: ocp(N_u=2.5), "N_u must be a whole number of at least 0, got 2.5"),
-    "N that is text": (lambda: double_integrator(N="20"), "N must be a whole number of at least 0, got '20'"),
-    "N that is true": (lambda: double_integrator(N=True), "N must be a whole number of at least 0, got True"),
+    "N of 2.5": (lambda: ocp(N_u=2.5), "N_u must be a whole number of at least 1, got 2.5"),
+    "N that is text": (lambda: double_integrator(N="20"), "N must be a whole number of at least 1, got '20'"),
+    "N that is true": (lambda: double_integrator(N=True), "N must be a whole number of at least 1, got True"),
     "dt that is text": (lambda: ocp(dt="0.1"), "dt must be real numbers, got '0.1'"),
-    "dt of two numbers": (lambda: ocp(dt=[0.1, 0.1]), "dt must be an array of shape (), got float64 of shape (2,)"),
-    "method that is a list": (lambda: ocp(method=["rk4"]), "integrator must be one of euler, rk4, irk, got ['rk4']"),
+    "dt of two numbers": (lambda: ocp(dt=[0.1, 0.1]), "dt must be one number, got [0.1, 0.1]"),
+    "method that is a list": (lambda: ocp(method=["rk4"]), "method must be one of euler, rk4, irk, got ['rk4']"),
+    "build that is a list": (lambda: Rti(ocp(), build=["native"], compile=False), "build must be one of portable, native, got ['native']"),  # type: ignore[arg-type]
+    "Q that is masked": (lambda: ocp(Q=np.ma.masked_array([1.0, 9e9], [False, True])), "Q must be real numbers, got masked_array"),
+    "lbu of inf": (lambda: ocp(lbu=INF), "lbu must lie below inf, -inf where there is no bound, got [inf]"),
+    "ubx of -inf": (lambda: ocp(ubx=[-INF, 1.0]), "ubx must lie above -inf, inf where there is no bound, got [-inf, 1.0]"),
+    "u_ref that is NaN": (lambda: ocp(R_u=1.0, u_ref=np.nan), "u_ref must be finite, got SX(nan)"),
+    "widest of a weight": (lambda: ocp().widest("Q"), "the name of a bound must be one of lbu, ubu, lbdu, ubdu, lbx, ubx, lh, uh"),
+    "tightest of a number": (lambda: ocp().tightest(3), "the name of a bound must be one of lbu, "),  # type: ignore[arg-type]
     "Q that is text": (lambda: ocp(Q="1, 1"), "Q must be real numbers, got '1, 1'"),
     "Q by name": (lambda: ocp(Q={"r": 1.0, "v": 1.0}), "Q must be real numbers, got {'r'"),
     "Q of rows of different lengths": (lambda: ocp(Q=[[1.0], [1.0, 2.0]]), "Q must be real numbers, got [[1.0]"),
@@ -216,6 +235,7 @@ SAMPLE: dict[str, tuple[Callable[[Rti], object], str]] = {
     "retune(a negative weight)": (lambda rti: rti.retune({"delta": -np.ones(rti.ocp.N)}), "delta must be finite and not negative, got [-1.0"),
     "retune(a bound that is NaN)": (lambda rti: rti.retune({"lbu": np.full(1, np.nan)}), "lbu must not be NaN"),
     "retune(weights of inputs where there were none)": (lambda rti: rti.retune({"R_u": np.ones(1)}), "R_u must stay zero, as it was when compiled"),
+    "retune(None)": (lambda rti: rti.retune(None), "values must be weights and bounds by name, got None"),
     "retune(a bound where there is none)": (lambda rti: rti.retune({"lbx": np.zeros(2)}), "lbx must be finite exactly where it was when compiled"),
 }
 
@@ -304,6 +324,21 @@ def test_a_state_is_taken_in_whatever_numbers_come(rti: Rti, state: Any) -> None
         assert rti.feedback(x0).usable
         plans.append(rti.u.copy())
     np.testing.assert_allclose(*plans, rtol=0, atol=1e-7)  # what float32 leaves of 0.1
+
+
+@pytest.mark.parametrize(
+    "weight",
+    [ca.DM([4, 9]), [Fraction(4), Fraction(9)], [Decimal(4), Decimal(9)], np.array([4, 9], dtype=object)],
+    ids=["DM", "fractions", "decimals", "objects"],
+)
+def test_weights_are_taken_in_whatever_exact_numbers_come(weight: Any) -> None:
+    np.testing.assert_array_equal(ocp(Q=weight).Q, np.diag([4.0, 9.0]))
+
+
+def test_bound_of_a_large_integer_and_a_period_of_casadis_are_numbers() -> None:
+    problem = ocp(ubu=10**20, dt=ca.DM(0.25))
+    assert problem.ubu.tolist() == [1e20]
+    assert problem.dt == 0.25
 
 
 def test_an_axis_of_length_one_may_be_left_out() -> None:

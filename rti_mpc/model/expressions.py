@@ -99,6 +99,9 @@ def expanded(columns: Mapping[str, ca.MX], symbols: list[str]) -> dict[str, ca.S
             function = ca.Function(name, [columns[symbol] for symbol in symbols], [value]).expand()
         except Exception as error:
             reason = str(error).strip().splitlines()[-1]
-            raise OcpError(f"{name} must be SX, or MX of operations that SX has too, no external function or integrator, got {reason}") from None
+            hint = ", for which solve(A, b, 'symbolicqr', {}) can stand" if "Linsol" in reason else ""
+            raise OcpError(
+                f"{name} must be SX, or MX of operations that SX has too, no external function or integrator, got {reason}{hint}"
+            ) from None
         replaced[name] = function(*(replaced[symbol] for symbol in symbols))
     return replaced

@@ -277,7 +277,8 @@ def quaternions_of(model: Model) -> tuple[tuple[str, str, str, str], ...]:
         listed = (listed,)
     vectors = [{signal.name for signal in signals if not signal.angle} for signals in (model.outputs, model.states)]
     for names in listed if isinstance(listed, tuple | list) else (listed,):
-        if not isinstance(names, tuple | list) or len(names) != 4 or len(set(names)) < 4 or not any(set(names) <= plain for plain in vectors):
+        four = set(filter(lambda name: isinstance(name, str), names)) if isinstance(names, tuple | list) else set()
+        if len(four) != 4 or len(names) != 4 or not any(four <= plain for plain in vectors):
             told = "quaternions must be names of four outputs or of four states each, w, x, y, z, no angles"
             raise OcpError(f"model {model.name}: {told}, got {given.quoted(names)}")
     return tuple(tuple(names) for names in listed)

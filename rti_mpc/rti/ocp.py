@@ -184,10 +184,10 @@ class Ocp:
         given.instance("model", model, Model)
         if absent := [name for name in ("states", "inputs", "outputs") if not getattr(model, name)]:
             raise OcpError(f"model {model.name} must have {' and '.join(absent)} for a problem, got none")
-        N = given.whole("N", N, 0)
+        N = given.whole("N", N, 1)
         if blocks is None:
-            N_u = N if N_u is None else given.whole("N_u", N_u, 0)
-            if not 1 <= N_u <= N:
+            N_u = N if N_u is None else given.whole("N_u", N_u, 1)
+            if N_u > N:
                 raise OcpError(f"N_u and N must satisfy 1 <= N_u <= N, got N_u = {N_u}, N = {N}")
             blocks = [1] * (N_u - 1) + [N - N_u + 1]
         try:
@@ -216,6 +216,8 @@ class Ocp:
         inputs = column("u_ref", model.u_rest if u_ref is None else u_ref)
         if isinstance(inputs, ca.MX) or inputs.shape != (model.nu, 1) or [s for s in ca.symvar(inputs) if not ca.depends_on(model.p, s)]:
             raise OcpError(f"u_ref must be {model.nu} numbers, or SX of the model's p, in a column, got {given.quoted(inputs)}")
+        if not all(inputs[j].is_regular() for j in range(model.nu) if inputs[j].is_constant()):
+            raise OcpError(f"u_ref must be finite, got {given.quoted(inputs)}")
         fields: dict[str, Any] = {"model": model, "N": N, "N_u": len(blocks), "blocks": blocks, "dt": seconds, "method": method}
         fields |= {"h_expr": h_expr, "u_ref": inputs}
         for name, value in fields.items():
@@ -313,12 +315,12 @@ class Ocp:
 
     def widest(self, name: str) -> Array:
         """Return a bound over all stages, the loosest of each signal, shape ``(n,)``: infinite where a stage has none; what a robot may ever do."""
-        rows = np.atleast_2d(getattr(self, name))
+        rows = np.atleast_2d(getattr(self, given.one_of("the name of a bound", name, BOUNDS)))
         return np.asarray((rows.min if name.startswith("l") else rows.max)(axis=0))
 
     def tightest(self, name: str) -> Array:
         """Return the tightest bound of each signal over all stages, shape ``(n,)``: infinite where no stage has one."""
-        rows = np.atleast_2d(getattr(self, name))
+        rows = np.atleast_2d(getattr(self, given.one_of("the name of a bound", name, BOUNDS)))
         return np.asarray((rows.max if name.startswith("l") else rows.min)(axis=0))
 
     @property
@@ -393,7 +395,7 @@ def integrated(model: Model, method: str | None, stages: int | None, steps: int 
     own = {"sim_method_num_stages": stages, "sim_method_num_steps": steps, "method": None if method == "euler" else method}
     changes: dict[str, Any] = {name: value for name, value in own.items() if value is not None}
     if method is not None:
-        given.one_of("integrator", method, (*TABLEAUS, IRK))
+        given.one_of("method", method, (*TABLEAUS, IRK))
     if model.dt is not None:
         if changes or method is not None:
             raise OcpError(f"model {model.name} is in discrete time: integrator, stages and steps must be left out, got {method or changes}")
@@ -503,8 +505,8 @@ def by_stage(name: str, value: ArrayLike, check: Callable[[str, ArrayLike, int],
 def weight_matrix(name: str, value: ArrayLike, size: int) -> Array:
     """Return a finite symmetric positive semidefinite matrix, given so or by its diagonal."""
     array = given.numbers(name, value)
-    if array.shape == (size,) or (size == 1 and array.shape == ()):
-        array = np.diag(np.atleast_1d(array))
+    if array.shape == (size,) or (size == 1 and array.shape == ()) or (hasattr(value, "full") and array.shape == (size, 1)):
+        array = np.diag(array.reshape(size))
     if array.shape != (size, size):
         raise OcpError(f"{name} must have shape ({size}, {size}) or be its diagonal ({size},), got shape {array.shape}")
     if (
@@ -521,6 +523,11 @@ def bound(name: str, value: ArrayLike, length: int) -> Array:
     array = vector(name, value, length)
     if np.any(np.isnan(array)):
         raise OcpError(f"{name} must not be NaN, got {array.tolist()}")
+    impossible = np.inf if name.startswith("l") else -np.inf
+    if np.any(array == impossible):
+        raise OcpError(
+            f"{name} must lie {'below inf' if impossible > 0 else 'above -inf'}, {-impossible:g} where there is no bound, got {array.tolist()}"
+        )
     return array
 
 
@@ -562,6 +569,8 @@ WEIGHTS_AND_BOUNDS: dict[str, tuple[Any, ...]] = {
     "zddu": (weights, "nu"),
     "Zddu": (weights, "nu"),
 }
+
+BOUNDS = (*itertools.chain(*PAIRS), "lbx_e", "ubx_e", "lbddu", "ubddu", "lg", "ug")  # by name; the last two are the softened ones of all kinds
 
 # Those that compiled functions have as arguments, in this order; those of second differences are among lh, uh, zh and Zh there.
 ARGUMENTS = tuple(name for name in WEIGHTS_AND_BOUNDS if name not in ("lbddu", "ubddu", "zddu", "Zddu"))

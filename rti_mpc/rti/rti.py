@@ -114,8 +114,7 @@ class Rti:
     ) -> None:
         given.instance("ocp", ocp, Ocp)
         check_options(solver, settings, iterations, tolerance)
-        if build not in BUILDS:
-            raise OcpError(f"build must be one of {', '.join(BUILDS)}, got {build!r}")
+        given.one_of("build", build, BUILDS)
         self.ocp, self.problem = ocp, as_solved(ocp)
         own, model, N, N_u = ocp.model, self.problem.model, ocp.N, ocp.N_u
         self.formulation = formulation_of(ocp, formulation)
@@ -278,6 +277,8 @@ class Rti:
                 changed then.
             ShapeError: A shape does not fit.
         """
+        if not isinstance(values, Mapping):
+            raise OcpError(f"values must be weights and bounds by name, got {given.quoted(values)}")
         known = {name: np.shape(getattr(self.ocp, given.one_of("the name of a weight or bound", name, self._parts))) for name in values}
         taken = {name: self.ocp.checked(name, given.array(name, value, known[name])) for name, value in values.items()}
         for name, value in taken.items():

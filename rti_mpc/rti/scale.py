@@ -54,11 +54,13 @@ def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
     seen = np.concatenate([response, np.tile(np.eye(model.nu), (N, 1, 1))], axis=1)[:, :nv]
     curvature = np.einsum("kai,kab,kbi->i", seen, H, seen) + ocp.lambda_.sum(axis=0) * np.diag(ocp.R) + ocp.N_u * np.atleast_2d(ocp.R_u).mean(axis=0)
 
+    with np.errstate(divide="ignore"):  # an input that costs nothing reaches any distance
+        reach_cost = 1.0 / np.sqrt(curvature)
     reach_u = first(
         half(ocp.widest("lbu"), ocp.widest("ubu")),
         half(ocp.widest("lbdu"), ocp.widest("ubdu")) * ocp.N_u,
         beyond(ocp.widest("lbu"), ocp.widest("ubu"), np.array(model.u_rest)),
-        1.0 / np.sqrt(curvature),
+        reach_cost,
         ones(model.inputs),
     )
     reach = shared(np.abs(response * reach_u).sum(axis=2).max(axis=0), model.states)

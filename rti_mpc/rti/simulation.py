@@ -123,9 +123,15 @@ def simulate(
     rows = None if callable(reference) else given.numbers("reference", reference)
     if rows is not None:
         rows = given.array("reference", rows, (len(np.atleast_1d(rows)), model.ny))
+        if len(rows) < (least := 2 if samples is None else 1):
+            raise OcpError(
+                f"reference must have at least {least} rows, the first at the start, or samples must be given for one row, got {len(rows)}"
+            )
     if samples is None and rows is None:
         raise OcpError("samples must be given where the reference is a function, got None")
     samples = given.whole("samples", len(rows) - 1 if samples is None and rows is not None else samples, 1)
+    if parameters is not None and not callable(parameters):
+        raise OcpError(f"parameters must be a function of a state, got {given.quoted(parameters)}")
     step, p = next_state(plant, model, dt), np.tile(np.array(model.p_nominal), (samples + 1, 1))
 
     def at(k: Any) -> Array:
@@ -137,6 +143,8 @@ def simulate(
     x: Array = np.empty((samples + 1, model.nx))
     u: Array = np.empty((samples, model.nu))
     x[0] = rti.x_nominal if x0 is None else given.array("x0", x0, (model.nx,))
+    if not np.isfinite(x[0]).all():
+        raise OcpError(f"x0 must be finite, got {x[0].tolist()}")
     u0: Array = np.array(model.u_rest)
     status = []
     rti.reset(x[0], u0)

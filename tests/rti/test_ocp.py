@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -102,9 +103,9 @@ def test_plan_in_blocks_is_moved_on_as_each_block_begins_a_stage_later() -> None
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"N_u": 0}, "1 <= N_u <= N, got N_u = 0, N = 7"),
+        ({"N_u": 0}, "N_u must be a whole number of at least 1, got 0"),
         ({"N_u": 8}, "1 <= N_u <= N, got N_u = 8, N = 7"),
-        ({"N": 0}, "1 <= N_u <= N"),
+        ({"N": 0}, "N must be a whole number of at least 1, got 0"),
         ({"blocks": [1, 2, 3]}, r"blocks must have N = 7 stages together, got 6 in \[1, 2, 3\]"),
         ({"blocks": [1, 0, 6]}, "each of blocks must be a whole number of at least 1, got 0"),
         ({"blocks": []}, "blocks must be a list of the stages of each block"),
@@ -112,7 +113,7 @@ def test_plan_in_blocks_is_moved_on_as_each_block_begins_a_stage_later() -> None
         ({"blocks": [1, 2, 4], "lambda_": [1.0] * 7}, r"lambda_ must be a number or have shape \(3,\)"),
         ({"dt": 0.0}, "dt must be a positive number of seconds, got 0.0"),
         ({"dt": INF}, "dt must be a positive"),
-        ({"method": "heun"}, "integrator must be one of euler, rk4, irk, got 'heun'"),
+        ({"method": "heun"}, "method must be one of euler, rk4, irk, got 'heun'"),
         ({"Q": [1.0, 1.0]}, r"Q must have shape \(3, 3\) or be its diagonal \(3,\), got shape \(2,\)"),
         ({"Q": [1.0, 1.0, -0.05]}, "Q must be finite, symmetric and positive semidefinite"),
         ({"R": [[1.0, 0.1], [0.2, 1.0]]}, "R must be finite, symmetric and positive semidefinite"),
@@ -215,3 +216,10 @@ def test_reference_of_inputs_is_of_the_parameters_alone() -> None:
         double_integrator(u_ref=double_integrator().model.x[0])
     with pytest.raises(OcpError, match="R_u must be finite and not negative"):
         double_integrator(R_u=-1.0)
+
+
+def test_inputs_that_cost_nothing_are_no_division_by_zero() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rti = Rti(double_integrator(Q=[0.0, 0.0], R=0.0), compile=False)
+    assert np.isfinite(rti.scale).all()

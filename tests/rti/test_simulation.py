@@ -137,7 +137,16 @@ WRONG = {
         "what reference returns must be an array of shape (10, 2)",
     ),
     "no samples": (lambda rti: simulate(rti, rti.ocp.phi(), lambda t: t), "samples must be given where the reference is a function"),
-    "one row": (lambda rti: simulate(rti, rti.ocp.phi(), [[1.0, 0.0]]), "samples must be a whole number of at least 1, got 0"),
+    "one row": (
+        lambda rti: simulate(rti, rti.ocp.phi(), [[1.0, 0.0]]),
+        "reference must have at least 2 rows, the first at the start, or samples must",
+    ),
+    "no rows": (lambda rti: simulate(rti, rti.ocp.phi(), np.zeros((0, 2)), samples=3), "reference must have at least 1 rows, the first at the start"),
+    "a start that is NaN": (lambda rti: simulate(rti, rti.ocp.phi(), [[1.0, 0.0]] * 2, x0=[np.nan, 0.0]), "x0 must be finite, got [nan, 0.0]"),
+    "parameters that are numbers": (
+        lambda rti: simulate(rti, rti.ocp.phi(), [[1.0, 0.0]] * 2, parameters=[1.0]),
+        "parameters must be a function of a state, got [1.0]",
+    ),
     "half a sample": (lambda rti: simulate(rti, rti.ocp.phi(), [[1.0, 0.0]], samples=0.5), "samples must be a whole number of at least 1, got 0.5"),
     "a start too short": (lambda rti: simulate(rti, rti.ocp.phi(), [[1.0, 0.0]] * 2, x0=[1.0]), "x0 must be an array of shape (2,)"),
     "a comparison of nothing": (lambda rti: compare({}), "runs must be simulations by name, at least one, got {}"),
