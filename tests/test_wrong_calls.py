@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from decimal import Decimal
 from fractions import Fraction
@@ -122,6 +124,8 @@ OCP = {
     "u_ref that is NaN": (lambda: ocp(R_u=1.0, u_ref=np.nan), "u_ref must be finite, got SX(nan)"),
     "widest of a weight": (lambda: ocp().widest("Q"), "the name of a bound must be one of lbu, ubu, lbdu, ubdu, lbx, ubx, lh, uh"),
     "tightest of a number": (lambda: ocp().tightest(3), "the name of a bound must be one of lbu, "),  # type: ignore[arg-type]
+    "copy of an Rti": (lambda: copy(Rti(ocp(), compile=False)), "an Rti must be made where it is used, Rti(ocp) in each process"),
+    "pickle of an Rti": (lambda: pickle.dumps(Rti(ocp(), compile=False)), "an Rti must be made where it is used, Rti(ocp) in each process"),
     "Q that is text": (lambda: ocp(Q="1, 1"), "Q must be real numbers, got '1, 1'"),
     "Q by name": (lambda: ocp(Q={"r": 1.0, "v": 1.0}), "Q must be real numbers, got {'r'"),
     "Q of rows of different lengths": (lambda: ocp(Q=[[1.0], [1.0, 2.0]]), "Q must be real numbers, got [[1.0]"),

@@ -8,7 +8,7 @@ written in it, and it means the same as long as SX has its operations.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import casadi as ca
@@ -41,6 +41,18 @@ def to_sx(symbols: Mapping[str, Any], expressions: Mapping[str, Any]) -> dict[st
                 raise OcpError(f"{name} must be MX like the others, or all of them SX, got {given.quoted(value)}")
             columns[name] = ca.MX(ca.DM(value))
     return expanded(columns, list(symbols))
+
+
+def to_text(columns: Mapping[str, ca.SX]) -> str:
+    """Return columns that share symbols as text from which `from_text` makes them again; for pickles, since CasADi's own are of one expression."""
+    serializer = ca.StringSerializer()
+    serializer.pack(list(columns.values()))
+    return str(serializer.encode())
+
+
+def from_text(names: Iterable[str], text: str) -> dict[str, ca.SX]:
+    """Return the columns of `to_text` by name, in its order, in symbols of their own."""
+    return dict(zip(names, ca.StringDeserializer(text).unpack(), strict=True))
 
 
 def column(name: str, value: Any) -> Expression:

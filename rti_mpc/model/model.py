@@ -19,7 +19,7 @@ import numpy as np
 
 from rti_mpc import given
 from rti_mpc.errors import OcpError
-from rti_mpc.model.expressions import to_sx
+from rti_mpc.model.expressions import from_text, to_sx, to_text
 from rti_mpc.rotation import Rotations
 from rti_mpc.signals import ROLES_OF_VECTOR, misplaced, signals
 from rti_mpc.signals import Signal as Signal
@@ -176,6 +176,26 @@ class Model:
             raise OcpError(f"sim_method_num_stages must be at most {MAX_IMPLICIT_STAGES}, got {stages}")
         given.one_of("method", self.method, METHODS)
         return {"dt": dt, "sim_method_num_steps": given.whole("sim_method_num_steps", self.sim_method_num_steps, 1)}
+
+    def __copy__(self) -> Model:
+        """Return this model: nothing in it changes, and expressions of its symbols stay such."""
+        return self
+
+    def __deepcopy__(self, memo: Any) -> Model:
+        """As a copy."""
+        return self
+
+    def __getstate__(self) -> tuple[dict[str, Any], tuple[str, ...], str]:
+        """Return the fields for a pickle, expressions as text."""
+        fields = dict(vars(self))
+        names = [name for name in (*SYMBOLS, *EXPRESSIONS, *OPTIONAL_EXPRESSIONS) if fields[name] is not None]
+        columns = {name: fields.pop(name) for name in names}
+        return fields, tuple(columns), to_text(columns)
+
+    def __setstate__(self, state: tuple[dict[str, Any], tuple[str, ...], str]) -> None:
+        """Take the fields of a pickle."""
+        fields, names, text = state
+        vars(self).update(fields | from_text(names, text))
 
     @property
     def dynamics(self) -> dict[str, ca.SX]:

@@ -31,7 +31,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -42,7 +41,7 @@ from numpy.typing import ArrayLike, NDArray
 from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
-from rti_mpc.model.expressions import column
+from rti_mpc.model.expressions import column, from_text, to_text
 from rti_mpc.model.integrator import TABLEAUS, steps
 from rti_mpc.model.model import IRK, Model
 from rti_mpc.si import HasUnit, ones
@@ -231,6 +230,30 @@ class Ocp:
             values |= {linear: usual[0] if z_given is None else z_given, square: usual[1] if Z_given is None else Z_given}
         self._take(values)
 
+    def __copy__(self) -> Ocp:
+        """Return this problem: nothing in it changes, see `retuned`."""
+        return self
+
+    def __deepcopy__(self, memo: Any) -> Ocp:
+        """As a copy."""
+        return self
+
+    def __getstate__(self) -> tuple[dict[str, Any], str]:
+        """Return the fields for a pickle, expressions as text beside the model's symbols."""
+        fields, model = dict(vars(self)), self.model
+        own = {name: fields.pop(name) for name in ("h_expr", "u_ref")}
+        return fields, to_text({"x": model.x, "u": model.u, "p": model.p} | own)
+
+    def __setstate__(self, state: tuple[dict[str, Any], str]) -> None:
+        """Take the fields of a pickle; expressions become those of its model's symbols."""
+        fields, text = state
+        model: Model = fields["model"]
+        x, u, p, *own = from_text(("x", "u", "p", "h_expr", "u_ref"), text).values()
+        h_expr, u_ref = ca.substitute(own, [x, u, p], [model.x, model.u, model.p])
+        vars(self).update(fields | {"h_expr": h_expr, "u_ref": u_ref})
+        for name in WEIGHTS_AND_BOUNDS:
+            getattr(self, name).setflags(write=False)
+
     def retuned(self, **values: ArrayLike) -> Ocp:
         """
         Return this problem with other weights and bounds, by their names; no expression is built.
@@ -238,7 +261,8 @@ class Ocp:
         Raises:
             OcpError: As at construction.
         """
-        other = copy(self)
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
         other._take(values)
         return other
 

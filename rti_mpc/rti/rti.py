@@ -171,6 +171,10 @@ class Rti:
             self.solvers = [ForeignSolver(qp, solver) for qp in qps]
         self.reset(self.x_nominal, np.array(model.u_rest))
 
+    def __reduce_ex__(self, protocol: Any) -> str:
+        """Refuse copies and pickles: compiled calls hold the memory of this object's arrays."""
+        raise OcpError("an Rti must be made where it is used, Rti(ocp) in each process, and cannot be copied or pickled as its Ocp can")
+
     def _normalise(self, qps: Sequence[Qp], known: dict[str, Any]) -> None:
         """
         Compute the scales of the variables, and normalise the cost, so that one step size of ADMM and one tolerance fit every problem.

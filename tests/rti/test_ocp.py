@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import pickle
 import warnings
+from copy import copy, deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +15,9 @@ import pytest
 
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.errors import OcpError
+from rti_mpc.model.disturbance import with_disturbances
 from rti_mpc.model.model import Model, Signal
+from rti_mpc.model.obstacle import with_obstacles
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.rti.linearization import shift
 from rti_mpc.rti.ocp import Ocp, rest_fault
@@ -216,6 +220,44 @@ def test_reference_of_inputs_is_of_the_parameters_alone() -> None:
         double_integrator(u_ref=double_integrator().model.x[0])
     with pytest.raises(OcpError, match="R_u must be finite and not negative"):
         double_integrator(R_u=-1.0)
+
+
+def pickled_problem() -> Ocp:
+    """A problem with parameters, obstacles, and a general constraint and a reference of inputs of its own."""
+    model = with_obstacles(with_disturbances(pioneer_3dx(), ["u_c"]), [(1.0, 0.5, 0.3)])
+    h_expr, u_ref = ca.vertcat(model.h_expr, model.x[3] * model.x[4]), ca.vertcat(model.p[-4], 0.1)
+    return Ocp(model, **PAPER, h_expr=h_expr, lh=[0.0, -0.2], uh=[INF, 0.2], R_u=0.1, u_ref=u_ref)
+
+
+def test_problem_from_a_pickle_commands_the_same_and_is_as_read_only() -> None:
+    ocp = pickled_problem()
+    again: Ocp = pickle.loads(pickle.dumps(ocp))
+    commands = []
+    for problem in (ocp, again, again.retuned(R_u=0.1)):
+        rti = Rti(problem, compile=False)
+        rti.prepare(np.add(rti.y_ref, [1.0, 0.2, 0.1]))
+        assert rti.feedback(rti.x[0]).usable
+        commands.append(rti.u.tobytes())
+    assert len(set(commands)) == 1
+    with pytest.raises(ValueError, match="read-only"):
+        again.Q[0, 0] = 9.0
+    assert not ca.depends_on(again.h_expr, ocp.model.x), "its symbols are its own"
+
+
+def test_model_in_discrete_time_comes_from_a_pickle_with_its_period() -> None:
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    model = Model(name="sampled", x=x, u=u, disc_dyn_expr=0.5 * x + u, dt=0.1, y_expr=x, states="x", inputs="u", outputs="x", stop_expr=-x)
+    again: Model = pickle.loads(pickle.dumps(model))
+    assert (again.dt, again.f_expl_expr, again.states) == (0.1, None, model.states)
+    f = ca.Function("f", [again.x, again.u], [again.disc_dyn_expr, again.stop_expr])
+    assert [float(value) for value in f(2.0, 3.0)] == [4.0, -2.0]
+
+
+def test_copy_of_a_problem_keeps_the_symbols_that_its_owner_writes_expressions_in() -> None:
+    ocp = double_integrator()
+    for other in (copy(ocp), deepcopy(ocp), deepcopy(ocp.model), deepcopy({"ocp": ocp})["ocp"]):
+        model = other.model if isinstance(other, Ocp) else other
+        assert ca.is_equal(model.x, ocp.model.x)
 
 
 def test_inputs_that_cost_nothing_are_no_division_by_zero() -> None:
