@@ -364,7 +364,9 @@ class Guard:
             return f"blind: no state for {1e-9 * (now_ns - self._clock.stamp_ns):.3f} s"
         age_ns = now_ns - command.state_stamp_ns
         if age_ns > self._delay_ns + self._stale_ns or age_ns < -MAX_STATE_AHEAD_NS * self._clock.rate:
-            return f"{'stale' if age_ns > 0 else 'early'}: it answers a state of {1e-9 * age_ns:.3f} s ago"
+            if age_ns < 0:
+                return f"early: it answers a state {-1e-9 * age_ns:.3f} s ahead of now"
+            return f"stale: it answers a state of {1e-9 * age_ns:.3f} s ago"
         if until_ns <= max(command.stamp_ns, now_ns):
             return "expired"
         if reason := limits.objection(command):

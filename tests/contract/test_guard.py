@@ -145,6 +145,13 @@ def test_command_that_is_not_in_order_is_refused_as_a_whole_and_the_plan_plays_o
     assert scene.send() is not None
 
 
+def test_a_state_in_the_future_is_told_by_how_far_it_is_ahead(scene: Scene) -> None:
+    ahead = 100 * MS
+    assert scene.send(state_stamp_ns=scene.now_ns + ahead, stamp_ns=scene.now_ns + ahead, valid_until_ns=scene.now_ns + 350 * MS) is None
+    (text,) = [notice.text for notice in scene.guard.notices if notice.code == "command_early"]
+    assert text.endswith("was refused: it answers a state 0.100 s ahead of now")
+
+
 def test_rounding_is_forgiven_and_never_passed_on(scene: Scene) -> None:
     scene.drive(500)
     passed = scene.send(np.float32(BOUND).astype(np.float64))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import subprocess
 import sys
@@ -11,10 +12,12 @@ from pathlib import Path
 from threading import Event
 from urllib.parse import quote, urlsplit
 
-from rti_mpc.errors import ConfigError
+from rti_mpc.errors import ConfigError, Stopped
 
 RERUN_ADDRESS = "127.0.0.1:9876"
 CONNECT_TIMEOUT_S = 30.0  # for a viewer that is starting
+VIEWER_ENDED = "the Rerun viewer has ended; where there is no screen, --rerun-save records to a file"
+MEMORY_LIMIT = re.compile(r"[0-9]+(\.[0-9]+)?\s?(%|[kKMGT]?i?B)")  # Rerun takes any text, and has no limit then
 END_TIMEOUT_S = 3.0
 
 
@@ -78,12 +81,29 @@ def page(url: str, web_port: int) -> str:
     return f"http://127.0.0.1:{web_port}/?url={quote(url, safe='')}"
 
 
-def reached(url: str, stop: Event) -> None:
+def check_memory_limit(limit: str) -> None:
+    """
+    Refuse what is no size of a memory.
+
+    Raises:
+        ConfigError: As said.
+    """
+    if MEMORY_LIMIT.fullmatch(limit) is None:
+        raise ConfigError(f"rerun-memory-limit must be a share such as 25% or a size such as 2GB, got {limit!r}")
+
+
+def reached(url: str, stop: Event, viewer: subprocess.Popen[bytes] | None = None) -> None:
     """
     Wait until a viewer listens.
 
+    Args:
+        url: Where.
+        stop: Ends the wait.
+        viewer: The process that is to listen there, if this one has started it.
+
     Raises:
-        ConfigError: It does not in time.
+        ConfigError: It does not in time, or has ended.
+        Stopped: Before it did.
     """
     address, deadline_s = urlsplit(url), time.monotonic() + CONNECT_TIMEOUT_S
     while not stop.wait(0.05):
@@ -91,8 +111,11 @@ def reached(url: str, stop: Event) -> None:
             socket.create_connection((address.hostname or "127.0.0.1", address.port or 9876), 1.0).close()
             return
         except OSError:
+            if viewer is not None and viewer.poll() is not None:
+                raise ConfigError(VIEWER_ENDED) from None
             if time.monotonic() > deadline_s:
                 raise ConfigError(f"a Rerun viewer must listen at {url} within {CONNECT_TIMEOUT_S:g} s, none does") from None
+    raise Stopped(f"stopped before a viewer listened at {url}")
 
 
 def _port(url: str) -> str:

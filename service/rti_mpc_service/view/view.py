@@ -17,10 +17,11 @@ from rti_mpc.wire.announcer import Announcer
 from rti_mpc.wire.bus import Bus, BusSettings, new_epoch
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
+from rti_mpc.wire.reach import remind
 from rti_mpc_service.announce import announce
 from rti_mpc_service.view.listener import Listener
 from rti_mpc_service.view.outlet import Outlet, file_outlet, load_arrow, viewer_outlet
-from rti_mpc_service.view.screen import RERUN_ADDRESS, end_page, page, reached, serve_page, spawn_viewer, viewer_url
+from rti_mpc_service.view.screen import RERUN_ADDRESS, VIEWER_ENDED, check_memory_limit, end_page, page, reached, serve_page, spawn_viewer, viewer_url
 
 ROLE = "viewer"
 DRAIN_PERIOD_S = 0.05
@@ -32,6 +33,9 @@ log = logging.getLogger(__name__)
 class Screens:
     """
     Where to draw; in a spawned viewer if neither a viewer, nor a file, nor a page is given.
+
+    Raises:
+        ConfigError: A size is none.
 
     Attributes:
         rerun_spawn: Whether to start a viewer on this machine, listening on loopback; it stays open afterwards.
@@ -46,6 +50,10 @@ class Screens:
     rerun_save: Path | None = None
     rerun_memory_limit: str = "25%"
     web_port: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check what Rerun does not."""
+        check_memory_limit(self.rerun_memory_limit)
 
     @property
     def url(self) -> str:
@@ -134,8 +142,7 @@ def pump(
         entries = [entry for listener in listeners for entry in listener.drain()]
         said = notices(outlets)
         if spawned is not None and spawned.poll() is not None:
-            text = "the Rerun viewer has ended; where there is no screen, --rerun-save records to a file"
-            said.append(Notice(Severity.WARNING, "viewer_ended", text))
+            said.append(Notice(Severity.WARNING, "viewer_ended", VIEWER_ENDED))
             spawned = None
         for notice in said:
             announce(log, announcer, notice, listeners[0].now_ns)
@@ -173,15 +180,18 @@ def show(path: Path, screens: Screens, *, stop: Event | None = None) -> int:
         return 0
     stop = stop or stop_on_signals()
     server = None if screens.web_port is None else serve_page(url, screens.web_port, screens.rerun_memory_limit)
-    if server is None and screens.rerun_connect is None:
-        spawn_viewer(url, screens.rerun_memory_limit)
+    viewer = spawn_viewer(url, screens.rerun_memory_limit) if server is None and screens.rerun_connect is None else None
+    waited = Event()
+    remind(log.warning, lambda: f"no viewer answers yet at {url}", waited)
     try:
-        reached(url, stop)
+        reached(url, stop, viewer)
+        waited.set()
         draw_in_viewer(recording, path.stem, url)
         if screens.web_port is not None:
             log.info("open %s", page(url, screens.web_port))
             stop.wait()
     finally:
+        waited.set()
         if server is not None:
             end_page(server)
     return 0

@@ -25,13 +25,13 @@ from rerun.chunk import RrdReader
 
 from rti_mpc.contract.message import Command, Event, Severity, State, Telemetry
 from rti_mpc.contract.status import Mode, QpStatus
-from rti_mpc.errors import ConfigError
+from rti_mpc.errors import ConfigError, Stopped
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.view.listener import Listener
 from rti_mpc_service.view.outlet import file_outlet
-from rti_mpc_service.view.screen import spawn_viewer, viewer_url
+from rti_mpc_service.view.screen import reached, spawn_viewer, viewer_url
 from rti_mpc_service.view.view import Screens
 from rti_mpc_service.view.view import main as view
 from tests.in_time import PATIENT, ends_in_time
@@ -305,6 +305,32 @@ def test_a_spawned_viewer_that_has_ended_is_told_of(port: int, children: list[Ch
     source = no_screen + VIEWER.replace("rerun_connect=live", "rerun_connect=live, rerun_spawn=True")
     children.append(Child(source, port, tmp_path / "run.rrd", f"127.0.0.1:{free_port()}"))
     children[0].wait_for("the Rerun viewer has ended")
+
+
+def test_a_recording_waits_for_no_viewer_that_has_ended(port: int) -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    with pytest.raises(ConfigError, match="the Rerun viewer has ended; where there is no screen, --rerun-save records to a file"):
+        reached(viewer_url(f"127.0.0.1:{port}"), Flag(), ended)
+
+
+def test_a_recording_is_not_drawn_where_its_user_stopped_before_a_viewer_listened(port: int) -> None:
+    """Rerun would wait for a viewer for more than a minute."""
+    stop = Flag()
+    stop.set()
+    with pytest.raises(Stopped):
+        reached(viewer_url(f"127.0.0.1:{port}"), stop)
+
+
+@pytest.mark.parametrize("limit", ["25%", "12.5%", "2GB", "1.5 GiB", "800MB"])
+def test_memory_of_a_viewer_is_a_share_or_a_size(limit: str) -> None:
+    assert Screens(rerun_memory_limit=limit).rerun_memory_limit == limit
+
+
+@pytest.mark.parametrize("limit", ["much", "", "2", "GB", "-1GB", "25 percent"])
+def test_any_other_memory_of_a_viewer_is_refused_since_rerun_would_have_no_limit(limit: str) -> None:
+    with pytest.raises(ConfigError, match="rerun-memory-limit must be a share such as 25% or a size such as 2GB, got"):
+        Screens(rerun_memory_limit=limit)
 
 
 def test_a_viewer_is_spawned_on_loopback_only() -> None:
