@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.cli import app
-from rti_mpc_service.commands.arguments import new_file
+from rti_mpc_service.commands.arguments import claimed, new_file
 from rti_mpc_service.faults.table import FAULTS
 from rti_mpc_service.shipped import SHIPPED, TEMPLATES
 from tests.command import built, command
@@ -127,9 +127,29 @@ def test_bad_option_is_exit_status_2() -> None:
 
 @pytest.mark.parametrize("name", ["bench", "conformance", "doctor", "faults"])
 def test_file_that_cannot_be_written_is_refused_before_anything_is_measured(name: str, tmp_path: Path) -> None:
-    done = command(name, "--json", tmp_path / "nowhere" / "found.json")
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-    assert done.stderr.startswith("rti-mpc: --json must be a file that can be written")
+    for path in (tmp_path / "nowhere" / "found.json", tmp_path):
+        done = command(name, "--json", path)
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+        assert done.stderr.startswith(f"rti-mpc: --json must be a file that can be written, got {path}: ")
+
+
+def test_file_of_results_is_neither_made_nor_emptied_where_there_are_none(tmp_path: Path) -> None:
+    path = tmp_path / "rows.json"
+    refused = "bench", "--problem", "slalm", "--json", path
+    assert command(*refused).returncode == 2
+    assert not path.exists()
+    path.write_text("[]")
+    assert command(*refused).returncode == 2
+    assert path.read_text() == "[]"
+    os.mkfifo(tmp_path / "pipe")
+    assert claimed(tmp_path / "pipe") == tmp_path / "pipe", "it is not waited for a reader"
+
+
+@pytest.mark.parametrize("option", ["--interpreted", "--costs"])
+def test_option_that_a_family_of_problems_would_ignore_is_refused(option: str) -> None:
+    done = command("bench", "--problem", "tight", option)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "rti-mpc: --interpreted and --costs must be left out with --problem, which always compiles and compares costs\n"
 
 
 NOBODY = ": no process answers at tcp/127.0.0.1:1: no process listens there, or the address is wrong"

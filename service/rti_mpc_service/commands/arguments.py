@@ -45,10 +45,18 @@ def new_folder(param: typer.CallbackParam, path: Path | None) -> Path | None:
 
 
 def claimed(path: Path | None) -> Path | None:
-    """Check that a file can be written, before its content is computed for minutes; scripts ask for it again and again, so it is replaced."""
+    """
+    Check that a file can be written, before its content is computed for minutes; scripts ask for it again and again, so it is replaced.
+
+    Raises:
+        ConfigError: It cannot; none is left behind that was not there before.
+    """
     try:
-        if path is not None:
-            path.touch()
+        if path is not None and (path.is_file() or path.is_dir() or not path.exists()):  # a pipe is opened once, by whoever writes
+            new = not path.exists()
+            path.open("ab").close()
+            if new:
+                path.unlink()
     except OSError as error:
         raise ConfigError(f"--json must be a file that can be written, got {path}: {error.strerror}") from error
     return path

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from rti_mpc.errors import ConfigError
 from rti_mpc_service.commands.arguments import (
     ConfigPath,
     JsonPath,
@@ -62,6 +63,8 @@ def bench(
 ) -> None:
     """Measure the computing time per sample by horizon, solver and formulation, and of IPOPT on the same states."""
     if problem:
+        if interpreted or costs:
+            raise ConfigError("--interpreted and --costs must be left out with --problem, which always compiles and compares costs")
         from rti_mpc_service.bench import family_bench
 
         raise typer.Exit(family_bench.main(problem, horizon or (), solver or family_bench.DEFAULT_SOLVERS, quick=quick, path=path))
