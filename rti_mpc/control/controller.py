@@ -76,7 +76,7 @@ class Controller:
         config_hash: Hash of the configuration, for the commands.
         observer: Estimator of disturbances and unmeasured states, None for none.
         stop_law: How the robot comes to rest where its inputs do not ramp to rest.
-        second_opinion: Plans of another solver from one that OSQP judges, in `second_opinion`, to the next; 0: none.
+        second_opinion: Interval, in plans, at which OSQP also solves the QP of another solver's plan, in the method of this name; 0: never.
         compile: Whether to compile the small functions around the real-time iteration.
 
     Raises:
@@ -204,8 +204,8 @@ class Controller:
     @reported
     def receive_reference(self, reference: Reference, rows: Array | None = None) -> Reference | None:
         """
-        Follow a reference from the next sample on; if no state has come yet, or a new life of the robot is heard that is not believed, from
-        the next state on that counts.
+        Follow a reference from the next sample on; if no state has come yet, or a restart of the robot has been heard but is not confirmed
+        yet, from the next accepted state on.
 
         Args:
             reference: Message of a planner.
@@ -305,7 +305,7 @@ class Controller:
     @reported
     def in_time(self, command: Command, local_ns: int) -> Command | None:
         """
-        Hold a sample to its budget: its command must be there before its first row is over.
+        Enforce the time budget of a sample: its command must be ready before its first row is over.
 
         Args:
             command: The proposal for this sample.
@@ -371,10 +371,10 @@ class Controller:
 
     def rehearse(self, local_ns: int) -> Command | None:
         """
-        Go the way from state to command once more with the last state, shortly before the next one is due: that one then finds warm caches.
+        Run the code from state to command once more with the last state, shortly before the next one is due, which then finds warm caches.
 
-        Nothing changes on which a later call depends, so it is not `reported`: what the way
-        overwrites is put back, and the state is judged by another judge.
+        Nothing changes on which a later call depends, so it is not `reported`: what is
+        overwritten is put back, and the state is checked by a copy of the clock and of the sequence numbers.
 
         Args:
             local_ns: Local monotonic time.

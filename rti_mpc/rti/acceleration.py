@@ -4,9 +4,9 @@ Acceleration of the iterations within a sample, by the long step of [Barzilai198
 
 Gauss-Newton neglects curvature, so its steps do not shrink quadratically but by a
 factor: along an obstacle, whose curvature they overestimate, each is two thirds of the
-one before. Two steps tell the factor, and with it the sum of all that would follow. The
-next guess is ahead of the plan by as much. For steps in one direction that is Aitken's
-formula.
+one before. From two steps follow the factor, and with it the sum of all steps that would
+come. The next guess is extrapolated beyond the plan by this sum. For steps in one
+direction that is Aitken's formula.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rti_mpc.rti.qp.qp import Guess
 
 MIN_RELAXATION = 1.5  # that is worth it: below, each step is less than a third of the one before
 MAX_RELAXATION = 4.0  # for steps of three quarters of the one before, and more
-LARGE_STEP = 0.25  # of an input, in half ranges: after such a one, as from a cold start, the factor tells nothing yet
+LARGE_STEP = 0.25  # of an input, in half ranges: after such a step, as from a cold start, the factor means nothing yet
 BOUNDS = "lbx", "ubx", "lbu", "ubu"
 
 

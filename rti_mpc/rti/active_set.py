@@ -24,22 +24,22 @@ from rti_mpc.rti.places import Places
 from rti_mpc.rti.qp.qp import Guess
 
 MAX_ROLL_OUTS = 6  # after the first, as long as fewer places change from one to the next, or at most `FEW` of those in the first
-FEW = 0.5  # where so few change, it may be more than in the one before: they settle soon
-MAX_CHANGES = 45  # of places in the first roll-out from which they change one at a time: with more, the way to the solution is long
-MAX_MOVES = 40  # roll-outs on that way; a step of the interior point takes as long as two or three
+FEW = 0.5  # of the first changes: where so few change, there may be more than in the roll-out before, since they settle soon
+MAX_CHANGES = 45  # of places in the first roll-out with which a homotopy is followed: with more, it takes too many roll-outs
+MAX_MOVES = 40  # roll-outs along the homotopy; a step of the interior point takes as long as two or three
 MAX_STEPS = 50  # of the interior point, for each QP that a sample may have; all of its QPs share the sum
-ROLL_OUTS_TO_GO_ON = 14  # the same of roll-outs with gains, a step counted as two: a sample that has taken more begins no other QP
+ROLL_OUTS_TO_GO_ON = 14  # roll-outs with new gains per QP, a step counted as two: a sample that has taken more begins no further QP
 MAX_ROLL_OUTS_HANDED_BACK = 2  # from places that the interior point has found
 START_RANGE = 1.0, 1e16  # limits of the product of distance and multiplier at its start, otherwise the duality gap: with less, first steps are short
-START_FAR = 1e6  # the same of a second try, after one that gave no numbers
+START_FAR = 1e6  # the same for a second attempt, after one whose numbers were not finite
 GAP_SHARES = 1.0, 1e-3  # of MAX_GAP, at which it hands its places back
-LEAST_SHARE = 0.1  # sum of products to which steps lead, relative to the largest gap of a certified plan; with less, digits are lost to stiffness
+LEAST_SHARE = 0.1  # sum of products that steps aim at, relative to the largest gap of a certified plan; with less, digits are lost to stiffness
 JUDGED_BELOW = 100.0  # times the least product: the plan of a step with a larger one is not judged, because it would fail
 MAX_REFINEMENTS = 2  # of a plan that is not certified yet
 MAX_VIOLATION = 1e-9  # of dynamics, bounds and increments by a certified plan, relative to their scales
 MAX_GAP = 1e-6  # by which a certified plan may cost more than the optimum, relative to its normalised cost and COST_FLOOR
 COST_FLOOR = 1e-2  # normalised cost, in half ranges squared, below which a plan is as good as its reference
-MAX_VIOLATION_INACCURATE, MAX_GAP_INACCURATE = 1e-6, 1e-2  # the same limits of a plan that may be commanded as inaccurate
+MAX_VIOLATION_INACCURATE, MAX_GAP_INACCURATE = 1e-6, 1e-2  # the same limits for a plan that may be commanded with the status INACCURATE
 SOLVED, INACCURATE, FAILED = QpStatus.SOLVED, QpStatus.INACCURATE, QpStatus.FAILED  # read faster than a member of the enumeration
 
 
@@ -206,7 +206,7 @@ class ActiveSet:
         self._lowest = np.inf
         self._judged()
         self._keep_better()
-        self._found[:] = 0.0  # a plan that heeds no bound is often nearer to the optimum than one that heeds wrong ones
+        self._found[:] = 0.0  # a plan without active bounds is often nearer to the optimum than one with wrong ones
         self.roll_out_again()
         self._count()
         self._judged()
@@ -219,9 +219,9 @@ class ActiveSet:
 
     def _settle(self) -> bool:
         """
-        Find the places, and return whether that gave a plan.
+        Find the places by roll-outs, and return whether they settle.
 
-        All places change at once first. Where more and more of them do, or they go in circles, they change one at a time, on the way from the guess.
+        All places change at once first. If their number grows, or they cycle, they change one at a time instead, along the homotopy from the guess.
         """
         copy(self._keep_first)
         first = before = self._changes[0]
@@ -237,7 +237,7 @@ class ActiveSet:
         return self._changes[0] == 0.0
 
     def _follow(self) -> None:
-        """Follow the homotopy from the guess, on the curves of the places rolled out first, to this QP: see `rti_mpc.rti.homotopy`."""
+        """Follow the homotopy from the guess, with the places of the first roll-out, to this QP: see `rti_mpc.rti.homotopy`."""
         copy(self._take_first)
         self.begin_homotopy()
         for _ in range(MAX_MOVES):
@@ -261,7 +261,7 @@ class ActiveSet:
             if self._hands_back():
                 return SOLVED
             if self._product[0] < np.inf:
-                break  # otherwise it has begun so near to the bounds that rounding decided
+                break  # otherwise it has started so near to the bounds that rounding errors dominated
             self._restore_best()
         return self._restore_best()
 
@@ -273,7 +273,7 @@ class ActiveSet:
         """Take steps of the interior point until the gap of its plan is below one, and return whether it is; the best plan is kept."""
         interior, after = self._moved
         while self.steps < MAX_STEPS * self._qps:
-            # To products that are small beside the cost, and no smaller: the stiffer the sides, the more digits are lost.
+            # Aim at products that are small beside the cost, but no smaller: the stiffer the sides, the more digits are lost.
             unit = (COST_FLOOR + self._verdict[2]) / self._places.size
             self._least[0] = LEAST_SHARE * gap * unit
             self.step()

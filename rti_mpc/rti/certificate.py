@@ -2,8 +2,8 @@
 r"""
 Certificate of a plan for the QP of a sample: a bound on its cost above the optimum, from the problem's own data.
 
-It uses nothing of the recursion but the multipliers of increments and softened bounds.
-These may come from any solver: wrong ones make the certificate worse, never better. Let
+Of the solver it uses only the multipliers of increments and softened bounds, which may
+come from any solver: wrong ones make the bound looser, but never invalid. Let
 r be the gradient of the Lagrangian, reduced to the inputs by one adjoint sweep. By
 convexity it bounds the cost of every plan from below, so that a plan costs at most
 
@@ -103,7 +103,7 @@ def node(ocp: Ocp, lin: Linearization) -> ca.Function:
                 beyond = sign * value[j] - bound
                 s = ca.fmax(0, beyond)
                 penalty = (zg[j] * s + Zg[j] * s**2 / 2) / 2
-                most = (zg[j] + Zg[j] * (s + scale_g[j])) / 2  # slope of the penalty beyond this slack: a larger multiplier is none
+                most = (zg[j] + Zg[j] * (s + scale_g[j])) / 2  # slope of the penalty beyond this slack: no multiplier is larger
                 multiplier = ca.fmax(0, ca.fmin(sign * mu[j], most))
                 gap += penalty - multiplier * beyond + ca.fmax(0, multiplier - zg[j] / 2) ** 2 / ca.fmax(Zg[j], SMALLEST_DIVISOR)
                 cost += penalty

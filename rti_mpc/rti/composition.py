@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-Functions in turn, as one call.
+Composition of functions, called one after the other, into one.
 
 For CasADi's virtual machine they are one graph. Compiled, each is called with pointers
 to what the caller has given and to what those before it have written: nothing is copied,
@@ -23,16 +23,16 @@ def compose(name: str, calls: Sequence[tuple[ca.Function, Names]], outputs: Sequ
     """
     Build one function of several.
 
-    Each takes results of those before it; what none has returned is an argument of the whole. A result may lie in the memory of an argument that no
-    function takes after the one that returns it, if that one does not read there what it has written.
+    Each takes results of those before it; what none has returned is an argument of the composed function. A result may share its memory with an
+    argument, if no function reads the argument after the one that returns the result, and if that one reads each entry before it overwrites it.
 
     Args:
         name: Its name, see `rti_mpc.codegen.function_in_c`.
-        calls: The functions in their order, with the names that their arguments and results have in the whole where these are others.
-        outputs: Names of the results that are returned, which the caller must take; all if none are given. The others stay in the work memory.
+        calls: The functions in their order, with the names that their arguments and results have in the composed function, where these differ.
+        outputs: Names of the results that are returned, all of which the caller must take; all if none are given. The others stay in the work memory.
 
     Raises:
-        ValueError: An argument has another pattern than what it is given.
+        ValueError: The sparsity pattern of an argument differs from that of what it is given.
     """
     outputs = outputs or [str(names.get(result, result)) for function, names in calls for result in function.name_out()]
     given: dict[str, ca.MX] = {}

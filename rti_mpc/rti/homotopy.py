@@ -12,8 +12,8 @@ Any point on the curves is the solution of some QP. On the line from the data of
 to those of the sample's, all coordinates move straight towards those that are rolled
 out with the same places, until the first of them comes to the end of its segment. That
 row goes on to the next segment, and the next roll-out gives the new direction: one
-change of a place for each roll-out with its gains. As the QP is convex, the way ends.
-It begins at the guess.
+change of a place for each roll-out with its gains. As the QP is convex, the homotopy
+ends. It begins at the guess.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class BoundedRow:
         The coordinate at which a row begins.
 
         That is its guess, `now`, on its segment. A multiplier outside it begins inside: as large with the other sign, or at half of the largest one.
-        Otherwise all rows that change would do so at the very beginning, in an order that means nothing.
+        Otherwise all rows that change would do so at the very beginning, in an arbitrary order.
         """
         beyond = ca.if_else(self.place > 0, ca.fmax(self.now, self.upper), ca.fmin(self.now, self.lower))
         inside = ca.if_else(self.target > self.most, self.most / 2, ca.fmin(ca.fabs(self.target), self.most))
@@ -94,7 +94,7 @@ def begin(ocp: Ocp, lin: Linearization, stages: ca.MX) -> ca.Function:
     return function("begin", {"u": lin.u, "stages": stages, **lin.weights, **given}, {"point": point, **dict(zip(LIMITS, of_rows, strict=True))})
 
 
-# The same as `BoundedRow` says, without the division for rows that do not change.
+# The same as `BoundedRow`, without the division for rows that do not change.
 SHARE = """
 static casadi_real share_of(casadi_real place, casadi_real found, casadi_real now, casadi_real target, casadi_real bound, casadi_real most) {
   const casadi_real end = fabs(place) != 1 ? bound : found == 0 ? 0 : most;
@@ -113,7 +113,7 @@ MOVE = """
       if (share < least) least = share;
     }
   }
-  for (i = 0; i < ROWS; ++i) {  /* a row is read before it is written: it may lie where it lay */
+  for (i = 0; i < ROWS; ++i) {  /* a row is read before it is written: results may share the memory of arguments */
     const casadi_real of = place[i], to = found[i], now = point[i], bound = of + to > 0 ? upper[i] : lower[i];
     if (of != to && share_of(of, to, now, target[i], bound, most[i]) == least) {
       res[0][i] = to;

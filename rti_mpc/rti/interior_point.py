@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Primal-dual interior point on the Riccati recursion, for QPs whose places do not settle.
+Primal-dual interior-point method on the Riccati recursion, for QPs whose places do not settle.
 
 Each *side*, a lower or an upper bound of a row, has a distance t from its bound and a
 multiplier :math:`\lambda`. One of a softened row also has a slack s and the multiplier
@@ -29,7 +29,7 @@ from rti_mpc.rti.qp.transcription import INFINITY
 from rti_mpc.rti.riccati import Riccati, Rows, Stage, softened_steps
 
 START_DISTANCE = 1.0  # least distance from a hard bound at the start
-SHARE_OF_WAY = 0.995  # to the nearest bound, that a step may go
+SHARE_OF_WAY = 0.995  # fraction to the boundary: of the way to the nearest bound, how much a step may go
 
 
 class Point(NamedTuple):
@@ -149,7 +149,7 @@ def step(ocp: Ocp, lin: Linearization, recursion: Riccati, stages: ca.MX, x0: ca
     interior = ca.MX.sym("interior", sum(sizes))
     dx, d, *numbers = ca.vertsplit(interior, np.cumsum([0, *sizes]).tolist())
     now = Point(*numbers)
-    per = Point(*(1 / number for number in now))  # divisions take longest
+    per = Point(*(1 / number for number in now))  # once, because divisions take longest
     stiff, stiff_slack = now.lam * per.t, now.nu * per.s
     stiff_hard, stiff_soft = sides.split(stiff)
     per_divisor, slope = 1 / (sides.Z + stiff_soft + stiff_slack), sides.z + sides.Z * now.s

@@ -106,7 +106,7 @@ class Ocp:
 
     Raises:
         OcpError: An argument does not fit; the message names it, and what it must be. A rest input other than zero must be inside the bounds, and
-            from anywhere in the bounds of the first block those of all others must be reached in turn, inside those of increments.
+            from any input inside the bounds of the first block, those of each following block must be reachable inside those of increments.
     """
 
     model: Model
@@ -487,7 +487,7 @@ def where(wrong: NDArray[np.bool_], lower: Array, upper: Array) -> str:
 
 
 def pace_fault(ocp: Ocp) -> str:
-    """Return which inputs of the first block could not reach the bounds of all others in turn, inside their increments; empty if all can."""
+    """Return which inputs could not keep the bounds of all blocks from anywhere in those of the first, inside their increments; empty if all can."""
     if ocp.lbu.ndim == 1:
         return ""
     falling, rising = (np.broadcast_to(bound, ocp.lbu.shape) for bound in (ocp.lbdu, ocp.ubdu))

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 r"""
-Functions of the active-set method: bounds enter the Riccati recursion by the *place* of what they bound.
+Functions of the active-set method: bounds enter the Riccati recursion by the *place* of what they bound. All places
+together are what others call the working set.
 
 A value at its bound is held there by a penalty too stiff to yield noticeably; a value
 beyond a softened bound pays the penalty of its slack; any other value is free. In a
 roll-out from the initial state, a value that crosses a bound is placed at it, and a
 bound whose multiplier has changed its sign is released: a primal-dual active-set method
-[Hintermueller2003]_. It may go in circles, which `rti_mpc.rti.homotopy` does not. A
+[Hintermueller2003]_. It may cycle, which `rti_mpc.rti.homotopy` does not. A
 roll-out that changes no place is the solution, up to the small amount by which the
 penalty yields; a refinement, one sweep over vectors with the same gains, removes that.
 """
@@ -63,8 +64,8 @@ class Places:
             the plan shifted by one stage.
         gains: ``(stages, u, *ARGUMENTS, scale, places, gains_known, P_known, p_known, places_of_known) -> (gains, P, p, places_of)``: gains, and the
             cost-to-go before each stage, all of these places. With the known ones of other places, but of the same linearization, compiled code goes
-            only over the stages up to the last one whose places differ. What is known may be in the memory of the results. Places that are NaN
-            differ at all stages.
+            only over the stages up to the last one whose places differ. What is known may be in the memory of the results. Known places
+            that are NaN differ at all stages.
         roll_out: ``(x, u, u_prev, x0, stages, gains, *ARGUMENTS, scale, places) -> (x_plan, u_plan, violation, change, changes, stiff,
             places_found, multipliers, targets)``: the plan after the full step, its largest violation of softened bounds, in their unit and
             relative to their scale, the size of the step, and how many places change: -1 if data, gains or plan are not finite. `stiff` is the

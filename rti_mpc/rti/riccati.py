@@ -12,8 +12,8 @@ The increments couple an input to the one before, so the recursion is in
 
 and from these the gains. Each bounded *row*, an input, an increment or an expression
 with softened bounds, adds :math:`\tfrac12 W d^2 + v d` in its deviation d from the guess;
-the solver chooses the weight W and the pull v. Once the gains are known, other pulls
-cost only a sweep over vectors.
+the solver chooses the weight W and the linear term v, its *pull*. Once the gains are
+known, other pulls cost only a sweep over vectors.
 
 Stages are separate functions: *free* ones, whose input is a variable, and those where
 the input before is *held*, after the control horizon or the first stage of a block.
@@ -173,8 +173,8 @@ class Gain:
         self.K, self.L = ca.reshape(K, of.nu, of.n), ca.SX(lower, L)
 
 
-class Behind(NamedTuple):
-    """Cost-to-go of a stage in its state and its input, before the input is eliminated, and the symbols it depends on."""
+class QFunction(NamedTuple):
+    """Q-function of a stage, its cost-to-go in its state and its input, before the input is eliminated, and the symbols it depends on."""
 
     Qxx: ca.SX
     Qux: ca.SX
@@ -184,8 +184,8 @@ class Behind(NamedTuple):
     symbols: dict[str, ca.SX]
 
 
-def behind(of: Stage) -> Behind:
-    """Return the cost-to-go of a stage from that of the next stage."""
+def q_function(of: Stage) -> QFunction:
+    """Return the Q-function of a stage from the cost-to-go of the next one."""
     nx, upper = of.nx, ca.Sparsity.upper(of.n)
     P_nz, p = ca.SX.sym("P", upper.nnz()), ca.SX.sym("p", of.n)
     weight, pull = ca.SX.sym("weight_g", of.ng), ca.SX.sym("pull_g", of.ng)
@@ -204,13 +204,13 @@ def behind(of: Stage) -> Behind:
     px = p_end[:nx] + Pxx @ of.b
     qx, qu = A.T @ px, B.T @ px + p_end[nx:] + Pxu.T @ of.b
     symbols = {**of.dynamics, **of.defect, **of.cost, **of.softened, "weight_g": weight, "pull_g": pull, "P": P_nz, "p": p}
-    return Behind(Qxx, Qux, Quu, qx, qu, symbols)
+    return QFunction(Qxx, Qux, Quu, qx, qu, symbols)
 
 
 def backward_held(ocp: Ocp, lin: Linearization) -> ca.Function:
     """Build a stage of the recursion whose input is that of the stage before: ``-> (P_before, p_before)``."""
     of = Stage(ocp, lin)
-    Qxx, Qux, Quu, qx, qu, symbols = behind(of)
+    Qxx, Qux, Quu, qx, qu, symbols = q_function(of)
     Qss, qs = ca.blockcat([[Qxx, Qux.T], [Qux, Quu]]), ca.vertcat(qx, qu)
     P_before, p_before = ca.cse([nonzeros(ca.densify(Qss)[ca.Sparsity.upper(of.n)]), ca.densify(qs)])
     return function("held", symbols, {"P_before": P_before, "p_before": p_before})
@@ -220,7 +220,7 @@ def backward_free(ocp: Ocp, lin: Linearization) -> ca.Function:
     """Build a stage of the recursion with an input: ``-> (P_before, p_before, gain)``."""
     of = Stage(ocp, lin)
     n, nu = of.n, of.nu
-    Qxx, Qux, Quu, qx, qu, symbols = behind(of)
+    Qxx, Qux, Quu, qx, qu, symbols = q_function(of)
     R_nz, factor = ca.SX.sym("R", lin.R.sparsity().nnz()), {"lambda_k": ca.SX.sym("lambda_k")} if ocp.lambda_.ndim == 1 else {}
     names = ("damping", "force", "weight_u", "pull_u", "weight_du", "pull_du")
     damping, force, weight_u, pull_u, weight_du, pull_du = own = [ca.SX.sym(name, nu) for name in names]

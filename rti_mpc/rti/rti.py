@@ -6,8 +6,8 @@ Preparation needs no state: it shifts the guess, linearizes there and prepares t
 solver, factorization included. Feedback embeds the initial state, solves and takes
 the full step. Only feedback is on the path from sensor to actuator
 [Diehl2005]_ [Gros2020]_. If that step is large, one linearization was not enough, and
-feedback iterates a few times at most, the last times from guesses that are ahead. With
-at most one iteration this is the plain scheme; with many, and a small tolerance, it is
+feedback iterates a few times at most, the last times from extrapolated guesses, see
+`rti_mpc.rti.acceleration`. With at most one iteration this is the plain scheme; with many, and a small tolerance, it is
 sequential quadratic programming.
 
 `ActiveSet` solves nearly every QP; a QP solver takes over when it fails. Softened bounds
@@ -59,8 +59,8 @@ class Rti:
 
     Attributes:
         ocp: The problem.
-        problem: The problem as the solvers have it, whose further states are the inputs sent last, see `rti_mpc.rti.second_difference`; `ocp`
-            itself unless second differences are bounded. `scale` and `guess` are of this one.
+        problem: The problem that the solvers solve: with the inputs sent last as further states, see `rti_mpc.rti.second_difference`, where second
+            differences are bounded, else `ocp` itself. `scale` and `guess` belong to this one.
         formulation: ``"simultaneous"`` or ``"sequential"``.
         iterations: QPs per sample at most: 1 is the plain real-time iteration, many with a small tolerance are converged SQP.
         tolerance: Change of the inputs, relative to their scale, half their range: an iteration with a larger change is followed by another.
@@ -130,7 +130,7 @@ class Rti:
         self.y_ref: Array = np.zeros((N, model.ny))
         p: Array = np.tile(np.array(model.p_nominal), (N + 1, 1))
         x0 = built.x_nominal.copy()
-        # What was sent, and where blocks begin, is after the model's own states and parameters: nobody else sees it.
+        # Inputs sent and marks of blocks come after the model's own states and parameters; the views that others read leave them out.
         self.x, self.p, self.x0 = x_plan[:, : own.nx], p[:, : own.np_], x0[: own.nx]
         self._bounded = list(ocp.soft_ddu)
         self._remembered: Array = x0[own.nx :].reshape(REMEMBERED, -1)
@@ -383,7 +383,7 @@ class Rti:
             self.active_set.keep_guess()
 
     def _roll_out(self) -> None:
-        """Make a guess in motion, with inputs half way to their upper bounds, that is its own reference: scales are computed there, undamped."""
+        """Make a guess in motion, with inputs half way to their upper bounds, and its outputs the reference: scales are computed there, undamped."""
         ubu = self.ocp.ubu
         self.u[:] = np.where(np.isfinite(ubu), 0.5 * (np.clip(ubu, -INFINITY, INFINITY) + self.u_prev), self.u_prev)
         self._stay_at(self.x_nominal)
@@ -456,7 +456,7 @@ class Rti:
 
     def rehearse(self, x0: Array) -> None:
         """
-        Do what `feedback` mostly does, so that the next one finds the processor's caches warm: make a plan by one roll-out, and judge it.
+        Do what `feedback` does in most samples, so that the next one finds warm caches: make a plan by one roll-out, and certify it.
 
         The caller puts the arrays that are `rehearsed` back, with `rti_mpc.kept.Kept`: then nothing has changed. A QP solver is not rehearsed, since
         it starts from its last iterate.
@@ -497,7 +497,7 @@ class Rti:
         self._acceleration.begin()
         while self.status.usable and self.taken < self.iterations and self._change[0] > self.tolerance:
             if self._settled and self.active_set is not None and not self.active_set.goes_on:
-                break  # the next sample goes on; after a start, a plan that is left early may lead nowhere
+                break  # the next sample continues; after a cold start, a plan that has not converged may be useless
             if isinstance(self.solver, ActiveSet):
                 self.solver.sharpen()
             self._acceleration.advance()
