@@ -155,7 +155,7 @@ def params(bus_settings: BusSettings, keys: Keys, words: Sequence[str], timeout_
     Args:
         bus_settings: How to join the bus.
         keys: The robot's keys.
-        words: ``get`` and keys or tables of keys, all keys if none are given; or ``set`` and any number of ``KEY=VALUE``.
+        words: ``get`` and keys or tables of keys, all keys if none are given; or ``set`` and at least one ``KEY=VALUE``.
         timeout_s: How long to wait for an answer.
 
     Returns:
@@ -165,6 +165,8 @@ def params(bus_settings: BusSettings, keys: Keys, words: Sequence[str], timeout_
         ConfigError: The words are not valid.
     """
     action, *wanted = words
+    if action == "set" and not wanted:
+        raise ConfigError("params set must be followed by KEY=VALUE, such as ocp.weights.Q.x=2.0, got nothing")
     if action == "set":
         return main(bus_settings, keys, "params", timeout_s, set=to_json(parse_assignments(wanted)))
     if action != "get":

@@ -238,6 +238,19 @@ def test_request_that_meets_nobody_says_why_and_speaks_of_changes_only_where_one
     assert done.stderr == f"rti-mpc: pioneer has no controller that answers within 0.3 s{NOBODY}{changes}\n"
 
 
+def test_change_of_nothing_is_refused_before_a_controller_is_asked() -> None:
+    done = command("params", "set")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "rti-mpc: params set must be followed by KEY=VALUE, such as ocp.weights.Q.x=2.0, got nothing\n"
+
+
+@pytest.mark.parametrize("words", [["view"], ["why"], ["certs", "issue"]])
+def test_usage_has_the_brackets_and_dots_of_an_argument_once(words: list[str]) -> None:
+    usage = command(*words, "--help").stdout.splitlines()[0]
+    assert "[[" not in usage
+    assert "......" not in usage.replace("}", "").replace("]", "")
+
+
 def test_check_of_the_shipped_configuration_prints_both_phases_and_the_verdict() -> None:
     done = command("check")
     assert done.returncode == 0, done.stderr

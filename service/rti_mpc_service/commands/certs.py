@@ -33,7 +33,7 @@ def certs_authority(
 @certs.command("issue")
 def certs_issue(
     config: Annotated[Path, typer.Argument(metavar="CONFIG", help="The robot's TOML file.")],
-    roles: Annotated[list[str], typer.Argument(metavar="ROLE...", help=f"Roles that run on the host: {', '.join(ROLES)}.")],
+    roles: Annotated[list[str], typer.Argument(metavar="ROLE", help=f"Roles that run on the host: {', '.join(ROLES)}.")],
     router: Annotated[str, typer.Option(metavar="ENDPOINT", help="Endpoint of the robot's router, such as tls/robot.local:7447.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write: the bundle of one host.")],
     authority: AuthorityPath = Path("authority"),

@@ -87,7 +87,7 @@ def reference(
 def view(
     config: Config,
     bus: BusSettings,
-    words: Annotated[list[str] | None, typer.Argument(metavar="[RUN.mcap]", help="Recording to draw in place of the robot.")] = None,
+    words: Annotated[list[str] | None, typer.Argument(metavar="RUN.mcap", help="Recording to draw in place of the robot.")] = None,
     rerun_spawn: Annotated[bool, typer.Option("--rerun-spawn", help="Start a Rerun viewer on this machine.")] = False,
     rerun_connect: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Draw in a Rerun viewer at this address, also if it starts later.")

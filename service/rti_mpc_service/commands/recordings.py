@@ -100,7 +100,7 @@ def replay(
 def why(
     config: Config,
     bus: BusSettings,
-    words: Annotated[list[str] | None, typer.Argument(metavar="[RUN.mcap]", help="Recording, in place of the running controller.")] = None,
+    words: Annotated[list[str] | None, typer.Argument(metavar="RUN.mcap", help="Recording, in place of the running controller.")] = None,
     at: Annotated[str | None, typer.Option("--at", metavar="TIME", help="Time of the robot's clock, such as 72.5s.")] = None,
     seq: Annotated[int | None, typer.Option("--seq", metavar="NUMBER", help="Number of the command.", show_default="the last command")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
