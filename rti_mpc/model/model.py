@@ -29,6 +29,7 @@ OPTIONAL_EXPRESSIONS = ("f_expl_expr", "disc_dyn_expr", "stop_expr")
 IRK = "irk"
 METHODS = ("rk4", IRK)  # by which a model is integrated; Euler is one for the stages of a problem only
 MAX_IMPLICIT_STAGES = 3
+MAX_STEPS = 1000  # each is written out in the expressions of a stage, which take some 20 s to build with that many
 LEFT_OUT: Any = None  # in place of an expression that a model does not have
 
 
@@ -63,7 +64,7 @@ class Model:
         dt: The period of a model in discrete time, s; None in continuous time.
         method: How the model is integrated by all who predict with it: ``"rk4"``, or ``"irk"`` for a stiff one, which is Radau IIA.
         sim_method_num_stages: Stages of an implicit step, 1 to 3, of order 1, 3 and 5.
-        sim_method_num_steps: Steps into which the integrator divides what it integrates over.
+        sim_method_num_steps: Steps into which the integrator divides what it integrates over, at most 1000.
         quaternions: Names of w, x, y, z of each attitude, of outputs, of states or of both. Of outputs the cost weighs not the differences from the
             reference, but the small angles between the two, see `residual`: w has no weight, x, y, z those of angles in rad about the axes of the
             body. Of states, that they have length 1 and may be written with either sign is known to the controller, to the guard and to ways to rest.
@@ -174,8 +175,11 @@ class Model:
         stages = given.whole("sim_method_num_stages", self.sim_method_num_stages, 1)
         if stages > MAX_IMPLICIT_STAGES:
             raise OcpError(f"sim_method_num_stages must be at most {MAX_IMPLICIT_STAGES}, got {stages}")
+        steps = given.whole("sim_method_num_steps", self.sim_method_num_steps, 1)
+        if steps > MAX_STEPS:
+            raise OcpError(f"sim_method_num_steps must be at most {MAX_STEPS}, got {steps}")
         given.one_of("method", self.method, METHODS)
-        return {"dt": dt, "sim_method_num_steps": given.whole("sim_method_num_steps", self.sim_method_num_steps, 1)}
+        return {"dt": dt, "sim_method_num_steps": steps}
 
     def __copy__(self) -> Model:
         """Return this model: nothing in it changes, and expressions of its symbols stay such."""

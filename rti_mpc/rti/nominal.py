@@ -23,7 +23,7 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
-from rti_mpc.model.model import IRK
+from rti_mpc.model.model import IRK, MAX_STEPS
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.si import ones
 
@@ -106,8 +106,10 @@ def check_stiffness(ocp: Ocp, x: Array) -> None:
         shares = np.geomspace(1.0, 1e-9, 20_000)
         longest = ocp.dt * next(share for share in shares if abs(np.polyval(growth, share * z)) <= 1.0)
         state = model.states[int(np.argmax(np.abs(mode)))].name
+        needed = math.ceil(steps * ocp.dt / longest)
+        divided = f"or sim_method_num_steps = {needed}, " if needed <= MAX_STEPS else ""
         raise OcpError(
             f"dt must be at most {longest:.3g} s for {ocp.method} and model {model.name}, which is stiff: {state} settles with a time constant of "
-            f"{-1.0 / eigenvalue.real:.3g} s; take the implicit integrator, {IRK}, or "
-            f"sim_method_num_steps = {math.ceil(steps * ocp.dt / longest)}, or shorten dt, got dt = {ocp.dt:g} s"
+            f"{-1.0 / eigenvalue.real:.3g} s; take the implicit integrator, {IRK}, "
+            f"{divided}or shorten dt, got dt = {ocp.dt:g} s"
         )

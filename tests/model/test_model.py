@@ -96,6 +96,7 @@ def test_parameters_change_by_name_and_the_original_stays() -> None:
         ({"quaternions": "r"}, "quaternions must be names of four outputs or of four states each"),
         ({"method": "euler"}, "method must be one of rk4, irk, got 'euler'"),
         ({"sim_method_num_stages": 4}, "sim_method_num_stages must be at most 3, got 4"),
+        ({"sim_method_num_steps": 1001}, "sim_method_num_steps must be at most 1000, got 1001"),
         ({"sim_method_num_steps": 0}, "sim_method_num_steps must be a whole number of at least 1, got 0"),
         ({"f_expl_expr": ca.SX(3, 1)}, "f_expl_expr must have 2 entries, as x has, got 3"),
         ({"x": ca.SX.sym("x", 1, 2)}, r"x must be a column, of shape \(2, 1\), got shape \(1, 2\)"),

@@ -147,6 +147,11 @@ def test_motion_that_swings_or_grows_by_itself_is_not_taken_for_stiff(rate: ca.S
     assert Rti(Ocp(model, N=5, dt=0.02, Q=1, R=0.1), compile=False)
 
 
+def test_stiff_model_is_not_advised_to_take_more_steps_than_can_be_built() -> None:
+    with pytest.raises(OcpError, match=r"take the implicit integrator, irk, or shorten dt, got dt = 0\.1 s"):
+        Rti(Ocp(drive(1e-9), N=20, dt=0.1, Q=1, R=0.1, lbu=-1, ubu=1), compile=False)
+
+
 @pytest.mark.parametrize("changes", [{"method": "irk"}, {"sim_method_num_steps": 4}], ids=["implicit", "steps"])
 def test_stiff_model_is_built_with_the_integrator_that_its_refusal_names(changes: dict[str, Any]) -> None:
     problem_of = {"N": 20, "dt": 0.1, "Q": 1, "R": 0.1, "lbu": -1, "ubu": 1}
