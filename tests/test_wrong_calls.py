@@ -24,6 +24,7 @@ from rti_mpc.model.disturbance import with_disturbances
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.obstacle import with_obstacles
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc.reference.path import read_path
 from rti_mpc.reference.trajectory import circle, eight, find_trajectory, rows, waypoints
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.terminal import lqr_weight
@@ -148,6 +149,12 @@ OCP = {
     "disc that is NaN": (lambda: with_obstacles(pioneer_3dx(), [(1.0, np.nan, 0.3)]), "discs must be finite rows"),
     "discs of text": (lambda: with_obstacles(pioneer_3dx(), ["tree"]), "discs must be real numbers, got ['tree']"),  # type: ignore[list-item]
     "disturbance there twice": (lambda: with_disturbances(pioneer_3dx(), ["u_c", "u_c"]), "names of disturbances must be there once each"),
+    "disturbances that are None": (
+        lambda: with_disturbances(pioneer_3dx(), None),  # type: ignore[arg-type]
+        "disturbances must be names of inputs or states, got None",
+    ),
+    "path of a number": (lambda: read_path(3), "file must be the path of a CSV file, got 3"),  # type: ignore[arg-type]
+    "path of a file that is not there": (lambda: read_path("nowhere.csv"), "nowhere.csv: must be a readable file, got No such file or directory"),
     "disturbance of a number": (lambda: with_disturbances(pioneer_3dx(), [3]), "a disturbance must be of an input (u_c"),  # type: ignore[list-item]
 }
 

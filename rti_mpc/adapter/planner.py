@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from typing import Self
 
@@ -20,6 +19,7 @@ from rti_mpc.wire.layout import most_rows
 from rti_mpc.wire.rival import Rival
 
 ROLE = "reference"
+MAX_PERIOD_S = 1e9  # whose nanoseconds fit a stamp
 
 
 class PlannerAdapter:
@@ -80,8 +80,8 @@ class PlannerAdapter:
                 raise ConfigError(f"{name} must be a table of finite numbers, as many rows as y has, got shape {table.shape}")
         if len(rows) > (most := most_rows(rows.shape[1], parameters.shape[1])):
             raise ConfigError(f"y must have at most {most} rows of this length, for a reference to arrive, got {len(rows)}: send the others later")
-        if not 0.0 < given.number("period_s", period_s) < math.inf:
-            raise ConfigError(f"period_s must be above 0 and finite, got {period_s}")
+        if not 0.0 < given.number("period_s", period_s) <= MAX_PERIOD_S:
+            raise ConfigError(f"period_s must be above 0 and at most {MAX_PERIOD_S:g} s, got {period_s}")
         reference = Reference(self._epoch, self._seq + 1, stamp_ns, round(1e9 * period_s), end, rows, parameters)
         try:
             payload = taken(reference)

@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from threading import Event
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -238,9 +238,21 @@ def check_limits(
 
     Raises:
         ConfigError: A name is none of an input, or a number does not fit.
+        OcpError: What must be numbers is none.
+        ShapeError: A pair of bounds is none.
     """
-    if not 0.0 < dt_s <= 10.0:
+    if not 0.0 < given.number("dt_s", dt_s) <= 10.0:
         raise ConfigError(f"dt_s must be above 0 and at most 10 s, got {dt_s}")
+    shapes: dict[str, tuple[Mapping[str, Any], tuple[int, ...]]] = {
+        "inputs": (inputs, (2,)),
+        "increments": (increments, (2,)),
+        "u_rest": (u_rest, ()),
+    }
+    for what, (values, shape) in shapes.items():
+        if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
+            raise ConfigError(f"{what} must have numbers by the names of inputs, got {given.quoted(values)}")
+        for name, value in values.items():
+            given.array(f"{what}.{name}", value, shape)
     if not inputs:
         raise ConfigError("inputs must name at least one input, got none")
     for what, table in (("increments", increments), ("u_rest", u_rest)):

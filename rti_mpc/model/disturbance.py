@@ -37,6 +37,8 @@ def with_disturbances(model: Model, names: Iterable[str]) -> Model:
         OcpError: A name is neither an input nor a state, or there twice.
     """
     given.instance("model", model, Model)
+    if not isinstance(names, Iterable):
+        raise OcpError(f"disturbances must be names of inputs or states, got {given.quoted(names)}")
     names = (names,) if isinstance(names, str) else tuple(names)
     if not names:
         return model

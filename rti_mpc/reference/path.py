@@ -289,7 +289,7 @@ def pieces(points: Array, **values: Array | float | None) -> tuple[Path, ...]:
 
 
 def read_path(
-    file: File, *, width_m: float = 1.0, speed_m_s: float = 1.0, closed: bool | None = None, smooth_m: float | None = None
+    file: File | str, *, width_m: float = 1.0, speed_m_s: float = 1.0, closed: bool | None = None, smooth_m: float | None = None
 ) -> tuple[Path, ...]:
     """
     Read a path from a CSV file: a centre line with widths, as in the TUM's race track database, a race line with speeds, or waypoints.
@@ -307,7 +307,9 @@ def read_path(
     Raises:
         ConfigError: The file cannot be read, or is no path: file, line and column are named.
     """
-    table = read_track(file)
+    if not isinstance(file, str | File):
+        raise ConfigError(f"file must be the path of a CSV file, got {given.quoted(file)}")
+    table = read_track(File(file))
     points = np.column_stack([table["x"], table["y"]])
     values = [table.get(name, np.full(len(points), constant)) for name, constant in (("right", width_m), ("left", width_m), ("speed", speed_m_s))]
     try:

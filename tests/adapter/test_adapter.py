@@ -246,10 +246,18 @@ def test_state_of_another_size_than_its_angles_is_refused(monkeypatch: pytest.Mo
             "quaternions must be places of w, x, y, z among the states, of none that is an angle, got [0, 1, 2]",
         ),
         ({"increments": {"v_c": [0.1, 0.2]}}, "increments.v_c must go from below 0 to above 0, got [0.1, 0.2]"),
+        ({"dt_s": "0.05"}, "dt_s must be real numbers, got '0.05'"),
+        ({"inputs": [[-1, 1]]}, "inputs must have numbers by the names of inputs, got [[-1, 1]]"),
+        ({"inputs": {1: [-1, 1]}}, "inputs must have numbers by the names of inputs, got {1: [-1, 1]}"),
+        ({"inputs": {"v_c": 1.0}}, "inputs.v_c must be an array of shape (2,), got float64 of shape ()"),
+        ({"inputs": {"v_c": [-1, "a"]}}, "inputs.v_c must be real numbers, got [-1, 'a']"),
+        ({"increments": None}, "increments must have numbers by the names of inputs, got None"),
+        ({"increments": {"v_c": [-0.1]}}, "increments.v_c must be an array of shape (2,), got float64 of shape (1,)"),
+        ({"u_rest": {"v_c": "0"}}, "u_rest.v_c must be real numbers, got '0'"),
     ],
 )
 def test_limits_that_do_not_fit_are_refused_in_one_line(limits: dict[str, Any], refusal: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigError) as refused:
+    with pytest.raises(RtiMpcError) as refused:
         Scene(monkeypatch, **limits)
     assert str(refused.value) == refusal
 
@@ -301,7 +309,8 @@ WRONG_REFERENCES: dict[str, tuple[dict[str, Any], str]] = {
     "no columns": ({"y": [[]]}, "y must be a table of finite numbers, as many rows as y has, got shape (1, 0)"),
     "numbers that are too large": ({"y": [[1e19]]}, "y must be finite and at most 1e+18, got 1e+19"),
     "a period of text": ({"period_s": "fast"}, "period_s must be real numbers, got 'fast'"),
-    "a period that is infinite": ({"period_s": np.inf}, "period_s must be above 0 and finite, got inf"),
+    "a period that is infinite": ({"period_s": np.inf}, "period_s must be above 0 and at most 1e+09 s, got inf"),
+    "a period that no stamp holds": ({"period_s": 1e300}, "period_s must be above 0 and at most 1e+09 s, got 1e+300"),
     "a period below a nanosecond": ({"period_s": 1e-12}, "period_ns must be from 1 to 3600000000000, got 0"),
     "a period of two hours": ({"period_s": 7200.0}, "period_ns must be from 1 to 3600000000000, got 7200000000000"),
     "a time beyond all clocks": ({"stamp_ns": 2**63}, "a reference must be one that receivers take: integers must fit into their fields"),
