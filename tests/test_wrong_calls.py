@@ -170,6 +170,18 @@ CONTROL = {
     "SolverSettings of half an iteration": (lambda: SolverSettings(max_iter=0.5), "max_iter must be a whole number of at least 1"),  # type: ignore[arg-type]
     "Controller of an Ocp": (lambda: Controller(pioneer(), Timing()), "rti must be of rti_mpc.rti.rti.Rti, got"),  # type: ignore[arg-type]
     "Controller timed by a number": (lambda: Controller(None, 0.1), "timing must be of rti_mpc.control.grid.Timing, got 0.1"),  # type: ignore[arg-type]
+    "Controller that observes a number": (
+        lambda: Controller(Rti(pioneer(), compile=False), Timing(), observer=3, compile=False),  # type: ignore[arg-type]
+        "observer must be of rti_mpc.control.observer.Observer, got 3",
+    ),
+    "Controller that stops by text": (
+        lambda: Controller(Rti(pioneer(), compile=False), Timing(), stop_law="ramp", compile=False),  # type: ignore[arg-type]
+        "stop_law must be of rti_mpc.rti.way_to_rest.StopLaw, got 'ramp'",
+    ),
+    "Controller of an epoch of half": (
+        lambda: Controller(Rti(pioneer(), compile=False), Timing(), epoch=1.5, compile=False),  # type: ignore[arg-type]
+        "epoch must be a whole number of at least 0, got 1.5",
+    ),
     "Timing of text": (lambda: Timing("measured"), "delay_s must be real numbers, got 'measured'"),  # type: ignore[arg-type]
     "Timing without a timeout": (lambda: Timing(stale_s=0.0), "stale_s must be a time above 0 s, got 0.0"),
     "Observer of a number": (

@@ -80,7 +80,7 @@ class Controller:
         compile: Whether to compile the small functions around the real-time iteration.
 
     Raises:
-        OcpError: The bounds exclude the input at which the robot rests.
+        OcpError: The bounds exclude the input at which the robot rests, or an argument is of the wrong kind.
     """
 
     def __init__(
@@ -96,6 +96,11 @@ class Controller:
         compile: bool = True,
     ) -> None:
         given.instance("timing", timing, Timing)
+        for name, part, kind in (("observer", observer, Observer), ("stop_law", stop_law, StopLaw)):
+            if part is not None:
+                given.instance(name, part, kind)
+        for name, number in (("epoch", epoch), ("config_hash", config_hash)):
+            given.whole(name, number, 0)
         if wrong := rest_fault(given.instance("rti", rti, Rti).ocp):
             raise OcpError(wrong)
         parts = assemble(rti, timing, epoch=epoch, config_hash=config_hash, observer=observer, stop_law=stop_law, compile=compile)
