@@ -23,7 +23,7 @@ from rti_mpc.contract.status import QpStatus
 from rti_mpc.rti.places import Places
 from rti_mpc.rti.qp.qp import Guess
 
-MAX_ROLL_OUTS = 6  # after the first, as long as fewer places change from one to the next, or at most `FEW` of those in the first
+MAX_ROLL_OUTS = 6  # after the first, as long as fewer places change than in that one, and no more than in the one before or than `FEW` of the first
 FEW = 0.5  # of the first changes: where so few change, there may be more than in the roll-out before, since they settle soon
 MAX_CHANGES = 45  # of places in the first roll-out with which a homotopy is followed: with more, it takes too many roll-outs
 MAX_MOVES = 40  # roll-outs along the homotopy; a step of the interior point takes as long as two or three
@@ -229,7 +229,7 @@ class ActiveSet:
             self.roll_out_again()
             self._count()
             changes = self._changes[0]
-            if changes <= 0.0 or (changes >= before and changes > FEW * first):
+            if not 0.0 < changes < first or (changes > before and changes > FEW * first):
                 break
             before = changes
         if self._changes[0] > 0.0 and first <= MAX_CHANGES:

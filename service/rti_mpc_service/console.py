@@ -28,7 +28,5 @@ def widened(console: Console) -> Console:
 
 def print_whole(console: Console, table: Table) -> None:
     """Print a table with each row in one line, on a console that from now on is as wide."""
-    for column in table.columns:
-        column.no_wrap = True
     console.width = max(console.width, console.measure(table, options=console.options.update(max_width=MAX_WIDTH_COLUMNS)).maximum)
     console.print(table)

@@ -56,7 +56,7 @@ def claimed(path: Path | None) -> Path | None:
             new = not path.exists()
             path.open("ab").close()
             if new:
-                path.unlink()
+                path.resolve().unlink()  # not a link to it
     except OSError as error:
         raise ConfigError(f"--json must be a file that can be written, got {path}: {error.strerror}") from error
     return path

@@ -42,8 +42,7 @@ class Motion:
         outputs = [model.outputs[i] for i in self._columns]
         self._one = ones(outputs)
         measured = [replace(output, unit=in_si(output)) for output in outputs]
-        units = {output.unit for output in measured}
-        self.unit = units.pop() if len(units) == 1 else "1"
+        self.unit = measured[0].unit if len({read(output.unit).dimension for output in outputs}) == 1 else "1"
         self.driven_speed = DRIVEN_OUTPUT_SPEED if place is None else DRIVEN_SPEED_M_S
         self._rotations = Rotations.of(measured, model.quaternions)
         self._h, self._p = model.h(), model.p_nominal

@@ -176,7 +176,7 @@ class MatrixReport(Redrawn):
         unit = next((row.unit for row in self.rows), "m")
         for name in COLUMNS:
             title = name.replace("mUNIT", "1e-3" if unit == "1" else f"m{unit}").replace("UNIT", unit)
-            table.add_column(title, justify="left" if name in COLUMNS[:2] else "right")
+            table.add_column(title, justify="left" if name in COLUMNS[:2] else "right", no_wrap=True)
         for row in self.rows:
             table.add_row(*(Text(cell, "red" if row.broken else "") for cell in row.cells()))
         return table

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from rti_mpc.signals import as_label
 from rti_mpc_service.rig.figure import COMMAND_COLOR, LIMIT_COLOR, MEASURED_COLOR, MIN_DRAWN_MM, PLOT_STYLE, REFERENCE_COLOR
 from rti_mpc_service.rig.run_data import Run
 
@@ -38,7 +39,7 @@ def figure(runs: Sequence[Run], path: Path, title: str) -> None:
     with mpl.rc_context(PLOT_STYLE):
         page = Figure(figsize=(13.0, max(6.0, 1.9 * max(map(len, columns)))), layout="constrained")
         FigureCanvasAgg(page)
-        page.suptitle(title, x=0.01, ha="left", fontsize=12)
+        page.suptitle(as_label(title), x=0.01, ha="left", fontsize=12)
         halves = page.add_gridspec(1, 2, width_ratios=[1.0, 1.15])
         for half, panels in enumerate(columns):
             grid = halves[half].subgridspec(len(panels), 1)
@@ -67,7 +68,7 @@ def _times(run: Run, runs: Sequence[Run]) -> np.ndarray[tuple[int], np.dtype[np.
 def _path(axes: Axes, runs: Sequence[Run]) -> None:
     axes.plot(*runs[0].path.T, color=REFERENCE_COLOR, linewidth=6.0, alpha=0.5, solid_capstyle="round", label="reference")
     for run, color, width in zip(runs, COLORS, WIDTHS, strict=True):
-        axes.plot(*run.position.T, color=color, linewidth=width, label=run.scenario)
+        axes.plot(*run.position.T, color=color, linewidth=width, label=as_label(run.scenario))
     axes.plot(*runs[0].position[0], "o", color=MEASURED_COLOR, markerfacecolor="white", zorder=4, label="begin")
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.08)
@@ -77,7 +78,7 @@ def _path(axes: Axes, runs: Sequence[Run]) -> None:
 
 def _distance(axes: Axes, runs: Sequence[Run]) -> None:
     for run, color, width in zip(runs, COLORS, WIDTHS, strict=True):
-        axes.semilogy(_times(run, runs), np.maximum(run.error_mm, MIN_DRAWN_MM), color=color, linewidth=width, label=run.scenario)
+        axes.semilogy(_times(run, runs), np.maximum(run.error_mm, MIN_DRAWN_MM), color=color, linewidth=width, label=as_label(run.scenario))
     axes.set(title="Tracking error", ylabel="distance [mm]")
 
 
@@ -85,8 +86,8 @@ def _output(axes: Axes, runs: Sequence[Run], i: int) -> None:
     label = runs[0].info.outputs[i]
     axes.plot(_times(runs[0], runs), runs[0].reference[:, i], color=REFERENCE_COLOR, linewidth=6.0, alpha=0.5, label="reference")
     for run, color, width in zip(runs, COLORS, WIDTHS, strict=True):
-        axes.plot(_times(run, runs), run.reference[:, i] + run.output_error[:, i], color=color, linewidth=width, label=run.scenario)
-    axes.set(title=f"Output {label.name}", ylabel=f"[{label.unit}]")
+        axes.plot(_times(run, runs), run.reference[:, i] + run.output_error[:, i], color=color, linewidth=width, label=as_label(run.scenario))
+    axes.set(title=f"Output {as_label(label.name)}", ylabel=f"[{as_label(label.unit)}]")
 
 
 def _command(axes: Axes, runs: Sequence[Run], i: int) -> None:
@@ -95,6 +96,6 @@ def _command(axes: Axes, runs: Sequence[Run], i: int) -> None:
         if np.isfinite(bound):
             axes.axhline(bound, color=LIMIT_COLOR, linewidth=1.0, linestyle="--")
     for run, color, width in zip(runs, COLORS, WIDTHS, strict=True):
-        axes.step(_times(run, runs), run.u_applied[:, i], where="post", color=color, linewidth=width, label=run.scenario)
+        axes.step(_times(run, runs), run.u_applied[:, i], where="post", color=color, linewidth=width, label=as_label(run.scenario))
     axes.margins(y=0.12)
-    axes.set(title=f"Command {info.inputs[i].name}", ylabel=f"[{info.inputs[i].unit}]")
+    axes.set(title=f"Command {as_label(info.inputs[i].name)}", ylabel=f"[{as_label(info.inputs[i].unit)}]")

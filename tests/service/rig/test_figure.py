@@ -145,3 +145,24 @@ def test_an_angle_that_is_whole_turns_off_has_no_error(run: Run) -> None:
     error = replace(run, info=arm, y=run.reference + 2 * np.pi).output_error
     assert np.abs(error[:, 0]).max() < 1e-9
     assert error[:, 1] == pytest.approx(2 * np.pi)
+
+
+@pytest.mark.parametrize("planar", [True, False])
+def test_dollar_signs_begin_no_formula_in_any_figure_of_a_run(planar: bool, run: Run, tmp_path: Path) -> None:
+    import matplotlib as mpl
+
+    from rti_mpc_service.replay import figure as replayed  # with matplotlib
+
+    roles = ("x", "y") if planar else ("", "")
+    named = replace(
+        PIONEER,
+        inputs=tuple(Label(rf"$\price{i}$", "$/s", state=one.state) for i, one in enumerate(PIONEER.inputs)),
+        outputs=tuple(Label(rf"$\value{role}$", "m", role=role) for role in roles),
+    )
+    dollars = replace(run, info=named, scenario=r"of $\cost$")
+    with mpl.rc_context({"svg.fonttype": "none"}):
+        figure(dollars, tmp_path / "run.svg")
+        replayed.figure([dollars, dollars], tmp_path / "both.svg", r"two $\drives$")
+    for name in ("run.svg", "both.svg"):
+        assert r"of $\cost$" in (drawn := words(tmp_path / name))
+        assert r"Command $\price0$" in drawn
