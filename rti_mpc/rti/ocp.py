@@ -44,12 +44,11 @@ from rti_mpc.errors import OcpError
 from rti_mpc.model.expressions import column, from_text, to_text
 from rti_mpc.model.integrator import TABLEAUS, steps
 from rti_mpc.model.model import IRK, Model
-from rti_mpc.si import HasUnit, ones
 from rti_mpc.signals import quantity
 
 DISCRETE = "discrete"  # method of a problem whose model is in discrete time
 PAIRS = (("lbu", "ubu"), ("lbdu", "ubdu"), ("lbx", "ubx"), ("lh", "uh"))  # bounds that may differ from stage to stage, both of them then
-DEFAULT_SLACK_WEIGHT = 1e3  # L1 weight, in cost per SI unit of what is bounded, and L2 weight, in cost per SI unit squared
+DEFAULT_SLACK_WEIGHT = 1e3  # L1 weight, in cost per unit of the state, and L2 weight, in cost per unit squared
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -82,8 +81,7 @@ class Ocp:
         lbx: Softened lower bound on states at nodes 1 to N, shape ``(nx,)``.
         ubx: Softened upper bound on states, shape ``(nx,)``.
         z: L1 weight of the slacks, shape ``(nx,)``, or given as a constant; cost / unit of the state. As the three other weights of slacks of states
-            and of h it may have a row per node, ``(N, nx)``: the last one is that of the end of the horizon. Weights of slacks that are left out are
-            `DEFAULT_SLACK_WEIGHT` in SI units, see `rti_mpc.si`; of an `h_expr` that is given here, whose units nobody tells, in its own.
+            and of h it may have a row per node, ``(N, nx)``: the last one is that of the end of the horizon.
         Z: L2 weight of the slacks, shape ``(nx,)``, or given as a constant; cost / unit of the state squared.
         lbx_e: Softened lower bound on states at node N alone, besides `lbx`, shape ``(nx,)``: a terminal set. Its slacks have the weights `z`, `Z`
             of node N.
@@ -163,22 +161,22 @@ class Ocp:
         ubdu: ArrayLike = np.inf,
         lbx: ArrayLike = -np.inf,
         ubx: ArrayLike = np.inf,
-        z: ArrayLike | None = None,
-        Z: ArrayLike | None = None,
+        z: ArrayLike = DEFAULT_SLACK_WEIGHT,
+        Z: ArrayLike = DEFAULT_SLACK_WEIGHT,
         Q_e: ArrayLike | None = None,
         h_expr: ca.SX | None = None,
         lh: ArrayLike = -np.inf,
         uh: ArrayLike = np.inf,
-        zh: ArrayLike | None = None,
-        Zh: ArrayLike | None = None,
+        zh: ArrayLike = DEFAULT_SLACK_WEIGHT,
+        Zh: ArrayLike = DEFAULT_SLACK_WEIGHT,
         lbx_e: ArrayLike = -np.inf,
         ubx_e: ArrayLike = np.inf,
         R_u: ArrayLike = 0.0,
         u_ref: ca.SX | ArrayLike | None = None,
         lbddu: ArrayLike = -np.inf,
         ubddu: ArrayLike = np.inf,
-        zddu: ArrayLike | None = None,
-        Zddu: ArrayLike | None = None,
+        zddu: ArrayLike = DEFAULT_SLACK_WEIGHT,
+        Zddu: ArrayLike = DEFAULT_SLACK_WEIGHT,
     ) -> None:
         given.instance("model", model, Model)
         if absent := [name for name in ("states", "inputs", "outputs") if not getattr(model, name)]:
@@ -205,7 +203,7 @@ class Ocp:
             raise OcpError(f"dt must be a positive number of seconds, got {dt}")
         model = integrated(model, method, sim_method_num_stages, sim_method_num_steps, seconds)
         method = DISCRETE if model.dt is not None else model.method if method is None else method
-        h_expr, constrained = (model.h_expr, model.constraints) if h_expr is None else (column("h_expr", h_expr), ())
+        h_expr = model.h_expr if h_expr is None else column("h_expr", h_expr)
         if isinstance(h_expr, ca.MX):
             raise OcpError(f"h_expr must be SX, of the model's x, u, p, or be given to the Model, got {given.quoted(h_expr)}")
         nh = h_expr.numel()
@@ -222,12 +220,8 @@ class Ocp:
         for name, value in fields.items():
             object.__setattr__(self, name, value)
         values = {"Q": Q, "R": R, "delta": delta, "lambda_": lambda_, "lbu": lbu, "ubu": ubu, "lbdu": lbdu, "ubdu": ubdu, "lbx": lbx, "ubx": ubx}
-        values |= {"Q_e": np.zeros(model.ny) if Q_e is None else Q_e, "lh": lh, "uh": uh, "lbx_e": lbx_e, "ubx_e": ubx_e}
-        values |= {"R_u": R_u, "lbddu": lbddu, "ubddu": ubddu}
-        slacks = (("z", z, "Z", Z, model.states), ("zh", zh, "Zh", Zh, constrained), ("zddu", zddu, "Zddu", Zddu, model.inputs))
-        for linear, z_given, square, Z_given, bounded in slacks:
-            usual = default_slack_weights(bounded)
-            values |= {linear: usual[0] if z_given is None else z_given, square: usual[1] if Z_given is None else Z_given}
+        values |= {"z": z, "Z": Z, "Q_e": np.zeros(model.ny) if Q_e is None else Q_e, "lh": lh, "uh": uh, "zh": zh, "Zh": Zh}
+        values |= {"lbx_e": lbx_e, "ubx_e": ubx_e, "R_u": R_u, "lbddu": lbddu, "ubddu": ubddu, "zddu": zddu, "Zddu": Zddu}
         self._take(values)
 
     def __copy__(self) -> Ocp:
@@ -500,12 +494,6 @@ def pace_fault(ocp: Ocp) -> str:
             told = f"from anywhere in those of the first, {first}, inside its increments"
             return f"bounds of input {signal.name} must be reached in every block {told}, got bounds that can be reached from {able} alone"
     return ""
-
-
-def default_slack_weights(bounded: Sequence[HasUnit]) -> tuple[ArrayLike, ArrayLike]:
-    """Return the L1 and L2 weights of slacks that nobody gives, each of shape ``(n,)``, in the units of what is bounded; a constant of none."""
-    one = ones(bounded) if bounded else 1.0
-    return DEFAULT_SLACK_WEIGHT / one, DEFAULT_SLACK_WEIGHT / one**2
 
 
 def weights(name: str, value: ArrayLike, length: int) -> Array:

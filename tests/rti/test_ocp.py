@@ -16,7 +16,7 @@ import pytest
 from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.errors import OcpError
 from rti_mpc.model.disturbance import with_disturbances
-from rti_mpc.model.model import Model, Signal
+from rti_mpc.model.model import Model
 from rti_mpc.model.obstacle import with_obstacles
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.rti.linearization import shift
@@ -35,20 +35,6 @@ def test_diagonals_constants_and_defaults_become_arrays() -> None:
     np.testing.assert_array_equal(ocp.lbx, [-INF, -INF])
     assert ocp.soft == ()
     assert double_integrator(N=4).N_u == 4
-
-
-def test_slack_weights_that_are_left_out_are_those_of_the_same_robot_in_si_units() -> None:
-    """Also of constraints that the model names, and of inputs, whose second differences are bounded."""
-    x, u = ca.SX.sym("x"), ca.SX.sym("u")
-    found = []
-    for units in (("m", "m/s", "N"), ("mm", "km/h", "kN")):
-        signals = {name: Signal(name, unit) for name, unit in zip(("r", "v", "F"), units, strict=True)}
-        vectors = {"states": signals["r"], "inputs": signals["v"], "outputs": signals["r"], "constraints": signals["F"]}
-        model = Model("carriage", x, u, u, x, **vectors, h_expr=x * u)
-        found.append(Ocp(model, N=2, dt=0.1, Q=1.0, R=1.0))
-    for name, factor in (("z", 1e-3), ("Z", 1e-6), ("zh", 1e3), ("Zh", 1e6), ("zddu", 1 / 3.6), ("Zddu", 1 / 3.6**2)):
-        assert getattr(found[0], name) == 1e3
-        assert getattr(found[1], name) == pytest.approx(1e3 * factor, rel=1e-15)
 
 
 def test_states_with_a_bound_on_either_side_are_soft() -> None:

@@ -91,17 +91,16 @@ def retuned(config: Config, problem: Ocp) -> Ocp:
 
 def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
     """Return the weights and bounds that may change at run time, by their names in `Ocp`."""
+    from rti_mpc.rti.ocp import DEFAULT_SLACK_WEIGHT
+
     weights, limits, stages, N, N_u = config.ocp.weights, config.ocp.bounds, config.ocp.stages, config.ocp.N, config.N_u
+    z, Z = (DEFAULT_SLACK_WEIGHT if weight is None else weight for weight in (limits.soft_weight, limits.soft_weight_L2))
     lbu, ubu = by_stage(limits.inputs, stages.inputs, names(model.inputs), N_u)
     lbdu, ubdu = by_stage(limits.increments, stages.increments, names(model.inputs), N_u)
     lbx, ubx = by_stage(limits.states, stages.states, names(model.states), N)
     lbddu, ubddu = bounds(limits.second_differences, names(model.inputs))
     lbx_e, ubx_e = bounds(limits.terminal, names(model.states))
-    bounded = bounded_constraints(config, model)
-    given, by_node = (limits.soft_weight, limits.soft_weight_L2), (stages.soft_weight, stages.soft_weight_L2)
-    z, Z = slack_weights(given, by_node, model.states, N)
-    zh, Zh = slack_weights(given, by_node, [signal for signal in model.constraints if signal.name in bounded], N)
-    zddu, Zddu = slack_weights(given, ({}, {}), model.inputs, N)
+    constraints = bounded_constraints(config, model)
     return {
         "Q": [weights.Q[output.name] for output in model.outputs],
         "R": [weights.R[input.name] for input in model.inputs],
@@ -114,16 +113,16 @@ def weights_and_bounds(config: Config, model: Model) -> dict[str, Any]:
         "ubdu": ubdu,
         "lbx": lbx,
         "ubx": ubx,
-        "z": z,
-        "Z": Z,
-        "zh": zh,
-        "Zh": Zh,
+        "z": slack_weights(z, stages.soft_weight, names(model.states), N),
+        "Z": slack_weights(Z, stages.soft_weight_L2, names(model.states), N),
+        "zh": slack_weights(z, stages.soft_weight, constraints, N),
+        "Zh": slack_weights(Z, stages.soft_weight_L2, constraints, N),
         "lbx_e": lbx_e,
         "ubx_e": ubx_e,
         "lbddu": lbddu,
         "ubddu": ubddu,
-        "zddu": zddu,
-        "Zddu": Zddu,
+        "zddu": z,
+        "Zddu": Z,
     }
 
 
@@ -326,18 +325,9 @@ def factors(sequence: tuple[float, ...], stages: Mapping[str, Sequence[float]], 
     return [[factor * stages[name][k] if name in stages else factor for name in names] for k, factor in enumerate(sequence)] if stages else sequence
 
 
-def slack_weights(
-    given: Sequence[float | None], stages: Sequence[Mapping[str, Sequence[float]]], signals: Sequence[Signal], count: int
-) -> tuple[Any, ...]:
-    """Return L1 and L2 weights of slacks in the order of the signals, or, where some differ from stage to stage, with a row per stage."""
-    from rti_mpc.rti.ocp import default_slack_weights
-
-    order = names(signals)
-    found = []
-    for weight, usual, rows in zip(given, default_slack_weights(signals), stages, strict=True):
-        weights = np.broadcast_to(usual if weight is None else weight, len(order)).tolist()
-        found.append(by_block(dict(zip(order, weights, strict=True)), {name: rows[name] for name in order if name in rows}, order, count))
-    return tuple(found)
+def slack_weights(weight: float, stages: Mapping[str, Sequence[float]], names: Sequence[str], count: int) -> Any:
+    """Return the weights of slacks in the order of the names, or, where some differ from stage to stage, a row per stage."""
+    return by_block(dict.fromkeys(names, weight), {name: stages[name] for name in names if name in stages}, names, count)
 
 
 def by_block(weights: Mapping[str, float], stages: Mapping[str, Sequence[float]], names: Sequence[str], count: int) -> Any:

@@ -131,12 +131,9 @@ class BoundSection(Section):
     )
     constraints: dict[str, Interval] = Field(default={}, description="softened bounds of the model's constraints, by name, in the constraint's unit")
     soft_weight: Weight | None = Field(
-        default=None,
-        description="L1 weight on the violation of a softened bound or an obstacle, in cost / unit of what is bounded; 1000 / SI unit if left out",
+        default=None, description="L1 weight on the violation of a softened bound or an obstacle, in cost / unit of what is bounded"
     )
-    soft_weight_L2: Weight | None = Field(
-        default=None, description="L2 weight on the same, in cost / that unit squared; 1000 / SI unit squared if left out"
-    )
+    soft_weight_L2: Weight | None = Field(default=None, description="L2 weight on the same, in cost / that unit squared")
 
 
 class StagesSection(Section):
