@@ -33,9 +33,11 @@ def watch(links: Callable[[], int | None], why: Callable[[], str], tell: Callabl
             if count and lost_s:
                 tell(Notice(Severity.INFO, "linked", f"linked to others again after {time.monotonic() - lost_s:.1f} s"))
                 lost_s = 0.0
-            elif linked and not count and not lost_s and (text := why()) and not over.is_set():
-                lost_s = time.monotonic()
-                tell(Notice(Severity.ERROR, "unlinked", f"all links to other processes are lost: {text}", change=True))
+            elif linked and not count and not lost_s:
+                since_s, text = time.monotonic(), why()  # which may take seconds
+                if text and not over.is_set():
+                    lost_s = since_s
+                    tell(Notice(Severity.ERROR, "unlinked", f"all links to other processes are lost: {text}", change=True))
             linked = count > 0 or linked
 
     began = links() or 0

@@ -5,7 +5,8 @@ Settings with which a process joins the bus, and the Zenoh session made from the
 Peers find each other by gossip. The robot listens on the rendezvous endpoint, the others
 on a free loopback port. Those connect to the robot, trying until it is there, learn of
 one another and link directly. So processes may start and restart in any order, and those
-already linked stay so without the robot; `rti_mpc.wire.introduction` makes links that are lost again. Multicast is off. Across hosts, name the
+already linked stay so without the robot, and see `rti_mpc.wire.introduction` for those
+that were held up. Multicast is off. Across hosts, name the
 endpoint to listen on. Across a security boundary, use ``mode="client"`` and a router: a
 peer never forwards, and never passes a router's access control.
 """
@@ -17,7 +18,7 @@ import os
 import re
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from rti_mpc.contract.message import Reference
 from rti_mpc.errors import ConfigError, Stopped
 from rti_mpc.text_file import read_text_file
 from rti_mpc.wire import credentials
-from rti_mpc.wire.handshake import obstacles
+from rti_mpc.wire.handshake import ADDRESS, obstacles
 from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
 from rti_mpc.wire.reach import remind
 
@@ -47,6 +48,8 @@ RETRY_INTERVAL_S = 0.1  # between two attempts to reach a router
 ZENOH_THREADS = "(rx: (worker_threads: 4), tx: (worker_threads: 4))"
 
 MAX_MESSAGE_BYTES = MAX_PAYLOAD_BYTES[Reference] + (1 << 12)  # payload and Zenoh's own bytes: a longer message is dropped before it is reassembled
+
+ALL_ADDRESSES, LOOPBACK = ("0.0.0.0", "[::]"), ("127.0.0.1", "localhost", "::1")
 
 # Settings of this package, unless the user's own Zenoh configuration says otherwise.
 ZENOH_DEFAULTS: dict[str, Any] = {
@@ -124,12 +127,20 @@ def zenoh_config(settings: BusSettings) -> zenoh.Config:
     return config
 
 
+def listens_itself(endpoint: str, listen: Sequence[str]) -> bool:
+    """Whether a process that listens on some endpoints does so at this one: one of them, or of this host where it listens on all addresses."""
+    this = ADDRESS.match(endpoint)
+    if this is None or (this["v6"] or this["host"]) not in LOOPBACK:
+        return endpoint in listen
+    return any(f"{this['protocol']}/{host}:{this['port']}" in listen for host in ALL_ADDRESSES) or endpoint in listen
+
+
 def _by_name(settings: BusSettings, mode: str) -> dict[str, Any]:
     """Return the settings by their names in Zenoh. No process connects to itself, and a router to none by default."""
     others = () if mode == "router" and settings.connect == (RENDEZVOUS_ENDPOINT,) else settings.connect
     return {
         "listen/endpoints": settings.listen or {"client": [], "peer": ["tcp/127.0.0.1:0"], "router": [RENDEZVOUS_ENDPOINT]}.get(mode, []),
-        "connect/endpoints": [endpoint for endpoint in others if endpoint not in settings.listen],
+        "connect/endpoints": [endpoint for endpoint in others if not listens_itself(endpoint, settings.listen)],
         "connect/timeout_ms": CLIENT_TIMEOUT_MS if mode == "client" else -1,
         "scouting/multicast/enabled": settings.multicast,
         **ZENOH_DEFAULTS,

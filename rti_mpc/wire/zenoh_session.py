@@ -11,7 +11,6 @@ Zenoh session of one process, which carries the buses of its robots (`rti_mpc.wi
 
 from __future__ import annotations
 
-import atexit
 import math
 import os
 import secrets
@@ -38,7 +37,6 @@ from rti_mpc.wire.session import BusSettings, certificate, endpoints, guest_conf
 CLOSE_TIMEOUT_S = 0.5
 HEARTBEAT_S = 1.0  # period at which a cached publisher sends the number of its last message
 MAX_ENCODING_CHARS = 256  # of an encoding that are read
-RING_LINKS = 1024  # links made or lost that wait for their receiver
 RING_TOKENS = 1024  # changes of presence that wait for their receiver
 WAKE_BYTES = 16  # of the message by which a process wakes its own receiver
 RING_QUERIES = 16  # requests that wait for their answer
@@ -191,10 +189,8 @@ class ZenohSession:
         self._following: list[threading.Thread] = []
         if meets(self._config):
             self._introduction = Introduction(self._peers, lambda: zenoh.open(guest_config(settings)), self._over)
-            listener = self._session.info.declare_link_events_listener(zenoh.handlers.RingChannel(RING_LINKS), history=True)
-            self._following.append(threading.Thread(target=self._introduction.follow, args=(listener,), name="introduction", daemon=True))
+            self._following.append(threading.Thread(target=self._introduction.follow, name="introduction", daemon=True))
             self._following[-1].start()
-        atexit.register(self.close)  # where nobody closes it: a thread that waits in Zenoh while the interpreter ends would abort the process
 
     def __enter__(self) -> ZenohSession:
         return self
@@ -208,7 +204,6 @@ class ZenohSession:
 
         Unless it does, threads that follow are over by then: one that comes back from Zenoh while the interpreter ends would abort the process.
         """
-        atexit.unregister(self.close)
         self._over.set()
         closing = threading.Thread(target=self._session.close, daemon=True)
         closing.start()

@@ -3,9 +3,10 @@ from __future__ import annotations
 
 import os
 import socket
+import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 
 from rti_mpc.contract.message import State
 from rti_mpc.wire.bus import Bus, BusSettings
-from rti_mpc.wire.introduction import listens
+from rti_mpc.wire.introduction import HELD_UP_S, LOOK_INTERVAL_S, Introduction
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.wire.test_bus import eventually
@@ -77,35 +78,55 @@ def heard(sender: Bus, receiver: Bus) -> bool:
     return eventually(look)
 
 
-def test_peers_that_have_met_by_gossip_meet_again_after_their_link_is_lost(buses: list[Bus], endpoint: str) -> None:
+def hold_up(bus: Bus) -> None:
+    """Have a process believe that it was held up."""
+    bus._session._introduction.looked_s -= 2.0 * HELD_UP_S  # type: ignore[attr-defined]
+
+
+def test_peer_that_was_held_up_meets_again_those_that_have_given_it_up(buses: list[Bus], endpoint: str) -> None:
     _, guard, controller = buses
+    eventually(lambda: len(guard._session._introduction._met) == 2)  # type: ignore[attr-defined]
     for _ in range(3):
         assert heard(controller, guard)
         assert heard(guard, controller)
         assert cut(keep=port(endpoint)) >= 2, "both ends of a connection"
+        hold_up(guard)
 
 
-def test_peer_that_has_ended_is_not_looked_for(buses: list[Bus], endpoint: str) -> None:
-    """Nor one that was a guest, whose end would have the others look for it."""
-    robot, guard, controller = buses
-    assert heard(controller, guard)
-    guests: list[int] = []
-    for bus in (robot, controller):
-        introduction: Callable[..., object] = bus._session._introduction._guest  # type: ignore[attr-defined]
-        bus._session._introduction._guest = lambda join=introduction: guests.append(1) or join()  # type: ignore[attr-defined]
-    guard.close()
-    lost = [bus._session._introduction for bus in (robot, controller)]  # type: ignore[attr-defined]
-    eventually(lambda: all(len(one._links) == 1 and not one._lost for one in lost))
-    assert not guests
+class Invited:
+    """A session's peers, and how many guests were invited; a lost link is never made again."""
+
+    def __init__(self) -> None:
+        self.linked, self.guests = {"robot", "controller"}, 0
+        self.introduction = Introduction(lambda: set(self.linked), self._guest, threading.Event())
+        self.introduction._over.wait = lambda _=None: False  # type: ignore[method-assign]
+        self.now_s = self.introduction.looked_s
+        self.look()
+
+    def _guest(self) -> AbstractContextManager[None]:
+        self.guests += 1
+        return nullcontext()
+
+    def look(self, after_s: float = LOOK_INTERVAL_S) -> None:
+        self.now_s += after_s
+        self.introduction._look(self.now_s)
+        self.introduction.looked_s = self.now_s
 
 
-def test_end_is_only_called_gone_if_its_host_says_so(endpoint: str) -> None:
-    assert not listens(endpoint)
-    with socket.create_server(("127.0.0.1", port(endpoint))):
-        assert listens(endpoint)
-        assert listens(endpoint.replace("tcp/", "tls/"))
-    assert listens("udp/127.0.0.1:9")
-    assert listens("tcp/nowhere.invalid:7447")
+def test_only_who_was_held_up_and_has_lost_a_link_invites_guests_and_no_more_than_a_few() -> None:
+    held_up, running, unharmed, alone = (Invited() for _ in range(4))
+    for one in (held_up, unharmed, alone):
+        one.look(HELD_UP_S + 1.0)
+    assert [one.guests for one in (held_up, unharmed, alone)] == [0, 0, 0], "no link is known to be lost yet"
+    for one in (held_up, running):
+        one.linked.discard("controller")
+    alone.linked.clear()
+    for one in (held_up, running, unharmed, alone):
+        for _ in range(100):
+            one.look()
+    assert [one.guests for one in (held_up, running, unharmed, alone)] == [6, 0, 0, 0]
+    held_up.look(HELD_UP_S + 1.0)
+    assert held_up.guests == 6, "what was lost long ago is not looked for"
 
 
 def test_no_thread_of_a_session_is_left_when_it_has_closed(buses: list[Bus], endpoint: str) -> None:
@@ -115,6 +136,7 @@ def test_no_thread_of_a_session_is_left_when_it_has_closed(buses: list[Bus], end
     assert [thread.name for thread in before] == len(buses) * ["introduction"]
     cut(keep=port(endpoint))
     for bus in buses:
+        hold_up(bus)
         bus.close()
     deadline_s = time.monotonic() + 60.0
     for thread in before:

@@ -45,6 +45,7 @@ def test_a_peer_listens_on_loopback_and_connects_to_the_rendezvous() -> None:
 
 def test_nobody_connects_to_himself() -> None:
     assert value(BusSettings(listen=(RENDEZVOUS_ENDPOINT,)), "connect/endpoints") == []
+    assert value(BusSettings(listen=(RENDEZVOUS_ENDPOINT.replace("127.0.0.1", "0.0.0.0"),)), "connect/endpoints") == [], "not from any address"
     assert value(BusSettings(mode="router"), "connect/endpoints") == []
     assert value(BusSettings(mode="router", listen=("tcp/0.0.0.0:7447",)), "connect/endpoints") == []
 
