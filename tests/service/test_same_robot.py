@@ -42,12 +42,6 @@ def robot(document: dict[str, Any], name: str, units: Mapping[str, str]) -> Conf
     return Config.model_validate(document_with_units(document, MODEL, units) | {"model": {"name": f"tests.robots:{name}"}})
 
 
-def test_penalties_that_are_left_out_are_the_same() -> None:
-    plain, other = (build_ocp(config) for config in robots())
-    np.testing.assert_allclose(other.z, plain.z * STATES, rtol=1e-12)
-    np.testing.assert_allclose(other.Z, plain.Z * STATES**2, rtol=1e-12)
-
-
 @pytest.mark.parametrize("name", ["sines", "steps"])
 def test_references_of_outputs_are_the_same(name: str) -> None:
     x = np.array([0.1, -0.2, 0.3, 0.1, 0.2])
