@@ -16,7 +16,7 @@ from rti_mpc.contract.message import Telemetry
 from rti_mpc.contract.status import Mode
 from rti_mpc.wire.cdr import decode
 from rti_mpc_service.host.hold_up import Host
-from tests.in_time import in_time, on_time
+from tests.in_time import MS, explained, in_time, on_time
 from tests.processes.system import KEYS, heard, owner, rti_mpc, until
 from tests.processes.watched import CONTROLLERS, Watched, configuration, within_limits
 
@@ -39,6 +39,11 @@ def test_standby_takes_over_in_time_and_the_old_leader_is_fenced(redundant: Watc
     assert second.mode is Mode.TRACKING
     took_s = 1e-9 * (system.answered_ns(second) - died_ns)
     print(f"dt = {system.dt_s} s: took over {1e3 * took_s:.1f} ms after the leader's death, {1e3 * max(3 * system.dt_s, 0.05):.0f} promised")
+    if took_s < 0.0:  # the leader was late before its fault, and was relieved while it still answered: of that, nothing is promised
+        silent_ms = 1e3 * max(3 * system.dt_s, 0.05)
+        since_ns = system.fault_at_ns - round((silent_ms - 1e3 * took_s) * MS)
+        assert explained(host, "the leader was relieved before its fault", silent_ms - 1e3 * system.dt_s, since_ns, system.fault_at_ns)
+        return
     in_time(host, "the takeover", 1e3 * took_s, 1e3 * max(3 * system.dt_s, 0.05), system.fault_at_ns)
     if system.dt_s == 0.1:
         stepped_down = system.bus.subscriber(KEYS.event("standby"), capacity=64, history=False)
