@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from rti_mpc.array import Array
+from rti_mpc.array import Array, copy, memories
 
 
 class Kept:
@@ -17,12 +17,10 @@ class Kept:
     """
 
     def __init__(self, arrays: Iterable[Array]) -> None:
-        # Copied through memory views that are made once, as in `Rti`.
-        self._pairs = tuple((array.copy().reshape(-1).data, array.reshape(-1).data) for array in arrays)
+        self._pairs = memories((array.copy(), array) for array in arrays)
 
     def __enter__(self) -> None:
-        for kept, array in self._pairs:
-            kept[:] = array
+        copy(self._pairs)
 
     def __exit__(self, *_: object) -> None:
         for kept, array in self._pairs:

@@ -262,8 +262,12 @@ class Bus:
         """Why nothing can be heard: no process is linked to this one; empty if one is, or it cannot be known."""
         if self._session.links != 0:
             return ""
+        return self._unanswered() or "no process has connected yet"
+
+    def _unanswered(self) -> str:
+        """Where no process answers, and why; empty if this one waits for others to connect."""
         where = self._session.connects_to
-        return f"no process answers at {where}" if where else "no process has connected yet"
+        return f"no process answers at {where}" if where else ""
 
     def watch_connection(self, tell: Callable[[Notice], object]) -> None:
         """
@@ -272,12 +276,7 @@ class Bus:
         That all links are lost, unless this process waits for others to connect, and that there are links again; and from
         `rti_mpc.wire.certificate.WARN_DAYS` before it on, once a day, the end of this process's certificate.
         """
-
-        def why() -> str:
-            where = self._session.connects_to
-            return f"no process answers at {where}" if where else ""
-
-        connection.watch(lambda: self._session.links, why, tell, self._over)
+        connection.watch(lambda: self._session.links, self._unanswered, tell, self._over)
         if (path := self._session.certificate) is not None:
             warn_of_end(path, tell, self._over)
 

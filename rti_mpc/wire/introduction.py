@@ -24,7 +24,7 @@ from rti_mpc.errors import ConfigError
 LOOK_INTERVAL_S = 0.25
 HELD_UP_S = 1.0  # between two looks, after which others may have given this process up: they do after 1.5 to 2 s without a word
 WATCHED_S = 20.0  # after that, in which lost links are noticed
-PAUSE_S = 0.5  # after the first guest; twice as long after each further one, six in all at most: the other side may give a link up later
+PAUSE_S = 0.5  # after the first guest, twice as long after each further one, since the other side may give a link up later: six at most
 VISIT_S = 0.5  # for which a guest stays: links take 4 ms on an idle host, and Zenoh keeps those to a peer that leaves within 50 ms for good
 
 

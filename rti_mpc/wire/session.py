@@ -18,7 +18,7 @@ import os
 import re
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -127,12 +127,13 @@ def zenoh_config(settings: BusSettings) -> zenoh.Config:
     return config
 
 
-def listens_itself(endpoint: str, listen: Sequence[str]) -> bool:
+def listens_itself(endpoint: str, listen: Iterable[str]) -> bool:
     """Whether a process that listens on some endpoints does so at this one: one of them, or of this host where it listens on all addresses."""
     this = ADDRESS.match(endpoint)
-    if this is None or (this["v6"] or this["host"]) not in LOOPBACK:
-        return endpoint in listen
-    return any(f"{this['protocol']}/{host}:{this['port']}" in listen for host in ALL_ADDRESSES) or endpoint in listen
+    own = {endpoint}
+    if this is not None and (this["v6"] or this["host"]) in LOOPBACK:
+        own |= {f"{this['protocol']}/{host}:{this['port']}" for host in ALL_ADDRESSES}
+    return not own.isdisjoint(listen)
 
 
 def _by_name(settings: BusSettings, mode: str) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from rti_mpc.array import copy, memories
 from rti_mpc.contract.message import Command
 from rti_mpc.journal.book import Book
 from rti_mpc.rti.rti import Rti
@@ -38,7 +39,7 @@ class KeptCase:
         """
         theirs = rti.guess.arguments | {"x0": rti.guess.x0, "x_plan": rti.guess.plan.x, "u_plan": rti.u}
         ours = {name: array.copy() for name, array in theirs.items()}
-        self._pairs = tuple((array.reshape(-1).data, theirs[name].reshape(-1).data) for name, array in ours.items() if array.size)
+        self._pairs = memories((array, theirs[name]) for name, array in ours.items())
         self._plan = ours.pop("x_plan"), ours.pop("u_plan")
         self._arrays = ours
         self._qp = qp_on(rti, ours)
@@ -64,8 +65,7 @@ class KeptCase:
         if self._waits or (self._last_ns is not None and local_ns - self._last_ns < PERIOD_NS):
             self.missed += 1
             return
-        for own, array in self._pairs:
-            own[:] = array
+        copy(self._pairs)
         self._about = {"inputs": self._inputs, **about_sample(self._rti, proposal, why), "not_kept": self.missed}
         self._waits, self._last_ns, self.missed = True, local_ns, 0
         if not self._book.keep(self):
