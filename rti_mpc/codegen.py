@@ -34,6 +34,7 @@ from rti_mpc.units import FEWER_PASSES, FUNCTION, units
 COMPILER_FLAGS = ("-O3", "-std=gnu89", "-fno-semantic-interposition", "-shared", "-fPIC", "-w")  # no fast-math
 
 # What a build may use. A portable one has no contraction into fused operations: it agrees with CasADi's virtual machine as far as orders of sums do.
+# It has the longer vectors of a processor that has them, in which each number is what it is without.
 # With longer vectors than 256 bits, GCC 12 mixes two lengths in a loop, and takes data for aligned that are not.
 BUILDS = {"portable": ("-ffp-contract=off",), "native": ("-march=native", "-mprefer-vector-width=256", "-ffp-contract=fast")}
 
@@ -50,6 +51,11 @@ while_compiling: Callable[[float], AbstractContextManager[object]] = nullcontext
 def flags_of(build: str) -> tuple[str, ...]:
     """Return the compiler's flags for a build, by its name in `BUILDS`."""
     return tuple(flag for flag in (*BUILDS[build], *COMPILER_FLAGS) if os.uname().machine == "x86_64" or not flag.startswith("-mprefer-"))
+
+
+def longer_vectors() -> tuple[str, ...]:
+    """Return the compiler's flags for vectors of 256 bits, if this processor has them."""
+    return ("-mavx",) if os.uname().machine == "x86_64" and "avx" in processor_flags().split() else ()
 
 
 @cache
@@ -79,7 +85,7 @@ def compiled(*functions: ca.Function, build: str = "portable") -> list[ca.Functi
 
     Args:
         functions: Functions with different names.
-        build: ``"portable"`` for any processor of this kind, or ``"native"``, for this very one; see `BUILDS`.
+        build: ``"portable"`` for the same numbers on any processor of this kind, or ``"native"``, for this very one; see `BUILDS`.
     """
     found = shutil.which("cc")
     if found is None:
@@ -89,8 +95,9 @@ def compiled(*functions: ca.Function, build: str = "portable") -> list[ca.Functi
     for function in functions:
         generator.add(function)
     sources = units(with_bodies(generator.dump()))
-    flags = flags_of(build)
-    target = (resolved(compiler, flags), processor_flags()) if build == "native" else (os.uname().machine,)
+    native = build == "native"
+    flags = flags_of(build) if native else (*flags_of(build), *longer_vectors())
+    target = (resolved(compiler, flags), processor_flags()) if native else (os.uname().machine,)
     key = hashlib.sha256("\0".join((*sources, compiler, *flags, *target)).encode()).hexdigest()[:32]
     name = f"{functions[0].name()}-{key}.so"
     try:

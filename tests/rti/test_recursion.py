@@ -212,6 +212,26 @@ def test_native_portable_and_interpreted_solvers_command_the_same_on_1000_sample
 
 
 @needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("nx", [3, LEAST_SIZE])
+def test_portable_code_gives_the_same_bits_with_longer_vectors_and_without(nx: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    ocp, rng = problem(nx, 2, 6, 4), np.random.default_rng(8)
+    functions = places(ocp)
+    stages = functions.linearize(**arguments(functions.linearize, ocp, rng, {}))["stages"]
+    inside = functions.enter(**arguments(functions.enter, ocp, rng, {"stages": stages, "start": ca.DM(1.0)}))
+    known = {"stages": stages, "least": ca.DM(1e-6), **inside}
+    chosen = functions.linearize, functions.roll_out, functions.step, certificate(ocp)
+    given = [arguments(function, ocp, rng, known) for function in chosen]
+    found = []
+    for processor in ("flags: sse2", "flags: sse2 avx") if "avx" in codegen.processor_flags().split() else ("flags: sse2",):
+        monkeypatch.setattr(codegen, "processor_flags", lambda processor=processor: processor)
+        found.append([one(**arrays) for one, arrays in zip(compiled(*chosen), given, strict=True)])
+    for results in zip(*found, strict=True):
+        for name in results[0]:
+            assert all((np.array(result[name]) == np.array(results[0][name])).all() for result in results), name
+
+
+@needs_compiler
 def test_native_code_is_kept_by_what_compiler_and_processor_make_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     x = ca.SX.sym("x")
