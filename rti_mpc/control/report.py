@@ -17,18 +17,24 @@ class Reports:
     """
     Reports of one robot, compared with what is believed to act.
 
+    Attributes:
+        ramps: Last reports in a row of the robot's own ramp to rest where a command was believed to act.
+
     Args:
         sent: What is believed.
         limits: Bounds of the inputs by name, owned by the caller, obeyed as they are.
     """
 
     def __init__(self, sent: Sent, limits: Mapping[str, Array]) -> None:
+        self.ramps = 0
         self._sent = sent
         self._limits = limits
 
     def correct(self, state: State) -> bool:
         """Believe the input that a robot reports; return whether it was another than believed."""
-        return self._sent.correct(state.stamp_ns, self._within(state.u, state.stamp_ns), (state.command_epoch, state.command_seq))
+        surprised = self._sent.correct(state.stamp_ns, self._within(state.u, state.stamp_ns), (state.command_epoch, state.command_seq))
+        self.ramps = self.ramps + 1 if surprised and not state.command_seq else 0
+        return surprised
 
     def expects(self, state: State, t_ns: int) -> bool:
         """Whether the report of a state would be believed if it were stamped `t_ns`; nothing changes."""

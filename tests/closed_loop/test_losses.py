@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -123,6 +124,18 @@ def test_robot_that_does_not_report_is_told_of_once() -> None:
         said[reports] = [notice.code for notice in scene.controller.notices()]
     assert said[False].count("inputs_unreported") == 1
     assert "inputs_unreported" not in said[True]
+
+
+@pytest.mark.parametrize(("at", "named", "times"), [("none", False, 1), ("none", True, 0), ("controller", True, 0)], ids=["unnamed", "named", "lost"])
+def test_robot_whose_inputs_come_from_no_command_is_told_of_once(at: str, named: bool, times: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes none, or does not say which; the loss of some commands is no such case."""
+    scene = Scene(guarded=False, at=at)
+    if not named:
+        receive = scene.controller.receive_state
+        unnamed = lambda state, now_ns: receive(replace(state, command_epoch=0, command_seq=0), now_ns)  # noqa: E731
+        monkeypatch.setattr(scene.controller, "receive_state", unnamed)
+    scene.drive(20.0)
+    assert [notice.code for notice in scene.controller.notices()].count("commands_untaken") == times
 
 
 @pytest.mark.parametrize("drop", [lambda _: True, lambda k: k % 3 == 0], ids=["a burst", "every third"])
