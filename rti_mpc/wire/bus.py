@@ -10,14 +10,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 from weakref import WeakSet
 
 from rti_mpc.contract.message import Notice
 from rti_mpc.errors import MessageError
 from rti_mpc.wire import connection, document, presence
-from rti_mpc.wire.cdr import M, Message
+from rti_mpc.wire.cdr import M
 from rti_mpc.wire.certificate import warn_of_end
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Key, Keys
@@ -27,14 +26,15 @@ from rti_mpc.wire.received import Received as Received
 from rti_mpc.wire.session import BusSettings as BusSettings
 from rti_mpc.wire.streams import ALIVE, MAX_REQUEST_BYTES, role_of
 from rti_mpc.wire.zenoh_session import CLOSE_TIMEOUT_S, ZenohSession
+from rti_mpc.wire.zenoh_session import Declared as Declared
+from rti_mpc.wire.zenoh_session import Publisher as Publisher
+from rti_mpc.wire.zenoh_session import Subscriber as Subscriber
 
 RING_MESSAGES = 1024  # messages that wait for a receiver: those of half a second at 2000 per second
 MAX_NUMBER = 10_000_000  # below it are the numbers of processes that share a role
 RETRY_INTERVAL_S = 0.1  # between two attempts to reach a process that is not there yet
 SETTLED_S = 0.5  # without a new link, after which all others are taken to be met
 SETTLING_S = 5.0  # for which that is waited for at most, where others come and go
-
-Sent = TypeVar("Sent", bound=Message, contravariant=True)
 
 
 def unix_s() -> int:
@@ -52,102 +52,6 @@ def new_epoch() -> int:
     return time.time_ns() // 1_000_000
 
 
-class Declared(Protocol):
-    """A declaration on the bus that lasts until it is undeclared."""
-
-    def undeclare(self) -> object:
-        """End the declaration."""
-
-
-class Publisher(Protocol[Sent]):
-    """Sender of the messages of a stream, see `rti_mpc.wire.zenoh_session.ZenohPublisher`."""
-
-    @property
-    def heard(self) -> bool:
-        """Whether anybody listens now; always true for a cached publisher."""
-
-    def put(self, message: Sent) -> None:
-        """Send a message; never blocks, and does nothing once the session is closed."""
-
-    def put_bytes(self, payload: bytes) -> None:
-        """Send bytes as they are."""
-
-    def undeclare(self) -> object:
-        """Leave the key."""
-
-
-class Subscriber(Protocol):
-    """Receiver of a stream, see `rti_mpc.wire.zenoh_session.ZenohSubscriber`."""
-
-    def recv(self) -> Received | None:
-        """Next sample, waiting for it; `WOKEN` if it was woken instead; None once the session is closed."""
-
-    def try_recv(self) -> Received | None:
-        """Next sample, None if there is none now."""
-
-    def drain(self) -> list[Received]:
-        """All samples there are now, oldest first."""
-
-    def wake(self) -> None:
-        """Have `recv`, in another thread, return `WOKEN`, now or when it is next called, unless messages are taken before by `try_recv`."""
-
-    def undeclare(self) -> object:
-        """Stop receiving."""
-
-
-class Session(Protocol):
-    """Connection of one process to the others, of any robot: the part of Zenoh that a bus needs, see `rti_mpc.wire.zenoh_session`."""
-
-    @property
-    def connects_to(self) -> str:
-        """Endpoints that it connects to, and what is wrong there, in words; empty if it waits for others to connect."""
-
-    @property
-    def routers(self) -> frozenset[str]:
-        """Numbers of the routers that this process is linked to; empty for peers, and once it is closed."""
-
-    def again(self, timeout_s: float, stop: threading.Event) -> Session:
-        """
-        Open another session with the same settings, as a client.
-
-        Raises:
-            ConfigError: No router was there in time.
-            Stopped: The wait was ended by `stop`.
-        """
-
-    @property
-    def certificate(self) -> Path | None:
-        """Certificate with which it has joined, PEM; None without TLS."""
-
-    @property
-    def links(self) -> int | None:
-        """Number of other processes that this one is linked to; None once it is closed."""
-
-    def publisher(self, key: Key[M]) -> Publisher[M]:
-        """Publisher of a stream."""
-
-    def subscriber(self, key: Key[Any], capacity: int, *, history: bool, wakes: bool = False) -> Subscriber:
-        """Subscriber to a stream."""
-
-    def serve(self, key: Key[Any], answer: Callable[[Received], bytes | None]) -> Declared:
-        """Answer queries, in a thread of its own."""
-
-    def ask(self, key: Key[Any], payload: bytes, timeout_s: float) -> Iterator[Received]:
-        """Yield the answers of all processes that serve a key."""
-
-    def token(self, key: Key[Any]) -> Declared:
-        """Show presence."""
-
-    def present(self, key: Key[Any], timeout_s: float) -> bool:
-        """Whether anybody shows presence within the timeout."""
-
-    def watch(self, key: Key[Any], tell: Callable[[str, bool], None]) -> Declared:
-        """Report each key with whether its owner is present, for all now and then at every change."""
-
-    def close(self) -> None:
-        """Close the session, in bounded time."""
-
-
 class Bus:
     """
     Streams of one robot.
@@ -157,7 +61,14 @@ class Bus:
         closed: Whether `close` was called.
     """
 
-    def __init__(self, session: Session, keys: Keys, *, stop: threading.Event | None = None, say: Callable[[str], object] = lambda _: None) -> None:
+    def __init__(
+        self,
+        session: ZenohSession,
+        keys: Keys,
+        *,
+        stop: threading.Event | None = None,
+        say: Callable[[str], object] = lambda _: None,
+    ) -> None:
         """
         Open the streams of one robot on a session, which may carry those of other robots as well.
 

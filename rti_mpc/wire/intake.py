@@ -6,12 +6,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from struct import error as StructError
-from typing import Generic, Protocol
+from typing import Generic
 
 from rti_mpc.contract.epoch import EPOCH_LEAD, highest_believed
 from rti_mpc.contract.message import Notice, Reference, Severity, State
 from rti_mpc.wire.cdr import MESSAGE_VERSION, M, Message, Refused, decode, encode, encoding
 from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
+from rti_mpc.wire.received import Received
 from rti_mpc.wire.source import Source, Verdict
 
 OPTIONAL_ARRAYS = {(Reference, "p"), (State, "u")}  # arrays that may be left out: nominal parameters, inputs that are not reported
@@ -31,22 +32,6 @@ def taken(message: Message) -> bytes:
         raise Refused("value", f"integers must fit into their fields, got: {error}") from None
     decode(type(message), payload)
     return payload
-
-
-class Payload(Protocol):
-    """Payload from the bus, see `rti_mpc.wire.received.Received`."""
-
-    @property
-    def payload(self) -> bytes:
-        """Bytes as they came."""
-
-    @property
-    def encoding(self) -> str:
-        """Encoding that the sender declares."""
-
-    @property
-    def size(self) -> int:
-        """Number of bytes sent; if they are more than the key allows, `payload` is empty."""
 
 
 class Intake(Generic[M]):
@@ -95,7 +80,7 @@ class Intake(Generic[M]):
         self._pending: dict[str, Notice] = {}
         self._said_ns: dict[str, int] = {}
 
-    def read(self, received: Payload, known: int = 0) -> M | None:
+    def read(self, received: Received, known: int = 0) -> M | None:
         """
         Return the message in a payload of any sender; None if it is malformed, or its epoch is not believed.
 
@@ -125,7 +110,7 @@ class Intake(Generic[M]):
         if self._last:
             decode(self._cls, self._last)
 
-    def accept(self, received: Payload, now_ns: int) -> M | None:
+    def accept(self, received: Received, now_ns: int) -> M | None:
         """
         Return the message in a payload; None if it is malformed, repeated or not from the source.
 
@@ -154,14 +139,14 @@ class Intake(Generic[M]):
             self._note(Severity.WARNING, "source_refused", f"{text}; {self.source.dropped} dropped so far")
         return None
 
-    def newest(self, waiting: Iterable[Payload], now_ns: int) -> M | None:
+    def newest(self, waiting: Iterable[Received], now_ns: int) -> M | None:
         """Return the last message that is accepted among several payloads, oldest first; None if none is."""
         message = None
         for received in waiting:
             message = self.accept(received, now_ns) or message
         return message
 
-    def newest_of_each(self, waiting: Iterable[Payload], counts: Callable[[M], bool] = lambda _: True) -> list[M]:
+    def newest_of_each(self, waiting: Iterable[Received], counts: Callable[[M], bool] = lambda _: True) -> list[M]:
         """
         Return the last message of each epoch among several payloads, for a receiver that judges all sources itself.
 
@@ -178,7 +163,7 @@ class Intake(Generic[M]):
                 newest[message.epoch] = message
         return list(newest.values())
 
-    def highest_epoch(self, waiting: Iterable[Payload]) -> int:
+    def highest_epoch(self, waiting: Iterable[Received]) -> int:
         """Return the highest epoch among several payloads of any sender; 0 if none is a message."""
         epoch = 0
         for received in waiting:

@@ -13,12 +13,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from threading import Event, Thread
-from typing import Any, Protocol
+from typing import Any
 
 import zenoh
 
 from rti_mpc.errors import ConfigError, Stopped
 from rti_mpc.wire.keys import Key
+from rti_mpc.wire.zenoh_session import ZenohSession
 
 FIRST_LOOK_S = 2.0  # after presence is first shown, when the process has started
 LOOK_INTERVAL_S = 1.0  # between two looks
@@ -26,27 +27,7 @@ LOOKS = 5  # in vain, one after the other and with both sessions linked to one r
 OPEN_TIMEOUT_S = 10.0  # for the second session
 
 
-class Lookout(Protocol):
-    """What is needed of a session."""
-
-    @property
-    def routers(self) -> frozenset[str]:
-        """Numbers of the routers that it is linked to."""
-
-    def again(self, timeout_s: float, stop: Event) -> Lookout:
-        """Open another session with the same settings."""
-
-    def token(self, key: Key[Any]) -> Any:
-        """Show presence until what is returned is undeclared."""
-
-    def present(self, key: Key[Any], timeout_s: float) -> bool:
-        """Whether anybody shows presence within the timeout."""
-
-    def close(self) -> None:
-        """Close the session."""
-
-
-def watch(session: Lookout, key: Key[Any], tell: Callable[[], object], over: Event) -> None:
+def watch(session: ZenohSession, key: Key[Any], tell: Callable[[], object], over: Event) -> None:
     """
     Look, in a thread of its own, whether presence is seen, and tell once if it is certain that it is not.
 
@@ -73,7 +54,7 @@ def watch(session: Lookout, key: Key[Any], tell: Callable[[], object], over: Eve
     Thread(target=look, name="presence", daemon=True).start()
 
 
-def unseen(session: Lookout, other: Lookout, key: Key[Any], over: Event) -> bool:
+def unseen(session: ZenohSession, other: ZenohSession, key: Key[Any], over: Event) -> bool:
     """Whether presence is certainly not seen by another session at the same router."""
     in_vain = 0
     while in_vain < LOOKS:

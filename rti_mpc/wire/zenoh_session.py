@@ -22,7 +22,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any, Generic
+from typing import Any, Generic, Protocol
 
 import zenoh
 from zenoh import ext
@@ -46,7 +46,14 @@ JSON_ENCODING = "application/json"  # of descriptions, requests and answers
 give_way: Callable[[], None] = getattr(os, "sched_yield", lambda: None)  # not on every system
 
 
-class ZenohPublisher(Generic[M]):
+class Declared(Protocol):
+    """A declaration that lasts until it is undeclared."""
+
+    def undeclare(self) -> object:
+        """End the declaration."""
+
+
+class Publisher(Generic[M]):
     """Publisher of a stream. `put` never blocks, and does nothing once the publisher is undeclared or the session closed."""
 
     def __init__(self, publisher: zenoh.Publisher | ext.AdvancedPublisher, *, realtime: bool = False) -> None:
@@ -81,7 +88,7 @@ class ZenohPublisher(Generic[M]):
         publisher.undeclare()
 
 
-class ZenohSubscriber:
+class Subscriber:
     """Subscriber to one key expression, with a ring of the newest samples, oldest first. It is empty after `ZenohSession.close`."""
 
     def __init__(
@@ -136,7 +143,11 @@ class ZenohSubscriber:
         return list(islice(iter(self.try_recv, None), self._capacity))
 
     def wake(self) -> None:
-        """Have `recv` return `WOKEN`, see `rti_mpc.wire.bus.Subscriber.wake`; nothing once the session is closed."""
+        """
+        Have `recv`, in another thread, return `WOKEN`, now or when it is next called, unless messages are taken before by `try_recv`.
+
+        Does nothing once the session is closed.
+        """
         assert self._put_here is not None, "a subscriber to be woken must be declared so"
         with suppress(zenoh.ZError):
             self._put_here(self._wake)
@@ -159,7 +170,7 @@ class ZenohSubscriber:
 
 
 class ZenohSession:
-    """A session as `rti_mpc.wire.bus.Session` describes it."""
+    """Connection of one process to the others, of any robot: the part of Zenoh that a bus needs."""
 
     def __init__(
         self,
@@ -221,7 +232,13 @@ class ZenohSession:
             return frozenset()
 
     def again(self, timeout_s: float, stop: threading.Event) -> ZenohSession:
-        """Open another session with the same settings, see `rti_mpc.wire.bus.Session.again`."""
+        """
+        Open another session with the same settings, as a client.
+
+        Raises:
+            ConfigError: No router was there in time.
+            Stopped: The wait was ended by `stop`.
+        """
         return ZenohSession(replace(self._settings, mode="client", listen=()), timeout_s=timeout_s, stop=stop)
 
     @property
@@ -246,7 +263,7 @@ class ZenohSession:
         """Return the numbers of the peers that this process is linked to."""
         return {str(peer) for peer in self._session.info.peers_zid()}
 
-    def publisher(self, key: Key[M]) -> ZenohPublisher[M]:
+    def publisher(self, key: Key[M]) -> Publisher[M]:
         """Publisher of a stream, with the quality of service that the table gives it."""
         message, qos = key.stream.message, key.stream.qos
         options: Any = {
@@ -257,14 +274,12 @@ class ZenohSession:
             "allowed_destination": zenoh.Locality.REMOTE,
         }
         if not qos.cached:
-            return ZenohPublisher(self._session.declare_publisher(key, **options), realtime=qos.express)
+            return Publisher(self._session.declare_publisher(key, **options), realtime=qos.express)
         # Without heartbeats a subscriber would not notice that the last message was dropped.
         options["sample_miss_detection"] = ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None)
-        return ZenohPublisher(
-            ext.declare_advanced_publisher(self._session, key, cache=ext.CacheConfig(qos.cached), publisher_detection=True, **options)
-        )
+        return Publisher(ext.declare_advanced_publisher(self._session, key, cache=ext.CacheConfig(qos.cached), publisher_detection=True, **options))
 
-    def subscriber(self, key: Key[Any], capacity: int, *, history: bool, wakes: bool = False) -> ZenohSubscriber:
+    def subscriber(self, key: Key[Any], capacity: int, *, history: bool, wakes: bool = False) -> Subscriber:
         """Subscriber to a stream, see `rti_mpc.wire.bus.Bus.subscriber`."""
         capacity = key.stream.capacity(capacity)
         ring: Any = zenoh.handlers.RingChannel(capacity)
@@ -272,15 +287,15 @@ class ZenohSession:
         if wakes:
             assert not key.stream.qos.cached
             put_here = partial(self._session.put, key, allowed_destination=zenoh.Locality.SESSION_LOCAL)
-            return ZenohSubscriber(self._session.declare_subscriber(key, ring), key, capacity, "", put_here)
+            return Subscriber(self._session.declare_subscriber(key, ring), key, capacity, "", put_here)
         if not (history and key.stream.qos.cached):
-            return ZenohSubscriber(self._session.declare_subscriber(key, ring, allowed_origin=origin), key, capacity, own="")
+            return Subscriber(self._session.declare_subscriber(key, ring, allowed_origin=origin), key, capacity, own="")
         request = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
         recovery = ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
         subscriber = ext.declare_advanced_subscriber(self._session, key, ring, allowed_origin=origin, history=request, recovery=recovery)
-        return ZenohSubscriber(subscriber, key, capacity, own=str(self._session.info.zid()))
+        return Subscriber(subscriber, key, capacity, own=str(self._session.info.zid()))
 
-    def serve(self, key: Key[Any], answer: Callable[[Received], bytes | None]) -> Any:
+    def serve(self, key: Key[Any], answer: Callable[[Received], bytes | None]) -> Declared:
         """Answer queries, in a thread of its own, until what is returned is undeclared; None is no answer."""
         ring: Any = zenoh.handlers.RingChannel(RING_QUERIES)
         queryable = self._session.declare_queryable(key, ring)
@@ -310,7 +325,7 @@ class ZenohSession:
             if reply.ok is not None:
                 yield _withheld(reply.ok.payload, key, document.MAX_DOCUMENT_BYTES)
 
-    def token(self, key: Key[Any]) -> Any:
+    def token(self, key: Key[Any]) -> Declared:
         """Show presence until what is returned is undeclared, the session closed or the process gone."""
         return self._session.liveliness().declare_token(key)
 
@@ -318,7 +333,7 @@ class ZenohSession:
         """Whether anybody shows presence within the timeout, this process included."""
         return any(reply.ok is not None for reply in self._session.liveliness().get(key, timeout=timeout_s))
 
-    def watch(self, key: Key[Any], tell: Callable[[str, bool], None]) -> Any:
+    def watch(self, key: Key[Any], tell: Callable[[str, bool], None]) -> Declared:
         """Report, in a thread of its own, each key with whether its owner is present, for all now and then at every change."""
         ring: Any = zenoh.handlers.RingChannel(RING_TOKENS)
         subscriber = self._session.liveliness().declare_subscriber(key, ring, history=True)

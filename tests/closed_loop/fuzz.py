@@ -10,7 +10,6 @@ else may happen.
 from __future__ import annotations
 
 from collections import Counter, deque
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.wire.actuator import Actuator
 from rti_mpc.wire.cdr import decode, encode, encoding
 from rti_mpc.wire.intake import Intake
+from rti_mpc.wire.received import Received
 from rti_mpc_service.injection import FAILURES, FaultyRti
 from tests.problems import pioneer
 
@@ -32,16 +32,6 @@ WINDOW_NS = 75 * MS  # in which inputs change by no more than the slew limits: a
 LATENCY_NS = 10 * MS
 # One is a matter of clocks, here; the other is no failure to the controller.
 FAULTS = tuple(failure for failure in FAILURES if failure not in ("over_budget", "gradient"))
-
-
-@dataclass(slots=True)
-class Payload:
-    payload: bytes
-    encoding: str
-
-    @property
-    def size(self) -> int:
-        return len(self.payload)
 
 
 class Fuzz:
@@ -78,7 +68,7 @@ class Fuzz:
         self._actuator = Actuator(np.zeros(2), STEP / 0.1, self._epoch)
         self._played: deque[tuple[int, float, float, bool]] = deque()  # until when, what, and whether the robot braked on its own
         self._queue.clear()
-        self._waiting: Payload | None = None  # the newest state that the controller has not had time for
+        self._waiting: Received | None = None  # the newest state that the controller has not had time for
         self._busy_ns = now_ns  # until when it has none
         self._settled_ns = 0  # until when after a jump nobody but the robot, and a guard beside it, knows what acts
         self._ordered_ns = 0  # until when no state overtakes another
@@ -151,7 +141,7 @@ class Fuzz:
         else:
             self._receive(received, arrival_ns)
 
-    def _receive(self, received: Payload, arrival_ns: int) -> None:
+    def _receive(self, received: Received, arrival_ns: int) -> None:
         """Let the controller answer a state."""
         rng, controller = self.rng, self.controller
         self._waiting = None
@@ -214,7 +204,7 @@ class Fuzz:
             stamp_ns -= int(rng.integers(0, 200)) * MS  # one that was sent before
         return State(self._epoch, self._seq, stamp_ns, x)
 
-    def _received(self, payload: bytes, kind: str) -> Payload:
+    def _received(self, payload: bytes, kind: str) -> Received:
         """Return the payload of a message as received: cut, changed or of another encoding at times."""
         rng, r = self.rng, self.rng.random()
         if r < 0.005:
@@ -227,7 +217,7 @@ class Fuzz:
             payload = rng.bytes(int(rng.integers(0, 200)))
         elif r < 0.014:
             kind = "application/json"
-        return Payload(payload, kind)
+        return Received(payload, kind, "")
 
     # What else happens.
 
@@ -279,7 +269,7 @@ class Fuzz:
         self._waiting = None
         kept = sorted(self.rng.choice(np.arange(first_ns, last_ns, DT), size=2))
         for stamp_ns in kept:
-            self._receive(Payload(encode(self._state(int(stamp_ns))), encoding(State)), self._busy_ns)
+            self._receive(Received(encode(self._state(int(stamp_ns))), encoding(State), ""), self._busy_ns)
 
     def _restart(self) -> None:
         """Begin another life of the robot, which stands, on another clock, at another speed of time."""

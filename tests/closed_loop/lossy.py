@@ -24,7 +24,8 @@ from rti_mpc.control.controller import Controller, Timing
 from rti_mpc.rti.rti import Rti
 from rti_mpc.wire.actuator import Actuator
 from rti_mpc.wire.cdr import decode, encode
-from tests.closed_loop.fuzz import BOUND, DT, MS, ROUNDING, STEP, WINDOW_NS, Fuzz, Payload
+from rti_mpc.wire.received import Received
+from tests.closed_loop.fuzz import BOUND, DT, MS, ROUNDING, STEP, WINDOW_NS, Fuzz
 from tests.problems import pioneer
 
 TICK_NS = 20 * MS  # of the guard
@@ -128,7 +129,7 @@ class Lossy(Fuzz):
             self._link(to, state, self._now_ns)
         return state
 
-    def _receive(self, received: Payload, arrival_ns: int) -> None:
+    def _receive(self, received: Received, arrival_ns: int) -> None:
         if self.rng.random() < 0.03:
             self._waiting = None
             self.seen["lost to controller"] += 1

@@ -18,7 +18,7 @@ Said = tuple[Kind, str, str]  # how a key is used, the name of its stream, and t
 
 class FakeSession:
     """
-    A session as `rti_mpc.wire.bus.Session` describes it.
+    A session as `rti_mpc.wire.zenoh_session.ZenohSession`, as far as a bus needs one.
 
     Attributes:
         said: Everything that was ever declared to be published, answered or shown.
