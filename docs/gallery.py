@@ -18,7 +18,6 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from rti_mpc.array import Array
@@ -194,7 +193,6 @@ def draw(run: Drive, view: View, path: Path) -> None:
     """Draw the robot along its path, and its errors over time."""
     with mpl.rc_context(PLOT_STYLE):
         page = Figure(figsize=(8.4, 3.6), layout="constrained")
-        FigureCanvasAgg(page)
         plan, errors = page.subplots(1, 2, width_ratios=[1.25, 1.0])
         if view.wanted is not None:
             plan.plot(*np.array([view.wanted(y) for y in run.y_ref]).T, color=REFERENCE_COLOR, linewidth=4.0, alpha=0.55, label="reference")

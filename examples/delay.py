@@ -49,11 +49,9 @@ def draw_circle(delay_s: float | None) -> tuple[np.ndarray, np.ndarray, float]:
 
 def draw(runs: dict[str, np.ndarray], wanted: np.ndarray, file: str) -> None:
     """Draw the circles, and the errors over time."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     page = Figure(figsize=(8.4, 3.4), layout="constrained")
-    FigureCanvasAgg(page)
     plan, errors = page.subplots(1, 2, width_ratios=[1.0, 1.4])
     plan.plot(*wanted.T, color="0.8", linewidth=5.0)
     for name, drawn in runs.items():

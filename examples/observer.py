@@ -44,11 +44,9 @@ def sail(config: Config) -> tuple[np.ndarray, np.ndarray]:
 
 def draw(ways: dict[str, np.ndarray], wanted: np.ndarray, file: str) -> None:
     """Draw the ways sailed, and the errors over time."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     page = Figure(figsize=(8.4, 3.4), layout="constrained")
-    FigureCanvasAgg(page)
     plan, errors = page.subplots(1, 2, width_ratios=[1.0, 1.2])
     plan.plot(*wanted.T, color="0.8", linewidth=5.0)
     for name, sailed in ways.items():

@@ -26,12 +26,10 @@ def line(t: np.ndarray) -> np.ndarray:
 
 def draw(run: Simulation, file: str) -> None:
     """Draw the discs and the way around them."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle
 
     page = Figure(figsize=(8.4, 3.2), layout="constrained")
-    FigureCanvasAgg(page)
     axes = page.subplots()
     for x, y, radius in DISCS:
         axes.add_patch(Circle((x, y), radius, color="0.8"))

@@ -56,11 +56,9 @@ class Planner:
 
 def draw(driven: np.ndarray, file: str) -> None:
     """Draw both ways."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     page = Figure(figsize=(8.4, 2.6), layout="constrained")
-    FigureCanvasAgg(page)
     axes = page.subplots()
     axes.plot(*walker(driven[:, 0]).T, linewidth=4.0, alpha=0.4, label="walker")
     axes.plot(*driven[:, 1:3].T, label="robot, a second behind")

@@ -155,11 +155,9 @@ def judged(path: Path, x: np.ndarray, unusable: int, laps: int) -> Lap:
 
 def draw(laps: dict[str, tuple[Path, Lap]], file: str) -> None:
     """Draw the race line on each track, its colour the speed."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     page = Figure(figsize=(15, 5.2), layout="constrained")
-    FigureCanvasAgg(page)
     for axes, (name, (path, lap)) in zip(page.subplots(1, len(laps)), laps.items(), strict=True):
         s = np.linspace(0.0, path.length, 1000)
         centre, along = path.position(s), path.tangent(s)

@@ -63,11 +63,9 @@ def drive(folder: Path) -> list[dict[str, dict]]:
 
 def draw(folder: Path, file: str) -> None:
     """Draw the tracks in one plane."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     page = Figure(figsize=(8.4, 3.6), layout="constrained")
-    FigureCanvasAgg(page)
     axes = page.subplots()
     for name, config in CONFIGS.items():
         with (folder / f"{name}.csv").open(newline="") as log:

@@ -30,11 +30,9 @@ def eight(t: np.ndarray) -> np.ndarray:
 
 def draw(runs: dict[str, Simulation], file: str) -> None:
     """Draw the ways driven, and what was commanded for them."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     page = Figure(figsize=(8.4, 3.4), layout="constrained")
-    FigureCanvasAgg(page)
     plan, inputs = page.subplots(1, 2, width_ratios=[1.0, 1.4])
     for name, run in runs.items():
         plan.plot(*run.x[:, :2].T, linewidth=1.2)

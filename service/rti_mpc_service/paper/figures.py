@@ -10,7 +10,6 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from rti_mpc.array import Array
@@ -63,7 +62,6 @@ def page(path: Path, paint: Callable[[Figure, Any], None], content: Any) -> None
     """Write one figure."""
     with mpl.rc_context(PLOT_STYLE):
         figure = Figure(figsize=(9.6, 4.6), layout="constrained")
-        FigureCanvasAgg(figure)
         paint(figure, content)
         figure.savefig(path, dpi=DPI, metadata={"Software": None})
 

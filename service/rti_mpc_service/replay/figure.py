@@ -10,7 +10,6 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from rti_mpc.signals import as_label
@@ -38,7 +37,6 @@ def figure(runs: Sequence[Run], path: Path, title: str) -> None:
     columns: list[list[Panel]] = [[_path], [_distance, *commands]] if planar else [outputs, commands]
     with mpl.rc_context(PLOT_STYLE):
         page = Figure(figsize=(13.0, max(6.0, 1.9 * max(map(len, columns)))), layout="constrained")
-        FigureCanvasAgg(page)
         page.suptitle(as_label(title), x=0.01, ha="left", fontsize=12)
         halves = page.add_gridspec(1, 2, width_ratios=[1.0, 1.15])
         for half, panels in enumerate(columns):

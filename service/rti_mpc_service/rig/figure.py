@@ -11,7 +11,6 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 
@@ -63,7 +62,6 @@ def figure(run: Run, path: Path) -> None:
         below = 0 if run.planar else ny
         above = PATH_PANELS if not run.planar and (run.along is not None or plane(run.info.outputs) is not None) else 0
         page = Figure(figsize=(13.0, max(7.6, 1.8 * len(panels), 1.8 * (above + below))), layout="constrained")
-        FigureCanvasAgg(page)
         halves = page.add_gridspec(1, 2, width_ratios=[1.0, 1.15])
         left = halves[0].subgridspec(above + below, 1) if above else None
         if run.planar or left is not None:

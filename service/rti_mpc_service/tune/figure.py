@@ -9,7 +9,6 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from rti_mpc.signals import as_label
@@ -41,7 +40,6 @@ def figure(
     """
     with mpl.rc_context(PLOT_STYLE):
         page = Figure(figsize=(12.0, 5.4), layout="constrained")
-        FigureCanvasAgg(page)
         left, right = page.subplots(1, 2)
         name, trials, front, today, chosen = studied
         _points(left, trials, color=REFERENCE_COLOR, size=3.5, label=f"{len(trials)} trials")
