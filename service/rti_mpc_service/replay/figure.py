@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rti_mpc.signals import as_label
-from rti_mpc_service.rig.figure import COMMAND_COLOR, LIMIT_COLOR, MEASURED_COLOR, MIN_DRAWN_MM, PLOT_STYLE, REFERENCE_COLOR
+from rti_mpc_service.rig.figure import COMMAND_COLOR, LIMIT_COLOR, MEASURED_COLOR, MIN_DRAWN_MM, PLOT_STYLE, REFERENCE_COLOR, legend_above
 from rti_mpc_service.rig.run_data import Run
 
 COLORS = MEASURED_COLOR, COMMAND_COLOR  # of the recorded drive, and of the closed loop
@@ -49,13 +49,8 @@ def figure(runs: Sequence[Run], path: Path, title: str) -> None:
                     axes.tick_params(labelbottom=k == len(panels) - 1)
                     axes.set_xlabel("time since the first state [s]" if k == len(panels) - 1 else "")
             if half or not planar:
-                axes_legend(page.axes[-len(panels)])
+                legend_above(page.axes[-len(panels)])
         page.savefig(path, dpi=130)
-
-
-def axes_legend(axes: Axes) -> None:
-    """Put the legend beside the title, where it covers nothing."""
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=3, borderaxespad=0.0, borderpad=0.2)
 
 
 def _times(run: Run, runs: Sequence[Run]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

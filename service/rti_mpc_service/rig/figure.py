@@ -114,7 +114,7 @@ def _error(axes: Axes, run: Run) -> None:
         label = f"after the transient: max {settled.max():.3g} mm, rms {np.sqrt((settled**2).mean()):.3g} mm"
         axes.axhline(settled.max(), color=ERROR_COLOR, linewidth=0.9, linestyle="--", label=label)
     axes.set(title="Tracking error", ylabel="distance [mm]")
-    _legend_above(axes)
+    legend_above(axes)
 
 
 def _output(axes: Axes, run: Run, i: int) -> None:
@@ -126,7 +126,7 @@ def _output(axes: Axes, run: Run, i: int) -> None:
     axes.plot(run.time_s, run.reference[:, i] + run.output_error[:, i], color=MEASURED_COLOR, label=f"true{said}")
     axes.margins(y=0.12)
     axes.set(title=as_label(f"Output {label.name}" if i else f"Output {label.name}: {run.scenario}"), ylabel=as_label(f"[{label.unit}]"))
-    _legend_above(axes)
+    legend_above(axes)
 
 
 def _command(axes: Axes, run: Run, i: int) -> None:
@@ -141,7 +141,7 @@ def _command(axes: Axes, run: Run, i: int) -> None:
     axes.plot([], [], color=LIMIT_COLOR, linewidth=1.0, linestyle="--", label="limits")
     axes.margins(y=0.12)
     axes.set(title=as_label(f"Command {label.name}"), ylabel=as_label(f"[{label.unit}]"))
-    _legend_above(axes)
+    legend_above(axes)
 
 
 def _phases(axes: Axes, run: Run) -> None:
@@ -159,6 +159,6 @@ def _phases(axes: Axes, run: Run) -> None:
     axes.legend(loc="upper right", ncols=2)
 
 
-def _legend_above(axes: Axes) -> None:
+def legend_above(axes: Axes) -> None:
     """Put the legend beside the title, where it covers nothing."""
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=3, borderaxespad=0.0, borderpad=0.2)
