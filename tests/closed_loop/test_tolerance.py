@@ -8,7 +8,8 @@ import pytest
 from rti_mpc.rti.construction import FORMULATIONS
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import Rti
-from rti_mpc_service.bench.bench import closed_loop_cost, paper_ocp
+from rti_mpc_service.bench.bench import closed_loop_cost
+from rti_mpc_service.bench.families import paper_ocp
 from tests.slow import slow_but
 
 pytestmark = pytest.mark.usefixtures("interpreted")

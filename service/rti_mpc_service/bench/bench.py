@@ -27,11 +27,11 @@ from rti_mpc.array import Array
 from rti_mpc.contract.status import QpStatus
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
-from rti_mpc.reference.trajectory import eight, positioning, rows
-from rti_mpc.rti.ocp import Ocp
+from rti_mpc.reference.trajectory import eight, positioning
 from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.qp.qpsolvers import check_name
 from rti_mpc.rti.rti import Rti
+from rti_mpc_service.bench.families import paper_ocp, reference_rows
 from rti_mpc_service.bench.parts import PARTS, Parts
 from rti_mpc_service.bench.yardstick import Ipopt
 from rti_mpc_service.console import print_whole, table_console
@@ -62,32 +62,12 @@ class Times:
         return np.asarray(np.add(self.prepare, self.feedback))
 
 
-def paper_ocp(N: int) -> Ocp:
-    """Return the paper's problem."""
-    inf = np.inf
-    return Ocp(
-        pioneer_3dx(),
-        N=N,
-        dt=DT_S,
-        method="euler",
-        Q=[1, 1, 0.05],
-        R=[1, 1],
-        delta=28,
-        lambda_=0.8,
-        lbu=[-0.5, -0.745],
-        ubu=[0.5, 0.745],
-        lbx=[-inf, -inf, -inf, -0.5, -0.745],
-        ubx=[inf, inf, inf, 0.5, 0.745],
-    )
-
-
 def samples(N: int, quick: bool) -> Iterator[tuple[str, int, Array, Array]]:
     """Yield scenario, sample, reference rows at nodes 1 to N, and the initial state, for all samples of both scenarios."""
     for trajectory, duration_s in ((eight(), 4.0 if quick else 80.0), (positioning(), 4.0 if quick else 40.0)):
         x0 = np.array([*trajectory.pose0, 0.0, 0.0])
         count = round(duration_s / DT_S)
-        y = rows(trajectory.lasting(duration_s + (N + 2) * DT_S), DT_S, "tangent")
-        y[:, 2] += 2 * np.pi * np.round((x0[2] - y[0, 2]) / (2 * np.pi))
+        y = reference_rows(trajectory, count, N)
         for k in range(count):
             yield trajectory.name, k, y[k + 1 : k + 1 + N], x0
 

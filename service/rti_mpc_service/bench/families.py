@@ -19,6 +19,7 @@ from rti_mpc.array import Array
 from rti_mpc.model.integrator import integrator
 from rti_mpc.model.model import Model, Signal
 from rti_mpc.model.obstacle import with_obstacles
+from rti_mpc.model.robots.chain import chain as hanging_chain
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.reference.trajectory import Trajectory, eight, positioning, rows
 from rti_mpc.rti.ocp import Ocp
@@ -78,9 +79,13 @@ class Family:
         return float(e @ ocp.Q_at(0) @ e + du @ ocp.R_at(0) @ du + z @ s + 0.5 * s @ (Z * s))
 
 
+def paper_ocp(N: int) -> Ocp:
+    """Return the paper's problem."""
+    return Ocp(pioneer_3dx(), N=N, dt=0.1, method="euler", Q=[1, 1, 0.05], **COST_WEIGHTS, **INPUT_BOUNDS, **SPEED_BOUNDS)
+
+
 def paper(N: int) -> Family:
     """Return the paper's problem on its two trajectories."""
-    ocp = Ocp(pioneer_3dx(), N=N, dt=0.1, method="euler", Q=[1, 1, 0.05], **COST_WEIGHTS, **INPUT_BOUNDS, **SPEED_BOUNDS)
     driven = (eight(), 800), (positioning(), 400)
     legs = [(reference_rows(trajectory, count, N), np.array([*trajectory.pose0, 0.0, 0.0])) for trajectory, count in driven]
 
@@ -88,7 +93,7 @@ def paper(N: int) -> Family:
         leg, j = divmod(k, 800)
         return legs[leg][0][j + 1 : j + 1 + N], None
 
-    return Family(ocp, 1200, at, lambda k: legs[k // 800][1] if k % 800 == 0 else None, substeps=20)
+    return Family(paper_ocp(N), 1200, at, lambda k: legs[k // 800][1] if k % 800 == 0 else None, substeps=20)
 
 
 def tight(N: int) -> Family:
@@ -223,26 +228,10 @@ def cart_pole(N: int) -> Family:
 
 def chain(N: int, masses: int) -> Family:
     """Return a hanging chain between a fixed point and one whose velocity is commanded, with a wall, disturbed six times [Wirsching2006]."""
-    free = masses - 2
-    nx, mass, stiffness, rest_length = 3 * (2 * free + 1), 0.033, 1.0, 0.033
-    whole, u = ca.SX.sym("whole", nx), ca.SX.sym("u", 3)
-    at, velocity = whole[: 3 * (free + 1)], whole[3 * (free + 1) :]
-    acceleration = ca.SX(ca.repmat(ca.DM([0.0, 0.0, -9.81]), free))
-    for link in range(free + 1):
-        stretched = at[3 * link : 3 * link + 3] - (at[3 * link - 3 : 3 * link] if link else 0.0)
-        pull = stiffness / mass * (1.0 - rest_length / ca.norm_2(stretched)) * stretched
-        if link < free:
-            acceleration[3 * link : 3 * link + 3] -= pull
-        if link:
-            acceleration[3 * link - 3 : 3 * link] += pull
-    held = np.array([1.0, 0.0, 0.0])
-    hanging = ca.SX.sym("hanging", 3 * free)
-    forces = ca.substitute(acceleration, at, ca.vertcat(hanging, ca.DM(held)))
-    guess = np.stack([np.linspace(0.0, 1.0, masses)[1:-1], np.zeros(free), np.full(free, -0.3)], axis=1).ravel()
-    found = ca.rootfinder("rest", "newton", {"x": hanging, "g": forces})(x0=guess)["x"]
-    rest = np.concatenate([np.array(found).ravel(), held, np.zeros(3 * free)])
+    hung, free = hanging_chain(masses, drag=0.0), masses - 2
+    nx = hung.nx
     x = ca.SX.sym("x", nx)  # deviation from rest
-    model = plain(f"chain_{masses}", x, u, ca.substitute(ca.vertcat(velocity, u, acceleration), whole, x + ca.DM(rest)))
+    model = plain(f"chain_{masses}", x, hung.u, ca.substitute(hung.f_expl_expr, hung.x, x + ca.DM(hung.x_nominal)))
     lbx = np.full(nx, -INF)
     lbx[1 : 3 * (free + 1) : 3] = -0.05  # m: the wall
     Q = [2.0] * (3 * free) + [2.5] * 3 + [0.25] * (3 * free)
