@@ -14,14 +14,14 @@ from mcap.records import Attachment, Channel, Metadata
 from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.recording.host import HOST
 from rti_mpc.recording.mcap_file import McapFile
-from rti_mpc.recording.ros2 import JSON, read_text
+from rti_mpc.recording.ros2 import read_text
 from rti_mpc.recording.writer import ABOUT, OUTCOME
 from rti_mpc.wire import document
-from rti_mpc.wire.cdr import decode, encoding
+from rti_mpc.wire.cdr import decode
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.layout import STAMP_LIMIT_NS
 from rti_mpc.wire.received import Received
-from rti_mpc.wire.streams import STREAMS, Kind, Stream
+from rti_mpc.wire.streams import JSON_ENCODING, STREAMS, Kind, Stream
 
 STREAM_OF_NAME: dict[str, Stream[Any]] = {stream.name: stream for stream in (*STREAMS, HOST) if stream.kind is Kind.MESSAGE}
 TIME = re.compile(r"-?[0-9]{1,19}")
@@ -109,11 +109,10 @@ class Recording:
                 elif content.name == OUTCOME:
                     self.outcome = content.metadata
             elif isinstance(content, Channel) and (stream := STREAM_OF_NAME.get(content.metadata.get("stream", ""))) is not None:
-                expected = JSON if stream.message is None else encoding(stream.message)
                 if missing := NAMED - content.metadata.keys():
                     raise MessageError(f"{path} must say the {' and '.join(sorted(missing))} of its channel {content.topic}, got none")
-                if (got := content.metadata["encoding"]) != expected:
-                    raise MessageError(f"{path} must hold messages of encoding {expected}, got {got}")
+                if (got := content.metadata["encoding"]) != stream.encoding:
+                    raise MessageError(f"{path} must hold messages of encoding {stream.encoding}, got {got}")
                 try:
                     Keys(robot=content.metadata["robot"])  # which becomes the name of a folder
                 except ConfigError as error:
@@ -146,7 +145,7 @@ class Recording:
             }
             for stored in McapFile(path).messages(channels):
                 about = channels[stored.channel_id].metadata
-                payload = read_text(stored.payload) if about["encoding"] == JSON else stored.payload
+                payload = read_text(stored.payload) if about["encoding"] == JSON_ENCODING else stored.payload
                 received = Received(payload, about["encoding"], about["key"])
                 yield Recorded(about["robot"], about["stream"], about["role"], stored.time_ns - self.unix_offset_ns, received)
 

@@ -18,7 +18,6 @@ from rti_mpc.wire.layout import msg_text
 PROFILE = "ros2"
 SCHEMA_ENCODING = "ros2msg"
 MESSAGE_ENCODING = "cdr"
-JSON = "application/json"  # encoding on the bus of what is stored as text
 TEXT_SCHEMA = ("std_msgs/msg/String", "string data\n")
 LENGTH = Struct("<I")
 

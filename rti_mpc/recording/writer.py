@@ -9,8 +9,7 @@ from typing import Any
 from mcap.writer import CompressionType, Writer
 
 from rti_mpc.recording.chunk_file import ChunkFile
-from rti_mpc.recording.ros2 import JSON, MESSAGE_ENCODING, PROFILE, SCHEMA_ENCODING, ros2_schema, topic, write_text
-from rti_mpc.wire.cdr import encoding
+from rti_mpc.recording.ros2 import MESSAGE_ENCODING, PROFILE, SCHEMA_ENCODING, ros2_schema, topic, write_text
 from rti_mpc.wire.keys import Key
 from rti_mpc.wire.streams import role_of
 
@@ -71,7 +70,7 @@ class RecordingWriter:
             if name not in self._schemas:
                 self._schemas[name] = self._writer.register_schema(name, SCHEMA_ENCODING, definition.encode())
             about = {"robot": robot, "stream": key.stream.name, "role": role_of(key) if key.stream.by_role else "", "key": key}
-            about |= {"encoding": JSON if message is None else encoding(message), "offered_qos_profiles": ""}
+            about |= {"encoding": key.stream.encoding, "offered_qos_profiles": ""}
             self._channels[key] = self._writer.register_channel(topic(key), MESSAGE_ENCODING, self._schemas[name], about)
         time_ns = local_ns + self._offset_ns
         self._writer.add_message(self._channels[key], time_ns, write_text(payload) if message is None else payload, time_ns, seq & MAX_UINT32)

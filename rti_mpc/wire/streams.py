@@ -17,13 +17,14 @@ from typing import Any, Generic, Literal
 
 from rti_mpc.contract.message import Command, Event, Journal, Reference, State, Telemetry
 from rti_mpc.wire import document
-from rti_mpc.wire.cdr import M
+from rti_mpc.wire.cdr import M, encoding
 from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES
 
 KNOWN_ROLES = ("controller", "standby", "guard", "robot", "reference", "viewer", "recorder", "router", "operator", "relay", "echo")
 ROLE_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,31}(\.[0-9]{1,7})?", re.ASCII)  # where several processes share a role they are numbered: standby.17
 MAX_UNKNOWN_ROLES = 16  # further roles whose messages are read; limited, since any peer can invent roles
 
+JSON_ENCODING = "application/json"  # of descriptions, requests and answers
 MAX_REQUEST_BYTES = 32_768  # parsing JSON holds the interpreter's lock for 30 ms per megabyte
 MAX_RING_BYTES = 1 << 30  # size of one receiver's ring filled with the longest payloads
 
@@ -88,6 +89,11 @@ class Stream(Generic[M]):
     kind: Kind = Kind.MESSAGE
     by_role: bool = False
     askers: tuple[str, ...] = ()
+
+    @property
+    def encoding(self) -> str:
+        """Encoding of its messages; of a query also that of the answers."""
+        return JSON_ENCODING if self.message is None else encoding(self.message)
 
     @property
     def max_bytes(self) -> int:

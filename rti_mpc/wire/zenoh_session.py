@@ -28,11 +28,12 @@ import zenoh
 from zenoh import ext
 
 from rti_mpc.wire import document
-from rti_mpc.wire.cdr import M, encode, encoding
+from rti_mpc.wire.cdr import M, encode
 from rti_mpc.wire.introduction import Introduction
 from rti_mpc.wire.keys import Key
 from rti_mpc.wire.received import WOKEN, Received
 from rti_mpc.wire.session import BusSettings, certificate, endpoints, guest_config, meets, open_session, zenoh_config
+from rti_mpc.wire.streams import JSON_ENCODING
 
 CLOSE_TIMEOUT_S = 0.5
 HEARTBEAT_S = 1.0  # period at which a cached publisher sends the number of its last message
@@ -41,7 +42,6 @@ RING_TOKENS = 1024  # changes of presence that wait for their receiver
 WAKE_BYTES = 16  # of the message by which a process wakes its own receiver
 RING_QUERIES = 16  # requests that wait for their answer
 CLOSED_WORDS = ("closed", "Undeclared")  # in Zenoh's errors about a session that is closed or a publisher that is undeclared
-JSON_ENCODING = "application/json"  # of descriptions, requests and answers
 
 give_way: Callable[[], None] = getattr(os, "sched_yield", lambda: None)  # not on every system
 
@@ -265,9 +265,9 @@ class ZenohSession:
 
     def publisher(self, key: Key[M]) -> Publisher[M]:
         """Publisher of a stream, with the quality of service that the table gives it."""
-        message, qos = key.stream.message, key.stream.qos
+        qos = key.stream.qos
         options: Any = {
-            "encoding": JSON_ENCODING if message is None else encoding(message),
+            "encoding": key.stream.encoding,
             "priority": getattr(zenoh.Priority, qos.priority),
             "express": qos.express,
             "congestion_control": getattr(zenoh.CongestionControl, qos.congestion),

@@ -21,7 +21,7 @@ from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.errors import ConfigError
 from rti_mpc.recording import Recording
 from rti_mpc.wire.bus import Bus, BusSettings, Declared
-from rti_mpc.wire.cdr import Message, encode, encoding
+from rti_mpc.wire.cdr import Message, encode
 from rti_mpc.wire.keys import Key
 from rti_mpc.wire.received import Received
 from rti_mpc.wire.streams import MAX_UNKNOWN_ROLES, role_of
@@ -52,7 +52,7 @@ class Bench:
 
     def put(self, key: Key, message: Message | bytes, local_ns: int = START_NS, encoded: str = "") -> None:
         payload = message if isinstance(message, bytes) else encode(message)
-        kind = encoded or ("application/json" if key.stream.message is None else encoding(key.stream.message))
+        kind = encoded or key.stream.encoding
         self.recorder._inbox.put(Arrived(KEYS.robot, key.stream, local_ns, Received(payload, kind, key)))
 
     def run(self) -> int:
