@@ -31,6 +31,7 @@ ROLES_OF_VECTOR: dict[str, tuple[Role, ...]] = {
     "parameters": ("axle_offset", *DISC_ROLES, *PATH_ROLES),
     "constraints": (),
 }  # roles that the signals of each vector may have
+KNOTS_BEHIND = 3  # knots of a followed path's window behind a robot: one for the spline, two for robots that move back
 REPEATABLE_ROLES: tuple[Role, ...] = ("", *DISC_ROLES, "path_x")  # roles that several signals of one vector may have
 
 
@@ -117,6 +118,12 @@ class HasRole(Protocol):
 def place(signals: Sequence[HasRole], role: Role) -> int | None:
     """Return the index of the signal of a role; None if there is none."""
     return next((i for i, signal in enumerate(signals) if signal.role == role), None)
+
+
+def path_place(parameters: Sequence[HasRole]) -> tuple[int, int] | None:
+    """Return where a followed path begins among stage parameters, and how many knots it has; None if there is none."""
+    first = place(parameters, "path_start")
+    return None if first is None else (first, sum(signal.role == "path_x" for signal in parameters))
 
 
 def plane(signals: Sequence[HasRole]) -> tuple[int, int] | None:

@@ -33,13 +33,12 @@ import casadi as ca
 from rti_mpc import given
 from rti_mpc.errors import OcpError
 from rti_mpc.model.model import Model
-from rti_mpc.signals import Signal, place, plane
+from rti_mpc.signals import KNOTS_BEHIND, Signal, path_place, place, plane
 
 KNOTS = 24
 LAG_S = 0.1  # time constant of the point's speed behind its command
 NOMINAL_STEP_M, NOMINAL_WIDTH_M, NOMINAL_SPEED_M_S = 0.5, 1.0, 1.0
 KNOT_PARTS = {"x": "m", "y": "m", "right": "m", "left": "m", "speed": "m/s"}  # a knot's parameters, as `Path.window` has them
-KNOTS_BEHIND = 3  # knots of a window behind a robot: one for the spline, two for robots that move back
 
 
 def path_following(model: Model, knots: int = KNOTS, lag_s: float = LAG_S) -> Model:
@@ -167,5 +166,4 @@ def nominal_window(knots: int) -> list[float]:
 
 def window_place(model: Model) -> tuple[int, int] | None:
     """Return where the path's parameters begin among a model's, and how many knots they have; None if it follows no path."""
-    first = place(model.parameters, "path_start")
-    return None if first is None else (first, sum(signal.role == "path_x" for signal in model.parameters))
+    return path_place(model.parameters)

@@ -17,10 +17,10 @@ from rti_mpc import given
 from rti_mpc.array import Array
 from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.reference.path import Path
+from rti_mpc.signals import KNOTS_BEHIND
 
 ARRIVED_M = 0.05  # from the end of a piece at which it counts as driven
 RESTING_M_S = 0.1  # pace below which a robot rests there
-BEHIND = 3  # knots of a window behind a robot: one for the spline, two for robots that move back
 
 
 class PathSource:
@@ -94,7 +94,7 @@ class PathSource:
             self.passed_m += self.path.length
             self.piece += 1
         path = self.path
-        first = math.floor((progress_m - self.passed_m) / path.step_m) - BEHIND
+        first = math.floor((progress_m - self.passed_m) / path.step_m) - KNOTS_BEHIND
         self._p[self._first] = self.passed_m + first * path.step_m
         self._p[self._first + 1] = path.step_m
         self._p[self._window] = path.window(first, self._knots).ravel()

@@ -16,7 +16,7 @@ from typing import Any
 
 from rti_mpc.errors import MessageError
 from rti_mpc.rotation import Rotations
-from rti_mpc.signals import Signal, place, plane
+from rti_mpc.signals import Signal, path_place, place, plane
 from rti_mpc.wire.document import read
 from rti_mpc.wire.layout import NUMBER_LIMIT
 from rti_mpc.wire.received import Received
@@ -221,8 +221,7 @@ class Info:
     @property
     def path(self) -> tuple[int, int] | None:
         """Where the followed path's parameters begin in a reference's `p`, and how many knots it has; None: the robot follows no path."""
-        first = place(self.stage_parameters, "path_start")
-        return None if first is None else (first, sum(label.role == "path_x" for label in self.stage_parameters))
+        return path_place(self.stage_parameters)
 
     def measured(self, i: int) -> int | None:
         """Index of the state that input `i` commands; None: there is none."""

@@ -13,11 +13,11 @@ import pytest
 from rti_mpc.array import Array
 from rti_mpc.errors import ConfigError, OcpError
 from rti_mpc.model.model import Model, Signal
-from rti_mpc.model.path_following import KNOTS, KNOTS_BEHIND, path_following, window_place, with_drift
+from rti_mpc.model.path_following import KNOTS, path_following, window_place, with_drift
 from rti_mpc.model.robots.dynamic_bicycle import dynamic_bicycle
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
 from rti_mpc.reference.path import Path, pieces, smooth_path
-from rti_mpc.reference.path_source import BEHIND, PathSource
+from rti_mpc.reference.path_source import PathSource
 from rti_mpc.reference.speed_profile import SpeedLimits
 from rti_mpc.reference.tracks import track
 from rti_mpc.rti.construction import FORMULATIONS
@@ -84,10 +84,6 @@ def test_augmented_model_has_progress_and_pace_behind_its_own_states() -> None:
     assert [signal.name for signal in model.constraints] == ["alpha_f", "alpha_r", "left", "right", "lateral_acceleration"]
     assert window_place(model) == (len(dynamic_bicycle().parameters), KNOTS)
     assert window_place(dynamic_bicycle()) is None
-
-
-def test_window_reaches_as_far_back_in_library_and_model() -> None:
-    assert BEHIND == KNOTS_BEHIND
 
 
 @pytest.mark.parametrize("at", [0.0, 7.3, 31.0, 90.0])
