@@ -241,6 +241,12 @@ def stiff() -> Model:
     return replace(model, f_expl_expr=ca.vertcat(*rates[:4], 1e4 * (model.u[1] - model.x[4])))
 
 
+def loaded(folder: Path, text: str, *, with_model: bool = True) -> Config:
+    path = folder / "robot.toml"
+    path.write_text(text)
+    return load(path, with_model=with_model)
+
+
 @pytest.mark.parametrize(("right", "wrong", "told"), WRONG, ids=[wrong.replace("\n", " ") or f"no {right}" for right, wrong, _ in WRONG])
 def test_wrong_value_is_refused_in_one_line_that_says_what_would_be_right(
     right: str, wrong: str, told: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -275,9 +281,7 @@ def test_blocks_of_held_inputs_are_those_of_the_file(tmp_path: Path) -> None:
 
 
 def test_configuration_becomes_the_ocp_it_describes(tmp_path: Path) -> None:
-    path = tmp_path / "robot.toml"
-    path.write_text(MINIMAL)
-    ocp = build_ocp(load(path))
+    ocp = build_ocp(loaded(tmp_path, MINIMAL))
     assert (ocp.N, ocp.N_u, ocp.dt, ocp.method) == (3, 3, 0.1, "euler")
     np.testing.assert_array_equal(np.diag(ocp.Q), [1, 2, 0])
     np.testing.assert_array_equal(np.diag(ocp.R), [1, 3])
@@ -300,17 +304,13 @@ def test_integrator_of_the_file_is_that_of_problem_observer_and_simulated_robot(
 
 
 def test_equal_bounds_fix_an_input_and_a_terminal_set_bounds_the_end_alone(tmp_path: Path) -> None:
-    path = tmp_path / "robot.toml"
-    path.write_text(MINIMAL + "[ocp.bounds]\ninputs = { u_c = [0, 0], omega_c = [-1, 1] }\nterminal = { omega = [-0.1, inf] }\n")
-    ocp = build_ocp(load(path))
+    ocp = build_ocp(loaded(tmp_path, MINIMAL + "[ocp.bounds]\ninputs = { u_c = [0, 0], omega_c = [-1, 1] }\nterminal = { omega = [-0.1, inf] }\n"))
     assert (ocp.lbu.tolist(), ocp.ubu.tolist()) == ([0.0, -1.0], [0.0, 1.0])
     assert (ocp.lbx_e.tolist(), ocp.ubx_e.tolist()) == ([-math.inf] * 4 + [-0.1], [math.inf] * 5)
 
 
 def test_weights_of_inputs_count_from_their_references(tmp_path: Path) -> None:
-    path = tmp_path / "robot.toml"
-    path.write_text(MINIMAL.replace("delta =", "R_u = { u_c = 0.5 }, u_ref = { u_c = 0.2 }, delta ="))
-    ocp = build_ocp(load(path))
+    ocp = build_ocp(loaded(tmp_path, MINIMAL.replace("delta =", "R_u = { u_c = 0.5 }, u_ref = { u_c = 0.2 }, delta =")))
     assert ocp.R_u.tolist() == [0.5, 0.0]
     np.testing.assert_array_equal(np.array(ca.DM(ocp.u_ref)).ravel(), [0.2, 0.0])
 
@@ -339,23 +339,17 @@ def limited() -> Model:
 
 
 def test_terminal_weight_is_the_one_given_or_the_regulators(tmp_path: Path) -> None:
-    path = tmp_path / "robot.toml"
-    path.write_text(MINIMAL + "[ocp.terminal]\nQ = { psi = 3.0, x = 1.0, y = 2.0 }\n")
-    np.testing.assert_array_equal(np.diag(build_ocp(load(path)).Q_e), [1, 2, 3])
-    path.write_text(MINIMAL)
-    assert not build_ocp(load(path)).Q_e.any()
-    path.write_text(MINIMAL + "[ocp.terminal.lqr]\nstates = { u = 0.25 }\ninputs = { u_c = 0.25 }\n")
-    ocp = build_ocp(load(path))
+    given = loaded(tmp_path, MINIMAL + "[ocp.terminal]\nQ = { psi = 3.0, x = 1.0, y = 2.0 }\n")
+    np.testing.assert_array_equal(np.diag(build_ocp(given).Q_e), [1, 2, 3])
+    assert not build_ocp(loaded(tmp_path, MINIMAL)).Q_e.any()
+    ocp = build_ocp(loaded(tmp_path, MINIMAL + "[ocp.terminal.lqr]\nstates = { u = 0.25 }\ninputs = { u_c = 0.25 }\n"))
     np.testing.assert_array_equal(ocp.Q_e, lqr_weight(ocp, np.array([0, 0, 0, 0.25, 0]), np.array([0.25, 0])))
 
 
 def test_moving_obstacles_are_parameters_that_a_reference_carries_row_by_row(tmp_path: Path) -> None:
-    path = tmp_path / "robot.toml"
     discs = DISC + "radius_m = 0.3\n" + DISC + "radius_m = 0.2\nmargin_m = 0.1\n"
-    path.write_text(MINIMAL + discs)
-    assert stage_parameters(load(path), np.array([0.0, 2.0])).shape == (2, 0), "none moves: all nominal"
-    path.write_text(MINIMAL + discs + "velocity_m_s = [0.0, -0.1]\n")
-    config = load(path)
+    assert stage_parameters(loaded(tmp_path, MINIMAL + discs), np.array([0.0, 2.0])).shape == (2, 0), "none moves: all nominal"
+    config = loaded(tmp_path, MINIMAL + discs + "velocity_m_s = [0.0, -0.1]\n")
     rows, nominal = stage_parameters(config, np.array([0.0, 2.0])), build_ocp(config).model.p_nominal
     np.testing.assert_allclose(rows[0], nominal, rtol=1e-15)
     np.testing.assert_allclose(rows[1], [*nominal[:-2], 0.3, 0.3], rtol=1e-15)
@@ -363,9 +357,7 @@ def test_moving_obstacles_are_parameters_that_a_reference_carries_row_by_row(tmp
 
 @pytest.mark.parametrize("name", ["riccati", "osqp", "daqp"])
 def test_solver_is_chosen_by_one_word(name: str, tmp_path: Path) -> None:
-    path = tmp_path / "robot.toml"
-    path.write_text(MINIMAL + f'[solver]\nname = "{name}"\nsecond_opinion = 3\n')
-    config = load(path)
+    config = loaded(tmp_path, MINIMAL + f'[solver]\nname = "{name}"\nsecond_opinion = 3\n')
     assert config.solver.second_opinion == 3, "of every one, as a number of iterations is"
     rti = build_rti(config)
     assert (rti.active_set is None) is (name != "riccati")
@@ -380,9 +372,7 @@ def test_bounds_go_to_the_signals_they_name_whatever_their_order() -> None:
 
 
 def test_parameters_by_name_reach_the_model(tmp_path: Path) -> None:
-    path = tmp_path / "robot.toml"
-    path.write_text(MINIMAL.replace('"pioneer_3dx"', '"pioneer_3dx", parameters = { a = 0.1 }'))
-    assert build_model(load(path)).p_nominal[-1] == 0.1
+    assert build_model(loaded(tmp_path, MINIMAL.replace('"pioneer_3dx"', '"pioneer_3dx", parameters = { a = 0.1 }'))).p_nominal[-1] == 0.1
 
 
 OWN = """
@@ -430,25 +420,17 @@ def test_folder_of_the_model_may_be_another_one(tmp_path: Path) -> None:
 
 def test_zenoh_file_is_found_beside_the_configuration(tmp_path: Path) -> None:
     (tmp_path / "zenoh.json5").write_text("{}")
-    path = tmp_path / "robot.toml"
-    path.write_text(MINIMAL + '[bus]\nconfig = "zenoh.json5"\n')
-    assert bus_settings(load(path)).config == tmp_path / "zenoh.json5"
+    assert bus_settings(loaded(tmp_path, MINIMAL + '[bus]\nconfig = "zenoh.json5"\n')).config == tmp_path / "zenoh.json5"
 
 
 def test_staleness_follows_the_period_within_limits(tmp_path: Path) -> None:
-    stale_s = []
-    for dt_s in (0.01, 0.04, 0.2):
-        path = tmp_path / "robot.toml"
-        path.write_text(MINIMAL.replace("dt_s = 0.1", f"dt_s = {dt_s}"))
-        stale_s.append(load(path).stale_s)
+    stale_s = [loaded(tmp_path, MINIMAL.replace("dt_s = 0.1", f"dt_s = {dt_s}")).stale_s for dt_s in (0.01, 0.04, 0.2)]
     assert stale_s == [0.05, 0.1, 0.225]
 
 
 def test_hash_follows_what_decides_a_command_and_nothing_else(tmp_path: Path) -> None:
     def config_hash(text: str) -> int:
-        path = tmp_path / "robot.toml"
-        path.write_text(text)
-        return load(path).config_hash
+        return loaded(tmp_path, text).config_hash
 
     reference = config_hash(MINIMAL)
     assert 0 <= reference < 2**64
@@ -481,28 +463,23 @@ def test_plant_takes_its_own_parameters_the_rest_from_the_controller(tmp_path: P
 
 
 def test_limits_of_iterations_reach_the_controller(tmp_path: Path) -> None:
-    path = tmp_path / "robot.toml"
-    path.write_text(MINIMAL + "[solver]\niterations = 7\ntolerance = 1e-3\neps = 1e-4\n")
-    rti = build_rti(load(path))
+    config = loaded(tmp_path, MINIMAL + "[solver]\niterations = 7\ntolerance = 1e-3\neps = 1e-4\n")
+    rti = build_rti(config)
     assert (rti.iterations, rti.tolerance) == (7, 1e-3)
-    assert solver_settings(load(path)).eps == 1e-4
+    assert solver_settings(config).eps == 1e-4
 
 
 def test_guard_must_know_every_limit(tmp_path: Path) -> None:
-    path = tmp_path / "robot.toml"
     text = SHIPPED.read_text().replace(", omega_c = [-0.745, 0.745] }", " }")
-    path.write_text(text + "\n[guard]\nenabled = true\n")
     with pytest.raises(ConfigError, match=r"ocp\.bounds\.inputs must bound every input where a guard is enabled, omega_c is missing"):
-        load(path)
-    path.write_text(text)
-    load(path)  # nobody else minds
+        loaded(tmp_path, text + "\n[guard]\nenabled = true\n")
+    loaded(tmp_path, text)  # nobody else minds
 
 
 def test_limits_of_the_guard_are_those_of_the_problem_in_the_models_order(tmp_path: Path) -> None:
-    path = tmp_path / "robot.toml"
     bounds = "u_c = [-0.5, 0.5], omega_c = [-0.745, 0.745]"
-    path.write_text(SHIPPED.read_text().replace(bounds, "omega_c = [-0.745, 0.745], u_c = [-0.5, 0.5]") + "\n[guard]\nenabled = true\n")
-    config = load(path)
+    turned = SHIPPED.read_text().replace(bounds, "omega_c = [-0.745, 0.745], u_c = [-0.5, 0.5]")
+    config = loaded(tmp_path, turned + "\n[guard]\nenabled = true\n")
     limits, ocp = guard_limits(config, build_signals(config)), build_ocp(config)
     for name in ("lbu", "ubu", "lbdu", "ubdu"):
         np.testing.assert_array_equal(getattr(limits, name), getattr(ocp, name))
@@ -529,10 +506,8 @@ def coasting() -> Model:
 
 
 def with_model(name: str, folder: Path, stop: str = "rests") -> Config:
-    path = folder / "robot.toml"
-    named = SHIPPED.read_text().replace('"pioneer_3dx"', f'"tests.service.config.test_config:{name}"')
-    path.write_text(named.replace("[model]", f'[model]\nstop = "{stop}"'))
-    return load(path)
+    named = SHIPPED.read_text().replace('"pioneer_3dx"', f'"{HERE}:{name}"')
+    return loaded(folder, named.replace("[model]", f'[model]\nstop = "{stop}"'))
 
 
 def test_stop_is_a_ramp_or_a_way_to_rest_that_the_model_leads_to(tmp_path: Path) -> None:
@@ -553,20 +528,16 @@ def test_robot_that_a_stop_does_not_bring_to_rest_is_refused_with_where_that_is(
 
 @pytest.mark.slow  # finds two ways to rest
 def test_disturbances_that_go_on_at_rest_are_balanced_by_a_way_to_rest(tmp_path: Path) -> None:
-    path, slip = tmp_path / "robot.toml", "disturbances = { u_c = { drift = 0.1, limit = 0.1 } }\n"
-    path.write_text(SHIPPED.read_text() + f"[observer]\n{slip}")
-    assert check_stop(load(path)) is None
-    path.write_text(SHIPPED.read_text() + f"[observer]\nat_rest = true\n{slip}")
-    law = check_stop(load(path))
+    observed, slip = SHIPPED.read_text() + "[observer]\n", "disturbances = { u_c = { drift = 0.1, limit = 0.1 } }\n"
+    assert check_stop(loaded(tmp_path, observed + slip)) is None
+    law = check_stop(loaded(tmp_path, observed + "at_rest = true\n" + slip))
     assert law is not None
     assert not law.holds
     assert np.array_equal(law.disturbances, [0.1])
-    path.write_text(SHIPPED.read_text() + f"[observer]\nat_rest = true\n{slip.replace('0.1 }', '0.8 }')}")
     with pytest.raises(ConfigError, match=r"d_u_c = -?0\.8 m/s it still moves.*lower limits in observer.disturbances to what its inputs can balance"):
-        check_stop(load(path))
-    path.write_text(SHIPPED.read_text() + "[observer]\nat_rest = true\n")
+        check_stop(loaded(tmp_path, observed + "at_rest = true\n" + slip.replace("0.1 }", "0.8 }")))
     with pytest.raises(ConfigError, match=r"observer\.at_rest says what observer\.disturbances do while the robot stands, and there are none"):
-        load(path)
+        loaded(tmp_path, observed + "at_rest = true\n")
 
 
 def test_nothing_is_done_with_a_robot_that_a_stop_does_not_bring_to_rest(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -582,9 +553,7 @@ def test_nothing_is_done_with_a_robot_that_a_stop_does_not_bring_to_rest(monkeyp
 
 
 def test_states_may_come_more_often_than_samples_and_be_stale_after_less_than_a_period(tmp_path: Path) -> None:
-    path = tmp_path / "robot.toml"
-    path.write_text(MINIMAL + "[timing]\nstale_s = 0.05\n[sim]\nstate_period_s = 0.01\n")
-    assert load(path, with_model=False).stale_s == 0.05
+    assert loaded(tmp_path, MINIMAL + "[timing]\nstale_s = 0.05\n[sim]\nstate_period_s = 0.01\n", with_model=False).stale_s == 0.05
 
 
 @pytest.mark.parametrize(
@@ -601,9 +570,7 @@ def test_states_may_come_more_often_than_samples_and_be_stale_after_less_than_a_
     ],
 )
 def test_states_that_are_measured_longer_ago_than_their_commands_act_are_refused_on_the_bus(tmp_path: Path, changes: str, said: str) -> None:
-    path = tmp_path / "robot.toml"
-    path.write_text(MINIMAL + changes)
-    config = load(path, with_model=False)
+    config = loaded(tmp_path, MINIMAL + changes, with_model=False)
     if not said:
         check_period(config)
         return
@@ -613,10 +580,8 @@ def test_states_that_are_measured_longer_ago_than_their_commands_act_are_refused
 
 def test_plan_of_one_stage_is_refused_on_the_bus(tmp_path: Path) -> None:
     """It ends when the next one begins to be computed: the robot's inputs ran out at 48 of 50 samples."""
-    path = tmp_path / "robot.toml"
-    path.write_text(MINIMAL.replace("ocp.N = 3", "ocp.N = 1").replace("delta = [1, 2, 3]", "delta = 1"))
     with pytest.raises(ConfigError, match=r"^ocp\.N must be at least 2 for a robot on the bus: a plan of one stage lasts for ocp\.dt_s = 0\.1 s"):
-        check_period(load(path, with_model=False))
+        check_period(loaded(tmp_path, MINIMAL.replace("ocp.N = 3", "ocp.N = 1").replace("delta = [1, 2, 3]", "delta = 1"), with_model=False))
 
 
 @pytest.mark.parametrize(
@@ -625,9 +590,7 @@ def test_plan_of_one_stage_is_refused_on_the_bus(tmp_path: Path) -> None:
 )
 def test_period_that_is_longer_than_a_command_acts_is_refused_on_the_bus(tmp_path: Path, dt_s: float, valid_s: float, longest: str | None) -> None:
     """Or the robot would go to rest between any two commands, in the mode TRACKING, three metres behind its reference after a minute."""
-    path = tmp_path / "robot.toml"
-    path.write_text(MINIMAL.replace("dt_s = 0.1", f"dt_s = {dt_s}") + f"[timing]\nvalid_s = {valid_s}\n")
-    config = load(path, with_model=False)
+    config = loaded(tmp_path, MINIMAL.replace("dt_s = 0.1", f"dt_s = {dt_s}") + f"[timing]\nvalid_s = {valid_s}\n", with_model=False)
     if longest is None:
         check_period(config)
         return
