@@ -115,16 +115,16 @@ def follow(rti: Rti, path: Path, laps: int = 2) -> Lap:
     return judged(path, run.x, sum(not status.usable for status in run.status), laps)
 
 
-def track_centre_line(rti: Rti, path: Path, speed: float, laps: int = 1) -> Lap:
-    """Let the car track the centre line at constant speed, beginning with that speed."""
+def track_centre_line(rti: Rti, path: Path, speed: float) -> Lap:
+    """Let the car track the centre line for a lap at constant speed, beginning with that speed."""
 
     def rows(t: np.ndarray) -> np.ndarray:
         along = path.tangent(speed * t)
         return np.column_stack([path.position(speed * t), np.arctan2(along[:, 1], along[:, 0])])
 
-    samples = round((laps * path.length / speed + 1.0) / DT_S)
+    samples = round((path.length / speed + 1.0) / DT_S)
     run = simulate(rti, worn(dynamic_bicycle()), rows, x0=standing(path, speed), samples=samples)
-    return judged(path, run.x, sum(not status.usable for status in run.status), laps)
+    return judged(path, run.x, sum(not status.usable for status in run.status), 1)
 
 
 def fastest_constant(rti: Rti, path: Path) -> tuple[float, Lap]:

@@ -24,6 +24,7 @@ import numpy as np
 from rti_mpc.array import Array
 from rti_mpc.errors import OcpError
 
+MAX_LAPS = 50  # until a heading must have repeated
 RK4_STEP_S = 0.005  # of the consistent heading, whose rates are below a few 1/s
 MIN_SPEED_M_S = 1e-9  # a slower motion has no direction
 
@@ -83,7 +84,7 @@ def consistent(velocity: Curve, t: Array, a: float, psi0: float) -> Array:
     return np.array(trace[::n])
 
 
-def periodic(velocity: Curve, lap_s: float, a: float, psi0: float, laps: int = 50) -> float:
+def periodic(velocity: Curve, lap_s: float, a: float, psi0: float) -> float:
     """
     Initial value of the consistent heading that repeats in every lap of a closed path.
 
@@ -94,7 +95,7 @@ def periodic(velocity: Curve, lap_s: float, a: float, psi0: float, laps: int = 5
         OcpError: No heading repeats: the path is too tight for a point so far ahead of the axle.
     """
     t = np.linspace(0.0, lap_s, max(2, math.ceil(lap_s / RK4_STEP_S) + 1))
-    for _ in range(laps):
+    for _ in range(MAX_LAPS):
         end = float(consistent(velocity, t, a, psi0)[-1])
         change = math.remainder(end - psi0, math.tau)
         psi0 = math.remainder(end, math.tau)

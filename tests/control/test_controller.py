@@ -32,9 +32,9 @@ from tests.slow import slow_but
 DT = 100 * MS
 
 
-def to_go(point: tuple[float, float, float], rows: int = 1, end: End = End.HOLD, stamp_ns: int = 0, epoch: int = 1) -> Reference:
+def to_go(point: tuple[float, float, float], rows: int = 1) -> Reference:
     y = np.tile(np.array(point), (rows, 1))
-    return Reference(epoch, 1, stamp_ns, DT, end, y, np.zeros((rows, 0)))
+    return Reference(1, 1, 0, DT, End.HOLD, y, np.zeros((rows, 0)))
 
 
 # Starting.

@@ -30,7 +30,6 @@ ZENOH = ("--mode", "--connect", "--listen", "--config", "--cfg", "--no-multicast
 RTI_MPC = (sys.executable, "-c", "from rti_mpc_service.cli import main; main()")
 COMMANDS = sorted(built().commands)
 OF_RECORDINGS = {"export", "replay", "solve-case"}  # commands that read a recording, or a case of one, and no bus
-IN_PLACE = "--path is followed in place of a scenario and says nothing of time"
 
 
 def rti_mpc(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:

@@ -13,21 +13,20 @@ STATES = 1000  # of operation from which a robot is stopped
 LETTERS = {RestClass.HOLDS: "a", RestClass.DRIFTS: "b", RestClass.UNSTABLE: "c"}
 
 
-def stop_from_everywhere(ocp: Ocp, law: StopLaw | None, count: int = STATES, *, disturbed: bool = False) -> str:
+def stop_from_everywhere(ocp: Ocp, law: StopLaw | None, *, disturbed: bool = False) -> str:
     """
     Return in one line what a stop does to a robot, from many states of operation.
 
     Args:
         ocp: Its problem.
         law: What its way to rest is made with; None: its inputs ramp to rest.
-        count: How many states.
         disturbed: Whether an observer estimates what disturbs it.
 
     Raises:
         OcpError: It does not come to rest from one of them.
     """
     ends = "; its disturbances are taken to end where it stands: if they are wind or current, observer.at_rest must say so"
-    return rest_line(ocp.model, law, assess(ocp, law, count)) + (ends if disturbed and law is None else "")
+    return rest_line(ocp.model, law, assess(ocp, law, STATES)) + (ends if disturbed and law is None else "")
 
 
 def rest_line(model: Model, law: StopLaw | None, rest: Rest) -> str:

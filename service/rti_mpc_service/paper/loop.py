@@ -35,7 +35,7 @@ class Loop:
         cpu_us: CPU time of each solve, shape ``(samples,)``.
     """
 
-    def __init__(self, experiment: Experiment, contender: Contender, seed: int = 1) -> None:
+    def __init__(self, experiment: Experiment, contender: Contender) -> None:
         self.experiment, self.contender = experiment, contender
         n, model = experiment.samples, experiment.robot
         self.y = experiment.reference()
@@ -43,7 +43,7 @@ class Loop:
         self.u: Array = np.zeros((n, model.nu))
         self.between_mm, self.wall_us, self.cpu_us = np.zeros(n), np.zeros(n), np.zeros(n)
         self._k = 0
-        self._rng = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(1)
         euler = experiment.plant == "euler"
         looks = 1 if euler else max(1, round(PLANT_STEPS_IN_100_MS * experiment.T0 / 0.1))
         self._acting, self._p = np.zeros((looks, model.nu)), np.tile(model.p_nominal, (looks, 1))

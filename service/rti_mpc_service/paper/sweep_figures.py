@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from rti_mpc_service.paper.readings import PRINTED_MM
 from rti_mpc_service.paper.sweeps import MISMATCHES
 
-BLUE, ORANGE, GREEN, PURPLE, YELLOW, BLACK = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#000000"
+BLUE, ORANGE, GREEN, YELLOW, BLACK = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#000000"
 Row = dict[str, Any]
 WEIGHT_LABELS = {"consistent": "the paper's weights", "none": "best weights"}
 
