@@ -11,7 +11,7 @@ from rti_mpc.errors import ConfigError
 MAX_FILE_BYTES = 1 << 17  # ten times what a configuration with a weight for each of a thousand stages needs
 
 
-def read_text_file(path: Path, kind: str = "text", max_bytes: int = MAX_FILE_BYTES) -> str:
+def read_text_file(path: Path, kind: str, max_bytes: int = MAX_FILE_BYTES) -> str:
     """
     Read a whole file; never waits, as it would for a pipe, and refuses a file that is too large.
 

@@ -58,8 +58,8 @@ class Leadership:
         dt_s: float,
         standby: bool,
         say: Callable[[Notice], None],
+        model_hash: str,
         local_ns: int = 0,
-        model_hash: str = "",
     ) -> None:
         """
         Begin to lead, or to stand by.
@@ -71,8 +71,8 @@ class Leadership:
             dt_s: Period of the controller, s.
             standby: Whether it stands by at first.
             say: Receiver of notices.
-            local_ns: Local monotonic time.
             model_hash: Hash of its model's equations; empty if it fits any.
+            local_ns: Local monotonic time.
         """
         self.number = number
         self.epoch = epoch_above(epoch - 1, number)

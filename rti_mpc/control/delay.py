@@ -49,7 +49,7 @@ class DelayEstimator:
         p: Parameters of the model, shape ``(np,)``; nominal unless written.
     """
 
-    def __init__(self, model: Model, dt_ns: int, most_ns: int, *, scale: Array, measured: Sequence[int] | None = None, compile: bool = True) -> None:
+    def __init__(self, model: Model, dt_ns: int, most_ns: int, *, scale: Array, measured: Sequence[int] | None = None, compile: bool) -> None:
         """
         Begin with no delay.
 

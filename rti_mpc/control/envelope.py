@@ -32,7 +32,7 @@ class Envelope:
         written: The arrays that `fit` writes.
     """
 
-    def __init__(self, ocp: Ocp, *, compile: bool = True) -> None:
+    def __init__(self, ocp: Ocp, *, compile: bool) -> None:
         nu = ocp.model.nu
         self.limits = {name: ocp.widest(name) for name in INPUT_BOUNDS}
         by_stage = {name: np.array(getattr(ocp, name)) for name in INPUT_BOUNDS if getattr(ocp, name).ndim == 2}

@@ -22,7 +22,7 @@ class Prediction:
         written: The arrays that `predict` writes.
     """
 
-    def __init__(self, model: Model, sent: Sent, *, compile: bool = True) -> None:
+    def __init__(self, model: Model, sent: Sent, *, compile: bool) -> None:
         self.x: Array = np.zeros(model.nx)
         self.p: Array = np.array(model.p_nominal)
         self._sent = sent

@@ -46,7 +46,7 @@ class Stopping:
         rows: All rows of the last plan or way to rest, shape ``(N, nu)``, of which its command has the first ones.
     """
 
-    def __init__(self, ocp: Ocp, law: StopLaw, limits: Mapping[str, Array], prediction: Prediction, valid_ns: int, *, compile: bool = True) -> None:
+    def __init__(self, ocp: Ocp, law: StopLaw, limits: Mapping[str, Array], prediction: Prediction, valid_ns: int, *, compile: bool) -> None:
         """
         Begin with no way.
 

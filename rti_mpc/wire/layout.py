@@ -209,7 +209,7 @@ MESSAGE_DESCRIPTIONS: dict[type[Any], str] = {
 WIDTH_DESCRIPTIONS: dict[str, str] = {"nx": "states per row", "nu": "inputs per row", "ny": "outputs per row", "np": "stage parameters per row"}
 
 
-def most_rows(ny: int, np_: int = 0) -> int:
+def most_rows(ny: int, np_: int) -> int:
     """Return how many rows a reference may have; a longer one arrives nowhere, for sessions drop it before it is reassembled."""
     return (MAX_PAYLOAD_BYTES[Reference] - REFERENCE_HEAD_BYTES) // (8 * (ny + np_))
 

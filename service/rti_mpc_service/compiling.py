@@ -15,7 +15,7 @@ MIN_DURATION_S = 1.0  # shorter waits are not worth a line
 
 
 @contextmanager
-def compilation_shown(duration_s: float, say: Callable[[str], object] = lambda _: None) -> Iterator[None]:
+def compilation_shown(duration_s: float, say: Callable[[str], object]) -> Iterator[None]:
     """
     Show that something is being compiled: on a terminal with the time elapsed, gone when it is done.
 

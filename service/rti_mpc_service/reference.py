@@ -85,7 +85,7 @@ class ReferenceSource:
         anchored: How often the reference was anchored to a life of the robot.
     """
 
-    def __init__(self, bus: Bus, scenario: Scenario, parameters: Callable[[Array], Array] | None = None) -> None:
+    def __init__(self, bus: Bus, scenario: Scenario, parameters: Callable[[Array], Array] | None) -> None:
         self.anchored = 0
         self._scenario, self._parameters = scenario, parameters
         self._epoch = new_epoch()

@@ -97,7 +97,7 @@ class SampledPlant:
         u: Input acting on the plant now, after the lag, shape ``(nu,)``.
     """
 
-    def __init__(self, model: Model, x0: Array, lag_s: float = 0.0) -> None:
+    def __init__(self, model: Model, x0: Array, lag_s: float) -> None:
         assert model.dt is not None
         self._period_s, self._lag_s = model.dt, lag_s
         self.x = np.array(x0, dtype=np.float64)

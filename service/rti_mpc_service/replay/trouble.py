@@ -23,7 +23,7 @@ from rti_mpc_service.replay.rebuild import Journaled, Rebuilt, journals, rebuild
 MAX_CASES = 100  # of one recording
 
 
-def cases_of(path: Path, *, folder: Path = Path(), trust: bool = False) -> Iterator[QpCase]:
+def cases_of(path: Path, *, folder: Path, trust: bool) -> Iterator[QpCase]:
     """
     Yield the cases of a recording, `MAX_CASES` at most: those of a controller that cannot be replayed here as far as they were kept.
 

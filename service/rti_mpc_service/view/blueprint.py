@@ -271,7 +271,7 @@ UNIT_CIRCLE: Array = np.column_stack([np.cos(angles := np.linspace(0, 2 * np.pi,
 ROBOT_Z_M = 0.008  # [m], between trail and horizon
 
 
-def looks(info: Info, name: str = "", driven: str = DRIVEN_COLORS[0]) -> dict[str, rr.AsComponents]:
+def looks(info: Info, name: str, driven: str) -> dict[str, rr.AsComponents]:
     """Return the constant components of a recording, by entity; of several robots each has its name, and a color of where it has driven."""
     return _series_looks(info) | _cost_looks(info) | _lane_looks(info) | (_world_looks(info, name, driven) if info.planar else {})
 
