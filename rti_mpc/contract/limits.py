@@ -57,6 +57,11 @@ class Limits:
         return np.minimum(-self.lbdu, self.ubdu) / self.dt_s
 
     @cached_property
+    def step(self) -> Array:
+        """By how much an input changes in one period at the rate of the ramp to rest, shape ``(nu,)``."""
+        return self.slew * self.dt_s
+
+    @cached_property
     def settling_s(self) -> float:
         """Time in s for which a command without a way to rest may still move the robot after its state: to its end, and down the ramp."""
         return self.delay_s + 1e-9 * MAX_VALID_NS + self.ramp_s

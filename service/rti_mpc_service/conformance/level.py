@@ -45,7 +45,7 @@ class Levels:
         Raises:
             ConfigError: An input has no bound, or cannot move.
         """
-        rest, step = limits.u_rest, limits.slew * limits.dt_s
+        rest, step = limits.u_rest, limits.step
         up, down = (np.minimum(MOST_SHARE * way, MOST_STEPS * step) for way in (limits.ubu - rest, rest - limits.lbu))
         if not (np.isfinite(up) & np.isfinite(down)).all():
             raise ConfigError("ocp.bounds.inputs must bound every input: how far a test may move it is not known otherwise")

@@ -44,11 +44,6 @@ def rows(command: Command, *u: Any) -> Command:
     return replace(command, u=np.vstack(u))
 
 
-def step(limits: Limits) -> Any:
-    """Return how far each input may move in a period, to either side, shape ``(nu,)``."""
-    return limits.slew * limits.dt_s
-
-
 WRONG = (
     Wrong("of a lower epoch", "epochs", lambda command, _: replace(command, epoch=command.epoch - 1)),
     Wrong("that has expired", "late", lambda command, _: replace(command, valid_until_ns=command.stamp_ns - 1)),
@@ -76,7 +71,7 @@ WRONG = (
     Wrong(
         "beyond the slew limits from row to row",
         "limits",
-        lambda command, limits: rows(command, limits.ubu, limits.ubu - 1.2 * step(limits)),
+        lambda command, limits: rows(command, limits.ubu, limits.ubu - 1.2 * limits.step),
         by_guard=True,
     ),
 )

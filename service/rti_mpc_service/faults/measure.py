@@ -126,11 +126,6 @@ def measure(log: RobotLog, position: Array, error: Array, incident: Incident, li
     )
 
 
-def step(limits: Limits) -> Array:
-    """Return the largest change of each input in a period, shape ``(nu,)``."""
-    return limits.slew * limits.dt_s
-
-
 def settled(condition: Mask, window: Mask) -> int | None:
     """Return the row from which a condition holds up to the end of a window; None if it does not hold there."""
     rows = np.flatnonzero(window)
@@ -143,10 +138,10 @@ def settled(condition: Mask, window: Mask) -> int | None:
 def braking(log: RobotLog, limits: Limits, first: int, zero: int) -> int:
     """Return the row at which the ramp to rest that ends at row `zero` begins; see the module's docstring."""
     t_s = 1e-9 * (log.stamp_ns - log.stamp_ns[zero])
-    left_s = (np.abs(log.u - limits.u_rest) / step(limits)).max(axis=1) * limits.dt_s
+    left_s = (np.abs(log.u - limits.u_rest) / limits.step).max(axis=1) * limits.dt_s
     way = np.abs(log.u - limits.u_rest)
     for row in range(max(first, 1), zero):
-        share = float(((way[row - 1] - way[row]) / step(limits)).max())
+        share = float(((way[row - 1] - way[row]) / limits.step).max())
         if share >= MIN_RAMP_STEP_SHARE and -t_s[row - 1] <= MAX_RAMP_STRETCH * left_s[row - 1] + MAX_RAMP_LATENESS_S:
             return row
     return zero
@@ -161,7 +156,7 @@ def fresh_ns(log: RobotLog, incident: Incident) -> int:
 
 def step_share(u: Array, limits: Limits) -> float:
     """Return the largest change from row to row, as a share of the largest allowed change in a period."""
-    return float((np.abs(np.diff(u, axis=0)) / step(limits)).max()) if len(u) > 1 else 0.0
+    return float((np.abs(np.diff(u, axis=0)) / limits.step).max()) if len(u) > 1 else 0.0
 
 
 def ramp_share(log: RobotLog, limits: Limits, brake: int, zero: int) -> float:
@@ -173,7 +168,7 @@ def ramp_share(log: RobotLog, limits: Limits, brake: int, zero: int) -> float:
     t, share = log.stamp_ns[: zero + 1], 0.0
     for row in range(max(brake - 1, 0), zero):
         last = int(np.searchsorted(t, t[row] + 1e9 * limits.dt_s - RAMP_STEP_NS, side="right")) - 1
-        share = max(share, float((np.abs(log.u[last] - log.u[row]) / step(limits)).max()))
+        share = max(share, float((np.abs(log.u[last] - log.u[row]) / limits.step).max()))
     return share
 
 
