@@ -10,6 +10,7 @@ import casadi as ca
 
 from rti_mpc.model.model import Model, Signal
 from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc.model.robots.unicycle import unicycle
 from tests.units import PIONEER_TEXTS, with_units
 
 OUTPUTS = (2, 0, 1)  # psi, x, y
@@ -64,18 +65,7 @@ def glider() -> Model:
 
 def rover() -> Model:
     """A unicycle, its position on the axle: a heading, and no offset."""
-    x, u = ca.SX.sym("x", 3), ca.SX.sym("u", 2)
-    pose = (Signal("x", "m", role="x"), Signal("y", "m", role="y"), Signal("psi", "rad", angle=True, role="heading"))
-    return Model(
-        name="rover",
-        x=x,
-        u=u,
-        f_expl_expr=ca.vertcat(u[0] * ca.cos(x[2]), u[0] * ca.sin(x[2]), u[1]),
-        y_expr=x,
-        states=pose,
-        inputs=(Signal("v", "m/s"), Signal("w", "rad/s")),
-        outputs=pose,
-    )
+    return replace(unicycle(), name="rover", inputs=(Signal("v", "m/s"), Signal("w", "rad/s")))
 
 
 def arm() -> Model:

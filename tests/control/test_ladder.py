@@ -19,7 +19,7 @@ from rti_mpc.rti.rti import BUILT_IN_SOLVERS
 from rti_mpc_service.injection import FAILURES, MAX_FAILING_SAMPLES, FaultyRti, answer
 from rti_mpc_sim.lockstep import Lockstep
 from rti_mpc_sim.settings import RobotSettings
-from tests.loop import MS, Run, drive, reference, robot
+from tests.loop import MS, Run, codes, drive, reference, robot
 from tests.movers import law_of, ocp_of
 from tests.problems import double_integrator, pioneer
 from tests.slow import slow_but
@@ -67,10 +67,6 @@ def cold_starts(rti: FaultyRti, monkeypatch: pytest.MonkeyPatch) -> list[Array]:
 
 def fail(rti: FaultyRti, failure: str, samples: int) -> None:
     assert rti.inject({"failure": failure, "samples": samples})["ok"]
-
-
-def codes(controller: Controller) -> list[str]:
-    return [notice.code for notice in controller.notices()]
 
 
 def sample(controller: Controller, body: Lockstep, took_ms: float = 0.0) -> Command | None:

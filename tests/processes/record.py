@@ -10,6 +10,7 @@ import numpy as np
 
 from rti_mpc.array import Array
 from rti_mpc.contract.approach import SLEW_WINDOW_PERIODS
+from rti_mpc.contract.message import State
 from tests.processes.system import System, until
 
 STANDSTILL_SPEED = 1e-3  # m/s, rad/s
@@ -17,6 +18,14 @@ SLEW = np.array([0.25, 0.40])  # of the shipped configuration, over 0.1 s
 MS = 1_000_000
 PERIOD_NS = 10 * MS  # of the states: the resolution of the record
 FAST_STATES = f"[sim]\nstate_period_s = {1e-9 * PERIOD_NS}\n"  # what a configuration needs beside the shipped one
+
+
+def moves(state: State) -> bool:
+    return bool(abs(state.x[3]) > 0.03)
+
+
+def rests(state: State) -> bool:
+    return bool(np.abs(state.x[3:]).max() < STANDSTILL_SPEED)
 
 
 @dataclass

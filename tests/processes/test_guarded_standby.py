@@ -22,7 +22,7 @@ from rti_mpc.contract.status import Mode
 from rti_mpc_service.host.hold_up import Host
 from tests.guarded import GUARDED
 from tests.in_time import explained, in_time, on_time
-from tests.processes.record import FAST_STATES, MS, STANDSTILL_SPEED, recorded, within_slew
+from tests.processes.record import FAST_STATES, MS, recorded, rests, within_slew
 from tests.processes.system import KEYS, until
 from tests.processes.watched import Watched
 
@@ -115,7 +115,7 @@ def test_restarted_guard_passes_one_leader_and_none_has_taken_over_for_want_of_a
     system.tracking()
     killed_ns = system.fault(signal.SIGKILL, "guard")
     system.kill("guard")
-    system.state(lambda state: bool(np.abs(state.x[3:]).max() < STANDSTILL_SPEED))
+    system.state(rests)
     passed(system)
     before = len(system.actuation)
     system.start("guard")

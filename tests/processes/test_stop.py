@@ -21,16 +21,15 @@ import numpy as np
 import pytest
 import zenoh
 
-from rti_mpc.contract.message import Command, State
+from rti_mpc.contract.message import Command
 from rti_mpc.contract.status import Mode
 from tests.guarded import write_robot
-from tests.processes.record import FAST_STATES
+from tests.processes.record import FAST_STATES, moves, rests
 from tests.processes.system import KEYS, System, heard, rti_mpc, until
 
 pytestmark = pytest.mark.slow
 
 REQUESTS_PER_S = 300
-STANDSTILL_SPEED = 1e-3  # m/s, rad/s
 
 
 class Operated(System):
@@ -50,14 +49,6 @@ class Operated(System):
     def commanded_to_stand(self) -> None:
         heard(self.bus.subscriber(KEYS.command), Command, lambda command: command.mode is Mode.STOPPED and not command.u.any())
         self.stands()
-
-
-def moves(state: State) -> bool:
-    return bool(abs(state.x[3]) > 0.03)
-
-
-def rests(state: State) -> bool:
-    return bool(np.abs(state.x[3:]).max() < STANDSTILL_SPEED)
 
 
 @pytest.fixture

@@ -25,9 +25,9 @@ from rti_mpc.wire.session import BusSettings
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.shipped import SHIPPED
 from tests.in_time import MS, in_time, on_time
+from tests.processes.record import STANDSTILL_SPEED, moves, rests
 from tests.processes.system import CONFIG, KEYS, SPEED, System, heard, rti_mpc, until
 
-STANDSTILL_SPEED = 1e-3  # m/s, rad/s
 END_MS = 1000.0  # from Ctrl-C to the end of a process
 PERIOD_MS = 1e3 * CONFIG.ocp.dt_s / SPEED
 OTHER_VERSION = f"@{cdr.MESSAGE_VERSION + 1}"  # in a refusal
@@ -50,14 +50,6 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
         system.start("robot", "controller", "reference")
         system.tracking()
         yield system
-
-
-def rests(state: State) -> bool:
-    return bool(np.abs(state.x[3:]).max() < STANDSTILL_SPEED)
-
-
-def moves(state: State) -> bool:
-    return bool(np.abs(state.x[3]) > 0.03)
 
 
 @pytest.mark.slow

@@ -22,6 +22,7 @@ from rti_mpc_sim.settings import RobotSettings
 from tests.movers import law_of, ocp_of
 from tests.service.conformance.link import EPOCH, as_it_is
 from tests.service.conformance.link import LockstepLink as Link
+from tests.service.conformance.test_robot import for_ever
 
 
 class LockstepLink(Link):
@@ -57,10 +58,6 @@ def broken(name: str, link: LockstepLink) -> set[str]:
 def test_ours_keeps_every_promise(name: str) -> None:
     found = verdicts(name, LockstepLink(name))
     assert {verdict for verdict, _ in found.values()} == {"yes"}, found
-
-
-def for_ever(command: Command) -> Command:
-    return replace(command, valid_until_ns=2**62, u=np.vstack([command.u, np.tile(command.u[-1], (900, 1))]))
 
 
 def without_gain(command: Command) -> Command:
