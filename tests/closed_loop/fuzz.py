@@ -10,6 +10,7 @@ else may happen.
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -43,10 +44,10 @@ class Fuzz:
         seen: What happened, by name: that it did is part of the test.
     """
 
-    def __init__(self, seed: int, *, measured: bool = False, compile: bool = True) -> None:
+    def __init__(self, seed: int, *, measured: bool = False) -> None:
         self.rng = np.random.default_rng(seed)
-        self.rti = FaultyRti(pioneer(N=6, N_u=4), compile=compile)
-        self.controller = Controller(self.rti, Timing(delay_s=None if measured else 0.0), epoch=7, compile=compile)
+        self.rti = FaultyRti(pioneer(N=6, N_u=4))
+        self.controller = Controller(self.rti, Timing(delay_s=None if measured else 0.0), epoch=7)
         self.samples = 0
         self.seen: Counter[str] = Counter()
         self._states = Intake(State, 1.0, {"x": 5})
@@ -99,10 +100,7 @@ class Fuzz:
             if not (played and played[-1][1:3] == (u_c, omega_c)):
                 while played and played[0][0] <= self._now_ns - WINDOW_NS:
                     played.popleft()
-                # Braking is the robot's own: in steps, and from a row that may just have begun to act.
-                known = played if not self._actuator.braking and self._now_ns > self._settled_ns else list(played)[-1:]
-                for end_ns, u_before, omega_before, braked in known if self._now_ns > self._settled_ns else ():
-                    most = 1.1 + ROUNDING if braked else 1.0 + ROUNDING
+                for end_ns, u_before, omega_before, most in self._bounding():
                     assert abs(u_c - u_before) <= 0.25 * most, (self.samples, self._now_ns, end_ns, u_c, u_before)
                     assert abs(omega_c - omega_before) <= 0.4 * most, (self.samples, self._now_ns, end_ns, omega_c, omega_before)
                 played.append((until_ns, u_c, omega_c, self._actuator.braking))
@@ -110,7 +108,19 @@ class Fuzz:
                 played[-1] = (until_ns, *played[-1][1:])
             self._now_ns = until_ns
 
+    def _bounding(self) -> Iterator[tuple[int, float, float, float]]:
+        """Yield until when what acted that bounds what acts now, and the share of the slew limits by which it does."""
+        if self._now_ns > self._settled_ns:
+            # Braking is the robot's own: in steps, and from a row that may just have begun to act.
+            for end_ns, u, omega, braked in list(self._played)[-1:] if self._actuator.braking else self._played:
+                yield end_ns, u, omega, 1.1 + ROUNDING if braked else 1.0 + ROUNDING
+
     # One sample.
+
+    def run(self, samples: int) -> None:
+        """Go on until so many states were sent."""
+        while self.samples < samples:
+            self.step()
 
     def step(self) -> None:
         """Let one period pass, with random events in it."""

@@ -20,15 +20,10 @@ def resident_bytes() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
-def run(fuzz: Fuzz, samples: int) -> None:
-    while fuzz.samples < samples:
-        fuzz.step()
-
-
 @pytest.mark.parametrize("measured", [pytest.param(False, marks=pytest.mark.slow, id="no delay"), pytest.param(True, id="measured delay")])
 def test_no_fuzzed_sample_leaves_the_limits_or_raises(measured: bool) -> None:
     fuzz = Fuzz(seed=1, measured=measured)
-    run(fuzz, SHORT_SAMPLES if measured else 2 * SHORT_SAMPLES)
+    fuzz.run(SHORT_SAMPLES if measured else 2 * SHORT_SAMPLES)
     happened = set(fuzz.seen)
     assert {"TRACKING", "HOLDING", "FALLBACK", "BRAKING", "STOPPED", "over budget", "reference", "jump", "refused at the door"} <= happened
     assert {"qp", "nan_model", "solver", "state_stale", "state_old", "state_refused", "robot_restarted", "clock_jumped", "gap"} <= happened
@@ -37,11 +32,11 @@ def test_no_fuzzed_sample_leaves_the_limits_or_raises(measured: bool) -> None:
 def test_no_fuzzed_sample_leaves_a_reference_cycle() -> None:
     """The daemon runs with the collector off: what only that frees would stay for good."""
     fuzz = Fuzz(seed=5, measured=True)
-    run(fuzz, 100)
+    fuzz.run(100)
     gc.collect()
     gc.disable()
     try:
-        run(fuzz, 700)
+        fuzz.run(700)
         left = gc.collect()
     finally:
         gc.enable()
@@ -53,9 +48,9 @@ def test_no_fuzzed_sample_leaves_a_reference_cycle() -> None:
 @pytest.mark.parametrize("seed", [2, 3])
 def test_no_sample_of_a_million_leaves_the_limits_or_raises(seed: int) -> None:
     fuzz = Fuzz(seed=seed)
-    run(fuzz, MANY_SAMPLES // 5)
+    fuzz.run(MANY_SAMPLES // 5)
     before = resident_bytes()
-    run(fuzz, MANY_SAMPLES)
+    fuzz.run(MANY_SAMPLES)
     grown = resident_bytes() - before
     print(f"\n{fuzz.samples} samples, memory grown by {grown / 2**20:.2f} MiB: {dict(fuzz.seen)}")
     assert grown < 2**22  # bytes; of 800,000 samples
@@ -72,7 +67,7 @@ LOSSY = [
 @pytest.mark.parametrize(("guarded", "reports"), LOSSY)
 def test_no_input_leaves_its_limits_whatever_is_lost_late_repeated_or_reordered_on_any_link(guarded: bool, reports: bool) -> None:
     fuzz = Lossy(seed=4, guarded=guarded, reports=reports)  # a seed in whose few samples the clock jumps, which one in a thousand brings
-    run(fuzz, SHORT_SAMPLES)
+    fuzz.run(SHORT_SAMPLES)
     assert {"TRACKING", "BRAKING", "accepted", "lost to robot", "lost to standby", "lost to controller", "takeover", "jump"} <= set(fuzz.seen)
 
 
@@ -81,5 +76,5 @@ def test_no_input_leaves_its_limits_whatever_is_lost_late_repeated_or_reordered_
 @pytest.mark.parametrize("seed", [2, 3])
 def test_no_sample_of_a_million_leaves_its_limits_on_links_that_lose(seed: int, guarded: bool) -> None:
     fuzz = Lossy(seed=seed, guarded=guarded)
-    run(fuzz, int(os.environ.get("FUZZ_SAMPLES", MANY_SAMPLES)))
+    fuzz.run(int(os.environ.get("FUZZ_SAMPLES", MANY_SAMPLES)))
     print(f"\n{fuzz.samples} samples: {dict(fuzz.seen)}")
