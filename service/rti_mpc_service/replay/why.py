@@ -98,16 +98,6 @@ def main(
     return 0
 
 
-def explain(journal: Journaled, built: Rebuilt, place: Place) -> dict[str, Any]:
-    """
-    Return the facts about a command.
-
-    Raises:
-        Unreached: No replay reaches it.
-    """
-    return explained(journal, built, place)[0]
-
-
 def explained(journal: Journaled, built: Rebuilt, place: Place) -> tuple[dict[str, Any], QpCase | None]:
     """
     Return the facts about a command, and the QP of its sample, if it had one.

@@ -28,7 +28,7 @@ from rti_mpc_service.replay.place import find
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
 from rti_mpc_service.replay.replay import main, overridden, snapshot_before
 from rti_mpc_service.replay.robot_time import first_stamp
-from rti_mpc_service.replay.why import explain
+from rti_mpc_service.replay.why import explained
 from rti_mpc_service.shipped import SHIPPED
 from tests.loop import MS
 from tests.processes.test_path import robot_in
@@ -76,7 +76,7 @@ def test_standby_that_took_over_is_driven_from_its_takeover_on_and_explained(tmp
     place = find(journal, 0.0, None)
     assert place is not None
     assert place.command.epoch == 6, "the first command that acted"
-    facts = explain(journal, rebuild(journal, folder=tmp_path), place)
+    facts = explained(journal, rebuild(journal, folder=tmp_path), place)[0]
     assert facts["replayed"] == "0 bits differ"
     assert ["stands_by", "took_over"] == [one["code"] for one in facts["events"] if one["code"] in ("stands_by", "took_over")][-2:]
 
@@ -115,7 +115,7 @@ def test_robot_in_discrete_time_is_driven_as_it_was_and_explained(tmp_path: Path
     assert states(driven) == states(was), "no bit differs"
     place = find(journal, None, 3)
     assert place is not None
-    facts = explain(journal, rebuild(journal, folder=tmp_path), place)
+    facts = explained(journal, rebuild(journal, folder=tmp_path), place)[0]
     assert facts["replayed"] == "0 bits differ"
     assert sum(facts["cost_terms"].values()) == pytest.approx(facts["cost"], rel=1e-6), "all terms are there"
     assert facts["bounds"]
@@ -148,7 +148,7 @@ def test_robot_that_follows_a_path_is_driven_as_it_was_and_explained(tmp_path: P
     for seq in (1, 40):
         place = find(journal, None, seq)
         assert place is not None
-        facts = explain(journal, rebuild(journal, folder=tmp_path), place)
+        facts = explained(journal, rebuild(journal, folder=tmp_path), place)[0]
         assert facts["replayed"] == "0 bits differ"
         assert sum(facts["cost_terms"].values()) == pytest.approx(facts["cost"], rel=1e-6), "contour and lag of the path that it was sent"
     assert {"error of contour", "error of lag", "error of pace_error"} <= set(facts["cost_terms"])

@@ -23,7 +23,7 @@ from rti_mpc_service.replay.drive import Drive, drive
 from rti_mpc_service.replay.place import find
 from rti_mpc_service.replay.rebuild import CONFIGURATION, Journaled, configuration, rebuild
 from rti_mpc_service.replay.replay import lines, overridden, play
-from rti_mpc_service.replay.why import explain
+from rti_mpc_service.replay.why import explained
 from rti_mpc_service.shipped import SHIPPED
 from tests.service.replay.driven import journal_of
 
@@ -215,7 +215,7 @@ def test_robot_with_an_observer_and_an_obstacle_is_replayed_explained_and_driven
     assert (outcome.samples, outcome.differing) == (29, 0)
     place = find(journal, None, 10)
     assert place is not None
-    facts = explain(journal, rebuild(journal, folder=tmp_path), place)
+    facts = explained(journal, rebuild(journal, folder=tmp_path), place)[0]
     assert facts["replayed"] == "0 bits differ"
     assert facts["mode"] == "TRACKING"
     assert len(facts["disturbances"]) == 1

@@ -21,7 +21,7 @@ from rti_mpc.wire.keys import Keys
 from rti_mpc_service.config.config import load
 from rti_mpc_service.replay.place import Place, acted, find
 from rti_mpc_service.replay.rebuild import Journaled, rebuild
-from rti_mpc_service.replay.why import explain, lines, main
+from rti_mpc_service.replay.why import explained, lines, main
 from rti_mpc_service.shipped import SHIPPED
 from tests.recording.samples import telemetry
 from tests.service.replay.driven import failing, journal_of, recorded, straight
@@ -32,7 +32,7 @@ INJECTED = SHIPPED.read_text() + "\n[debug]\ninject = true\n"
 
 def asked(journal: Journaled, place: Place | None, folder: Path) -> tuple[str, dict[str, Any]]:
     assert place is not None
-    facts = json.loads(json.dumps(explain(journal, rebuild(journal, folder=folder), place)))
+    facts = json.loads(json.dumps(explained(journal, rebuild(journal, folder=folder), place)[0]))
     assert facts["replayed"] == "0 bits differ"
     return "\n".join(lines(facts)), facts
 
