@@ -76,10 +76,6 @@ class JournalPublisher:
             self._say("snapshot_waits", f"{text}: a replay begins at an earlier one")
         return False
 
-    def ask(self) -> None:
-        """Ask for a snapshot."""
-        self._book.ask()
-
     def photograph(self, local_ns: int) -> None:
         """Take a snapshot, while nobody else calls the controller."""
         self._book.photograph(local_ns)
