@@ -5,16 +5,17 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rti_mpc.array import Array
+from rti_mpc.wire.actuator import Counters
 from rti_mpc.wire.info import Info
 
-COUNTERS = ("lost", "late", "expired", "refused", "starved")
+COUNTERS = tuple(field.name for field in fields(Counters))
 
 
 @dataclass(frozen=True, eq=False)
