@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from threading import Event as Stop
 from types import SimpleNamespace
 from typing import Any
@@ -14,13 +15,13 @@ import pytest
 
 from rti_mpc.adapter import PlannerAdapter, RobotAdapter, robot
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Event, Reference, State
-from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.errors import ConfigError, RtiMpcError
 from rti_mpc.wire.bus import Bus, Received
 from rti_mpc.wire.cdr import decode, encode, encoding
 from rti_mpc.wire.info import Label, labels
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.layout import MAX_PAYLOAD_BYTES, REFERENCE_HEAD_BYTES, most_rows
+from rti_mpc_service.conformance.answer import answer
 from tests.wire.fake_session import FakeSession
 
 MS = 1_000_000
@@ -75,27 +76,8 @@ class Scene:
     def command(self, u: list[list[float]], **change: Any) -> None:
         """Answer the last state with rows of 0.1 s, valid for 250 ms."""
         self.seq += 1
-        state = self.state()
-        about = {"epoch": 7, "seq": self.seq, "state_epoch": state.epoch, "valid_until_ns": state.stamp_ns + 250 * MS} | change
-        self.session.waiting.append(
-            Received(
-                encode(
-                    Command(
-                        stamp_ns=state.stamp_ns,
-                        state_seq=state.seq,
-                        state_stamp_ns=state.stamp_ns,
-                        config_hash=0,
-                        mode=Mode.TRACKING,
-                        status=QpStatus.SOLVED,
-                        period_ns=100 * MS,
-                        u=np.array(u),
-                        **about,
-                    )
-                ),
-                encoding(Command),
-                KEYS.command,
-            )
-        )
+        command = answer(self.state(), np.array(u), epoch=7, seq=self.seq, period_ns=100 * MS, valid_ns=250 * MS)
+        self.session.waiting.append(Received(encode(replace(command, **change)), encoding(Command), KEYS.command))
 
     def acts(self, after_ms: int) -> list[float]:
         self.now_ns += after_ms * MS

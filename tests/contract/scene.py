@@ -12,8 +12,8 @@ from rti_mpc.array import Array
 from rti_mpc.contract.guard import Guard
 from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command, State
-from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.wire.actuator import Actuator
+from rti_mpc_service.conformance.answer import answer
 
 MS = 1_000_000
 LOCAL_NS = 10**15  # local time when the robot's clock is 0
@@ -85,23 +85,9 @@ class Scene:
         """A command that answers the last state; constant rows, or those given."""
         assert self.state is not None
         self.seq += 1
-        stamp_ns = self.state.stamp_ns
         rows = np.tile(u, (20, 1)) if np.ndim(u) == 1 else np.array(u)
-        healthy = Command(
-            epoch=self.leader,
-            seq=self.seq,
-            stamp_ns=stamp_ns,
-            state_epoch=self.state.epoch,
-            state_seq=self.state.seq,
-            state_stamp_ns=stamp_ns,
-            valid_until_ns=stamp_ns + 250 * MS,
-            config_hash=5,
-            mode=Mode.TRACKING,
-            status=QpStatus.SOLVED,
-            period_ns=100 * MS,
-            u=rows,
-        )
-        return replace(healthy, **change)
+        healthy = answer(self.state, rows, epoch=self.leader, seq=self.seq, period_ns=100 * MS, valid_ns=250 * MS)
+        return replace(healthy, **{"config_hash": 5, **change})
 
     def send(self, u: Any = FULL, **change: Any) -> Command | None:
         return self.publish(self.guard.receive_command(self.command(u, **change), self.local_ns))

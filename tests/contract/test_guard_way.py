@@ -14,9 +14,9 @@ from rti_mpc.contract.approach import SLEW_WINDOW_PERIODS, Increments
 from rti_mpc.contract.guard import Guard
 from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command, State
-from rti_mpc.contract.status import Mode, QpStatus
 from rti_mpc.rotation import Rotations
 from rti_mpc.wire.actuator import Actuator
+from rti_mpc_service.conformance.answer import answer
 
 MS = 1_000_000
 LOCAL_NS = 10**15  # local time when the robot's clock is 0
@@ -94,24 +94,9 @@ class Mass:
     def command(self, u: Array | None = None, **change: Any) -> Command:
         """Rows, coasting unless told otherwise, for 250 ms from the last state on, and the brakes after them."""
         self.seq += 1
-        stamp_ns = self.state.stamp_ns
-        healthy = Command(
-            epoch=100,
-            seq=self.seq,
-            stamp_ns=stamp_ns,
-            state_epoch=7,
-            state_seq=self.state.seq,
-            state_stamp_ns=stamp_ns,
-            valid_until_ns=stamp_ns + 250 * MS,
-            config_hash=0,
-            mode=Mode.TRACKING,
-            status=QpStatus.SOLVED,
-            period_ns=DT,
-            u=np.zeros((3, 1)) if u is None else u,
-            rest_period_ns=DT,
-            u_rest=np.array(BRAKES)[:, None],
-        )
-        return replace(healthy, **change)
+        rows = np.zeros((3, 1)) if u is None else u
+        healthy = answer(self.state, rows, epoch=100, seq=self.seq, period_ns=DT, valid_ns=250 * MS)
+        return replace(healthy, **{"rest_period_ns": DT, "u_rest": np.array(BRAKES)[:, None], **change})
 
     def send(self, **change: Any) -> bool:
         """Command, through the guard if there is one; return whether the robot got it."""

@@ -20,7 +20,8 @@ from rti_mpc.array import Array
 from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command, State
-from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.contract.status import Mode
+from rti_mpc_service.conformance.answer import answer
 from rti_mpc_service.conformance.finding import Case, Finding, Unseen
 from rti_mpc_service.conformance.level import Levels, shown, slew_share
 from rti_mpc_service.conformance.wrong import refused, wrong
@@ -91,21 +92,7 @@ class Trial:
     def command(self, u: Array, **change: object) -> Command:
         """Return the next command, an answer to the last state."""
         self._seq += 1
-        state = self.state
-        healthy = Command(
-            epoch=self.epoch,
-            seq=self._seq,
-            stamp_ns=state.stamp_ns,
-            state_epoch=state.epoch,
-            state_seq=state.seq,
-            state_stamp_ns=state.stamp_ns,
-            valid_until_ns=state.stamp_ns + self._valid_ns,
-            config_hash=0,
-            mode=Mode.TRACKING,
-            status=QpStatus.SOLVED,
-            period_ns=self.dt_ns,
-            u=u,
-        )
+        healthy = answer(self.state, u, epoch=self.epoch, seq=self._seq, period_ns=self.dt_ns, valid_ns=self._valid_ns)
         return replace(healthy, **change)  # type: ignore[arg-type]
 
     def send(self, command: Command | bytes) -> None:

@@ -14,9 +14,10 @@ from rti_mpc.array import Array
 from rti_mpc.contract.limits import Limits
 from rti_mpc.contract.message import Command, State
 from rti_mpc.contract.schedule import Schedule
-from rti_mpc.contract.status import Mode, QpStatus
+from rti_mpc.contract.status import Mode
 from rti_mpc.wire.actuator import STALE_NS, Actuator
 from rti_mpc.wire.bus import Bus
+from rti_mpc_service.conformance.answer import answer
 from rti_mpc_service.conformance.level import Levels
 
 MS = 1_000_000
@@ -127,23 +128,9 @@ class Stand:
     def command(self, u: Any, **change: Any) -> Command:
         """A command that answers the last state: an input held over twenty rows, or those rows."""
         self.seq += 1
-        stamp_ns = self.state.stamp_ns
         rows = np.tile(u, (20, 1)) if np.ndim(u) == 1 else np.array(u)
-        healthy = Command(
-            epoch=self.leader,
-            seq=self.seq,
-            stamp_ns=stamp_ns,
-            state_epoch=self.epoch,
-            state_seq=self.state.seq,
-            state_stamp_ns=stamp_ns,
-            valid_until_ns=stamp_ns + VALID_NS,
-            config_hash=0,
-            mode=Mode.TRACKING,
-            status=QpStatus.SOLVED,
-            period_ns=self.period_ns,
-            u=rows,
-        )
-        return replace(healthy, **change)
+        healthy = answer(self.state, rows, epoch=self.leader, seq=self.seq, period_ns=self.period_ns, valid_ns=VALID_NS)
+        return replace(healthy, **{"state_epoch": self.epoch, **change})
 
     def send(self, command: Command | bytes) -> None:
         """Send a command of the controller, or bytes that are none."""
