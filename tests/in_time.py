@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from rti_mpc_service.host.hold_up import Host, Threads
 
@@ -18,6 +19,7 @@ WAIT_BEFORE_CLOSE = "transport/link/tx/queue/congestion_control/block/wait_befor
 PATIENT = (f"{WAIT_BEFORE_DROP}:60000000",)  # settings of a bus that waits rather than drop a message where a busy host holds up the link
 SEEN = 0.8  # share of a delay that the witness sees at least, where the host is the reason
 LOOK_MS = 20.0  # between two looks at a process that ends
+MIN_HALT_MS = 20.0  # shorter ones are not told from timers that are late by themselves
 PATIENCE_S = 120.0  # for an end: a busy host takes its time
 BEFORE_NS = 50 * MS  # what has just been sent when something begins may be held up already
 
@@ -54,10 +56,10 @@ def computed_ms(process: subprocess.Popen[bytes]) -> float:
 
 
 def ends_in_time(
-    process: subprocess.Popen[bytes], what: str, limit_ms: float, patience_s: float = PATIENCE_S, asked: Sequence[subprocess.Popen[bytes]] = ()
+    process: subprocess.Popen[Any], what: str, limit_ms: float, patience_s: float = PATIENCE_S, asked: Sequence[subprocess.Popen[Any]] = ()
 ) -> int:
     """
-    Hold a process that was just asked to end to a time, less that in which its own threads waited for a core; return its exit status.
+    Hold a process that was just asked to end to a time, less that in which its own threads got no core; return its exit status.
 
     What others wait for meanwhile excuses nothing, but for those whose answer the end takes: where many end at once, that alone would excuse any end.
 
@@ -78,14 +80,14 @@ def ends_in_time(
         one.look()
         one.close()
     waited_ms = [round(one.ms) for one in waits]
-    late = f"{what} took {took_ms:.0f} ms of {limit_ms:.0f}, of which its threads waited {waited_ms[0]} ms for a core"
+    late = f"{what} took {took_ms:.0f} ms of {limit_ms:.0f}, of which its threads had no core for {waited_ms[0]} ms"
     assert SEEN * (took_ms - limit_ms) <= sum(waited_ms), late + "".join(f", those of a process that it asks {ms} ms" for ms in waited_ms[1:])
     return process.returncode
 
 
 class OwnWaits:
     """
-    For how long the threads of one process have waited for a core, at most the time that passed.
+    For how long the threads of one process have got no core, at most the time that passed: they waited for one, or the host was halted.
 
     Attributes:
         ms: The sum until the last look.
@@ -93,14 +95,18 @@ class OwnWaits:
 
     def __init__(self, pid: int) -> None:
         self.ms = 0.0
-        self._threads, self._looked_ns = Threads(pid), time.monotonic_ns()
+        self._threads, self._looked_ns, self._busy_ns = Threads(pid), time.monotonic_ns(), busy_ns()
 
     def look(self) -> None:
-        """Add what has passed since the last look; to be called every few tens of milliseconds, while the process lives."""
+        """Add what has passed since the last look; to be called every `LOOK_MS` by a thread that sleeps meanwhile, while the process lives."""
         self._threads.find()
-        now_ns = time.monotonic_ns()
-        self.ms += min(self._threads.waited_ns(), now_ns - self._looked_ns) / MS
-        self._looked_ns = now_ns
+        now_ns, now_busy_ns = time.monotonic_ns(), busy_ns()
+        passed_ns = now_ns - self._looked_ns
+        # Who was to sleep for `LOOK_MS`, and has neither computed nor waited for a core for the rest, was halted with everybody else.
+        halted_ns = passed_ns - (now_busy_ns - self._busy_ns) - round(LOOK_MS * MS)
+        gone_ns = self._threads.waited_ns() + (halted_ns if halted_ns > MIN_HALT_MS * MS else 0)
+        self.ms += min(gone_ns, passed_ns) / MS
+        self._looked_ns, self._busy_ns = now_ns, now_busy_ns
 
     def close(self) -> None:
         """Close what was opened of threads that live on."""
@@ -111,12 +117,6 @@ class OwnWaits:
         return SEEN * late_ms <= self.ms
 
 
-def awake_ms(process: subprocess.Popen[str]) -> float:
-    """Wait for a process to end; return the time this took, less the time its main thread waited for a core, ms."""
-    since_ns, queued_ns = time.monotonic_ns(), 0
-    while process.poll() is None:
-        with suppress(FileNotFoundError, ProcessLookupError):  # it has just ended
-            queued_ns = int(Path(f"/proc/{process.pid}/schedstat").read_text().split()[1])
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(0.01)
-    return (time.monotonic_ns() - since_ns - queued_ns) / MS
+def busy_ns() -> int:
+    """Return for how long this thread has computed or waited for a core."""
+    return sum(map(int, Path("/proc/thread-self/schedstat").read_text().split()[:2]))
