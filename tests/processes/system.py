@@ -31,7 +31,8 @@ from tests.in_time import ends_in_time
 ROOT = Path(__file__).parents[2]
 CONFIG = load(SHIPPED)
 KEYS = CONFIG.keys()
-PATIENCE_S = 60.0  # to start processes and hear of them on a host that is busy; the first controller on a machine compiles
+PATIENCE_S = 120.0  # to start processes and hear of them on a host that is busy; the first controller on a machine compiles
+ANSWERED = ("--timeout", PATIENCE_S)  # of a request whose answer, not its time, is tested: whoever answers may be held up for seconds
 SPEED = 4.0
 MAX_SAID = 2000  # characters of a log that a failure shows
 STATE = Path(tempfile.mkdtemp(prefix="rti-mpc-state-"))  # of commands that belong to no system; never the user's own

@@ -25,13 +25,12 @@ from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.guarded import write_robot
 from tests.in_time import LOOK_MS, OwnWaits
 from tests.processes.network import ip, missing, name_of
-from tests.processes.system import ROOT, command_line, environment, until
+from tests.processes.system import PATIENCE_S, ROOT, command_line, environment, until
 
 pytestmark = pytest.mark.slow
 
 RAMP_S = 0.6  # that a controller or guard may take to bring the robot to rest; others take none
 END_S = 2.0  # from the end of the ramp to the end of the process
-PATIENCE_S = 120.0  # for all to be driven: a busy host takes its time
 ENDPOINT = "tcp/127.0.0.1:7447"  # of a network of its own
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 LIVING = {  # what each process says once it can be ended, and the words that start it
@@ -163,7 +162,7 @@ class Round:
 
     def _living(self, role: str) -> None:
         words, _ = LIVING[role]
-        until(lambda: words in self._said(role) or self._running[role].poll() is not None, f"{role} says {words!r}", 0.02, PATIENCE_S)
+        until(lambda: words in self._said(role) or self._running[role].poll() is not None, f"{role} says {words!r}", 0.02)
         assert self._running[role].poll() is None, self._said(role)
 
     def _said(self, role: str) -> str:

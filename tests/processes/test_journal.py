@@ -17,17 +17,17 @@ from rti_mpc_service.replay.rebuild import journals, rebuild
 from rti_mpc_service.replay.trouble import kept, troubles
 from rti_mpc_service.shipped import SHIPPED
 from tests.guarded import write_robot
-from tests.processes.system import System, heard, rti_mpc
+from tests.processes.system import ANSWERED, PATIENCE_S, System, heard, rti_mpc
 
 pytestmark = pytest.mark.slow
 
 
 def ask(system: System, **request: object) -> None:
-    assert system.bus.request(system.keys.request, request, 5.0)["ok"]
+    assert system.bus.request(system.keys.request, request, PATIENCE_S)["ok"]
 
 
 def asked(system: System, *request: object) -> None:
-    done = rti_mpc(*request, system.config, "-e", system.endpoint)
+    done = rti_mpc(*request, system.config, "-e", system.endpoint, *ANSWERED)
     assert done.returncode == 0, done.stderr
 
 
@@ -45,7 +45,7 @@ def test_journal_of_a_run_with_whatever_an_operator_and_a_link_do_replays_withou
         heard(system.bus.subscriber(system.keys.command), Command, lambda command: command.mode is Mode.STOPPED)
         asked(system, "enable")
         system.tracking()
-        done = rti_mpc("params", "set", system.config, "ocp.weights.R.u_c=2.0", "-e", system.endpoint)
+        done = rti_mpc("params", "set", system.config, "ocp.weights.R.u_c=2.0", "-e", system.endpoint, *ANSWERED)
         assert done.returncode == 0, done.stderr
         ask(system, request="inject", failure="qp", samples=6)
         telemetry = system.bus.subscriber(system.keys.telemetry)

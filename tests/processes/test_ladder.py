@@ -19,7 +19,7 @@ from rti_mpc.wire.cdr import decode
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.shipped import SHIPPED
 from tests.in_time import explained, on_time
-from tests.processes.system import CONFIG, KEYS, SPEED, System, heard
+from tests.processes.system import CONFIG, KEYS, PATIENCE_S, SPEED, System, heard
 
 SLEW = np.array([0.25, 0.4]) / CONFIG.ocp.dt_s  # per s
 STOPPED_S = 1.5
@@ -39,7 +39,7 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Iterator[System]:
 
 
 def inject(system: System, failure: str, samples: int) -> None:
-    answer = system.bus.request(KEYS.request, {"request": "inject", "failure": failure, "samples": samples}, 5.0)
+    answer = system.bus.request(KEYS.request, {"request": "inject", "failure": failure, "samples": samples}, PATIENCE_S)
     assert answer == {"ok": True, "request": "inject", "failure": failure, "samples": samples}
 
 
@@ -149,7 +149,7 @@ def test_inputs_stayed_inside_bounds_and_slew_limits_through_all_of_it(driven: S
 @pytest.mark.slow
 @pytest.mark.parametrize("request_", [{"request": "inject", "failure": "flood"}, {"request": "inject", "failure": "qp", "samples": 0}])
 def test_failure_that_cannot_be_injected_is_refused_with_what_can(driven: System, request_: dict[str, object]) -> None:
-    answer = driven.bus.request(KEYS.request, request_, 5.0)
+    answer = driven.bus.request(KEYS.request, request_, PATIENCE_S)
     assert answer["ok"] is False
     assert "must be" in answer["error"]
 
@@ -158,5 +158,5 @@ def test_failure_that_cannot_be_injected_is_refused_with_what_can(driven: System
 def test_nothing_fails_on_request_unless_the_configuration_says_so(tmp_path: Path) -> None:
     with System(tmp_path) as system:
         system.start("robot", "controller")
-        answer = system.bus.request(KEYS.request, {"request": "inject", "failure": "qp", "samples": 3}, 20.0)
+        answer = system.bus.request(KEYS.request, {"request": "inject", "failure": "qp", "samples": 3}, PATIENCE_S)
     assert answer == {"ok": False, "error": "inject must be enabled in the configuration, with debug.inject = true, got false"}

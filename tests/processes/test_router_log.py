@@ -14,7 +14,7 @@ import pytest
 from rti_mpc.contract.message import Command, State
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.keys import Keys
-from tests.processes.system import heard, rti_mpc, until
+from tests.processes.system import ANSWERED, heard, rti_mpc, until
 
 pytest.importorskip("cryptography", reason="the extra certs is not installed: certificates were NOT tried")
 
@@ -81,7 +81,7 @@ def test_router_has_nothing_to_say_about_a_system_in_which_each_process_has_its_
     commands = viewer.subscriber(viewer.keys.actuation)
     heard(commands, Command, lambda command: command.mode.name == "TRACKING")
     for request in ("stop", "enable"):
-        done = rti_mpc(request, system.config, "--tls", system.tls, "--timeout", 10)
+        done = rti_mpc(request, system.config, "--tls", system.tls, *ANSWERED)
         assert done.returncode == 0, done.stderr
     heard(commands, Command, lambda command: command.mode.name == "TRACKING")
     heard(viewer.subscriber(viewer.keys.state), State, lambda _: True)

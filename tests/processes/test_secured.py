@@ -18,7 +18,7 @@ from rti_mpc.wire.bus import Bus
 from rti_mpc.wire.cdr import decode, encode
 from rti_mpc.wire.keys import Key, Keys
 from rti_mpc_service.rig.endpoint import free_endpoint
-from tests.processes.system import PATIENCE_S, heard, rti_mpc, until
+from tests.processes.system import ANSWERED, PATIENCE_S, heard, rti_mpc, until
 
 pytest.importorskip("cryptography", reason="the extra certs is not installed: certificates were NOT tried")
 
@@ -75,10 +75,10 @@ def test_every_process_works_with_its_own_certificate_a_stop_stops_and_a_viewer_
     assert heard(viewer.subscriber(bus.keys.telemetry), Telemetry, lambda _: True).x0.shape == (5,)
     late = bus.join("recorder").subscriber(bus.keys.reference)  # after the only reference was sent: from the planner's cache
     assert len(heard(late, Reference, lambda _: True).y) > 1
-    done = rti_mpc("stop", bus.config, "--tls", bus.tls, "--timeout", 10)
+    done = rti_mpc("stop", bus.config, "--tls", bus.tls, *ANSWERED)
     assert (done.returncode, json.loads(done.stdout)["role"]) == (0, "guard"), done.stderr
     heard(viewer.subscriber(bus.keys.state), State, lambda s: bool(np.all(np.abs(s.u) < 1e-3)))
-    done = rti_mpc("enable", bus.config, "--tls", bus.tls, "--timeout", 10)
+    done = rti_mpc("enable", bus.config, "--tls", bus.tls, *ANSWERED)
     assert done.returncode == 0, done.stderr
     heard(commands, Command, lambda command: command.mode.name == "TRACKING")
     lives: set[str] = set()
@@ -140,7 +140,7 @@ def test_wildcards_requests_and_presence_of_others_are_denied(bus: Secured, crow
         assert not arrives(crowd["viewer"], key, b"forged", crowd["operator"], bus.keys.command, crowd["robot"]), text
     asked: list[dict[str, Any]] = []
     crowd["controller"].serve(bus.keys.request, lambda request: asked.append(request) or {"ok": True})
-    assert crowd["operator"].request(bus.keys.request, {"from": "operator"}, 20.0) == {"ok": True}
+    assert crowd["operator"].request(bus.keys.request, {"from": "operator"}, PATIENCE_S) == {"ok": True}
     for role in ("viewer", "planner", "robot", "other"):
         with pytest.raises(TimeoutError):
             crowd[role].request(bus.keys.request, {"from": role}, 1.0)
@@ -150,7 +150,7 @@ def test_wildcards_requests_and_presence_of_others_are_denied(bus: Secured, crow
         crowd["operator"].request(bus.keys.stop, {"request": "stop"}, 1.0)
     crowd["viewer"].alive("controller")
     crowd["robot"].alive("robot")
-    assert crowd["operator"].is_alive("robot", 20.0)
+    assert crowd["operator"].is_alive("robot", PATIENCE_S)
     assert not crowd["operator"].is_alive("controller", 1.0)
 
 

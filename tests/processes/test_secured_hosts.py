@@ -26,7 +26,7 @@ from rti_mpc_service.scenario import find_trajectory
 from tests.guarded import GUARDED
 from tests.processes.network import Network, missing
 from tests.processes.overheard import Overheard
-from tests.processes.system import ROOT, command_line, until
+from tests.processes.system import ANSWERED, ROOT, command_line, until
 
 pytest.importorskip("cryptography", reason="the extra certs is not installed: three commands were NOT tried")
 
@@ -106,6 +106,6 @@ def run(folder: Path, *words: str) -> None:
 
 def asked(network: Network, *words: str, cwd: Path) -> dict[str, Any]:
     """Return the answer to an operator on the desk."""
-    done = network.run("desk", "rti_mpc_service.cli", *words, cwd=cwd)
+    done = network.run("desk", "rti_mpc_service.cli", *words, *ANSWERED, cwd=cwd)
     assert done.returncode == 0, done.stderr
     return dict(json.loads(done.stdout))

@@ -17,7 +17,7 @@ from rti_mpc.contract.status import Mode
 from rti_mpc.wire.cdr import decode
 from rti_mpc_service.host.hold_up import Host
 from tests.in_time import MS, explained, in_time, on_time
-from tests.processes.system import KEYS, heard, owner, rti_mpc, until
+from tests.processes.system import ANSWERED, KEYS, heard, owner, rti_mpc, until
 from tests.processes.watched import CONTROLLERS, Watched, configuration, within_limits
 
 
@@ -68,7 +68,7 @@ def test_orders_hold_whoever_leads_and_of_two_that_stand_by_the_lower_number_lea
     with Watched(tmp_path, 0.1, live=True) as system:
         system.start("robot", "leader", "reference")
         system.tracking()
-        assert rti_mpc("params", "set", system.config, "ocp.weights.Q.psi=0.0", "-e", system.endpoint).returncode == 0
+        assert rti_mpc("params", "set", system.config, "ocp.weights.Q.psi=0.0", "-e", system.endpoint, *ANSWERED).returncode == 0
         system.start("standby", "third")  # that hear of the change from the leader
         standby_telemetry = system.bus.subscriber(KEYS.standby_telemetry, capacity=64)
         sources = set()
@@ -93,14 +93,14 @@ def test_orders_hold_whoever_leads_and_of_two_that_stand_by_the_lower_number_lea
             assert system.process(second.epoch) == low
             assert "leads from now on" not in system.said(high)
 
-        answer = rti_mpc("stop", system.config, "-e", system.endpoint)
+        answer = rti_mpc("stop", system.config, "-e", system.endpoint, *ANSWERED)
         assert (answer.returncode, json.loads(answer.stdout)["ok"]) == (0, True)
         system.state(lambda state: bool(np.abs(state.x[3:]).max() < 1e-3))
         system.kill(system.process(second.epoch))
         third = system.led_by_another(second.epoch)
         system.answers(third, 10)
         assert {command.mode for command in system.commands if command.epoch == third.epoch} == {Mode.STOPPED}
-        assert rti_mpc("enable", system.config, "-e", system.endpoint).returncode == 0
+        assert rti_mpc("enable", system.config, "-e", system.endpoint, *ANSWERED).returncode == 0
         assert system.tracking().epoch == third.epoch
         assert system.samples_of_two_epochs() == []
 

@@ -23,13 +23,16 @@ import zenoh
 
 from rti_mpc.contract.message import Command
 from rti_mpc.contract.status import Mode
+from rti_mpc_service.host.hold_up import Host
 from tests.guarded import write_robot
+from tests.in_time import MS, in_time
 from tests.processes.record import FAST_STATES, moves, rests
-from tests.processes.system import KEYS, System, heard, rti_mpc, until
+from tests.processes.system import ANSWERED, KEYS, PATIENCE_S, System, heard, rti_mpc, until
 
 pytestmark = pytest.mark.slow
 
 REQUESTS_PER_S = 300
+ANSWER_MS = 2000.0  # for which the command `stop` waits for an answer
 
 
 class Operated(System):
@@ -104,18 +107,19 @@ def flood(endpoint: str) -> Iterator[list[float]]:
             thread.join()
 
 
-def test_stop_is_answered_beside_300_requests_a_second(system: Operated) -> None:
+def test_stop_is_answered_beside_300_requests_a_second(system: Operated, host: Host) -> None:
     system.start("robot", "controller", "reference")
     system.tracking()
     with flood(system.endpoint) as asked:
-        took_s = []
+        took_ms = []
         for word in ("stop", "enable") * 5:  # of which three of five stops were lost where they waited with the others
-            start_s, before = time.monotonic(), len(asked)
-            answer = next(system.bus.answers(KEYS.stop, {"request": word}, 2.0))
-            took_s.append(time.monotonic() - start_s)
+            start_ns, before = time.monotonic_ns(), len(asked)
+            answer = next(system.bus.answers(KEYS.stop, {"request": word}, PATIENCE_S))
+            took_ms.append((time.monotonic_ns() - start_ns) / MS)
+            in_time(host, f"the answer to {word}", took_ms[-1], ANSWER_MS, start_ns)
             assert answer["ok"] is True
             until(lambda: len(asked) > before + REQUESTS_PER_S // 5, "more requests")  # noqa: B023
-        print(f"\n{len(asked)} requests; stop and enable were answered within {1e3 * max(took_s):.0f} ms, median {1e3 * np.median(took_s):.1f}")
+        print(f"\n{len(asked)} requests; stop and enable were answered within {max(took_ms):.0f} ms, median {np.median(took_ms):.1f}")
     system.tracking()
 
 
@@ -124,7 +128,7 @@ def test_stop_outlives_all_processes_of_a_guarded_robot_and_the_guard_tells_a_co
     system.start("robot", "guard", "controller", "reference")
     system.tracking()
     system.state(moves)
-    done = system.says("stop")
+    done = system.says("stop", *ANSWERED)
     assert (done.returncode, json.loads(done.stdout)["role"]) == (0, "guard"), done.stderr
     system.state(rests)
 
@@ -146,7 +150,7 @@ def test_stop_outlives_all_processes_of_a_guarded_robot_and_the_guard_tells_a_co
     system.commanded_to_stand()
 
     system.kill("controller")
-    done = system.says("enable")  # the guard alone is there, and acts
+    done = system.says("enable", *ANSWERED)  # the guard alone is there, and acts
     assert (done.returncode, json.loads(done.stdout)["role"]) == (0, "guard"), done.stderr
     system.start("controller")
     system.tracking()
@@ -155,4 +159,4 @@ def test_stop_outlives_all_processes_of_a_guarded_robot_and_the_guard_tells_a_co
     system.kill("guard")
     done = system.says("stop", "--timeout", 1.0)
     assert done.returncode == 1
-    assert "the guard has not confirmed stop within 1 s; controller has" in done.stderr
+    assert "the guard has not confirmed stop within 5 s; controller has" in done.stderr

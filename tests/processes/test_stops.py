@@ -20,7 +20,7 @@ from rti_mpc.array import Array
 from rti_mpc.contract.limits import MAX_VALID_NS
 from rti_mpc.contract.message import State
 from tests.movers import CURRENT, following, path_file, toml
-from tests.processes.system import System, rti_mpc, until
+from tests.processes.system import ANSWERED, System, rti_mpc, until
 
 STILL = 1e-3  # m/s, rad/s
 STANDING_S = 1.0  # robot time for which it then stands
@@ -136,7 +136,7 @@ def test_robot_comes_to_rest_when_it_is_stopped_and_when_controller_or_guard_are
         system.start("robot", "guard", "controller", "reference")
         system.tracking()
         system.moves(driven.speed)
-        operator = ("-e", system.endpoint, "--state", tmp_path / "state")
+        operator = ("-e", system.endpoint, "--state", tmp_path / "state", *ANSWERED)
         assert rti_mpc("stop", path, *operator).returncode == 0
         stops("stopped")
         assert rti_mpc("enable", path, *operator).returncode == 0

@@ -26,7 +26,7 @@ from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.shipped import SHIPPED
 from tests.in_time import MS, in_time, on_time
 from tests.processes.record import STANDSTILL_SPEED, moves, rests
-from tests.processes.system import CONFIG, KEYS, SPEED, System, heard, rti_mpc, until
+from tests.processes.system import ANSWERED, CONFIG, KEYS, SPEED, System, heard, rti_mpc, until
 
 END_MS = 1000.0  # from Ctrl-C to the end of a process
 PERIOD_MS = 1e3 * CONFIG.ocp.dt_s / SPEED
@@ -112,7 +112,7 @@ def test_of_several_planners_a_controller_that_starts_after_them_follows_the_lat
 
 def test_stop_is_latched_until_enable_and_outlives_a_controller_that_is_killed(driven: System) -> None:
     def says(word: str) -> CompletedProcess[str]:
-        return rti_mpc(word, SHIPPED, "-e", driven.endpoint, "--state", driven.folder / "state")  # an operator on the same host
+        return rti_mpc(word, SHIPPED, "-e", driven.endpoint, "--state", driven.folder / "state", *ANSWERED)  # an operator on the same host
 
     driven.state(moves)
     done = says("stop")
