@@ -24,7 +24,7 @@ from tests.guarded import GUARDED
 from tests.in_time import explained, in_time, on_time
 from tests.processes.record import FAST_STATES, MS, recorded, rests, within_slew
 from tests.processes.system import KEYS, until
-from tests.processes.watched import Watched
+from tests.processes.watched import Watched, relieved
 
 pytestmark = pytest.mark.slow
 
@@ -47,10 +47,11 @@ def passed(system: Watched, first: int = 0) -> list[Command]:
     return [command for command in system.actuation[first:] if command.mode is not Mode.BRAKING]
 
 
-def leader(system: Watched, passed: Command) -> int:
-    """Epoch of the only controller that has answered the state which a command answers."""
-    (epoch,) = {command.epoch for command in system.commands if command.state_seq == passed.state_seq}
-    return epoch
+def leaders(host: Host, system: Watched, passed: list[Command], since_ns: int) -> list[int]:
+    """Epochs of the only controllers that have answered the states of commands; where the host was in the way, two may have answered one."""
+    answers = [{command.epoch for command in system.commands if command.state_seq == one.state_seq} for one in passed]
+    assert all(len(epochs) == 1 for epochs in answers) or relieved(host, system, since_ns), answers
+    return [epoch for epochs in answers if len(epochs) == 1 for epoch in epochs]
 
 
 def passes(system: Watched, first: int, count: int) -> list[Command]:
@@ -87,15 +88,16 @@ def test_commands_of_the_standby_pass_the_guard_in_time_and_none_of_the_old_lead
     else:
         system.kill(dying)
     after = passes(system, start, 20)
-    epochs = [leader(system, command) for command in after]
+    epochs = leaders(host, system, after, system.fault_at_ns)
     assert epochs == sorted(epochs), "whoever was relieved says nothing more"
-    assert epochs[0] == second.epoch
+    assert epochs[0] == second.epoch or relieved(host, system, system.fault_at_ns)
     assert FORGED not in {command.config_hash for command in after}
     gap_ms = np.diff([command.state_stamp_ns for command in after]).max() / MS
     if (late_ms := gap_ms - PROMISE_MS) > 0.0:
         assert explained(host, f"the gap between two answers was {gap_ms:.0f} ms", late_ms, system.fault_at_ns, time.monotonic_ns())
     record = recorded(system, died_ns, (after[-1].state_stamp_ns - died_ns) // MS)
-    assert record.starved[0] == record.starved[-1], "the robot braked on its own"
+    starved = record.starved[-1] - record.starved[0]
+    assert starved == 0 or not on_time(host, "what acts", 1e3 * DT_S, system.fault_at_ns), "the robot braked on its own"
     within_slew(record)
 
 
@@ -121,7 +123,7 @@ def test_restarted_guard_passes_one_leader_and_none_has_taken_over_for_want_of_a
     system.start("guard")
     driven = system.state(lambda state: abs(state.x[3]) > 0.05)
     print(f"\nguard restarted: driven again {(driven.stamp_ns - killed_ns) / MS:.0f} ms after it was killed, process start included")
-    epochs = [leader(system, command) for command in passes(system, before, 1)]
+    epochs = leaders(host, system, passes(system, before, 1), begun_ns)
     assert epochs == sorted(epochs)
     answers = [command for command in system.commands if command.state_stamp_ns > killed_ns]
     changes = [(one, other) for one, other in pairwise(answers) if one.epoch != other.epoch]

@@ -59,10 +59,11 @@ def drives_on(system: Watched, host: Host, since_ns: int) -> None:
     """Check that commands of a controller alone acted, in tracking, without a longer gap than a takeover may have."""
     system.listen()
     acted = [command for command in system.actuation if command.state_stamp_ns >= since_ns]
-    assert {command.mode for command in acted} <= {Mode.TRACKING, Mode.BRAKING}
+    punctual = on_time(host, "what acts", 1e3 * DT_S, system.driven_ns)  # else commands are fallbacks, and the guard changes those that come late
+    assert {command.mode for command in acted} <= {Mode.TRACKING, Mode.BRAKING} or not punctual
     answered = {(command.state_seq, command.u.tobytes()) for command in system.commands}
     passed = [command for command in acted if command.mode is Mode.TRACKING]
-    assert all((command.state_seq, command.u.tobytes()) in answered for command in passed)
+    assert all((command.state_seq, command.u.tobytes()) in answered for command in passed) or not punctual
     gap_ms = np.diff([command.state_stamp_ns for command in passed]).max() / MS
-    assert gap_ms <= PROMISE_MS or not on_time(host, "what acts", 1e3 * DT_S, system.driven_ns), gap_ms
+    assert gap_ms <= PROMISE_MS or not punctual, gap_ms
     within_slew(recorded(system, since_ns, (passed[-1].state_stamp_ns - since_ns) // MS))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rti_mpc.contract.approach import SLEW_WINDOW_PERIODS
 from rti_mpc.contract.epoch import NUMBER_BITS
 from rti_mpc.contract.message import Command, Telemetry
 from rti_mpc.contract.status import Mode
@@ -16,7 +17,7 @@ from rti_mpc.wire.cdr import decode
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.shipped import SHIPPED
 from tests.guarded import write_robot
-from tests.in_time import on_time
+from tests.in_time import BEFORE_NS, MS, SEEN, on_time
 from tests.processes.system import KEYS, System, heard, owner, until
 
 ARGUMENTS: dict[str, tuple[object, ...]] = {
@@ -105,11 +106,28 @@ class Watched(System):
         return until(look, "the robot's log tells of the command", pause_s=0.05)
 
 
+def half_period(dt_s: float) -> str:
+    """What a configuration needs for two states a period, so that inputs are recorded more often than their slew limits may be used up."""
+    return f"\n[sim]\nstate_period_s = {dt_s / 2}\n"
+
+
+def relieved(host: Host, system: Watched, since_ns: int) -> bool:
+    """Whether the host has held processes up for so long that a living leader may have been taken for silent; prints it if so."""
+    silent_ms = 1e3 * max(3 * system.dt_s, 0.05)
+    worst_ms = host.worst_ms(since_ns - BEFORE_NS, time.monotonic_ns(), round(silent_ms * MS))
+    if so := worst_ms >= SEEN * (silent_ms - 1e3 * system.dt_s):
+        print(f"\na living leader may have been relieved: within {silent_ms:.0f} ms the host held processes up for {worst_ms:.0f} ms")
+    return so
+
+
 def within_limits(host: Host, system: Watched) -> None:
     """Check that inputs never jumped, and commands never ran out, unless the host held up the process that had to answer."""
     rows = system.log()
+    t_s = 1e-9 * np.array([int(row["stamp_ns"]) for row in rows])
     u = np.array([[float(row["u_c"]), float(row["omega_c"])] for row in rows])
-    assert np.all(np.abs(np.diff(u, axis=0)) <= np.array([SPEED_LIMIT, TURN_LIMIT]) * system.dt_s + 1e-9)  # rounding
+    near = np.diff(t_s) <= SLEW_WINDOW_PERIODS * system.dt_s  # late and punctual commands may begin less than a period apart
+    assert near.mean() > 0.5
+    assert np.all(np.abs(np.diff(u, axis=0)[near]) <= np.array([SPEED_LIMIT, TURN_LIMIT]) * system.dt_s + 1e-9)  # rounding
     driven = [row for row in rows if int(row["stamp_ns"]) >= system.driven_stamp_ns]  # while processes start, they hold each other up
     starved = int(driven[-1]["starved"]) - int(driven[0]["starved"])
     assert starved == 0 or not on_time(host, "what acts", 1e3 * system.dt_s, system.driven_ns)
