@@ -26,7 +26,7 @@ from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.shipped import SHIPPED
 from tests.command import command
-from tests.in_time import PATIENT, in_time
+from tests.in_time import MS, PATIENT, in_time
 from tests.processes.system import KEYS, ROOT, System, command_line, environment, until
 from tests.recording.test_recording import read_by_others
 
@@ -88,7 +88,8 @@ def test_recorder_killed_at_any_instant_leaves_all_but_the_last_second(tmp_path:
             assert not recording.whole
             assert seqs == list(range(seqs[0], seqs[-1] + 1))
             assert seqs[0] <= begun
-            in_time(host, "what a killed recorder had not written yet", 1e3 * (last - seqs[-1]) / RATE_HZ, LAST_MS, killed_ns)
+            unwritten_ms = 1e3 * (last - seqs[-1]) / RATE_HZ
+            in_time(host, "what a killed recorder had not written yet", unwritten_ms, LAST_MS, killed_ns - round(unwritten_ms * MS))
             assert repair(path, path) >= len(seqs)
             assert read_by_others(path)["/rti_mpc/pioneer/state"] == len(seqs)
 

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from rti_mpc_service.host.hold_up import Host
 from tests.bench.paced import pace, two
+from tests.in_time import explained
 
 pytestmark = pytest.mark.slow
 
@@ -19,10 +22,13 @@ EARLY_S = 2.5e-3  # at most: from before the control thread is woken to after th
 MOST = 1.5  # median of early states, with over without: with rehearsals it is 0.85 if they come in time; busy hosts differ by less than this
 
 
-def test_states_that_come_early_are_answered_as_soon_with_rehearsals_as_without(tmp_path: Path) -> None:
+def test_states_that_come_early_are_answered_as_soon_with_rehearsals_as_without(tmp_path: Path, host: Host) -> None:
     early_s = np.random.default_rng(1).uniform(0.0, EARLY_S, SAMPLES)
+    begun_ns = time.monotonic_ns()
     with two(tmp_path, DT_S) as robots:
         numbers = list(pace(robots, DT_S, SAMPLES, early_s))[FIRST:]
     rehearsed, plain = (robot.latency_us(numbers) for robot in robots)
-    assert min(len(rehearsed), len(plain)) > 0.9 * len(numbers)
+    missing = len(numbers) - min(len(rehearsed), len(plain))
+    by_ms = 0.5e3 * DT_S * missing  # half a period each, at least
+    assert missing < 0.1 * len(numbers) or explained(host, f"{missing} states were not answered", by_ms, begun_ns, time.monotonic_ns())
     assert np.median(rehearsed) < MOST * np.median(plain)

@@ -157,6 +157,6 @@ def test_stop_outlives_all_processes_of_a_guarded_robot_and_the_guard_tells_a_co
     system.state(moves)
 
     system.kill("guard")
-    done = system.says("stop", "--timeout", 1.0)
+    done = system.says("stop", "--timeout", 5.0)  # longer than the host may hold the controller up
     assert done.returncode == 1
     assert "the guard has not confirmed stop within 5 s; controller has" in done.stderr
