@@ -5,19 +5,18 @@ from __future__ import annotations
 
 import gc
 import os
-from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.closed_loop.fuzz import Fuzz
 from tests.closed_loop.lossy import Lossy
+from tests.memory import PARTS, anonymous_bytes, leaked_bytes
 
 SHORT_SAMPLES = 2_500
 MANY_SAMPLES = 20_000 if "CI" in os.environ else 1_000_000
 
 
-def resident_bytes() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
 @pytest.mark.parametrize("measured", [pytest.param(False, marks=pytest.mark.slow, id="no delay"), pytest.param(True, id="measured delay")])
@@ -48,12 +47,12 @@ def test_no_fuzzed_sample_leaves_a_reference_cycle() -> None:
 @pytest.mark.parametrize("seed", [2, 3])
 def test_no_sample_of_a_million_leaves_the_limits_or_raises(seed: int) -> None:
     fuzz = Fuzz(seed=seed)
-    fuzz.run(MANY_SAMPLES // 5)
-    before = resident_bytes()
-    fuzz.run(MANY_SAMPLES)
-    grown = resident_bytes() - before
-    print(f"\n{fuzz.samples} samples, memory grown by {grown / 2**20:.2f} MiB: {dict(fuzz.seen)}")
-    assert grown < 2**22  # bytes; of 800,000 samples
+    looked = []
+    for samples in np.linspace(MANY_SAMPLES // 5, MANY_SAMPLES, PARTS + 1):
+        fuzz.run(round(samples))
+        looked.append(anonymous_bytes())
+    print(f"\n{fuzz.samples} samples, memory grown by {(looked[-1] - looked[0]) / 2**20:.2f} MiB: {dict(fuzz.seen)}")
+    assert leaked_bytes(looked) < 2**22, looked  # of 800,000 samples
 
 
 LOSSY = [

@@ -187,12 +187,6 @@ def until(look: Callable[[], T | None], what: str, pause_s: float = 0.002, patie
     raise AssertionError(f"waited {patience_s} s in vain: {what}")
 
 
-def anonymous_bytes(pid: int) -> int:
-    """Memory of a process that no file backs, in bytes."""
-    line = next(line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("RssAnon"))
-    return 1024 * int(line.split()[1])
-
-
 def handles(pid: int, number: signal.Signals) -> bool:
     """
     Whether a process handles a signal, one that Python leaves alone.

@@ -31,7 +31,8 @@ from rti_mpc_service.host import machine, realtime
 from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.robot_log import RobotLog
 from tests.bench.driven import Driven, driven, quantiles
-from tests.processes.system import ROOT, anonymous_bytes, environment, until
+from tests.memory import PARTS, anonymous_bytes
+from tests.processes.system import ROOT, environment, until
 
 pytestmark = pytest.mark.slow
 
@@ -46,7 +47,6 @@ ROLES = ("controller", "robot", "reference")
 WARM_UP_S = 600.0  # in which the arenas of the allocator meet their stalls; a quarter of a shorter run
 MIN_SLOPE_RUN_S = 900.0  # in a shorter run, a growth per hour cannot be distinguished from the step that a stall leaves
 SHORT_RUN_GROWTH = 100.0  # MiB/h, limit in a shorter run: a leak of a hundred bytes per sample
-PARTS = 3  # of a shorter run: a leak grows in each, the step that a stall leaves is in one
 MIB = 2**20
 
 TIMER = """
