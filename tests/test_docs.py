@@ -15,7 +15,7 @@ import pytest
 from rti_mpc_service.conformance import guard, robot
 from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.command import built
-from tests.processes.system import until
+from tests.processes.system import PATIENCE_S, until
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -70,7 +70,7 @@ def test_tutorial_of_the_adapter_drives_the_robot_word_by_word(tmp_path: Path) -
         (tmp_path / name).write_text(f"from rti_mpc.wire.bus import BusSettings\n{joined}")
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "STATE_DIRECTORY": str(tmp_path / "state")}
     cli = ("-c", "from rti_mpc_service.cli import main; main()")
-    subprocess.run([sys.executable, *cli, "init", "my_robot"], cwd=tmp_path, env=environment, check=True, timeout=60)
+    subprocess.run([sys.executable, *cli, "init", "my_robot"], cwd=tmp_path, env=environment, check=True, timeout=PATIENCE_S)
     processes: dict[str, subprocess.Popen[bytes]] = {}
     try:
         for name, line in {"robot": ("robot.py",), "run": (*cli, "run", "my_robot.toml", "-e", endpoint), "planner": ("planner.py",)}.items():
@@ -78,10 +78,10 @@ def test_tutorial_of_the_adapter_drives_the_robot_word_by_word(tmp_path: Path) -
                 processes[name] = subprocess.Popen([sys.executable, *line], cwd=tmp_path, env=environment, stdout=log, stderr=log)
             if name == "run":
                 until(lambda: "waiting: first state" in (tmp_path / "run.log").read_text(), "the controller hears the robot", pause_s=0.1)
-        assert processes["planner"].wait(60.0) == 0
+        assert processes["planner"].wait(PATIENCE_S) == 0
         for name in ("robot", "run"):
             processes[name].send_signal(signal.SIGINT)
-            assert processes[name].wait(30.0) == 0
+            assert processes[name].wait(PATIENCE_S) == 0
     finally:
         for process in processes.values():
             process.kill()

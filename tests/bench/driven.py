@@ -20,7 +20,7 @@ from rti_mpc_service.rig.children import Children
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.rig.robot_log import RobotLog
 from rti_mpc_service.shipped import SHIPPED
-from tests.processes.system import until
+from tests.processes.system import PATIENCE_S, until
 
 INFO = Info("controller", states=tuple(map(Label, ("x", "y", "psi", "u", "omega"))), inputs=tuple(map(Label, ("u_c", "omega_c"))))
 
@@ -51,7 +51,7 @@ class Driven:
         """Wait for this number of new samples."""
         first = self.listen()
         period_s = 1e-9 * (self.telemetry[-1].state_stamp_ns - self.telemetry[-2].state_stamp_ns)
-        until(lambda: self.listen() >= first + number, f"{number} samples", pause_s=0.2, patience_s=2 * number * period_s + 10.0)
+        until(lambda: self.listen() >= first + number, f"{number} samples", pause_s=0.2, patience_s=2 * number * period_s + PATIENCE_S)
         return self.telemetry[first : first + number]
 
     def log(self) -> RobotLog:
@@ -83,10 +83,10 @@ def driven(folder: Path, dt_s: float, duration_s: float, realtime: str = "") -> 
             "controller": children.start("controller", "rti_mpc_service.cli", "run", toml, "-e", endpoint),
             "reference": children.start("reference", "rti_mpc_service.cli", "reference", toml, "-e", endpoint, "--duration", duration_s),
         }
-        until(lambda: pids.keys() <= lives, "controller and reference", patience_s=60.0)
+        until(lambda: pids.keys() <= lives, "controller and reference")
         robot = Driven(folder, endpoint, bus, children, lives, bus.subscriber(keys.telemetry, capacity=8192), pids)
         pids["robot"] = children.start("robot", "rti_mpc_service.cli", "sim", toml, *meeting, "--log", folder / "robot.csv")
-        until(lambda: robot.listen() > 1, "the first samples", patience_s=30.0)
+        until(lambda: robot.listen() > 1, "the first samples")
         yield robot
 
 

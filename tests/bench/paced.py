@@ -57,7 +57,7 @@ class Paced:
         self.telemetries = self.bus.subscriber(keys.telemetry, capacity=RING_MESSAGES)
         threading.Thread(target=self.hear, daemon=True).start()
         children.start(name, "rti_mpc_service.cli", "run", self.toml, "-e", endpoint)
-        until(lambda: self.states.heard, "the controller", patience_s=60.0)
+        until(lambda: self.states.heard, "the controller")
         self.references.put(reference(eight().lasting(LIVES_S), "consistent"))
 
     def hear(self) -> None:

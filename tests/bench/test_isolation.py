@@ -58,7 +58,7 @@ def block(robot: Driven, name: str) -> list[Telemetry]:
     recording = robot.folder / "run.rrd"
     recording.unlink(missing_ok=True)
     pid = robot.children.start("viewer", "rti_mpc_service.cli", "view", robot.toml, "-e", robot.endpoint, "--rerun-save", recording, nice=10)
-    until(lambda: "viewer" in robot.lives and recording.exists() and recording.stat().st_size, "the viewer records", patience_s=30.0)
+    until(lambda: "viewer" in robot.lives and recording.exists() and recording.stat().st_size, "the viewer records")
     robot.listen()
     TROUBLES[name](pid)
     samples = robot.samples(BLOCK_SAMPLES)
@@ -74,7 +74,7 @@ def recorded(robot: Driven) -> list[Telemetry]:
     recording = robot.folder / "run.mcap"
     recording.unlink(missing_ok=True)
     robot.children.start("recorder", "rti_mpc_service.cli", "record", robot.toml, "-e", robot.endpoint, "--out", recording, nice=10)
-    until(lambda: "recorder" in robot.lives and recording.exists() and recording.stat().st_size > RECORDS_B, "it records", patience_s=30.0)
+    until(lambda: "recorder" in robot.lives and recording.exists() and recording.stat().st_size > RECORDS_B, "it records")
     robot.listen()
     size = recording.stat().st_size
     samples = robot.samples(BLOCK_SAMPLES)

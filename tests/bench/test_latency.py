@@ -34,7 +34,7 @@ from rti_mpc_service.rig import robot_log
 from rti_mpc_service.rig.children import Children
 from rti_mpc_service.rig.endpoint import free_endpoint
 from tests.bench.driven import INFO, quantiles, sampled
-from tests.processes.system import until
+from tests.processes.system import PATIENCE_S, until
 
 pytestmark = pytest.mark.benchmark
 
@@ -111,7 +111,7 @@ def test_command_takes_at_most_one_and_a_half_echoes_and_the_feedback(config: Co
         bus.watch_alive(lambda role, present: (lives.add if present else lives.discard)(role))
         children.start("controller", "rti_mpc_service.cli", "run", toml, "-e", endpoint)
         children.start("reference", "rti_mpc_service.cli", "reference", toml, "-e", endpoint, "--duration", 120)
-        until(lambda: {"controller", "reference"} <= lives, "controller and reference", patience_s=60.0)
+        until(lambda: {"controller", "reference"} <= lives, "controller and reference")
         samples = bus.subscriber(keys.telemetry, capacity=4096)
         pings = Pings(bus, session, encode(State(0, 0, 0, np.zeros(5))))
         pings.start()
@@ -121,7 +121,7 @@ def test_command_takes_at_most_one_and_a_half_echoes_and_the_feedback(config: Co
             telemetry.extend(decode(Telemetry, received.payload) for received in samples.drain())
             return len(telemetry) >= SAMPLES
 
-        until(enough, f"{SAMPLES} samples", pause_s=0.2, patience_s=2 * SAMPLES * DT_S + 20.0)
+        until(enough, f"{SAMPLES} samples", pause_s=0.2, patience_s=2 * SAMPLES * DT_S + PATIENCE_S)
         for name in ("controller", "robot", "reference"):
             children.end(name)
     log = robot_log.read(tmp_path / "robot.csv", INFO)

@@ -16,7 +16,7 @@ from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.shipped import SHIPPED
 from tests.guarded import write_robot
 from tests.in_time import MS, computed_ms, in_time
-from tests.processes.system import ROOT, command_line, environment, until
+from tests.processes.system import PATIENCE_S, ROOT, command_line, environment, until
 
 pytestmark = pytest.mark.slow
 
@@ -45,11 +45,11 @@ def test_process_that_reaches_nobody_says_so_within_three_seconds_besides_its_st
         line = command_line(command, config, "-e", UNUSED_ENDPOINT, "-m", mode, *options)
         process = subprocess.Popen(line, cwd=ROOT, env=environment(), stdout=file, stderr=subprocess.STDOUT)
     try:
-        until(lambda: "not connected" in log.read_text(errors="replace"), f"{command} says that it reaches nobody", pause_s=0.01, patience_s=60.0)
+        until(lambda: "not connected" in log.read_text(errors="replace"), f"{command} says that it reaches nobody", pause_s=0.01)
         took_ms, limit_ms = (time.monotonic_ns() - began_ns) / MS, MAX_REMINDER_MS + computed_ms(process)
         in_time(host, f"to say of {command} that it reaches nobody", took_ms, limit_ms, began_ns)
         process.terminate()
-        assert process.wait(30.0) == 0
+        assert process.wait(PATIENCE_S) == 0
         assert "Traceback" not in log.read_text(errors="replace")
     finally:
         process.kill()
@@ -97,13 +97,13 @@ def test_process_with_a_wrong_certificate_says_why_it_is_refused(trusted: str, r
             with logs[command].open("wb") as file:
                 line = command_line(command, SHIPPED, "-c", config)
                 processes.append(subprocess.Popen(line, cwd=ROOT, env=environment(), stdout=file, stderr=subprocess.STDOUT))
-            until(lambda c=command, w=word: w in logs[c].read_text(errors="replace"), f"{command} says {word}", pause_s=0.01, patience_s=60.0)
+            until(lambda c=command, w=word: w in logs[c].read_text(errors="replace"), f"{command} says {word}", pause_s=0.01)
         limit_ms = MAX_REMINDER_MS + computed_ms(processes[-1])
         in_time(host, "to say that nobody is reached", (time.monotonic_ns() - began_ns) / MS, limit_ms, began_ns)
         assert re.search(f"{endpoint}: .*{reason.format(tmp_path)}", logs["reference"].read_text())
         for process in reversed(processes):
             process.terminate()
-            assert process.wait(30.0) == 0
+            assert process.wait(PATIENCE_S) == 0
     finally:
         for process in processes:
             process.kill()

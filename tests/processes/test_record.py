@@ -27,7 +27,7 @@ from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.shipped import SHIPPED
 from tests.command import command
 from tests.in_time import MS, PATIENT, in_time
-from tests.processes.system import KEYS, ROOT, System, command_line, environment, until
+from tests.processes.system import KEYS, PATIENCE_S, ROOT, System, command_line, environment, until
 from tests.recording.test_recording import read_by_others
 
 pytestmark = pytest.mark.slow
@@ -101,7 +101,7 @@ def test_recording_of_a_driven_robot_holds_everything_that_a_stranger_needs(tmp_
             system.tracking()
             until(lambda: b"tracking" in (tmp_path / "run.mcap").read_bytes() or system.sample().seq > 20, "it drives")
             process.terminate()
-            assert process.wait(30) == 0
+            assert process.wait(PATIENCE_S) == 0
     recording = Recording(tmp_path / "run.mcap")
     assert recording.whole
     assert recording.outcome["missing"] == recording.outcome["refused"] == "0"
@@ -122,7 +122,7 @@ def test_robots_by_a_pattern_are_recorded_together(tmp_path: Path) -> None:
         with Chatter(others[0]), Chatter(others[1]), Chatter(others[2]), recorder(tmp_path, endpoint, out, "--robot", "ant*") as process:
             until(lambda: _robots(out) == ["ant", "anthill"], "both are recorded", pause_s=0.2)
             process.terminate()
-            assert process.wait(30) == 0
+            assert process.wait(PATIENCE_S) == 0
     assert Recording(out).robots == ["ant", "anthill"]
 
 

@@ -14,7 +14,7 @@ import pytest
 from rti_mpc.contract.message import Command, State
 from rti_mpc.errors import ConfigError
 from rti_mpc.wire.keys import Keys
-from tests.processes.system import ANSWERED, heard, rti_mpc, until
+from tests.processes.system import ANSWERED, PATIENCE_S, heard, rti_mpc, until
 
 pytest.importorskip("cryptography", reason="the extra certs is not installed: certificates were NOT tried")
 
@@ -87,5 +87,5 @@ def test_router_has_nothing_to_say_about_a_system_in_which_each_process_has_its_
     heard(viewer.subscriber(viewer.keys.state), State, lambda _: True)
     for name in ("run", "guard", "reference", "sim"):
         system.running[name].terminate()
-        system.running[name].wait(60.0)
+        system.running[name].wait(PATIENCE_S)
     assert warnings(system) == []

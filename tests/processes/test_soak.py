@@ -32,7 +32,7 @@ from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.rig.robot_log import RobotLog
 from tests.bench.driven import Driven, driven, quantiles
 from tests.memory import PARTS, anonymous_bytes
-from tests.processes.system import ROOT, environment, until
+from tests.processes.system import PATIENCE_S, ROOT, environment, until
 
 pytestmark = pytest.mark.slow
 
@@ -82,7 +82,7 @@ class Timers:
         finally:
             for timer in timers:
                 timer.send_signal(signal.SIGINT)
-            status = [timer.wait(10.0) for timer in timers]
+            status = [timer.wait(PATIENCE_S) for timer in timers]
         assert not any(status)
         self.ticks = [np.load(path) for path in self._paths.values()]
 

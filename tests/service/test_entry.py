@@ -20,7 +20,7 @@ from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.keys import Keys
 from rti_mpc_service.rig.endpoint import free_endpoint
 from rti_mpc_service.shipped import SHIPPED
-from tests.processes.system import CONFIG
+from tests.processes.system import CONFIG, PATIENCE_S
 from tests.slow import slow_but
 
 ROOT = Path(__file__).parents[2]
@@ -45,7 +45,7 @@ def main():
             heard.set()
     for _ in range(4):
         threading.Thread(target=follow, args=(bus.subscriber(bus.keys.state),), daemon=True).start()
-    assert heard.wait(20.0)
+    assert heard.wait(50.0)
 
 enter(main)
 """
@@ -190,9 +190,9 @@ def test_log_that_nobody_takes_ends_nobody(output: str) -> None:
         Bus.join(BusSettings(mode="client", connect=(endpoint,)), CONFIG.keys()) as bus,
     ):
         try:
-            assert bus.is_alive("router", 20.0)
+            assert bus.is_alive("router", PATIENCE_S)
             subprocess.run(["pkill", "-TERM", "-P", str(process.pid)], check=True)
-            assert process.wait(20.0) == 0
+            assert process.wait(PATIENCE_S) == 0
             assert process.stderr is not None
             assert process.stderr.read() == b""
         finally:

@@ -157,7 +157,9 @@ def test_commanded_robot_moves_stops_on_silence_and_ends_on_ctrl_c_standing(endp
     latencies = [float(line["latency_us"]) for line in lines if line["latency_us"]]
     assert len(latencies) >= 10
     assert 50.0 < np.median(latencies)
-    in_time(host, "a command", 1e-3 * float(np.median(latencies)), 20.0, begun_ns)
+    late_ms = 1e-3 * float(np.median(latencies)) - 20.0
+    by_ms = 0.5 * len(latencies) * late_ms  # half of them are as late, at least
+    assert late_ms <= 0.0 or explained(host, f"most commands took {late_ms:.0f} ms more than 20", by_ms, begun_ns, time.monotonic_ns())
     u = np.array([float(line["u_c"]) for line in lines])
     assert u.max() == 0.4
     assert -np.diff(u).min() <= 1.0 * 0.05 + 0.01 + 1e-9  # the ramp: 1 per s over 0.05 s, in steps of 10 ms

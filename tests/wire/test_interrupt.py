@@ -97,4 +97,4 @@ stop.wait()
 
 def test_signal_that_the_kernel_hands_to_another_thread_stops_the_process_as_well() -> None:
     """As it does where the main thread has just been woken: a router that waited without a timeout then hung."""
-    assert subprocess.run([sys.executable, "-c", ELSEWHERE], cwd=ROOT, timeout=20.0).returncode == 0
+    assert subprocess.run([sys.executable, "-c", ELSEWHERE], cwd=ROOT, timeout=120.0).returncode == 0

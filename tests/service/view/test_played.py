@@ -20,7 +20,7 @@ from rti_mpc_service.rig.endpoint import free_port
 from rti_mpc_service.view.played import played
 from rti_mpc_service.view.screen import page
 from tests.command import command
-from tests.processes.system import ROOT, command_line, environment, rti_mpc, until
+from tests.processes.system import PATIENCE_S, ROOT, command_line, environment, rti_mpc, until
 from tests.recording.samples import write
 
 COUNT = 300
@@ -94,7 +94,7 @@ def test_page_for_browsers_comes_from_this_machine_on_loopback_alone(run: Path, 
         assert sorted(local.partition(":")[0] for local in ours) == ["0100007F", "0100007F"]
     finally:
         process.terminate()
-        assert process.wait(30) == 0
+        assert process.wait(PATIENCE_S) == 0
     until(lambda: not _listens(web), "the server has ended with it")
 
 
