@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeVar
 
@@ -155,6 +156,13 @@ class System:
         except AssertionError as error:
             said = "\n".join(f"{role}: {self.said(role)[-MAX_SAID:]}" for role in self.running)
             raise AssertionError(f"{error}\n{said}") from None
+
+
+def begun_ns(logs: Path) -> int:
+    """Return when the drive of a demo began, by the monotonic clock: all its processes were there when the reference was anchored to the robot."""
+    lines = map(json.loads, (logs / "reference.log").read_text().splitlines())
+    began = next(line["time"] for line in lines if "s of the robot on" in line["text"])
+    return time.monotonic_ns() - round(1e9 * (datetime.now(UTC) - datetime.fromisoformat(began)).total_seconds())
 
 
 def owner(log: str) -> int:

@@ -23,7 +23,7 @@ from rti_mpc_service.host.hold_up import Host
 from rti_mpc_service.shipped import SHIPPED
 from tests.command import command
 from tests.in_time import explained
-from tests.processes.system import PATIENCE_S, ROOT, command_line, environment, rti_mpc, until
+from tests.processes.system import PATIENCE_S, ROOT, begun_ns, command_line, environment, rti_mpc, until
 
 pytest.importorskip("rerun")
 pytest.importorskip("matplotlib")
@@ -31,7 +31,6 @@ from rerun.chunk import RrdReader
 
 SPEED = 3
 HELD_UP_MS = 0.5 * 100.0 / SPEED  # half a period: what a sample that is missed has met, at least
-MAX_MISSED = 60  # of 241, on the busiest host
 QUANTILES = ("prepare_us", "feedback_us", "latency_us", "echo_us")
 ASKED_FOR = {
     *("scenario", "samples", "max_error_mm", "rms_error_mm", "final_error_mm", "final_speed_mm_s"),
@@ -42,7 +41,7 @@ ASKED_FOR = {
 
 @dataclass(frozen=True)
 class Demo:
-    """Files of a demo, and the times of its run by the monotonic clock."""
+    """Files of a demo, and the times of its drive by the monotonic clock."""
 
     folder: Path
     printed: str
@@ -53,10 +52,10 @@ class Demo:
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory, host: Host) -> Demo:
     """Twenty-four seconds of the circle."""
-    folder, from_ns = tmp_path_factory.mktemp("demo") / "out", time.monotonic_ns()
+    folder = tmp_path_factory.mktemp("demo") / "out"
     done = rti_mpc("demo", "--scenario", "circle", "--duration", 24, "--speed", SPEED, "--out", folder, timeout_s=600.0)
     assert done.returncode == 0, done.stdout + done.stderr
-    return Demo(folder, done.stdout, from_ns, time.monotonic_ns())
+    return Demo(folder, done.stdout, begun_ns(folder / "logs"), time.monotonic_ns())
 
 
 @pytest.fixture
@@ -84,7 +83,6 @@ def test_robot_is_driven_onto_its_path_at_every_sample_that_the_host_leaves_us(s
     assert summary["transient_s"] == 12.0
     missed = 241 - 6 - summary["samples"] + summary["fallbacks"]  # before its first sample a controller has to hear of the robot
     what = f"{missed} samples are missing, and the error is {summary['rms_error_mm']:.1f} mm rms"
-    assert missed < MAX_MISSED, f"{what}: the start of its processes alone would explain as much"
     if missed > 0:
         assert explained(host, what, missed * HELD_UP_MS, demo.from_ns, demo.to_ns)
     else:

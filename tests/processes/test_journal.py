@@ -12,18 +12,27 @@ import pytest
 
 from rti_mpc.contract.message import Command, Telemetry
 from rti_mpc.contract.status import Mode
+from rti_mpc.errors import ConfigError
 from rti_mpc.wire.cdr import decode
 from rti_mpc_service.replay.rebuild import journals, rebuild
 from rti_mpc_service.replay.trouble import kept, troubles
 from rti_mpc_service.shipped import SHIPPED
 from tests.guarded import write_robot
-from tests.processes.system import ANSWERED, PATIENCE_S, System, heard, rti_mpc
+from tests.processes.system import ANSWERED, PATIENCE_S, System, heard, rti_mpc, until
 
 pytestmark = pytest.mark.slow
 
 
 def ask(system: System, **request: object) -> None:
     assert system.bus.request(system.keys.request, request, PATIENCE_S)["ok"]
+
+
+def known(run: Path) -> int:
+    """Return of how many controllers a recording that goes on has both a journal and the files."""
+    try:
+        return sum(bool(journal.files) for journal in journals(run))
+    except ConfigError:  # of nobody yet
+        return 0
 
 
 def asked(system: System, *request: object) -> None:
@@ -103,7 +112,8 @@ def test_both_controllers_of_a_takeover_behind_a_guard_replay_without_a_differin
         first = system.tracking()
         system.start("standby")
         shadow = system.bus.subscriber(system.keys.standby_telemetry)
-        heard(shadow, Telemetry, lambda sample: sample.mode is Mode.TRACKING and sample.seq > 60)  # the recorder has its files by then
+        heard(shadow, Telemetry, lambda sample: sample.mode is Mode.TRACKING)
+        until(lambda: known(run) == 2, "the recorder has what both replays need", pause_s=0.5)
         system.kill("controller")
         commands = system.bus.subscriber(system.keys.command, capacity=4096)
         heard(commands, Command, lambda command: command.epoch > first.epoch and command.mode is Mode.TRACKING)
