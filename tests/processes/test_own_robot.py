@@ -94,7 +94,7 @@ def run(folder: Path, command: str, module: str, *options: str, **tables: str) -
     (folder / "own" / "robot.toml").write_text(TOML.format(**tables))
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | {"STATE_DIRECTORY": str(STATE)}
     arguments = command_line(command, "../own/robot.toml", *options)
-    return subprocess.run(arguments, cwd=folder / "elsewhere", env=environment, capture_output=True, text=True, timeout=240)
+    return subprocess.run(arguments, cwd=folder / "elsewhere", env=environment, capture_output=True, text=True, timeout=600)
 
 
 def punctual(host: Host, folder: Path) -> bool:
