@@ -37,7 +37,7 @@ from rti_mpc_service.compiling import work_shown
 from rti_mpc_service.config import signals_file
 from rti_mpc_service.config.build import build_ocp, build_rti, build_signals, robot_settings
 from rti_mpc_service.config.config import load
-from rti_mpc_service.config.fit import check_stop, unstopped
+from rti_mpc_service.config.fit import check_period, check_stop, unstopped
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.console import table_console
 from rti_mpc_service.description import check_length
@@ -93,6 +93,7 @@ class CheckReport:
 def main(path: Path) -> int:
     """Check a configuration, print what was found, and return the exit status: 0 if every sample was usable and both solvers agree."""
     config = load(path)
+    check_period(config)
     with work_shown("finding how the robot comes to rest", say):
         law = check_stop(config)
     console, ocp = table_console(), build_ocp(config)

@@ -134,6 +134,7 @@ def test_sample_without_a_plan_is_told_with_the_state_it_began_at(
     """Nothing keeps the wave from the bottom of the tank."""
     path = tmp_path / "robot.toml"
     path.write_text(TANK)
+    monkeypatch.setattr(check, "check_period", lambda config: None)
     monkeypatch.setattr(check, "check_stop", lambda config: None)
     monkeypatch.setattr(check, "stop_from_everywhere", lambda ocp, law, **options: "")
     assert check.main(path) == 1
