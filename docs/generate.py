@@ -41,18 +41,18 @@ def configuration() -> Iterator[str]:
         "One TOML file per robot, as `rti-mpc schema` describes it for editors. Unknown keys are refused, with the nearest known one.",
     )
     yield from table("top level", schema, schema)
-    for key, reference, description in tables(schema, schema):
-        yield from ("", f"## `[{key}]`", "", description.capitalize() + ".", *table(key, reference, schema))
+    for header, reference, description in tables(schema, schema):
+        yield from ("", f"## `{header}`", "", description.capitalize() + ".", *table(header, reference, schema))
 
 
 def tables(section: dict[str, Any], schema: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, dict[str, Any], str]]:
-    """Yield key, schema and description of every table below one."""
+    """Yield header, schema and description of every table below one; `NAME` stands for the names of tables that are by name."""
     for name, field in section["properties"].items():
         for reference in references(field):
             inner = schema["$defs"][reference]
             if "properties" in inner:
-                key = f"{prefix}{name}"
-                yield key, inner, field.get("description", inner.get("description", ""))
+                key = f"{prefix}{name}.NAME" if "additionalProperties" in field else f"{prefix}{name}"
+                yield f"[[{key}]]" if field.get("type") == "array" else f"[{key}]", inner, field.get("description", inner.get("description", ""))
                 yield from tables(inner, schema, f"{key}.")
 
 

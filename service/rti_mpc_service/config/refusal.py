@@ -6,7 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
@@ -14,13 +14,15 @@ if TYPE_CHECKING:
     from rti_mpc.model.model import Signal
 
 MAX_QUOTED_CHARACTERS = 200  # of a value in a refusal
+NAME = "NAME"  # in keys of the tree: any name
+TABLE, LIST = "must be a table, such as { name = 1.0 }", "must be a list"
 
 # Patterns in Pydantic's messages, and the wording for a TOML file.
 REWORDINGS = (
     (r"^Value error, ", ""),
     (r"^(Input|String) should ", "must "),
-    (r"be a valid dictionary.*", "be a table, such as { name = 1.0 }"),
-    (r"be a valid tuple", "be a list"),
+    (r"^must be a valid dictionary.*", TABLE),
+    (r"^must be a valid tuple", LIST),
     (r"be a valid string", "be text"),
     (r"be a valid integer", "be a whole number"),
     (r"be a valid number", "be a number"),
@@ -44,6 +46,8 @@ def explain(error: ValidationError, tree: type[BaseModel], document: Mapping[str
         return f"{key} is missing: {what}"
     first, *others = (reworded(one["msg"]) for one in complaints if written(one["loc"], document) == loc)  # one for each kind of value that it may be
     must = " or ".join((first, *(other.removeprefix("must be ") for other in others)))
+    if must in (TABLE, LIST) and (inside := keys_of(loc, keys)):
+        must = f"{TABLE.partition(',')[0]} {inside}" if must == TABLE else f"{LIST} of tables, each {inside}: [[{key}]]"
     return f"{key} ({what}) {must}, got {quoted(got)}"
 
 
@@ -96,13 +100,13 @@ def unknown_signal(name: str, kind: str, signals: Sequence[Signal]) -> str:
 
 
 def entries(tree: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield every key of a tree with its description, depth first."""
+    """Yield every key of a tree with its description, depth first; `NAME` stands for the names of tables that are by name."""
     for name, field in tree.model_fields.items():
         key = prefix + (field.alias or name)
         yield key, field.description or ""
         for inside in (field.annotation, *get_args(field.annotation)):  # a table, one that may be left out, or a list of tables
             if isinstance(inside, type) and issubclass(inside, BaseModel):
-                yield from entries(inside, key + ".")
+                yield from entries(inside, f"{key}.{NAME}." if get_origin(field.annotation) is dict else f"{key}.")
 
 
 def dotted(loc: Sequence[int | str]) -> str:
@@ -110,19 +114,34 @@ def dotted(loc: Sequence[int | str]) -> str:
     return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in loc).removeprefix(".")
 
 
-def tree_key(loc: Sequence[int | str]) -> str:
-    """Return a location as a key of the tree, without indices of lists."""
-    return ".".join(step for step in loc if isinstance(step, str))
+def tree_key(loc: Sequence[int | str], tree: Mapping[str, str]) -> str:
+    """Return a location as a key of the tree: without indices of lists, and with `NAME` for the names of tables that are by name."""
+    key = ""
+    for step in loc:
+        if isinstance(step, str):
+            named = any(other.startswith(f"{key}.{NAME}.") for other in tree)
+            key = f"{key}.{NAME if named else step}".removeprefix(".")
+    return key
+
+
+def keys_of(loc: Sequence[int | str], tree: Mapping[str, str]) -> str:
+    """Return which keys a table has, in words; empty if it is one of values by name."""
+    below = f"{tree_key(loc, tree)}."
+    names = [key.removeprefix(below) for key in tree if key.startswith(below)]
+    if any(name.startswith(f"{NAME}.") for name in names):
+        return "of tables by name, each " + keys_of((*loc, NAME), tree)
+    own = [name for name in names if "." not in name]
+    return f"with {', '.join(own)}" if own else ""
 
 
 def description_of(loc: Sequence[int | str], tree: dict[str, str]) -> str:
     """Return the description of the innermost key that has one."""
-    return next((tree[key] for n in range(len(loc), 0, -1) if (key := tree_key(loc[:n])) in tree), "")
+    return next((tree[key] for n in range(len(loc), 0, -1) if (key := tree_key(loc[:n], tree)) in tree), "")
 
 
 def suggestion(loc: Sequence[int | str], tree: dict[str, str]) -> str:
     """Return the same key in another table, else the most similar key of the same table, else all keys of that table."""
-    section, _, name = tree_key(loc).rpartition(".")
+    section, _, name = tree_key(loc, tree).rpartition(".")
     beside = {other.rpartition(".")[2]: other for other in tree if other.rpartition(".")[0] == section}
     near = [other for other in tree if other.rpartition(".")[2] == name]
     near += [other for n, other in beside.items() if n.lower() == name.lower()] + [beside[n] for n in get_close_matches(name, beside, 1)]

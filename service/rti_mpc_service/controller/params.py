@@ -25,7 +25,7 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
 from rti_mpc_service.config.build import build_rti, retuned
 from rti_mpc_service.config.fit import check_names, check_rest, check_tree
-from rti_mpc_service.config.refusal import entries, explain
+from rti_mpc_service.config.refusal import NAME, entries, explain, tree_key
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.parameter import BOUND_KEYS, from_json, to_json
 
@@ -176,9 +176,10 @@ def weighs_inputs(config: Config) -> bool:
 def why_fixed(key: str) -> str:
     """Return the reason why a key may not change."""
     known = dict(entries(Config))
-    table = key.rpartition(".")[0]
-    named = known.get(table, "") if not any(other.startswith(f"{table}.") for other in known) else ""  # a table of names
-    what = known.get(key, named)
+    entry = tree_key(key.split("."), known)
+    table, _, name = entry.rpartition(".")
+    named = name == NAME or not any(other.startswith(f"{table}.") for other in known)  # an entry of a table of names
+    what = known.get(entry, known.get(table, "") if named else "")
     return (
         f"({what}) is fixed while the controller runs: change its file, and restart it"
         if what

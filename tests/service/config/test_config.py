@@ -54,6 +54,7 @@ pytestmark = pytest.mark.usefixtures("interpreted")
 
 HERE = "tests.service.config.test_config"
 DISC = "[[ocp.obstacles]]\ncentre_m = [1.0, 0.5]\n"
+OBSERVED = "[observer.disturbances]\nx = { "
 
 # What a user may write into the shipped file, and what the one line must tell them.
 WRONG = [
@@ -122,6 +123,14 @@ WRONG = [
         DISC.replace("0.5]", "0.5, 0.1]") + "radius_m = 0.3\n[model]",
         ["ocp.obstacles[0].centre_m", "[x, y], two numbers", "0.1]"],
     ),
+    ("[model]", "[ocp.obstacles]\nradius_m = 0.3\n[model]", ["must be a list of tables, each with centre_m, radius_m,", ": [[ocp.obstacles]], got"]),
+    ("[model]", "guard = true\n[model]", ["guard", "must be a table with enabled, tick_s, got True"]),
+    ("[model]", OBSERVED + "limit = 0.4, std = 0.1 }\n[model]", ["observer.disturbances.x.std is unknown, known: drift, limit, got 0.1"]),
+    ("[model]", OBSERVED + "limit = 0.4 }\n[model]", ["observer.disturbances.x.drift is missing: intensity of its random walk, in"]),
+    ("[model]", OBSERVED + "limt = 0.4 }\n[model]", ["perhaps observer.disturbances.x.limit is meant (largest magnitude"]),
+    ("[model]", "[observer]\ndrift = 0.1\n[model]", ["perhaps observer.disturbances.NAME.drift is meant (intensity"]),
+    ("[model]", "[observer]\ndisturbances = 0.1\n[model]", ["must be a table of tables by name, each with drift, limit, got 0.1"]),
+    ("[model]", "[observer.disturbances]\ndrift = 0.1\n[model]", ["observer.disturbances.drift", "must be a table with drift, limit, got 0.1"]),
     ("[model]", DISC + "radius_m = inf\n[model]", ["ocp.obstacles[0].radius_m", "in m", "finite", "inf"]),
     ("[ocp.bounds]", "[ocp.obstacles]\nradius_m = 0.3\n[ocp.bounds]", ["ocp.obstacles", "discs to stay out of", "list"]),
     ('name = "pioneer_3dx"', 'name = "nowhere:car"', ["model.name", "nowhere", "package.module:function"]),
@@ -596,3 +605,11 @@ def test_period_that_is_longer_than_a_command_acts_is_refused_on_the_bus(tmp_pat
         return
     with pytest.raises(ConfigError, match=rf"^ocp.dt_s must be at most {longest} s for a robot on the bus: .*, got {dt_s:g} s: shorten it"):
         daemon.main(config, BusSettings())
+
+
+def test_period_that_is_longer_than_a_command_acts_is_refused_before_anything_is_tried(tmp_path: Path) -> None:
+    """A file that `check` takes would otherwise be refused by `run`."""
+    path = tmp_path / "robot.toml"
+    path.write_text(MINIMAL.replace("dt_s = 0.1", "dt_s = 0.25"))
+    with pytest.raises(ConfigError, match=r"^ocp.dt_s must be at most 0.23 s for a robot on the bus: "):
+        check.main(path)

@@ -86,6 +86,7 @@ REFUSED: list[tuple[dict[str, Any], list[str]]] = [
     ({"ocp.N": 7}, ["ocp.N (horizon, in stages)", "fixed while the controller runs", "restart", "got 7"]),
     ({"ocp.dt_s": 0.05}, ["ocp.dt_s", "fixed while the controller runs"]),
     ({"model.parameters.a": 0.3}, ["model.parameters.a", "fixed while the controller runs"]),
+    ({"observer.disturbances.x.drift": 0.3}, ["observer.disturbances.x.drift (intensity of its random walk", "fixed while the controller runs"]),
     ({"ocp.weigths.Q.x": 1.0}, ["ocp.weigths.Q.x", "none of", "ocp.weights.Q"]),
     ({"ocp.weights.Q.phi": 1.0}, ["ocp.weights.Q.phi", "no output", "psi [rad]"]),
     ({"ocp.weights.Q.psi": -1.0}, ["ocp.weights.Q.psi", "at least 0", "-1.0"]),
