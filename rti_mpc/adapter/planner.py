@@ -46,6 +46,7 @@ class PlannerAdapter:
         self._publisher = self._bus.publisher(self._bus.keys.reference)
         self._epoch, self._seq = new_epoch(), 0
         self._rival = Rival(self._bus, self._epoch)
+        self._bus.watch_connection(lambda notice: self._say(notice.text))
         self._bus.alive(ROLE)
 
     def __enter__(self) -> Self:

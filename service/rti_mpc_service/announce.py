@@ -12,6 +12,6 @@ LOG_LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Se
 
 
 def announce(log: logging.Logger, announcer: Announcer, notice: Notice, stamp_ns: int) -> None:
-    """Publish and log a notice with a stamp in robot time; a fault that was announced just before is not repeated."""
+    """Publish and log a notice with a stamp in robot time, 0 where none is known yet; a fault that was announced just before is not repeated."""
     if announcer.say(notice, stamp_ns):
-        log.log(LOG_LEVELS[notice.severity], "%s", notice.text, extra={"robot_ns": stamp_ns})
+        log.log(LOG_LEVELS[notice.severity], "%s", notice.text, extra={"robot_ns": stamp_ns or None})

@@ -181,23 +181,24 @@ def main(name: str, model: Model, pieces: Sequence[Path], bus_settings: BusSetti
         publisher, states = bus.publisher(keys.reference), bus.subscriber(keys.state, capacity=RING_MESSAGES)
         announcer, intake = Announcer(bus, ROLE, epoch), bus.intake(State, STALE_S, {"x": model.nx})
         lives, rival = Lives(STALE_S, STALE_S), Rival(bus, epoch)
-        begun = 0
+        begun, stamp_ns = 0, 0  # how often, and the last state's
         bus.expect("state", lambda: begun)
+        bus.watch_connection(lambda notice: announce(logger, announcer, notice, stamp_ns))
         bus.alive(ROLE)
         text = f"path {name} of {sum(piece.length for piece in pieces):.1f} m, {sum(piece.time_s for piece in pieces):.1f} s"
         logger.info("%s for %s", text, keys.robot)
         while not stop.wait(LOOK_PERIOD_S):
             now_ns = time.monotonic_ns()
             if (notice := rival.notice()) is not None:
-                announce(logger, announcer, notice, 0)
+                announce(logger, announcer, notice, stamp_ns)
             for state in intake.newest_of_each(states.drain()):
-                heard = lives.judge(state.epoch, now_ns)
+                heard, stamp_ns = lives.judge(state.epoch, now_ns), state.stamp_ns
                 if heard is Heard.BEGINS:
                     begun += 1
                     references.begin(state.x)
-                    announcer.say(Notice(Severity.INFO, "reference_published", text), state.stamp_ns)
+                    announcer.say(Notice(Severity.INFO, "reference_published", text), stamp_ns)
                 if heard is not Heard.OTHER and (reference := references.answer(state.stamp_ns, state.x)) is not None:
                     publisher.put(reference)
             for notice in intake.notices(now_ns):
-                announcer.say(notice, 0)
+                announcer.say(notice, stamp_ns)
     return 0

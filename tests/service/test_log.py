@@ -96,5 +96,6 @@ def test_line_holds_wall_time_and_robot_time_where_that_is_known() -> None:
 def test_mode_change_is_logged_with_the_robot_s_time(caplog: pytest.LogCaptureFixture) -> None:
     announcer: Any = SimpleNamespace(say=lambda notice, stamp_ns: True)
     with caplog.at_level(logging.INFO):
-        announce(logging.getLogger("guard"), announcer, Notice(Severity.INFO, "guard_passing", "commands pass"), 1_500_000_000)
-    assert robot_ns(caplog.records[0]) == 1_500_000_000
+        for stamp_ns in (1_500_000_000, 0):
+            announce(logging.getLogger("guard"), announcer, Notice(Severity.INFO, "guard_passing", "commands pass"), stamp_ns)
+    assert [robot_ns(record) for record in caplog.records] == [1_500_000_000, None], "none before the first state"

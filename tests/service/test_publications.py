@@ -10,12 +10,17 @@ from threading import Event
 import numpy as np
 import pytest
 
+from rti_mpc.adapter import PlannerAdapter
 from rti_mpc.contract.message import State
+from rti_mpc.model.path_following import path_following
+from rti_mpc.model.robots.pioneer_3dx import pioneer_3dx
+from rti_mpc.reference.path import smooth_path
+from rti_mpc.reference.speed_profile import SpeedLimits
 from rti_mpc.wire.bus import Bus, BusSettings, Received
 from rti_mpc.wire.info import Info, Leader, latches
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.streams import RELAY, STREAMS
-from rti_mpc_service import guard, request, router
+from rti_mpc_service import guard, path_reference, request, router
 from rti_mpc_service import reference as source
 from rti_mpc_service.config.build import robot_settings
 from rti_mpc_service.config.config import load
@@ -79,19 +84,49 @@ def test_process_publishes_what_the_table_lets_its_roles_and_nothing_else(roles:
 
 
 def test_viewer_publishes_what_the_table_lets_it(session: FakeSession, tmp_path: Path) -> None:
-    pytest.importorskip("rerun")
-    from rti_mpc_service.view import view
-
-    view.main(SETTINGS, KEYS, view.Screens(rerun_save=tmp_path / "run.rrd"), stop=STOPPED)
+    viewer(tmp_path)
     assert session.said == may("viewer")
 
 
 def test_recorder_publishes_what_the_table_lets_it(session: FakeSession, tmp_path: Path) -> None:
+    recorder(tmp_path)
+    assert session.said == may("recorder")
+
+
+def viewer(folder: Path) -> None:
+    pytest.importorskip("rerun")
+    from rti_mpc_service.view import view
+
+    view.main(SETTINGS, KEYS, view.Screens(rerun_save=folder / "run.rrd"), stop=STOPPED)
+
+
+def recorder(folder: Path) -> None:
     pytest.importorskip("mcap")
     from rti_mpc_service.record import record
 
-    record.main(SETTINGS, KEYS, out=tmp_path / "run.mcap", stop=STOPPED)
-    assert session.said == may("recorder")
+    record.main(SETTINGS, KEYS, out=folder / "run.mcap", stop=STOPPED)
+
+
+def path_source(_: Path) -> None:
+    path = smooth_path(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 1.0]])).limited(SpeedLimits(0.4, 0.3, 0.3, 0.3))
+    path_reference.main("bend", path_following(pioneer_3dx()), [path], SETTINGS, KEYS, stop=STOPPED)
+
+
+CONNECTED = [
+    *(PROCESSES[roles] for roles in (("robot",), ("reference",), ("controller", "standby"), ("guard",), ("router",))),
+    *(viewer, recorder, path_source, lambda _: PlannerAdapter("wheels").close()),
+]
+CONNECTED_NAMES = ["robot", "reference", "controller", "guard", "router", "viewer", "recorder", "path source", "planner adapter"]
+
+
+@pytest.mark.parametrize("process", CONNECTED, ids=CONNECTED_NAMES)
+def test_process_watches_for_the_loss_of_all_its_links(
+    process: Callable[[Path], object], session: FakeSession, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watching: list[Bus] = []
+    monkeypatch.setattr(Bus, "watch_connection", lambda bus, tell: watching.append(bus))
+    process(tmp_path)
+    assert watching
 
 
 @pytest.mark.parametrize("roles", [("robot",), ("guard",), ("controller", "standby")], ids="_".join)

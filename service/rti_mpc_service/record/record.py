@@ -34,7 +34,7 @@ from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.received import Received
-from rti_mpc.wire.streams import CONTROLLER_ROLES, JOURNAL, KNOWN_ROLES, admitted, role_of
+from rti_mpc.wire.streams import CONTROLLER_ROLES, JOURNAL, KNOWN_ROLES, STATE, admitted, role_of
 from rti_mpc_service.announce import announce
 from rti_mpc_service.host.pressure import waited_us
 from rti_mpc_service.record.hearing import fetch_origin, hear
@@ -104,6 +104,7 @@ def main(
                     recorder.follow(robot)
 
             bus.watch_robots(meet)
+        bus.watch_connection(recorder.say)
         return recorder.run(stop)
 
 
@@ -122,7 +123,8 @@ class Recorder:
         self._segments = segments
         self._inbox = Inbox()
         self._buses: dict[str, Bus] = {}
-        self._announcers: list[Announcer] = []
+        self._announcers: dict[str, Announcer] = {}  # by robot
+        self._stamps_ns: dict[str, int] = {}  # of each robot's last state
         self._files: list[tuple[str, Mapping[str, str]]] = []  # of controllers, to be attached, with the beginning of their names
         self._lock = Lock()
         self._doors: dict[type[Any], Intake[Any]] = {}
@@ -143,7 +145,7 @@ class Recorder:
             except ConfigError:
                 return
             self._buses[robot] = bus
-            self._announcers.append(Announcer(bus, ROLE, new_epoch()))
+            self._announcers[robot] = Announcer(bus, ROLE, new_epoch())
         hear(bus, self._inbox, self._described)
         bus.alive(ROLE)
         bus.alive(self._own)
@@ -159,16 +161,23 @@ class Recorder:
                 self._write(time.monotonic_ns())
                 if (lost := self.counts["missing"]) > told:
                     text = f"{lost} messages are missing in the recording so far, {self._inbox.dropped} of them because the disk was too slow"
-                    self._tell(Notice(Severity.WARNING, "recording_incomplete", text))
+                    self.say(Notice(Severity.WARNING, "recording_incomplete", text))
                     told = lost
             self._segments.writer.finish(self._outcome())
         except OSError as error:
             self._segments.writer.abandon()
             text = f"the recording ends here: {error.strerror}; its {1e-6 * self._segments.size:.1f} MB before are whole, see rti-mpc record --repair"
-            self._tell(Notice(Severity.ERROR, "recording_ended", text))
+            self.say(Notice(Severity.ERROR, "recording_ended", text))
             return 1
         log.info("%s, %.1f MB", ", ".join(f"{count} {name}" for name, count in self.counts.items()), 1e-6 * self._segments.size)
         return 0
+
+    def say(self, notice: Notice) -> None:
+        """Announce to every robot, with the stamp of its last state; in any thread."""
+        with self._lock:
+            announcers = dict(self._announcers)
+        for robot, announcer in announcers.items():
+            announce(log, announcer, notice, self._stamps_ns.get(robot, 0))
 
     def _write(self, now_ns: int) -> None:
         """
@@ -224,6 +233,8 @@ class Recorder:
                 self.counts["refused"] += 1
                 return
             seq = message.seq
+            if stream is STATE:
+                self._stamps_ns[entry.robot] = message.stamp_ns
             if stream is not JOURNAL:  # whose numbers count entries
                 self._follow_numbers(received.key, message.epoch, seq)
         self._add(entry, key, seq)
@@ -272,12 +283,6 @@ class Recorder:
 
     def _outcome(self) -> dict[str, str]:
         return {**{name: str(count) for name, count in self.counts.items()}, "dropped": str(self._inbox.dropped)}
-
-    def _tell(self, notice: Notice) -> None:
-        with self._lock:
-            announcers = list(self._announcers)
-        for announcer in announcers:
-            announce(log, announcer, notice, 0)
 
 
 def repaired(path: Path, to: Path) -> int:

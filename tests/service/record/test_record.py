@@ -18,10 +18,11 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from rti_mpc.contract.epoch import NUMBER_BITS
+from rti_mpc.contract.message import Event
 from rti_mpc.errors import ConfigError
 from rti_mpc.recording import Recording
 from rti_mpc.wire.bus import Bus, BusSettings, Declared
-from rti_mpc.wire.cdr import Message, encode
+from rti_mpc.wire.cdr import Message, decode, encode
 from rti_mpc.wire.keys import Key
 from rti_mpc.wire.received import Received
 from rti_mpc.wire.streams import MAX_UNKNOWN_ROLES, role_of
@@ -72,7 +73,8 @@ def test_recorder_writes_what_can_be_decoded_and_counts_the_rest(tmp_path: Path)
     recording = Recording(tmp_path / "run.mcap")
     assert [recorded.local_ns for recorded in recording.messages(streams=("state",))] == [START_NS + k * MS for k in (1, 2, 5, 6)]
     assert recording.outcome == {"recorded": "5", "missing": "2", "refused": "3", "dropped": "0"}
-    assert b"2 messages are missing" in bench.session.put[KEYS.event("recorder")]
+    told = decode(Event, bench.session.put[KEYS.event("recorder")])
+    assert (told.stamp_ns, told.text[:22]) == (state(6).stamp_ns, "2 messages are missing")
 
 
 def test_waiting_for_cores_is_recorded_for_each_chunk_and_read_by_tools_of_ros(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
