@@ -11,9 +11,7 @@ import sys
 
 import numpy as np
 
-from rti_mpc import Controller
-from rti_mpc.contract.message import Reference
-from rti_mpc.control.controller import Timing
+from rti_mpc import Controller, Reference, Timing
 from rti_mpc_service.config.build import build_rti, robot_settings
 from rti_mpc_service.config.config import load
 from rti_mpc_service.scenario import find_scenario

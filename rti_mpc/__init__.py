@@ -11,7 +11,9 @@ neither CasADi nor OSQP.
 Public names: `Model` and `Signal` describe a robot, `find_model` finds one that ships,
 `Ocp` is the problem, `Rti` solves one sample of it, `simulate` closes the loop, `plot` and
 `compare` show what came of it, and `Controller` does so in the robot's time and handles
-everything that may go wrong.
+everything that may go wrong: with the delays and timeouts of a `Timing` it takes each
+`State` and `Reference`, which says by `End` what follows its last row, and returns each
+`Command`.
 
 Example:
     >>> from rti_mpc import Ocp, Rti, find_model
@@ -67,7 +69,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rti_mpc.contract.message import Command as Command
+    from rti_mpc.contract.message import End as End
+    from rti_mpc.contract.message import Reference as Reference
+    from rti_mpc.contract.message import State as State
     from rti_mpc.control.controller import Controller as Controller
+    from rti_mpc.control.grid import Timing as Timing
     from rti_mpc.model.find import find_model as find_model
     from rti_mpc.model.model import Model as Model
     from rti_mpc.model.model import Signal as Signal
@@ -78,11 +85,16 @@ if TYPE_CHECKING:
     from rti_mpc.rti.simulation import simulate as simulate
 
 MODULE_OF_NAME = {
+    "Command": "rti_mpc.contract.message",
     "Controller": "rti_mpc.control.controller",
+    "End": "rti_mpc.contract.message",
     "Model": "rti_mpc.model.model",
     "Ocp": "rti_mpc.rti.ocp",
+    "Reference": "rti_mpc.contract.message",
     "Rti": "rti_mpc.rti.rti",
     "Signal": "rti_mpc.model.model",
+    "State": "rti_mpc.contract.message",
+    "Timing": "rti_mpc.control.grid",
     "compare": "rti_mpc.rti.simulation",
     "find_model": "rti_mpc.model.find",
     "plot": "rti_mpc.rti.plot",
@@ -90,7 +102,23 @@ MODULE_OF_NAME = {
 }
 
 __version__ = "0.1.0"
-__all__ = ["Controller", "Model", "Ocp", "Rti", "Signal", "__version__", "compare", "find_model", "plot", "simulate"]
+__all__ = [
+    "Command",
+    "Controller",
+    "End",
+    "Model",
+    "Ocp",
+    "Reference",
+    "Rti",
+    "Signal",
+    "State",
+    "Timing",
+    "__version__",
+    "compare",
+    "find_model",
+    "plot",
+    "simulate",
+]
 
 
 def __getattr__(name: str) -> Any:

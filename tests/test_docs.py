@@ -28,9 +28,9 @@ def blocks(page: str, language: str) -> list[str]:
 
 @pytest.mark.slow
 def test_tutorial_of_your_robot_runs_word_by_word(tmp_path: Path) -> None:
-    module, script, compared = blocks("your_robot.md", "python")
+    module, script, compared, loop = blocks("your_robot.md", "python")
     (table,) = blocks("your_robot.md", "toml")
-    for name, text in {"my_robot.py": module, "script.py": script, "compared.py": compared, "car.toml": table}.items():
+    for name, text in {"my_robot.py": module, "script.py": script, "compared.py": compared, "loop.py": loop, "car.toml": table}.items():
         (tmp_path / name).write_text(text)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
 
@@ -40,6 +40,9 @@ def test_tutorial_of_your_robot_runs_word_by_word(tmp_path: Path) -> None:
 
     assert run("script.py") == "off by 0.0 mm after 10 s\n"
     assert [line.partition("  ")[0] for line in run("compared.py").splitlines()] == ["", "R = 0.1", "R = 1.0"]
+    *changes, end = run("loop.py").splitlines()
+    assert [line.partition(": ")[2].partition(":")[0] for line in changes] == ["idle to waiting", "waiting to tracking", "tracking to braking"]
+    assert f"`{end}`" in (DOCS / "your_robot.md").read_text()
     assert (tmp_path / "run.png").stat().st_size > 10_000
     assert "solved" in run("-P", "-c", "from rti_mpc_service.cli import main; main()", "check", "car.toml")
 

@@ -45,7 +45,7 @@ class State:
     Attributes:
         x: State estimate, shape ``(nx,)``. Angles may wrap.
         u: Inputs that act at `stamp_ns`, shape ``(nu,)``; empty if the robot does not report them.
-        command_epoch: Epoch of the command that `u` comes from; 0: the robot's own ramp, or not reported.
+        command_epoch: Epoch of the command that `u` comes from; 0: the robot's own ramp to rest, from which plans begin, or no `u` is reported.
         command_seq: Sequence number of that command.
     """
 
