@@ -20,7 +20,7 @@ GALLERY = Path(__file__).parents[1] / "docs" / "gallery.md"
 # The first number that each prints, or the one after a word, and what it must not exceed.
 MOST = {
     "delay": (r"([\d.]+) mm off at most with the delay measured", 1.0),
-    "observer": (r"([\d.]+) mm with it", 5.0),
+    "observer": (r"([\d.]+) mm off with it", 5.0),
     "obstacles": (r"([\d.]+) mm off in the end", 1.0),
     "own_planner": (r"([\d.]+) mm off the walker", 20.0),
     "quadrotor": (r"([\d.]+) mm from where", 1.0),
