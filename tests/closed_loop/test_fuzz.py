@@ -17,8 +17,6 @@ SHORT_SAMPLES = 2_500
 MANY_SAMPLES = 20_000 if "CI" in os.environ else 1_000_000
 
 
-
-
 @pytest.mark.parametrize("measured", [pytest.param(False, marks=pytest.mark.slow, id="no delay"), pytest.param(True, id="measured delay")])
 def test_no_fuzzed_sample_leaves_the_limits_or_raises(measured: bool) -> None:
     fuzz = Fuzz(seed=1, measured=measured)
