@@ -7,12 +7,16 @@ import json
 import os
 import time
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
 
+from rti_mpc_service.config.config import load
 from rti_mpc_service.faults.promise import BRAKING
+from rti_mpc_service.faults.system import System, Wiring
 from rti_mpc_service.host.hold_up import Host
+from rti_mpc_service.shipped import SHIPPED
 from tests.command import command
 from tests.in_time import MS, SEEN
 from tests.movers import CURRENT, path_file, toml
@@ -65,6 +69,17 @@ def test_scenario_that_comes_to_rest_is_one_line_before_anything_is_started() ->
     done = command("faults", "--scenario", "positioning")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "rti-mpc: --scenario must move the robot for at least 60 s, positioning does for 15.8 s\n"
+
+
+def test_a_viewer_that_was_killed_is_followed_by_another_which_saves_to_a_file_of_its_own(tmp_path: Path) -> None:
+    """As before each further fault of a viewer: a command that saves overwrites nothing."""
+    pytest.importorskip("rerun")
+    folder = tmp_path / "system"
+    with System(load(SHIPPED), Wiring.PEERS, folder, Event()) as system:
+        for saved in (1, 2):
+            system.ensure("viewer")
+            system.wait(lambda saved=saved: len(list(folder.glob("*.rrd"))) == saved, "a file of its own")
+            system.kill("viewer")
 
 
 @pytest.mark.slow

@@ -337,11 +337,11 @@ def suffer(system: System, fault: Fault, limits: Limits, report: MatrixReport, h
     """
     report.say(fault, fault.text)
     fault_ns, mend_ns = endure(system, fault)
-    robots = system.robots
+    lives = system.lives["robot"]
     reference = system.witness.reference
     report.say(fault, "waiting for the robot to recover")
     fault.mend(system)
-    if system.robots != robots:  # another life: nothing of the last one counts
+    if system.lives["robot"] != lives:  # another life: nothing of the last one counts
         system.wait(lambda: system.observer.epoch, "the robot's first state")
         fault_ns = mend_ns = 0
     recovered(system, mend_ns, host)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import resource
 import signal
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import Enum
@@ -78,7 +79,7 @@ class System:
         witness: Collects the controller's messages.
         observer: Follows the robot's states.
         link: Link between controller and router, used with wiring `ROUTER`.
-        robots: Number of robots started so far.
+        lives: How often each process was started so far: files that it writes have this number, since none is overwritten.
         motion: What the robot's reaction is measured by.
     """
 
@@ -95,7 +96,7 @@ class System:
         folder.mkdir(parents=True)
         self.keys = config.keys()
         self.period_ns = round(1e9 * config.ocp.dt_s)
-        self.robots = 0
+        self.lives: Counter[str] = Counter()
         self.wiring, self._folder, self._stop, self._reference, self._tell = wiring, folder, stop, reference, tell
         self._robot_keys = Keys(f"{self.keys.prefix}/behind", self.keys.robot) if wiring in RELAYED else self.keys
         self._balanced = disturbances_at_rest(config)
@@ -144,8 +145,8 @@ class System:
     def start(self, *roles: str) -> None:
         """Start processes; each start of the robot is a new life with its own record."""
         for role in roles:
+            self.lives[role] += 1
             if role == "robot":
-                self.robots += 1
                 self.observer.forget()
             module, *arguments = self._command(role)
             self.children.start(role, str(module), *arguments, nice=WATCHER_NICENESS if role in WATCHERS else 0)
@@ -195,7 +196,7 @@ class System:
             "guard": (CLI_MODULE, "guard", *meeting),
             "reference": (CLI_MODULE, "reference", *meeting, *self._reference),
             "robot": (CLI_MODULE, "sim", *meeting, *(() if "-m" in meeting else ("-l", "tcp/127.0.0.1:0")), "--log", self.log_path),
-            "viewer": (CLI_MODULE, "view", *meeting, "--rerun-save", self._folder / "run.rrd"),
+            "viewer": (CLI_MODULE, "view", *meeting, "--rerun-save", self._folder / f"viewer-{self.lives['viewer']}.rrd"),
             RECORDER: (CLI_MODULE, "record", *meeting, "--out", self._recording),
             "router": (CLI_MODULE, "router", here, "-l", self._endpoint),
             RELAY: ("rti_mpc_service.faults.relay", self._endpoint, self._robot_keys.prefix, self.keys.prefix, self.keys.robot),
@@ -207,7 +208,7 @@ class System:
     @property
     def log_path(self) -> Path:
         """Record of the robot's present life."""
-        return self._folder / f"robot-{self.robots}.csv"
+        return self._folder / f"robot-{self.lives['robot']}.csv"
 
     def log(self) -> RobotLog:
         """Return the record of the robot's present life, as far as it is written; a guard's own commands are no answers."""
