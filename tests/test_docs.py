@@ -12,10 +12,17 @@ from pathlib import Path
 
 import pytest
 
+from rti_mpc.errors import ConfigError
+from rti_mpc.reference.trajectory import followed_roles
+from rti_mpc.signals import Signal
+from rti_mpc_service.config.build import build_ocp
+from rti_mpc_service.config.config import load
 from rti_mpc_service.conformance import guard, robot
 from rti_mpc_service.rig.endpoint import free_endpoint
+from rti_mpc_service.shipped import SHIPPED
 from tests.command import built
 from tests.processes.system import PATIENCE_S, until
+from tests.recording.samples import write
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -93,6 +100,63 @@ def test_tutorial_of_the_adapter_drives_the_robot_word_by_word(tmp_path: Path) -
     assert said is not None
     assert abs(float(said[1]) - 1.0) < 0.1, "m: where a busy host holds up robot or controller, it overshoots"
     assert abs(float(said[2])) < 0.05, "m"
+
+
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run Python in a folder, as a reader of a page does."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run([sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.slow
+def test_scripts_of_the_page_on_paths_run(tmp_path: Path) -> None:
+    (tmp_path / "track.csv").write_text("x,y\n0,0\n1,0\n2,1\n3,1\n")
+    for script in blocks("paths.md", "python"):
+        done = run(tmp_path, "-c", script)
+        assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == "at 3.00, 1.00 after 15 s\n", "the last one drives to the end of its path"
+
+
+def test_table_of_the_page_on_paths_is_that_of_a_robot_that_follows_one(tmp_path: Path) -> None:
+    (table,) = blocks("paths.md", "toml")
+    (statement,) = re.findall(r"`(def robot\(\): return .*?)`", (DOCS / "paths.md").read_text(encoding="utf-8"))
+    imports = "from rti_mpc import find_model\nfrom rti_mpc.model.path_following import path_following\n"
+    (tmp_path / "follower.py").write_text(f"{imports}{statement}\n")
+    (tmp_path / "robot.toml").write_text(table)
+    ocp = build_ocp(load(tmp_path / "robot.toml"))
+    assert (ocp.model.ny, len(ocp.lh)) == (3, 2)
+
+
+def test_table_of_the_page_on_tuning_can_be_appended_to_the_shipped_file(tmp_path: Path) -> None:
+    (table,) = blocks("tune.md", "toml")
+    (tmp_path / "noisy.toml").write_text(f"{SHIPPED.read_text()}\n{table}")
+    assert load(tmp_path / "noisy.toml").sim.actuator_lag_s == 0.1
+
+
+@pytest.mark.slow
+def test_scripts_of_the_page_on_recordings_read_one(tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    pytest.importorskip("pandas")
+    first, second = blocks("recording.md", "python")
+    write(tmp_path / "run.mcap", 10)
+    script = f"{first}{second}".replace('"pioneer"', '"wheels"').replace("u.omega_c", "u.v")  # what the robot of this recording has
+    done = run(tmp_path, "-c", script)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_an_error_in_a_model_is_answered_by_the_line_shown(tmp_path: Path) -> None:
+    """Of the tutorial's model, with a name misspelt."""
+    (shown,) = re.findall(r"^rti-mpc: car.toml: .*$", (DOCS / "your_robot.md").read_text(encoding="utf-8"), re.MULTILINE)
+    (tmp_path / "my_robot.py").write_text(blocks("your_robot.md", "python")[0].replace("/ lag_s", "/ lag"))
+    (tmp_path / "car.toml").write_text(blocks("your_robot.md", "toml")[0])
+    done = run(tmp_path, "-m", "rti_mpc_service.cli", "check", "car.toml")
+    assert (done.returncode, done.stderr.strip()) == (2, shown.replace("/home/you", str(tmp_path)))
+
+
+def test_outputs_that_no_path_fills_are_answered_by_the_line_shown() -> None:
+    with pytest.raises(ConfigError) as refused:
+        followed_roles("arm", (Signal("q1", "rad"), Signal("q2", "rad")))
+    assert f"\nrti-mpc: {refused.value}\n" in (DOCS / "your_robot.md").read_text(encoding="utf-8")
 
 
 def test_every_page_of_the_site_exists_and_is_reached() -> None:
