@@ -36,7 +36,7 @@ RELEASE_MULTIPLIER = 1e-6  # a bound is released when its multiplier has the wro
 
 UNTIL = """
   const casadi_real *now = arg[0], *of = arg[1];
-  casadi_int j, k, differs = 0;
+  casadi_int j, k, differs = of[0] != of[0]; /* NaN: all stages, also those that have no place of their own */
   for (k = STAGES - 1; k >= 0; --k) {
     const casadi_int u = NU * BLOCK, du = NU * (FREE + BLOCK), g = NU * 2 * FREE + NG * k;
     for (j = 0; j < NG; ++j) differs |= now[g + j] != of[g + j];

@@ -126,6 +126,8 @@ def _loop(
     count = "until" if resumed or limited else len(block)
     yield f"for (k = {count} - 1; k >= 0; --k) {{" if backward else f"for (k = 0; k < {count}; ++k) {{"
     for i, stage in enumerate(kinds):
+        if not any(stage.numel_out(j) for j in range(stage.n_out())):
+            continue  # CasADi calls no function without results, so that there is no code of it
         yield f"  {'else ' if i else ''}{f'if ({is_first}) ' if i + 1 < len(kinds) else ''}{{"
         for j, argument in enumerate(stage.name_in()):
             whole, rows, source = given[argument].size2() == 1, given[argument].size1(), f"arg[{place[argument]}]"

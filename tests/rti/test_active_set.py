@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from rti_mpc.rti.qp.osqp import SolverSettings
 from rti_mpc.rti.rti import Rti
 from tests.problems import arc, beacon, double_integrator, fenced, pioneer
 from tests.slow import slow_but
+from tests.test_codegen import needs_compiler
 
 TIGHT = SolverSettings(eps=1e-9, max_iter=200_000, scaling=10)
 
@@ -141,3 +143,32 @@ def test_refinement_that_makes_the_plan_worse_is_taken_back() -> None:
     rti.active_set.roll_out()
     np.testing.assert_array_equal(planned[0], rti.u)
     np.testing.assert_array_equal(planned[1], rti.x)
+
+
+HOLDING: dict[str, dict[str, Any]] = {"none held": {}, "the last held": {"N_u": 3}, "one alone": {"N_u": 1}, "blocks": {"blocks": [1, 3, 2]}}
+NONE: dict[str, Any] = {"lbx": -np.inf, "ubx": np.inf, "lbdu": -np.inf, "ubdu": np.inf}
+BOUNDED: dict[str, dict[str, Any]] = {
+    "inputs": NONE,
+    "nothing": NONE | {"lbu": -np.inf, "ubu": np.inf},
+    "increments": NONE | {"lbdu": [-0.25, -0.4], "ubdu": [0.25, 0.4]},
+    "all": {},
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("holding", slow_but(HOLDING, "the last held"))
+@pytest.mark.parametrize("bounded", slow_but(BOUNDED, "inputs"))
+def test_compiled_code_has_the_plans_of_the_virtual_machine_whatever_is_held_and_bounded(holding: str, bounded: str) -> None:
+    """Without softened bounds, stages that hold an input have no place, and no call of their own."""
+    ocp = pioneer(N=6, **HOLDING[holding], **BOUNDED[bounded])
+    assert (ocp.ng == 0) is (bounded != "all")
+    compiled, interpreted = (Rti(ocp, compile=compile) for compile in (True, False))
+    x = np.array([0.0, 0.3, 0.8, 0.0, 0.0])
+    for rti in (compiled, interpreted):
+        rti.reset(x, np.zeros(2))
+    for k in range(20):
+        for rti in (compiled, interpreted):
+            rti.prepare(arc(0.1 * np.arange(k + 1, k + 7, dtype=float)))
+            assert rti.feedback(x) is QpStatus.SOLVED
+        np.testing.assert_allclose(compiled.u, interpreted.u, rtol=0.0, atol=1e-9)  # rounding, which a plan refined at held bounds may multiply
+        x = interpreted.x[1].copy()
