@@ -25,7 +25,7 @@ from rti_mpc.rti.qp.qp import Guess
 
 MAX_ROLL_OUTS = 6  # after the first, as long as fewer places change than in that one, and no more than in the one before or than `FEW` of the first
 FEW = 0.5  # of the first changes: where so few change, there may be more than in the roll-out before, since they settle soon
-MAX_CHANGES = 30  # of places in the first roll-out with which a homotopy is followed: with more, it takes too many roll-outs
+MAX_CHANGES = 45  # of places in the first roll-out with which a homotopy is followed: with more, it takes too many roll-outs
 MAX_MOVES = 40  # roll-outs along the homotopy; a step of the interior point takes as long as two
 MAX_STEPS = 50  # of the interior point, for each QP that a sample may have; all of its QPs share the sum
 ROLL_OUTS_TO_GO_ON = 14  # roll-outs with new gains per QP, a step counted as two: a sample that has taken more begins no further QP
