@@ -48,8 +48,9 @@ IDLE = Mode.IDLE  # read faster than a member of the enumeration
 INPUTS_UNREPORTED = (
     "the robot does not report which inputs act: commands are assumed to act, and only the robot itself or a guard can handle lost ones"
 )
+UNTAKEN = 20  # reports in a row of the robot's own ramp, where commands should act, after which that is said
 COMMANDS_UNTAKEN = (
-    "the robot has reported its own ramp to rest for over a second where commands should act: it takes none and says why, or its states "
+    f"the robot has reported its own ramp to rest in {UNTAKEN} states in a row where commands should act: it takes none and says why, or its states "
     "lack command_epoch and command_seq, the command that their u comes from"
 )
 
@@ -441,7 +442,7 @@ class Controller:
     def _hear(self, state: State) -> bool:
         """Learn which input acts, from a report and, on a way to rest with feedback, from the state; return whether the report was not expected."""
         surprised = len(state.u) > 0 and self._reports.correct(state)
-        if surprised and self._reports.untaken and self.mode.planned:
+        if surprised and self._reports.ramps == UNTAKEN and self.mode.planned:
             self._modes.say(Severity.WARNING, "commands_untaken", COMMANDS_UNTAKEN)
         self._sent.feed_back(state.x, state.stamp_ns)
         return surprised

@@ -12,16 +12,13 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import State
 from rti_mpc.control.sent import Sent
 
-UNTAKEN_REPORTS, UNTAKEN_NS = 20, 1_000_000_000  # how many, and for how long: a robot that has lost some commands ramps as well
-
 
 class Reports:
     """
     Reports of one robot, compared with what is believed to act.
 
     Attributes:
-        untaken: Whether the last report is the one after which it may be said that the robot takes no commands: it has reported its own ramp to rest
-            where they should act, in `UNTAKEN_REPORTS` reports in a row and for `UNTAKEN_NS`.
+        ramps: Last reports in a row of the robot's own ramp to rest where a command was believed to act.
 
     Args:
         sent: What is believed.
@@ -29,24 +26,15 @@ class Reports:
     """
 
     def __init__(self, sent: Sent, limits: Mapping[str, Array]) -> None:
-        self.untaken = False
-        self._ramps, self._since_ns, self._told = 0, 0, False  # reports of the ramp in a row, since when, and whether `untaken` was true
+        self.ramps = 0
         self._sent = sent
         self._limits = limits
 
     def correct(self, state: State) -> bool:
         """Believe the input that a robot reports; return whether it was another than believed."""
         surprised = self._sent.correct(state.stamp_ns, self._within(state.u, state.stamp_ns), (state.command_epoch, state.command_seq))
-        self.untaken = False
-        if not surprised or state.command_seq:
-            self._ramps, self._told = 0, False
-            return surprised
-        if self._ramps == 0:
-            self._since_ns = state.stamp_ns
-        self._ramps += 1
-        if not self._told and self._ramps >= UNTAKEN_REPORTS and state.stamp_ns - self._since_ns >= UNTAKEN_NS:
-            self.untaken = self._told = True
-        return True
+        self.ramps = self.ramps + 1 if surprised and not state.command_seq else 0
+        return surprised
 
     def expects(self, state: State, t_ns: int) -> bool:
         """Whether the report of a state would be believed if it were stamped `t_ns`; nothing changes."""
