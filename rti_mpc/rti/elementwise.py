@@ -46,8 +46,7 @@ def elementwise(name: str, inputs: Mapping[str, ca.SX], outputs: Mapping[str, ca
         shared: Inputs that are the same for all of them.
 
     Returns:
-        A function of vectors of shape ``(count,)``, or numbers for what is shared, that returns vectors of shape ``(count,)``, all of which the
-        caller must take.
+        A function of vectors of shape ``(count,)``, or numbers for what is shared, that returns vectors of shape ``(count,)``.
 
     Raises:
         KeyError: An expression has an operation that is not in `IN_C`.
@@ -65,7 +64,8 @@ def _loop(one: ca.Function, count: int, shared: list[bool]) -> Iterator[str]:
     """Return the body of the same function in C."""
     yield "casadi_int i;"
     yield from (f"const casadi_real *__restrict__ x{k} = arg[{k}];" for k in range(one.n_in()))
-    yield from (f"casadi_real *__restrict__ y{k} = res[{k}];" for k in range(one.n_out()))
+    yield f"casadi_real untaken[{count}];"  # CasADi gives no place to results that nobody takes
+    yield from (f"casadi_real *__restrict__ y{k} = res[{k}] ? res[{k}] : untaken;" for k in range(one.n_out()))
     yield "#pragma GCC ivdep"
     yield f"for (i = 0; i < {count}; ++i) {{"
     yield f"  casadi_real {', '.join(f'v{k}' for k in range(one.sz_w()))};"

@@ -38,6 +38,18 @@ def test_each_element_is_what_the_expressions_give_compiled_or_not(count: int) -
         np.testing.assert_allclose(np.array(found["ordered"]).ravel(), ordered, rtol=1e-13)
 
 
+@needs_compiler
+@pytest.mark.parametrize("taken", ["once", "twice"])
+def test_results_that_nobody_takes_may_be_left(taken: str) -> None:
+    """CasADi passes a null pointer for them."""
+    a, vector = ca.SX.sym("a"), ca.MX.sym("a", 5)
+    both = elementwise("both", {"a": a}, {"once": a + 1, "twice": 2 * a}, 5)
+    interpreted = function("one_of_both", {"a": vector}, {"found": both(a=vector)[taken]})
+    numbers = np.arange(5.0)
+    for one in (interpreted, *compiled(interpreted)):
+        np.testing.assert_array_equal(np.array(one(numbers)).ravel(), {"once": numbers + 1, "twice": 2 * numbers}[taken])
+
+
 def test_function_of_no_elements_is_empty() -> None:
     a, b = ca.SX.sym("a"), ca.SX.sym("b")
     assert elementwise("none", {"a": a, "b": b}, {"sum": a + b}, 0, shared=("b",))(a=ca.DM(0, 1), b=1.0)["sum"].shape == (0, 1)
