@@ -112,7 +112,7 @@ def assemble(
         understudy=StateStream(model, stale_ns, grid.dt_ns, settling_s),
         track=Track(model, ocp.N, grid.dt_ns, compile=compile),
         sent=sent,
-        reports=Reports(sent, envelope.limits),
+        reports=Reports(sent, envelope.limits, grid.dt_ns),
         prediction=prediction,
         ways=None if stop_law is None else Stopping(ocp, stop_law, envelope.limits, prediction, valid_ns, compile=compile),
         issued=Issued(epoch, config_hash, grid.dt_ns),

@@ -48,10 +48,10 @@ IDLE = Mode.IDLE  # read faster than a member of the enumeration
 INPUTS_UNREPORTED = (
     "the robot does not report which inputs act: commands are assumed to act, and only the robot itself or a guard can handle lost ones"
 )
-UNTAKEN = 20  # reports in a row of the robot's own ramp, where commands should act, after which that is said
+UNTAKEN_NS = 2_000_000_000  # robot time of its own ramp, where commands should act, after which that is said: links lose commands for less
 COMMANDS_UNTAKEN = (
-    f"the robot has reported its own ramp to rest in {UNTAKEN} states in a row where commands should act: it takes none and says why, or its states "
-    "lack command_epoch and command_seq, the command that their u comes from"
+    f"the robot has reported its own ramp to rest for {1e-9 * UNTAKEN_NS:.0f} s where commands should act: none reaches it, it takes none and says "
+    "why, or its states lack command_epoch and command_seq, the command that their u comes from"
 )
 
 
@@ -128,6 +128,7 @@ class Controller:
         braking = {Mode.STOPPED, Mode.BRAKING} if balances else set()
         self._known = braking | {mode for mode in Mode if mode.planned}  # modes in which disturbances are estimated
         self._unreported = False  # whether it was said that the robot does not report its inputs
+        self._untaken = False  # whether it was said that the robot takes no command, and it has taken none since
 
     @property
     def mode(self) -> Mode:
@@ -442,7 +443,10 @@ class Controller:
     def _hear(self, state: State) -> bool:
         """Learn which input acts, from a report and, on a way to rest with feedback, from the state; return whether the report was not expected."""
         surprised = len(state.u) > 0 and self._reports.correct(state)
-        if surprised and self._reports.ramps == UNTAKEN and self.mode.planned:
+        if surprised and self._reports.untaken_ns < UNTAKEN_NS:
+            self._untaken = False
+        elif surprised and self.mode.planned and not self._untaken:
+            self._untaken = True
             self._modes.say(Severity.WARNING, "commands_untaken", COMMANDS_UNTAKEN)
         self._sent.feed_back(state.x, state.stamp_ns)
         return surprised

@@ -126,10 +126,13 @@ def test_robot_that_does_not_report_is_told_of_once() -> None:
     assert "inputs_unreported" not in said[True]
 
 
+@pytest.mark.parametrize("state_period_s", [0.1, 0.01, 0.005])
 @pytest.mark.parametrize(("at", "named", "times"), [("none", False, 1), ("none", True, 0), ("controller", True, 0)], ids=["unnamed", "named", "lost"])
-def test_robot_whose_inputs_come_from_no_command_is_told_of_once(at: str, named: bool, times: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It takes none, or does not say which; the loss of some commands is no such case."""
-    scene = Scene(guarded=False, at=at)
+def test_robot_whose_inputs_come_from_no_command_is_told_of_once(
+    at: str, named: bool, times: int, state_period_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It takes none, or does not say which, however fast its states come; the loss of commands for less than a second is no such case."""
+    scene = Scene(guarded=False, at=at, state_period_s=state_period_s)
     if not named:
         receive = scene.controller.receive_state
         unnamed = lambda state, now_ns: receive(replace(state, command_epoch=0, command_seq=0), now_ns)  # noqa: E731
