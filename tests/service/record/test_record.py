@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from rti_mpc.contract.epoch import NUMBER_BITS
-from rti_mpc.contract.message import Event
+from rti_mpc.contract.message import Event, Notice, Severity
 from rti_mpc.errors import ConfigError
 from rti_mpc.recording import Recording
 from rti_mpc.wire.bus import Bus, BusSettings, Declared
@@ -208,6 +208,13 @@ def test_controller_is_asked_for_its_files_as_soon_as_it_describes_itself(tmp_pa
     recorder.follow(KEYS.robot)
     assert done.wait(10.0), "it is asked by the thread that hears it; nothing is written in this test"
     assert asked == [9]
+
+
+def test_recorder_that_has_met_no_robot_says_what_is_wrong_in_its_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    recorder = Recorder(Bus(FakeSession(), KEYS), Segments(tmp_path / "run.mcap", EVERYTHING, START_NS, UNIX_OFFSET_NS))
+    recorder.say(Notice(Severity.ERROR, "unlinked", "all links to other processes are lost"))
+    assert [(record.levelname, record.message) for record in caplog.records] == [("ERROR", "all links to other processes are lost")]
+    assert recorder.run(STOPPED) == 0
 
 
 class TokenSession(FakeSession):
