@@ -32,7 +32,6 @@ def plot(run: Simulation) -> Figure:
     """
     model = given.instance("run", run, Simulation).ocp.model
     try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ModuleNotFoundError as error:
         raise RtiMpcError(f"matplotlib must be installed for a plot: pip install 'rti-mpc[figure]', got: {error}") from None
@@ -40,7 +39,6 @@ def plot(run: Simulation) -> Figure:
     panels = model.ny + model.nu
     columns = 1 if position is None else 2
     page = Figure(figsize=(6.5 * columns, max(3.5, PANEL_INCHES * panels)), layout="constrained")
-    FigureCanvasAgg(page)
     grid = page.add_gridspec(panels, columns)
     if position is not None:
         draw_path(page.add_subplot(grid[:, 0]), run, position)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated robot as a peer on the bus: plant, sensors and actuators; and a source of references."""
+"""Simulated robot as a peer on the bus: plant, sensors and actuators."""
