@@ -26,7 +26,7 @@ from rti_mpc.array import Array
 from rti_mpc.codegen import bind, compiled, function
 from rti_mpc.contract.message import Notice, Severity
 from rti_mpc.rti.blocks import all_inputs
-from rti_mpc.rti.linearization import constraints
+from rti_mpc.rti.linearization import constraints, scale_size
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import TOUCHING_DISTANCE, Rti
 
@@ -103,7 +103,7 @@ def progress(ocp: Ocp, own: int) -> ca.Function:
     """
     model, N, Q, nh = ocp.model, ocp.N, ca.DM(ocp.Q), ocp.h_expr.numel()
     x, u, y_ref = ca.MX.sym("x", model.nx, N + 1), ca.MX.sym("u", model.nu, ocp.N_u), ca.MX.sym("y_ref", model.ny, N)
-    p, scale = ca.MX.sym("p", model.np_, N + 1), ca.MX.sym("scale", model.nx + model.nu + ocp.ng)
+    p, scale = ca.MX.sym("p", model.np_, N + 1), ca.MX.sym("scale", scale_size(ocp))
     bounds = {name: ca.MX.sym(name, *np.shape(getattr(ocp, name))[::-1]) for name in ("lbx", "ubx", "lh", "uh")}
     lbx, ubx = (bound if bound.size2() == 1 else bound[:, -1] for bound in (bounds["lbx"], bounds["ubx"]))  # those of the end
     lh, uh = bounds["lh"], bounds["uh"]

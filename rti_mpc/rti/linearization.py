@@ -18,7 +18,9 @@ and the cost becomes its Gauss-Newton approximation. It is halved, to have the f
 Gauss-Newton neglects a part of the curvature, residual times second derivative. Far from
 the reference this is the larger part, and full steps oscillate. So steps are damped in
 proportion to the cost at the guess (Levenberg-Marquardt [FanYuan2005]_): there is no
-damping where the reference is met, and the optimum stays the same.
+damping where the reference is met, and the optimum stays the same. Where the reference is
+further away than inputs move the robot over the horizon, in proportion to the distance:
+what is neglected grows no faster, and what a step saves does not.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ from rti_mpc.codegen import function
 from rti_mpc.rti.blocks import all_inputs, at_each, at_starts, moved_on, summed
 from rti_mpc.rti.ocp import ARGUMENTS, Ocp
 
-DAMPING_PER_COST = 0.005  # weight of half the square of a step, in half ranges of an input, per cost at the guess; see docs/engine.md
+DAMPING_PER_COST = 0.005  # weight of half the square of a step, in half ranges of an input, per cost within reach at the guess; see docs/engine.md
 
 
 class Forms(NamedTuple):
@@ -86,6 +88,7 @@ class Linearization:
         p: Stage parameters, shape ``(np, N + 1)``.
         w: The weights and bounds, by the names in `ARGUMENTS`.
         scale_x: Scales of the states, see `rti_mpc.rti.scale`, shape ``(nx, 1)``; `scale_u` those of the inputs, `scale_g` those of g.
+        within_reach: About the cost of outputs that are off by what inputs change over the horizon.
         A: Sensitivities to the state, nonzeros of `A_k` column by column, shape ``(nnz, N)``.
         B: Sensitivities to the input, nonzeros of `B_k`, shape ``(nnz, N)``.
         A_k: Sparsity of A at one stage, shape ``(nx, nx)``.
@@ -125,8 +128,8 @@ class Linearization:
         self.y_ref = ca.MX.sym("y_ref", model.ny, N)
         self.p = ca.MX.sym("p", model.np_, N + 1)
         self.w = {name: ca.MX.sym(name, *np.shape(getattr(ocp, name))[::-1]) for name in ARGUMENTS}
-        self._scale = ca.MX.sym("scale", nx + nu + ocp.ng)
-        self.scale_x, self.scale_u, self.scale_g = self._scale[:nx], self._scale[nx : nx + nu], self._scale[nx + nu :]
+        self._scale = ca.MX.sym("scale", scale_size(ocp))
+        self.scale_x, self.scale_u, self.scale_g, reach = ca.vertsplit(self._scale, np.cumsum([0, nx, nu, ocp.ng, nx]).tolist())
 
         stage, self.A_k, self.B_k = linearize(ocp)
         inputs = all_inputs(self.u, ocp.blocks)
@@ -165,7 +168,9 @@ class Linearization:
             gradient = at_each(w["R_u"], N_u) * off
             self.force += running_sum(gradient)
             self.cost += ca.dot(off, gradient)
-        self.damping = damping(ocp) * self.cost / self.scale_u**2
+        H, size = ca.MX(self.H_i, ca.sum2(self.hessian)), ca.vertcat(reach, self.scale_u)[:nv]
+        self.within_reach = ca.dot(ca.diag(H), size**2)
+        self.damping = damping(ocp) * ca.fmin(self.cost, ca.sqrt(self.cost * self.within_reach)) / self.scale_u**2
         if ocp.R_u.any():
             self.damping = (self.damping if ocp.R_u.ndim == 1 else ca.repmat(self.damping, 1, N_u)) + w["R_u"]
         self.checksum = ca.sum1(ca.vec(stages)) + ca.sum1(ca.vec(nodes)) + self.cost + ca.sum1(ca.vec(self.b))
@@ -280,6 +285,11 @@ def linearization(ocp: Ocp) -> Linearization:
     if ocp not in _linearizations:
         _linearizations[ocp] = Linearization(ocp)
     return _linearizations[ocp]
+
+
+def scale_size(ocp: Ocp) -> int:
+    """Return how many numbers `rti_mpc.rti.scale.scale` has: of states, inputs, softened bounds, and the reach of each state."""
+    return 2 * ocp.model.nx + ocp.model.nu + ocp.ng
 
 
 def input_reference(ocp: Ocp) -> ca.Function:

@@ -32,6 +32,7 @@ from rti_mpc.errors import OcpError
 from rti_mpc.rti.acceleration import Acceleration
 from rti_mpc.rti.active_set import ActiveSet
 from rti_mpc.rti.construction import FORMULATIONS, construction
+from rti_mpc.rti.linearization import scale_size
 from rti_mpc.rti.ocp import ARGUMENTS, Ocp
 from rti_mpc.rti.qp.osqp import Solver, SolverSettings
 from rti_mpc.rti.qp.qp import Guess, Qp, Step, step_size
@@ -72,7 +73,7 @@ class Rti:
         y_ref: Reference rows of the current sample, shape ``(N, ny)``.
         p: Stage parameters of the current sample, shape ``(N + 1, np)``.
         x0: Initial state of the current sample, shape ``(nx,)``, its angles in the turn of the plan.
-        scale: Scales of states, inputs and softened bounds inside the solvers, see `rti_mpc.rti.scale`; shape ``(nx + nu + ng,)``.
+        scale: Scales of states, inputs and softened bounds inside the solvers, and the states' reach, see `rti_mpc.rti.scale`; shape ``(2 nx + nu + ng,)``.
         cost_scale: Factor of the cost inside the solvers.
         x_nominal: State around which the model is regular, given or found, shape ``(nx,)``; the plan begins there before the first `reset`.
         guess: Arrays of the guess at which the current sample is linearized, which the solvers read and write.
@@ -147,7 +148,7 @@ class Rti:
         # OSQP knows no infinity but its own.
         self._weights = {name: np.clip(getattr(self.problem, name), -INFINITY, INFINITY) for name in ARGUMENTS}
         self._parts = parts(ocp, self._weights)
-        self.scale: Array = np.ones(model.nx + model.nu + self.problem.ng)
+        self.scale: Array = np.ones(scale_size(self.problem))
         self.guess = Guess(
             sample={"x": x, "u": u, "u_prev": self.u_prev, "y_ref": self.y_ref, "p": p},
             weights=self._weights | {"scale": self.scale},
@@ -224,7 +225,7 @@ class Rti:
     @property
     def scale_g(self) -> Array:
         """Scales of what has softened bounds in `problem`, shape ``(ng,)``."""
-        return self.scale[self.problem.model.nx + self.problem.model.nu :]
+        return self.scale[self.problem.model.nx + self.problem.model.nu :][: self.problem.ng]
 
     @property
     def qp(self) -> Qp:

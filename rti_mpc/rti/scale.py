@@ -27,7 +27,9 @@ from rti_mpc.si import HasUnit, ones, read
 
 def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
     """
-    Return the scales of states, inputs and softened bounds, one after the other, shape ``(nx + nu + ng,)``, all positive.
+    Return the scales of states, inputs and softened bounds, then the reach of the states, shape ``(2 nx + nu + ng,)``, all positive.
+
+    The reach is how far inputs move a state over the horizon, whatever its bounds; the scale of one that they do not move.
 
     Args:
         ocp: The problem.
@@ -77,7 +79,7 @@ def scale(ocp: Ocp, x: Array, u: Array, y_ref: Array, p: Array) -> Array:
     if isinstance(ocp, Remembering):
         remembered = list(ocp.remembered)
         scale_g[ocp.ng_path - len(remembered) : ocp.ng_path] = reach_u[remembered]
-    return np.concatenate([scale_x, reach_u, scale_g])
+    return np.concatenate([scale_x, reach_u, scale_g, np.where(reach > 0.0, reach, scale_x)])
 
 
 def shared(reach: Array, states: Sequence[HasUnit]) -> Array:

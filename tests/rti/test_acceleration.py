@@ -25,7 +25,7 @@ def next_guess(
 ) -> tuple[Array, Array, Array, float]:
     """The next guess of states and inputs, the step and its relaxation, in units in which all half ranges are 1."""
     lower = ocp.lbx if lbx is None else lbx
-    given = x.T, u.T, x_plan.T, u_plan.T, step.T, omega, lower, ocp.ubx, ocp.lbu, ocp.ubu, np.ones(7 + ocp.ng)
+    given = x.T, u.T, x_plan.T, u_plan.T, step.T, omega, lower, ocp.ubx, ocp.lbu, ocp.ubu, 1.0
     x_next, u_next, step_next, omega_next = (np.array(one) for one in relaxation(ocp)(*given))
     return x_next.T, u_next.T, step_next.T, float(omega_next[0, 0])
 

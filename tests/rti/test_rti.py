@@ -689,6 +689,22 @@ def test_list_of_what_is_compiled_leaves_the_qp_behind_an_active_set_out() -> No
     assert listed == [*of_qp, "certificate"]
 
 
+def test_robot_whose_horizon_is_much_shorter_than_its_way_comes_to_its_path() -> None:
+    """Inputs that act for 20 ms move it by millimetres, and hardly lower the cost of what it is away: damped by all of that it would creep."""
+    dt, delta = 0.001, np.full(20, 28.0)
+    delta[-1] += 28.0 / dt  # for the second after the horizon
+    rti = Rti(pioneer(N=20, dt=dt, delta=delta, ubx=INF, lbx=-INF), iterations=1, compile=False)
+    plant, x, u = rti.ocp.phi(), np.array([0.0, 0.3, 0.0, 0.25, 0.0]), np.array([0.25, 0.0])
+    rti.reset(x, u)
+    for k in range(round(1.0 / dt)):
+        t = dt * np.arange(k + 1, k + 21)
+        rti.prepare(np.column_stack([0.25 * t, 0 * t, 0 * t]), shift=k > 0, u_prev=u)
+        assert rti.feedback(x) is QpStatus.SOLVED
+        u = rti.u[0].copy()
+        x = np.array(plant(x, u, rti.ocp.model.p_nominal)).ravel()
+    assert abs(x[1]) < 0.15  # half of it in a second; undamped it is at 0.12
+
+
 @pytest.mark.parametrize("iterations", [1, 3])
 @pytest.mark.parametrize("beside_m", [0.02, 1.0])
 def test_metres_behind_its_reference_a_robot_does_not_swing(iterations: int, beside_m: float) -> None:

@@ -193,10 +193,13 @@ def test_any_robot_is_driven_alike_in_units_of_any_size(robot: str, starts: int)
 
 
 def test_scale_of_what_has_no_bounds_is_the_reach_of_the_inputs() -> None:
-    """A mass pushed by at most 2 for a second: half a metre times two, and two metres per second."""
+    """A mass pushed by at most 2 for a second: half a metre times two, and two metres per second; with bounds that is its reach still."""
     ocp = double_integrator(lbu=-2.0, ubu=2.0)
-    found = scale(ocp, np.zeros((11, 2)), np.zeros((10, 1)), np.zeros((10, 2)), np.zeros((11, 0)))
-    np.testing.assert_allclose(found, [1.0, 2.0, 2.0], rtol=1e-12)
+    args = np.zeros((11, 2)), np.zeros((10, 1)), np.zeros((10, 2)), np.zeros((11, 0))
+    found = scale(ocp, *args)
+    np.testing.assert_allclose(found, [1.0, 2.0, 2.0, 1.0, 2.0], rtol=1e-12)
+    bounded = scale(double_integrator(lbu=-2.0, ubu=2.0, lbx=[-7.0, -0.5], ubx=[7.0, 0.5]), *args)
+    np.testing.assert_allclose(bounded, [7.0, 0.5, 2.0, 7.0, 0.5, 1.0, 2.0], rtol=1e-12)
 
 
 @pytest.mark.parametrize(("x", "y"), [("km", "mm"), ("m", "km"), ("m", "m")])
@@ -222,7 +225,7 @@ def test_scale_of_a_constraint_is_how_far_its_states_are_moved_in_any_direction(
     away = 3.0 * model.x[1] - 4.0 * model.x[0]  # m
     rti = Rti(Ocp(model, N=2, dt=0.1, Q=[1, 1, 1], R=[1, 1], lbu=-0.5, ubu=0.5, h_expr=ca.vertcat(model.x[1], away), uh=[0.3, 0.3]), compile=False)
     _, of_y = rti.scale[:2]  # that of x
-    np.testing.assert_allclose(rti.scale[-2:], [of_y, 5.0 * of_y], rtol=1e-12)
+    np.testing.assert_allclose(rti.scale_g, [of_y, 5.0 * of_y], rtol=1e-12)
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)

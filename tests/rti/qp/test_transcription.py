@@ -43,15 +43,15 @@ def built(name: str, formulation: str, compile: bool) -> Rti:
     return Rti(PROBLEMS[name](), formulation=formulation, solver="osqp", compile=compile)
 
 
-def at_random(name: str, seed: int, *, formulation: str = "simultaneous", compile: bool = False) -> Rti:
-    """Linearize everything, state bounds included, at a guess, reference and parameters that are nowhere special."""
+def at_random(name: str, seed: int, *, formulation: str = "simultaneous", compile: bool = False, away: float = 1.0) -> Rti:
+    """Linearize everything, state bounds included, at a guess, reference and parameters that are nowhere special, the reference so often away."""
     rng = np.random.default_rng(seed)
     rti = built(name, formulation, compile)
     rti.reset(np.zeros(rti.ocp.model.nx), np.array(rti.ocp.model.u_rest))
     rti.x[:] = rng.normal(size=rti.x.shape)
     rti.u[:] = rng.normal(size=rti.u.shape)
     p = np.array(rti.ocp.model.p_nominal) * rng.uniform(0.8, 1.2, size=rti.p.shape)
-    rti.prepare(rng.normal(size=rti.y_ref.shape), p, shift=False, u_prev=rng.normal(size=rti.ocp.model.nu))
+    rti.prepare(away * rng.normal(size=rti.y_ref.shape), p, shift=False, u_prev=rng.normal(size=rti.ocp.model.nu))
     for solver in rti.solvers:
         solver.load()
     return rti
@@ -170,17 +170,18 @@ def test_gradient_is_half_that_of_the_cost(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_hessian_is_the_gauss_newton_approximation_and_the_damping(name: str) -> None:
-    """Outputs that are not linear included: their Hessian follows the guess. Steps in inputs are damped in proportion to the cost."""
-    for seed in (4, 5):
-        rti = at_random(name, seed=seed)
+    """Outputs that are not linear included: their Hessian follows the guess. Steps in inputs are damped in proportion to the cost within reach."""
+    for seed, away in ((4, 1.0), (5, 1.0), (6, 30.0)):
+        rti = at_random(name, seed=seed, away=away)
         ocp, problem = rti.ocp, ByHand(rti)
-        nx, nu = ocp.model.nx, ocp.model.nu
+        nx = ocp.model.nx
         J = jacobian(problem.residuals, problem.guess)
         expected = J.T @ J
         slacks = len(problem.guess) - ocp.N * len(ocp.lg)
         steps = range(slacks - rti.u.size, slacks)
         residuals = problem.residuals(problem.guess)
-        expected[steps, steps] += np.tile(damping(ocp) / rti.scale[nx : nx + nu] ** 2, ocp.N_u) * (residuals @ residuals)
+        cost, within_reach = residuals @ residuals, np.diag(expected)[nx : (ocp.N + 1) * nx] @ np.tile(rti.scale[-nx:], ocp.N) ** 2
+        expected[steps, steps] += np.tile(damping(ocp) / rti.scale_u**2, ocp.N_u) * min(cost, np.sqrt(cost * within_reach))
         expected[slacks:, slacks:] = np.diag(0.5 * rti.cost_scale * SLACK_UNIT**2 * np.tile([*ocp.Z[list(ocp.soft)], *ocp.Zh], ocp.N))
         np.testing.assert_allclose(hessian(whole(rti)), expected, rtol=1e-7, atol=1e-6)
 
