@@ -50,6 +50,7 @@ References, cited by key throughout:
   2003.
 * [Ferreau2008] H. J. Ferreau, H. G. Bock, M. Diehl, "An online active set strategy to overcome the limitations of explicit MPC", Int. J. Robust and
   Nonlinear Control 18(8), 2008.
+* [Bland1977] R. G. Bland, "New finite pivoting rules for the simplex method", Mathematics of Operations Research 2 (2), 1977.
 * [Mehrotra1992] S. Mehrotra, "On the implementation of a primal-dual interior point method", SIAM J. Optim. 2(4), 1992.
 * [Kapania2016] N. Kapania, J. Subosits, J. C. Gerdes, "A sequential two-step algorithm for fast generation of vehicle racing trajectories",
   J. Dyn. Sys. Meas. Control 138(9), 2016.

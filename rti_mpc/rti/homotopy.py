@@ -14,6 +14,11 @@ out with the same places, until the first of them comes to the end of its segmen
 row goes on to the next segment, and the next roll-out gives the new direction: one
 change of a place for each roll-out with its gains. As the QP is convex, the homotopy
 ends. It begins at the guess.
+
+Rows that come to their ends together change together, which is right as a rule. If they
+then have to change again at once, some of them can be at their bounds only without the
+others, and they would take turns for ever. So after a few moves without a way they
+change one at a time, always the first of them [Bland1977]_.
 """
 
 from __future__ import annotations
@@ -26,6 +31,7 @@ from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.qp.transcription import INFINITY
 
 LIMITS = "lower", "upper", "most"  # names of what `limits` returns
+MAX_STILL = 3  # moves in a row that lead nowhere; from then on one row changes at a time
 
 
 def limits(ocp: Ocp, lin: Linearization) -> list[ca.MX]:
@@ -73,25 +79,25 @@ class BoundedRow:
         end = ca.if_else(self.held, ca.if_else(self.found == 0, 0, self.most), self.bound)
         return ca.if_else(self.found == self.place, INFINITY, ca.fmax((end - self.now) / (self.target - self.now), 0))
 
-    def after(self, share: ca.SX, least: ca.SX) -> list[ca.SX]:
-        """Return place and coordinate after the least share of all rows."""
+    def after(self, changes: ca.SX, least: ca.SX) -> list[ca.SX]:
+        """Return place and coordinate after the least share of all rows, and whether the row changes there."""
         first = ca.if_else(ca.fabs(self.found) == 1, ca.if_else(self.place == 0, 0, self.most), self.bound)
-        changes = share == least
         return [ca.if_else(changes, self.found, self.place), ca.if_else(changes, first, self.now + least * (self.target - self.now))]
 
 
 def begin(ocp: Ocp, lin: Linearization, stages: ca.MX) -> ca.Function:
     """
-    Build ``(u, stages, *ARGUMENTS, scale, places, targets) -> (point, lower, upper, most)``.
+    Build ``(u, stages, *ARGUMENTS, scale, places, targets) -> (point, still, lower, upper, most)``.
 
-    That is where the homotopy begins, from the guess and a roll-out with places, and the `limits` of its rows.
+    That is where the homotopy begins, from the guess and a roll-out with places, no moves without a way, and the `limits` of its rows.
     """
     row, forms = BoundedRow(), lin.forms_in(stages)
     guess = ca.veccat(lin.u, forms.increments, forms.g)
     given, of_rows = {name: ca.MX.sym(name, guess.numel()) for name in ("places", "targets")}, limits(ocp, lin)
     start = ca.Function("start", [row.place, row.now, row.target, row.lower, row.upper, row.most], [row.start]).map(guess.numel())
     point = start(*(of.T for of in (given["places"], guess, given["targets"], *of_rows))).T
-    return function("begin", {"u": lin.u, "stages": stages, **lin.weights, **given}, {"point": point, **dict(zip(LIMITS, of_rows, strict=True))})
+    found = {"point": point, "still": ca.MX(0), **dict(zip(LIMITS, of_rows, strict=True))}
+    return function("begin", {"u": lin.u, "stages": stages, **lin.weights, **given}, found)
 
 
 # The same as `BoundedRow`, without the division for rows that do not change.
@@ -104,8 +110,9 @@ static casadi_real share_of(casadi_real place, casadi_real found, casadi_real no
 """
 MOVE = """
   const casadi_real *place = arg[0], *found = arg[1], *point = arg[2], *target = arg[3], *lower = arg[4], *upper = arg[5], *most = arg[6];
+  const casadi_real still = arg[7][0];
   casadi_real least = 1;
-  casadi_int i;
+  casadi_int i, changed = 0;
   for (i = 0; i < ROWS; ++i) {
     if (found[i] != place[i]) {
       const casadi_real bound = place[i] + found[i] > 0 ? upper[i] : lower[i];
@@ -115,7 +122,9 @@ MOVE = """
   }
   for (i = 0; i < ROWS; ++i) {  /* a row is read before it is written: results may share the memory of arguments */
     const casadi_real of = place[i], to = found[i], now = point[i], bound = of + to > 0 ? upper[i] : lower[i];
-    if (of != to && share_of(of, to, now, target[i], bound, most[i]) == least) {
+    const casadi_int together = still < MAX_STILL || !changed;
+    if (of != to && together && share_of(of, to, now, target[i], bound, most[i]) == least) {
+      changed = 1;
       res[0][i] = to;
       res[1][i] = fabs(to) != 1 ? bound : of == 0 ? 0 : most[i];
     } else {
@@ -123,26 +132,33 @@ MOVE = """
       res[1][i] = now + least * (target[i] - now);
     }
   }
+  res[2][0] = least > 0 ? 0 : still + 1;
   return 0;
 """
 
 
 def move(size: int) -> ca.Function:
     """
-    Build ``(places, places_found, point, targets, lower, upper, most) -> (places_next, point_next)``: the way to the first change of a place.
+    Build ``(places, places_found, point, targets, lower, upper, most, still) -> (places_next, point_next, still_next)``.
 
-    Compiled, the results may be in the memory of places and point.
+    The way to the first change of a place. `still` is the number of moves before it that led nowhere. Compiled, the results may be in the memory of
+    places, point and still.
 
     Args:
         size: Number of rows.
     """
     row = BoundedRow()
     names = "places", "places_found", "point", "targets", *LIMITS
-    given = {name: ca.MX.sym(name, size) for name in names}
+    given, still = {name: ca.MX.sym(name, size) for name in names}, ca.MX.sym("still")
     of_rows = [of.T for of in given.values()]
     shares = ca.Function("share", row.symbols, [row.share]).map(size)(*of_rows)
-    share, least = ca.SX.sym("share"), ca.SX.sym("least")
-    after = ca.Function("after", [*row.symbols, share, least], row.after(share, least)).map(size)
-    places, point = after(*of_rows, shares, ca.repmat(ca.fmin(ca.mmin(shares), 1), 1, size))
-    body = f"{SHARE}{BEFORE_BODY}enum {{ ROWS = {size} }};{MOVE}"
-    return function_in_c("move", given, {"places_next": places.T, "point_next": point.T}, body)
+    least, index = ca.fmin(ca.mmin(shares), 1), ca.DM(range(size)).T
+    at_end = shares == least
+    first = ca.mmin(size + at_end * (index - size))
+    changes = ca.logic_and(at_end, ca.logic_or(still < MAX_STILL, index == first))
+    symbols = [ca.SX.sym(name) for name in ("changes", "least")]
+    after = ca.Function("after", [*row.symbols, *symbols], row.after(*symbols)).map(size)
+    places, point = after(*of_rows, changes, ca.repmat(least, 1, size))
+    body = f"{SHARE}{BEFORE_BODY}enum {{ ROWS = {size}, MAX_STILL = {MAX_STILL} }};{MOVE}"
+    results = {"places_next": places.T, "point_next": point.T, "still_next": ca.if_else(least > 0, 0, still + 1)}
+    return function_in_c("move", given | {"still": still}, results, body)

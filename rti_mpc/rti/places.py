@@ -73,7 +73,7 @@ class Places:
             rows, see `rti_mpc.rti.homotopy`.
         roll_out_again: Gains of other places, then their roll-out, ``roll_out`` with the places ``places_of``.
         move_on: The way along the homotopy to the next change of a place, see `rti_mpc.rti.homotopy.move`, then the same of its ``places``. Of the
-            change and the roll-out before, it takes ``places_known``, ``point_known``, ``places_found_known`` and ``targets_known``.
+            change and the roll-out before, it takes ``places_known``, ``point_known``, ``places_found_known``, ``targets_known`` and ``still_known``.
         refine: ``(x, u, u_prev, stages, gains, *ARGUMENTS, scale, places, r, x_plan, u_plan, multipliers) -> (x_refined,
             u_refined, multipliers_refined)``: plan and multipliers after a Newton step that removes the remaining gradient r of the Lagrangian,
             see `rti_mpc.rti.certificate`.
@@ -136,7 +136,8 @@ def places(ocp: Ocp) -> Places:
     rolled = roll_out(ocp, at, x0)
     gains, rolling = gains_of(ocp, recursion, at, stages, flat), function("roll_out", {**guess, "x0": x0, **fixed}, rolled)
     again: list[tuple[ca.Function, Names]] = [(gains, {}), (rolling, {"places": "places_of"})]
-    on_way = {name: f"{name}_known" for name in ("places", "places_found", "point", "targets")} | {"places_next": "places", "point_next": "point"}
+    on_way = {name: f"{name}_known" for name in ("places", "places_found", "point", "targets", "still")}
+    on_way |= {"places_next": "places", "point_next": "point", "still_next": "still"}
     plan = {"r": lin.u, "x_plan": lin.x, "u_plan": lin.u, "multipliers": rolled["multipliers"]}
     plan = {name: ca.MX.sym(name, *like.shape) for name, like in plan.items()}
     return Places(

@@ -73,7 +73,8 @@ class Rti:
         y_ref: Reference rows of the current sample, shape ``(N, ny)``.
         p: Stage parameters of the current sample, shape ``(N + 1, np)``.
         x0: Initial state of the current sample, shape ``(nx,)``, its angles in the turn of the plan.
-        scale: Scales of states, inputs and softened bounds inside the solvers, and the states' reach, see `rti_mpc.rti.scale`; shape ``(2 nx + nu + ng,)``.
+        scale: Scales of states, inputs and softened bounds inside the solvers, then the states' reach, see `rti_mpc.rti.scale`; shape
+            ``(2 nx + nu + ng,)``.
         cost_scale: Factor of the cost inside the solvers.
         x_nominal: State around which the model is regular, given or found, shape ``(nx,)``; the plan begins there before the first `reset`.
         guess: Arrays of the guess at which the current sample is linearized, which the solvers read and write.
