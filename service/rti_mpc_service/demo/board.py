@@ -70,7 +70,7 @@ class Board(Redrawn):
             ),
             "preparation": f"{medians['prepare_us']:.0f} us",
             "feedback": f"{medians['feedback_us']:.0f} us",
-            "in period": f"{np.mean([sample.slack_s >= 0.0 for sample in telemetry]):.2%}",
+            "computed in period": f"{np.mean([sample.slack_s >= 0.0 for sample in telemetry]):.2%}",
             "fallbacks": str(last.fallbacks),
         }
 
@@ -90,10 +90,10 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
         rows = [("path", path_text(path)), ("nearer edge", f"at least {path['closest_to_edge_mm']:.3g} mm away"), *rows]
     rows = [row for row in rows if MISSING_TEXT not in row[1]]
     rows += [
-        ("samples in period", f"{summary['in_period_share']:.2%} of {summary['samples']}, {summary['skipped']} skipped"),
+        ("computed in period", f"{summary['in_period_share']:.2%} of {summary['samples']} samples, {summary['skipped']} skipped"),
         ("inputs in bounds", "always" if inputs_in_bounds(summary) else "NOT ALWAYS"),
         ("states over bounds", f"at most {summary['states_over_share']:.2%}"),
-        ("fallbacks", str(summary["fallbacks"])),
+        ("fallbacks", f"{summary['fallbacks']} samples without a new plan"),
         ("second opinion", second_opinion_text(summary["second_opinion"])),
         ("commands", f"{summary['lost']} lost, {summary['late']} late, {summary['expired']} expired, {summary['refused']} refused"),
     ]

@@ -50,7 +50,8 @@ def test_summary_loses_no_number_and_no_word(columns: str, monkeypatch: pytest.M
     assert printed.count("918273645") == 4
     assert "30.2 m of 12.5 m, laps of 4.12, 5.00 s; 3.8 s by the speed profile" in printed
     assert "at least 148 mm away" in printed
-    assert "987654321, 0 skipped" in printed
+    assert "100.00% of 987654321 samples, 0 skipped" in printed
+    assert "192837465 samples without a new plan" in printed
     assert "50.00% of the samples, at most 2e-09 of half a range off, p50 918.0, p99 4321.0 us" in printed
     assert "WARNING of the robot at 1.0 s: a sentence of many words [of the robot], on one line" in lines
     assert "…" not in printed
@@ -83,6 +84,6 @@ def test_progress_in_a_pipe_is_one_whole_line_each(monkeypatch: pytest.MonkeyPat
         "starting controller, echo, reference, viewer",
         (
             "    0 of 126 s: mode tracking, error q_1 +0.1 rad, command torque [1] +1.000 Nm, preparation 123456789 us, feedback 123456789 us, "
-            "in period 100.00%, fallbacks 0"
+            "computed in period 100.00%, fallbacks 0"
         ),
     ]
