@@ -82,7 +82,7 @@ def join(endpoint: str) -> Iterator[Callable[..., Bus]]:
     with ExitStack() as stack:
 
         def join(*, robot: bool = False, **settings: Any) -> Bus:
-            settings = {"listen": (endpoint,) if robot else (), "connect": (endpoint,), "cfg": (*FAST, *PATIENT), **settings}
+            settings = {"listen": (endpoint,) if robot else (), "connect": (endpoint,), "cfg": PATIENT, **settings}
             return stack.enter_context(Bus.join(BusSettings(**settings), KEYS))
 
         yield join
