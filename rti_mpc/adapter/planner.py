@@ -56,7 +56,7 @@ class PlannerAdapter:
         self.close()
 
     def close(self) -> None:
-        """Leave the bus; the robot follows the last reference to its end."""
+        """Leave the bus; the robot follows the last reference to its end. From then on `send` does nothing."""
         self._bus.close()
 
     def send(self, y: ArrayLike, period_s: float, *, stamp_ns: int = STAMP_ON_ARRIVAL, end: End = End.HOLD, p: ArrayLike | None = None) -> None:

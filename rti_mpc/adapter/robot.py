@@ -129,7 +129,7 @@ class RobotAdapter:
         self.close()
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Leave the bus: from then on `send` does nothing, and `act` leads the inputs to rest."""
         self._bus.close()
 
     def every(self, period_s: float) -> Iterator[int]:

@@ -10,6 +10,7 @@ integer nanoseconds of the robot's clock. SI units unless a name says otherwise.
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -35,6 +36,11 @@ class Severity(IntEnum):
     INFO = 0
     WARNING = 1
     ERROR = 2
+
+    @property
+    def level(self) -> int:
+        """Level of a line of the log."""
+        return (logging.INFO, logging.WARNING, logging.ERROR)[self]
 
 
 @dataclass(slots=True)

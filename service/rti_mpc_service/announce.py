@@ -5,13 +5,11 @@ from __future__ import annotations
 
 import logging
 
-from rti_mpc.contract.message import Notice, Severity
+from rti_mpc.contract.message import Notice
 from rti_mpc.wire.announcer import Announcer
-
-LOG_LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
 
 
 def announce(log: logging.Logger, announcer: Announcer, notice: Notice, stamp_ns: int) -> None:
     """Publish and log a notice with a stamp in robot time, 0 where none is known yet; a fault that was announced just before is not repeated."""
     if announcer.say(notice, stamp_ns):
-        log.log(LOG_LEVELS[notice.severity], "%s", notice.text, extra={"robot_ns": stamp_ns or None})
+        log.log(notice.severity.level, "%s", notice.text, extra={"robot_ns": stamp_ns or None})

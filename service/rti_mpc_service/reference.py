@@ -130,8 +130,7 @@ class ReferenceSource:
 
     def _warn(self, notice: Notice) -> None:
         """Announce and log what does not come from the robot; in any thread."""
-        self._announcer.say(notice, self._stamp_ns)
-        logger.warning("%s", notice.text)
+        announce(logger, self._announcer, notice, self._stamp_ns)
 
     def _anchor(self, state: State) -> None:
         """Publish the reference that starts at a state."""

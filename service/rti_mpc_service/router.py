@@ -33,7 +33,7 @@ def main(settings: BusSettings, keys: Keys, *, stop: Event | None = None) -> Non
         log.warning(f"{endpoint} is open: whoever reaches it can command the robot; use TLS, see `rti-mpc certs`")
     with Bus.join(settings, keys, stop=stop, say=log.warning) as bus:
         bus.alive("router")
-        bus.watch_connection(lambda notice: log.warning(notice.text))
+        bus.watch_connection(lambda notice: log.log(notice.severity.level, notice.text))
         log.info("routing")
         stop.wait()
     log.info("stopped")

@@ -188,7 +188,7 @@ class Robot:
     def warn(self, notice: Notice) -> None:
         """Announce and log what does not come from the robot's own loop; in any thread."""
         self._announcer.say(notice, self.body.now_ns)
-        logger.warning("%s", notice.text)
+        logger.log(notice.severity.level, "%s", notice.text)
 
     def finish(self) -> RobotSummary:
         """Go the way to rest and coast until the robot stands, ahead of the clock, and sum up."""

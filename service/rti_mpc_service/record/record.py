@@ -35,7 +35,6 @@ from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.received import Received
 from rti_mpc.wire.streams import CONTROLLER_ROLES, JOURNAL, KNOWN_ROLES, STATE, admitted, role_of
-from rti_mpc_service.announce import LOG_LEVELS, announce
 from rti_mpc_service.host.pressure import waited_us
 from rti_mpc_service.record.hearing import fetch_origin, hear
 from rti_mpc_service.record.inbox import Arrived, Inbox
@@ -173,13 +172,14 @@ class Recorder:
         return 0
 
     def say(self, notice: Notice) -> None:
-        """Announce to every robot, with the stamp of its last state; log it where none is known yet. In any thread."""
+        """Announce to every robot, with the stamp of its last state, and log it once. In any thread."""
         with self._lock:
             announcers = dict(self._announcers)
-        if not announcers:
-            log.log(LOG_LEVELS[notice.severity], "%s", notice.text)
-        for robot, announcer in announcers.items():
-            announce(log, announcer, notice, self._stamps_ns.get(robot, 0))
+        stamps_ns = {robot: self._stamps_ns.get(robot, 0) for robot in announcers}
+        said = [announcer.say(notice, stamps_ns[robot]) for robot, announcer in announcers.items()]
+        if any(said) or not said:
+            alone_ns = sum(stamps_ns.values()) if len(said) == 1 else 0  # several robots have a time each
+            log.log(notice.severity.level, "%s", notice.text, extra={"robot_ns": alone_ns or None})
 
     def _write(self, now_ns: int) -> None:
         """

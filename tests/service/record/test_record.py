@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 import json
+import logging
 import resource
 import zlib
 from collections.abc import Iterator
@@ -215,6 +216,19 @@ def test_recorder_that_has_met_no_robot_says_what_is_wrong_in_its_log(tmp_path: 
     recorder.say(Notice(Severity.ERROR, "unlinked", "all links to other processes are lost"))
     assert [(record.levelname, record.message) for record in caplog.records] == [("ERROR", "all links to other processes are lost")]
     assert recorder.run(STOPPED) == 0
+
+
+def test_recorder_of_many_robots_tells_each_of_them_and_its_log_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Good news as such: that it is linked again was a warning, once for each robot."""
+    session, robots = FakeSession(), ("a", "b", "c")
+    recorder = Recorder(Bus(session, KEYS), Segments(tmp_path / "run.mcap", EVERYTHING, START_NS, UNIX_OFFSET_NS))
+    for robot in robots:
+        recorder.follow(robot)
+    with caplog.at_level(logging.INFO):
+        recorder.say(Notice(Severity.INFO, "linked", "linked to others again after 3.0 s"))
+    assert [(record.levelname, record.message) for record in caplog.records] == [("INFO", "linked to others again after 3.0 s")]
+    told = [decode(Event, payload).code for key, payload in session.put.items() if "/event/" in key]
+    assert told == ["linked"] * len(robots)
 
 
 class TokenSession(FakeSession):
