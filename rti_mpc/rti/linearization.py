@@ -36,6 +36,7 @@ import scipy.sparse as sp
 from rti_mpc.array import Array
 from rti_mpc.codegen import function
 from rti_mpc.rti.blocks import all_inputs, at_each, at_starts, moved_on, summed
+from rti_mpc.rti.columns import over_columns
 from rti_mpc.rti.ocp import ARGUMENTS, Ocp
 
 DAMPING_PER_COST = 0.005  # weight of half the square of a step, in half ranges of an input, per cost within reach at the guess; see docs/engine.md
@@ -133,7 +134,7 @@ class Linearization:
 
         stage, self.A_k, self.B_k = linearize(ocp)
         inputs = all_inputs(self.u, ocp.blocks)
-        stages = stage.map(N)(self.x[:, :-1], inputs, self.p[:, :-1])
+        stages = over_columns(stage, N)(self.x[:, :-1], inputs, self.p[:, :-1])
         to_B = nx + self.A_k.nnz()
         self.A, self.B = stages[nx:to_B, :], stages[to_B:, :]
         self.b = stages[:nx, :] - self.x[:, 1:]
@@ -146,12 +147,12 @@ class Linearization:
             W = ca.repmat(self.w["Q"], 1, N) * ca.kron(root, ca.DM.ones(1, model.ny)) * ca.repmat(ca.vec(root).T, model.ny, 1)
         W = ca.horzcat(W[:, : -model.ny], W[:, -model.ny :] + self.w["Q_e"])
         nv = self.H_i.size1()
-        nodes = node.map(N)(self.x[:, 1:], *([inputs] if nv > nx else []), self.p[:, 1:], self.y_ref, W)
+        nodes = over_columns(node, N)(self.x[:, 1:], *([inputs] if nv > nx else []), self.p[:, 1:], self.y_ref, W)
         self.gradient, self.hessian = nodes[:nv, :], nodes[nv + 1 :, :]
 
         w = self.w
         constraint, self.G_x, self.G_u = constraints(ocp)
-        bounded = constraint.map(N)(self.x[:, 1:], inputs, self.p[:, 1:])
+        bounded = over_columns(constraint, N)(self.x[:, 1:], inputs, self.p[:, 1:])
         to_x, to_u = ocp.ng, ocp.ng + self.G_x.nnz()
         self.g, self.g_x, self.g_u = bounded[:to_x, :], bounded[to_x:to_u, :], bounded[to_u:, :]
         self.lg, self.ug = softened(ocp, w, "lbx", "lh", "lbx_e"), softened(ocp, w, "ubx", "uh", "ubx_e")
