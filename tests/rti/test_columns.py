@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from rti_mpc import codegen
 from rti_mpc.codegen import bind, compiled
 from rti_mpc.rti import columns
 from rti_mpc.rti.columns import KNOWN, LEAST_COUNT, LEAST_SIZE, MOST_SIZE, over_columns
@@ -39,10 +40,13 @@ def long(count: int) -> ca.SX:
 
 
 @needs_compiler
+@pytest.mark.parametrize("long_vectors", [True, False], ids=["the longest vectors", "vectors of two"])
 @pytest.mark.parametrize("count", [LEAST_COUNT, 5, 6, 7, 8, 21])
-def test_each_column_is_to_the_last_bit_what_the_function_makes_of_it_alone(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_column_is_to_the_last_bit_what_the_function_makes_of_it_alone(count: int, long_vectors: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """By all operations that a vector has, on numbers that are no multiple of its length as well."""
     monkeypatch.setattr(columns, "LEAST_SIZE", 0)
+    if not long_vectors:
+        monkeypatch.setattr(codegen, "longer_vectors", lambda: ())
     function = one(EVERYTHING)
     assert {function.instruction_id(k) for k in range(function.n_instructions())} == KNOWN - {ca.OP_ASSIGN}
     rng, found = np.random.default_rng(count), []
