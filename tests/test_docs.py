@@ -65,7 +65,7 @@ def test_problem_of_the_comparison_is_solved_as_its_page_says(tmp_path: Path) ->
 def test_constraint_of_the_page_on_problems_is_tightened_as_it_says(tmp_path: Path) -> None:
     (script,) = blocks("problem.md", "python")
     done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
-    assert done.stdout == "at most 1.24 m/s^2, then 0.50 m/s^2\n", done.stderr
+    assert done.stdout == "at most 1.24 m/s^2, then 0.51 m/s^2\n", done.stderr
     assert f"It prints `{done.stdout.strip()}`" in (DOCS / "problem.md").read_text()
 
 
