@@ -80,7 +80,7 @@ class BoundedRow:
         return ca.if_else(self.found == self.place, INFINITY, ca.fmax((end - self.now) / (self.target - self.now), 0))
 
     def after(self, changes: ca.SX, least: ca.SX) -> list[ca.SX]:
-        """Return place and coordinate after the least share of all rows, and whether the row changes there."""
+        """Return place and coordinate after the least share of all rows, where the row changes or not."""
         first = ca.if_else(ca.fabs(self.found) == 1, ca.if_else(self.place == 0, 0, self.most), self.bound)
         return [ca.if_else(changes, self.found, self.place), ca.if_else(changes, first, self.now + least * (self.target - self.now))]
 

@@ -89,7 +89,6 @@ class Linearization:
         p: Stage parameters, shape ``(np, N + 1)``.
         w: The weights and bounds, by the names in `ARGUMENTS`.
         scale_x: Scales of the states, see `rti_mpc.rti.scale`, shape ``(nx, 1)``; `scale_u` those of the inputs, `scale_g` those of g.
-        within_reach: About the cost of outputs that are off by what inputs change over the horizon.
         A: Sensitivities to the state, nonzeros of `A_k` column by column, shape ``(nnz, N)``.
         B: Sensitivities to the input, nonzeros of `B_k`, shape ``(nnz, N)``.
         A_k: Sparsity of A at one stage, shape ``(nx, nx)``.
@@ -170,8 +169,9 @@ class Linearization:
             self.force += running_sum(gradient)
             self.cost += ca.dot(off, gradient)
         H, size = ca.MX(self.H_i, ca.sum2(self.hessian)), ca.vertcat(reach, self.scale_u)[:nv]
-        self.within_reach = ca.dot(ca.diag(H), size**2)
-        self.damping = damping(ocp) * ca.fmin(self.cost, ca.sqrt(self.cost * self.within_reach)) / self.scale_u**2
+        within_reach = ca.dot(ca.diag(H), size**2)  # about the cost of outputs that are off by what inputs change over the horizon
+        geometric_mean = ca.sqrt(ca.fmax(0, self.cost * within_reach))  # rounding takes a cost of zero below it
+        self.damping = damping(ocp) * ca.fmin(self.cost, geometric_mean) / self.scale_u**2
         if ocp.R_u.any():
             self.damping = (self.damping if ocp.R_u.ndim == 1 else ca.repmat(self.damping, 1, N_u)) + w["R_u"]
         self.checksum = ca.sum1(ca.vec(stages)) + ca.sum1(ca.vec(nodes)) + self.cost + ca.sum1(ca.vec(self.b))

@@ -29,6 +29,7 @@ from rti_mpc.rti.rti import Rti
 from tests.memory import PARTS, anonymous_bytes, leaked_bytes
 from tests.oracle import nlp
 from tests.problems import INF, arc, beacon, double_integrator, pioneer
+from tests.rti.test_recursion import needs_compiler
 from tests.slow import slow_but
 
 TIGHT = SolverSettings(eps=1e-9, max_iter=200_000)
@@ -703,6 +704,21 @@ def test_robot_whose_horizon_is_much_shorter_than_its_way_comes_to_its_path() ->
         u = rti.u[0].copy()
         x = np.array(plant(x, u, rti.ocp.model.p_nominal)).ravel()
     assert abs(x[1]) < 0.15  # half of it in a second; undamped it is at 0.12
+
+
+@needs_compiler
+def test_reference_that_costs_nothing_but_rounding_is_met_by_compiled_code() -> None:
+    """With a weight on one combination of outputs the cost may be as little as -1e-14, which has no root."""
+    combination = np.array([1.0, 3.0, 0.0])
+    rti, costs = Rti(pioneer(N=3, Q=np.outer(combination, combination), ubx=INF, lbx=-INF)), []
+    x0 = np.zeros(5)
+    for seed in range(40):
+        away = 10.0 * np.random.default_rng(seed).normal(size=3)
+        rti.reset(x0, np.zeros(2))
+        rti.prepare(np.column_stack([3.0 * away, -away, 0.0 * away]))
+        assert rti.feedback(x0) is QpStatus.SOLVED
+        costs.append(rti.cost)
+    assert min(costs) < 0.0 < max(costs) < 1e-8  # rounding of distances of tens of metres
 
 
 @pytest.mark.parametrize("iterations", [1, 3])
