@@ -66,7 +66,10 @@ def problem(nx: int, nu: int, N: int, within: int | list[int], *, softened: bool
 
 def arguments(of: ca.Function, ocp: Ocp, rng: np.random.Generator, known: dict[str, ca.DM]) -> dict[str, ca.DM]:
     """Numbers for a function of the solver: the problem's weights and bounds, what is known, and random ones."""
-    fixed = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY).T for name in ARGUMENTS} | {"scale": np.ones(of.size1_in("scale"))} | known
+    fixed = {name: np.clip(getattr(ocp, name), -INFINITY, INFINITY).T for name in ARGUMENTS}
+    scale = np.ones(of.size1_in("scale"))
+    scale[-ocp.model.nx :] = 1e3  # the reach: random references are within it, and steps damped as they are there
+    fixed |= {"scale": scale} | known
     return {name: ca.DM(fixed[name]) if name in fixed else ca.DM(rng.normal(size=of.size_in(name))) for name in of.name_in()}
 
 
