@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 # Tolerances by each solver's own option names, where its defaults are too loose; the last digits cost one or two iterations.
 SOLVER_TOLERANCES: dict[str, dict[str, Any]] = {
-    "clarabel": {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11},
+    "clarabel": {"tol_gap_abs": 1e-13, "tol_gap_rel": 1e-13, "tol_feas": 1e-11},
     "daqp": {"primal_tol": 1e-10, "dual_tol": 1e-12},
     "piqp": {"eps_abs": 1e-12, "eps_rel": 1e-13, "eps_duality_gap_abs": 1e-12, "eps_duality_gap_rel": 1e-13},
     "proxqp": {"eps_abs": 1e-10, "eps_rel": 0.0},
