@@ -9,27 +9,18 @@ bit what the function makes of it alone.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import casadi as ca
-import numpy as np
 
 from rti_mpc.codegen import BEFORE_BODY, function_in_c
+from rti_mpc.rti.elementwise import IN_C, instructions
 
 LEAST_COUNT = 4  # columns: as many as the longest vector has numbers
 LEAST_SIZE = 200  # instructions from which on it pays; with 93 it takes 1.2 times as long, with 600 half as long
 MOST_SIZE = 5000  # beyond which a compiler takes too much of time and memory: 5964 of a chain's stage take it 3 s and 40 MB more
-OF_VECTORS = {
-    ca.OP_ASSIGN: "{}",
-    ca.OP_ADD: "{} + {}",
-    ca.OP_SUB: "{} - {}",
-    ca.OP_MUL: "{} * {}",
-    ca.OP_DIV: "{} / {}",
-    ca.OP_NEG: "-{}",
-    ca.OP_INV: "1 / {}",
-    ca.OP_SQ: "{0} * {0}",
-    ca.OP_TWICE: "{0} + {0}",
-}
+OF_VECTORS = {ca.OP_ASSIGN, ca.OP_ADD, ca.OP_SUB, ca.OP_MUL, ca.OP_DIV, ca.OP_NEG, ca.OP_INV, ca.OP_SQ, ca.OP_TWICE}  # in C as of numbers
 OF_NUMBERS = {
     ca.OP_SIN: "sin",
     ca.OP_COS: "cos",
@@ -78,9 +69,7 @@ def over_columns(one: ca.Function, count: int) -> ca.Function:
     whole = one.map(count)
     if count < LEAST_COUNT or not one.is_a("SXFunction") or not LEAST_SIZE <= one.n_instructions() <= MOST_SIZE:
         return whole
-    operations = [one.instruction_id(k) for k in range(one.n_instructions())]
-    constants = [one.instruction_constant(k) for k, operation in enumerate(operations) if operation == ca.OP_CONST]
-    if not KNOWN.issuperset(operations) or not np.isfinite(constants).all():
+    if not all(operation in KNOWN and math.isfinite(constant) for operation, _, _, constant in instructions(one)):
         return whole
     given = {name: ca.MX.sym(name, *whole.size_in(name)) for name in whole.name_in()}
     body = "\n".join([BEFORE, BEFORE_BODY, *_body(one, count)])
@@ -96,8 +85,7 @@ def _body(one: ca.Function, count: int) -> Iterator[str]:
     yield "for (i = 0;; i += COLUMNS) {"
     yield f"  columns {', '.join(f'v{k}' for k in range(one.sz_w()))};"
     yield f"  if (i > {count} - COLUMNS) i = {count} - COLUMNS;"
-    for k in range(one.n_instructions()):
-        operation, to, of = one.instruction_id(k), one.instruction_output(k), one.instruction_input(k)
+    for operation, to, of, constant in instructions(one):
         if operation == ca.OP_OUTPUT:
             yield f"  y[{to[1]}] = v{of[0]};"
             continue
@@ -105,9 +93,9 @@ def _body(one: ca.Function, count: int) -> Iterator[str]:
             rows = one.numel_in(of[0])
             value = f"(columns) TAKEN(arg[{of[0]}] + {rows} * i + {of[1]}, {rows})"
         elif operation == ca.OP_CONST:
-            value = f"(columns) SAME({one.instruction_constant(k)!r})"
+            value = f"(columns) SAME({constant!r})"
         elif operation in OF_VECTORS:
-            value = OF_VECTORS[operation].format(*(f"v{number}" for number in of))
+            value = IN_C[operation].format(*(f"v{number}" for number in of))
         elif operation in OF_NUMBERS:
             value = f"(columns) OF_EACH({OF_NUMBERS[operation]}, v{of[0]})"
         else:

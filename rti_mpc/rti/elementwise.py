@@ -69,18 +69,25 @@ def _loop(one: ca.Function, count: int, shared: list[bool]) -> Iterator[str]:
     yield "#pragma GCC ivdep"
     yield f"for (i = 0; i < {count}; ++i) {{"
     yield f"  casadi_real {', '.join(f'v{k}' for k in range(one.sz_w()))};"
-    for k in range(one.n_instructions()):
-        operation, to, of = one.instruction_id(k), one.instruction_output(k), one.instruction_input(k)
+    for operation, to, of, constant in instructions(one):
         if operation == ca.OP_OUTPUT:
             yield f"  y{to[0]}[i] = v{of[0]};"
         elif operation == ca.OP_INPUT:
             yield f"  v{to[0]} = x{of[0]}[{'0' if shared[of[0]] else 'i'}];"
         elif operation == ca.OP_CONST:
-            yield f"  v{to[0]} = {one.instruction_constant(k)!r};"
+            yield f"  v{to[0]} = {constant!r};"
         else:
             yield f"  v{to[0]} = {IN_C[operation].format(*(f'v{number}' for number in of))};"
     yield "}"
     yield "return 0;"
+
+
+def instructions(one: ca.Function) -> Iterator[tuple[int, list[int], list[int], float]]:
+    """Yield the instructions of a function of scalar expressions: operation, what it makes, of what; and a constant, 0 if it is none."""
+    for k in range(one.n_instructions()):
+        operation = one.instruction_id(k)
+        constant = one.instruction_constant(k) if operation == ca.OP_CONST else 0.0
+        yield operation, one.instruction_output(k), one.instruction_input(k), constant
 
 
 def total(numbers: ca.MX) -> ca.MX:

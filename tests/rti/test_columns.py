@@ -27,8 +27,8 @@ EVERYTHING = ca.vertcat(
 )
 
 
-def one(found: ca.SX, *given: ca.SX) -> ca.Function:
-    return ca.Function("one", [*(given or (x, p))], [ca.densify(found)])
+def one(found: ca.SX) -> ca.Function:
+    return ca.Function("one", [x, p], [ca.densify(found)])
 
 
 def long(count: int) -> ca.SX:

@@ -89,8 +89,9 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
     if (path := summary["path"]) is not None:
         rows = [("path", path_text(path)), ("nearer edge", f"at least {path['closest_to_edge_mm']:.3g} mm away"), *rows]
     rows = [row for row in rows if MISSING_TEXT not in row[1]]
+    samples = summary["samples"] + summary["skipped"]
     rows += [
-        ("computed in period", f"{summary['in_period_share']:.2%} of {summary['samples']} samples, {summary['skipped']} skipped"),
+        ("computed in period", f"{summary['in_period_share']:.2%} of {samples} samples, {summary['skipped']} skipped"),
         ("inputs in bounds", "always" if inputs_in_bounds(summary) else "NOT ALWAYS"),
         ("states over bounds", f"at most {summary['states_over_share']:.2%}"),
         ("fallbacks", f"{summary['fallbacks']} samples without a new plan"),

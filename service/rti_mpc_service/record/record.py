@@ -178,7 +178,7 @@ class Recorder:
         stamps_ns = {robot: self._stamps_ns.get(robot, 0) for robot in announcers}
         said = [announcer.say(notice, stamps_ns[robot]) for robot, announcer in announcers.items()]
         if any(said) or not said:
-            alone_ns = sum(stamps_ns.values()) if len(said) == 1 else 0  # several robots have a time each
+            alone_ns = next(iter(stamps_ns.values())) if len(said) == 1 else 0  # several robots have a time each
             log.log(notice.severity.level, "%s", notice.text, extra={"robot_ns": alone_ns or None})
 
     def _write(self, now_ns: int) -> None:

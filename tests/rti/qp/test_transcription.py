@@ -44,7 +44,7 @@ def built(name: str, formulation: str, compile: bool) -> Rti:
 
 
 def at_random(name: str, seed: int, *, formulation: str = "simultaneous", compile: bool = False, away: float = 1.0) -> Rti:
-    """Linearize everything, state bounds included, at a guess, reference and parameters that are nowhere special, the reference so often away."""
+    """Linearize everything, state bounds included, at a guess, reference and parameters that are nowhere special; `away` times as far a reference."""
     rng = np.random.default_rng(seed)
     rti = built(name, formulation, compile)
     rti.reset(np.zeros(rti.ocp.model.nx), np.array(rti.ocp.model.u_rest))
