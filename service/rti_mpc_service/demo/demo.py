@@ -35,7 +35,7 @@ from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.cdr import encode
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc_service.config.build import build_model, build_ocp, robot_settings
-from rti_mpc_service.config.fit import check_stop
+from rti_mpc_service.config.fit import check_period, check_stop
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.console import plain_console, widened
 from rti_mpc_service.demo.board import Board, print_summary
@@ -173,8 +173,10 @@ def main(config: Config, scenario: str | None, **options: Any) -> int:
         Exit status: 0 if the robot was driven to the end.
 
     Raises:
-        ConfigError: A stop would not bring the robot to rest, the scenario is none, or does not fit the robot, or the folder cannot be written.
+        ConfigError: A stop would not bring the robot to rest, a command not last until the next, the scenario is none, or does not fit the robot,
+            or the folder cannot be written.
     """
+    check_period(config)
     check_stop(config)
     console = plain_console()
     run = plan(config, scenario, **options)

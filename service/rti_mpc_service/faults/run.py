@@ -29,7 +29,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc_service.config.build import build_ocp, build_signals, guard_limits, robot_settings
 from rti_mpc_service.config.config import load
-from rti_mpc_service.config.fit import check_model, check_stop, check_tree
+from rti_mpc_service.config.fit import check_model, check_period, check_stop, check_tree
 from rti_mpc_service.config.schema import Config
 from rti_mpc_service.console import plain_console
 from rti_mpc_service.entry import EXIT_FAILED, say
@@ -97,14 +97,15 @@ def main(
         Exit status: 0 if every promise was kept; 1 if one was not, or the host has no witness.
 
     Raises:
-        ConfigError: A name is unknown, the robot cannot be guarded or has no pose to start from, the scenario ends too early,
-            or the folder cannot take recordings.
+        ConfigError: A name is unknown, the robot cannot be guarded or has no pose to start from, a command does not last until the next, the
+            scenario ends too early, or the folder cannot take recordings.
         ModuleNotFoundError: It is to be recorded, without the extra that does that.
     """
     faults = chosen(only)
     if record is not None:
         make_folder(record)
     config = load(config_path)
+    check_period(config)
     heading = BEST_HEADINGS.get(scenario or "")
     followed = find_scenario(config, scenario, heading, REFERENCE_DURATION_S, waypoint_speed_m_s, waypoint_smoothing_m)
     config = prepared(config, followed)

@@ -126,12 +126,13 @@ def summarize(outcome: Outcome) -> dict[str, Any]:
     """
     Return the summary of a run, in JSON.
 
-    Lengths are in mm, times in the unit of the name. Skipped samples count in
+    Lengths are in mm, times in the unit of the name. Misses and events are at times of
+    the robot's clock, as `rti-mpc why --at` takes them. Skipped samples count in
     ``in_period_share`` as not in period.
     """
     run, samples, counters = outcome.run(), outcome.samples, outcome.log.counters
     if not run.stamp_ns.size or not samples:
-        return {"scenario": run.scenario, "driven": False, "samples": 0, "events": fault_events(outcome.events)}
+        return {"scenario": run.scenario, "driven": False, "samples": 0, "events": fault_events(outcome)}
     skipped = samples[-1].skipped - samples[0].skipped
     misses = [sample for sample in samples if sample.slack_s < 0.0]
     return {
@@ -148,7 +149,7 @@ def summarize(outcome: Outcome) -> dict[str, Any]:
         "in_period_share": (len(samples) - len(misses)) / (len(samples) + skipped),
         "misses": [
             {
-                "at_s": 1e-9 * (sample.state_stamp_ns - outcome.anchor_ns),
+                "at_s": 1e-9 * sample.state_stamp_ns,
                 "slack_s": sample.slack_s,
                 "prepare_us": sample.prepare_us,
                 "feedback_us": sample.feedback_us,
@@ -166,7 +167,7 @@ def summarize(outcome: Outcome) -> dict[str, Any]:
         "latency_us": quantiles(run.latency_us),
         "echo_us": quantiles(np.array(outcome.echo_us)),
         "second_opinion": second_opinions(samples),
-        "events": fault_events(outcome.events),
+        "events": fault_events(outcome),
     }
 
 
@@ -247,10 +248,10 @@ def quantiles(values: Array) -> dict[str, float | None]:
     return {name: round(float(np.percentile(values, share)), 1) for name, share in (("p50", 50), ("p99", 99), ("max", 100))}
 
 
-def fault_events(events: Sequence[Event]) -> list[dict[str, Any]]:
-    """Return the warnings and errors among the events."""
+def fault_events(outcome: Outcome) -> list[dict[str, Any]]:
+    """Return the warnings and errors among the events before the end, after which processes are stopped while the robot may still be moving."""
     return [
         {"at_s": 1e-9 * event.stamp_ns, "source": event.source, "severity": event.severity.name, "code": event.code, "text": event.text}
-        for event in events
-        if event.severity is not Severity.INFO
+        for event in outcome.events
+        if event.severity is not Severity.INFO and event.stamp_ns <= outcome.end_ns
     ]

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,6 +38,7 @@ from rti_mpc_service.config.schema import Config
 from rti_mpc_service.controller import daemon
 from rti_mpc_service.demo import demo
 from rti_mpc_service.entry import status_of
+from rti_mpc_service.faults import run as faults
 from rti_mpc_sim.settings import RobotSettings
 
 ROOT = Path(__file__).parents[3]
@@ -611,5 +613,7 @@ def test_period_that_is_longer_than_a_command_acts_is_refused_before_anything_is
     """A file that `check` takes would otherwise be refused by `run`."""
     path = tmp_path / "robot.toml"
     path.write_text(MINIMAL.replace("dt_s = 0.1", "dt_s = 0.25"))
-    with pytest.raises(ConfigError, match=r"^ocp.dt_s must be at most 0.23 s for a robot on the bus: "):
-        check.main(path)
+    starts: list[Callable[[], int]] = [lambda: check.main(path), lambda: demo.main(load(path), None), lambda: faults.main(path, [], None)]
+    for start in starts:
+        with pytest.raises(ConfigError, match=r"^ocp.dt_s must be at most 0.23 s for a robot on the bus: "):
+            start()

@@ -119,8 +119,16 @@ def test_share_in_period_counts_what_was_missed_and_what_was_skipped(outcome: Ou
     samples = [sample(k, skipped=3 * (k > 600), slack_s=-0.02 if k in (400, 500) else 0.09) for k in range(1, 1258)]
     summary = summarize(replace(outcome, telemetry=samples))
     assert summary["in_period_share"] == pytest.approx(1255 / 1260)
-    assert [miss["at_s"] for miss in summary["misses"]] == pytest.approx([39.9, 49.9])
+    assert [miss["at_s"] for miss in summary["misses"]] == pytest.approx([1e-9 * samples[k - 1].state_stamp_ns for k in (400, 500)])
     assert summary["skipped"] == 3
+
+
+def test_events_are_told_until_the_end_and_not_what_follows_when_processes_are_stopped(outcome: Outcome) -> None:
+    """The robot then runs out of commands, and says so."""
+    late = replace(outcome.events[0], stamp_ns=outcome.end_ns)
+    after = replace(late, stamp_ns=outcome.end_ns + 1, severity=Severity.ERROR)
+    events = summarize(replace(outcome, events=[*outcome.events, late, after]))["events"]
+    assert [(event["at_s"], event["severity"]) for event in events] == [(0.9, "WARNING"), (pytest.approx(1e-9 * outcome.end_ns), "WARNING")]
 
 
 def test_second_opinions_that_came_to_an_end_are_summed_up(outcome: Outcome) -> None:
