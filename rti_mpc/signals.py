@@ -17,6 +17,7 @@ from typing import Any, Literal, Protocol
 from rti_mpc import given
 from rti_mpc.errors import OcpError
 from rti_mpc.rotation import TURNS
+from rti_mpc.si import misspelt
 
 Role = Literal["", "x", "y", "heading", "axle_offset", "disc_x", "disc_y", "disc_radius", "progress", "path_start", "path_x"]
 
@@ -42,7 +43,7 @@ class Signal:
 
     Attributes:
         name: Unique within its vector; what configuration and viewers call it.
-        unit: SI unit, or another one that `rti_mpc.si` knows, ``"1"`` if none.
+        unit: SI unit, or another one that `rti_mpc.si` knows, ``"1"`` if none. Any other text counts as it is.
         angle: Whether it is an angle whose whole turns do not matter: it may wrap at half a turn, and the dynamics repeat with each turn. Its unit,
             rad or deg, says how large a turn is.
         role: Of states and outputs ``"x"``, ``"y"`` (position in the plane, m) and ``"heading"`` (an angle, from the x axis to the left); of a
@@ -51,7 +52,7 @@ class Signal:
         commands: Of an input, the name of the state that follows it, a speed; empty: none.
 
     Raises:
-        OcpError: A field is of the wrong type, the name is empty, or an angle is in neither rad nor deg.
+        OcpError: A field is of the wrong type, the name is empty, the unit is a known one in another spelling, or an angle is in neither rad nor deg.
     """
 
     name: str
@@ -72,6 +73,9 @@ class Signal:
             raise OcpError(f"name and unit of a signal must be printable, in one line, got {self.name!r} in {self.unit!r}")
         if self.angle and self.unit not in TURNS:
             raise OcpError(f"unit of the signal {self.name!r} must be {' or '.join(TURNS)} for angle=True, to know a whole turn, got {self.unit!r}")
+        if wrong := misspelt(self.unit):
+            instead = ", ".join(f"{right} instead of {symbol}" for symbol, right in wrong.items())
+            raise OcpError(f"unit of the signal {self.name!r} must have {instead}, got {self.unit!r}")
 
 
 def as_label(text: str) -> str:
