@@ -19,6 +19,7 @@ from rti_mpc_service.view.playback import Actuation
 from rti_mpc_service.view.recording import Entry, Message
 from rti_mpc_service.view.timeline import Timeline
 
+DRAIN_PERIOD_NS = 50_000_000  # after which a listener is drained again
 MAX_WAITING_MESSAGES = 2048  # per stream: 2 s at 1 kHz
 STALE_S = 2.0
 
@@ -132,13 +133,17 @@ class Listener:
 
     def _messages(self, now_ns: int) -> Iterator[Entry]:
         for stream, subscriber in self._streams:
-            for received in subscriber.drain():
+            waiting = subscriber.drain()
+            for behind, received in zip(range(len(waiting) - 1, -1, -1), waiting, strict=True):
                 door = self._door(stream, received)
                 message = None if door is None else door.accept(received, now_ns)
                 if message is None:
                     continue
                 if isinstance(message, State):
-                    yield self._entry(self._timeline.place_state(message.epoch, message.stamp_ns, now_ns), message)
+                    # When each state arrived is not known: they are spread over the period. If all had arrived at once,
+                    # those of a robot whose clock is much faster than the local one would be drawn on top of each other.
+                    arrived_ns = now_ns - DRAIN_PERIOD_NS * behind // len(waiting)
+                    yield self._entry(self._timeline.place_state(message.epoch, message.stamp_ns, arrived_ns), message)
                 elif received.key == self._actuation:
                     yield self._entry(self._timeline.place(message.stamp_ns, now_ns), Actuation(message))
                 elif message.stamp_ns != STAMP_ON_ARRIVAL:  # such a reference follows with its real stamp

@@ -52,6 +52,9 @@ class Playback:
 
     A plan is therefore played only when the next one has come. A ramp that was sent
     in time but not needed leaves no row.
+
+    Its rows lie as far apart on the timeline as the times of both plans tell, which is not
+    a period where several robots share the timeline and this one's clock runs slower or faster.
     """
 
     def __init__(self) -> None:
@@ -62,17 +65,25 @@ class Playback:
         """Add plans, and return the rows that were played before the last of them begins."""
         plans = [*self._last, *zip(times, (actuation.command for actuation in actuations), strict=True)]
         self._last = plans[-1:]
-        return [row for (time_ns, command), (end_ns, _) in pairwise(plans) for row in self._play(time_ns, command, end_ns)]
+        return [row for plan, after in pairwise(plans) for row in self._play(*plan, after[0], _pace(plan, after))]
 
     def end(self) -> list[PlayedRow]:
         """Return the rows of the last plan, if no other one follows."""
         return [row for time_ns, command in self._last for row in self._play(time_ns, command, time_ns + MAX_AHEAD_NS)]
 
-    def _play(self, time_ns: int, command: Command, end_ns: int) -> list[PlayedRow]:
+    def _play(self, time_ns: int, command: Command, end_ns: int, pace: float = 1.0) -> list[PlayedRow]:
         rows = []
-        end_ns = min(end_ns, time_ns + command.valid_until_ns - command.stamp_ns)
-        for begin_ns, u in zip(range(time_ns, end_ns, command.period_ns), command.u, strict=False):
-            if min(begin_ns + command.period_ns, end_ns) > self._played_ns:  # skip rows that ended before the plan came
+        period_ns = max(round(pace * command.period_ns), 1)
+        end_ns = min(end_ns, time_ns + round(pace * (command.valid_until_ns - command.stamp_ns)))
+        for begin_ns, u in zip(range(time_ns, end_ns, period_ns), command.u, strict=False):
+            if min(begin_ns + period_ns, end_ns) > self._played_ns:  # skip rows that ended before the plan came
                 self._played_ns = max(begin_ns, self._played_ns + 1)
                 rows.append(PlayedRow(self._played_ns, u, command.mode))
         return rows
+
+
+def _pace(plan: tuple[int, Command], after: tuple[int, Command]) -> float:
+    """Return how much the timeline advances per time of the robot's clock, between two plans for one life of the robot."""
+    (time_ns, command), (after_ns, next_command) = plan, after
+    span_ns = next_command.stamp_ns - command.stamp_ns
+    return (after_ns - time_ns) / span_ns if span_ns > 0 and next_command.state_epoch == command.state_epoch else 1.0

@@ -12,10 +12,8 @@ from rti_mpc.wire.bus import unix_s
 from rti_mpc.wire.intake import Intake
 from rti_mpc.wire.keys import Key, Keys
 from rti_mpc.wire.received import Received
-from rti_mpc_service.view.listener import Listener
+from rti_mpc_service.view.listener import DRAIN_PERIOD_NS, Listener
 from rti_mpc_service.view.recording import Entry
-
-STEP_NS = 50_000_000  # of arrival times that are drained together, as live
 
 
 class PlayedSubscriber:
@@ -58,16 +56,16 @@ class PlayedBus:
 
 
 def played(recording: Recording, robot: str, *, root: str = "", begun_ns: int | None = None) -> Iterator[list[Entry]]:
-    """Yield what a listener makes of the messages of one robot, a list a step of their arrival; `root` and `begun_ns` are those of the listener."""
+    """Yield what a listener makes of the messages of one robot, drained as often as live; `root` and `begun_ns` are those of the listener."""
     bus: PlayedBus | None = None
     end_ns = 0
     for recorded in recording.messages(robot):
         if bus is None:
             bus = PlayedBus(Keys(recorded.received.key.partition(f"/{robot}/")[0], robot))
-            listener, end_ns = Listener(bus, root=root, begun_ns=begun_ns), recorded.local_ns + STEP_NS
+            listener, end_ns = Listener(bus, root=root, begun_ns=begun_ns), recorded.local_ns + DRAIN_PERIOD_NS
         if recorded.local_ns >= end_ns:
             yield listener.drain(end_ns)
-            end_ns = recorded.local_ns + STEP_NS
+            end_ns = recorded.local_ns + DRAIN_PERIOD_NS
         bus.put(recorded.stream, recorded.received)
     if bus is not None:
         yield listener.drain(end_ns)

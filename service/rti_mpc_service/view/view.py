@@ -19,12 +19,11 @@ from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
 from rti_mpc.wire.reach import remind
 from rti_mpc_service.announce import announce
-from rti_mpc_service.view.listener import Listener
+from rti_mpc_service.view.listener import DRAIN_PERIOD_NS, Listener
 from rti_mpc_service.view.outlet import Outlet, file_outlet, load_arrow, viewer_outlet
 from rti_mpc_service.view.screen import RERUN_ADDRESS, VIEWER_ENDED, check_memory_limit, end_page, page, reached, serve_page, spawn_viewer, viewer_url
 
 ROLE = "viewer"
-DRAIN_PERIOD_S = 0.05
 
 log = logging.getLogger(__name__)
 
@@ -138,7 +137,7 @@ def pump(
     """Pass messages on until stopped, then the remaining ones; announce failures of an outlet or viewer on the bus and to all outlets."""
     stopped = False
     while not stopped:
-        stopped = stop.wait(DRAIN_PERIOD_S)
+        stopped = stop.wait(1e-9 * DRAIN_PERIOD_NS)
         entries = [entry for listener in listeners for entry in listener.drain()]
         said = notices(outlets)
         if spawned is not None and spawned.poll() is not None:

@@ -63,6 +63,14 @@ def test_rows_do_not_depend_on_how_plans_were_batched() -> None:
     assert [(row.time_ns / MS, row.u[0], row.mode.name) for row in together] == played(*plans)
 
 
+@pytest.mark.parametrize("pace", [0.25, 2.0])
+def test_beside_other_robots_a_row_is_played_no_longer_than_by_the_robots_clock(pace: float) -> None:
+    """Of a clock at half the speed, a second row would be drawn where the next plan has long been the one that acts."""
+    plans = [plan(0, [1.0, 2.0]), plan(100, [3.0, 4.0]), plan(300, [5.0, 6.0])]
+    rows = Playback().add([round(pace * a.command.stamp_ns) for a in plans], plans)
+    assert [(row.time_ns / MS, row.u[0]) for row in rows] == [(0, 1.0), (100 * pace, 3.0), (200 * pace, 4.0)]
+
+
 def test_a_plan_without_end_costs_no_more_than_its_rows() -> None:
     endless = plan(0, [1.0] * 5, lasts_ms=10**9)
     assert len(played(endless)) == 5

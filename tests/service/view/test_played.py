@@ -7,23 +7,31 @@ import json
 import subprocess
 import urllib.request
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rerun")
 from rerun.chunk import RrdReader
 
 from rti_mpc.recording import Recording
-from rti_mpc.wire.keys import Keys
+from rti_mpc.recording.writer import RecordingWriter
+from rti_mpc.wire.cdr import Message, encode
+from rti_mpc.wire.keys import Key, Keys
 from rti_mpc_service.rig.endpoint import free_port
 from rti_mpc_service.view.played import played
 from rti_mpc_service.view.screen import page
+from rti_mpc_service.view.show import draw_into_file
 from tests.command import command
 from tests.processes.system import PATIENCE_S, ROOT, command_line, environment, rti_mpc, until
-from tests.recording.samples import write
+from tests.recording.samples import INFO, MS, REFERENCE, START_NS, UNIX_OFFSET_NS, state, telemetry, write
+from tests.recording.samples import command as sent
+from tests.service.view.test_view import rows
 
 COUNT = 300
+PLANE = [{"name": name, "unit": "m", "angle": False, "role": name} for name in "xy"]
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +77,52 @@ def test_several_robots_are_drawn_in_one_view_by_the_time_of_arrival(tmp_path: P
     (states, *_) = [chunk for chunk in chunks if chunk.entity_path == "/wheels/state/x" and not chunk.is_static]
     first = states.to_record_batch().column("robot_time").to_numpy(zero_copy_only=False).astype("timedelta64[ms]").astype(int)[0]
     assert 0 <= first <= 60, "since the beginning of the recording, to a step; its own clock is at 10 ms"
+
+
+def write_late(path: Path, robots: dict[str, float], count: int, late_ns: int) -> None:
+    """
+    Write the messages of robots.
+
+    Args:
+        path: The recording.
+        robots: Speeds of their clocks by name.
+        count: States of each, whose numbers are the values of all that belongs to them.
+        late_ns: Time of a robot's clock from a state to what belongs to it.
+    """
+    info = {**INFO, "states": PLANE, "outputs": [{**label, "state": label["name"]} for label in PLANE]}
+    arrivals: list[tuple[int, Keys, Key, Message]] = []
+    for name, speed in robots.items():
+        keys = Keys(robot=name)
+        for k in range(1, count + 1):
+            head = state(k)
+            arrivals.append((int(head.stamp_ns / speed), keys, keys.state, replace(head, x=np.array([k, 0.0]))))
+            plan = replace(sent(k), u=np.full((20, 1), float(k)))
+            sample = replace(telemetry(k), cost=float(k), y_ref=np.zeros((20, 2)), y=np.zeros(2))
+            anew = replace(REFERENCE, seq=k, stamp_ns=head.stamp_ns, y=np.full((2, 2), float(k)), p=np.zeros((2, 0)))
+            belongs = [(keys.command, plan), (keys.actuation, plan), (keys.telemetry, sample), (keys.reference, anew)]
+            arrivals += [(int((head.stamp_ns + late_ns) / speed), keys, key, message) for key, message in belongs]
+    writer = RecordingWriter(path, START_NS, UNIX_OFFSET_NS, "0.0")
+    for name in robots:
+        writer.add(name, Keys(robot=name).info("controller"), START_NS, json.dumps(info).encode())
+    for local_ns, keys, key, message in sorted(arrivals, key=lambda arrival: arrival[0]):
+        writer.add(keys.robot, key, START_NS + local_ns, encode(message), message.seq)
+    writer.finish({"recorded": str(len(arrivals))})
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 4.0])
+def test_of_several_robots_what_comes_late_is_drawn_beside_its_state(speed: float, tmp_path: Path) -> None:
+    write_late(tmp_path / "run.mcap", {"ant": speed, "bee": 1.0}, COUNT, 300 * MS)
+    draw_into_file(Recording(tmp_path / "run.mcap"), tmp_path / "run.rrd")
+    for robot in ("ant", "bee"):
+        states = {k: time_ns for time_ns, k in rows(tmp_path / "run.rrd", f"{robot}/state/x")}
+        assert len(states) == COUNT
+        assert len(set(states.values())) == COUNT, "each at a time of its own"
+        references = {strip[0][0]: time_ns for time_ns, strip in rows(tmp_path / "run.rrd", f"{robot}/world/reference", "LineStrips3D:strips")}
+        assert references == states
+        for drawn in ("command/v", "actuation/v", "telemetry/cost"):
+            beside = {k: time_ns - states[k] for time_ns, k in reversed(rows(tmp_path / "run.rrd", f"{robot}/{drawn}"))}
+            assert len(beside) >= COUNT, drawn
+            assert set(beside.values()) == {0}, drawn
 
 
 def test_what_is_no_recording_is_refused_in_a_line(tmp_path: Path) -> None:

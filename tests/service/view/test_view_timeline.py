@@ -4,7 +4,7 @@ from __future__ import annotations
 import pytest
 
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL
-from rti_mpc_service.view.timeline import GAP_BETWEEN_LIVES_NS, MAX_AHEAD_NS, MAX_APART_NS, Timeline
+from rti_mpc_service.view.timeline import GAP_BETWEEN_LIVES_NS, MAX_AHEAD_NS, MAX_APART_NS, MAX_PLACED_STATES, Timeline
 
 SECOND = 1_000_000_000
 
@@ -76,6 +76,26 @@ def test_robots_that_share_a_view_end_at_the_present_however_fast_their_clocks_a
     assert abs(placed[-1] - 67 * SECOND) <= MAX_APART_NS + SECOND // 20
     assert timeline.place(round(speed * 60 * SECOND)) - placed[-1] <= MAX_AHEAD_NS
     assert timeline.place(0) >= 7 * SECOND, "what belongs to its beginning is not before it"
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 4.0])
+def test_what_is_late_is_placed_at_its_state_however_fast_the_clock_is(speed: float) -> None:
+    timeline, period_ns = Timeline(begun_ns=0), SECOND // 50
+    placed = {k * period_ns: timeline.place_state(1, k * period_ns, 7 * SECOND + round(k * period_ns / speed)) for k in range(1000)}
+    for stamp_ns, time_ns in placed.items():
+        assert timeline.place(stamp_ns) == time_ns
+        assert time_ns <= timeline.place(stamp_ns + period_ns // 2) <= placed.get(stamp_ns + period_ns, 99 * SECOND), "and between two states"
+    now_ns, stamp_ns = timeline.now_ns, 990 * period_ns
+    assert timeline.place_state(1, stamp_ns, 99 * SECOND) == placed[stamp_ns], "a state that comes late, too"
+    assert timeline.now_ns == now_ns
+
+
+def test_times_of_as_many_states_are_kept_as_messages_wait() -> None:
+    timeline = Timeline(begun_ns=0)
+    placed = [timeline.place_state(1, k * SECOND, 2 * k * SECOND) for k in range(2 * MAX_PLACED_STATES)]
+    kept = placed[-MAX_PLACED_STATES:]
+    assert [timeline.place((MAX_PLACED_STATES + k) * SECOND) for k in range(MAX_PLACED_STATES)] == kept
+    assert timeline.place((MAX_PLACED_STATES - 1) * SECOND) == kept[0] - SECOND, "older ones by the robot's clock"
 
 
 def test_a_clock_that_waits_or_jumps_does_not_leave_the_robots_beside_it() -> None:
