@@ -2,7 +2,7 @@
 r"""
 The backward recursion of many states in C, as loops over dense columns that the compiler vectorizes.
 
-Unrolled into scalars, a stage of n states and inputs is some :math:`n^3` statements: slow from about 12 on, and at 36 a
+Unrolled into scalars, a stage of n states and inputs is some :math:`n^3` statements: slow from 9 on, and at 36 a
 matter of minutes and of hundreds of MB for the compiler. Here, with one more coordinate that is always 1, cost-to-go M and
 stage :math:`\Phi = (1 \; 0 \; 0; \; b \; A \; B; \; 0 \; 0 \; I)` are single matrices, gradients and defects are columns of them, and the
 recursion is :math:`M \leftarrow (M \Phi)^T \Phi`, less :math:`S^T G` where an input is eliminated.
@@ -20,7 +20,7 @@ from rti_mpc.rti.linearization import Linearization
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.recursion import block_table, resume, stage_in_c
 
-LEAST_SIZE = 12  # states and inputs from which on loops are faster
+LEAST_SIZE = 9  # states and inputs from which on loops are faster: 13 us instead of 20 with a dynamic bicycle; with a boat, of 8, as fast
 PADDED = 4  # columns are padded to multiples of this, the numbers in the longest vector that is used
 SHORTEST = 2  # numbers in a vector of any processor
 INPUT_WEIGHTS = ("R", "damping")  # arguments of a stage that are the same at every one, mostly
