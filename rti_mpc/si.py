@@ -51,7 +51,6 @@ DERIVED = {
     "Wh": (3600.0, "kg m^2 s^-2"),
     "Ah": (3600.0, "A s"),
     "V": (1.0, "kg m^2 s^-3 A^-1"),
-    "C": (1.0, "A s"),
     "F": (1.0, "kg^-1 m^-2 s^4 A^2"),
     "H": (1.0, "kg m^2 s^-2 A^-2"),
     "S": (1.0, "kg^-1 m^-2 s^3 A^2"),
@@ -62,7 +61,7 @@ DERIVED = {
     "°C": (1.0, "K"),
     "degC": (1.0, "K"),
     "%": (0.01, ""),
-}  # size of each unit in SI units, and these
+}  # size of each unit in SI units, and these; not the coulomb, since C is a degree, as in deg C
 WITHOUT_PREFIX = {"kg", "t", "in", "ft", "mi", "nmi", "mph", "kn", "min", "h", "rev", "°C", "degC", "%"}  # kt is not taken for a kilotonne
 MEANT = {
     "meter": "m",
@@ -84,6 +83,7 @@ MEANT = {
     "sec": "s",
     "second": "s",
     "msec": "ms",
+    "usec": "us",
     "minute": "min",
     "hr": "h",
     "hour": "h",
