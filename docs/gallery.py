@@ -20,11 +20,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from rti_mpc import Controller, Model, Reference, Timing, find_model
 from rti_mpc.array import Array
-from rti_mpc.contract.message import Reference
-from rti_mpc.control.controller import Controller, Timing
-from rti_mpc.model.find import SHIPPED_MODELS, find_model
-from rti_mpc.model.model import Model
+from rti_mpc.model.find import SHIPPED_MODELS
 from rti_mpc.model.robots.truck_trailer import PARAMETERS
 from rti_mpc.signals import quantity
 from rti_mpc_service.config.build import build_observer, build_rti, robot_settings

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+import rti_mpc
 from rti_mpc.errors import ConfigError
 from rti_mpc.reference.trajectory import followed_roles
 from rti_mpc.signals import Signal
@@ -185,6 +186,16 @@ def test_every_command_of_a_page_exists_with_its_options(line: str) -> None:
     known = known.commands[rest[0]] if command == "certs" else known
     options = {name for parameter in known.params for name in parameter.opts}
     assert {word for word in rest if word.startswith("--")} <= options
+
+
+READ = [*DOCS.glob("*.md"), *DOCS.glob("*.py"), *ROOT.glob("examples/*.*"), *ROOT.glob("deploy/*.md"), ROOT / "README.md"]
+
+
+@pytest.mark.parametrize("path", sorted(READ), ids=lambda path: path.name)
+def test_what_users_read_imports_public_names_from_the_package_itself(path: Path) -> None:
+    """Readers copy imports, and only the public names are kept where they are."""
+    imports = re.findall(r"from (rti_mpc\.[\w.]+) import (\([^)]*\)|[^\n\\]*)", path.read_text(encoding="utf-8"))
+    assert not [(module, name) for module, names in imports for name in re.findall(r"\w+", names) if name in rti_mpc.__all__]
 
 
 def test_contract_says_what_conformance_judges_word_by_word() -> None:
