@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rti_mpc import given
-from rti_mpc.contract.message import STAMP_ON_ARRIVAL, End, Reference
+from rti_mpc.contract.message import STAMP_ON_ARRIVAL, End, Reference, Severity
 from rti_mpc.errors import ConfigError, MessageError
 from rti_mpc.wire.bus import Bus, BusSettings, new_epoch
 from rti_mpc.wire.intake import taken
@@ -46,7 +46,7 @@ class PlannerAdapter:
         self._publisher = self._bus.publisher(self._bus.keys.reference)
         self._epoch, self._seq = new_epoch(), 0
         self._rival = Rival(self._bus, self._epoch)
-        self._bus.watch_connection(lambda notice: self._say(notice.text))
+        self._bus.watch_connection(lambda notice: self._say(notice.text, notice.severity))
         self._bus.alive(ROLE)
 
     def __enter__(self) -> Self:
@@ -91,7 +91,8 @@ class PlannerAdapter:
         self._seq += 1
         self._publisher.put_bytes(payload)
         if (notice := self._rival.notice()) is not None:
-            self._say(notice.text)
+            self._say(notice.text, notice.severity)
 
-    def _say(self, line: str) -> None:
-        print(f"{self._robot}: {line}", file=sys.stderr)
+    def _say(self, line: str, severity: Severity = Severity.WARNING) -> None:
+        """Print a line with its level, as the logs of the other processes have it; what the bus waits for is a warning there, too."""
+        print(f"{severity.name:<7} {self._robot}: {line}", file=sys.stderr)

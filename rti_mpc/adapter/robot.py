@@ -221,10 +221,11 @@ class RobotAdapter:
     def _warn(self, notice: Notice) -> None:
         """Announce and print what does not come from the control loop; in any thread."""
         self._announcer.say(notice, time.monotonic_ns())
-        self._say(notice.text)
+        self._say(notice.text, notice.severity)
 
-    def _say(self, line: str) -> None:
-        print(f"{self._robot}: {line}", file=sys.stderr)
+    def _say(self, line: str, severity: Severity = Severity.WARNING) -> None:
+        """Print a line with its level, as the logs of the other processes have it; what the bus waits for is a warning there, too."""
+        print(f"{severity.name:<7} {self._robot}: {line}", file=sys.stderr)
 
 
 def check_limits(

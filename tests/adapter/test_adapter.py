@@ -3,9 +3,13 @@
 
 from __future__ import annotations
 
+import io
 import json
+import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from queue import SimpleQueue
 from threading import Event as Stop
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +20,7 @@ import pytest
 from rti_mpc.adapter import PlannerAdapter, RobotAdapter, robot
 from rti_mpc.contract.message import STAMP_ON_ARRIVAL, Command, End, Event, Reference, State
 from rti_mpc.errors import ConfigError, RtiMpcError
+from rti_mpc.wire import connection
 from rti_mpc.wire.bus import Bus, Received
 from rti_mpc.wire.cdr import decode, encode, encoding
 from rti_mpc.wire.info import Label, labels
@@ -25,6 +30,7 @@ from rti_mpc_service.conformance.answer import answer
 from tests.wire.fake_session import FakeSession
 
 MS = 1_000_000
+TIMEOUT_S = 60.0
 KEYS = Keys(robot="car")
 LIMITS: dict[str, Any] = {"dt_s": 0.1, "inputs": {"v_c": [-1.0, 1.0], "kappa": [-0.5, 0.5]}, "increments": {"v_c": [-0.2, 0.2]}}
 
@@ -282,7 +288,41 @@ def test_planner_beside_another_source_is_told_so_in_a_line(monkeypatch: pytest.
         for _ in range(2):
             planner.send([[0.0], [1.0]], 0.05)
     said = "another source publishes references for car: its controller follows this one, not that one, while this one publishes; stop one of the two"
-    assert capsys.readouterr().err == f"car: {said}\n"
+    assert capsys.readouterr().err == f"WARNING car: {said}\n"
+
+
+class Lines(io.StringIO):
+    """Standard error, line by line as it is printed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.printed: SimpleQueue[str] = SimpleQueue()
+
+    def write(self, text: str) -> int:
+        if text.strip():
+            self.printed.put(text)
+        return len(text)
+
+
+ADAPTERS: dict[str, Callable[[], RobotAdapter | PlannerAdapter]] = {
+    "robot": lambda: RobotAdapter("car", stop=Stop(), **LIMITS),
+    "planner": lambda: PlannerAdapter("car"),
+}
+
+
+@pytest.mark.parametrize("name", ADAPTERS)
+def test_line_of_an_adapter_says_whether_it_is_a_fault_or_news(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loss and return of the links looked alike."""
+    session, lines = FakeSession(), Lines()
+    session.links, session.connects_to = 1, "tcp/127.0.0.1:7447"
+    monkeypatch.setattr(Bus, "join", lambda settings, keys, **_: Bus(session, keys))
+    monkeypatch.setattr(connection, "LOOK_INTERVAL_S", 0.001)
+    monkeypatch.setattr(sys, "stderr", lines)
+    with ADAPTERS[name]():
+        session.links = 0
+        assert lines.printed.get(timeout=TIMEOUT_S).startswith("ERROR   car: all links to other processes are lost")
+        session.links = 1
+        assert lines.printed.get(timeout=TIMEOUT_S).startswith("INFO    car: linked to others again")
 
 
 WRONG_REFERENCES: dict[str, tuple[dict[str, Any], str]] = {
@@ -358,7 +398,7 @@ def test_commands_of_a_model_with_the_same_inputs_in_another_order_are_refused_a
     scene.command([[0.1, 0.2]])
     assert scene.acts(10) == [0.0, 0.0]
     event = decode(Event, scene.session.put[KEYS.event("robot")])
-    assert capsys.readouterr().err == "car: inputs must be in the order of the model, kappa, v_c, got v_c, kappa: no command is taken\n"
+    assert capsys.readouterr().err == "ERROR   car: inputs must be in the order of the model, kappa, v_c, got v_c, kappa: no command is taken\n"
     assert event.code in ("inputs_misordered", "command_misordered")
     for right in (("v_c", "kappa"), ("v", "omega")):
         described(*right)
