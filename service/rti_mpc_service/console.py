@@ -26,7 +26,12 @@ def widened(console: Console) -> Console:
     return console
 
 
+def whole_width(console: Console, table: Table) -> int:
+    """Return how many columns a table needs for each row to be in one line."""
+    return console.measure(table, options=console.options.update(max_width=MAX_WIDTH_COLUMNS)).maximum
+
+
 def print_whole(console: Console, table: Table) -> None:
     """Print a table with each row in one line, on a console that from now on is as wide."""
-    console.width = max(console.width, console.measure(table, options=console.options.update(max_width=MAX_WIDTH_COLUMNS)).maximum)
+    console.width = max(console.width, whole_width(console, table))
     console.print(table)

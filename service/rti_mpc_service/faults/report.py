@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Report of the fault matrix: a growing table on a terminal, and the whole table at the end."""
+"""Report of the fault matrix: a growing table on a terminal, and the whole table at the end; lines on a terminal that is too narrow for it."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -12,7 +13,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from rti_mpc_service.console import print_whole, widened
+from rti_mpc_service.console import print_whole, whole_width, widened
 from rti_mpc_service.faults.measure import Measured
 from rti_mpc_service.faults.table import Fault
 from rti_mpc_service.host import machine
@@ -131,7 +132,7 @@ class MatrixReport(Redrawn):
         if self.live:
             head = Table.grid(padding=(0, 2))
             head.add_row(f"{len(self.rows)} of {self._count}", ProgressBar(total=self._count, completed=len(self.rows), width=32), fault.name, text)
-            self.draw(Group(self._table(), head) if self.rows else head)
+            self.draw(Group(self._lines(self.rows[-1:]) if self._narrow() else self._table(), head) if self.rows else head)
 
     def waiting(self, text: str) -> None:
         """Print a line if a wait has lasted for long; `text` says what is waited for, and after a colon what is missing."""
@@ -158,25 +159,47 @@ class MatrixReport(Redrawn):
             self.console.print(f"{len(self.rows)} of {self._count}: {row.fault.name}, the robot {row.did}: {said}", soft_wrap=True)
 
     def conclude(self) -> None:
-        """Print the whole table, and the broken or excused limits."""
-        print_whole(widened(self.console), self._table())
+        """Print the whole table, and the broken or excused limits; lines are broken at words where the terminal is too narrow for the table."""
+        whole = not self._narrow()
+        if whole:
+            print_whole(widened(self.console), self._table())
+        else:
+            self.console.print(self._lines(self.rows))
         for row in self.rows:
             if words := [*row.broken, *row.excused]:
-                self.console.print(f"{row.fault.name}: {row.fault.promise.text}: {'; '.join(words)}", soft_wrap=True)
+                self.console.print(f"{row.fault.name}: {row.fault.promise.text}: {'; '.join(words)}", soft_wrap=whole)
         if not self.complete:
-            self.console.print(f"stopped after {len(self.rows)} of {self._count} faults, in {self._now}", soft_wrap=True)
+            self.console.print(f"stopped after {len(self.rows)} of {self._count} faults, in {self._now}", soft_wrap=whole)
         kept = sum(not row.broken for row in self.rows)
         about = machine.machine_info()
         self.console.print(
-            f"{kept} of {len(self.rows)} within their promise; robot time at speed 1, {about['processor']}, {about['cores']} cores", soft_wrap=True
+            f"{kept} of {len(self.rows)} within their promise; robot time at speed 1, {about['processor']}, {about['cores']} cores", soft_wrap=whole
         )
 
     def _table(self) -> Table:
         table = Table(box=None, padding=(0, 1))
-        unit = next((row.unit for row in self.rows), "m")
-        for name in COLUMNS:
-            title = name.replace("mUNIT", "1e-3" if unit == "1" else f"m{unit}").replace("UNIT", unit)
+        for name, title in zip(COLUMNS, self._titles(), strict=True):
             table.add_column(title, justify="left" if name in COLUMNS[:2] else "right", no_wrap=True)
         for row in self.rows:
             table.add_row(*(Text(cell, "red" if row.broken else "") for cell in row.cells()))
         return table
+
+    def _titles(self) -> list[str]:
+        """Return the headings, each with its unit in a second line."""
+        unit = next((row.unit for row in self.rows), "m")
+        return [name.replace("mUNIT", "1e-3" if unit == "1" else f"m{unit}").replace("UNIT", unit) for name in COLUMNS]
+
+    def _narrow(self) -> bool:
+        """Whether this is a terminal that is too narrow for the table, which would be cut off while it grows, and then wrapped."""
+        return self.live and whole_width(self.console, self._table()) > self.console.width
+
+    def _lines(self, rows: Sequence[MatrixRow]) -> Table:
+        """Return a line for each value of some rows."""
+        lines = Table.grid(padding=(0, 2, 0, 0))
+        for row in rows:
+            for title, cell in zip(self._titles(), row.cells(), strict=True):
+                name, _, unit = title.partition("\n")
+                if cell != NO_VALUE:
+                    lines.add_row(name, Text(f"{cell} {unit}".rstrip(), "red" if row.broken else ""))
+            lines.add_row("", "")
+        return lines

@@ -18,7 +18,7 @@ from rti_mpc.errors import ConfigError
 from rti_mpc.wire.bus import Bus, BusSettings
 from rti_mpc.wire.interrupt import stop_on_signals
 from rti_mpc.wire.keys import Keys
-from rti_mpc_service.console import plain_console, widened
+from rti_mpc_service.console import plain_console, whole_width, widened
 from rti_mpc_service.json_text import json_text
 from rti_mpc_service.redrawn import Redrawn
 from rti_mpc_service.status.survey import Survey
@@ -27,7 +27,6 @@ LISTEN_PERIOD_S = 0.05  # resolution of the ages
 DRAW_EACH = 5  # of these periods
 FIND_S = 1.0  # at least, for robots to be found
 MAX_ROBOTS = 100
-MAX_WIDTH = 1000  # columns, more than any table needs
 STALE_S = 1.0  # ages from which on they are marked
 GOOD, BAD = ("TRACKING", "HOLDING"), ("BRAKING", "STOPPED", "FALLBACK")
 COLUMNS = ("mode", "error", "age of state", "reference", "times p50/max [us]", "leads", "solvers differ", "versions")
@@ -143,7 +142,7 @@ def shown(reports: Mapping[str, Mapping[str, Any]], console: Console) -> Rendera
     table = Table("robot", *COLUMNS, box=None, padding=(0, 2, 0, 0))
     for robot, row in rows.items():
         table.add_row(robot, *row)
-    if console.measure(table, options=console.options.update(width=MAX_WIDTH)).maximum <= console.width:
+    if whole_width(console, table) <= console.width:
         below = Table.grid(padding=(0, 2, 0, 0))
         for robot, event in events.items():
             below.add_row(f"{robot}:", event or "no event")

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import time
 from contextlib import ExitStack
 from dataclasses import replace
@@ -11,6 +12,7 @@ from threading import Event
 
 import pytest
 from rich.console import Console
+from rich.text import Text
 
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.config.config import load
@@ -61,6 +63,36 @@ def test_matrix_is_printed_with_what_was_not_kept() -> None:
     for cell in (*report.rows[0].cells(), *report.rows[1].cells()):
         assert cell in printed, "no number is cut off where the terminal is narrow"
     assert not report.kept
+
+
+def report_on(console: Console) -> str:
+    """Return what is printed of two faults."""
+    with MatrixReport(console, 3) as report:
+        report.add(row("guard_and_controller_killed", replace(STOPPED, brake_s=0.31)))
+        report.add(row("viewer_killed", DRIVING))
+        report.say(BY_NAME["controller_hung"], "starting peers")
+    report.conclude()
+    return Text.from_ansi(console.file.getvalue()).plain  # type: ignore[attr-defined]
+
+
+def test_terminal_that_is_too_narrow_for_the_matrix_has_a_line_for_each_value() -> None:
+    printed = report_on(Console(file=io.StringIO(), width=80, force_terminal=True))
+    assert max(map(len, printed.splitlines())) <= 80
+    assert "…" not in printed, "nothing is cut off, nor was while the matrix grew"
+    end = re.sub(r" +", " ", printed).rpartition("fault guard_and_controller_killed")[2]
+    assert [line.strip() for line in end.splitlines()[1:10]] == [
+        *("the robot braked, stood, drove again", "speed 0.20 m/s", "braking 310 ms", "zero 400 ms", "standstill 1.80 s", "way 0.250 m"),
+        *("step 100 %", "recovery 2.50 s", "kept NO"),
+    ]
+    assert "fault viewer_killed\n" in end.replace(" \n", "\n")
+    assert " brake_s must be at most 0.3, got 0.31 stopped after 2 of 3 faults, " in " ".join(end.split())
+
+
+def test_matrix_is_a_table_on_a_terminal_that_is_wide_enough_and_in_a_pipe_however_narrow() -> None:
+    tables = [report_on(console) for console in (Console(file=io.StringIO(), width=150, force_terminal=True), Console(file=io.StringIO(), width=80))]
+    for printed in tables:
+        (of_guard,) = {line.strip() for line in printed.splitlines() if line.startswith(" guard_and_controller_killed ")}
+        assert re.split("  +", of_guard)[2:] == ["0.20", "310", "400", "1.80", "0.250", "100", "-", "2.50", "NO"]
 
 
 def test_wait_that_lasts_is_told_in_a_line_and_a_run_that_ends_in_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
