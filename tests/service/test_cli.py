@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 from rti_mpc.errors import ConfigError
 from rti_mpc_service.cli import app
 from rti_mpc_service.commands.arguments import claimed, new_file
+from rti_mpc_service.demo.board import COMMAND_COUNTS
 from rti_mpc_service.faults.table import FAULTS
 from rti_mpc_service.shipped import SHIPPED, TEMPLATES
 from tests.command import built, command
@@ -295,6 +296,13 @@ def test_help_of_faults_names_each_with_what_is_done_to_whom() -> None:
     shown = " ".join(command("faults", "--help", columns=80).stdout.split())
     for fault in FAULTS:
         assert f"{fault.name} {fault.text}" in shown
+
+
+def test_help_of_the_demo_and_the_page_of_its_output_explain_each_count_of_commands() -> None:
+    shown, page = " ".join(command("demo", "--help", columns=80).stdout.split()), (ROOT / "docs/measured.md").read_text(encoding="utf-8")
+    for count, text in COMMAND_COUNTS.items():
+        assert f"{count} {text}" in shown
+        assert f"| `{count}` | {text} |" in page
 
 
 def test_version_names_what_decides_what_a_command_does() -> None:

@@ -34,7 +34,18 @@ if TYPE_CHECKING:
 drives = typer.Typer()
 
 
-@drives.command()
+class DemoCommand(TyperCommand):
+    """Command whose help explains how the summary counts commands."""
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:
+        """Write what each count means; its module is imported here only."""
+        from rti_mpc_service.demo.board import COMMAND_COUNTS
+
+        with formatter.section("Commands that the summary counts"):
+            formatter.write_dl(list(COMMAND_COUNTS.items()))
+
+
+@drives.command(cls=DemoCommand)
 def demo(
     config: ConfigPath = SHIPPED,
     robot: RobotName = None,

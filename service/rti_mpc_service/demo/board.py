@@ -22,6 +22,13 @@ MAX_SHOWN_EVENTS = 3
 MAX_TOLD = 10  # misses, and events, at the end: on a busy host hundreds of lines would hide the summary
 PROGRESS_LINES = 10  # per run, where there is no terminal
 MISSING_TEXT = "none"
+COMMAND_COUNTS = {
+    "lost": "The number is missing between those of two others: the command never came, came after a later one or was refused.",
+    "late": "It came when its first row was over: the rows that are left act.",
+    "expired": "It came when its last row or its validity was over: nothing of it acts.",
+    "refused": "It is malformed, not finite, repeated, out of order, from another sender, for another life of the robot or a state still to come: "
+    "nothing of it acts.",
+}  # what became of commands at the robot, from its start on
 
 
 class Board(Redrawn):
@@ -96,7 +103,7 @@ def print_summary(console: Console, summary: Mapping[str, Any]) -> None:
         ("states over bounds", f"at most {summary['states_over_share']:.2%}"),
         ("fallbacks", f"{summary['fallbacks']} samples without a new plan"),
         ("second opinion", second_opinion_text(summary["second_opinion"])),
-        ("commands", f"{summary['lost']} lost, {summary['late']} late, {summary['expired']} expired, {summary['refused']} refused"),
+        ("commands", ", ".join(f"{summary[name]} {name}" for name in COMMAND_COUNTS)),
     ]
     names = {"prepare_us": "preparation", "feedback_us": "feedback", "latency_us": "state out to command in", "echo_us": "bare echo"}
     rows += [(name, "p50 {p50}, p99 {p99}, max {max} us".format(**summary[key])) for key, name in names.items()]
