@@ -33,7 +33,7 @@ from rti_mpc.rti.ocp import WEIGHTS_AND_BOUNDS, Ocp
 from rti_mpc.rti.qp.osqp import Solver
 
 MADE_IN = ("rti_mpc.contract.", "rti_mpc.control.", "rti_mpc.rti.")  # modules of the classes whose objects are made anew
-GROWING = {("Track", "_rows")}  # arrays with as many rows as a reference has; all others that a controller was built with keep their shape
+RESIZED = {("Track", "_rows")}  # arrays of the size of a reference; all others that a controller was built with keep their shape
 ATOMS = frozenset((type(None), bool, int, float, str, bytes))
 MAX_BYTES = 1 << 28  # of a snapshot that is decompressed
 
@@ -240,7 +240,7 @@ class Camera:
             for key, child in nodes:
                 value, at = self._value(child), (type(made).__name__, key)
                 check(
-                    f"{name}.{key}", value, alike(getattr(made, key, None), value, rows=at not in GROWING) and has_width(value, self._widths.get(at))
+                    f"{name}.{key}", value, alike(getattr(made, key, None), value, shape=at not in RESIZED) and has_width(value, self._widths.get(at))
                 )
                 object.__setattr__(made, key, value)
             return made
@@ -272,13 +272,14 @@ def fits(ours: np.ndarray[Any, Any], theirs: Any) -> bool:
 
 
 def widths(controller: Controller) -> dict[tuple[str, str], tuple[int, set[int]]]:
-    """Return the number of axes, and the possible lengths of the last one, of arrays of objects that are made anew, by class and attribute."""
+    """Return the number of axes, and the possible lengths of the last one, of arrays that are made anew or resized, by class and attribute."""
     (nx,), (nu,), ny = controller._states.x.shape, controller.envelope.limits["lbu"].shape, controller._track.y_ref.shape[1]
     plan = {("Plan", "u"): (2, {nu}), ("Plan", "asked"): (2, {nu}), ("Plan", "before"): (1, {nu})}
     state = {("State", "x"): (1, {nx}), ("State", "u"): (1, {0, nu})}
     reference = {("Reference", "y"): (2, {ny}), ("Reference", "p"): (2, {0, controller.np_})}
     rest = {("Command", "u_rest"): (2, {0, nu}), ("Command", "x_rest"): (2, {0, nx}), ("Command", "K"): (2, {0, nx})}
-    return {**plan, **state, **reference, ("Command", "u"): (2, {nu}), **rest}
+    track = {("Track", "_rows"): (2, {2 * columns for columns in controller._track._found})}  # with and without parameters
+    return {**plan, **state, **reference, **track, ("Command", "u"): (2, {nu}), **rest}
 
 
 def has_width(value: Any, width: tuple[int, set[int]] | None) -> bool:
@@ -286,11 +287,10 @@ def has_width(value: Any, width: tuple[int, set[int]] | None) -> bool:
     return width is None or (isinstance(value, np.ndarray) and value.ndim == width[0] and value.shape[-1] in width[1])
 
 
-def alike(ours: Any, theirs: Any, *, rows: bool = True) -> bool:
-    """Whether arrays, or those in tuples, have the same type and shape, with or without the number of rows; other values are not compared."""
+def alike(ours: Any, theirs: Any, *, shape: bool = True) -> bool:
+    """Whether arrays, or those in tuples, have the same type and, unless it may differ, the same shape; other values are not compared."""
     if isinstance(ours, np.ndarray) and isinstance(theirs, np.ndarray):
-        skipped = 0 if rows else 1
-        return ours.dtype == theirs.dtype and ours.ndim == theirs.ndim and ours.shape[skipped:] == theirs.shape[skipped:]
+        return ours.dtype == theirs.dtype and (ours.shape == theirs.shape or not shape)
     if isinstance(ours, tuple) and isinstance(theirs, tuple):
         return all(map(alike, ours, theirs))
     return True

@@ -19,11 +19,14 @@ from rti_mpc.journal.book import Book
 from rti_mpc.journal.replay import Replay, ReplayOutcome, difference, replay
 from rti_mpc.journal.snapshot import ARRAY, PINNED, Camera, Snapshot
 from rti_mpc.model.disturbance import with_disturbances
+from rti_mpc.model.obstacle import with_obstacles
 from rti_mpc.rti.ocp import Ocp
 from rti_mpc.rti.rti import Rti
+from rti_mpc_sim.lockstep import Lockstep
+from rti_mpc_sim.settings import RobotSettings
 from tests.closed_loop.test_rest import MOTIONS, tracking
 from tests.life import live_through
-from tests.loop import MS, drive
+from tests.loop import MS, PIONEER, drive
 from tests.movers import law_of, ocp_of
 from tests.problems import PAPER, SLEW, pioneer
 
@@ -210,6 +213,35 @@ def test_robot_with_a_way_to_rest_replays_from_every_snapshot(name: str) -> None
         book.photograph(0)
         messages += book.messages(0)
     for start_seq in [message.seq for message in messages if message.kind is JournalKind.SNAPSHOT][:-1]:
+        on = Replay(*build())
+        for _ in replay(on, messages, start_seq):
+            pass
+        assert on.outcome.samples > 3
+        assert not on.outcome.differences, str(on.outcome.differences[0])
+
+
+def test_controller_whose_reference_moves_a_disc_replays_from_every_snapshot() -> None:
+    """Rows of such a reference are longer than those of one without parameters, which a controller is built with."""
+
+    def build() -> tuple[Controller, Rti]:
+        model = with_obstacles(pioneer(N=6, N_u=4).model, [(3.0, 3.0, 0.2)])
+        rti = Rti(Ocp(model, **(PAPER | SLEW | {"N": 6, "N_u": 4, "lh": 0.0})), compile=False)
+        return Controller(rti, Timing(), compile=False), rti
+
+    controller, rti = build()
+    body, book, t = Lockstep(RobotSettings(PIONEER, np.zeros(5))), Book(controller), 0.1 * np.arange(60)
+    rows, discs = np.stack([0.2 * t, 0 * t, 0 * t], axis=-1), np.tile(rti.ocp.model.p_nominal, (60, 1))
+    discs[:, -3:-1] = np.stack([2.0 - 0.1 * t, 0 * t + 0.3], axis=-1)
+    messages: list[Journal] = []
+    for seq, p in enumerate((discs, np.zeros((60, 0)), discs), start=1):
+        controller.receive_reference(Reference(1, seq, 0, 100 * MS, End.HOLD, rows, p))
+        drive(controller, body, seq * 1.0)
+        book.photograph(0)
+        drive(controller, body, seq * 1.0 + 0.5)
+        messages += book.messages(0)
+    starts = [message.seq for message in messages if message.kind is JournalKind.SNAPSHOT]
+    assert len(starts) == 3
+    for start_seq in starts:
         on = Replay(*build())
         for _ in replay(on, messages, start_seq):
             pass
