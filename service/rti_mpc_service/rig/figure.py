@@ -13,7 +13,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
+from matplotlib.patches import Circle
 
+from rti_mpc.array import Array
 from rti_mpc.signals import as_label, plane
 from rti_mpc_service.outline import outline, placed
 from rti_mpc_service.rig.run_data import Run
@@ -97,12 +99,21 @@ def _path(axes: Axes, run: Run) -> None:
             pose = (*run.position[row], run.x[row, run.info.heading])
             for polygon in outline(run.info.model):
                 axes.fill(*placed(polygon, *pose).T, facecolor=SHADE_COLOR, edgecolor=INK_COLOR, linewidth=1.0, alpha=alpha, zorder=1)
+    for i, disc in enumerate(run.discs):
+        _obstacle(axes, run, disc, "" if i else "obstacle, when nearest")
     axes.plot(*run.position[0], "o", color=MEASURED_COLOR, markerfacecolor="white", zorder=4, label="start")
     axes.plot(*run.position[-1], "o", color=MEASURED_COLOR, zorder=4, label="end")
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.08)
     axes.set(title=as_label(f"Path: {run.scenario}"), xlabel="x [m]", ylabel="y [m]")
     axes.legend(loc="upper center", ncols=4, bbox_to_anchor=(0.5, -0.07))
+
+
+def _obstacle(axes: Axes, run: Run, disc: Array, label: str) -> None:
+    """Draw a disc where the robot came nearest to it, and the way of its centre, dotted."""
+    x, y, radius = disc[np.argmin(np.hypot(*(run.position - disc[:, :2]).T) - disc[:, 2])]
+    axes.plot(*disc[:, :2].T, color=LIMIT_COLOR, linewidth=1.0, linestyle=":")
+    axes.add_patch(Circle((x, y), radius, facecolor=SHADE_COLOR, edgecolor=LIMIT_COLOR, linewidth=1.0, zorder=1, label=label))
 
 
 def _error(axes: Axes, run: Run) -> None:

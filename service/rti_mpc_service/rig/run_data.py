@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rti_mpc.array import Array
 from rti_mpc.contract.message import Reference
 from rti_mpc.signals import in_plane, plane
-from rti_mpc.wire.info import Info
+from rti_mpc.wire.info import Info, Obstacle
 from rti_mpc_service.rig.along_path import AlongPath
 
 
@@ -35,6 +35,7 @@ class Run:
         speed: Seconds of robot time per second.
         transient_s: Time that the robot may take to reach the reference.
         along: The drive along a path that says nothing of time; None where none was followed.
+        discs: x, y and radius of each obstacle at the stamps, in m, each of shape ``(M, 3)``.
     """
 
     info: Info
@@ -51,6 +52,7 @@ class Run:
     speed: float = 1.0
     transient_s: float = 20.0
     along: AlongPath | None = None
+    discs: tuple[Array, ...] = ()
 
     @property
     def time_s(self) -> Array:
@@ -107,3 +109,13 @@ def wanted(reference: Reference, stamp_ns: NDArray[np.int64]) -> Array:
     """Return the outputs a reference asks for at stamps, shape ``(..., ny)``, interpolated between its rows; at its ends beyond them."""
     rows = (stamp_ns - reference.stamp_ns) / reference.period_ns
     return np.stack([np.interp(rows, np.arange(len(reference.y)), column) for column in reference.y.T], axis=-1)
+
+
+def located(obstacle: Obstacle, reference: Reference | None, stamps: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+    """Return x, y and radius of an obstacle at stamps, each of shape ``(n,)``, in m; constant before and after the reference, as in a controller."""
+    if reference is None or reference.p.shape[1] < obstacle.at + 3:
+        x, y, r = (np.full(len(stamps), value) for value in (obstacle.x, obstacle.y, obstacle.r))
+    else:
+        row = (stamps - reference.stamp_ns) / reference.period_ns
+        x, y, r = (np.interp(row, np.arange(len(reference.p)), reference.p[:, obstacle.at + part]) for part in range(3))
+    return x, y, r

@@ -27,7 +27,7 @@ from rti_mpc.signals import plane
 from rti_mpc.wire.info import Info
 from rti_mpc_service.rig.along_path import AlongPath
 from rti_mpc_service.rig.robot_log import RobotLog
-from rti_mpc_service.rig.run_data import Run, wanted
+from rti_mpc_service.rig.run_data import Run, located, wanted
 from rti_mpc_service.scenario import Scenario
 
 TRANSIENT_S = 20.0
@@ -112,6 +112,7 @@ class Outcome:
             speed=self.speed,
             transient_s=min(TRANSIENT_S, self.duration_s / 2),
             along=along,
+            discs=tuple(np.stack(located(obstacle, self.reference, log.stamp_ns), axis=-1) for obstacle in self.info.obstacles),
         )
 
     def _wanted(self, stamp_ns: NDArray[np.int64]) -> Array:

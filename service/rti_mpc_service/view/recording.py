@@ -16,7 +16,8 @@ from rti_mpc.array import Array
 from rti_mpc.contract.message import Command, Event, Reference, Severity, State, Telemetry
 from rti_mpc.contract.status import Mode
 from rti_mpc.signals import plane
-from rti_mpc.wire.info import Info, Label, Obstacle
+from rti_mpc.wire.info import Info, Label
+from rti_mpc_service.rig.run_data import located
 from rti_mpc_service.view.blueprint import DRIVEN_COLORS, RUNG_COLORS, STRIPS, TIMELINE, Frame, below, blueprint, legend, lifted, looks
 from rti_mpc_service.view.path_window import KNOT_PARTS, MIN_KNOTS, path_window
 from rti_mpc_service.view.plan import FREE, acting_bounds, cost_terms, is_plan
@@ -355,16 +356,6 @@ class RerunRecording:
             text = [f"{source}: {events[k].text} ({events[k].code})" for k in mine]
             columns = rr.TextLog.columns(text=text, level=[RERUN_LEVELS[events[k].severity] for k in mine])
             self._columns(f"event/{rr.escape_entity_path_part(source)}", times[mine] // EVENT_GRID_NS * EVENT_GRID_NS, columns)
-
-
-def located(obstacle: Obstacle, reference: Reference | None, stamps: NDArray[np.int64]) -> tuple[Array, Array, Array]:
-    """Return x, y and radius of an obstacle at stamps, each of shape ``(n,)``, in m; constant before and after the reference, as in a controller."""
-    if reference is None or reference.p.shape[1] < obstacle.at + 3:
-        x, y, r = (np.full(len(stamps), value) for value in (obstacle.x, obstacle.y, obstacle.r))
-    else:
-        row = (stamps - reference.stamp_ns) / reference.period_ns
-        x, y, r = (np.interp(row, np.arange(len(reference.p)), reference.p[:, obstacle.at + part]) for part in range(3))
-    return x, y, r
 
 
 def _widths(message: Message) -> dict[str, int]:

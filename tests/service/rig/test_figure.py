@@ -91,6 +91,24 @@ def test_the_figure_names_what_it_shows_with_units(run: Run, tmp_path: Path) -> 
         assert expected in shown
 
 
+def test_an_obstacle_is_drawn_where_the_robot_came_nearest_to_it(run: Run) -> None:
+    """It moves past the robot from the right; without it, nobody sees why the robot leaves the path."""
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Circle
+
+    from rti_mpc_service.rig.figure import _path
+
+    disc = np.column_stack([np.linspace(4.0, -4.0, len(run.y)), np.full(len(run.y), 1.2), np.full(len(run.y), 0.3)])
+    axes = Figure().add_subplot()
+    _path(axes, replace(run, discs=(disc,)))
+    (circle,) = (patch for patch in axes.patches if isinstance(patch, Circle))
+    nearest = disc[np.hypot(*(run.y - disc[:, :2]).T).argmin()]
+    assert (*circle.center, circle.radius) == pytest.approx(tuple(nearest))
+    legend = axes.get_legend()
+    assert legend is not None
+    assert "obstacle, when nearest" in [text.get_text() for text in legend.get_texts()]
+
+
 def test_the_figure_is_an_image_of_a_legible_size_and_leaves_the_callers_settings_alone(run: Run, tmp_path: Path) -> None:
     import matplotlib as mpl
     from matplotlib.image import imread
